@@ -1,0 +1,1 @@
+"""Soil properties from photographs of a tool moving through it."""

@@ -1,0 +1,38 @@
+"""Errors a user can act on: one sentence that says what is wrong, where, and what to do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+class SplatsoilError(Exception):
+    """Base of every error that is the user's to mend; the command line prints it without a traceback."""
+
+
+class MeasurementError(SplatsoilError):
+    """A measurement set breaks its contract.
+
+    Args:
+        message: what is wrong and what to do about it.
+        file: the offending file, if one is to blame.
+        field: the field (JSON key, CSV column) inside it.
+    """
+
+    def __init__(self, message: str, *, file: str | Path | None = None, field: str | None = None) -> None:
+        self.file = None if file is None else Path(file)
+        self.field = field
+        where = "" if file is None else f"{file}: "
+        what = "" if field is None else f"{field}: "
+        super().__init__(f"{where}{what}{message}")
+
+
+class ParameterError(SplatsoilError):
+    """A parameter, effect or option is unknown, out of its bounds, or meaningless in combination."""
+
+
+class SimulationError(SplatsoilError):
+    """The simulation cannot go on: non-finite state, particles off the grid, a broken step limit."""
+
+
+class RunError(SplatsoilError):
+    """A run folder is missing, unreadable, or belongs to another experiment."""
