@@ -1,0 +1,31 @@
+"""Measurement sets: cameras, photographs, video, the tool and its motion; read, checked and written.
+
+Nothing here imports torch until an image is undistorted, so that looking at a set is quick.
+"""
+
+from splatsoil.measurement.blender import read_blender
+from splatsoil.measurement.camera import CAMERA_MODELS, Camera
+from splatsoil.measurement.colmap import read_colmap
+from splatsoil.measurement.frames import Frame
+from splatsoil.measurement.measurement import FORMAT, Bed, Measurement
+from splatsoil.measurement.motion import ToolMotion
+from splatsoil.measurement.remarks import Remark, remarks
+from splatsoil.measurement.tool import Tool
+from splatsoil.measurement.writer import Picture, write_measurement
+
+__all__ = [
+    "CAMERA_MODELS",
+    "FORMAT",
+    "Bed",
+    "Camera",
+    "Frame",
+    "Measurement",
+    "Picture",
+    "Remark",
+    "Tool",
+    "ToolMotion",
+    "read_blender",
+    "read_colmap",
+    "remarks",
+    "write_measurement",
+]

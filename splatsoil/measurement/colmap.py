@@ -1,0 +1,207 @@
+"""Import of COLMAP's sparse models, text or binary.
+
+The formats are those of COLMAP's documentation (https://colmap.github.io/format.html) and of its
+src/colmap/sensor/models.h: world to camera, OpenCV axes, Hamilton quaternions wxyz. A model's scale and orientation are
+arbitrary unless it was geo-registered; ``similarity`` brings it into metres with z up.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from splatsoil.errors import MeasurementError
+from splatsoil.measurement.camera import FISHEYE, Camera
+from splatsoil.measurement.fields import inside, read_text
+from splatsoil.measurement.frames import Frame
+from splatsoil.measurement.images import check_image
+from splatsoil.measurement.rotations import quaternion_to_matrix
+
+FloatArray = npt.NDArray[np.float64]
+
+# COLMAP's number and name of a model -> what its parameters are, in our words ("f" stands for both focal lengths).
+_MODELS: dict[str, tuple[int, str, tuple[str, ...]]] = {
+    "SIMPLE_PINHOLE": (0, "PINHOLE", ("f", "cx", "cy")),
+    "PINHOLE": (1, "PINHOLE", ("fx", "fy", "cx", "cy")),
+    "SIMPLE_RADIAL": (2, "OPENCV", ("f", "cx", "cy", "k1")),
+    "RADIAL": (3, "OPENCV", ("f", "cx", "cy", "k1", "k2")),
+    "OPENCV": (4, "OPENCV", ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")),
+    "OPENCV_FISHEYE": (5, FISHEYE, ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")),
+    "SIMPLE_RADIAL_FISHEYE": (8, FISHEYE, ("f", "cx", "cy", "k1")),
+    "RADIAL_FISHEYE": (9, FISHEYE, ("f", "cx", "cy", "k1", "k2")),
+}
+_NAMES = {number: name for name, (number, _, _) in _MODELS.items()}
+
+_Calibration = tuple[str, int, int, tuple[float, ...]]  # model, width, height, parameters
+_Pose = tuple[int, str, FloatArray, FloatArray]  # camera id, image name, quaternion (4,), translation (3,)
+
+
+def read_colmap(model: str | Path, images: str | Path, *, similarity: npt.ArrayLike | None = None) -> tuple[Frame, ...]:
+    """Frames of a COLMAP sparse model, ordered by image name.
+
+    Args:
+        model: folder with cameras and images, ``.bin`` or ``.txt`` (``sparse/0``).
+        images: folder that the image names are relative to.
+        similarity: (4, 4) matrix (uniform scale, rotation, translation) from the model's world to metres with z up.
+
+    Raises:
+        MeasurementError: naming file and field.
+    """
+    folder, root = Path(model), Path(images)
+    if (folder / "cameras.bin").is_file() and (folder / "images.bin").is_file():
+        calibrations, poses = _read_cameras_bin(folder / "cameras.bin"), _read_images_bin(folder / "images.bin")
+        source = folder / "images.bin"
+    else:
+        calibrations, poses = _read_cameras_txt(folder / "cameras.txt"), _read_images_txt(folder / "images.txt")
+        source = folder / "images.txt"
+    if not poses:
+        raise MeasurementError("the model has no registered image", file=source)
+    frames = []
+    for camera_id, name, quaternion, translation in sorted(poses, key=lambda pose: pose[1]):
+        if camera_id not in calibrations:
+            raise MeasurementError(f"camera {camera_id} is not among the model's cameras", file=source, field=name)
+        path = inside(name, root, root, source, "NAME")
+        matrix = _camera_to_world(quaternion, translation, similarity, source, name)
+        camera = _camera(calibrations[camera_id], matrix, source)
+        check_image(path, (camera.width, camera.height), sizes_from=f"WIDTH and HEIGHT of camera {camera_id}")
+        frames.append(Frame(camera, path))
+    return tuple(frames)
+
+
+def _camera(calibration: _Calibration, matrix: FloatArray, file: Path) -> Camera:
+    name, width, height, values = calibration
+    _, model, keys = _MODELS[name]
+    if len(values) != len(keys) or not np.isfinite(values).all():
+        raise MeasurementError(f"{name} has {len(keys)} finite parameters, not {values}", file=file, field="PARAMS")
+    given = dict(zip(keys, values, strict=True))
+    focal = given.pop("f", None)
+    if focal is not None:
+        given |= {"fx": focal, "fy": focal}
+    return Camera(width=width, height=height, camera_to_world=matrix, **given, name="", model=model)
+
+
+def _camera_to_world(
+    quaternion: FloatArray, translation: FloatArray, similarity: npt.ArrayLike | None, file: Path, name: str
+) -> FloatArray:
+    norm = float(np.linalg.norm(quaternion))
+    if not np.isfinite(translation).all() or not 0.5 < norm < 2.0:
+        raise MeasurementError("the pose is no rigid motion", file=file, field=name)
+    rotation = quaternion_to_matrix(quaternion / norm)
+    out = np.eye(4)
+    out[:3, :3] = rotation.T @ np.diag([1.0, -1.0, -1.0])  # OpenCV to OpenGL camera axes
+    out[:3, 3] = -rotation.T @ translation
+    if similarity is not None:
+        similar = np.asarray(similarity, dtype=np.float64)
+        scale = float(np.cbrt(np.linalg.det(similar[:3, :3])))
+        out[:3, 3] = similar[:3, :3] @ out[:3, 3] + similar[:3, 3]
+        out[:3, :3] = similar[:3, :3] @ out[:3, :3] / scale
+    return out
+
+
+def _known(model: str, file: Path, field: str) -> str:
+    if model not in _MODELS:
+        raise MeasurementError(
+            f"camera model {model!r} cannot be imported, only {', '.join(_MODELS)}; undistort with COLMAP first",
+            file=file,
+            field=field,
+        )
+    return model
+
+
+def _lines(file: Path) -> list[str]:
+    return [line.strip() for line in read_text(file).splitlines() if not line.startswith("#")]
+
+
+def _numbers(words: Sequence[str], file: Path, field: str) -> tuple[float, ...]:
+    try:
+        return tuple(float(word) for word in words)
+    except ValueError as error:
+        raise MeasurementError(f"expected numbers, found {' '.join(words)[:60]!r}", file=file, field=field) from error
+
+
+def _read_cameras_txt(file: Path) -> dict[int, _Calibration]:
+    out: dict[int, _Calibration] = {}
+    for line in filter(None, _lines(file)):
+        words = line.split()
+        if len(words) < 5:
+            raise MeasurementError("expected CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", file=file, field=line[:40])
+        identity, width, height = (int(v) for v in _numbers([words[0], *words[2:4]], file, line[:40]))
+        model = _known(words[1], file, f"camera {identity}, MODEL")
+        out[identity] = model, width, height, _numbers(words[4:], file, f"camera {identity}, PARAMS")
+    return out
+
+
+def _read_images_txt(file: Path) -> list[_Pose]:
+    lines = _lines(file)
+    while lines and not lines[0]:
+        lines.pop(0)
+    out: list[_Pose] = []
+    for line in lines[::2]:  # every second line lists 2-D points and may be empty
+        if not line:
+            break
+        words = line.split(maxsplit=9)
+        if len(words) != 10:
+            raise MeasurementError(
+                "expected IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", file=file, field=line[:40]
+            )
+        values = np.array(_numbers(words[1:9], file, words[9]))
+        out.append((int(values[7]), words[9], values[:4], values[4:7]))
+    return out
+
+
+class _Bytes:
+    """Little-endian values from a binary file, with MeasurementError at its end."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        self.data = file.read_bytes()
+        self.at = 0
+
+    def take(self, form: str) -> tuple[float, ...]:
+        size = struct.calcsize("<" + form)
+        if self.at + size > len(self.data):
+            raise MeasurementError("the file is truncated", file=self.file, field=f"byte {len(self.data)}")
+        values = struct.unpack_from("<" + form, self.data, self.at)
+        self.at += size
+        return values
+
+    def word(self) -> str:
+        end = self.data.find(b"\0", self.at)
+        if end < 0:
+            raise MeasurementError("the file is truncated", file=self.file, field=f"byte {len(self.data)}")
+        raw = self.data[self.at : end]
+        self.at = end + 1
+        try:
+            return raw.decode()
+        except UnicodeDecodeError as error:
+            raise MeasurementError("not a COLMAP file", file=self.file, field=f"byte {end - len(raw)}") from error
+
+    def skip(self, count: int) -> None:
+        if self.at + count > len(self.data):
+            raise MeasurementError("the file is truncated", file=self.file, field=f"byte {len(self.data)}")
+        self.at += count
+
+
+def _read_cameras_bin(file: Path) -> dict[int, _Calibration]:
+    data = _Bytes(file)
+    out: dict[int, _Calibration] = {}
+    for _ in range(int(data.take("Q")[0])):
+        identity, number, width, height = (int(v) for v in data.take("IiQQ"))
+        model = _known(_NAMES.get(number, f"number {number}"), file, f"camera {identity}, MODEL")
+        out[identity] = model, width, height, data.take(f"{len(_MODELS[model][2])}d")
+    return out
+
+
+def _read_images_bin(file: Path) -> list[_Pose]:
+    data = _Bytes(file)
+    out: list[_Pose] = []
+    for _ in range(int(data.take("Q")[0])):
+        values = data.take("I7dI")
+        name = data.word()
+        data.skip(24 * int(data.take("Q")[0]))  # x, y, POINT3D_ID of each 2-D point
+        out.append((int(values[8]), name, np.array(values[1:5]), np.array(values[5:8])))
+    return out

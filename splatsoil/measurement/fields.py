@@ -1,0 +1,231 @@
+"""Reading numbers, words and paths out of JSON and CSV, so that each fault names its file and field."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+import numpy.typing as npt
+
+from splatsoil.errors import MeasurementError
+
+FloatArray = npt.NDArray[np.float64]
+
+
+class Fields:
+    """A JSON object of a file, with the way that led to it.
+
+    Every reader raises MeasurementError, naming the file and the field's full path (``bed.upper[2]``).
+    """
+
+    def __init__(self, data: dict[str, Any], file: Path, prefix: str = "", parent: Fields | None = None) -> None:
+        self.data = data
+        self.file = file
+        self.prefix = prefix
+        self.parent = parent
+
+    @classmethod
+    def read(cls, file: Path) -> Fields:
+        """The object that a JSON file holds."""
+        data = read_json(file)
+        if not isinstance(data, dict):
+            raise MeasurementError(f"expected a JSON object, found {_kind(data)}", file=file)
+        return cls(data, file)
+
+    def path_of(self, key: str) -> str:
+        """Full name of a field, as errors show it."""
+        return f"{self.prefix}.{key}" if self.prefix else key
+
+    def fail(self, key: str, message: str) -> NoReturn:
+        """Raise MeasurementError about a field of this object, or of the enclosing one that the value came from."""
+        name = key.split("[")[0]
+        if self.parent is not None and self.data.get(name) is None and self.parent.has(name):
+            self.parent.fail(key, message)
+        raise MeasurementError(message, file=self.file, field=self.path_of(key))
+
+    def has(self, key: str) -> bool:
+        """Whether the field is there, here or in the enclosing object it falls back to, and not null."""
+        return self._find(key) is not None
+
+    def raw(self, key: str) -> Any:
+        """The value as JSON has it; missing or null is an error."""
+        value = self._find(key)
+        if value is None:
+            self.fail(key, "missing; the format requires it")
+        return value
+
+    def child(self, key: str) -> Fields:
+        """A nested object."""
+        value = self.raw(key)
+        if not isinstance(value, dict):
+            self.fail(key, f"expected an object, found {_kind(value)}")
+        return Fields(value, self.file, self.path_of(key))
+
+    def children(self, key: str) -> Iterator[Fields]:
+        """The objects of a non-empty list; fields missing in them are looked up in this object."""
+        value = self.raw(key)
+        if not isinstance(value, list):
+            self.fail(key, f"expected a list, found {_kind(value)}")
+        if not value:
+            self.fail(key, "the list is empty")
+        for i, item in enumerate(value):
+            name = f"{key}[{i}]"
+            if not isinstance(item, dict):
+                self.fail(name, f"expected an object, found {_kind(item)}")
+            yield Fields(item, self.file, self.path_of(name), parent=self)
+
+    def text(self, key: str) -> str:
+        """A non-empty string."""
+        value = self.raw(key)
+        if not isinstance(value, str) or not value.strip():
+            self.fail(key, f"expected text, found {_kind(value)}")
+        return value
+
+    def number(
+        self, key: str, lower: float = -math.inf, upper: float = math.inf, default: float | None = None, hint: str = ""
+    ) -> float:
+        """A finite number within [lower, upper]; ``hint`` is appended to the message when it is outside."""
+        if default is not None and not self.has(key):
+            return default
+        number = self._finite(key, self.raw(key))
+        if not lower <= number <= upper:
+            self.fail(key, f"{number:g} lies outside [{lower:g}, {upper:g}]{hint and '; ' + hint}")
+        return number
+
+    def integer(self, key: str, lower: int, upper: int) -> int:
+        """A whole number within [lower, upper]."""
+        number = self.number(key, lower, upper)
+        if number != int(number):
+            self.fail(key, f"expected a whole number, found {number:g}")
+        return int(number)
+
+    def vector(self, key: str, length: int) -> FloatArray:
+        """A list of ``length`` finite numbers."""
+        value = self.raw(key)
+        if not isinstance(value, list) or len(value) != length:
+            self.fail(key, f"expected a list of {length} numbers, found {_kind(value)}")
+        return np.array([self._finite(f"{key}[{i}]", v) for i, v in enumerate(value)])
+
+    def matrix(self, key: str, rows: int, columns: int) -> FloatArray:
+        """A list of ``rows`` lists of ``columns`` finite numbers."""
+        value = self.raw(key)
+        shaped = isinstance(value, list) and len(value) == rows
+        if not shaped or not all(isinstance(row, list) and len(row) == columns for row in value):
+            self.fail(key, f"expected a {rows} x {columns} matrix (a list of {rows} lists of {columns} numbers)")
+        return np.array(
+            [[self._finite(f"{key}[{i}][{j}]", v) for j, v in enumerate(row)] for i, row in enumerate(value)]
+        )
+
+    def path(self, key: str, root: Path, base: Path) -> Path:
+        """An existing file named relative to ``base`` that lies inside ``root``, also after following links."""
+        return inside(self.text(key), root, base, self.file, self.path_of(key))
+
+    def _find(self, key: str) -> Any:
+        value = self.data.get(key)
+        if value is None and self.parent is not None:
+            return self.parent._find(key)
+        return value
+
+    def _finite(self, key: str, value: Any) -> float:
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            self.fail(key, f"expected a number, found {_kind(value)}")
+        try:
+            number = float(value)
+        except OverflowError:
+            number = math.inf
+        if not math.isfinite(number):
+            self.fail(key, f"{number} is not a finite number")
+        return number
+
+
+def inside(name: str, root: Path, base: Path, file: Path, field: str) -> Path:
+    """The existing file ``name`` (relative to ``base``), which must lie inside ``root`` after following links.
+
+    Raises:
+        MeasurementError: about ``field`` of ``file`` when the path leaves the folder or is unusable, else about the
+            missing file itself.
+    """
+    path = base / name
+    try:
+        leaves = Path(name).is_absolute() or not path.resolve().is_relative_to(root.resolve())
+        found, is_file = path.exists(), path.is_file()
+    except (OSError, ValueError, RuntimeError) as error:  # name too long, null character, loop of links
+        raise MeasurementError(f"{name[:80]!r} is no usable path ({error})", file=file, field=field) from error
+    if leaves:
+        raise MeasurementError(
+            f"{name!r} leaves the measurement set; put the file into the folder and name it relatively",
+            file=file,
+            field=field,
+        )
+    if not found:
+        raise MeasurementError(f"no such file, though {file.name} names it", file=path, field=field)
+    if not is_file:
+        raise MeasurementError(f"{name!r} is not a file", file=file, field=field)
+    return path
+
+
+def read_json(file: Path) -> Any:
+    """What a JSON file holds; MeasurementError when it is missing, unreadable or not JSON."""
+    text = read_text(file)
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError as error:
+        raise MeasurementError(f"not JSON: {error.msg} in line {error.lineno}", file=file) from error
+    except (ValueError, RecursionError) as error:  # numbers of thousands of digits, endless nesting
+        raise MeasurementError(f"not usable JSON: {error}", file=file) from error
+
+
+def read_text(file: Path) -> str:
+    """A UTF-8 text file's content; MeasurementError when it is missing, unreadable or not text."""
+    try:
+        return file.read_text(encoding="utf-8-sig")
+    except FileNotFoundError as error:
+        raise MeasurementError("no such file", file=file) from error
+    except UnicodeDecodeError as error:
+        raise MeasurementError("not a text file (it is not UTF-8)", file=file) from error
+    except OSError as error:
+        raise MeasurementError(f"cannot be read: {error.strerror}", file=file) from error
+
+
+def read_table(file: Path, columns: Sequence[str]) -> FloatArray:
+    """A CSV file with exactly the header ``columns``: (rows, columns) finite numbers, at least one row."""
+    rows = list(csv.reader(read_text(file).splitlines()))
+    header = [name.strip() for name in rows[0]] if rows else []
+    if header != list(columns):
+        found = ",".join(header)[:80] or "nothing"
+        raise MeasurementError(f"expected the header {','.join(columns)}, found {found}", file=file, field="line 1")
+    table: list[list[float]] = []
+    for line, row in enumerate(rows[1:], start=2):
+        if not any(cell.strip() for cell in row):
+            continue
+        if len(row) != len(columns):
+            raise MeasurementError(
+                f"{len(row)} values where the header has {len(columns)}", file=file, field=f"line {line}"
+            )
+        table.append([_cell(cell, file, f"{name}, line {line}") for name, cell in zip(columns, row, strict=True)])
+    if not table:
+        raise MeasurementError("the table has no rows", file=file)
+    return np.array(table)
+
+
+def _cell(text: str, file: Path, field: str) -> float:
+    try:
+        number = float(text)
+    except ValueError as error:
+        raise MeasurementError(f"{text.strip()[:40]!r} is not a number", file=file, field=field) from error
+    if not math.isfinite(number):
+        raise MeasurementError(f"{text.strip()} is not a finite number", file=file, field=field)
+    return number
+
+
+def _kind(value: Any) -> str:
+    if isinstance(value, dict):
+        return "an object"
+    if isinstance(value, list):
+        return f"a list of {len(value)}"
+    return json.dumps(value)[:40]

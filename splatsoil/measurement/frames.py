@@ -1,0 +1,240 @@
+"""Photographs with their cameras: nerfstudio's transforms.json, read and checked."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from splatsoil.errors import MeasurementError
+from splatsoil.measurement.camera import CAMERA_MODELS, Camera
+from splatsoil.measurement.fields import Fields
+from splatsoil.measurement.images import check_image, read_alpha, read_image
+from splatsoil.measurement.rotations import nearest_rigid, why_not_rigid
+
+FloatImage = npt.NDArray[np.float32]
+BoolImage = npt.NDArray[np.bool_]
+
+_COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
+_DEPTH_UNIT = 1e-3  # nerfstudio's depth images are 16-bit millimetres
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One photograph.
+
+    Attributes:
+        camera: calibration and pose.
+        path: the image file.
+        camera_name: which camera took it; empty where the set does not say.
+        frame: its number on the tool motion's clock, negative before the motion (pre-roll), None for views.
+        time: seconds on that clock, None for views.
+        mask_path: image that is black where pixels are to be ignored, or None.
+        depth_path: 16-bit image in millimetres, or .npy in metres, of the depth along the camera's axis, or None.
+    """
+
+    camera: Camera
+    path: Path
+    camera_name: str = ""
+    frame: int | None = None
+    time: float | None = None
+    mask_path: Path | None = None
+    depth_path: Path | None = None
+
+    def image(self) -> FloatImage:
+        """The image as stored: (height, width, 3) float32, sRGB in [0, 1]."""
+        return read_image(self.path)
+
+    def mask(self) -> BoolImage | None:
+        """Where the image is to be used, by its mask or its own transparency: (height, width) bool, or None."""
+        if self.mask_path is not None:
+            return read_image(self.mask_path).max(axis=2) > 0.0
+        return read_alpha(self.path)
+
+    def depth(self) -> FloatImage | None:
+        """Depth along the camera's axis, (height, width) float32 metres, 0 where unknown; None if there is none."""
+        if self.depth_path is None:
+            return None
+        if self.depth_path.suffix == ".npy":
+            return np.load(self.depth_path, allow_pickle=False).astype(np.float32)
+        return read_image(self.depth_path)[:, :, 0] * np.float32(65535.0 * _DEPTH_UNIT)
+
+    def undistorted_image(self) -> FloatImage:
+        """The image that ``camera.undistorted()`` would have taken; black where this lens did not see."""
+        if not self.camera.has_distortion:
+            return self.image()
+        return _resample(self.image(), self.camera)
+
+    def undistorted_mask(self) -> BoolImage:
+        """Where ``undistorted_image()`` shows the scene and the mask allows it: (height, width) bool."""
+        mask = self.mask()
+        if mask is None:
+            mask = np.ones((self.camera.height, self.camera.width), dtype=bool)
+        if not self.camera.has_distortion:
+            return mask
+        # A pixel blended from outside the image or from masked pixels is not to be trusted.
+        return _resample(mask[:, :, None].astype(np.float32), self.camera)[:, :, 0] > 0.999
+
+
+def _resample(image: FloatImage, camera: Camera) -> FloatImage:
+    """Bilinear resampling of (height, width, channels) to the camera without distortion, zero outside the image."""
+    import torch
+    from kornia.geometry.transform import remap
+
+    # kornia puts pixel centres at whole numbers, we at halves.
+    where = np.nan_to_num(camera.undistortion_map() - 0.5, nan=-10.0 * max(camera.width, camera.height))
+    grid = torch.from_numpy(where.astype(np.float32))
+    pixels = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None]
+    out = remap(pixels, grid[None, :, :, 0], grid[None, :, :, 1], align_corners=True)
+    return np.asarray(out[0].permute(1, 2, 0).numpy())
+
+
+def read_transforms(file: Path, root: Path, *, video: bool) -> tuple[Frame, ...]:
+    """Read a nerfstudio transforms.json and check every image it names.
+
+    Args:
+        file: the transforms.json; images are relative to its folder.
+        root: the measurement set's folder, which no path may leave.
+        video: require ``camera``, ``frame`` and ``time`` on each frame, and cameras that stay where they are.
+
+    Raises:
+        MeasurementError: naming file and field.
+    """
+    fields = Fields.read(file)
+    frames = tuple(_read_frame(item, root, video=video) for item in fields.children("frames"))
+    _check_unique(frames, file, video=video)
+    if video:
+        _check_fixed(frames, file)
+        _check_times(frames, file)
+    for frame in frames:
+        size = (frame.camera.width, frame.camera.height)
+        check_image(frame.path, size, sizes_from=f"w and h of {file.name}")
+        if frame.mask_path is not None:
+            check_image(frame.mask_path, size, sizes_from=f"w and h of {file.name}")
+        if frame.depth_path is not None:
+            _check_depth(frame.depth_path, size, file)
+    return frames
+
+
+def read_camera(fields: Fields, name: str) -> Camera:
+    """A camera from one frame's fields (those the frame lacks come from the top of the file)."""
+    model = fields.text("camera_model") if fields.has("camera_model") else "OPENCV"
+    if model not in CAMERA_MODELS:
+        fields.fail("camera_model", f"unknown camera model {model!r}; known are {', '.join(CAMERA_MODELS)}")
+    width, height = fields.integer("w", 1, 100_000), fields.integer("h", 1, 100_000)
+    bend = {key: fields.number(key, default=0.0) for key in _COEFFICIENTS}
+    if model == "PINHOLE" and any(bend.values()):
+        first = next(key for key, value in bend.items() if value)
+        fields.fail(first, f"a PINHOLE camera has no distortion, but {first} = {bend[first]:g}; say OPENCV")
+    hint = "focal lengths are given in pixels"
+    camera = Camera(
+        width=width,
+        height=height,
+        fx=fields.number("fl_x", 0.05 * width, 1000.0 * width, hint=hint),
+        fy=fields.number("fl_y", 0.05 * height, 1000.0 * height, hint=hint),
+        cx=fields.number("cx", -10.0 * width, 11.0 * width),
+        cy=fields.number("cy", -10.0 * height, 11.0 * height),
+        camera_to_world=_read_pose(fields),
+        **bend,
+        name=name,
+        model=model,
+    )
+    if not np.isfinite(camera.rays([[camera.cx, camera.cy]])[1]).all():
+        fields.fail("k1", "the distortion leaves no image, not even at the principal point")
+    return camera
+
+
+def _read_pose(fields: Fields) -> npt.NDArray[np.float64]:
+    matrix = fields.matrix("transform_matrix", 4, 4)
+    fault = why_not_rigid(matrix)
+    if fault:
+        fields.fail("transform_matrix", f"not a rigid motion: {fault}")
+    return nearest_rigid(matrix)
+
+
+def _read_frame(fields: Fields, root: Path, *, video: bool) -> Frame:
+    base = fields.file.parent
+    name = fields.text("camera") if video or fields.has("camera") else ""
+    number = fields.integer("frame", -(10**9), 10**9) if video else None
+    time = fields.number("time", -1e9, 1e9) if video else None
+    optional = {
+        key: fields.path(key, root, base) if fields.has(key) else None for key in ("mask_path", "depth_file_path")
+    }
+    return Frame(
+        camera=read_camera(fields, name),
+        path=fields.path("file_path", root, base),
+        camera_name=name,
+        frame=number,
+        time=time,
+        mask_path=optional["mask_path"],
+        depth_path=optional["depth_file_path"],
+    )
+
+
+def _check_unique(frames: tuple[Frame, ...], file: Path, *, video: bool) -> None:
+    seen: dict[object, int] = {}
+    for i, frame in enumerate(frames):
+        keys: list[tuple[object, str, str]] = [(frame.path, f"frames[{i}].file_path", f"the image {frame.path.name}")]
+        if video:
+            what = f"frame {frame.frame} of camera {frame.camera_name!r}"
+            keys.append(((frame.camera_name, frame.frame), f"frames[{i}].frame", what))
+        for key, field, what in keys:
+            if key in seen:
+                raise MeasurementError(f"{what} is given twice, first in frames[{seen[key]}]", file=file, field=field)
+            seen[key] = i
+
+
+def _by_camera(frames: tuple[Frame, ...]) -> Iterator[list[tuple[int, Frame]]]:
+    for name in dict.fromkeys(frame.camera_name for frame in frames):
+        yield [(i, frame) for i, frame in enumerate(frames) if frame.camera_name == name]
+
+
+def _check_fixed(frames: tuple[Frame, ...], file: Path) -> None:
+    for group in _by_camera(frames):
+        first = group[0][1].camera
+        for i, frame in group[1:]:
+            camera = frame.camera
+            if np.abs(camera.camera_to_world - first.camera_to_world).max() > 1e-4:
+                raise MeasurementError(
+                    f"camera {frame.camera_name!r} moves; the video's cameras must stand still",
+                    file=file,
+                    field=f"frames[{i}].transform_matrix",
+                )
+            here = (camera.width, camera.height, *camera.intrinsics.ravel(), *camera.distortion)
+            there = (first.width, first.height, *first.intrinsics.ravel(), *first.distortion)
+            if here != there or camera.model != first.model:
+                raise MeasurementError(
+                    f"camera {frame.camera_name!r} has another calibration than in frames[{group[0][0]}]",
+                    file=file,
+                    field=f"frames[{i}]",
+                )
+
+
+def _check_times(frames: tuple[Frame, ...], file: Path) -> None:
+    for group in _by_camera(frames):
+        ordered = sorted(group, key=lambda pair: pair[1].frame or 0)
+        for (_, before), (i, after) in pairwise(ordered):
+            assert before.time is not None and after.time is not None
+            if after.time <= before.time:
+                raise MeasurementError(
+                    f"time runs backwards: camera {after.camera_name!r} has frame {before.frame} at {before.time:g} s, "
+                    f"frame {after.frame} at {after.time:g} s",
+                    file=file,
+                    field=f"frames[{i}].time",
+                )
+
+
+def _check_depth(path: Path, size: tuple[int, int], file: Path) -> None:
+    if path.suffix != ".npy":
+        check_image(path, size, sizes_from=f"w and h of {file.name}")
+        return
+    try:
+        shape = np.load(path, mmap_mode="r", allow_pickle=False).shape
+    except (OSError, ValueError, EOFError) as error:
+        raise MeasurementError("not a NumPy array of numbers", file=path) from error
+    if shape != size[::-1]:
+        raise MeasurementError(f"the depth is {shape} where h and w of {file.name} say {size[::-1]}", file=path)

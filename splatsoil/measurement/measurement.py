@@ -1,0 +1,287 @@
+"""A measurement set: a folder of photographs, video frames, tool mesh and motion. Read-only."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from splatsoil.errors import MeasurementError
+from splatsoil.measurement.camera import Camera
+from splatsoil.measurement.fields import Fields
+from splatsoil.measurement.frames import Frame, read_transforms
+from splatsoil.measurement.motion import ToolMotion
+from splatsoil.measurement.tool import DEFAULT_FRICTION, Tool, read_force, read_mesh
+
+FloatArray = npt.NDArray[np.float64]
+
+FORMAT = "splatsoil-measurement/1"
+EXPERIMENT = "experiment.json"
+
+# What a laboratory or a field could hold; beyond it a unit is wrong (millimetres, g/cm³).
+_SMALLEST_BED, _LARGEST_BED = 0.01, 50.0
+_FARTHEST_BED = 1000.0  # from the origin: positions are single precision in places
+_DENSITIES = (100.0, 20_000.0)
+_GRAVITIES = (1e-3, 300.0)
+_FAR_CAMERA = 100.0  # in diagonals of the bed
+_LARGE_TOOL, _SMALL_TOOL = 10.0, 1e-3  # in diagonals of the bed
+
+
+@dataclass(frozen=True, eq=False)
+class Bed:
+    """The box of soil.
+
+    Attributes:
+        lower: (3,) lowest corner in metres; its z is the floor.
+        upper: (3,) highest corner in metres; its z is the top of the space the soil may use, not the soil's surface.
+        density: bulk density in kg/m³.
+        wall_friction: Coulomb coefficient at the box's sides.
+        floor_friction: Coulomb coefficient at its floor.
+    """
+
+    lower: FloatArray
+    upper: FloatArray
+    density: float
+    wall_friction: float = 0.0
+    floor_friction: float = 0.6
+
+    def __post_init__(self) -> None:
+        for name in ("lower", "upper"):
+            corner = np.array(getattr(self, name), dtype=np.float64).reshape(3)
+            corner.setflags(write=False)
+            object.__setattr__(self, name, corner)
+
+    @property
+    def extents(self) -> FloatArray:
+        """Lengths (3,) of the box's edges in metres."""
+        return self.upper - self.lower
+
+    @property
+    def corners(self) -> FloatArray:
+        """The box's corners (8, 3) in metres."""
+        pick = np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)])
+        return np.where(pick == 1, self.upper, self.lower)
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """A measurement set, checked.
+
+    Attributes:
+        folder: where it lies; nothing in it is ever modified.
+        name: what it calls itself.
+        gravity: (3,) m/s².
+        frame_rate: frames a second of the tool motion's and the video's numbering.
+        bed: the box of soil.
+        tool: the tool and its motion.
+        views: photographs before anything moves.
+        video: the fixed cameras' frames, pre-roll included.
+        assumed: fields that ``experiment.json`` leaves out, and the values taken for them.
+    """
+
+    folder: Path
+    name: str
+    gravity: FloatArray
+    frame_rate: float
+    bed: Bed
+    tool: Tool
+    views: tuple[Frame, ...]
+    video: tuple[Frame, ...]
+    assumed: dict[str, float] = field(default_factory=dict)
+    sources: tuple[Path, ...] = ()
+
+    @classmethod
+    def load(cls, folder: str | Path) -> Measurement:
+        """Read a set and check all of it, every image included.
+
+        Raises:
+            MeasurementError: at the first thing that is wrong, naming the file and the field.
+        """
+        root = Path(folder)
+        if not root.exists():
+            raise MeasurementError("no such folder; give the folder of a measurement set", file=root)
+        if not root.is_dir():
+            raise MeasurementError("not a folder; give the folder of a measurement set", file=root)
+        file = root / EXPERIMENT
+        if not file.is_file():
+            raise MeasurementError(f"no {EXPERIMENT} in this folder; it is no measurement set", file=file)
+        fields = Fields.read(file)
+        tag = fields.text("format")
+        if tag != FORMAT:
+            fields.fail("format", f"{tag!r} is not {FORMAT!r}; this is another format or another version of it")
+        if fields.has("up") and fields.text("up") != "z":
+            fields.fail("up", "only 'z' is known; turn the world so that z is up")
+        assumed: dict[str, float] = {}
+        bed = _read_bed(fields.child("bed"), assumed)
+        tool_fields = fields.child("tool")
+        tool = _read_tool(tool_fields, root, assumed)
+        transforms = {key: fields.path(key, root, root) for key in ("views", "video")}
+        measurement = cls(
+            folder=root,
+            name=fields.text("name") if fields.has("name") else root.resolve().name,
+            gravity=_read_gravity(fields),
+            frame_rate=fields.number("frame_rate", 1e-3, 1e6, hint="it is in frames a second"),
+            bed=bed,
+            tool=tool,
+            views=read_transforms(transforms["views"], root, video=False),
+            video=read_transforms(transforms["video"], root, video=True),
+            assumed=assumed,
+            sources=(file, *transforms.values(), tool_fields.path("motion", root, root)),
+        )
+        _check_tool(measurement, tool_fields)
+        _check_cameras(measurement)
+        return measurement
+
+    @cached_property
+    def hash(self) -> str:
+        """SHA-256 (hex) over names and contents of the set's files; ``truth*`` and strangers don't count."""
+        digest = hashlib.sha256()
+        for path in sorted(set(self._files()), key=lambda p: p.relative_to(self.folder).as_posix()):
+            content = path.read_bytes()
+            digest.update(f"{path.relative_to(self.folder).as_posix()}\0{len(content)}\0".encode())
+            digest.update(content)
+        return digest.hexdigest()
+
+    @cached_property
+    def cameras(self) -> dict[str, Camera]:
+        """The video's cameras by name."""
+        out: dict[str, Camera] = {}
+        for frame in self.video:
+            out.setdefault(frame.camera_name, frame.camera)
+        return out
+
+    @cached_property
+    def frames(self) -> tuple[int, ...]:
+        """Frame numbers of the video from 0 on, sorted."""
+        return tuple(sorted({f.frame for f in self.video if f.frame is not None and f.frame >= 0}))
+
+    @cached_property
+    def pre_roll(self) -> tuple[Frame, ...]:
+        """Video frames with negative numbers, in which nothing moves."""
+        return tuple(f for f in self.video if f.frame is not None and f.frame < 0)
+
+    def video_frame(self, camera: str, frame: int) -> Frame:
+        """The video frame of a camera; MeasurementError when there is none."""
+        for candidate in self.video:
+            if candidate.camera_name == camera and candidate.frame == frame:
+                return candidate
+        known = f"cameras are {', '.join(self.cameras)}, frames {self.frames[:3]} … {self.frames[-1:]}"
+        raise MeasurementError(f"no frame {frame} of camera {camera!r}; {known}", file=self.folder)
+
+    def _files(self) -> Iterator[Path]:
+        yield from self.sources
+        yield from (p for p in (self.tool.mesh_path, self.tool.force_path) if p is not None)
+        for frame in (*self.views, *self.video):
+            yield from (p for p in (frame.path, frame.mask_path, frame.depth_path) if p is not None)
+
+
+def _read_bed(fields: Fields, assumed: dict[str, float]) -> Bed:
+    lower, upper = fields.vector("lower", 3), fields.vector("upper", 3)
+    for axis, (low, high) in enumerate(zip(lower, upper, strict=True)):
+        size = high - low
+        if size <= 0.0:
+            fields.fail(f"upper[{axis}]", f"{high:g} is not above lower[{axis}] = {low:g}")
+        if not _SMALLEST_BED <= size <= _LARGEST_BED:
+            fields.fail(
+                f"upper[{axis}]",
+                f"the bed is {size:g} m along {'xyz'[axis]}, outside [{_SMALLEST_BED:g}, {_LARGEST_BED:g}] m; "
+                "lengths are in metres",
+            )
+        if max(abs(low), abs(high)) > _FARTHEST_BED:
+            fields.fail(f"upper[{axis}]", f"the bed lies {abs(high):g} m from the origin; move the origin to it")
+    return Bed(
+        lower,
+        upper,
+        density=fields.number("density", *_DENSITIES, hint="it is the bulk density in kg/m³"),
+        wall_friction=_read_friction(fields, "wall_friction", 0.0, assumed),
+        floor_friction=_read_friction(fields, "floor_friction", 0.6, assumed),
+    )
+
+
+def _read_friction(fields: Fields, key: str, default: float, assumed: dict[str, float]) -> float:
+    if not fields.has(key):
+        assumed[fields.path_of(key)] = default
+    return fields.number(key, 0.0, 10.0, default=default, hint="it is a coefficient of friction, not an angle")
+
+
+def _read_gravity(fields: Fields) -> FloatArray:
+    gravity = fields.vector("gravity", 3)
+    size = float(np.linalg.norm(gravity))
+    if not _GRAVITIES[0] <= size <= _GRAVITIES[1]:
+        fields.fail(
+            "gravity", f"{size:g} m/s² is no gravity that soil is known to stand in; on Earth it is 0, 0, -9.81"
+        )
+    if gravity[2] > -0.5 * size:
+        fields.fail("gravity", "it does not point down; z is up, so that its third number is the large, negative one")
+    return gravity
+
+
+def _read_tool(fields: Fields, root: Path, assumed: dict[str, float]) -> Tool:
+    mesh_path = fields.path("mesh", root, root)
+    motion_path = fields.path("motion", root, root)
+    force_path = fields.path("force", root, root) if fields.has("force") else None
+    return Tool(
+        mesh=read_mesh(mesh_path),
+        motion=ToolMotion.read(motion_path),
+        friction=_read_friction(fields, "friction", DEFAULT_FRICTION, assumed),
+        force=None if force_path is None else read_force(force_path),
+        mesh_path=mesh_path,
+        force_path=force_path,
+    )
+
+
+def _check_tool(measurement: Measurement, fields: Fields) -> None:
+    """The tool's size and path against the bed's."""
+    bed, tool = measurement.bed, measurement.tool
+    diagonal = float(np.linalg.norm(bed.extents))
+    size = float(np.max(tool.mesh.extents))
+    if not _SMALL_TOOL * diagonal <= size <= _LARGE_TOOL * diagonal:
+        raise MeasurementError(
+            f"the tool is {size:g} m long, the bed's diagonal {diagonal:g} m; meshes are in metres",
+            file=tool.mesh_path,
+            field="vertices",
+        )
+    if not tool.touches(bed.lower, bed.upper).any():
+        raise MeasurementError(
+            "the tool never touches the soil's box: it is outside of the bed for the whole run; "
+            "are motion and bed in the same world, in metres?",
+            file=fields.file.parent / fields.text("motion"),
+            field="x,y,z",
+        )
+
+
+def _check_cameras(measurement: Measurement) -> None:
+    """The cameras' places and directions against the bed."""
+    bed = measurement.bed
+    centre = 0.5 * (bed.lower + bed.upper)
+    diagonal = float(np.linalg.norm(bed.extents))
+    for file, frames in zip(measurement.sources[1:3], (measurement.views, measurement.video), strict=True):
+        distances = [float(np.linalg.norm(f.camera.position - centre)) for f in frames]
+        far = int(np.argmax(distances))
+        if distances[far] > _FAR_CAMERA * diagonal:
+            raise MeasurementError(
+                f"the camera is {distances[far]:g} m from a bed of {diagonal:.2g} m; positions are in metres",
+                file=file,
+                field=f"frames[{far}].transform_matrix",
+            )
+        if not any(sees(frame.camera, bed) for frame in frames):
+            raise MeasurementError(
+                "no camera looks at the soil's box; matrices are camera to world, and cameras look down their -z axis",
+                file=file,
+                field="frames[0].transform_matrix",
+            )
+
+
+def sees(camera: Camera, bed: Bed) -> bool:
+    """Whether any of a grid of points of the bed's box falls into the image."""
+    steps = np.linspace(0.0, 1.0, 9)
+    grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
+    pixels, depth = camera.project(bed.lower + grid * bed.extents)
+    with np.errstate(invalid="ignore"):
+        within = (pixels >= 0.0).all(axis=1) & (pixels[:, 0] <= camera.width) & (pixels[:, 1] <= camera.height)
+    return bool((within & (depth > 0.0)).any())

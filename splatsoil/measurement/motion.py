@@ -1,0 +1,118 @@
+"""The tool's motion: a pose for each frame, interpolated in time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from splatsoil.errors import MeasurementError
+from splatsoil.measurement.fields import read_table
+from splatsoil.measurement.rotations import quaternion_to_matrix, rotation_matrix, rotation_vector
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+MOTION_COLUMNS = ("frame", "time", "x", "y", "z", "qw", "qx", "qy", "qz")
+_QUATERNION_SLACK = 0.05  # further from length 1 than rounding explains: the columns are likely mixed up
+
+
+@dataclass(frozen=True, eq=False)
+class ToolMotion:
+    """Poses of the tool's frame in the world.
+
+    Attributes:
+        frames: (n,) frame numbers, increasing.
+        times: (n,) seconds, increasing.
+        positions: (n, 3) metres.
+        quaternions: (n, 4) unit, wxyz.
+
+    Between rows positions are interpolated linearly and orientations along the shortest arc; before the first and after
+    the last row the tool rests.
+    """
+
+    frames: IntArray
+    times: FloatArray
+    positions: FloatArray
+    quaternions: FloatArray
+
+    def __post_init__(self) -> None:
+        n = len(self.times)
+        for name, shape in (("frames", (n,)), ("times", (n,)), ("positions", (n, 3)), ("quaternions", (n, 4))):
+            kind = np.int64 if name == "frames" else np.float64
+            array = np.array(getattr(self, name), dtype=kind)
+            if n == 0 or array.shape != shape:
+                raise ValueError(f"{name} must be {shape} with at least one row, not {array.shape}")
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+
+    @classmethod
+    def read(cls, file: Path) -> ToolMotion:
+        """Read ``frame,time,x,y,z,qw,qx,qy,qz``; MeasurementError names the line and column of what is wrong."""
+        table = read_table(file, MOTION_COLUMNS)
+        frames, times = table[:, 0], table[:, 1]
+        check_clock(frames, times, file)
+        norms = np.linalg.norm(table[:, 5:], axis=1)
+        off = np.flatnonzero(np.abs(norms - 1.0) > _QUATERNION_SLACK)
+        if off.size:
+            i = int(off[0])
+            message = (
+                "the quaternion has length 0; no turn is 1,0,0,0"
+                if norms[i] < 1e-12
+                else f"the quaternion has length {norms[i]:g} instead of 1; the order is w, x, y, z"
+            )
+            raise MeasurementError(message, file=file, field=f"qw,qx,qy,qz, frame {int(frames[i])}")
+        return cls(frames.astype(np.int64), times, table[:, 2:5], table[:, 5:] / norms[:, None])
+
+    def pose(self, time: float) -> tuple[FloatArray, FloatArray]:
+        """Rotation (3, 3), tool frame to world, and position (3,) of the tool frame's origin at ``time`` in seconds."""
+        i, t = self._segment(time)
+        if t == 0.0:
+            return quaternion_to_matrix(self.quaternions[i]), self.positions[i].copy()
+        turn = rotation_matrix(t * rotation_vector(self.quaternions[i], self.quaternions[i + 1]))
+        position = (1.0 - t) * self.positions[i] + t * self.positions[i + 1]
+        return turn @ quaternion_to_matrix(self.quaternions[i]), position
+
+    def matrix(self, time: float) -> FloatArray:
+        """The pose as a (4, 4) matrix, tool frame to world."""
+        out = np.eye(4)
+        out[:3, :3], out[:3, 3] = self.pose(time)
+        return out
+
+    def twist(self, time: float) -> tuple[FloatArray, FloatArray]:
+        """Velocity (3,) in m/s of the tool frame's origin and angular velocity (3,) in rad/s, both in the world.
+
+        Constant between rows (at a row's time, that of the motion which begins there); zero outside the rows.
+        """
+        if len(self.times) < 2 or not self.times[0] <= time < self.times[-1]:
+            return np.zeros(3), np.zeros(3)
+        i = int(np.searchsorted(self.times, time, side="right")) - 1
+        step = self.times[i + 1] - self.times[i]
+        linear = (self.positions[i + 1] - self.positions[i]) / step
+        return linear, rotation_vector(self.quaternions[i], self.quaternions[i + 1]) / step
+
+    def _segment(self, time: float) -> tuple[int, float]:
+        """Row before ``time`` and the fraction of the way to the next."""
+        i = int(np.searchsorted(self.times, time, side="right")) - 1
+        if i < 0:
+            return 0, 0.0
+        if i >= len(self.times) - 1:
+            return len(self.times) - 1, 0.0
+        return i, float((time - self.times[i]) / (self.times[i + 1] - self.times[i]))
+
+
+def check_clock(frames: FloatArray, times: FloatArray, file: Path) -> None:
+    """Raise MeasurementError unless frame numbers are whole and both frames and times increase from row to row."""
+    broken = np.flatnonzero(frames != np.round(frames))
+    if broken.size:
+        raise MeasurementError(f"{frames[broken[0]]:g} is not a whole number", file=file, field="frame")
+    for name, values, verb in (("frame", frames, "does not increase"), ("time", times, "runs backwards")):
+        steps = np.flatnonzero(np.diff(values) <= 0.0)
+        if steps.size:
+            i = int(steps[0])
+            said = "stands still" if values[i + 1] == values[i] else verb
+            raise MeasurementError(
+                f"{said}: {values[i]:g} is followed by {values[i + 1]:g}", file=file, field=f"{name}, row {i + 2}"
+            )

@@ -1,0 +1,86 @@
+"""The tool: its mesh, its motion and, where it was measured, the force on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import trimesh
+
+from splatsoil.errors import MeasurementError
+from splatsoil.measurement.fields import read_table
+from splatsoil.measurement.motion import ToolMotion, check_clock
+
+FloatArray = npt.NDArray[np.float64]
+
+FORCE_COLUMNS = ("frame", "time", "fx", "fy", "fz")
+DEFAULT_FRICTION = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Tool:
+    """A rigid tool.
+
+    Attributes:
+        mesh: closed surface in the tool's frame, metres.
+        motion: where that frame is over time.
+        friction: Coulomb coefficient between tool and soil.
+        force: (n, 5) columns frame, time, fx, fy, fz: the soil's force on the tool in newtons, world axes; or None.
+        mesh_path: the file the mesh came from, if any.
+        force_path: the file the force came from, if any.
+    """
+
+    mesh: trimesh.Trimesh
+    motion: ToolMotion
+    friction: float = DEFAULT_FRICTION
+    force: FloatArray | None = None
+    mesh_path: Path | None = None
+    force_path: Path | None = None
+
+    def bounds(self, time: float) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper corner (3,) of the tool's axis-aligned box in the world at ``time``."""
+        rotation, position = self.motion.pose(time)
+        corners = self.mesh.vertices @ rotation.T + position
+        return corners.min(axis=0), corners.max(axis=0)
+
+    def touches(self, lower: FloatArray, upper: FloatArray) -> npt.NDArray[np.bool_]:
+        """For each row of the motion, whether the tool's box overlaps that from ``lower`` to ``upper``: (n,) bool."""
+        out = np.zeros(len(self.motion.times), dtype=bool)
+        for i, time in enumerate(self.motion.times):
+            low, high = self.bounds(float(time))
+            out[i] = bool(np.all(low < upper) and np.all(high > lower))
+        return out
+
+
+def read_mesh(file: Path) -> trimesh.Trimesh:
+    """A closed mesh with outward faces from any file that trimesh reads; MeasurementError otherwise."""
+    try:
+        mesh = trimesh.load_mesh(file)
+    except Exception as error:  # trimesh's readers raise whatever their parsers do
+        reason = " ".join(str(error).split())[:160] or type(error).__name__
+        raise MeasurementError(f"the mesh cannot be read ({reason}); is it what its name says?", file=file) from error
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
+        raise MeasurementError("the file holds no triangles; is it what its name says?", file=file)
+    if not np.isfinite(mesh.vertices).all():
+        raise MeasurementError("the mesh has vertices that are not finite numbers", file=file, field="vertices")
+    mesh.merge_vertices()
+    extents = np.asarray(mesh.extents)
+    if abs(mesh.volume) <= 1e-9 * float(np.prod(np.maximum(extents, extents.max() * 1e-3))):
+        raise MeasurementError(
+            "the mesh has no volume; give the tool its thickness and close its surface", file=file, field="faces"
+        )
+    if not mesh.is_watertight:
+        raise MeasurementError(
+            "the mesh has holes or loose edges, so it has no volume; close its surface", file=file, field="faces"
+        )
+    trimesh.repair.fix_normals(mesh)
+    return mesh
+
+
+def read_force(file: Path) -> FloatArray:
+    """``frame,time,fx,fy,fz``: (n, 5)."""
+    table = read_table(file, FORCE_COLUMNS)
+    check_clock(table[:, 0], table[:, 1], file)
+    return table

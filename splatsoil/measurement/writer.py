@@ -1,0 +1,191 @@
+"""Writing a measurement set: all of it or nothing."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+
+from splatsoil.errors import MeasurementError
+from splatsoil.measurement.camera import Camera
+from splatsoil.measurement.frames import Frame
+from splatsoil.measurement.measurement import EXPERIMENT, FORMAT, Bed, Measurement
+from splatsoil.measurement.motion import MOTION_COLUMNS
+from splatsoil.measurement.tool import FORCE_COLUMNS, Tool
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """An image to be written, with its camera.
+
+    Attributes:
+        camera: calibration and pose; its ``name`` is the video camera's name.
+        image: (height, width, 3) sRGB, float in [0, 1] or uint8.
+        frame: number on the tool motion's clock, for video.
+        time: seconds on that clock, for video.
+    """
+
+    camera: Camera
+    image: npt.NDArray[Any]
+    frame: int | None = None
+    time: float | None = None
+
+
+def write_measurement(
+    folder: str | Path,
+    *,
+    name: str,
+    bed: Bed,
+    tool: Tool,
+    views: Sequence[Picture | Frame],
+    video: Sequence[Picture | Frame],
+    frame_rate: float,
+    gravity: npt.ArrayLike = (0.0, 0.0, -9.81),
+    suffix: str = ".jpg",
+    quality: int = 95,
+    truth: Mapping[str, Any] | None = None,
+) -> Measurement:
+    """Write a set that ``Measurement.load`` accepts, and load it.
+
+    The set is put together in a temporary folder beside its place, loaded, and only then moved there: a fault, or an
+    interruption, leaves nothing behind.
+
+    Args:
+        folder: where to; must not exist, or be an empty folder.
+        name: the set's name.
+        bed, tool, frame_rate, gravity: as in Measurement.
+        views, video: pictures to encode, or frames of another set, whose files are copied as they are.
+        suffix: file type of encoded pictures, ``.jpg`` or ``.png``.
+        quality: JPEG quality (no chroma subsampling).
+        truth: content of ``truth.json``, for synthetic sets.
+
+    Raises:
+        MeasurementError: the place is taken, or the set breaks the format's rules.
+    """
+    target = Path(folder)
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise MeasurementError("already there and not an empty folder; nothing is overwritten", file=target)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}-") as temporary:
+        root = Path(temporary) / target.name
+        root.mkdir()
+        tool.mesh.export(root / "tool.stl")
+        motion = tool.motion
+        table = np.column_stack([motion.frames, motion.times, motion.positions, motion.quaternions])
+        _write_table(root / "tool_motion.csv", MOTION_COLUMNS, table)
+        if tool.force is not None:
+            _write_table(root / "tool_force.csv", FORCE_COLUMNS, tool.force)
+        for kind, frames in (("views", views), ("video", video)):
+            _write_frames(root / kind, frames, video=kind == "video", suffix=suffix, quality=quality)
+        experiment = {
+            "format": FORMAT,
+            "name": name,
+            "up": "z",
+            "gravity": np.asarray(gravity, dtype=np.float64).tolist(),
+            "frame_rate": frame_rate,
+            "bed": {
+                "lower": bed.lower.tolist(),
+                "upper": bed.upper.tolist(),
+                "density": bed.density,
+                "wall_friction": bed.wall_friction,
+                "floor_friction": bed.floor_friction,
+            },
+            "tool": {
+                "mesh": "tool.stl",
+                "motion": "tool_motion.csv",
+                "friction": tool.friction,
+                **({} if tool.force is None else {"force": "tool_force.csv"}),
+            },
+            "views": "views/transforms.json",
+            "video": "video/transforms.json",
+        }
+        _write_json(root / EXPERIMENT, experiment)
+        if truth is not None:
+            _write_json(root / "truth.json", dict(truth))
+        Measurement.load(root)
+        if target.exists():
+            target.rmdir()
+        shutil.move(root, target)
+    return Measurement.load(target)
+
+
+def transforms(camera: Camera) -> dict[str, Any]:
+    """nerfstudio's fields for a camera, its pose included."""
+    return {
+        "camera_model": camera.model,
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": camera.fx,
+        "fl_y": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        **dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), camera.distortion, strict=True)),
+        "transform_matrix": camera.camera_to_world.tolist(),
+    }
+
+
+def _write_frames(folder: Path, frames: Sequence[Picture | Frame], *, video: bool, suffix: str, quality: int) -> None:
+    entries: list[dict[str, Any]] = []
+    for i, frame in enumerate(frames):
+        camera = frame.camera
+        place = camera.name or (frame.camera_name if isinstance(frame, Frame) else "") if video else "images"
+        if not place or Path(place).name != place:
+            raise MeasurementError(
+                f"{place!r} is no name for a camera; it also names a folder", file=folder, field=f"frames[{i}].camera"
+            )
+        if video and (frame.frame is None or frame.time is None):
+            raise MeasurementError("a video frame needs a number and a time", file=folder, field=f"frames[{i}].frame")
+        stem = f"{frame.frame:+05d}" if video else f"{i:04d}"
+        entry: dict[str, Any] = {}
+        if isinstance(frame, Frame):
+            entry["file_path"] = _copy(frame.path, folder, f"{place}/{stem}")
+            if frame.mask_path is not None:
+                entry["mask_path"] = _copy(frame.mask_path, folder, f"masks/{place}/{stem}")
+            if frame.depth_path is not None:
+                entry["depth_file_path"] = _copy(frame.depth_path, folder, f"depth/{place}/{stem}")
+        else:
+            entry["file_path"] = f"{place}/{stem}{suffix}"
+            _encode(frame, folder / entry["file_path"], quality)
+        if video:
+            entry |= {"camera": place, "frame": frame.frame, "time": frame.time}
+        entries.append(entry | transforms(camera))
+    folder.mkdir(exist_ok=True)
+    _write_json(folder / "transforms.json", {"frames": entries})
+
+
+def _encode(picture: Picture, path: Path, quality: int) -> None:
+    pixels = np.asarray(picture.image)
+    wanted = (picture.camera.height, picture.camera.width, 3)
+    if pixels.shape != wanted:
+        raise MeasurementError(f"the image is {pixels.shape} where the camera says {wanted}", file=path)
+    if pixels.dtype != np.uint8:
+        if not np.isfinite(pixels).all():
+            raise MeasurementError("the image has values that are not finite numbers", file=path)
+        pixels = np.round(np.clip(pixels, 0.0, 1.0) * 255.0).astype(np.uint8)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(pixels).save(path, quality=quality, subsampling=0)
+
+
+def _copy(source: Path, folder: Path, name: str) -> str:
+    target = folder / f"{name}{source.suffix.lower()}"
+    target.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(source, target)
+    return target.relative_to(folder).as_posix()
+
+
+def _write_table(path: Path, columns: Sequence[str], table: npt.NDArray[np.float64]) -> None:
+    rows = [",".join(columns)]
+    rows += [",".join([str(int(row[0])), *(repr(float(v)) for v in row[1:])]) for row in table]
+    path.write_text("\n".join(rows) + "\n", encoding="utf-8")
+
+
+def _write_json(path: Path, data: Mapping[str, Any]) -> None:
+    path.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
