@@ -1,0 +1,192 @@
+"""CPU kernels of SSIM: one task per band of rows, both blurs in the first-level cache.
+
+The window is separable. For every output row the five blurred moments (a, b, a², b², ab) are summed down the columns first
+(eleven rows, straight through memory), then along the row. With μ, s² and c the blurred means, variances and covariance, the
+derivative of the map's loss by a picture is  W∗(g·∂/∂μ_a) + 2a·W∗(g·∂/∂(a²)) + b·W∗(g·∂/∂(ab)),  W∗ the same symmetric blur.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+BAND = 16
+"""Rows per task."""
+
+MAX_CHANNELS = 16
+"""Most interleaved channels the row buffers have room for."""
+
+# columns are taken in blocks, so that the padded row buffers live on the stack whatever the picture's width
+_SIMILARITY = """
+    constexpr int HALF = 5, BLOCK = 256, EDGE = 5 * 16, LENGTH = BLOCK + 2 * EDGE;
+    const int y_begin = band * 16, y_end = y_begin + 16 < height ? y_begin + 16 : height;
+    const int edge = HALF * channels;
+    const bool want_a = slopes_a.shape[0] > 0, want_b = slopes_b.shape[0] > 0;
+    const long long plane = (long long)height * row;
+    float wide[5][LENGTH];
+    for (int y = y_begin; y < y_end; ++y) {
+        const int first = y - HALF > 0 ? y - HALF : 0, last = y + HALF < height - 1 ? y + HALF : height - 1;
+        for (int x0 = 0; x0 < row; x0 += BLOCK) {
+            const int n = row - x0 < BLOCK ? row - x0 : BLOCK;
+            const int from = x0 - edge > 0 ? x0 - edge : 0, to = x0 + n + edge < row ? x0 + n + edge : row;
+            for (int m = 0; m < 5; ++m) for (int i = 0; i < n + 2 * edge; ++i) wide[m][i] = 0.0f;
+            const int shift = from - (x0 - edge), count = to - from;
+            for (int j = first; j <= last; ++j) {
+                const float weight = window.data[j - y + HALF];
+                const float* pa = a.data + (long long)j * row + from;
+                const float* pb = b.data + (long long)j * row + from;
+                #pragma clang loop vectorize(enable) interleave(enable)
+                for (int i = 0; i < count; ++i) {
+                    const float u = pa[i], v = pb[i], wu = weight * u, wv = weight * v;
+                    wide[0][shift + i] += wu;
+                    wide[1][shift + i] += wv;
+                    wide[2][shift + i] += wu * u;
+                    wide[3][shift + i] += wv * v;
+                    wide[4][shift + i] += wu * v;
+                }
+            }
+            float moments[5][BLOCK];
+            for (int m = 0; m < 5; ++m) {
+                for (int i = 0; i < n; ++i) moments[m][i] = 0.0f;
+                for (int k = 0; k < 11; ++k) {
+                    const float weight = window.data[k];
+                    const float* source = wide[m] + k * channels;
+                    #pragma clang loop vectorize(enable) interleave(enable)
+                    for (int i = 0; i < n; ++i) moments[m][i] += weight * source[i];
+                }
+            }
+            const long long at = (long long)y * row + x0;
+            #pragma clang loop vectorize(enable)
+            for (int i = 0; i < n; ++i) {
+                const float mu_a = moments[0][i], mu_b = moments[1][i];
+                const float var_a = moments[2][i] - mu_a * mu_a, var_b = moments[3][i] - mu_b * mu_b;
+                const float cov = moments[4][i] - mu_a * mu_b;
+                const float l = 2.0f * mu_a * mu_b + 1e-4f, c = 2.0f * cov + 9e-4f;
+                const float p = 1.0f / (mu_a * mu_a + mu_b * mu_b + 1e-4f), q = 1.0f / (var_a + var_b + 9e-4f);
+                const float s = l * p * c * q;
+                out.data[at + i] = s;
+                // by a², by ab, and by the blurred mean, of which variance and covariance depend, too
+                moments[0][i] = -s * q;
+                moments[1][i] = 2.0f * l * p * q;
+                moments[2][i] = 2.0f * p * (mu_b * c * q - mu_a * s) + 2.0f * mu_a * s * q - mu_b * moments[1][i];
+                moments[3][i] = 2.0f * p * (mu_a * c * q - mu_b * s) + 2.0f * mu_b * s * q - mu_a * moments[1][i];
+            }
+            for (int i = 0; want_a && i < n; ++i) {
+                slopes_a.data[at + i] = moments[2][i];
+                slopes_a.data[plane + at + i] = moments[0][i];
+                slopes_a.data[2 * plane + at + i] = moments[1][i];
+            }
+            for (int i = 0; want_b && i < n; ++i) {
+                slopes_b.data[at + i] = moments[3][i];
+                slopes_b.data[plane + at + i] = moments[0][i];
+                slopes_b.data[2 * plane + at + i] = moments[1][i];
+            }
+        }
+    }
+"""
+
+_GRADIENT = """
+    constexpr int HALF = 5, BLOCK = 256, EDGE = 5 * 16, LENGTH = BLOCK + 2 * EDGE;
+    const int y_begin = band * 16, y_end = y_begin + 16 < height ? y_begin + 16 : height;
+    const int edge = HALF * channels;
+    const long long plane = (long long)height * row;
+    float wide[3][LENGTH];
+    for (int y = y_begin; y < y_end; ++y) {
+        const int first = y - HALF > 0 ? y - HALF : 0, last = y + HALF < height - 1 ? y + HALF : height - 1;
+        for (int x0 = 0; x0 < row; x0 += BLOCK) {
+            const int n = row - x0 < BLOCK ? row - x0 : BLOCK;
+            const int from = x0 - edge > 0 ? x0 - edge : 0, to = x0 + n + edge < row ? x0 + n + edge : row;
+            for (int m = 0; m < 3; ++m) for (int i = 0; i < n + 2 * edge; ++i) wide[m][i] = 0.0f;
+            const int shift = from - (x0 - edge), count = to - from;
+            for (int j = first; j <= last; ++j) {
+                const float weight = window.data[j - y + HALF];
+                const long long at = (long long)j * row + from;
+                const float* g = upstream.data + at;
+                const float* s0 = slopes.data + at;
+                const float* s1 = s0 + plane;
+                const float* s2 = s1 + plane;
+                #pragma clang loop vectorize(enable) interleave(enable)
+                for (int i = 0; i < count; ++i) {
+                    const float scaled = weight * g[i];
+                    wide[0][shift + i] += scaled * s0[i];
+                    wide[1][shift + i] += scaled * s1[i];
+                    wide[2][shift + i] += scaled * s2[i];
+                }
+            }
+            float blurred[3][BLOCK];
+            for (int m = 0; m < 3; ++m) {
+                for (int i = 0; i < n; ++i) blurred[m][i] = 0.0f;
+                for (int k = 0; k < 11; ++k) {
+                    const float weight = window.data[k];
+                    const float* source = wide[m] + k * channels;
+                    #pragma clang loop vectorize(enable) interleave(enable)
+                    for (int i = 0; i < n; ++i) blurred[m][i] += weight * source[i];
+                }
+            }
+            const long long at = (long long)y * row + x0;
+            for (int i = 0; i < n; ++i)
+                out.data[at + i] = blurred[0][i] + 2.0f * own.data[at + i] * blurred[1][i] + other.data[at + i] * blurred[2][i];
+        }
+    }
+"""
+
+
+@wp.func_native(_SIMILARITY)
+def _similarity_band(
+    band: int,
+    height: int,
+    row: int,
+    channels: int,
+    a: wp.array(dtype=float),
+    b: wp.array(dtype=float),
+    window: wp.array(dtype=float),
+    out: wp.array(dtype=float),
+    slopes_a: wp.array(dtype=float),
+    slopes_b: wp.array(dtype=float),
+): ...
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def similarity(
+    height: int,
+    row: int,
+    channels: int,
+    a: wp.array(dtype=float),
+    b: wp.array(dtype=float),
+    window: wp.array(dtype=float),
+    out: wp.array(dtype=float),
+    slopes_a: wp.array(dtype=float),
+    slopes_b: wp.array(dtype=float),
+):
+    """SSIM map of two pictures (height, row) with interleaved channels, and its slopes (3, height, row) where wanted."""
+    _similarity_band(wp.tid(), height, row, channels, a, b, window, out, slopes_a, slopes_b)
+
+
+@wp.func_native(_GRADIENT)
+def _gradient_band(
+    band: int,
+    height: int,
+    row: int,
+    channels: int,
+    own: wp.array(dtype=float),
+    other: wp.array(dtype=float),
+    upstream: wp.array(dtype=float),
+    window: wp.array(dtype=float),
+    slopes: wp.array(dtype=float),
+    out: wp.array(dtype=float),
+): ...
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def similarity_gradient(
+    height: int,
+    row: int,
+    channels: int,
+    own: wp.array(dtype=float),
+    other: wp.array(dtype=float),
+    upstream: wp.array(dtype=float),
+    window: wp.array(dtype=float),
+    slopes: wp.array(dtype=float),
+    out: wp.array(dtype=float),
+):
+    """Gradient of a loss by the picture ``own``, from the map's ``upstream`` gradient and the slopes for that picture."""
+    _gradient_band(wp.tid(), height, row, channels, own, other, upstream, window, slopes, out)

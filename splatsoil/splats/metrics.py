@@ -1,0 +1,111 @@
+"""How alike two pictures are: PSNR and SSIM, the latter fast and differentiable."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from splatsoil.errors import ParameterError
+from splatsoil.splats import kernels_ssim
+from splatsoil.splats.warp_torch import as_warp, launch
+
+WINDOW = 11
+"""Side of the SSIM window, px."""
+
+SIGMA = 1.5
+"""Standard deviation of the SSIM window, px."""
+
+C1 = 0.01**2
+C2 = 0.03**2
+
+
+def psnr(a: Tensor, b: Tensor) -> Tensor:
+    """Peak signal-to-noise ratio of two pictures with values in [0, 1], dB; infinite when they are equal."""
+    _check(a, b)
+    return -10.0 * torch.log10(torch.mean((a - b) ** 2))
+
+
+def ssim(a: Tensor, b: Tensor) -> Tensor:
+    """Mean structural similarity of two pictures (h, w) or (h, w, c) with values in [0, 1]; 1 when they are equal.
+
+    The convention of the splatting papers: Gaussian window of 11 px (σ = 1.5), zeros beyond the border, the mean over all
+    pixels and channels; a loss is ``1 - ssim(a, b)``. Differentiable in both pictures.
+    """
+    _check(a, b)
+    return ssim_map(a, b).mean()
+
+
+def ssim_map(a: Tensor, b: Tensor) -> Tensor:
+    """Structural similarity of every pixel and channel, shaped like ``a``; see `ssim`."""
+    _check(a, b)
+    channels = a[0, 0].numel()
+    if a.device.type == "cpu" and a.dtype == b.dtype == torch.float32 and channels <= kernels_ssim.MAX_CHANNELS:
+        return _Similarity.apply(a, b)
+    return _ssim_map_torch(a, b)
+
+
+def window(dtype: torch.dtype = torch.float64) -> Tensor:
+    """The normalised one-dimensional SSIM window (11,)."""
+    half = WINDOW // 2
+    weights = [math.exp(-0.5 * (i / SIGMA) ** 2) for i in range(-half, half + 1)]
+    return torch.tensor([w / math.fsum(weights) for w in weights], dtype=dtype)
+
+
+def _check(a: Tensor, b: Tensor) -> None:
+    if a.shape != b.shape or a.ndim not in (2, 3):
+        raise ParameterError(f"pictures of shapes {tuple(a.shape)} and {tuple(b.shape)} cannot be compared")
+
+
+def _ssim_map_torch(a: Tensor, b: Tensor) -> Tensor:
+    """SSIM by separable convolutions and autograd: the path for CUDA, and the check of the CPU kernels."""
+    planes = [t.reshape(t.shape[0], t.shape[1], -1).permute(2, 0, 1)[:, None] for t in (a, b)]
+    weights = window(a.dtype).to(a.device)
+
+    def blurred(t: Tensor) -> Tensor:
+        t = torch.nn.functional.conv2d(t, weights.reshape(1, 1, 1, WINDOW), padding=(0, WINDOW // 2))
+        return torch.nn.functional.conv2d(t, weights.reshape(1, 1, WINDOW, 1), padding=(WINDOW // 2, 0))
+
+    x, y = planes
+    mx, my, xx, yy, xy = blurred(torch.cat([x, y, x * x, y * y, x * y])).chunk(5)
+    vx, vy, cov = xx - mx * mx, yy - my * my, xy - mx * my
+    out = (2 * mx * my + C1) * (2 * cov + C2) / ((mx * mx + my * my + C1) * (vx + vy + C2))
+    return out[:, 0].permute(1, 2, 0).reshape(a.shape)
+
+
+class _Similarity(torch.autograd.Function):
+    """SSIM map by the CPU kernels; the partial derivatives by the three blurred moments are kept for backward."""
+
+    @staticmethod
+    def forward(ctx: Any, a: Tensor, b: Tensor) -> Tensor:  # type: ignore[override]
+        height, row = a.shape[0], a[0].numel()
+        channels = row // a.shape[1]
+        pictures = [t.contiguous() for t in (a, b)]
+        out = torch.empty_like(pictures[0])
+        slopes = [a.new_empty((3 if needed else 0, height, row)) for needed in ctx.needs_input_grad]
+        arrays = [as_warp(t.reshape(-1), wp.float32) for t in (*pictures, window(torch.float32), out, *slopes)]
+        launch(kernels_ssim.similarity, -(-height // kernels_ssim.BAND), [height, row, channels, *arrays], a)
+        ctx.save_for_backward(*pictures, *slopes)
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None]:  # type: ignore[override]
+        a, b, *slopes = ctx.saved_tensors
+        height, row = a.shape[0], a[0].numel()
+        channels = row // a.shape[1]
+        results: list[Tensor | None] = []
+        for own, other, partial, needed in ((a, b, slopes[0], 0), (b, a, slopes[1], 1)):
+            if not ctx.needs_input_grad[needed]:
+                results.append(None)
+                continue
+            out = torch.empty_like(own)
+            tensors = (own, other, gradient, window(torch.float32), partial, out)
+            arrays = [as_warp(t.reshape(-1), wp.float32) for t in tensors]
+            launch(
+                kernels_ssim.similarity_gradient, -(-height // kernels_ssim.BAND), [height, row, channels, *arrays], a
+            )
+            results.append(out)
+        return results[0], results[1]

@@ -1,0 +1,275 @@
+"""Drawing Gaussians: `rasterise`, `rasterise_covariances`, `rasterise_features`, all differentiable torch functions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from splatsoil.errors import ParameterError
+from splatsoil.splats import constants, kernels_cpu
+from splatsoil.splats.binning import Bins, bin_by_tile
+from splatsoil.splats.camera import AnyCamera, View, view_of
+from splatsoil.splats.gaussians import Gaussians
+from splatsoil.splats.projection import Projection, covariances_of, project
+from splatsoil.splats.warp_torch import as_warp, launch
+
+MOMENTS = 6
+"""Moments of ∂L/∂σ in a row of gradients (1, dx, dy, dx², dx·dy, dy²), in front of the feature gradients."""
+
+
+@dataclass(frozen=True)
+class Features:
+    """Blended feature channels.
+
+    Attributes:
+        image: (h, w, k), Σ wᵢ fᵢ + T·background.
+        alpha: (h, w), 1 − T: how much of the pixel is covered.
+        projection: the Gaussians on the image plane; retain the gradient of ``projection.centres`` to densify by it.
+    """
+
+    image: Tensor
+    alpha: Tensor
+    projection: Projection
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """A picture of Gaussians.
+
+    Attributes:
+        colour: (h, w, 3), over the background.
+        alpha: (h, w), coverage in [0, 1].
+        depth: (h, w), m: expected depth along the camera's z axis, Σwz / Σw; 0 where nothing is covered.
+        normal: (h, w, 3), world frame: Σ w n, not normalised; None when normals were not asked for.
+        projection: the Gaussians on the image plane (centres in px, visible reach, …).
+    """
+
+    colour: Tensor
+    alpha: Tensor
+    depth: Tensor
+    normal: Tensor | None
+    projection: Projection
+
+
+def rasterise(
+    gaussians: Gaussians,
+    camera: AnyCamera,
+    *,
+    background: Tensor | Sequence[float] = (0.0, 0.0, 0.0),
+    antialias: bool = False,
+    normals: bool = True,
+) -> Rendering:
+    """Draw Gaussians; differentiable with respect to all their tensors, on the device where these live.
+
+    Args:
+        gaussians: what to draw.
+        camera: a pinhole camera without distortion, or an `OrthographicCamera`.
+        background: colour behind everything (3,).
+        antialias: keep the total opacity of Gaussians smaller than a pixel (Mip-splatting's factor).
+        normals: blend normals, too (each Gaussian's shortest axis, facing the camera); False saves time.
+    """
+    view = view_of(camera)
+    covariances = covariances_of(gaussians.scales, gaussians.quaternions)
+    axes = None
+    if normals:
+        # an orthographic camera faces along its axis: put the point to face very far behind it
+        eye = view.position - (1e6 * view.forward if view.orthographic else 0.0)
+        axes = gaussians.normals(torch.as_tensor(eye))
+    return _draw(
+        gaussians.means, covariances, gaussians.opacities, gaussians.colours, axes, view, background, antialias
+    )
+
+
+def rasterise_covariances(
+    means: Tensor,
+    covariances: Tensor,
+    opacities: Tensor,
+    colours: Tensor,
+    normals: Tensor | None,
+    camera: AnyCamera,
+    *,
+    background: Tensor | Sequence[float] = (0.0, 0.0, 0.0),
+    antialias: bool = False,
+) -> Rendering:
+    """Draw Gaussians given by covariance matrices (of deformed particles, say); differentiable in every tensor.
+
+    Args:
+        means: (n, 3), m.
+        covariances: (n, 3, 3), m², symmetric.
+        opacities: (n,).
+        colours: (n, 3).
+        normals: (n, 3) to blend, or None.
+        camera: a pinhole camera without distortion, or an `OrthographicCamera`.
+        background: colour behind everything (3,).
+        antialias: see `rasterise`.
+    """
+    return _draw(means, covariances, opacities, colours, normals, view_of(camera), background, antialias)
+
+
+def rasterise_features(
+    means: Tensor,
+    covariances: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    camera: AnyCamera,
+    *,
+    background: Tensor | Sequence[float] | None = None,
+    antialias: bool = False,
+) -> Features:
+    """Blend any features (n, k), 1 ≤ k ≤ 8, with the weights that colours would get; differentiable in every tensor."""
+    if background is None:
+        background = features.new_zeros(features.shape[1])
+    return _blend(means, covariances, opacities, features, view_of(camera), background, antialias)
+
+
+def _draw(
+    means: Tensor,
+    covariances: Tensor,
+    opacities: Tensor,
+    colours: Tensor,
+    normals: Tensor | None,
+    view: View,
+    background: Tensor | Sequence[float],
+    antialias: bool,
+) -> Rendering:
+    projection = _projected(means, covariances, opacities, view, antialias)
+    depths = projection.depths[:, None]
+    parts = [colours, depths] if normals is None else [colours, depths, normals]
+    behind = torch.as_tensor(background, dtype=torch.float32, device=means.device)
+    if behind.shape != (3,):
+        raise ParameterError(f"background has shape {tuple(behind.shape)}, expected (3,)")
+    behind = torch.cat([behind, behind.new_zeros(1 if normals is None else 4)])
+    image, alpha = _composite(projection, torch.cat(parts, dim=1), view, behind)
+    colour, weighted_depth, *rest = image.split([3, 1] if normals is None else [3, 1, 3], dim=2)
+    depth = weighted_depth[:, :, 0] / alpha.clamp_min(1e-8)
+    return Rendering(colour, alpha, depth, rest[0] if rest else None, projection)
+
+
+def _blend(
+    means: Tensor,
+    covariances: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    view: View,
+    background: Tensor | Sequence[float],
+    antialias: bool,
+) -> Features:
+    if features.ndim != 2 or not 1 <= features.shape[1] <= constants.MAX_CHANNELS:
+        raise ParameterError(
+            f"features have shape {tuple(features.shape)}, expected (n, 1 to {constants.MAX_CHANNELS})"
+        )
+    projection = _projected(means, covariances, opacities, view, antialias)
+    behind = torch.as_tensor(background, dtype=torch.float32, device=means.device)
+    if behind.shape != features.shape[1:]:
+        raise ParameterError(f"background has shape {tuple(behind.shape)}, expected ({features.shape[1]},)")
+    image, alpha = _composite(projection, features, view, behind)
+    return Features(image, alpha, projection)
+
+
+def _projected(means: Tensor, covariances: Tensor, opacities: Tensor, view: View, antialias: bool) -> Projection:
+    n = means.shape[0]
+    for name, tensor, shape in (
+        ("means", means, (n, 3)), ("covariances", covariances, (n, 3, 3)), ("opacities", opacities, (n,)),
+    ):  # fmt: skip
+        if tuple(tensor.shape) != shape:
+            raise ParameterError(f"{name} have shape {tuple(tensor.shape)}, expected {shape}")
+        if tensor.dtype != torch.float32:
+            raise ParameterError(f"{name} are {tensor.dtype}; the rasteriser takes torch.float32")
+    return project(means, covariances, opacities, view, antialias)
+
+
+def _composite(projection: Projection, features: Tensor, view: View, background: Tensor) -> tuple[Tensor, Tensor]:
+    p = projection
+    image, transmittance = _Composite.apply(p.centres, p.conics, p.strengths, features, background, p, view)
+    return image, 1.0 - transmittance
+
+
+class _Composite(torch.autograd.Function):
+    """Blend projected Gaussians front to back."""
+
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: Any,
+        centres: Tensor,
+        conics: Tensor,
+        strengths: Tensor,
+        features: Tensor,
+        background: Tensor,
+        projection: Projection,
+        view: View,
+    ) -> tuple[Tensor, Tensor]:
+        bins = bin_by_tile(projection, features, view)
+        channels = features.shape[1]
+        image = features.new_empty((view.height, view.width, channels))
+        transmittance = features.new_empty((view.height, view.width))
+        inputs = _tile_arguments(bins, view)
+        inputs += [as_warp(t.reshape(-1), wp.float32) for t in (background, image, transmittance)]
+        launch(kernels_cpu.forward_kernel(channels), bins.tiles_x * bins.tiles_y, inputs, features)
+        ctx.bins, ctx.view = bins, view
+        ctx.save_for_backward(conics, strengths, image, transmittance)
+        return image, transmittance
+
+    @staticmethod
+    def backward(ctx: Any, v_image: Tensor, v_transmittance: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        conics, strengths, image, transmittance = ctx.saved_tensors
+        bins: Bins = ctx.bins
+        view: View = ctx.view
+        n, channels = conics.shape[0], image.shape[2]
+        gradients = image.new_zeros((bins.ranks.shape[0], MOMENTS + channels))
+        inputs = [*_tile_arguments(bins, view), as_warp(bins.entries, wp.int32)]
+        tensors = (image, transmittance, v_image, v_transmittance, gradients)
+        inputs += [as_warp(t.reshape(-1), wp.float32) for t in tensors]
+        launch(kernels_cpu.backward_kernel(channels), bins.tiles_x * bins.tiles_y, inputs, image)
+        shapes = ((n, 2), (n, 3), (n,), (n, channels))
+        outputs = [image.new_zeros(shape) for shape in shapes]
+        types = (wp.vec2, wp.vec3, wp.float32, wp.float32)
+        arrays = [as_warp(bins.order, wp.int32), as_warp(bins.ends, wp.int32), as_warp(gradients, wp.float32)]
+        arrays += [as_warp(conics, wp.vec3), as_warp(strengths, wp.float32)]
+        arrays += [as_warp(t, d) for t, d in zip(outputs, types, strict=True)]
+        launch(_gather, bins.order.shape[0], arrays, image)
+        v_background = torch.einsum("hw,hwk->k", transmittance, v_image) if ctx.needs_input_grad[4] else None
+        return (*outputs, v_background, None, None)
+
+
+def _tile_arguments(bins: Bins, view: View) -> list[Any]:
+    """What both tile kernels take first."""
+    rows, starts, ranks = as_warp(bins.rows, wp.float32), as_warp(bins.starts, wp.int32), as_warp(bins.ranks, wp.int32)
+    return [0, view.width, view.height, bins.tiles_x, rows, starts, ranks]
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _gather(
+    order: wp.array(dtype=wp.int32),
+    ends: wp.array(dtype=wp.int32),
+    gradients: wp.array2d(dtype=float),
+    conics: wp.array(dtype=wp.vec3),
+    strengths: wp.array(dtype=float),
+    v_centres: wp.array(dtype=wp.vec2),
+    v_conics: wp.array(dtype=wp.vec3),
+    v_strengths: wp.array(dtype=float),
+    v_features: wp.array2d(dtype=float),
+):
+    """Sum the entries of a rank in order, and turn moments of ∂L/∂σ into gradients (σ = ½ dᵀ conic d, α = o e^−σ)."""
+    rank = wp.tid()
+    begin = wp.int32(0)
+    if rank > 0:
+        begin = ends[rank - 1]
+    i = order[rank]
+    s = wp.float32(0.0)
+    first = wp.vec2()
+    second = wp.vec3()
+    for e in range(begin, ends[rank]):
+        s += gradients[e, 0]
+        first += wp.vec2(gradients[e, 1], gradients[e, 2])
+        second += wp.vec3(gradients[e, 3], gradients[e, 4], gradients[e, 5])
+        for k in range(v_features.shape[1]):
+            v_features[i, k] += gradients[e, 6 + k]
+    conic = conics[i]
+    v_centres[i] = -wp.vec2(conic[0] * first[0] + conic[1] * first[1], conic[1] * first[0] + conic[2] * first[1])
+    v_conics[i] = wp.vec3(0.5 * second[0], second[1], 0.5 * second[2])
+    v_strengths[i] = -s / strengths[i]
