@@ -1,1 +1,5 @@
 """Soil properties from photographs of a tool moving through it."""
+
+from splatsoil._version import __version__
+
+__all__ = ["__version__"]

@@ -1,0 +1,60 @@
+# Each target does its own set-up on a machine that has python3 (>= 3.11) and make; the second time it is quick.
+#
+#   make demo     the whole path on examples/plow-dry, ending in runs/demo/report.html
+#   make test     the tests
+#   make lint     formatting, lint and types
+#   make clean    remove what these made, the virtual environment included; runs/ stays
+#
+# PYTHON        interpreter to make the virtual environment with
+# VENV          where it goes
+# TORCH_INDEX   package index to take torch from first; without a GPU https://download.pytorch.org/whl/cpu saves 4 GB
+# PYTEST_ARGS   arguments for pytest
+
+PYTHON ?= python3
+VENV ?= .venv
+TORCH_INDEX ?=
+PYTEST_ARGS ?= -n 2 --dist loadfile
+
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+SOURCES := $(shell find splatsoil envs inverse benchmarks -type f -not -path '*/__pycache__/*')
+
+.PHONY: demo test lint clean
+.DELETE_ON_ERROR:
+
+demo: $(VENV)/.use
+	$(BIN)/splatsoil run examples/plow-dry --run runs/demo
+
+# One thread per worker: the workers together already fill the machine.
+test: $(VENV)/.develop
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(PYTEST_ARGS)
+
+# Static checkers cannot see that envs/, inverse/ and benchmarks/ install as splatsoil.*, so mypy gets the built package.
+lint: $(VENV)/.develop build/installed/.stamp
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	cd build/installed && "$(abspath $(BIN))/mypy" --config-file "$(CURDIR)/pyproject.toml" -p splatsoil
+
+clean:
+	rm -rf build .pytest_cache .mypy_cache .ruff_cache *.egg-info $(VENV)
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "splatsoil needs Python 3.11 or newer: make PYTHON=/path/to/python3.11 …" >&2; exit 2; }
+	@$(PYTHON) -m venv $(VENV) || \
+		{ rm -rf $(VENV); echo "python3 cannot make virtual environments; on Debian: apt install python3-venv" >&2; exit 2; }
+
+$(VENV)/.use: pyproject.toml | $(BIN)/python
+	$(if $(TORCH_INDEX),$(PIP) install torch --index-url $(TORCH_INDEX))
+	$(PIP) install --editable .
+	@touch $@
+
+$(VENV)/.develop: pyproject.toml | $(VENV)/.use
+	$(PIP) install --editable '.[dev]'
+	@touch $(VENV)/.use $@
+
+build/installed/.stamp: $(SOURCES) pyproject.toml README.md LICENSE $(VENV)/.develop
+	rm -rf build/lib build/bdist.* build/wheel build/installed
+	$(PIP) wheel --quiet --no-deps --no-build-isolation --wheel-dir build/wheel .
+	$(PIP) install --quiet --no-deps --target build/installed build/wheel/*.whl
+	@touch $@

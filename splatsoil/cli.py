@@ -1,0 +1,88 @@
+"""The command line: assembles the modules of ``splatsoil.commands`` and handles what they have in common.
+
+A module there is a command of the same name. It has a frozen dataclass ``Config`` (its docstring is the help; a field
+``json`` makes the command print one JSON object and nothing else on stdout), a function ``run(config) -> int`` that
+returns the exit code, and optionally ``interrupted(config) -> str``, a sentence on what is kept and how to go on.
+Whatever is slow to import belongs inside ``run``.
+
+Exit codes: what ``run`` returns; 2 for a mistake of the user's (one line on stderr, no traceback), 130 after Ctrl-C.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import pkgutil
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from typing import Any
+
+import tyro
+
+import splatsoil.commands
+from splatsoil import __version__
+from splatsoil.commands._output import only_json, print_json
+from splatsoil.errors import SplatsoilError
+
+DESCRIPTION = "Soil properties from photographs of a tool moving through it."
+
+
+@dataclass(frozen=True)
+class Command:
+    """A subcommand.
+
+    Attributes:
+        config: the dataclass of its options.
+        run: acts on them and returns the exit code.
+        interrupted: says what Ctrl-C left and how to go on.
+    """
+
+    config: type
+    run: Callable[[Any], int]
+    interrupted: Callable[[Any], str]
+
+
+def commands() -> dict[str, Command]:
+    """All subcommands by name."""
+    out = {}
+    for info in pkgutil.iter_modules(splatsoil.commands.__path__):
+        if not info.name.startswith("_"):
+            module = importlib.import_module(f"splatsoil.commands.{info.name}")
+            interrupted = getattr(module, "interrupted", lambda _: "start the command again")
+            out[info.name.replace("_", "-")] = Command(module.Config, module.run, interrupted)
+    return out
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit code; help and usage errors leave by SystemExit (0 and 2)."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if words == ["--version"]:
+        print(f"splatsoil {__version__}")
+        return 0
+    known = commands()
+    config = tyro.extras.subcommand_cli_from_dict(
+        {name: command.config for name, command in known.items()},
+        prog="splatsoil",
+        description=DESCRIPTION,
+        args=words,
+        config=(tyro.conf.FlagCreatePairsOff,),
+    )
+    command = next(c for c in known.values() if isinstance(config, c.config))
+    wants_json = bool(getattr(config, "json", False))
+    with only_json() if wants_json else nullcontext():
+        try:
+            return command.run(config)
+        except SplatsoilError as error:
+            message = " ".join(str(error).split())
+            print(f"splatsoil: {message}", file=sys.stderr)
+            if wants_json:
+                print_json({"ok": False, "error": message})
+            return 2
+        except KeyboardInterrupt:
+            print(f"\nsplatsoil: interrupted; {command.interrupted(config)}", file=sys.stderr)
+            return 130
+        except BrokenPipeError:  # the reader of our output (head, less) has gone
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+            return 0
