@@ -37,7 +37,7 @@ def read_blender(file: str | Path) -> tuple[Frame, ...]:
         if fault:
             item.fail("transform_matrix", f"not a rigid motion: {fault}")
         width, height = image_size(image)
-        check_image(image, (width, height))
+        check_image(image, (width, height), sizes_from="its own header")
         focal = 0.5 * width / math.tan(0.5 * angle)
         camera = Camera(
             width,

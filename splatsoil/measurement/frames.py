@@ -110,13 +110,14 @@ def read_transforms(file: Path, root: Path, *, video: bool) -> tuple[Frame, ...]
     if video:
         _check_fixed(frames, file)
         _check_times(frames, file)
-    for frame in frames:
+    told = f"w and h of {file.name}"
+    for i, frame in enumerate(frames):
         size = (frame.camera.width, frame.camera.height)
-        check_image(frame.path, size, sizes_from=f"w and h of {file.name}")
+        check_image(frame.path, size, sizes_from=told, field=f"frames[{i}].file_path")
         if frame.mask_path is not None:
-            check_image(frame.mask_path, size, sizes_from=f"w and h of {file.name}")
+            check_image(frame.mask_path, size, sizes_from=told, field=f"frames[{i}].mask_path")
         if frame.depth_path is not None:
-            _check_depth(frame.depth_path, size, file)
+            _check_depth(frame.depth_path, size, told, f"frames[{i}].depth_file_path")
     return frames
 
 
@@ -228,13 +229,13 @@ def _check_times(frames: tuple[Frame, ...], file: Path) -> None:
                 )
 
 
-def _check_depth(path: Path, size: tuple[int, int], file: Path) -> None:
+def _check_depth(path: Path, size: tuple[int, int], told: str, field: str) -> None:
     if path.suffix != ".npy":
-        check_image(path, size, sizes_from=f"w and h of {file.name}")
+        check_image(path, size, sizes_from=told, field=field)
         return
     try:
         shape = np.load(path, mmap_mode="r", allow_pickle=False).shape
     except (OSError, ValueError, EOFError) as error:
-        raise MeasurementError("not a NumPy array of numbers", file=path) from error
+        raise MeasurementError("not a NumPy array of numbers", file=path, field=field) from error
     if shape != size[::-1]:
-        raise MeasurementError(f"the depth is {shape} where h and w of {file.name} say {size[::-1]}", file=path)
+        raise MeasurementError(f"the depth is {shape[::-1]} where {told} say {size}", file=path, field=field)

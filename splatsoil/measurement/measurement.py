@@ -261,14 +261,14 @@ def _check_cameras(measurement: Measurement) -> None:
     centre = 0.5 * (bed.lower + bed.upper)
     diagonal = float(np.linalg.norm(bed.extents))
     for file, frames in zip(measurement.sources[1:3], (measurement.views, measurement.video), strict=True):
-        distances = [float(np.linalg.norm(f.camera.position - centre)) for f in frames]
-        far = int(np.argmax(distances))
-        if distances[far] > _FAR_CAMERA * diagonal:
-            raise MeasurementError(
-                f"the camera is {distances[far]:g} m from a bed of {diagonal:.2g} m; positions are in metres",
-                file=file,
-                field=f"frames[{far}].transform_matrix",
-            )
+        for i, frame in enumerate(frames):
+            distance = float(np.linalg.norm(frame.camera.position - centre))
+            if distance > _FAR_CAMERA * diagonal:
+                raise MeasurementError(
+                    f"the camera is {distance:g} m from a bed of {diagonal:.2g} m; positions are in metres",
+                    file=file,
+                    field=f"frames[{i}].transform_matrix",
+                )
         if not any(sees(frame.camera, bed) for frame in frames):
             raise MeasurementError(
                 "no camera looks at the soil's box; matrices are camera to world, and cameras look down their -z axis",

@@ -67,7 +67,9 @@ def read_mesh(file: Path) -> trimesh.Trimesh:
         raise MeasurementError("the mesh has vertices that are not finite numbers", file=file, field="vertices")
     mesh.merge_vertices()
     extents = np.asarray(mesh.extents)
-    if abs(mesh.volume) <= 1e-9 * float(np.prod(np.maximum(extents, extents.max() * 1e-3))):
+    with np.errstate(all="ignore"):  # the centre of mass of a flat mesh divides by zero
+        volume = abs(float(mesh.volume))
+    if not volume > 1e-9 * float(np.prod(np.maximum(extents, extents.max() * 1e-3))):
         raise MeasurementError(
             "the mesh has no volume; give the tool its thickness and close its surface", file=file, field="faces"
         )

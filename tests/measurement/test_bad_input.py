@@ -1,0 +1,378 @@
+"""Each way a measurement set can be wrong: one clear error that names file and field, exit code 2, nothing written."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from splatsoil.cli import main
+from splatsoil.errors import MeasurementError
+from splatsoil.measurement import Measurement
+
+
+@dataclass(frozen=True)
+class Case:
+    """A fault: what spoils a good set, and what the error must say."""
+
+    name: str
+    spoil: Callable[[Path], object]
+    file: str
+    field: str | None
+    says: str
+
+
+def edit(file: str, *keys: str | int, to: Any = None, drop: bool = False) -> Callable[[Path], None]:
+    """Set, or drop, a value inside a JSON file."""
+
+    def spoil(folder: Path) -> None:
+        data = json.loads((folder / file).read_text())
+        place = data
+        for key in keys[:-1]:
+            place = place[key]
+        if drop:
+            del place[keys[-1]]
+        else:
+            place[keys[-1]] = to
+        (folder / file).write_text(json.dumps(data))
+
+    return spoil
+
+
+def replace(file: str, content: str | bytes) -> Callable[[Path], None]:
+    """Replace a file's content."""
+    raw = content.encode() if isinstance(content, str) else content
+    return lambda folder: (folder / file).write_bytes(raw) and None
+
+
+def cell(row: int, column: int, value: str, file: str = "tool_motion.csv") -> Callable[[Path], None]:
+    """Replace a cell of a CSV file; row 0 is the header."""
+
+    def spoil(folder: Path) -> None:
+        rows = [line.split(",") for line in (folder / file).read_text().splitlines()]
+        rows[row][column] = value
+        (folder / file).write_text("\n".join(",".join(r) for r in rows))
+
+    return spoil
+
+
+def motion(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], None]:
+    """Change the numbers of the tool's motion as a whole."""
+
+    def spoil(folder: Path) -> None:
+        file = folder / "tool_motion.csv"
+        head, *rows = file.read_text().splitlines()
+        table = change(np.array([[float(v) for v in row.split(",")] for row in rows]))
+        file.write_text("\n".join([head, *(",".join(f"{v:.10g}" for v in row) for row in table)]))
+
+    return spoil
+
+
+def truncate(file: str, keep: float) -> Callable[[Path], None]:
+    """Cut a file off after a fraction of its bytes."""
+
+    def spoil(folder: Path) -> None:
+        raw = (folder / file).read_bytes()
+        (folder / file).write_bytes(raw[: int(keep * len(raw))])
+
+    return spoil
+
+
+def mesh(build: Callable[[], trimesh.Trimesh]) -> Callable[[Path], None]:
+    """Another mesh for the tool."""
+    return lambda folder: build().export(folder / "tool.stl") and None
+
+
+def scale_cameras(factor: float) -> Callable[[Path], None]:
+    """Multiply the views' positions."""
+
+    def spoil(folder: Path) -> None:
+        file = folder / VIEWS
+        data = json.loads(file.read_text())
+        for frame in data["frames"]:
+            for row in range(3):
+                frame["transform_matrix"][row][3] *= factor
+        file.write_text(json.dumps(data))
+
+    return spoil
+
+
+def to_opencv(folder: Path) -> None:
+    """The views' matrices with OpenCV's axes by mistake: y and z of the camera turned round."""
+    file = folder / VIEWS
+    data = json.loads(file.read_text())
+    for frame in data["frames"]:
+        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist()
+    file.write_text(json.dumps(data))
+
+
+def outside(name: str) -> Callable[[Path], None]:
+    """A good image outside of the folder, reached by ``name``."""
+
+    def spoil(folder: Path) -> None:
+        target = folder.parent / "stranger.jpg"
+        target.write_bytes((folder / "views/images/001.jpg").read_bytes())
+        if name == "link":
+            (folder / "views/images/link.jpg").symlink_to(target)
+        path = {"absolute": str(target), "dots": "../../stranger.jpg", "link": "images/link.jpg"}[name]
+        edit(VIEWS, "frames", 1, "file_path", to=path)(folder)
+
+    return spoil
+
+
+def wrong_size(folder: Path) -> None:
+    Image.new("RGB", (319, 240)).save(folder / "views/images/002.jpg")
+
+
+def renamed_png(folder: Path) -> None:
+    Image.new("RGB", (320, 240)).save(folder / "views/images/002.jpg", format="PNG")
+
+
+def wrong_mask(folder: Path) -> None:
+    Image.new("L", (3, 4)).save(folder / "views/mask.png")
+    edit(VIEWS, "frames", 1, "mask_path", to="mask.png")(folder)
+
+
+def unknown_mesh(folder: Path) -> None:
+    (folder / "tool.stl").rename(folder / "tool.dat")
+    edit(SET, "tool", "mesh", to="tool.dat")(folder)
+
+
+def short_row(folder: Path) -> None:
+    with (folder / "tool_motion.csv").open("a") as file:
+        file.write("99,9.9\n")
+
+
+def duplicate_video_frame(folder: Path) -> None:
+    data = json.loads((folder / VIDEO).read_text())
+    extra = dict(data["frames"][0], file_path=data["frames"][2]["file_path"])
+    data["frames"][2] = extra
+    (folder / VIDEO).write_text(json.dumps(data))
+
+
+def flat_plate() -> trimesh.Trimesh:
+    return trimesh.Trimesh([[0, -0.06, -0.06], [0, 0.06, -0.06], [0, 0.06, 0.06]], [[0, 1, 2]])
+
+
+def open_box() -> trimesh.Trimesh:
+    box = trimesh.creation.box((0.01, 0.1, 0.1))
+    return trimesh.Trimesh(box.vertices, box.faces[2:])
+
+
+def big_box() -> trimesh.Trimesh:
+    return trimesh.creation.box((12.0, 120.0, 120.0))
+
+
+FIRST = "frames[1].file_path"
+SECOND = "frames[2].file_path"
+LEAVES = "leaves the measurement set"
+MATRIX = "frames[1].transform_matrix"
+VIEWS, VIDEO, SET = "views/transforms.json", "video/transforms.json", "experiment.json"
+POSE = ("frames", 1, "transform_matrix")
+STRETCHED = [[2.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1], [0, 0, 0, 1]]
+DOUBLED = [[2.0, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 1], [0, 0, 0, 1]]
+MIRROR = [[-1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1], [0, 0, 0, 1]]
+SHEARED = [[1.0, 0.1, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1], [0, 0, 0, 1]]
+PROJECTIVE = [[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1], [0, 0, 1, 1]]
+
+CASES = [
+    # images
+    Case("image-missing", lambda f: (f / "views/images/001.jpg").unlink(), "views/images/001.jpg", FIRST,
+         "no such file"),
+    Case("image-truncated", truncate("views/images/001.jpg", 0.6), "views/images/001.jpg", FIRST, "truncated"),
+    Case("image-empty", replace("views/images/001.jpg", b""), "views/images/001.jpg", FIRST, "not an image"),
+    Case("image-of-another-size", wrong_size, "views/images/002.jpg", SECOND, "319 x 240"),
+    Case("image-is-text", replace("views/images/001.jpg", "hello"), "views/images/001.jpg", FIRST, "not an image"),
+    Case("image-is-png-named-jpg", renamed_png, "views/images/002.jpg", SECOND, "PNG"),
+    Case("video-image-truncated", truncate("video/left/+010.jpg", 0.6), "video/left/+010.jpg", "frames[6].file_path",
+         "truncated"),
+    Case("image-is-a-folder", edit(VIEWS, "frames", 1, "file_path", to="images"), VIEWS, FIRST, "not a file"),
+    Case("image-listed-twice", edit(VIEWS, "frames", 1, "file_path", to="images/000.jpg"), VIEWS, FIRST,
+         "twice"),
+    Case("mask-of-another-size", wrong_mask, "views/mask.png", "frames[1].mask_path", "3 x 4"),
+    # paths
+    Case("path-absolute", outside("absolute"), VIEWS, FIRST, LEAVES),
+    Case("path-with-dots", outside("dots"), VIEWS, FIRST, LEAVES),
+    Case("path-through-link", outside("link"), VIEWS, FIRST, LEAVES),
+    Case("path-of-mesh-leaves", edit(SET, "tool", "mesh", to="../tool.stl"), SET, "tool.mesh", LEAVES),
+    Case("path-of-views-leaves", edit(SET, "views", to="/etc/passwd"), SET, "views", LEAVES),
+    Case("path-with-null", edit(VIEWS, "frames", 1, "file_path", to="a\0b"), VIEWS, FIRST, "no usable path"),
+    Case("path-endless", edit(VIEWS, "frames", 1, "file_path", to="a" * 5000), VIEWS, FIRST,
+         "no usable path"),
+    Case("path-is-a-number", edit(VIEWS, "frames", 1, "file_path", to=7), VIEWS, FIRST, "expected text"),
+    # matrices
+    Case("matrix-stretches", edit(VIEWS, *POSE, to=STRETCHED), VIEWS, MATRIX, "not a rigid motion"),
+    Case("matrix-scales", edit(VIEWS, *POSE, to=DOUBLED), VIEWS, MATRIX, "it scales by 2"),
+    Case("matrix-mirrors", edit(VIEWS, *POSE, to=MIRROR), VIEWS, MATRIX, "mirrors"),
+    Case("matrix-shears", edit(VIEWS, *POSE, to=SHEARED), VIEWS, MATRIX, "not a rotation"),
+    Case("matrix-last-row", edit(VIEWS, *POSE, to=PROJECTIVE), VIEWS, MATRIX, "last row"),
+    Case("matrix-of-zeros", edit(VIEWS, *POSE, to=[[0.0] * 4] * 3 + [[0, 0, 0, 1]]), VIEWS, MATRIX, "not a rotation"),
+    Case("matrix-3x4", edit(VIEWS, *POSE, to=MIRROR[:3]), VIEWS, MATRIX, "4 x 4"),
+    Case("matrix-nan", edit(VIEWS, *POSE, 2, 3, to=math.nan), VIEWS, MATRIX + "[2][3]", "not a finite number"),
+    Case("matrix-text", edit(VIEWS, *POSE, 2, 3, to="1.0"), VIEWS, MATRIX + "[2][3]", "expected a number"),
+    Case("matrix-missing", edit(VIEWS, *POSE, drop=True), VIEWS, MATRIX, "missing"),
+    Case("matrices-in-opencv-axes", to_opencv, VIEWS, "frames[0].transform_matrix", "no camera looks at"),
+    # cameras
+    Case("camera-model-unknown", edit(VIEWS, "camera_model", to="EQUIRECTANGULAR"), VIEWS, "camera_model",
+         "EQUIRECTANGULAR"),
+    Case("pinhole-with-distortion",
+         lambda f: (edit(VIEWS, "camera_model", to="PINHOLE")(f), edit(VIEWS, "k1", to=0.1)(f)), VIEWS, "k1", "OPENCV"),
+    Case("focal-length-infinite", edit(VIEWS, "fl_x", to=math.inf), VIEWS, "fl_x", "not a finite number"),
+    Case("focal-length-of-a-frame-negative", edit(VIEWS, "frames", 2, "fl_x", to=-300.0), VIEWS, "frames[2].fl_x",
+         "outside"),
+    Case("focal-length-in-metres", edit(VIEWS, "fl_x", to=0.035), VIEWS, "fl_x", "pixels"),
+    Case("focal-length-missing", edit(VIEWS, "fl_x", drop=True), VIEWS, "frames[0].fl_x", "missing"),
+    Case("principal-point-missing", edit(VIEWS, "cx", drop=True), VIEWS, "frames[0].cx", "missing"),
+    Case("width-not-whole", edit(VIEWS, "w", to=320.5), VIEWS, "w", "whole number"),
+    Case("width-true", edit(VIEWS, "w", to=True), VIEWS, "w", "expected a number"),
+    Case("distortion-nan", edit(VIEWS, "k2", to=math.nan), VIEWS, "k2", "not a finite number"),
+    Case("views-without-frames", edit(VIEWS, "frames", to=[]), VIEWS, "frames", "empty"),
+    Case("views-frames-not-a-list", edit(VIEWS, "frames", to={"a": 1}), VIEWS, "frames", "expected a list"),
+    Case("views-frame-not-an-object", edit(VIEWS, "frames", 1, to=3), VIEWS, "frames[1]", "expected an object"),
+    Case("cameras-in-millimetres", scale_cameras(1000.0), VIEWS, "frames[0].transform_matrix",
+         "positions are in metres"),
+    # video
+    Case("video-frame-twice", duplicate_video_frame, VIDEO, "frames[2].frame", "given twice"),
+    Case("video-time-backwards", edit(VIDEO, "frames", 6, "time", to=-5.0), VIDEO, "frames[6].time", "runs backwards"),
+    Case("video-without-camera", edit(VIDEO, "frames", 0, "camera", drop=True), VIDEO, "frames[0].camera", "missing"),
+    Case("video-without-number", edit(VIDEO, "frames", 0, "frame", drop=True), VIDEO, "frames[0].frame", "missing"),
+    Case("video-without-time", edit(VIDEO, "frames", 0, "time", drop=True), VIDEO, "frames[0].time", "missing"),
+    Case("video-number-not-whole", edit(VIDEO, "frames", 0, "frame", to=0.5), VIDEO, "frames[0].frame", "whole number"),
+    Case("video-camera-moves", edit(VIDEO, "frames", 6, "transform_matrix", 0, 3, to=-0.2), VIDEO,
+         "frames[6].transform_matrix", "moves"),
+    Case("video-camera-zooms", edit(VIDEO, "frames", 6, "fl_x", to=350.0), VIDEO, "frames[6]", "another calibration"),
+    # experiment.json
+    Case("set-missing", lambda f: (f / SET).unlink(), SET, None, "no experiment.json"),
+    Case("set-not-json", replace(SET, "format: splatsoil"), SET, None, "not JSON"),
+    Case("set-is-binary", replace(SET, b"\x89PNG\xff\xfe"), SET, None, "not a text file"),
+    Case("set-is-a-list", replace(SET, "[1, 2]"), SET, None, "expected a JSON object"),
+    Case("set-nested-endlessly", replace(SET, "[" * 100_000), SET, None, "not usable JSON"),
+    Case("format-missing", edit(SET, "format", drop=True), SET, "format", "missing"),
+    Case("format-of-another-version", edit(SET, "format", to="splatsoil-measurement/2"), SET, "format",
+         "another version"),
+    Case("up-is-y", edit(SET, "up", to="y"), SET, "up", "z"),
+    Case("bed-missing", edit(SET, "bed", drop=True), SET, "bed", "missing"),
+    Case("bed-800-m-long", edit(SET, "bed", "upper", 0, to=800.0), SET, "bed.upper[0]", "800 m along x"),
+    Case("bed-in-kilometres", edit(SET, "bed", "upper", to=[0.0008, 0.0005, 0.00027]), SET, "bed.upper[0]", "metres"),
+    Case("bed-upside-down", edit(SET, "bed", "upper", 2, to=-1.0), SET, "bed.upper[2]", "not above"),
+    Case("bed-infinite", edit(SET, "bed", "upper", 2, to=math.inf), SET, "bed.upper[2]", "not a finite number"),
+    Case("bed-with-two-numbers", edit(SET, "bed", "lower", to=[0, 0]), SET, "bed.lower", "list of 3"),
+    Case("bed-huge-number", edit(SET, "bed", "density", to=10**400), SET, "bed.density", "not a finite number"),
+    Case("density-missing", edit(SET, "bed", "density", drop=True), SET, "bed.density", "missing"),
+    Case("density-in-g-per-cm3", edit(SET, "bed", "density", to=1.6), SET, "bed.density", "kg/m³"),
+    Case("gravity-missing", edit(SET, "gravity", drop=True), SET, "gravity", "missing"),
+    Case("gravity-upwards", edit(SET, "gravity", to=[0, 0, 9.81]), SET, "gravity", "does not point down"),
+    Case("gravity-along-y", edit(SET, "gravity", to=[0, -9.81, 0]), SET, "gravity", "does not point down"),
+    Case("gravity-in-mm", edit(SET, "gravity", to=[0, 0, -9810.0]), SET, "gravity", "m/s²"),
+    Case("frame-rate-zero", edit(SET, "frame_rate", to=0), SET, "frame_rate", "outside"),
+    Case("friction-is-an-angle", edit(SET, "tool", "friction", to=17.0), SET, "tool.friction", "not an angle"),
+    Case("friction-negative", edit(SET, "bed", "floor_friction", to=-0.1), SET, "bed.floor_friction", "outside"),
+    Case("views-missing", edit(SET, "views", drop=True), SET, "views", "missing"),
+    Case("video-file-missing", lambda f: (f / VIDEO).unlink(), VIDEO, "video", "no such file"),
+    Case("tool-not-an-object", edit(SET, "tool", to="tool.stl"), SET, "tool", "expected an object"),
+    # the tool's mesh
+    Case("mesh-missing", lambda f: (f / "tool.stl").unlink(), "tool.stl", "tool.mesh", "no such file"),
+    Case("mesh-without-volume", mesh(flat_plate), "tool.stl", "faces", "no volume"),
+    Case("mesh-open", mesh(open_box), "tool.stl", "faces", "holes"),
+    Case("mesh-in-millimetres", mesh(big_box), "tool.stl", "vertices", "metres"),
+    Case("mesh-is-text", replace("tool.stl", "this is no mesh"), "tool.stl", None, "what its name says"),
+    Case("mesh-empty", replace("tool.stl", b""), "tool.stl", None, "what its name says"),
+    Case("mesh-truncated", truncate("tool.stl", 0.5), "tool.stl", None, "what its name says"),
+    Case("mesh-of-no-known-type", unknown_mesh, "tool.dat", None,
+         "what its name says"),
+    # the tool's motion and force
+    Case("motion-missing", lambda f: (f / "tool_motion.csv").unlink(), "tool_motion.csv", "tool.motion",
+         "no such file"),
+    Case("motion-header", cell(0, 5, "qx"), "tool_motion.csv", "line 1", "expected the header"),
+    Case("motion-empty", replace("tool_motion.csv", ""), "tool_motion.csv", "line 1", "expected the header"),
+    Case("motion-without-rows", replace("tool_motion.csv", "frame,time,x,y,z,qw,qx,qy,qz\n"), "tool_motion.csv", None,
+         "no rows"),
+    Case("motion-time-backwards", cell(10, 1, "0.1"), "tool_motion.csv", "time, row 10", "runs backwards"),
+    Case("motion-time-stands-still", cell(10, 1, "0.16"), "tool_motion.csv", "time, row 10", "stands still"),
+    Case("motion-frame-twice", cell(10, 0, "8"), "tool_motion.csv", "frame, row 10", "stands still"),
+    Case("motion-frame-not-whole", cell(10, 0, "8.5"), "tool_motion.csv", "frame", "whole number"),
+    Case("motion-nan", cell(10, 3, "nan"), "tool_motion.csv", "y, line 11", "not a finite number"),
+    Case("motion-infinite", cell(10, 1, "inf"), "tool_motion.csv", "time, line 11", "not a finite number"),
+    Case("motion-word", cell(10, 2, "left"), "tool_motion.csv", "x, line 11", "not a number"),
+    Case("motion-short-row", short_row, "tool_motion.csv", "line 43",
+         "2 values"),
+    Case("motion-quaternion-zero", motion(lambda t: t * [1, 1, 1, 1, 1, 0, 0, 0, 0]), "tool_motion.csv",
+         "qw,qx,qy,qz, frame 0", "length 0"),
+    Case("motion-quaternion-long", motion(lambda t: t * [1, 1, 1, 1, 1, 2, 2, 2, 2]), "tool_motion.csv",
+         "qw,qx,qy,qz, frame 0", "instead of 1"),
+    Case("motion-outside-of-bed", motion(lambda t: t + np.eye(9)[4] * 3.0), "tool_motion.csv", "x,y,z",
+         "never touches"),
+    Case("motion-in-millimetres", motion(lambda t: t * [1, 1, 1e3, 1e3, 1e3, 1, 1, 1, 1]), "tool_motion.csv", "x,y,z",
+         "never touches"),
+    Case("force-header", cell(0, 2, "force_x", "tool_force.csv"), "tool_force.csv", "line 1", "expected the header"),
+    Case("force-nan", cell(3, 2, "nan", "tool_force.csv"), "tool_force.csv", "fx, line 4", "not a finite number"),
+    Case("force-missing", lambda f: (f / "tool_force.csv").unlink(), "tool_force.csv", "tool.force", "no such file"),
+]  # fmt: skip
+
+
+def everything_under(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+@pytest.mark.parametrize("case", CASES, ids=[case.name for case in CASES])
+def test_a_fault_gets_one_clear_error(
+    case: Case, small_set: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    case.spoil(small_set)
+    with pytest.raises(MeasurementError) as caught:
+        Measurement.load(small_set)
+    assert caught.value.file == small_set / case.file
+    assert caught.value.field == case.field
+    assert case.says in str(caught.value)
+
+    before = everything_under(small_set.parent)
+    monkeypatch.chdir(small_set.parent)
+    assert main(["check", str(small_set)]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1, "one line"
+    assert case.says in err and case.file in err and (case.field or "") in err
+    assert everything_under(small_set.parent) == before, "nothing written"
+
+
+def test_good_set_passes(small_set: Path) -> None:
+    """The set that all the cases spoil is itself in order: each error is the fault's own."""
+    assert Measurement.load(small_set).frames == (0, 10)
+
+
+def test_a_set_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", str(tmp_path / "nowhere")]) == 2
+    assert "no such folder" in capsys.readouterr().err
+    (tmp_path / "file").write_text("")
+    assert main(["check", str(tmp_path / "file")]) == 2
+    assert "not a folder" in capsys.readouterr().err
+
+
+def test_an_error_as_json(small_set: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Machines get the error as the one object on stdout."""
+    edit(SET, "bed", "upper", 0, to=800.0)(small_set)
+    assert main(["check", str(small_set), "--json"]) == 2
+    out, err = capsys.readouterr()
+    data = json.loads(out)
+    assert data["ok"] is False and "bed.upper[0]" in data["error"]
+    assert "bed.upper[0]" in err
+
+
+def test_links_inside_the_folder_are_allowed(small_set: Path) -> None:
+    (small_set / "views/images/link.jpg").symlink_to(small_set / "views/images/001.jpg")
+    edit(VIEWS, "frames", 1, "file_path", to="images/link.jpg")(small_set)
+    assert len(Measurement.load(small_set).views) == 4
+
+
+def test_the_folder_itself_may_be_a_link(small_set: Path) -> None:
+    link = small_set.parent / "link"
+    link.symlink_to(small_set)
+    assert Measurement.load(link).hash == Measurement.load(small_set).hash
