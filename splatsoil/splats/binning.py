@@ -1,9 +1,9 @@
 """Which Gaussians touch which screen tile, front to back.
 
-Visible Gaussians are ranked by depth once (stable: ties keep their input order). Each rank then lists the tiles that its
-ellipse of opacity 1/255 really touches, and a stable sort of these entries by tile leaves every tile's list in depth order.
-An entry's number in rank order stays with it: the backward pass writes one row of gradients per entry, and rows of one
-Gaussian are neighbours, so that their sum has a fixed order however many threads draw.
+Visible Gaussians are ranked by depth once (stable: ties keep their input order). Each rank then lists the tiles that
+its ellipse of opacity 1/255 really touches, and a stable sort of these entries by tile leaves every tile's list in
+depth order. An entry's number in rank order stays with it: the backward pass writes one row of gradients per entry, and
+rows of one Gaussian are neighbours, so that their sum has a fixed order however many threads draw.
 """
 
 from __future__ import annotations
@@ -55,6 +55,14 @@ def _pack(
 
 
 @wp.func
+def _tiles_between(low: float, high: float, tiles: int):
+    """First and one-past-last tile with a pixel centre between two places (px); clamped before the integer."""
+    first = wp.clamp(wp.floor((low - 0.5) / _SIDE), 0.0, float(tiles))
+    last = wp.clamp(wp.floor((high - 0.5) / _SIDE) + 1.0, 0.0, float(tiles))
+    return wp.vec2i(int(first), int(last))
+
+
+@wp.func
 def _tile_span(rows: wp.array2d(dtype=float), rank: int, tile_row: int, tiles_x: int):
     """First and one-past-last tile column that the ellipse touches in one row of tiles."""
     x = rows[rank, 0]
@@ -73,17 +81,13 @@ def _tile_span(rows: wp.array2d(dtype=float), rank: int, tile_row: int, tiles_x:
     dy_left = wp.clamp(-tip, top, bottom)
     right = (-b * dy_right + wp.sqrt(wp.max(cut * a - determinant * dy_right * dy_right, 0.0))) / a
     left = (-b * dy_left - wp.sqrt(wp.max(cut * a - determinant * dy_left * dy_left, 0.0))) / a
-    first = int(wp.floor((x + left - 0.5) / _SIDE))
-    last = int(wp.floor((x + right - 0.5) / _SIDE)) + 1
-    return wp.vec2i(wp.max(first, 0), wp.min(last, tiles_x))
+    return _tiles_between(x + left, x + right, tiles_x)
 
 
 @wp.func
 def _tile_rows(rows: wp.array2d(dtype=float), rank: int, tiles_y: int):
     """First and one-past-last row of tiles that the ellipse touches."""
-    first = int(wp.floor((rows[rank, 1] - rows[rank, 6] - 0.5) / _SIDE))
-    last = int(wp.floor((rows[rank, 1] + rows[rank, 6] - 0.5) / _SIDE)) + 1
-    return wp.vec2i(wp.max(first, 0), wp.min(last, tiles_y))
+    return _tiles_between(rows[rank, 1] - rows[rank, 6], rows[rank, 1] + rows[rank, 6], tiles_y)
 
 
 @wp.kernel(enable_backward=False, module="unique")

@@ -78,11 +78,12 @@ class OrthographicCamera:
         It stands where the box begins, so depth runs from 0 to the box's extent along ``direction``.
 
         Args:
-            direction: viewing direction (3,), any length; (0, 0, −1) looks down. For a shadow map: from the sun to the scene.
+            direction: viewing direction (3,), any length; (0, 0, −1) looks down. For a shadow map: from the sun to the
+                scene.
             lower: smallest corner of the box (3,), m.
             upper: largest corner of the box (3,), m.
             pixel_size: side of a pixel, m.
-            up: the direction that points up in the image (it may not be parallel to ``direction``; if it is, +x is used).
+            up: the direction that points up in the image; +x takes its place if it is parallel to ``direction``.
         """
         forward = np.asarray(direction, dtype=np.float64)
         length = np.linalg.norm(forward)

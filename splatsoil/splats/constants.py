@@ -1,4 +1,4 @@
-"""Numbers that define the image of a set of Gaussians; they follow the reference 3-D Gaussian splatting code and gsplat."""
+"""Numbers that define the image of Gaussians; they follow the original 3-D Gaussian splatting code and gsplat."""
 
 from __future__ import annotations
 
@@ -21,8 +21,9 @@ NEAR = 0.01
 """Gaussians whose centre is nearer than this to a perspective camera's plane (m) are not drawn."""
 
 TANGENT_LIMIT = 3.0
-"""Largest |x/z| and |y/z| at which the perspective Jacobian is evaluated. The reference code takes 1.3 times the half-angle
-of the image instead, which makes a cropped picture differ from the crop of the full one; a fixed limit does not."""
+"""Largest |x/z| and |y/z| at which the perspective Jacobian is evaluated. The original code takes 1.3 times the
+half-angle of the image instead, which makes a cropped picture differ from the crop of the full one; a fixed limit does
+not."""
 
 TILE = 16
 """Side of the square screen tiles, in px; the CPU kernels hold one row of a tile in one 16-wide vector."""

@@ -1,12 +1,13 @@
 """CPU kernels: one task per 16 × 16 tile, one 16-wide vector per row of pixels.
 
-Written in C++ for the clang that comes with Warp (``wp.func_native``): arrays of a whole tile stay in the first-level cache,
-Gaussians are the outer loop, rows out of a Gaussian's reach are skipped, and a row is sixteen pixels without a branch
-(polynomial exp2). A negative transmittance marks a finished pixel; its magnitude is the final value.
+Written in C++ for the clang that comes with Warp (``wp.func_native``): arrays of a whole tile stay in the first-level
+cache, Gaussians are the outer loop, rows out of a Gaussian's reach are skipped, and a row is sixteen pixels without a
+branch (polynomial exp2). A negative transmittance marks a finished pixel; its magnitude is the final value.
 
-The backward pass walks front to back again. With S, the part of (colour · gradient) that is still to come, the derivative
-of the loss by a Gaussian's opacity in a pixel is T (c·v) − S / (1 − α). Position, shape and opacity need six moments of
-∂L/∂σ over the pixels; a lane is a column, so three sums (weights 1, dy, dy²) stay in registers and dx enters once per tile.
+The backward pass walks front to back again. With S, the part of (colour · gradient) that is still to come, the
+derivative of the loss by a Gaussian's opacity in a pixel is T (c·v) − S / (1 − α). Position, shape and opacity need six
+moments of ∂L/∂σ over the pixels; a lane is a column, so three sums (weights 1, dy, dy²) stay in registers and dx enters
+once per tile.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ MOMENTS = 6
 _COMMON = """
     typedef float v16 __attribute__((ext_vector_type(16)));
     typedef int i16 __attribute__((ext_vector_type(16)));
-    const v16 lane = {0.5f, 1.5f, 2.5f, 3.5f, 4.5f, 5.5f, 6.5f, 7.5f, 8.5f, 9.5f, 10.5f, 11.5f, 12.5f, 13.5f, 14.5f, 15.5f};
+    const v16 lane = {0.5f, 1.5f, 2.5f, 3.5f, 4.5f, 5.5f, 6.5f, 7.5f,
+                      8.5f, 9.5f, 10.5f, 11.5f, 12.5f, 13.5f, 14.5f, 15.5f};
     const int x0 = (tile % tiles_x) * 16, y0 = (tile / tiles_x) * 16;
     const int columns = width - x0 < 16 ? width - x0 : 16, lines = height - y0 < 16 ? height - y0 : 16;
     const int begin = starts.data[tile], end = starts.data[tile + 1];
@@ -44,7 +46,7 @@ _GAUSSIAN = """
         const v16 linear = dx * g[3];
 """
 
-# 2^p by rounding to an integer (adding 1.5·2²³ leaves it in the low bits) and a polynomial on [−½, ½], relative error 2e-7
+# 2^p by rounding to an integer (adding 1.5·2²³ leaves it in the low bits) and a polynomial on [−½, ½] (from Cephes)
 _ALPHA = """
             const float dy = (float)(y0 + r) + 0.5f - g[1];
             v16 p = quadratic + dy * (linear + dy * g[4]);
@@ -57,7 +59,8 @@ _ALPHA = """
             poly = poly * f + 2.402264791e-1f;
             poly = poly * f + 6.931472028e-1f;
             poly = poly * f + 1.0f;
-            const v16 raw = __builtin_bit_cast(v16, __builtin_bit_cast(i16, poly) + (__builtin_bit_cast(i16, shifted) << 23));
+            const i16 exponent = __builtin_bit_cast(i16, shifted) << 23;
+            const v16 raw = __builtin_bit_cast(v16, __builtin_bit_cast(i16, poly) + exponent);
             v16 alpha = __builtin_elementwise_min(raw, (v16)(ALPHA_MAX));
             v16 t = T[r];
             alpha = ((alpha >= ALPHA_MIN) & (t > 0.0f)) ? alpha : (v16)(0.0f);

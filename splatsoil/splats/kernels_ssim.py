@@ -1,8 +1,9 @@
 """CPU kernels of SSIM: one task per band of rows, both blurs in the first-level cache.
 
-The window is separable. For every output row the five blurred moments (a, b, a², b², ab) are summed down the columns first
-(eleven rows, straight through memory), then along the row. With μ, s² and c the blurred means, variances and covariance, the
-derivative of the map's loss by a picture is  W∗(g·∂/∂μ_a) + 2a·W∗(g·∂/∂(a²)) + b·W∗(g·∂/∂(ab)),  W∗ the same symmetric blur.
+The window is separable. For every output row the five blurred moments (a, b, a², b², ab) are summed down the columns
+first (eleven rows, straight through memory), then along the row. With S the similarity as a function of the blurred
+moments and g the gradient of the loss by S, the gradient by picture a is W∗(g ∂S/∂W(a)) + 2a W∗(g ∂S/∂W(a²)) +
+b W∗(g ∂S/∂W(ab)), where W∗ is the same symmetric blur.
 """
 
 from __future__ import annotations
@@ -124,7 +125,8 @@ _GRADIENT = """
             }
             const long long at = (long long)y * row + x0;
             for (int i = 0; i < n; ++i)
-                out.data[at + i] = blurred[0][i] + 2.0f * own.data[at + i] * blurred[1][i] + other.data[at + i] * blurred[2][i];
+                out.data[at + i] = blurred[0][i] + 2.0f * own.data[at + i] * blurred[1][i]
+                                 + other.data[at + i] * blurred[2][i];
         }
     }
 """
@@ -157,7 +159,7 @@ def similarity(
     slopes_a: wp.array(dtype=float),
     slopes_b: wp.array(dtype=float),
 ):
-    """SSIM map of two pictures (height, row) with interleaved channels, and its slopes (3, height, row) where wanted."""
+    """SSIM map of two pictures (height, row), channels interleaved, and its slopes (3, height, row) where wanted."""
     _similarity_band(wp.tid(), height, row, channels, a, b, window, out, slopes_a, slopes_b)
 
 
@@ -188,5 +190,5 @@ def similarity_gradient(
     slopes: wp.array(dtype=float),
     out: wp.array(dtype=float),
 ):
-    """Gradient of a loss by the picture ``own``, from the map's ``upstream`` gradient and the slopes for that picture."""
+    """Gradient of a loss by the picture ``own``, from the map's ``upstream`` gradient and that picture's slopes."""
     _gradient_band(wp.tid(), height, row, channels, own, other, upstream, window, slopes, out)

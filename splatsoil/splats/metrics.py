@@ -32,8 +32,8 @@ def psnr(a: Tensor, b: Tensor) -> Tensor:
 def ssim(a: Tensor, b: Tensor) -> Tensor:
     """Mean structural similarity of two pictures (h, w) or (h, w, c) with values in [0, 1]; 1 when they are equal.
 
-    The convention of the splatting papers: Gaussian window of 11 px (σ = 1.5), zeros beyond the border, the mean over all
-    pixels and channels; a loss is ``1 - ssim(a, b)``. Differentiable in both pictures.
+    The convention of the splatting papers: Gaussian window of 11 px (σ = 1.5), zeros beyond the border, the mean over
+    all pixels and channels; a loss is ``1 - ssim(a, b)``. Differentiable in both pictures.
     """
     _check(a, b)
     return ssim_map(a, b).mean()

@@ -1,8 +1,9 @@
 """Gaussians to and from the ``.ply`` layout of the reference 3-D Gaussian splatting code, which common viewers open.
 
-One binary little-endian ``vertex`` element of float32 properties, in this order: ``x y z nx ny nz f_dc_0..2 f_rest_0..44
-opacity scale_0..2 rot_0..3``. Normals are zero, opacity is a logit, scales are natural logarithms of standard deviations,
-``rot`` is wxyz and need not be normalised, colour is 0.5 + Y00·f_dc; ``f_rest`` (view-dependent terms) is zero.
+One binary little-endian ``vertex`` element of float32 properties, in this order: ``x y z nx ny nz f_dc_0..2
+f_rest_0..44 opacity scale_0..2 rot_0..3``. Normals are zero, opacity is a logit, scales are natural logarithms of
+standard deviations, ``rot`` is wxyz and need not be normalised, colour is 0.5 + Y00·f_dc; ``f_rest`` (view-dependent
+terms) is zero.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ _LAYOUT = [*_POSITION, *_NORMAL, *_DC, *_REST, "opacity", *_SCALE, *_ROTATION]
 
 
 def save_ply(path: str | Path, gaussians: Gaussians) -> None:
-    """Write Gaussians to ``path``; opacities and scales are kept away from 0 and 1 so that the logarithms stay finite."""
+    """Write Gaussians to ``path``; opacities of 0 and 1 and scales of 0 are moved to where logarithms are finite."""
     vertices = np.zeros(len(gaussians), dtype=[(name, "<f4") for name in _LAYOUT])
     g = gaussians.detach().to("cpu")
     opacities = g.opacities.double().clamp(1e-6, 1 - 1e-6)

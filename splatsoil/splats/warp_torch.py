@@ -10,7 +10,7 @@ from torch import Tensor
 
 
 def as_warp(tensor: Tensor, dtype: Any) -> Any:
-    """A contiguous float32 or int32 tensor as a Warp array of ``dtype`` (scalars, vectors or matrices) over its memory."""
+    """A contiguous float32 or int32 tensor as a Warp array of ``dtype`` (scalar, vector, matrix) over its memory."""
     wp.init()
     return wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=False)
 

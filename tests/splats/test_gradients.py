@@ -1,0 +1,151 @@
+"""Gradients: against finite differences, and the kernels against the slow reference."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from splatsoil.measurement import Camera
+from splatsoil.splats import Gaussians, OrthographicCamera, rasterise, rasterise_features, reference
+from splatsoil.splats.gaussians import rotation_matrices
+
+CameraMaker = Callable[..., Camera]
+CloudMaker = Callable[..., Gaussians]
+
+
+def symmetric(matrices: Tensor) -> Tensor:
+    """Gradient by a symmetric matrix: only the symmetric part has a meaning."""
+    return 0.5 * (matrices + matrices.transpose(1, 2)) if matrices.ndim == 3 else matrices
+
+
+def relative(a: Tensor, b: Tensor) -> float:
+    """Largest difference relative to the largest value of ``b``."""
+    return float((a.double() - b.double()).abs().max() / b.double().abs().max())
+
+
+@pytest.mark.parametrize("antialias", [False, True])
+@pytest.mark.parametrize("orthographic", [False, True])
+def test_reference_gradients_against_finite_differences(
+    orthographic: bool, antialias: bool, camera_at: CameraMaker, cloud: CloudMaker
+) -> None:
+    """The 1/255 step is taken out: a finite difference would see it jump."""
+    g = cloud(4, f=20.0, extent=0.3, seed=4)
+    camera = camera_at(width=8, height=7, f=20.0)
+    if orthographic:
+        camera = OrthographicCamera(8, 7, 0.07, np.diag([1.0, -1.0, -1.0, 1.0]))
+    weights = torch.rand(7, 8, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+    def loss(means: Tensor, scales: Tensor, quaternions: Tensor, opacities: Tensor, features: Tensor) -> Tensor:
+        half = rotation_matrices(quaternions) * scales[:, None, :]
+        image, alpha = reference.rasterise_features(
+            means, half @ half.transpose(1, 2), opacities, features, camera, antialias=antialias, skip_below=0.0
+        )
+        return (image * weights[:, :, :3]).sum() + (alpha * weights[:, :, 3]).sum()
+
+    opacities = 0.8 * g.opacities  # away from the clamp
+    inputs = [t.double().requires_grad_() for t in (g.means, g.scales, g.quaternions, opacities, g.colours)]
+    assert torch.autograd.gradcheck(loss, inputs, eps=1e-6, atol=1e-6, rtol=1e-4)
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4, 7, 8])
+@pytest.mark.parametrize("kind", ["plain", "antialias", "orthographic"])
+def test_kernels_against_reference(kind: str, channels: int, camera_at: CameraMaker, cloud: CloudMaker) -> None:
+    """Values and all gradients on a crowded image with partial tiles, clamped and saturated pixels."""
+    f = 60.0
+    g = cloud(150, f=f, extent=1.0, sigma=3.0, seed=channels)
+    camera = camera_at(width=53, height=41, f=f, cx=27.3, cy=18.9)
+    if kind == "orthographic":
+        camera = OrthographicCamera(53, 41, 0.03, np.diag([1.0, -1.0, -1.0, 1.0]))
+    antialias = kind == "antialias"
+    generator = torch.Generator().manual_seed(7)
+    features = torch.randn(len(g), channels, generator=generator)
+    background = torch.rand(channels, generator=generator)
+    opacities = g.opacities * 1.05  # some beyond the clamp
+    inputs = [t.clone().requires_grad_() for t in (g.means, g.covariances(), opacities, features, background)]
+    out = rasterise_features(*inputs[:4], camera, background=inputs[4], antialias=antialias)
+    exact_inputs = [t.detach().double().requires_grad_() for t in inputs]
+    image, alpha = reference.rasterise_features(
+        *exact_inputs[:4], camera, background=exact_inputs[4], antialias=antialias
+    )
+    assert float(alpha.detach().max()) > 0.99
+    torch.testing.assert_close(out.image.double(), image, rtol=0, atol=5e-5)
+    torch.testing.assert_close(out.alpha.double(), alpha, rtol=0, atol=2e-5)
+    v_image = torch.randn(image.shape, generator=generator)
+    v_alpha = torch.randn(alpha.shape, generator=generator)
+    gradients = torch.autograd.grad((out.image * v_image).sum() + (out.alpha * v_alpha).sum(), inputs)
+    exact = torch.autograd.grad((image * v_image).sum() + (alpha * v_alpha).sum(), exact_inputs)
+    # in the antialiasing factor of a needle the determinant is a small difference of large numbers
+    tolerance = 2e-4 if antialias else 2e-5
+    for name, a, b in zip(
+        ("means", "covariances", "opacities", "features", "background"), gradients, exact, strict=True
+    ):
+        assert relative(symmetric(a), symmetric(b)) < tolerance, name
+
+
+def test_kernels_against_finite_differences(camera_at: CameraMaker, cloud: CloudMaker) -> None:
+    """Central differences of the float32 picture itself; these Gaussians cover every pixel well above 1/255."""
+    g = cloud(6, f=20.0, extent=0.2, sigma=8.0, seed=2)
+    # the shortest axis is clearly the shortest, or the normal would jump
+    g = g.replace(opacities=0.3 + 0.3 * g.opacities, scales=g.scales.clamp(0.35, 0.6) * torch.tensor([1.1, 0.8, 1.3]))
+    camera = camera_at(width=12, height=10, f=20.0)
+    weights = torch.randn(10, 12, 8, generator=torch.Generator().manual_seed(0))
+    names = ("means", "scales", "quaternions", "opacities", "colours")
+
+    def loss(h: Gaussians) -> Tensor:
+        picture = rasterise(h, camera)
+        assert picture.normal is not None
+        channels = [picture.colour, picture.alpha[:, :, None], picture.depth[:, :, None], picture.normal]
+        return (torch.cat(channels, dim=2).double() * weights).sum()
+
+    leaves = [getattr(g, name).clone().requires_grad_() for name in names]
+    gradients = torch.autograd.grad(loss(Gaussians(*leaves)), leaves)
+    assert float(rasterise(g, camera).alpha.min()) > 0.2
+    generator = torch.Generator().manual_seed(1)
+    for name, gradient in zip(names, gradients, strict=True):
+        value = getattr(g, name)
+        for _ in range(3):
+            direction = torch.randn(value.shape, generator=generator)
+            step = 2e-3 * float(value.abs().mean())
+            there, back = (loss(g.replace(**{name: value + s * direction})) for s in (step, -step))
+            measured = float((there - back) / (2 * step))
+            assert measured == pytest.approx(float((gradient * direction).sum()), rel=5e-3, abs=2e-2), name
+
+
+def test_gradients_reach_every_tensor_of_a_rendering(camera_at: CameraMaker, cloud: CloudMaker) -> None:
+    g = cloud(30)
+    for output in ("colour", "alpha", "depth", "normal"):
+        leaves = [t.clone().requires_grad_() for t in (g.means, g.scales, g.quaternions, g.opacities, g.colours)]
+        picture = rasterise(Gaussians(*leaves), camera_at())
+        getattr(picture, output).square().sum().backward()
+        for leaf, name in zip(leaves[:4], ("means", "scales", "quaternions", "opacities"), strict=True):
+            assert leaf.grad is not None
+            assert torch.isfinite(leaf.grad).all()
+            assert leaf.grad.abs().sum() > 0, (output, name)
+
+
+def test_covariances_in_one_kernel(cloud: CloudMaker) -> None:
+    from splatsoil.splats.projection import covariances_of
+
+    g = cloud(50)
+    scales, quaternions = g.scales.clone().requires_grad_(), g.quaternions.clone().requires_grad_()
+    weights = torch.randn(50, 3, 3)
+    fast = covariances_of(scales, quaternions)
+    slow = g.replace(scales=scales, quaternions=quaternions).covariances()
+    torch.testing.assert_close(fast, slow, rtol=1e-5, atol=1e-9)
+    a = torch.autograd.grad((fast * weights).sum(), (scales, quaternions))
+    b = torch.autograd.grad((slow * weights).sum(), (scales, quaternions))
+    assert max(relative(x, y) for x, y in zip(a, b, strict=True)) < 1e-5
+
+
+def test_same_input_same_bits(camera_at: CameraMaker, cloud: CloudMaker) -> None:
+    g = cloud(400)
+    results = []
+    for _ in range(2):
+        leaves = [t.clone().requires_grad_() for t in (g.means, g.scales, g.quaternions, g.opacities, g.colours)]
+        picture = rasterise(Gaussians(*leaves), camera_at())
+        results.append([picture.colour, *torch.autograd.grad(picture.colour.square().sum(), leaves)])
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))

@@ -1,0 +1,115 @@
+"""What must not change the picture, or change it in a known way."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from splatsoil.measurement import Camera
+from splatsoil.splats import Gaussians, rasterise, rasterise_covariances
+
+CameraMaker = Callable[..., Camera]
+CloudMaker = Callable[..., Gaussians]
+
+POSE = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def assert_same_picture(a: torch.Tensor, b: torch.Tensor, pixels: float = 0.0) -> None:
+    """Equal but for rounding, which may also move a pixel across the 1/255 step: a share of ``pixels`` may differ."""
+    wrong = (a - b).abs() > 2e-5
+    assert float(wrong.double().mean()) <= pixels
+    assert float((a - b).abs().max()) < 2 / 255
+
+
+def test_order_of_the_input(camera_at: CameraMaker, cloud: CloudMaker) -> None:
+    g = cloud(300)
+    order = torch.randperm(300, generator=torch.Generator().manual_seed(0))
+    shuffled = rasterise(g[order], camera_at())
+    plain = rasterise(g, camera_at())
+    assert torch.equal(shuffled.colour, plain.colour)
+    assert torch.equal(shuffled.depth, plain.depth)
+
+
+@pytest.mark.parametrize(("x0", "y0"), [(0, 0), (16, 16), (3, 7), (21, 13)])
+def test_crop_and_tile_grid(x0: int, y0: int, camera_at: CameraMaker, cloud: CloudMaker) -> None:
+    """A crop with its off-centre principal point is the crop of the picture; odd offsets move the tiles' grid."""
+    g = cloud(300, sigma=3.0)
+    camera = camera_at(width=80, height=64)
+    whole = rasterise(g, camera)
+    part = rasterise(g, camera.cropped(x0, y0, 37, 29))
+    for name in ("colour", "alpha", "depth", "normal"):
+        full = getattr(whole, name)[y0 : y0 + 29, x0 : x0 + 37]
+        assert_same_picture(getattr(part, name), full, pixels=2e-3)
+
+
+def test_rigid_motion_of_scene_and_camera(camera_at: CameraMaker, cloud: CloudMaker) -> None:
+    g = cloud(200)
+    turn, shift = Rotation.from_euler("xyz", [0.4, -1.1, 2.0]), np.array([0.3, -2.0, 0.7])
+    motion = np.eye(4)
+    motion[:3, :3], motion[:3, 3] = turn.as_matrix(), shift
+    x, y, z, w = turn.as_quat()
+    own = Rotation.from_quat(g.quaternions.double().numpy()[:, [1, 2, 3, 0]])
+    moved = g.replace(
+        means=(g.means.double() @ torch.from_numpy(turn.as_matrix()).T + torch.from_numpy(shift)).float(),
+        quaternions=torch.from_numpy((turn * own).as_quat()[:, [3, 0, 1, 2]]).float(),
+    )
+    assert abs(w) < 1
+    assert x * x + y * y + z * z > 0
+    before = rasterise(g, camera_at())
+    after = rasterise(moved, camera_at(camera_to_world=motion @ POSE))
+    assert_same_picture(after.colour, before.colour, pixels=2e-3)
+    assert_same_picture(after.depth, before.depth, pixels=2e-3)
+    assert before.normal is not None
+    assert after.normal is not None
+    turned = before.normal @ torch.from_numpy(turn.as_matrix()).float().T
+    assert_same_picture(after.normal, turned, pixels=2e-3)
+
+
+def test_joint_scaling_of_scene_and_camera(camera_at: CameraMaker, cloud: CloudMaker) -> None:
+    g = cloud(200)
+    big = g.replace(means=g.means * 7.0, scales=g.scales * 7.0)
+    before, after = rasterise(g, camera_at()), rasterise(big, camera_at())
+    assert_same_picture(after.colour, before.colour, pixels=2e-3)
+    assert_same_picture(after.depth / 7, before.depth, pixels=2e-3)
+
+
+def test_linear_in_colour_and_background(camera_at: CameraMaker, cloud: CloudMaker) -> None:
+    g, other, camera = cloud(200), cloud(200, seed=5), camera_at()
+    b1, b2 = torch.tensor([0.2, 0.5, 0.1]), torch.tensor([0.9, -0.3, 0.4])
+    mixed = rasterise(
+        g.replace(colours=2 * g.colours - 0.5 * other.colours), camera, background=2 * b1 - 0.5 * b2
+    ).colour
+    first = rasterise(g, camera, background=b1).colour
+    second = rasterise(g.replace(colours=other.colours), camera, background=b2).colour
+    torch.testing.assert_close(mixed, 2 * first - 0.5 * second, rtol=0, atol=5e-6)
+
+
+def test_length_of_quaternions(camera_at: CameraMaker, cloud: CloudMaker) -> None:
+    g = cloud(100)
+    lengths = torch.rand(100, 1, generator=torch.Generator().manual_seed(3)) * 5 + 0.1
+    longer = rasterise(g.replace(quaternions=-g.quaternions * lengths), camera_at())
+    assert_same_picture(longer.colour, rasterise(g, camera_at()).colour, pixels=2e-3)
+
+
+def test_covariances_draw_the_same_as_scales_and_quaternions(camera_at: CameraMaker, cloud: CloudMaker) -> None:
+    g, camera = cloud(200), camera_at()
+    normals = g.normals(torch.zeros(3))
+    a = rasterise(g, camera, background=(0.1, 0.2, 0.3))
+    b = rasterise_covariances(
+        g.means, g.covariances(), g.opacities, g.colours, normals, camera, background=(0.1, 0.2, 0.3)
+    )
+    for name in ("colour", "alpha", "depth", "normal"):
+        assert_same_picture(getattr(a, name), getattr(b, name), pixels=2e-3)
+
+
+def test_a_subset_and_a_concatenation_keep_every_tensor(cloud: CloudMaker) -> None:
+    g = cloud(10)
+    halves = Gaussians.concatenate([g[:4], g[torch.arange(4, 10)]])
+    for field in fields(Gaussians):
+        assert torch.equal(getattr(halves, field.name), getattr(g, field.name))
+    assert len(g[g.opacities > 2]) == 0
