@@ -59,7 +59,9 @@ def read_mesh(file: Path) -> trimesh.Trimesh:
     try:
         mesh = trimesh.load_mesh(file)
     except Exception as error:  # trimesh's readers raise whatever their parsers do
-        reason = " ".join(str(error).split())[:160] or type(error).__name__
+        # For bytes that are no text trimesh asks for a module that guesses encodings: no hint for a user.
+        guessing = isinstance(error, ImportError) and error.name in ("chardet", "charset_normalizer")
+        reason = "it is no text" if guessing else " ".join(str(error).split())[:160] or type(error).__name__
         raise MeasurementError(f"the mesh cannot be read ({reason}); is it what its name says?", file=file) from error
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise MeasurementError("the file holds no triangles; is it what its name says?", file=file)

@@ -1,0 +1,102 @@
+"""The tool's pose and velocity in time, against SciPy's rotations and by hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation, Slerp
+
+from splatsoil.measurement import ToolMotion
+from splatsoil.measurement.rotations import quaternion_to_matrix, rotation_matrix, rotation_vector
+
+TIMES = np.array([0.0, 0.1, 0.25, 0.3, 1.0])
+
+
+@pytest.fixture
+def tumbling() -> tuple[ToolMotion, Slerp]:
+    """Random poses at uneven times, with quaternion signs that hop; and SciPy's interpolation of them."""
+    rng = np.random.default_rng(3)
+    rotations = Rotation.from_rotvec(np.cumsum(rng.normal(scale=0.7, size=(5, 3)), axis=0))
+    quaternions = rotations.as_quat()[:, [3, 0, 1, 2]] * np.array([1, -1, 1, -1, -1])[:, None]
+    motion = ToolMotion(np.arange(5), TIMES, rng.normal(size=(5, 3)), quaternions)
+    return motion, Slerp(TIMES, rotations)
+
+
+def test_pose_is_interpolated_as_scipy_does(tumbling: tuple[ToolMotion, Slerp]) -> None:
+    motion, slerp = tumbling
+    for time in np.linspace(0.0, 1.0, 101):
+        rotation, position = motion.pose(time)
+        np.testing.assert_allclose(rotation, slerp(time).as_matrix(), atol=1e-12)
+        expected = [np.interp(time, TIMES, motion.positions[:, axis]) for axis in range(3)]
+        np.testing.assert_allclose(position, expected, atol=1e-12)
+        matrix = motion.matrix(time)
+        np.testing.assert_array_equal(matrix[:3, :3], rotation)
+        np.testing.assert_array_equal(matrix[:, 3], [*position, 1.0])
+
+
+def test_the_tool_rests_before_and_after(tumbling: tuple[ToolMotion, Slerp]) -> None:
+    motion, _ = tumbling
+    for outside, row in ((-5.0, 0), (7.0, -1)):
+        np.testing.assert_array_equal(motion.pose(outside)[1], motion.positions[row])
+        np.testing.assert_allclose(motion.pose(outside)[0], quaternion_to_matrix(motion.quaternions[row]))
+        assert not np.any(motion.twist(outside))
+
+
+def test_twist_is_the_poses_derivative(tumbling: tuple[ToolMotion, Slerp]) -> None:
+    motion, _ = tumbling
+    h = 1e-6
+    for time in (0.05, 0.2, 0.27, 0.9):
+        (before, x0), (after, x1) = motion.pose(time - h), motion.pose(time + h)
+        linear, angular = motion.twist(time)
+        np.testing.assert_allclose(linear, (x1 - x0) / (2 * h), rtol=1e-6)
+        spin = Rotation.from_matrix(after @ before.T).as_rotvec() / (2 * h)
+        np.testing.assert_allclose(angular, spin, rtol=1e-6, atol=1e-6)
+
+
+def test_turning_about_an_axis_by_hand() -> None:
+    """A quarter turn about z and 0.1 m along x in half a second."""
+    s = np.sqrt(0.5)
+    motion = ToolMotion([0, 1], [0.0, 0.5], [[0, 0, 0], [0.1, 0, 0]], [[1, 0, 0, 0], [s, 0, 0, s]])
+    rotation, position = motion.pose(0.25)
+    np.testing.assert_allclose(rotation, [[s, -s, 0], [s, s, 0], [0, 0, 1]], atol=1e-12)
+    np.testing.assert_allclose(position, [0.05, 0, 0])
+    linear, angular = motion.twist(0.25)
+    np.testing.assert_allclose(linear, [0.2, 0, 0])
+    np.testing.assert_allclose(angular, [0, 0, np.pi], atol=1e-12)
+    np.testing.assert_allclose(motion.twist(0.0)[0], [0.2, 0, 0], err_msg="at a row, what begins there")
+    np.testing.assert_array_equal(motion.twist(0.5)[0], 0.0)
+
+
+def test_plow_drys_motion(plow_dry: Path) -> None:
+    """Rows of its CSV, and the plunge's 0.2 m/s between the first two."""
+    motion = ToolMotion.read(plow_dry / "tool_motion.csv")
+    assert len(motion.times) == 201 and motion.frames[-1] == 200
+    rotation, position = motion.pose(0.02)
+    np.testing.assert_allclose(position, [0.2, 0.25, 0.206])
+    np.testing.assert_allclose(rotation, Rotation.from_quat([0, 0.173648, 0, 0.984808]).as_matrix(), atol=1e-9)
+    np.testing.assert_allclose(motion.twist(0.01)[0], [0, 0, -0.2], atol=1e-12)
+
+
+def test_one_row_is_a_resting_tool() -> None:
+    motion = ToolMotion([0], [0.0], [[1, 2, 3]], [[1, 0, 0, 0]])
+    np.testing.assert_array_equal(motion.pose(4.0)[1], [1, 2, 3])
+    assert not np.any(motion.twist(0.0))
+
+
+def test_rotation_vectors_are_scipys() -> None:
+    vectors = np.random.default_rng(5).normal(size=(50, 3))
+    vectors[0] = 0.0
+    vectors[1] *= 1e-13
+    for vector in vectors:
+        np.testing.assert_allclose(rotation_matrix(vector), Rotation.from_rotvec(vector).as_matrix(), atol=1e-14)
+        w = Rotation.from_rotvec(vector).as_quat()[[3, 0, 1, 2]]
+        shortest = Rotation.from_rotvec(vector).as_rotvec()
+        np.testing.assert_allclose(rotation_vector([1, 0, 0, 0], w), shortest, atol=1e-13)
+        np.testing.assert_allclose(rotation_vector(w, [1, 0, 0, 0]), -shortest, atol=1e-13)
+
+
+def test_tables_of_uneven_length_are_refused() -> None:
+    with pytest.raises(ValueError, match="positions"):
+        ToolMotion([0, 1], [0.0, 1.0], [[0, 0, 0]], [[1, 0, 0, 0]] * 2)
