@@ -1,0 +1,108 @@
+"""Presets, and the resolution and time step that follow from them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from splatsoil.errors import ParameterError
+from splatsoil.measurement import Measurement
+
+
+@dataclass(frozen=True)
+class Preset:
+    """How finely to simulate.
+
+    Attributes:
+        name: what the command line calls it.
+        cells_across_tool: cells along the tool's second longest edge (a blade's width).
+        particles_per_edge: particles along a cell's edge at the start.
+        young: Young's modulus in Pa. Dry sand under a tool is nearly rigid, so the answer must not hang on it; a soft
+            skeleton allows long steps.
+        poisson: Poisson's ratio.
+        courant: sound-wave Courant number of a substep.
+        transport: most cells the tool may travel in one step of the particles.
+    """
+
+    name: str
+    cells_across_tool: float
+    particles_per_edge: int = 2
+    young: float = 3.0e5
+    poisson: float = 0.3
+    courant: float = 0.5
+    transport: float = 0.1
+
+
+PRESETS: dict[str, Preset] = {
+    preset.name: preset
+    for preset in (
+        Preset("tiny", cells_across_tool=3.0, young=1.0e5, transport=0.2),
+        Preset("small", cells_across_tool=6.0),
+        Preset("fine", cells_across_tool=8.0, young=1.0e6),
+        Preset("paper", cells_across_tool=3.2, young=1.0e6, poisson=0.2),
+    )
+}
+
+
+@dataclass(frozen=True)
+class Resolution:
+    """Lengths, times and stiffness of one simulation.
+
+    Attributes:
+        cell: nominal edge of a grid cell in m.
+        spacing: edge of the cube of soil that a particle stands for, in m.
+        frame_time: time between frames in s.
+        steps: steps of the particles in a frame; more while soil moves faster than the tool.
+        substeps: substeps of the grid in a step.
+        bulk: bulk modulus in Pa.
+        shear: shear modulus in Pa.
+        density: bulk density in kg/m^3.
+    """
+
+    cell: float
+    spacing: float
+    frame_time: float
+    steps: int
+    courant: float
+    bulk: float
+    shear: float
+    density: float
+
+    @property
+    def wave_speed(self) -> float:
+        """Speed of pressure waves in m/s."""
+        return math.sqrt((self.bulk + 4.0 * self.shear / 3.0) / self.density)
+
+    def substeps(self, steps: int) -> int:
+        """Substeps in each of ``steps`` steps of a frame that keep the Courant limit."""
+        return max(1, math.ceil(self.frame_time / steps * self.wave_speed / (self.courant * self.cell) - 1e-9))
+
+    @classmethod
+    def derive(cls, measurement: Measurement, preset: Preset | str = "small") -> Resolution:
+        """Resolution for a measurement set: the cell from the tool's width, the steps from its speed.
+
+        Raises:
+            ParameterError: an unknown preset.
+        """
+        if isinstance(preset, str):
+            if preset not in PRESETS:
+                raise ParameterError(f"preset {preset!r} is unknown; known are {', '.join(PRESETS)}")
+            preset = PRESETS[preset]
+        extents = np.sort(measurement.tool.mesh.extents)
+        cell = float(extents[1]) / preset.cells_across_tool
+        motion = measurement.tool.motion
+        travel = np.linalg.norm(np.diff(motion.positions, axis=0), axis=1) / np.diff(motion.times)
+        frame_time = 1.0 / measurement.frame_rate
+        steps = max(1, math.ceil(float(travel.max()) * frame_time / (preset.transport * cell) - 1e-6))
+        return cls(
+            cell=cell,
+            spacing=cell / preset.particles_per_edge,
+            frame_time=frame_time,
+            steps=steps,
+            courant=preset.courant,
+            bulk=preset.young / (3.0 * (1.0 - 2.0 * preset.poisson)),
+            shear=preset.young / (2.0 * (1.0 + preset.poisson)),
+            density=measurement.bed.density,
+        )

@@ -1,0 +1,277 @@
+"""The solver: a batch of simulations of one scene, advanced frame by frame.
+
+Two clocks. Particles and grid exchange state a few times a frame, as often as the motion needs it. Between two
+exchanges, the grid's nodes move in many substeps, as often as the sound waves of the soil's skeleton need it, on frozen
+weights. What an exchange blurs is so tied to the distance travelled and not to the number of steps, and the answer does
+not hang on stiffness.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import numpy.typing as npt
+import trimesh
+import warp as wp
+
+from splatsoil.errors import SimulationError
+from splatsoil.mpm.grid import GridShape
+from splatsoil.mpm.presets import Resolution
+from splatsoil.mpm.state import Cells, Nodes, Particles
+from splatsoil.mpm.substep import contact_forces, make_stress_kernel, move_nodes
+from splatsoil.mpm.tool import Pose, build_tool
+from splatsoil.mpm.transfer import (
+    average_cells,
+    bound_stretch,
+    find_gaps,
+    grid_to_particles,
+    mark_cells,
+    momentum_to_velocity,
+    number_cells,
+    particles_to_grid,
+)
+from splatsoil.soil.law import Law
+from splatsoil.soil.settings import Settings
+
+FloatArray = npt.NDArray[np.floating]
+
+BULK_VISCOSITY = 0.2
+"""Linear bulk viscosity over (density * wave speed * cell), as explicit codes use against ringing (Benson 1992)."""
+INERTIA_MARGIN = 1.2
+"""Inertia of nearly empty nodes over the central-difference stability limit; 2/3 is marginal for a full cell."""
+CONTACT_DAMPING = 0.2
+"""Fraction of critical damping of the contact spring of one particle."""
+FLOW_TRAVEL = 0.4
+"""Most cells that soil may cross in one step of the particles."""
+STRETCH = (0.4, 2.5)
+"""Bounds of the visual deformation's singular values."""
+
+
+class Solver:
+    """A batch of simulations in one bed with one tool, which differ in parameters and particles.
+
+    Args:
+        positions: particles (simulations, n, 3) in m.
+        lower: lower corner (3,) of the bed in m.
+        upper: upper corner (3,) of the space that soil may use, in m.
+        mesh: the tool in its own frame, m.
+        resolution: lengths, steps and stiffness.
+        law: the soil law; its effects' parameters are columns of ``values``.
+        base: settings of the experiment, before any effect.
+        values: parameters by name, one mapping for each simulation.
+        device: Warp device name.
+
+    Raises:
+        SimulationError: particles outside the bed, or arrays of the wrong shape.
+        ParameterError: parameters that are unknown or out of bounds.
+    """
+
+    def __init__(
+        self,
+        positions: FloatArray,
+        lower: npt.ArrayLike,
+        upper: npt.ArrayLike,
+        mesh: trimesh.Trimesh,
+        resolution: Resolution,
+        law: Law,
+        base: Settings,
+        values: Sequence[Mapping[str, float]],
+        device: str = "cpu",
+    ) -> None:
+        wp.config.quiet = True
+        self.resolution, self.law, self.device = resolution, law, device
+        self.values = [dict(v) for v in values]
+        x = np.ascontiguousarray(positions, dtype=np.float32)
+        if x.ndim != 3 or x.shape[2] != 3 or x.shape[0] != len(self.values) or x.shape[1] == 0:
+            raise SimulationError(
+                f"particles have shape {x.shape}; {len(self.values)} simulations need ({len(self.values)}, n, 3)"
+            )
+        low, high = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
+        slack = 1e-4 * resolution.cell
+        if not (np.isfinite(x).all() and (x >= low - slack).all() and (x <= high + slack).all()):
+            raise SimulationError("some particles start outside the bed's box or at positions that are not finite")
+        self.simulations, self.particles_each = x.shape[0], x.shape[1]
+        self.shape = GridShape.covering(low, high, resolution.cell)
+        self.grid = self.shape.to_warp()
+        self.ceiling = float(high[2] + 2.0 * resolution.cell)
+        self._table = wp.array(law.table(base, self.values).astype(np.float32), dtype=float, device=device)
+        self._stress_kernel = make_stress_kernel(law.update)
+        self._allocate(x)
+        spring = resolution.bulk * resolution.spacing
+        self.tool = build_tool(
+            mesh,
+            margin=1.5 * resolution.cell,
+            stiffness=spring,
+            damping=2.0 * CONTACT_DAMPING * math.sqrt(spring * self._particles.mass),
+            device=device,
+        )
+        self._rest_at_overburden(x, base)
+        self.frame = 0
+        self.steps = resolution.steps
+
+    def _allocate(self, x: npt.NDArray[np.float32]) -> None:
+        n, count, device = x.shape[0] * x.shape[1], self.simulations * self.grid.nodes, self.device
+
+        def vectors(size: int) -> wp.array:
+            return wp.zeros(size, dtype=wp.vec3, device=device)
+
+        def floats(size: int) -> wp.array:
+            return wp.zeros(size, dtype=float, device=device)
+
+        def ints(size: int) -> wp.array:
+            return wp.zeros(size, dtype=int, device=device)
+
+        p = Particles()
+        p.position = wp.array(x.reshape(-1, 3), dtype=wp.vec3, device=device)
+        p.velocity, p.normal, p.shear, p.gap_normal = vectors(n), vectors(n), vectors(n), vectors(n)
+        p.affine = wp.zeros(n, dtype=wp.mat33, device=device)
+        p.deformation = wp.array(np.tile(np.eye(3, dtype=np.float32), (n, 1, 1)), dtype=wp.mat33, device=device)
+        p.elastic, p.opening, p.gap, p.cell = floats(n), floats(n), floats(n), ints(n)
+        p.per_simulation = self.particles_each
+        p.volume = self.resolution.spacing**3
+        p.mass = p.volume * self.resolution.density
+        self._particles = p
+
+        g = Nodes()
+        g.mass, g.inertia, g.active, g.count = floats(count), floats(count), ints(count), ints(1)
+        g.velocity, g.force, g.displacement = vectors(count), vectors(count), vectors(count)
+        self._nodes = g
+
+        most = min(n, count)
+        c = Cells()
+        c.slot, c.node, c.count = ints(count), ints(most), ints(1)
+        c.volume, c.elastic, c.opening = floats(most), floats(most), floats(most)
+        c.normal, c.shear, c.gradient = vectors(most), vectors(most), vectors(8 * most)
+        self._cells = c
+
+        self._near, self._near_count = ints(n), ints(1)
+        self._escaped, self._fastest = ints(1), floats(1)
+        self._pose = floats(13)
+        self._force = vectors(self.simulations)
+
+    def _rest_at_overburden(self, x: npt.NDArray[np.float32], base: Settings) -> None:
+        """Start from the pressure of the soil above, so that the bed does not settle when the run begins."""
+        low, cell = self.shape.lower, self.shape.cell
+        plan = (self.shape.nodes[0] - 1, self.shape.nodes[1] - 1)
+        index = np.clip(((x[..., :2] - low[:2]) / cell[:2]).astype(int), 0, np.array(plan) - 1)
+        column = index[..., 0] * plan[1] + index[..., 1]
+        strain = np.empty(x.shape[:2], dtype=np.float32)
+        weight = self.resolution.density * abs(base.gravity[2])
+        for row in range(x.shape[0]):
+            top = np.full(plan[0] * plan[1], -np.inf)
+            np.maximum.at(top, column[row], x[row, :, 2])
+            depth = top[column[row]] + 0.5 * self.resolution.spacing - x[row, :, 2]
+            strain[row] = -weight * depth / self.resolution.bulk
+        self._particles.elastic = wp.array(strain.reshape(-1), dtype=float, device=self.device)
+
+    def advance(self, poses: Sequence[Pose]) -> npt.NDArray[np.float64]:
+        """Advance one frame.
+
+        Args:
+            poses: the tool at the start of each of the frame's steps; their number sets the step.
+
+        Returns:
+            Mean force (simulations, 3) of the soil on the tool over the frame, N.
+
+        Raises:
+            SimulationError: soil left the grid or the state is not finite.
+        """
+        steps = len(poses)
+        substeps = self.resolution.substeps(steps)
+        step_time = self.resolution.frame_time / steps
+        self._force.zero_()
+        self._fastest.zero_()
+        for pose in poses:
+            self._step(pose, step_time, substeps, 1.0 / (steps * substeps))
+        lost = int(self._escaped.numpy()[0])
+        if lost:
+            raise SimulationError(
+                f"{lost} of {self.simulations * self.particles_each} particles left the grid or lost a finite state in "
+                f"frame {self.frame + 1} ({steps} steps of {substeps} substeps); parameters {self.values}"
+            )
+        self.frame += 1
+        fastest = float(self._fastest.numpy()[0])
+        needed = math.ceil(fastest * self.resolution.frame_time / (FLOW_TRAVEL * self.resolution.cell) - 1e-6)
+        self.steps = max(self.resolution.steps, needed)
+        return self._force.numpy().astype(np.float64)
+
+    def _step(self, pose: Pose, step_time: float, substeps: int, share: float) -> None:
+        p, c, g, grid, device = self._particles, self._cells, self._nodes, self.grid, self.device
+        r = self.resolution
+        dt = step_time / substeps
+        modulus = r.bulk + 4.0 * r.shear / 3.0
+        n, node_count, cell_count = p.position.shape[0], g.mass.shape[0], c.node.shape[0]
+        self._pose.assign(pose.row().astype(np.float32))
+        for array in (g.mass, g.inertia, g.velocity, g.force, g.displacement, g.count, c.count, self._near_count):
+            array.zero_()
+        c.slot.fill_(-1)
+        wp.launch(mark_cells, dim=n, inputs=[p, c, grid], device=device)
+        cells = self._size(c.count, cell_count)
+        wp.launch(number_cells, dim=cells, inputs=[c], device=device)
+        wp.launch(particles_to_grid, dim=n, inputs=[p, c, g, grid], device=device)
+        wp.launch(average_cells, dim=cells, inputs=[c, g, grid, INERTIA_MARGIN * modulus * dt * dt], device=device)
+        wp.launch(momentum_to_velocity, dim=node_count, inputs=[g], device=device)
+        reach = r.cell
+        wp.launch(
+            find_gaps, dim=n, inputs=[p, self.tool, self._pose, reach, self._near, self._near_count], device=device
+        )
+        nodes, near = self._size(g.count, node_count), self._size(self._near_count, n)
+        viscosity = BULK_VISCOSITY * r.density * r.wave_speed * r.cell
+        stress = wp.launch(
+            self._stress_kernel,
+            dim=cells,
+            inputs=[c, g, grid, r.bulk, r.shear, viscosity, dt, self._table],
+            device=device,
+            record_cmd=True,
+        )
+        contact = wp.launch(
+            contact_forces,
+            dim=max(near, 1),
+            inputs=[
+                p,
+                g,
+                grid,
+                self.tool,
+                self._pose,
+                self._near,
+                self._near_count,
+                dt,
+                share,
+                self._table,
+                self._force,
+            ],
+            device=device,
+            record_cmd=True,
+        )
+        move = wp.launch(move_nodes, dim=nodes, inputs=[g, grid, dt, self._table], device=device, record_cmd=True)
+        for _ in range(substeps):
+            stress.launch()
+            contact.launch()
+            move.launch()
+        wp.launch(
+            grid_to_particles,
+            dim=n,
+            inputs=[p, c, g, grid, self.ceiling, self._escaped, self._fastest],
+            device=device,
+        )
+
+    def _size(self, count: wp.array, most: int) -> int:
+        """How many threads to launch for a packed list: its length where reading it is free, else its capacity."""
+        return most if self.device != "cpu" else max(int(count.numpy()[0]), 1)
+
+    def positions(self) -> npt.NDArray[np.float32]:
+        """Particles now, (simulations, n, 3) in m."""
+        return self._particles.position.numpy().reshape(self.simulations, -1, 3).copy()
+
+    def deformations(self) -> npt.NDArray[np.float32]:
+        """Visual deformation since frame 0, (simulations, n, 3, 3), its singular values bounded."""
+        p = self._particles
+        wp.launch(bound_stretch, dim=p.position.shape[0], inputs=[p, *STRETCH], device=self.device)
+        return p.deformation.numpy().reshape(self.simulations, -1, 3, 3).copy()
+
+    def momentum(self) -> npt.NDArray[np.float64]:
+        """Total momentum (simulations, 3) in kg m/s."""
+        velocity = self._particles.velocity.numpy().astype(np.float64)
+        return self._particles.mass * velocity.reshape(self.simulations, -1, 3).sum(axis=1)

@@ -1,0 +1,92 @@
+"""Arrays of particles and grid, as structures that kernels take whole."""
+
+from __future__ import annotations
+
+import warp as wp
+
+
+@wp.struct
+class Particles:
+    """Particles of all simulations of a batch, simulation after simulation.
+
+    Attributes:
+        position: m.
+        velocity: m/s.
+        affine: APIC velocity gradient, 1/s.
+        deformation: visual deformation since frame 0 (rotation and bounded stretch).
+        normal: deviatoric stress, diagonal, Pa.
+        shear: deviatoric stress, off-diagonal (xy, xz, yz), Pa.
+        elastic: elastic logarithmic volume strain.
+        opening: logarithmic volume opened in tension.
+        cell: entry of the particle's cell among the active cells.
+        gap: signed distance to the tool, m, carried through a step's substeps.
+        gap_normal: outward normal of the tool there, in the world.
+        per_simulation: particles of one simulation.
+        volume: initial volume of a particle, m^3.
+        mass: kg.
+    """
+
+    position: wp.array(dtype=wp.vec3)
+    velocity: wp.array(dtype=wp.vec3)
+    affine: wp.array(dtype=wp.mat33)
+    deformation: wp.array(dtype=wp.mat33)
+    normal: wp.array(dtype=wp.vec3)
+    shear: wp.array(dtype=wp.vec3)
+    elastic: wp.array(dtype=float)
+    opening: wp.array(dtype=float)
+    cell: wp.array(dtype=int)
+    gap: wp.array(dtype=float)
+    gap_normal: wp.array(dtype=wp.vec3)
+    per_simulation: int
+    volume: float
+    mass: float
+
+
+@wp.struct
+class Nodes:
+    """Nodes of all simulations of a batch.
+
+    Attributes:
+        mass: kg.
+        inertia: mass that resists stress forces, kg; at least ``mass``, raised at nearly empty nodes for stability.
+        velocity: m/s.
+        force: N, gathered in a substep.
+        displacement: m, gathered in a step.
+        active: the numbers of nodes with mass, packed.
+        count: how many are active.
+    """
+
+    mass: wp.array(dtype=float)
+    inertia: wp.array(dtype=float)
+    velocity: wp.array(dtype=wp.vec3)
+    force: wp.array(dtype=wp.vec3)
+    displacement: wp.array(dtype=wp.vec3)
+    active: wp.array(dtype=int)
+    count: wp.array(dtype=int)
+
+
+@wp.struct
+class Cells:
+    """Cells with soil in them, packed; each is one stress point.
+
+    Attributes:
+        slot: entry among the active cells for every cell of the batch, -1 where empty (indexed by lowest node).
+        node: lowest node of each active cell.
+        count: how many are active.
+        volume: soil in the cell, m^3.
+        gradient: mean gradient of the eight corners' weights over the cell's soil, 1/m; entry 8 * cell + corner.
+        normal: deviatoric stress, diagonal, Pa.
+        shear: deviatoric stress, off-diagonal, Pa.
+        elastic: elastic logarithmic volume strain.
+        opening: logarithmic volume opened in tension.
+    """
+
+    slot: wp.array(dtype=int)
+    node: wp.array(dtype=int)
+    count: wp.array(dtype=int)
+    volume: wp.array(dtype=float)
+    gradient: wp.array(dtype=wp.vec3)
+    normal: wp.array(dtype=wp.vec3)
+    shear: wp.array(dtype=wp.vec3)
+    elastic: wp.array(dtype=float)
+    opening: wp.array(dtype=float)

@@ -1,0 +1,152 @@
+"""Kernels that run many times a step, on frozen weights: stress, contact, motion of the nodes."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from splatsoil.mpm.grid import Grid, base_node, cell_of, corner_offset, corner_weight, local_coordinates
+from splatsoil.mpm.state import Cells, Nodes, Particles
+from splatsoil.mpm.tool import Tool, tool_velocity
+from splatsoil.soil.law import FLOOR_FRICTION, GRAVITY, TOOL_FRICTION, WALL_FRICTION, Stress
+
+
+@cache
+def make_stress_kernel(update: Any) -> Any:
+    """Kernel that advances every active cell's stress by ``update`` and adds its force to the nodes.
+
+    One stress point a cell, from the mean velocity gradient of its soil (Flanagan & Belytschko 1981): eight particles a
+    cell that each held their volume would lock and make the soil too strong, the more so the stiffer it is.
+    """
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def stress_forces(
+        cells: Cells,
+        nodes: Nodes,
+        grid: Grid,
+        bulk: float,
+        shear: float,
+        viscosity: float,
+        dt: float,
+        values: wp.array2d(dtype=float),
+    ) -> None:
+        entry = wp.tid()
+        if entry < cells.count[0]:
+            base = cells.node[entry]
+            gradient = wp.mat33(0.0)
+            for corner in range(8):
+                node = base + corner_offset(grid, corner)
+                gradient += wp.outer(nodes.velocity[node], cells.gradient[8 * entry + corner])
+            stress = Stress()
+            stress.normal = cells.normal[entry]
+            stress.shear = cells.shear[entry]
+            stress.elastic = cells.elastic[entry]
+            stress.opening = cells.opening[entry]
+            stress = update(stress, gradient, bulk, shear, dt, values, base / grid.nodes)
+            cells.normal[entry] = stress.normal
+            cells.shear[entry] = stress.shear
+            cells.elastic[entry] = stress.elastic
+            cells.opening[entry] = stress.opening
+            pressure = -bulk * stress.elastic
+            if pressure > 0.0:
+                # bulk viscosity takes the ringing out of pressure waves and never pulls
+                pressure = wp.max(pressure - viscosity * wp.trace(gradient), 0.0)
+            n = stress.normal
+            o = stress.shear
+            sigma = wp.mat33(n[0] - pressure, o[0], o[1], o[0], n[1] - pressure, o[2], o[1], o[2], n[2] - pressure) * (
+                -cells.volume[entry]
+            )
+            for corner in range(8):
+                node = base + corner_offset(grid, corner)
+                wp.atomic_add(nodes.force, node, sigma * cells.gradient[8 * entry + corner])
+
+    return stress_forces
+
+
+@wp.kernel(enable_backward=False)
+def contact_forces(
+    particles: Particles,
+    nodes: Nodes,
+    grid: Grid,
+    tool: Tool,
+    pose: wp.array(dtype=float),
+    near: wp.array(dtype=int),
+    count: wp.array(dtype=int),
+    dt: float,
+    share: float,
+    values: wp.array2d(dtype=float),
+    force: wp.array(dtype=wp.vec3),
+) -> None:
+    """Penalty contact with Coulomb friction between particles and tool; ``force`` (simulations) gains share * force.
+
+    A particle keeps the side of the tool it is on, so a plate thinner than a cell holds soil on both its faces, and
+    what the soil feels is exactly what the tool feels.
+    """
+    i = wp.tid()
+    if i < count[0]:
+        p = near[i]
+        row = p / particles.per_simulation
+        x = particles.position[p]
+        cell = cell_of(grid, x)
+        f = local_coordinates(grid, x, cell)
+        base = row * grid.nodes + base_node(grid, cell)
+        velocity = wp.vec3(0.0)
+        for corner in range(8):
+            velocity += corner_weight(f, corner) * nodes.velocity[base + corner_offset(grid, corner)]
+        normal = particles.gap_normal[p]
+        slip = velocity - tool_velocity(pose, x)
+        closing = wp.dot(slip, normal)
+        gap = particles.gap[p] + dt * closing
+        particles.gap[p] = gap
+        if gap < 0.0:
+            push = wp.max(-tool.stiffness * gap - tool.damping * closing, 0.0)
+            slip -= closing * normal
+            speed = wp.length(slip)
+            drag = wp.min(values[row, TOOL_FRICTION] * push, particles.mass * speed / dt)
+            pull = push * normal - slip * (drag / wp.max(speed, 1.0e-9))
+            wp.atomic_add(force, row, -share * pull)
+            for corner in range(8):
+                wp.atomic_add(nodes.force, base + corner_offset(grid, corner), corner_weight(f, corner) * pull)
+
+
+@wp.func
+def slide(velocity: wp.vec3, inward: wp.vec3, friction: float) -> wp.vec3:
+    """Velocity at a fixed wall with unit normal ``inward``: no entry, Coulomb friction on what remains."""
+    entry = wp.dot(velocity, inward)
+    result = velocity
+    if entry < 0.0:
+        along = velocity - entry * inward
+        speed = wp.length(along)
+        result = along * wp.max(0.0, 1.0 + friction * entry / wp.max(speed, 1.0e-9))
+    return result
+
+
+@wp.kernel(enable_backward=False)
+def move_nodes(nodes: Nodes, grid: Grid, dt: float, values: wp.array2d(dtype=float)) -> None:
+    """Advance velocities by the gathered forces and gravity; hold floor and walls; add up displacements."""
+    k = wp.tid()
+    if k < nodes.count[0]:
+        i = nodes.active[k]
+        row = i / grid.nodes
+        gravity = wp.vec3(values[row, GRAVITY], values[row, GRAVITY + 1], values[row, GRAVITY + 2])
+        velocity = nodes.velocity[i] + (dt / nodes.inertia[i]) * (nodes.force[i] + nodes.mass[i] * gravity)
+        local = i % grid.nodes
+        iz = local % grid.shape[2]
+        iy = (local / grid.shape[2]) % grid.shape[1]
+        ix = local / (grid.shape[2] * grid.shape[1])
+        wall = values[row, WALL_FRICTION]
+        if iz == 0:
+            velocity = slide(velocity, wp.vec3(0.0, 0.0, 1.0), values[row, FLOOR_FRICTION])
+        if ix == 0:
+            velocity = slide(velocity, wp.vec3(1.0, 0.0, 0.0), wall)
+        if ix == grid.shape[0] - 1:
+            velocity = slide(velocity, wp.vec3(-1.0, 0.0, 0.0), wall)
+        if iy == 0:
+            velocity = slide(velocity, wp.vec3(0.0, 1.0, 0.0), wall)
+        if iy == grid.shape[1] - 1:
+            velocity = slide(velocity, wp.vec3(0.0, -1.0, 0.0), wall)
+        nodes.velocity[i] = velocity
+        nodes.displacement[i] += dt * velocity
+        nodes.force[i] = wp.vec3(0.0)

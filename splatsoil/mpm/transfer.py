@@ -1,0 +1,193 @@
+"""Kernels that run once a step: particles to grid, grid to particles."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from splatsoil.mpm.grid import (
+    Grid,
+    base_node,
+    cell_of,
+    corner_gradient,
+    corner_offset,
+    corner_weight,
+    local_coordinates,
+)
+from splatsoil.mpm.state import Cells, Nodes, Particles
+from splatsoil.mpm.tool import FAR, Tool, distance_normal, signed_distance, tool_position, tool_rotation
+
+
+@wp.kernel
+def mark_cells(particles: Particles, cells: Cells, grid: Grid) -> None:
+    """List every cell that holds a particle once, and note for each particle the lowest node of its cell."""
+    p = wp.tid()
+    cell = cell_of(grid, particles.position[p])
+    node = (p / particles.per_simulation) * grid.nodes + base_node(grid, cell)
+    if wp.atomic_cas(cells.slot, node, -1, 0) == -1:
+        cells.node[wp.atomic_add(cells.count, 0, 1)] = node
+    particles.cell[p] = node
+
+
+@wp.kernel
+def number_cells(cells: Cells) -> None:
+    """Write each active cell's entry back into the map and clear its sums."""
+    entry = wp.tid()
+    if entry < cells.count[0]:
+        cells.slot[cells.node[entry]] = entry
+        cells.volume[entry] = 0.0
+        cells.normal[entry] = wp.vec3(0.0)
+        cells.shear[entry] = wp.vec3(0.0)
+        cells.elastic[entry] = 0.0
+        cells.opening[entry] = 0.0
+        for corner in range(8):
+            cells.gradient[8 * entry + corner] = wp.vec3(0.0)
+
+
+@wp.kernel
+def particles_to_grid(particles: Particles, cells: Cells, nodes: Nodes, grid: Grid) -> None:
+    """Add each particle's mass and momentum (APIC, Jiang et al. 2015) to nodes, its stress and shape to its cell."""
+    p = wp.tid()
+    x = particles.position[p]
+    f = local_coordinates(grid, x, cell_of(grid, x))
+    base = particles.cell[p]
+    entry = cells.slot[base]
+    particles.cell[p] = entry
+    volume = particles.volume
+    wp.atomic_add(cells.volume, entry, volume)
+    wp.atomic_add(cells.normal, entry, volume * particles.normal[p])
+    wp.atomic_add(cells.shear, entry, volume * particles.shear[p])
+    wp.atomic_add(cells.elastic, entry, volume * particles.elastic[p])
+    wp.atomic_add(cells.opening, entry, volume * particles.opening[p])
+    v = particles.velocity[p]
+    affine = particles.affine[p]
+    for corner in range(8):
+        node = base + corner_offset(grid, corner)
+        weight = particles.mass * corner_weight(f, corner)
+        offset = wp.vec3(float(corner >> 2), float((corner >> 1) & 1), float(corner & 1)) - f
+        wp.atomic_add(nodes.mass, node, weight)
+        wp.atomic_add(nodes.velocity, node, weight * (v + affine * wp.cw_mul(offset, grid.cell)))
+        wp.atomic_add(cells.gradient, 8 * entry + corner, volume * corner_gradient(f, corner, grid.inverse))
+
+
+@wp.kernel
+def average_cells(cells: Cells, nodes: Nodes, grid: Grid, stiffness: float) -> None:
+    """Sums to means; ``stiffness`` = c (K + 4G/3) dt^2 turns a node's share of stiffness into the least stable inertia.
+
+    Trilinear weights vanish at a cell's faces but their gradients do not, so a node reached only by the edge of a
+    particle would be flung away by stress. The inertia bound is the central-difference limit node by node.
+    """
+    entry = wp.tid()
+    if entry < cells.count[0]:
+        volume = cells.volume[entry]
+        share = 1.0 / volume
+        cells.normal[entry] = share * cells.normal[entry]
+        cells.shear[entry] = share * cells.shear[entry]
+        cells.elastic[entry] = share * cells.elastic[entry]
+        cells.opening[entry] = share * cells.opening[entry]
+        for corner in range(8):
+            gradient = share * cells.gradient[8 * entry + corner]
+            cells.gradient[8 * entry + corner] = gradient
+            node = cells.node[entry] + corner_offset(grid, corner)
+            wp.atomic_add(nodes.inertia, node, stiffness * volume * wp.length_sq(gradient))
+
+
+@wp.kernel
+def momentum_to_velocity(nodes: Nodes) -> None:
+    """Divide by mass, and pack the nodes that have any."""
+    i = wp.tid()
+    mass = nodes.mass[i]
+    if mass > 0.0:
+        nodes.velocity[i] = nodes.velocity[i] / mass
+        nodes.inertia[i] = wp.max(nodes.inertia[i], mass)
+        nodes.active[wp.atomic_add(nodes.count, 0, 1)] = i
+
+
+@wp.kernel
+def find_gaps(
+    particles: Particles,
+    tool: Tool,
+    pose: wp.array(dtype=float),
+    reach: float,
+    near: wp.array(dtype=int),
+    count: wp.array(dtype=int),
+) -> None:
+    """Distance and normal of each particle to the tool; those within ``reach`` (m) are listed in ``near``."""
+    p = wp.tid()
+    rotation = tool_rotation(pose)
+    local = wp.quat_rotate_inv(rotation, particles.position[p] - tool_position(pose))
+    gap = signed_distance(tool, local)
+    particles.gap[p] = gap
+    if gap < reach:
+        particles.gap_normal[p] = wp.quat_rotate(rotation, distance_normal(tool, local))
+        near[wp.atomic_add(count, 0, 1)] = p
+
+
+@wp.kernel
+def grid_to_particles(
+    particles: Particles,
+    cells: Cells,
+    nodes: Nodes,
+    grid: Grid,
+    ceiling: float,
+    escaped: wp.array(dtype=int),
+    fastest: wp.array(dtype=float),
+) -> None:
+    """Move particles with the step's displacement; take over velocity (APIC), stress and volume of the cell."""
+    p = wp.tid()
+    x = particles.position[p]
+    f = local_coordinates(grid, x, cell_of(grid, x))
+    entry = particles.cell[p]
+    base = cells.node[entry]
+    velocity = wp.vec3(0.0)
+    displacement = wp.vec3(0.0)
+    affine = wp.mat33(0.0)
+    stretch = wp.mat33(0.0)
+    for corner in range(8):
+        node = base + corner_offset(grid, corner)
+        weight = corner_weight(f, corner)
+        gradient = corner_gradient(f, corner, grid.inverse)
+        velocity += weight * nodes.velocity[node]
+        displacement += weight * nodes.displacement[node]
+        affine += wp.outer(nodes.velocity[node], gradient)
+        stretch += wp.outer(nodes.displacement[node], gradient)
+    particles.velocity[p] = velocity
+    particles.affine[p] = affine
+    particles.deformation[p] += stretch * particles.deformation[p]
+    particles.normal[p] = cells.normal[entry]
+    particles.shear[p] = cells.shear[entry]
+    particles.elastic[p] = cells.elastic[entry]
+    particles.opening[p] = cells.opening[entry]
+
+    x += displacement
+    gap = particles.gap[p]
+    if gap < 0.0 and gap > -FAR:
+        x -= gap * particles.gap_normal[p]
+    low = grid.origin
+    high = low + wp.cw_mul(
+        grid.cell, wp.vec3(float(grid.shape[0] - 1), float(grid.shape[1] - 1), float(grid.shape[2] - 1))
+    )
+    margin = 1.0e-3 * grid.cell
+    # comparisons with NaN are false: "not inside" catches a broken state as well as a lost particle
+    speed = wp.length(velocity)
+    if not (x[2] < ceiling and speed < 1.0e3):
+        wp.atomic_add(escaped, 0, 1)
+        x = particles.position[p]
+    else:
+        wp.atomic_max(fastest, 0, speed)
+    particles.position[p] = wp.vec3(
+        wp.clamp(x[0], low[0] + margin[0], high[0] - margin[0]),
+        wp.clamp(x[1], low[1] + margin[1], high[1] - margin[1]),
+        wp.clamp(x[2], low[2] + margin[2], high[2] - margin[2]),
+    )
+
+
+@wp.kernel
+def bound_stretch(particles: Particles, least: float, most: float) -> None:
+    """Clamp the singular values of the visual deformation, so that flowing sand does not become needles."""
+    p = wp.tid()
+    u = wp.mat33()
+    sigma = wp.vec3()
+    v = wp.mat33()
+    wp.svd3(particles.deformation[p], u, sigma, v)
+    sigma = wp.vec3(wp.clamp(sigma[0], least, most), wp.clamp(sigma[1], least, most), wp.clamp(sigma[2], least, most))
+    particles.deformation[p] = u * wp.diag(sigma) * wp.transpose(v)

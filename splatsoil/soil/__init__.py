@@ -1,0 +1,1 @@
+"""The soil: its strength, the library of effects, and the law that both the solver and element tests run."""

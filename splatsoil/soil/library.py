@@ -1,0 +1,76 @@
+"""Finding effects: built in, installed by other packages (entry points), or in a user's own file."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import inspect
+import pkgutil
+import sys
+from collections.abc import Iterable
+from functools import cache
+from importlib.metadata import entry_points
+from pathlib import Path
+from types import ModuleType
+
+from splatsoil.errors import ParameterError
+from splatsoil.soil import effects as builtin
+from splatsoil.soil.effect import Effect
+
+ENTRY_POINT_GROUP = "splatsoil.effects"
+
+
+@cache
+def library() -> dict[str, Effect]:
+    """All built-in and installed effects by name, in alphabetical order."""
+    found: dict[str, Effect] = {}
+    for info in pkgutil.iter_modules(builtin.__path__):
+        for effect in _effects_of(importlib.import_module(f"{builtin.__name__}.{info.name}")):
+            found[effect.name] = effect
+    for point in entry_points(group=ENTRY_POINT_GROUP):
+        effect = point.load()()
+        found[effect.name] = effect
+    return dict(sorted(found.items()))
+
+
+def find_effects(names: Iterable[str]) -> tuple[Effect, ...]:
+    """Effects by name, or from ``path/to/file.py`` (every Effect subclass the file defines).
+
+    Raises:
+        ParameterError: an unknown name, a file without effects, or an effect named twice.
+    """
+    chosen: list[Effect] = []
+    for name in names:
+        if name.endswith(".py"):
+            chosen.extend(_effects_of(_load_file(Path(name))))
+        elif name in library():
+            chosen.append(library()[name])
+        else:
+            raise ParameterError(f"effect {name!r} is unknown; known are {', '.join(library())}")
+    repeated = {e.name for e in chosen if sum(o.name == e.name for o in chosen) > 1}
+    if repeated:
+        raise ParameterError(f"effect named twice: {', '.join(sorted(repeated))}")
+    return tuple(chosen)
+
+
+def _effects_of(module: ModuleType) -> list[Effect]:
+    return [
+        member()
+        for _, member in inspect.getmembers(module, inspect.isclass)
+        if issubclass(member, Effect) and member is not Effect and member.__module__ == module.__name__
+    ]
+
+
+def _load_file(path: Path) -> ModuleType:
+    if not path.is_file():
+        raise ParameterError(f"effect file {path} does not exist")
+    name = f"splatsoil_effect_{path.stem}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise ParameterError(f"effect file {path} cannot be imported")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    if not _effects_of(module):
+        raise ParameterError(f"effect file {path} defines no subclass of splatsoil.soil.effect.Effect")
+    return module

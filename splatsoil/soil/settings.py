@@ -1,0 +1,50 @@
+"""What one run of the soil model needs to know, before any effect and after all of them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from splatsoil.errors import ParameterError
+from splatsoil.parameters import Parameter
+from splatsoil.soil.matching import Matching
+
+FRICTION_ANGLE = Parameter(
+    name="friction_angle",
+    unit="deg",
+    lower=20.0,
+    upper=50.0,
+    default=35.0,
+    meaningful=1.0,
+    label="friction angle",
+)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Numbers of one simulation that effects may change.
+
+    Attributes:
+        friction_angle: Mohr-Coulomb friction angle in degrees.
+        matching: stress state in which the Drucker-Prager cone agrees with Mohr-Coulomb.
+        gravity: acceleration (3,) in m/s^2.
+        tool_friction: Coulomb coefficient between soil and tool.
+        wall_friction: Coulomb coefficient at the bed's side walls.
+        floor_friction: Coulomb coefficient at the bed's floor.
+    """
+
+    friction_angle: float
+    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
+    tool_friction: float = 0.3
+    wall_friction: float = 0.0
+    floor_friction: float = 0.6
+    matching: Matching = Matching.COMPRESSION
+
+    def __post_init__(self) -> None:
+        FRICTION_ANGLE.check(self.friction_angle)
+        for name in ("tool_friction", "wall_friction", "floor_friction"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0.0):
+                raise ParameterError(f"{name}: {value} is not a friction coefficient; give a number >= 0")
+        if not all(math.isfinite(g) for g in self.gravity):
+            raise ParameterError(f"gravity: {self.gravity} is not finite")
