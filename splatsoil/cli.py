@@ -81,7 +81,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 print_json({"ok": False, "error": message})
             return 2
         except KeyboardInterrupt:
-            print(f"\nsplatsoil: interrupted; {command.interrupted(config)}", file=sys.stderr)
+            message = f"interrupted; {command.interrupted(config)}"
+            print(f"\nsplatsoil: {message}", file=sys.stderr)
+            if wants_json:
+                print_json({"ok": False, "error": message})
             return 130
         except BrokenPipeError:  # the reader of our output (head, less) has gone
             os.dup2(os.open(os.devnull, os.O_WRONLY), 1)

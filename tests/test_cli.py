@@ -1,0 +1,176 @@
+"""The command line: what all commands have in common, and ``check``."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+import splatsoil.commands
+from splatsoil import cli
+from splatsoil.commands._output import only_json, print_json
+from splatsoil.errors import RunError
+
+
+def run(*words: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """The command line in a process of its own."""
+    return subprocess.run(
+        [sys.executable, "-m", "splatsoil", *words], cwd=cwd, capture_output=True, text=True, timeout=120, check=False
+    )
+
+
+def test_check_shows_a_table_and_json(plow_dry: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["check", str(plow_dry)]) == 0
+    table = capsys.readouterr().out
+    for words in ("plow-dry", "0.8 x 0.5 x 0.27 m", "40 of 320 x 240 pixels", "left, right", "complete and consistent"):
+        assert words in table
+    assert cli.main(["check", str(plow_dry), "--json"]) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert data["ok"] is True and data["views"] == 40 and data["remarks"] == []
+    assert data["video"]["pre_roll"] == [-4, -3, -2, -1] and data["bed"]["density"] == 1600.0
+
+
+def test_check_says_what_is_odd(small_set: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Remarks are no failure."""
+    assert cli.main(["check", str(small_set)]) == 0
+    assert "only 4 views" in " ".join(capsys.readouterr().out.split())
+    assert cli.main(["check", str(small_set), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["remarks"][0]["about"] == "views"
+
+
+def test_check_writes_nothing_even_where_it_cannot(plow_dry: Path, tmp_path: Path) -> None:
+    done = run("check", str(plow_dry), cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_mistake_is_one_line_without_traceback(small_set: Path) -> None:
+    (small_set / "views" / "images" / "001.jpg").unlink()
+    done = run("check", str(small_set))
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("splatsoil: ") and done.stderr.count("\n") == 1
+    assert "001.jpg" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_usage_errors_and_version(capsys: pytest.CaptureFixture[str]) -> None:
+    for words in ([], ["chek"], ["check"], ["check", "a", "--nonsense"]):
+        with pytest.raises(SystemExit) as left:
+            cli.main(words)
+        assert left.value.code == 2, words
+    with pytest.raises(SystemExit) as left:
+        cli.main(["--help"])
+    assert left.value.code == 0
+    assert "check" in capsys.readouterr().out
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"splatsoil {splatsoil.__version__}\n"
+
+
+def test_help_and_check_do_not_load_the_heavy_packages(plow_dry: Path) -> None:
+    """What makes a command line slow to answer stays out until it is needed."""
+    code = (
+        "import sys; from splatsoil import cli; cli.commands()\n"
+        f"assert cli.main(['check', {str(plow_dry)!r}, '--json']) == 0\n"
+        "print(sorted({'torch', 'warp', 'botorch', 'matplotlib', 'kornia'} & set(sys.modules)), file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0 and done.stderr == "[]\n"
+
+
+def command(monkeypatch: pytest.MonkeyPatch, behaviour: object) -> None:
+    """Make ``splatsoil try`` a command that does ``behaviour``."""
+
+    @dataclass(frozen=True)
+    class Config:
+        """Try something."""
+
+        json: bool = False
+        """Print JSON."""
+
+    def act(config: Config) -> int:
+        print("chatter")
+        return behaviour()  # type: ignore[operator, no-any-return]
+
+    known = cli.commands()
+    known["try"] = cli.Command(Config, act, lambda _: "3 of 10 are kept; go on with: splatsoil try")
+    monkeypatch.setattr(cli, "commands", lambda: known)
+
+
+def test_ctrl_c_says_what_is_kept(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def interrupt() -> int:
+        raise KeyboardInterrupt
+
+    command(monkeypatch, interrupt)
+    assert cli.main(["try"]) == 130
+    assert capsys.readouterr().err.strip() == "splatsoil: interrupted; 3 of 10 are kept; go on with: splatsoil try"
+    assert cli.main(["try", "--json"]) == 130
+    assert json.loads(capsys.readouterr().out)["error"].startswith("interrupted; 3 of 10 are kept")
+
+
+def test_a_new_command_is_one_new_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "dig_deep.py").write_text(
+        "from dataclasses import dataclass\n"
+        "@dataclass(frozen=True)\n"
+        "class Config:\n    'Dig.'\n    depth: float = 1.0\n    'Metres.'\n"
+        "def run(config):\n    print(config.depth)\n    return 7\n"
+    )
+    monkeypatch.setattr(splatsoil.commands, "__path__", [*splatsoil.commands.__path__, str(tmp_path)])
+    assert cli.main(["dig-deep", "--depth", "2.5"]) == 7
+    assert capsys.readouterr().out == "2.5\n"
+
+
+def test_json_is_alone_on_stdout(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Whatever else a command or a library prints goes to stderr, errors come as an object too."""
+
+    def answer() -> int:
+        print_json({"a": 1})
+        print("more chatter")
+        return 0
+
+    command(monkeypatch, answer)
+    assert cli.main(["try", "--json"]) == 0
+    out, err = capsys.readouterr()
+    assert json.loads(out) == {"a": 1}
+    assert err == "chatter\nmore chatter\n"
+
+    def fail() -> int:
+        raise RunError("the run folder\nis of another set")
+
+    command(monkeypatch, fail)
+    assert cli.main(["try", "--json"]) == 2
+    out, err = capsys.readouterr()
+    assert json.loads(out) == {"ok": False, "error": "the run folder is of another set"}
+    assert err == "chatter\nsplatsoil: the run folder is of another set\n"
+
+
+def test_defects_are_not_dressed_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An error that is not the user's keeps its traceback."""
+
+    def break_down() -> int:
+        raise ZeroDivisionError
+
+    command(monkeypatch, break_down)
+    with pytest.raises(ZeroDivisionError):
+        cli.main(["try"])
+
+
+def test_json_holds_no_nan(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(ValueError, match="JSON"), only_json():
+        print_json({"loss": float("nan")})
+    assert capsys.readouterr().out == ""
+
+
+def test_a_reader_that_goes_away_is_no_error(plow_dry: Path) -> None:
+    """``splatsoil check SET --json | true``."""
+    read, write = os.pipe()
+    os.close(read)
+    words = [sys.executable, "-m", "splatsoil", "check", str(plow_dry), "--json"]
+    done = subprocess.run(words, stdout=write, stderr=subprocess.PIPE, text=True, timeout=120, check=False)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (0, "")
