@@ -1,0 +1,27 @@
+"""From moved particles to pictures: Gaussians that ride on particles, lit by sun and sky, with the tool among them."""
+
+from splatsoil.scene.binding import Binding, bind
+from splatsoil.scene.estimate import LightEstimate, estimate_light, seen_colours, still_frames
+from splatsoil.scene.light import Light, LitRelief, ToolBody, encoded, light_relief, linear
+from splatsoil.scene.relief import Relief, relief_of_particles
+from splatsoil.scene.render import Layers, Posed, Scene
+
+__all__ = [
+    "Binding",
+    "Layers",
+    "Light",
+    "LightEstimate",
+    "LitRelief",
+    "Posed",
+    "Relief",
+    "Scene",
+    "ToolBody",
+    "bind",
+    "encoded",
+    "estimate_light",
+    "light_relief",
+    "linear",
+    "relief_of_particles",
+    "seen_colours",
+    "still_frames",
+]

@@ -1,0 +1,142 @@
+"""Albedo from colours: what the soil's Gaussians, the grains beneath them and the tool would show in even light."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from splatsoil.measurement import Camera, Frame
+from splatsoil.scene.light import encoded, linear
+from splatsoil.splats import rasterise_features
+
+FloatArray = npt.NDArray[np.float64]
+
+BRIGHTEST = 2.0
+"""Largest linear albedo, in units of level sunlit soil's mean; only errors lie beyond."""
+
+
+def correlation_length(points: Tensor, values: Tensor, longest: float) -> float:
+    """Distance at which the values' correlation has fallen to 1/e, m.
+
+    Args:
+        points: (n, 2) or (n, 3); x and y are used, m.
+        values: (n,).
+        longest: pairs farther apart than this are not looked at, and it is the answer where nothing falls, m.
+    """
+    xy = points[:, :2].cpu().numpy().astype(np.float64)
+    v = values.cpu().numpy().astype(np.float64)
+    v = v - v.mean()
+    variance = float(np.mean(v * v))
+    if variance < 1e-12 or len(v) < 10:
+        return longest
+    chosen = np.random.default_rng(0).permutation(len(v))[:2000]
+    tree = cKDTree(xy)
+    edges = np.linspace(0.0, longest, 21)
+    total, count = np.zeros(20), np.zeros(20)
+    for i, others in zip(chosen, tree.query_ball_point(xy[chosen], longest), strict=True):
+        others = np.asarray(others)
+        others = others[others != i]
+        distance = np.linalg.norm(xy[others] - xy[i], axis=1)
+        bins = np.minimum((distance / longest * 20).astype(int), 19)
+        np.add.at(total, bins, v[i] * v[others])
+        np.add.at(count, bins, 1.0)
+    correlation = total / np.maximum(count, 1.0) / variance
+    known = count > 30
+    centre = 0.5 * (edges[1:] + edges[:-1])
+    fallen = np.flatnonzero(known & (correlation < np.exp(-1.0)))
+    return float(centre[fallen[0]]) if fallen.size else longest
+
+
+def grain_albedo(
+    grains: Tensor, depth: Tensor, centres: Tensor, albedo: Tensor, spacing: float, length: float
+) -> Tensor:
+    """Albedo of each particle, guessed from the surface above it.
+
+    The surface's blotches are taken to reach as deep as they are wide: at a depth d the guess is the mean plus
+    exp(−d/length) times what the surface above deviates from it. That is the best linear guess where the correlation
+    falls so, and it tends to the mean, as it must, where nothing is known.
+
+    Args:
+        grains: (p, 3) particles, m.
+        depth: (p,) below the surface, m.
+        centres: (n, 3) surface Gaussians, m.
+        albedo: (n, 3) linear.
+        spacing: of the particles, m.
+        length: correlation length of the surface's albedo, m.
+
+    Returns:
+        (p, 3) linear.
+    """
+    mean = albedo.mean(dim=0)
+    k = min(16, len(centres))
+    away, index = cKDTree(centres[:, :2].cpu().numpy()).query(grains[:, :2].cpu().numpy(), k=k)
+    distance = torch.from_numpy(away.reshape(len(grains), k)).to(grains.device)
+    weight = torch.exp(-0.5 * (distance.square() - distance[:, :1].square()) / (0.5 * spacing) ** 2).float()
+    near = albedo[torch.from_numpy(index.reshape(len(grains), k)).to(grains.device)]
+    above = (weight[..., None] * near).sum(dim=1) / weight.sum(dim=1, keepdim=True)
+    share = torch.exp(-depth.clamp_min(0.0) / length)[:, None]
+    return mean + share * (above - mean)
+
+
+def refined(
+    centres: Tensor,
+    covariances: Tensor,
+    opacities: Tensor,
+    albedo: Tensor,
+    targets: Sequence[tuple[Camera, Tensor, Tensor]],
+    *,
+    rounds: int,
+) -> Tensor:
+    """Albedo that makes the drawn Gaussians agree with unlit photographs.
+
+    The drawn colour is linear in the Gaussians' colours. Each round moves every Gaussian by the mean of the residuals of
+    the pixels it shows in, weighted by how much (simultaneous algebraic reconstruction); one that shows nowhere keeps
+    what it has.
+
+    Args:
+        centres: (n, 3) m; covariances: (n, 3, 3) m²; opacities: (n,): every Gaussian that is drawn.
+        albedo: (n, 3) sRGB-encoded, the start.
+        targets: camera, unlit photograph (h, w, 3) encoded like the albedo, weight (h, w) of its pixels.
+        rounds: how often all photographs are gone through.
+    """
+    current = albedo.clone()
+    ceiling = encoded(torch.tensor(BRIGHTEST)).item()
+    for _ in range(rounds):
+        push, weight = torch.zeros_like(current), current.new_zeros(len(current), 1)
+        for camera, target, mask in targets:
+            features = torch.nn.functional.pad(current, (0, 1), value=1.0).requires_grad_()
+            with torch.enable_grad():
+                drawn = rasterise_features(centres, covariances, opacities, features, camera)
+                image = drawn.image
+            covered = drawn.alpha.detach().clamp_min(1e-3)[..., None]
+            residual = (target - image[..., :3].detach() / covered) * mask[..., None]
+            pull = torch.cat([residual, mask[..., None]], dim=2)
+            (gradient,) = torch.autograd.grad(image, features, pull)
+            push += gradient[:, :3]
+            weight += gradient[:, 3:]
+        current = (current + push / (weight + 0.5)).clamp(0.0, ceiling)
+    return current
+
+
+def tool_albedo(frames: Sequence[Frame], lit_tool: Callable[[Camera], Tensor]) -> FloatArray:
+    """Linear albedo (3,) of the tool, one for all of it: the median over the pixels that show nothing else.
+
+    Args:
+        frames: photographs.
+        lit_tool: for a camera, (h, w, 4): the radiance of a white tool times its share of each pixel, and that share.
+    """
+    found = []
+    for frame in frames:
+        white = lit_tool(frame.camera.undistorted())
+        whole = white[..., 3] > 0.99
+        image = linear(torch.from_numpy(np.ascontiguousarray(frame.undistorted_image())))
+        found.append(image[whole.cpu()] / white[..., :3][whole].cpu().clamp_min(1e-2))
+    pixels = torch.cat(found)
+    if len(pixels) == 0:
+        return np.full(3, 0.5)
+    return pixels.median(dim=0).values.numpy().astype(np.float64)

@@ -1,0 +1,112 @@
+"""A scene out of a reconstruction: light, albedo and binding, from photographs of the undisturbed bed."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+
+from splatsoil.errors import ParameterError
+from splatsoil.measurement import Frame, Measurement
+from splatsoil.scene import albedo as albedos
+from splatsoil.scene.binding import bind
+from splatsoil.scene.estimate import estimate_light, still_frames
+from splatsoil.scene.light import Light, ToolBody, encoded, light_relief, linear
+from splatsoil.scene.relief import relief_of_particles
+from splatsoil.scene.render import Posed, Scene
+from splatsoil.splats import Gaussians
+
+ROUNDS = 4
+"""Rounds of `albedo.refined`; more follow the noise of the photographs."""
+
+_LONGEST = 0.1
+"""Blotches of albedo wider than this count as this wide, m."""
+
+
+class Reconstructed(Protocol):
+    """What a scene needs of a reconstruction: `reconstruction.Reconstruction` has it."""
+
+    @property
+    def gaussians(self) -> Gaussians: ...
+    @property
+    def soil(self) -> Any: ...
+    @property
+    def tool(self) -> Any: ...
+
+
+def build_scene(
+    reconstruction: Reconstructed,
+    measurement: Measurement,
+    particles: Any,
+    spacing: float,
+    *,
+    light: Light | None = None,
+    device: torch.device | str = "cpu",
+    rounds: int = ROUNDS,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> Scene:
+    """See `Scene.from_reconstruction`."""
+    x = torch.as_tensor(np.asarray(particles), dtype=torch.float32).to(device).contiguous()
+    if x.ndim != 2 or x.shape[1] != 3 or len(x) == 0:
+        raise ParameterError(f"particles have shape {tuple(x.shape)}, expected (n, 3) with n > 0")
+    everything = reconstruction.gaussians.detach().to(device)
+    soil_mask, tool_mask = (
+        torch.as_tensor(np.asarray(m)).to(device, torch.bool) for m in (reconstruction.soil, reconstruction.tool)
+    )
+    soil, around = everything[soil_mask], everything[~soil_mask & ~tool_mask]
+    if len(soil) == 0:
+        raise ParameterError("the reconstruction has no soil")
+    body = ToolBody(measurement.tool.mesh, device)
+    relief = relief_of_particles(x, spacing, measurement.bed.lower, measurement.bed.upper)
+    if light is None:
+        light = estimate_light(measurement, relief, body).light
+    motion = measurement.tool.motion
+    start = motion.pose(float(motion.times[0]))
+    lit = light_relief(relief, light, body.at(*start))
+    soil_albedo = (linear(soil.colours) / lit.irradiance(soil.means.contiguous(), 0.002).clamp_min(0.05)).clamp(
+        0.0, albedos.BRIGHTEST
+    )
+    length = albedos.correlation_length(soil.means, soil_albedo.clamp_min(1e-3).log().mean(dim=1), _LONGEST)
+    depth = relief.depth_below(x)
+    grains = albedos.grain_albedo(x, depth, soil.means, soil_albedo, spacing, length)
+    scene = Scene(
+        soil=bind(soil.means, soil.covariances(), x, spacing),
+        soil_opacity=soil.opacities.contiguous(),
+        soil_albedo=encoded(soil_albedo),
+        grain_albedo=encoded(grains),
+        surroundings=around,
+        light=light,
+        tool=body,
+        tool_albedo=np.ones(3),
+        bed=measurement.bed,
+        spacing=spacing,
+        background=np.asarray(background, dtype=np.float64),
+    )
+    with torch.no_grad():
+        posed = scene.pose(x, None, start)
+        frames = still_frames(measurement)
+        scene = scene.replace(tool_albedo=albedos.tool_albedo(frames, lambda camera: scene.layers(posed, camera).tool))
+    return _refined(scene, posed, frames, rounds) if rounds > 0 else scene
+
+
+def _refined(scene: Scene, posed: Posed, frames: list[Frame], rounds: int) -> Scene:
+    """The scene with the albedo of its visible soil made to agree with the photographs, each pixel's light taken out."""
+    targets = []
+    with torch.no_grad():
+        for frame in frames:
+            camera = frame.camera.undistorted()
+            layers = scene.layers(posed, camera)
+            image = torch.from_numpy(np.ascontiguousarray(frame.undistorted_image())).to(scene.device)
+            good = torch.from_numpy(np.ascontiguousarray(frame.undistorted_mask())).to(scene.device)
+            sure = (layers.soil > 0.95) & (layers.tool[..., 3] == 0.0) & good
+            unlit = encoded((linear(image) / layers.light.clamp_min(0.05)).clamp(0.0, albedos.BRIGHTEST))
+            targets.append((camera, unlit, sure.float()))
+    shown, near = scene.shown(posed.lit.relief, scene.soil.rest, scene.soil.particles)
+    count = int(shown.sum()) + int(near.sum())
+    parts = (posed.centres[:count], posed.covariances[:count], posed.opacities[:count])
+    found = albedos.refined(*parts, posed.features[:count, :3], targets, rounds=rounds)
+    soil, grains = scene.soil_albedo.clone(), scene.grain_albedo.clone()
+    soil[shown] = found[: int(shown.sum())]
+    grains[near] = found[int(shown.sum()) :]
+    return scene.replace(soil_albedo=soil, grain_albedo=grains)

@@ -1,0 +1,236 @@
+"""The light estimated from photographs of the undisturbed bed.
+
+Albedo varies from place to place and its blotches look like slopes; where a shadow ends, or a slope turns, brightness
+changes over millimetres while the albedo does not know of it. So differences of log brightness over a short distance are
+compared with those that a light predicts, with a robust loss: the tool's shadow, where there is one, gives the sun's
+direction and the sky's share by its edge, and slopes add what they know.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import torch
+import warp as wp
+from scipy.optimize import minimize, minimize_scalar
+from torch import Tensor
+
+from splatsoil.measurement import Frame, Measurement
+from splatsoil.scene import kernels
+from splatsoil.scene.light import (
+    SOIL_REFLECTANCE,
+    Light,
+    LitRelief,
+    ToolBody,
+    ceiling,
+    grid_of,
+    linear,
+    march_step,
+    sky_openness,
+    sun_on_points,
+)
+from splatsoil.scene.relief import Relief
+from splatsoil.splats.warp_torch import as_warp, launch
+
+FloatArray = npt.NDArray[np.float64]
+
+_CELLS = 200
+"""Cells along the longer side of the bed at which colours are compared."""
+
+_FINEST = 0.004
+"""Smallest cell, m: about a pixel of the photographs the method was measured on."""
+
+_MARGIN = 0.03
+"""Strip along the walls that is left out, m: walls shade it and hide it."""
+
+_LAG = 3
+"""Distance of compared cells: a shadow's edge is blurred over about two."""
+
+
+@dataclass(frozen=True)
+class LightEstimate:
+    """A light and how well it explains what was seen.
+
+    Attributes:
+        light: the light.
+        explained: share of the (robust) spread of brightness differences that the light explains; near 0 means that the
+            photographs show neither shadow nor slope and the light is a guess.
+        shadowed: share of the bed's area that lies in the tool's shadow.
+    """
+
+    light: Light
+    explained: float
+    shadowed: float
+
+
+def still_frames(measurement: Measurement) -> list[Frame]:
+    """Every photograph in which nothing has moved: the views, the pre-roll and frame 0 of the video."""
+    still = [f for f in measurement.video if f.frame is not None and f.frame <= 0]
+    return [*measurement.views, *still]
+
+
+def seen_colours(
+    points: Tensor, frames: Sequence[Frame], relief: Relief, tool: object, *, slack: float = 0.004
+) -> tuple[Tensor, Tensor]:
+    """Linear colours of points on the surface, the median over the photographs that see them.
+
+    Args:
+        points: (n, 3), m.
+        frames: photographs.
+        relief: the surface, for what hides what.
+        tool: the tool's pose in these photographs, in the kernels' form.
+        slack: how far a point may lie beneath the surface and still count as seen, m.
+
+    Returns:
+        (n, 3) colours, NaN where no photograph sees the point, and (n,) how many do.
+    """
+    samples = torch.full((len(frames), len(points), 3), math.nan)
+    where = points.double().cpu().numpy()
+    for k, frame in enumerate(frames):
+        camera = frame.camera
+        pixels, depth = camera.project(where)
+        seen = torch.empty(len(points), dtype=torch.float32, device=points.device)
+        inputs = [
+            as_warp(points, wp.vec3),
+            wp.vec3(*camera.position),
+            as_warp(relief.height, wp.float32),
+            grid_of(relief),
+        ]
+        inputs += [tool, march_step(relief), ceiling(relief), slack, as_warp(seen, wp.float32)]
+        launch(kernels.points_seen, len(points), inputs, points)
+        inside = (
+            (depth > 0) & (pixels > 1.0).all(axis=1) & (pixels < [camera.width - 1.0, camera.height - 1.0]).all(axis=1)
+        )
+        visible = (seen.cpu().numpy() > 0.5) & inside
+        image = linear(torch.from_numpy(np.ascontiguousarray(frame.image())))
+        normalised = torch.from_numpy(2.0 * pixels[visible] / [camera.width, camera.height] - 1.0).float()
+        picked = torch.nn.functional.grid_sample(
+            image.permute(2, 0, 1)[None], normalised[None, None], mode="bilinear", align_corners=False
+        )
+        samples[k, torch.from_numpy(visible)] = picked[0, :, 0].T
+    count = torch.isfinite(samples[:, :, 0]).sum(dim=0)
+    return samples.nanmedian(dim=0).values.to(points.device), count.to(points.device)
+
+
+def estimate_light(measurement: Measurement, relief: Relief, body: ToolBody) -> LightEstimate:
+    """Sun and sky over a measurement set, from its photographs before anything moves.
+
+    Args:
+        measurement: the set; its tool stands where its motion begins.
+        relief: the undisturbed surface.
+        body: the tool.
+    """
+    motion = measurement.tool.motion
+    tool = body.at(*motion.pose(float(motion.times[0])))
+    lower, upper = np.asarray(measurement.bed.lower), np.asarray(measurement.bed.upper)
+    points, shape = _cells(relief, lower, upper)
+    colours, count = seen_colours(points, still_frames(measurement), relief, tool)
+    colours[count < 2] = math.nan
+    return fit_light(points, colours, shape, relief, tool)
+
+
+def fit_light(points: Tensor, colours: Tensor, shape: tuple[int, int], relief: Relief, tool: object) -> LightEstimate:
+    """The light that explains the colours of a grid of points on a surface.
+
+    Args:
+        points: (rows · columns, 3) points of a regular grid in x and y, row by row, m.
+        colours: (rows · columns, 3) linear colours; NaN where unknown.
+        shape: rows and columns.
+        relief: the surface.
+        tool: the tool's pose in the kernels' form.
+    """
+    problem = _Problem(points, colours, shape, relief, tool)
+    grey = problem.brightness.mean(dim=1)
+    start = min(
+        (problem.cost(grey, azimuth, elevation, share), azimuth, elevation, share)
+        for elevation in (20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0)
+        for azimuth in np.arange(-180.0, 180.0, 10.0)
+        for share in (0.4, 0.6, 0.8)
+    )
+    first = np.array(start[1:])
+    simplex = first + np.array([[0, 0, 0], [6.0, 0, 0], [0, 5.0, 0], [0, 0, -0.1]])
+    found = minimize(
+        lambda v: problem.cost(grey, *v),
+        first,
+        method="Nelder-Mead",
+        options={"initial_simplex": simplex, "xatol": 0.02, "fatol": 1e-6, "maxfev": 250},
+    )
+    azimuth, elevation, _ = found.x
+    ambient = [
+        minimize_scalar(
+            lambda a, c=channel: problem.cost(problem.brightness[:, c], azimuth, elevation, a),
+            bounds=(0.02, 0.98), method="bounded", options={"xatol": 1e-3},
+        ).x
+        for channel in range(3)
+    ]  # fmt: skip
+    level = torch.nanmedian(colours, dim=0).values.cpu().numpy().astype(np.float64)
+    bounce = SOIL_REFLECTANCE * level / float(level.mean())
+    light = Light.from_angles(float(azimuth), float(np.clip(elevation, 5.0, 89.9)), np.array(ambient), bounce=bounce)
+    nothing = float(problem.spread(problem.differences(grey)))
+    shadowed = float(1.0 - problem.tool_light(light).mean())
+    return LightEstimate(light, 1.0 - float(found.fun) / max(nothing, 1e-12), shadowed)
+
+
+class _Problem:
+    """Robust fit of log-brightness differences on a grid."""
+
+    def __init__(self, points: Tensor, colours: Tensor, shape: tuple[int, int], relief: Relief, tool: object) -> None:
+        self.points, self.shape, self.relief, self.tool = points, shape, relief, tool
+        self.brightness = colours.clamp_min(1e-4).log()
+        self.normal = torch.nn.functional.normalize(relief.sample(relief.normal, points), dim=1)
+        self.openness_map = sky_openness(relief, tool)
+        self.openness = relief.sample(self.openness_map, points)
+        self._lit: tuple[float, float, Tensor, Tensor] | None = None
+        self.scale = 1.0
+        grey = self.differences(self.brightness.mean(dim=1))
+        self.scale = 1.4826 * float(grey[torch.isfinite(grey)].abs().median())
+
+    def differences(self, values: Tensor) -> Tensor:
+        """Differences over the lag along both axes of the grid."""
+        grid = values.reshape(self.shape)
+        return torch.cat([(grid[_LAG:] - grid[:-_LAG]).reshape(-1), (grid[:, _LAG:] - grid[:, :-_LAG]).reshape(-1)])
+
+    def spread(self, residual: Tensor) -> Tensor:
+        """Mean pseudo-Huber loss of the residuals that are known."""
+        known = residual[torch.isfinite(residual)]
+        return (torch.sqrt(1.0 + (known / self.scale) ** 2) - 1.0).mean()
+
+    def cost(self, brightness: Tensor, azimuth: float, elevation: float, ambient: float) -> float:
+        """Loss of a light; the sky's share is held between 0 and 1, the sun above the horizon."""
+        if not 5.0 <= elevation <= 89.9 or not 0.02 <= ambient <= 0.98:
+            return 1e3
+        direct = self._direct(azimuth, elevation)
+        e = ambient * self.openness + (1.0 - ambient) * direct + 0.5 * SOIL_REFLECTANCE * (1.0 - self.openness)
+        return float(self.spread(self.differences(brightness - e.clamp_min(1e-3).log())))
+
+    def tool_light(self, light: Light) -> Tensor:
+        """Share of the sun that the tool lets through to each point."""
+        open_sky = torch.ones_like(self.relief.height)
+        lit = LitRelief(self.relief, light, self.tool, open_sky, open_sky)
+        return sun_on_points(lit, self.points, 0.25 * _FINEST)
+
+    def _direct(self, azimuth: float, elevation: float) -> Tensor:
+        """The sun's light on each point, 1 on level open ground; the last direction is kept."""
+        if self._lit is None or self._lit[:2] != (azimuth, elevation):
+            light = Light.from_angles(azimuth, elevation, 0.5)
+            sun = torch.tensor(light.direction.tolist(), dtype=torch.float32, device=self.points.device)
+            direct = (self.normal @ sun).clamp_min(0.0) / sun[2] * self.tool_light(light)
+            self._lit = (azimuth, elevation, direct, sun)
+        return self._lit[2]
+
+
+def _cells(relief: Relief, lower: FloatArray, upper: FloatArray) -> tuple[Tensor, tuple[int, int]]:
+    """Points of a regular grid on the surface, away from the walls."""
+    extent = upper[:2] - lower[:2]
+    margin = min(_MARGIN, 0.1 * float(extent.min()))
+    size = max(_FINEST, float(extent.max()) / _CELLS)
+    nx, ny = (max(4 * _LAG, int((extent[k] - 2 * margin) / size)) for k in (0, 1))
+    x = torch.linspace(float(lower[0] + margin), float(upper[0] - margin), nx, device=relief.device)
+    y = torch.linspace(float(lower[1] + margin), float(upper[1] - margin), ny, device=relief.device)
+    ys, xs = torch.meshgrid(y, x, indexing="ij")
+    flat = torch.stack([xs.reshape(-1), ys.reshape(-1)], dim=1)
+    return torch.cat([flat, relief.sample(relief.height, flat)[:, None]], dim=1), (ny, nx)

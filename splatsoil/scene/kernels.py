@@ -1,0 +1,371 @@
+"""Warp kernels of light and shade; the same source runs on CPU and CUDA.
+
+Every kernel is a gather: each thread writes its own outputs, so results do not depend on the order of threads.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+
+@wp.struct
+class Grid:
+    """Where a map over the bed lies: centre of its first cell and one over the cell size."""
+
+    x0: float
+    y0: float
+    inverse_x: float
+    inverse_y: float
+
+
+@wp.struct
+class Illumination:
+    """The light's numbers: see ``light.Light``."""
+
+    sun: wp.vec3
+    ambient: wp.vec3
+    bounce: wp.vec3
+    softness: float
+
+
+@wp.struct
+class ToolPose:
+    """The tool's mesh (in its own frame) and where it stands; ``mesh`` is 0 for no tool."""
+
+    mesh: wp.uint64
+    rotation: wp.mat33
+    position: wp.vec3
+    centre: wp.vec3
+    radius: float
+
+
+@wp.func
+def sample(values: wp.array2d(dtype=wp.float32), grid: Grid, x: float, y: float) -> float:
+    """Bilinear value of a map (ny, nx), held constant beyond its border."""
+    ny = values.shape[0]
+    nx = values.shape[1]
+    u = wp.clamp((x - grid.x0) * grid.inverse_x, 0.0, float(nx) - 1.001)
+    v = wp.clamp((y - grid.y0) * grid.inverse_y, 0.0, float(ny) - 1.001)
+    j = int(u)
+    i = int(v)
+    fu = u - float(j)
+    fv = v - float(i)
+    low = values[i, j] * (1.0 - fu) + values[i, j + 1] * fu
+    high = values[i + 1, j] * (1.0 - fu) + values[i + 1, j + 1] * fu
+    return low * (1.0 - fv) + high * fv
+
+
+@wp.func
+def sample_normal(values: wp.array2d(dtype=wp.vec3), grid: Grid, x: float, y: float) -> wp.vec3:
+    """Bilinear unit normal of a map (ny, nx)."""
+    ny = values.shape[0]
+    nx = values.shape[1]
+    u = wp.clamp((x - grid.x0) * grid.inverse_x, 0.0, float(nx) - 1.001)
+    v = wp.clamp((y - grid.y0) * grid.inverse_y, 0.0, float(ny) - 1.001)
+    j = int(u)
+    i = int(v)
+    fu = u - float(j)
+    fv = v - float(i)
+    low = values[i, j] * (1.0 - fu) + values[i, j + 1] * fu
+    high = values[i + 1, j] * (1.0 - fu) + values[i + 1, j + 1] * fu
+    return wp.normalize(low * (1.0 - fv) + high * fv)
+
+
+@wp.func
+def tool_hit(tool: ToolPose, origin: wp.vec3, direction: wp.vec3, reach: float) -> float:
+    """Distance at which a ray meets the tool, or -1."""
+    if tool.mesh == wp.uint64(0):
+        return -1.0
+    to = tool.centre - origin
+    along = wp.dot(to, direction)
+    if wp.dot(to, to) - along * along > tool.radius * tool.radius or along < -tool.radius:
+        return -1.0
+    back = wp.transpose(tool.rotation)
+    query = wp.mesh_query_ray(tool.mesh, back * (origin - tool.position), back * direction, reach)
+    if query.result:
+        return query.t
+    return -1.0
+
+
+@wp.func
+def tool_normal(tool: ToolPose, origin: wp.vec3, direction: wp.vec3) -> wp.vec3:
+    """World normal of the face that a ray is known to meet, turned towards the ray's origin."""
+    back = wp.transpose(tool.rotation)
+    query = wp.mesh_query_ray(tool.mesh, back * (origin - tool.position), back * direction, 1.0e3)
+    normal = tool.rotation * query.normal
+    return wp.where(wp.dot(normal, direction) > 0.0, -normal, normal)
+
+
+@wp.func
+def soil_shadow(
+    height: wp.array2d(dtype=wp.float32), grid: Grid, point: wp.vec3, light: Illumination, step: float, top: float
+) -> float:
+    """Share of the sun (0 to 1) that the soil's surface lets through to a point; soft by the sun's width."""
+    open_share = 1.0
+    flat = wp.sqrt(light.sun[0] * light.sun[0] + light.sun[1] * light.sun[1])
+    if flat < 1.0e-4:
+        return open_share
+    rise = light.sun[2] / flat
+    dx = light.sun[0] / flat
+    dy = light.sun[1] / flat
+    r = step
+    z = point[2] + r * rise
+    while z < top and open_share > 0.0:
+        gap = z - sample(height, grid, point[0] + r * dx, point[1] + r * dy)
+        # A cell's worth of blur near the blocker, the sun's own width farther out.
+        width = light.softness * r + 0.35 * step
+        open_share = wp.min(open_share, wp.clamp(0.5 + 0.5 * gap / width, 0.0, 1.0))
+        r += step
+        z = point[2] + r * rise
+    return open_share
+
+
+@wp.func
+def wedge(elevation: float, up: float, along: float) -> float:
+    """Antiderivative of (up·sin e + along·cos e)·cos e: what a slice of uniform sky gives to a facet."""
+    s = wp.sin(elevation)
+    return 0.5 * up * s * s + 0.5 * along * (elevation + 0.5 * wp.sin(2.0 * elevation))
+
+
+@wp.kernel(enable_backward=False)
+def tool_columns(
+    grid: Grid,
+    tool: ToolPose,
+    ceiling: float,
+    floor: float,
+    bottom: wp.array2d(dtype=wp.float32),
+    top: wp.array2d(dtype=wp.float32),
+):
+    """Lowest and highest point of the tool over each cell; bottom > top where there is none."""
+    i, j = wp.tid()
+    x = grid.x0 + float(j) / grid.inverse_x
+    y = grid.y0 + float(i) / grid.inverse_y
+    bottom[i, j] = 1.0e6
+    top[i, j] = -1.0e6
+    reach = ceiling - floor
+    down = tool_hit(tool, wp.vec3(x, y, ceiling), wp.vec3(0.0, 0.0, -1.0), reach)
+    if down >= 0.0:
+        up = tool_hit(tool, wp.vec3(x, y, floor), wp.vec3(0.0, 0.0, 1.0), reach)
+        top[i, j] = ceiling - down
+        bottom[i, j] = wp.where(up >= 0.0, floor + up, floor)
+
+
+@wp.kernel(enable_backward=False)
+def sky_openness(
+    height: wp.array2d(dtype=wp.float32),
+    normal: wp.array2d(dtype=wp.vec3),
+    grid: Grid,
+    bottom: wp.array2d(dtype=wp.float32),
+    top: wp.array2d(dtype=wp.float32),
+    azimuths: int,
+    steps: wp.array(dtype=wp.float32),
+    openness: wp.array2d(dtype=wp.float32),
+):
+    """Light of a uniform sky that reaches each cell, 1 on an open plane: its horizon in every azimuth, less the tool."""
+    i, j = wp.tid()
+    x = grid.x0 + float(j) / grid.inverse_x
+    y = grid.y0 + float(i) / grid.inverse_y
+    z = height[i, j]
+    n = normal[i, j]
+    total = 0.0
+    half = 1.5707963
+    for a in range(azimuths):
+        angle = 6.2831853 * (float(a) + 0.5) / float(azimuths)
+        dx = wp.cos(angle)
+        dy = wp.sin(angle)
+        along = n[0] * dx + n[1] * dy
+        horizon = wp.atan2(-along, n[2])
+        slope = wp.tan(wp.clamp(horizon, -1.5, 1.5))
+        tool_low = 1.0e6
+        tool_high = -1.0e6
+        for s in range(steps.shape[0]):
+            r = steps[s]
+            px = x + r * dx
+            py = y + r * dy
+            slope = wp.max(slope, (sample(height, grid, px, py) - z) / r)
+            v = int(wp.clamp((py - grid.y0) * grid.inverse_y + 0.5, 0.0, float(height.shape[0]) - 1.0))
+            u = int(wp.clamp((px - grid.x0) * grid.inverse_x + 0.5, 0.0, float(height.shape[1]) - 1.0))
+            if top[v, u] > bottom[v, u]:
+                tool_low = wp.min(tool_low, (bottom[v, u] - z) / r)
+                tool_high = wp.max(tool_high, (top[v, u] - z) / r)
+        horizon = wp.atan(slope)
+        total += wedge(half, n[2], along) - wedge(horizon, n[2], along)
+        low = wp.max(horizon, wp.atan(tool_low))
+        high = wp.atan(tool_high)
+        if high > low:
+            total -= wedge(high, n[2], along) - wedge(low, n[2], along)
+    openness[i, j] = wp.clamp(2.0 * total / float(azimuths), 0.0, 1.0)
+
+
+@wp.kernel(enable_backward=False)
+def sun_visibility(
+    height: wp.array2d(dtype=wp.float32),
+    grid: Grid,
+    light: Illumination,
+    step: float,
+    top: float,
+    visible: wp.array2d(dtype=wp.float32),
+):
+    """Share of the sun that the soil lets through to each cell."""
+    i, j = wp.tid()
+    point = wp.vec3(grid.x0 + float(j) / grid.inverse_x, grid.y0 + float(i) / grid.inverse_y, height[i, j])
+    visible[i, j] = soil_shadow(height, grid, point, light, step, top)
+
+
+@wp.func
+def tool_shadow(tool: ToolPose, light: Illumination, point: wp.vec3, spread: float) -> float:
+    """Share of the sun that the tool lets through to a patch of half width ``spread`` around a point."""
+    if tool.mesh == wp.uint64(0):
+        return 1.0
+    lit = 0.0
+    for k in range(4):
+        sx = wp.where(k % 2 == 0, -0.5, 0.5)
+        sy = wp.where(k < 2, -0.5, 0.5)
+        # A turned square covers more distinct edges' positions than an upright one.
+        shift = wp.vec3(0.8 * sx - 0.6 * sy, 0.6 * sx + 0.8 * sy, 0.0) * spread
+        if tool_hit(tool, point + shift + light.sun * 1.0e-3, light.sun, 1.0e3) < 0.0:
+            lit += 0.25
+    return lit
+
+
+@wp.kernel(enable_backward=False)
+def sun_on_points(
+    points: wp.array(dtype=wp.vec3),
+    height: wp.array2d(dtype=wp.float32),
+    grid: Grid,
+    light: Illumination,
+    tool: ToolPose,
+    step: float,
+    top: float,
+    spread: float,
+    visible: wp.array(dtype=wp.float32),
+):
+    """Share of the sun that soil and tool let through to any points on the soil."""
+    p = wp.tid()
+    share = tool_shadow(tool, light, points[p], spread)
+    if share > 0.0:
+        share *= soil_shadow(height, grid, points[p], light, step, top)
+    visible[p] = share
+
+
+@wp.kernel(enable_backward=False)
+def points_seen(
+    points: wp.array(dtype=wp.vec3),
+    eye: wp.vec3,
+    height: wp.array2d(dtype=wp.float32),
+    grid: Grid,
+    tool: ToolPose,
+    step: float,
+    top: float,
+    slack: float,
+    seen: wp.array(dtype=wp.float32),
+):
+    """1 where neither soil (by more than ``slack``) nor tool stands between a point and the eye, else 0."""
+    p = wp.tid()
+    way = eye - points[p]
+    distance = wp.length(way)
+    direction = way / distance
+    seen[p] = 0.0
+    if tool_hit(tool, points[p] + direction * 1.0e-3, direction, distance) >= 0.0:
+        return
+    r = step
+    q = points[p] + direction * r
+    while r < distance and q[2] < top:
+        if q[2] + slack < sample(height, grid, q[0], q[1]):
+            return
+        r += step
+        q = points[p] + direction * r
+    seen[p] = 1.0
+
+
+@wp.struct
+class Eye:
+    """A pinhole: world from camera (OpenCV axes), position, focal lengths and principal point in pixels."""
+
+    rotation: wp.mat33
+    position: wp.vec3
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+
+@wp.func
+def pixel_ray(eye: Eye, u: float, v: float) -> wp.vec3:
+    """Direction through a point of the image, with length 1 along the camera's axis."""
+    return eye.rotation * wp.vec3((u - eye.cx) / eye.fx, (v - eye.cy) / eye.fy, 1.0)
+
+
+@wp.kernel(enable_backward=False)
+def illuminate(
+    eye: Eye,
+    depth: wp.array2d(dtype=wp.float32),
+    soil: wp.array2d(dtype=wp.float32),
+    height: wp.array2d(dtype=wp.float32),
+    normal: wp.array2d(dtype=wp.vec3),
+    openness: wp.array2d(dtype=wp.float32),
+    visible: wp.array2d(dtype=wp.float32),
+    grid: Grid,
+    light: Illumination,
+    tool: ToolPose,
+    albedo: wp.vec3,
+    step: float,
+    top: float,
+    snap: float,
+    light_out: wp.array2d(dtype=wp.vec3),
+    tool_out: wp.array2d(dtype=wp.vec4),
+):
+    """For each pixel: the light on the soil it shows, and the tool's radiance times its share of the pixel, and that share.
+
+    The splats' depth finds the soil; the point is then moved along the pixel's ray onto the surface (by at most
+    ``snap``), because blobs end a little before or behind it.
+    """
+    i, j = wp.tid()
+    ray = pixel_ray(eye, float(j) + 0.5, float(i) + 0.5)
+    z = depth[i, j]
+    light_out[i, j] = wp.vec3(1.0, 1.0, 1.0)
+    tool_out[i, j] = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    if soil[i, j] > 0.01 and z > 0.0:
+        moved = 0.0
+        n = wp.vec3(0.0, 0.0, 1.0)
+        for _ in range(3):
+            x = eye.position + ray * (z + moved)
+            n = sample_normal(normal, grid, x[0], x[1])
+            slope = wp.dot(ray, n) / n[2]
+            if slope < -0.05:
+                moved -= (x[2] - sample(height, grid, x[0], x[1])) / slope
+                moved = wp.clamp(moved, -snap, snap)
+        z += moved
+        x = eye.position + ray * z
+        n = sample_normal(normal, grid, x[0], x[1])
+        sky = sample(openness, grid, x[0], x[1])
+        direct = wp.max(wp.dot(n, light.sun), 0.0) / light.sun[2]
+        if direct > 0.0:
+            direct *= sample(visible, grid, x[0], x[1])
+        if direct > 0.0:
+            direct *= tool_shadow(tool, light, x, 0.5 * z / eye.fx)
+        light_out[i, j] = (
+            light.ambient * sky + (wp.vec3(1.0, 1.0, 1.0) - light.ambient) * direct + light.bounce * (1.0 - sky)
+        )
+    share = 0.0
+    radiance = wp.vec3(0.0, 0.0, 0.0)
+    for k in range(4):
+        sx = wp.where(k % 2 == 0, -0.25, 0.25)
+        sy = wp.where(k < 2, -0.25, 0.25)
+        fine = pixel_ray(eye, float(j) + 0.5 + 0.8 * sx - 0.6 * sy, float(i) + 0.5 + 0.6 * sx + 0.8 * sy)
+        length = wp.length(fine)
+        way = fine / length
+        t = tool_hit(tool, eye.position, way, 1.0e3)
+        if t >= 0.0 and (t / length < z or z <= 0.0):
+            share += 0.25
+            point = eye.position + way * t
+            n = tool_normal(tool, eye.position, way)
+            sky = 0.5 * (1.0 + n[2])
+            direct = wp.max(wp.dot(n, light.sun), 0.0) / light.sun[2]
+            if direct > 0.0:
+                direct *= soil_shadow(height, grid, point, light, step, top)
+                if tool_hit(tool, point + n * 1.0e-4, light.sun, 1.0e3) >= 0.0:
+                    direct = 0.0
+            lit = light.ambient * sky + (wp.vec3(1.0, 1.0, 1.0) - light.ambient) * direct + light.bounce * (1.0 - sky)
+            radiance += 0.25 * wp.cw_mul(albedo, lit)
+    tool_out[i, j] = wp.vec4(radiance[0], radiance[1], radiance[2], share)

@@ -1,0 +1,228 @@
+"""What a camera sees of particles that carry Gaussians, under a light, with the tool among them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+import warp as wp
+from torch import Tensor
+
+from splatsoil.measurement import Bed, Camera, Measurement
+from splatsoil.scene import kernels
+from splatsoil.scene.binding import Binding
+from splatsoil.scene.light import (
+    Light,
+    LitRelief,
+    ToolBody,
+    ceiling,
+    encoded,
+    grid_of,
+    light_relief,
+    linear,
+    march_step,
+)
+from splatsoil.scene.relief import Relief, relief_of_particles
+from splatsoil.splats import Gaussians, rasterise_features
+from splatsoil.splats.warp_torch import as_warp, launch
+
+FloatArray = npt.NDArray[np.float64]
+FloatImage = npt.NDArray[np.float32]
+Pose = tuple[npt.ArrayLike, npt.ArrayLike]
+
+PARTICLE_SIZE = 0.5
+"""Standard deviation of a particle's own Gaussian in particle spacings."""
+
+PARTICLE_OPACITY = 0.95
+
+_HIDDEN = 2.5
+"""Particles this many spacings below the surface are not drawn."""
+
+_SNAP = 2.0
+"""How far along its ray a pixel of soil may be moved to the surface, in particle spacings."""
+
+
+@dataclass(frozen=True)
+class Posed:
+    """A scene at one moment: soil moved, lit, tool in place.
+
+    Attributes:
+        centres: (n, 3) Gaussians that can be seen: soil, then surroundings.
+        covariances: (n, 3, 3).
+        opacities: (n,).
+        features: (n, 4): albedo (soil) or colour (surroundings) in sRGB, and 1 for soil.
+        lit: the soil's surface under the light, with the tool's pose.
+    """
+
+    centres: Tensor
+    covariances: Tensor
+    opacities: Tensor
+    features: Tensor
+    lit: LitRelief
+
+
+@dataclass(frozen=True)
+class Layers:
+    """What one camera sees, before light and colour meet; tensors on the scene's device.
+
+    Attributes:
+        colour: (h, w, 3) sRGB: albedo where soil is, colour elsewhere.
+        soil: (h, w) share of soil in the pixel.
+        depth: (h, w) along the camera's axis, m; 0 where nothing is.
+        light: (h, w, 3) light on the soil; 1 elsewhere.
+        tool: (h, w, 4) the tool's linear radiance times its share of the pixel, and that share.
+    """
+
+    colour: Tensor
+    soil: Tensor
+    depth: Tensor
+    light: Tensor
+    tool: Tensor
+
+    @property
+    def image(self) -> Tensor:
+        """(h, w, 3) sRGB in [0, 1]."""
+        gain = 1.0 + self.soil[..., None] * (self.light - 1.0)
+        share = self.tool[..., 3:]
+        return encoded(linear(self.colour) * gain * (1.0 - share) + self.tool[..., :3]).clamp(0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Soil that carries its albedo, a light, a tool, and surroundings that stay.
+
+    Attributes:
+        soil: the reconstruction's soil Gaussians, bound to the particles.
+        soil_opacity: (s,).
+        soil_albedo: (s, 3) sRGB-encoded albedo, see `light`.
+        grain_albedo: (p, 3) the same for each particle's own Gaussian.
+        surroundings: Gaussians that neither move nor change their colour.
+        light: sun and sky.
+        tool: the tool's mesh.
+        tool_albedo: (3,) linear.
+        bed: the bed's box.
+        spacing: of the particles, m.
+        background: (3,) sRGB where nothing is.
+    """
+
+    soil: Binding
+    soil_opacity: Tensor
+    soil_albedo: Tensor
+    grain_albedo: Tensor
+    surroundings: Gaussians
+    light: Light
+    tool: ToolBody
+    tool_albedo: FloatArray
+    bed: Bed
+    spacing: float
+    background: FloatArray
+
+    @property
+    def device(self) -> torch.device:
+        """Where the scene is drawn."""
+        return self.soil.rest.device
+
+    @classmethod
+    def from_reconstruction(
+        cls, reconstruction: Any, measurement: Measurement, particles: Any, spacing: float, **options: Any
+    ) -> Scene:
+        """A scene from photographs of the undisturbed bed: light estimated, colours turned into albedo, Gaussians bound.
+
+        Args:
+            reconstruction: has ``gaussians`` (sRGB colours) and masks ``soil`` and ``tool`` (n,).
+            measurement: the set it was made from.
+            particles: (p, 3) at rest, m: those that will move.
+            spacing: side of the cube of soil a particle stands for, m.
+            options: ``light`` (a `Light`; estimated if left out), ``device``, ``rounds`` (of refining the albedo),
+                ``background`` (3,) sRGB.
+        """
+        from splatsoil.scene.build import build_scene
+
+        return build_scene(reconstruction, measurement, particles, spacing, **options)
+
+    def replace(self, **changes: Any) -> Scene:
+        """A copy with some parts replaced."""
+        return replace(self, **changes)
+
+    def shown(self, relief: Relief, centres: Tensor, particles: Tensor) -> tuple[Tensor, Tensor]:
+        """Which soil Gaussians and which particles lie near enough to the surface to be drawn: masks (s,) and (p,)."""
+        limit = _HIDDEN * self.spacing
+        return relief.depth_below(centres) < limit, relief.depth_below(particles) < limit
+
+    def pose(self, positions: Any, deformations: Any, tool: Pose | None) -> Posed:
+        """Move, hide and light everything for one moment.
+
+        Args:
+            positions: (p, 3) particles now, m (array or tensor).
+            deformations: (p, 3, 3) visual deformation since rest, or None.
+            tool: rotation (3, 3) and position (3,) of the tool's frame, or None for no tool.
+        """
+        x = torch.as_tensor(positions, dtype=torch.float32, device=self.device).contiguous()
+        f = None if deformations is None else torch.as_tensor(deformations, dtype=torch.float32, device=self.device)
+        relief = relief_of_particles(x, self.spacing, self.bed.lower, self.bed.upper)
+        placed = self.tool.absent() if tool is None else self.tool.at(*tool)
+        lit = light_relief(relief, self.light, placed)
+        centres, covariances = self.soil.carry(x, None if f is None else f.contiguous())
+        shown, near = self.shown(relief, centres, x)
+        grains = (PARTICLE_SIZE * self.spacing) ** 2 * torch.eye(3, device=self.device)
+        around = self.surroundings
+        parts = (
+            (centres[shown], covariances[shown], self.soil_opacity[shown], self.soil_albedo[shown], 1.0),
+            (
+                x[near],
+                grains.expand(int(near.sum()), 3, 3),
+                x.new_full((int(near.sum()),), PARTICLE_OPACITY),
+                self.grain_albedo[near],
+                1.0,
+            ),
+            (around.means, around.covariances(), around.opacities, around.colours, 0.0),
+        )
+        features = torch.cat([torch.nn.functional.pad(p[3], (0, 1), value=p[4]) for p in parts])
+        return Posed(*(torch.cat([p[k] for p in parts]) for k in range(3)), features, lit)
+
+    def layers(self, posed: Posed, camera: Camera) -> Layers:
+        """What a camera without distortion sees of a posed scene."""
+        view = torch.as_tensor(camera.world_to_camera, dtype=torch.float32, device=self.device)
+        along = posed.centres @ view[2, :3] + view[2, 3]
+        features = torch.cat([posed.features, along[:, None]], dim=1)
+        behind = torch.tensor([*self.background, 0.0, 0.0], dtype=torch.float32, device=self.device)
+        drawn = rasterise_features(
+            posed.centres, posed.covariances, posed.opacities, features, camera, background=behind
+        )
+        colour, soil, depth = drawn.image[..., :3], drawn.image[..., 3].contiguous(), drawn.image[..., 4]
+        depth = torch.where(drawn.alpha > 0.3, depth / drawn.alpha.clamp_min(0.3), 0.0).contiguous()
+        light, tool = _illuminated(posed.lit, camera, depth, soil, self.tool_albedo, _SNAP * self.spacing)
+        return Layers(colour, soil, depth, light, tool)
+
+    def render(self, positions: Any, deformations: Any, tool: Pose | None, camera: Camera) -> FloatImage:
+        """The picture (h, w, 3) float32 sRGB in [0, 1] that an undistorted camera takes of particles and tool."""
+        return self.picture(self.pose(positions, deformations, tool), camera)
+
+    def picture(self, posed: Posed, camera: Camera) -> FloatImage:
+        """The picture (h, w, 3) float32 sRGB in [0, 1] of a posed scene; several cameras may share the posing."""
+        with torch.no_grad():
+            return self.layers(posed, camera).image.cpu().numpy().astype(np.float32)
+
+
+def _illuminated(
+    lit: LitRelief, camera: Camera, depth: Tensor, soil: Tensor, tool_albedo: FloatArray, snap: float
+) -> tuple[Tensor, Tensor]:
+    """Light on the soil (h, w, 3) and the tool's share (h, w, 4) of each pixel."""
+    eye = kernels.Eye()
+    axes = camera.world_to_camera[:3, :3].T
+    eye.rotation = wp.mat33(*axes.reshape(-1))
+    eye.position = wp.vec3(*camera.position)
+    eye.fx, eye.fy, eye.cx, eye.cy = camera.fx, camera.fy, camera.cx, camera.cy
+    relief = lit.relief
+    size = (camera.height, camera.width)
+    light = torch.empty((*size, 3), dtype=torch.float32, device=depth.device)
+    tool = torch.empty((*size, 4), dtype=torch.float32, device=depth.device)
+    maps = [as_warp(depth, wp.float32), as_warp(soil.contiguous(), wp.float32), as_warp(relief.height, wp.float32)]
+    maps += [as_warp(relief.normal, wp.vec3), as_warp(lit.openness, wp.float32), as_warp(lit.visible, wp.float32)]
+    numbers = [grid_of(relief), lit.light.kernel_form(), lit.tool, wp.vec3(*tool_albedo), march_step(relief)]
+    outputs = [as_warp(light, wp.vec3), as_warp(tool, wp.vec4)]
+    launch(kernels.illuminate, size, [eye, *maps, *numbers, ceiling(relief), snap, *outputs], depth)
+    return light, tool
