@@ -125,7 +125,7 @@ class Solver:
 
         p = Particles()
         p.position = wp.array(x.reshape(-1, 3), dtype=wp.vec3, device=device)
-        p.velocity, p.normal, p.shear, p.gap_normal = vectors(n), vectors(n), vectors(n), vectors(n)
+        p.velocity, p.normal, p.shear, p.gap_normal, p.drift = (vectors(n) for _ in range(5))
         p.affine = wp.zeros(n, dtype=wp.mat33, device=device)
         p.deformation = wp.array(np.tile(np.eye(3, dtype=np.float32), (n, 1, 1)), dtype=wp.mat33, device=device)
         p.elastic, p.opening, p.gap, p.cell = floats(n), floats(n), floats(n), ints(n)

@@ -20,6 +20,7 @@ class Particles:
         opening: logarithmic volume opened in tension.
         cell: entry of the particle's cell among the active cells.
         gap: signed distance to the tool, m, carried through a step's substeps.
+        drift: way the particle has gone relative to the tool since the step began, m.
         gap_normal: outward normal of the tool there, in the world.
         per_simulation: particles of one simulation.
         volume: initial volume of a particle, m^3.
@@ -36,6 +37,7 @@ class Particles:
     opening: wp.array(dtype=float)
     cell: wp.array(dtype=int)
     gap: wp.array(dtype=float)
+    drift: wp.array(dtype=wp.vec3)
     gap_normal: wp.array(dtype=wp.vec3)
     per_simulation: int
     volume: float

@@ -9,7 +9,7 @@ import warp as wp
 
 from splatsoil.mpm.grid import Grid, base_node, cell_of, corner_offset, corner_weight, local_coordinates
 from splatsoil.mpm.state import Cells, Nodes, Particles
-from splatsoil.mpm.tool import Tool, tool_velocity
+from splatsoil.mpm.tool import Tool, signed_distance, tool_position, tool_rotation, tool_velocity
 from splatsoil.soil.law import FLOOR_FRICTION, GRAVITY, TOOL_FRICTION, WALL_FRICTION, Stress
 
 
@@ -98,7 +98,12 @@ def contact_forces(
         normal = particles.gap_normal[p]
         slip = velocity - tool_velocity(pose, x)
         closing = wp.dot(slip, normal)
+        particles.drift[p] += dt * slip
         gap = particles.gap[p] + dt * closing
+        if gap < 0.0:
+            # the flat estimate would push on where a particle has slid off an edge: measure
+            place = x + particles.drift[p] - tool_position(pose)
+            gap = signed_distance(tool, wp.quat_rotate_inv(tool_rotation(pose), place))
         particles.gap[p] = gap
         if gap < 0.0:
             push = wp.max(-tool.stiffness * gap - tool.damping * closing, 0.0)

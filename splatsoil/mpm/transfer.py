@@ -119,6 +119,7 @@ def find_gaps(
     particles.gap[p] = gap
     if gap < reach:
         particles.gap_normal[p] = wp.quat_rotate(rotation, distance_normal(tool, local))
+        particles.drift[p] = wp.vec3(0.0)
         near[wp.atomic_add(count, 0, 1)] = p
 
 
