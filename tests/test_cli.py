@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -174,3 +175,16 @@ def test_a_reader_that_goes_away_is_no_error(plow_dry: Path) -> None:
     done = subprocess.run(words, stdout=write, stderr=subprocess.PIPE, text=True, timeout=120, check=False)
     os.close(write)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_the_readme_lists_the_commands_there_are(repository: Path) -> None:
+    listed = re.findall(r"^\| `splatsoil ([a-z-]+)", (repository / "README.md").read_text(), flags=re.MULTILINE)
+    assert sorted(listed) == sorted(cli.commands())
+
+
+def test_the_readmes_make_targets_exist(repository: Path) -> None:
+    for target in set(re.findall(r"\bmake ([a-z]+)", (repository / "README.md").read_text())):
+        asked = subprocess.run(
+            ["make", "--dry-run", target], cwd=repository, capture_output=True, timeout=60, check=False
+        )
+        assert asked.returncode == 0, asked.stderr
