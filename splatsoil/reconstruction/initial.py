@@ -1,0 +1,244 @@
+"""The first Gaussians: discs on the soil, on the tool, and on what surrounds the bed, coloured by the photographs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from splatsoil.measurement import Bed
+from splatsoil.reconstruction.height_field import HeightField
+from splatsoil.reconstruction.stereo import draw, visibility
+from splatsoil.reconstruction.surface import Relief, scale_of
+from splatsoil.reconstruction.views import Views, surface_points
+from splatsoil.splats import Gaussians
+
+Array = NDArray[np.float64]
+
+SURROUNDINGS, SOIL, TOOL = 0, 1, 2
+
+FLATNESS = 0.15  # a disc's thickness over its radius
+OVERLAP = 0.6  # a disc's standard deviation over the distance to the next disc
+PIXELS = 8.0  # distance between the surroundings' first discs as the nearest view sees them
+BEYOND = 0.8  # half of the span of these rays over the image's, more than 0.5: other cameras will look a little farther
+FAR = 6.0  # beyond so many bed sizes the ground gives way to a sphere around everything
+
+
+@dataclass(frozen=True)
+class Seeds:
+    """Discs before they are trained.
+
+    Attributes:
+        points: (n, 3) centres, metres.
+        normals: (n, 3) unit.
+        spacing: (n,) distance to the neighbours, metres.
+        label: (n,) SURROUNDINGS, SOIL or TOOL.
+    """
+
+    points: Array
+    normals: Array
+    spacing: Array
+    label: NDArray[np.int8]
+
+    @classmethod
+    def of(cls, points: Array, normals: Array, spacing: float | Array, label: int) -> Seeds:
+        n = len(points)
+        return cls(points, normals, np.broadcast_to(spacing, (n,)).astype(float), np.full(n, label, dtype=np.int8))
+
+    @staticmethod
+    def join(parts: list[Seeds]) -> Seeds:
+        return Seeds(
+            *(
+                np.concatenate([getattr(part, name) for part in parts])
+                for name in ("points", "normals", "spacing", "label")
+            )
+        )
+
+
+def seed_soil(surface: HeightField, bed: Bed, spacing: float) -> Seeds:
+    """Discs on the surface, in rows `spacing` apart, every other row shifted by half of it."""
+    width, depth = (bed.upper - bed.lower)[:2]
+    columns, rows = max(1, round(width / spacing)), max(1, round(depth / spacing))
+    x, y = np.meshgrid((np.arange(columns) + 0.25) / columns, (np.arange(rows) + 0.5) / rows)
+    x[1::2] += 0.5 / columns
+    xy = np.stack([bed.lower[0] + width * x.ravel(), bed.lower[1] + depth * y.ravel()], axis=1)
+    normals = np.stack(
+        [HeightField(surface.x, surface.y, surface.normals[..., k]).sample(xy) for k in range(3)], axis=1
+    )
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return Seeds.of(np.column_stack([xy, surface.smooth(xy)]), normals, spacing, SOIL)
+
+
+def seed_tool(mesh: trimesh.Trimesh, spacing: float, most: int) -> Seeds:
+    """Discs on a mesh in world coordinates, at most about `most` of them."""
+    spacing = max(spacing, float(np.sqrt(mesh.area / most)))
+    points, face = surface_points(mesh, 0.5 * spacing)
+    # Both sides of a thin blade need their discs: thin out by facing, too.
+    key = np.column_stack(
+        [np.floor((points - mesh.bounds[0]) / spacing), np.sign(np.round(mesh.face_normals[face], 3))]
+    )
+    _, first = np.unique(key.astype(np.int64), axis=0, return_index=True)
+    points, face = points[np.sort(first)], face[np.sort(first)]
+    return Seeds.of(points, np.asarray(mesh.face_normals[face]), spacing, TOOL)
+
+
+def seed_rim(relief: Relief, bed: Bed, spacing: float) -> Seeds:
+    """Discs on a border around the bed, level with the soil beside it, and on its outer side down to the ground."""
+    parts = []
+    lower, upper = bed.lower[:2], bed.upper[:2]
+    for inset in np.arange(0.5 * spacing, relief.rim, spacing):
+        xy, _ = _around(lower - inset, upper + inset, spacing)
+        top = np.column_stack([xy, relief.surface.sample(xy)])
+        parts.append(Seeds.of(top, np.tile([0.0, 0.0, 1.0], (len(top), 1)), spacing, SURROUNDINGS))
+    xy, outward = _around(lower - relief.rim, upper + relief.rim, spacing)
+    height = relief.surface.sample(xy)
+    for level in np.arange(relief.ground + 0.5 * spacing, float(height.max()), spacing):
+        kept = height > level
+        side = np.column_stack([xy[kept], np.full(int(kept.sum()), level)])
+        parts.append(Seeds.of(side, outward[kept], spacing, SURROUNDINGS))
+    return Seeds.join(parts)
+
+
+def _around(lower: Array, upper: Array, spacing: float) -> tuple[Array, Array]:
+    """Points (n, 2) on a rectangle's border, and outward normals (n, 3)."""
+    points, normals = [], []
+    for axis in (0, 1):
+        count = max(1, round(float(upper[axis] - lower[axis]) / spacing))
+        along = lower[axis] + (np.arange(count) + 0.5) * (upper[axis] - lower[axis]) / count
+        for end, sign in ((lower, -1.0), (upper, 1.0)):
+            point, normal = np.empty((count, 2)), np.zeros((count, 3))
+            point[:, axis], point[:, 1 - axis] = along, end[1 - axis]
+            normal[:, 1 - axis] = sign
+            points.append(point)
+            normals.append(normal)
+    return np.concatenate(points), np.concatenate(normals)
+
+
+def seed_far(views: Views, bed: Bed, relief: Relief) -> Seeds:
+    """Discs on the ground and, beyond it, on a sphere around everything, wherever the photographs look.
+
+    Every so many pixels a ray is followed to the ground, or to the sphere when it misses or the ground is too far;
+    where rays fall close together in angle as seen from their cameras, one disc is kept.
+    """
+    length = scale_of(bed)
+    centre = np.array([*(bed.lower + bed.upper)[:2] / 2, relief.ground])
+    radius = FAR * max(length, float(np.linalg.norm(views.positions.numpy() - centre, axis=1).max()))
+    points, normals, spacings = [], [], []
+    for camera in views.cameras:
+        columns = np.arange((0.5 - BEYOND) * camera.width, (0.5 + BEYOND) * camera.width, PIXELS)
+        rows = np.arange((0.5 - BEYOND) * camera.height, (0.5 + BEYOND) * camera.height, PIXELS)
+        pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+        origin, direction = camera.rays(pixels)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            distance = (relief.ground - origin[:, 2]) / direction[:, 2]
+        landed = origin + distance[:, None] * direction
+        on_ground = np.isfinite(distance) & (distance > 0) & (np.linalg.norm(landed - centre, axis=1) < radius)
+        offset = origin - centre
+        along = (offset * direction).sum(1)
+        to_sphere = -along + np.sqrt(np.maximum(along**2 - (offset**2).sum(1) + radius**2, 0.0))
+        distance = np.where(on_ground, distance, to_sphere)
+        hit = origin + distance[:, None] * direction
+        points.append(hit)
+        inward = (centre - hit) / radius
+        normals.append(np.where(on_ground[:, None], [0.0, 0.0, 1.0], inward))
+        slant = np.where(on_ground, np.maximum(-direction[:, 2], 0.2), 1.0)
+        spacings.append(distance * PIXELS / np.sqrt(camera.fx * camera.fy) / slant**0.5)
+    every, facing, spacing = np.concatenate(points), np.concatenate(normals), np.concatenate(spacings)
+    beside = np.maximum.reduce(
+        [bed.lower[0] - every[:, 0], every[:, 0] - bed.upper[0], bed.lower[1] - every[:, 1], every[:, 1] - bed.upper[1]]
+    )
+    kept = _thinned(every, spacing, beside > relief.rim)
+    return Seeds.of(every[kept], facing[kept], spacing[kept], SURROUNDINGS)
+
+
+def _thinned(points: Array, spacing: Array, allowed: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Indices of points no closer together than about their spacing: one per cell of grids whose size doubles."""
+    level = np.floor(np.log2(spacing / spacing[allowed].min())).astype(np.int64)
+    kept = []
+    for k in np.unique(level[allowed]):
+        here = np.flatnonzero(allowed & (level == k))
+        size = spacing[allowed].min() * 2.0**k * 1.4
+        _, first = np.unique(np.floor(points[here] / size).astype(np.int64), axis=0, return_index=True)
+        kept.append(here[np.sort(first)])
+    # A coarse disc where finer ones lie already would only blur them.
+    result = kept[:1]
+    for group in kept[1:]:
+        distance, _ = cKDTree(points[np.concatenate(result)]).query(points[group])
+        result.append(group[distance > 0.8 * spacing[group]])
+    return np.concatenate(result)
+
+
+def colours_seen(views: Views, relief: Relief, seeds: Seeds, *, batch: int = 8192) -> Array:
+    """(n, 3) median colour of each disc over the photographs that see it.
+
+    Discs that none sees get the colour of the nearest one that is seen.
+    """
+    n = len(seeds.points)
+    colour, count = np.zeros((n, 3)), np.zeros(n)
+    # The occluder is as coarse as its cells: step out of it before asking what hides a disc.
+    cell = max(relief.occluder.cell)
+    lifted = seeds.points + 1.5 * cell * seeds.normals
+    for start in range(0, n, batch):
+        part = slice(start, start + batch)
+        points = torch.tensor(seeds.points[part], dtype=torch.float32)
+        homogeneous = torch.cat([points, torch.ones(len(points), 1)], dim=1)[None]
+        tool = torch.tensor(seeds.label[part] == TOOL)
+        drawn, seen = draw(views, homogeneous, relief.trust)
+        drawn_tool, seen_tool = draw(views, homogeneous, views.valid)
+        colours = torch.where(tool[None, None, None], drawn_tool, drawn)[:, :, 0]
+        weight = torch.where(tool[None], seen_tool[:, 0], seen[:, 0])
+        facing = ((views.positions[:, None] - points) * torch.tensor(seeds.normals[part], dtype=torch.float32)).sum(
+            -1
+        ) > 0
+        weight = weight * facing * visibility(views, lifted[part], relief.occluder, clearance=0.5 * cell)
+        known = torch.where((weight > 0)[:, None], colours, torch.nan)
+        colour[part] = torch.nanmedian(known, dim=0).values.T.numpy()
+        count[part] = (weight > 0).sum(0).numpy()
+    blind = count == 0
+    if blind.all():
+        colour[:] = 0.5
+    elif blind.any():
+        _, nearest = cKDTree(seeds.points[~blind]).query(seeds.points[blind])
+        colour[blind] = colour[~blind][nearest]
+    return colour
+
+
+def discs(seeds: Seeds, colours: Array, opacity: float) -> Gaussians:
+    """Flat Gaussians whose shortest axis is the seed's normal."""
+    normal = seeds.normals / np.linalg.norm(seeds.normals, axis=1, keepdims=True)
+    # The rotation that takes z to the normal; for a normal of −z, half a turn about x.
+    quaternion = np.column_stack([1.0 + normal[:, 2], -normal[:, 1], normal[:, 0], np.zeros(len(normal))])
+    quaternion[normal[:, 2] < -0.999999] = [0.0, 1.0, 0.0, 0.0]
+    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
+    scales = (OVERLAP * seeds.spacing)[:, None] * np.array([1.0, 1.0, FLATNESS])
+    means, spread, turn, shade = (
+        torch.tensor(a, dtype=torch.float32) for a in (seeds.points, scales, quaternion, colours)
+    )
+    return Gaussians(means, spread, turn, torch.full((len(normal),), opacity), shade)
+
+
+def first_gaussians(
+    views: Views, bed: Bed, tool: trimesh.Trimesh, relief: Relief, spacing: float
+) -> tuple[Gaussians, torch.Tensor]:
+    """All Gaussians before training, and their labels (n,) int8.
+
+    Args:
+        views: the photographs to train on.
+        bed: the box that holds the soil.
+        tool: mesh in world coordinates.
+        relief: what stereo found.
+        spacing: distance between the soil's discs, metres.
+    """
+    parts = [
+        seed_soil(relief.surface, bed, spacing),
+        seed_tool(tool, spacing, most=3000),
+        seed_rim(relief, bed, 1.3 * spacing),
+        seed_far(views, bed, relief),
+    ]
+    seeds = Seeds.join(parts)
+    colours = colours_seen(views, relief, seeds)
+    return discs(seeds, colours, 0.8), torch.from_numpy(seeds.label)

@@ -1,0 +1,168 @@
+"""The whole way from a measurement set to a reconstruction."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+import torch
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from splatsoil import __version__
+from splatsoil.errors import MeasurementError, ParameterError
+from splatsoil.measurement import Bed, Measurement
+from splatsoil.reconstruction.height_field import HeightField
+from splatsoil.reconstruction.initial import TOOL, first_gaussians
+from splatsoil.reconstruction.presets import preset_named
+from splatsoil.reconstruction.result import HeldOut, Reconstruction
+from splatsoil.reconstruction.surface import find_relief, soil_mesh
+from splatsoil.reconstruction.training import train
+from splatsoil.reconstruction.views import Views, load_views, silhouettes, surface_points
+from splatsoil.splats import Gaussians, OrthographicCamera, psnr, rasterise, ssim
+
+Array = NDArray[np.float64]
+
+FEWEST_VIEWS = 3
+
+
+def reconstruct(
+    measurement: Measurement,
+    *,
+    seed: int = 0,
+    device: str = "cpu",
+    preset: str = "small",
+    holdout: int = 8,
+    progress: Callable[[str, float], None] | None = None,
+) -> Reconstruction:
+    """Gaussians, surface and solid of the scene before anything moves, from a set's views.
+
+    Args:
+        measurement: the set; its `views` show the bed and the tool at the first pose of its motion.
+        seed: the same seed on the CPU with the same number of threads gives the same bits.
+        device: where the Gaussians are trained, as torch names it.
+        preset: how much work; see `presets.PRESETS`.
+        holdout: every so many views one is set aside, the first among them, to judge by; 0 sets none aside.
+        progress: called with what is being done and how much of that is done (0 to 1).
+
+    Raises:
+        MeasurementError: too few views.
+        ParameterError: an unknown preset, a negative holdout.
+    """
+    started = time.monotonic()
+    report = progress or (lambda what, share: None)
+    chosen = preset_named(preset)
+    if holdout < 0 or holdout == 1:
+        raise ParameterError(f"holdout sets every so many views aside: 0 for none, or 2 and more, not {holdout}")
+    if device != "cpu" and not torch.cuda.is_available():
+        raise ParameterError(f"there is no device {device!r} here; choose cpu")
+    report("reading photographs", 0.0)
+    every = load_views(measurement.views, chosen.longest_side)
+    aside = list(range(0, len(every), holdout)) if holdout else []
+    views = every.subset([k for k in range(len(every)) if k not in set(aside)])
+    if len(views) < FEWEST_VIEWS:
+        raise MeasurementError(
+            f"{len(views)} views are left to reconstruct from and {FEWEST_VIEWS} are needed; take more photographs",
+            file=measurement.folder,
+            field="views",
+        )
+    bed = measurement.bed
+    tool = measurement.tool.mesh.copy()
+    tool.apply_transform(measurement.tool.motion.matrix(float(measurement.tool.motion.times[0])))
+    report("finding the tool", 0.0)
+    relief = find_relief(views, bed, silhouettes(views, tool), chosen, report)
+    spacing = chosen.soil_spacing * max(relief.surface.cell)
+    report("placing Gaussians", 0.0)
+    first, label = first_gaussians(views, bed, tool, relief, spacing)
+    trained = train(
+        first, label, views, relief.surface,
+        iterations=chosen.iterations, growth=chosen.growth, seed=seed, device=device, report=report,
+    )  # fmt: skip
+    soil, on_tool = segments(trained.gaussians, trained.label, relief.surface, bed, tool)
+    surface = fused(trained.gaussians[soil], relief.surface, bed)
+    held_out = judged(trained.gaussians, every.subset(aside), trained.background)
+    return Reconstruction(
+        gaussians=trained.gaussians,
+        soil=soil,
+        tool=on_tool,
+        surface=surface,
+        mesh=soil_mesh(surface, bed),
+        background=trained.background,
+        held_out=held_out,
+        metadata={
+            "measurement": measurement.name,
+            "measurement_hash": measurement.hash,
+            "version": __version__,
+            "preset": preset,
+            "seed": seed,
+            "device": device,
+            "threads": torch.get_num_threads(),
+            "holdout": holdout,
+            "ground": relief.ground,
+            "first_loss": float(np.mean(trained.losses[: len(views)])),
+            "last_loss": float(np.mean(trained.losses[-len(views) :])),
+        },
+        seconds=time.monotonic() - started,
+    )
+
+
+def segments(
+    gaussians: Gaussians, label: torch.Tensor, surface: HeightField, bed: Bed, tool: trimesh.Trimesh
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Which Gaussians are soil and which are tool, each (n,) bool.
+
+    By place, not by where they began: the tool's lie within their own size of its mesh; the soil's inside the bed's box
+    within a few cells of the surface.
+    """
+    place = gaussians.means.numpy().astype(np.float64)
+    reach = gaussians.scales.amax(dim=1).numpy().astype(np.float64)
+    cell = max(surface.cell)
+    skin, _ = surface_points(tool, cell)
+    distance, _ = cKDTree(skin).query(place)
+    began = label.numpy() == TOOL
+    inside = np.all((place[:, :2] > bed.lower[:2]) & (place[:, :2] < bed.upper[:2]), axis=1)
+    above = place[:, 2] - surface.sample(place[:, :2])
+    at_surface = np.abs(above) < 3.0 * cell
+    on_tool = (distance < cell + np.where(began, reach, 0.0)) & (began | ~(inside & at_surface))
+    soil = inside & at_surface & ~on_tool
+    return torch.from_numpy(soil), torch.from_numpy(on_tool)
+
+
+def fused(soil: Gaussians, surface: HeightField, bed: Bed) -> HeightField:
+    """The surface that trained Gaussians draw seen from above, where they cover it; else the one they began with."""
+    drawn = seen_from_above(soil, surface, bed)
+    known = np.isfinite(drawn)
+    return HeightField(surface.x, surface.y, np.where(known, drawn, surface.height), surface.deviation)
+
+
+def seen_from_above(soil: Gaussians, surface: HeightField, bed: Bed) -> Array:
+    """(ny, nx) expected height of Gaussians along vertical rays through a surface's cells; NaN where they are thin."""
+    size = min(surface.cell) / 2.0
+    camera = OrthographicCamera.looking((0.0, 0.0, -1.0), bed.lower, bed.upper, size)
+    with torch.no_grad():
+        drawing = rasterise(soil, camera, normals=False)
+    height = float(camera.position[2]) - drawing.depth.numpy().astype(np.float64)
+    height[drawing.alpha.numpy() < 0.5] = np.nan
+    # Row 0 of the picture is the far end of y.
+    ny, nx = height.shape
+    x = camera.position[0] + (np.arange(nx) + 0.5 - nx / 2) * size
+    y = camera.position[1] + (np.arange(ny) + 0.5 - ny / 2) * size
+    picture = HeightField(x, y, height[::-1])
+    return picture.sample(surface.points[..., :2].reshape(-1, 2)).reshape(surface.height.shape)
+
+
+def judged(gaussians: Gaussians, views: Views, background: tuple[float, float, float]) -> tuple[HeldOut, ...]:
+    """Likeness of the drawn pictures to photographs that were set aside (pixels that are masked do not count)."""
+    result = []
+    for k, camera in enumerate(views.cameras):
+        photograph = views.photograph(k)
+        valid = views.valid[k, : camera.height, : camera.width, None]
+        with torch.no_grad():
+            drawn = rasterise(gaussians, camera, background=background, normals=False).colour.clamp(0.0, 1.0)
+            mixed = drawn * valid + photograph * (1.0 - valid)
+            share = float(valid.mean())
+            value = float(psnr(mixed, photograph)) + 10.0 * np.log10(max(share, 1e-6))
+            result.append(HeldOut(views.names[k], value, float(ssim(mixed, photograph))))
+    return tuple(result)

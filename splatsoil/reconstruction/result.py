@@ -1,0 +1,192 @@
+"""What a reconstruction leaves, on disk and in memory."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import trimesh
+from numpy.typing import NDArray
+
+from splatsoil.errors import RunError
+from splatsoil.files import read_json, write_bytes, write_json
+from splatsoil.reconstruction.height_field import HeightField
+from splatsoil.splats import Gaussians, save_ply
+
+FORMAT = "splatsoil-reconstruction/1"
+FILES = ("reconstruction.json", "gaussians.npz", "gaussians.ply", "surface.npz", "soil.ply")
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """How well one photograph that training never saw is predicted.
+
+    Attributes:
+        name: the photograph's file name.
+        psnr: peak signal-to-noise ratio, dB.
+        ssim: structural similarity, 1 is perfect.
+    """
+
+    name: str
+    psnr: float
+    ssim: float
+
+
+@dataclass(frozen=True, eq=False)
+class Reconstruction:
+    """The scene before anything moves.
+
+    Attributes:
+        gaussians: everything that was seen, float32 on the CPU, world frame in metres, colours in sRGB as seen.
+        soil: (n,) bool, the Gaussians on the soil's surface.
+        tool: (n,) bool, those on the tool at its first pose.
+        surface: the soil's surface over the bed's box.
+        mesh: the soil as a watertight solid between the box's sides, floor and surface.
+        background: (3,) sRGB colour behind all Gaussians.
+        held_out: one entry a photograph that was set aside.
+        metadata: what made it (version, preset, seed, device, measurement hash, …).
+        seconds: how long it took.
+    """
+
+    gaussians: Gaussians
+    soil: torch.Tensor
+    tool: torch.Tensor
+    surface: HeightField
+    mesh: trimesh.Trimesh
+    background: tuple[float, float, float]
+    held_out: tuple[HeldOut, ...]
+    metadata: dict[str, Any] = field(default_factory=dict)
+    seconds: float = 0.0
+
+    @property
+    def surroundings(self) -> torch.Tensor:
+        """(n,) bool, the Gaussians that belong neither to the soil nor to the tool."""
+        return ~(self.soil | self.tool)
+
+    @property
+    def psnr(self) -> float:
+        """Mean over the photographs that were set aside, dB; NaN if there are none."""
+        return float(np.mean([view.psnr for view in self.held_out])) if self.held_out else float("nan")
+
+    @property
+    def ssim(self) -> float:
+        """Mean over the photographs that were set aside; NaN if there are none."""
+        return float(np.mean([view.ssim for view in self.held_out])) if self.held_out else float("nan")
+
+    def summary(self) -> dict[str, Any]:
+        """The numbers, in JSON's types."""
+        return {
+            "format": FORMAT,
+            **self.metadata,
+            "seconds": self.seconds,
+            "gaussians": len(self.gaussians),
+            "soil_gaussians": int(self.soil.sum()),
+            "tool_gaussians": int(self.tool.sum()),
+            "background": list(self.background),
+            "psnr": self.psnr,
+            "ssim": self.ssim,
+            "held_out": [{"name": v.name, "psnr": v.psnr, "ssim": v.ssim} for v in self.held_out],
+            "surface": {
+                "cells": [len(self.surface.x), len(self.surface.y)],
+                "cell": list(self.surface.cell),
+                "lowest": float(self.surface.height.min()),
+                "highest": float(self.surface.height.max()),
+            },
+        }
+
+    def save(self, folder: str | Path) -> Path:
+        """Write the files of `FILES` into a folder, each whole or not at all; reconstruction.json comes last.
+
+        Raises:
+            RunError: the folder cannot be written to.
+        """
+        target = Path(folder)
+        g = self.gaussians.detach().to("cpu")
+        write_bytes(
+            target / "gaussians.npz",
+            _npz(
+                means=g.means, scales=g.scales, quaternions=g.quaternions, opacities=g.opacities, colours=g.colours,
+                soil=self.soil, tool=self.tool,
+            ),
+        )  # fmt: skip
+        deviation = {} if self.surface.deviation is None else {"deviation": self.surface.deviation}
+        write_bytes(
+            target / "surface.npz",
+            _npz(x=self.surface.x, y=self.surface.y, height=self.surface.height, **deviation),
+        )
+        write_bytes(target / "soil.ply", trimesh.exchange.ply.export_ply(self.mesh))
+        _whole_ply(target / "gaussians.ply", g)
+        write_json(target / "reconstruction.json", self.summary())
+        return target
+
+    @classmethod
+    def load(cls, folder: str | Path) -> Reconstruction:
+        """Read what `save` wrote.
+
+        Raises:
+            RunError: a file is missing, damaged or of another format.
+        """
+        source = Path(folder)
+        facts = read_json(source / "reconstruction.json")
+        if not isinstance(facts, dict) or facts.get("format") != FORMAT:
+            raise RunError(f"{source / 'reconstruction.json'}: is not of the format {FORMAT}; reconstruct again")
+        try:
+            arrays = _load_npz(source / "gaussians.npz")
+            heights = _load_npz(source / "surface.npz")
+            mesh = trimesh.load_mesh(source / "soil.ply", process=False)
+            tensors = {
+                name: torch.from_numpy(arrays[name])
+                for name in ("means", "scales", "quaternions", "opacities", "colours")
+            }
+            measured = (
+                "format",
+                "seconds",
+                "gaussians",
+                "soil_gaussians",
+                "tool_gaussians",
+                "background",
+                "psnr",
+                "ssim",
+            )
+            red, green, blue = facts["background"]
+            return cls(
+                gaussians=Gaussians(**tensors),
+                soil=torch.from_numpy(arrays["soil"]),
+                tool=torch.from_numpy(arrays["tool"]),
+                surface=HeightField(heights["x"], heights["y"], heights["height"], heights.get("deviation")),
+                mesh=mesh,
+                background=(float(red), float(green), float(blue)),
+                held_out=tuple(HeldOut(**view) for view in facts["held_out"]),
+                metadata={k: v for k, v in facts.items() if k not in (*measured, "held_out", "surface")},
+                seconds=float(facts["seconds"]),
+            )
+        except (OSError, KeyError, TypeError, ValueError) as error:
+            raise RunError(f"{source}: the reconstruction cannot be read ({error}); reconstruct again") from error
+
+
+def _npz(**arrays: torch.Tensor | NDArray[Any]) -> bytes:
+    stream = io.BytesIO()
+    plain: dict[str, Any] = {k: v.numpy() if isinstance(v, torch.Tensor) else v for k, v in arrays.items()}
+    np.savez_compressed(stream, **plain)
+    return stream.getvalue()
+
+
+def _load_npz(path: Path) -> dict[str, NDArray[Any]]:
+    with np.load(path, allow_pickle=False) as file:
+        return {name: file[name] for name in file.files}
+
+
+def _whole_ply(path: Path, gaussians: Gaussians) -> None:
+    """`save_ply` writes to a path of its own; move the finished file into place."""
+    beside = path.with_name(f".{path.name}.tmp")
+    try:
+        save_ply(beside, gaussians)
+        beside.replace(path)
+    except OSError as error:
+        raise RunError(f"{path}: cannot be written ({error.strerror}); free some space and try again") from error
+    finally:
+        beside.unlink(missing_ok=True)

@@ -1,0 +1,325 @@
+"""Multi-view stereo on a height field: which height makes the photographs agree on what a cell looks like?
+
+Soil seen from above is a height field, so the search is one-dimensional in every cell. Each photograph is drawn onto a
+candidate surface and the drawings are compared there in small windows, after the local mean of each drawing is taken
+out (light falls off towards a lens's edge, and exposures differ). Photographs that do not see a cell (beyond their
+border, behind the tool, behind a wall or a ridge) are left out; what is left of such disagreement is met by robust
+weights.
+
+Two stages: a sweep over the whole height range, solved together with a smoothness term by alternation (quadratic
+relaxation, as in DTAM, Newcombe et al., ICCV 2011); then Gauss-Newton on the same cost with a thin-plate prior, whose
+strength is the curvature that a loose material's surface may have. The curvature of the cost gives each height its
+standard deviation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sparse
+import torch
+from numpy.typing import NDArray
+from scipy.sparse.linalg import splu
+from torch.nn import functional
+
+from splatsoil.reconstruction.height_field import HeightField
+from splatsoil.reconstruction.views import Views
+
+Array = NDArray[np.float64]
+
+# Standard deviation of the surface's curvature (1/m times the bed's length in m): a heap with a radius of a tenth of
+# the bed is not unusual, sharper edges are held by the data.
+CURVATURE = 8.0
+SLOPE = 0.5  # and of its slope, that of a pile at rest
+FEWEST_VIEWS = 3.0
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Where heights are sought: the cells of a regular grid that `mask` marks; windows and smoothness end at its
+    border.
+
+    Attributes:
+        x: (nx,) cell centres, metres.
+        y: (ny,) cell centres, metres.
+        mask: (ny, nx) float32, 1 inside.
+    """
+
+    x: Array
+    y: Array
+    mask: torch.Tensor
+
+    @classmethod
+    def of(cls, field: HeightField, mask: NDArray[np.bool_] | None = None) -> Cells:
+        inside = np.ones(field.height.shape, dtype=bool) if mask is None else mask
+        return cls(field.x, field.y, torch.tensor(inside, dtype=torch.float32))
+
+    @property
+    def size(self) -> float:
+        """The longer side of a cell, metres."""
+        return max(float(self.x[1] - self.x[0]), float(self.y[1] - self.y[0]))
+
+    def points(self, height: torch.Tensor) -> torch.Tensor:
+        """(ny, nx, 4) homogeneous points on a surface of heights (ny, nx)."""
+        y, x = torch.meshgrid(
+            torch.tensor(self.y, dtype=torch.float32), torch.tensor(self.x, dtype=torch.float32), indexing="ij"
+        )
+        return torch.stack([x, y, height, torch.ones_like(height)], dim=-1)
+
+
+def _window(sigma: float) -> torch.Tensor:
+    reach = int(np.ceil(2.5 * sigma))
+    offset = torch.arange(-reach, reach + 1, dtype=torch.float32)
+    weights = torch.exp(-0.5 * (offset / sigma) ** 2)
+    return weights / weights.sum()
+
+
+def _blur(values: torch.Tensor, window: torch.Tensor) -> torch.Tensor:
+    """Separable convolution of the last two axes, zero beyond the border."""
+    shape = values.shape
+    reach = len(window) // 2
+    flat = values.reshape(-1, 1, shape[-2], shape[-1])
+    flat = functional.conv2d(flat, window.view(1, 1, 1, -1), padding=(0, reach))
+    flat = functional.conv2d(flat, window.view(1, 1, -1, 1), padding=(reach, 0))
+    return flat.reshape(shape)
+
+
+def draw(views: Views, points: torch.Tensor, trust: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """The photographs as seen at points: colours (v, 3, ny, nx) and whether each is to be trusted (v, ny, nx) in {0,
+    1}.
+
+    Args:
+        views: the photographs.
+        points: (ny, nx, 4) homogeneous world points.
+        trust: (v, h, w) 1 where a pixel may be used.
+    """
+    pixels = torch.einsum("vij,yxj->vyxi", views.projection, points)
+    depth = pixels[..., 2]
+    flat = pixels[..., :2] / depth[..., None].clamp_min(1e-6)
+    height, width = views.images.shape[-2:]
+    grid = torch.stack([flat[..., 0] * (2.0 / width) - 1.0, flat[..., 1] * (2.0 / height) - 1.0], dim=-1)
+    grid = grid.clamp(-4.0, 4.0)
+    channels = torch.cat([views.images, trust[:, None]], dim=1)
+    drawn = functional.grid_sample(channels, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
+    seen = ((drawn[:, 3] > 0.999) & (depth > 0)).to(torch.float32)
+    return drawn[:, :3], seen
+
+
+def disagreement(
+    views: Views,
+    cells: Cells,
+    height: torch.Tensor,
+    trust: torch.Tensor,
+    weight: torch.Tensor,
+    sigma: float,
+    *,
+    levels: bool = False,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """How much each photograph differs from the others' mean around each cell.
+
+    Args:
+        views: the photographs.
+        cells: where.
+        height: (ny, nx) candidate surface.
+        trust: (v, h, w) pixels that may be used.
+        weight: (v, ny, nx) what each photograph counts at each cell.
+        sigma: the window's standard deviation in cells.
+
+    Returns:
+        (v, ny, nx) windowed mean square difference summed over the channels, and (v, ny, nx) the weights that remain
+        (0 where a photograph does not show the cell).
+    """
+    colours, seen = draw(views, cells.points(height), trust)
+    weight = (weight * seen * cells.mask)[:, None]
+    wide = _window(max(2.0 * sigma, 4.0))
+    near = _window(sigma)
+    if not levels:
+        colours = colours - _blur(colours * weight, wide) / _blur(weight, wide).clamp_min(1e-6)
+    mean = (colours * weight).sum(0) / weight.sum(0).clamp_min(1e-6)
+    square = ((colours - mean) ** 2).sum(1, keepdim=True)
+    error = _blur(square * weight, near) / _blur(weight, near).clamp_min(1e-6)
+    return error[:, 0], weight[:, 0]
+
+
+class Smoothness:
+    """Sparse energies of a masked grid of heights; no term crosses the mask's border.
+
+    Attributes:
+        bending: Σ h_xx² + 2 h_xy² + h_yy², second differences between cells, as a matrix.
+        steps: (e, n) first differences between neighbouring cells.
+    """
+
+    def __init__(self, mask: NDArray[np.bool_]) -> None:
+        self.inside = mask.ravel()
+        self.index = np.arange(mask.size).reshape(mask.shape)
+        index = self.index
+        across = self._differences([index[:, :-1], index[:, 1:]], [-1.0, 1.0])
+        along = self._differences([index[:-1], index[1:]], [-1.0, 1.0])
+        self.steps = sparse.csr_matrix(sparse.vstack([across, along]))
+        second_x = self._differences([index[:, :-2], index[:, 1:-1], index[:, 2:]], [1.0, -2.0, 1.0])
+        second_y = self._differences([index[:-2], index[1:-1], index[2:]], [1.0, -2.0, 1.0])
+        corners = [index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]]
+        twist = self._differences(corners, [1.0, -1.0, -1.0, 1.0])
+        self.bending = second_x.T @ second_x + second_y.T @ second_y + 2.0 * (twist.T @ twist)
+
+    def _differences(self, places: list[NDArray[np.int64]], values: list[float]) -> sparse.csr_matrix:
+        kept = np.all([self.inside[place] for place in places], axis=0).ravel()
+        columns = np.stack([place.ravel()[kept] for place in places], axis=1)
+        rows = np.repeat(np.arange(len(columns)), columns.shape[1])
+        data = np.tile(values, len(columns))
+        return sparse.csr_matrix((data, (rows, columns.ravel())), shape=(len(columns), len(self.inside)))
+
+    def plate(self, weight: Array, target: Array, stiffness: float, tension: float) -> Array:
+        """argmin Σ weight (h − target)² + stiffness · bending(h) + tension · Σ steps(h)², heights (ny, nx)."""
+        energy = stiffness * self.bending + tension * (self.steps.T @ self.steps)
+        diagonal = weight.ravel() + 1e-9 * float(weight.mean()) + np.where(self.inside, 0.0, 1.0)
+        system = sparse.csc_matrix(sparse.diags_array(diagonal) + energy)
+        return splu(system, permc_spec="MMD_AT_PLUS_A").solve(diagonal * target.ravel()).reshape(target.shape)
+
+
+def sweep(
+    views: Views,
+    cells: Cells,
+    trust: torch.Tensor,
+    weight: torch.Tensor,
+    heights: Array,
+    *,
+    sigma: float = 2.5,
+) -> Array:
+    """(ny, nx) the best of the given heights in each cell under a smoothness term; good to about a step.
+
+    Args:
+        views: the photographs.
+        cells: where.
+        trust: (v, h, w) pixels that may be used.
+        weight: (v, ny, nx) what each photograph counts at each cell.
+        heights: (k,) evenly spaced candidates, metres.
+        sigma: the window's standard deviation in cells.
+    """
+    scale = (3.0 * views.noise) ** 2 * 3.0
+    costs = []
+    counts = []
+    for z in heights:
+        level = torch.full_like(cells.mask, float(z))
+        error, left = disagreement(views, cells, level, trust, weight, sigma)
+        costs.append((left * torch.log1p(error / scale)).sum(0))
+        counts.append(left.sum(0))
+    total, count = torch.stack(costs).numpy().astype(float), torch.stack(counts).numpy().astype(float)
+    # Two photographs agree by chance more easily than twenty: shrink towards what disagreement is usual.
+    usual = total.sum() / max(count.sum(), 1.0)
+    cost = (total + FEWEST_VIEWS * usual) / (count + FEWEST_VIEWS)
+    step = float(heights[1] - heights[0])
+    inside = cells.mask.numpy() > 0
+    smoothness = Smoothness(inside)
+    depth = np.maximum(np.median(cost, axis=0) - cost.min(axis=0), 0.0)
+    trusted = np.where(inside, depth, 0.0) ** 2
+    trusted /= max(float(trusted[inside].mean()), 1e-12)
+    height = heights[cost.argmin(axis=0)]
+    typical = max(float(np.median(depth[inside])), 1e-6)
+    for width in (24.0, 12.0, 6.0, 3.0, 1.5):
+        # A plate of stiffness s bends over about s^(1/4) cells.
+        flat = smoothness.plate(trusted, height, (0.7 * width) ** 4 / 4.0, 0.0)
+        coupled = cost + typical * ((heights[:, None, None] - flat) / (width * step)) ** 2
+        height = heights[coupled.argmin(axis=0)]
+    return smoothness.plate(trusted, height, 1.0, 0.0)
+
+
+def refine(
+    views: Views,
+    cells: Cells,
+    trust: torch.Tensor,
+    weight: torch.Tensor,
+    height: Array,
+    *,
+    iterations: int = 8,
+    sigma: float = 1.5,
+    reach: float,
+    length: float,
+) -> tuple[Array, Array]:
+    """Gauss-Newton from a good start.
+
+    Args:
+        views: the photographs.
+        cells: where.
+        trust: (v, h, w) pixels that may be used.
+        weight: (v, ny, nx) what each photograph counts at each cell.
+        height: (ny, nx) start, metres.
+        iterations: how many steps.
+        sigma: the last window's standard deviation in cells; the first is twice as wide.
+        reach: distance of the first trial heights above and below, metres; it shrinks to a third.
+        length: the bed's longest side, metres, which scales the curvature prior.
+
+    Returns:
+        (ny, nx) heights and (ny, nx) their standard deviations, metres.
+    """
+    inside = cells.mask.numpy() > 0
+    smoothness = Smoothness(inside)
+    bend = CURVATURE / length * cells.size**2
+    prior = 1.0 / bend**2
+    tension = 1.0 / (SLOPE * cells.size) ** 2
+    current = np.array(height, dtype=np.float64)
+    information = np.zeros_like(current)
+    for k in range(iterations):
+        progress = k / max(iterations - 1, 1)
+        delta = reach * (1.0 / 3.0) ** progress
+        width = sigma * 2.0 ** (1.0 - progress)
+        trials = []
+        for offset in (-delta, 0.0, delta):
+            level = torch.tensor(current + offset, dtype=torch.float32)
+            trials.append(disagreement(views, cells, level, trust, weight, width))
+        error, left = trials[1]
+        known = torch.where(left > 0, error, torch.nan)
+        middle = torch.nan_to_num(torch.nanmedian(known, dim=0).values, nan=0.0)
+        typical = float(middle[torch.tensor(inside)].median())
+        variance = max(typical, (views.noise**2) * 3.0 / 4.0)
+        spread = middle.clamp_min(variance)
+        robust = left / (1.0 + error / (4.0 * spread)) ** 2
+        below, here, above = [((robust * e).sum(0) / spread).numpy().astype(np.float64) for e, _ in trials]
+        # Half the sum of squares over the variance per channel is the negative log-likelihood.
+        slope = 3.0 * (above - below) / (4.0 * delta)
+        information = np.maximum(3.0 * (above - 2.0 * here + below) / (2.0 * delta**2), 0.0)
+        information[~inside] = 0.0
+        floor = 1e-3 * float(np.median(information[inside]))
+        damped = np.where(inside, information + floor, 1e-6)
+        move = np.clip(-slope / damped, -2.0 * delta, 2.0 * delta)
+        move[~inside] = 0.0
+        current = smoothness.plate(damped, current + move, prior, tension)
+    # The inverse's diagonal is dear; for a uniform weight w and stiffness s it is 1/(8 √(w s)), at most 1/w.
+    certain = np.maximum(information, 1e-12)
+    deviation = np.where(inside, np.minimum((64.0 * certain * prior) ** -0.25, certain**-0.5), np.nan)
+    return current, np.minimum(deviation, length)
+
+
+def visibility(views: Views, points: Array, surface: HeightField, *, clearance: float, steps: int = 32) -> torch.Tensor:
+    """(v, n) float32, 1 where a point is not hidden from a camera by a height field, by marching along the ray.
+
+    Args:
+        views: the cameras.
+        points: (n, 3) world points, metres.
+        surface: what may hide them.
+        clearance: how far above the ray the surface must rise to count, metres.
+        steps: samples between the point and where its ray leaves the surface's highest level.
+    """
+    top = float(np.nanmax(surface.height)) + clearance
+    grid = torch.tensor(np.nan_to_num(surface.height, nan=-1e9), dtype=torch.float32)[None, None]
+    low = np.array([surface.x[0], surface.y[0]]) - np.array(surface.cell) / 2
+    high = np.array([surface.x[-1], surface.y[-1]]) + np.array(surface.cell) / 2
+    start = torch.tensor(points, dtype=torch.float32)
+    fraction = ((torch.arange(steps) + 0.5) / steps) ** 1.5
+    result = torch.ones(len(views), len(points))
+    for k in range(len(views)):
+        direction = views.positions[k] - start
+        rise = direction[:, 2].clamp_min(1e-6)
+        along = ((top - start[:, 2]) / rise).clamp(0.0, 1.0)
+        ray = start[:, None] + (fraction[None, :, None] * along[:, None, None]) * direction[:, None]
+        where = torch.stack(
+            [(ray[..., a] - float(low[a])) * (2.0 / float(high[a] - low[a])) - 1.0 for a in (0, 1)], dim=-1
+        )
+        level = functional.grid_sample(grid, where[None], mode="bilinear", padding_mode="border", align_corners=False)[
+            0, 0
+        ]
+        outside = (where.abs() > 1.0).any(-1)
+        hidden = ((level - ray[..., 2] > clearance) & ~outside).any(-1)
+        result[k] = (~hidden).to(torch.float32)
+    return result

@@ -1,0 +1,161 @@
+"""From photographs to the soil's surface: silhouettes of the tool, stereo in the bed, what may hide what."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import trimesh
+from numpy.typing import NDArray
+
+from splatsoil.measurement import Bed
+from splatsoil.reconstruction.height_field import HeightField
+from splatsoil.reconstruction.presets import Preset
+from splatsoil.reconstruction.stereo import Cells, disagreement, refine, sweep, visibility
+from splatsoil.reconstruction.views import Views
+
+Array = NDArray[np.float64]
+Report = Callable[[str, float], None]
+
+RIM = 0.04  # width of what is taken to border the bed (a bin's wall), in square roots of the bed's area
+LEVEL_GAIN = (
+    1.0  # how much better (log of the squared misfit) the soil's level must explain the surroundings than the floor
+)
+
+
+@dataclass(frozen=True)
+class Relief:
+    """What the photographs say about shapes before any Gaussian is trained.
+
+    Attributes:
+        surface: the soil's surface over the bed's box, with standard deviations.
+        occluder: `surface` with a rim as high as the soil beside it, and far below everything beyond.
+        ground: height of the level ground around the bed, metres.
+        trust: (v, h, w) float32, 1 where a photograph shows no tool and may be used.
+        rim: the rim's width, metres.
+    """
+
+    surface: HeightField
+    occluder: HeightField
+    ground: float
+    trust: torch.Tensor
+    rim: float
+
+
+def scale_of(bed: Bed) -> float:
+    """The bed's size: square root of its area, metres."""
+    return float(np.sqrt(np.prod(bed.upper[:2] - bed.lower[:2])))
+
+
+def footprint(views: Views, bed: Bed) -> float:
+    """Side of a pixel on the bed in the median view, metres."""
+    centre = (bed.lower + bed.upper) / 2
+    return float(np.median([np.linalg.norm(c.position - centre) / np.sqrt(c.fx * c.fy) for c in views.cameras]))
+
+
+def find_relief(views: Views, bed: Bed, tool_silhouettes: torch.Tensor, preset: Preset, report: Report) -> Relief:
+    """Heights of the soil over the bed's box.
+
+    Args:
+        views: the photographs to use.
+        bed: the box that holds the soil.
+        tool_silhouettes: (v, h, w) 1 where the tool hides what is behind it.
+        preset: how much work.
+        report: called with what is being done and how much of it is done.
+    """
+    length = scale_of(bed)
+    cell = max(length / preset.cells**0.5, 1.2 * footprint(views, bed))
+    trust = views.valid * (1.0 - tool_silhouettes)
+    step = float(bed.upper[2] - bed.lower[2]) / (preset.candidates - 1)
+    coarse = HeightField.over(bed.lower, bed.upper, 2.0 * cell)
+    cells = Cells.of(coarse)
+    everything = torch.ones(len(views), *cells.mask.shape)
+    report("sweeping the bed's height", 0.0)
+    height = sweep(
+        views, cells, trust, everything, np.linspace(bed.lower[2], bed.upper[2], preset.candidates), sigma=1.5
+    )
+    report("refining heights", 0.4)
+    height, _ = refine(views, cells, trust, everything, height, sigma=1.0, reach=step, length=length)
+
+    fine = HeightField.over(bed.lower, bed.upper, cell)
+    where = fine.points[..., :2].reshape(-1, 2)
+    height = HeightField(coarse.x, coarse.y, height).smooth(where).reshape(fine.height.shape)
+    rim = RIM * length
+    for last in (False, True):
+        report("refining heights", 0.6 + 0.2 * last)
+        now = HeightField(fine.x, fine.y, height)
+        occluder = with_rim(now, bed, rim)
+        seen = visibility(views, now.points.reshape(-1, 3), occluder, clearance=1.5 * cell).reshape(
+            len(views), *height.shape
+        )
+        height, deviation = refine(
+            views, Cells.of(now), trust, seen, height, reach=0.5 * step, length=length, iterations=6 if last else 3
+        )
+    surface = HeightField(fine.x, fine.y, np.clip(height, bed.lower[2], None), deviation)
+    occluder = with_rim(surface, bed, rim)
+    return Relief(surface, occluder, ground_level(views, bed, surface, occluder, rim), trust, rim)
+
+
+def with_rim(surface: HeightField, bed: Bed, rim: float, *, level: float | None = None) -> HeightField:
+    """The surface, a border of `rim` metres as high as the soil beside it, then `level` (none: far below)."""
+    cell = min(surface.cell)
+    margin = rim + 2.0 * cell
+    outer = HeightField.over(bed.lower[:2] - margin, bed.upper[:2] + margin, cell)
+    xs, ys = np.meshgrid(outer.x, outer.y)
+    beyond = np.maximum.reduce([bed.lower[0] - xs, xs - bed.upper[0], bed.lower[1] - ys, ys - bed.upper[1]])
+    height = surface.sample(np.stack([xs.ravel(), ys.ravel()], axis=1)).reshape(xs.shape)
+    low = bed.lower[2] - 10.0 * scale_of(bed) if level is None else level
+    return HeightField(outer.x, outer.y, np.where(beyond <= rim, height, low))
+
+
+def ground_level(views: Views, bed: Bed, surface: HeightField, occluder: HeightField, rim: float) -> float:
+    """Height of the surroundings: the bed's floor (a bin on the ground), or the soil's level (a bed in a field).
+
+    The floor unless the photographs agree much better on what the soil's level beyond the rim looks like.
+    """
+    length = scale_of(bed)
+    level = float(np.median(np.concatenate([surface.height[[0, -1]].ravel(), surface.height[:, [0, -1]].ravel()])))
+    floor = float(bed.lower[2])
+    outer = HeightField.over(bed.lower[:2] - 0.4 * length, bed.upper[:2] + 0.4 * length, length / 60.0)
+    xs, ys = np.meshgrid(outer.x, outer.y)
+    beyond = np.maximum.reduce([bed.lower[0] - xs, xs - bed.upper[0], bed.lower[1] - ys, ys - bed.upper[1]])
+    cells = Cells.of(outer, beyond > rim)
+    misfit = []
+    for z in (floor, level):
+        plane = np.stack([xs, ys, np.full_like(xs, z)], axis=-1).reshape(-1, 3)
+        seen = visibility(views, plane, occluder, clearance=length / 200.0, steps=64).reshape(len(views), *xs.shape)
+        height = torch.full_like(cells.mask, z)
+        error, weight = disagreement(views, cells, height, views.valid, seen, 1.0, levels=True)
+        several = (weight.sum(0) >= 3).to(torch.float32)
+        value = (several * weight * torch.log1p(error / (27.0 * views.noise**2))).sum()
+        misfit.append(float(value / (several * weight).sum().clamp_min(1.0)))
+    return level if misfit[0] - misfit[1] > LEVEL_GAIN else floor
+
+
+def soil_mesh(surface: HeightField, bed: Bed) -> trimesh.Trimesh:
+    """The soil as a watertight solid: the surface on top, the box's sides and floor; metres, world frame.
+
+    The top reaches the box's sides (the outermost heights are carried on over half a cell).
+    """
+    x = np.concatenate([[bed.lower[0]], surface.x, [bed.upper[0]]])
+    y = np.concatenate([[bed.lower[1]], surface.y, [bed.upper[1]]])
+    xs, ys = np.meshgrid(x, y)
+    floor = float(bed.lower[2])
+    thin = 1e-4 * scale_of(bed)
+    top = np.maximum(surface.sample(np.stack([xs.ravel(), ys.ravel()], axis=1)).reshape(xs.shape), floor + thin)
+    ny, nx = xs.shape
+    upper = np.stack([xs, ys, top], axis=-1).reshape(-1, 3)
+    lower = np.stack([xs, ys, np.full_like(xs, floor)], axis=-1).reshape(-1, 3)
+    index = np.arange(nx * ny).reshape(ny, nx)
+    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
+    sheet = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    border = np.concatenate([index[0, :-1], index[:-1, -1], index[-1, :0:-1], index[:0:-1, 0]])
+    after = np.roll(border, -1)
+    below = nx * ny
+    sides = np.concatenate(
+        [np.stack([border, border + below, after + below], 1), np.stack([border, after + below, after], 1)]
+    )
+    faces = np.concatenate([sheet, sheet[:, ::-1] + below, sides])
+    return trimesh.Trimesh(np.concatenate([upper, lower]), faces, process=False)

@@ -1,0 +1,240 @@
+"""Training Gaussians on photographs: Adam on L1 and structural similarity, with growth, pruning and shape priors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from splatsoil.reconstruction.height_field import HeightField
+from splatsoil.reconstruction.initial import SOIL
+from splatsoil.reconstruction.views import Views
+from splatsoil.splats import Gaussians, rasterise, ssim
+
+Report = Callable[[str, float], None]
+
+SIMILARITY = 0.2  # share of 1 − SSIM in the photometric loss, as in Kerbl et al. (2023)
+RATES = {"means": 0.02, "scales": 0.01, "quaternions": 0.002, "opacities": 0.05, "colours": 0.005}
+# of which `means` counts in the Gaussian's own first size, so that far and near, large beds and small, learn alike
+LAST_RATE = 0.1  # of the means' rate, reached exponentially
+ANCHOR = 0.02  # weight of the soil's distance from the measured surface, in units of its standard deviation there
+FLAT = 0.02  # weight of a Gaussian's thickness over its breadth beyond a third
+FAINTEST = 0.02
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What training leaves.
+
+    Attributes:
+        gaussians: the Gaussians.
+        label: (n,) int8 of each.
+        background: (3,) colour behind them.
+        losses: photometric loss of each step.
+    """
+
+    gaussians: Gaussians
+    label: Tensor
+    background: tuple[float, float, float]
+    losses: list[float]
+
+
+class _Optimiser:
+    """Adam over per-Gaussian tensors that may be picked from and added to between steps."""
+
+    def __init__(self, gaussians: Gaussians) -> None:
+        self.values: dict[str, Tensor] = {
+            "means": gaussians.means.clone(),
+            "scales": gaussians.scales.log(),
+            "quaternions": gaussians.quaternions.clone(),
+            "opacities": torch.logit(gaussians.opacities),
+            "colours": gaussians.colours.clone(),
+        }
+        self.size = gaussians.scales.amax(dim=1)
+        self.first = {name: torch.zeros_like(value) for name, value in self.values.items()}
+        self.second = {name: torch.zeros_like(value) for name, value in self.values.items()}
+        self.age = torch.zeros(len(gaussians), device=gaussians.device)
+
+    def gaussians(self) -> Gaussians:
+        """The Gaussians, with gradients to `values`."""
+        for value in self.values.values():
+            value.requires_grad_(True)
+            value.grad = None
+        v = self.values
+        return Gaussians(v["means"], v["scales"].exp(), v["quaternions"], torch.sigmoid(v["opacities"]), v["colours"])
+
+    @torch.no_grad()
+    def step(self, rates: dict[str, float]) -> None:
+        """One step of Adam (β 0.9, 0.99) with bias correction by each Gaussian's own age."""
+        self.age += 1.0
+        for name, value in self.values.items():
+            gradient = value.grad
+            if gradient is None:
+                continue
+            value.requires_grad_(False)
+            shape = (-1,) + (1,) * (value.ndim - 1)
+            rate = rates[name] * (self.size.view(shape) if name == "means" else 1.0)
+            self.first[name].mul_(0.9).add_(gradient, alpha=0.1)
+            self.second[name].mul_(0.99).addcmul_(gradient, gradient, value=0.01)
+            mean = self.first[name] / (1.0 - 0.9**self.age).view(shape)
+            spread = (self.second[name] / (1.0 - 0.99**self.age).view(shape)).sqrt()
+            value -= rate * mean / (spread + 1e-12)
+        self.values["colours"].clamp_(0.0, 1.0)
+
+    @torch.no_grad()
+    def rearrange(self, kept: Tensor, copied: Tensor, changes: dict[str, Tensor]) -> None:
+        """Keep the Gaussians of index `kept`, then append those of index `copied` with some of their values changed."""
+        order = torch.cat([kept, copied])
+        fresh = len(kept)
+        for name in self.values:
+            value = self.values[name].detach()[order].clone()
+            if name in changes:
+                value[fresh:] = changes[name]
+            self.values[name] = value
+            for moment in (self.first, self.second):
+                moment[name] = moment[name][order].clone()
+                moment[name][fresh:] = 0.0
+        self.size = self.size[order]
+        self.age = self.age[order].clone()
+        self.age[fresh:] = 0.0
+
+
+def train(
+    gaussians: Gaussians,
+    label: Tensor,
+    views: Views,
+    surface: HeightField,
+    *,
+    iterations: int,
+    growth: float,
+    seed: int,
+    device: str,
+    report: Report,
+) -> Trained:
+    """Fit Gaussians to photographs.
+
+    Args:
+        gaussians: the first ones.
+        label: (n,) int8 what each belongs to; the soil's are held near `surface`.
+        views: photographs to fit.
+        surface: the measured surface and its standard deviations.
+        iterations: steps, one photograph each.
+        growth: at most this many times the first number of Gaussians.
+        seed: of the order of photographs and of what splitting draws.
+        device: where to work.
+        report: called with what is being done and how much of it is done.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    photographs = [views.photograph(k).contiguous().to(device) for k in range(len(views))]
+    valid = [
+        views.valid[k, : camera.height, : camera.width, None].contiguous().to(device)
+        for k, camera in enumerate(views.cameras)
+    ]
+    behind = torch.stack([p.reshape(-1, 3).median(dim=0).values for p in photographs]).median(dim=0).values.cpu()
+    background = (float(behind[0]), float(behind[1]), float(behind[2]))
+    anchor = _Anchor(surface, device)
+    state = _Optimiser(gaussians.to(device))
+    label = label.to(device)
+    most = int(growth * len(gaussians))
+    every = max(iterations // 7, 20)
+    pull = torch.zeros(len(gaussians), device=device)
+    hits = torch.zeros(len(gaussians), device=device)
+    losses: list[float] = []
+    order: list[int] = []
+    for step in range(iterations):
+        if step % 10 == 0:
+            report("training Gaussians", step / iterations)
+        if not order:
+            order = torch.randperm(len(views), generator=generator).tolist()
+        k = order.pop()
+        current = state.gaussians()
+        rendering = rasterise(current, views.cameras[k], background=background, normals=False)
+        rendering.projection.centres.retain_grad()
+        difference = (rendering.colour - photographs[k]) * valid[k]
+        likeness = ssim(rendering.colour * valid[k], photographs[k] * valid[k])
+        loss = (1.0 - SIMILARITY) * difference.abs().mean() + SIMILARITY * (1.0 - likeness)
+        losses.append(float(loss.detach()))
+        soil = label == SOIL
+        total = loss + ANCHOR * anchor(current.means[soil]) + FLAT * _thickness(current.scales)
+        total.backward()
+        gradient = rendering.projection.centres.grad
+        assert gradient is not None
+        seen = (rendering.projection.reaches > 0).all(dim=1)
+        pull += torch.where(seen, gradient.norm(dim=1), 0.0)
+        hits += seen
+        progress = step / max(iterations - 1, 1)
+        state.step({**RATES, "means": RATES["means"] * LAST_RATE**progress})
+        if (step + 1) % every == 0 and 0.1 < progress < 0.75:
+            label = _grow_and_prune(state, label, pull / hits.clamp_min(1.0), most, generator)
+            pull = torch.zeros(len(label), device=device)
+            hits = torch.zeros(len(label), device=device)
+    with torch.no_grad():
+        result = state.gaussians().detach()
+        kept = result.opacities > FAINTEST
+        # Quaternions of length 1 are what every reader of the file expects.
+        unit = result.replace(quaternions=torch.nn.functional.normalize(result.quaternions, dim=1))
+    report("training Gaussians", 1.0)
+    return Trained(unit[kept].to("cpu"), label[kept].to("cpu"), background, losses)
+
+
+def _thickness(scales: Tensor) -> Tensor:
+    ordered = scales.sort(dim=1).values
+    return torch.relu(ordered[:, 0] / ordered[:, 1] - 1.0 / 3.0).mean()
+
+
+class _Anchor:
+    """Mean squared distance of points from a surface along z in standard deviations, bounded for strays."""
+
+    def __init__(self, surface: HeightField, device: str) -> None:
+        spread = np.full_like(surface.height, min(surface.cell)) if surface.deviation is None else surface.deviation
+        # Half a cell at least: discs are that coarse, and the photographs may know better than stereo did.
+        spread = np.maximum(spread, 0.25 * min(surface.cell))
+        self.map = torch.tensor(np.stack([surface.height, spread]), dtype=torch.float32, device=device)[None]
+        cell = np.array(surface.cell)
+        low = np.array([surface.x[0], surface.y[0]]) - cell / 2
+        high = np.array([surface.x[-1], surface.y[-1]]) + cell / 2
+        self.low = torch.tensor(low, dtype=torch.float32, device=device)
+        self.scale = torch.tensor(2.0 / (high - low), dtype=torch.float32, device=device)
+
+    def __call__(self, points: Tensor) -> Tensor:
+        if len(points) == 0:
+            return points.sum()
+        where = (points[:, :2] - self.low) * self.scale - 1.0
+        value = torch.nn.functional.grid_sample(
+            self.map, where[None, None], mode="bilinear", padding_mode="border", align_corners=False
+        )[0, :, 0]
+        away = (points[:, 2] - value[0]) / value[1]
+        return (away**2 / (1.0 + away**2 / 25.0)).mean()
+
+
+@torch.no_grad()
+def _grow_and_prune(state: _Optimiser, label: Tensor, pull: Tensor, most: int, generator: torch.Generator) -> Tensor:
+    """Split the Gaussians that the pictures pull hardest on, drop the faint ones; the new labels."""
+    opacity = torch.sigmoid(state.values["opacities"].detach())
+    visible = opacity > FAINTEST
+    room = most - int(visible.sum())
+    share = min(max(room, 0), int(0.08 * len(pull)))
+    threshold = pull[visible].sort(descending=True).values[share] if share else torch.inf
+    split = torch.nonzero(visible & (pull > threshold))[:, 0]
+    # Of a split Gaussian's two halves one stays in its place in the list; both move apart along its longest axis.
+    scales = state.values["scales"].detach()
+    longest = scales[split].argmax(dim=1)
+    whole = Gaussians(
+        state.values["means"].detach(),
+        scales.exp(),
+        state.values["quaternions"].detach(),
+        opacity,
+        state.values["colours"].detach(),
+    )[split]
+    axis = whole.rotations().gather(2, longest[:, None, None].expand(-1, 3, 1))[:, :, 0]
+    away = 0.7 + 0.2 * torch.rand(len(split), generator=generator).to(axis)
+    offset = axis * (away * whole.scales.amax(dim=1))[:, None]
+    narrowed = scales[split].scatter_add(1, longest[:, None], torch.full((len(split), 1), -0.6).to(scales))
+    state.values["means"] = state.values["means"].detach().index_copy(0, split, whole.means - offset)
+    state.values["scales"] = scales.index_copy(0, split, narrowed)
+    kept = torch.nonzero(visible)[:, 0]
+    state.rearrange(kept, split, {"means": whole.means + offset, "scales": narrowed})
+    return torch.cat([label[kept], label[split]])

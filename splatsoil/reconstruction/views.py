@@ -1,0 +1,164 @@
+"""The photographs as one batch of tensors, free of distortion, with the pixels that must not be trusted marked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import trimesh
+from numpy.typing import NDArray
+from PIL import Image
+from scipy.ndimage import binary_closing, binary_dilation
+
+from splatsoil.errors import MeasurementError
+from splatsoil.measurement import Camera, Frame
+
+Array = NDArray[np.float64]
+Picture = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Views:
+    """A batch of undistorted photographs. Smaller pictures are padded to the largest; `valid` is 0 on the padding.
+
+    Attributes:
+        images: (v, 3, h, w) float32 sRGB in [0, 1].
+        valid: (v, h, w) float32, 1 where the pixel may be used (not padding, not masked, not beyond the lens's edge).
+        projection: (v, 3, 4) float32, world point -> homogeneous pixel; the third row is the depth along z.
+        positions: (v, 3) float32 camera centres.
+        cameras: the undistorted cameras.
+        names: the pictures' file names.
+    """
+
+    images: torch.Tensor
+    valid: torch.Tensor
+    projection: torch.Tensor
+    positions: torch.Tensor
+    cameras: tuple[Camera, ...]
+    names: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+    def subset(self, indices: Sequence[int]) -> Views:
+        """The views at the given places, in that order."""
+        index = torch.as_tensor(list(indices), dtype=torch.long)
+        return Views(
+            self.images[index],
+            self.valid[index],
+            self.projection[index],
+            self.positions[index],
+            tuple(self.cameras[i] for i in indices),
+            tuple(self.names[i] for i in indices),
+        )
+
+    def photograph(self, index: int) -> torch.Tensor:
+        """(h, w, 3) one photograph at its own size."""
+        camera = self.cameras[index]
+        return self.images[index, :, : camera.height, : camera.width].permute(1, 2, 0)
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of the pixel noise (sRGB in [0, 1]), by the median absolute second difference.
+
+        Immerkær's operator (CVIU 64, 1996) with a median in place of the mean, so that edges do not count.
+        """
+        grey = self.images.mean(dim=1)
+        operator = torch.tensor([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]])
+        response = torch.nn.functional.conv2d(grey[:, None], operator[None, None])
+        grey_noise = float(response.abs().median()) / 0.6745 / 6.0
+        return max(grey_noise * 3.0**0.5, 1.0 / 255.0)
+
+
+def projection_matrix(camera: Camera) -> Array:
+    """(3, 4) world point -> homogeneous pixel of an undistorted camera."""
+    return np.asarray(camera.intrinsics) @ np.asarray(camera.world_to_camera)[:3]
+
+
+def _shrink(image: Picture, width: int, height: int) -> Picture:
+    """Area-averaged to (height, width): a box filter per channel, exact for any ratio."""
+    channels = [
+        np.asarray(
+            Image.fromarray(np.ascontiguousarray(image[..., k]), mode="F").resize((width, height), Image.Resampling.BOX)
+        )
+        for k in range(image.shape[2])
+    ]
+    return np.stack(channels, axis=-1)
+
+
+def load_views(frames: Sequence[Frame], longest_side: int) -> Views:
+    """Read, undistort and, where a side is longer than `longest_side` pixels, shrink the photographs.
+
+    Raises:
+        MeasurementError: there are no photographs.
+    """
+    if not frames:
+        raise MeasurementError("there are no photographs to reconstruct from", field="views")
+    pictures: list[Picture] = []
+    masks: list[Picture] = []
+    cameras: list[Camera] = []
+    for frame in frames:
+        camera = frame.camera.undistorted()
+        image = np.asarray(frame.undistorted_image(), dtype=np.float32)
+        seen = frame.undistorted_mask().astype(np.float32)
+        factor = longest_side / max(camera.width, camera.height)
+        if factor < 1.0:
+            camera = camera.scaled(factor)
+            image = _shrink(image, camera.width, camera.height)
+            seen = _shrink(seen[..., None], camera.width, camera.height)[..., 0]
+        pictures.append(image)
+        masks.append((seen > 0.999).astype(np.float32))
+        cameras.append(camera)
+    height = max(image.shape[0] for image in pictures)
+    width = max(image.shape[1] for image in pictures)
+    images = np.zeros((len(pictures), height, width, 3), dtype=np.float32)
+    valids = np.zeros((len(pictures), height, width), dtype=np.float32)
+    for k, (image, valid) in enumerate(zip(pictures, masks, strict=True)):
+        images[k, : image.shape[0], : image.shape[1]] = image
+        valids[k, : image.shape[0], : image.shape[1]] = valid
+    return Views(
+        images=torch.from_numpy(images).permute(0, 3, 1, 2).contiguous(),
+        valid=torch.from_numpy(valids),
+        projection=torch.tensor(np.stack([projection_matrix(c) for c in cameras]), dtype=torch.float32),
+        positions=torch.tensor(np.stack([c.position for c in cameras]), dtype=torch.float32),
+        cameras=tuple(cameras),
+        names=tuple(frame.path.name for frame in frames),
+    )
+
+
+def silhouettes(views: Views, mesh: trimesh.Trimesh, margin: int = 2) -> torch.Tensor:
+    """(v, h, w) float32, 1 where a mesh in world coordinates covers the picture, grown by `margin` pixels.
+
+    Points sampled on its faces, closer together than half a pixel in the nearest view, are projected; so any mesh will
+    do.
+    """
+    height, width = views.images.shape[-2:]
+    result = np.zeros((len(views), height, width), dtype=np.float32)
+    centre = mesh.bounds.mean(axis=0)
+    for k, camera in enumerate(views.cameras):
+        distance = max(float(np.linalg.norm(camera.position - centre)) - float(np.ptp(mesh.bounds, axis=0).max()), 1e-3)
+        footprint = distance / max(camera.fx, camera.fy)
+        points, _ = surface_points(mesh, max(0.7 * footprint, (mesh.area / 400_000) ** 0.5))
+        pixels, depth = camera.project(points)
+        whole = np.floor(np.nan_to_num(pixels, nan=-1.0)).astype(int)
+        seen = (depth > 0) & (whole >= 0).all(1) & (whole[:, 0] < camera.width) & (whole[:, 1] < camera.height)
+        mask = np.zeros((height + 8, width + 8), dtype=bool)
+        mask[whole[seen, 1] + 4, whole[seen, 0] + 4] = True
+        mask = binary_closing(mask, iterations=2)
+        if margin:
+            mask = binary_dilation(mask, structure=np.ones((3, 3)), iterations=margin)
+        result[k] = mask[4:-4, 4:-4]
+    return torch.from_numpy(result)
+
+
+def surface_points(mesh: trimesh.Trimesh, spacing: float) -> tuple[Array, NDArray[np.int64]]:
+    """(n, 3) points no farther than about `spacing` metres apart that cover a mesh, and (n,) the faces they lie on.
+
+    The faces are split until their edges are that short; the points are the pieces' centres.
+    """
+    vertices, faces, origin = trimesh.remesh.subdivide_to_size(
+        mesh.vertices, mesh.faces, max_edge=1.4 * spacing, max_iter=30, return_index=True
+    )
+    return vertices[faces].mean(axis=1), np.asarray(origin)
