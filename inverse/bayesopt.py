@@ -1,0 +1,188 @@
+"""Bayesian optimisation as an agent: it knows a Gymnasium environment and nothing of soil.
+
+Ask, tell, and a result. What is asked next depends only on the seed and on what was told, so that a run told the
+evaluations of an interrupted one goes on as that one would have.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from .surrogate import FloatArray, Minimum, Surrogate, quiet, seeded, sobol
+
+#: Space-filling evaluations before the first acquisition.
+START = 4
+#: Quasi-Monte-Carlo draws, restarts and raw candidates of the acquisition function.
+DRAWS = 128
+RESTARTS = 4
+RAW = 128
+#: A proposal closer than this to an evaluated point (in [-1, 1]^n) adds too little: it is moved away.
+NEAREST = 1e-3
+
+
+@dataclass(frozen=True)
+class Told:
+    """One evaluation the optimiser knows: a point of [-1, 1]^n and its loss, None where the evaluation failed."""
+
+    action: FloatArray
+    loss: float | None
+
+
+class BayesianOptimiser:
+    """Noisy expected improvement over a GP, after a Sobol start.
+
+    Args:
+        dimension: number of free parameters; points live in [-1, 1]^dimension.
+        start: space-filling points before the first acquisition.
+        noise_std: standard deviation of one evaluation's noise, where it was measured; inferred otherwise.
+        seed: the same seed and evaluations give the same proposals.
+    """
+
+    def __init__(self, dimension: int, *, start: int = START, noise_std: float | None = None, seed: int = 0) -> None:
+        if dimension < 1 or start < 1:
+            raise ValueError("an optimiser needs at least one dimension and one starting point")
+        self.dimension = dimension
+        self.start = start
+        self.noise_std = noise_std
+        self.seed = seed
+        self.told: list[Told] = []
+
+    def tell(self, action: npt.ArrayLike, loss: float | None) -> None:
+        """Learn the loss (None: the evaluation failed) at a point (n,) of [-1, 1]^n."""
+        point = np.array(action, dtype=np.float64).reshape(self.dimension)
+        usable = loss is not None and np.isfinite(loss)
+        self.told.append(Told(point, float(loss) if usable and loss is not None else None))
+
+    def ask(self) -> npt.NDArray[np.float32]:
+        """The next point (n,) to evaluate, in float32 as environments take it."""
+        done = len(self.told)
+        if done < self.start or not self._succeeded():
+            # Beyond the start only while nothing has succeeded: keep filling the space.
+            return sobol(done + 1, self.dimension, self.seed)[done].astype(np.float32)
+        return self._acquire(self._stream(done)).astype(np.float32)
+
+    def surrogate(self) -> Surrogate:
+        """The GP over every evaluation that succeeded.
+
+        Raises:
+            ValueError: none has.
+        """
+        good = self._succeeded()
+        return Surrogate(
+            [t.action for t in good], [t.loss for t in good], noise_std=self.noise_std, seed=self._stream(0)
+        )
+
+    def result(self) -> Minimum:
+        """Minimiser of the GP's mean with its posterior spread."""
+        return self.surrogate().minimum(seed=self._stream(1))
+
+    def _succeeded(self) -> list[Told]:
+        return [t for t in self.told if t.loss is not None]
+
+    def _stream(self, index: int) -> int:
+        """An independent seed for each use."""
+        return int(np.random.SeedSequence([self.seed, index]).generate_state(1)[0])
+
+    def _acquire(self, seed: int) -> FloatArray:
+        with quiet():
+            from botorch.acquisition.logei import qLogNoisyExpectedImprovement
+            from botorch.optim import optimize_acqf
+            from botorch.sampling.normal import SobolQMCNormalSampler
+
+        # A failed simulation tells where not to go: for the search (not for the estimate) it counts as the worst seen.
+        worst = max(t.loss for t in self._succeeded() if t.loss is not None)
+        points = np.array([t.action for t in self.told])
+        losses = [worst if t.loss is None else t.loss for t in self.told]
+        surrogate = Surrogate(points, losses, noise_std=self.noise_std, seed=seed)
+        if surrogate.constant:
+            return self._farthest(points, seed)
+        bounds = torch.tensor([[0.0] * self.dimension, [1.0] * self.dimension], dtype=torch.float64)
+        with seeded(seed), quiet():
+            acquisition = qLogNoisyExpectedImprovement(
+                surrogate.likeliest,
+                torch.from_numpy(0.5 * (points + 1.0)),
+                sampler=SobolQMCNormalSampler(torch.Size([DRAWS]), seed=seed % 2**31),
+                prune_baseline=True,
+            )
+            best, _ = optimize_acqf(acquisition, bounds, q=1, num_restarts=RESTARTS, raw_samples=RAW)
+        proposal = 2.0 * best.detach().reshape(-1).numpy() - 1.0
+        if np.min(np.max(np.abs(points - proposal), axis=1)) < NEAREST:
+            return self._beside(proposal, seed)
+        return np.clip(proposal, -1.0, 1.0)
+
+    def _farthest(self, points: FloatArray, seed: int) -> FloatArray:
+        """The Sobol point farthest from all evaluated ones: what is left to do when all losses are equal."""
+        candidates = sobol(256, self.dimension, seed % 2**31)
+        gaps = np.linalg.norm(candidates[:, None] - points[None], axis=-1).min(axis=1)
+        return candidates[np.argmax(gaps)]
+
+    def _beside(self, proposal: FloatArray, seed: int) -> FloatArray:
+        """Close to a repeated proposal, but not on it: repetition says less about the slope than a neighbour does."""
+        step = np.random.default_rng(seed).uniform(0.02, 0.05, self.dimension)
+        sign = np.where(proposal > 0.0, -1.0, 1.0)
+        return np.clip(proposal + sign * step, -1.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Episode:
+    """What an agent brought back from one episode.
+
+    Attributes:
+        minimum: the estimate, in [-1, 1]^n.
+        told: every evaluation, in order.
+        optimiser: for the GP behind the estimate.
+    """
+
+    minimum: Minimum
+    told: tuple[Told, ...]
+    optimiser: BayesianOptimiser
+
+
+def optimise(
+    env: gym.Env[Any, Any],
+    *,
+    seed: int = 0,
+    start: int = START,
+    noise_std: float | None = None,
+    replay: Sequence[npt.ArrayLike] = (),
+    after_step: Callable[[int, dict[str, Any]], None] | None = None,
+) -> Episode:
+    """Play one episode of an environment whose reward is minus a loss, until it truncates or terminates.
+
+    Args:
+        env: action space Box(-1, 1, (n,)); ``info["status"] == "failed"`` marks an evaluation without a loss.
+        seed: of environment and agent.
+        start: Sobol points before the first acquisition.
+        noise_std: standard deviation of one evaluation's noise, if measured.
+        replay: actions of an interrupted episode, taken again before anything new is asked.
+        after_step: called with the number of steps done and the step's info.
+
+    Raises:
+        ValueError: the action space isn't [-1, 1]^n.
+        RuntimeError: every evaluation failed.
+    """
+    space = env.action_space
+    if not isinstance(space, gym.spaces.Box) or np.any(space.low != -1.0) or np.any(space.high != 1.0):
+        raise ValueError(f"Bayesian optimisation needs actions in [-1, 1]^n, not {space}")
+    optimiser = BayesianOptimiser(int(np.prod(space.shape)), start=start, noise_std=noise_std, seed=seed)
+    env.reset(seed=seed)
+    over = False
+    while not over:
+        done = len(optimiser.told)
+        action = np.asarray(replay[done] if done < len(replay) else optimiser.ask(), dtype=np.float32)
+        _, reward, terminated, truncated, info = env.step(action.reshape(space.shape))
+        failed = info.get("status") == "failed"
+        optimiser.tell(action, None if failed else -float(reward))
+        over = terminated or truncated
+        if after_step is not None:
+            after_step(done + 1, info)
+    if not any(t.loss is not None for t in optimiser.told):
+        raise RuntimeError("every evaluation of the episode failed")
+    return Episode(optimiser.result(), tuple(optimiser.told), optimiser)

@@ -1,0 +1,358 @@
+"""A fit: the agent on the environment, each evaluation stored as it ends, and what it all came to."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from splatsoil.envs.plow_sand import PlowSandEnv
+from splatsoil.envs.problem import Evaluation, Image, Problem
+
+from splatsoil.errors import RunError, SimulationError
+from splatsoil.parameters import Parameter, ParameterSpace
+
+from .bayesopt import START, Episode, optimise
+from .evaluations import EvaluationRecord, EvaluationStore, digest
+from .run_folder import RunFolder
+from .surrogate import Minimum, Surrogate
+
+FORMAT = "splatsoil-fit/1"
+#: Points of the GP's curve kept for the figure.
+CURVE = 201
+
+
+@dataclass(frozen=True)
+class FitSetup:
+    """Everything that decides what a fit comes to, but its budget (a longer fit begins like a shorter one).
+
+    Attributes:
+        measurement: hash of the measurement set.
+        reconstruction: digest of the reconstruction that the simulations start from.
+        parameters: names of the free parameters.
+        effects: names of the effects that are on.
+        preset: resolution of the solver.
+        device: ``cpu`` or ``cuda:N``.
+        seed: of agent and simulations.
+        version: of this package.
+        loss: name of the loss.
+        noise_std: measured noise of one evaluation, None to infer it.
+        start: Sobol points before the first acquisition.
+    """
+
+    measurement: str
+    reconstruction: str
+    parameters: tuple[str, ...]
+    effects: tuple[str, ...]
+    preset: str
+    device: str
+    seed: int
+    version: str
+    loss: str = ""
+    noise_std: float | None = None
+    start: int = START
+
+    @property
+    def name(self) -> str:
+        """Short name of the model that is fitted: ``base``, or its effects joined by plus signs."""
+        return "+".join(sorted(self.effects)) or "base"
+
+    def model(self) -> dict[str, Any]:
+        """What decides a single evaluation, but its parameters and seed. One CUDA device is like another."""
+        return {
+            "measurement": self.measurement,
+            "reconstruction": self.reconstruction,
+            "effects": sorted(self.effects),
+            "preset": self.preset,
+            "device": self.device.split(":")[0],
+            "version": self.version,
+            "loss": self.loss,
+        }
+
+    def description(self) -> dict[str, Any]:
+        """What decides the whole fit."""
+        return {
+            **self.model(),
+            "agent": "bayesopt",
+            "parameters": list(self.parameters),
+            "seed": self.seed,
+            "noise_std": self.noise_std,
+            "start": self.start,
+        }
+
+
+class StoredProblem:
+    """A problem whose evaluations go into the run database, and come from it when they are there.
+
+    Args:
+        problem: does the work.
+        store: open for writing.
+        setup: of the fit.
+    """
+
+    def __init__(self, problem: Problem, store: EvaluationStore, setup: FitSetup) -> None:
+        self.problem = problem
+        self.store = store
+        self.setup = setup
+        self.fit = digest(setup.description())
+        self.store.register(self.fit, setup.description())
+        self.stored = self.store.records(self.fit)
+        self._step = 0
+        self.last: EvaluationRecord | None = None
+
+    @property
+    def space(self) -> ParameterSpace:
+        """The free parameters."""
+        return self.problem.space
+
+    @property
+    def block_count(self) -> int:
+        """Length of the block residuals."""
+        return self.problem.block_count
+
+    @property
+    def worst_loss(self) -> float:
+        """Larger than any loss."""
+        return self.problem.worst_loss
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """(height, width) of the pictures."""
+        return self.problem.image_size
+
+    def begin(self, seed: int) -> None:
+        """Start an episode, from the fit's first evaluation."""
+        self._step = 0
+        self.problem.begin(seed)
+
+    def observed_image(self) -> Image:
+        """The observation as pictures show it."""
+        return self.problem.observed_image()
+
+    def truth(self) -> Mapping[str, float] | None:
+        """The hidden parameters of a synthetic experiment."""
+        return self.problem.truth()
+
+    def evaluate(self, parameters: Mapping[str, float], seed: int) -> Evaluation:
+        """The stored evaluation, or a new one, which is stored before it is returned."""
+        if self._step < len(self.stored):
+            record, evaluation = self._replay(parameters, seed)
+        else:
+            key = digest({**self.setup.model(), "values": dict(parameters), "seed": seed})
+            found = self.store.find(key)
+            if found is None:
+                evaluation = self._simulate(parameters, seed)
+                record = self._record(key, parameters, seed, evaluation)
+            else:
+                evaluation = _from_record(found)
+                record = replace(found, fit=self.fit, step=self._step, created="")
+            self.store.append(record)
+        self._step += 1
+        self.last = record
+        return evaluation
+
+    def _replay(self, parameters: Mapping[str, float], seed: int) -> tuple[EvaluationRecord, Evaluation]:
+        """The stored evaluation of this step."""
+        record = self.stored[self._step]
+        asked, known = (self.space.to_unit(self.space.to_vector(v)) for v in (parameters, record.parameters))
+        if record.seed != seed or not np.allclose(asked, known, rtol=0.0, atol=1e-6):
+            raise RunError(
+                f"{self.store.path}: evaluation {self._step} isn't the one this fit would make; choose another --run"
+            )
+        return record, _from_record(record)
+
+    def _simulate(self, parameters: Mapping[str, float], seed: int) -> Evaluation:
+        began = time.perf_counter()
+        try:
+            evaluation = self.problem.evaluate(parameters, seed)
+            if evaluation.loss is not None and not math.isfinite(evaluation.loss):
+                raise SimulationError(f"the loss is {evaluation.loss}")
+        except SimulationError as error:
+            evaluation = Evaluation(None, np.zeros(self.block_count), message=str(error))
+        return replace(evaluation, seconds=time.perf_counter() - began)
+
+    def _record(self, key: str, parameters: Mapping[str, float], seed: int, evaluation: Evaluation) -> EvaluationRecord:
+        unit = self.space.to_unit(self.space.to_vector(parameters))
+        return EvaluationRecord(
+            fit=self.fit,
+            step=self._step,
+            key=key,
+            parameters=dict(parameters),
+            # Environments act in float32: the action that led to these parameters is the nearest one.
+            action=tuple(float(np.float32(value)) for value in unit),
+            seed=seed,
+            status="failed" if evaluation.loss is None else "ok",
+            loss=evaluation.loss,
+            message=evaluation.message,
+            blocks=tuple(float(value) for value in evaluation.blocks),
+            extras={name: float(value) for name, value in evaluation.extras.items()},
+            seconds=evaluation.seconds,
+            device=self.setup.device,
+            preset=self.setup.preset,
+            version=self.setup.version,
+            measurement=self.setup.measurement,
+        )
+
+
+def _from_record(record: EvaluationRecord) -> Evaluation:
+    return Evaluation(
+        loss=record.loss,
+        blocks=np.array(record.blocks, dtype=np.float64),
+        message=record.message,
+        extras=dict(record.extras),
+        seconds=record.seconds,
+    )
+
+
+def fit(
+    problem: Problem,
+    run: RunFolder,
+    setup: FitSetup,
+    *,
+    budget: int = 10,
+    facts: Mapping[str, Any] | None = None,
+    after_evaluation: Callable[[int, EvaluationRecord], None] | None = None,
+) -> dict[str, Any]:
+    """Fit the free parameters and write ``fit.json``; goes on where an interrupted fit of the same setup stopped.
+
+    Args:
+        problem: simulate-and-compare.
+        run: the run folder; only this process may write to it meanwhile.
+        setup: what is fitted and how.
+        budget: evaluations, those already stored included.
+        facts: what the fit should say of how it was computed (time step, spacing, ...).
+        after_evaluation: called with the number done and the record of the last.
+
+    Returns:
+        What ``fit.json`` holds.
+
+    Raises:
+        RunError: every evaluation failed, or the run folder can't be written.
+    """
+    began = time.perf_counter()
+    with run.lock(), run.evaluations(writable=True) as store:
+        stored = StoredProblem(problem, store, setup)
+        earlier = sum(record.seconds for record in stored.stored[:budget])
+        env = PlowSandEnv(problem=stored, budget=budget)
+
+        def told(done: int, _: dict[str, Any]) -> None:
+            if after_evaluation is not None and stored.last is not None:
+                after_evaluation(done, stored.last)
+
+        try:
+            episode = optimise(
+                env,
+                seed=setup.seed,
+                start=setup.start,
+                noise_std=setup.noise_std,
+                replay=[record.action for record in stored.stored],
+                after_step=told,
+            )
+        except RuntimeError as error:
+            records = store.records(stored.fit)
+            if any(record.status == "ok" for record in records):
+                raise
+            first = records[0].message if records else str(error)
+            raise RunError(f"{run.path}: all {budget} simulations failed; the first said: {first}") from error
+        records = store.records(stored.fit)[:budget]
+    seconds = earlier + time.perf_counter() - began
+    result = summarise(episode, problem, setup, records, seconds=seconds)
+    result["run"] = {"measurement": dict(run.description["measurement"])}
+    result["facts"] = dict(facts or {})
+    run.write_fit(setup.name, result)
+    return result
+
+
+def summarise(
+    episode: Episode, problem: Problem, setup: FitSetup, records: list[EvaluationRecord], *, seconds: float
+) -> dict[str, Any]:
+    """A fit in plain numbers, physical units and words."""
+    minimum, space = episode.minimum, problem.space
+    surrogate = episode.optimiser.surrogate()
+    done = [record for record in records if record.status == "ok"]
+    best = min(done, key=lambda record: record.loss if record.loss is not None else math.inf)
+    return {
+        "format": FORMAT,
+        "name": setup.name,
+        "parameters": {p.name: _estimate(p, i, minimum, space) for i, p in enumerate(space)},
+        "loss": minimum.loss,
+        "loss_std": minimum.loss_std,
+        "noise_std": minimum.noise_std,
+        "informative": minimum.informative,
+        "evaluations": len(records),
+        "failed": len(records) - len(done),
+        "best": {"parameters": dict(best.parameters), "loss": best.loss, "step": best.step},
+        "seconds": round(seconds, 3),
+        "seed": setup.seed,
+        "device": setup.device,
+        "preset": setup.preset,
+        "version": setup.version,
+        "setup": setup.description(),
+        "notes": notes(minimum, space, failed=len(records) - len(done), total=len(records)),
+        "curves": {p.name: _curve(i, minimum, surrogate, space) for i, p in enumerate(space)},
+        "history": [
+            {
+                "step": record.step,
+                "parameters": dict(record.parameters),
+                "loss": record.loss,
+                "status": record.status,
+                "message": record.message,
+                "seconds": record.seconds,
+                "extras": dict(record.extras),
+            }
+            for record in records
+        ],
+    }
+
+
+def notes(minimum: Minimum, space: ParameterSpace, *, failed: int, total: int) -> list[str]:
+    """What a reader must know before believing the numbers."""
+    out = []
+    if not minimum.informative:
+        out.append(
+            "The evaluations hardly say where the loss is least: the parameters are not determined by this data."
+        )
+    for parameter, bound in zip(space, minimum.at_bound, strict=True):
+        if bound is not None:
+            value = parameter.lower if bound == "lower" else parameter.upper
+            out.append(
+                f"The estimate of {parameter.name} lies on its {bound} bound ({value:g} {parameter.unit}): "
+                "the minimum may lie beyond it, or the model may lack an effect."
+            )
+    if failed:
+        out.append(f"{failed} of {total} simulations failed and were left out.")
+    return out
+
+
+def _estimate(parameter: Parameter, index: int, minimum: Minimum, space: ParameterSpace) -> dict[str, Any]:
+    def physical(unit: float) -> float:
+        point = minimum.estimate.copy()
+        point[index] = unit
+        return float(space.from_unit(point)[index])
+
+    centre = float(minimum.estimate[index])
+    std = float(minimum.std[index])
+    # Half the width of ± one std in physical units: exact on a linear axis, sensible on a logarithmic one. Both
+    # ends are pushed inside the bounds together, so that a bound doesn't halve the std.
+    middle = float(np.clip(centre, -1.0 + min(std, 1.0), 1.0 - min(std, 1.0)))
+    return {
+        "estimate": physical(centre),
+        "std": 0.5 * (physical(middle + std) - physical(middle - std)),
+        "low": physical(float(minimum.low[index])),
+        "high": physical(float(minimum.high[index])),
+        "unit": parameter.unit,
+        "title": parameter.title,
+        "bounds": [parameter.lower, parameter.upper],
+        "at_bound": minimum.at_bound[index],
+    }
+
+
+def _curve(index: int, minimum: Minimum, surrogate: Surrogate, space: ParameterSpace) -> dict[str, list[float]]:
+    """The GP along one parameter, the others at their estimates."""
+    points = np.repeat(minimum.estimate[None], CURVE, axis=0)
+    points[:, index] = np.linspace(-1.0, 1.0, CURVE)
+    mean, std = surrogate.mean_and_std(points)
+    return {"x": space.from_unit(points)[:, index].tolist(), "mean": mean.tolist(), "std": std.tolist()}

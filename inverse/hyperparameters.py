@@ -1,0 +1,137 @@
+"""Length scales, noise and mean of a GP: their posterior, not only their best values.
+
+Ten evaluations leave these open, and one best guess is overconfident: on pure noise it may call every point a valley.
+So the surrogate averages over draws from the posterior, made by emcee from starting points that importance resampling
+of the prior provides. Inputs live in [0, 1]^n, outcomes have mean 0 and standard deviation 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import emcee
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import minimize
+from scipy.stats import norm, qmc
+
+FloatArray = npt.NDArray[np.float64]
+
+#: ln of a length scale: the dimension-scaled prior of Hvarfner, Hellsten & Nardi (2024), BoTorch's default.
+LENGTH_MEAN, LENGTH_STD = np.sqrt(2.0), np.sqrt(3.0)
+#: ln of the noise variance: BoTorch's median, twice its width, so that "all of it is noise" (0) stays thinkable.
+NOISE_MEAN, NOISE_STD = -4.0, 2.0
+#: Below these the kernel matrix is singular to machine precision, above nothing changes any more.
+LENGTH_BOUNDS = (np.log(0.025), np.log(1e3))
+NOISE_BOUNDS = (np.log(1e-6), np.log(4.0))
+#: Added to the diagonal for the Cholesky factor's sake.
+JITTER = 1e-8
+#: Prior points for importance resampling (a power of two, for Sobol), and emcee's steps after it.
+PRIOR_POINTS, STEPS = 4096, 60
+
+
+@dataclass(frozen=True)
+class Hyperparameters:
+    """k settings of a GP.
+
+    Attributes:
+        lengths: (k, n) length scales.
+        noise: (k, m) noise variance of each outcome.
+        mean: (k,) constant mean.
+    """
+
+    lengths: FloatArray
+    noise: FloatArray
+    mean: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.mean)
+
+
+class Density:
+    """Log posterior density of (ln lengths, mean[, ln noise]), for many settings at once.
+
+    Args:
+        x: (m, n) inputs in [0, 1].
+        y: (m,) standardised outcomes.
+        noise: (m,) known noise variances, None to infer one for all.
+    """
+
+    def __init__(self, x: FloatArray, y: FloatArray, noise: FloatArray | None) -> None:
+        self.y = y
+        self.noise = noise
+        self.n = x.shape[1]
+        self.squares = (x[:, None] - x[None]) ** 2
+        length_mean = LENGTH_MEAN + 0.5 * np.log(self.n)
+        known = noise is not None
+        self.means = np.array([length_mean] * self.n + [0.0] + ([] if known else [NOISE_MEAN]))
+        self.stds = np.array([LENGTH_STD] * self.n + [1.0] + ([] if known else [NOISE_STD]))
+        self.bounds = np.array([LENGTH_BOUNDS] * self.n + [(-8.0, 8.0)] + ([] if known else [NOISE_BOUNDS]))
+
+    def prior(self, points: FloatArray) -> FloatArray:
+        """(w, d) to (w,): log prior density, −∞ out of bounds."""
+        inside = np.all((points >= self.bounds[:, 0]) & (points <= self.bounds[:, 1]), axis=1)
+        return np.where(inside, -0.5 * np.sum(((points - self.means) / self.stds) ** 2, axis=1), -np.inf)
+
+    def likelihood(self, points: FloatArray) -> FloatArray:
+        """(w, d) to (w,): log marginal likelihood."""
+        settings = self.unpack(points)
+        exponent = np.einsum("ijn,wn->wij", self.squares, settings.lengths**-2.0)
+        kernel = np.exp(-0.5 * exponent)
+        diagonal = np.arange(len(self.y))
+        kernel[:, diagonal, diagonal] += settings.noise + JITTER
+        factor = np.linalg.cholesky(kernel)
+        residual = self.y - settings.mean[:, None]
+        white = np.linalg.solve(factor, residual[..., None])[..., 0]
+        return -0.5 * np.sum(white**2, axis=1) - np.sum(np.log(factor[:, diagonal, diagonal]), axis=1)
+
+    def __call__(self, points: FloatArray) -> FloatArray:
+        """(w, d) to (w,): log posterior density up to a constant."""
+        out = self.prior(points)
+        good = np.isfinite(out)
+        if good.any():
+            out[good] += self.likelihood(points[good])
+        return out
+
+    def unpack(self, points: FloatArray) -> Hyperparameters:
+        """Settings (w, d) by name."""
+        count = len(points)
+        noise = np.exp(points[:, -1:]) if self.noise is None else self.noise[None]
+        return Hyperparameters(
+            lengths=np.exp(points[:, : self.n]),
+            noise=np.broadcast_to(noise, (count, len(self.y))).copy(),
+            mean=points[:, self.n].copy(),
+        )
+
+
+def posterior(
+    x: FloatArray, y: FloatArray, noise: FloatArray | None, *, count: int, seed: int
+) -> tuple[Hyperparameters, Hyperparameters]:
+    """The most probable setting (k = 1), and ``count`` draws from the posterior.
+
+    Args:
+        x: (m, n) inputs in [0, 1].
+        y: (m,) outcomes with mean 0 and standard deviation 1.
+        noise: (m,) known noise variances, None to infer one for all.
+        count: draws; even, and at least twice the number of hyperparameters.
+        seed: the same seed gives the same bits.
+    """
+    density = Density(x, y, noise)
+    cube = qmc.Sobol(len(density.means), rng=np.random.default_rng(seed)).random(PRIOR_POINTS)
+    points = density.means + density.stds * norm.ppf(np.clip(cube, 1e-6, 1.0 - 1e-6))
+    points = np.clip(points, density.bounds[:, 0], density.bounds[:, 1])
+    likelihood = density.likelihood(points)
+
+    best = points[np.argmax(density(points))]
+    found = minimize(lambda p: -density(p[None])[0], best, bounds=density.bounds, method="L-BFGS-B")
+    best = found.x if np.isfinite(found.fun) and found.fun < -density(best[None])[0] else best
+
+    random = np.random.RandomState(seed)  # the kind that emcee takes
+    weights = np.exp(likelihood - likelihood.max())
+    start = points[random.choice(PRIOR_POINTS, count, p=weights / weights.sum())]
+    # Twins would never part: emcee's moves are along differences between walkers.
+    start = start + 0.05 * density.stds * random.standard_normal(start.shape)
+    start = np.clip(start, density.bounds[:, 0] + 1e-9, density.bounds[:, 1] - 1e-9)
+    sampler = emcee.EnsembleSampler(count, len(best), density, vectorize=True)
+    state = sampler.run_mcmc(emcee.State(start, random_state=random.get_state()), STEPS, skip_initial_state_check=True)
+    return density.unpack(best[None]), density.unpack(np.asarray(state.coords))

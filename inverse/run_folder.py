@@ -1,0 +1,146 @@
+"""A run folder: everything one measurement set led to, described by the files themselves.
+
+| file | what |
+|---|---|
+| `run.json` | what the folder is for: measurement (name, folder, hash), preset, seed, version |
+| `reconstruction/` | Gaussians, surface, metrics |
+| `evaluations.db` | every simulate-and-compare (SQLite) |
+| `fits/NAME.json` | each finished fit (`base`, `cohesion`, ...), `fit.json` is the latest |
+| `comparison/` | pictures and losses at the latest estimate |
+| `report.html` | for reading |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from splatsoil.errors import RunError
+from splatsoil.files import read_json, write_json
+
+from .evaluations import EvaluationStore, writer_lock
+
+FORMAT = "splatsoil-run/1"
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """Paths and description of a run.
+
+    Attributes:
+        path: the folder.
+        description: contents of ``run.json``.
+    """
+
+    path: Path
+    description: Mapping[str, Any]
+
+    @classmethod
+    def open(cls, path: str | Path) -> RunFolder:
+        """Open an existing run.
+
+        Raises:
+            RunError: there is none, or it isn't one of ours.
+        """
+        folder = Path(path)
+        if not folder.is_dir():
+            raise RunError(f"{folder}: there is no such run folder; `splatsoil fit SET --run {folder}` makes one")
+        if not (folder / "run.json").is_file():
+            raise RunError(f"{folder}: has no run.json, so it isn't a run folder; name one made by `splatsoil fit`")
+        description = read_json(folder / "run.json")
+        if not isinstance(description, dict) or description.get("format") != FORMAT:
+            raise RunError(f"{folder / 'run.json'}: isn't a run of format {FORMAT}; choose another run folder")
+        return cls(folder, description)
+
+    @classmethod
+    def prepare(
+        cls, path: str | Path, *, measurement: Mapping[str, str], preset: str, seed: int, version: str
+    ) -> RunFolder:
+        """Open the run for this experiment, or make it.
+
+        Args:
+            path: the folder; made if absent. A folder with other things in it is refused.
+            measurement: ``name``, ``folder`` and ``hash`` of the measurement set.
+            preset: resolution of reconstruction and solver.
+            seed: seed of reconstruction and fits.
+            version: of this package; noted, and part of each evaluation's key.
+
+        Raises:
+            RunError: the folder belongs to another experiment, isn't a run, or can't be written.
+        """
+        folder = Path(path)
+        if (folder / "run.json").exists():
+            run = cls.open(folder)
+            run._must_match(measurement["hash"], preset, seed)
+            return run
+        if folder.exists() and (not folder.is_dir() or any(p.name != "writer.lock" for p in folder.iterdir())):
+            raise RunError(f"{folder}: exists and isn't a run folder; choose another --run")
+        description = {
+            "format": FORMAT,
+            "measurement": dict(measurement),
+            "preset": preset,
+            "seed": seed,
+            "version": version,
+            "created": datetime.now(UTC).isoformat(timespec="seconds"),
+        }
+        write_json(folder / "run.json", description)
+        return cls(folder, description)
+
+    def _must_match(self, measurement_hash: str, preset: str, seed: int) -> None:
+        wanted = {"measurement": measurement_hash, "preset": preset, "seed": seed}
+        found = {
+            "measurement": self.description["measurement"]["hash"],
+            "preset": self.description["preset"],
+            "seed": self.description["seed"],
+        }
+        for name, value in wanted.items():
+            if found[name] != value:
+                what = (
+                    f"another measurement set ({self.description['measurement']['name']}), or the set has changed"
+                    if name == "measurement"
+                    else f"{name} {found[name]}, not {value}"
+                )
+                raise RunError(f"{self.path}: belongs to {what}; choose another --run")
+
+    @property
+    def reconstruction(self) -> Path:
+        """Folder of the reconstruction."""
+        return self.path / "reconstruction"
+
+    @property
+    def comparison(self) -> Path:
+        """Folder of pictures and losses at the estimate."""
+        return self.path / "comparison"
+
+    @property
+    def report(self) -> Path:
+        """The report."""
+        return self.path / "report.html"
+
+    def lock(self) -> AbstractContextManager[None]:
+        """Be the only process that writes into the run; a context manager."""
+        return writer_lock(self.path)
+
+    def evaluations(self, *, writable: bool = False) -> EvaluationStore:
+        """The run database; a context manager."""
+        return EvaluationStore(self.path / "evaluations.db", writable=writable)
+
+    def write_fit(self, name: str, fit: Mapping[str, Any]) -> Path:
+        """Keep a finished fit as ``fits/NAME.json`` and as the latest, ``fit.json``."""
+        write_json(self.path / "fits" / f"{name}.json", dict(fit))
+        return write_json(self.path / "fit.json", dict(fit))
+
+    def fit(self) -> dict[str, Any]:
+        """The latest finished fit.
+
+        Raises:
+            RunError: no fit has been finished.
+        """
+        path = self.path / "fit.json"
+        if not path.is_file():
+            raise RunError(f"{self.path}: no fit has been finished here; `splatsoil fit` goes on where it stopped")
+        return read_json(path)

@@ -1,0 +1,89 @@
+"""Files that are whole or absent: every result is written beside its place and then moved onto it."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from splatsoil.errors import RunError
+
+
+def write_bytes(path: str | Path, data: bytes) -> Path:
+    """Write ``data`` to ``path`` so that a reader, or a crash, never sees half of it.
+
+    Raises:
+        RunError: the folder can't be written to.
+    """
+    target = Path(path)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        descriptor, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".tmp", dir=target.parent)
+    except OSError as error:
+        raise RunError(f"{target}: cannot be written ({error.strerror}); choose a folder you may write to") from error
+    try:
+        with os.fdopen(descriptor, "wb") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+        # mkstemp makes private files; a result is for everybody whom the user's umask lets read it.
+        umask = os.umask(0)
+        os.umask(umask)
+        Path(name).chmod(0o666 & ~umask)
+        Path(name).replace(target)
+    except OSError as error:
+        Path(name).unlink(missing_ok=True)
+        raise RunError(f"{target}: cannot be written ({error.strerror}); free some space and try again") from error
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+    return target
+
+
+def write_text(path: str | Path, text: str) -> Path:
+    """Write ``text`` as UTF-8, whole or not at all."""
+    return write_bytes(path, text.encode())
+
+
+def write_json(path: str | Path, data: Any) -> Path:
+    """Write ``data`` as indented, strictly valid JSON; NumPy numbers and arrays are taken, NaN becomes null."""
+    return write_text(path, json.dumps(plain(data), indent=1, allow_nan=False) + "\n")
+
+
+def read_json(path: str | Path) -> Any:
+    """Read a JSON file of a run folder.
+
+    Raises:
+        RunError: the file is missing, unreadable or not JSON.
+    """
+    source = Path(path)
+    try:
+        return json.loads(source.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise RunError(f"{source}: there is no such file") from error
+    except OSError as error:
+        raise RunError(f"{source}: cannot be read ({error.strerror})") from error
+    except ValueError as error:
+        raise RunError(f"{source}: is not JSON ({error}); delete it and run the command again") from error
+
+
+def plain(data: Any) -> Any:
+    """``data`` in JSON's own types; non-finite numbers become None."""
+    if isinstance(data, dict):
+        return {str(key): plain(value) for key, value in data.items()}
+    if isinstance(data, (list, tuple)):
+        return [plain(value) for value in data]
+    if isinstance(data, np.ndarray):
+        return plain(data.tolist())
+    if isinstance(data, np.generic):
+        return plain(data.item())
+    if isinstance(data, Path):
+        return str(data)
+    if isinstance(data, float) and not math.isfinite(data):
+        return None
+    return data

@@ -1,0 +1,103 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from splatsoil.inverse.run_folder import RunFolder
+
+from splatsoil.errors import RunError
+from splatsoil.files import read_json, write_bytes, write_json
+
+MEASUREMENT = {"name": "plow", "folder": "sets/plow", "hash": "a" * 64}
+
+
+def prepare(path: Path, **changes: object) -> RunFolder:
+    options: dict = {"measurement": MEASUREMENT, "preset": "tiny", "seed": 0, "version": "1"} | changes
+    return RunFolder.prepare(path, **options)
+
+
+def test_a_run_says_what_it_is_for(tmp_path: Path) -> None:
+    made = prepare(tmp_path / "deep" / "run")
+    again = RunFolder.open(tmp_path / "deep" / "run")
+    assert again.description == made.description
+    assert again.description["measurement"] == MEASUREMENT
+    assert prepare(tmp_path / "deep" / "run").description == made.description
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"measurement": MEASUREMENT | {"hash": "b" * 64}}, "another measurement set .plow."),
+        ({"preset": "small"}, "preset tiny, not small"),
+        ({"seed": 1}, "seed 0, not 1"),
+    ],
+)
+def test_another_experiment_is_refused(tmp_path: Path, changes: dict[str, object], says: str) -> None:
+    prepare(tmp_path / "run")
+    before = (tmp_path / "run" / "run.json").read_bytes()
+    with pytest.raises(RunError, match=says):
+        prepare(tmp_path / "run", **changes)
+    assert (tmp_path / "run" / "run.json").read_bytes() == before
+
+
+def test_a_folder_with_other_things_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(RunError, match="isn't a run folder"):
+        prepare(tmp_path)
+    assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_an_empty_folder_is_taken(tmp_path: Path) -> None:
+    assert prepare(tmp_path).path == tmp_path
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"format": "other/1"}'])
+def test_a_broken_description_gets_one_sentence(tmp_path: Path, text: str) -> None:
+    (tmp_path / "run.json").write_text(text)
+    with pytest.raises(RunError, match=r"run\.json"):
+        RunFolder.open(tmp_path)
+
+
+def test_opening_what_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match="no such run folder"):
+        RunFolder.open(tmp_path / "nothing")
+    with pytest.raises(RunError, match=r"no run\.json"):
+        RunFolder.open(tmp_path)
+
+
+def test_the_latest_fit_and_the_earlier_ones(tmp_path: Path) -> None:
+    run = prepare(tmp_path)
+    with pytest.raises(RunError, match="no fit"):
+        run.fit()
+    run.write_fit("base", {"loss": 2.0})
+    run.write_fit("cohesion", {"loss": 1.0})
+    assert run.fit() == {"loss": 1.0}
+    assert read_json(tmp_path / "fits" / "base.json") == {"loss": 2.0}
+
+
+def test_a_write_that_fails_leaves_the_old_file_and_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_json(tmp_path / "a.json", {"old": True})
+
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("splatsoil.files.os.fsync", full)
+    with pytest.raises(RunError, match="No space left"):
+        write_bytes(path, b"new")
+    assert json.loads(path.read_text()) == {"old": True}
+    assert [p.name for p in tmp_path.iterdir()] == ["a.json"]
+
+
+def test_json_is_strict(tmp_path: Path) -> None:
+    import numpy as np
+
+    path = write_json(
+        tmp_path / "a.json", {"nan": float("nan"), "array": np.arange(2), "path": tmp_path, "n": np.int64(3)}
+    )
+    assert json.loads(path.read_text(), parse_constant=lambda _: pytest.fail("not JSON")) == {
+        "nan": None,
+        "array": [0, 1],
+        "path": str(tmp_path),
+        "n": 3,
+    }
