@@ -29,7 +29,7 @@ class Preset:
     name: str
     cells_across_tool: float
     particles_per_edge: int = 2
-    young: float = 3.0e5
+    young: float = 5.0e5
     poisson: float = 0.3
     courant: float = 0.5
     transport: float = 0.1
@@ -38,7 +38,7 @@ class Preset:
 PRESETS: dict[str, Preset] = {
     preset.name: preset
     for preset in (
-        Preset("tiny", cells_across_tool=3.0, young=1.0e5, transport=0.2),
+        Preset("tiny", cells_across_tool=3.0, young=2.0e5, transport=0.2),
         Preset("small", cells_across_tool=6.0),
         Preset("fine", cells_across_tool=8.0, young=1.0e6),
         Preset("paper", cells_across_tool=3.2, young=1.0e6, poisson=0.2),
@@ -54,7 +54,7 @@ class Resolution:
         cell: nominal edge of a grid cell in m.
         spacing: edge of the cube of soil that a particle stands for, in m.
         frame_time: time between frames in s.
-        steps: steps of the particles in a frame; more while soil moves faster than the tool.
+        steps: steps of the particles in a frame.
         substeps: substeps of the grid in a step.
         bulk: bulk modulus in Pa.
         shear: shear modulus in Pa.

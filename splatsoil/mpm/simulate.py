@@ -111,7 +111,7 @@ def simulate(
     last = wanted[-1] if wanted else 0
     for frame in range(1, last + 1):
         start = (frame - 1) * resolution.frame_time
-        poses = step_poses(measurement.tool.motion, start, resolution.frame_time, solver.steps)
+        poses = step_poses(measurement.tool.motion, start, resolution.frame_time, resolution.steps)
         forces.append(solver.advance(poses))
         if frame in wanted:
             recorded.append((solver.positions(), solver.deformations()))

@@ -130,10 +130,15 @@ def grid_to_particles(
     nodes: Nodes,
     grid: Grid,
     ceiling: float,
-    escaped: wp.array(dtype=int),
-    fastest: wp.array(dtype=float),
+    limit: float,
+    broken: wp.array(dtype=int),
+    strays: wp.array(dtype=int),
 ) -> None:
-    """Move particles with the step's displacement; take over velocity (APIC), stress and volume of the cell."""
+    """Move particles with the step's displacement; take over velocity (APIC), stress and volume of the cell.
+
+    A particle faster than ``limit`` (m/s) or without a finite state counts as ``broken``; one that rises above
+    ``ceiling`` (m) counts as a stray, loses its velocity and falls back.
+    """
     p = wp.tid()
     x = particles.position[p]
     f = local_coordinates(grid, x, cell_of(grid, x))
@@ -168,13 +173,15 @@ def grid_to_particles(
         grid.cell, wp.vec3(float(grid.shape[0] - 1), float(grid.shape[1] - 1), float(grid.shape[2] - 1))
     )
     margin = 1.0e-3 * grid.cell
-    # comparisons with NaN are false: "not inside" catches a broken state as well as a lost particle
-    speed = wp.length(velocity)
-    if not (x[2] < ceiling and speed < 1.0e3):
-        wp.atomic_add(escaped, 0, 1)
+    # comparisons with NaN are false: "not slower" catches a broken state as well as a runaway
+    if not wp.length(velocity) < limit:
+        wp.atomic_add(broken, 0, 1)
         x = particles.position[p]
-    else:
-        wp.atomic_max(fastest, 0, speed)
+    elif x[2] > ceiling:
+        wp.atomic_add(strays, 0, 1)
+        particles.velocity[p] = wp.vec3(0.0)
+        particles.affine[p] = wp.mat33(0.0)
+        x = wp.vec3(x[0], x[1], ceiling)
     particles.position[p] = wp.vec3(
         wp.clamp(x[0], low[0] + margin[0], high[0] - margin[0]),
         wp.clamp(x[1], low[1] + margin[1], high[1] - margin[1]),
