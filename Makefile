@@ -17,7 +17,8 @@ PYTEST_ARGS ?= -n 2 --dist loadfile
 
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
-SOURCES := $(shell find splatsoil envs inverse benchmarks -type f -not -path '*/__pycache__/*')
+PACKAGES := splatsoil envs inverse benchmarks
+SOURCES := $(shell find $(PACKAGES) -type f -not -path '*/__pycache__/*')
 
 .PHONY: demo test lint clean
 .DELETE_ON_ERROR:
@@ -31,8 +32,8 @@ test: $(VENV)/.develop
 
 # Static checkers cannot see that envs/, inverse/ and benchmarks/ install as splatsoil.*, so mypy gets the built package.
 lint: $(VENV)/.develop build/installed/.stamp
-	$(BIN)/ruff format --check .
-	$(BIN)/ruff check .
+	$(BIN)/ruff format --check $(PACKAGES) tests examples
+	$(BIN)/ruff check $(PACKAGES) tests examples
 	cd build/installed && "$(abspath $(BIN))/mypy" --config-file "$(CURDIR)/pyproject.toml" -p splatsoil
 
 clean:
