@@ -4,7 +4,7 @@ from splatsoil.splats.camera import OrthographicCamera
 from splatsoil.splats.gaussians import Gaussians
 from splatsoil.splats.metrics import psnr, ssim, ssim_map
 from splatsoil.splats.ply import load_ply, save_ply
-from splatsoil.splats.rasterise import (
+from splatsoil.splats.rasteriser import (
     Features,
     Rendering,
     rasterise,

@@ -1,13 +1,16 @@
-"""CPU kernels: one task per 16 × 16 tile, one 16-wide vector per row of pixels.
+# mypy: ignore-errors
+# (Warp reads the annotations of kernels as types of its own)
+"""CPU kernels: one task per 16 × 16 tile, one 8-wide vector per half row of pixels.
 
 Written in C++ for the clang that comes with Warp (``wp.func_native``): arrays of a whole tile stay in the first-level
-cache, Gaussians are the outer loop, rows out of a Gaussian's reach are skipped, and a row is sixteen pixels without a
-branch (polynomial exp2). A negative transmittance marks a finished pixel; its magnitude is the final value.
+cache, Gaussians are the outer loop, rows that a Gaussian's ellipse misses are skipped for each half of the tile, and a
+row is eight pixels without a branch (polynomial exp2). A negative transmittance marks a finished pixel; its magnitude
+is the final value.
 
 The backward pass walks front to back again. With S, the part of (colour · gradient) that is still to come, the
 derivative of the loss by a Gaussian's opacity in a pixel is T (c·v) − S / (1 − α). Position, shape and opacity need six
 moments of ∂L/∂σ over the pixels; a lane is a column, so three sums (weights 1, dy, dy²) stay in registers and dx enters
-once per tile.
+once per half tile.
 """
 
 from __future__ import annotations
@@ -18,139 +21,175 @@ from typing import Any
 import warp as wp
 
 from splatsoil.splats import constants
-from splatsoil.splats.binning import HEADER
-
-MOMENTS = 6
-"""Moments of ∂L/∂σ per entry (1, dx, dy, dx², dx·dy, dy²), in front of the feature gradients."""
+from splatsoil.splats.kernels_binning import HEADER, MOMENTS
 
 _COMMON = """
-    typedef float v16 __attribute__((ext_vector_type(16)));
-    typedef int i16 __attribute__((ext_vector_type(16)));
-    const v16 lane = {0.5f, 1.5f, 2.5f, 3.5f, 4.5f, 5.5f, 6.5f, 7.5f,
-                      8.5f, 9.5f, 10.5f, 11.5f, 12.5f, 13.5f, 14.5f, 15.5f};
+    typedef float v8 __attribute__((ext_vector_type(8)));
+    typedef int i8 __attribute__((ext_vector_type(8)));
+    const v8 lane = {0.5f, 1.5f, 2.5f, 3.5f, 4.5f, 5.5f, 6.5f, 7.5f};
     const int x0 = (tile % tiles_x) * 16, y0 = (tile / tiles_x) * 16;
     const int columns = width - x0 < 16 ? width - x0 : 16, lines = height - y0 < 16 ? height - y0 : 16;
     const int begin = starts.data[tile], end = starts.data[tile + 1];
-    v16 T[16];
-    for (int r = 0; r < 16; ++r)
-        T[r] = r < lines ? (lane < (float)columns ? (v16)(1.0f) : (v16)(-1.0f)) : (v16)(-1.0f);
+    v8 T[2][16];
+    for (int h = 0; h < 2; ++h)
+        for (int r = 0; r < 16; ++r) {
+            const v8 inside = lane + 8.0f * h < (float)columns ? (v8)(1.0f) : (v8)(-1.0f);
+            T[h][r] = r < lines ? inside : (v8)(-1.0f);
+        }
+"""
+
+# The rows of each half of the tile that the ellipse dy = slope·dx ± √(room − bend·dx²) reaches; tip is dx of its lowest
+# point, and the highest one lies opposite. Sixteen Gaussians at a time and without branches, apart from the loops over
+# rows, whose length would otherwise be known too late for the processor to run ahead.
+_RANGES = """
+        const int count = end - chunk < 16 ? end - chunk : 16;
+        int from[16][2], to[16][2];
+        for (int i = 0; i < count; ++i) {
+            const float* g = rows.data + (long long)ranks.data[chunk + i] * STRIDE;
+            for (int h = 0; h < 2; ++h) {
+                const float left = (float)(x0 + 8 * h) + 0.5f - g[0], right = left + 7.0f, tip = g[8];
+                const float low = tip < left ? left : tip > right ? right : tip;
+                const float high = -tip < left ? left : -tip > right ? right : -tip;
+                const float low_room = g[10] - g[11] * (low * low), high_room = g[10] - g[11] * (high * high);
+                const float middle = g[1] - 0.5f - (float)y0;
+                const float top = g[9] * high + middle - __builtin_sqrtf(high_room > 0.0f ? high_room : 0.0f);
+                const float bottom = g[9] * low + middle + __builtin_sqrtf(low_room > 0.0f ? low_room : 0.0f);
+                const int first = (int)__builtin_ceilf(top > 0.0f ? top : 0.0f);
+                const int last = (int)__builtin_floorf(bottom < (float)(lines - 1) ? bottom : (float)(lines - 1));
+                from[i][h] = (low_room < 0.0f) | (high_room < 0.0f) ? 16 : first;
+                to[i][h] = last;
+            }
+        }
 """
 
 _GAUSSIAN = """
-        const float* g = rows.data + (long long)ranks.data[e] * STRIDE;
-        const v16 dx = lane + ((float)x0 - g[0]);
-        const float from = g[1] - g[6] - 0.5f - (float)y0, to = g[1] + g[6] - 0.5f - (float)y0;
-        const int r0 = from > 0.0f ? (int)__builtin_ceilf(from) : 0;
-        const int r1 = to < (float)(lines - 1) ? (int)__builtin_floorf(to) : lines - 1;
-        const v16 quadratic = g[5] + (dx * dx) * g[2];
-        const v16 linear = dx * g[3];
+                const v8 dx = lane + ((float)(x0 + 8 * h) - g[0]);
+                const v8 quadratic = (dx * dx) * g[2] + g[5];
+                const v8 linear = dx * g[3];
 """
 
-# 2^p by rounding to an integer (adding 1.5·2²³ leaves it in the low bits) and a polynomial on [−½, ½] (from Cephes)
+# 2^p by rounding to an integer (adding 1.5·2²³ leaves it in the low bits) and a polynomial on [−½, ½] (from Cephes).
+# A finished pixel has t < 0 and so stays finished: t (1 − alpha) < 0.
 _ALPHA = """
-            const float dy = (float)(y0 + r) + 0.5f - g[1];
-            v16 p = quadratic + dy * (linear + dy * g[4]);
-            p = __builtin_elementwise_max(p, (v16)(-64.0f));
-            const v16 shifted = p + 12582912.0f;
-            const v16 f = p - (shifted - 12582912.0f);
-            v16 poly = f * 1.535336188e-4f + 1.339887440e-3f;
-            poly = poly * f + 9.618437357e-3f;
-            poly = poly * f + 5.550332471e-2f;
-            poly = poly * f + 2.402264791e-1f;
-            poly = poly * f + 6.931472028e-1f;
-            poly = poly * f + 1.0f;
-            const i16 exponent = __builtin_bit_cast(i16, shifted) << 23;
-            const v16 raw = __builtin_bit_cast(v16, __builtin_bit_cast(i16, poly) + exponent);
-            v16 alpha = __builtin_elementwise_min(raw, (v16)(ALPHA_MAX));
-            v16 t = T[r];
-            alpha = ((alpha >= ALPHA_MIN) & (t > 0.0f)) ? alpha : (v16)(0.0f);
-            const v16 after = t - t * alpha;
-            const i16 stop = (after <= TRANSMITTANCE_MIN) & (alpha > 0.0f);
-            T[r] = stop ? -t : after;
-            const v16 w = stop ? (v16)(0.0f) : alpha * t;
+                const float dy = (float)(y0 + r) + 0.5f - g[1];
+                v8 p = (linear + dy * g[4]) * dy + quadratic;
+                p = __builtin_elementwise_max(p, (v8)(-64.0f));
+                const v8 shifted = p + 12582912.0f;
+                const v8 f = p - (shifted - 12582912.0f);
+                v8 poly = f * 1.535336188e-4f + 1.339887440e-3f;
+                poly = poly * f + 9.618437357e-3f;
+                poly = poly * f + 5.550332471e-2f;
+                poly = poly * f + 2.402264791e-1f;
+                poly = poly * f + 6.931472028e-1f;
+                poly = poly * f + 1.0f;
+                const i8 exponent = __builtin_bit_cast(i8, shifted) << 23;
+                const v8 raw = __builtin_bit_cast(v8, __builtin_bit_cast(i8, poly) + exponent);
+                v8 alpha = __builtin_elementwise_min(raw, (v8)(ALPHA_MAX));
+                alpha = alpha >= ALPHA_MIN ? alpha : (v8)(0.0f);
+                const v8 t = T[h][r];
+                const v8 after = t - t * alpha;
+                const i8 stop = after <= TRANSMITTANCE_MIN;
+                T[h][r] = stop ? -__builtin_elementwise_abs(t) : after;
+                const v8 w = stop ? (v8)(0.0f) : alpha * t;
 """
 
 _SATURATED = """
-        if (((e - begin) & 15) == 15) {
-            i16 alive = T[0] > 0.0f;
-            for (int r = 1; r < 16; ++r) alive |= T[r] > 0.0f;
-            if (!__builtin_reduce_or(alive)) break;
-        }
+        i8 alive = T[0][0] > 0.0f;
+        for (int r = 0; r < 16; ++r) alive |= (T[0][r] > 0.0f) | (T[1][r] > 0.0f);
+        if (!__builtin_reduce_or(alive)) break;
 """
 
 _FORWARD = """
     COMMON
-    v16 sum[K][16];
-    for (int k = 0; k < K; ++k) for (int r = 0; r < 16; ++r) sum[k][r] = 0.0f;
-    for (int e = begin; e < end; ++e) {
-        GAUSSIAN
-        for (int r = r0; r <= r1; ++r) {
-            ALPHA
-            #pragma unroll
-            for (int k = 0; k < K; ++k) sum[k][r] += w * g[8 + k];
+    v8 sum[2][16][K];
+    for (int h = 0; h < 2; ++h) for (int r = 0; r < 16; ++r) for (int k = 0; k < K; ++k) sum[h][r][k] = 0.0f;
+    for (int chunk = begin; chunk < end; chunk += 16) {
+        RANGES
+        for (int i = 0; i < count; ++i) {
+            const float* g = rows.data + (long long)ranks.data[chunk + i] * STRIDE;
+            for (int h = 0; h < 2; ++h) {
+                GAUSSIAN
+                for (int r = from[i][h]; r <= to[i][h]; ++r) {
+                    ALPHA
+                    #pragma unroll
+                    for (int k = 0; k < K; ++k) sum[h][r][k] = w * g[HEADER + k] + sum[h][r][k];
+                }
+            }
         }
         SATURATED
     }
     for (int r = 0; r < lines; ++r) {
         for (int x = 0; x < columns; ++x) {
             const long long pixel = (long long)(y0 + r) * width + x0 + x;
-            const float left = __builtin_fabsf(T[r][x]);
+            const float left = __builtin_fabsf(T[x >> 3][r][x & 7]);
             transmittance.data[pixel] = left;
-            for (int k = 0; k < K; ++k) image.data[pixel * K + k] = sum[k][r][x] + left * background.data[k];
+            for (int k = 0; k < K; ++k)
+                image.data[pixel * K + k] = sum[x >> 3][r][k][x & 7] + left * background.data[k];
         }
     }
 """
 
 _BACKWARD = """
-    COMMON
-    typedef float v8 __attribute__((ext_vector_type(8)));
     typedef float v4 __attribute__((ext_vector_type(4)));
-    const auto total = [](v16 a) {
-        const v8 b = a.lo + a.hi;
-        const v4 c = b.lo + b.hi;
-        return (c.x + c.z) + (c.y + c.w);
-    };
-    v16 v[K][16], S[16];
-    for (int r = 0; r < 16; ++r) {
-        S[r] = 0.0f;
-        for (int k = 0; k < K; ++k) v[k][r] = 0.0f;
-        for (int x = 0; r < lines && x < columns; ++x) {
+    COMMON
+    v8 v[2][16][K], S[2][16];
+    for (int h = 0; h < 2; ++h) for (int r = 0; r < 16; ++r) {
+        S[h][r] = 0.0f;
+        for (int k = 0; k < K; ++k) v[h][r][k] = 0.0f;
+    }
+    for (int r = 0; r < lines; ++r) {
+        for (int x = 0; x < columns; ++x) {
             const long long pixel = (long long)(y0 + r) * width + x0 + x;
             float s = transmittance.data[pixel] * v_transmittance.data[pixel];
             for (int k = 0; k < K; ++k) {
                 const float gradient = v_image.data[pixel * K + k];
-                v[k][r][x] = gradient;
+                v[x >> 3][r][k][x & 7] = gradient;
                 s += gradient * image.data[pixel * K + k];
             }
-            S[r][x] = s;
+            S[x >> 3][r][x & 7] = s;
         }
     }
-    for (int e = begin; e < end; ++e) {
-        GAUSSIAN
-        v16 m0 = 0.0f, m1 = 0.0f, m2 = 0.0f, vf[K];
-        for (int k = 0; k < K; ++k) vf[k] = 0.0f;
-        for (int r = r0; r <= r1; ++r) {
-            ALPHA
-            v16 cv = g[8] * v[0][r];
-            #pragma unroll
-            for (int k = 1; k < K; ++k) cv += g[8 + k] * v[k][r];
-            #pragma unroll
-            for (int k = 0; k < K; ++k) vf[k] += w * v[k][r];
-            const v16 left = S[r] - w * cv;
-            S[r] = left;
-            // zero where nothing was blended or where alpha was clamped
-            v16 vs = left * alpha / (1.0f - alpha) - w * cv;
-            vs = ((w > 0.0f) & (raw <= ALPHA_MAX)) ? vs : (v16)(0.0f);
-            m0 += vs;
-            m1 += vs * dy;
-            m2 += vs * (dy * dy);
+    for (int chunk = begin; chunk < end; chunk += 16) {
+        RANGES
+        for (int i = 0; i < count; ++i) {
+        const float* g = rows.data + (long long)ranks.data[chunk + i] * STRIDE;
+        v8 sums[MOMENTS + K];
+        for (int j = 0; j < MOMENTS + K; ++j) sums[j] = 0.0f;
+        for (int h = 0; h < 2; ++h) {
+            GAUSSIAN
+            v8 m0 = 0.0f, m1 = 0.0f, m2 = 0.0f;
+            for (int r = from[i][h]; r <= to[i][h]; ++r) {
+                ALPHA
+                v8 cv = v[h][r][0] * g[HEADER];
+                #pragma unroll
+                for (int k = 1; k < K; ++k) cv = v[h][r][k] * g[HEADER + k] + cv;
+                #pragma unroll
+                for (int k = 0; k < K; ++k) sums[MOMENTS + k] = w * v[h][r][k] + sums[MOMENTS + k];
+                const v8 part = w * cv;
+                const v8 rest = S[h][r] - part;
+                S[h][r] = rest;
+                // nothing where the pixel is finished or alpha was clamped
+                v8 vs = rest * (alpha / (1.0f - alpha)) - part;
+                vs = (stop | (raw > ALPHA_MAX)) ? (v8)(0.0f) : vs;
+                m0 += vs;
+                m1 = vs * dy + m1;
+                m2 = vs * (dy * dy) + m2;
+            }
+            const v8 dx_m0 = dx * m0;
+            sums[0] += m0;
+            sums[1] += dx_m0;
+            sums[2] += m1;
+            sums[3] = dx * dx_m0 + sums[3];
+            sums[4] = dx * m1 + sums[4];
+            sums[5] += m2;
         }
-        float* out = gradients.data + (long long)entries.data[e] * (6 + K);
-        const v16 sums[6 + K] = {m0, dx * m0, m1, dx * dx * m0, dx * m1, m2};
+        float* out = gradients.data + (long long)entries.data[chunk + i] * (MOMENTS + K);
         #pragma unroll
-        for (int i = 0; i < 6; ++i) out[i] = total(sums[i]);
-        #pragma unroll
-        for (int k = 0; k < K; ++k) out[6 + k] = total(vf[k]);
+        for (int j = 0; j < MOMENTS + K; ++j) {
+            const v4 a = sums[j].lo + sums[j].hi;
+            out[j] = (a.x + a.z) + (a.y + a.w);
+        }
+        }
         SATURATED
     }
 """
@@ -159,13 +198,20 @@ _BACKWARD = """
 def _snippet(template: str, channels: int) -> str:
     """C++ text of a template for ``channels`` features."""
     text = template
-    for name, part in (("COMMON", _COMMON), ("GAUSSIAN", _GAUSSIAN), ("ALPHA", _ALPHA), ("SATURATED", _SATURATED)):
+    for name, part in (
+        ("COMMON", _COMMON),
+        ("RANGES", _RANGES),
+        ("GAUSSIAN", _GAUSSIAN),
+        ("ALPHA", _ALPHA),
+        ("SATURATED", _SATURATED),
+    ):
         text = text.replace(f" {name}\n", part)
-    return f"""
-    constexpr int K = {channels}, STRIDE = {HEADER + channels};
+    return f"""{{
+    #pragma clang fp contract(on)
+    constexpr int K = {channels}, HEADER = {HEADER}, MOMENTS = {MOMENTS}, STRIDE = {HEADER + channels};
     constexpr float ALPHA_MAX = {constants.ALPHA_MAX!r}f, ALPHA_MIN = {constants.ALPHA_MIN!r}f;
     constexpr float TRANSMITTANCE_MIN = {constants.TRANSMITTANCE_MIN!r}f;
-    {text}"""
+    {text}}}"""
 
 
 @cache
@@ -247,3 +293,92 @@ def backward_kernel(channels: int) -> Any:
         )  # fmt: skip
 
     return splat_backward
+
+
+@wp.func_native("""
+    // radix sort, least significant digit first, three times eleven bits; the result ends in row 1 of the scratch
+    const long long n = depths.shape[0];
+    unsigned* key[2] = {(unsigned*)scratch.data + 2 * n, (unsigned*)scratch.data + 3 * n};
+    int* index[2] = {scratch.data, scratch.data + n};
+    unsigned histogram[3][2048];
+    for (int pass = 0; pass < 3; ++pass) for (int i = 0; i < 2048; ++i) histogram[pass][i] = 0;
+    int visible = 0;
+    for (int i = 0; i < n; ++i) {
+        if (!(reaches.data[i][0] > 0.0f)) continue;
+        const unsigned bits = __builtin_bit_cast(unsigned, depths.data[i]);
+        const unsigned ordered = bits ^ (bits >> 31 ? 0xffffffffu : 0x80000000u);  // negative floats sort backwards
+        key[0][visible] = ordered;
+        index[0][visible++] = i;
+        for (int pass = 0; pass < 3; ++pass) ++histogram[pass][ordered >> (11 * pass) & 2047u];
+    }
+    for (int pass = 0; pass < 3; ++pass) {
+        unsigned sum = 0;
+        for (int i = 0; i < 2048; ++i) {
+            const unsigned here = histogram[pass][i];
+            histogram[pass][i] = sum;
+            sum += here;
+        }
+        const int from = pass & 1, to = 1 - from;
+        for (int i = 0; i < visible; ++i) {
+            const unsigned at = histogram[pass][key[from][i] >> (11 * pass) & 2047u]++;
+            key[to][at] = key[from][i];
+            index[to][at] = index[from][i];
+        }
+    }
+    count.data[0] = visible;
+""")
+def _depth_order(
+    depths: wp.array(dtype=float),
+    reaches: wp.array(dtype=wp.vec2),
+    scratch: wp.array2d(dtype=wp.int32),
+    count: wp.array(dtype=wp.int32),
+): ...
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def depth_order(
+    depths: wp.array(dtype=float),
+    reaches: wp.array(dtype=wp.vec2),
+    scratch: wp.array2d(dtype=wp.int32),
+    count: wp.array(dtype=wp.int32),
+):
+    """Stable order of the visible Gaussians by depth, nearest first, in row 1 of ``scratch`` (4, n); one task."""
+    _depth_order(depths, reaches, scratch, count)
+
+
+@wp.func_native("""
+    const int n = (int)tiles.shape[0], last = (int)starts.shape[0] - 1;
+    for (int e = 0; e < n; ++e) ++starts.data[tiles.data[e]];
+    int sum = 0;
+    for (int tile = 0; tile < last; ++tile) {
+        const int here = starts.data[tile];
+        starts.data[tile] = sum;
+        sum += here;
+    }
+    for (int e = 0; e < n; ++e) {
+        const int at = starts.data[tiles.data[e]]++;
+        ranks.data[at] = owners.data[e];
+        entries.data[at] = e;
+    }
+    for (int tile = last; tile > 0; --tile) starts.data[tile] = starts.data[tile - 1];
+    starts.data[0] = 0;
+""")
+def _tile_sort(
+    tiles: wp.array(dtype=wp.int32),
+    owners: wp.array(dtype=wp.int32),
+    starts: wp.array(dtype=wp.int32),
+    ranks: wp.array(dtype=wp.int32),
+    entries: wp.array(dtype=wp.int32),
+): ...
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def tile_sort(
+    tiles: wp.array(dtype=wp.int32),
+    owners: wp.array(dtype=wp.int32),
+    starts: wp.array(dtype=wp.int32),
+    ranks: wp.array(dtype=wp.int32),
+    entries: wp.array(dtype=wp.int32),
+):
+    """Stable counting sort of entries by tile; ``starts`` (tiles + 1) is zero beforehand; one task."""
+    _tile_sort(tiles, owners, starts, ranks, entries)

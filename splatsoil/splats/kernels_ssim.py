@@ -1,3 +1,5 @@
+# mypy: ignore-errors
+# (Warp reads the annotations of kernels as types of its own)
 """CPU kernels of SSIM: one task per band of rows, both blurs in the first-level cache.
 
 The window is separable. For every output row the five blurred moments (a, b, a², b², ab) are summed down the columns

@@ -80,7 +80,7 @@ class _Similarity(torch.autograd.Function):
     """SSIM map by the CPU kernels; the partial derivatives by the three blurred moments are kept for backward."""
 
     @staticmethod
-    def forward(ctx: Any, a: Tensor, b: Tensor) -> Tensor:  # type: ignore[override]
+    def forward(ctx: Any, a: Tensor, b: Tensor) -> Tensor:
         height, row = a.shape[0], a[0].numel()
         channels = row // a.shape[1]
         pictures = [t.contiguous() for t in (a, b)]
@@ -92,7 +92,7 @@ class _Similarity(torch.autograd.Function):
         return out
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None]:  # type: ignore[override]
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None]:
         a, b, *slopes = ctx.saved_tensors
         height, row = a.shape[0], a[0].numel()
         channels = row // a.shape[1]

@@ -11,15 +11,12 @@ import warp as wp
 from torch import Tensor
 
 from splatsoil.errors import ParameterError
-from splatsoil.splats import constants, kernels_cpu
+from splatsoil.splats import constants, kernels_binning, kernels_cpu
 from splatsoil.splats.binning import Bins, bin_by_tile
 from splatsoil.splats.camera import AnyCamera, View, view_of
 from splatsoil.splats.gaussians import Gaussians
 from splatsoil.splats.projection import Projection, covariances_of, project
 from splatsoil.splats.warp_torch import as_warp, launch
-
-MOMENTS = 6
-"""Moments of ∂L/∂σ in a row of gradients (1, dx, dy, dx², dx·dy, dy²), in front of the feature gradients."""
 
 
 @dataclass(frozen=True)
@@ -193,7 +190,7 @@ class _Composite(torch.autograd.Function):
     """Blend projected Gaussians front to back."""
 
     @staticmethod
-    def forward(  # type: ignore[override]
+    def forward(
         ctx: Any,
         centres: Tensor,
         conics: Tensor,
@@ -215,12 +212,12 @@ class _Composite(torch.autograd.Function):
         return image, transmittance
 
     @staticmethod
-    def backward(ctx: Any, v_image: Tensor, v_transmittance: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+    def backward(ctx: Any, v_image: Tensor, v_transmittance: Tensor) -> tuple[Tensor | None, ...]:
         conics, strengths, image, transmittance = ctx.saved_tensors
         bins: Bins = ctx.bins
         view: View = ctx.view
         n, channels = conics.shape[0], image.shape[2]
-        gradients = image.new_zeros((bins.ranks.shape[0], MOMENTS + channels))
+        gradients = image.new_zeros((bins.ranks.shape[0], kernels_binning.MOMENTS + channels))
         inputs = [*_tile_arguments(bins, view), as_warp(bins.entries, wp.int32)]
         tensors = (image, transmittance, v_image, v_transmittance, gradients)
         inputs += [as_warp(t.reshape(-1), wp.float32) for t in tensors]
@@ -231,7 +228,7 @@ class _Composite(torch.autograd.Function):
         arrays = [as_warp(bins.order, wp.int32), as_warp(bins.ends, wp.int32), as_warp(gradients, wp.float32)]
         arrays += [as_warp(conics, wp.vec3), as_warp(strengths, wp.float32)]
         arrays += [as_warp(t, d) for t, d in zip(outputs, types, strict=True)]
-        launch(_gather, bins.order.shape[0], arrays, image)
+        launch(kernels_binning.gather, bins.order.shape[0], arrays, image)
         v_background = torch.einsum("hw,hwk->k", transmittance, v_image) if ctx.needs_input_grad[4] else None
         return (*outputs, v_background, None, None)
 
@@ -240,36 +237,3 @@ def _tile_arguments(bins: Bins, view: View) -> list[Any]:
     """What both tile kernels take first."""
     rows, starts, ranks = as_warp(bins.rows, wp.float32), as_warp(bins.starts, wp.int32), as_warp(bins.ranks, wp.int32)
     return [0, view.width, view.height, bins.tiles_x, rows, starts, ranks]
-
-
-@wp.kernel(enable_backward=False, module="unique")
-def _gather(
-    order: wp.array(dtype=wp.int32),
-    ends: wp.array(dtype=wp.int32),
-    gradients: wp.array2d(dtype=float),
-    conics: wp.array(dtype=wp.vec3),
-    strengths: wp.array(dtype=float),
-    v_centres: wp.array(dtype=wp.vec2),
-    v_conics: wp.array(dtype=wp.vec3),
-    v_strengths: wp.array(dtype=float),
-    v_features: wp.array2d(dtype=float),
-):
-    """Sum the entries of a rank in order, and turn moments of ∂L/∂σ into gradients (σ = ½ dᵀ conic d, α = o e^−σ)."""
-    rank = wp.tid()
-    begin = wp.int32(0)
-    if rank > 0:
-        begin = ends[rank - 1]
-    i = order[rank]
-    s = wp.float32(0.0)
-    first = wp.vec2()
-    second = wp.vec3()
-    for e in range(begin, ends[rank]):
-        s += gradients[e, 0]
-        first += wp.vec2(gradients[e, 1], gradients[e, 2])
-        second += wp.vec3(gradients[e, 3], gradients[e, 4], gradients[e, 5])
-        for k in range(v_features.shape[1]):
-            v_features[i, k] += gradients[e, 6 + k]
-    conic = conics[i]
-    v_centres[i] = -wp.vec2(conic[0] * first[0] + conic[1] * first[1], conic[1] * first[0] + conic[2] * first[1])
-    v_conics[i] = wp.vec3(0.5 * second[0], second[1], 0.5 * second[2])
-    v_strengths[i] = -s / strengths[i]
