@@ -1,0 +1,174 @@
+"""The forward model: a parameter vector in, what the cameras would have seen out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+
+from splatsoil.errors import ParameterError
+from splatsoil.measurement import Measurement
+from splatsoil.mpm import Resolution, Trajectory, simulate
+from splatsoil.parameters import Parameter, ParameterSpace
+from splatsoil.reconstruction import Reconstruction, fill
+from splatsoil.scene import Scene
+from splatsoil.soil.law import Law
+from splatsoil.soil.library import find_effects
+
+Image = npt.NDArray[np.float32]
+
+SCENES_KEPT = 4
+"""Scenes, one for each particle seed, that a model keeps at hand."""
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What the model says the instruments see.
+
+    Attributes:
+        values: the parameters, by name.
+        seed: of the particles.
+        images: (h, w, 3) sRGB in [0, 1] by (camera, frame), free of lens distortion.
+        trajectory: the simulation behind them.
+        seconds: time spent on simulation and on drawing.
+    """
+
+    values: Mapping[str, float]
+    seed: int
+    images: Mapping[tuple[str, int], Image]
+    trajectory: Trajectory
+    seconds: Mapping[str, float]
+
+
+class Model:
+    """A soil model of one experiment: base law and effects, started from one reconstruction.
+
+    Args:
+        measurement: bed, tool, motion, cameras.
+        reconstruction: of the scene before anything moves.
+        effects: names of effects (or files that define some) that are on.
+        preset: resolution of the solver.
+        device: ``cpu`` or ``cuda:N``.
+        frames: video frames to predict; all measured ones from frame 0 on by default.
+
+    Raises:
+        ParameterError: unknown preset, effect or frame.
+    """
+
+    def __init__(
+        self,
+        measurement: Measurement,
+        reconstruction: Reconstruction,
+        *,
+        effects: Iterable[str] = (),
+        preset: str = "small",
+        device: str = "cpu",
+        frames: Iterable[int] | None = None,
+    ) -> None:
+        self.measurement, self.reconstruction = measurement, reconstruction
+        self.preset, self.device = preset, device
+        self.law = Law(find_effects(effects))
+        self.resolution = Resolution.derive(measurement, preset)
+        measured = tuple(int(f) for f in measurement.frames)
+        self.frames = measured if frames is None else tuple(sorted({int(f) for f in frames}))
+        unknown = sorted(set(self.frames) - set(measured))
+        if unknown or not self.frames:
+            raise ParameterError(f"frames {unknown or 'none'} are not in the video; it has {measured}")
+        self._scene = lru_cache(maxsize=SCENES_KEPT)(self._build_scene)
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """All parameters of the law with its effects."""
+        return self.law.parameters
+
+    def space(self, names: Iterable[str] | None = None) -> ParameterSpace:
+        """The named parameters as free ones; by default the friction angle and those of all effects that are on.
+
+        Raises:
+            ParameterError: a name that this model does not have.
+        """
+        known = {p.name: p for p in self.parameters}
+        wanted = tuple(known) if names is None else tuple(names)
+        unknown = [n for n in wanted if n not in known]
+        if unknown:
+            raise ParameterError(f"unknown parameter {', '.join(unknown)}; this model has {', '.join(known)}")
+        return ParameterSpace(known[n] for n in wanted)
+
+    def particles(self, seed: int = 0) -> npt.NDArray[np.float64]:
+        """Particles (n, 3) in m that fill the reconstructed bed."""
+        return fill(self.reconstruction.surface, self.measurement.bed, self.resolution.spacing, seed=seed)
+
+    def scene(self, seed: int = 0) -> Scene:
+        """Scene whose Gaussians ride on the particles of ``seed``; its light is estimated once."""
+        return self._scene(seed)
+
+    def _build_scene(self, seed: int) -> Scene:
+        light = None if seed == 0 else self.scene(0).light
+        return Scene.from_reconstruction(
+            self.reconstruction,
+            self.measurement,
+            self.particles(seed),
+            self.resolution.spacing,
+            light=light,
+            device=self.device,
+        )
+
+    def simulate(
+        self, values: Mapping[str, float], seed: int = 0, progress: Callable[[int, int], None] | None = None
+    ) -> Trajectory:
+        """Run the soil for ``values`` (by name, in physical units; defaults for those left out).
+
+        Raises:
+            SimulationError: the simulation could not go on.
+            ParameterError: unknown names or values out of bounds.
+        """
+        return simulate(
+            self.measurement,
+            self.particles(seed),
+            values,
+            law=self.law,
+            resolution=self.resolution,
+            frames=self.frames,
+            device=self.device,
+            progress=progress,
+        )[0]
+
+    def draw(self, trajectory: Trajectory, seed: int = 0) -> dict[tuple[str, int], Image]:
+        """Pictures of a trajectory by (camera, frame), as undistorted cameras see it."""
+        scene = self.scene(seed)
+        motion = self.measurement.tool.motion
+        cameras = {name: camera.undistorted() for name, camera in self.measurement.cameras.items()}
+        images: dict[tuple[str, int], Image] = {}
+        for k, frame in enumerate(trajectory.frames):
+            tool = motion.pose(frame / self.measurement.frame_rate)
+            posed = scene.pose(trajectory.positions[k], trajectory.deformations[k], tool)
+            for name, camera in cameras.items():
+                images[name, frame] = scene.picture(posed, camera)
+        return images
+
+    def predict(
+        self,
+        values: Mapping[str, float],
+        seed: int = 0,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> Prediction:
+        """Simulate and draw.
+
+        Raises:
+            SimulationError, ParameterError: see :meth:`simulate`.
+        """
+        started = time.perf_counter()
+        trajectory = self.simulate(values, seed, progress)
+        simulated = time.perf_counter()
+        images = self.draw(trajectory, seed)
+        return Prediction(
+            values=dict(values),
+            seed=seed,
+            images=images,
+            trajectory=trajectory,
+            seconds={"simulation": simulated - started, "drawing": time.perf_counter() - simulated},
+        )
