@@ -194,7 +194,10 @@ def read_text(file: Path) -> str:
 
 def read_table(file: Path, columns: Sequence[str]) -> FloatArray:
     """A CSV file with exactly the header ``columns``: (rows, columns) finite numbers, at least one row."""
-    rows = list(csv.reader(read_text(file).splitlines()))
+    try:
+        rows = list(csv.reader(read_text(file).splitlines()))
+    except csv.Error as error:
+        raise MeasurementError(f"not a CSV table: {error}", file=file) from error
     header = [name.strip() for name in rows[0]] if rows else []
     if header != list(columns):
         found = ",".join(header)[:80] or "nothing"

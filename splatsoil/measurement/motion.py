@@ -16,6 +16,7 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
 MOTION_COLUMNS = ("frame", "time", "x", "y", "z", "qw", "qx", "qy", "qz")
+_LARGEST_FRAME = 1e9
 _QUATERNION_SLACK = 0.05  # further from length 1 than rounding explains: the columns are likely mixed up
 
 
@@ -105,9 +106,10 @@ class ToolMotion:
 
 def check_clock(frames: FloatArray, times: FloatArray, file: Path) -> None:
     """Raise MeasurementError unless frame numbers are whole and both frames and times increase from row to row."""
-    broken = np.flatnonzero(frames != np.round(frames))
+    broken = np.flatnonzero((frames != np.round(frames)) | (np.abs(frames) > _LARGEST_FRAME))
     if broken.size:
-        raise MeasurementError(f"{frames[broken[0]]:g} is not a whole number", file=file, field="frame")
+        i = int(broken[0])
+        raise MeasurementError(f"{frames[i]:g} is no frame number", file=file, field=f"frame, row {i + 1}")
     for name, values, verb in (("frame", frames, "does not increase"), ("time", times, "runs backwards")):
         steps = np.flatnonzero(np.diff(values) <= 0.0)
         if steps.size:

@@ -83,6 +83,9 @@ def _on_video(measurement: Measurement) -> list[str]:
             out.append(f"Camera {name!r} lacks {len(missing)} frames that others have: {_some(missing)}.")
         if not sees(cameras[name], measurement.bed):
             out.append(f"Camera {name!r} does not show the soil's box.")
+    lost = [str(n) for n in _lost(frames)]
+    if lost:
+        out.append(f"The video lacks {len(lost)} frames in an otherwise even row: {_some(lost)}.")
     motion = measurement.tool.motion
     late = [str(n) for n in frames if not motion.frames[0] <= n <= motion.frames[-1]]
     if late:
@@ -124,6 +127,16 @@ def _on_tool(measurement: Measurement) -> list[str]:
         first = int(tool.motion.frames[gaps[0]]) + 1
         out.append(f"The motion skips frames (first {first}); the pose is interpolated there.")
     return out
+
+
+def _lost(frames: tuple[int, ...]) -> list[int]:
+    """Numbers that would fill the gaps which are whole multiples of the usual step between frames."""
+    steps = np.diff(frames)
+    if len(steps) < 3:
+        return []
+    usual = int(np.bincount(steps).argmax())
+    gaps = [(n, int(step)) for n, step in zip(frames, steps, strict=False) if step > usual and step % usual == 0]
+    return [n + k for n, step in gaps for k in range(usual, step, usual)]
 
 
 def _off_clock(frame: Frame, measurement: Measurement) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -189,6 +190,23 @@ def test_remarks_say_in_plain_words_what_is_odd(small_set: Path, spoil: object, 
         file.write_text(json.dumps(content))
     texts = [remark.text for remark in remarks(Measurement.load(small_set))]
     assert any(says in text for text in texts), texts
+
+
+def test_lost_video_frames_are_named(plow_dry: Path, tmp_path: Path) -> None:
+    """Frame 110 is missing from both cameras; that 199 follows 190 is no gap."""
+    shutil.copytree(plow_dry, tmp_path / "set")
+    file = tmp_path / "set" / "video" / "transforms.json"
+    data = json.loads(file.read_text())
+    data["frames"] = [frame for frame in data["frames"] if frame["frame"] != 110]
+    file.write_text(json.dumps(data))
+    (remark,) = remarks(Measurement.load(tmp_path / "set"))
+    assert remark.text == "The video lacks 1 frames in an otherwise even row: 110."
+
+
+def test_cameras_and_sets_survive_pickling(plow_dry: Path) -> None:
+    m = pickle.loads(pickle.dumps(Measurement.load(plow_dry)))
+    np.testing.assert_array_equal(m.cameras["left"].camera_to_world[3], [0, 0, 0, 1])
+    assert m.tool.mesh.is_watertight and m.hash == Measurement.load(plow_dry).hash
 
 
 def test_remarks_on_the_tools_motion(small_set: Path) -> None:
