@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import warp as wp
 
 from splatsoil.splats import constants
@@ -17,7 +19,6 @@ MOMENTS = 6
 """Moments of ∂L/∂σ per entry (1, dx, dy, dx², dx·dy, dy²), in front of the feature gradients."""
 
 _HEADER = wp.constant(wp.int32(HEADER))
-_MOMENTS = wp.constant(wp.int32(MOMENTS))
 _SIDE = wp.constant(wp.float32(constants.TILE))
 _ALPHA_MIN = wp.constant(wp.float32(constants.ALPHA_MIN))
 _LOG2E = wp.constant(wp.float32(1.4426950408889634))
@@ -38,32 +39,55 @@ def _tiles_between(low: float, high: float, tiles: int):
     return wp.vec2i(int(first), int(last))
 
 
+@wp.struct
+class Ellipse:
+    """Where a Gaussian's opacity is 1/255: dx = slope·dy ± √(room − bend·dy²) around (x, y)."""
+
+    x: float
+    y: float
+    reach: float
+    tip: float
+    slope: float
+    room: float
+    bend: float
+
+
 @wp.func
-def _tile_span(rows: wp.array2d(dtype=float), rank: int, tile_row: int, tiles_x: int):
-    """First and one-past-last tile column that the ellipse touches in one row of tiles."""
-    x = rows[rank, 0]
-    y = rows[rank, 1]
+def _ellipse(rows: wp.array2d(dtype=float), rank: int):
     a = -2.0 * rows[rank, 2]
     b = -rows[rank, 3]
     c = -2.0 * rows[rank, 4]
-    # the ellipse a dx² + 2 b dx dy + c dy² = cut, all scaled by log₂ e; a little larger, against rounding
+    # everything is scaled by log₂ e; a little larger, against rounding
     cut = (2.0 * (rows[rank, 5] - _LOG2_ALPHA_MIN)) * 1.0001 + 1.0e-4
     determinant = _determinant(a, b, c)
-    top = float(tile_row) * _SIDE + 0.5 - y
-    bottom = top + _SIDE - 1.0
-    # rightmost point of the ellipse, moved into the band of rows; the leftmost one lies opposite
-    tip = -b * wp.sqrt(cut / (c * determinant))
-    dy_right = wp.clamp(tip, top, bottom)
-    dy_left = wp.clamp(-tip, top, bottom)
-    right = (-b * dy_right + wp.sqrt(wp.max(cut * a - determinant * dy_right * dy_right, 0.0))) / a
-    left = (-b * dy_left - wp.sqrt(wp.max(cut * a - determinant * dy_left * dy_left, 0.0))) / a
-    return _tiles_between(x + left, x + right, tiles_x)
+    ellipse = Ellipse()
+    ellipse.x = rows[rank, 0]
+    ellipse.y = rows[rank, 1]
+    ellipse.reach = rows[rank, 6]
+    ellipse.tip = -b * wp.sqrt(cut / (c * determinant))
+    ellipse.slope = -b / a
+    ellipse.room = cut / a
+    ellipse.bend = determinant / (a * a)
+    return ellipse
 
 
 @wp.func
-def _tile_rows(rows: wp.array2d(dtype=float), rank: int, tiles_y: int):
+def _tile_rows(ellipse: Ellipse, tiles_y: int):
     """First and one-past-last row of tiles that the ellipse touches."""
-    return _tiles_between(rows[rank, 1] - rows[rank, 6], rows[rank, 1] + rows[rank, 6], tiles_y)
+    return _tiles_between(ellipse.y - ellipse.reach, ellipse.y + ellipse.reach, tiles_y)
+
+
+@wp.func
+def _tile_span(ellipse: Ellipse, tile_row: int, tiles_x: int):
+    """First and one-past-last tile column that the ellipse touches in one row of tiles."""
+    top = float(tile_row) * _SIDE + 0.5 - ellipse.y
+    bottom = top + _SIDE - 1.0
+    # rightmost point of the ellipse, moved into the band of rows; the leftmost one lies opposite
+    dy_right = wp.clamp(ellipse.tip, top, bottom)
+    dy_left = wp.clamp(-ellipse.tip, top, bottom)
+    right = ellipse.slope * dy_right + wp.sqrt(wp.max(ellipse.room - ellipse.bend * dy_right * dy_right, 0.0))
+    left = ellipse.slope * dy_left - wp.sqrt(wp.max(ellipse.room - ellipse.bend * dy_left * dy_left, 0.0))
+    return _tiles_between(ellipse.x + left, ellipse.x + right, tiles_x)
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -100,10 +124,11 @@ def pack(
     rows[rank, 11] = determinant / (conic[2] * conic[2])
     for k in range(features.shape[1]):
         rows[rank, _HEADER + k] = features[i, k]
-    band = _tile_rows(rows, rank, tiles_y)
+    ellipse = _ellipse(rows, rank)
+    band = _tile_rows(ellipse, tiles_y)
     total = wp.int32(0)
     for tile_row in range(band[0], band[1]):
-        span = _tile_span(rows, rank, tile_row, tiles_x)
+        span = _tile_span(ellipse, tile_row, tiles_x)
         total += wp.max(span[1] - span[0], 0)
     counts[rank] = total
 
@@ -122,46 +147,50 @@ def list_tiles(
     entry = wp.int32(0)
     if rank > 0:
         entry = ends[rank - 1]
-    band = _tile_rows(rows, rank, tiles_y)
+    ellipse = _ellipse(rows, rank)
+    band = _tile_rows(ellipse, tiles_y)
     for tile_row in range(band[0], band[1]):
-        span = _tile_span(rows, rank, tile_row, tiles_x)
+        span = _tile_span(ellipse, tile_row, tiles_x)
         for column in range(span[0], span[1]):
             tiles[entry] = tile_row * tiles_x + column
             ranks[entry] = rank
             entry += 1
 
 
-@wp.kernel(enable_backward=False, module="unique")
-def gather(
-    order: wp.array(dtype=wp.int32),
-    ends: wp.array(dtype=wp.int32),
-    gradients: wp.array2d(dtype=float),
-    conics: wp.array(dtype=wp.vec3),
-    strengths: wp.array(dtype=float),
-    v_centres: wp.array(dtype=wp.vec2),
-    v_conics: wp.array(dtype=wp.vec3),
-    v_strengths: wp.array(dtype=float),
-    v_features: wp.array2d(dtype=float),
-):
-    """Sum the entries of a rank in order, and turn moments of ∂L/∂σ into gradients (σ = ½ dᵀ conic d, α = o e^−σ)."""
-    rank = wp.tid()
-    begin = wp.int32(0)
-    if rank > 0:
-        begin = ends[rank - 1]
-    i = order[rank]
-    s = wp.float32(0.0)
-    first = wp.vec2()
-    second = wp.vec3()
-    for e in range(begin, ends[rank]):
-        s += gradients[e, 0]
-        first += wp.vec2(gradients[e, 1], gradients[e, 2])
-        second += wp.vec3(gradients[e, 3], gradients[e, 4], gradients[e, 5])
-    conic = conics[i]
-    v_centres[i] = -wp.vec2(conic[0] * first[0] + conic[1] * first[1], conic[1] * first[0] + conic[2] * first[1])
-    v_conics[i] = wp.vec3(0.5 * second[0], second[1], 0.5 * second[2])
-    v_strengths[i] = -s / strengths[i]
-    for k in range(v_features.shape[1]):
-        v = wp.float32(0.0)
+@cache
+def gather_kernel(channels: int):
+    """Kernel over ranks that sums their entries' rows of gradients for ``channels`` features."""
+    Row = wp.types.vector(length=MOMENTS + channels, dtype=float)
+    Features = wp.types.vector(length=channels, dtype=float)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def gather(
+        order: wp.array(dtype=wp.int32),
+        ends: wp.array(dtype=wp.int32),
+        gradients: wp.array(dtype=Row),
+        conics: wp.array(dtype=wp.vec3),
+        strengths: wp.array(dtype=float),
+        v_centres: wp.array(dtype=wp.vec2),
+        v_conics: wp.array(dtype=wp.vec3),
+        v_strengths: wp.array(dtype=float),
+        v_features: wp.array(dtype=Features),
+    ):
+        """Sum in order, and turn moments of ∂L/∂σ into gradients (σ = ½ dᵀ conic d, α = o e^−σ)."""
+        rank = wp.tid()
+        begin = wp.int32(0)
+        if rank > 0:
+            begin = ends[rank - 1]
+        s = Row()
         for e in range(begin, ends[rank]):
-            v += gradients[e, _MOMENTS + k]
-        v_features[i, k] = v
+            s += gradients[e]
+        i = order[rank]
+        conic = conics[i]
+        v_centres[i] = -wp.vec2(conic[0] * s[1] + conic[1] * s[2], conic[1] * s[1] + conic[2] * s[2])
+        v_conics[i] = wp.vec3(0.5 * s[3], s[4], 0.5 * s[5])
+        v_strengths[i] = -s[0] / strengths[i]
+        v = Features()
+        for k in range(channels):
+            v[k] = s[MOMENTS + k]
+        v_features[i] = v
+
+    return gather

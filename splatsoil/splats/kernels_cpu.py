@@ -30,6 +30,7 @@ _COMMON = """
     const int x0 = (tile % tiles_x) * 16, y0 = (tile / tiles_x) * 16;
     const int columns = width - x0 < 16 ? width - x0 : 16, lines = height - y0 < 16 ? height - y0 : 16;
     const int begin = starts.data[tile], end = starts.data[tile + 1];
+    int top[2] = {0, 0}, bottom[2] = {lines - 1, lines - 1};
     v8 T[2][16];
     for (int h = 0; h < 2; ++h)
         for (int r = 0; r < 16; ++r) {
@@ -52,12 +53,12 @@ _RANGES = """
                 const float high = -tip < left ? left : -tip > right ? right : -tip;
                 const float low_room = g[10] - g[11] * (low * low), high_room = g[10] - g[11] * (high * high);
                 const float middle = g[1] - 0.5f - (float)y0;
-                const float top = g[9] * high + middle - __builtin_sqrtf(high_room > 0.0f ? high_room : 0.0f);
-                const float bottom = g[9] * low + middle + __builtin_sqrtf(low_room > 0.0f ? low_room : 0.0f);
-                const int first = (int)__builtin_ceilf(top > 0.0f ? top : 0.0f);
-                const int last = (int)__builtin_floorf(bottom < (float)(lines - 1) ? bottom : (float)(lines - 1));
-                from[i][h] = (low_room < 0.0f) | (high_room < 0.0f) ? 16 : first;
-                to[i][h] = last;
+                const float first = g[9] * high + middle - __builtin_sqrtf(high_room > 0.0f ? high_room : 0.0f);
+                const float last = g[9] * low + middle + __builtin_sqrtf(low_room > 0.0f ? low_room : 0.0f);
+                const float begin_row = (float)top[h], end_row = (float)bottom[h];
+                const int start = (int)__builtin_ceilf(first > begin_row ? first : begin_row);
+                from[i][h] = (low_room < 0.0f) | (high_room < 0.0f) ? 16 : start;
+                to[i][h] = (int)__builtin_floorf(last < end_row ? last : end_row);
             }
         }
 """
@@ -93,10 +94,13 @@ _ALPHA = """
                 const v8 w = stop ? (v8)(0.0f) : alpha * t;
 """
 
+# rows at the upper and lower end of each half that are finished need no more work
 _SATURATED = """
-        i8 alive = T[0][0] > 0.0f;
-        for (int r = 0; r < 16; ++r) alive |= (T[0][r] > 0.0f) | (T[1][r] > 0.0f);
-        if (!__builtin_reduce_or(alive)) break;
+        for (int h = 0; h < 2; ++h) {
+            while (top[h] <= bottom[h] && !__builtin_reduce_or(T[h][top[h]] > 0.0f)) ++top[h];
+            while (top[h] <= bottom[h] && !__builtin_reduce_or(T[h][bottom[h]] > 0.0f)) --bottom[h];
+        }
+        if (top[0] > bottom[0] && top[1] > bottom[1]) break;
 """
 
 _FORWARD = """

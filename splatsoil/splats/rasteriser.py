@@ -224,11 +224,12 @@ class _Composite(torch.autograd.Function):
         launch(kernels_cpu.backward_kernel(channels), bins.tiles_x * bins.tiles_y, inputs, image)
         shapes = ((n, 2), (n, 3), (n,), (n, channels))
         outputs = [image.new_zeros(shape) for shape in shapes]
-        types = (wp.vec2, wp.vec3, wp.float32, wp.float32)
-        arrays = [as_warp(bins.order, wp.int32), as_warp(bins.ends, wp.int32), as_warp(gradients, wp.float32)]
+        row = wp.types.vector(length=kernels_binning.MOMENTS + channels, dtype=wp.float32)
+        types = (wp.vec2, wp.vec3, wp.float32, wp.types.vector(length=channels, dtype=wp.float32))
+        arrays = [as_warp(bins.order, wp.int32), as_warp(bins.ends, wp.int32), as_warp(gradients, row)]
         arrays += [as_warp(conics, wp.vec3), as_warp(strengths, wp.float32)]
         arrays += [as_warp(t, d) for t, d in zip(outputs, types, strict=True)]
-        launch(kernels_binning.gather, bins.order.shape[0], arrays, image)
+        launch(kernels_binning.gather_kernel(channels), bins.order.shape[0], arrays, image)
         v_background = torch.einsum("hw,hwk->k", transmittance, v_image) if ctx.needs_input_grad[4] else None
         return (*outputs, v_background, None, None)
 
