@@ -1,0 +1,114 @@
+"""What a run folder holds, read for showing. Only files: this knows nothing of how a fit is made."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from splatsoil.errors import RunError
+from splatsoil.files import read_json
+
+FIT_FORMAT = "splatsoil-fit/1"
+COMPARISON_FORMAT = "splatsoil-comparison/1"
+
+
+@dataclass(frozen=True)
+class Surface:
+    """The reconstructed surface.
+
+    Attributes:
+        x: (nx,) cell centres in m.
+        y: (ny,) cell centres in m.
+        height: (ny, nx) in m.
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    height: np.ndarray
+
+
+@dataclass(frozen=True)
+class RunData:
+    """Everything a report may show; what a run hasn't come to yet is None or empty.
+
+    Attributes:
+        folder: the run folder.
+        run: ``run.json``.
+        fit: ``fit.json``, the latest fit.
+        fits: every finished fit by name.
+        comparison: ``comparison/comparison.json`` when it belongs to the latest fit.
+        reconstruction: ``reconstruction/reconstruction.json``.
+        surface: the reconstructed surface.
+    """
+
+    folder: Path
+    run: Mapping[str, Any]
+    fit: Mapping[str, Any]
+    fits: Mapping[str, Mapping[str, Any]]
+    comparison: Mapping[str, Any] | None
+    reconstruction: Mapping[str, Any] | None
+    surface: Surface | None
+
+
+def load(folder: str | Path) -> RunData:
+    """Read a run folder.
+
+    Raises:
+        RunError: it isn't one, has no finished fit, or a file in it is damaged.
+    """
+    path = Path(folder)
+    if not (path / "run.json").is_file():
+        raise RunError(f"{path}: isn't a run folder (it has no run.json); name one made by `splatsoil fit`")
+    if not (path / "fit.json").is_file():
+        raise RunError(f"{path}: no fit has been finished here; `splatsoil fit` goes on where it stopped")
+    fit = _checked(path / "fit.json", FIT_FORMAT)
+    fits = {file.stem: _checked(file, FIT_FORMAT) for file in sorted((path / "fits").glob("*.json"))}
+    return RunData(
+        folder=path,
+        run=read_json(path / "run.json"),
+        fit=fit,
+        fits=fits or {str(fit["name"]): fit},
+        comparison=_comparison(path / "comparison", fit),
+        reconstruction=_reconstruction(path / "reconstruction"),
+        surface=_surface(path / "reconstruction" / "surface.npz"),
+    )
+
+
+def _checked(path: Path, format_tag: str) -> dict[str, Any]:
+    data = read_json(path)
+    if not isinstance(data, dict) or data.get("format") != format_tag:
+        raise RunError(f"{path}: isn't of format {format_tag}; run the command that made it again")
+    return data
+
+
+def estimates(fit: Mapping[str, Any]) -> dict[str, float]:
+    """The fitted values by name."""
+    return {name: float(entry["estimate"]) for name, entry in fit["parameters"].items()}
+
+
+def _comparison(folder: Path, fit: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The comparison, unless it was made at another estimate."""
+    if not (folder / "comparison.json").is_file():
+        return None
+    data = _checked(folder / "comparison.json", COMPARISON_FORMAT)
+    same = data["fit"] == fit["name"] and data["parameters"] == estimates(fit)
+    return data if same else None
+
+
+def _reconstruction(folder: Path) -> dict[str, Any] | None:
+    path = folder / "reconstruction.json"
+    return read_json(path) if path.is_file() else None
+
+
+def _surface(path: Path) -> Surface | None:
+    if not path.is_file():
+        return None
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            return Surface(arrays["x"], arrays["y"], arrays["height"])
+    except (OSError, ValueError, KeyError) as error:
+        raise RunError(f"{path}: cannot be read ({error}); reconstruct again") from error

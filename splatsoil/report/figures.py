@@ -1,0 +1,145 @@
+"""Figures as SVG whose colours are the page's CSS variables, so that they follow its light or dark theme."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from splatsoil.report.data import Surface
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+#: Colours matplotlib draws with, and the variables they stand for: reserved, so that nothing else is replaced.
+INK, FAINT, ACCENT, SECOND, PAPER = "#010203", "#010204", "#010205", "#010206", "#010207"
+VARIABLES = {INK: "--ink", FAINT: "--faint", ACCENT: "--accent", SECOND: "--second", PAPER: "--paper"}
+
+#: Small on purpose: at a phone's width the text is still as large as the page's.
+SIZE = (3.7, 2.5)
+
+STYLE = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "splatsoil",
+    "font.size": 9.0,
+    "text.color": INK,
+    "axes.edgecolor": FAINT,
+    "axes.labelcolor": INK,
+    "axes.facecolor": "none",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "figure.facecolor": "none",
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "legend.frameon": False,
+    "lines.linewidth": 1.6,
+}
+
+
+def _draw(draw: Any, size: tuple[float, float] = SIZE) -> str:
+    """SVG of what ``draw(figure, axes)`` draws."""
+    import matplotlib as mpl
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.figure import Figure
+
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=size, layout="constrained")
+        FigureCanvasSVG(figure)
+        draw(figure, figure.subplots())
+        stream = io.StringIO()
+        figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None}, transparent=True)
+    svg = stream.getvalue()
+    svg = svg[svg.index("<svg") :]
+    # The page sets the size and the typeface.
+    head, rest = svg.split(">", 1)
+    svg = re.sub(r' (width|height)="[^"]*"', "", head) + ">" + rest
+    svg = re.sub(r"font: (\d+(?:\.\d+)?)px [^;\"]*", r"font-size: \1px", svg)
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
+    for colour, variable in VARIABLES.items():
+        svg = svg.replace(colour, f"var({variable})")
+    return svg
+
+
+def surrogate(fit: Mapping[str, Any], name: str) -> str:
+    """The GP over one parameter with its evaluations: the paper's figure."""
+    curve, entry = fit["curves"][name], fit["parameters"][name]
+    x, mean, std = (np.array(curve[key]) for key in ("x", "mean", "std"))
+    done = [step for step in fit["history"] if step["loss"] is not None]
+    failed = [step for step in fit["history"] if step["loss"] is None]
+
+    def draw(_: Figure, axes: Axes) -> None:
+        axes.fill_between(x, mean - 2.0 * std, mean + 2.0 * std, color=ACCENT, alpha=0.18, linewidth=0, label="± 2 std")
+        axes.plot(x, mean, color=ACCENT, label="mean of the GP")
+        axes.axvspan(entry["low"], entry["high"], color=SECOND, alpha=0.15, linewidth=0)
+        axes.axvline(entry["estimate"], color=SECOND, label="estimate, 5 to 95 %")
+        points = [step["parameters"][name] for step in done]
+        axes.scatter(points, [step["loss"] for step in done], s=22, color=INK, zorder=3, label="evaluation")
+        top = max(float(np.max(mean + 2.0 * std)), max(step["loss"] for step in done))
+        for step in failed:
+            axes.scatter(step["parameters"][name], top, marker="x", color=SECOND, zorder=3)
+        axes.set_xlabel(entry["title"])
+        axes.set_ylabel("loss")
+        axes.margins(x=0.01)
+        axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, 1.17), ncols=2, columnspacing=1.0)
+
+    return _draw(draw, (SIZE[0], 2.9))
+
+
+def losses(comparison: Mapping[str, Any]) -> str:
+    """Loss of each compared frame, for each camera, with the level that noise alone leaves."""
+    name = comparison["loss"]
+
+    def draw(_: Figure, axes: Axes) -> None:
+        for camera, colour, marker in zip(comparison["cameras"], _cycle(), "os^Dv<>" * 10, strict=False):
+            steps = sorted((f for f in comparison["frames"] if f["camera"] == camera), key=lambda f: f["frame"])
+            frames = [f["frame"] for f in steps]
+            axes.plot(frames, [f["losses"][name] for f in steps], color=colour, marker=marker, ms=3.5, label=camera)
+        noise = comparison.get("noise", {}).get(name)
+        if noise:
+            axes.axhline(noise, color=FAINT, linestyle="--", linewidth=1.2, label="noise alone")
+        axes.set_ylim(bottom=0.0)
+        axes.set_xlabel("frame")
+        axes.set_ylabel(f"loss ({name})")
+        axes.legend(fontsize=8)
+
+    return _draw(draw)
+
+
+def surface_map(surface: Surface) -> str:
+    """The reconstructed surface seen from above."""
+
+    def draw(figure: Figure, axes: Axes) -> None:
+        half_x, half_y = 0.5 * (surface.x[1] - surface.x[0]), 0.5 * (surface.y[1] - surface.y[0])
+        extent = (surface.x[0] - half_x, surface.x[-1] + half_x, surface.y[0] - half_y, surface.y[-1] + half_y)
+        image = axes.imshow(1e3 * surface.height, origin="lower", extent=extent, cmap="cividis")
+        bar = figure.colorbar(image, ax=axes, shrink=0.9, pad=0.02)
+        bar.outline.set_visible(False)  # type: ignore[operator]
+        bar.set_label("height [mm]")
+        axes.set_xlabel("x [m]")
+        axes.set_ylabel("y [m]")
+
+    return _draw(draw)
+
+
+def history(fits: Mapping[str, Mapping[str, Any]], order: Sequence[str]) -> str:
+    """The loss at the estimate of each model that was fitted: does it fall when an effect is added?"""
+
+    def draw(_: Figure, axes: Axes) -> None:
+        rows = np.arange(len(order))[::-1]
+        values = [fits[name]["loss"] for name in order]
+        spread = [2.0 * fits[name]["loss_std"] for name in order]
+        axes.barh(rows, values, color=ACCENT, alpha=0.75, height=0.55)
+        axes.errorbar(values, rows, xerr=spread, fmt="none", ecolor=INK, capsize=3)
+        axes.set_yticks(rows, [name.replace("_", " ") for name in order])
+        axes.set_xlabel("loss at the estimate (± 2 std)")
+        axes.set_xlim(left=0.0)
+
+    return _draw(draw, (SIZE[0], 0.8 + 0.36 * len(order)))
+
+
+def _cycle() -> list[str]:
+    return [ACCENT, SECOND, INK, FAINT] * 20

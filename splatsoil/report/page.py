@@ -1,0 +1,101 @@
+"""Putting the page together."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import splatsoil
+from splatsoil.errors import RunError
+from splatsoil.files import write_text
+from splatsoil.report import figures, words
+from splatsoil.report.data import RunData, load
+
+HERE = Path(__file__).parent
+KINDS = ("observed", "predicted", "difference")
+
+
+def write_report(folder: str | Path) -> Path:
+    """Write ``report.html`` into a run folder from what is in it, and return its path.
+
+    The page is one file: it asks for nothing from anywhere, and says nothing that the folder's files don't.
+
+    Raises:
+        RunError: not a run folder, no finished fit, a damaged file, or the folder can't be written.
+    """
+    data = load(folder)
+    return write_text(data.folder / "report.html", render(data))
+
+
+def render(data: RunData) -> str:
+    """The page as a string."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+    from markupsafe import Markup
+
+    environment = Environment(
+        loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.filters["duration"] = words.duration
+    environment.filters["symbol"] = words.symbol
+    environment.filters["model"] = words.model_name
+    comparison = data.comparison
+    order = sorted(data.fits, key=lambda name: (name != "base", -data.fits[name]["loss"]))
+    return environment.get_template("page.html").render(
+        style=Markup((HERE / "page.css").read_text(encoding="utf-8")),
+        script=Markup((HERE / "page.js").read_text(encoding="utf-8")),
+        program=splatsoil.__version__,
+        data=data,
+        fit=data.fit,
+        answers=words.answers(data.fit),
+        residual=words.residual_sentence(comparison),
+        ratio=words.ratio_to_noise(comparison),
+        at_the_noise=words.AT_THE_NOISE,
+        surrogates={name: Markup(figures.surrogate(data.fit, name)) for name in data.fit["parameters"]},
+        losses=None if comparison is None else Markup(figures.losses(comparison)),
+        pictures=None if comparison is None else _pictures(data.folder / "comparison", comparison),
+        kinds=KINDS,
+        surface=None if data.surface is None else Markup(figures.surface_map(data.surface)),
+        order=order,
+        history=Markup(figures.history(data.fits, order)) if len(order) > 1 else None,
+    )
+
+
+def _pictures(folder: Path, comparison: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """For each camera its frames in order, each with three data URLs and its loss."""
+    name = comparison["loss"]
+    return [
+        {
+            "camera": camera,
+            "frames": [
+                {
+                    "frame": entry["frame"],
+                    "loss": f"{entry['losses'][name]:.4g}",
+                    **{kind: data_url(folder / entry[kind]) for kind in KINDS},
+                }
+                for entry in sorted(comparison["frames"], key=lambda e: e["frame"])
+                if entry["camera"] == camera
+            ],
+        }
+        for camera in comparison["cameras"]
+    ]
+
+
+def data_url(path: Path) -> str:
+    """A picture as a ``data:`` URL.
+
+    Raises:
+        RunError: it is missing or neither JPEG nor PNG.
+    """
+    try:
+        contents = path.read_bytes()
+    except OSError as error:
+        raise RunError(f"{path}: cannot be read ({error.strerror}); run `splatsoil compare` again") from error
+    if contents.startswith(b"\x89PNG\r\n\x1a\n"):
+        kind = "png"
+    elif contents.startswith(b"\xff\xd8\xff"):
+        kind = "jpeg"
+    else:
+        raise RunError(f"{path}: is neither PNG nor JPEG; run `splatsoil compare` again")
+    return f"data:image/{kind};base64,{base64.b64encode(contents).decode()}"

@@ -1,0 +1,107 @@
+"""The report's sentences. Each says no more than the numbers do."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+#: A residual up to this many times the noise is called noise: the noise itself is only known to about this.
+AT_THE_NOISE = 1.5
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A fitted parameter as a reader wants it.
+
+    Attributes:
+        name: "friction angle".
+        value: "35.6".
+        std: "0.8".
+        unit: "°".
+        state: ``determined``, ``bound`` or ``open``.
+        remark: one sentence when the state isn't ``determined``.
+    """
+
+    name: str
+    value: str
+    std: str
+    unit: str
+    state: str
+    remark: str
+
+
+def with_std(value: float, std: float) -> tuple[str, str]:
+    """A value and its std with the std's two leading digits (one when it begins with 3 or more): "35.6", "0.8"."""
+    if not std > 0.0:
+        return f"{value:.4g}", "0"
+    exponent = int(f"{std:e}".split("e")[1])
+    leading = std / 10.0**exponent
+    decimals = -exponent + (1 if leading < 2.95 else 0)
+    if decimals >= 0:
+        return f"{value:.{decimals}f}", f"{std:.{decimals}f}"
+    return f"{round(value, decimals):.0f}", f"{round(std, decimals):.0f}"
+
+
+def symbol(unit: str) -> str:
+    """A unit as it is printed after a number."""
+    return {"deg": "°", "1": ""}.get(unit, f" {unit}")
+
+
+def answers(fit: Mapping[str, Any]) -> list[Answer]:
+    """The fitted parameters."""
+    out = []
+    for name, entry in fit["parameters"].items():
+        value, std = with_std(entry["estimate"], entry["std"])
+        plain = name.replace("_", " ")
+        state, remark = "determined", ""
+        if not fit["informative"]:
+            state = "open"
+            remark = f"These pictures do not determine the {plain}: the loss hardly depends on it."
+        elif entry["at_bound"] is not None:
+            state = "bound"
+            remark = (
+                f"The {plain} lies on the {entry['at_bound']} bound of its range: "
+                "the best value may lie beyond it, or the model may lack an effect."
+            )
+        out.append(Answer(plain, value, std, symbol(entry["unit"]), state, remark))
+    return out
+
+
+def ratio_to_noise(comparison: Mapping[str, Any] | None) -> float | None:
+    """The residual in units of what the cameras' noise alone would leave; None where it isn't known."""
+    if comparison is None:
+        return None
+    name = comparison["loss"]
+    noise = comparison.get("noise", {}).get(name)
+    return None if not noise else float(comparison["total"][name]) / float(noise)
+
+
+def residual_sentence(comparison: Mapping[str, Any] | None) -> str:
+    """How far the prediction is from the pictures, and what that does and doesn't mean."""
+    if comparison is None:
+        return "The prediction has not been compared with the pictures frame by frame yet."
+    ratio = ratio_to_noise(comparison)
+    if ratio is None:
+        return "How far the residual is above the noise is unknown: the set has no pre-roll frames to measure it on."
+    if ratio <= AT_THE_NOISE:
+        return f"The residual is {ratio:.1f} × what the cameras' noise alone leaves: nothing more to explain here."
+    return (
+        f"The residual is {ratio:.1f} × what the cameras' noise alone leaves. The rest is the model's, the "
+        "reconstruction's or the light's: this page cannot tell which."
+    )
+
+
+def model_name(name: str) -> str:
+    """A fit's name for readers: "base model", "base model with cohesion, dilatancy"."""
+    return "base model" if name == "base" else f"base model with {name.replace('+', ', ').replace('_', ' ')}"
+
+
+def duration(seconds: float) -> str:
+    """A time for readers: "48 s", "3 min 20 s", "2 h 5 min"."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60} s"
+    return f"{whole // 3600} h {whole % 3600 // 60} min"

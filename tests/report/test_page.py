@@ -1,0 +1,293 @@
+"""The page as a browser's parser sees it: complete, self-contained, and true to the run folder's files."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from splatsoil.errors import RunError
+from splatsoil.files import write_json
+from splatsoil.report import write_report
+
+VOID = {"meta", "img", "input", "br", "link"}
+FRAMES = (0, 50)
+
+
+def fit(name: str = "base", **changes: Any) -> dict[str, Any]:
+    x = np.linspace(20.0, 50.0, 31)
+    return {
+        "format": "splatsoil-fit/1",
+        "name": name,
+        "parameters": {
+            "friction_angle": {
+                "estimate": 35.62,
+                "std": 0.81,
+                "low": 34.0,
+                "high": 37.1,
+                "unit": "deg",
+                "title": "friction angle [°]",
+                "bounds": [20.0, 50.0],
+                "at_bound": None,
+            }
+        },
+        "loss": 0.123,
+        "loss_std": 0.01,
+        "noise_std": 0.02,
+        "informative": True,
+        "evaluations": 3,
+        "failed": 1,
+        "seconds": 83.0,
+        "seed": 5,
+        "device": "cpu",
+        "preset": "small",
+        "version": "0.1.0",
+        "notes": [],
+        "facts": {"cell": "20 mm", "time step": "0.25 ms"},
+        "curves": {"friction_angle": {"x": list(x), "mean": list((x - 35.6) ** 2), "std": [0.1] * 31}},
+        "history": [
+            {
+                "step": 0,
+                "parameters": {"friction_angle": 30.0},
+                "loss": 31.0,
+                "status": "ok",
+                "message": "",
+                "seconds": 8.0,
+            },
+            {
+                "step": 1,
+                "parameters": {"friction_angle": 40.0},
+                "loss": 20.0,
+                "status": "ok",
+                "message": "",
+                "seconds": 8.0,
+            },
+            {
+                "step": 2,
+                "parameters": {"friction_angle": 21.0},
+                "loss": None,
+                "status": "failed",
+                "message": "particles left the grid",
+                "seconds": 2.0,
+            },
+        ],
+    } | changes
+
+
+def make_run(folder: Path, name: str = "plow", *, compare: bool = True, **changes: Any) -> Path:
+    write_json(
+        folder / "run.json",
+        {"format": "splatsoil-run/1", "measurement": {"name": name, "folder": "sets/plow", "hash": "ab" * 32}},
+    )
+    latest = fit(**changes)
+    write_json(folder / "fit.json", latest)
+    write_json(folder / "fits" / f"{latest['name']}.json", latest)
+    reconstruction = {"held_out": [{}, {}], "psnr": 31.24, "ssim": 0.931, "gaussians": 24011, "seconds": 131.0}
+    write_json(folder / "reconstruction" / "reconstruction.json", reconstruction)
+    x, y = np.linspace(0.0025, 0.0975, 20), np.linspace(0.0025, 0.0475, 10)
+    np.savez(folder / "reconstruction" / "surface.npz", x=x, y=y, height=0.1 + 0.1 * y[:, None] * x)
+    if compare:
+        frames = []
+        for camera in ("left", "right"):
+            for frame in FRAMES:
+                entry: dict[str, Any] = {"camera": camera, "frame": frame, "losses": {"robust": 0.02, "rgb": 0.001}}
+                for kind in ("observed", "predicted", "difference"):
+                    entry[kind] = f"{camera}_{frame}_{kind}.jpg"
+                    colour = (frame, 50 * len(kind) % 256, 100)
+                    (folder / "comparison").mkdir(exist_ok=True)
+                    Image.new("RGB", (8, 6), colour).save(folder / "comparison" / entry[kind])
+                frames.append(entry)
+        comparison = {
+            "format": "splatsoil-comparison/1",
+            "fit": latest["name"],
+            "parameters": {"friction_angle": 35.62},
+            "loss": "robust",
+            "total": {"robust": 0.02},
+            "noise": {"robust": 0.005},
+            "cameras": ["left", "right"],
+            "frames": frames,
+        }
+        write_json(folder / "comparison" / "comparison.json", comparison)
+    return folder
+
+
+class Page(HTMLParser):
+    """Tags in balance, text, and every address the page mentions."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.addresses: list[str] = []
+        self.words: list[str] = []
+        self.tags: list[str] = []
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.addresses += [v or "" for k, v in attributes if k in ("src", "href", "xlink:href", "action", "srcset")]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+        self.addresses += [v or "" for k, v in attributes if k in ("src", "href", "xlink:href")]
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open and self.open.pop() == tag, f"</{tag}> closes nothing"
+
+    def handle_data(self, data: str) -> None:
+        if self.open and self.open[-1] not in ("script", "style"):
+            self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self.words).split())
+
+
+def test_everything_is_on_the_page(tmp_path: Path) -> None:
+    path = write_report(make_run(tmp_path))
+    assert path == tmp_path / "report.html"
+    page = Page(path.read_text())
+    assert page.open == []
+    for phrase in (
+        "35.6 ± 0.8°",
+        "4.0 × what the cameras' noise alone leaves",
+        "31.2 dB",
+        "0.931",
+        "failed: particles left the grid",
+        "small, cpu, 5",
+        "0.25 ms",
+        "1 min 23 s for the fit",
+        "1 of 3 simulations failed",
+        "friction angle [°]",
+    ):
+        assert phrase in page.text, phrase
+    assert page.tags.count("svg") == 3
+
+
+def test_the_page_asks_for_nothing_from_anywhere(tmp_path: Path) -> None:
+    text = write_report(make_run(tmp_path)).read_text()
+    page = Page(text)
+    assert page.addresses
+    assert all(a.startswith(("data:image/", "#")) for a in page.addresses)
+    assert not re.search(r"@import|url\((?!#)|fetch\(|XMLHttpRequest|<link", text)
+    assert "default-src 'none'" in text
+
+
+def test_every_compared_frame_of_every_camera_is_there(tmp_path: Path) -> None:
+    text = write_report(make_run(tmp_path)).read_text()
+    found = re.search(r'<script type="application/json" id="frames">(.*?)</script>', text, re.DOTALL)
+    assert found is not None
+    cameras = json.loads(found.group(1))
+    assert [c["camera"] for c in cameras] == ["left", "right"]
+    assert all([f["frame"] for f in c["frames"]] == list(FRAMES) for c in cameras)
+    pictures = {f[kind] for c in cameras for f in c["frames"] for kind in ("observed", "predicted", "difference")}
+    assert len(pictures) == 6 and all(p.startswith("data:image/jpeg;base64,") for p in pictures)
+
+
+def test_names_cannot_break_out_of_the_page(tmp_path: Path) -> None:
+    evil = "</title></script><script>alert(1)</script>\"'"
+    text = write_report(make_run(tmp_path, name=evil)).read_text()
+    assert "alert(1)</script>" not in text.replace("&lt;", "<lt>")
+    page = Page(text)
+    assert page.open == [] and "<script>alert(1)" in page.text
+
+
+def test_colours_follow_the_theme(tmp_path: Path) -> None:
+    text = write_report(make_run(tmp_path)).read_text()
+    assert "prefers-color-scheme: dark" in text
+    charts = re.findall(r"<svg.*?</svg>", text, re.DOTALL)
+    for chart in charts:
+        assert "var(--ink)" in chart
+        assert not re.search(r"(fill|stroke): #(?!none)(000000|ffffff)", chart)
+        assert "width=" not in chart.split(">", 1)[0]
+
+
+def test_a_run_that_has_only_been_fitted(tmp_path: Path) -> None:
+    make_run(tmp_path, compare=False)
+    shutil.rmtree(tmp_path / "reconstruction")
+    page = Page(write_report(tmp_path).read_text())
+    assert page.open == [] and page.tags.count("svg") == 1
+    assert "has not been compared" in page.text
+
+
+def test_a_comparison_at_another_estimate_is_not_shown(tmp_path: Path) -> None:
+    make_run(tmp_path)
+    latest = fit()
+    latest["parameters"]["friction_angle"]["estimate"] = 33.0
+    write_json(tmp_path / "fit.json", latest)
+    assert "has not been compared" in Page(write_report(tmp_path).read_text()).text
+
+
+def test_several_models_are_set_side_by_side(tmp_path: Path) -> None:
+    make_run(tmp_path)
+    write_json(tmp_path / "fits" / "cohesion.json", fit("cohesion", loss=0.05))
+    page = Page(write_report(tmp_path).read_text())
+    assert page.tags.count("svg") == 4
+    assert page.text.index("base model with cohesion") > page.text.index("Models tried")
+
+
+def test_same_files_same_page(tmp_path: Path) -> None:
+    make_run(tmp_path)
+    assert write_report(tmp_path).read_bytes() == write_report(tmp_path).read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("damage", "says"),
+    [
+        (lambda f: (f / "run.json").unlink(), "run.json"),
+        (lambda f: (f / "fit.json").unlink(), "no fit has been finished"),
+        (lambda f: (f / "fit.json").write_text("{"), "fit.json"),
+        (lambda f: (f / "fit.json").write_text("{}"), "fit.json: isn't of format"),
+        (lambda f: (f / "comparison" / "left_0_observed.jpg").unlink(), "left_0_observed.jpg"),
+        (lambda f: (f / "comparison" / "left_0_observed.jpg").write_text("<svg>"), "neither PNG nor JPEG"),
+        (lambda f: (f / "reconstruction" / "surface.npz").write_text("x"), r"surface\.npz"),
+    ],
+)
+def test_what_is_missing_or_damaged_is_named(tmp_path: Path, damage: Any, says: str) -> None:
+    make_run(tmp_path)
+    damage(tmp_path)
+    with pytest.raises(RunError, match=says):
+        write_report(tmp_path)
+    assert not (tmp_path / "report.html").exists()
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="needs chromium")
+@pytest.mark.parametrize("width", [390, 1200])
+def test_a_browser_lays_it_out_without_sideways_scrolling(tmp_path: Path, width: int) -> None:
+    path = write_report(make_run(tmp_path))
+    probe = (
+        "<script>addEventListener('load', () => { const s = document.getElementById('frame'); s.value = 0;"
+        "s.dispatchEvent(new Event('input')); document.title = [document.documentElement.scrollWidth, innerWidth,"
+        "document.querySelector('.frame').textContent].join(' '); });</script></body>"
+    )
+    # Headless windows are never narrower than 500 pixels: a frame is.
+    framed = tmp_path / "framed.html"
+    inner = path.read_text().replace("</body>", probe.replace("document.title =", "parent.document.title ="))
+    framed.write_text(
+        f'<title></title><iframe style="border:0;width:{width}px;height:900px" '
+        f'srcdoc="{inner.replace("&", "&amp;").replace(chr(34), "&quot;")}"></iframe>'
+    )
+    command = ["chromium", "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path}/profile"]
+    out = subprocess.run(
+        [*command, "--virtual-time-budget=3000", "--dump-dom", framed.as_uri()],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    ).stdout
+    found = re.search(r"<title>(\d+) (\d+) (\d+)</title>", out)
+    assert found is not None
+    content, window, frame = (int(group) for group in found.groups())
+    assert window == width
+    assert content <= window
+    # Moving the slider to the left end shows the first frame.
+    assert frame == FRAMES[0]

@@ -1,0 +1,50 @@
+from __future__ import annotations
+
+import pytest
+
+from splatsoil.report import words
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "expected"),
+    [
+        (35.6321, 0.8123, ("35.6", "0.8")),
+        (35.6321, 1.26, ("35.6", "1.3")),
+        (35.6321, 0.0261, ("35.632", "0.026")),
+        (35.6321, 3.2, ("36", "3")),
+        (298.4, 48.9, ("300", "50")),
+        (298.4, 0.0, ("298.4", "0")),
+        (35.6321, 0.0996, ("35.63", "0.10")),
+        (12345.0, 1234.0, ("12300", "1200")),
+    ],
+)
+def test_a_value_is_quoted_to_the_digits_its_std_allows(value: float, std: float, expected: tuple[str, str]) -> None:
+    assert words.with_std(value, std) == expected
+
+
+def comparison(total: float, noise: float | None) -> dict:
+    return {"loss": "robust", "total": {"robust": total}, "noise": {} if noise is None else {"robust": noise}}
+
+
+def test_the_verdict_follows_the_ratio_to_the_noise() -> None:
+    assert "nothing more to explain" in words.residual_sentence(comparison(0.011, 0.01))
+    far = words.residual_sentence(comparison(0.038, 0.01))
+    assert "3.8 ×" in far and "cannot tell which" in far
+    assert "unknown" in words.residual_sentence(comparison(0.038, None))
+    assert "not been compared" in words.residual_sentence(None)
+
+
+@pytest.mark.parametrize(
+    ("informative", "at_bound", "state"),
+    [(True, None, "determined"), (True, "upper", "bound"), (False, "upper", "open")],
+)
+def test_an_answer_that_is_none_says_so(informative: bool, at_bound: str | None, state: str) -> None:
+    entry = {"estimate": 36.0, "std": 1.0, "unit": "deg", "at_bound": at_bound}
+    (answer,) = words.answers({"parameters": {"friction_angle": entry}, "informative": informative})
+    assert answer.state == state
+    assert bool(answer.remark) == (state != "determined")
+
+
+@pytest.mark.parametrize(("seconds", "text"), [(48.2, "48 s"), (200.0, "3 min 20 s"), (7500.0, "2 h 5 min")])
+def test_durations(seconds: float, text: str) -> None:
+    assert words.duration(seconds) == text
