@@ -7,8 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from splatsoil.errors import ParameterError
+from splatsoil.errors import ParameterError, SimulationError
 from splatsoil.measurement import Measurement
+
+COURANT_LIMIT = 0.8
+"""Of the substeps: a full cell becomes unstable at 1."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +72,16 @@ class Resolution:
     bulk: float
     shear: float
     density: float
+
+    def __post_init__(self) -> None:
+        for name in ("cell", "spacing", "frame_time", "steps", "courant", "bulk", "shear", "density"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise SimulationError(f"resolution: {name} = {value} must be a positive number")
+        if self.courant > COURANT_LIMIT:
+            raise SimulationError(
+                f"resolution: a Courant number of {self.courant} breaks the wave-speed limit of {COURANT_LIMIT}"
+            )
 
     @property
     def wave_speed(self) -> float:

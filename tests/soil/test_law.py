@@ -1,0 +1,174 @@
+"""The law at a single stress point, driven by prescribed velocity gradients, against closed forms."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import warp as wp
+
+from splatsoil.errors import ParameterError
+from splatsoil.soil.law import Law, Stress
+from splatsoil.soil.library import find_effects, library
+from splatsoil.soil.settings import Settings
+
+BULK, SHEAR = 2.0e7, 1.0e7
+BASE = Settings(friction_angle=35.0)
+
+
+def drive(
+    law: Law, values: Mapping[str, float], gradient: npt.ArrayLike, pressure: float, duration: float, steps: int
+) -> tuple[npt.NDArray[np.float64], float]:
+    """Stress tensor (tension positive, Pa) and opening after ``duration`` under one velocity gradient."""
+    return drive_through(law, values, [(gradient, duration)], pressure, steps)
+
+
+def drive_through(
+    law: Law, values: Mapping[str, float], stages: list[tuple[Any, float]], pressure: float, steps: int
+) -> tuple[npt.NDArray[np.float64], float]:
+    update = law.update
+
+    @wp.kernel(module="unique")
+    def advance(
+        state: wp.array(dtype=float), gradient: wp.mat33, dt: float, steps: int, values: wp.array2d(dtype=float)
+    ) -> None:
+        stress = Stress()
+        stress.normal = wp.vec3(state[0], state[1], state[2])
+        stress.shear = wp.vec3(state[3], state[4], state[5])
+        stress.elastic = state[6]
+        stress.opening = state[7]
+        for _ in range(steps):
+            stress = update(stress, gradient, BULK, SHEAR, dt, values, 0)
+        for k in range(3):
+            state[k] = stress.normal[k]
+            state[3 + k] = stress.shear[k]
+        state[6] = stress.elastic
+        state[7] = stress.opening
+
+    state = wp.zeros(8, dtype=float, device="cpu")
+    state.assign(np.array([0, 0, 0, 0, 0, 0, -pressure / BULK, 0], dtype=np.float32))
+    table = wp.array(law.table(BASE, [values]).astype(np.float32), dtype=float, device="cpu")
+    for gradient, duration in stages:
+        matrix = wp.mat33(*np.asarray(gradient, dtype=np.float64).reshape(-1))
+        wp.launch(advance, dim=1, inputs=[state, matrix, duration / steps, steps, table], device="cpu")
+    s = state.numpy().astype(np.float64)
+    deviator = np.array([[s[0], s[3], s[4]], [s[3], s[1], s[5]], [s[4], s[5], s[2]]])
+    return deviator + BULK * s[6] * np.eye(3), float(s[7])
+
+
+@pytest.mark.parametrize("angle", [25.0, 30.0, 35.0, 40.0, 45.0])
+@pytest.mark.parametrize("cohesion", [0.0, 300.0])
+def test_triaxial_compression_fails_at_the_mohr_coulomb_stress_ratio(angle: float, cohesion: float) -> None:
+    law = Law(find_effects(["cohesion"] if cohesion else []))
+    values = {"friction_angle": angle, **({"cohesion": cohesion} if cohesion else {})}
+    stress, _ = drive(law, values, np.diag([0.5, 0.5, -1.0]), 1.0e4, 0.02, 2000)
+    lateral, axial = -stress[0, 0], -stress[2, 2]
+    flow = math.tan(math.radians(45.0 + angle / 2.0)) ** 2
+    assert axial == pytest.approx(lateral * flow + 2.0 * cohesion * math.sqrt(flow), rel=1e-3)
+
+
+def test_small_strain_follows_hooke() -> None:
+    stress, _ = drive(Law(), {"friction_angle": 45.0}, [[0, 2e-4, 0], [0, 0, 0], [0, 0, 0]], 1.0e4, 1.0, 10)
+    assert stress[0, 1] == pytest.approx(SHEAR * 2e-4, rel=1e-3)
+    assert np.trace(stress) / 3.0 == pytest.approx(-1.0e4, rel=1e-5)
+
+
+def test_rigid_rotation_turns_stress_and_makes_none() -> None:
+    """A quarter turn about z swaps the stresses along x and y (objectivity of the Jaumann rate)."""
+    squeeze = (np.diag([-2e-5, 2e-5, 0.0]), 1.0)
+    turn = (np.array([[0.0, -math.pi / 2, 0], [math.pi / 2, 0, 0], [0, 0, 0]]), 1.0)
+    before, _ = drive_through(Law(), {"friction_angle": 45.0}, [squeeze], 1.0e4, 2000)
+    after, _ = drive_through(Law(), {"friction_angle": 45.0}, [squeeze, turn], 1.0e4, 2000)
+    assert abs(before[0, 0] - before[1, 1]) > 300.0
+    assert after[0, 0] == pytest.approx(before[1, 1], rel=2e-3)
+    assert after[1, 1] == pytest.approx(before[0, 0], rel=2e-3)
+    assert abs(after[0, 1]) < 2.0
+    assert np.trace(after) == pytest.approx(np.trace(before), rel=1e-5)
+
+
+def test_soil_that_came_apart_bears_no_load_until_it_has_closed() -> None:
+    """Opening by 5 % and closing by as much ends at the starting pressure; half-way closed there is none."""
+    apart, half, back = (np.diag([r, 0.0, 0.0]) for r in (0.05, -0.025, -0.025))
+    law, values = Law(), {"friction_angle": 35.0}
+    opened, gap = drive_through(law, values, [(apart, 1.0)], 1.0e3, 500)
+    assert np.abs(opened).max() < 1e-3
+    assert gap == pytest.approx(0.05 - 1.0e3 / BULK, rel=1e-3)
+    halfway, _ = drive_through(law, values, [(apart, 1.0), (half, 1.0)], 1.0e3, 500)
+    assert np.abs(halfway).max() < 1e-3
+    closed, gap = drive_through(law, values, [(apart, 1.0), (half, 1.0), (back, 1.0)], 1.0e3, 500)
+    assert -np.trace(closed) / 3.0 == pytest.approx(1.0e3, rel=0.02)
+    assert gap == pytest.approx(0.0, abs=1e-6)
+
+
+def test_shear_flow_keeps_volume() -> None:
+    stress, opening = drive(Law(), {"friction_angle": 30.0}, [[0, 1.0, 0], [0, 0, 0], [0, 0, 0]], 5.0e3, 1.0, 5000)
+    assert -np.trace(stress) / 3.0 == pytest.approx(5.0e3, rel=1e-4)
+    assert opening == 0.0
+
+
+def test_an_effect_that_is_off_costs_nothing() -> None:
+    """Effects that do not touch strength leave the very same function; those that do give another."""
+    assert Law(find_effects(["tool_friction"])).update is Law().update
+    assert Law(find_effects(["cohesion"])).update is not Law().update
+
+
+def test_effect_at_its_off_value_changes_nothing() -> None:
+    shear = [[0, 1.0, 0], [0, 0, 0], [0, 0, 0]]
+    plain, _ = drive(Law(), {"friction_angle": 33.0}, shear, 2.0e3, 0.1, 500)
+    damp, _ = drive(Law(find_effects(["cohesion"])), {"friction_angle": 33.0, "cohesion": 0.0}, shear, 2.0e3, 0.1, 500)
+    np.testing.assert_array_equal(plain, damp)
+
+
+def test_a_users_own_file_is_an_effect_like_any_other(tmp_path: Path) -> None:
+    """Friction that falls with shear rate, from a file outside the package, halves the strength of fast shear."""
+    file = tmp_path / "my_effect.py"
+    file.write_text(
+        "import warp as wp\n"
+        "from splatsoil.parameters import Parameter\n"
+        "from splatsoil.soil.effect import Effect\n"
+        "from splatsoil.soil.strength import SoilState, Strength\n"
+        "@wp.func\n"
+        "def slippery(strength: Strength, state: SoilState, values: wp.array2d(dtype=float), row: int, column: int)"
+        " -> Strength:\n"
+        "    result = strength\n"
+        "    result.slope = strength.slope / (1.0 + values[row, column] * state.shear_rate)\n"
+        "    return result\n"
+        "class Slippery(Effect):\n"
+        "    name = 'slippery'\n"
+        "    parameters = (Parameter('slip_time', 's', 0.0, 10.0, 0.0, off=0.0, meaningful=0.1, sign=1),)\n"
+        "    strength = slippery\n"
+    )
+    shear = [[0, 2.0, 0], [0, 0, 0], [0, 0, 0]]
+    law = Law(find_effects([str(file), "cohesion"]))
+    assert [p.name for p in law.parameters] == ["friction_angle", "slip_time", "cohesion"]
+    plain, _ = drive(Law(), {"friction_angle": 33.0}, shear, 2.0e3, 1.0, 1000)
+    slow, _ = drive(law, {"friction_angle": 33.0, "slip_time": 0.5}, shear, 2.0e3, 1.0, 1000)
+    assert slow[0, 1] == pytest.approx(0.5 * plain[0, 1], rel=5e-3)
+    damp, _ = drive(law, {"friction_angle": 33.0, "slip_time": 0.5, "cohesion": 300.0}, shear, 2.0e3, 1.0, 1000)
+    assert damp[0, 1] - slow[0, 1] == pytest.approx(law.table(BASE, [{"friction_angle": 33.0}])[0, 1] * 300.0, rel=5e-3)
+
+
+def test_unknown_and_absurd_parameters_are_named() -> None:
+    with pytest.raises(ParameterError, match=r"cohesion.*effect is on"):
+        Law().settings(BASE, {"cohesion": 100.0})
+    with pytest.raises(ParameterError, match=r"friction_angle: 80 deg lies outside \[20, 50\]"):
+        Law().settings(BASE, {"friction_angle": 80.0})
+    with pytest.raises(ParameterError, match="'magic' is unknown; known are cohesion"):
+        find_effects(["magic"])
+    with pytest.raises(ParameterError, match="twice"):
+        find_effects(["cohesion", "cohesion"])
+
+
+def test_every_built_in_effect_is_complete() -> None:
+    assert {"cohesion", "tool_friction"} <= set(library())
+    for name, effect in library().items():
+        assert effect.name == name
+        assert effect.note and effect.source
+        for parameter in effect.parameters:
+            assert parameter.off is not None and parameter.meaningful > 0.0
+            assert parameter.default == parameter.off
