@@ -12,7 +12,8 @@ from splatsoil.measurement import Frame, Measurement
 from splatsoil.scene import albedo as albedos
 from splatsoil.scene.binding import bind
 from splatsoil.scene.estimate import estimate_light, still_frames
-from splatsoil.scene.light import Light, ToolBody, encoded, light_relief, linear
+from splatsoil.scene.light import Light, encoded, linear
+from splatsoil.scene.lit import ToolBody, light_relief
 from splatsoil.scene.relief import relief_of_particles
 from splatsoil.scene.render import Posed, Scene
 from splatsoil.splats import Gaussians

@@ -21,14 +21,13 @@ from torch import Tensor
 
 from splatsoil.measurement import Frame, Measurement
 from splatsoil.scene import kernels
-from splatsoil.scene.light import (
-    SOIL_REFLECTANCE,
-    Light,
+from splatsoil.scene.light import SOIL_REFLECTANCE, Light, linear
+from splatsoil.scene.lit import (
     LitRelief,
     ToolBody,
     ceiling,
+    direct_light,
     grid_of,
-    linear,
     march_step,
     sky_openness,
     sun_on_points,
@@ -167,9 +166,8 @@ def fit_light(points: Tensor, colours: Tensor, shape: tuple[int, int], relief: R
         ).x
         for channel in range(3)
     ]  # fmt: skip
-    level = torch.nanmedian(colours, dim=0).values.cpu().numpy().astype(np.float64)
-    bounce = SOIL_REFLECTANCE * level / float(level.mean())
-    light = Light.from_angles(float(azimuth), float(np.clip(elevation, 5.0, 89.9)), np.array(ambient), bounce=bounce)
+    level = torch.nanmedian(colours, dim=0).values.clamp_min(1e-3).cpu().numpy().astype(np.float64)
+    light = Light.from_angles(float(azimuth), float(np.clip(elevation, 5.0, 89.9)), np.array(ambient), level=level)
     nothing = float(problem.spread(problem.differences(grey)))
     shadowed = float(1.0 - problem.tool_light(light).mean())
     return LightEstimate(light, 1.0 - float(found.fun) / max(nothing, 1e-12), shadowed)
@@ -181,10 +179,8 @@ class _Problem:
     def __init__(self, points: Tensor, colours: Tensor, shape: tuple[int, int], relief: Relief, tool: object) -> None:
         self.points, self.shape, self.relief, self.tool = points, shape, relief, tool
         self.brightness = colours.clamp_min(1e-4).log()
-        self.normal = torch.nn.functional.normalize(relief.sample(relief.normal, points), dim=1)
-        self.openness_map = sky_openness(relief, tool)
-        self.openness = relief.sample(self.openness_map, points)
-        self._lit: tuple[float, float, Tensor, Tensor] | None = None
+        self.openness = relief.sample(sky_openness(relief, tool)[0], points)
+        self._known: tuple[float, float, Tensor] | None = None
         self.scale = 1.0
         grey = self.differences(self.brightness.mean(dim=1))
         self.scale = 1.4826 * float(grey[torch.isfinite(grey)].abs().median())
@@ -209,18 +205,19 @@ class _Problem:
 
     def tool_light(self, light: Light) -> Tensor:
         """Share of the sun that the tool lets through to each point."""
-        open_sky = torch.ones_like(self.relief.height)
-        lit = LitRelief(self.relief, light, self.tool, open_sky, open_sky)
-        return sun_on_points(lit, self.points, 0.25 * _FINEST)
+        return sun_on_points(self._open(light), self.points, 0.25 * _FINEST)
+
+    def _open(self, light: Light) -> LitRelief:
+        """The relief with no shadow of its own: before anything has moved it is too gentle for one."""
+        everything = torch.ones_like(self.relief.height)
+        return LitRelief(self.relief, light, self.tool, everything, everything, everything[..., None].expand(-1, -1, 3))
 
     def _direct(self, azimuth: float, elevation: float) -> Tensor:
-        """The sun's light on each point, 1 on level open ground; the last direction is kept."""
-        if self._lit is None or self._lit[:2] != (azimuth, elevation):
+        """The sun's light on each point, 1 on level open ground; that of the last direction is kept."""
+        if self._known is None or self._known[:2] != (azimuth, elevation):
             light = Light.from_angles(azimuth, elevation, 0.5)
-            sun = torch.tensor(light.direction.tolist(), dtype=torch.float32, device=self.points.device)
-            direct = (self.normal @ sun).clamp_min(0.0) / sun[2] * self.tool_light(light)
-            self._lit = (azimuth, elevation, direct, sun)
-        return self._lit[2]
+            self._known = (azimuth, elevation, direct_light(self._open(light), self.points, 0.25 * _FINEST))
+        return self._known[2]
 
 
 def _cells(relief: Relief, lower: FloatArray, upper: FloatArray) -> tuple[Tensor, tuple[int, int]]:

@@ -3,6 +3,8 @@
 Every kernel is a gather: each thread writes its own outputs, so results do not depend on the order of threads.
 """
 
+# ruff: noqa: UP018  (Warp takes a bare literal for a constant: what a loop changes starts as float(...))
+
 from __future__ import annotations
 
 import warp as wp
@@ -24,7 +26,7 @@ class Illumination:
 
     sun: wp.vec3
     ambient: wp.vec3
-    bounce: wp.vec3
+    ground: wp.vec3
     softness: float
 
 
@@ -56,8 +58,8 @@ def sample(values: wp.array2d(dtype=wp.float32), grid: Grid, x: float, y: float)
 
 
 @wp.func
-def sample_normal(values: wp.array2d(dtype=wp.vec3), grid: Grid, x: float, y: float) -> wp.vec3:
-    """Bilinear unit normal of a map (ny, nx)."""
+def sample_vector(values: wp.array2d(dtype=wp.vec3), grid: Grid, x: float, y: float) -> wp.vec3:
+    """Bilinear vector of a map (ny, nx), held constant beyond its border."""
     ny = values.shape[0]
     nx = values.shape[1]
     u = wp.clamp((x - grid.x0) * grid.inverse_x, 0.0, float(nx) - 1.001)
@@ -68,7 +70,7 @@ def sample_normal(values: wp.array2d(dtype=wp.vec3), grid: Grid, x: float, y: fl
     fv = v - float(i)
     low = values[i, j] * (1.0 - fu) + values[i, j + 1] * fu
     high = values[i + 1, j] * (1.0 - fu) + values[i + 1, j + 1] * fu
-    return wp.normalize(low * (1.0 - fv) + high * fv)
+    return low * (1.0 - fv) + high * fv
 
 
 @wp.func
@@ -101,7 +103,7 @@ def soil_shadow(
     height: wp.array2d(dtype=wp.float32), grid: Grid, point: wp.vec3, light: Illumination, step: float, top: float
 ) -> float:
     """Share of the sun (0 to 1) that the soil's surface lets through to a point; soft by the sun's width."""
-    open_share = 1.0
+    open_share = float(1.0)
     flat = wp.sqrt(light.sun[0] * light.sun[0] + light.sun[1] * light.sun[1])
     if flat < 1.0e-4:
         return open_share
@@ -160,14 +162,16 @@ def sky_openness(
     azimuths: int,
     steps: wp.array(dtype=wp.float32),
     openness: wp.array2d(dtype=wp.float32),
+    hidden: wp.array2d(dtype=wp.float32),
 ):
-    """Light of a uniform sky that reaches each cell, 1 on an open plane: its horizon in every azimuth, less the tool."""
+    """Share of a uniform sky that reaches each cell (its horizon in every azimuth, less the tool), and what the tool hides."""
     i, j = wp.tid()
     x = grid.x0 + float(j) / grid.inverse_x
     y = grid.y0 + float(i) / grid.inverse_y
     z = height[i, j]
     n = normal[i, j]
-    total = 0.0
+    total = float(0.0)
+    tool_share = float(0.0)
     half = 1.5707963
     for a in range(azimuths):
         angle = 6.2831853 * (float(a) + 0.5) / float(azimuths)
@@ -176,8 +180,8 @@ def sky_openness(
         along = n[0] * dx + n[1] * dy
         horizon = wp.atan2(-along, n[2])
         slope = wp.tan(wp.clamp(horizon, -1.5, 1.5))
-        tool_low = 1.0e6
-        tool_high = -1.0e6
+        tool_low = float(1.0e6)
+        tool_high = float(-1.0e6)
         for s in range(steps.shape[0]):
             r = steps[s]
             px = x + r * dx
@@ -193,8 +197,9 @@ def sky_openness(
         low = wp.max(horizon, wp.atan(tool_low))
         high = wp.atan(tool_high)
         if high > low:
-            total -= wedge(high, n[2], along) - wedge(low, n[2], along)
-    openness[i, j] = wp.clamp(2.0 * total / float(azimuths), 0.0, 1.0)
+            tool_share += wedge(high, n[2], along) - wedge(low, n[2], along)
+    hidden[i, j] = wp.clamp(2.0 * tool_share / float(azimuths), 0.0, 1.0)
+    openness[i, j] = wp.clamp(2.0 * (total - tool_share) / float(azimuths), 0.0, 1.0)
 
 
 @wp.kernel(enable_backward=False)
@@ -217,7 +222,7 @@ def tool_shadow(tool: ToolPose, light: Illumination, point: wp.vec3, spread: flo
     """Share of the sun that the tool lets through to a patch of half width ``spread`` around a point."""
     if tool.mesh == wp.uint64(0):
         return 1.0
-    lit = 0.0
+    lit = float(0.0)
     for k in range(4):
         sx = wp.where(k % 2 == 0, -0.5, 0.5)
         sy = wp.where(k < 2, -0.5, 0.5)
@@ -296,6 +301,29 @@ def pixel_ray(eye: Eye, u: float, v: float) -> wp.vec3:
     return eye.rotation * wp.vec3((u - eye.cx) / eye.fx, (v - eye.cy) / eye.fy, 1.0)
 
 
+@wp.func
+def surface_depth(
+    height: wp.array2d(dtype=wp.float32), grid: Grid, origin: wp.vec3, ray: wp.vec3, top: float, step: float, far: float
+) -> float:
+    """Depth at which a ray from above first falls beneath the surface, or -1 if it does not before the depth ``far``."""
+    if ray[2] >= -1.0e-3:
+        return -1.0
+    z = wp.max((top - origin[2]) / ray[2], 0.0)
+    x = origin + ray * z
+    gap = x[2] - sample(height, grid, x[0], x[1])
+    if gap < 0.0:
+        return -1.0
+    stride = step / wp.length(ray)
+    while z < far:
+        before = gap
+        z += stride
+        x = origin + ray * z
+        gap = x[2] - sample(height, grid, x[0], x[1])
+        if gap < 0.0:
+            return z - stride * gap / (gap - before)
+    return -1.0
+
+
 @wp.kernel(enable_backward=False)
 def illuminate(
     eye: Eye,
@@ -305,20 +333,21 @@ def illuminate(
     normal: wp.array2d(dtype=wp.vec3),
     openness: wp.array2d(dtype=wp.float32),
     visible: wp.array2d(dtype=wp.float32),
+    bounced: wp.array2d(dtype=wp.vec3),
     grid: Grid,
     light: Illumination,
     tool: ToolPose,
     albedo: wp.vec3,
     step: float,
     top: float,
-    snap: float,
+    reach: float,
     light_out: wp.array2d(dtype=wp.vec3),
     tool_out: wp.array2d(dtype=wp.vec4),
 ):
     """For each pixel: the light on the soil it shows, and the tool's radiance times its share of the pixel, and that share.
 
-    The splats' depth finds the soil; the point is then moved along the pixel's ray onto the surface (by at most
-    ``snap``), because blobs end a little before or behind it.
+    The splats say that a pixel shows soil; light is looked up where the pixel's ray meets the surface (at most ``reach``
+    behind their depth), because blobs end a little before or behind it, and at a rim their mean depth lies in the air.
     """
     i, j = wp.tid()
     ray = pixel_ray(eye, float(j) + 0.5, float(i) + 0.5)
@@ -326,28 +355,20 @@ def illuminate(
     light_out[i, j] = wp.vec3(1.0, 1.0, 1.0)
     tool_out[i, j] = wp.vec4(0.0, 0.0, 0.0, 0.0)
     if soil[i, j] > 0.01 and z > 0.0:
-        moved = 0.0
-        n = wp.vec3(0.0, 0.0, 1.0)
-        for _ in range(3):
-            x = eye.position + ray * (z + moved)
-            n = sample_normal(normal, grid, x[0], x[1])
-            slope = wp.dot(ray, n) / n[2]
-            if slope < -0.05:
-                moved -= (x[2] - sample(height, grid, x[0], x[1])) / slope
-                moved = wp.clamp(moved, -snap, snap)
-        z += moved
+        found = surface_depth(height, grid, eye.position, ray, top, step, z + reach)
+        if found > 0.0:
+            z = found
         x = eye.position + ray * z
-        n = sample_normal(normal, grid, x[0], x[1])
+        n = wp.normalize(sample_vector(normal, grid, x[0], x[1]))
         sky = sample(openness, grid, x[0], x[1])
         direct = wp.max(wp.dot(n, light.sun), 0.0) / light.sun[2]
         if direct > 0.0:
             direct *= sample(visible, grid, x[0], x[1])
         if direct > 0.0:
             direct *= tool_shadow(tool, light, x, 0.5 * z / eye.fx)
-        light_out[i, j] = (
-            light.ambient * sky + (wp.vec3(1.0, 1.0, 1.0) - light.ambient) * direct + light.bounce * (1.0 - sky)
-        )
-    share = 0.0
+        back = sample_vector(bounced, grid, x[0], x[1])
+        light_out[i, j] = light.ambient * sky + (wp.vec3(1.0, 1.0, 1.0) - light.ambient) * direct + back
+    share = float(0.0)
     radiance = wp.vec3(0.0, 0.0, 0.0)
     for k in range(4):
         sx = wp.where(k % 2 == 0, -0.25, 0.25)
@@ -366,6 +387,6 @@ def illuminate(
                 direct *= soil_shadow(height, grid, point, light, step, top)
                 if tool_hit(tool, point + n * 1.0e-4, light.sun, 1.0e3) >= 0.0:
                     direct = 0.0
-            lit = light.ambient * sky + (wp.vec3(1.0, 1.0, 1.0) - light.ambient) * direct + light.bounce * (1.0 - sky)
+            lit = light.ambient * sky + (wp.vec3(1.0, 1.0, 1.0) - light.ambient) * direct + light.ground * (1.0 - sky)
             radiance += 0.25 * wp.cw_mul(albedo, lit)
     tool_out[i, j] = wp.vec4(radiance[0], radiance[1], radiance[2], share)

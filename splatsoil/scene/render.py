@@ -14,17 +14,8 @@ from torch import Tensor
 from splatsoil.measurement import Bed, Camera, Measurement
 from splatsoil.scene import kernels
 from splatsoil.scene.binding import Binding
-from splatsoil.scene.light import (
-    Light,
-    LitRelief,
-    ToolBody,
-    ceiling,
-    encoded,
-    grid_of,
-    light_relief,
-    linear,
-    march_step,
-)
+from splatsoil.scene.light import Light, encoded, linear
+from splatsoil.scene.lit import LitRelief, ToolBody, ceiling, grid_of, light_relief, march_step
 from splatsoil.scene.relief import Relief, relief_of_particles
 from splatsoil.splats import Gaussians, rasterise_features
 from splatsoil.splats.warp_torch import as_warp, launch
@@ -41,8 +32,8 @@ PARTICLE_OPACITY = 0.95
 _HIDDEN = 2.5
 """Particles this many spacings below the surface are not drawn."""
 
-_SNAP = 2.0
-"""How far along its ray a pixel of soil may be moved to the surface, in particle spacings."""
+_REACH = 4.0
+"""How far behind the splats the surface that a pixel shows is looked for, in particle spacings."""
 
 
 @dataclass(frozen=True)
@@ -164,7 +155,7 @@ class Scene:
         f = None if deformations is None else torch.as_tensor(deformations, dtype=torch.float32, device=self.device)
         relief = relief_of_particles(x, self.spacing, self.bed.lower, self.bed.upper)
         placed = self.tool.absent() if tool is None else self.tool.at(*tool)
-        lit = light_relief(relief, self.light, placed)
+        lit = light_relief(relief, self.light, placed, self.tool_albedo)
         centres, covariances = self.soil.carry(x, None if f is None else f.contiguous())
         shown, near = self.shown(relief, centres, x)
         grains = (PARTICLE_SIZE * self.spacing) ** 2 * torch.eye(3, device=self.device)
@@ -194,7 +185,7 @@ class Scene:
         )
         colour, soil, depth = drawn.image[..., :3], drawn.image[..., 3].contiguous(), drawn.image[..., 4]
         depth = torch.where(drawn.alpha > 0.3, depth / drawn.alpha.clamp_min(0.3), 0.0).contiguous()
-        light, tool = _illuminated(posed.lit, camera, depth, soil, self.tool_albedo, _SNAP * self.spacing)
+        light, tool = _illuminated(posed.lit, camera, depth, soil, self.tool_albedo, _REACH * self.spacing)
         return Layers(colour, soil, depth, light, tool)
 
     def render(self, positions: Any, deformations: Any, tool: Pose | None, camera: Camera) -> FloatImage:
@@ -208,7 +199,7 @@ class Scene:
 
 
 def _illuminated(
-    lit: LitRelief, camera: Camera, depth: Tensor, soil: Tensor, tool_albedo: FloatArray, snap: float
+    lit: LitRelief, camera: Camera, depth: Tensor, soil: Tensor, tool_albedo: FloatArray, reach: float
 ) -> tuple[Tensor, Tensor]:
     """Light on the soil (h, w, 3) and the tool's share (h, w, 4) of each pixel."""
     eye = kernels.Eye()
@@ -222,7 +213,8 @@ def _illuminated(
     tool = torch.empty((*size, 4), dtype=torch.float32, device=depth.device)
     maps = [as_warp(depth, wp.float32), as_warp(soil.contiguous(), wp.float32), as_warp(relief.height, wp.float32)]
     maps += [as_warp(relief.normal, wp.vec3), as_warp(lit.openness, wp.float32), as_warp(lit.visible, wp.float32)]
+    maps += [as_warp(lit.bounced, wp.vec3)]
     numbers = [grid_of(relief), lit.light.kernel_form(), lit.tool, wp.vec3(*tool_albedo), march_step(relief)]
     outputs = [as_warp(light, wp.vec3), as_warp(tool, wp.vec4)]
-    launch(kernels.illuminate, size, [eye, *maps, *numbers, ceiling(relief), snap, *outputs], depth)
+    launch(kernels.illuminate, size, [eye, *maps, *numbers, ceiling(relief), reach, *outputs], depth)
     return light, tool
