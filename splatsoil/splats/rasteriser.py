@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from types import ModuleType
 from typing import Any
 
 import torch
@@ -11,7 +12,7 @@ import warp as wp
 from torch import Tensor
 
 from splatsoil.errors import ParameterError
-from splatsoil.splats import constants, kernels_binning, kernels_cpu
+from splatsoil.splats import constants, kernels_binning, kernels_cpu, kernels_cuda
 from splatsoil.splats.binning import Bins, bin_by_tile
 from splatsoil.splats.camera import AnyCamera, View, view_of
 from splatsoil.splats.gaussians import Gaussians
@@ -206,7 +207,8 @@ class _Composite(torch.autograd.Function):
         transmittance = features.new_empty((view.height, view.width))
         inputs = _tile_arguments(bins, view)
         inputs += [as_warp(t.reshape(-1), wp.float32) for t in (background, image, transmittance)]
-        launch(kernels_cpu.forward_kernel(channels), bins.tiles_x * bins.tiles_y, inputs, features)
+        kernels = _kernels(features)
+        launch(kernels.forward_kernel(channels), bins.tiles_x * bins.tiles_y * kernels.THREADS, inputs, features)
         ctx.bins, ctx.view = bins, view
         ctx.save_for_backward(conics, strengths, image, transmittance)
         return image, transmittance
@@ -221,7 +223,8 @@ class _Composite(torch.autograd.Function):
         inputs = [*_tile_arguments(bins, view), as_warp(bins.entries, wp.int32)]
         tensors = (image, transmittance, v_image, v_transmittance, gradients)
         inputs += [as_warp(t.reshape(-1), wp.float32) for t in tensors]
-        launch(kernels_cpu.backward_kernel(channels), bins.tiles_x * bins.tiles_y, inputs, image)
+        kernels = _kernels(image)
+        launch(kernels.backward_kernel(channels), bins.tiles_x * bins.tiles_y * kernels.THREADS, inputs, image)
         shapes = ((n, 2), (n, 3), (n,), (n, channels))
         outputs = [image.new_zeros(shape) for shape in shapes]
         row = wp.types.vector(length=kernels_binning.MOMENTS + channels, dtype=wp.float32)
@@ -232,6 +235,11 @@ class _Composite(torch.autograd.Function):
         launch(kernels_binning.gather_kernel(channels), bins.order.shape[0], arrays, image)
         v_background = torch.einsum("hw,hwk->k", transmittance, v_image) if ctx.needs_input_grad[4] else None
         return (*outputs, v_background, None, None)
+
+
+def _kernels(like: Tensor) -> ModuleType:
+    """The tile kernels for the device of ``like``."""
+    return kernels_cuda if like.is_cuda else kernels_cpu
 
 
 def _tile_arguments(bins: Bins, view: View) -> list[Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import torch
 import warp as wp
 from torch import Tensor
 
@@ -15,16 +14,10 @@ def as_warp(tensor: Tensor, dtype: Any) -> Any:
     return wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=False)
 
 
-def warp_device(tensor: Tensor) -> Any:
-    """The Warp device a tensor lives on."""
-    return wp.device_from_torch(tensor.device)
-
-
-def launch(kernel: Any, count: int, inputs: list[Any], like: Tensor, **options: Any) -> None:
-    """Run a kernel where ``like`` lives, on torch's current stream."""
-    device = warp_device(like)
-    if device.is_cuda:
-        with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(like.device)), sync_enter=False):
-            wp.launch(kernel, dim=count, inputs=inputs, device=device, **options)
+def launch(kernel: Any, count: int, inputs: list[Any], like: Tensor, block: int = 256) -> None:
+    """Run ``count`` threads of a kernel where ``like`` lives, on torch's current stream."""
+    if like.is_cuda:
+        stream = wp.stream_from_torch(like.device)
+        wp.launch(kernel, dim=count, inputs=inputs, device=stream.device, stream=stream, block_dim=block)
     else:
-        wp.launch(kernel, dim=count, inputs=inputs, device=device, **options)
+        wp.launch(kernel, dim=count, inputs=inputs, device="cpu")

@@ -1,0 +1,212 @@
+"""CUDA kernels against the slow reference: on a GPU; and without one compiled for the GPU, and run on the CPU."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from torch import Tensor
+
+from splatsoil.measurement import Camera
+from splatsoil.splats import (
+    Gaussians,
+    OrthographicCamera,
+    kernels_binning,
+    kernels_cuda,
+    kernels_projection,
+    rasterise,
+    rasterise_features,
+    rasteriser,
+    reference,
+    ssim,
+)
+from splatsoil.splats.camera import view_of
+
+CameraMaker = Callable[..., Camera]
+CloudMaker = Callable[..., Gaussians]
+
+AnyCamera = Camera | OrthographicCamera
+
+NAMES = ("means", "scales", "quaternions", "opacities", "colours")
+
+
+def on_gpu(test: Callable[..., None]) -> Callable[..., None]:
+    """Marks a test that needs a GPU."""
+    return pytest.mark.cuda(pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")(test))
+
+
+def outputs_and_gradients(
+    g: Gaussians, paint: Callable[[Gaussians, Tensor], dict[str, Tensor]], dtype: torch.dtype
+) -> dict[str, Tensor]:
+    """Every output of a rendering, and the gradients of a fixed random weighting of all of them, on the CPU."""
+    leaves = [getattr(g, name).detach().to(dtype).requires_grad_() for name in NAMES]
+    background = torch.tensor([0.3, 0.6, 0.1], device=g.device, dtype=dtype, requires_grad=True)
+    outputs = paint(Gaussians(*leaves), background)
+    generator = torch.Generator().manual_seed(0)
+    weighted = [(o * torch.randn(o.shape, generator=generator).to(o)).sum() for o in outputs.values()]
+    gradients = torch.autograd.grad(torch.stack(weighted).sum(), [*leaves, background])
+    named = zip((*(f"by {n}" for n in NAMES), "by background"), gradients, strict=True)
+    return {name: value.detach().float().cpu() for name, value in (outputs | dict(named)).items()}
+
+
+def draw(g: Gaussians, camera: AnyCamera, antialias: bool = False) -> dict[str, Tensor]:
+    """By the rasteriser, where ``g`` lives."""
+
+    def paint(h: Gaussians, background: Tensor) -> dict[str, Tensor]:
+        picture = rasterise(h, camera, background=background, antialias=antialias)
+        assert picture.normal is not None
+        return {"colour": picture.colour, "alpha": picture.alpha, "depth": picture.depth, "normal": picture.normal}
+
+    return outputs_and_gradients(g, paint, torch.float32)
+
+
+def draw_slowly(g: Gaussians, camera: AnyCamera, antialias: bool = False) -> dict[str, Tensor]:
+    """By the reference in double precision: no Warp kernel takes part, so it runs on any machine."""
+    view = view_of(camera)
+    eye = torch.as_tensor(view.position - (1e6 * view.forward if view.orthographic else 0.0))
+
+    def paint(h: Gaussians, background: Tensor) -> dict[str, Tensor]:
+        depths = reference.project(h.means, h.covariances(), h.opacities, camera)[3]
+        features = torch.cat([h.colours, depths[:, None], h.normals(eye)], dim=1)
+        behind = torch.cat([background, background.new_zeros(4)])
+        image, alpha = reference.rasterise_features(
+            h.means, h.covariances(), h.opacities, features, camera, background=behind, antialias=antialias
+        )
+        colour, depth, normal = image.split([3, 1, 3], dim=2)
+        return {"colour": colour, "alpha": alpha, "depth": depth[:, :, 0] / alpha.clamp_min(1e-8), "normal": normal}
+
+    return outputs_and_gradients(g, paint, torch.float64)
+
+
+def assert_agree(a: dict[str, Tensor], b: dict[str, Tensor]) -> None:
+    """Values to 1e-4 and gradients to 1e-3 of their largest, for all but a few that rounding moves across 1/255."""
+    for name, value in a.items():
+        limit = (1e-3 if name.startswith("by") else 1e-4) * float(value.abs().max())
+        wrong = (value - b[name]).abs() > limit
+        assert float(wrong.double().mean()) < 2e-3, name
+        assert float((value - b[name]).abs().max()) < 0.02 * float(value.abs().max()), name
+
+
+def scenes(camera_at: CameraMaker, cloud: CloudMaker) -> list[tuple[str, Gaussians, AnyCamera, bool]]:
+    """Crowded and saturated, partial tiles, needles, clamped opacities, both kinds of camera."""
+    f = 60.0
+    crowd = cloud(400, f=f, extent=1.0, sigma=3.0)
+    crowd = crowd.replace(opacities=(crowd.opacities * 1.1).clamp(max=1.0))
+    pinhole = camera_at(width=53, height=41, f=f, cx=27.3, cy=18.9)
+    parallel = OrthographicCamera(53, 41, 0.03, np.diag([1.0, -1.0, -1.0, 1.0]))
+    return [
+        ("pinhole", crowd, pinhole, False),
+        ("antialias", crowd, pinhole, True),
+        ("orthographic", crowd, parallel, False),
+    ]
+
+
+def test_cuda_kernels_on_the_cpu(monkeypatch: pytest.MonkeyPatch, camera_at: CameraMaker, cloud: CloudMaker) -> None:
+    """The same kernels, a warp being one lane wide: all but the three warp-wide operations is put to the test."""
+    for _, g, camera, antialias in scenes(camera_at, cloud):
+        expected = draw_slowly(g, camera, antialias)
+        with monkeypatch.context() as patch:
+            patch.setattr(rasteriser, "_kernels", lambda like: kernels_cuda)
+            assert_agree(draw(g, camera, antialias), expected)
+
+
+@pytest.mark.parametrize("channels", [1, 8])
+def test_cuda_kernels_compile(channels: int, tmp_path: Path) -> None:
+    """NVRTC comes with Warp, so a CUDA compiler error shows without a GPU; sm_90 is an H100 or H200."""
+    wp.init()
+    for kernel in (
+        kernels_cuda.forward_kernel(channels),
+        kernels_cuda.backward_kernel(channels),
+        kernels_binning.gather_kernel(channels),
+        kernels_binning.pack,
+        kernels_binning.list_tiles,
+        kernels_projection.project_forward,
+        kernels_projection.project_backward,
+        kernels_projection.covariance_forward,
+        kernels_projection.covariance_backward,
+    ):
+        (artifact,) = wp.compile_aot_module(kernel.module, arch=90, module_dir=tmp_path, use_ptx=True)
+        text = Path(artifact).read_text()
+        assert ".entry" in text
+        if "splat" in kernel.key:
+            assert "vote.sync" in text
+            assert "local_depot" not in text, "sums that should stay in registers spill to memory"
+
+
+@on_gpu
+@pytest.mark.parametrize("index", [0, 1, 2])
+def test_values_and_gradients_on_cuda(index: int, camera_at: CameraMaker, cloud: CloudMaker) -> None:
+    _, g, camera, antialias = scenes(camera_at, cloud)[index]
+    assert_agree(draw(g.to("cuda"), camera, antialias), draw_slowly(g, camera, antialias))
+
+
+@on_gpu
+@pytest.mark.parametrize("channels", [1, 3, 8])
+def test_features_on_cuda(channels: int, camera_at: CameraMaker, cloud: CloudMaker) -> None:
+    g, camera = cloud(2000, sigma=1.5), camera_at(width=130, height=97)
+    features = torch.randn(len(g), channels, generator=torch.Generator().manual_seed(1))
+    results = []
+
+    def fast(*arguments: Any) -> tuple[Tensor, Tensor]:
+        out = rasterise_features(*arguments)
+        return out.image, out.alpha
+
+    for draw_features, device, dtype in (
+        (fast, "cuda", torch.float32),
+        (reference.rasterise_features, "cpu", torch.float64),
+    ):
+        inputs = [t.to(device, dtype).requires_grad_() for t in (g.means, g.covariances(), g.opacities, features)]
+        image, alpha = draw_features(*inputs, camera)
+        gradients = torch.autograd.grad(image.square().sum() + alpha.square().sum(), inputs)
+        gradients = [0.5 * (v + v.mT) if v.ndim == 3 else v for v in gradients]  # by a symmetric matrix
+        named = zip(("by means", "by covariances", "by opacities", "by features"), gradients, strict=True)
+        results.append({k: v.detach().float().cpu() for k, v in (("image", image), ("alpha", alpha), *named)})
+    assert_agree(*results)
+
+
+@on_gpu
+def test_a_large_scene_on_cuda(camera_at: CameraMaker, cloud: CloudMaker) -> None:
+    """Too large for the reference: a crop, on another grid of tiles, must be the crop of the picture."""
+    camera = camera_at(width=512, height=400, f=600.0)
+    g = cloud(50_000, f=600.0, sigma=2.0).to("cuda")
+    whole, part = rasterise(g, camera), rasterise(g, camera.cropped(101, 53, 300, 280))
+    for name in ("colour", "alpha", "depth"):
+        difference = (getattr(whole, name)[53:333, 101:401] - getattr(part, name)).abs()
+        assert float((difference > 2e-5).double().mean()) < 2e-3, name
+        assert float(difference.max()) < 0.02
+    assert float(whole.alpha.max()) > 0.999
+
+
+@on_gpu
+def test_an_empty_scene_on_cuda(camera_at: CameraMaker, cloud: CloudMaker) -> None:
+    picture = rasterise(cloud(5)[:0].to("cuda"), camera_at(width=21, height=9), background=(0.1, 0.2, 0.3))
+    assert torch.allclose(picture.colour.cpu(), torch.tensor([0.1, 0.2, 0.3]).expand(9, 21, 3))
+
+
+@on_gpu
+def test_on_a_stream_of_its_own(camera_at: CameraMaker, cloud: CloudMaker) -> None:
+    _, g, camera, _ = scenes(camera_at, cloud)[0]
+    expected = draw(g.to("cuda"), camera)
+    moved = g.to("cuda")
+    torch.cuda.synchronize()
+    with torch.cuda.stream(torch.cuda.Stream()):
+        assert_agree(draw(moved, camera), expected)
+
+
+@on_gpu
+def test_ssim_on_cuda() -> None:
+    g = torch.Generator().manual_seed(0)
+    a, b = torch.rand(70, 83, 3, generator=g), torch.rand(70, 83, 3, generator=g)
+    results = []
+    for device, dtype in (("cuda", torch.float32), ("cpu", torch.float64)):
+        x = a.to(device, dtype).requires_grad_()
+        value = ssim(x, b.to(device, dtype))
+        (gradient,) = torch.autograd.grad(value, x)
+        results.append((value.detach().float().cpu(), gradient.float().cpu()))
+    torch.testing.assert_close(results[0][0], results[1][0], rtol=0, atol=1e-5)
+    torch.testing.assert_close(results[0][1], results[1][1], rtol=0, atol=1e-4 * float(results[1][1].abs().max()))
