@@ -1,0 +1,208 @@
+"""Does the answer hang on numerics? The solver against an independent one, and against itself.
+
+For each measurement set that carries its true particles: the friction angle is scanned from the true particles at frame
+0 with all other parameters true, and heights are compared with the truth at the frames it has. Then one piece of the
+numerics at a time is changed; the shift is how far the friction angle of the unchanged solver must move to look like
+the changed one. Heights are averaged over particle seeds, whose scatter is stated.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter
+
+from splatsoil.errors import MeasurementError
+from splatsoil.measurement import Measurement
+from splatsoil.mpm import Resolution, simulate
+from splatsoil.reconstruction import HeightField, fill
+from splatsoil.scene import relief_of_particles
+from splatsoil.soil.law import Law
+from splatsoil.soil.library import find_effects
+
+FloatArray = npt.NDArray[np.float64]
+
+CELL = 0.01
+"""Edge of the cells in which heights are compared, m."""
+PATCH = 1.5
+"""Standard deviation, in cells, of the smoothing under which shifts are measured: patches larger than chance."""
+OFFSETS = (-9.0, -6.0, -3.0, 0.0, 3.0, 6.0, 9.0)
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Particles of an independent simulator.
+
+    Attributes:
+        measurement: the set they belong to.
+        particles: (n, 3) in m by frame.
+        volume: of one particle, m^3.
+        values: true parameters by name.
+        effects: effects that are on in the truth and known to the model.
+    """
+
+    measurement: Measurement
+    particles: dict[int, FloatArray]
+    volume: float
+    values: dict[str, float]
+    effects: tuple[str, ...]
+
+    @classmethod
+    def load(cls, folder: Path) -> Truth:
+        """Read ``truth.json`` and ``truth_particles.npz``; MeasurementError when the set has none."""
+        measurement = Measurement.load(folder)
+        try:
+            told = json.loads((folder / "truth.json").read_text())
+            with np.load(folder / "truth_particles.npz") as file:
+                particles = {int(k[1:]): file[k] * float(file["scale"]) for k in file.files if k[0] == "f"}
+                volume = float(file["spacing"]) ** 3
+        except OSError as error:
+            raise MeasurementError("the benchmark needs true particles", file=folder) from error
+        values = {"friction_angle": float(told["phi"])}
+        if told["cohesion"]:
+            values["cohesion"] = float(told["cohesion"])
+        return cls(measurement, particles, volume, values, tuple(n for n in ("cohesion",) if n in values))
+
+    def heights(self, x: npt.NDArray[np.floating], volume: float) -> FloatArray:
+        """Surface (ny, nx) in m, smoothed over one cell, whatever the particles' size."""
+        bed = self.measurement.bed
+        # the kernel's width is a length of the bed, the same for every particle size
+        spacing = volume ** (1.0 / 3.0)
+        positions = torch.as_tensor(np.ascontiguousarray(x), dtype=torch.float32)
+        relief = relief_of_particles(positions, spacing, bed.lower, bed.upper, smoothing=CELL / spacing)
+        nx, ny = (round(float(e) / CELL) for e in (bed.upper - bed.lower)[:2])
+        xs, ys = (bed.lower[k] + CELL * (np.arange(n) + 0.5) for k, n in ((0, nx), (1, ny)))
+        points = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)
+        sampled = relief.sample(relief.height, torch.as_tensor(points, dtype=torch.float32))
+        return gaussian_filter(sampled.numpy().reshape(ny, nx).astype(np.float64), 1.0)
+
+    def start(self, spacing: float, seed: int) -> FloatArray:
+        """Other particles in the volume that the true ones fill at frame 0."""
+        bed, first = self.measurement.bed, self.particles[0]
+        height = self.heights(first, self.volume)
+        plan = bed.upper[:2] - bed.lower[:2]
+        height += len(first) * self.volume / float(np.prod(plan)) - (height - bed.lower[2]).mean()
+        ny, nx = height.shape
+        field = HeightField(
+            bed.lower[0] + CELL * (np.arange(nx) + 0.5), bed.lower[1] + CELL * (np.arange(ny) + 0.5), height
+        )
+        return fill(field, bed, spacing, seed=seed)
+
+
+@dataclass(frozen=True)
+class Scan:
+    """Heights (angles, frames, ny, nx) over friction angles, averaged over seeds, with their scatter in m."""
+
+    angles: FloatArray
+    heights: FloatArray
+    chance: float
+    volume_gain: float
+
+    def best(self, other: FloatArray) -> float:
+        """Angle whose heights lie nearest to ``other`` (frames, ny, nx) in patches."""
+        smooth = gaussian_filter(self.heights - other, (0, 0, PATCH, PATCH))
+        loss = np.mean(smooth**2, axis=(1, 2, 3))
+        fine = np.linspace(self.angles[0], self.angles[-1], 2001)
+        return float(fine[np.argmin(CubicSpline(self.angles, loss)(fine))])
+
+
+def scan(truth: Truth, resolution: Resolution, angles: Sequence[float], seeds: Sequence[int], device: str) -> Scan:
+    """Simulate all angles for all seeds; on a GPU as one batch."""
+    frames = sorted(f for f in truth.particles if f > 0)
+    batch = [{**truth.values, "friction_angle": float(a)} for a in angles]
+    law = Law(find_effects(truth.effects))
+    volume = resolution.spacing**3
+    everything, gains = [], []
+    for seed in seeds:
+        x = truth.start(resolution.spacing, seed)
+        groups = [batch] if device != "cpu" else [[values] for values in batch]
+        runs = [
+            run
+            for group in groups
+            for run in simulate(
+                truth.measurement, x, group, law=law, resolution=resolution, frames=frames, device=device
+            )
+        ]
+        everything.append([[truth.heights(p, volume) for p in run.positions] for run in runs])
+        start = truth.heights(x, volume).mean()
+        gains.append(max(h.mean() for h in everything[-1][len(angles) // 2]) / start - 1.0)
+    heights = np.array(everything)
+    scatter = float(np.sqrt(heights.var(axis=0, ddof=1).mean())) if len(seeds) > 1 else 0.0
+    return Scan(np.asarray(angles, dtype=np.float64), heights.mean(axis=0), scatter, float(np.mean(gains)))
+
+
+def variants(base: Resolution) -> dict[str, Resolution]:
+    """The solver with one piece of its numerics changed."""
+    fine = 0.75
+    return {
+        "half the particles' step": replace(base, steps=2 * base.steps),
+        "half the grid's substep": replace(base, courant=base.courant / 2.0),
+        "stiffness x 3": replace(base, bulk=3.0 * base.bulk, shear=3.0 * base.shear),
+        "cell x 3/4": replace(base, cell=fine * base.cell, spacing=fine * base.spacing),
+        "particles x 2": replace(base, spacing=base.spacing / 2.0 ** (1.0 / 3.0)),
+    }
+
+
+def run(
+    sets: Sequence[Path], preset: str = "small", seeds: int = 3, device: str = "cpu", shifts: bool = True
+) -> dict[str, Any]:
+    """Measure all sets; a JSON-able result with one entry for each."""
+    result: dict[str, Any] = {"preset": preset, "seeds": seeds, "device": device.split(":")[0], "sets": {}}
+    for folder in sets:
+        truth = Truth.load(Path(folder))
+        base = Resolution.derive(truth.measurement, preset)
+        true_angle = truth.values["friction_angle"]
+        angles = [true_angle + offset for offset in OFFSETS]
+        found = scan(truth, base, angles, range(seeds), device)
+        frames = sorted(f for f in truth.particles if f > 0)
+        observed = np.array([truth.heights(truth.particles[f], truth.volume) for f in frames])
+        centre = len(angles) // 2
+        rmse = np.sqrt(np.mean((found.heights[centre] - observed) ** 2, axis=(1, 2)))
+        entry: dict[str, Any] = {
+            "true_angle": true_angle,
+            "best_angle": found.best(observed),
+            "rmse_mm": {str(f): round(1e3 * float(e), 2) for f, e in zip(frames, rmse, strict=True)},
+            "chance_mm": round(1e3 * found.chance, 2),
+            "volume_gain": found.volume_gain,
+            "shifts": {},
+        }
+        for name, resolution in variants(base).items() if shifts else ():
+            changed = scan(truth, resolution, [true_angle], range(seeds), device)
+            entry["shifts"][name] = found.best(changed.heights[0]) - found.best(found.heights[centre])
+        result["sets"][truth.measurement.name] = entry
+    return result
+
+
+def table(result: dict[str, Any]) -> str:
+    """The result as Markdown."""
+    lines = [
+        f"Preset `{result['preset']}`, {result['seeds']} particle seeds, {result['device']}.",
+        "",
+        "| set | true φ | best φ of the scan | height RMSE at the truth, mm (frames) | chance, mm | volume gain |",
+        "|---|---|---|---|---|---|",
+    ]
+    for name, entry in result["sets"].items():
+        errors = ", ".join(f"{e:.1f} ({f})" for f, e in entry["rmse_mm"].items())
+        lines.append(
+            f"| {name} | {entry['true_angle']:.1f}° | {entry['best_angle']:.1f}° | {errors} "
+            f"| {entry['chance_mm']:.1f} | {100 * entry['volume_gain']:+.2f} % |"
+        )
+    if any(entry["shifts"] for entry in result["sets"].values()):
+        names = list(result["sets"])
+        lines += [
+            "",
+            "| change | " + " | ".join(f"shift of φ, {n}" for n in names) + " |",
+            "|---" * (len(names) + 1) + "|",
+        ]
+        for change in next(iter(result["sets"].values()))["shifts"]:
+            cells = " | ".join(f"{result['sets'][n]['shifts'][change]:+.1f}°" for n in names)
+            lines.append(f"| {change} | {cells} |")
+    return "\n".join(lines)
