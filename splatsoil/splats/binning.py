@@ -77,23 +77,33 @@ def _depth_order(projection: Projection) -> Tensor:
     """Indices (v,) int32 of the visible Gaussians, nearest first."""
     depths = projection.depths.detach()
     if depths.is_cuda:
-        visible = torch.nonzero(projection.visible).squeeze(1)
-        return visible[torch.argsort(depths[visible], stable=True)].to(torch.int32)
-    n = depths.shape[0]
-    scratch = torch.empty((4, n), dtype=torch.int32)
+        return _depth_order_torch(projection)
+    scratch = torch.empty((4, depths.shape[0]), dtype=torch.int32)
     count = torch.zeros(1, dtype=torch.int32)
     inputs = [as_warp(depths, wp.float32), as_warp(projection.reaches, wp.vec2)]
     launch(kernels_cpu.depth_order, 1, [*inputs, as_warp(scratch, wp.int32), as_warp(count, wp.int32)], depths)
     return scratch[1, : int(count)]
 
 
+def _depth_order_torch(projection: Projection) -> Tensor:
+    """`_depth_order` by torch's own sort, for CUDA."""
+    visible = torch.nonzero(projection.visible).squeeze(1)
+    return visible[torch.argsort(projection.depths.detach()[visible], stable=True)].to(torch.int32)
+
+
 def _sort_by_tile(tiles: Tensor, owners: Tensor, tile_count: int) -> tuple[Tensor, Tensor, Tensor]:
     """Where each tile begins (tile_count + 1,), ranks (m,) and entries (m,) by tile in a stable order; all int32."""
-    starts = torch.zeros(tile_count + 1, dtype=torch.int32, device=tiles.device)
     if tiles.is_cuda:
-        entries = torch.argsort(tiles, stable=True)
-        starts[1:] = torch.bincount(tiles, minlength=tile_count).cumsum(0)
-        return starts, owners[entries], entries.to(torch.int32)
+        return _sort_by_tile_torch(tiles, owners, tile_count)
+    starts = torch.zeros(tile_count + 1, dtype=torch.int32)
     ranks, entries = torch.empty_like(owners), torch.empty_like(tiles)
     launch(kernels_cpu.tile_sort, 1, [as_warp(t, wp.int32) for t in (tiles, owners, starts, ranks, entries)], tiles)
     return starts, ranks, entries
+
+
+def _sort_by_tile_torch(tiles: Tensor, owners: Tensor, tile_count: int) -> tuple[Tensor, Tensor, Tensor]:
+    """`_sort_by_tile` by torch's own sort, for CUDA."""
+    entries = torch.argsort(tiles, stable=True)
+    starts = torch.zeros(tile_count + 1, dtype=torch.int32, device=tiles.device)
+    starts[1:] = torch.bincount(tiles, minlength=tile_count).cumsum(0)
+    return starts, owners[entries], entries.to(torch.int32)

@@ -23,9 +23,6 @@ import warp as wp
 from splatsoil.splats import constants
 from splatsoil.splats.kernels_binning import HEADER, MOMENTS
 
-THREADS = 1
-"""Tasks per tile."""
-
 _COMMON = """
     typedef float v8 __attribute__((ext_vector_type(8)));
     typedef int i8 __attribute__((ext_vector_type(8)));

@@ -151,6 +151,7 @@ def _similarity_band(
 
 @wp.kernel(enable_backward=False, module="unique")
 def similarity(
+    first: int,
     height: int,
     row: int,
     channels: int,
@@ -162,7 +163,7 @@ def similarity(
     slopes_b: wp.array(dtype=float),
 ):
     """SSIM map of two pictures (height, row), channels interleaved, and its slopes (3, height, row) where wanted."""
-    _similarity_band(wp.tid(), height, row, channels, a, b, window, out, slopes_a, slopes_b)
+    _similarity_band(first + wp.tid(), height, row, channels, a, b, window, out, slopes_a, slopes_b)
 
 
 @wp.func_native(_GRADIENT)
@@ -182,6 +183,7 @@ def _gradient_band(
 
 @wp.kernel(enable_backward=False, module="unique")
 def similarity_gradient(
+    first: int,
     height: int,
     row: int,
     channels: int,
@@ -193,4 +195,4 @@ def similarity_gradient(
     out: wp.array(dtype=float),
 ):
     """Gradient of a loss by the picture ``own``, from the map's ``upstream`` gradient and that picture's slopes."""
-    _gradient_band(wp.tid(), height, row, channels, own, other, upstream, window, slopes, out)
+    _gradient_band(first + wp.tid(), height, row, channels, own, other, upstream, window, slopes, out)

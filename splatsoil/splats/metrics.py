@@ -11,13 +11,16 @@ from torch import Tensor
 
 from splatsoil.errors import ParameterError
 from splatsoil.splats import kernels_ssim
-from splatsoil.splats.warp_torch import as_warp, launch
+from splatsoil.splats.warp_torch import as_warp, launch_parts, thread_count
 
 WINDOW = 11
 """Side of the SSIM window, px."""
 
 SIGMA = 1.5
 """Standard deviation of the SSIM window, px."""
+
+_NUMBERS_PER_MILLISECOND = 100_000
+"""About how many pixels times channels one CPU core compares in a millisecond."""
 
 C1 = 0.01**2
 C2 = 0.03**2
@@ -87,7 +90,7 @@ class _Similarity(torch.autograd.Function):
         out = torch.empty_like(pictures[0])
         slopes = [a.new_empty((3 if needed else 0, height, row)) for needed in ctx.needs_input_grad]
         arrays = [as_warp(t.reshape(-1), wp.float32) for t in (*pictures, window(torch.float32), out, *slopes)]
-        launch(kernels_ssim.similarity, -(-height // kernels_ssim.BAND), [height, row, channels, *arrays], a)
+        _launch_bands(kernels_ssim.similarity, [height, row, channels, *arrays])
         ctx.save_for_backward(*pictures, *slopes)
         return out
 
@@ -104,8 +107,13 @@ class _Similarity(torch.autograd.Function):
             out = torch.empty_like(own)
             tensors = (own, other, gradient, window(torch.float32), partial, out)
             arrays = [as_warp(t.reshape(-1), wp.float32) for t in tensors]
-            launch(
-                kernels_ssim.similarity_gradient, -(-height // kernels_ssim.BAND), [height, row, channels, *arrays], a
-            )
+            _launch_bands(kernels_ssim.similarity_gradient, [height, row, channels, *arrays])
             results.append(out)
         return results[0], results[1]
+
+
+def _launch_bands(kernel: Any, inputs: list[Any]) -> None:
+    """Run a kernel over bands of rows, by as many threads as pay; ``inputs`` begin with the picture's size."""
+    bands = -(-inputs[0] // kernels_ssim.BAND)
+    threads = thread_count(inputs[0] * inputs[1] / _NUMBERS_PER_MILLISECOND)
+    launch_parts(kernel, [bands * i // threads for i in range(threads + 1)], inputs)

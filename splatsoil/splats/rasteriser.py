@@ -17,7 +17,10 @@ from splatsoil.splats.binning import Bins, bin_by_tile
 from splatsoil.splats.camera import AnyCamera, View, view_of
 from splatsoil.splats.gaussians import Gaussians
 from splatsoil.splats.projection import Projection, covariances_of, project
-from splatsoil.splats.warp_torch import as_warp, launch
+from splatsoil.splats.warp_torch import as_warp, launch, launch_parts, thread_count
+
+_ENTRIES_PER_MILLISECOND = 8000
+"""About how many pairs of a Gaussian and a tile one CPU core draws in a millisecond."""
 
 
 @dataclass(frozen=True)
@@ -205,10 +208,9 @@ class _Composite(torch.autograd.Function):
         channels = features.shape[1]
         image = features.new_empty((view.height, view.width, channels))
         transmittance = features.new_empty((view.height, view.width))
-        inputs = _tile_arguments(bins, view)
-        inputs += [as_warp(t.reshape(-1), wp.float32) for t in (background, image, transmittance)]
-        kernels = _kernels(features)
-        launch(kernels.forward_kernel(channels), bins.tiles_x * bins.tiles_y * kernels.THREADS, inputs, features)
+        tensors = (background, image, transmittance)
+        inputs = [*_tile_arguments(bins, view), *(as_warp(t.reshape(-1), wp.float32) for t in tensors)]
+        _launch_tiles(_kernels(features).forward_kernel(channels), bins, inputs, features)
         ctx.bins, ctx.view = bins, view
         ctx.save_for_backward(conics, strengths, image, transmittance)
         return image, transmittance
@@ -220,11 +222,10 @@ class _Composite(torch.autograd.Function):
         view: View = ctx.view
         n, channels = conics.shape[0], image.shape[2]
         gradients = image.new_zeros((bins.ranks.shape[0], kernels_binning.MOMENTS + channels))
-        inputs = [*_tile_arguments(bins, view), as_warp(bins.entries, wp.int32)]
         tensors = (image, transmittance, v_image, v_transmittance, gradients)
+        inputs = [*_tile_arguments(bins, view), as_warp(bins.entries, wp.int32)]
         inputs += [as_warp(t.reshape(-1), wp.float32) for t in tensors]
-        kernels = _kernels(image)
-        launch(kernels.backward_kernel(channels), bins.tiles_x * bins.tiles_y * kernels.THREADS, inputs, image)
+        _launch_tiles(_kernels(image).backward_kernel(channels), bins, inputs, image)
         shapes = ((n, 2), (n, 3), (n,), (n, channels))
         outputs = [image.new_zeros(shape) for shape in shapes]
         row = wp.types.vector(length=kernels_binning.MOMENTS + channels, dtype=wp.float32)
@@ -242,7 +243,20 @@ def _kernels(like: Tensor) -> ModuleType:
     return kernels_cuda if like.is_cuda else kernels_cpu
 
 
+def _launch_tiles(kernel: Any, bins: Bins, inputs: list[Any], like: Tensor) -> None:
+    """Run a tile kernel over all tiles; on the CPU by as many threads as pay, with equal numbers of entries."""
+    tiles = bins.tiles_x * bins.tiles_y
+    if like.is_cuda:
+        launch(kernel, tiles * kernels_cuda.THREADS, [0, *inputs], like, block=kernels_cuda.THREADS)
+        return
+    total = bins.ranks.shape[0]
+    threads = thread_count(total / _ENTRIES_PER_MILLISECOND)
+    shares = torch.arange(1, threads) * total // threads
+    inner = torch.searchsorted(bins.starts, shares.to(torch.int32)).tolist()
+    launch_parts(kernel, [0, *inner, tiles], inputs)
+
+
 def _tile_arguments(bins: Bins, view: View) -> list[Any]:
-    """What both tile kernels take first."""
+    """What both tile kernels take first, after the number of the first tile."""
     rows, starts, ranks = as_warp(bins.rows, wp.float32), as_warp(bins.starts, wp.int32), as_warp(bins.ranks, wp.int32)
-    return [0, view.width, view.height, bins.tiles_x, rows, starts, ranks]
+    return [view.width, view.height, bins.tiles_x, rows, starts, ranks]

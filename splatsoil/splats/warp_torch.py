@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import pairwise
+from threading import Thread
 from typing import Any
 
+import torch
 import warp as wp
 from torch import Tensor
 
@@ -21,3 +25,30 @@ def launch(kernel: Any, count: int, inputs: list[Any], like: Tensor, block: int 
         wp.launch(kernel, dim=count, inputs=inputs, device=stream.device, stream=stream, block_dim=block)
     else:
         wp.launch(kernel, dim=count, inputs=inputs, device="cpu")
+
+
+def launch_parts(kernel: Any, bounds: Sequence[int], inputs: list[Any]) -> None:
+    """Run a CPU kernel in several Python threads, which a call into compiled code sets free of Python's lock.
+
+    Args:
+        kernel: its first argument is the number of its first task, and its tasks write to disjoint memory.
+        bounds: part i does the tasks from ``bounds[i]`` up to ``bounds[i + 1]``; the caller's thread does the last.
+        inputs: the other arguments.
+    """
+    parts = [
+        wp.launch(kernel, dim=end - begin, inputs=[begin, *inputs], device="cpu", record_cmd=True)
+        for begin, end in pairwise(bounds)
+        if end > begin
+    ]
+    threads = [Thread(target=part.launch) for part in parts[:-1]]
+    for thread in threads:
+        thread.start()
+    for part in parts[-1:]:
+        part.launch()
+    for thread in threads:
+        thread.join()
+
+
+def thread_count(work: float) -> int:
+    """Threads to draw with: as many as torch may use, but each should have a millisecond of ``work`` (in ms)."""
+    return max(1, min(torch.get_num_threads(), int(work)))

@@ -16,6 +16,7 @@ from splatsoil.measurement import Camera
 from splatsoil.splats import (
     Gaussians,
     OrthographicCamera,
+    binning,
     kernels_binning,
     kernels_cuda,
     kernels_projection,
@@ -106,12 +107,25 @@ def scenes(camera_at: CameraMaker, cloud: CloudMaker) -> list[tuple[str, Gaussia
     ]
 
 
+def launch_pixels(kernel: Any, bins: binning.Bins, inputs: list[Any], like: Tensor) -> None:
+    """As for a GPU: one thread per pixel of every tile."""
+    wp.launch(kernel, dim=bins.tiles_x * bins.tiles_y * kernels_cuda.THREADS, inputs=[0, *inputs], device="cpu")
+
+
+def launch_pixels(kernel: Any, bins: binning.Bins, inputs: list[Any], like: Tensor) -> None:
+    """As for a GPU: one thread per pixel of every tile."""
+    wp.launch(kernel, dim=bins.tiles_x * bins.tiles_y * kernels_cuda.THREADS, inputs=[0, *inputs], device="cpu")
+
+
 def test_cuda_kernels_on_the_cpu(monkeypatch: pytest.MonkeyPatch, camera_at: CameraMaker, cloud: CloudMaker) -> None:
-    """The same kernels, a warp being one lane wide: all but the three warp-wide operations is put to the test."""
+    """The same sorting and kernels, a warp being one lane wide: all but three warp-wide operations is tested."""
     for _, g, camera, antialias in scenes(camera_at, cloud):
         expected = draw_slowly(g, camera, antialias)
         with monkeypatch.context() as patch:
             patch.setattr(rasteriser, "_kernels", lambda like: kernels_cuda)
+            patch.setattr(rasteriser, "_launch_tiles", launch_pixels)
+            patch.setattr(binning, "_depth_order", binning._depth_order_torch)
+            patch.setattr(binning, "_sort_by_tile", binning._sort_by_tile_torch)
             assert_agree(draw(g, camera, antialias), expected)
 
 

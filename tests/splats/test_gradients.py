@@ -10,8 +10,10 @@ import torch
 from torch import Tensor
 
 from splatsoil.measurement import Camera
-from splatsoil.splats import Gaussians, OrthographicCamera, rasterise, rasterise_features, reference
+from splatsoil.splats import Gaussians, OrthographicCamera, rasterise, rasterise_features, reference, ssim_map
 from splatsoil.splats.gaussians import rotation_matrices
+from splatsoil.splats.projection import covariances_of
+from splatsoil.splats.warp_torch import thread_count
 
 CameraMaker = Callable[..., Camera]
 CloudMaker = Callable[..., Gaussians]
@@ -128,8 +130,6 @@ def test_gradients_reach_every_tensor_of_a_rendering(camera_at: CameraMaker, clo
 
 
 def test_covariances_in_one_kernel(cloud: CloudMaker) -> None:
-    from splatsoil.splats.projection import covariances_of
-
     g = cloud(50)
     scales, quaternions = g.scales.clone().requires_grad_(), g.quaternions.clone().requires_grad_()
     weights = torch.randn(50, 3, 3)
@@ -141,11 +141,28 @@ def test_covariances_in_one_kernel(cloud: CloudMaker) -> None:
     assert max(relative(x, y) for x, y in zip(a, b, strict=True)) < 1e-5
 
 
-def test_same_input_same_bits(camera_at: CameraMaker, cloud: CloudMaker) -> None:
-    g = cloud(400)
+def test_same_bits_with_any_number_of_threads(camera_at: CameraMaker, cloud: CloudMaker) -> None:
+    """Run after run, and however many threads share the tiles."""
+    g = cloud(6000, sigma=4.0)
+    camera = camera_at(width=130, height=130)
+    target = torch.rand(130, 130, 3, generator=torch.Generator().manual_seed(0))
+    before = torch.get_num_threads()
     results = []
-    for _ in range(2):
-        leaves = [t.clone().requires_grad_() for t in (g.means, g.scales, g.quaternions, g.opacities, g.colours)]
-        picture = rasterise(Gaussians(*leaves), camera_at())
-        results.append([picture.colour, *torch.autograd.grad(picture.colour.square().sum(), leaves)])
-    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+    try:
+        for threads in (1, 1, 2, 3):
+            torch.set_num_threads(threads)
+            leaves = [t.clone().requires_grad_() for t in (g.means, g.scales, g.quaternions, g.opacities, g.colours)]
+            picture = rasterise(Gaussians(*leaves), camera)
+            similarity = ssim_map(picture.colour, target)
+            # weights instead of a sum, which torch's threads may add in another order
+            gradients = torch.autograd.grad([picture.colour, similarity], leaves, [target, target])
+            results.append([picture.colour, picture.depth, similarity, *gradients])
+    finally:
+        torch.set_num_threads(before)
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+def test_threads_are_used_when_they_pay(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 4)
+    assert [thread_count(work) for work in (0.0, 0.9, 2.5, 100.0)] == [1, 1, 2, 4]
