@@ -48,7 +48,7 @@ def ssim_map(a: Tensor, b: Tensor) -> Tensor:
     channels = a[0, 0].numel()
     if a.device.type == "cpu" and a.dtype == b.dtype == torch.float32 and channels <= kernels_ssim.MAX_CHANNELS:
         return _Similarity.apply(a, b)
-    return _ssim_map_torch(a, b)
+    return ssim_map_torch(a, b)
 
 
 def window(dtype: torch.dtype = torch.float64) -> Tensor:
@@ -63,7 +63,7 @@ def _check(a: Tensor, b: Tensor) -> None:
         raise ParameterError(f"pictures of shapes {tuple(a.shape)} and {tuple(b.shape)} cannot be compared")
 
 
-def _ssim_map_torch(a: Tensor, b: Tensor) -> Tensor:
+def ssim_map_torch(a: Tensor, b: Tensor) -> Tensor:
     """SSIM by separable convolutions and autograd: the path for CUDA, and the check of the CPU kernels."""
     planes = [t.reshape(t.shape[0], t.shape[1], -1).permute(2, 0, 1)[:, None] for t in (a, b)]
     weights = window(a.dtype).to(a.device)

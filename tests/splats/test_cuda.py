@@ -112,11 +112,6 @@ def launch_pixels(kernel: Any, bins: binning.Bins, inputs: list[Any], like: Tens
     wp.launch(kernel, dim=bins.tiles_x * bins.tiles_y * kernels_cuda.THREADS, inputs=[0, *inputs], device="cpu")
 
 
-def launch_pixels(kernel: Any, bins: binning.Bins, inputs: list[Any], like: Tensor) -> None:
-    """As for a GPU: one thread per pixel of every tile."""
-    wp.launch(kernel, dim=bins.tiles_x * bins.tiles_y * kernels_cuda.THREADS, inputs=[0, *inputs], device="cpu")
-
-
 def test_cuda_kernels_on_the_cpu(monkeypatch: pytest.MonkeyPatch, camera_at: CameraMaker, cloud: CloudMaker) -> None:
     """The same sorting and kernels, a warp being one lane wide: all but three warp-wide operations is tested."""
     for _, g, camera, antialias in scenes(camera_at, cloud):

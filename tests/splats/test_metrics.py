@@ -11,6 +11,7 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from splatsoil.errors import ParameterError
 from splatsoil.splats import psnr, ssim, ssim_map
+from splatsoil.splats.metrics import ssim_map_torch
 
 
 def pair(height: int = 40, width: int = 51, channels: int = 3) -> tuple[torch.Tensor, torch.Tensor]:
@@ -90,3 +91,9 @@ def test_pictures_of_different_shapes() -> None:
         ssim(torch.zeros(4, 4, 3), torch.zeros(4, 5, 3))
     with pytest.raises(ParameterError, match="cannot be compared"):
         psnr(torch.zeros(4, 4, 3), torch.zeros(4, 4, 1))
+
+
+def test_convolutions_on_the_cpu_give_the_same_map() -> None:
+    """The path for CUDA, which no GPU need be there to check."""
+    a, b = pair()
+    torch.testing.assert_close(ssim_map_torch(a, b), ssim_map(a, b), rtol=0, atol=1e-5)
