@@ -6,6 +6,7 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from splatsoil.errors import ParameterError
 from splatsoil.measurement import Frame, Measurement
@@ -13,7 +14,7 @@ from splatsoil.scene import albedo as albedos
 from splatsoil.scene.binding import bind
 from splatsoil.scene.estimate import estimate_light, still_frames
 from splatsoil.scene.light import Light, encoded, linear
-from splatsoil.scene.lit import ToolBody, light_relief
+from splatsoil.scene.lit import LitRelief, ToolBody, light_relief
 from splatsoil.scene.relief import relief_of_particles
 from splatsoil.scene.render import Posed, Scene
 from splatsoil.splats import Gaussians
@@ -23,6 +24,13 @@ ROUNDS = 4
 
 _LONGEST = 0.1
 """Blotches of albedo wider than this count as this wide, m."""
+
+
+_FOOTPRINT = 0.002
+"""Half width of the patch of surface that a Gaussian's colour was seen on, m, for shadows' edges."""
+
+_EDGE = 3
+"""Pixels around the tool that are not used: lenses, blur and JPEG blocks mix colours there."""
 
 
 class Reconstructed(Protocol):
@@ -64,18 +72,11 @@ def build_scene(
         light = estimate_light(measurement, relief, body).light
     motion = measurement.tool.motion
     start = motion.pose(float(motion.times[0]))
-    lit = light_relief(relief, light, body.at(*start))
-    soil_albedo = (linear(soil.colours) / lit.irradiance(soil.means.contiguous(), 0.002).clamp_min(0.05)).clamp(
-        0.0, albedos.BRIGHTEST
-    )
-    length = albedos.correlation_length(soil.means, soil_albedo.clamp_min(1e-3).log().mean(dim=1), _LONGEST)
-    depth = relief.depth_below(x)
-    grains = albedos.grain_albedo(x, depth, soil.means, soil_albedo, spacing, length)
     scene = Scene(
         soil=bind(soil.means, soil.covariances(), x, spacing),
         soil_opacity=soil.opacities.contiguous(),
-        soil_albedo=encoded(soil_albedo),
-        grain_albedo=encoded(grains),
+        soil_albedo=soil.colours,
+        grain_albedo=x.new_full(x.shape, 0.5),
         surroundings=around,
         light=light,
         tool=body,
@@ -84,25 +85,36 @@ def build_scene(
         spacing=spacing,
         background=np.asarray(background, dtype=np.float64),
     )
+    frames = still_frames(measurement)
     with torch.no_grad():
         posed = scene.pose(x, None, start)
-        frames = still_frames(measurement)
         scene = scene.replace(tool_albedo=albedos.tool_albedo(frames, lambda camera: scene.layers(posed, camera).tool))
-    return _refined(scene, posed, frames, rounds) if rounds > 0 else scene
+        lit = light_relief(relief, light, body.at(*start), scene.tool_albedo)
+        scene = scene.replace(**_albedo(soil, lit, x, spacing))
+        return _refined(scene, scene.pose(x, None, start), frames, rounds) if rounds > 0 else scene
+
+
+def _albedo(soil: Gaussians, lit: LitRelief, grains: Tensor, spacing: float) -> dict[str, Tensor]:
+    """First albedo of soil and grains: the reconstruction's colours with the light on them taken out."""
+    light = lit.irradiance(soil.means.contiguous(), _FOOTPRINT).clamp_min(0.05)
+    albedo = (linear(soil.colours) / light).clamp(0.0, albedos.BRIGHTEST)
+    length = albedos.correlation_length(soil.means, albedo.clamp_min(1e-3).log().mean(dim=1), _LONGEST)
+    beneath = albedos.grain_albedo(grains, lit.relief.depth_below(grains), soil.means, albedo, spacing, length)
+    return {"soil_albedo": encoded(albedo), "grain_albedo": encoded(beneath)}
 
 
 def _refined(scene: Scene, posed: Posed, frames: list[Frame], rounds: int) -> Scene:
     """The scene with the albedo of its visible soil made to agree with the photographs, each pixel's light taken out."""
     targets = []
-    with torch.no_grad():
-        for frame in frames:
-            camera = frame.camera.undistorted()
-            layers = scene.layers(posed, camera)
-            image = torch.from_numpy(np.ascontiguousarray(frame.undistorted_image())).to(scene.device)
-            good = torch.from_numpy(np.ascontiguousarray(frame.undistorted_mask())).to(scene.device)
-            sure = (layers.soil > 0.95) & (layers.tool[..., 3] == 0.0) & good
-            unlit = encoded((linear(image) / layers.light.clamp_min(0.05)).clamp(0.0, albedos.BRIGHTEST))
-            targets.append((camera, unlit, sure.float()))
+    for frame in frames:
+        camera = frame.camera.undistorted()
+        layers = scene.layers(posed, camera)
+        image = torch.from_numpy(np.ascontiguousarray(frame.undistorted_image())).to(scene.device)
+        good = torch.from_numpy(np.ascontiguousarray(frame.undistorted_mask())).to(scene.device)
+        tool = torch.nn.functional.max_pool2d(layers.tool[None, None, ..., 3], 2 * _EDGE + 1, 1, _EDGE)[0, 0]
+        sure = (layers.soil > 0.95) & (tool == 0.0) & good
+        unlit = encoded((linear(image) / layers.light.clamp_min(0.05)).clamp(0.0, albedos.BRIGHTEST))
+        targets.append((camera, unlit, sure.float()))
     shown, near = scene.shown(posed.lit.relief, scene.soil.rest, scene.soil.particles)
     count = int(shown.sum()) + int(near.sum())
     parts = (posed.centres[:count], posed.covariances[:count], posed.opacities[:count])

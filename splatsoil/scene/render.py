@@ -32,7 +32,7 @@ PARTICLE_OPACITY = 0.95
 _HIDDEN = 2.5
 """Particles this many spacings below the surface are not drawn."""
 
-_REACH = 4.0
+_REACH = 10.0
 """How far behind the splats the surface that a pixel shows is looked for, in particle spacings."""
 
 
