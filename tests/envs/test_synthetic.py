@@ -1,0 +1,172 @@
+"""PlowSand-v0 as a newcomer meets it: no arguments, our own solver and renderer."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import subprocess
+import sys
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils.env_checker import check_env
+from splatsoil.envs import register
+from splatsoil.envs.plow_sand import PlowSandEnv
+from splatsoil.envs.synthetic import BLOCKS, HEIGHT, WIDTH, SyntheticProblem, compare, pattern
+
+import splatsoil
+from splatsoil.errors import ParameterError
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> None:
+    torch.set_num_threads(1)
+
+
+def act(*values: float) -> np.ndarray:
+    return np.array(values, dtype=np.float32)
+
+
+def test_importing_the_package_registers_and_again_changes_nothing() -> None:
+    assert splatsoil.__version__
+    before = gym.registry["PlowSand-v0"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        register()
+    assert gym.registry["PlowSand-v0"] is before
+
+
+def test_the_module_prefix_works_in_a_fresh_interpreter() -> None:
+    script = "import gymnasium as gym; print(gym.make('splatsoil:PlowSand-v0').action_space)"
+    out = subprocess.run([sys.executable, "-W", "error::UserWarning", "-c", script], capture_output=True, text=True)
+    assert out.stdout.strip().endswith("Box(-1.0, 1.0, (1,), float32)"), out.stderr
+
+
+def test_check_env_is_clean() -> None:
+    env = gym.make("PlowSand-v0", budget=4, render_mode="rgb_array")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(env.unwrapped)
+
+
+def test_the_spec_survives_json() -> None:
+    env = gym.make("PlowSand-v0", budget=3, parameters=["friction_angle"], effects=[], preset="tiny", device="cpu")
+    assert env.spec is not None
+    text = env.spec.to_json()
+    json.loads(text)
+    again = EnvSpec.from_json(text)
+    assert again.kwargs == env.spec.kwargs
+    twin = gym.make(again)
+    assert isinstance(twin.unwrapped, PlowSandEnv) and twin.unwrapped.budget == 3
+
+
+def test_pickled_after_a_step() -> None:
+    env = gym.make("PlowSand-v0", budget=3)
+    env.reset(seed=1)
+    env.step(act(0.2))
+    twin = pickle.loads(pickle.dumps(env))
+    one, other = env.step(act(-0.3)), twin.step(act(-0.3))
+    assert one[1] == other[1]
+    np.testing.assert_array_equal(one[0]["block_residuals"], other[0]["block_residuals"])
+
+
+def test_vectors_of_environments() -> None:
+    envs = gym.make_vec("PlowSand-v0", num_envs=2, vectorization_mode="sync", budget=2)
+    observations, _ = envs.reset(seed=[1, 2])
+    assert observations["best_parameters"].shape == (2, 1)
+    for step in range(2):
+        observations, rewards, terminated, truncated, infos = envs.step(np.array([[0.0], [0.0]], dtype=np.float32))
+        assert np.all(rewards < 0.0) and not terminated.any() and truncated.all() == (step == 1)
+    assert infos["truth"]["friction_angle"][0] != infos["truth"]["friction_angle"][1]
+    envs.close()
+
+
+def test_the_seed_draws_the_hidden_angle_and_only_the_end_tells() -> None:
+    truths = []
+    for seed in (1, 1, 2):
+        env = gym.make("PlowSand-v0", budget=2)
+        _, info = env.reset(seed=seed)
+        _, _, _, _, first = env.step(act(0.0))
+        _, _, _, truncated, last = env.step(act(0.0))
+        assert "truth" not in info and "truth" not in first and truncated
+        truths.append(last["truth"]["friction_angle"])
+    assert truths[0] == truths[1] != truths[2]
+    assert all(20.0 < t < 50.0 for t in truths)
+
+
+def test_near_the_truth_the_loss_is_smaller_than_far_from_it() -> None:
+    """Over several particle seeds, and though observation and prediction share no particle."""
+    problem = SyntheticProblem()
+    problem.begin(5)
+    truth = problem.truth()
+    assert truth is not None
+    angle = truth["friction_angle"]
+
+    def losses(value: float) -> list[float]:
+        found = [problem.evaluate({"friction_angle": value}, seed).loss for seed in (11, 12, 13)]
+        return [loss for loss in found if loss is not None]
+
+    near = losses(angle)
+    far = losses(angle - 9.0 if angle > 33.0 else angle + 9.0)
+    assert max(near) < min(far)
+    # Chance keeps the loss above zero; soil that doesn't move would have 1.
+    assert min(near) > 0.0 and max(near) < 0.3
+    assert len(set(near)) == 3
+
+
+def test_same_seed_same_bits() -> None:
+    first, second = (SyntheticProblem() for _ in range(2))
+    for problem in (first, second):
+        problem.begin(3)
+    a, b = (p.evaluate({"friction_angle": 31.0}, 4) for p in (first, second))
+    assert a.loss == b.loss
+    assert a.blocks.tobytes() == b.blocks.tobytes()
+
+
+def test_two_parameters_and_an_effect() -> None:
+    env = gym.make("PlowSand-v0", budget=2, parameters=["friction_angle", "cohesion"], effects=["cohesion"])
+    env.reset(seed=0)
+    observation, reward, _, _, info = env.step(act(0.0, -1.0))
+    assert set(info["parameters"]) == {"friction_angle", "cohesion"}
+    assert info["parameters"]["cohesion"] == pytest.approx(0.0)
+    assert observation["best_parameters"].shape == (2,)
+    assert reward < 0.0
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"parameters": ["phi"]}, "unknown parameter phi.*friction_angle"),
+        ({"effects": ["antigravity"]}, "antigravity"),
+        ({"preset": "huge"}, "huge"),
+    ],
+)
+def test_unknown_names_are_refused_when_the_environment_is_made(options: dict, says: str) -> None:
+    with pytest.raises(ParameterError, match=says):
+        gym.make("PlowSand-v0", **options)
+
+
+def test_the_comparison_by_hand() -> None:
+    """Constant pictures: blurring changes nothing, so the loss and the patches are what arithmetic says."""
+    shape = (2, HEIGHT, WIDTH, 3)
+    observed, still = np.full(shape, 0.5, np.float32), np.full(shape, 0.3, np.float32)
+    predicted = observed.copy()
+    predicted[1] = 0.4
+    loss, blocks = compare(observed, predicted, still)
+    assert loss == pytest.approx(0.5 * 0.1**2 / 0.2**2, rel=1e-5)
+    assert blocks.shape == (2 * BLOCKS[0] * BLOCKS[1],)
+    np.testing.assert_allclose(blocks[:12], 0.0, atol=1e-5)
+    np.testing.assert_allclose(blocks[12:], 25.5, rtol=1e-5)
+    assert compare(observed, still, still)[0] == pytest.approx(1.0)
+
+
+def test_the_pattern_is_sand_and_the_same_in_every_world() -> None:
+    points = np.random.default_rng(0).uniform(0.0, 0.3, (500, 3))
+    first = pattern(points)
+    assert first.shape == (500, 3) and first.min() > 0.1 and first.max() <= 1.0
+    assert np.array_equal(first, pattern(points))
+    assert 0.01 < first.std(axis=0).min() < 0.1
