@@ -18,10 +18,10 @@ from splatsoil.reconstruction.height_field import HeightField
 from splatsoil.reconstruction.initial import TOOL, first_gaussians
 from splatsoil.reconstruction.presets import preset_named
 from splatsoil.reconstruction.result import HeldOut, Reconstruction
-from splatsoil.reconstruction.surface import find_relief, soil_mesh
+from splatsoil.reconstruction.surface import find_relief, soil_mesh, surface_through
 from splatsoil.reconstruction.training import train
 from splatsoil.reconstruction.views import Views, load_views, silhouettes, surface_points
-from splatsoil.splats import Gaussians, OrthographicCamera, psnr, rasterise, ssim
+from splatsoil.splats import Gaussians, psnr, rasterise, ssim
 
 Array = NDArray[np.float64]
 
@@ -81,7 +81,7 @@ def reconstruct(
         iterations=chosen.iterations, growth=chosen.growth, seed=seed, device=device, report=report,
     )  # fmt: skip
     soil, on_tool = segments(trained.gaussians, trained.label, relief.surface, bed, tool)
-    surface = fused(trained.gaussians[soil], relief.surface, bed)
+    surface = surface_through(trained.gaussians[soil], relief.surface)
     held_out = judged(trained.gaussians, every.subset(aside), trained.background)
     return Reconstruction(
         gaussians=trained.gaussians,
@@ -128,29 +128,6 @@ def segments(
     on_tool = (distance < cell + np.where(began, reach, 0.0)) & (began | ~(inside & at_surface))
     soil = inside & at_surface & ~on_tool
     return torch.from_numpy(soil), torch.from_numpy(on_tool)
-
-
-def fused(soil: Gaussians, surface: HeightField, bed: Bed) -> HeightField:
-    """The surface that trained Gaussians draw seen from above, where they cover it; else the one they began with."""
-    drawn = seen_from_above(soil, surface, bed)
-    known = np.isfinite(drawn)
-    return HeightField(surface.x, surface.y, np.where(known, drawn, surface.height), surface.deviation)
-
-
-def seen_from_above(soil: Gaussians, surface: HeightField, bed: Bed) -> Array:
-    """(ny, nx) expected height of Gaussians along vertical rays through a surface's cells; NaN where they are thin."""
-    size = min(surface.cell) / 2.0
-    camera = OrthographicCamera.looking((0.0, 0.0, -1.0), bed.lower, bed.upper, size)
-    with torch.no_grad():
-        drawing = rasterise(soil, camera, normals=False)
-    height = float(camera.position[2]) - drawing.depth.numpy().astype(np.float64)
-    height[drawing.alpha.numpy() < 0.5] = np.nan
-    # Row 0 of the picture is the far end of y.
-    ny, nx = height.shape
-    x = camera.position[0] + (np.arange(nx) + 0.5 - nx / 2) * size
-    y = camera.position[1] + (np.arange(ny) + 0.5 - ny / 2) * size
-    picture = HeightField(x, y, height[::-1])
-    return picture.sample(surface.points[..., :2].reshape(-1, 2)).reshape(surface.height.shape)
 
 
 def judged(gaussians: Gaussians, views: Views, background: tuple[float, float, float]) -> tuple[HeldOut, ...]:

@@ -6,6 +6,7 @@ import io
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -164,7 +165,7 @@ class Reconstruction:
                 metadata={k: v for k, v in facts.items() if k not in (*measured, "held_out", "surface")},
                 seconds=float(facts["seconds"]),
             )
-        except (OSError, KeyError, TypeError, ValueError) as error:
+        except (OSError, KeyError, TypeError, ValueError, BadZipFile) as error:
             raise RunError(f"{source}: the reconstruction cannot be read ({error}); reconstruct again") from error
 
 

@@ -9,20 +9,22 @@ import numpy as np
 import torch
 import trimesh
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from splatsoil.measurement import Bed
 from splatsoil.reconstruction.height_field import HeightField
 from splatsoil.reconstruction.presets import Preset
 from splatsoil.reconstruction.stereo import Cells, disagreement, refine, sweep, visibility
 from splatsoil.reconstruction.views import Views
+from splatsoil.splats import Gaussians
 
 Array = NDArray[np.float64]
 Report = Callable[[str, float], None]
 
 RIM = 0.04  # width of what is taken to border the bed (a bin's wall), in square roots of the bed's area
-LEVEL_GAIN = (
-    1.0  # how much better (log of the squared misfit) the soil's level must explain the surroundings than the floor
-)
+# How much better (log of the squared misfit) the soil's level must explain the surroundings than the bed's floor.
+LEVEL_GAIN = 1.0
+NEIGHBOURS = 24  # Gaussians that a height is drawn from
 
 
 @dataclass(frozen=True)
@@ -132,6 +134,38 @@ def ground_level(views: Views, bed: Bed, surface: HeightField, occluder: HeightF
         value = (several * weight * torch.log1p(error / (27.0 * views.noise**2))).sum()
         misfit.append(float(value / (several * weight).sum().clamp_min(1.0)))
     return level if misfit[0] - misfit[1] > LEVEL_GAIN else floor
+
+
+def surface_through(soil: Gaussians, start: HeightField) -> HeightField:
+    """The surface through trained Gaussians: a plane through the centres around each cell, weighted by opacity and
+    nearness.
+
+    The depth that a camera above would see is not used: it blends centres front to back, and on a slope those in front
+    are the higher ones, which raises the surface by a good part of a Gaussian's radius times the slope.
+
+    Args:
+        soil: the Gaussians on the surface.
+        start: cells; Gaussians that are far from its heights count little, and where there are none its heights stay.
+    """
+    place = soil.means.detach().cpu().numpy().astype(np.float64)
+    cells = start.points.reshape(-1, 3)
+    count = min(NEIGHBOURS, len(place))
+    if count < 3:
+        return start
+    distance, index = cKDTree(place[:, :2]).query(cells[:, :2], k=count)
+    size = max(start.cell)
+    offset = place[index] - cells[:, None]
+    weight = soil.opacities.detach().cpu().numpy().astype(np.float64)[index] * np.exp(-0.5 * (distance / size) ** 2)
+    weight /= 1.0 + (offset[..., 2] / size) ** 2
+    columns = np.stack([np.ones_like(distance), offset[..., 0] / size, offset[..., 1] / size], axis=-1)
+    # A trace of "no slope" keeps cells at the border, whose neighbours may lie in a row, solvable.
+    matrix = np.einsum("nk,nka,nkb->nab", weight, columns, columns) + np.diag([0.0, 1e-3, 1e-3])
+    vector = np.einsum("nk,nka,nk->na", weight, columns, offset[..., 2])
+    known = weight.sum(axis=1) > 0.1
+    correction = np.zeros(len(cells))
+    correction[known] = np.linalg.solve(matrix[known], vector[known][..., None])[:, 0, 0]
+    height = start.height + correction.reshape(start.height.shape)
+    return HeightField(start.x, start.y, height, start.deviation)
 
 
 def soil_mesh(surface: HeightField, bed: Bed) -> trimesh.Trimesh:

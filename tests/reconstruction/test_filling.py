@@ -1,0 +1,103 @@
+"""Particles against the analytic volume and surface of a wavy bed."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from splatsoil.errors import ParameterError
+from splatsoil.measurement import Bed
+from splatsoil.reconstruction import HeightField, fill, soil_mesh, volume
+
+BED = Bed(np.array([-0.2, 1.0, 0.05]), np.array([0.6, 1.5, 0.32]), 1600.0)
+AMPLITUDE, LENGTH = 0.025, 0.16  # five waves along x: their mean over the bed is zero
+MEAN = 0.113
+
+
+def height(x):
+    return BED.lower[2] + MEAN + AMPLITUDE * np.sin(2 * np.pi * (x - BED.lower[0]) / LENGTH)
+
+
+@pytest.fixture(scope="module")
+def waves() -> HeightField:
+    field = HeightField.over(BED.lower, BED.upper, 0.005)
+    return HeightField(field.x, field.y, height(np.meshgrid(field.x, field.y)[0]))
+
+
+EXACT = 0.8 * 0.5 * MEAN
+
+
+@pytest.mark.parametrize("spacing", [0.02, 0.01, 0.0073])
+@pytest.mark.parametrize("jitter", [0.0, 1.0])
+def test_the_particles_hold_the_soils_volume(waves, spacing, jitter):
+    particles = fill(waves, BED, spacing, seed=1, jitter=jitter)
+    assert len(particles) * spacing**3 == pytest.approx(EXACT, rel=1e-3)
+    assert volume(waves, BED) == pytest.approx(EXACT, rel=1e-3)
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.5, 1.0])
+def test_particles_stay_in_the_soil(waves, jitter):
+    particles = fill(waves, BED, 0.01, seed=2, jitter=jitter)
+    assert np.all(particles > BED.lower) and np.all(particles[:, :2] < BED.upper[:2])
+    # The spline through 5 mm cells is not the sine itself.
+    assert np.all(particles[:, 2] < height(particles[:, 0]) + 2e-4)
+
+
+def test_mass_stands_where_the_soil_is(waves):
+    """Slabs across the waves: mass in proportion to depth, its centre at half of it; no slab is favoured."""
+    spacing = 0.01
+    particles = fill(waves, BED, spacing, seed=3, jitter=0.5)
+    edges = np.linspace(BED.lower[0], BED.upper[0], 21)
+    for low, high in pairwise(edges):
+        inside = particles[(particles[:, 0] >= low) & (particles[:, 0] < high)]
+        x = np.linspace(low, high, 201)
+        depth = height(x) - BED.lower[2]
+        exact = np.trapezoid(depth, x) * 0.5
+        assert len(inside) * spacing**3 == pytest.approx(exact, rel=0.012)
+        middle = np.trapezoid(depth**2 / 2, x) / np.trapezoid(depth, x)
+        assert (inside[:, 2] - BED.lower[2]).mean() == pytest.approx(middle, rel=0.012)
+
+
+def test_the_top_layer_has_no_bias_and_no_steps(waves):
+    """The uppermost particle of a column lies half its share of the depth below, on crests and in troughs."""
+    spacing = 0.01
+    particles = fill(waves, BED, spacing, seed=4, jitter=0.0)
+    column = np.unique(np.round(particles[:, :2], 9), axis=0, return_inverse=True)[1].ravel()
+    top = np.full(column.max() + 1, -np.inf)
+    np.maximum.at(top, column, particles[:, 2])
+    first = np.unique(column, return_index=True)[1]
+    below = height(particles[first, 0]) - top
+    assert abs(below.mean() - spacing / 2) < 1e-4
+    assert below.std() < 0.05 * spacing
+
+
+def test_seeds_repeat_and_differ(waves):
+    one, same, other = (fill(waves, BED, 0.02, seed=s) for s in (5, 5, 6))
+    np.testing.assert_array_equal(one, same)
+    assert one.shape != other.shape or not np.array_equal(one, other)
+
+
+def test_columns_without_soil_stay_empty():
+    field = HeightField.over(BED.lower, BED.upper, 0.01)
+    x = np.meshgrid(field.x, field.y)[0]
+    step = HeightField(field.x, field.y, np.where(x < 0.2, BED.lower[2] + 0.1, BED.lower[2]))
+    particles = fill(step, BED, 0.01, jitter=0.0)
+    # The spline rings for a few cells beside a step this steep.
+    assert (particles[:, 0] > 0.24).sum() < 0.01 * len(particles)
+    assert len(particles) * 1e-6 == pytest.approx(0.4 * 0.5 * 0.1, rel=0.02)
+
+
+@pytest.mark.parametrize(("spacing", "jitter"), [(0.0, 0.5), (-1.0, 0.5), (0.5, 0.5), (float("nan"), 0.5), (0.01, 1.5)])
+def test_senseless_numbers_are_refused(waves, spacing, jitter):
+    with pytest.raises(ParameterError):
+        fill(waves, BED, spacing, jitter=jitter)
+
+
+def test_the_solid_is_closed_and_has_the_soils_volume(waves):
+    solid = soil_mesh(waves, BED)
+    assert solid.is_watertight and solid.is_winding_consistent
+    assert solid.volume == pytest.approx(EXACT, rel=2e-3)
+    np.testing.assert_allclose(solid.bounds[:, :2], [BED.lower[:2], BED.upper[:2]])
+    assert solid.bounds[0, 2] == pytest.approx(BED.lower[2])

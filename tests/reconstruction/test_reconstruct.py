@@ -1,0 +1,166 @@
+"""The whole path on a small ray-cast set: pictures, surface, segments, files, repeatability, command line."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from splatsoil.cli import main
+from splatsoil.errors import MeasurementError, ParameterError, RunError
+from splatsoil.measurement import Measurement, Picture, write_measurement
+from splatsoil.reconstruction import HeightField, Reconstruction, reconstruct
+from splatsoil.reconstruction.initial import SOIL, Seeds, discs
+from splatsoil.reconstruction.surface import surface_through
+from splatsoil.splats import load_ply, rasterise
+
+LENS = {"k1": -0.12, "k2": 0.02, "p1": 0.002, "p2": -0.001, "cx": 70.0, "cy": 44.0}
+
+
+@pytest.fixture(scope="module")
+def measurement(scene, tmp_path_factory) -> Measurement:
+    """16 views through a lens that distorts and whose centre is off the image's."""
+    cameras = scene.cameras(16, 128, 96, **LENS)
+    pictures = [Picture(camera, scene.render(camera, seed=k)) for k, camera in enumerate(cameras)]
+    video = [Picture(replace(cameras[0], name="left"), pictures[0].image, frame=0, time=0.0)]
+    folder = tmp_path_factory.mktemp("set") / "waves"
+    return write_measurement(
+        folder,
+        name="waves",
+        bed=scene.bed,
+        tool=scene.tool(),
+        views=pictures,
+        video=video,
+        frame_rate=50,
+        suffix=".png",
+    )
+
+
+@pytest.fixture(scope="module")
+def result(measurement) -> Reconstruction:
+    return reconstruct(measurement, preset="tiny", seed=3)
+
+
+def test_views_that_were_set_aside_are_predicted(measurement, result):
+    assert [view.name for view in result.held_out] == [measurement.views[k].path.name for k in (0, 8)]
+    assert result.psnr > 26.0
+    assert result.ssim > 0.85
+    # Drawn again from what is public, at the camera free of distortion.
+    frame = measurement.views[8]
+    drawn = rasterise(result.gaussians, frame.camera.undistorted(), background=result.background).colour.clamp(0, 1)
+    valid = frame.undistorted_mask()
+    error = (drawn.numpy() - frame.undistorted_image())[valid]
+    assert -10 * np.log10((error**2).mean()) == pytest.approx(result.held_out[1].psnr, abs=1e-3)
+
+
+def test_the_surface_is_metric_and_without_bias(scene, result):
+    exact = HeightField(
+        result.surface.x, result.surface.y, scene.height(*np.meshgrid(result.surface.x, result.surface.y))
+    )
+    assert result.surface.rmse(exact) < 2.5e-3
+    assert abs(result.surface.bias(exact)) < 0.7e-3
+
+
+def test_gaussians_are_told_apart(scene, measurement, result):
+    place = result.gaussians.means.numpy()
+    colour = result.gaussians.colours.numpy()
+    assert not (result.soil & result.tool).any()
+    soil = place[result.soil.numpy()]
+    assert np.all((soil[:, :2] > scene.bed.lower[:2]) & (soil[:, :2] < scene.bed.upper[:2]))
+    away = np.abs(soil[:, 2] - scene.height(soil[:, 0], soil[:, 1]))
+    assert np.median(away) < 2e-3
+    assert result.soil.sum() > 1000
+    tool = place[result.tool.numpy()] - scene.tool_centre
+    assert result.tool.sum() > 50
+    assert np.all(np.abs(tool) < np.array([0.01, 0.06, 0.05]) + 0.03)
+    blue = colour[result.tool.numpy()]
+    sand = colour[result.soil.numpy()]
+    assert np.median(blue[:, 2] - blue[:, 0]) > 0.1 > np.median(sand[:, 2] - sand[:, 0])
+
+
+def test_the_surface_through_discs_is_theirs(scene):
+    """A steep plane exactly, a wave to a small part of its height, and the start's heights where there are no discs."""
+    field = HeightField.over(scene.bed.lower, scene.bed.upper, 0.01, height=0.42)
+    dense = HeightField.over(scene.bed.lower, scene.bed.upper, 0.008)
+    x, y = (a.ravel() for a in np.meshgrid(dense.x, dense.y))
+    xs, ys = np.meshgrid(field.x, field.y)
+    up = np.tile([0.0, 0.0, 1.0], (len(x), 1))
+
+    def through(height, kept=slice(None)):
+        seeds = Seeds.of(np.stack([x, y, height(x, y)], 1)[kept], up[kept], 0.008, SOIL)
+        return surface_through(discs(seeds, np.full((len(seeds.points), 3), 0.5), 0.9), field).height
+
+    plane = lambda x, y: 0.42 + 0.04 * (x - 1.3) + 0.06 * (y + 0.3)  # noqa: E731
+    np.testing.assert_allclose(through(plane), plane(xs, ys), atol=1e-5)
+    wave = lambda x, y: 0.42 + 0.01 * np.sin(2 * np.pi * x / 0.2)  # noqa: E731
+    inner = (slice(None), slice(2, -2))
+    np.testing.assert_allclose(through(wave)[inner], wave(xs, ys)[inner], atol=8e-4)
+    half = through(plane, x < 1.3)
+    np.testing.assert_array_equal(half[xs > 1.4], 0.42)
+
+
+def test_what_is_saved_is_what_is_loaded(result, tmp_path):
+    result.save(tmp_path / "out")
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == sorted(
+        ["gaussians.npz", "gaussians.ply", "reconstruction.json", "soil.ply", "surface.npz"]
+    )
+    again = Reconstruction.load(tmp_path / "out")
+    for name in ("means", "scales", "quaternions", "opacities", "colours"):
+        assert torch.equal(getattr(again.gaussians, name), getattr(result.gaussians, name))
+    assert torch.equal(again.soil, result.soil) and torch.equal(again.tool, result.tool)
+    np.testing.assert_array_equal(again.surface.height, result.surface.height)
+    assert again.held_out == result.held_out
+    assert again.metadata == result.metadata and again.background == pytest.approx(result.background)
+    assert again.mesh.is_watertight
+    assert again.mesh.volume == pytest.approx(result.mesh.volume, rel=1e-4)
+    assert len(load_ply(tmp_path / "out" / "gaussians.ply")) == len(result.gaussians)
+    facts = json.loads((tmp_path / "out" / "reconstruction.json").read_text())
+    assert {"version", "preset", "seed", "device", "measurement_hash", "psnr", "ssim", "seconds"} <= facts.keys()
+
+
+def test_a_damaged_result_is_an_error_of_one_line(result, tmp_path):
+    with pytest.raises(RunError):
+        Reconstruction.load(tmp_path / "nowhere")
+    result.save(tmp_path)
+    (tmp_path / "gaussians.npz").write_bytes(b"PK\x03\x04 no")
+    with pytest.raises(RunError, match="reconstruct again"):
+        Reconstruction.load(tmp_path)
+    (tmp_path / "reconstruction.json").write_text('{"format": "something else"}')
+    with pytest.raises(RunError, match="format"):
+        Reconstruction.load(tmp_path)
+
+
+def test_options_that_make_no_sense(measurement):
+    for options in ({"preset": "huge"}, {"holdout": 1}, {"holdout": -2}, {"device": "cuda:99"}, {"device": "abacus"}):
+        with pytest.raises(ParameterError):
+            reconstruct(measurement, **options)
+    few = replace(measurement, views=measurement.views[:3])
+    with pytest.raises(MeasurementError, match="views"):
+        reconstruct(few, preset="tiny")
+
+
+def test_command_line_and_the_same_seed_gives_the_same_bits(measurement, result, tmp_path, capsys):
+    out = tmp_path / "result"
+    command = ["reconstruct", str(measurement.folder), "--out", str(out), "--preset", "tiny", "--seed", "3", "--json"]
+    assert main([*command, "--device", "cpu"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["ok"] and said["preset"] == "tiny" and said["measurement_hash"] == measurement.hash
+    again = Reconstruction.load(out)
+    assert again.psnr == result.psnr == said["psnr"]
+    for name in ("means", "scales", "quaternions", "opacities", "colours"):
+        assert torch.equal(getattr(again.gaussians, name), getattr(result.gaussians, name)), name
+    np.testing.assert_array_equal(again.surface.height, result.surface.height)
+
+
+def test_interrupting_leaves_nothing(measurement, tmp_path, monkeypatch, capsys):
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("splatsoil.reconstruction.pipeline.find_relief", interrupt)
+    out = tmp_path / "result"
+    assert main(["reconstruct", str(measurement.folder), "--out", str(out), "--preset", "tiny"]) == 130
+    assert not out.exists()
+    assert "start again with" in capsys.readouterr().err

@@ -1,0 +1,114 @@
+"""What stereo finds in ray-cast photographs, and its parts against geometry done by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from splatsoil.measurement import Camera
+from splatsoil.reconstruction import PRESETS, HeightField
+from splatsoil.reconstruction.stereo import Smoothness, visibility
+from splatsoil.reconstruction.surface import find_relief, with_rim
+from splatsoil.reconstruction.views import Views, projection_matrix, silhouettes
+
+
+def as_views(cameras: list[Camera], images: list[np.ndarray]) -> Views:
+    return Views(
+        images=torch.tensor(np.stack(images)).permute(0, 3, 1, 2).contiguous(),
+        valid=torch.ones(len(images), *images[0].shape[:2]),
+        projection=torch.tensor(np.stack([projection_matrix(c) for c in cameras]), dtype=torch.float32),
+        positions=torch.tensor(np.stack([c.position for c in cameras]), dtype=torch.float32),
+        cameras=tuple(cameras),
+        names=tuple(f"{k}.png" for k in range(len(images))),
+    )
+
+
+@pytest.fixture(scope="module")
+def views(scene) -> Views:
+    cameras = scene.cameras(14, 128, 96)
+    return as_views(cameras, [scene.render(camera, seed=k) for k, camera in enumerate(cameras)])
+
+
+def placed_tool(scene) -> trimesh.Trimesh:
+    tool = scene.tool()
+    mesh = tool.mesh.copy()
+    mesh.apply_transform(tool.motion.matrix(0.0))
+    return mesh
+
+
+@pytest.fixture(scope="module")
+def relief(scene, views):
+    return find_relief(
+        views, scene.bed, silhouettes(views, placed_tool(scene)), PRESETS["tiny"], lambda what, share: None
+    )
+
+
+def truth(scene, field: HeightField) -> HeightField:
+    return HeightField(field.x, field.y, scene.height(*np.meshgrid(field.x, field.y)))
+
+
+def test_the_surface_is_found_to_a_fraction_of_a_pixel(scene, views, relief):
+    """A pixel is 8 mm on the bed here. The tool hides parts of it in every view, the walls in some."""
+    exact = truth(scene, relief.surface)
+    assert relief.surface.rmse(exact) < 2.5e-3
+    assert abs(relief.surface.bias(exact)) < 0.7e-3
+    flat = HeightField(exact.x, exact.y, np.full_like(exact.height, scene.level))
+    assert flat.rmse(exact) > 3 * relief.surface.rmse(exact)  # the check can fail: the waves are larger than the bound
+
+
+def test_the_ground_under_a_bin_and_around_a_field(scene, relief):
+    assert relief.ground == pytest.approx(float(scene.bed.lower[2]))
+
+
+def test_silhouettes_cover_the_tool_and_little_else(scene, views):
+    drawn = silhouettes(views, placed_tool(scene), margin=1).numpy() > 0
+    for k, camera in enumerate(views.cameras):
+        columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+        origin, ray = camera.rays(np.stack([columns.ravel(), rows.ravel()], 1))
+        exact = scene._meets_tool(origin, ray)[0].reshape(camera.height, camera.width)
+        assert not np.any(exact & ~drawn[k])
+        grown = exact.copy()
+        for _ in range(3):
+            grown = grown | np.roll(grown, 1, 0) | np.roll(grown, -1, 0)
+            grown = grown | np.roll(grown, 1, 1) | np.roll(grown, -1, 1)
+        assert not np.any(drawn[k] & ~grown)
+
+
+def test_a_wall_hides_what_lies_in_its_shadow():
+    """A wall 0.2 m high, seen from 45°: points within 0.2 m behind it are hidden, those farther off are not."""
+    x = 0.005 + 0.01 * np.arange(100)
+    ground = HeightField(x, x, np.where((x > 0.5) & (x < 0.55), 0.2, 0.0) * np.ones((100, 1)))
+    pose = np.eye(4)
+    pose[:3, 3] = [0.55 + 100.0, 0.5, 100.0 + 0.2]
+    camera = Camera(8, 8, 10.0, 10.0, 4.0, 4.0, pose)
+    views = as_views([camera], [np.zeros((8, 8, 3), np.float32)])
+    distance = np.array([0.02, 0.1, 0.18, 0.22, 0.3])
+    points = np.stack([0.5 - distance, np.full(5, 0.5), np.zeros(5)], 1)
+    # The ray from a point at distance d behind the wall's near face reaches 0.2 m at 0.2 m: the far edge decides.
+    seen = visibility(views, points, ground, clearance=0.005, steps=64)[0].numpy()
+    np.testing.assert_array_equal(seen, [0, 0, 0, 1, 1])
+    beyond = np.array([[0.6, 0.5, 0.0], [0.52, 0.5, 0.2]])
+    np.testing.assert_array_equal(visibility(views, beyond, ground, clearance=0.005)[0].numpy(), [1, 1])
+
+
+def test_the_rim_is_as_high_as_the_soil_beside_it(scene, relief):
+    rim = with_rim(relief.surface, scene.bed, 0.03, level=-1.0)
+    lower = scene.bed.lower
+    edge = relief.surface.sample(np.array([[lower[0], lower[1] + 0.2]]))
+    assert rim.sample(np.array([[lower[0] - 0.015, lower[1] + 0.2]])) == pytest.approx(edge, abs=5e-3)
+    assert rim.height.min() == -1.0
+
+
+def test_a_plate_bends_no_plane_and_stops_at_the_border():
+    x, y = np.meshgrid(np.arange(20.0), np.arange(14.0))
+    plane = 0.2 * x - 0.1 * y
+    mask = np.ones(plane.shape, dtype=bool)
+    mask[:, 10:] = False
+    known = np.zeros_like(plane)
+    known[3::5, ::3] = 1.0
+    filled = Smoothness(mask).plate(known, plane, 100.0, 0.0)
+    np.testing.assert_allclose(filled[mask], plane[mask], atol=1e-5)
+    spoilt = np.where(mask, plane, 1e3)
+    np.testing.assert_allclose(Smoothness(mask).plate(known, spoilt, 100.0, 0.0)[mask], plane[mask], atol=1e-5)
