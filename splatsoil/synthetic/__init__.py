@@ -1,0 +1,22 @@
+"""Synthetic worlds: our own solver moves the sand, a path tracer that shares nothing with the splats photographs it."""
+
+from splatsoil.synthetic.appearance import Appearance
+from splatsoil.synthetic.setups import Setup, like, paper, plow
+from splatsoil.synthetic.soil_surface import soil_surface
+from splatsoil.synthetic.stage import Body, Light, Stage, photograph
+from splatsoil.synthetic.world import World, make_set
+
+__all__ = [
+    "Appearance",
+    "Body",
+    "Light",
+    "Setup",
+    "Stage",
+    "World",
+    "like",
+    "make_set",
+    "paper",
+    "photograph",
+    "plow",
+    "soil_surface",
+]

@@ -1,0 +1,121 @@
+"""All pictures of a set: photographs before anything moves, and the fixed cameras' video."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+import trimesh
+
+from splatsoil.measurement import Camera, Picture
+from splatsoil.mpm import Trajectory
+from splatsoil.synthetic.appearance import Appearance
+from splatsoil.synthetic.setups import Setup
+from splatsoil.synthetic.soil_surface import soil_surface
+from splatsoil.synthetic.stage import Body, FloatImage, Stage, photograph
+
+FloatArray = npt.NDArray[np.float64]
+
+NOISE = 1.5 / 255.0
+"""Standard deviation of the sensor's noise, sRGB."""
+PATHS = 4
+"""Each pixel is the mean of this many light paths, squared."""
+WALL = 0.03
+"""Thickness of the bin's walls and floor, as a share of the bed's narrower side."""
+RIM = 0.006
+"""How far the bin's walls stand over the soil along them, m."""
+GRAIN = 0.1
+"""Contrast of the fine pattern of bin and ground."""
+
+
+@dataclass
+class Photographer:
+    """Takes the pictures of one simulated run.
+
+    Attributes:
+        setup: tool, bed and cameras.
+        trajectory: particles at all frames of the video.
+        look: sun, sky and colours.
+        seed: of light paths and sensor noise.
+        device: Warp device name.
+        progress: called with the share of the pictures that is done.
+    """
+
+    setup: Setup
+    trajectory: Trajectory
+    look: Appearance
+    seed: int
+    device: str = "cpu"
+    progress: Callable[[float], None] = lambda share: None
+    _done: int = field(default=0, init=False)
+
+    def take(self) -> tuple[list[Picture], list[Picture]]:
+        """Views and video, the video's pictures by frame and then by camera."""
+        setup = self.setup
+        rest = self.trajectory.positions[self.trajectory.frames.index(0)].astype(np.float64)
+        colours = self.look.sand_albedo(rest, setup.bed)
+        views: list[Picture] = []
+        video: list[Picture] = []
+        for frame in setup.frames:
+            stage = self.stage(frame, colours)
+            if frame == setup.frames[0]:
+                for i, camera in enumerate(setup.views):
+                    views.append(Picture(camera, self._expose(self._light(stage, camera, 0, i), 0, i)))
+            for which, camera in enumerate(setup.video.values(), start=1):
+                light = self._light(stage, camera, which, frame)
+                # Nothing moves in the pre-roll: the same light, but the sensor's noise is another each time.
+                for number in (*setup.pre_roll, frame) if frame == setup.frames[0] else (frame,):
+                    exposed = self._expose(light, which, number)
+                    video.append(Picture(camera, exposed, number, number / setup.frame_rate))
+        order = {name: k for k, name in enumerate(setup.video)}
+        video.sort(key=lambda picture: (picture.frame, order[picture.camera.name]))
+        return views, video
+
+    def stage(self, frame: int, colours: FloatArray) -> Stage:
+        """Soil, tool, bin and ground at one recorded frame; particle albedo (n, 3), linear."""
+        setup, look = self.setup, self.look
+        particles = self.trajectory.positions[self.trajectory.frames.index(frame)]
+        soil = soil_surface(particles, colours, self.trajectory.spacing, setup.bed)
+        rotation, position = setup.tool.motion.pose(frame / setup.frame_rate)
+        tool = setup.tool.mesh
+        placed = trimesh.Trimesh(tool.vertices @ rotation.T + position, tool.faces, process=False)
+        walls, ground = bin_of(setup)
+        return Stage(
+            [soil, Body.flat(placed, look.tool), *(Body.flat(wall, look.bin, GRAIN) for wall in walls)],
+            look.light,
+            ground=ground,
+            ground_colour=look.ground,
+            ground_grain=GRAIN,
+            pattern=look.seed,
+            device=self.device,
+        )
+
+    def _light(self, stage: Stage, camera: Camera, which: int, number: int) -> FloatImage:
+        paths = np.random.default_rng([self.seed, 4, which, number]).integers(2**31)
+        image = stage.radiance(camera, seed=int(paths), side=PATHS)
+        self._done += 1
+        self.progress(self._done / (len(self.setup.views) + len(self.setup.video) * len(self.setup.frames)))
+        return image
+
+    def _expose(self, light: FloatImage, which: int, number: int) -> npt.NDArray[np.uint8]:
+        # Generators take no negative numbers, which the pre-roll has.
+        return photograph(light, NOISE, np.random.default_rng([self.seed, 5, which, number % 2**32]))
+
+
+def bin_of(setup: Setup) -> tuple[list[trimesh.Trimesh], float]:
+    """Floor and walls around the soil, and the height in m of the ground that they stand on."""
+    bed, height = setup.bed, setup.surface.height
+    thick = WALL * float(bed.extents[:2].min())
+    edges = np.concatenate([height[0], height[-1], height[:, 0], height[:, -1]])
+    top = float(edges.max()) + RIM
+    (x0, y0, z0), (x1, y1) = bed.lower.tolist(), bed.upper[:2].tolist()
+    boxes = (
+        ((x0 - thick, y0 - thick, z0 - thick), (x1 + thick, y1 + thick, z0)),
+        ((x0 - thick, y0 - thick, z0), (x0, y1 + thick, top)),
+        ((x1, y0 - thick, z0), (x1 + thick, y1 + thick, top)),
+        ((x0, y0 - thick, z0), (x1, y0, top)),
+        ((x0, y1, z0), (x1, y1 + thick, top)),
+    )
+    return [trimesh.creation.box(bounds=box) for box in boxes], z0 - thick

@@ -1,0 +1,254 @@
+"""From a setup and parameters to a measurement set: simulate, photograph, write."""
+
+from __future__ import annotations
+
+import math
+import os
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from splatsoil import __version__
+from splatsoil.errors import ParameterError
+from splatsoil.measurement import Measurement, write_measurement
+from splatsoil.mpm import Resolution, Trajectory, simulate
+from splatsoil.mpm.simulate import base_settings
+from splatsoil.reconstruction.filling import fill
+from splatsoil.soil.law import Law
+from splatsoil.soil.library import find_effects
+from splatsoil.synthetic.appearance import Appearance
+from splatsoil.synthetic.pictures import NOISE, Photographer
+from splatsoil.synthetic.setups import Setup
+
+FloatArray = npt.NDArray[np.float64]
+Report = Callable[[str, float], None]
+
+QUALITY = 96
+"""Of JPEG files."""
+
+
+@dataclass(frozen=True)
+class World:
+    """A world that has been made.
+
+    Attributes:
+        measurement: the set, as loaded from its folder.
+        truth: what ``truth.json`` says.
+        particles: their number.
+        seconds: spent on simulation and on pictures.
+    """
+
+    measurement: Measurement
+    truth: Mapping[str, Any]
+    particles: int
+    seconds: Mapping[str, float]
+
+
+def make_set(
+    out: str | Path,
+    setup: Setup,
+    *,
+    friction_angle: float = 35.0,
+    effects: Iterable[str] = (),
+    values: Mapping[str, float] | None = None,
+    preset: str = "small",
+    seed: int = 0,
+    particle_seed: int | None = None,
+    device: str = "cpu",
+    appearance: Appearance | None = None,
+    progress: Report | None = None,
+) -> World:
+    """Make a synthetic measurement set with ``truth.json`` and ``truth_particles.npz``.
+
+    Nothing is written before everything is computed; the folder then appears whole or not at all.
+
+    Args:
+        out: the set's folder; must not exist, or be empty.
+        setup: bed, surface, tool, motion and cameras.
+        friction_angle: degrees.
+        effects: names of effects (or files that define some) that act.
+        values: their parameters by name; each effect needs one that differs from its off value.
+        preset: resolution of the solver.
+        seed: of looks, noise and, unless given, particles.
+        particle_seed: of the particles' places. A model fills its bed by seeds 0, 1, 2 and so on; the default is none
+            of them, so that no fit starts from the very particles of the world.
+        device: ``auto``, ``cpu`` or ``cuda:N``.
+        appearance: looks; drawn by seed by default.
+        progress: called with (what, share done).
+
+    Raises:
+        ParameterError: unknown or meaningless options, or a place that is taken.
+        SimulationError: the simulation could not go on.
+    """
+    report = progress or (lambda what, share: None)
+    target = Path(out)
+    check_place(target)
+    device = check_device(device)
+    if seed < 0 or (particle_seed is not None and particle_seed < 0):
+        raise ParameterError(f"seeds are whole numbers from 0 on, not {seed if seed < 0 else particle_seed}")
+    law = Law(find_effects(effects))
+    parameters = check_values(law, {**(values or {}), "friction_angle": friction_angle})
+    experiment = setup.experiment()
+    settings = law.settings(base_settings(experiment), parameters)
+    resolution = Resolution.derive(experiment, preset)
+    look = appearance or Appearance.drawn(seed)
+    if particle_seed is None:
+        particle_seed = int(np.random.default_rng([seed, 3]).integers(2**16, 2**31))
+    particles = fill(setup.surface, setup.bed, resolution.spacing, seed=particle_seed)
+
+    began = time.perf_counter()
+    kept = truth_frames(setup.frames)
+    last = max(int(setup.tool.motion.frames[-1]), setup.frames[-1])
+    trajectory = simulate(
+        experiment,
+        particles,
+        parameters,
+        law=law,
+        resolution=resolution,
+        frames={*setup.frames, last},
+        device=device,
+        progress=lambda frame, end: report("sand", frame / max(end, 1)),
+    )[0]
+    simulated = time.perf_counter()
+    photographer = Photographer(setup, trajectory, look, seed, device, lambda share: report("pictures", share))
+    views, video = photographer.take()
+    drawn = time.perf_counter()
+
+    truth: dict[str, Any] = {
+        "made_by": f"splatsoil {__version__}",
+        "parameters": parameters,
+        "effects": [effect.name for effect in law.effects],
+        "settings": {k: str(v) if k == "matching" else v for k, v in asdict(settings).items()},
+        "seed": seed,
+        "particle_seed": particle_seed,
+        "particles": len(particles),
+        "preset": preset,
+        "resolution": asdict(resolution),
+        "device": device,
+        "appearance": asdict(look),
+        "sensor_noise": NOISE,
+    }
+    frames = np.arange(1, len(trajectory.force) + 1)
+    force = np.column_stack([frames, frames / setup.frame_rate, trajectory.force])
+    with _whole(target) as place:
+        write_measurement(
+            place,
+            name=target.resolve().name,
+            bed=setup.bed,
+            tool=replace(setup.tool, force=force),
+            views=views,
+            video=video,
+            frame_rate=setup.frame_rate,
+            gravity=setup.gravity,
+            quality=QUALITY,
+            truth=truth,
+        )
+        save_particles(place / "truth_particles.npz", trajectory, kept)
+    seconds = {"simulation": simulated - began, "pictures": drawn - simulated}
+    return World(Measurement.load(target), truth, len(particles), seconds)
+
+
+def check_place(target: Path) -> None:
+    """Raise ParameterError unless a new folder can be made at ``target``."""
+    if (target.is_dir() and any(target.iterdir())) or (target.exists() and not target.is_dir()):
+        raise ParameterError(f"{target}: already there and not an empty folder; nothing is overwritten")
+    parent = target.absolute().parent
+    while not parent.exists():
+        parent = parent.parent
+    if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
+        raise ParameterError(f"{target}: {parent} is no folder you may write to; choose another place")
+
+
+def check_device(device: str) -> str:
+    """A device that is there; ``auto`` is the first CUDA device or else the CPU."""
+    wp.config.quiet = True
+    wp.init()
+    cuda = [str(d) for d in wp.get_cuda_devices()]
+    if device == "auto":
+        return cuda[0] if cuda else "cpu"
+    if device not in ("cpu", *cuda):
+        raise ParameterError(f"device {device!r} is not here; there are {', '.join(['auto', 'cpu', *cuda])}")
+    return device
+
+
+def check_values(law: Law, values: Mapping[str, float]) -> dict[str, float]:
+    """All parameters of the law by name, with bounds checked and every effect really on.
+
+    Raises:
+        ParameterError: unknown names, values out of bounds, or an effect left at its off value.
+    """
+    known = {p.name: p for p in law.parameters}
+    unknown = sorted(set(values) - set(known))
+    if unknown:
+        raise ParameterError(
+            f"unknown parameter {', '.join(unknown)}; this world has {', '.join(known)}"
+            " (an effect's parameters exist when the effect is on)"
+        )
+    full = {name: p.check(values.get(name, p.default)) for name, p in known.items()}
+    for effect in law.effects:
+        switches = [p for p in effect.parameters if p.off is not None]
+        if switches and all(full[p.name] == p.off for p in switches):
+            first = switches[0]
+            example = first.upper if first.sign >= 0 else first.lower
+            raise ParameterError(
+                f"effect {effect.name!r} is on but all its parameters are at their off values; "
+                f"give it one, for example --set {first.name}={0.5 * (first.off or 0.0) + 0.5 * example:g}"
+            )
+    return full
+
+
+def truth_frames(frames: tuple[int, ...]) -> tuple[int, ...]:
+    """Video frames nearest to 0, 1/4, 1/2, 3/4 and 1 of the run."""
+    numbers = np.array(frames)
+    return tuple(
+        sorted({int(numbers[np.abs(numbers - s * numbers[-1]).argmin()]) for s in (0.0, 0.25, 0.5, 0.75, 1.0)})
+    )
+
+
+def save_particles(path: Path, trajectory: Trajectory, frames: Iterable[int]) -> None:
+    """Positions as ``fNNN`` (n, 3) uint16: times ``scale`` plus ``origin`` they are metres; with ``spacing``."""
+    rows = {frame: k for k, frame in enumerate(trajectory.frames)}
+    chosen = {frame: trajectory.positions[rows[frame]].astype(np.float64) for frame in frames}
+    lowest = np.min([p.min(axis=0) for p in chosen.values()], axis=0)
+    origin = np.minimum(np.floor(lowest * 100.0) / 100.0, 0.0)
+    reach = max(float((p - origin).max()) for p in chosen.values())
+    # 12.5 micrometres up to 0.82 m; coarser where the bed is larger.
+    scale = 1.25e-5 * max(1, math.ceil(reach / (1.25e-5 * 65535)))
+    arrays: dict[str, Any] = {
+        f"f{frame:03d}": np.round((p - origin) / scale).astype(np.uint16) for frame, p in chosen.items()
+    }
+    np.savez_compressed(path, **arrays, scale=scale, origin=origin, spacing=trajectory.spacing)
+
+
+@contextmanager
+def _whole(target: Path) -> Iterator[Path]:
+    """A folder beside ``target`` to fill; in the end it takes its place, or disappears with what was made for it."""
+    new = [p for p in target.absolute().parents if not p.exists()]
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}-") as temporary:
+            place = Path(temporary) / target.name
+            yield place
+            if target.exists():
+                target.rmdir()
+            place.rename(target)
+    except OSError as error:
+        _forget(new)
+        raise ParameterError(f"{target}: cannot be written ({error.strerror}); choose another place") from error
+    except BaseException:
+        _forget(new)
+        raise
+
+
+def _forget(folders: list[Path]) -> None:
+    for folder in folders:
+        with suppress(OSError):
+            folder.rmdir()
