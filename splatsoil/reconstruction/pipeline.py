@@ -140,6 +140,6 @@ def judged(gaussians: Gaussians, views: Views, background: tuple[float, float, f
             drawn = rasterise(gaussians, camera, background=background, normals=False).colour.clamp(0.0, 1.0)
             mixed = drawn * valid + photograph * (1.0 - valid)
             share = float(valid.mean())
-            value = float(psnr(mixed, photograph)) + 10.0 * np.log10(max(share, 1e-6))
+            value = float(psnr(mixed, photograph) + 10.0 * np.log10(max(share, 1e-6)))
             result.append(HeldOut(views.names[k], value, float(ssim(mixed, photograph))))
     return tuple(result)

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from splatsoil.errors import SimulationError
 from splatsoil.reconstruction.height_field import HeightField
 from splatsoil.reconstruction.initial import SOIL
 from splatsoil.reconstruction.views import Views
@@ -157,6 +158,8 @@ def train(
         likeness = ssim(rendering.colour * valid[k], photographs[k] * valid[k])
         loss = (1.0 - SIMILARITY) * difference.abs().mean() + SIMILARITY * (1.0 - likeness)
         losses.append(float(loss.detach()))
+        if not np.isfinite(losses[-1]):
+            raise SimulationError(f"training fell apart at step {step}: the loss is {losses[-1]}; try another seed")
         soil = label == SOIL
         total = loss + ANCHOR * anchor(current.means[soil]) + FLAT * _thickness(current.scales)
         total.backward()
