@@ -3,7 +3,7 @@
 from splatsoil.scene.binding import Binding, bind
 from splatsoil.scene.estimate import LightEstimate, estimate_light, seen_colours, still_frames
 from splatsoil.scene.light import Light, encoded, linear
-from splatsoil.scene.lit import LitRelief, ToolBody, light_relief
+from splatsoil.scene.lit import LitRelief, ToolBody, light_relief, silhouette
 from splatsoil.scene.relief import Relief, relief_of_particles
 from splatsoil.scene.render import Layers, Posed, Scene
 
@@ -24,5 +24,6 @@ __all__ = [
     "linear",
     "relief_of_particles",
     "seen_colours",
+    "silhouette",
     "still_frames",
 ]

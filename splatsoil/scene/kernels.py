@@ -329,6 +329,7 @@ def illuminate(
     eye: Eye,
     depth: wp.array2d(dtype=wp.float32),
     soil: wp.array2d(dtype=wp.float32),
+    unhidden: wp.array2d(dtype=wp.float32),
     height: wp.array2d(dtype=wp.float32),
     normal: wp.array2d(dtype=wp.vec3),
     openness: wp.array2d(dtype=wp.float32),
@@ -348,6 +349,9 @@ def illuminate(
 
     The splats say that a pixel shows soil; light is looked up where the pixel's ray meets the surface (at most ``reach``
     behind their depth), because blobs end a little before or behind it, and at a rim their mean depth lies in the air.
+
+    Soil hides the tool where both say so: the smooth surface runs on behind a blade that holds soil back, and single blobs
+    stand out from the soil that a blade touches.
     """
     i, j = wp.tid()
     ray = pixel_ray(eye, float(j) + 0.5, float(i) + 0.5)
@@ -377,8 +381,11 @@ def illuminate(
         length = wp.length(fine)
         way = fine / length
         t = tool_hit(tool, eye.position, way, 1.0e3)
-        if t >= 0.0 and (t / length < z or z <= 0.0):
-            share += 0.25
+        part = float(0.0)
+        if t >= 0.0:
+            part = wp.where(t / length < z or z <= 0.0, 1.0, unhidden[i, j])
+        if part > 0.0:
+            share += 0.25 * part
             point = eye.position + way * t
             n = tool_normal(tool, eye.position, way)
             sky = 0.5 * (1.0 + n[2])
@@ -388,5 +395,13 @@ def illuminate(
                 if tool_hit(tool, point + n * 1.0e-4, light.sun, 1.0e3) >= 0.0:
                     direct = 0.0
             lit = light.ambient * sky + (wp.vec3(1.0, 1.0, 1.0) - light.ambient) * direct + light.ground * (1.0 - sky)
-            radiance += 0.25 * wp.cw_mul(albedo, lit)
+            radiance += 0.25 * part * wp.cw_mul(albedo, lit)
     tool_out[i, j] = wp.vec4(radiance[0], radiance[1], radiance[2], share)
+
+
+@wp.kernel(enable_backward=False)
+def silhouette(eye: Eye, tool: ToolPose, shows: wp.array2d(dtype=wp.uint8)):
+    """1 for each pixel whose middle would show the tool if nothing hid it."""
+    i, j = wp.tid()
+    ray = wp.normalize(pixel_ray(eye, float(j) + 0.5, float(i) + 0.5))
+    shows[i, j] = wp.uint8(wp.where(tool_hit(tool, eye.position, ray, 1.0e3) >= 0.0, 1, 0))

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
+import torch.nn.functional as functional
 import warp as wp
 from torch import Tensor
 
@@ -15,7 +16,7 @@ from splatsoil.measurement import Bed, Camera, Measurement
 from splatsoil.scene import kernels
 from splatsoil.scene.binding import Binding
 from splatsoil.scene.light import Light, encoded, linear
-from splatsoil.scene.lit import LitRelief, ToolBody, ceiling, grid_of, light_relief, march_step
+from splatsoil.scene.lit import LitRelief, ToolBody, ceiling, eye_of, grid_of, light_relief, march_step
 from splatsoil.scene.relief import Relief, relief_of_particles
 from splatsoil.splats import Gaussians, rasterise_features
 from splatsoil.splats.warp_torch import as_warp, launch
@@ -28,6 +29,9 @@ PARTICLE_SIZE = 0.5
 """Standard deviation of a particle's own Gaussian in particle spacings."""
 
 PARTICLE_OPACITY = 0.95
+
+TOOL_OPACITY = 0.95
+"""Of the discs that stand for the tool; from this weight on a pixel's tool counts as unhidden."""
 
 _HIDDEN = 2.5
 """Particles this many spacings below the surface are not drawn."""
@@ -45,6 +49,8 @@ class Posed:
         covariances: (n, 3, 3).
         opacities: (n,).
         features: (n, 4): albedo (soil) or colour (surroundings) in sRGB, and 1 for soil.
+        grains: the particles' own Gaussians among them.
+        discs: centres (k, 3) and covariances (k, 3, 3) of the discs that stand for the tool.
         lit: the soil's surface under the light, with the tool's pose.
     """
 
@@ -52,6 +58,8 @@ class Posed:
     covariances: Tensor
     opacities: Tensor
     features: Tensor
+    grains: slice
+    discs: tuple[Tensor, Tensor]
     lit: LitRelief
 
 
@@ -60,9 +68,9 @@ class Layers:
     """What one camera sees, before light and colour meet; tensors on the scene's device.
 
     Attributes:
-        colour: (h, w, 3) sRGB: albedo where soil is, colour elsewhere.
-        soil: (h, w) share of soil in the pixel.
-        depth: (h, w) along the camera's axis, m; 0 where nothing is.
+        colour: (h, w, 3) sRGB of all but the tool: albedo where soil is, colour elsewhere.
+        soil: (h, w) share of soil in that.
+        depth: (h, w) of that, along the camera's axis, m; 0 where nothing is.
         light: (h, w, 3) light on the soil; 1 elsewhere.
         tool: (h, w, 4) the tool's linear radiance times its share of the pixel, and that share.
     """
@@ -159,20 +167,24 @@ class Scene:
         centres, covariances = self.soil.carry(x, None if f is None else f.contiguous())
         shown, near = self.shown(relief, centres, x)
         grains = (PARTICLE_SIZE * self.spacing) ** 2 * torch.eye(3, device=self.device)
+        count = int(near.sum())
         around = self.surroundings
         parts = (
             (centres[shown], covariances[shown], self.soil_opacity[shown], self.soil_albedo[shown], 1.0),
             (
                 x[near],
-                grains.expand(int(near.sum()), 3, 3),
-                x.new_full((int(near.sum()),), PARTICLE_OPACITY),
+                grains.expand(count, 3, 3),
+                x.new_full((count,), PARTICLE_OPACITY),
                 self.grain_albedo[near],
                 1.0,
             ),
             (around.means, around.covariances(), around.opacities, around.colours, 0.0),
         )
-        features = torch.cat([torch.nn.functional.pad(p[3], (0, 1), value=p[4]) for p in parts])
-        return Posed(*(torch.cat([p[k] for p in parts]) for k in range(3)), features, lit)
+        features = torch.cat([functional.pad(p[3], (0, 1), value=p[4]) for p in parts])
+        first = int(shown.sum())
+        grain_part = slice(first, first + count)
+        discs = (x.new_zeros((0, 3)), x.new_zeros((0, 3, 3))) if tool is None else self.tool.discs(*tool)
+        return Posed(*(torch.cat([p[k] for p in parts]) for k in range(3)), features, grain_part, discs, lit)
 
     def layers(self, posed: Posed, camera: Camera) -> Layers:
         """What a camera without distortion sees of a posed scene."""
@@ -185,7 +197,8 @@ class Scene:
         )
         colour, soil, depth = drawn.image[..., :3], drawn.image[..., 3].contiguous(), drawn.image[..., 4]
         depth = torch.where(drawn.alpha > 0.3, depth / drawn.alpha.clamp_min(0.3), 0.0).contiguous()
-        light, tool = _illuminated(posed.lit, camera, depth, soil, self.tool_albedo, _REACH * self.spacing)
+        unhidden = _tool_among_splats(posed, camera)
+        light, tool = _illuminated(posed.lit, camera, depth, soil, unhidden, self.tool_albedo, _REACH * self.spacing)
         return Layers(colour, soil, depth, light, tool)
 
     def render(self, positions: Any, deformations: Any, tool: Pose | None, camera: Camera) -> FloatImage:
@@ -198,23 +211,54 @@ class Scene:
             return self.layers(posed, camera).image.cpu().numpy().astype(np.float32)
 
 
+def _tool_among_splats(posed: Posed, camera: Camera) -> Tensor:
+    """(h, w) how much of the tool the particles before it leave to be seen, where it is; drawn only around it.
+
+    Only particles count, which no tool lets through; what they carry may poke through a thin blade.
+    """
+    out = posed.centres.new_zeros((camera.height, camera.width))
+    centres, covariances = posed.discs
+    if len(centres) == 0:
+        return out
+    pixels, _ = camera.project(centres.cpu().numpy())
+    pixels = pixels[np.isfinite(pixels).all(axis=1)]
+    if len(pixels) == 0:
+        return out
+    low = np.maximum(np.floor(pixels.min(axis=0)).astype(int) - 2, 0)
+    high = np.minimum(np.ceil(pixels.max(axis=0)).astype(int) + 2, [camera.width, camera.height])
+    if np.any(high <= low):
+        return out
+    x0, y0, width, height = int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1])
+    parts = (
+        torch.cat([posed.centres[posed.grains], centres]),
+        torch.cat([posed.covariances[posed.grains], covariances]),
+        torch.cat([posed.opacities[posed.grains], out.new_full((len(centres),), TOOL_OPACITY)]),
+    )
+    mark = torch.zeros((len(parts[0]), 1), device=out.device)
+    mark[-len(centres) :] = 1.0
+    drawn = rasterise_features(*parts, mark, camera.cropped(x0, y0, width, height))
+    out[y0 : y0 + height, x0 : x0 + width] = (drawn.image[..., 0] / TOOL_OPACITY).clamp_max(1.0)
+    return out
+
+
 def _illuminated(
-    lit: LitRelief, camera: Camera, depth: Tensor, soil: Tensor, tool_albedo: FloatArray, reach: float
+    lit: LitRelief,
+    camera: Camera,
+    depth: Tensor,
+    soil: Tensor,
+    unhidden: Tensor,
+    tool_albedo: FloatArray,
+    reach: float,
 ) -> tuple[Tensor, Tensor]:
     """Light on the soil (h, w, 3) and the tool's share (h, w, 4) of each pixel."""
-    eye = kernels.Eye()
-    axes = camera.world_to_camera[:3, :3].T
-    eye.rotation = wp.mat33(*axes.reshape(-1))
-    eye.position = wp.vec3(*camera.position)
-    eye.fx, eye.fy, eye.cx, eye.cy = camera.fx, camera.fy, camera.cx, camera.cy
     relief = lit.relief
     size = (camera.height, camera.width)
     light = torch.empty((*size, 3), dtype=torch.float32, device=depth.device)
     tool = torch.empty((*size, 4), dtype=torch.float32, device=depth.device)
-    maps = [as_warp(depth, wp.float32), as_warp(soil.contiguous(), wp.float32), as_warp(relief.height, wp.float32)]
+    maps = [as_warp(m, wp.float32) for m in (depth, soil, unhidden, relief.height)]
     maps += [as_warp(relief.normal, wp.vec3), as_warp(lit.openness, wp.float32), as_warp(lit.visible, wp.float32)]
     maps += [as_warp(lit.bounced, wp.vec3)]
     numbers = [grid_of(relief), lit.light.kernel_form(), lit.tool, wp.vec3(*tool_albedo), march_step(relief)]
     outputs = [as_warp(light, wp.vec3), as_warp(tool, wp.vec4)]
-    launch(kernels.illuminate, size, [eye, *maps, *numbers, ceiling(relief), reach, *outputs], depth)
+    launch(kernels.illuminate, size, [eye_of(camera), *maps, *numbers, ceiling(relief), reach, *outputs], depth)
     return light, tool

@@ -1,0 +1,359 @@
+"""Observed against predicted pictures: losses, residual pictures, and block residuals for inference.
+
+Two losses. ``rgb`` is the mean square of the colour difference, the one in print. ``robust`` is made for sand, whose fine
+shape after a tool has passed is chance:
+
+- It compares changes since frame 0 (observed I_t − I_0 with predicted I_t − I_0), so that whatever is wrong with the
+  reconstruction before anything moves cancels.
+- It looks at differences averaged over centimetres, at several scales; single lumps average out, trench, berm and shadows
+  stay.
+- It grows with the square of small differences, but only linearly with large ones, so that a tool's edge that is off by a
+  pixel does not outweigh a berm.
+- Each scale is measured in units of what a model without any motion would leave: 0 is perfect, 1 is as good as no model.
+
+Only the bed's interior counts, and pixels in which both pictures show the tool do not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from kornia.filters import gaussian_blur2d
+from scipy.ndimage import binary_dilation, binary_erosion
+from torch import Tensor
+
+from splatsoil.errors import ParameterError
+from splatsoil.measurement import Camera, Measurement
+from splatsoil.reconstruction.height_field import HeightField
+from splatsoil.scene import ToolBody, silhouette
+
+FloatArray = npt.NDArray[np.float64]
+Image = npt.NDArray[np.float32]
+BoolImage = npt.NDArray[np.bool_]
+Key = tuple[str, int]
+"""Camera and frame."""
+
+SCALES = (0.0125, 0.025)
+"""Standard deviations of the averaging, m on the bed: about the size of chance lumps, and twice that."""
+
+SATURATION = 0.05
+"""sRGB difference (averaged over centimetres) beyond which the robust loss grows linearly."""
+
+PATCH = 0.04
+"""Side of a block on the bed, m."""
+
+MARGIN = 0.02
+"""Strip along the walls that is left out, m."""
+
+_FEWEST = 12
+"""Pixels a block needs."""
+
+_SEPARATE = 4.0
+"""Standard deviations between the tool's and the soil's colours from which pixels are told apart by colour."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """Where a block residual was taken: a square of the bed as one camera sees it at one frame.
+
+    Attributes:
+        camera: name.
+        frame: number.
+        x: centre of the square, m.
+        y: centre of the square, m.
+    """
+
+    camera: str
+    frame: int
+    x: float
+    y: float
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """How a prediction differs from what was seen.
+
+    Attributes:
+        loss: the robust loss, all cameras and frames; 0 is perfect, 1 is as good as predicting no motion.
+        losses: the robust loss by camera and frame; their mean is ``loss``.
+        rgb_mse: mean square colour difference (sRGB in [0, 1]) in the bed by camera and frame.
+        blocks: (b,) mean change observed minus mean change predicted of each block, in grey levels of 255; 0 where a
+            block cannot be seen (the tool hides it).
+        labels: the blocks' places, in the same order.
+    """
+
+    loss: float
+    losses: Mapping[Key, float]
+    rgb_mse: Mapping[Key, float]
+    blocks: FloatArray
+    labels: tuple[Block, ...]
+
+    @property
+    def rgb(self) -> float:
+        """Mean of ``rgb_mse``."""
+        return float(np.mean(list(self.rgb_mse.values())))
+
+
+class Comparator:
+    """The measured side of comparisons, read and prepared once.
+
+    Args:
+        measurement: video, cameras, bed, tool.
+        surface: the undisturbed surface, to know which pixels show the bed; by default half of the bed's height.
+        frames: frames to compare; all from the first on by default. The first one in the video is what changes refer to
+            and has no loss of its own.
+        cameras: names; all by default.
+
+    Raises:
+        ParameterError: a frame or camera that is not in the video, or nothing to compare.
+    """
+
+    def __init__(
+        self,
+        measurement: Measurement,
+        *,
+        surface: HeightField | None = None,
+        frames: Iterable[int] | None = None,
+        cameras: Iterable[str] | None = None,
+    ) -> None:
+        self.measurement = measurement
+        self.reference = int(measurement.frames[0])
+        self.cameras = tuple(measurement.cameras) if cameras is None else tuple(cameras)
+        chosen = measurement.frames if frames is None else tuple(sorted({int(f) for f in frames}))
+        unknown = (
+            [f for f in chosen if f not in measurement.frames],
+            [c for c in self.cameras if c not in measurement.cameras],
+        )
+        if any(unknown):
+            raise ParameterError(f"the video has no {', '.join(map(str, unknown[0] + unknown[1]))}")
+        self.frames = tuple(f for f in chosen if f != self.reference)
+        if not self.frames or not self.cameras:
+            raise ParameterError("there is nothing to compare: name a camera and a frame after the first")
+        self.keys: tuple[Key, ...] = tuple((c, f) for c in self.cameras for f in self.frames)
+        self._views = {c: measurement.cameras[c].undistorted() for c in self.cameras}
+        self.observed: dict[Key, Image] = {
+            (c, f): measurement.video_frame(c, f).undistorted_image()
+            for c in self.cameras
+            for f in (self.reference, *self.frames)
+        }
+        level = float(np.mean([measurement.bed.lower[2], measurement.bed.upper[2]]))
+        level = level if surface is None else float(np.nanmean(surface.height))
+        self._plane = {c: _on_plane(camera, level) for c, camera in self._views.items()}
+        self.interior = {c: self._inside(c) for c in self.cameras}
+        self._still = {
+            c: [f.undistorted_image() for f in measurement.pre_roll if f.camera_name == c] for c in self.cameras
+        }
+        self._before = {c: np.mean([*self._still[c], self.observed[c, self.reference]], axis=0) for c in self.cameras}
+        self._silhouettes = self._tool_silhouettes()
+        self._tool_colour = {c: self._tool_rule(c) for c in self.cameras}
+        self.labels, self._patches = self._layout()
+        self._unit = self._motionless()
+        self.noise = self._noise()
+
+    def compare(self, images: Mapping[Key, Image]) -> Comparison:
+        """Compare predicted with observed pictures.
+
+        Args:
+            images: (h, w, 3) sRGB in [0, 1] by camera and frame, as undistorted cameras see them; the reference frame
+                among them.
+
+        Raises:
+            ParameterError: a picture is missing or has another size.
+        """
+        for key in (*self.keys, *((c, self.reference) for c in self.cameras)):
+            if key not in images:
+                raise ParameterError(f"the prediction has no picture of camera {key[0]!r} at frame {key[1]}")
+            if images[key].shape != self.observed[key].shape:
+                raise ParameterError(
+                    f"camera {key[0]!r}, frame {key[1]}: predicted {images[key].shape}, observed {self.observed[key].shape}"
+                )
+        losses, squares, means = {}, {}, []
+        for camera in self.cameras:
+            start = images[camera, self.reference]
+            hidden = self._both_tool(camera, self.reference, start)
+            masks = [
+                self.interior[camera] & ~hidden & ~self._both_tool(camera, f, images[camera, f]) for f in self.frames
+            ]
+            change = [self._change(camera, f) - (images[camera, f] - start) for f in self.frames]
+            for frame, mask in zip(self.frames, masks, strict=True):
+                difference = (self.observed[camera, frame] - images[camera, frame])[mask]
+                squares[camera, frame] = float(np.mean(np.square(difference, dtype=np.float64))) if mask.any() else 0.0
+            scaled = self._scaled_losses(camera, change, masks) / self._unit[camera]
+            losses.update({(camera, f): float(v) for f, v in zip(self.frames, scaled.mean(axis=1), strict=True)})
+            means.append(self._block_means(camera, change, masks))
+        blocks = 255.0 * np.concatenate([m.reshape(-1) for m in means])
+        return Comparison(float(np.mean(list(losses.values()))), losses, squares, blocks, self.labels)
+
+    def picture(self, images: Mapping[Key, Image], camera: str, frame: int, gain: float = 4.0) -> Image:
+        """Observed, predicted and their difference (grey where equal, times ``gain``) side by side: (h, 3w, 3)."""
+        observed, predicted = self.observed[camera, frame], images[camera, frame]
+        difference = np.clip(0.5 + gain * (observed - predicted), 0.0, 1.0)
+        return np.concatenate([observed, predicted, difference], axis=1).astype(np.float32)
+
+    def _change(self, camera: str, frame: int) -> Image:
+        """Observed change since nothing had moved; the mean of all still frames stands for that."""
+        return self.observed[camera, frame] - self._before[camera]
+
+    def _inside(self, camera: str) -> BoolImage:
+        """Pixels whose ray meets the level of the bed's surface inside its walls."""
+        low, high = self.measurement.bed.lower[:2], self.measurement.bed.upper[:2]
+        margin = min(MARGIN, 0.1 * float(np.min(high - low)))
+        point = self._plane[camera]
+        with np.errstate(invalid="ignore"):
+            return np.all((point > low + margin) & (point < high - margin), axis=-1)
+
+    def _tool_silhouettes(self) -> dict[Key, BoolImage]:
+        body, motion = ToolBody(self.measurement.tool.mesh), self.measurement.tool.motion
+        out = {}
+        for frame in (self.reference, *self.frames):
+            pose = motion.pose(frame / self.measurement.frame_rate)
+            for camera in self.cameras:
+                shape = silhouette(body.at(*pose), self._views[camera]).numpy()
+                out[camera, frame] = binary_dilation(shape, iterations=2)
+        return out
+
+    def _tool_rule(self, camera: str) -> tuple[FloatArray, float] | None:
+        """A linear rule (weights (2,), threshold) on log colour ratios that tells tool from soil, whatever the light on
+        them; None where their colours are too alike."""
+        shape = self._silhouettes[camera, self.reference]
+        ratios = _log_ratios(self._before[camera])
+        tool = ratios[binary_erosion(shape, iterations=4)]
+        soil = ratios[self.interior[camera] & ~shape]
+        if len(tool) < 20 or len(soil) < 20:
+            return None
+        spread = 0.5 * (np.cov(tool.T) + np.cov(soil.T)) + 1e-6 * np.eye(2)
+        apart = tool.mean(axis=0) - soil.mean(axis=0)
+        weights = np.linalg.solve(spread, apart)
+        if float(np.sqrt(weights @ apart)) < _SEPARATE:
+            return None
+        return weights, float(weights @ (tool.mean(axis=0) + soil.mean(axis=0)) / 2)
+
+    def _both_tool(self, camera: str, frame: int, predicted: Image) -> BoolImage:
+        """Pixels in which both pictures show the tool, a pixel wider; all of its silhouette where colours don't tell."""
+        shape = self._silhouettes[camera, frame]
+        rule = self._tool_colour[camera]
+        if rule is None:
+            return shape
+        seen = [_log_ratios(image) @ rule[0] > rule[1] for image in (self.observed[camera, frame], predicted)]
+        return binary_dilation(shape & seen[0] & seen[1], iterations=2)
+
+    def _layout(self) -> tuple[tuple[Block, ...], dict[str, npt.NDArray[np.int64]]]:
+        """Labels of all blocks, and for each camera the block (in its order) that each pixel belongs to, or -1."""
+        low, high = self.measurement.bed.lower[:2], self.measurement.bed.upper[:2]
+        count = np.maximum(np.round((high - low) / PATCH).astype(int), 1)
+        size = (high - low) / count
+        labels: list[Block] = []
+        patches = {}
+        for camera in self.cameras:
+            inside = self.interior[camera]
+            cell = np.full((*inside.shape, 2), -1)
+            cell[inside] = np.clip(((self._plane[camera][inside] - low) / size).astype(int), 0, count - 1)
+            flat = np.where(inside, cell[..., 1] * count[0] + cell[..., 0], -1)
+            pixels = np.bincount(flat[inside], minlength=int(np.prod(count)))
+            kept = np.flatnonzero(pixels >= _FEWEST)
+            number = np.full(int(np.prod(count)) + 1, -1)
+            number[kept] = np.arange(len(kept))
+            patches[camera] = number[flat]
+            centres = low + (np.stack([kept % count[0], kept // count[0]], axis=1) + 0.5) * size
+            labels += [Block(camera, f, float(x), float(y)) for f in self.frames for x, y in centres]
+        return tuple(labels), patches
+
+    def _block_means(self, camera: str, change: list[Image], masks: list[BoolImage]) -> FloatArray:
+        """(frames, blocks) mean residual over the pixels of each block that count."""
+        patch = self._patches[camera]
+        blocks = int(patch.max()) + 1
+        out = np.zeros((len(change), blocks))
+        for k, (residual, mask) in enumerate(zip(change, masks, strict=True)):
+            good = mask & (patch >= 0)
+            count = np.bincount(patch[good], minlength=blocks)
+            total = np.bincount(patch[good], residual.mean(axis=-1, dtype=np.float64)[good], minlength=blocks)
+            out[k] = np.where(count >= _FEWEST / 2, total / np.maximum(count, 1), 0.0)
+        return out
+
+    def _scaled_losses(self, camera: str, change: list[Image], masks: list[BoolImage]) -> FloatArray:
+        """(frames, scales) the robust loss of residual changes, before it is put into units."""
+        residual = torch.from_numpy(np.stack(change).astype(np.float32)).permute(0, 3, 1, 2)
+        weight = torch.from_numpy(np.stack(masks)).float()[:, None]
+        pixels = self._pixels_per_metre(camera)
+        return np.stack([_robust(*_averaged(residual, weight, scale * pixels)).numpy() for scale in SCALES], axis=1)
+
+    def _pixels_per_metre(self, camera: str) -> float:
+        """Of the bed's middle in the image."""
+        view, point = self._views[camera], self._plane[camera]
+        inside = point[self.interior[camera]]
+        if len(inside) == 0:
+            raise ParameterError(f"camera {camera!r} does not see the inside of the bed")
+        middle = np.array([*inside.mean(axis=0), float(self.measurement.bed.lower[2])])
+        return 0.5 * (view.fx + view.fy) / float(np.linalg.norm(middle - view.position))
+
+    def _motionless(self) -> dict[str, FloatArray]:
+        """(scales,) what a model leaves in which nothing moves, for each camera: the loss' unit."""
+        out = {}
+        for camera in self.cameras:
+            hidden = self._silhouettes[camera, self.reference]
+            masks = [self.interior[camera] & ~hidden & ~self._silhouettes[camera, f] for f in self.frames]
+            change = [self._change(camera, f) for f in self.frames]
+            out[camera] = np.maximum(self._scaled_losses(camera, change, masks).mean(axis=0), 1e-12)
+        return out
+
+    def _noise(self) -> float | None:
+        """The robust loss that the cameras' noise alone leaves, from frames in which nothing moves; None without any."""
+        found = []
+        for camera, still in self._still.items():
+            frames = [*still, self.observed[camera, self.reference]]
+            if len(frames) < 2:
+                continue
+            total = np.sum(frames, axis=0)
+            change = [image - (total - image) / (len(frames) - 1) for image in frames]
+            mask = self.interior[camera] & ~self._silhouettes[camera, self.reference]
+            scaled = self._scaled_losses(camera, change, [mask] * len(frames)) / self._unit[camera]
+            found.append(float(scaled.mean()))
+        return float(np.mean(found)) if found else None
+
+
+def compare(measurement: Measurement, images: Mapping[Key, Image], **options: object) -> Comparison:
+    """One comparison; `Comparator` saves reading the video again where there are several."""
+    return Comparator(measurement, **options).compare(images)  # type: ignore[arg-type]
+
+
+def _on_plane(camera: Camera, level: float) -> FloatArray:
+    """(h, w, 2) where each pixel's ray meets a height; NaN where it does not."""
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    origins, directions = camera.rays(np.stack([x, y], axis=-1).reshape(-1, 2))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        reach = (level - origins[:, 2]) / directions[:, 2]
+        reach[~(reach > 0.0)] = np.nan
+        return (origins + directions * reach[:, None])[:, :2].reshape(camera.height, camera.width, 2)
+
+
+def _log_ratios(image: Image) -> FloatArray:
+    """(…, 2) log red/green and blue/green: colour without brightness."""
+    logs = np.log(np.maximum(image.astype(np.float64), 0.02))
+    return np.stack([logs[..., 0] - logs[..., 1], logs[..., 2] - logs[..., 1]], axis=-1)
+
+
+def _averaged(residual: Tensor, weight: Tensor, sigma: float) -> tuple[Tensor, Tensor]:
+    """Gaussian mean (n, 3, h', w') of what counts of a residual (n, 3, h, w), and the share (n, 1, h', w') that does.
+
+    Pixels are pooled first where the Gaussian is wide enough not to notice.
+    """
+    factor = max(1, int(sigma / 2.0))
+    both = torch.cat([residual * weight, weight], dim=1)
+    both = torch.nn.functional.avg_pool2d(both, factor, ceil_mode=True, count_include_pad=False)
+    width = sigma / factor
+    size = 2 * max(1, round(3.0 * width)) + 1
+    size = min(size, 2 * ((min(both.shape[2:]) - 1) // 2) + 1)
+    both = gaussian_blur2d(both, (size, size), (width, width), border_type="constant")
+    share = both[:, 3:]
+    return both[:, :3] / share.clamp_min(1e-6), share
+
+
+def _robust(mean: Tensor, share: Tensor) -> Tensor:
+    """(n,) loss of averaged residuals: quadratic where small, linear where large, weighted by what counts."""
+    square = mean.square().mean(dim=1, keepdim=True)
+    loss = SATURATION**2 * (torch.sqrt(1.0 + 2.0 * square / SATURATION**2) - 1.0)
+    return (loss * share).sum(dim=(1, 2, 3)).double() / share.sum(dim=(1, 2, 3)).clamp_min(1e-6).double()
