@@ -90,8 +90,10 @@ class Gaussians:
         Args:
             towards: a point (3,), m, that the normals should face (a camera), or None to keep the axis' own sign.
         """
-        shortest = self.scales.detach().argmin(dim=1)
-        axis = self.rotations().gather(2, shortest[:, None, None].expand(-1, 3, 1)).squeeze(2)
+        shortest = torch.nn.functional.one_hot(self.scales.detach().argmin(dim=1), 3).to(self.means)
+        w, imaginary = torch.nn.functional.normalize(self.quaternions, dim=1).split([1, 3], dim=1)
+        turned = 2 * torch.linalg.cross(imaginary, shortest)
+        axis = shortest + w * turned + torch.linalg.cross(imaginary, turned)
         if towards is None:
             return axis
         outward = ((towards.to(self.means) - self.means) * axis).sum(dim=1, keepdim=True).detach()

@@ -18,10 +18,22 @@ BAND = 16
 MAX_CHANNELS = 16
 """Most interleaved channels the row buffers have room for."""
 
+WINDOW = 11
+"""Side of the window, px."""
+
+C1 = 0.01**2
+C2 = 0.03**2
+
+_CONSTANTS = f"""{{
+    #pragma clang fp contract(on)
+    constexpr float C1 = {C1!r}f, C2 = {C2!r}f;
+    constexpr int BAND = {BAND}, WINDOW = {WINDOW}, HALF = WINDOW / 2, BLOCK = 256, EDGE = HALF * {MAX_CHANNELS};
+    constexpr int LENGTH = BLOCK + 2 * EDGE;
+"""
+
 # columns are taken in blocks, so that the padded row buffers live on the stack whatever the picture's width
 _SIMILARITY = """
-    constexpr int HALF = 5, BLOCK = 256, EDGE = 5 * 16, LENGTH = BLOCK + 2 * EDGE;
-    const int y_begin = band * 16, y_end = y_begin + 16 < height ? y_begin + 16 : height;
+    const int y_begin = band * BAND, y_end = y_begin + BAND < height ? y_begin + BAND : height;
     const int edge = HALF * channels;
     const bool want_a = slopes_a.shape[0] > 0, want_b = slopes_b.shape[0] > 0;
     const long long plane = (long long)height * row;
@@ -50,7 +62,7 @@ _SIMILARITY = """
             float moments[5][BLOCK];
             for (int m = 0; m < 5; ++m) {
                 for (int i = 0; i < n; ++i) moments[m][i] = 0.0f;
-                for (int k = 0; k < 11; ++k) {
+                for (int k = 0; k < WINDOW; ++k) {
                     const float weight = window.data[k];
                     const float* source = wide[m] + k * channels;
                     #pragma clang loop vectorize(enable) interleave(enable)
@@ -63,8 +75,8 @@ _SIMILARITY = """
                 const float mu_a = moments[0][i], mu_b = moments[1][i];
                 const float var_a = moments[2][i] - mu_a * mu_a, var_b = moments[3][i] - mu_b * mu_b;
                 const float cov = moments[4][i] - mu_a * mu_b;
-                const float l = 2.0f * mu_a * mu_b + 1e-4f, c = 2.0f * cov + 9e-4f;
-                const float p = 1.0f / (mu_a * mu_a + mu_b * mu_b + 1e-4f), q = 1.0f / (var_a + var_b + 9e-4f);
+                const float l = 2.0f * mu_a * mu_b + C1, c = 2.0f * cov + C2;
+                const float p = 1.0f / (mu_a * mu_a + mu_b * mu_b + C1), q = 1.0f / (var_a + var_b + C2);
                 const float s = l * p * c * q;
                 out.data[at + i] = s;
                 // by a², by ab, and by the blurred mean, of which variance and covariance depend, too
@@ -85,11 +97,10 @@ _SIMILARITY = """
             }
         }
     }
-"""
+}"""
 
 _GRADIENT = """
-    constexpr int HALF = 5, BLOCK = 256, EDGE = 5 * 16, LENGTH = BLOCK + 2 * EDGE;
-    const int y_begin = band * 16, y_end = y_begin + 16 < height ? y_begin + 16 : height;
+    const int y_begin = band * BAND, y_end = y_begin + BAND < height ? y_begin + BAND : height;
     const int edge = HALF * channels;
     const long long plane = (long long)height * row;
     float wide[3][LENGTH];
@@ -118,7 +129,7 @@ _GRADIENT = """
             float blurred[3][BLOCK];
             for (int m = 0; m < 3; ++m) {
                 for (int i = 0; i < n; ++i) blurred[m][i] = 0.0f;
-                for (int k = 0; k < 11; ++k) {
+                for (int k = 0; k < WINDOW; ++k) {
                     const float weight = window.data[k];
                     const float* source = wide[m] + k * channels;
                     #pragma clang loop vectorize(enable) interleave(enable)
@@ -131,10 +142,10 @@ _GRADIENT = """
                                  + other.data[at + i] * blurred[2][i];
         }
     }
-"""
+}"""
 
 
-@wp.func_native(_SIMILARITY)
+@wp.func_native(_CONSTANTS + _SIMILARITY)
 def _similarity_band(
     band: int,
     height: int,
@@ -166,7 +177,7 @@ def similarity(
     _similarity_band(first + wp.tid(), height, row, channels, a, b, window, out, slopes_a, slopes_b)
 
 
-@wp.func_native(_GRADIENT)
+@wp.func_native(_CONSTANTS + _GRADIENT)
 def _gradient_band(
     band: int,
     height: int,

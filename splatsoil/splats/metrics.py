@@ -11,19 +11,14 @@ from torch import Tensor
 
 from splatsoil.errors import ParameterError
 from splatsoil.splats import kernels_ssim
+from splatsoil.splats.kernels_ssim import C1, C2, WINDOW
 from splatsoil.splats.warp_torch import as_warp, launch_parts, thread_count
-
-WINDOW = 11
-"""Side of the SSIM window, px."""
 
 SIGMA = 1.5
 """Standard deviation of the SSIM window, px."""
 
 _NUMBERS_PER_MILLISECOND = 100_000
 """About how many pixels times channels one CPU core compares in a millisecond."""
-
-C1 = 0.01**2
-C2 = 0.03**2
 
 
 def psnr(a: Tensor, b: Tensor) -> Tensor:
@@ -64,19 +59,24 @@ def _check(a: Tensor, b: Tensor) -> None:
 
 
 def ssim_map_torch(a: Tensor, b: Tensor) -> Tensor:
-    """SSIM by separable convolutions and autograd: the path for CUDA, and the check of the CPU kernels."""
-    planes = [t.reshape(t.shape[0], t.shape[1], -1).permute(2, 0, 1)[:, None] for t in (a, b)]
-    weights = window(a.dtype).to(a.device)
+    """`ssim_map` by autograd: the path for CUDA and other float types, and the check of the CPU kernels.
+
+    The blur is a sum of shifted pictures: convolutions on CUDA may round to ten bits (TF32), which spoils variances.
+    """
+    x, y = (t.reshape(t.shape[0], t.shape[1], -1).permute(2, 0, 1) for t in (a, b))
+    height, width = a.shape[:2]
+    weights = window().tolist()
+    half = WINDOW // 2
 
     def blurred(t: Tensor) -> Tensor:
-        t = torch.nn.functional.conv2d(t, weights.reshape(1, 1, 1, WINDOW), padding=(0, WINDOW // 2))
-        return torch.nn.functional.conv2d(t, weights.reshape(1, 1, WINDOW, 1), padding=(WINDOW // 2, 0))
+        t = torch.nn.functional.pad(t, (half, half, half, half))
+        t = torch.stack([w * t[:, :, i : i + width] for i, w in enumerate(weights)]).sum(dim=0)
+        return torch.stack([w * t[:, i : i + height] for i, w in enumerate(weights)]).sum(dim=0)
 
-    x, y = planes
     mx, my, xx, yy, xy = blurred(torch.cat([x, y, x * x, y * y, x * y])).chunk(5)
     vx, vy, cov = xx - mx * mx, yy - my * my, xy - mx * my
     out = (2 * mx * my + C1) * (2 * cov + C2) / ((mx * mx + my * my + C1) * (vx + vy + C2))
-    return out[:, 0].permute(1, 2, 0).reshape(a.shape)
+    return out.permute(1, 2, 0).reshape(a.shape)
 
 
 class _Similarity(torch.autograd.Function):

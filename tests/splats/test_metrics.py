@@ -64,7 +64,7 @@ def test_ssim_of_equal_and_of_flat_pictures() -> None:
 
 
 def test_ssim_gradients() -> None:
-    """Kernel and convolutions agree on both gradients, and both with finite differences in double precision."""
+    """Kernel and autograd agree on both gradients, and both with finite differences in double precision."""
     a, b = pair(height=23, width=19)
     g = torch.Generator().manual_seed(1)
     weights = torch.rand(a.shape, generator=g)
@@ -93,7 +93,7 @@ def test_pictures_of_different_shapes() -> None:
         psnr(torch.zeros(4, 4, 3), torch.zeros(4, 4, 1))
 
 
-def test_convolutions_on_the_cpu_give_the_same_map() -> None:
+def test_the_path_without_kernels_gives_the_same_map() -> None:
     """The path for CUDA, which no GPU need be there to check."""
     a, b = pair()
     torch.testing.assert_close(ssim_map_torch(a, b), ssim_map(a, b), rtol=0, atol=1e-5)
