@@ -12,8 +12,8 @@ from splatsoil.splats import constants
 
 HEADER = 12
 """Numbers in front of the features in a packed row: x, y, the quadratic, mixed and other quadratic coefficient of log₂
-opacity, log₂ strength, reach in y, strength, and the ellipse of opacity 1/255 as dy = slope·dx ± √(room − bend·dx²):
-dx of its lowest point, slope, room, bend."""
+opacity, log₂ strength, reach in y, nothing (it makes a row of four features one cache line), and the ellipse of
+opacity 1/255 as dy = slope·dx ± √(room − bend·dx²): dx of its lowest point, slope, room, bend."""
 
 MOMENTS = 6
 """Moments of ∂L/∂σ per entry (1, dx, dy, dx², dx·dy, dy²), in front of the feature gradients."""
@@ -114,7 +114,7 @@ def pack(
     rows[rank, 4] = -0.5 * _LOG2E * conic[2]
     rows[rank, 5] = wp.log2(strengths[i])
     rows[rank, 6] = reaches[i][1]
-    rows[rank, 7] = strengths[i]
+    rows[rank, 7] = 0.0
     # a little larger than the ellipse, against rounding
     cut = 2.0 * wp.log(strengths[i] / _ALPHA_MIN) * 1.0001 + 1.0e-4
     determinant = _determinant(conic[0], conic[1], conic[2])
