@@ -11,7 +11,8 @@ shape after a tool has passed is chance:
   pixel does not outweigh a berm.
 - Each scale is measured in units of what a model without any motion would leave: 0 is perfect, 1 is as good as no model.
 
-Only the bed's interior counts, and pixels in which both pictures show the tool do not.
+Only the bed's interior counts, and pixels in which either picture shows the tool do not: where soil meets the tool, a
+millimetre decides what is seen. Where the tool stood at frame 0, pictures are compared as they are.
 """
 
 from __future__ import annotations
@@ -103,7 +104,7 @@ class Comparator:
 
     Args:
         measurement: video, cameras, bed, tool.
-        surface: the undisturbed surface, to know which pixels show the bed; by default half of the bed's height.
+        surface: the undisturbed surface, to know which pixels show the bed; by default the middle of the bed's height.
         frames: frames to compare; all from the first on by default. The first one in the video is what changes refer to
             and has no loss of its own.
         cameras: names; all by default.
@@ -173,12 +174,10 @@ class Comparator:
                 )
         losses, squares, means = {}, {}, []
         for camera in self.cameras:
-            start = images[camera, self.reference]
-            hidden = self._both_tool(camera, self.reference, start)
-            masks = [
-                self.interior[camera] & ~hidden & ~self._both_tool(camera, f, images[camera, f]) for f in self.frames
-            ]
-            change = [self._change(camera, f) - (images[camera, f] - start) for f in self.frames]
+            still = self._before[camera] - images[camera, self.reference]
+            still[self._shows_tool(camera, self.reference, images[camera, self.reference])] = 0.0
+            masks = [self.interior[camera] & ~self._shows_tool(camera, f, images[camera, f]) for f in self.frames]
+            change = [self.observed[camera, f] - images[camera, f] - still for f in self.frames]
             for frame, mask in zip(self.frames, masks, strict=True):
                 difference = (self.observed[camera, frame] - images[camera, frame])[mask]
                 squares[camera, frame] = float(np.mean(np.square(difference, dtype=np.float64))) if mask.any() else 0.0
@@ -193,10 +192,6 @@ class Comparator:
         observed, predicted = self.observed[camera, frame], images[camera, frame]
         difference = np.clip(0.5 + gain * (observed - predicted), 0.0, 1.0)
         return np.concatenate([observed, predicted, difference], axis=1).astype(np.float32)
-
-    def _change(self, camera: str, frame: int) -> Image:
-        """Observed change since nothing had moved; the mean of all still frames stands for that."""
-        return self.observed[camera, frame] - self._before[camera]
 
     def _inside(self, camera: str) -> BoolImage:
         """Pixels whose ray meets the level of the bed's surface inside its walls."""
@@ -232,14 +227,14 @@ class Comparator:
             return None
         return weights, float(weights @ (tool.mean(axis=0) + soil.mean(axis=0)) / 2)
 
-    def _both_tool(self, camera: str, frame: int, predicted: Image) -> BoolImage:
-        """Pixels in which both pictures show the tool, a pixel wider; all of its silhouette where colours don't tell."""
+    def _shows_tool(self, camera: str, frame: int, predicted: Image) -> BoolImage:
+        """Pixels in which either picture shows the tool, a bit wider; all of its silhouette where colours don't tell."""
         shape = self._silhouettes[camera, frame]
         rule = self._tool_colour[camera]
         if rule is None:
             return shape
         seen = [_log_ratios(image) @ rule[0] > rule[1] for image in (self.observed[camera, frame], predicted)]
-        return binary_dilation(shape & seen[0] & seen[1], iterations=2)
+        return binary_dilation(shape & (seen[0] | seen[1]), iterations=2)
 
     def _layout(self) -> tuple[tuple[Block, ...], dict[str, npt.NDArray[np.int64]]]:
         """Labels of all blocks, and for each camera the block (in its order) that each pixel belongs to, or -1."""
@@ -294,9 +289,10 @@ class Comparator:
         """(scales,) what a model leaves in which nothing moves, for each camera: the loss' unit."""
         out = {}
         for camera in self.cameras:
-            hidden = self._silhouettes[camera, self.reference]
-            masks = [self.interior[camera] & ~hidden & ~self._silhouettes[camera, f] for f in self.frames]
-            change = [self._change(camera, f) for f in self.frames]
+            first = self.observed[camera, self.reference]
+            hidden = self._shows_tool(camera, self.reference, first)
+            masks = [self.interior[camera] & ~hidden & ~self._shows_tool(camera, f, first) for f in self.frames]
+            change = [self.observed[camera, f] - self._before[camera] for f in self.frames]
             out[camera] = np.maximum(self._scaled_losses(camera, change, masks).mean(axis=0), 1e-12)
         return out
 
