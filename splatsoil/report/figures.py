@@ -71,7 +71,7 @@ def surrogate(fit: Mapping[str, Any], name: str) -> str:
     done = [step for step in fit["history"] if step["loss"] is not None]
     failed = [step for step in fit["history"] if step["loss"] is None]
 
-    def draw(_: Figure, axes: Axes) -> None:
+    def draw(figure: Figure, axes: Axes) -> None:
         axes.fill_between(x, mean - 2.0 * std, mean + 2.0 * std, color=ACCENT, alpha=0.18, linewidth=0, label="± 2 std")
         axes.plot(x, mean, color=ACCENT, label="mean of the GP")
         axes.axvspan(entry["low"], entry["high"], color=SECOND, alpha=0.15, linewidth=0)
@@ -84,7 +84,7 @@ def surrogate(fit: Mapping[str, Any], name: str) -> str:
         axes.set_xlabel(entry["title"])
         axes.set_ylabel("loss")
         axes.margins(x=0.01)
-        axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, 1.17), ncols=2, columnspacing=1.0)
+        figure.legend(fontsize=8, loc="outside upper center", ncols=2, columnspacing=1.0)
 
     return _draw(draw, (SIZE[0], 2.9))
 

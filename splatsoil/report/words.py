@@ -81,15 +81,29 @@ def residual_sentence(comparison: Mapping[str, Any] | None) -> str:
     """How far the prediction is from the pictures, and what that does and doesn't mean."""
     if comparison is None:
         return "The prediction has not been compared with the pictures frame by frame yet."
+    name = comparison["loss"]
+    total, rest = float(comparison["total"][name]), comparison.get("motionless", {}).get(name)
+    left = f"The prediction leaves {percent(total / rest)} of the misfit that soil at rest would leave" if rest else ""
     ratio = ratio_to_noise(comparison)
     if ratio is None:
-        return "How far the residual is above the noise is unknown: the set has no pre-roll frames to measure it on."
+        unknown = (
+            "How far that is above the cameras' noise is unknown: the set has no pre-roll frames to measure it on."
+        )
+        return f"{left}. {unknown}" if left else unknown
     if ratio <= AT_THE_NOISE:
         return f"The residual is {ratio:.1f} × what the cameras' noise alone leaves: nothing more to explain here."
+    above = f"{ratio:.{1 if ratio < 10.0 else 0}f} × what the cameras' noise alone leaves"
+    said = f"{left}; that is {above}." if left else f"The residual is {above}."
     return (
-        f"The residual is {ratio:.1f} × what the cameras' noise alone leaves. The rest is the model's, the "
-        "reconstruction's or the light's: this page cannot tell which."
+        f"{said} Part of the rest is the chance of where grains fall; the other part is the model's, the "
+        "reconstruction's or the light's, and this page cannot tell which."
     )
+
+
+def percent(share: float) -> str:
+    """A share for readers: "7.3 %", "0.26 %", "81 %"."""
+    value = 100.0 * share
+    return f"{value:.0f} %" if value >= 9.95 else f"{value:.2g} %"
 
 
 def model_name(name: str) -> str:

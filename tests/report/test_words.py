@@ -31,6 +31,9 @@ def test_the_verdict_follows_the_ratio_to_the_noise() -> None:
     far = words.residual_sentence(comparison(0.038, 0.01))
     assert "3.8 ×" in far and "cannot tell which" in far
     assert "unknown" in words.residual_sentence(comparison(0.038, None))
+    assert "160 ×" in words.residual_sentence(comparison(1.6, 0.01))
+    with_unit = comparison(0.073, 0.01) | {"motionless": {"robust": 1.0}}
+    assert "leaves 7.3 % of the misfit that soil at rest would leave" in words.residual_sentence(with_unit)
     assert "not been compared" in words.residual_sentence(None)
 
 

@@ -1,0 +1,179 @@
+"""Simulate-and-compare against a measurement set: the real thing."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from splatsoil.parameters import ParameterSpace
+
+from .problem import Evaluation, Image
+
+if TYPE_CHECKING:
+    from splatsoil.comparison import Comparator, Comparison
+    from splatsoil.measurement import Measurement
+    from splatsoil.model import Model, Prediction
+    from splatsoil.reconstruction import Reconstruction
+
+#: Name of the loss that is fitted, part of what identifies an evaluation.
+LOSS = "robust"
+#: Beds of particles that simulations take turns with. Each costs a scene of its own (several seconds), and two are
+#: enough to show the agent that the same parameters don't give the same loss twice.
+BEDS = 2
+
+
+class MeasuredProblem:
+    """A model and a measured video.
+
+    Args:
+        model: predicts the pictures.
+        space: the free parameters.
+        progress: called with (frame, last frame) while a simulation runs.
+    """
+
+    #: A loss of 1 is as good as predicting that nothing moves; ten times that is cut.
+    worst_loss = 10.0
+
+    def __init__(
+        self, model: Model, space: ParameterSpace, *, progress: Callable[[int, int], None] | None = None
+    ) -> None:
+        from splatsoil.comparison import Comparator
+
+        self.model = model
+        self.space = space
+        self.progress = progress
+        self.comparator: Comparator = Comparator(
+            model.measurement, surface=model.reconstruction.surface, frames=model.frames
+        )
+        self._shown = (self.comparator.cameras[0], self.comparator.frames[-1])
+        self._recipe: dict[str, Any] | None = None
+
+    @classmethod
+    def load(
+        cls,
+        measurement: str | Path,
+        parameters: Sequence[str] = ("friction_angle",),
+        effects: Sequence[str] = (),
+        *,
+        preset: str = "small",
+        device: str = "cpu",
+        reconstruction: str | Path | None = None,
+    ) -> MeasuredProblem:
+        """From names and folders, as ``gymnasium.make`` gives them.
+
+        Args:
+            measurement: folder of the set.
+            parameters: names of the free parameters.
+            effects: names of effects that are on.
+            preset: resolution of the solver, and of the reconstruction if one has to be made.
+            device: ``auto``, ``cpu`` or ``cuda:N``.
+            reconstruction: folder of a saved reconstruction; None takes it from the user's cache, and makes it
+                (minutes) when it isn't there.
+
+        Raises:
+            MeasurementError, ParameterError, RunError: what is wrong, before anything is simulated.
+        """
+        from splatsoil.measurement import Measurement
+        from splatsoil.model import Model
+        from splatsoil.reconstruction import Reconstruction
+
+        from .synthetic import resolve_device
+
+        recipe = {
+            "measurement": str(measurement),
+            "parameters": tuple(parameters),
+            "effects": tuple(effects),
+            "preset": preset,
+            "device": device,
+            "reconstruction": None if reconstruction is None else str(reconstruction),
+        }
+        measured = Measurement.load(measurement)
+        device = resolve_device(device)
+        if reconstruction is None:
+            scene = cached_reconstruction(measured, preset, device)
+        else:
+            scene = Reconstruction.load(reconstruction)
+        model = Model(measured, scene, effects=effects, preset=preset, device=device)
+        problem = cls(model, model.space(parameters))
+        problem._recipe = recipe
+        return problem
+
+    @property
+    def block_count(self) -> int:
+        """Length of the block residuals: squares of the bed, for each camera and frame."""
+        return len(self.comparator.labels)
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """(height, width) of the pictures."""
+        height, width = self.observed_image().shape[:2]
+        return height, width
+
+    def begin(self, seed: int) -> None:
+        """Nothing is drawn: the world is what was measured."""
+
+    def truth(self) -> Mapping[str, float] | None:
+        """None: nobody knows it."""
+        return None
+
+    def observed_image(self) -> Image:
+        """The first camera's last frame."""
+        return self.comparator.observed[self._shown]
+
+    def predict(self, parameters: Mapping[str, float], seed: int) -> tuple[Prediction, Comparison]:
+        """Simulate, draw, compare, and keep everything.
+
+        Raises:
+            SimulationError: the simulation could not go on.
+        """
+        prediction = self.model.predict(parameters, seed % BEDS, self.progress)
+        return prediction, self.comparator.compare(prediction.images)
+
+    def evaluate(self, parameters: Mapping[str, float], seed: int) -> Evaluation:
+        """Simulate, draw, compare.
+
+        Raises:
+            SimulationError: the simulation could not go on.
+        """
+        began = time.perf_counter()
+        prediction, comparison = self.predict(parameters, seed)
+        return Evaluation(
+            loss=min(comparison.loss, self.worst_loss),
+            blocks=comparison.blocks,
+            extras={"rgb": comparison.rgb, "bed": float(prediction.seed)},
+            seconds=time.perf_counter() - began,
+            observed=self.observed_image(),
+            predicted=prediction.images[self._shown],
+        )
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Scenes and solver kernels don't travel between processes; folders and names do.
+        if self._recipe is None:
+            raise TypeError("only a problem made by MeasuredProblem.load, from folders and names, can be pickled")
+        return _load, (self._recipe,)
+
+
+def _load(recipe: dict[str, Any]) -> MeasuredProblem:
+    return MeasuredProblem.load(**recipe)
+
+
+def cache_folder() -> Path:
+    """Where reconstructions made for environments are kept: ``SPLATSOIL_CACHE``, or the user's cache folder."""
+    chosen = os.environ.get("SPLATSOIL_CACHE")
+    if chosen:
+        return Path(chosen)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "splatsoil"
+
+
+def cached_reconstruction(measurement: Measurement, preset: str, device: str) -> Reconstruction:
+    """The set's reconstruction with seed 0, made once for a set, preset and version."""
+    from splatsoil import __version__
+    from splatsoil.reconstruction import Reconstruction, reconstruct
+
+    folder = cache_folder() / f"{measurement.hash[:16]}-{preset}-{__version__}"
+    if not (folder / "reconstruction.json").is_file():
+        reconstruct(measurement, preset=preset, device=device).save(folder)
+    return Reconstruction.load(folder)

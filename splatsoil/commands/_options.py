@@ -1,0 +1,59 @@
+"""Options that `fit` and `run` share."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from tyro.conf import Positional
+
+#: Evaluations for each free parameter, unless the user says how many.
+EVALUATIONS = 10
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """What decides a fit."""
+
+    set: Positional[Path]
+    """Folder of the measurement set."""
+    parameters: tuple[str, ...] = ()
+    """Free parameters; the friction angle and those of the effects that are on, if not given."""
+    effects: Annotated[tuple[str, ...], tyro.conf.arg(name="with", metavar="EFFECT")] = ()
+    """Effects to add to the base model, by name, or files that define some."""
+    budget: int | None = None
+    """Evaluations; 10 for each free parameter if not given."""
+    preset: Literal["tiny", "small", "paper", "fine"] = "small"
+    """How finely to reconstruct and simulate; small suits a laptop without a graphics card."""
+    device: str = "auto"
+    """Where to compute: auto, cpu, cuda:0, …"""
+    seed: int = 0
+    """Of everything random; the same seed on the CPU gives the same bits."""
+    run: Path | None = None
+    """Run folder; runs/NAME-PRESET if not given, with the seed when it isn't 0. A fit that was interrupted goes on."""
+    json: bool = False
+    """Print one JSON object and nothing else."""
+
+    def folder(self, name: str) -> Path:
+        """The run folder for a measurement set of this name."""
+        if self.run is not None:
+            return self.run
+        return Path("runs") / (f"{name}-{self.preset}" + (f"-seed{self.seed}" if self.seed else ""))
+
+    def again(self, command: str) -> str:
+        """The command line that means this."""
+        words = ["splatsoil", command, str(self.set)]
+        for option, values in (("--parameters", self.parameters), ("--with", self.effects)):
+            words += [option, *values] if values else []
+        for option, value, usual in (
+            ("--budget", self.budget, None),
+            ("--preset", self.preset, "small"),
+            ("--device", self.device, "auto"),
+            ("--seed", self.seed, 0),
+            ("--run", self.run, None),
+        ):
+            words += [option, str(value)] if value != usual else []
+        return shlex.join(words)

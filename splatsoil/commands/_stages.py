@@ -1,0 +1,257 @@
+"""The stages that commands are made of: set, run folder, reconstruction, fit, comparison."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from splatsoil.commands._options import EVALUATIONS, FitOptions
+from splatsoil.errors import MeasurementError, ParameterError, RunError
+
+if TYPE_CHECKING:
+    from splatsoil.commands._progress import Report
+    from splatsoil.inverse.evaluations import EvaluationRecord
+    from splatsoil.inverse.run_folder import RunFolder
+    from splatsoil.measurement import Measurement
+    from splatsoil.model import Model
+    from splatsoil.reconstruction import Reconstruction
+
+#: Differences are shown this many times as strong as they are.
+GAIN = 4.0
+
+
+def device_named(name: str) -> str:
+    """``auto`` resolved; ParameterError where there is no such device."""
+    import torch
+
+    if name == "auto":
+        return "cuda:0" if torch.cuda.is_available() else "cpu"
+    if name == "cpu":
+        return name
+    count = torch.cuda.device_count()
+    known = ["cpu", *(f"cuda:{i}" for i in range(count))]
+    if name not in known:
+        raise ParameterError(f"there is no device {name!r} here; choose one of auto, {', '.join(known)}")
+    return name
+
+
+def hush() -> None:
+    """Keep Warp from telling which kernels it loads, and that it found no GPU."""
+    import warp
+
+    warp.config.log_level = warp.LOG_ERROR
+
+
+def prepare(options: FitOptions) -> tuple[Measurement, RunFolder]:
+    """The checked set and its run folder. Nothing is written before all of it is found good.
+
+    Raises:
+        MeasurementError, ParameterError, RunError: what is wrong, before any work.
+    """
+    from splatsoil import __version__
+    from splatsoil.inverse.run_folder import RunFolder
+    from splatsoil.measurement import Measurement
+    from splatsoil.soil.law import Law
+    from splatsoil.soil.library import find_effects
+
+    if options.budget is not None and options.budget < 2:
+        raise ParameterError(f"--budget: a fit needs at least 2 evaluations, not {options.budget}")
+    if options.seed < 0:
+        raise ParameterError(f"--seed: must be 0 or more, not {options.seed}")
+    known = [p.name for p in Law(find_effects(options.effects)).parameters]
+    unknown = [name for name in options.parameters if name not in known]
+    if unknown:
+        raise ParameterError(f"--parameters: unknown {', '.join(unknown)}; this model has {', '.join(known)}")
+    device_named(options.device)
+    measurement = Measurement.load(options.set)
+    if not measurement.frames:
+        raise MeasurementError("has no video frames from 0 on: there is nothing to compare with", file=options.set)
+    run = RunFolder.prepare(
+        options.folder(measurement.name),
+        measurement={
+            "name": measurement.name,
+            "folder": str(measurement.folder.resolve()),
+            "hash": measurement.hash,
+        },
+        preset=options.preset,
+        seed=options.seed,
+        version=__version__,
+    )
+    return measurement, run
+
+
+def reconstructed(measurement: Measurement, run: RunFolder, device: str, report: Report) -> Reconstruction:
+    """The run's reconstruction: from the folder, or made and kept there."""
+    from splatsoil import __version__
+    from splatsoil.reconstruction import Reconstruction, reconstruct
+
+    preset, seed = run.description["preset"], run.description["seed"]
+    wanted = {"measurement_hash": measurement.hash, "preset": preset, "seed": seed, "version": __version__}
+    if (run.reconstruction / "reconstruction.json").is_file():
+        report("reading", 0.0)
+        kept = Reconstruction.load(run.reconstruction)
+        if all(kept.metadata.get(key) == value for key, value in wanted.items()):
+            return kept
+    made = reconstruct(measurement, seed=seed, device=device, preset=preset, progress=report)
+    with run.lock():
+        made.save(run.reconstruction)
+    # Read back: float32 on disk is what every later command will start from.
+    return Reconstruction.load(run.reconstruction)
+
+
+def digest_of(reconstruction: Reconstruction) -> str:
+    """SHA-256 of what simulations and pictures start from; the same arrays, the same digest."""
+    digest = hashlib.sha256()
+    g = reconstruction.gaussians
+    tensors = (g.means, g.scales, g.quaternions, g.opacities, g.colours, reconstruction.soil, reconstruction.tool)
+    for tensor in tensors:
+        digest.update(np.ascontiguousarray(tensor.detach().cpu().numpy()).tobytes())
+    digest.update(np.ascontiguousarray(reconstruction.surface.height).tobytes())
+    return digest.hexdigest()
+
+
+def facts(model: Model) -> dict[str, str]:
+    """How a model computes, for readers."""
+    r = model.resolution
+    step = r.frame_time / r.steps
+    return {
+        "cell": f"{1e3 * r.cell:.3g} mm",
+        "particles": f"{len(model.particles(0))}, {1e3 * r.spacing:.3g} mm apart",
+        "time step": f"{1e3 * step:.3g} ms, in {r.substeps(r.steps)} substeps",
+        "compared frames": f"{len(model.frames) - 1} of each of {len(model.measurement.cameras)} cameras",
+    }
+
+
+def fitted(
+    options: FitOptions, measurement: Measurement, run: RunFolder, model: Model, report: Report
+) -> dict[str, Any]:
+    """Fit, evaluation by evaluation; what is in the run folder already isn't simulated again."""
+    from splatsoil import __version__
+    from splatsoil.envs.measured import LOSS, MeasuredProblem
+    from splatsoil.inverse.fitting import FitSetup, fit
+
+    space = model.space(options.parameters or None)
+    budget = options.budget or EVALUATIONS * len(space)
+    setup = FitSetup(
+        measurement=measurement.hash,
+        reconstruction=digest_of(model.reconstruction),
+        parameters=space.names,
+        effects=options.effects,
+        preset=options.preset,
+        device=model.device,
+        seed=options.seed,
+        version=__version__,
+        loss=LOSS,
+    )
+    units = {p.name: "°" if p.unit == "deg" else f" {p.unit}" for p in space}
+
+    finished = 0
+
+    def told(done: int, record: EvaluationRecord) -> None:
+        nonlocal finished
+        finished = done
+        values = ", ".join(f"{name} {value:.4g}{units[name]}" for name, value in record.parameters.items())
+        outcome = "failed" if record.loss is None else f"loss {record.loss:.4g}"
+        report(f"{done} of {budget}: {values}, {outcome}", done / budget)
+
+    def simulating(frame: int, last: int) -> None:
+        report(f"simulation {finished + 1} of {budget}, frame {frame}", (finished + frame / (last + 1)) / budget)
+
+    report("reading the video", 0.0)
+    problem = MeasuredProblem(model, space, progress=simulating)
+    return fit(problem, run, setup, budget=budget, facts=facts(model), after_evaluation=told)
+
+
+def compared(run: RunFolder, model: Model, report: Report) -> dict[str, Any]:
+    """Simulate at the latest fit's estimate, and keep pictures and losses of every frame in ``comparison/``."""
+    from splatsoil import __version__
+    from splatsoil.envs.measured import LOSS, MeasuredProblem
+    from splatsoil.files import write_json
+    from splatsoil.report.data import COMPARISON_FORMAT, estimates
+
+    result = run.fit()
+    values = estimates(result)
+    report("reading the video", 0.0)
+    problem = MeasuredProblem(
+        model, model.space(tuple(values)), progress=lambda frame, last: report(f"frame {frame}", 0.9 * frame / last)
+    )
+    prediction, comparison = problem.predict(values, 0)
+    comparator = problem.comparator
+    report("writing pictures", 0.95)
+    frames = []
+    for camera, frame in comparator.keys:
+        strip = comparator.picture(prediction.images, camera, frame, GAIN)
+        names = {kind: f"{camera}_{frame:04d}_{kind}.jpg" for kind in ("observed", "predicted", "difference")}
+        for name, picture in zip(names.values(), np.split(strip, 3, axis=1), strict=True):
+            write_jpeg(run.comparison / name, picture)
+        losses = {LOSS: comparison.losses[camera, frame], "rgb": comparison.rgb_mse[camera, frame]}
+        frames.append({"camera": camera, "frame": frame, "losses": losses, **names})
+    data = {
+        "format": COMPARISON_FORMAT,
+        "fit": result["name"],
+        "parameters": values,
+        "seed": prediction.seed,
+        "preset": model.preset,
+        "device": model.device,
+        "version": __version__,
+        "measurement": run.description["measurement"]["hash"],
+        "loss": LOSS,
+        "total": {LOSS: comparison.loss, "rgb": comparison.rgb},
+        "noise": {} if comparator.noise is None else {LOSS: comparator.noise},
+        # The loss is measured in units of what soil at rest would leave.
+        "motionless": {LOSS: 1.0},
+        "gain": GAIN,
+        "cameras": list(comparator.cameras),
+        "frames": frames,
+        "seconds": sum(prediction.seconds.values()),
+    }
+    write_json(run.comparison / "comparison.json", data)
+    return data
+
+
+def write_jpeg(path: Path, picture: np.ndarray) -> None:
+    """A picture (h, w, 3) in [0, 1] as a JPEG file, whole or not at all."""
+    import io
+
+    from PIL import Image
+
+    from splatsoil.files import write_bytes
+
+    stream = io.BytesIO()
+    pixels = np.rint(255.0 * np.clip(picture, 0.0, 1.0)).astype(np.uint8)
+    Image.fromarray(pixels).save(stream, format="JPEG", quality=90)
+    write_bytes(path, stream.getvalue())
+
+
+def measurement_of(run: RunFolder) -> Measurement:
+    """The set that a run was made from.
+
+    Raises:
+        RunError: it has moved or changed since.
+    """
+    from splatsoil.measurement import Measurement
+
+    folder = Path(run.description["measurement"]["folder"])
+    if not folder.is_dir():
+        raise RunError(f"{run.path}: its measurement set {folder} isn't there any more; put it back")
+    measurement = Measurement.load(folder)
+    if measurement.hash != run.description["measurement"]["hash"]:
+        raise RunError(f"{run.path}: its measurement set {folder} has changed since; fit again into another --run")
+    return measurement
+
+
+def kept(options: FitOptions) -> str:
+    """How many evaluations an interrupted fit leaves, for the sentence after Ctrl-C."""
+    from splatsoil.inverse.evaluations import EvaluationStore
+    from splatsoil.measurement import Measurement
+
+    try:
+        folder = options.run or options.folder(Measurement.load(options.set).name)
+        with EvaluationStore(folder / "evaluations.db", writable=False) as store:
+            count = len(store.records())
+    except (RunError, MeasurementError):
+        return "no evaluation has been finished"
+    return f"{count} evaluation{'s are' if count != 1 else ' is'} kept in {folder}"

@@ -1,0 +1,37 @@
+"""``splatsoil report``: the page for reading."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from splatsoil.commands._output import print_json
+
+
+@dataclass(frozen=True)
+class Config:
+    """Write report.html, one self-contained page, from what is in a run folder."""
+
+    run: Positional[Path]
+    """The run folder."""
+    json: bool = False
+    """Print one JSON object instead of a sentence."""
+
+
+def run(config: Config) -> int:
+    """Write the page; RunError when the folder has no finished fit."""
+    from splatsoil.report import write_report
+
+    path = write_report(config.run)
+    if config.json:
+        print_json({"ok": True, "report": str(path)})
+    else:
+        print(f"report: {path}")
+    return 0
+
+
+def interrupted(config: Config) -> str:
+    """The page is written whole or not at all."""
+    return f"the page was not written; start again with: splatsoil report {config.run}"
