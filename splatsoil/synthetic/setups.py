@@ -111,8 +111,8 @@ def plow(seed: int = 0, *, views: int = VIEWS, depth: float | None = None) -> Se
         frame_rate=FRAME_RATE,
         views=tuple(camera(eye, target) for eye in spiral(target, 0.95, views)),
         video={
-            "left": camera((-0.1, -0.37, 0.6), (0.42, 0.24, 0.09), "left"),
-            "right": camera((0.95, 0.85, 0.58), (0.42, 0.27, 0.1), "right"),
+            "left": camera((-0.1, -0.37, 0.6), (0.43, 0.25, 0.08), "left"),
+            "right": camera((0.95, 0.85, 0.58), target, "right"),
         },
         frames=video_frames(199),
     )

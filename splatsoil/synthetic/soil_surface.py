@@ -60,7 +60,7 @@ def soil_surface(particles: npt.NDArray[np.floating], colours: FloatArray, spaci
     weight /= weight.sum(axis=1, keepdims=True)
     return Body(
         points=vertices,
-        faces=faces.astype(np.int64),
+        faces=faces[:, ::-1].astype(np.int64),  # marching_cubes winds them the other way round than its normals
         normals=normals.astype(np.float64),
         colours=np.einsum("nk,nkc->nc", weight, colours[nearest]),
     )
