@@ -63,11 +63,11 @@ class Photographer:
             if frame == setup.frames[0]:
                 for i, camera in enumerate(setup.views):
                     views.append(Picture(camera, self._expose(self._light(stage, camera, 0, i), 0, i)))
+            # Nothing moves in the pre-roll, but it has its own light paths: it measures all of the pictures' noise.
+            numbers = (*setup.pre_roll, frame) if frame == setup.frames[0] else (frame,)
             for which, camera in enumerate(setup.video.values(), start=1):
-                light = self._light(stage, camera, which, frame)
-                # Nothing moves in the pre-roll: the same light, but the sensor's noise is another each time.
-                for number in (*setup.pre_roll, frame) if frame == setup.frames[0] else (frame,):
-                    exposed = self._expose(light, which, number)
+                for number in numbers:
+                    exposed = self._expose(self._light(stage, camera, which, number), which, number)
                     video.append(Picture(camera, exposed, number, number / setup.frame_rate))
         order = {name: k for k, name in enumerate(setup.video)}
         video.sort(key=lambda picture: (picture.frame, order[picture.camera.name]))
@@ -93,15 +93,20 @@ class Photographer:
         )
 
     def _light(self, stage: Stage, camera: Camera, which: int, number: int) -> FloatImage:
-        paths = np.random.default_rng([self.seed, 4, which, number]).integers(2**31)
+        paths = self._generator(4, which, number).integers(2**31)
         image = stage.radiance(camera, seed=int(paths), side=PATHS)
         self._done += 1
-        self.progress(self._done / (len(self.setup.views) + len(self.setup.video) * len(self.setup.frames)))
+        setup = self.setup
+        total = len(setup.views) + len(setup.video) * (len(setup.pre_roll) + len(setup.frames))
+        self.progress(self._done / total)
         return image
 
     def _expose(self, light: FloatImage, which: int, number: int) -> npt.NDArray[np.uint8]:
-        # Generators take no negative numbers, which the pre-roll has.
-        return photograph(light, NOISE, np.random.default_rng([self.seed, 5, which, number % 2**32]))
+        return photograph(light, NOISE, self._generator(5, which, number))
+
+    def _generator(self, use: int, which: int, number: int) -> np.random.Generator:
+        # Seeds may not be negative, which the pre-roll's numbers are.
+        return np.random.default_rng([self.seed, use, which, number % 2**32])
 
 
 def bin_of(setup: Setup) -> tuple[list[trimesh.Trimesh], float]:

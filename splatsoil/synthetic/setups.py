@@ -100,7 +100,7 @@ def plow(seed: int = 0, *, views: int = VIEWS, depth: float | None = None) -> Se
     target = (0.4, 0.25, 0.08)
     focal = 343.12
 
-    def camera(eye: Sequence[float], aim: Sequence[float], name: str = "") -> Camera:
+    def camera(eye: npt.ArrayLike, aim: npt.ArrayLike, name: str = "") -> Camera:
         return Camera(320, 240, focal, focal, 160.0, 120.0, look_at(eye, aim), name=name)
 
     return Setup(
@@ -132,7 +132,7 @@ def paper(*, views: int = VIEWS) -> Setup:
     target = (0.5, 0.5, 0.25)
     focal = 640.0 / math.tan(math.radians(0.5 * 61.93))
 
-    def camera(eye: Sequence[float], name: str = "") -> Camera:
+    def camera(eye: npt.ArrayLike, name: str = "") -> Camera:
         return Camera(1280, 720, focal, focal, 640.0, 360.0, look_at(eye, target), name=name)
 
     return Setup(

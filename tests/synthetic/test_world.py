@@ -92,7 +92,8 @@ def test_nothing_moves_in_the_pre_roll_but_the_noise(world: World) -> None:
     for name in world.measurement.cameras:
         frames = [f.image() for f in world.measurement.pre_roll if f.camera_name == name]
         noise = np.std(np.stack(frames), axis=0, ddof=1)
-        assert 255.0 * np.sqrt(np.mean(noise**2)) == pytest.approx(1.5, rel=0.25)
+        # The sensor's 1.5 grey levels, those of the light paths, and what JPEG makes of both.
+        assert 1.2 < 255.0 * np.sqrt(np.mean(noise**2)) < 3.0
         assert all((a != b).any() for a, b in pairwise(frames))
 
 
@@ -100,7 +101,7 @@ def test_pictures_show_the_push(world: World) -> None:
     measurement = world.measurement
     still = np.abs(measurement.video_frame("left", 0).image() - measurement.video_frame("left", -1).image()).mean()
     moved = np.abs(measurement.video_frame("left", LAST).image() - measurement.video_frame("left", 0).image()).mean()
-    assert moved > 3.0 * still
+    assert moved > 2.0 * still
     colours = np.stack([f.image().mean(axis=(0, 1)) for f in measurement.views])
     assert (colours > 0.2).all() and (colours < 0.9).all()
     assert (colours[:, 0] > colours[:, 2]).all(), "sand is more red than blue"
