@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from splatsoil.parameters import ParameterSpace
 
+from .devices import resolve_device
 from .problem import Evaluation, Image
 
 if TYPE_CHECKING:
@@ -80,8 +81,6 @@ class MeasuredProblem:
         from splatsoil.model import Model
         from splatsoil.reconstruction import Reconstruction
 
-        from .synthetic import resolve_device
-
         recipe = {
             "measurement": str(measurement),
             "parameters": tuple(parameters),
@@ -90,8 +89,8 @@ class MeasuredProblem:
             "device": device,
             "reconstruction": None if reconstruction is None else str(reconstruction),
         }
-        measured = Measurement.load(measurement)
         device = resolve_device(device)
+        measured = Measurement.load(measurement)
         if reconstruction is None:
             scene = cached_reconstruction(measured, preset, device)
         else:

@@ -19,6 +19,7 @@ from scipy.ndimage import gaussian_filter
 from splatsoil.errors import ParameterError
 from splatsoil.parameters import ParameterSpace
 
+from .devices import resolve_device
 from .problem import Evaluation, Image
 
 if TYPE_CHECKING:
@@ -175,7 +176,7 @@ class SyntheticProblem:
         self.space = ParameterSpace(known[name] for name in parameters)
         self.effects = tuple(effects)
         self.preset = preset
-        self.device = device
+        self.device = resolve_device(device)
         self._truth: dict[str, float] | None = None
         self._truth_seed = 0
         self._observed: Image | None = None
@@ -240,7 +241,7 @@ class SyntheticProblem:
 
     @cached_property
     def _world(self) -> World:
-        return World(self.effects, self.preset, resolve_device(self.device))
+        return World(self.effects, self.preset, self.device)
 
     def __getstate__(self) -> dict[str, Any]:
         # Solver and scene are made again from their names: kernels and meshes don't travel between processes.
@@ -331,12 +332,3 @@ class World:
             spacing=self.resolution.spacing,
             background=np.array([0.75, 0.77, 0.8]),
         )
-
-
-def resolve_device(device: str) -> str:
-    """``auto`` is the first CUDA device, where there is one."""
-    if device != "auto":
-        return device
-    import torch
-
-    return "cuda:0" if torch.cuda.is_available() else "cpu"

@@ -23,21 +23,6 @@ if TYPE_CHECKING:
 GAIN = 4.0
 
 
-def device_named(name: str) -> str:
-    """``auto`` resolved; ParameterError where there is no such device."""
-    import torch
-
-    if name == "auto":
-        return "cuda:0" if torch.cuda.is_available() else "cpu"
-    if name == "cpu":
-        return name
-    count = torch.cuda.device_count()
-    known = ["cpu", *(f"cuda:{i}" for i in range(count))]
-    if name not in known:
-        raise ParameterError(f"there is no device {name!r} here; choose one of auto, {', '.join(known)}")
-    return name
-
-
 def hush() -> None:
     """Keep Warp from telling which kernels it loads, and that it found no GPU."""
     import warp
@@ -52,6 +37,7 @@ def prepare(options: FitOptions) -> tuple[Measurement, RunFolder]:
         MeasurementError, ParameterError, RunError: what is wrong, before any work.
     """
     from splatsoil import __version__
+    from splatsoil.envs.devices import resolve_device
     from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.measurement import Measurement
     from splatsoil.soil.law import Law
@@ -65,7 +51,7 @@ def prepare(options: FitOptions) -> tuple[Measurement, RunFolder]:
     unknown = [name for name in options.parameters if name not in known]
     if unknown:
         raise ParameterError(f"--parameters: unknown {', '.join(unknown)}; this model has {', '.join(known)}")
-    device_named(options.device)
+    resolve_device(options.device)
     measurement = Measurement.load(options.set)
     if not measurement.frames:
         raise MeasurementError("has no video frames from 0 on: there is nothing to compare with", file=options.set)

@@ -28,13 +28,14 @@ def run(config: Config) -> int:
     """Simulate, draw, compare; pictures and losses go into the run folder."""
     from splatsoil.commands import _stages as stage
     from splatsoil.commands._progress import stages
+    from splatsoil.envs.devices import resolve_device
     from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.model import Model
 
     stage.hush()
     folder = RunFolder.open(config.run)
     setup = folder.fit()["setup"]
-    device = stage.device_named(config.device)
+    device = resolve_device(config.device)
     measurement = stage.measurement_of(folder)
     with stages(quiet=config.json) as begin:
         reconstruction = stage.reconstructed(measurement, folder, device, begin("reconstruct"))

@@ -19,11 +19,12 @@ def run(config: Config) -> int:
     """Reconstruct (unless the run folder has it), fit, print; everything is kept in the run folder."""
     from splatsoil.commands import _stages as stage
     from splatsoil.commands._progress import stages
+    from splatsoil.envs.devices import resolve_device
     from splatsoil.model import Model
 
     stage.hush()
     measurement, folder = stage.prepare(config)
-    device = stage.device_named(config.device)
+    device = resolve_device(config.device)
     with stages(quiet=config.json) as begin:
         reconstruction = stage.reconstructed(measurement, folder, device, begin("reconstruct"))
         model = Model(measurement, reconstruction, effects=config.effects, preset=config.preset, device=device)

@@ -18,6 +18,7 @@ def run(config: Config) -> int:
     from splatsoil.commands import _stages as stage
     from splatsoil.commands import compare, fit
     from splatsoil.commands._progress import stages
+    from splatsoil.envs.devices import resolve_device
     from splatsoil.model import Model
     from splatsoil.report import write_report
 
@@ -25,7 +26,7 @@ def run(config: Config) -> int:
     with stages(quiet=config.json) as begin:
         begin("check")("reading every image", 0.0)
         measurement, folder = stage.prepare(config)
-        device = stage.device_named(config.device)
+        device = resolve_device(config.device)
         reconstruction = stage.reconstructed(measurement, folder, device, begin("reconstruct"))
         model = Model(measurement, reconstruction, effects=config.effects, preset=config.preset, device=device)
         result = stage.fitted(config, measurement, folder, model, begin("fit"))

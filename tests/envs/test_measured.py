@@ -1,0 +1,91 @@
+"""PlowSand-v0 on a measurement set: the example, cut down, at the coarsest preset."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium.envs.registration import EnvSpec
+from splatsoil.envs import measured
+from splatsoil.envs.measured import BEDS, MeasuredProblem
+
+from splatsoil.errors import MeasurementError, ParameterError, RunError
+from splatsoil.measurement import Measurement
+from splatsoil.reconstruction import reconstruct
+
+
+@pytest.fixture(scope="module")
+def reconstruction(plow_dry: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    torch.set_num_threads(1)
+    folder = tmp_path_factory.mktemp("reconstruction")
+    return reconstruct(Measurement.load(plow_dry), preset="tiny").save(folder)
+
+
+@pytest.mark.slow
+def test_a_step_is_a_simulation_compared_with_the_video(small_set: Path, reconstruction: Path) -> None:
+    options = {"measurement": str(small_set), "preset": "tiny", "budget": 2, "reconstruction": str(reconstruction)}
+    made = gym.make("PlowSand-v0", **options, render_mode="rgb_array")
+    made.reset(seed=0)
+    observation, reward, _, truncated, info = made.step(np.zeros(1, dtype=np.float32))
+    assert info["parameters"] == {"friction_angle": 35.0}
+    assert -10.0 < reward < 0.0 and not truncated
+    assert info["bed"] in range(BEDS)
+    assert observation in made.observation_space
+    assert observation["block_residuals"].std() > 0.0
+    picture = made.render()
+    assert isinstance(picture, np.ndarray) and picture.shape == (240, 3 * 320, 3)
+    _, _, _, truncated, info = made.step(np.zeros(1, dtype=np.float32))
+    assert truncated and "truth" not in info
+
+    assert made.spec is not None
+    spec = EnvSpec.from_json(made.spec.to_json())
+    assert spec.kwargs == made.spec.kwargs
+    # The same world in another process: same seed, same reward.
+    twin = pickle.loads(pickle.dumps(made.unwrapped.problem))  # type: ignore[attr-defined]
+    seed = made.unwrapped.simulation_seed(0)  # type: ignore[attr-defined]
+    assert twin.evaluate({"friction_angle": 35.0}, seed).loss == pytest.approx(-reward, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "says"),
+    [
+        ({"reconstruction": "nowhere"}, RunError, "nowhere"),
+        ({"measurement": "nowhere"}, MeasurementError, "nowhere"),
+        ({"device": "cuda:77"}, ParameterError, "cuda:77"),
+    ],
+)
+def test_what_cannot_be_opened_is_named(small_set: Path, options: dict, error: type, says: str) -> None:
+    with pytest.raises(error, match=says):
+        gym.make("PlowSand-v0", **({"measurement": str(small_set)} | options))
+
+
+def test_reconstructions_are_kept_for_a_set_and_a_preset(
+    small_set: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[str] = []
+
+    class Result:
+        def save(self, folder: Path) -> None:
+            made.append(folder.name)
+            folder.mkdir(parents=True)
+            (folder / "reconstruction.json").write_text("{}")
+
+    monkeypatch.setenv("SPLATSOIL_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr("splatsoil.reconstruction.reconstruct", lambda *_, **__: Result())
+    monkeypatch.setattr("splatsoil.reconstruction.Reconstruction.load", staticmethod(lambda folder: folder))
+    measurement = Measurement.load(small_set)
+    first = measured.cached_reconstruction(measurement, "tiny", "cpu")
+    assert measured.cached_reconstruction(measurement, "tiny", "cpu") == first
+    assert measured.cached_reconstruction(measurement, "small", "cpu") != first
+    assert len(made) == 2 and made[0].startswith(measurement.hash[:16])
+
+
+def test_a_problem_made_from_objects_says_why_it_cannot_travel() -> None:
+    problem = MeasuredProblem.__new__(MeasuredProblem)
+    problem._recipe = None
+    with pytest.raises(TypeError, match="from folders and names"):
+        pickle.dumps(problem)
