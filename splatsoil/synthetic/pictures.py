@@ -77,7 +77,7 @@ class Photographer:
         """Soil, tool, bin and ground at one recorded frame; particle albedo (n, 3), linear."""
         setup, look = self.setup, self.look
         particles = self.trajectory.positions[self.trajectory.frames.index(frame)]
-        soil = soil_surface(particles, colours, self.trajectory.spacing, setup.bed)
+        soil = soil_surface(particles, colours, self.trajectory.spacing, setup.bed, sides=not setup.walls)
         rotation, position = setup.tool.motion.pose(frame / setup.frame_rate)
         tool = setup.tool.mesh
         placed = trimesh.Trimesh(tool.vertices @ rotation.T + position, tool.faces, process=False)
@@ -123,4 +123,5 @@ def bin_of(setup: Setup) -> tuple[list[trimesh.Trimesh], float]:
         ((x0, y0 - thick, z0), (x1, y0, top)),
         ((x0, y1, z0), (x1, y1 + thick, top)),
     )
-    return [trimesh.creation.box(bounds=box) for box in boxes], z0 - thick
+    shown = boxes if setup.walls else boxes[:1]
+    return [trimesh.creation.box(bounds=box) for box in shown], z0 - thick

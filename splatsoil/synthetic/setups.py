@@ -51,6 +51,7 @@ class Setup:
         video: fixed cameras by name.
         frames: video frames, from 0 on.
         pre_roll: video frames before that, negative.
+        walls: whether the bed's walls can be seen; without them the soil's sides show, as behind glass.
     """
 
     bed: Bed
@@ -62,6 +63,7 @@ class Setup:
     video: Mapping[str, Camera]
     frames: tuple[int, ...]
     pre_roll: tuple[int, ...] = PRE_ROLL
+    walls: bool = True
 
     def experiment(self) -> Measurement:
         """The experiment as the solver takes it, without pictures."""
@@ -144,6 +146,7 @@ def paper(*, views: int = VIEWS) -> Setup:
         views=tuple(camera(eye) for eye in spiral(target, 1.8, views)),
         video={"left": camera((-0.5, -0.5, 0.5), "left"), "right": camera((-0.5, 1.5, 0.5), "right")},
         frames=video_frames(199),
+        walls=False,  # their cameras stand so low that walls would hide the furrow
     )
 
 

@@ -25,7 +25,9 @@ COLOUR_REACH = 0.5
 """Width of the weights by which particles lend their colour to the surface, in particle spacings."""
 
 
-def soil_surface(particles: npt.NDArray[np.floating], colours: FloatArray, spacing: float, bed: Bed) -> Body:
+def soil_surface(
+    particles: npt.NDArray[np.floating], colours: FloatArray, spacing: float, bed: Bed, *, sides: bool = False
+) -> Body:
     """The soil's surface with the albedo of the particles beneath it.
 
     Particles are counted on a grid, the counts blurred by one particle spacing and cut at 0.45 of the bulk. The bed's
@@ -36,6 +38,7 @@ def soil_surface(particles: npt.NDArray[np.floating], colours: FloatArray, spaci
         colours: (n, 3) albedo, linear.
         spacing: edge of the cube of soil that a particle stands for, m.
         bed: its box.
+        sides: whether the soil's sides are seen, as behind glass; otherwise walls are taken to hide them.
 
     Raises:
         SimulationError: nothing is left of the soil, or its surface is nowhere.
@@ -47,8 +50,10 @@ def soil_surface(particles: npt.NDArray[np.floating], colours: FloatArray, spaci
     shape = (int(plan[0]), int(plan[1]), int(np.ceil((top - bed.lower[2]) / cell[2])))
     filling = _counts(points, bed.lower, cell, shape) * spacing**3 / float(np.prod(cell))
     filling = gaussian_filter(filling, BLUR * spacing / cell, mode=("reflect", "reflect", "nearest"), truncate=4.0)
-    # One cell more to the sides and below, so that the surface reaches into the walls and leaves no gap.
-    filling = np.pad(filling, ((1, 1), (1, 1), (1, 0)), mode="edge")
+    # One cell more below and to the sides: there the surface ends, or goes on into the walls and leaves no gap.
+    filling = np.pad(filling, ((0, 0), (0, 0), (1, 0)), mode="edge")
+    around = ((1, 1), (1, 1), (0, 0))
+    filling = np.pad(filling, around) if sides else np.pad(filling, around, mode="edge")
     if not filling.min() < LEVEL < filling.max():
         raise SimulationError("the particles have no surface: there is no soil, or no space over it")
     vertices, faces, normals, _ = marching_cubes(filling, LEVEL, spacing=tuple(cell), gradient_direction="descent")

@@ -39,6 +39,14 @@ def test_level_soil_is_level_up_to_the_walls() -> None:
     assert (np.einsum("ij,ij->i", turned, body.normals[body.faces[:, 0]]) > 0.0).all(), "faces point inward"
 
 
+def test_sides_stand_where_the_bed_ends() -> None:
+    particles = lattice()
+    body = soil_surface(particles, np.ones((len(particles), 3)), SPACING, BED, sides=True)
+    np.testing.assert_allclose(body.points[:, :2].min(axis=0), BED.lower[:2], atol=0.1 * SPACING)
+    np.testing.assert_allclose(body.points[:, :2].max(axis=0), BED.upper[:2], atol=0.1 * SPACING)
+    assert body.points[:, 2].min() <= BED.lower[2]
+
+
 def test_a_slope_has_its_normal() -> None:
     particles = lattice(0.12)
     slope = 0.3
