@@ -22,8 +22,8 @@ Array = NDArray[np.float64]
 Report = Callable[[str, float], None]
 
 RIM = 0.04  # width of what is taken to border the bed (a bin's wall), in square roots of the bed's area
-# How much better (log of the squared misfit) the soil's level must explain the surroundings than the bed's floor.
-LEVEL_GAIN = 1.0
+# How many times better the soil's level must explain the surroundings than the bed's floor to be taken for their height.
+LEVEL_GAIN = 1.5
 NEIGHBOURS = 24  # Gaussians that a height is drawn from
 
 
@@ -133,7 +133,7 @@ def ground_level(views: Views, bed: Bed, surface: HeightField, occluder: HeightF
         several = (weight.sum(0) >= 3).to(torch.float32)
         value = (several * weight * torch.log1p(error / (27.0 * views.noise**2))).sum()
         misfit.append(float(value / (several * weight).sum().clamp_min(1.0)))
-    return level if misfit[0] - misfit[1] > LEVEL_GAIN else floor
+    return level if misfit[0] > LEVEL_GAIN * misfit[1] else floor
 
 
 def surface_through(soil: Gaussians, start: HeightField) -> HeightField:

@@ -71,6 +71,7 @@ class _Optimiser:
     def step(self, rates: dict[str, float]) -> None:
         """One step of Adam (β 0.9, 0.99) with bias correction by each Gaussian's own age."""
         self.age += 1.0
+        short, long = 1.0 - 0.9**self.age, (1.0 - 0.99**self.age).sqrt()
         for name, value in self.values.items():
             gradient = value.grad
             if gradient is None:
@@ -80,8 +81,7 @@ class _Optimiser:
             rate = rates[name] * (self.size.view(shape) if name == "means" else 1.0)
             self.first[name].mul_(0.9).add_(gradient, alpha=0.1)
             self.second[name].mul_(0.99).addcmul_(gradient, gradient, value=0.01)
-            mean = self.first[name] / (1.0 - 0.9**self.age).view(shape)
-            spread = (self.second[name] / (1.0 - 0.99**self.age).view(shape)).sqrt()
+            mean, spread = self.first[name] / short.view(shape), self.second[name].sqrt() / long.view(shape)
             value -= rate * mean / (spread + 1e-12)
         self.values["colours"].clamp_(0.0, 1.0)
 

@@ -47,6 +47,7 @@ class Scene:
         sun: direction to the sun.
         tool_centre: of the box-shaped tool.
         noise: standard deviation of the pixels.
+        stretch: of the waves along x and y.
     """
 
     bed: Bed = field(default_factory=lambda: Bed(np.array([1.0, -0.5, 0.3]), np.array([1.6, -0.1, 0.5]), 1600.0))
@@ -57,6 +58,7 @@ class Scene:
     sun: tuple[float, float, float] = (0.4, 0.3, 0.85)
     tool_height: float = 0.12
     noise: float = 0.005
+    stretch: float = 1.0
     seed: int = 5
 
     @property
@@ -73,7 +75,8 @@ class Scene:
         """The soil's surface."""
         u, v = x - self.bed.lower[0], y - self.bed.lower[1]
         return self.level + self.wave * (
-            np.sin(2 * np.pi * u / 0.31) * np.cos(2 * np.pi * v / 0.27) + 0.4 * np.cos(7 * u)
+            np.sin(2 * np.pi * u / (0.31 * self.stretch)) * np.cos(2 * np.pi * v / (0.27 * self.stretch))
+            + 0.4 * np.cos(7 * u / self.stretch)
         )
 
     def soil_colour(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:

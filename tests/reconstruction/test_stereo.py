@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -60,6 +62,13 @@ def test_the_surface_is_found_to_a_fraction_of_a_pixel(scene, views, relief):
 
 def test_the_ground_under_a_bin_and_around_a_field(scene, relief):
     assert relief.ground == pytest.approx(float(scene.bed.lower[2]))
+    field = replace(scene, wall=0.0)
+    cameras = field.cameras(10, 128, 96)
+    views = as_views(cameras, [field.render(camera, seed=k) for k, camera in enumerate(cameras)])
+    found = find_relief(
+        views, field.bed, silhouettes(views, placed_tool(field)), PRESETS["tiny"], lambda what, share: None
+    )
+    assert found.ground == pytest.approx(field.level, abs=0.5 * field.wave)
 
 
 def test_silhouettes_cover_the_tool_and_little_else(scene, views):
