@@ -1,7 +1,11 @@
-"""Progress on stderr: one line a stage, with what it is doing, how much is done and how long the rest will take."""
+"""Progress on stderr: one line a stage, with what it is doing, how much is done and how long the rest will take.
+
+Where stderr is no terminal (a log), a line is printed when a stage begins and at every tenth of it.
+"""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -32,7 +36,11 @@ def stages(*, quiet: bool = False) -> Iterator[Stage]:
         TimeRemainingColumn(),
         TextColumn("{task.fields[what]}"),
     )
-    with Progress(*columns, console=Console(stderr=True), speed_estimate_period=3600.0) as bar:
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield _logged
+        return
+    with Progress(*columns, console=console, speed_estimate_period=3600.0) as bar:
         current: list[TaskID] = []
 
         def finish() -> None:
@@ -53,3 +61,17 @@ def stages(*, quiet: bool = False) -> Iterator[Stage]:
 
         yield begin
         finish()
+
+
+def _logged(name: str) -> Report:
+    """A stage as lines of a log."""
+    print(name, file=sys.stderr, flush=True)
+    tenth = 0
+
+    def report(what: str, share: float) -> None:
+        nonlocal tenth
+        if int(10.0 * share + 1e-9) > tenth:
+            tenth = int(10.0 * share + 1e-9)
+            print(f"{name}: {100.0 * share:.0f} %, {what}", file=sys.stderr, flush=True)
+
+    return report

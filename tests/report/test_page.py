@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 import subprocess
+import sys
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -294,3 +295,12 @@ def test_a_browser_lays_it_out_without_sideways_scrolling(tmp_path: Path, width:
     assert content <= window
     # Moving the slider to the left end shows the first frame.
     assert frame == FRAMES[0]
+
+
+def test_the_report_knows_nothing_of_how_a_fit_is_made() -> None:
+    script = (
+        "import sys, splatsoil.report, splatsoil.report.page, splatsoil.report.figures, splatsoil.report.data;"
+        "print([m for m in sys.modules if m.startswith(('splatsoil.inverse', 'splatsoil.model', 'torch'))])"
+    )
+    out = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
+    assert out.strip() == "[]"
