@@ -8,6 +8,7 @@ the changed one. Heights are averaged over particle seeds, whose scatter is stat
 
 from __future__ import annotations
 
+import argparse
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -206,3 +207,21 @@ def table(result: dict[str, Any]) -> str:
             cells = " | ".join(f"{result['sets'][n]['shifts'][change]:+.1f}°" for n in names)
             lines.append(f"| {change} | {cells} |")
     return "\n".join(lines)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Command line; exit code 0."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("sets", nargs="+", type=Path)
+    parser.add_argument("--preset", default="small")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--device", default="cpu", help="cuda:0 runs a scan as one batch")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args(arguments)
+    result = run(options.sets, options.preset, options.seeds, options.device)
+    print(json.dumps(result, indent=1) if options.json else table(result))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
