@@ -1,15 +1,16 @@
 """Observed against predicted pictures: losses, residual pictures, and block residuals for inference.
 
-Two losses. ``rgb`` is the mean square of the colour difference, the one in print. ``robust`` is made for sand, whose fine
-shape after a tool has passed is chance:
+Two losses. ``rgb`` is the mean square of the colour difference, the one in print. ``robust`` is made for sand, whose
+fine shape after a tool has passed is chance:
 
 - It compares changes since frame 0 (observed I_t − I_0 with predicted I_t − I_0), so that whatever is wrong with the
   reconstruction before anything moves cancels.
-- It looks at differences averaged over centimetres, at several scales; single lumps average out, trench, berm and shadows
-  stay.
-- It grows with the square of small differences, but only linearly with large ones, so that a tool's edge that is off by a
-  pixel does not outweigh a berm.
-- Each scale is measured in units of what a model without any motion would leave: 0 is perfect, 1 is as good as no model.
+- It looks at differences averaged over centimetres, at several scales; single lumps average out, trench, berm and
+  shadows stay.
+- It grows with the square of small differences, but only linearly with large ones, so that a tool's edge that is off
+  by a pixel does not outweigh a berm.
+- Each scale is measured in units of what a model without any motion would leave: 0 is perfect, 1 is as good as no
+  model.
 
 Only the bed's interior counts, and pixels in which either picture shows the tool do not: where soil meets the tool, a
 millimetre decides what is seen. Where the tool stood at frame 0, pictures are compared as they are.
@@ -170,7 +171,8 @@ class Comparator:
                 raise ParameterError(f"the prediction has no picture of camera {key[0]!r} at frame {key[1]}")
             if images[key].shape != self.observed[key].shape:
                 raise ParameterError(
-                    f"camera {key[0]!r}, frame {key[1]}: predicted {images[key].shape}, observed {self.observed[key].shape}"
+                    f"camera {key[0]!r}, frame {key[1]}: the prediction is {images[key].shape}, "
+                    f"the photograph {self.observed[key].shape}"
                 )
         losses, squares, means = {}, {}, []
         for camera in self.cameras:
@@ -228,7 +230,7 @@ class Comparator:
         return weights, float(weights @ (tool.mean(axis=0) + soil.mean(axis=0)) / 2)
 
     def _shows_tool(self, camera: str, frame: int, predicted: Image) -> BoolImage:
-        """Pixels in which either picture shows the tool, a bit wider; all of its silhouette where colours don't tell."""
+        """Pixels in which either picture shows the tool, and near ones; its silhouette where colours don't tell."""
         shape = self._silhouettes[camera, frame]
         rule = self._tool_colour[camera]
         if rule is None:
@@ -297,7 +299,7 @@ class Comparator:
         return out
 
     def _noise(self) -> float | None:
-        """The robust loss that the cameras' noise alone leaves, from frames in which nothing moves; None without any."""
+        """The robust loss that the cameras' noise alone leaves, from frames before anything moves; None without."""
         found = []
         for camera, still in self._still.items():
             frames = [*still, self.observed[camera, self.reference]]

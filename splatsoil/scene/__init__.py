@@ -3,9 +3,10 @@
 from splatsoil.scene.binding import Binding, bind
 from splatsoil.scene.estimate import LightEstimate, estimate_light, seen_colours, still_frames
 from splatsoil.scene.light import Light, encoded, linear
-from splatsoil.scene.lit import LitRelief, ToolBody, light_relief, silhouette
+from splatsoil.scene.lit import LitRelief, light_relief
 from splatsoil.scene.relief import Relief, relief_of_particles
 from splatsoil.scene.render import Layers, Posed, Scene
+from splatsoil.scene.tool import ToolBody, silhouette
 
 __all__ = [
     "Binding",

@@ -94,9 +94,9 @@ def refined(
 ) -> Tensor:
     """Albedo that makes the drawn Gaussians agree with unlit photographs.
 
-    The drawn colour is linear in the Gaussians' colours. Each round moves every Gaussian by the mean of the residuals of
-    the pixels it shows in, weighted by how much (simultaneous algebraic reconstruction); one that shows nowhere keeps
-    what it has.
+    The drawn colour is linear in the Gaussians' colours. Each round moves every Gaussian by the mean of the residuals
+    of the pixels it shows in, weighted by how much (simultaneous algebraic reconstruction); one that shows nowhere
+    keeps what it has.
 
     Args:
         centres: (n, 3) m; covariances: (n, 3, 3) m²; opacities: (n,): every Gaussian that is drawn.

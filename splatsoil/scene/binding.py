@@ -1,7 +1,7 @@
 """Gaussians that ride on particles.
 
-A Gaussian of the reconstruction rests at X with covariance Σ. Its particles p (the nearest at rest) have moved from X_p to
-x_p and deformed by F_p (the visual deformation). With weights w that sum to 1,
+A Gaussian of the reconstruction rests at X with covariance Σ. Its particles p (the nearest at rest) have moved from X_p
+to x_p and deformed by F_p (the visual deformation). With weights w that sum to 1,
 
     x = Σ w (x_p + F_p (X − X_p)),      F = Σ w F_p with singular values clamped,      Σ' = F Σ Fᵀ
 
@@ -64,10 +64,12 @@ class Binding:
             raise ValueError(f"{tuple(self.particles.shape)} particles at rest, {tuple(positions.shape)} now")
         centres, covariances = torch.empty_like(self.rest), torch.empty_like(self.covariances)
         still = deformations is None
-        if deformations is None:
-            deformations = positions.new_zeros((0, 3, 3))
+        held = positions.new_zeros((0, 3, 3)) if deformations is None else torch.empty_like(deformations)
+        if deformations is not None:
+            shapes = [as_warp(deformations, wp.mat33), *STRETCH, as_warp(held, wp.mat33)]
+            launch(_hold, len(held), shapes, held)
         inputs = [as_warp(self.rest, wp.vec3), as_warp(self.covariances, wp.mat33), as_warp(self.particles, wp.vec3)]
-        inputs += [as_warp(positions, wp.vec3), as_warp(deformations, wp.mat33), int(still)]
+        inputs += [as_warp(positions, wp.vec3), as_warp(held, wp.mat33), int(still)]
         inputs += [as_warp(self.index, wp.int32), as_warp(self.weights, wp.float32), *STRETCH]
         outputs = [as_warp(centres, wp.vec3), as_warp(covariances, wp.mat33)]
         launch(_carry, len(self), inputs + outputs, centres)
@@ -125,6 +127,12 @@ def bounded_deformation(f: wp.mat33, smallest: float, largest: float) -> wp.mat3
 
 
 @wp.kernel(enable_backward=False)
+def _hold(deformations: wp.array(dtype=wp.mat33), smallest: float, largest: float, held: wp.array(dtype=wp.mat33)):
+    p = wp.tid()
+    held[p] = bounded_deformation(deformations[p], smallest, largest)
+
+
+@wp.kernel(enable_backward=False)
 def _carry(
     rest: wp.array(dtype=wp.vec3),
     covariances: wp.array(dtype=wp.mat33),
@@ -149,7 +157,7 @@ def _carry(
         if still == 1:
             x += w * (positions[p] + arm)
         else:
-            d = bounded_deformation(deformations[p], smallest, largest)
+            d = deformations[p]
             x += w * (positions[p] + d * arm)
             f += w * d
     centres_out[g] = x

@@ -14,9 +14,10 @@ from splatsoil.scene import albedo as albedos
 from splatsoil.scene.binding import bind
 from splatsoil.scene.estimate import estimate_light, still_frames
 from splatsoil.scene.light import Light, encoded, linear
-from splatsoil.scene.lit import LitRelief, ToolBody, light_relief
+from splatsoil.scene.lit import LitRelief, light_relief
 from splatsoil.scene.relief import relief_of_particles
 from splatsoil.scene.render import Posed, Scene
+from splatsoil.scene.tool import ToolBody
 from splatsoil.splats import Gaussians
 
 ROUNDS = 4
@@ -42,6 +43,8 @@ class Reconstructed(Protocol):
     def soil(self) -> Any: ...
     @property
     def tool(self) -> Any: ...
+    @property
+    def background(self) -> tuple[float, float, float]: ...
 
 
 def build_scene(
@@ -53,7 +56,7 @@ def build_scene(
     light: Light | None = None,
     device: torch.device | str = "cpu",
     rounds: int = ROUNDS,
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    background: tuple[float, float, float] | None = None,
 ) -> Scene:
     """See `Scene.from_reconstruction`."""
     x = torch.as_tensor(np.asarray(particles), dtype=torch.float32).to(device).contiguous()
@@ -83,7 +86,7 @@ def build_scene(
         tool_albedo=np.ones(3),
         bed=measurement.bed,
         spacing=spacing,
-        background=np.asarray(background, dtype=np.float64),
+        background=np.asarray(reconstruction.background if background is None else background, dtype=np.float64),
     )
     frames = still_frames(measurement)
     with torch.no_grad():
@@ -104,7 +107,7 @@ def _albedo(soil: Gaussians, lit: LitRelief, grains: Tensor, spacing: float) -> 
 
 
 def _refined(scene: Scene, posed: Posed, frames: list[Frame], rounds: int) -> Scene:
-    """The scene with the albedo of its visible soil made to agree with the photographs, each pixel's light taken out."""
+    """The scene with its visible albedo made to agree with the photographs, each pixel's light taken out."""
     targets = []
     for frame in frames:
         camera = frame.camera.undistorted()

@@ -1,9 +1,9 @@
 """The light estimated from photographs of the undisturbed bed.
 
 Albedo varies from place to place and its blotches look like slopes; where a shadow ends, or a slope turns, brightness
-changes over millimetres while the albedo does not know of it. So differences of log brightness over a short distance are
-compared with those that a light predicts, with a robust loss: the tool's shadow, where there is one, gives the sun's
-direction and the sky's share by its edge, and slopes add what they know.
+changes over millimetres while the albedo does not know of it. So differences of log brightness over a short distance
+are compared with those that a light predicts, with a robust loss: the tool's shadow, where there is one, gives the
+sun's direction and the sky's share by its edge, and slopes add what they know.
 """
 
 from __future__ import annotations
@@ -22,17 +22,10 @@ from torch import Tensor
 from splatsoil.measurement import Frame, Measurement
 from splatsoil.scene import kernels
 from splatsoil.scene.light import SOIL_REFLECTANCE, Light, linear
-from splatsoil.scene.lit import (
-    LitRelief,
-    ToolBody,
-    ceiling,
-    direct_light,
-    grid_of,
-    march_step,
-    sky_openness,
-    sun_on_points,
-)
-from splatsoil.scene.relief import Relief
+from splatsoil.scene.lit import LitRelief, ceiling, direct_light, march_step, sun_on_points
+from splatsoil.scene.relief import Relief, grid_of
+from splatsoil.scene.sky import sky_openness
+from splatsoil.scene.tool import ToolBody
 from splatsoil.splats.warp_torch import as_warp, launch
 
 FloatArray = npt.NDArray[np.float64]

@@ -3,8 +3,6 @@
 Every kernel is a gather: each thread writes its own outputs, so results do not depend on the order of threads.
 """
 
-# ruff: noqa: UP018  (Warp takes a bare literal for a constant: what a loop changes starts as float(...))
-
 from __future__ import annotations
 
 import warp as wp
@@ -122,13 +120,6 @@ def soil_shadow(
     return open_share
 
 
-@wp.func
-def wedge(elevation: float, up: float, along: float) -> float:
-    """Antiderivative of (up·sin e + along·cos e)·cos e: what a slice of uniform sky gives to a facet."""
-    s = wp.sin(elevation)
-    return 0.5 * up * s * s + 0.5 * along * (elevation + 0.5 * wp.sin(2.0 * elevation))
-
-
 @wp.kernel(enable_backward=False)
 def tool_columns(
     grid: Grid,
@@ -150,56 +141,6 @@ def tool_columns(
         up = tool_hit(tool, wp.vec3(x, y, floor), wp.vec3(0.0, 0.0, 1.0), reach)
         top[i, j] = ceiling - down
         bottom[i, j] = wp.where(up >= 0.0, floor + up, floor)
-
-
-@wp.kernel(enable_backward=False)
-def sky_openness(
-    height: wp.array2d(dtype=wp.float32),
-    normal: wp.array2d(dtype=wp.vec3),
-    grid: Grid,
-    bottom: wp.array2d(dtype=wp.float32),
-    top: wp.array2d(dtype=wp.float32),
-    azimuths: int,
-    steps: wp.array(dtype=wp.float32),
-    openness: wp.array2d(dtype=wp.float32),
-    hidden: wp.array2d(dtype=wp.float32),
-):
-    """Share of a uniform sky that reaches each cell (its horizon in every azimuth, less the tool), and what the tool hides."""
-    i, j = wp.tid()
-    x = grid.x0 + float(j) / grid.inverse_x
-    y = grid.y0 + float(i) / grid.inverse_y
-    z = height[i, j]
-    n = normal[i, j]
-    total = float(0.0)
-    tool_share = float(0.0)
-    half = 1.5707963
-    for a in range(azimuths):
-        angle = 6.2831853 * (float(a) + 0.5) / float(azimuths)
-        dx = wp.cos(angle)
-        dy = wp.sin(angle)
-        along = n[0] * dx + n[1] * dy
-        horizon = wp.atan2(-along, n[2])
-        slope = wp.tan(wp.clamp(horizon, -1.5, 1.5))
-        tool_low = float(1.0e6)
-        tool_high = float(-1.0e6)
-        for s in range(steps.shape[0]):
-            r = steps[s]
-            px = x + r * dx
-            py = y + r * dy
-            slope = wp.max(slope, (sample(height, grid, px, py) - z) / r)
-            v = int(wp.clamp((py - grid.y0) * grid.inverse_y + 0.5, 0.0, float(height.shape[0]) - 1.0))
-            u = int(wp.clamp((px - grid.x0) * grid.inverse_x + 0.5, 0.0, float(height.shape[1]) - 1.0))
-            if top[v, u] > bottom[v, u]:
-                tool_low = wp.min(tool_low, (bottom[v, u] - z) / r)
-                tool_high = wp.max(tool_high, (top[v, u] - z) / r)
-        horizon = wp.atan(slope)
-        total += wedge(half, n[2], along) - wedge(horizon, n[2], along)
-        low = wp.max(horizon, wp.atan(tool_low))
-        high = wp.atan(tool_high)
-        if high > low:
-            tool_share += wedge(high, n[2], along) - wedge(low, n[2], along)
-    hidden[i, j] = wp.clamp(2.0 * tool_share / float(azimuths), 0.0, 1.0)
-    openness[i, j] = wp.clamp(2.0 * (total - tool_share) / float(azimuths), 0.0, 1.0)
 
 
 @wp.kernel(enable_backward=False)
@@ -305,7 +246,10 @@ def pixel_ray(eye: Eye, u: float, v: float) -> wp.vec3:
 def surface_depth(
     height: wp.array2d(dtype=wp.float32), grid: Grid, origin: wp.vec3, ray: wp.vec3, top: float, step: float, far: float
 ) -> float:
-    """Depth at which a ray from above first falls beneath the surface, or -1 if it does not before the depth ``far``."""
+    """Depth at which a ray from above first falls beneath the surface, or -1 if not before ``far``.
+
+    Far above the surface the steps are as long as slopes of 1.2 allow; steeper ones are met a little late.
+    """
     if ray[2] >= -1.0e-3:
         return -1.0
     z = wp.max((top - origin[2]) / ray[2], 0.0)
@@ -313,9 +257,11 @@ def surface_depth(
     gap = x[2] - sample(height, grid, x[0], x[1])
     if gap < 0.0:
         return -1.0
-    stride = step / wp.length(ray)
+    shortest = 0.5 * step / wp.length(ray)
+    closing = 1.0 / (1.2 * wp.sqrt(ray[0] * ray[0] + ray[1] * ray[1]) - ray[2])
     while z < far:
         before = gap
+        stride = wp.max(shortest, gap * closing)
         z += stride
         x = origin + ray * z
         gap = x[2] - sample(height, grid, x[0], x[1])
@@ -345,13 +291,12 @@ def illuminate(
     light_out: wp.array2d(dtype=wp.vec3),
     tool_out: wp.array2d(dtype=wp.vec4),
 ):
-    """For each pixel: the light on the soil it shows, and the tool's radiance times its share of the pixel, and that share.
+    """For each pixel: the light on the soil it shows; the tool's radiance times its share of the pixel, and that share.
 
-    The splats say that a pixel shows soil; light is looked up where the pixel's ray meets the surface (at most ``reach``
-    behind their depth), because blobs end a little before or behind it, and at a rim their mean depth lies in the air.
-
-    Soil hides the tool where both say so: the smooth surface runs on behind a blade that holds soil back, and single blobs
-    stand out from the soil that a blade touches.
+    The splats say that a pixel shows soil; light is looked up where the pixel's ray meets the surface (at most
+    ``reach`` behind their depth), because blobs end a little before or behind it, and at a rim their mean depth lies in
+    the air. Soil hides the tool where both say so: the smooth surface runs on behind a blade that holds soil back, and
+    single blobs stand out from the soil that a blade touches.
     """
     i, j = wp.tid()
     ray = pixel_ray(eye, float(j) + 0.5, float(i) + 0.5)

@@ -1,15 +1,15 @@
 """Sun and sky.
 
-The colour carried by Gaussians is albedo, in units of the colour that level, open, sunlit soil shows: linear radiance is
-albedo times
+The colour carried by Gaussians is albedo, in units of the colour that level, open, sunlit soil shows: linear radiance
+is albedo times
 
     E = ambient · openness + (1 − ambient) · max(n·l, 0)/l_z · visible + bounced      (per channel)
 
 with n the surface's normal, l the direction to the sun, openness the share of a uniform sky (weighted by the cosine)
-that soil and tool leave open, visible the share of the sun that they let through, and bounced the light that comes from
-the soil and the tool which stand in the sky's way. E is 1 on level ground, so the images' exposure and white balance
-stay inside the albedo, and a direction and an ambient share a channel describe the light. All of this is in linear
-colour, which sRGB images are turned into first: sums of light in sRGB would be wrong.
+that soil and tool leave open, visible the share of the sun that they let through, and bounced the light that comes
+from the soil and the tool which stand in the sky's way. E is 1 on level ground, so the images' exposure and white
+balance stay inside the albedo, and a direction and an ambient share a channel describe the light. All of this is in
+linear colour, which sRGB images are turned into first: sums of light in sRGB would be wrong.
 """
 
 from __future__ import annotations

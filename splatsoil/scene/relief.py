@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +18,7 @@ import torch.nn.functional as functional
 import warp as wp
 from torch import Tensor
 
+from splatsoil.scene import kernels
 from splatsoil.splats.warp_torch import as_warp, launch
 
 FloatArray = npt.NDArray[np.float64]
@@ -95,6 +97,14 @@ class Relief:
         """How far points (n, 3) lie below the surface, measured along its normal, m; negative above it."""
         gap = self.sample(self.height, points) - points[:, 2]
         return gap * self.sample(self.normal[..., 2], points)
+
+
+def grid_of(relief: Relief) -> Any:
+    """Where the relief's maps lie, in the kernels' form."""
+    grid = kernels.Grid()
+    grid.x0, grid.y0 = relief.origin
+    grid.inverse_x, grid.inverse_y = 1.0 / relief.cell[0], 1.0 / relief.cell[1]
+    return grid
 
 
 def relief_of_particles(

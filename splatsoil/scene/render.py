@@ -16,8 +16,9 @@ from splatsoil.measurement import Bed, Camera, Measurement
 from splatsoil.scene import kernels
 from splatsoil.scene.binding import Binding
 from splatsoil.scene.light import Light, encoded, linear
-from splatsoil.scene.lit import LitRelief, ToolBody, ceiling, eye_of, grid_of, light_relief, march_step
-from splatsoil.scene.relief import Relief, relief_of_particles
+from splatsoil.scene.lit import LitRelief, ceiling, light_relief, march_step
+from splatsoil.scene.relief import Relief, grid_of, relief_of_particles
+from splatsoil.scene.tool import ToolBody, eye_of
 from splatsoil.splats import Gaussians, rasterise_features
 from splatsoil.splats.warp_torch import as_warp, launch
 
@@ -25,7 +26,7 @@ FloatArray = npt.NDArray[np.float64]
 FloatImage = npt.NDArray[np.float32]
 Pose = tuple[npt.ArrayLike, npt.ArrayLike]
 
-PARTICLE_SIZE = 0.5
+PARTICLE_SIZE = 0.4
 """Standard deviation of a particle's own Gaussian in particle spacings."""
 
 PARTICLE_OPACITY = 0.95
@@ -128,7 +129,7 @@ class Scene:
     def from_reconstruction(
         cls, reconstruction: Any, measurement: Measurement, particles: Any, spacing: float, **options: Any
     ) -> Scene:
-        """A scene from photographs of the undisturbed bed: light estimated, colours turned into albedo, Gaussians bound.
+        """A scene from photographs of the undisturbed bed: light estimated, albedo taken from colours, Gaussians bound.
 
         Args:
             reconstruction: has ``gaussians`` (sRGB colours) and masks ``soil`` and ``tool`` (n,).
@@ -136,7 +137,7 @@ class Scene:
             particles: (p, 3) at rest, m: those that will move.
             spacing: side of the cube of soil a particle stands for, m.
             options: ``light`` (a `Light`; estimated if left out), ``device``, ``rounds`` (of refining the albedo),
-                ``background`` (3,) sRGB.
+                ``background`` (3,) sRGB (the reconstruction's if left out).
         """
         from splatsoil.scene.build import build_scene
 
@@ -195,8 +196,13 @@ class Scene:
         drawn = rasterise_features(
             posed.centres, posed.covariances, posed.opacities, features, camera, background=behind
         )
-        colour, soil, depth = drawn.image[..., :3], drawn.image[..., 3].contiguous(), drawn.image[..., 4]
-        depth = torch.where(drawn.alpha > 0.3, depth / drawn.alpha.clamp_min(0.3), 0.0).contiguous()
+        covered = drawn.alpha.clamp_min(1e-3)
+        depth = torch.where(drawn.alpha > 0.3, drawn.image[..., 4] / covered, 0.0).contiguous()
+        # Soil is opaque: what shines through between its Gaussians is not there.
+        ground = (drawn.alpha > 0.3) & (drawn.image[..., 3] > 0.5 * drawn.alpha)
+        filled = drawn.image[..., :4] - (1.0 - drawn.alpha[..., None]) * behind[:4]
+        seen = torch.where(ground[..., None], filled / covered[..., None], drawn.image[..., :4])
+        colour, soil = seen[..., :3], seen[..., 3].contiguous()
         unhidden = _tool_among_splats(posed, camera)
         light, tool = _illuminated(posed.lit, camera, depth, soil, unhidden, self.tool_albedo, _REACH * self.spacing)
         return Layers(colour, soil, depth, light, tool)
