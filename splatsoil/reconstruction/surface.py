@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 Report = Callable[[str, float], None]
 
 RIM = 0.04  # width of what is taken to border the bed (a bin's wall), in square roots of the bed's area
-# How many times better the soil's level must explain the surroundings than the bed's floor to be taken for their height.
+# How many times better the soil's level must explain the surroundings than the bed's floor, to be their height.
 LEVEL_GAIN = 1.5
 NEIGHBOURS = 24  # Gaussians that a height is drawn from
 
