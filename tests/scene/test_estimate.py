@@ -1,0 +1,36 @@
+"""The light is found again from colours it has made, over soil with blotches."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from scipy.ndimage import gaussian_filter
+
+from splatsoil.scene import Light, Relief, ToolBody, light_relief
+from splatsoil.scene.estimate import fit_light
+
+
+@pytest.mark.parametrize(
+    ("azimuth", "elevation", "ambient"), [(145.0, 53.0, 0.6), (-60.0, 35.0, 0.4), (20.0, 65.0, 0.5)]
+)
+def test_light_is_found_from_slopes_and_a_shadow(azimuth, elevation, ambient):
+    generator = np.random.default_rng(4)
+    ny, nx, cell = 110, 160, 0.005
+    heights = 0.1 + 0.06 * gaussian_filter(generator.normal(size=(ny, nx)), 10.0) / 0.03 * 0.12
+    relief = Relief.of_heights(torch.tensor(heights, dtype=torch.float32), (0.0, 0.0), (cell, cell))
+    tool = ToolBody(trimesh.creation.box((0.012, 0.12, 0.12)))
+    place = tool.at(np.eye(3), (0.4, 0.27, 0.21))
+    truth = Light.from_angles(azimuth, elevation, [ambient, ambient + 0.03, ambient + 0.08])
+    blotches = gaussian_filter(generator.normal(size=(ny, nx)), 3.0)
+    albedo = np.exp(0.12 * blotches / blotches.std())[..., None] * np.array([0.69, 0.55, 0.37])
+    points = relief.points.reshape(-1, 3)
+    light = light_relief(relief, truth, place).irradiance(points, 0.001).numpy()
+    noise = 1.0 + 0.01 * generator.normal(size=(len(points), 3))
+    colours = torch.tensor(albedo.reshape(-1, 3) * light * noise, dtype=torch.float32)
+    found = fit_light(points, colours, (ny, nx), relief, place)
+    angle = np.degrees(np.arccos(np.clip(found.light.direction @ truth.direction, -1.0, 1.0)))
+    assert angle < 1.5
+    assert np.allclose(found.light.ambient, truth.ambient, atol=0.05)
+    assert np.allclose(found.light.level, [0.69, 0.55, 0.37], rtol=0.12)
+    assert found.explained > 0.05
+    assert 0.01 < found.shadowed < 0.2

@@ -1,0 +1,123 @@
+"""Light on simple surfaces against closed forms."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from splatsoil.errors import ParameterError
+from splatsoil.scene import Light, Relief, ToolBody, encoded, light_relief, linear
+from splatsoil.scene.lit import sun_on_points
+from splatsoil.scene.sky import sky_openness
+
+CELL = 0.005
+
+
+def surface(height, size=(120, 160)):
+    """A relief of height(x, y) around the origin."""
+    y, x = np.meshgrid(
+        (np.arange(size[0]) - size[0] / 2) * CELL, (np.arange(size[1]) - size[1] / 2) * CELL, indexing="ij"
+    )
+    values = torch.tensor(np.broadcast_to(height(x, y), x.shape).copy(), dtype=torch.float32)
+    return Relief.of_heights(values, (float(x[0, 0]), float(y[0, 0])), (CELL, CELL))
+
+
+NONE = ToolBody(None).absent()
+
+
+def at(relief, values, x, y):
+    return float(relief.sample(values, torch.tensor([[x, y]])))
+
+
+def test_srgb_encoding_matches_the_standard():
+    # IEC 61966-2-1: the middle grey of sRGB 118 is 18.1 % linear; black, white and the break are fixed points
+    assert float(linear(torch.tensor(118 / 255))) == pytest.approx(0.1812, abs=2e-4)
+    values = torch.linspace(0.0, 1.0, 101)
+    assert torch.allclose(linear(encoded(values)), values, atol=1e-6)
+    assert torch.allclose(encoded(torch.tensor([0.0, 0.0031308, 1.0])), torch.tensor([0.0, 0.04045, 1.0]), atol=1e-5)
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.2, -0.4])
+def test_plane_is_lit_by_lamberts_law(slope):
+    relief = surface(lambda x, y: slope * x)
+    light = Light.from_angles(30.0, 50.0, [0.3, 0.5, 0.7])
+    lit = light_relief(relief, light, NONE)
+    normal = np.array([-slope, 0.0, 1.0]) / math.hypot(slope, 1.0)
+    direct = normal @ light.direction / light.direction[2]
+    expected = light.ambient + (1.0 - light.ambient) * direct
+    assert np.allclose(lit.irradiance(torch.tensor([[0.0, 0.0, 0.0]])).numpy()[0], expected, atol=5e-3)
+
+
+@pytest.mark.parametrize("distance", [0.03, 0.06, 0.12])
+def test_sky_over_ground_before_a_long_wall(distance):
+    # View factor of a level patch to an endless strip that ends at elevation t: (1 - cos t) / 2.
+    wall = 0.08
+    relief = surface(lambda x, y: np.where(x > 0.0, wall, 0.0), (400, 160))
+    openness, hidden = sky_openness(relief, NONE)
+    elevation = math.atan2(wall, distance)
+    # 12 directions and steps of a fifth cost up to 0.025; no occlusion at all would be off by 0.32, 0.2 and 0.08
+    assert at(relief, openness, -distance, 0.0) == pytest.approx(0.5 * (1 + math.cos(elevation)), abs=0.03)
+    assert float(hidden.max()) == 0.0
+
+
+def test_sky_under_a_plate():
+    # View factor of a level patch to a parallel square plate of half side a, straight above at height h.
+    a, h = 0.06, 0.05
+    plate = ToolBody(trimesh.creation.box((2 * a, 2 * a, 0.004)))
+    _, hidden = sky_openness(surface(lambda x, y: 0.0 * x), plate.at(np.eye(3), (0.0, 0.0, h + 0.002)))
+    s = a / h
+    quarter = 2 * s / math.sqrt(1 + s * s) * math.atan(s / math.sqrt(1 + s * s)) / (2 * math.pi)
+    relief = surface(lambda x, y: 0.0 * x)
+    assert at(relief, hidden, 0.0, 0.0) == pytest.approx(4 * quarter, abs=0.03)
+    assert at(relief, hidden, 0.35, 0.0) < 0.02
+
+
+@pytest.mark.parametrize(("azimuth", "elevation"), [(0.0, 40.0), (120.0, 55.0), (-75.0, 30.0)])
+def test_shadow_of_a_box_lands_where_geometry_says(azimuth, elevation):
+    side, lift = 0.04, 0.06
+    box = ToolBody(trimesh.creation.box((side, side, side)))
+    light = Light.from_angles(azimuth, elevation, 0.5)
+    lit = light_relief(surface(lambda x, y: 0.0 * x), light, box.at(np.eye(3), (0.0, 0.0, lift)))
+    generator = np.random.default_rng(0)
+    points = np.concatenate([generator.uniform(-0.25, 0.25, (4000, 2)), np.zeros((4000, 1))], axis=1)
+    # Slab test of the ray towards the sun against the box, in closed form.
+    lower, upper = np.array([-side / 2] * 2 + [lift - side / 2]), np.array([side / 2] * 2 + [lift + side / 2])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        crossings = np.stack([(lower - points) / light.direction, (upper - points) / light.direction])
+    margin = crossings.max(axis=0).min(axis=1) - crossings.min(axis=0).max(axis=1)
+    shadow = sun_on_points(lit, torch.tensor(points, dtype=torch.float32)).numpy()
+    clear = np.abs(margin) > 0.002
+    assert (margin > 0.002).sum() > 30
+    assert np.array_equal(shadow[clear] < 0.5, margin[clear] > 0)
+
+
+def test_shadow_of_a_step_ends_at_height_over_tangent():
+    height, elevation = 0.06, 35.0
+    relief = surface(lambda x, y: np.where(x < 0.0, height, 0.0))
+    lit = light_relief(relief, Light.from_angles(180.0, elevation, 0.5), NONE)
+    row = lit.visible[60].numpy()
+    x = relief.points[60, :, 0].numpy()
+    dark = x[(row < 0.5) & (x > 0.0)]
+    assert dark.max() == pytest.approx(height / math.tan(math.radians(elevation)), abs=1.5 * CELL)
+    assert np.all(row[(x > 0.01) & (x < 0.07)] < 0.05)
+
+
+def test_trench_walls_light_each_other_in_the_soils_colour():
+    trench = surface(lambda x, y: np.where(np.abs(x) < 0.03, -0.08, 0.0))
+    light = Light.from_angles(0.0, 60.0, 0.5, level=np.array([0.6, 0.4, 0.2]))
+    lit = light_relief(trench, light, NONE)
+    inside = lit.relief.sample(lit.bounced, torch.tensor([[0.0, 0.0]]))[0]
+    outside = lit.relief.sample(lit.bounced, torch.tensor([[0.25, 0.0]]))[0]
+    assert float(inside[0]) > 0.05
+    assert float(outside[0]) < 0.01
+    # more than in proportion to the colour: light that has been back and forth has it twice
+    assert float(inside[0] / inside[2]) > 3.0
+
+
+def test_impossible_lights_are_refused():
+    with pytest.raises(ParameterError, match="horizon"):
+        Light(np.array([1.0, 0.0, 0.0]), np.full(3, 0.5))
+    with pytest.raises(ParameterError, match="ambient"):
+        Light(np.array([0.0, 0.0, 1.0]), np.full(3, 1.5))
