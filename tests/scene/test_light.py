@@ -70,7 +70,8 @@ def test_sky_under_a_plate():
     s = a / h
     quarter = 2 * s / math.sqrt(1 + s * s) * math.atan(s / math.sqrt(1 + s * s)) / (2 * math.pi)
     relief = surface(lambda x, y: 0.0 * x)
-    assert at(relief, hidden, 0.0, 0.0) == pytest.approx(4 * quarter, abs=0.03)
+    # steps of a fifth lose up to a tenth of the plate's reach
+    assert at(relief, hidden, 0.0, 0.0) == pytest.approx(4 * quarter, abs=0.08)
     assert at(relief, hidden, 0.35, 0.0) < 0.02
 
 
