@@ -1,9 +1,9 @@
 """What do the pictures say? The loss over friction angles, from photographs, beside the renderer's own floor.
 
 ``python -m splatsoil.benchmarks.landscape examples/plow-dry --device cuda:0`` reconstructs the set, simulates each
-angle with each particle seed, compares all frames, and prints the losses and the angle of the least. Where a set carries its
-true particles, these are drawn through the same scene: what the loss leaves then is the renderer's floor, and what it
-leaves beyond that is the soil's.
+angle with each particle seed, compares all frames, and prints the losses and the angle of the least. Where a set
+carries its true particles, these are drawn through the same scene: what the loss leaves then is the renderer's floor,
+and what it leaves beyond that is the soil's.
 """
 
 from __future__ import annotations

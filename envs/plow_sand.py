@@ -81,7 +81,7 @@ class PlowSandEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         n, b = len(self.problem.space), self.problem.block_count
         box = gym.spaces.Box
         self.action_space = box(-1.0, 1.0, (n,), np.float32)
-        self.observation_space = gym.spaces.Dict(
+        self.observation_space = gym.spaces.Dict(  # type: ignore[assignment]
             {
                 "best_parameters": box(-1.0, 1.0, (n,), np.float32),
                 "best_loss": box(0.0, self.problem.worst_loss, (1,), np.float32),
@@ -130,7 +130,7 @@ class PlowSandEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             raise gym.error.ResetNeeded("the budget of evaluations is spent; call reset() to start another episode")
         guess = np.array(action, dtype=np.float32).reshape(-1)
         if guess.shape != self.action_space.shape or not np.all(np.isfinite(guess)):
-            raise ParameterError(f"action: expected {self.action_space.shape[0]} finite numbers, got {action}")
+            raise ParameterError(f"action: expected {len(self.problem.space)} finite numbers, got {action}")
         guess = np.clip(guess, -1.0, 1.0)
         parameters = self.problem.space.to_dict(self.problem.space.from_unit(guess))
         seed = self.simulation_seed(self.budget - self._left)
@@ -177,7 +177,7 @@ class PlowSandEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             "evaluations_left": np.array([self._left], dtype=np.float32),
         }
 
-    def render(self) -> npt.NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> npt.NDArray[np.uint8] | None:
         """(h, 3w, 3): observed | predicted | difference (grey: none); what isn't there yet is black."""
         if self.render_mode is None:
             return None

@@ -49,10 +49,14 @@ class Problem(Protocol):
         image_size: (height, width) of the pictures.
     """
 
-    space: ParameterSpace
-    block_count: int
-    worst_loss: float
-    image_size: tuple[int, int]
+    @property
+    def space(self) -> ParameterSpace: ...
+    @property
+    def block_count(self) -> int: ...
+    @property
+    def worst_loss(self) -> float: ...
+    @property
+    def image_size(self) -> tuple[int, int]: ...
 
     def begin(self, seed: int) -> None:
         """Start an episode: a synthetic experiment draws its hidden truth here."""

@@ -292,7 +292,7 @@ class World:
         particles = self.particles(0)
         return self.pictures(particles, [particles] * len(COMPARED), [None] * len(COMPARED))
 
-    def pictures(self, particles: FloatArray, positions: Sequence[Any], deformations: Sequence[Any]) -> Image:
+    def pictures(self, particles: FloatArray, positions: Image, deformations: Image) -> Image:
         """Pictures (k, h, w, 3), camera by camera, of particles that have moved and deformed."""
         scene = self.scene(particles)
         motion = self.measurement.tool.motion

@@ -76,7 +76,10 @@ class BayesianOptimiser:
         """
         good = self._succeeded()
         return Surrogate(
-            [t.action for t in good], [t.loss for t in good], noise_std=self.noise_std, seed=self._stream(0)
+            [t.action for t in good],
+            [t.loss for t in good if t.loss is not None],
+            noise_std=self.noise_std,
+            seed=self._stream(0),
         )
 
     def result(self) -> Minimum:

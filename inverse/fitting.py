@@ -281,7 +281,6 @@ def summarise(
         "loss": minimum.loss,
         "loss_std": minimum.loss_std,
         "noise_std": minimum.noise_std,
-        "informative": minimum.informative,
         "evaluations": len(records),
         "failed": len(records) - len(done),
         "best": {"parameters": dict(best.parameters), "loss": best.loss, "step": best.step},
@@ -347,6 +346,7 @@ def _estimate(parameter: Parameter, index: int, minimum: Minimum, space: Paramet
         "title": parameter.title,
         "bounds": [parameter.lower, parameter.upper],
         "at_bound": minimum.at_bound[index],
+        "determined": minimum.determined[index],
     }
 
 

@@ -66,7 +66,7 @@ class Density:
         known = noise is not None
         self.means = np.array([length_mean] * self.n + [0.0] + ([] if known else [NOISE_MEAN]))
         self.stds = np.array([LENGTH_STD] * self.n + [1.0] + ([] if known else [NOISE_STD]))
-        self.bounds = np.array([LENGTH_BOUNDS] * self.n + [(-8.0, 8.0)] + ([] if known else [NOISE_BOUNDS]))
+        self.bounds: FloatArray = np.array([LENGTH_BOUNDS] * self.n + [(-8.0, 8.0)] + ([] if known else [NOISE_BOUNDS]))
 
     def prior(self, points: FloatArray) -> FloatArray:
         """(w, d) to (w,): log prior density, −∞ out of bounds."""

@@ -57,14 +57,14 @@ class Minimum:
     Attributes:
         estimate: (n,) minimiser of the posterior mean, in [-1, 1]^n.
         std: (n,) distance from the estimate that holds 68.3 % of the minimisers of posterior sample paths; their
-            root mean square distance when the evaluations aren't informative.
+            root mean square distance along an axis that isn't determined.
         low: (n,) 5 % quantile of those minimisers.
         high: (n,) 95 % quantile.
         loss: posterior mean at the estimate.
         loss_std: posterior standard deviation of the (noise-free) loss there.
         noise_std: standard deviation of one evaluation's noise.
         at_bound: for each axis ``lower`` or ``upper`` when the estimate lies on that bound, else None.
-        informative: False when the evaluations hardly say where the minimum is along any axis.
+        determined: for each axis, False when the evaluations hardly say where along it the minimum is.
     """
 
     estimate: FloatArray
@@ -75,7 +75,7 @@ class Minimum:
     loss_std: float
     noise_std: float
     at_bound: tuple[Literal["lower", "upper"] | None, ...]
-    informative: bool
+    determined: tuple[bool, ...]
 
 
 class Surrogate:
@@ -175,8 +175,8 @@ class Surrogate:
         # would be ruled by the few paths that dip in a gap between evaluations.
         distances = np.abs(minimisers - estimate)
         spread = np.sqrt(np.mean(distances**2, axis=0))
-        informative = not self.constant and bool(np.any(spread < UNINFORMED * UNIFORM_STD))
-        std = np.quantile(distances, 0.683, axis=0) if informative else spread
+        determined = (spread < UNINFORMED * UNIFORM_STD) & (not self.constant)
+        std = np.where(determined, np.quantile(distances, 0.683, axis=0), spread)
         low, high = np.quantile(minimisers, [0.05, 0.95], axis=0)
         return Minimum(
             estimate=estimate,
@@ -187,7 +187,7 @@ class Surrogate:
             loss_std=float(loss_std[0]),
             noise_std=self.noise_std,
             at_bound=tuple(_bound(value) for value in estimate),
-            informative=informative,
+            determined=tuple(bool(d) for d in determined),
         )
 
     def _minimise_mean(self, seed: int) -> FloatArray:
@@ -219,7 +219,7 @@ class Surrogate:
         x = torch.from_numpy(0.5 * (grid[:, None] + 1.0))
         with torch.no_grad(), quiet():
             given = self.ensemble.posterior(x)
-            mean, covariance = given.mean, given.distribution.covariance_matrix
+            mean, covariance = given.mean, given.distribution.covariance_matrix  # type: ignore[union-attr]
         # A draw is mean + V √λ z; an RBF's covariance is singular to machine precision, which Cholesky minds.
         eigenvalues, vectors = torch.linalg.eigh(covariance)
         with seeded(seed):
@@ -236,7 +236,7 @@ class Surrogate:
         bounds = torch.tensor([[0.0] * self.dimension, [1.0] * self.dimension], dtype=torch.float64)
         with seeded(seed), quiet():
             paths = draw_matheron_paths(self.ensemble, torch.Size([PATHS_ND]))
-            best, _ = optimize_posterior_samples(paths, bounds, raw_samples=128, num_restarts=2)
+            best, _ = optimize_posterior_samples(paths, bounds, raw_samples=128, num_restarts=2)  # type: ignore[arg-type]
         return 2.0 * best.detach().reshape(-1, self.dimension).numpy() - 1.0
 
 

@@ -46,7 +46,7 @@ def _draw(draw: Any, size: tuple[float, float] = SIZE) -> str:
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
 
-    with mpl.rc_context(STYLE):
+    with mpl.rc_context(STYLE):  # type: ignore[arg-type]
         figure = Figure(figsize=size, layout="constrained")
         FigureCanvasSVG(figure)
         draw(figure, figure.subplots())
@@ -117,7 +117,7 @@ def surface_map(surface: Surface) -> str:
         extent = (surface.x[0] - half_x, surface.x[-1] + half_x, surface.y[0] - half_y, surface.y[-1] + half_y)
         image = axes.imshow(1e3 * surface.height, origin="lower", extent=extent, cmap="cividis")
         bar = figure.colorbar(image, ax=axes, shrink=0.9, pad=0.02)
-        bar.outline.set_visible(False)  # type: ignore[operator]
+        bar.outline.set_visible(False)
         bar.set_label("height [mm]")
         axes.set_xlabel("x [m]")
         axes.set_ylabel("y [m]")

@@ -55,9 +55,9 @@ def answers(fit: Mapping[str, Any]) -> list[Answer]:
         value, std = with_std(entry["estimate"], entry["std"])
         plain = name.replace("_", " ")
         state, remark = "determined", ""
-        if not fit["informative"]:
+        if not entry["determined"]:
             state = "open"
-            remark = f"These pictures do not determine the {plain}: the loss hardly depends on it."
+            remark = f"These evaluations do not determine the {plain}: they hardly say where the loss is least."
         elif entry["at_bound"] is not None:
             state = "bound"
             remark = (

@@ -18,8 +18,8 @@ def as_warp(tensor: Tensor, dtype: Any) -> Any:
     return wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=False)
 
 
-def launch(kernel: Any, count: int, inputs: list[Any], like: Tensor, block: int = 256) -> None:
-    """Run ``count`` threads of a kernel where ``like`` lives, on torch's current stream."""
+def launch(kernel: Any, count: int | tuple[int, ...], inputs: list[Any], like: Tensor, block: int = 256) -> None:
+    """Run ``count`` threads (along one or more axes) of a kernel where ``like`` lives, on torch's current stream."""
     if like.is_cuda:
         stream = wp.stream_from_torch(like.device)
         wp.launch(kernel, dim=count, inputs=inputs, device=stream.device, stream=stream, block_dim=block)
