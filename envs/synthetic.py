@@ -7,7 +7,7 @@ loss is chance and not zero. It is a toy for trying agents on; an answer about r
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -292,7 +292,7 @@ class World:
         particles = self.particles(0)
         return self.pictures(particles, [particles] * len(COMPARED), [None] * len(COMPARED))
 
-    def pictures(self, particles: FloatArray, positions: Image, deformations: Image) -> Image:
+    def pictures(self, particles: FloatArray, positions: Iterable[Any], deformations: Iterable[Any]) -> Image:
         """Pictures (k, h, w, 3), camera by camera, of particles that have moved and deformed."""
         scene = self.scene(particles)
         motion = self.measurement.tool.motion
