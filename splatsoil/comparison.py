@@ -105,7 +105,8 @@ class Comparator:
 
     Args:
         measurement: video, cameras, bed, tool.
-        surface: the undisturbed surface, to know which pixels show the bed; by default the middle of the bed's height.
+        surface: the undisturbed surface, to know which pixels show the bed.
+        level: its mean height in m, instead of the surface; by default the middle of the bed's box.
         frames: frames to compare; all from the first on by default. The first one in the video is what changes refer to
             and has no loss of its own.
         cameras: names; all by default.
@@ -119,6 +120,7 @@ class Comparator:
         measurement: Measurement,
         *,
         surface: HeightField | None = None,
+        level: float | None = None,
         frames: Iterable[int] | None = None,
         cameras: Iterable[str] | None = None,
     ) -> None:
@@ -126,12 +128,10 @@ class Comparator:
         self.reference = int(measurement.frames[0])
         self.cameras = tuple(measurement.cameras) if cameras is None else tuple(cameras)
         chosen = measurement.frames if frames is None else tuple(sorted({int(f) for f in frames}))
-        unknown = (
-            [f for f in chosen if f not in measurement.frames],
-            [c for c in self.cameras if c not in measurement.cameras],
-        )
-        if any(unknown):
-            raise ParameterError(f"the video has no {', '.join(map(str, unknown[0] + unknown[1]))}")
+        unknown = [str(f) for f in chosen if f not in measurement.frames]
+        unknown += [c for c in self.cameras if c not in measurement.cameras]
+        if unknown:
+            raise ParameterError(f"the video has no {', '.join(unknown)}")
         self.frames = tuple(f for f in chosen if f != self.reference)
         if not self.frames or not self.cameras:
             raise ParameterError("there is nothing to compare: name a camera and a frame after the first")
@@ -142,8 +142,9 @@ class Comparator:
             for c in self.cameras
             for f in (self.reference, *self.frames)
         }
-        level = float(np.mean([measurement.bed.lower[2], measurement.bed.upper[2]]))
-        level = level if surface is None else float(np.nanmean(surface.height))
+        if level is None:
+            middle = np.mean([measurement.bed.lower[2], measurement.bed.upper[2]])
+            level = float(middle if surface is None else np.nanmean(surface.height))
         self._plane = {c: _on_plane(camera, level) for c, camera in self._views.items()}
         self.interior = {c: self._inside(c) for c in self.cameras}
         self._still = {

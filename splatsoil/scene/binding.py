@@ -127,7 +127,9 @@ def bounded_deformation(f: wp.mat33, smallest: float, largest: float) -> wp.mat3
 
 
 @wp.kernel(enable_backward=False)
-def _hold(deformations: wp.array(dtype=wp.mat33), smallest: float, largest: float, held: wp.array(dtype=wp.mat33)):
+def _hold(
+    deformations: wp.array(dtype=wp.mat33), smallest: float, largest: float, held: wp.array(dtype=wp.mat33)
+) -> None:
     p = wp.tid()
     held[p] = bounded_deformation(deformations[p], smallest, largest)
 
@@ -146,7 +148,7 @@ def _carry(
     largest: float,
     centres_out: wp.array(dtype=wp.vec3),
     covariances_out: wp.array(dtype=wp.mat33),
-):
+) -> None:
     g = wp.tid()
     x = wp.vec3()
     f = wp.mat33()

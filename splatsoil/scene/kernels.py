@@ -130,7 +130,7 @@ def tool_columns(
     floor: float,
     bottom: wp.array2d(dtype=wp.float32),
     top: wp.array2d(dtype=wp.float32),
-):
+) -> None:
     """Lowest and highest point of the tool over each cell; bottom > top where there is none."""
     i, j = wp.tid()
     x = grid.x0 + float(j) / grid.inverse_x
@@ -153,7 +153,7 @@ def sun_visibility(
     step: float,
     top: float,
     visible: wp.array2d(dtype=wp.float32),
-):
+) -> None:
     """Share of the sun that the soil lets through to each cell."""
     i, j = wp.tid()
     point = wp.vec3(grid.x0 + float(j) / grid.inverse_x, grid.y0 + float(i) / grid.inverse_y, height[i, j])
@@ -187,7 +187,7 @@ def sun_on_points(
     top: float,
     spread: float,
     visible: wp.array(dtype=wp.float32),
-):
+) -> None:
     """Share of the sun that soil and tool let through to any points on the soil."""
     p = wp.tid()
     share = tool_shadow(tool, light, points[p], spread)
@@ -207,7 +207,7 @@ def points_seen(
     top: float,
     slack: float,
     seen: wp.array(dtype=wp.float32),
-):
+) -> None:
     """1 where neither soil (by more than ``slack``) nor tool stands between a point and the eye, else 0."""
     p = wp.tid()
     way = eye - points[p]
@@ -292,7 +292,7 @@ def illuminate(
     reach: float,
     light_out: wp.array2d(dtype=wp.vec3),
     tool_out: wp.array2d(dtype=wp.vec4),
-):
+) -> None:
     """For each pixel: the light on the soil it shows; the tool's radiance times its share of the pixel, and that share.
 
     The splats say that a pixel shows soil; light is looked up where the pixel's ray meets the surface (at most
@@ -347,7 +347,7 @@ def illuminate(
 
 
 @wp.kernel(enable_backward=False)
-def silhouette(eye: Eye, tool: ToolPose, shows: wp.array2d(dtype=wp.uint8)):
+def silhouette(eye: Eye, tool: ToolPose, shows: wp.array2d(dtype=wp.uint8)) -> None:
     """1 for each pixel whose middle would show the tool if nothing hid it."""
     i, j = wp.tid()
     ray = wp.normalize(pixel_ray(eye, float(j) + 0.5, float(i) + 0.5))

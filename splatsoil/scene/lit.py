@@ -140,8 +140,11 @@ def _coarser(relief: Relief) -> Relief:
 
 def _resized(values: Tensor, size: tuple[int, int]) -> Tensor:
     """A map on another number of cells over the same rectangle, averaged when there are fewer."""
-    options = {"size": size, "mode": "bilinear", "align_corners": False, "antialias": size[0] < values.shape[0]}
-    return torch.nn.functional.interpolate(values[None, None], **options)[0, 0].contiguous()
+    shrinking = size[0] < values.shape[0]
+    resized = torch.nn.functional.interpolate(
+        values[None, None], size=size, mode="bilinear", align_corners=False, antialias=shrinking
+    )
+    return resized[0, 0].contiguous()
 
 
 def sun_on_points(lit: LitRelief, points: Tensor, spread: float = 0.0) -> Tensor:

@@ -169,7 +169,7 @@ def _spread(positions: Tensor, low: FloatArray, cell: FloatArray, count: npt.NDA
 @wp.kernel(enable_backward=False)
 def _spread_kernel(
     positions: wp.array(dtype=wp.vec3), low: wp.vec3, inverse: wp.vec3, grid: wp.array3d(dtype=wp.float32)
-):
+) -> None:
     p = wp.tid()
     q = wp.cw_mul(positions[p] - low, inverse)
     edge_x = float(grid.shape[0]) - 7.0

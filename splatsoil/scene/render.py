@@ -185,7 +185,8 @@ class Scene:
         first = int(shown.sum())
         grain_part = slice(first, first + count)
         discs = (x.new_zeros((0, 3)), x.new_zeros((0, 3, 3))) if tool is None else self.tool.discs(*tool)
-        return Posed(*(torch.cat([p[k] for p in parts]) for k in range(3)), features, grain_part, discs, lit)
+        centres, covariances, opacities = (torch.cat([p[k] for p in parts]) for k in range(3))
+        return Posed(centres, covariances, opacities, features, grain_part, discs, lit)
 
     def layers(self, posed: Posed, camera: Camera) -> Layers:
         """What a camera without distortion sees of a posed scene."""

@@ -1,0 +1,188 @@
+"""Pictures of small scenes against what geometry says, and true particles against real frames."""
+
+import os
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from splatsoil.comparison import Comparator
+from splatsoil.measurement import Bed, Camera, Measurement
+from splatsoil.scene import (
+    Light,
+    Scene,
+    ToolBody,
+    bind,
+    encoded,
+    linear,
+    relief_of_particles,
+    seen_colours,
+    still_frames,
+)
+from splatsoil.splats import Gaussians
+
+SPACING = 0.02
+BED = Bed(np.zeros(3), np.array([0.4, 0.4, 0.2]), 1600.0)
+SUN = Light.from_angles(180.0, 45.0, [0.4, 0.5, 0.6])
+ALBEDO = torch.tensor([0.5, 0.4, 0.3])
+TOOL = np.array([0.1, 0.2, 0.6])
+
+
+def nothing():
+    return Gaussians(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, 4), torch.zeros(0), torch.zeros(0, 3))
+
+
+def level_bed(height=0.1):
+    axis = np.arange(SPACING / 2, 0.4, SPACING)
+    levels = np.arange(SPACING / 2, height, SPACING)
+    grid = np.stack(np.meshgrid(axis, axis, levels, indexing="ij"), axis=-1)
+    return torch.tensor(grid.reshape(-1, 3), dtype=torch.float32)
+
+
+def scene_of(particles, light=SUN, mesh=None):
+    y, x = torch.meshgrid(torch.arange(0.005, 0.4, 0.01), torch.arange(0.005, 0.4, 0.01), indexing="ij")
+    relief = relief_of_particles(particles, SPACING, BED.lower, BED.upper)
+    flat = torch.stack([x.reshape(-1), y.reshape(-1)], dim=1)
+    centres = torch.cat([flat, relief.sample(relief.height, flat)[:, None]], dim=1)
+    shape = torch.diag(torch.tensor([0.006, 0.006, 0.001]) ** 2).expand(len(centres), 3, 3).contiguous()
+    albedo = encoded(ALBEDO)
+    return Scene(
+        soil=bind(centres, shape, particles, SPACING),
+        soil_opacity=torch.full((len(centres),), 0.9),
+        soil_albedo=albedo.expand(len(centres), 3).contiguous(),
+        grain_albedo=albedo.expand(len(particles), 3).contiguous(),
+        surroundings=nothing(),
+        light=light,
+        tool=ToolBody(mesh),
+        tool_albedo=TOOL,
+        bed=BED,
+        spacing=SPACING,
+        background=np.zeros(3),
+    )
+
+
+def camera(eye=(0.2, -0.35, 0.6), target=(0.2, 0.2, 0.1), size=(120, 90)):
+    back = np.subtract(eye, target) / np.linalg.norm(np.subtract(eye, target))
+    right = np.cross([0.0, 0.0, 1.0], back)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(back, right), back], axis=1)
+    pose[:3, 3] = eye
+    return Camera(size[0], size[1], 150.0, 150.0, size[0] / 2, size[1] / 2, pose, model="PINHOLE")
+
+
+def pixel(view, point):
+    (u, v), _ = (a[0] for a in view.project([point]))
+    return int(v), int(u)
+
+
+def test_level_soil_shows_its_albedo():
+    bed, view = level_bed(), camera()
+    image = scene_of(bed).render(bed, None, None, view)
+    assert np.allclose(image[pixel(view, (0.2, 0.2, 0.1))], encoded(ALBEDO).numpy(), atol=0.01)
+
+
+def test_soil_in_the_shadow_of_a_box_keeps_the_sky_alone():
+    bed, view = level_bed(), camera()
+    box = trimesh.creation.box((0.08, 0.08, 0.02))
+    # 0.15 m above the soil under a sun at 45 degrees over -x: the shadow's middle is 0.15 m further along +x
+    scene = scene_of(bed, mesh=box)
+    image = scene.render(bed, None, (np.eye(3), np.array([0.12, 0.2, 0.25])), view)
+    shade = linear(torch.tensor(image[pixel(view, (0.27, 0.2, 0.1))])).numpy()
+    expected = ALBEDO.numpy() * SUN.ambient
+    assert np.all(np.abs(shade / expected - 1.0) < 0.12)
+    lit = linear(torch.tensor(image[pixel(view, (0.37, 0.1, 0.1))])).numpy()
+    assert np.all(np.abs(lit / ALBEDO.numpy() - 1.0) < 0.08)
+
+
+def test_tool_hides_soil_and_soil_hides_tool():
+    bed, view = level_bed(), camera()
+    box = trimesh.creation.box((0.1, 0.02, 0.1))
+    scene = scene_of(bed, mesh=box)
+    for depth, shows in ((0.16, True), (0.04, False)):
+        centre = (0.2, 0.2, depth)
+        image = scene.render(bed, None, (np.eye(3), np.array(centre)), view)
+        colour = image[pixel(view, (0.2, 0.19, depth))]
+        assert (colour[2] > colour[0]) == shows
+
+
+def test_background_is_seen_past_the_bed():
+    bed, view = level_bed(), camera()
+    scene = scene_of(bed).replace(background=np.array([0.2, 0.3, 0.4]))
+    assert np.allclose(scene.render(bed, None, None, view)[0, 0], [0.2, 0.3, 0.4], atol=1e-6)
+
+
+def test_lifting_all_soil_is_moving_the_camera_down():
+    bed = level_bed()
+    scene = scene_of(bed)
+    lifted = scene.render(bed + torch.tensor([0.0, 0.0, 0.03]), None, None, camera())
+    lowered = scene.render(bed, None, None, camera((0.2, -0.35, 0.57), (0.2, 0.2, 0.07)))
+    middle = np.s_[30:60, 40:80]
+    assert np.abs(lifted[middle] - lowered[middle]).max() < 0.02
+
+
+def test_the_same_call_gives_the_same_bits():
+    bed, view = level_bed(), camera()
+    scene = scene_of(bed)
+    assert np.array_equal(scene.render(bed, None, None, view), scene.render(bed, None, None, view))
+
+
+def coloured_surface(measurement, particles, spacing, cell=0.004):
+    """A reconstruction's stand-in: flat Gaussians on the particles' surface, coloured by the photographs."""
+    relief = relief_of_particles(particles, spacing, measurement.bed.lower, measurement.bed.upper)
+    low, high = measurement.bed.lower, measurement.bed.upper
+    axes = [torch.arange(low[k] + cell / 2, high[k], cell, dtype=torch.float32) for k in (1, 0)]
+    y, x = torch.meshgrid(*axes, indexing="ij")
+    flat = torch.stack([x.reshape(-1), y.reshape(-1)], dim=1)
+    points = torch.cat([flat, relief.sample(relief.height, flat)[:, None]], dim=1)
+    motion = measurement.tool.motion
+    body = ToolBody(measurement.tool.mesh)
+    colours, _ = seen_colours(points, still_frames(measurement), relief, body.at(*motion.pose(float(motion.times[0]))))
+    colours = torch.where(torch.isfinite(colours), colours, torch.nanmedian(colours, dim=0).values)
+    normal = torch.nn.functional.normalize(relief.sample(relief.normal, points), dim=1)
+    turn = torch.stack([1 + normal[:, 2], -normal[:, 1], normal[:, 0], torch.zeros(len(points))], dim=1)
+    scales = torch.tensor([0.6, 0.6, 0.1]).mul(cell).expand(len(points), 3).contiguous()
+    gaussians = Gaussians(points, scales, turn, torch.full((len(points),), 0.9), encoded(colours))
+    soil = torch.ones(len(points), dtype=torch.bool)
+    return SimpleNamespace(gaussians=gaussians, soil=soil, tool=~soil, background=(0.0, 0.0, 0.0))
+
+
+@pytest.mark.slow
+def test_true_particles_look_like_the_measured_frames():
+    """The renderer's floor, apart from any physics: an independent simulator's particles, its path-traced frames.
+
+    The bound is well below what is left when light or motion are wrong: both controls must exceed twice the floor.
+    """
+    folder = Path(os.environ.get("SPLATSOIL_EXAMPLES", Path(__file__).parents[2] / "examples")) / "plow-dry"
+    measurement = Measurement.load(folder)
+    stored = np.load(folder / "truth_particles.npz")
+    frames = (0, 50, 100, 150, 199)
+    true = {f: (stored[f"f{f:03d}"] * float(stored["scale"])).astype(np.float32) for f in frames}
+    start, spacing = torch.tensor(true[0]), float(stored["spacing"])
+    reconstruction = coloured_surface(measurement, start, spacing)
+    scene = Scene.from_reconstruction(reconstruction, measurement, start, spacing, rounds=1)
+    # the sun as its shadow shows it in the photographs, measured by hand: azimuth 145, elevation 53 degrees
+    assert abs(scene.light.azimuth - 145.0) < 3.0
+    assert abs(scene.light.elevation - 53.0) < 3.0
+    level = float(relief_of_particles(start, spacing, measurement.bed.lower, measurement.bed.upper).height.mean())
+    comparator = Comparator(measurement, level=level, frames=frames)
+
+    def loss(scene, particles):
+        images = {}
+        for frame in frames:
+            pose = measurement.tool.motion.pose(frame / measurement.frame_rate)
+            posed = scene.pose(particles[frame], None, pose)
+            for name, view in measurement.cameras.items():
+                images[name, frame] = scene.picture(posed, view)
+        return comparator.compare(images)
+
+    floor = loss(scene, true)
+    assert floor.loss < 0.11
+    assert floor.rgb < 85e-5
+    baked = scene.replace(light=Light(scene.light.direction, np.ones(3), scene.light.level))
+    assert loss(baked, true).loss > 2.0 * floor.loss
+    late = dict(zip(frames, (true[0], true[0], true[50], true[100], true[150]), strict=True))
+    assert loss(scene, late).loss > 2.0 * floor.loss

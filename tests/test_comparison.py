@@ -1,0 +1,140 @@
+"""Losses and block residuals of pictures made from the measured ones, so that the right answer is known."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatsoil.comparison import Comparator, compare
+from splatsoil.errors import ParameterError
+from splatsoil.measurement import Measurement
+
+FOLDER = Path(os.environ.get("SPLATSOIL_EXAMPLES", Path(__file__).parents[1] / "examples")) / "plow-dry"
+FRAMES = (0, 50, 100)
+
+
+@pytest.fixture(scope="module")
+def comparator():
+    return Comparator(Measurement.load(FOLDER), level=0.12, frames=FRAMES)
+
+
+@pytest.fixture
+def seen(comparator):
+    """What a perfect model would predict but for noise: the frames, and before anything moved their mean."""
+    images = {key: image.copy() for key, image in comparator.observed.items()}
+    for camera in comparator.cameras:
+        images[camera, 0] = comparator._before[camera].astype(np.float32)
+    return images
+
+
+def patch_of(comparator, camera, x, y):
+    """Pixels of the bed near a place."""
+    return np.linalg.norm(comparator._plane[camera] - [x, y], axis=-1) < 0.06
+
+
+def test_perfect_prediction_leaves_nothing(comparator, seen):
+    found = comparator.compare(seen)
+    assert found.loss == pytest.approx(0.0, abs=1e-9)
+    assert found.rgb == 0.0
+    assert np.allclose(found.blocks, 0.0, atol=1e-4)
+    assert set(found.losses) == {(c, f) for c in ("left", "right") for f in (50, 100)}
+    assert len(found.labels) == len(found.blocks) > 200
+
+
+def test_no_motion_scores_about_one_and_motion_matters_more_than_noise(comparator, seen):
+    still = {}
+    for camera, frame in seen:  # no motion of the soil; the tool, which the unit leaves out, must not stay where it was
+        tool = comparator._shows_tool(camera, 0, seen[camera, 0])[..., None]
+        still[camera, frame] = seen[camera, 0] if frame == 0 else np.where(tool, seen[camera, frame], seen[camera, 0])
+    assert comparator.compare(still).loss == pytest.approx(1.0, abs=0.15)
+    assert 0.0 < comparator.noise < 0.02
+
+
+def test_a_bias_that_was_there_before_anything_moved_cancels(comparator, seen):
+    stripes = 0.05 * np.sin(np.arange(320) / 7.0)[None, :, None].astype(np.float32)
+    found = comparator.compare({key: image + stripes for key, image in seen.items()})
+    # it does not cancel where the tool stood at frame 0
+    assert found.loss < 0.1
+    assert found.rgb == pytest.approx(0.05**2 / 2, rel=0.1)
+
+
+def test_blocks_answer_linearly_and_where_the_change_is(comparator, seen):
+    place = patch_of(comparator, "left", 0.5, 0.12)
+
+    def blocks(amount):
+        images = {key: image.copy() for key, image in seen.items()}
+        images["left", 100][place] -= amount
+        return comparator.compare(images)
+
+    one, two = blocks(0.02), blocks(0.04)
+    assert np.allclose(two.blocks, 2.0 * one.blocks, atol=1e-3)
+    largest = one.labels[int(np.argmax(np.abs(one.blocks)))]
+    assert (largest.camera, largest.frame) == ("left", 100)
+    assert np.hypot(largest.x - 0.5, largest.y - 0.12) < 0.05
+    # a block that lies within the change shows all of it: 0.02 of 255 grey levels, observed minus predicted
+    assert one.blocks.max() == pytest.approx(0.02 * 255, rel=1e-3)
+    assert two.loss > one.loss > 0.0
+    assert [k for k, v in one.losses.items() if v > 1e-9] == [("left", 100)]
+
+
+def test_small_differences_count_by_their_square_and_large_ones_by_their_size(comparator, seen):
+    place = patch_of(comparator, "right", 0.5, 0.3)
+
+    def loss(amount):
+        images = {key: image.copy() for key, image in seen.items()}
+        images["right", 50][place] = images["right", 50][place] - amount
+        return comparator.compare(images).losses["right", 50]
+
+    assert loss(0.004) / loss(0.002) == pytest.approx(4.0, rel=0.02)
+    assert loss(1.0) / loss(0.5) < 2.3
+
+
+def test_fine_noise_is_averaged_out_that_rgb_error_counts(comparator, seen):
+    generator = np.random.default_rng(0)
+    noisy = {k: v + (0.05 * generator.normal(size=v.shape)).astype(np.float32) * (k[1] > 0) for k, v in seen.items()}
+    found = comparator.compare(noisy)
+    assert found.rgb == pytest.approx(0.05**2, rel=0.05)
+    assert found.loss < 0.1
+
+
+def test_the_tool_is_left_out(comparator, seen):
+    painted = {key: image.copy() for key, image in seen.items()}
+    image = painted["left", 100]
+    blue = (image[..., 2] > 1.5 * image[..., 0]) & comparator.interior["left"]
+    assert blue.sum() > 300
+    image[blue] = image[blue] * 0.8
+    assert comparator.compare(painted).loss == pytest.approx(0.0, abs=1e-4)
+
+
+def test_walls_and_ground_are_left_out(comparator, seen):
+    outside = {key: np.where(comparator.interior[key[0]][..., None], image, 0.0) for key, image in seen.items()}
+    assert comparator.compare(outside).rgb == 0.0
+
+
+def test_pictures_side_by_side(comparator, seen):
+    picture = comparator.picture(seen, "left", 100)
+    assert picture.shape == (240, 960, 3)
+    assert np.allclose(picture[:, 640:], 0.5)
+
+
+def test_the_same_pictures_give_the_same_bits(comparator, seen):
+    images = {key: np.roll(image, 3, axis=1) for key, image in seen.items()}
+    first, second = comparator.compare(images), comparator.compare(images)
+    assert first.loss == second.loss
+    assert np.array_equal(first.blocks, second.blocks)
+
+
+def test_what_is_missing_is_named(comparator, seen):
+    del seen["right", 50]
+    with pytest.raises(ParameterError, match="'right' at frame 50"):
+        comparator.compare(seen)
+    with pytest.raises(ParameterError, match="33"):
+        compare(Measurement.load(FOLDER), {}, frames=(0, 33))
+    with pytest.raises(ParameterError, match="top"):
+        compare(Measurement.load(FOLDER), {}, cameras=("top",))
+    with pytest.raises(ParameterError, match="nothing to compare"):
+        compare(Measurement.load(FOLDER), {}, frames=(0,))
+    seen["right", 50] = np.zeros((10, 10, 3), dtype=np.float32)
+    with pytest.raises(ParameterError, match="frame 50"):
+        comparator.compare(seen)
