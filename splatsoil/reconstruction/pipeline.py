@@ -41,7 +41,7 @@ def reconstruct(
 
     Args:
         measurement: the set; its `views` show the bed and the tool at the first pose of its motion.
-        seed: the same seed on the CPU with the same number of threads gives the same bits.
+        seed: the same seed on the CPU gives the same bits.
         device: where the Gaussians are trained, as torch names it.
         preset: how much work; see `presets.PRESETS`.
         holdout: every so many views one is set aside, the first among them, to judge by; 0 sets none aside.
@@ -51,8 +51,20 @@ def reconstruct(
         MeasurementError: too few views.
         ParameterError: an unknown preset, a negative holdout.
     """
+    threads = torch.get_num_threads()
+    # The tensors are small: a second thread saves little on a free machine, costs tenfold on a busy one, and one thread
+    # gives the same bits everywhere.
+    torch.set_num_threads(1)
+    try:
+        return _reconstruct(measurement, seed, device, preset, holdout, progress or (lambda what, share: None))
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _reconstruct(
+    measurement: Measurement, seed: int, device: str, preset: str, holdout: int, report: Callable[[str, float], None]
+) -> Reconstruction:
     started = time.monotonic()
-    report = progress or (lambda what, share: None)
     chosen = preset_named(preset)
     if holdout < 0 or holdout == 1:
         raise ParameterError(f"holdout sets every so many views aside: 0 for none, or 2 and more, not {holdout}")
@@ -98,7 +110,6 @@ def reconstruct(
             "preset": preset,
             "seed": seed,
             "device": device,
-            "threads": torch.get_num_threads(),
             "holdout": holdout,
             "ground": relief.ground,
             "first_loss": float(np.mean(trained.losses[: len(views)])),
