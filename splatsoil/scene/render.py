@@ -171,17 +171,17 @@ class Scene:
         count = int(near.sum())
         around = self.surroundings
         parts = (
-            (centres[shown], covariances[shown], self.soil_opacity[shown], self.soil_albedo[shown], 1.0),
+            (centres[shown], covariances[shown], self.soil_opacity[shown], self.soil_albedo[shown]),
             (
                 x[near],
                 grains.expand(count, 3, 3),
                 x.new_full((count,), PARTICLE_OPACITY),
                 self.grain_albedo[near],
-                1.0,
             ),
-            (around.means, around.covariances(), around.opacities, around.colours, 0.0),
+            (around.means, around.covariances(), around.opacities, around.colours),
         )
-        features = torch.cat([functional.pad(p[3], (0, 1), value=p[4]) for p in parts])
+        is_soil = (1.0, 1.0, 0.0)
+        features = torch.cat([functional.pad(p[3], (0, 1), value=v) for p, v in zip(parts, is_soil, strict=True)])
         first = int(shown.sum())
         grain_part = slice(first, first + count)
         discs = (x.new_zeros((0, 3)), x.new_zeros((0, 3, 3))) if tool is None else self.tool.discs(*tool)
