@@ -15,12 +15,12 @@ from splatsoil.scene.binding import bind
 from splatsoil.scene.estimate import estimate_light, still_frames
 from splatsoil.scene.light import Light, encoded, linear
 from splatsoil.scene.lit import LitRelief, light_relief
-from splatsoil.scene.relief import relief_of_particles
+from splatsoil.scene.relief import Relief, relief_of_particles
 from splatsoil.scene.render import Posed, Scene
 from splatsoil.scene.tool import ToolBody
 from splatsoil.splats import Gaussians
 
-ROUNDS = 4
+ROUNDS = 2
 """Rounds of `albedo.refined`; more follow the noise of the photographs."""
 
 _LONGEST = 0.1
@@ -81,6 +81,7 @@ def build_scene(
         soil_albedo=soil.colours,
         grain_albedo=x.new_full(x.shape, 0.5),
         surroundings=around,
+        surrounding_shapes=around.covariances(),
         light=light,
         tool=body,
         tool_albedo=np.ones(3),
@@ -97,13 +98,27 @@ def build_scene(
         return _refined(scene, scene.pose(x, None, start), frames, rounds) if rounds > 0 else scene
 
 
+def rebound(scene: Scene, particles: Any) -> Scene:
+    """See `Scene.with_particles`."""
+    x = torch.as_tensor(np.asarray(particles), dtype=torch.float32).to(scene.device).contiguous()
+    relief = relief_of_particles(x, scene.spacing, scene.bed.lower, scene.bed.upper)
+    rest = scene.soil.rest
+    grains = _grains(rest, linear(scene.soil_albedo), relief, x, scene.spacing)
+    return scene.replace(soil=bind(rest, scene.soil.covariances, x, scene.spacing), grain_albedo=grains)
+
+
+def _grains(centres: Tensor, albedo: Tensor, relief: Relief, grains: Tensor, spacing: float) -> Tensor:
+    """Albedo (p, 3), sRGB-encoded, of particles beneath soil Gaussians of a linear albedo (n, 3)."""
+    length = albedos.correlation_length(centres, albedo.clamp_min(1e-3).log().mean(dim=1), _LONGEST)
+    return encoded(albedos.grain_albedo(grains, relief.depth_below(grains), centres, albedo, spacing, length))
+
+
 def _albedo(soil: Gaussians, lit: LitRelief, grains: Tensor, spacing: float) -> dict[str, Tensor]:
     """First albedo of soil and grains: the reconstruction's colours with the light on them taken out."""
     light = lit.irradiance(soil.means.contiguous(), _FOOTPRINT).clamp_min(0.05)
     albedo = (linear(soil.colours) / light).clamp(0.0, albedos.BRIGHTEST)
-    length = albedos.correlation_length(soil.means, albedo.clamp_min(1e-3).log().mean(dim=1), _LONGEST)
-    beneath = albedos.grain_albedo(grains, lit.relief.depth_below(grains), soil.means, albedo, spacing, length)
-    return {"soil_albedo": encoded(albedo), "grain_albedo": encoded(beneath)}
+    beneath = _grains(soil.means, albedo, lit.relief, grains, spacing)
+    return {"soil_albedo": encoded(albedo), "grain_albedo": beneath}
 
 
 def _refined(scene: Scene, posed: Posed, frames: list[Frame], rounds: int) -> Scene:

@@ -100,6 +100,7 @@ class Scene:
         soil_albedo: (s, 3) sRGB-encoded albedo, see `light`.
         grain_albedo: (p, 3) the same for each particle's own Gaussian.
         surroundings: Gaussians that neither move nor change their colour.
+        surrounding_shapes: their covariances (m, 3, 3), m².
         light: sun and sky.
         tool: the tool's mesh.
         tool_albedo: (3,) linear.
@@ -113,6 +114,7 @@ class Scene:
     soil_albedo: Tensor
     grain_albedo: Tensor
     surroundings: Gaussians
+    surrounding_shapes: Tensor
     light: Light
     tool: ToolBody
     tool_albedo: FloatArray
@@ -142,6 +144,13 @@ class Scene:
         from splatsoil.scene.build import build_scene
 
         return build_scene(reconstruction, measurement, particles, spacing, **options)
+
+    def with_particles(self, particles: Any) -> Scene:
+        """The same soil on other particles (p, 3) at rest, m, of the same spacing (another jitter, say): light and
+        surface albedo are kept, only the binding and the grains' albedo are made anew."""
+        from splatsoil.scene.build import rebound
+
+        return rebound(self, particles)
 
     def replace(self, **changes: Any) -> Scene:
         """A copy with some parts replaced."""
@@ -178,7 +187,7 @@ class Scene:
                 x.new_full((count,), PARTICLE_OPACITY),
                 self.grain_albedo[near],
             ),
-            (around.means, around.covariances(), around.opacities, around.colours),
+            (around.means, self.surrounding_shapes, around.opacities, around.colours),
         )
         is_soil = (1.0, 1.0, 0.0)
         features = torch.cat([functional.pad(p[3], (0, 1), value=v) for p, v in zip(parts, is_soil, strict=True)])

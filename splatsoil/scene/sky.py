@@ -16,6 +16,9 @@ from splatsoil.splats.warp_torch import as_warp, launch
 
 _AZIMUTHS = 12
 
+_STRIDE = 3
+"""Cells between those at which the tool is looked for: what it hides changes slowly."""
+
 _NOTHING = 1e6
 """A height beyond all others, m."""
 
@@ -35,10 +38,13 @@ def sky_openness(relief: Relief, tool: Any) -> tuple[Tensor, Tensor]:
     bottom, top = _tool_columns(relief, tool)
     distances = _distances(relief)
     margin = [int(np.ceil(distances[-1] / c)) for c in relief.cell]
-    window = _around(top > bottom, margin)
     wide = _padded(z, margin, "replicate")
     below, above = _padded(bottom, margin, "constant", _NOTHING), _padded(top, margin, "constant", -_NOTHING)
-    total, taken, rise = torch.zeros_like(z), torch.zeros_like(z), torch.empty_like(z)
+    with_tool = bool((top > bottom).any())
+    some = (slice(None, None, _STRIDE), slice(None, None, _STRIDE))
+    here, up = z[some].contiguous(), normal[..., 2][some].contiguous()
+    total, rise = torch.zeros_like(z), torch.empty_like(z)
+    taken, part = torch.zeros_like(here), torch.empty_like(here)
     for angle in 2.0 * np.pi * (np.arange(_AZIMUTHS) + 0.5) / _AZIMUTHS:
         along = float(np.cos(angle)) * normal[..., 0] + float(np.sin(angle)) * normal[..., 1]
         slope = -along / normal[..., 2]
@@ -47,17 +53,29 @@ def sky_openness(relief: Relief, tool: Any) -> tuple[Tensor, Tensor]:
             torch.sub(_shifted(wide, row, column, margin, z), z, out=rise)
             torch.maximum(slope, rise.mul_(inverse), out=slope)
         total += _wedge(None, normal[..., 2], along) - _wedge(slope, normal[..., 2], along)
-        if window is not None:
-            here = z[window]
+        if with_tool:
             low, high = torch.full_like(here, _NOTHING), torch.full_like(here, -_NOTHING)
             for row, column, inverse in looks:
-                low = torch.minimum(low, (_shifted(below, row, column, margin, z)[window] - here) * inverse)
-                high = torch.maximum(high, (_shifted(above, row, column, margin, z)[window] - here) * inverse)
-            low = torch.maximum(low, slope[window])
-            up, side = normal[..., 2][window], along[window]
-            taken[window] += torch.where(high > low, _wedge(high, up, side) - _wedge(low, up, side), 0.0)
+                torch.sub(_shifted(below, row, column, margin, z)[some], here, out=part)
+                torch.minimum(low, part.mul_(inverse), out=low)
+                torch.sub(_shifted(above, row, column, margin, z)[some], here, out=part)
+                torch.maximum(high, part.mul_(inverse), out=high)
+            torch.maximum(low, slope[some], out=low)
+            taken += torch.where(high > low, _wedge(high, up, along[some]) - _wedge(low, up, along[some]), 0.0)
+    hidden = _between(taken, _STRIDE, (z.shape[0], z.shape[1]))
     scale = 2.0 / _AZIMUTHS
-    return (scale * (total - taken)).clamp(0.0, 1.0), (scale * taken).clamp(0.0, 1.0)
+    return (scale * (total - hidden)).clamp(0.0, 1.0), (scale * hidden).clamp(0.0, 1.0)
+
+
+def _between(values: Tensor, stride: int, size: tuple[int, int]) -> Tensor:
+    """A map known at every so many rows and columns, the first among them, linearly in between."""
+    for axis in (0, 1):
+        place = torch.arange(size[axis], device=values.device) / stride
+        before = place.floor().long().clamp_max(max(values.shape[axis] - 2, 0))
+        after = (before + 1).clamp_max(values.shape[axis] - 1)
+        part = (place - before).clamp(0.0, 1.0).reshape((-1, 1) if axis == 0 else (1, -1))
+        values = values.index_select(axis, before) * (1.0 - part) + values.index_select(axis, after) * part
+    return values
 
 
 def _wedge(slope: Tensor | None, up: Tensor, along: Tensor) -> Tensor:
@@ -98,18 +116,6 @@ def _shifted(wide: Tensor, row: int, column: int, margin: list[int], like: Tenso
     """The padded map as seen from cells that look some rows and columns on."""
     ny, nx = like.shape
     return wide[margin[1] + row : margin[1] + row + ny, margin[0] + column : margin[0] + column + nx]
-
-
-def _around(mask: Tensor, margin: list[int]) -> tuple[slice, slice] | None:
-    """The window of cells no farther than the margin from a mask; None where it is empty."""
-    places = mask.nonzero()
-    if len(places) == 0:
-        return None
-    (top, left), (bottom, right) = places.amin(dim=0).tolist(), places.amax(dim=0).tolist()
-    return (
-        slice(max(0, top - margin[1]), bottom + margin[1] + 1),
-        slice(max(0, left - margin[0]), right + margin[0] + 1),
-    )
 
 
 def _tool_columns(relief: Relief, tool: Any) -> tuple[Tensor, Tensor]:

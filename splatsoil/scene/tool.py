@@ -46,6 +46,7 @@ class ToolBody:
             self._mesh = wp.Mesh(
                 wp.array(vertices, dtype=wp.vec3, device=where), wp.array(faces, dtype=wp.int32, device=where)
             )
+            wp.synchronize_device(where)  # rays are cast on torch's stream
             self._centre = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0)).astype(np.float64)
             self._radius = float(np.linalg.norm(vertices - self._centre, axis=1).max()) + 1e-4
 

@@ -55,6 +55,7 @@ def scene_of(particles, light=SUN, mesh=None):
         soil_albedo=albedo.expand(len(centres), 3).contiguous(),
         grain_albedo=albedo.expand(len(particles), 3).contiguous(),
         surroundings=nothing(),
+        surrounding_shapes=torch.zeros(0, 3, 3),
         light=light,
         tool=ToolBody(mesh),
         tool_albedo=TOOL,
@@ -124,10 +125,40 @@ def test_lifting_all_soil_is_moving_the_camera_down():
     assert np.abs(lifted[middle] - lowered[middle]).max() < 0.02
 
 
+def test_other_particles_carry_the_same_picture():
+    bed, view = level_bed(), camera()
+    generator = torch.Generator().manual_seed(3)
+    other = bed + 0.3 * SPACING * (torch.rand(bed.shape, generator=generator) - 0.5)
+    scene = scene_of(bed)
+    again = scene.with_particles(other)
+    assert len(again.grain_albedo) == len(other)
+    assert np.abs(again.render(other, None, None, view) - scene.render(bed, None, None, view)).mean() < 0.02
+
+
 def test_the_same_call_gives_the_same_bits():
     bed, view = level_bed(), camera()
     scene = scene_of(bed)
     assert np.array_equal(scene.render(bed, None, None, view), scene.render(bed, None, None, view))
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_cpu_and_cuda_agree():
+    bed, view, box = level_bed(), camera(), trimesh.creation.box((0.08, 0.08, 0.02))
+    scene = scene_of(bed, mesh=box)
+    pose = (np.eye(3), np.array([0.12, 0.2, 0.2]))
+    there = scene.replace(
+        soil=bind(scene.soil.rest.cuda(), scene.soil.covariances.cuda(), bed.cuda(), SPACING),
+        soil_opacity=scene.soil_opacity.cuda(),
+        soil_albedo=scene.soil_albedo.cuda(),
+        grain_albedo=scene.grain_albedo.cuda(),
+        surroundings=nothing().to("cuda:0"),
+        surrounding_shapes=torch.zeros(0, 3, 3).cuda(),
+        tool=ToolBody(box, "cuda:0"),
+    )
+    difference = np.abs(scene.render(bed, None, pose, view) - there.render(bed, None, pose, view))
+    assert difference.mean() < 1e-4
+    assert np.quantile(difference, 0.999) < 0.02
 
 
 def coloured_surface(measurement, particles, spacing, cell=0.004):
