@@ -310,10 +310,11 @@ def summarise(
 def notes(minimum: Minimum, space: ParameterSpace, *, failed: int, total: int) -> list[str]:
     """What a reader must know before believing the numbers."""
     out = []
-    if not minimum.informative:
-        out.append(
-            "The evaluations hardly say where the loss is least: the parameters are not determined by this data."
-        )
+    for parameter, determined in zip(space, minimum.determined, strict=True):
+        if not determined:
+            out.append(
+                f"The evaluations hardly say where the loss is least: {parameter.name} is not determined by them."
+            )
     for parameter, bound in zip(space, minimum.at_bound, strict=True):
         if bound is not None:
             value = parameter.lower if bound == "lower" else parameter.upper

@@ -53,7 +53,7 @@ def test_ten_noisy_evaluations_find_a_minimum_in_one_dimension(noise_std: float 
     assert np.sqrt(np.mean(errors**2)) < 0.1
     assert np.sum(np.abs(errors) < 2.0 * stds) >= 5
     assert np.all(stds < 0.3)
-    assert all(r.informative and r.at_bound == (None,) for r in results)
+    assert all(r.determined == (True,) and r.at_bound == (None,) for r in results)
 
 
 def test_two_dimensions() -> None:
@@ -100,7 +100,7 @@ def test_constant_losses_end_in_a_plain_statement() -> None:
     optimiser = play(lambda _: 0.25, 1, 8, 0.0, 0)
     actions = np.sort([t.action[0] for t in optimiser.told])
     result = optimiser.result()
-    assert not result.informative
+    assert result.determined == (False,)
     assert np.isfinite(result.estimate).all() and np.isfinite(result.std).all()
     # Nothing to go by: the points fill the axis.
     assert np.max(np.diff(actions)) < 0.6
@@ -110,8 +110,18 @@ def test_noise_without_a_minimum_is_not_taken_for_one() -> None:
     """Best-guess hyperparameters call the lowest of ten random numbers a valley, with a std of 0.03."""
     points = np.linspace(-1.0, 1.0, 10)[:, None]
     minima = [Surrogate(points, 1.0 + 0.1 * np.random.default_rng(s).normal(size=10)).minimum() for s in range(8)]
-    assert sum(m.informative for m in minima) <= 1
-    assert all(m.std[0] > 0.35 for m in minima if not m.informative)
+    assert sum(m.determined[0] for m in minima) <= 1
+    assert all(m.std[0] > 0.35 for m in minima if not m.determined[0])
+
+
+def test_one_axis_may_be_determined_and_another_not() -> None:
+    """A valley along the second axis: every place in it is as good as another."""
+    points = np.random.default_rng(2).uniform(-1.0, 1.0, (16, 2))
+    losses = (points[:, 0] - 0.3) ** 2 + 0.003 * np.random.default_rng(3).normal(size=16)
+    minimum = Surrogate(points, losses).minimum()
+    assert minimum.determined == (True, False)
+    assert minimum.estimate[0] == pytest.approx(0.3, abs=0.1)
+    assert minimum.std[1] > 0.35
 
 
 @pytest.mark.parametrize(("slope", "bound"), [(1.0, "lower"), (-1.0, "upper")])

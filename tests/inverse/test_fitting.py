@@ -167,7 +167,7 @@ def test_a_minimum_at_a_bound_and_a_flat_loss_are_said(analytic: ModuleType, tmp
     assert beyond["parameters"]["friction_angle"]["at_bound"] == "upper"
     assert any("upper bound (50 deg)" in note for note in beyond["notes"])
     flat = fit(analytic.AnalyticProblem(constant=True), analytic.prepare(tmp_path / "b"), analytic.SETUP, budget=5)
-    assert not flat["informative"]
+    assert flat["parameters"]["friction_angle"]["determined"] is False
     assert any("not determined" in note for note in flat["notes"])
     assert flat["parameters"]["friction_angle"]["std"] > 4.0
 

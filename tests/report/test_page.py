@@ -38,12 +38,12 @@ def fit(name: str = "base", **changes: Any) -> dict[str, Any]:
                 "title": "friction angle [°]",
                 "bounds": [20.0, 50.0],
                 "at_bound": None,
+                "determined": True,
             }
         },
         "loss": 0.123,
         "loss_std": 0.01,
         "noise_std": 0.02,
-        "informative": True,
         "evaluations": 3,
         "failed": 1,
         "seconds": 83.0,

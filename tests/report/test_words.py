@@ -38,12 +38,12 @@ def test_the_verdict_follows_the_ratio_to_the_noise() -> None:
 
 
 @pytest.mark.parametrize(
-    ("informative", "at_bound", "state"),
+    ("determined", "at_bound", "state"),
     [(True, None, "determined"), (True, "upper", "bound"), (False, "upper", "open")],
 )
-def test_an_answer_that_is_none_says_so(informative: bool, at_bound: str | None, state: str) -> None:
-    entry = {"estimate": 36.0, "std": 1.0, "unit": "deg", "at_bound": at_bound}
-    (answer,) = words.answers({"parameters": {"friction_angle": entry}, "informative": informative})
+def test_an_answer_that_is_none_says_so(determined: bool, at_bound: str | None, state: str) -> None:
+    entry = {"estimate": 36.0, "std": 1.0, "unit": "deg", "at_bound": at_bound, "determined": determined}
+    (answer,) = words.answers({"parameters": {"friction_angle": entry}})
     assert answer.state == state
     assert bool(answer.remark) == (state != "determined")
 
