@@ -12,9 +12,9 @@ up to 0.2 mm on average and 0.7 mm in a cell.
 from __future__ import annotations
 
 import argparse
-import json
 import resource
 import sys
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy.ndimage import gaussian_filter, map_coordinates
 
+from splatsoil.commands._output import only_json, print_json
 from splatsoil.measurement import Measurement
 from splatsoil.reconstruction import HeightField, Reconstruction, reconstruct, volume
 from splatsoil.reconstruction.progress import progress_bar
@@ -119,6 +120,11 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
     options = parser.parse_args(arguments)
+    with only_json() if options.json else nullcontext():
+        return _run(options)
+
+
+def _run(options: argparse.Namespace) -> int:
     scores = []
     for folder in options.sets:
         measurement = Measurement.load(folder)
@@ -130,7 +136,7 @@ def main(arguments: list[str] | None = None) -> int:
     # Linux counts in KiB, macOS in bytes.
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
     if options.json:
-        print(json.dumps({"scores": [vars(s) for s in scores], "memory": memory}, indent=1))
+        print_json({"scores": [vars(s) for s in scores], "memory": memory})
     else:
         _show(scores, memory)
     return 0
