@@ -94,7 +94,7 @@ def _reconstruct(
     )  # fmt: skip
     soil, on_tool = segments(trained.gaussians, trained.label, relief.surface, bed, tool)
     surface = surface_through(trained.gaussians[soil], relief.surface)
-    held_out = judged(trained.gaussians, every.subset(aside), trained.background)
+    held_out = judged(trained.gaussians.to(device), every.subset(aside), trained.background)
     return Reconstruction(
         gaussians=trained.gaussians,
         soil=soil,
@@ -145,8 +145,8 @@ def judged(gaussians: Gaussians, views: Views, background: tuple[float, float, f
     """Likeness of the drawn pictures to photographs that were set aside (pixels that are masked do not count)."""
     result = []
     for k, camera in enumerate(views.cameras):
-        photograph = views.photograph(k)
-        valid = views.valid[k, : camera.height, : camera.width, None]
+        photograph = views.photograph(k).contiguous().to(gaussians.device)
+        valid = views.valid[k, : camera.height, : camera.width, None].to(gaussians.device)
         with torch.no_grad():
             drawn = rasterise(gaussians, camera, background=background, normals=False).colour.clamp(0.0, 1.0)
             mixed = drawn * valid + photograph * (1.0 - valid)
