@@ -325,6 +325,7 @@ class World:
             soil_albedo=tensor(pattern(points)),
             grain_albedo=tensor(pattern(particles)),
             surroundings=Gaussians(empty, empty, tensor(np.zeros((0, 4))), tensor(np.zeros(0)), empty),
+            surrounding_shapes=tensor(np.zeros((0, 3, 3))),
             light=self.light,
             tool=ToolBody(self.measurement.tool.mesh, self.device),
             tool_albedo=np.array([0.08, 0.16, 0.5]),

@@ -103,17 +103,17 @@ class Model:
         return fill(self.reconstruction.surface, self.measurement.bed, self.resolution.spacing, seed=seed)
 
     def scene(self, seed: int = 0) -> Scene:
-        """Scene whose Gaussians ride on the particles of ``seed``; its light is estimated once."""
+        """Scene whose Gaussians ride on the particles of ``seed``; light and albedo are estimated once."""
         return self._scene(seed)
 
     def _build_scene(self, seed: int) -> Scene:
-        light = None if seed == 0 else self.scene(0).light
+        if seed != 0:
+            return self.scene(0).with_particles(self.particles(seed))
         return Scene.from_reconstruction(
             self.reconstruction,
             self.measurement,
-            self.particles(seed),
+            self.particles(0),
             self.resolution.spacing,
-            light=light,
             device=self.device,
         )
 
