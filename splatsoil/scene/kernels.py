@@ -262,13 +262,18 @@ def surface_depth(
     shortest = 0.5 * step / wp.length(ray)
     closing = 1.0 / (1.2 * wp.sqrt(ray[0] * ray[0] + ray[1] * ray[1]) - ray[2])
     while z < far:
-        before = gap
         stride = wp.max(shortest, gap * closing)
         z += stride
         x = origin + ray * z
         gap = x[2] - sample(height, grid, x[0], x[1])
         if gap < 0.0:
-            return z - stride * gap / (gap - before)
+            # Halve: at a wall, heights do not change linearly along the ray.
+            for _ in range(6):
+                stride *= 0.5
+                x = origin + ray * (z - stride)
+                if x[2] < sample(height, grid, x[0], x[1]):
+                    z -= stride
+            return z
     return -1.0
 
 
@@ -314,7 +319,11 @@ def illuminate(
         sky = sample(openness, grid, x[0], x[1])
         direct = wp.max(wp.dot(n, light.sun), 0.0) / light.sun[2]
         if direct > 0.0:
-            direct *= sample(visible, grid, x[0], x[1])
+            sunny = sample(visible, grid, x[0], x[1])
+            if sunny > 0.01 and sunny < 0.99:
+                # An edge of a shadow, or a wall too steep for a map: look from the point itself.
+                sunny = soil_shadow(height, grid, x, light, step, top)
+            direct *= sunny
         if direct > 0.0:
             direct *= tool_shadow(tool, light, x, 0.5 * z / eye.fx)
         back = sample_vector(bounced, grid, x[0], x[1])
