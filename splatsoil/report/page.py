@@ -25,8 +25,14 @@ def write_report(folder: str | Path) -> Path:
     Raises:
         RunError: not a run folder, no finished fit, a damaged file, or the folder can't be written.
     """
-    data = load(folder)
-    return write_text(data.folder / "report.html", render(data))
+    try:
+        page = render(load(folder))
+    except (KeyError, TypeError, IndexError) as error:
+        raise RunError(
+            f"{folder}: a file in it lacks what the page needs ({error!r}); it is damaged or made by another "
+            "version: fit and compare again"
+        ) from error
+    return write_text(Path(folder) / "report.html", page)
 
 
 def render(data: RunData) -> str:

@@ -251,6 +251,7 @@ def test_same_files_same_page(tmp_path: Path) -> None:
         (lambda f: (f / "fit.json").unlink(), "no fit has been finished"),
         (lambda f: (f / "fit.json").write_text("{"), "fit.json"),
         (lambda f: (f / "fit.json").write_text("{}"), "fit.json: isn't of format"),
+        (lambda f: (f / "fit.json").write_text('{"format": "splatsoil-fit/1", "name": "base"}'), "lacks .*parameters"),
         (lambda f: (f / "comparison" / "left_0_observed.jpg").unlink(), "left_0_observed.jpg"),
         (lambda f: (f / "comparison" / "left_0_observed.jpg").write_text("<svg>"), "neither PNG nor JPEG"),
         (lambda f: (f / "reconstruction" / "surface.npz").write_text("x"), r"surface\.npz"),
