@@ -2,6 +2,7 @@
 #
 #   make demo     the whole path on examples/plow-dry, ending in runs/demo/report.html
 #   make test     the tests
+#   make test-slow  the tests that take minutes: whole reconstructions and simulations of the example sets
 #   make lint     formatting, lint and types
 #   make clean    remove what these made, the virtual environment included; runs/ stays
 #
@@ -13,14 +14,14 @@
 PYTHON ?= python3
 VENV ?= .venv
 TORCH_INDEX ?=
-PYTEST_ARGS ?= -n 2 --dist loadfile
+PYTEST_ARGS ?= -n 2 --dist loadfile -m "not slow"
 
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 PACKAGES := splatsoil envs inverse benchmarks
 SOURCES := $(shell find $(PACKAGES) -type f -not -path '*/__pycache__/*')
 
-.PHONY: demo test lint clean
+.PHONY: demo test test-slow lint clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.use
@@ -29,6 +30,9 @@ demo: $(VENV)/.use
 # One thread per worker: the workers together already fill the machine.
 test: $(VENV)/.develop
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(PYTEST_ARGS)
+
+test-slow: $(VENV)/.develop
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m slow
 
 # Static checkers cannot see that envs/, inverse/ and benchmarks/ install as splatsoil.*, so mypy gets the built package.
 lint: $(VENV)/.develop build/installed/.stamp
