@@ -161,12 +161,17 @@ class Reconstruction:
                 surface=HeightField(heights["x"], heights["y"], heights["height"], heights.get("deviation")),
                 mesh=mesh,
                 background=(float(red), float(green), float(blue)),
-                held_out=tuple(HeldOut(**view) for view in facts["held_out"]),
+                held_out=tuple(HeldOut(v["name"], _number(v["psnr"]), _number(v["ssim"])) for v in facts["held_out"]),
                 metadata={k: v for k, v in facts.items() if k not in (*measured, "held_out", "surface")},
                 seconds=float(facts["seconds"]),
             )
         except (OSError, KeyError, TypeError, ValueError, BadZipFile) as error:
             raise RunError(f"{source}: the reconstruction cannot be read ({error}); reconstruct again") from error
+
+
+def _number(value: float | None) -> float:
+    """JSON has no NaN and no infinity; they were written as null."""
+    return float("nan") if value is None else float(value)
 
 
 def _npz(**arrays: torch.Tensor | NDArray[Any]) -> bytes:
