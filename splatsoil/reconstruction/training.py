@@ -21,8 +21,8 @@ SIMILARITY = 0.2  # share of 1 − SSIM in the photometric loss, as in Kerbl et 
 RATES = {"means": 0.02, "scales": 0.01, "quaternions": 0.002, "opacities": 0.05, "colours": 0.005}
 # of which `means` counts in the Gaussian's own first size, so that far and near, large beds and small, learn alike
 LAST_RATE = 0.1  # of the means' rate, reached exponentially
-# Weight of the soil's distance from the measured surface, in its standard deviations. Left alone, centres sink beneath the
-# surface that their Gaussians draw: by 0.4 of their spacing on ray-cast scenes, where this keeps them within 0.02 of it.
+# Weight of the soil's distance from the measured surface, in its standard deviations. Left alone, centres sink beneath
+# the surface that their Gaussians draw: by 0.4 of their spacing on ray-cast scenes, and this keeps them within 0.02.
 ANCHOR = 0.02
 FLAT = 0.02  # weight of a Gaussian's thickness over its breadth beyond a third
 FAINTEST = 0.02
@@ -154,7 +154,9 @@ def train(
             order = torch.randperm(len(views), generator=generator).tolist()
         k = order.pop()
         current = state.gaussians()
-        rendering = rasterise(current, views.cameras[k], background=background, normals=False)
+        # Another colour behind the scene in each step: nothing may be left translucent because what is behind matches.
+        colour = torch.rand(3, generator=generator)
+        rendering = rasterise(current, views.cameras[k], background=colour, normals=False)
         rendering.projection.centres.retain_grad()
         difference = (rendering.colour - photographs[k]) * valid[k]
         likeness = ssim(rendering.colour * valid[k], photographs[k] * valid[k])
