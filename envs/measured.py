@@ -21,9 +21,6 @@ if TYPE_CHECKING:
 
 #: Name of the loss that is fitted, part of what identifies an evaluation.
 LOSS = "robust"
-#: Beds of particles that simulations take turns with. Each costs a scene of its own (several seconds), and two are
-#: enough to show the agent that the same parameters don't give the same loss twice.
-BEDS = 2
 
 
 class MeasuredProblem:
@@ -128,7 +125,7 @@ class MeasuredProblem:
         Raises:
             SimulationError: the simulation could not go on.
         """
-        prediction = self.model.predict(parameters, seed % BEDS, self.progress)
+        prediction = self.model.predict(parameters, seed, self.progress)
         return prediction, self.comparator.compare(prediction.images)
 
     def evaluate(self, parameters: Mapping[str, float], seed: int) -> Evaluation:
@@ -142,7 +139,7 @@ class MeasuredProblem:
         return Evaluation(
             loss=min(comparison.loss, self.worst_loss),
             blocks=comparison.blocks,
-            extras={"rgb": comparison.rgb, "bed": float(prediction.seed)},
+            extras={"rgb": comparison.rgb},
             seconds=time.perf_counter() - began,
             observed=self.observed_image(),
             predicted=prediction.images[self._shown],
