@@ -154,9 +154,7 @@ def train(
             order = torch.randperm(len(views), generator=generator).tolist()
         k = order.pop()
         current = state.gaussians()
-        # Another colour behind the scene in each step: nothing may be left translucent because what is behind matches.
-        colour = torch.rand(3, generator=generator)
-        rendering = rasterise(current, views.cameras[k], background=colour, normals=False)
+        rendering = rasterise(current, views.cameras[k], background=background, normals=False)
         rendering.projection.centres.retain_grad()
         difference = (rendering.colour - photographs[k]) * valid[k]
         likeness = ssim(rendering.colour * valid[k], photographs[k] * valid[k])
