@@ -165,11 +165,11 @@ def cache_folder() -> Path:
 
 
 def cached_reconstruction(measurement: Measurement, preset: str, device: str) -> Reconstruction:
-    """The set's reconstruction with seed 0, made once for a set, preset and version."""
-    from splatsoil import __version__
+    """The set's reconstruction with seed 0, made once for a set, a preset and the code that makes it."""
+    from splatsoil.files import RECONSTRUCTING, code_digest
     from splatsoil.reconstruction import Reconstruction, reconstruct
 
-    folder = cache_folder() / f"{measurement.hash[:16]}-{preset}-{__version__}"
+    folder = cache_folder() / f"{measurement.hash[:16]}-{preset}-{code_digest(RECONSTRUCTING)}"
     if not (folder / "reconstruction.json").is_file():
         reconstruct(measurement, preset=preset, device=device).save(folder)
     return Reconstruction.load(folder)

@@ -38,6 +38,7 @@ class FitSetup:
         device: ``cpu`` or ``cuda:N``.
         seed: of agent and simulations.
         version: of this package.
+        code: digest of its sources and of the effects' own files, see :func:`splatsoil.files.code_digest`.
         loss: name of the loss.
         noise_std: measured noise of one evaluation, None to infer it.
         start: Sobol points before the first acquisition.
@@ -51,6 +52,7 @@ class FitSetup:
     device: str
     seed: int
     version: str
+    code: str = ""
     loss: str = ""
     noise_std: float | None = None
     start: int = START
@@ -69,6 +71,7 @@ class FitSetup:
             "preset": self.preset,
             "device": self.device.split(":")[0],
             "version": self.version,
+            "code": self.code,
             "loss": self.loss,
         }
 

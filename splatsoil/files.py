@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import os
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -87,3 +89,32 @@ def plain(data: Any) -> Any:
     if isinstance(data, float) and not math.isfinite(data):
         return None
     return data
+
+
+#: Parts of the package that decide what a reconstruction is, and what an evaluation comes to.
+RECONSTRUCTING = ("measurement", "splats", "reconstruction")
+FORWARD = (*RECONSTRUCTING, "soil", "mpm", "scene", "parameters.py", "model.py", "comparison.py")
+
+
+def code_digest(parts: Iterable[str] = FORWARD, others: Iterable[str | Path] = ()) -> str:
+    """SHA-256 (16 hex digits) of the package's sources: what they made before they changed isn't what they make now.
+
+    Args:
+        parts: folders and files of the package.
+        others: further files, such as a user's effects.
+
+    Raises:
+        RunError: one of the others can't be read.
+    """
+    root = Path(__file__).parent
+    files = sorted(
+        f for part in parts for f in ([root / part] if part.endswith(".py") else (root / part).rglob("*.py"))
+    )
+    digest = hashlib.sha256()
+    try:
+        for file in (*files, *map(Path, others)):
+            contents = file.read_bytes()
+            digest.update(f"{file.name} {len(contents)}\n".encode() + contents)
+    except OSError as error:
+        raise RunError(f"{error.filename}: cannot be read ({error.strerror})") from error
+    return digest.hexdigest()[:16]

@@ -134,6 +134,14 @@ def test_a_fit_with_another_seed_or_effect_shares_the_folder_but_no_evaluation(
         assert len(store.descriptions()) == 2
 
 
+def test_other_code_simulates_again(analytic: ModuleType, tmp_path: Path) -> None:
+    run = analytic.prepare(tmp_path)
+    problem = analytic.AnalyticProblem()
+    fit(problem, run, analytic.SETUP, budget=4)
+    fit(problem, run, replace(analytic.SETUP, code="other"), budget=4)
+    assert problem.calls == 4
+
+
 def test_an_evaluation_that_another_fit_made_is_taken_from_there(analytic: ModuleType, tmp_path: Path) -> None:
     """The same seed and model, another agent's setting: the Sobol start is shared."""
     run = analytic.prepare(tmp_path)

@@ -7,7 +7,7 @@ import pytest
 from splatsoil.inverse.run_folder import RunFolder
 
 from splatsoil.errors import RunError
-from splatsoil.files import read_json, write_bytes, write_json
+from splatsoil.files import RECONSTRUCTING, code_digest, read_json, write_bytes, write_json
 
 MEASUREMENT = {"name": "plow", "folder": "sets/plow", "hash": "a" * 64}
 
@@ -101,3 +101,14 @@ def test_json_is_strict(tmp_path: Path) -> None:
         "path": str(tmp_path),
         "n": 3,
     }
+
+
+def test_the_digest_of_the_code_knows_its_parts_and_a_users_file(tmp_path: Path) -> None:
+    effect = tmp_path / "my_effect.py"
+    effect.write_text("a = 1")
+    first = code_digest(others=[effect])
+    assert first == code_digest(others=[effect]) != code_digest() != code_digest(RECONSTRUCTING)
+    effect.write_text("a = 2")
+    assert code_digest(others=[effect]) != first
+    with pytest.raises(RunError, match="nowhere"):
+        code_digest(others=[tmp_path / "nowhere.py"])
