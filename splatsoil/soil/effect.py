@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
+from splatsoil.measurement import Measurement
+from splatsoil.observation import Observation
 from splatsoil.parameters import Parameter
 from splatsoil.soil.settings import Settings
 
@@ -12,13 +14,14 @@ from splatsoil.soil.settings import Settings
 class Effect:
     """One piece of physics that can be off or on. A new effect is one subclass in one file of its own.
 
-    An effect acts in one or both of two ways:
+    An effect acts in one or several of these ways:
 
     * ``settings`` changes the numbers a run starts from: contact friction, gravity, friction angle.
     * ``strength`` is a ``@wp.func`` called at every stress point in every step. It receives the
       :class:`~splatsoil.soil.strength.Strength` found so far, the :class:`~splatsoil.soil.strength.SoilState`, the
       array of parameter values (simulations, columns), the row of this simulation and the column of the effect's first
       parameter, and returns the changed Strength. It is compiled only into models that have the effect on.
+    * ``observe`` changes what the cameras report of a simulation, not the simulation.
 
     Attributes:
         name: identifier used by the command line and every file.
@@ -37,3 +40,13 @@ class Effect:
         """Return ``settings`` changed by this effect with parameter ``values``; unchanged by default."""
         del values
         return settings
+
+    def observe(self, observation: Observation, values: Mapping[str, float]) -> Observation:
+        """Return ``observation`` changed by this effect with parameter ``values``; unchanged by default."""
+        del values
+        return observation
+
+    def for_measurement(self, measurement: Measurement) -> Effect:
+        """The effect as a measurement set needs it, where its parameters depend on that; itself by default."""
+        del measurement
+        return self

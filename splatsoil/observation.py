@@ -1,0 +1,137 @@
+"""What cameras report of a scene that is given: their pose, exposure, clock and focus, the light, the tool's place.
+
+An observation never changes the simulation, so trying another one costs pictures only. Everything is off by default.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import correlate1d
+from scipy.spatial.transform import Rotation
+from scipy.special import ive
+
+from splatsoil.errors import ParameterError
+from splatsoil.measurement import Camera
+
+FloatArray = npt.NDArray[np.float64]
+Image = npt.NDArray[np.float32]
+Pose = tuple[FloatArray, FloatArray]
+
+
+@dataclass(frozen=True)
+class CameraShift:
+    """How a camera stands differently from its calibration, in its own axes; it turns about its centre of projection.
+
+    Attributes:
+        pan: turn to the right, degrees.
+        tilt: turn upwards, degrees.
+        roll: turn clockwise as seen from behind it, degrees.
+        right, up, forward: shift, m.
+    """
+
+    pan: float = 0.0
+    tilt: float = 0.0
+    roll: float = 0.0
+    right: float = 0.0
+    up: float = 0.0
+    forward: float = 0.0
+
+
+@dataclass(frozen=True)
+class Observation:
+    """Differences between what cameras are taken to report and what they do.
+
+    Attributes:
+        cameras: shift of each camera, in the measurement's order; those beyond the end stand as calibrated.
+        gain: factor on linear colour (exposure time, aperture).
+        drift: rate at which the gain's natural logarithm grows from time 0 on, 1/s.
+        offset: linear colour added to every channel (stray light, black level), of white's.
+        time_offset: pictures show a moment this much later than their frame number says, s.
+        tool_shift: (3,) shift of the drawn tool in the world, m; the soil is pushed where the motion says.
+        tool_turn: turn of the drawn tool about the vertical through its origin, from +x towards +y, degrees.
+        blur: standard deviation of a Gaussian blur of linear colour, pixels.
+        sun_azimuth: turn of the sun from +x towards +y, degrees.
+        sun_elevation: rise of the sun, degrees.
+        sky_share: growth of the sky's share of the light on level, open ground.
+    """
+
+    cameras: tuple[CameraShift, ...] = ()
+    gain: float = 1.0
+    drift: float = 0.0
+    offset: float = 0.0
+    time_offset: float = 0.0
+    tool_shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    tool_turn: float = 0.0
+    blur: float = 0.0
+    sun_azimuth: float = 0.0
+    sun_elevation: float = 0.0
+    sky_share: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not self.gain > 0.0:
+            raise ParameterError(f"an exposure's gain is positive, not {self.gain}")
+        if not self.blur >= 0.0:
+            raise ParameterError(f"a blur is 0 pixels or more, not {self.blur}")
+
+    def camera(self, camera: Camera, index: int) -> Camera:
+        """The camera in place ``index`` of the measurement's list as it really stands."""
+        if index >= len(self.cameras) or self.cameras[index] == CameraShift():
+            return camera
+        shift = self.cameras[index]
+        # Camera axes are OpenGL's: +x right, +y up, looking down -z.
+        turn = Rotation.from_euler("YXZ", [-shift.pan, shift.tilt, -shift.roll], degrees=True).as_matrix()
+        change = np.eye(4)
+        change[:3, :3] = turn
+        change[:3, 3] = [shift.right, shift.up, -shift.forward]
+        return replace(camera, camera_to_world=camera.camera_to_world @ change)
+
+    def tool(self, pose: Pose) -> Pose:
+        """Where the tool is drawn that stands at ``pose``: rotation (3, 3), tool to world, and position (3,) in m."""
+        if self.tool_turn == 0.0 and not any(self.tool_shift):
+            return pose
+        turn = Rotation.from_euler("z", self.tool_turn, degrees=True).as_matrix()
+        return turn @ pose[0], np.asarray(pose[1]) + np.array(self.tool_shift)
+
+    @property
+    def changes_light(self) -> bool:
+        """Whether sun and sky differ from those estimated."""
+        return bool(self.sun_azimuth or self.sun_elevation or self.sky_share)
+
+    def image(self, image: Image, time: float) -> Image:
+        """A picture (h, w, 3), sRGB in [0, 1], that the lens sees at ``time`` in s, as the camera reports it."""
+        gain = self.gain * math.exp(self.drift * time)
+        if gain == 1.0 and self.offset == 0.0 and self.blur == 0.0:
+            return image
+        colour = blurred(_linear(image.astype(np.float64)), self.blur)
+        return _encoded(np.clip(gain * colour + self.offset, 0.0, 1.0)).astype(np.float32)
+
+
+def blurred(image: FloatArray, sigma: float) -> FloatArray:
+    """An image (h, w, k) under a Gaussian blur of ``sigma`` pixels, its border held.
+
+    The kernel is the discrete Gaussian exp(-σ²) I_n(σ²), whose variance is σ² exactly, however small σ is (Lindeberg
+    1990, IEEE PAMI 12, sec. III-C).
+    """
+    if sigma == 0.0:
+        return image
+    radius = max(2, math.ceil(5.0 * sigma + 1.0))
+    weights = ive(np.abs(np.arange(-radius, radius + 1)), sigma**2)
+    weights /= weights.sum()
+    for axis in (0, 1):
+        image = correlate1d(image, weights, axis=axis, mode="nearest")
+    return image
+
+
+def _linear(srgb: FloatArray) -> FloatArray:
+    """IEC 61966-2-1, decoded."""
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((np.maximum(srgb, 0.04045) + 0.055) / 1.055) ** 2.4)
+
+
+def _encoded(colour: FloatArray) -> FloatArray:
+    """IEC 61966-2-1, encoded."""
+    low = colour <= 0.0031308
+    return np.where(low, 12.92 * colour, 1.055 * np.maximum(colour, 0.0031308) ** (1.0 / 2.4) - 0.055)
