@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -13,13 +14,17 @@ import numpy.typing as npt
 from splatsoil.errors import ParameterError
 from splatsoil.measurement import Measurement
 from splatsoil.mpm import Resolution, Trajectory, simulate
+from splatsoil.observation import Observation
 from splatsoil.parameters import Parameter, ParameterSpace
 from splatsoil.reconstruction import Reconstruction, fill
 from splatsoil.scene import Scene
+from splatsoil.soil.effect import Effect
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
 
 Image = npt.NDArray[np.float32]
+
+State = tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]
 
 SCENES_KEPT = 4
 """Scenes, one for each particle seed, that a model keeps at hand."""
@@ -71,7 +76,7 @@ class Model:
     ) -> None:
         self.measurement, self.reconstruction = measurement, reconstruction
         self.preset, self.device = preset, device
-        self.law = Law(find_effects(effects))
+        self.law = Law(effect.for_measurement(measurement) for effect in find_effects(effects))
         self.resolution = Resolution.derive(measurement, preset)
         measured = tuple(int(f) for f in measurement.frames)
         self.frames = measured if frames is None else tuple(sorted({int(f) for f in frames}))
@@ -80,10 +85,30 @@ class Model:
             raise ParameterError(f"frames {unknown or 'none'} are not in the video; it has {measured}")
         self._scene = lru_cache(maxsize=SCENES_KEPT)(self._build_scene)
 
+        self.recorded = self._recorded_frames()
+
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """All parameters of the law with its effects."""
         return self.law.parameters
+
+    @property
+    def observation_parameters(self) -> tuple[Parameter, ...]:
+        """Those of effects that change what the cameras report: `draw` needs no new simulation for them."""
+        return tuple(p for e in self.law.effects if type(e).observe is not Effect.observe for p in e.parameters)
+
+    def observation(self, values: Mapping[str, float] | None = None) -> Observation:
+        """What the cameras report under ``values`` (by name; defaults for those left out).
+
+        Raises:
+            ParameterError: values out of bounds.
+        """
+        given = values or {}
+        full = {p.name: p.check(given.get(p.name, p.default)) for p in self.parameters}
+        result = Observation()
+        for effect in self.law.effects:
+            result = effect.observe(result, full)
+        return result
 
     def space(self, names: Iterable[str] | None = None) -> ParameterSpace:
         """The named parameters as free ones; by default the friction angle and those of all effects that are on.
@@ -132,22 +157,41 @@ class Model:
             values,
             law=self.law,
             resolution=self.resolution,
-            frames=self.frames,
+            frames=self.recorded,
             device=self.device,
             progress=progress,
         )[0]
 
-    def draw(self, trajectory: Trajectory, seed: int = 0) -> dict[tuple[str, int], Image]:
-        """Pictures of a trajectory by (camera, frame), as undistorted cameras see it."""
+    def draw(
+        self, trajectory: Trajectory, seed: int = 0, values: Mapping[str, float] | None = None
+    ) -> dict[tuple[str, int], Image]:
+        """Pictures of a trajectory by (camera, frame), as cameras without distortion report it.
+
+        Args:
+            trajectory: from `simulate` of this model; one serves all values of `observation_parameters`.
+            seed: of the trajectory's particles.
+            values: by name; of these only observation effects' count. Everything is reported as it is by default.
+
+        Raises:
+            ParameterError: values out of bounds, or a trajectory without the frames that a time offset needs.
+        """
+        observation = self.observation(values)
         scene = self.scene(seed)
-        motion = self.measurement.tool.motion
-        cameras = {name: camera.undistorted() for name, camera in self.measurement.cameras.items()}
+        if observation.changes_light:
+            light = scene.light.changed(observation.sun_azimuth, observation.sun_elevation, observation.sky_share)
+            scene = scene.replace(light=light)
+        rate, motion = self.measurement.frame_rate, self.measurement.tool.motion
+        cameras = {
+            name: observation.camera(camera.undistorted(), k)
+            for k, (name, camera) in enumerate(self.measurement.cameras.items())
+        }
         images: dict[tuple[str, int], Image] = {}
-        for k, frame in enumerate(trajectory.frames):
-            tool = motion.pose(frame / self.measurement.frame_rate)
-            posed = scene.pose(trajectory.positions[k], trajectory.deformations[k], tool)
+        for frame in self.frames:
+            moment = frame + observation.time_offset * rate
+            tool = observation.tool(motion.pose(moment / rate))
+            posed = scene.pose(*state_at(trajectory, moment), tool)
             for name, camera in cameras.items():
-                images[name, frame] = scene.picture(posed, camera)
+                images[name, frame] = observation.image(scene.picture(posed, camera), frame / rate)
         return images
 
     def predict(
@@ -164,7 +208,7 @@ class Model:
         started = time.perf_counter()
         trajectory = self.simulate(values, seed, progress)
         simulated = time.perf_counter()
-        images = self.draw(trajectory, seed)
+        images = self.draw(trajectory, seed, values)
         return Prediction(
             values=dict(values),
             seed=seed,
@@ -172,3 +216,40 @@ class Model:
             trajectory=trajectory,
             seconds={"simulation": simulated - started, "drawing": time.perf_counter() - simulated},
         )
+
+    def _recorded_frames(self) -> tuple[int, ...]:
+        """The model's frames, and those around them between which a time offset within its bounds interpolates."""
+        late = sum(
+            max(abs(self.observation({p.name: bound}).time_offset) for bound in (p.lower, p.upper))
+            for p in self.observation_parameters
+        )
+        around = math.ceil(round(late * self.measurement.frame_rate, 6))
+        return tuple(sorted({max(f + k, 0) for f in self.frames for k in range(-around, around + 1)}))
+
+
+def state_at(trajectory: Trajectory, moment: float) -> State:
+    """Positions (n, 3) in m and deformations (n, 3, 3) at a moment in frames, linear between neighbouring frames.
+
+    Before frame 0 everything rests.
+
+    Raises:
+        ParameterError: the trajectory holds neither that frame nor the two around it.
+    """
+    wanted = round(max(moment, 0.0), 6)
+    index = {frame: k for k, frame in enumerate(trajectory.frames)}
+    before = math.floor(wanted)
+    share = wanted - before
+    missing = [f for f in (before, before + (share > 0.0)) if f not in index]
+    if missing:
+        raise ParameterError(
+            f"the trajectory has no frame {missing[0]}, which pictures at frame {wanted:g} need; "
+            "simulate with the effect that shifts time on"
+        )
+    k = index[before]
+    if share == 0.0:
+        return trajectory.positions[k], trajectory.deformations[k]
+    weight = np.float32(share)
+    return (
+        (1 - weight) * trajectory.positions[k] + weight * trajectory.positions[k + 1],
+        (1 - weight) * trajectory.deformations[k] + weight * trajectory.deformations[k + 1],
+    )

@@ -87,6 +87,17 @@ class Light:
         """Degrees above the horizon."""
         return math.degrees(math.asin(min(1.0, float(self.direction[2]))))
 
+    def changed(self, azimuth: float = 0.0, elevation: float = 0.0, ambient: float = 0.0) -> Light:
+        """The light with its sun turned and raised, degrees, and another sky's share; held where the sun stands 1 to 90
+        degrees above the horizon and shares lie in [0, 1]."""
+        return Light.from_angles(
+            self.azimuth + azimuth,
+            min(max(self.elevation + elevation, 1.0), 90.0),
+            np.clip(self.ambient + ambient, 0.0, 1.0),
+            level=self.level,
+            softness=self.softness,
+        )
+
     def reflectance(self, colour: npt.ArrayLike) -> FloatArray:
         """Share of light (3,) that a thing of a linear colour (in sun and sky, as ``level`` is) sends back."""
         return SOIL_REFLECTANCE * np.asarray(colour, dtype=np.float64) / float(self.level.mean())

@@ -21,7 +21,8 @@ class Effect:
       :class:`~splatsoil.soil.strength.Strength` found so far, the :class:`~splatsoil.soil.strength.SoilState`, the
       array of parameter values (simulations, columns), the row of this simulation and the column of the effect's first
       parameter, and returns the changed Strength. It is compiled only into models that have the effect on.
-    * ``observe`` changes what the cameras report of a simulation, not the simulation.
+    * ``observe`` changes what the cameras report of a simulation. An effect that has it does nothing else, so that its
+      parameters never cost a simulation.
 
     Attributes:
         name: identifier used by the command line and every file.
