@@ -47,12 +47,13 @@ def prepare(options: FitOptions) -> tuple[Measurement, RunFolder]:
         raise ParameterError(f"--budget: a fit needs at least 2 evaluations, not {options.budget}")
     if options.seed < 0:
         raise ParameterError(f"--seed: must be 0 or more, not {options.seed}")
-    known = [p.name for p in Law(find_effects(options.effects)).parameters]
+    effects = find_effects(options.effects)
+    resolve_device(options.device)
+    measurement = Measurement.load(options.set)
+    known = [p.name for p in Law(effect.for_measurement(measurement) for effect in effects).parameters]
     unknown = [name for name in options.parameters if name not in known]
     if unknown:
         raise ParameterError(f"--parameters: unknown {', '.join(unknown)}; this model has {', '.join(known)}")
-    resolve_device(options.device)
-    measurement = Measurement.load(options.set)
     if not measurement.frames:
         raise MeasurementError("has no video frames from 0 on: there is nothing to compare with", file=options.set)
     run = RunFolder.prepare(
