@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ from .devices import resolve_device
 from .problem import Evaluation, Image
 
 if TYPE_CHECKING:
-    from splatsoil.comparison import Comparator, Comparison
+    from splatsoil.comparison import Block, Comparator, Comparison
     from splatsoil.measurement import Measurement
     from splatsoil.model import Model, Prediction
     from splatsoil.reconstruction import Reconstruction
@@ -101,6 +102,16 @@ class MeasuredProblem:
     def block_count(self) -> int:
         """Length of the block residuals: squares of the bed, for each camera and frame."""
         return len(self.comparator.labels)
+
+    @property
+    def places(self) -> tuple[Block, ...]:
+        """Where each block residual is taken."""
+        return self.comparator.labels
+
+    @cached_property
+    def sensor_std(self) -> float:
+        """Standard deviation of a block residual by the cameras' noise alone."""
+        return self.comparator.block_noise()
 
     @property
     def image_size(self) -> tuple[int, int]:

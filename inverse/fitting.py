@@ -12,10 +12,11 @@ import numpy as np
 from splatsoil.envs.plow_sand import PlowSandEnv
 from splatsoil.envs.problem import Evaluation, Image, Problem
 
-from splatsoil.errors import RunError, SimulationError
+from splatsoil.errors import RunError
 from splatsoil.parameters import Parameter, ParameterSpace
 
 from .bayesopt import START, Episode, optimise
+from .campaign import Job, attempt, make_record
 from .evaluations import EvaluationRecord, EvaluationStore, digest
 from .run_folder import RunFolder
 from .surrogate import Minimum, Surrogate
@@ -147,8 +148,9 @@ class StoredProblem:
             key = digest({**self.setup.model(), "values": dict(parameters), "seed": seed})
             found = self.store.find(key)
             if found is None:
-                evaluation = self._simulate(parameters, seed)
-                record = self._record(key, parameters, seed, evaluation)
+                evaluation = attempt(self.problem, parameters, seed)
+                job = Job(dict(parameters), seed)
+                record = make_record(self.fit, self._step, key, job, evaluation, self.space, self.setup.model())
             else:
                 evaluation = _from_record(found)
                 record = replace(found, fit=self.fit, step=self._step, created="")
@@ -166,38 +168,6 @@ class StoredProblem:
                 f"{self.store.path}: evaluation {self._step} isn't the one this fit would make; choose another --run"
             )
         return record, _from_record(record)
-
-    def _simulate(self, parameters: Mapping[str, float], seed: int) -> Evaluation:
-        began = time.perf_counter()
-        try:
-            evaluation = self.problem.evaluate(parameters, seed)
-            if evaluation.loss is not None and not math.isfinite(evaluation.loss):
-                raise SimulationError(f"the loss is {evaluation.loss}")
-        except SimulationError as error:
-            evaluation = Evaluation(None, np.zeros(self.block_count), message=str(error))
-        return replace(evaluation, seconds=time.perf_counter() - began)
-
-    def _record(self, key: str, parameters: Mapping[str, float], seed: int, evaluation: Evaluation) -> EvaluationRecord:
-        unit = self.space.to_unit(self.space.to_vector(parameters))
-        return EvaluationRecord(
-            fit=self.fit,
-            step=self._step,
-            key=key,
-            parameters=dict(parameters),
-            # Environments act in float32: the action that led to these parameters is the nearest one.
-            action=tuple(float(np.float32(value)) for value in unit),
-            seed=seed,
-            status="failed" if evaluation.loss is None else "ok",
-            loss=evaluation.loss,
-            message=evaluation.message,
-            blocks=tuple(float(value) for value in evaluation.blocks),
-            extras={name: float(value) for name, value in evaluation.extras.items()},
-            seconds=evaluation.seconds,
-            device=self.setup.device,
-            preset=self.setup.preset,
-            version=self.setup.version,
-            measurement=self.setup.measurement,
-        )
 
 
 def _from_record(record: EvaluationRecord) -> Evaluation:

@@ -26,8 +26,9 @@ LENGTH_BOUNDS = (np.log(0.025), np.log(1e3))
 NOISE_BOUNDS = (np.log(1e-6), np.log(4.0))
 #: Added to the diagonal for the Cholesky factor's sake.
 JITTER = 1e-8
-#: Prior points for importance resampling (a power of two, for Sobol), and emcee's steps after it.
-PRIOR_POINTS, STEPS = 4096, 60
+#: Prior points for importance resampling (powers of two, for Sobol): for up to MANY outcomes; fewer beyond, down to a
+#: least number, since each costs the cube of them and more outcomes say more. Then emcee's steps.
+PRIOR_POINTS, MANY, LEAST_POINTS, STEPS = 4096, 32, 512, 60
 
 
 @dataclass(frozen=True)
@@ -117,7 +118,9 @@ def posterior(
         seed: the same seed gives the same bits.
     """
     density = Density(x, y, noise)
-    cube = qmc.Sobol(len(density.means), rng=np.random.default_rng(seed)).random(PRIOR_POINTS)
+    halvings = max(0, int(np.ceil(2.0 * np.log2(len(y) / MANY))))
+    prior_points = max(LEAST_POINTS, PRIOR_POINTS >> halvings)
+    cube = qmc.Sobol(len(density.means), rng=np.random.default_rng(seed)).random(prior_points)
     points = density.means + density.stds * norm.ppf(np.clip(cube, 1e-6, 1.0 - 1e-6))
     points = np.clip(points, density.bounds[:, 0], density.bounds[:, 1])
     likelihood = density.likelihood(points)
@@ -128,7 +131,7 @@ def posterior(
 
     random = np.random.RandomState(seed)  # the kind that emcee takes
     weights = np.exp(likelihood - likelihood.max())
-    start = points[random.choice(PRIOR_POINTS, count, p=weights / weights.sum())]
+    start = points[random.choice(prior_points, count, p=weights / weights.sum())]
     # Twins would never part: emcee's moves are along differences between walkers.
     start = start + 0.05 * density.stds * random.standard_normal(start.shape)
     start = np.clip(start, density.bounds[:, 0] + 1e-9, density.bounds[:, 1] - 1e-9)

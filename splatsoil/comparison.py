@@ -299,6 +299,19 @@ class Comparator:
             out[camera] = np.maximum(self._scaled_losses(camera, change, masks).mean(axis=0), 1e-12)
         return out
 
+    def block_noise(self) -> float:
+        """Standard deviation of a block's change by the cameras' noise alone, in grey levels of 255, from frames before
+        anything moves; 0 without."""
+        variances = []
+        for camera, still in self._still.items():
+            frames = [*still, self.observed[camera, self.reference]]
+            if len(frames) > 1:
+                masks = [self.interior[camera] & ~self._silhouettes[camera, self.reference]] * len(frames)
+                means = self._block_means(camera, [f - self._before[camera] for f in frames], masks)
+                # A later frame's own noise, and that of the mean it is compared with.
+                variances.append(np.sum(means**2, axis=0).mean() / (len(frames) - 1) * (1.0 + 1.0 / len(frames)))
+        return 255.0 * float(np.mean(variances)) ** 0.5 if variances else 0.0
+
     def _noise(self) -> float | None:
         """The robust loss that the cameras' noise alone leaves, from frames before anything moves; None without."""
         found = []

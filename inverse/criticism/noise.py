@@ -1,0 +1,275 @@
+"""Noise of features: what differs between observation and prediction although nothing is wrong with the model.
+
+The covariance is a sum of parts, each separable: a scale for each feature, AR(1) in time, a correlation between
+instruments and a Matérn-3/2 correlation in space with a nugget. Parts are estimated from samples that hold nothing but
+noise (other seeds, other numerics), with few parameters, because the samples are few: an empirical covariance from as
+many raises false alarms by the dozen.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.optimize import minimize
+
+from splatsoil.experiment.features import Layout
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+
+MOST_MEMORY = 0.98
+"""Largest correlation of neighbouring times."""
+RIDGE = 1e-6
+"""Added to the diagonal of a correlation, for its Cholesky factor's sake."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """One separable part of a covariance.
+
+    Attributes:
+        scale: (t, s) standard deviations.
+        memory: correlation of neighbouring times.
+        length: of the Matérn correlation, m; 0 for none.
+        nugget: share of the variance that is not correlated in space.
+        between: (c, c) correlation between instruments.
+    """
+
+    scale: FloatArray
+    memory: float = 0.0
+    length: float = 0.0
+    nugget: float = 0.0
+    between: FloatArray | None = None
+
+    def correlation(self, layout: Layout) -> FloatArray:
+        """(t s, t s) correlation of the features."""
+        return np.kron(_time(layout.steps(), self.memory), self.across(layout))
+
+    def across(self, layout: Layout) -> FloatArray:
+        """(s, s) correlation between sites at one time."""
+        return _space(layout, self.length, self.nugget, self.between)
+
+    def covariance(self, layout: Layout) -> FloatArray:
+        """(t s, t s) covariance."""
+        scale = self.scale.reshape(-1)
+        return scale[:, None] * self.correlation(layout) * scale[None]
+
+
+def independent(scale: FloatArray, memory: float = 0.0) -> Part:
+    """Noise of instruments: independent between sites."""
+    return Part(scale=scale, memory=memory, nugget=1.0)
+
+
+def estimate(layout: Layout, samples: FloatArray, seen: BoolArray) -> Part:
+    """The part that samples (k, t, s) of it, with mean zero, suggest.
+
+    Scales are pooled over each instrument, and vary over time and place as far as the samples show that they do more
+    than chance would (empirical Bayes on the logarithm of the variance). The correlation's parameters maximise the
+    Gaussian likelihood of the scaled samples.
+    """
+    samples = np.where(seen, samples, 0.0)
+    if not np.any(samples):
+        return Part(scale=np.zeros(layout.shape))
+    scale = _scales(layout, samples, seen, across=None, memory=0.0)
+    part = _correlation(layout, np.where(seen, samples / scale, 0.0), scale)
+    # How far the variance's own scatter is chance depends on the correlation, which depends on the variance: twice.
+    scale = _scales(layout, samples, seen, across=part.across(layout), memory=part.memory)
+    return _correlation(layout, np.where(seen, samples / scale, 0.0), scale)
+
+
+def _scales(
+    layout: Layout, samples: FloatArray, seen: BoolArray, across: FloatArray | None, memory: float
+) -> FloatArray:
+    """(t, s) standard deviations."""
+    squares = np.mean(samples**2, axis=0)
+    channel = layout.channel_numbers()
+    pooled = np.zeros(layout.shape)
+    for c in range(len(layout.channels)):
+        mine = channel == c
+        weight = seen[:, mine].sum()
+        pooled[:, mine] = squares[:, mine].sum() / max(weight, 1)
+    pooled = np.maximum(pooled, 1e-12 * max(float(pooled.max()), 1e-300))
+    in_time, in_space = _neighbours(layout)
+    share = in_time @ seen.astype(float) @ in_space.T
+    local = (in_time @ squares @ in_space.T) / np.maximum(share, 1e-9)
+    local = np.maximum(np.where(share > 1e-6, local, pooled), 1e-4 * pooled)
+    # Degrees of freedom of a local mean of squares whose terms are correlated.
+    time = _time(layout.steps(), memory)
+    space = np.eye(layout.shape[1]) if across is None else across
+    held = np.einsum("ij,ik,jk->i", in_time, in_time, time**2).mean()
+    held *= np.einsum("ij,ik,jk->i", in_space, in_space, space**2).mean()
+    freedom = samples.shape[0] / held
+    relative = np.log(local / pooled)[seen]
+    spread = float(np.var(relative)) if relative.size else 0.0
+    kept = max(0.0, 1.0 - (2.0 / freedom) / spread) if spread > 0.0 else 0.0
+    variance = pooled * np.exp(kept * np.log(local / pooled))
+    # The logarithm's mean lies below the mean's logarithm: keep each instrument's total.
+    for c in range(len(layout.channels)):
+        mine = channel == c
+        total = (variance * seen)[:, mine].sum()
+        variance[:, mine] *= squares[:, mine].sum() / max(total, 1e-300) if total > 0.0 else 1.0
+    return np.sqrt(np.maximum(variance, 1e-300))
+
+
+def _neighbours(layout: Layout) -> tuple[FloatArray, FloatArray]:
+    """Weights (t, t) and (s, s) of local means: Gaussian over one step, and over the spacing of sites."""
+    steps = layout.steps()
+    in_time = np.exp(-0.5 * np.subtract.outer(steps, steps) ** 2)
+    in_time /= in_time.sum(axis=1, keepdims=True)
+    distance, spacing = layout.distances(), _spacing(layout)
+    channel = layout.channel_numbers()
+    same = channel[:, None] == channel[None]
+    in_space = np.where(same, np.exp(-0.5 * (distance / spacing) ** 2), 0.0)
+    in_space /= in_space.sum(axis=1, keepdims=True)
+    return in_time, in_space
+
+
+def _spacing(layout: Layout) -> float:
+    """Median distance of a site to its nearest neighbour of the same instrument, m."""
+    channel = layout.channel_numbers()
+    distance = layout.distances() + np.where(channel[:, None] == channel[None], 0.0, np.inf)
+    distance[distance == 0.0] = np.inf
+    nearest = distance.min(axis=1)
+    nearest = nearest[np.isfinite(nearest)]
+    return float(np.median(nearest)) if nearest.size else 1.0
+
+
+def _correlation(layout: Layout, scaled: FloatArray, scale: FloatArray) -> Part:
+    """Parameters of the correlation that maximise the likelihood of scaled samples (k, t, s)."""
+    spacing, places = _spacing(layout), np.isfinite([site.x for site in layout.sites]).any()
+    channels = len(layout.channels)
+    pairs = [(a, b) for a in range(channels) for b in range(a)]
+    times, sites = layout.shape
+
+    def unpack(p: FloatArray) -> tuple[float, float, float, FloatArray]:
+        memory = MOST_MEMORY / (1.0 + math.exp(-p[0]))
+        length = spacing * math.exp(float(np.clip(p[1], -3.0, 4.0))) if places else 0.0
+        nugget = 0.01 + 0.98 / (1.0 + math.exp(-p[2])) if places else 0.01
+        between = np.eye(channels)
+        for (a, b), value in zip(pairs, p[3:], strict=True):
+            between[a, b] = between[b, a] = math.tanh(value)
+        return memory, length, nugget, _valid(between)
+
+    def loss(p: FloatArray) -> float:
+        memory, length, nugget, between = unpack(p)
+        lower_t = np.linalg.cholesky(_time(layout.steps(), memory))
+        lower_s = np.linalg.cholesky(_space(layout, length, nugget, between))
+        white = solve_triangular(lower_t, scaled.transpose(1, 0, 2).reshape(times, -1), lower=True)
+        white = white.reshape(times, -1, sites).transpose(2, 0, 1).reshape(sites, -1)
+        white = solve_triangular(lower_s, white, lower=True)
+        logs = 2.0 * (sites * np.log(np.diag(lower_t)).sum() + times * np.log(np.diag(lower_s)).sum())
+        return float(np.sum(white**2) + len(scaled) * logs)
+
+    start = np.concatenate([[0.0, 0.0, 0.0], np.zeros(len(pairs))])
+    found = minimize(loss, start, method="Nelder-Mead", options={"maxfev": 150 + 60 * len(pairs), "xatol": 0.02})
+    memory, length, nugget, between = unpack(found.x)
+    return Part(scale=scale, memory=memory, length=length, nugget=nugget, between=between)
+
+
+def _time(steps: FloatArray, memory: float) -> FloatArray:
+    gaps = np.abs(np.subtract.outer(steps, steps))
+    return np.where(gaps == 0.0, 1.0 + RIDGE, max(memory, 0.0) ** gaps if memory > 0.0 else 0.0)
+
+
+def _space(layout: Layout, length: float, nugget: float, between: FloatArray | None) -> FloatArray:
+    channel, distance = layout.channel_numbers(), layout.distances()
+    link = np.eye(len(layout.channels)) if between is None else between
+    if length > 0.0:
+        far = math.sqrt(3.0) * distance / length
+        smooth = (1.0 + far) * np.exp(-far)
+    else:
+        smooth = np.where(distance == 0.0, 1.0, 0.0)
+    held = (1.0 - nugget) * link[channel[:, None], channel[None]] * smooth
+    return held + (nugget + RIDGE) * np.eye(len(channel))
+
+
+def _valid(correlation: FloatArray) -> FloatArray:
+    """The nearest-looking correlation matrix whose eigenvalues are positive."""
+    values, vectors = np.linalg.eigh(correlation)
+    if values[0] > 1e-3:
+        return correlation
+    fixed = (vectors * np.maximum(values, 1e-3)) @ vectors.T
+    root = np.sqrt(np.diag(fixed))
+    return fixed / np.outer(root, root)
+
+
+@dataclass(frozen=True)
+class Noise:
+    """The covariance of the features that were seen, ready to solve with.
+
+    Attributes:
+        covariance: (n, n).
+        seen: (t, s) which features those are.
+    """
+
+    covariance: FloatArray
+    seen: BoolArray
+
+    @classmethod
+    def of(cls, layout: Layout, parts: Sequence[tuple[float, Part]], seen: BoolArray) -> Noise:
+        """The sum of parts, each with the factor on its variance."""
+        index = np.flatnonzero(seen.reshape(-1))
+        total = np.zeros((index.size, index.size))
+        for factor, part in parts:
+            total += factor * part.covariance(layout)[np.ix_(index, index)]
+        ridge = RIDGE * float(np.mean(np.diag(total)))
+        total[np.diag_indices_from(total)] += ridge
+        return cls(total, seen)
+
+    def pick(self, table: FloatArray) -> FloatArray:
+        """(..., t, s) to the features that were seen (..., n)."""
+        return table[..., self.seen]
+
+    def spread(self, vector: FloatArray) -> FloatArray:
+        """(n,) back to (t, s), 0 where nothing was seen."""
+        table = np.zeros(self.seen.shape)
+        table[self.seen] = vector
+        return table
+
+    @property
+    def scale(self) -> FloatArray:
+        """(n,) standard deviations."""
+        return np.sqrt(np.diag(self.covariance))
+
+    def plus(self, columns: FloatArray) -> Noise:
+        """With low-rank noise (n, k) added: columns times independent standard normal numbers."""
+        return Noise(self.covariance + columns @ columns.T, self.seen)
+
+    def rows(self, chosen: BoolArray) -> Noise:
+        """Only the features of some times (t,)."""
+        keep = self.seen & chosen[:, None]
+        inner = keep[self.seen]
+        return Noise(self.covariance[np.ix_(inner, inner)], keep)
+
+    def solver(self) -> Solver:
+        """Its Cholesky factor."""
+        return Solver(cho_factor(self.covariance, lower=True))
+
+
+@dataclass(frozen=True)
+class Solver:
+    """Products with the inverse of a covariance.
+
+    Attributes:
+        factor: SciPy's Cholesky factor.
+    """
+
+    factor: tuple[FloatArray, bool]
+
+    def solve(self, columns: FloatArray) -> FloatArray:
+        """Inverse covariance times (n,) or (n, k)."""
+        return cho_solve(self.factor, columns)
+
+    def whiten(self, columns: FloatArray) -> FloatArray:
+        """Inverse of the lower factor times (n,) or (n, k): noise becomes independent with variance 1."""
+        return solve_triangular(self.factor[0], columns, lower=True)
+
+    def sample(self, generator: np.random.Generator, count: int) -> FloatArray:
+        """(n, count) draws of the noise."""
+        lower = np.tril(self.factor[0])
+        return lower @ generator.standard_normal((len(lower), count))

@@ -1,0 +1,207 @@
+"""An emulator of features: what a simulation would say of them, and how sure that is, in microseconds.
+
+Features (residuals of hundreds of blocks) vary along few directions when parameters do. Principal components find
+these, and each component's score is a Gaussian process over the parameters, averaged over draws of its hyperparameters
+(Higdon et al. 2008, J. Am. Stat. Assoc. 103:570). The scatter between particle seeds is the processes' noise: what is
+predicted is the mean over seeds, and chance is reported apart.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from .hyperparameters import JITTER, Hyperparameters, posterior
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Share of the training features' variance that the components keep, and the most of them.
+VARIANCE, MOST = 0.995, 10
+#: Draws of the hyperparameters from which a prediction is averaged.
+DRAWS = 16
+#: A component predicted worse than this (share of its variance, points left out) says nothing of the parameters.
+LEAST_SKILL = 0.1
+#: Fewest training evaluations, beyond one for each parameter.
+FEWEST = 4
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """How well training points are predicted by the others.
+
+    Attributes:
+        skill: (p,) 1 − mean square error / variance, for each component; 1 is perfect, 0 no better than the mean.
+        z: (m, p) standardised errors, whose root mean square is 1 when the quoted variance is right.
+        coverage: share of errors inside the central 90 % interval.
+    """
+
+    skill: FloatArray
+    z: FloatArray
+    coverage: float
+
+
+class Emulator:
+    """Principal components of features, and a Gaussian process for each.
+
+    Args:
+        points: (m, n) parameters in [-1, 1]; a point may repeat, with another seed.
+        features: (m, b) of the simulations there.
+        seed: of the hyperparameters' draws.
+
+    Attributes:
+        centre: (b,) mean features.
+        basis: (b, p) orthonormal directions.
+        chance: (p, p) covariance of one simulation's scores about the mean over seeds.
+        left_out: leave-one-out diagnostics.
+
+    Raises:
+        ValueError: too few points, features that aren't finite, or shapes that don't agree.
+    """
+
+    def __init__(self, points: npt.ArrayLike, features: npt.ArrayLike, *, seed: int = 0) -> None:
+        self.points = np.atleast_2d(np.asarray(points, dtype=np.float64))
+        features = np.asarray(features, dtype=np.float64)
+        m, n = self.points.shape
+        if features.ndim != 2 or len(features) != m or not np.all(np.isfinite(features)):
+            raise ValueError(f"{m} points need finite features of shape ({m}, b), not {features.shape}")
+        if m < n + FEWEST:
+            raise ValueError(f"{m} evaluations are too few to emulate {n} parameters; {n + FEWEST} are needed at least")
+        self.centre = features.mean(axis=0)
+        varying = features - self.centre
+        left, size, right = np.linalg.svd(varying, full_matrices=False)
+        share = np.cumsum(size**2) / max(float(np.sum(size**2)), 1e-300)
+        count = min(int(np.searchsorted(share, VARIANCE)) + 1, MOST, m - 2)
+        if size[0] <= 1e-12 * max(1.0, float(np.abs(self.centre).max())):
+            raise ValueError("the features are the same wherever they were simulated: there is nothing to emulate")
+        scores = left[:, :count] * size[:count]
+        processes = [_Process(self.points, scores[:, k], seed + k) for k in range(count)]
+        kept = [k for k, process in enumerate(processes) if process.skill() > LEAST_SKILL]
+        # All of it chance: one component stays, so that what follows can say that nothing is determined.
+        kept = kept or [0]
+        self._processes = [processes[k] for k in kept]
+        self.basis = right[kept].T.copy()
+        self.scores = scores[:, kept]
+        self._outside = varying - self.scores @ self.basis.T
+        self.chance = self._measure_chance()
+        self.left_out = self._leave_out()
+
+    @property
+    def dimension(self) -> int:
+        """Number of parameters n."""
+        return self.points.shape[1]
+
+    @property
+    def count(self) -> int:
+        """Number of components p."""
+        return self.basis.shape[1]
+
+    @property
+    def outside_variance(self) -> FloatArray:
+        """(b,) variance, over training points, of the part of each feature that the components leave out."""
+        dof = max(len(self.points) - 1 - self.count, 1)
+        return np.sum(self._outside**2, axis=0) / dof
+
+    def project(self, features: npt.ArrayLike) -> FloatArray:
+        """Scores (…, p) of features (…, b)."""
+        return (np.asarray(features, dtype=np.float64) - self.centre) @ self.basis
+
+    def remainder(self, features: npt.ArrayLike) -> FloatArray:
+        """The part (…, b) of features that no parameter can explain: outside the basis."""
+        varying = np.asarray(features, dtype=np.float64) - self.centre
+        return varying - (varying @ self.basis) @ self.basis.T
+
+    def predict(self, points: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Mean (q, p) of the scores over seeds, and variance (q, p) of what is known of it, at points (q, n)."""
+        where = np.atleast_2d(np.asarray(points, dtype=np.float64))
+        found = [process.predict(where) for process in self._processes]
+        return np.stack([mean for mean, _ in found], axis=1), np.stack([var for _, var in found], axis=1)
+
+    def features(self, points: npt.ArrayLike) -> FloatArray:
+        """Mean features (q, b) at points (q, n)."""
+        return self.centre + self.predict(points)[0] @ self.basis.T
+
+    def _measure_chance(self) -> FloatArray:
+        """Scatter between seeds: from repeated points, leaning on the processes' noise where there are few of them."""
+        noise = np.array([process.noise_variance() for process in self._processes])
+        prior = np.diag(noise)
+        sums, freedom = np.zeros_like(prior), 0
+        for group in _groups(self.points):
+            if len(group) > 1:
+                inside = self.scores[group] - self.scores[group].mean(axis=0)
+                sums += inside.T @ inside
+                freedom += len(group) - 1
+        # As much weight for the prior as for p + 1 repeats: the fewest that make a covariance.
+        weight = self.count + 1.0
+        return (sums + weight * prior) / (freedom + weight)
+
+    def _leave_out(self) -> LeftOut:
+        """Each point, with its repeats, predicted by all others with the same hyperparameters."""
+        z = np.empty_like(self.scores)
+        skill = np.empty(self.count)
+        for k, process in enumerate(self._processes):
+            error, std = process.left_out()
+            z[:, k] = error / std
+            skill[k] = process.skill()
+        return LeftOut(skill, z, float(np.mean(np.abs(z) < 1.6449)))
+
+
+class _Process:
+    """A Gaussian process over scores, averaged over hyperparameters."""
+
+    def __init__(self, points: FloatArray, scores: FloatArray, seed: int) -> None:
+        self.x = 0.5 * (points + 1.0)
+        self.shift, self.scale = float(scores.mean()), float(scores.std(ddof=1)) or 1.0
+        self.y = (scores - self.shift) / self.scale
+        self.groups = _groups(points)
+        draws = max(DRAWS, 2 * (points.shape[1] + 3))
+        _, settings = posterior(self.x, self.y, None, count=draws + draws % 2, seed=seed)
+        self.settings = settings
+        inverses = [np.linalg.inv(self._kernel(settings, d)) for d in range(len(settings))]
+        self.inverse = np.stack(inverses)
+        self.weights = np.einsum("dij,dj->di", self.inverse, self.y - settings.mean[:, None])
+
+    def _kernel(self, settings: Hyperparameters, draw: int) -> FloatArray:
+        squares = (self.x[:, None] - self.x[None]) ** 2
+        kernel = np.exp(-0.5 * squares @ settings.lengths[draw] ** -2.0)
+        return kernel + np.diag(settings.noise[draw] + JITTER)
+
+    def noise_variance(self) -> float:
+        """Of one simulation's score."""
+        return float(self.settings.noise[:, 0].mean()) * self.scale**2
+
+    def predict(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        x = 0.5 * (points + 1.0)
+        squares = (x[:, None] - self.x[None]) ** 2
+        kernel = np.exp(-0.5 * np.einsum("qmn,dn->dqm", squares, self.settings.lengths**-2.0))
+        means = self.settings.mean[:, None] + np.einsum("dqm,dm->dq", kernel, self.weights)
+        variances = np.maximum(1.0 - np.einsum("dqm,dqm->dq", kernel @ self.inverse, kernel), 0.0)
+        total = variances.mean(axis=0) + means.var(axis=0)
+        return self.shift + self.scale * means.mean(axis=0), self.scale**2 * total
+
+    def left_out(self) -> tuple[FloatArray, FloatArray]:
+        """Errors (m,) and their quoted standard deviations when a point's own evaluations are left out.
+
+        Closed form: the errors of a left-out group G are (K⁻¹)_GG⁻¹ (K⁻¹(y − μ))_G, their covariance is (K⁻¹)_GG⁻¹.
+        """
+        errors = np.empty((len(self.settings), len(self.y)))
+        variances = np.empty_like(errors)
+        for d in range(len(self.settings)):
+            for group in self.groups:
+                block = np.linalg.inv(self.inverse[d][np.ix_(group, group)])
+                errors[d, group] = block @ self.weights[d, group]
+                variances[d, group] = np.diag(block)
+        total = variances.mean(axis=0) + errors.var(axis=0)
+        return self.scale * errors.mean(axis=0), self.scale * np.sqrt(total)
+
+    def skill(self) -> float:
+        """1 − mean square error over variance, points left out."""
+        error, _ = self.left_out()
+        return 1.0 - float(np.mean(error**2)) / self.scale**2
+
+
+def _groups(points: FloatArray) -> list[npt.NDArray[np.int64]]:
+    """Indices of points that are the same."""
+    _, which = np.unique(np.round(points, 9), axis=0, return_inverse=True)
+    return [np.flatnonzero(which == g) for g in range(which.max() + 1)]

@@ -1,0 +1,148 @@
+"""Where evaluations run: here, in processes of this machine, or on a Dask cluster, all shaped like a
+``concurrent.futures.Executor``.
+
+A worker that dies (killed, out of memory) costs the one evaluation it was at, which is repeated.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import queue
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from typing import Any
+
+from splatsoil.errors import ParameterError, RunError
+
+#: A job whose worker dies this often is to blame itself.
+ATTEMPTS = 4
+
+
+class Serial(Executor):
+    """Runs each job where it is submitted, at once."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Run it; the future returned is done."""
+        future: Future[Any] = Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+class Processes(Executor):
+    """Worker processes of this machine, each with a pool of its own: the death of one leaves the others at work.
+
+    Args:
+        workers: their number.
+
+    Raises:
+        ParameterError: fewer than one.
+    """
+
+    def __init__(self, workers: int) -> None:
+        if workers < 1:
+            raise ParameterError(f"processes:{workers}: at least one worker is needed")
+        # A fresh interpreter each: forking a process that has threads or a CUDA context breaks both.
+        self._context = multiprocessing.get_context("spawn")
+        self._jobs: queue.SimpleQueue[tuple[Future[Any], Callable[..., Any], tuple[Any, ...], dict[str, Any]] | None]
+        self._jobs = queue.SimpleQueue()
+        self._closed = False
+        self._threads = [threading.Thread(target=self._work, daemon=True) for _ in range(workers)]
+        for thread in self._threads:
+            thread.start()
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Queue a job; function, arguments and result have to be picklable."""
+        if self._closed:
+            raise RuntimeError("the executor has been shut down")
+        future: Future[Any] = Future()
+        self._jobs.put((future, fn, args, kwargs))
+        return future
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Let the workers finish what is queued (or only what they are at), and end them."""
+        self._closed = True
+        while cancel_futures:
+            try:
+                job = self._jobs.get_nowait()
+            except queue.Empty:
+                break
+            if job is not None:
+                job[0].cancel()
+        for _ in self._threads:
+            self._jobs.put(None)
+        for thread in self._threads if wait else ():
+            thread.join()
+
+    def _work(self) -> None:
+        pool: ProcessPoolExecutor | None = None
+        while (job := self._jobs.get()) is not None:
+            future, fn, args, kwargs = job
+            if not future.set_running_or_notify_cancel():
+                continue
+            for attempt in range(1, ATTEMPTS + 1):
+                pool = pool or ProcessPoolExecutor(1, mp_context=self._context)
+                try:
+                    future.set_result(pool.submit(fn, *args, **kwargs).result())
+                except BrokenProcessPool:
+                    pool.shutdown(wait=False)
+                    pool = None
+                    if attempt < ATTEMPTS:
+                        continue
+                    future.set_exception(
+                        RunError(f"a worker died {ATTEMPTS} times at the same evaluation; is there enough memory?")
+                    )
+                except Exception as error:
+                    future.set_exception(error)
+                break
+        if pool is not None:
+            pool.shutdown(wait=True)
+
+
+@contextmanager
+def executor(where: str = "serial") -> Iterator[Executor]:
+    """An executor by name.
+
+    Args:
+        where: ``serial``, ``processes:N``, or ``dask:ADDRESS`` (a scheduler's, as ``tcp://host:8786``; needs the extra
+            ``cluster``). SLURM and cloud clusters start such a scheduler with dask-jobqueue and dask-cloudprovider.
+
+    Raises:
+        ParameterError: another name, Dask isn't installed, or its scheduler doesn't answer.
+    """
+    kind, _, detail = where.partition(":")
+    if kind == "serial" and not detail:
+        yield Serial()
+    elif kind == "processes" and detail.isdigit():
+        pool = Processes(int(detail))
+        try:
+            yield pool
+        finally:
+            pool.shutdown(cancel_futures=True)
+    elif kind == "dask" and detail:
+        with _dask(detail) as pool:
+            yield pool
+    else:
+        raise ParameterError(f"executor {where!r} is unknown; give serial, processes:N or dask:ADDRESS")
+
+
+@contextmanager
+def _dask(address: str) -> Iterator[Executor]:
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise ParameterError("executor dask needs the extra: pip install 'splatsoil[cluster]'") from error
+    try:
+        client = Client(address, timeout="10s", set_as_default=False)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise ParameterError(f"no Dask scheduler answers at {address} ({error})") from error
+    try:
+        # A simulation is no pure function of its arguments to Dask: its own cache is not to answer for the database.
+        yield client.get_executor(pure=False, retries=ATTEMPTS - 1)
+    finally:
+        client.close()
