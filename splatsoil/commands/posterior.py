@@ -1,0 +1,127 @@
+"""``splatsoil posterior``: not only the best parameters, but all that the pictures leave possible."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tyro.conf import Positional
+
+from splatsoil.commands._output import print_json
+
+
+@dataclass(frozen=True)
+class Config:
+    """Sample the posterior of a run's latest fit. An interrupted one goes on where it stopped."""
+
+    run: Positional[Path]
+    """The run folder."""
+    design: int | None = None
+    """Simulations that fill the parameters' bounds; 8 for each parameter and 4 more, if not given."""
+    repeats: int = 4
+    """Simulations at the fit's estimate with other particles, which measure chance."""
+    checks: int = 3
+    """Simulations at places drawn from the posterior, which hold the emulator to its word."""
+    executor: str = "serial"
+    """Where simulations run: serial, processes:N, or dask:ADDRESS (extra cluster)."""
+    device: str = "auto"
+    """Where to compute: auto (what the fit used), cpu, cuda:0, …"""
+    seed: int = 0
+    """Of design and chains."""
+    json: bool = False
+    """Print one JSON object instead of a table."""
+
+
+def run(config: Config) -> int:
+    """Simulate what is missing, emulate, sample; ``posterior.json`` and the folder ``posterior`` are kept."""
+    from splatsoil import __version__
+    from splatsoil.commands import _stages as stage
+    from splatsoil.commands._progress import stages
+    from splatsoil.envs.devices import resolve_device
+    from splatsoil.envs.measured import MeasuredProblem
+    from splatsoil.errors import ParameterError
+    from splatsoil.files import code_digest
+    from splatsoil.inverse.executors import executor
+    from splatsoil.inverse.posterior_run import Effort, run_posterior, setup_of
+    from splatsoil.inverse.run_folder import RunFolder
+
+    for name in ("design", "repeats", "checks", "seed"):
+        value = getattr(config, name)
+        if value is not None and value < 0:
+            raise ParameterError(f"--{name}: must be 0 or more, not {value}")
+    stage.hush()
+    folder = RunFolder.open(config.run)
+    setup = setup_of(folder.fit()["setup"])
+    wanted = ("cuda:0" if setup.device == "cuda" else "cpu") if config.device == "auto" else config.device
+    device = resolve_device(wanted)
+    if device.split(":")[0] != setup.device:
+        raise ParameterError(
+            f"--device {config.device}: the fit in {folder.path} was made on {setup.device}; give the same or fit again"
+        )
+    own = [name for name in setup.effects if name.endswith(".py")]
+    if setup.version != __version__ or setup.code != code_digest(others=own):
+        raise ParameterError(
+            f"{folder.path}: the fit was made by other sources of splatsoil; fit again before the posterior"
+        )
+    measurement = stage.measurement_of(folder)
+    with stages(quiet=config.json) as begin, executor(config.executor) as pool:
+        stage.reconstructed(measurement, folder, device, begin("reconstruct"))
+        report = begin("posterior")
+        report("reading the video", 0.0)
+        problem = MeasuredProblem.load(
+            measurement.folder,
+            setup.parameters,
+            setup.effects,
+            preset=setup.preset,
+            device=device,
+            reconstruction=folder.reconstruction,
+        )
+        effort = Effort(config.design, config.repeats, config.checks)
+        result = run_posterior(problem, folder, setup, effort=effort, executor=pool, seed=config.seed, progress=report)
+    if config.json:
+        print_json({"ok": True, "run": str(folder.path), **result})
+    else:
+        show(result, str(folder.path))
+    return 0
+
+
+def interrupted(config: Config) -> str:
+    """What is kept, and the command that goes on."""
+    return f"what was simulated and sampled is kept; go on with the same command on {config.run}"
+
+
+def show(result: Mapping[str, Any], folder: str) -> None:
+    """A table of the parameters, and what to know about them."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    from splatsoil.report.words import duration, model_name, symbol, with_std
+
+    table = Table(title=f"posterior, {escape(model_name(result['fit']))}", title_justify="left")
+    for column in ("parameter", "mean", "5 to 95 %", "width / prior", ""):
+        table.add_column(column, justify="left" if column in ("parameter", "") else "right")
+    for name, entry in result["parameters"].items():
+        value, std = with_std(entry["mean"], entry["std"])
+        unit = symbol(entry["unit"])
+        table.add_row(
+            escape(name),
+            f"{value} ± {std}{unit}",
+            f"{entry['low']:.4g} to {entry['high']:.4g}{unit}",
+            f"{entry['contraction']:.2f}",
+            entry["verdict"],
+        )
+    console = Console(highlight=False)
+    console.print(table)
+    for note in result["notes"]:
+        console.print(f"[yellow]note[/yellow] {escape(note)}")
+    chains, emulator = result["chains"], result["emulator"]
+    console.print(
+        f"{result['evaluations']} simulations, {emulator['components']} components, skill "
+        f"{min(emulator['skill']):.2f} to {max(emulator['skill']):.2f}; R-hat {chains['r_hat']:.3f}, acceptance "
+        f"{chains['acceptance']:.2f}, {chains['effective']:.0f} independent samples; ln evidence "
+        f"{result['evidence']['log']:.1f} ± {result['evidence']['std']:.1f}; {duration(result['seconds'])}"
+    )
+    console.print(f"kept in {escape(folder)}: posterior.json, posterior/")
