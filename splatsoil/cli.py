@@ -62,13 +62,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"splatsoil {__version__}")
         return 0
     known = commands()
-    config = tyro.extras.subcommand_cli_from_dict(
-        {name: command.config for name, command in known.items()},
-        prog="splatsoil",
-        description=DESCRIPTION,
-        args=words,
-        config=(tyro.conf.FlagCreatePairsOff,),
-    )
+    config: Any
+    if words[:1] == ["benchmark"] and len(words) > 1 and not words[1].startswith("-"):
+        # What follows a benchmark's name is its own, options too.
+        config = known["benchmark"].config(words[1], tuple(words[2:]))
+    else:
+        config = tyro.extras.subcommand_cli_from_dict(
+            {name: command.config for name, command in known.items()},
+            prog="splatsoil",
+            description=DESCRIPTION,
+            args=words,
+            config=(tyro.conf.FlagCreatePairsOff,),
+        )
     command = next(c for c in known.values() if isinstance(config, c.config))
     wants_json = bool(getattr(config, "json", False))
     with only_json() if wants_json else nullcontext():

@@ -1,0 +1,68 @@
+"""``splatsoil benchmark``: measurements of the product itself."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+import runpy
+import sys
+from dataclasses import dataclass
+
+from tyro.conf import Positional
+
+from splatsoil.commands._output import print_json
+from splatsoil.errors import ParameterError
+
+
+@dataclass(frozen=True)
+class Config:
+    """List the benchmarks, or run one: splatsoil benchmark NAME --help shows its options."""
+
+    name: Positional[str] = ""
+    """Of the benchmark; without one they are listed."""
+    arguments: Positional[tuple[str, ...]] = ()
+    """The benchmark's own arguments."""
+    json: bool = False
+    """List as one JSON object; as an argument of a benchmark, it is the benchmark's own."""
+
+
+def benchmarks() -> dict[str, str]:
+    """Modules of ``splatsoil.benchmarks`` by the names that the command takes."""
+    import splatsoil.benchmarks
+
+    found = sorted(info.name for info in pkgutil.iter_modules(splatsoil.benchmarks.__path__))
+    return {name.replace("_", "-"): f"splatsoil.benchmarks.{name}" for name in found if not name.startswith("_")}
+
+
+def run(config: Config) -> int:
+    """Run the named benchmark as a script; ParameterError when there is none of that name."""
+    known = benchmarks()
+    if config.name in known:
+        return _execute(config.name, known[config.name], config.arguments)
+    if config.name:
+        raise ParameterError(f"benchmark {config.name!r} is unknown; there are {', '.join(known)}")
+    titles = {name: _title(module) for name, module in known.items()}
+    if config.json:
+        print_json({"ok": True, "benchmarks": titles})
+    else:
+        for name, title in titles.items():
+            print(f"{name:<16}{title}")
+    return 0
+
+
+def _execute(name: str, module: str, arguments: tuple[str, ...]) -> int:
+    """``python -m MODULE ARGUMENTS`` in this process; its exit code."""
+    before = sys.argv
+    sys.argv = [f"splatsoil benchmark {name}", *arguments]
+    try:
+        runpy.run_module(module, run_name="__main__")
+    except SystemExit as end:
+        return end.code if isinstance(end.code, int) else int(end.code is not None)
+    finally:
+        sys.argv = before
+    return 0
+
+
+def _title(module: str) -> str:
+    """First line of a module's text."""
+    return (importlib.import_module(module).__doc__ or "").strip().splitlines()[0]
