@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 import torch.nn.functional as functional
 import warp as wp
 from torch import Tensor
 
 from splatsoil.scene import kernels
+from splatsoil.scene.kernels_sky import WIDTH, sky_kernel
 from splatsoil.scene.relief import Relief, grid_of
 from splatsoil.splats.warp_torch import as_warp, launch
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
 
 _AZIMUTHS = 12
 
@@ -34,37 +40,71 @@ def sky_openness(relief: Relief, tool: Any) -> tuple[Tensor, Tensor]:
         Two maps (ny, nx): the share of the sky's light, weighted by the cosine, that soil and tool leave (1 on an open
         plane), and the share that the tool alone takes.
     """
-    z, normal = relief.height, relief.normal
     bottom, top = _tool_columns(relief, tool)
-    distances = _distances(relief)
-    margin = [int(np.ceil(distances[-1] / c)) for c in relief.cell]
-    wide = _padded(z, margin, "replicate")
-    below, above = _padded(bottom, margin, "constant", _NOTHING), _padded(top, margin, "constant", -_NOTHING)
-    with_tool = bool((top > bottom).any())
-    some = (slice(None, None, _STRIDE), slice(None, None, _STRIDE))
-    here, up = z[some].contiguous(), normal[..., 2][some].contiguous()
-    total, rise = torch.zeros_like(z), torch.empty_like(z)
-    taken, part = torch.zeros_like(here), torch.empty_like(here)
-    for angle in 2.0 * np.pi * (np.arange(_AZIMUTHS) + 0.5) / _AZIMUTHS:
-        along = float(np.cos(angle)) * normal[..., 0] + float(np.sin(angle)) * normal[..., 1]
-        slope = -along / normal[..., 2]
-        looks = _looks(angle, distances, relief.cell)
-        for row, column, inverse in looks:
-            torch.sub(_shifted(wide, row, column, margin, z), z, out=rise)
-            torch.maximum(slope, rise.mul_(inverse), out=slope)
-        total += _wedge(None, normal[..., 2], along) - _wedge(slope, normal[..., 2], along)
-        if with_tool:
-            low, high = torch.full_like(here, _NOTHING), torch.full_like(here, -_NOTHING)
-            for row, column, inverse in looks:
-                torch.sub(_shifted(below, row, column, margin, z)[some], here, out=part)
-                torch.minimum(low, part.mul_(inverse), out=low)
-                torch.sub(_shifted(above, row, column, margin, z)[some], here, out=part)
-                torch.maximum(high, part.mul_(inverse), out=high)
-            torch.maximum(low, slope[some], out=low)
-            taken += torch.where(high > low, _wedge(high, up, along[some]) - _wedge(low, up, along[some]), 0.0)
-    hidden = _between(taken, _STRIDE, (z.shape[0], z.shape[1]))
+    looks = _Looks.over(relief)
     scale = 2.0 / _AZIMUTHS
+    total = _sum(relief, looks, None, 1)
+    if not bool((top > bottom).any()):
+        return (scale * total).clamp(0.0, 1.0), torch.zeros_like(total)
+    taken = _sum(relief, looks, (bottom, top), _STRIDE)
+    hidden = _between(taken, _STRIDE, (total.shape[0], total.shape[1]))
     return (scale * (total - hidden)).clamp(0.0, 1.0), (scale * hidden).clamp(0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class _Looks:
+    """Where a cell looks: the same distances in every direction.
+
+    Attributes:
+        directions: (azimuths, 2) cosine and sine.
+        rows, columns: (azimuths, looks) cells on.
+        inverses: (azimuths, looks) one over the distance, 1/m.
+    """
+
+    directions: FloatArray
+    rows: IntArray
+    columns: IntArray
+    inverses: FloatArray
+
+    @classmethod
+    def over(cls, relief: Relief) -> _Looks:
+        angle = 2.0 * np.pi * (np.arange(_AZIMUTHS) + 0.5) / _AZIMUTHS
+        directions = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        away = directions[:, :, None] * np.array(_distances(relief))
+        columns, rows = (np.round(away[:, k] / relief.cell[k]).astype(np.int64) for k in (0, 1))
+        return cls(directions, rows, columns, 1.0 / np.hypot(columns * relief.cell[0], rows * relief.cell[1]))
+
+
+def _sum(relief: Relief, looks: _Looks, tool: tuple[Tensor, Tensor] | None, stride: int) -> Tensor:
+    """Sum over the azimuths of the sky that soil leaves open to every so many cells, or of what the tool takes of it.
+
+    Args:
+        relief: the surface.
+        looks: where its cells look.
+        tool: its lowest and highest point over each cell, or None for the soil.
+        stride: rows and columns from one cell to the next.
+    """
+    z = relief.height
+    ny, nx = z.shape
+    margin = [int(np.abs(cells).max()) for cells in (looks.columns, looks.rows)]
+    beyond = stride * WIDTH
+    wide = below = above = _padded(z, margin, beyond, "replicate")
+    if tool is not None:
+        below, above = (
+            _padded(part, margin, beyond, "constant", value)
+            for part, value in zip(tool, (_NOTHING, -_NOTHING), strict=True)
+        )
+    tables = (looks.directions.astype(np.float32), (looks.rows * wide.shape[1] + looks.columns).astype(np.int32))
+    directions, offsets, inverses = (
+        torch.from_numpy(t.reshape(-1)).to(z.device) for t in (*tables, looks.inverses.astype(np.float32))
+    )
+    result = z.new_empty((-(-ny // stride), -(-nx // stride)))
+    inputs = [as_warp(z, wp.float32), as_warp(relief.normal, wp.vec3)]
+    inputs += [as_warp(m, wp.float32) for m in (wide, below, above)]
+    inputs += [margin[0], margin[1], as_warp(directions, wp.float32), as_warp(offsets, wp.int32)]
+    inputs += [as_warp(inverses, wp.float32), *looks.rows.shape, as_warp(result, wp.float32)]
+    launch(sky_kernel(stride, tool is not None), (result.shape[0], -(-result.shape[1] // WIDTH)), inputs, z)
+    return result
 
 
 def _between(values: Tensor, stride: int, size: tuple[int, int]) -> Tensor:
@@ -78,15 +118,6 @@ def _between(values: Tensor, stride: int, size: tuple[int, int]) -> Tensor:
     return values
 
 
-def _wedge(slope: Tensor | None, up: Tensor, along: Tensor) -> Tensor:
-    """What a slice of uniform sky below an elevation e gives to a facet, up to a constant: the antiderivative of
-    (up·sin e + along·cos e)·cos e, from the slope tan e; None for the zenith."""
-    if slope is None:
-        return 0.5 * up + 0.25 * np.pi * along
-    rest = 1.0 / (1.0 + slope.square())
-    return 0.5 * up * (1.0 - rest) + 0.5 * along * (torch.atan(slope) + slope * rest)
-
-
 def _distances(relief: Relief) -> list[float]:
     """How far off a cell looks: each step a fifth farther, a cell at least, for blockers far away hide little sky."""
     cell = max(relief.cell)
@@ -97,25 +128,11 @@ def _distances(relief: Relief) -> list[float]:
     return out
 
 
-def _looks(angle: float, distances: list[float], cell: tuple[float, float]) -> list[tuple[int, int, float]]:
-    """Rows, columns and one over the distance of the cells looked at in a direction."""
-    out = []
-    for distance in distances:
-        column, row = round(np.cos(angle) * distance / cell[0]), round(np.sin(angle) * distance / cell[1])
-        out.append((row, column, 1.0 / float(np.hypot(column * cell[0], row * cell[1]))))
-    return out
-
-
-def _padded(values: Tensor, margin: list[int], mode: str, value: float = 0.0) -> Tensor:
-    """A map with ``margin`` columns and rows more on every side."""
-    wider = (margin[0], margin[0], margin[1], margin[1])
-    return functional.pad(values[None, None], wider, mode=mode, value=value if mode == "constant" else None)[0, 0]
-
-
-def _shifted(wide: Tensor, row: int, column: int, margin: list[int], like: Tensor) -> Tensor:
-    """The padded map as seen from cells that look some rows and columns on."""
-    ny, nx = like.shape
-    return wide[margin[1] + row : margin[1] + row + ny, margin[0] + column : margin[0] + column + nx]
+def _padded(values: Tensor, margin: list[int], beyond: int, mode: str, value: float = 0.0) -> Tensor:
+    """A map with ``margin`` columns and rows more on every side, and ``beyond`` more columns on the right."""
+    wider = (margin[0], margin[0] + beyond, margin[1], margin[1])
+    padded = functional.pad(values[None, None], wider, mode=mode, value=value if mode == "constant" else None)
+    return padded[0, 0].contiguous()
 
 
 def _tool_columns(relief: Relief, tool: Any) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,147 @@
+# mypy: ignore-errors
+# (Warp reads the annotations of kernels as types of its own)
+"""The sky over each cell of a relief, in C++ that both the CPU's clang and CUDA compile.
+
+A task is sixteen cells of a row, so that the loop over them fills vector registers on the CPU.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+WIDTH = 16
+"""Cells of a row that one task does."""
+
+_NOTHING = 1.0e6
+"""A height beyond all others, m."""
+
+_SNIPPET = """
+    constexpr int W = WIDTH, S = STRIDE;
+    const int ny = height.shape[0], nx = height.shape[1], across = wide.shape[1];
+    const int i = row * S;
+    const float* surface = wide.data + (i + margin_y) * across + margin_x + first * S;
+    const float* under = below.data + (i + margin_y) * across + margin_x + first * S;
+    const float* over = above.data + (i + margin_y) * across + margin_x + first * S;
+    float here[W], nx_[W], ny_[W], up[W], along[W], slope[W], low[W], high[W], sum[W];
+    for (int l = 0; l < W; ++l) {
+        const int j = (first + l) * S < nx ? (first + l) * S : nx - 1;
+        here[l] = height.data[i * nx + j];
+        const float* n = (const float*)normal.data + 3 * (i * nx + j);
+        nx_[l] = n[0]; ny_[l] = n[1]; up[l] = n[2];
+        sum[l] = 0.0f;
+    }
+    for (int a = 0; a < azimuths; ++a) {
+        const float c = directions.data[2 * a], s = directions.data[2 * a + 1];
+        for (int l = 0; l < W; ++l) {
+            along[l] = c * nx_[l] + s * ny_[l];
+            slope[l] = -along[l] / up[l];
+            low[l] = NOTHING; high[l] = -NOTHING;
+        }
+        for (int k = a * looks; k < (a + 1) * looks; ++k) {
+            const int offset = offsets.data[k];
+            const float inverse = inverses.data[k];
+            for (int l = 0; l < W; ++l) {
+                const float rise = (surface[offset + l * S] - here[l]) * inverse;
+                slope[l] = rise > slope[l] ? rise : slope[l];
+            }
+            if (TOOL)
+                for (int l = 0; l < W; ++l) {
+                    const float b = (under[offset + l * S] - here[l]) * inverse;
+                    const float t = (over[offset + l * S] - here[l]) * inverse;
+                    low[l] = b < low[l] ? b : low[l];
+                    high[l] = t > high[l] ? t : high[l];
+                }
+        }
+        for (int l = 0; l < W; ++l) {
+            const float horizon = WEDGE(slope[l], up[l], along[l]);
+            if (TOOL) {
+                const float b = low[l] > slope[l] ? low[l] : slope[l];
+                const float taken = WEDGE(high[l], up[l], along[l]) - WEDGE(b, up[l], along[l]);
+                sum[l] += high[l] > b ? taken : 0.0f;
+            } else
+                sum[l] += 0.5f * up[l] + 0.78539816f * along[l] - horizon;
+        }
+    }
+    for (int l = 0; l < W && first + l < result.shape[1]; ++l) result.data[row * result.shape[1] + first + l] = sum[l];
+"""
+
+# Light of a slice of uniform sky below a slope, up to a constant: the antiderivative of (up sin e + along cos e) cos e;
+# the arc tangent is Abramowitz & Stegun's 4.4.49, good to 1e-5.
+_WEDGE = """[](float slope, float up, float along) {
+        const float size = slope < 0.0f ? -slope : slope;
+        const float x = size > 1.0f ? 1.0f / size : size, q = x * x;
+        const float p = x * (0.9998660f + q * (-0.3302995f + q * (0.1801410f + q * (-0.0851330f + q * 0.0208351f))));
+        const float angle = size > 1.0f ? 1.57079633f - p : p;
+        const float rest = 1.0f / (1.0f + slope * slope);
+        return 0.5f * up * (1.0f - rest) + 0.5f * along * ((slope < 0.0f ? -angle : angle) + slope * rest);
+    }"""
+
+
+@cache
+def sky_kernel(stride: int, tool: bool) -> Any:
+    """Kernel over (rows, groups of `WIDTH`) of every ``stride``-th row and column of a map.
+
+    It sums, over the azimuths, the sky that soil leaves open to a cell, or what of that a tool takes; maps with margins
+    are wide enough for every look and ``WIDTH · stride`` columns more.
+    """
+    text = _SNIPPET.replace("WEDGE(", "wedge(").replace("WIDTH", str(WIDTH)).replace("STRIDE", str(stride))
+    text = text.replace("NOTHING", f"{_NOTHING!r}f").replace("TOOL", "true" if tool else "false")
+
+    @wp.func_native(f"    const auto wedge = {_WEDGE};\n{text}")
+    def sky_of_cells(
+        row: int,
+        first: int,
+        height: wp.array2d(dtype=wp.float32),
+        normal: wp.array2d(dtype=wp.vec3),
+        wide: wp.array2d(dtype=wp.float32),
+        below: wp.array2d(dtype=wp.float32),
+        above: wp.array2d(dtype=wp.float32),
+        margin_x: int,
+        margin_y: int,
+        directions: wp.array(dtype=wp.float32),
+        offsets: wp.array(dtype=wp.int32),
+        inverses: wp.array(dtype=wp.float32),
+        azimuths: int,
+        looks: int,
+        result: wp.array2d(dtype=wp.float32),
+    ): ...
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def sky(
+        height: wp.array2d(dtype=wp.float32),
+        normal: wp.array2d(dtype=wp.vec3),
+        wide: wp.array2d(dtype=wp.float32),
+        below: wp.array2d(dtype=wp.float32),
+        above: wp.array2d(dtype=wp.float32),
+        margin_x: int,
+        margin_y: int,
+        directions: wp.array(dtype=wp.float32),
+        offsets: wp.array(dtype=wp.int32),
+        inverses: wp.array(dtype=wp.float32),
+        azimuths: int,
+        looks: int,
+        result: wp.array2d(dtype=wp.float32),
+    ):
+        row, group = wp.tid()
+        sky_of_cells(
+            row,
+            group * wp.static(WIDTH),
+            height,
+            normal,
+            wide,
+            below,
+            above,
+            margin_x,
+            margin_y,
+            directions,
+            offsets,
+            inverses,
+            azimuths,
+            looks,
+            result,
+        )
+
+    return sky
