@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
+
+import numpy as np
 
 from splatsoil.measurement import Measurement
 from splatsoil.observation import Observation
-from splatsoil.parameters import Parameter
+from splatsoil.parameters import FloatArray, Parameter
 from splatsoil.soil.settings import Settings
 
 
@@ -19,16 +21,20 @@ class Effect:
     * ``settings`` changes the numbers a run starts from: contact friction, gravity, friction angle.
     * ``strength`` is a ``@wp.func`` called at every stress point in every step. It receives the
       :class:`~splatsoil.soil.strength.Strength` found so far, the :class:`~splatsoil.soil.strength.SoilState`, the
-      array of parameter values (simulations, columns), the row of this simulation and the column of the effect's first
-      parameter, and returns the changed Strength. It is compiled only into models that have the effect on.
+      array of values (simulations, columns), the row of this simulation and the effect's first column, and returns the
+      changed Strength. It is compiled only into models that have the effect on. ``columns`` says what stands in the
+      effect's columns: its parameters, or what is made of them once (a tangent instead of an angle).
+    * ``density`` gives the soil another weight at the start.
     * ``observe`` changes what the cameras report of a simulation. An effect that has it does nothing else, so that its
       parameters never cost a simulation.
 
     Attributes:
         name: identifier used by the command line and every file.
-        parameters: the effect's parameters, each with the value at which it is off.
+        parameters: the effect's parameters. The first is its size: at its ``off`` value the effect does nothing. Others
+            have an ``off`` value too where they act on their own, and None where they only shape the effect.
         note: what it is, in one or two sentences.
         source: paper or textbook with equation.
+        conflicts: effects that cannot be on at the same time, with the reason.
     """
 
     name: ClassVar[str]
@@ -36,11 +42,35 @@ class Effect:
     note: ClassVar[str] = ""
     source: ClassVar[str] = ""
     strength: ClassVar[Any | None] = None
+    conflicts: ClassVar[Mapping[str, str]] = {}
+
+    @property
+    def size(self) -> str:
+        """Name of the parameter that measures the effect."""
+        return self.parameters[0].name
 
     def settings(self, settings: Settings, values: Mapping[str, float]) -> Settings:
         """Return ``settings`` changed by this effect with parameter ``values``; unchanged by default."""
         del values
         return settings
+
+    def columns(self, settings: Settings, values: Mapping[str, float]) -> Sequence[float]:
+        """Numbers that ``strength`` finds from its column on; the parameters' values by default. Always as many.
+
+        Args:
+            settings: of this simulation, after all effects.
+            values: all parameters of the model by name.
+
+        Raises:
+            ParameterError: values that have no meaning together.
+        """
+        del settings
+        return [values[p.name] for p in self.parameters]
+
+    def density(self, depth: FloatArray, values: Mapping[str, float]) -> FloatArray:
+        """Bulk density (n,) over the nominal one, at depths (n,) in m below the surface at the start; 1 by default."""
+        del values
+        return np.ones_like(depth)
 
     def observe(self, observation: Observation, values: Mapping[str, float]) -> Observation:
         """Return ``observation`` changed by this effect with parameter ``values``; unchanged by default."""

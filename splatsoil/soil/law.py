@@ -1,14 +1,20 @@
 """The soil law: Drucker-Prager elastoplasticity with whatever effects a model has on, built as one Warp function.
 
-Hypoelastic deviator (Jaumann rate), exact radial return, no plastic volume change. The volume is kept by two numbers:
-the elastic logarithmic strain, which carries pressure, and the opening, by which soil that came apart in tension must
-close again before it bears load; a pile can therefore neither gain nor forget volume (cf. the volume correction of
-Tampubolon et al. 2017, sec. 4.3.4, here without a decomposition of F).
+Hypoelastic deviator (Jaumann rate), exact return to the cone. The logarithmic volume is the sum of up to three numbers:
+the elastic strain, which carries pressure; the opening, by which soil that came apart in tension must close again
+before it bears load; and what plastic shear has dilated, in laws with an effect that acts on strength. A pile can
+therefore neither gain nor forget volume (cf. the volume correction of Tampubolon et al. 2017, sec. 4.3.4, here without
+a decomposition of F).
+
+The flow is non-associated: a plastic shear strain g (engineering measure) lowers sqrt(J2) by G g and gains the volume
+b g, which raises the pressure by K b g, so the point that ends on the cone sqrt(J2) = k + a p has
+g = (sqrt(J2) - k - a p) / (G + a b K) of the trial stress (de Souza Neto et al. 2008, box 8.9, for a linear cone).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -29,7 +35,13 @@ TOOL_FRICTION = wp.constant(2)
 WALL_FRICTION = wp.constant(3)
 FLOOR_FRICTION = wp.constant(4)
 GRAVITY = wp.constant(5)
-BASE_COLUMNS = 8
+STIFFNESS = wp.constant(8)
+TOOL_ADHESION = wp.constant(9)
+OBSTACLE = wp.constant(10)
+BASE_COLUMNS = 14
+
+# A soil that loses volume in shear must not lose its pressure faster than its shear stress: G + a b K > 0.
+LEAST_DILATION = wp.constant(-0.8)
 
 
 @wp.struct
@@ -41,12 +53,18 @@ class Stress:
         shear: deviator's off-diagonal (xy, xz, yz) in Pa.
         elastic: elastic logarithmic volume strain; pressure = -K * elastic.
         opening: logarithmic volume opened in tension, >= 0.
+        plastic_strain: plastic shear strain so far; kept by laws with history only, like the next two.
+        dilated: logarithmic volume gained by plastic shear so far.
+        depth: of this soil below the surface at the start, m; constant.
     """
 
     normal: wp.vec3
     shear: wp.vec3
     elastic: float
     opening: float
+    plastic_strain: float
+    dilated: float
+    depth: float
 
 
 @wp.func
@@ -56,6 +74,9 @@ def base_strength(state: SoilState, values: wp.array2d(dtype=float), row: int) -
     strength.slope = values[row, SLOPE]
     strength.intercept = 0.0
     strength.intercept_per_cohesion = values[row, INTERCEPT_PER_COHESION]
+    strength.dilation = 0.0
+    strength.viscosity = 0.0
+    strength.crush_pressure = 0.0
     return strength
 
 
@@ -67,7 +88,7 @@ def _chain(previous: Any, effect: Any, column: int) -> Any:
     return strength
 
 
-def _stress_update(strength_of: Any) -> Any:
+def _stress_update(strength_of: Any, history: bool) -> Any:
     @wp.func
     def update(
         stress: Stress,
@@ -102,18 +123,51 @@ def _stress_update(strength_of: Any) -> Any:
         state.pressure = pressure
         state.shear_rate = wp.sqrt(2.0 * wp.ddot(deviator, deviator))
         state.opening = opening
+        if wp.static(history):
+            state.plastic_strain = stress.plastic_strain
+            state.dilated = stress.dilated
+            state.depth = stress.depth
         strength = strength_of(state, values, row)
         apex = -strength.intercept / wp.max(strength.slope, 1.0e-6)
         if pressure < apex:
             opening = opening + elastic + apex / bulk
             elastic = -apex / bulk
             pressure = apex
+        result = Stress()
         limit = wp.max(strength.intercept + strength.slope * pressure, 0.0)
         measure = wp.sqrt(0.5 * wp.ddot(s, s))
-        if measure > limit:
-            s = s * (limit / wp.max(measure, 1.0e-12))
-
-        result = Stress()
+        if wp.static(history):
+            dilated = stress.dilated
+            crush = strength.crush_pressure
+            if crush > 0.0 and pressure > crush:
+                dilated = dilated - (pressure - crush) / bulk
+                elastic = -crush / bulk
+                pressure = crush
+                limit = strength.intercept + strength.slope * pressure
+            if opening <= 0.0:
+                limit = limit + strength.viscosity * state.shear_rate
+            slip = 0.0
+            if measure > limit:
+                gain = 0.0
+                if opening <= 0.0:
+                    # soil that has come apart is looser than any dilation makes it
+                    least = LEAST_DILATION * shear / (bulk * wp.max(strength.slope, 1.0e-6))
+                    gain = wp.max(strength.dilation, least)
+                slip = (measure - limit) / (shear + strength.slope * gain * bulk)
+                slip = wp.min(slip, measure / shear)
+                dilated = dilated + gain * slip
+                elastic = elastic - gain * slip
+                if -bulk * elastic < apex:
+                    opening = opening + elastic + apex / bulk
+                    elastic = -apex / bulk
+                limit = wp.max(limit + strength.slope * gain * slip * bulk, 0.0)
+                s = s * (limit / wp.max(measure, 1.0e-12))
+            result.plastic_strain = stress.plastic_strain + slip
+            result.dilated = dilated
+            result.depth = stress.depth
+        else:
+            if measure > limit:
+                s = s * (limit / wp.max(measure, 1.0e-12))
         result.normal = wp.vec3(s[0, 0], s[1, 1], s[2, 2])
         result.shear = wp.vec3(s[0, 1], s[0, 2], s[1, 2])
         result.elastic = elastic
@@ -128,31 +182,68 @@ def _compiled(key: tuple[tuple[Any, int], ...]) -> Any:
     strength_of: Any = base_strength
     for function, column in key:
         strength_of = _chain(strength_of, function, column)
-    return _stress_update(strength_of)
+    return _stress_update(strength_of, bool(key))
 
 
 class Law:
     """The base law with a set of effects on.
 
+    Args:
+        effects: to switch on; their order does not matter.
+
+    Raises:
+        ParameterError: effects that exclude each other, or two that share a parameter's name.
+
     Attributes:
         effects: the effects that are on.
         parameters: friction angle, then the effects' parameters.
         update: ``@wp.func`` that advances a :class:`Stress`; equal objects for equal combinations.
+        history: whether ``update`` keeps plastic strain and volume and wants the depth: some effect acts on strength.
     """
 
     def __init__(self, effects: Iterable[Effect] = ()) -> None:
         self.effects: tuple[Effect, ...] = tuple(effects)
+        self._refuse_conflicts()
         self.parameters: tuple[Parameter, ...] = (
             FRICTION_ANGLE,
             *(p for effect in self.effects for p in effect.parameters),
         )
+        names = [p.name for p in self.parameters]
+        repeated = sorted({n for n in names if names.count(n) > 1})
+        if repeated:
+            raise ParameterError(f"two effects have a parameter named {', '.join(repeated)}; rename one")
+        # a chain in one fixed order: the same bits, and one compilation, for every order in which a user names effects
+        self._strong = sorted((e for e in self.effects if e.strength is not None), key=lambda e: e.name)
         key: list[tuple[Any, int]] = []
-        self._strength_parameters: list[str] = []
-        for effect in self.effects:
-            if effect.strength is not None:
-                key.append((effect.strength, BASE_COLUMNS + len(self._strength_parameters)))
-                self._strength_parameters.extend(p.name for p in effect.parameters)
+        column = BASE_COLUMNS
+        defaults = {p.name: p.default for p in self.parameters}
+        for effect in self._strong:
+            key.append((effect.strength, column))
+            column += len(effect.columns(Settings(FRICTION_ANGLE.default), defaults))
         self.update = _compiled(tuple(key))
+        self.history = bool(key)
+
+    def _refuse_conflicts(self) -> None:
+        on = {effect.name for effect in self.effects}
+        for effect in self.effects:
+            for other, reason in effect.conflicts.items():
+                if other in on:
+                    raise ParameterError(f"effects {effect.name} and {other} cannot both be on: {reason}")
+
+    def values(self, given: Mapping[str, float]) -> dict[str, float]:
+        """All parameters by name: ``given`` with bounds checked, defaults for the rest.
+
+        Raises:
+            ParameterError: an unknown name or a value outside its bounds.
+        """
+        known = {p.name: p for p in self.parameters}
+        unknown = sorted(set(given) - set(known))
+        if unknown:
+            raise ParameterError(
+                f"unknown parameter {', '.join(unknown)}; this model has {', '.join(known)}"
+                " (an effect's parameters exist when the effect is on)"
+            )
+        return {name: p.check(given.get(name, p.default)) for name, p in known.items()}
 
     def settings(self, base: Settings, values: Mapping[str, float]) -> Settings:
         """``base`` with the friction angle of ``values`` and every effect applied.
@@ -160,33 +251,22 @@ class Law:
         Raises:
             ParameterError: an unknown name or a value outside its bounds.
         """
-        known = {p.name: p for p in self.parameters}
-        unknown = sorted(set(values) - set(known))
-        if unknown:
-            raise ParameterError(
-                f"unknown parameter {', '.join(unknown)}; this model has {', '.join(known)}"
-                " (an effect's parameters exist when the effect is on)"
-            )
-        full = {name: p.check(values.get(name, p.default)) for name, p in known.items()}
-        result = Settings(
-            friction_angle=full["friction_angle"] if "friction_angle" in values else base.friction_angle,
-            gravity=base.gravity,
-            tool_friction=base.tool_friction,
-            wall_friction=base.wall_friction,
-            floor_friction=base.floor_friction,
-            matching=base.matching,
-        )
+        full = self.values(values)
+        result = replace(base, friction_angle=full["friction_angle"]) if "friction_angle" in values else base
         for effect in self.effects:
             result = effect.settings(result, full)
         return result
 
     def table(self, base: Settings, batch: Sequence[Mapping[str, float]]) -> FloatArray:
-        """Values (simulations, columns) that the kernels read, one row for each entry of ``batch``."""
+        """Values (simulations, columns) that the kernels read, one row for each entry of ``batch``.
+
+        Raises:
+            ParameterError: an unknown name, a value outside its bounds, or values without meaning together.
+        """
         rows = []
-        defaults = {p.name: p.default for p in self.parameters}
         for values in batch:
             s = self.settings(base, values)
-            full = {**defaults, **values}
+            full = self.values(values)
             rows.append(
                 [
                     cone_slope(s.friction_angle, s.matching),
@@ -195,7 +275,20 @@ class Law:
                     s.wall_friction,
                     s.floor_friction,
                     *s.gravity,
-                    *(full[name] for name in self._strength_parameters),
+                    s.stiffness,
+                    s.tool_adhesion,
+                    *s.obstacle,
+                    *(number for effect in self._strong for number in effect.columns(s, full)),
                 ]
             )
         return np.array(rows, dtype=np.float64)
+
+    def density(self, depth: FloatArray, values: Mapping[str, float]) -> FloatArray | None:
+        """Bulk density (n,) at the start over the nominal one at depths (n,) in m; None when it is 1 everywhere."""
+        full = self.values(values)
+        result: FloatArray | None = None
+        for effect in self.effects:
+            if type(effect).density is not Effect.density:
+                factor = effect.density(depth, full)
+                result = factor if result is None else result * factor
+        return result

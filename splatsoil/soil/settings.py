@@ -31,6 +31,9 @@ class Settings:
         tool_friction: Coulomb coefficient between soil and tool.
         wall_friction: Coulomb coefficient at the bed's side walls.
         floor_friction: Coulomb coefficient at the bed's floor.
+        stiffness: factor on the elastic moduli.
+        tool_adhesion: shear stress between soil and tool that needs no pressure, Pa.
+        obstacle: a fixed sphere: x and y of its centre from the middle of the bed, height above the floor, radius, m.
     """
 
     friction_angle: float
@@ -39,6 +42,9 @@ class Settings:
     wall_friction: float = 0.0
     floor_friction: float = 0.6
     matching: Matching = Matching.COMPRESSION
+    stiffness: float = 1.0
+    tool_adhesion: float = 0.0
+    obstacle: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         FRICTION_ANGLE.check(self.friction_angle)
@@ -46,5 +52,11 @@ class Settings:
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):
                 raise ParameterError(f"{name}: {value} is not a friction coefficient; give a number >= 0")
+        if not (math.isfinite(self.tool_adhesion) and self.tool_adhesion >= 0.0):
+            raise ParameterError(f"tool_adhesion: {self.tool_adhesion} is not a shear stress in Pa; give a number >= 0")
+        if not (math.isfinite(self.stiffness) and self.stiffness > 0.0):
+            raise ParameterError(f"stiffness: {self.stiffness} is not a positive factor")
+        if not (all(math.isfinite(v) for v in self.obstacle) and self.obstacle[3] >= 0.0):
+            raise ParameterError(f"obstacle: {self.obstacle} is not a centre and a radius in m")
         if not all(math.isfinite(g) for g in self.gravity):
             raise ParameterError(f"gravity: {self.gravity} is not finite")

@@ -11,25 +11,37 @@ class SoilState:
 
     Attributes:
         pressure: mean stress in Pa, positive in compression.
-        shear_rate: sqrt(2 dev(D):dev(D)) in 1/s.
+        shear_rate: sqrt(2 dev(D):dev(D)) in 1/s; the rate of engineering shear strain in simple shear.
         opening: logarithmic volume by which the soil has come apart in tension (>= 0).
+        plastic_strain: plastic shear strain gone through so far, in the same measure as the shear rate.
+        dilated: logarithmic volume gained (+) or lost (-) by plastic shear so far.
+        depth: how far below the surface this soil was at the start, m.
     """
 
     pressure: float
     shear_rate: float
     opening: float
+    plastic_strain: float
+    dilated: float
+    depth: float
 
 
 @wp.struct
 class Strength:
-    """Drucker-Prager strength sqrt(J2) <= intercept + slope * p.
+    """Drucker-Prager strength sqrt(J2) <= intercept + slope * p, and the plastic flow that goes with it.
 
     Attributes:
         slope: friction, sqrt(J2)/p.
         intercept: sqrt(J2) at zero pressure in Pa.
         intercept_per_cohesion: intercept that a Mohr-Coulomb cohesion of 1 Pa gives at this friction angle.
+        dilation: volume gained per plastic shear strain; negative where shear makes the soil denser.
+        viscosity: sqrt(J2) gained per shear rate while the soil holds together, Pa s.
+        crush_pressure: pressure above which the skeleton gives way and the soil becomes denser, Pa; none when zero.
     """
 
     slope: float
     intercept: float
     intercept_per_cohesion: float
+    dilation: float
+    viscosity: float
+    crush_pressure: float

@@ -1,0 +1,408 @@
+"""Element tests: the law that the solver runs, at a single stress point, as a soil laboratory would test it.
+
+A batch of parameter sets goes through the same test. Each of the three axes is controlled by strain or by stress; the
+strain increments that a wanted stress needs are found by Broyden's method (Broyden 1965), whose estimate of the
+stiffness is carried from step to step. A step that misses its stress stops the test with an error.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from splatsoil.errors import ParameterError, SimulationError
+from splatsoil.soil.law import STIFFNESS, Law, Stress
+from splatsoil.soil.matching import Matching
+from splatsoil.soil.settings import FRICTION_ANGLE, Settings
+
+FloatArray = npt.NDArray[np.float64]
+Values = Mapping[str, float] | Sequence[Mapping[str, float]]
+
+TOLERANCE = 1.0e-5
+"""Largest miss of a wanted stress, relative to the test's stress."""
+MOST_ITERATIONS = 60
+OUTPUTS = 12
+
+
+@dataclass(frozen=True)
+class ElementTest:
+    """What a test measured, for a batch of parameter sets; compression is positive, strains are logarithmic.
+
+    Attributes:
+        values: all parameters by name, one mapping for each set.
+        strain: principal-axis strains x, y, z (sets, steps + 1, 3).
+        stress: stresses on the same axes (sets, steps + 1, 3), Pa.
+        shear_strain: engineering shear strain xz (sets, steps + 1).
+        shear_stress: shear stress xz (sets, steps + 1), Pa.
+        plastic_strain: plastic shear strain gone through (sets, steps + 1); 0 where the law does not keep it.
+        initial_void_ratio: void ratio at the start.
+    """
+
+    values: tuple[Mapping[str, float], ...]
+    strain: FloatArray
+    stress: FloatArray
+    shear_strain: FloatArray
+    shear_stress: FloatArray
+    plastic_strain: FloatArray
+    initial_void_ratio: float
+
+    @property
+    def p(self) -> FloatArray:
+        """Mean stress (sets, steps + 1), Pa."""
+        return self.stress.mean(axis=2)
+
+    @property
+    def q(self) -> FloatArray:
+        """Axial less mean lateral stress (sets, steps + 1), Pa; negative in extension."""
+        return self.stress[..., 2] - 0.5 * (self.stress[..., 0] + self.stress[..., 1])
+
+    @property
+    def axial_strain(self) -> FloatArray:
+        """Strain along z (sets, steps + 1)."""
+        return self.strain[..., 2]
+
+    @property
+    def volume_strain(self) -> FloatArray:
+        """Logarithmic volume strain (sets, steps + 1), positive where the soil became denser."""
+        return self.strain.sum(axis=2)
+
+    @property
+    def void_ratio(self) -> FloatArray:
+        """Void ratio e (sets, steps + 1): 1 + e = (1 + e0) exp(-volume strain)."""
+        return (1.0 + self.initial_void_ratio) * np.exp(-self.volume_strain) - 1.0
+
+
+def triaxial(
+    law: Law,
+    values: Values,
+    *,
+    confining: float,
+    strains: npt.ArrayLike,
+    void_ratio: float = 0.8,
+    young: float = 5.0e7,
+    poisson: float = 0.2,
+    strain_rate: float = 1.0e-5,
+    largest_step: float = 2.0e-4,
+    matching: Matching = Matching.COMPRESSION,
+) -> ElementTest:
+    """Drained triaxial test: constant stress on x and y, given strain along z.
+
+    Args:
+        law: the soil law with its effects.
+        values: parameters by name, one mapping or one for each set of the batch.
+        confining: lateral stress in Pa, positive.
+        strains: axial logarithmic strains (n,) at which to record, from the isotropic state on; positive and rising in
+            compression, negative and falling in extension, any path in between. A nominal strain s is log: -ln(1 - s).
+        void_ratio: at the start.
+        young: Young's modulus in Pa.
+        poisson: Poisson's ratio.
+        strain_rate: of the axis, 1/s; only effects of rate feel it.
+        largest_step: most axial strain in one step of the law, so that the records may lie far apart.
+        matching: of the friction cone.
+
+    Returns:
+        The start and the n records.
+
+    Raises:
+        SimulationError: a step did not reach its stresses.
+        ParameterError: parameters, strains or constants without meaning.
+    """
+    _positive(confining=confining)
+    path = _path(strains)
+    targets = np.full((len(path), 4), confining)
+    targets[:, 2], targets[:, 3] = path, 0.0
+    return _drive(
+        law, values, targets, (True, True, False), confining, void_ratio, young, poisson, strain_rate, largest_step,
+        matching,
+    )  # fmt: skip
+
+
+def simple_shear(
+    law: Law,
+    values: Values,
+    *,
+    confining: float,
+    strains: npt.ArrayLike,
+    void_ratio: float = 0.8,
+    young: float = 5.0e7,
+    poisson: float = 0.2,
+    strain_rate: float = 1.0e-5,
+    largest_step: float = 2.0e-4,
+    matching: Matching = Matching.COMPRESSION,
+    constant_volume: bool = False,
+) -> ElementTest:
+    """Simple shear in the plane xz: constant stress along z (or constant volume), no strain along x and y.
+
+    Args:
+        strains: engineering shear strains (n,) at which to record.
+        confining: stress in Pa on all axes at the start, and along z throughout.
+        constant_volume: hold the height instead of the stress along z.
+
+    The other arguments, the result and the errors are those of :func:`triaxial`.
+    """
+    _positive(confining=confining)
+    path = _path(strains)
+    targets = np.zeros((len(path), 4))
+    targets[:, 3] = path
+    if not constant_volume:
+        targets[:, 2] = confining
+    return _drive(
+        law, values, targets, (False, False, not constant_volume), confining, void_ratio, young, poisson, strain_rate,
+        largest_step, matching,
+    )  # fmt: skip
+
+
+def isotropic_compression(
+    law: Law,
+    values: Values,
+    *,
+    confining: float,
+    pressures: npt.ArrayLike,
+    void_ratio: float = 0.8,
+    young: float = 5.0e7,
+    poisson: float = 0.2,
+    strain_rate: float = 1.0e-5,
+    largest_step: float = 2.0e-4,
+    matching: Matching = Matching.COMPRESSION,
+) -> ElementTest:
+    """Equal stress on all three axes, from ``confining`` through ``pressures`` (n,) in Pa at which to record.
+
+    The other arguments, the result and the errors are those of :func:`triaxial`.
+    """
+    _positive(confining=confining)
+    path = np.asarray(pressures, dtype=np.float64).reshape(-1)
+    if path.size == 0 or not (np.isfinite(path).all() and (path > 0.0).all()):
+        raise ParameterError("pressures: give at least one positive number of Pa")
+    targets = np.concatenate([np.repeat(path[:, None], 3, axis=1), np.zeros((len(path), 1))], axis=1)
+    return _drive(
+        law, values, targets, (True, True, True), confining, void_ratio, young, poisson, strain_rate, largest_step,
+        matching,
+    )  # fmt: skip
+
+
+def _drive(
+    law: Law,
+    values: Values,
+    targets: FloatArray,
+    by_stress: tuple[bool, bool, bool],
+    confining: float,
+    void_ratio: float,
+    young: float,
+    poisson: float,
+    strain_rate: float,
+    largest_step: float,
+    matching: Matching,
+) -> ElementTest:
+    """Run the batch through ``targets`` (n, 4): stress or strain of x, y, z, and the shear strain xz."""
+    _positive(void_ratio=void_ratio, young=young, strain_rate=strain_rate, largest_step=largest_step)
+    if not -1.0 < poisson < 0.5:
+        raise ParameterError(f"poisson: {poisson} is no Poisson's ratio; give one between -1 and 0.5")
+    batch = [values] if isinstance(values, Mapping) else list(values)
+    if not batch:
+        raise ParameterError("an element test needs at least one set of parameters")
+    base = Settings(friction_angle=FRICTION_ANGLE.default, matching=matching)
+    bulk, shear = young / (3.0 * (1.0 - 2.0 * poisson)), young / (2.0 * (1.0 + poisson))
+    start = np.array([confining if s else 0.0 for s in by_stress] + [0.0])
+    moves = np.diff(np.vstack([start, targets]), axis=0)
+    way = np.abs(np.where([*by_stress, False], moves / (3.0 * bulk), moves)).max(axis=1)
+    steps = np.maximum(np.ceil(way / largest_step - 1e-9), 1).astype(np.int32)
+    seconds = np.maximum(way, 1.0e-12) / steps / strain_rate
+
+    wp.config.quiet = True
+    sets, records = len(batch), len(targets)
+    table = wp.array(law.table(base, batch).astype(np.float32), dtype=float, device="cpu")
+    out = wp.zeros((sets, records, OUTPUTS), dtype=wp.float64, device="cpu")
+    failed = wp.full(sets, -1, dtype=int, device="cpu")
+    miss = wp.zeros(sets, dtype=float, device="cpu")
+    wp.launch(
+        _kernel(law.update),
+        dim=sets,
+        inputs=[
+            wp.array(targets, dtype=wp.float64, device="cpu"),
+            wp.array(steps, dtype=int, device="cpu"),
+            wp.array(seconds.astype(np.float32), dtype=float, device="cpu"),
+            wp.vec3i(*(int(s) for s in by_stress)),
+            confining,
+            bulk,
+            shear,
+            TOLERANCE * float(max(confining, np.abs(targets[:, :3][:, list(by_stress)]).max(initial=0.0))),
+            table,
+        ],
+        outputs=[out, failed, miss],
+        device="cpu",
+    )
+    bad = np.flatnonzero(failed.numpy() >= 0)
+    if bad.size:
+        k = int(bad[0])
+        record = int(failed.numpy()[k])
+        raise SimulationError(
+            f"element test: {bad.size} of {sets} parameter sets did not reach their stress; the first one missed it by "
+            f"{float(miss.numpy()[k]):.3g} Pa before record {record + 1} of {records} (target {targets[record]}), "
+            f"parameters {dict(batch[k])}; take smaller steps, or a path that this soil can follow"
+        )
+    result = out.numpy()
+    first = np.zeros((sets, 1, OUTPUTS))
+    first[..., 3:6] = confining
+    full = np.concatenate([first, result], axis=1)
+    if not np.isfinite(full).all():
+        raise SimulationError(f"element test: the state is not finite; parameters {[dict(v) for v in batch][:3]}")
+    return ElementTest(
+        values=tuple(law.values(v) for v in batch),
+        strain=full[..., 0:3],
+        stress=full[..., 3:6],
+        shear_strain=full[..., 6],
+        shear_stress=full[..., 7],
+        plastic_strain=full[..., 8],
+        initial_void_ratio=void_ratio,
+    )
+
+
+@wp.func
+def _axes(stress: Stress, bulk: float) -> wp.vec3:
+    """Normal stresses, compression positive, Pa."""
+    pressure = -bulk * stress.elastic
+    return wp.vec3(pressure - stress.normal[0], pressure - stress.normal[1], pressure - stress.normal[2])
+
+
+@wp.func
+def _wanted(by_stress: wp.vec3i, hooke: wp.mat33) -> wp.mat33:
+    """Inverse of the elastic stiffness of stress-controlled axes, with ones for those controlled by strain."""
+    matrix = hooke
+    for i in range(3):
+        if by_stress[i] == 0:
+            for j in range(3):
+                matrix[i, j] = 0.0
+                matrix[j, i] = 0.0
+            matrix[i, i] = 1.0
+    inverse = wp.inverse(matrix)
+    for i in range(3):
+        if by_stress[i] == 0:
+            inverse[i, i] = 0.0
+    return inverse
+
+
+@cache
+def _kernel(update: Any) -> Any:
+    @wp.kernel(module="unique", enable_backward=False)
+    def element_test(
+        targets: wp.array2d(dtype=wp.float64),
+        steps: wp.array(dtype=int),
+        seconds: wp.array(dtype=float),
+        by_stress: wp.vec3i,
+        confining: float,
+        bulk_modulus: float,
+        shear_modulus: float,
+        tolerance: float,
+        values: wp.array2d(dtype=float),
+        out: wp.array3d(dtype=wp.float64),
+        failed: wp.array(dtype=int),
+        miss: wp.array(dtype=float),
+    ) -> None:
+        row = wp.tid()
+        bulk = bulk_modulus * values[row, STIFFNESS]
+        shear = shear_modulus * values[row, STIFFNESS]
+        along = bulk + 4.0 * shear / 3.0
+        across = bulk - 2.0 * shear / 3.0
+        elastic = _wanted(by_stress, wp.mat33(along, across, across, across, along, across, across, across, along))
+        inverse = elastic
+        stress = Stress()
+        stress.elastic = -confining / bulk
+        total = wp.vec3d()
+        sheared = wp.float64(0.0)
+        before = wp.vec4d(
+            wp.float64(confining) * wp.float64(by_stress[0]),
+            wp.float64(confining) * wp.float64(by_stress[1]),
+            wp.float64(confining) * wp.float64(by_stress[2]),
+            wp.float64(0.0),
+        )
+        guess = wp.vec3(0.0)
+        for record in range(targets.shape[0]):
+            count = steps[record]
+            dt = seconds[record]
+            for step in range(count):
+                part = wp.float64(step + 1) / wp.float64(count)
+                # strain-controlled components move by what is left to the exact total, free ones start as last time
+                want = wp.vec3(0.0)
+                move = guess
+                for i in range(3):
+                    goal = before[i] + part * (targets[record, i] - before[i])
+                    want[i] = float(goal)
+                    if by_stress[i] == 0:
+                        move[i] = float(goal - total[i])
+                turn = float(before[3] + part * (targets[record, 3] - before[3]) - sheared)
+                best = wp.float32(1.0e30)
+                near = Stress()
+                chosen = move
+                error = wp.vec3(0.0)
+                previous = wp.vec3(0.0)
+                change = wp.vec3(0.0)
+                for iteration in range(wp.static(MOST_ITERATIONS)):
+                    gradient = wp.mat33(-move[0], 0.0, turn, 0.0, -move[1], 0.0, 0.0, 0.0, -move[2]) * (1.0 / dt)
+                    trial = update(stress, gradient, bulk, shear, dt, values, row)
+                    got = _axes(trial, bulk)
+                    for i in range(3):
+                        error[i] = wp.where(by_stress[i] == 0, 0.0, want[i] - got[i])
+                    size = wp.max(wp.max(wp.abs(error[0]), wp.abs(error[1])), wp.abs(error[2]))
+                    if size < best:
+                        best = size
+                        near = trial
+                        chosen = move
+                    if size <= tolerance:
+                        break
+                    if iteration == wp.static(MOST_ITERATIONS // 2):
+                        inverse = elastic
+                    elif iteration > 0:
+                        # Broyden: the inverse must turn the last change of stress into the last change of strain
+                        gained = previous - error
+                        foreseen = inverse * gained
+                        weight = wp.dot(change, foreseen)
+                        if wp.abs(weight) > 1.0e-30:
+                            inverse = inverse + wp.outer(change - foreseen, wp.transpose(inverse) * change) / weight
+                    previous = error
+                    change = inverse * error
+                    reach = wp.length(change)
+                    # a poor inverse must not throw the state far off
+                    most = 10.0 * (wp.length(move) + wp.abs(turn)) + 1.0e-6
+                    if reach > most:
+                        change = change * (most / reach)
+                    move = move + change
+                if not best <= 20.0 * tolerance:
+                    failed[row] = record
+                    miss[row] = best
+                    return
+                stress = near
+                guess = chosen
+                for i in range(3):
+                    total[i] = total[i] + wp.float64(chosen[i])
+                sheared = sheared + wp.float64(turn)
+            now = _axes(stress, bulk)
+            for i in range(3):
+                out[row, record, i] = total[i]
+                out[row, record, 3 + i] = wp.float64(now[i])
+                before[i] = targets[record, i]
+            before[3] = targets[record, 3]
+            out[row, record, 6] = sheared
+            out[row, record, 7] = wp.float64(stress.shear[1])
+            out[row, record, 8] = wp.float64(stress.plastic_strain)
+
+    return element_test
+
+
+def _path(strains: npt.ArrayLike) -> FloatArray:
+    path = np.asarray(strains, dtype=np.float64).reshape(-1)
+    if path.size == 0 or not np.isfinite(path).all():
+        raise ParameterError("strains: give at least one finite number")
+    return path
+
+
+def _positive(**numbers: float) -> None:
+    for name, value in numbers.items():
+        if not (math.isfinite(value) and value > 0.0):
+            raise ParameterError(f"{name}: {value} is not a positive number")
