@@ -1,0 +1,73 @@
+"""What benchmarks share: options, and results as files."""
+
+from __future__ import annotations
+
+import argparse
+import io
+import platform
+import sys
+from collections.abc import Callable, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from splatsoil import __version__
+from splatsoil.files import code_digest, write_bytes, write_json, write_text
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: Everything that a benchmark's numbers may hang on.
+ALL = ("measurement", "splats", "reconstruction", "soil", "mpm", "scene", "synthetic")
+
+
+def world_options(parser: argparse.ArgumentParser) -> None:
+    """Options that choose a world to simulate."""
+    parser.add_argument("set", type=Path, nargs="?", help="measurement set; none: the made-up world of PlowSand-v0")
+    parser.add_argument("--reconstruction", type=Path, help="of the set, if there is one already")
+    parser.add_argument("--parameters", nargs="+", default=["friction_angle"])
+    parser.add_argument("--with", dest="effects", nargs="*", default=[], metavar="EFFECT")
+    parser.add_argument("--preset", default="tiny")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--executor", default="serial", help="serial, processes:N or dask:ADDRESS")
+
+
+def output_options(parser: argparse.ArgumentParser) -> None:
+    """Options that say where results go."""
+    parser.add_argument("--out", type=Path, help="folder for result.json, table.md and figures")
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+
+
+def stamp(device: str) -> dict[str, Any]:
+    """What made a result."""
+    return {
+        "version": __version__,
+        "code": code_digest((*ALL, "parameters.py", "model.py", "comparison.py")),
+        "device": device.split(":")[0],
+        "machine": platform.machine(),
+        "made": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+
+
+def write_result(out: Path, result: Mapping[str, Any], table: str, figures: Mapping[str, Figure]) -> None:
+    """A benchmark's folder, each file whole or not there."""
+    write_json(out / "result.json", dict(result))
+    write_text(out / "table.md", table + "\n")
+    for name, figure in figures.items():
+        stream = io.BytesIO()
+        figure.savefig(stream, format="svg" if name.endswith(".svg") else "png", bbox_inches="tight")
+        write_bytes(out / name, stream.getvalue())
+
+
+def ticker(what: str) -> Callable[[int, int], None]:
+    """Progress as lines on stderr, one each tenth."""
+    told = -1
+
+    def report(done: int, total: int) -> None:
+        nonlocal told
+        tenth = 10 * done // max(total, 1)
+        if tenth != told:
+            told = tenth
+            print(f"{what}: {done} of {total}", file=sys.stderr, flush=True)
+
+    return report

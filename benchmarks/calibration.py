@@ -1,0 +1,233 @@
+"""Do intervals hold what they promise? Simulation-based calibration of posteriors.
+
+Truths are drawn from the prior and simulated, each with particles of its own; sensor noise is added. For each, an
+emulator is trained on the other simulations only, and the posterior is sampled exactly as ``splatsoil posterior`` does.
+Over many truths, 50 % and 90 % intervals should hold the truth in 50 % and 90 % of cases, and its rank among posterior
+draws should be uniform (Talts et al. 2018, arXiv:1804.06788).
+
+    splatsoil benchmark calibration --out runs/calibration
+
+The world is the made-up one of PlowSand-v0 unless a set is named; every truth is a real simulation of it, and the model
+is right but for chance. What a wrong model does to a posterior is not tested here.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.stats import binom, chisquare
+from splatsoil.benchmarks._common import output_options, stamp, ticker, world_options, write_result
+from splatsoil.inverse.emulator import Emulator
+from splatsoil.inverse.executors import executor
+from splatsoil.inverse.likelihood import Likelihood
+from splatsoil.inverse.mcmc import sample
+from splatsoil.inverse.misfit import measure
+from splatsoil.inverse.posterior import Data
+from splatsoil.inverse.simulations import simulations
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+FloatArray = npt.NDArray[np.float64]
+
+LEVELS = (0.5, 0.9)
+#: Emulators are trained without one of so many parts of the simulations, in turn.
+FOLDS = 8
+#: Posterior draws among which a truth's rank is taken, and the bins of the histogram.
+DRAWS, BINS = 199, 10
+
+
+def folds(data: Data, truths: int, count: int = FOLDS) -> list[tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]]:
+    """(train, test) indices: each of the first ``truths`` simulations is tested once, by an emulator without it."""
+    every = np.arange(len(data.points))
+    return [(np.setdiff1d(every, test), test) for test in np.array_split(every[:truths][::1], count)]
+
+
+def calibrate(
+    data: Data,
+    truths: int,
+    *,
+    training: int | None = None,
+    sensor_std: float = 1.0,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[dict[str, Any]]:
+    """One entry for each truth: its rank, and whether intervals hold it, for each parameter.
+
+    Args:
+        data: simulations; the first ``truths`` at points of the prior.
+        truths: how many of them are taken for the truth in turn.
+        training: simulations an emulator is trained on; all others by default.
+        sensor_std: noise added to a truth's features, in their unit.
+        seed: of noise, training sets and chains.
+        progress: called with (done, truths).
+    """
+    rng = np.random.default_rng([seed, 21])
+    out: list[dict[str, Any]] = []
+    for number, (train, test) in enumerate(folds(data, truths)):
+        if training is not None and training < len(train):
+            # Repeats stand at the end of the simulations: they stay, since chance is measured from them.
+            inner = train[train < truths]
+            keep = max(training - (len(train) - len(inner)), len(data.space) + 4)
+            train = np.concatenate([np.sort(rng.choice(inner, keep, replace=False)), train[train >= truths]])
+        emulator = Emulator(data.points[train], -data.residuals[train], seed=seed + 1000 * number)
+        for index in test:
+            observed = -data.residuals[index] + sensor_std * rng.standard_normal(data.residuals.shape[1])
+            expected = emulator.outside_variance + sensor_std**2
+            misfit = measure(emulator.remainder(observed), expected, emulator.basis, data.places)
+            likelihood = Likelihood(emulator, observed, sensor_std**2, misfit)
+            chains = sample(
+                likelihood, likelihood.lower, likelihood.upper, seed=int(index), ensembles=2, most_steps=2000
+            )
+            draws = chains.flat[:, : len(data.space)]
+            draws = draws[rng.choice(len(draws), DRAWS, replace=False)]
+            truth = data.points[index]
+            within = {}
+            for level in LEVELS:
+                low, high = np.quantile(chains.flat[:, : len(truth)], [0.5 - level / 2, 0.5 + level / 2], axis=0)
+                within[str(level)] = [bool(a <= t <= b) for a, t, b in zip(low, truth, high, strict=True)]
+            out.append(
+                {
+                    "truth": truth.tolist(),
+                    "rank": [int(r) for r in (draws < truth).sum(axis=0)],
+                    "within": within,
+                    "mean": draws.mean(axis=0).tolist(),
+                    "std": draws.std(axis=0).tolist(),
+                    "misfit": misfit.present,
+                    "converged": chains.converged,
+                }
+            )
+            if progress is not None:
+                progress(len(out), truths)
+    return out
+
+
+def summarise(entries: Sequence[dict[str, Any]], data: Data) -> dict[str, Any]:
+    """Coverage with its 95 % binomial range when all is right, and ranks with χ²'s p-value, for each parameter."""
+    count = len(entries)
+    parameters = {}
+    for i, p in enumerate(data.space):
+        ranks = np.array([e["rank"][i] for e in entries])
+        bins = np.histogram(ranks, bins=BINS, range=(-0.5, DRAWS + 0.5))[0]
+        z = np.array([(e["mean"][i] - e["truth"][i]) / e["std"][i] for e in entries])
+        half = 0.5 * (p.upper - p.lower)
+        parameters[p.name] = {
+            "coverage": {str(level): float(np.mean([e["within"][str(level)][i] for e in entries])) for level in LEVELS},
+            "ranks": bins.tolist(),
+            "p_uniform": float(chisquare(bins).pvalue),
+            "rms_z": float(np.sqrt(np.mean(z**2))),
+            "contraction": float(np.mean([e["std"][i] for e in entries]) * np.sqrt(3.0)),
+            "mean_std": None if p.log else float(np.mean([e["std"][i] for e in entries]) * half),
+            "unit": p.unit,
+        }
+    expected = {str(level): [float(v) / count for v in binom.interval(0.95, count, level)] for level in LEVELS}
+    return {
+        "truths": count,
+        "expected": expected,
+        "parameters": parameters,
+        "with_misfit": sum(e["misfit"] for e in entries),
+        "not_converged": sum(not e["converged"] for e in entries),
+    }
+
+
+def table(result: dict[str, Any]) -> str:
+    """The result as Markdown."""
+    lines = [
+        f"{result['world']}, preset `{result['preset']}`, {result['device']}: {result['truths']} truths, each a "
+        f"simulation of its own, emulators trained on {result['training']} other simulations; {result['seconds']:.0f} s.",
+        "",
+        "| parameter | 50 % intervals hold | 90 % intervals hold | ranks uniform, p | rms z | width / prior |",
+        "|---|---|---|---|---|---|",
+    ]
+    for name, entry in result["parameters"].items():
+        held = " | ".join(f"**{100.0 * entry['coverage'][str(level)]:.0f} %**" for level in LEVELS)
+        lines.append(
+            f"| {name} | {held} | {entry['p_uniform']:.2f} | {entry['rms_z']:.2f} | {entry['contraction']:.2f} |"
+        )
+    ranges = ", ".join(
+        f"{100.0 * level:.0f} %: {100.0 * result['expected'][str(level)][0]:.0f}–"
+        f"{100.0 * result['expected'][str(level)][1]:.0f} %"
+        for level in LEVELS
+    )
+    lines += ["", f"95 % of perfectly calibrated posteriors would land within {ranges} with so many truths."]
+    lines.append(
+        f"{result['with_misfit']} posteriors saw a misfit, {result['not_converged']} chains had not "
+        "converged in 2000 steps."
+    )
+    return "\n".join(lines)
+
+
+def figure(result: dict[str, Any]) -> Figure:
+    """Rank histograms with the band that uniform ranks stay in."""
+    from matplotlib.figure import Figure
+
+    names = list(result["parameters"])
+    drawn = Figure(figsize=(3.6 * len(names) + 0.4, 2.6), layout="constrained")
+    axes = np.atleast_1d(drawn.subplots(1, len(names)))
+    low, high = binom.interval(0.95, result["truths"], 1.0 / BINS)
+    for axis, name in zip(axes, names, strict=True):
+        axis.axhspan(low, high, color="0.88", label="95 % of uniform ranks")
+        axis.bar(np.arange(BINS) + 0.5, result["parameters"][name]["ranks"], width=0.9, color="#3b6ea5")
+        axis.set_xlabel(f"rank of the true {name.replace('_', ' ')}, tenths")
+        axis.legend(fontsize=7)
+    axes[0].set_ylabel("truths")
+    return drawn
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Command line; exit code 0."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    world_options(parser)
+    parser.add_argument("--truths", type=int, default=128)
+    parser.add_argument("--training", type=int, help="simulations for each emulator; all others by default")
+    parser.add_argument("--sensor", type=float, default=1.0, help="noise added to a truth's features, grey levels")
+    parser.add_argument("--seed", type=int, default=0)
+    output_options(parser)
+    options = parser.parse_args(arguments)
+    began = time.perf_counter()
+    with executor(options.executor) as pool:
+        data, file = simulations(
+            options.truths,
+            options.parameters,
+            options.effects,
+            measurement=options.set,
+            reconstruction=options.reconstruction,
+            preset=options.preset,
+            device=options.device,
+            seed=options.seed,
+            executor=pool,
+            progress=ticker("simulations"),
+        )
+    data = replace(data, sensor_std=options.sensor)
+    truths = min(options.truths, len(data.points))
+    entries = calibrate(
+        data, truths, training=options.training, sensor_std=options.sensor, seed=options.seed, progress=ticker("truths")
+    )
+    result = {
+        "benchmark": "calibration",
+        "world": "the made-up world of PlowSand-v0" if options.set is None else str(options.set),
+        "preset": options.preset,
+        "training": options.training or len(data.points) - truths // FOLDS,
+        "sensor": options.sensor,
+        "seed": options.seed,
+        "simulations": str(file),
+        **summarise(entries, data),
+        **stamp(options.device),
+        "seconds": time.perf_counter() - began,
+        "entries": entries,
+    }
+    if options.out is not None:
+        write_result(options.out, result, table(result), {"ranks.svg": figure(result)})
+    print(json.dumps(result, indent=1) if options.json else table(result))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

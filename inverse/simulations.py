@@ -1,0 +1,110 @@
+"""Simulations of a world over its parameters, made once and kept: what benchmarks draw synthetic truths from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from splatsoil.envs.measured import LOSS, MeasuredProblem, cache_folder
+from splatsoil.envs.problem import Problem
+from splatsoil.envs.synthetic import SyntheticProblem
+
+import splatsoil
+from splatsoil.files import FORWARD, code_digest
+from splatsoil.parameters import ParameterSpace
+
+from .campaign import Job, run_campaign
+from .evaluations import EvaluationStore, digest, writer_lock
+from .posterior import Data
+from .surrogate import sobol
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Seed of the made-up world's own truth, which cancels in all that is made from its simulations.
+WORLD = 1
+
+
+def simulations(
+    count: int,
+    parameters: Sequence[str] = ("friction_angle",),
+    effects: Sequence[str] = (),
+    *,
+    measurement: Path | None = None,
+    reconstruction: Path | None = None,
+    preset: str = "tiny",
+    device: str = "cpu",
+    seed: int = 0,
+    repeats: int = 8,
+    executor: Executor | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[Data, Path]:
+    """Simulations at Sobol points of the prior, each with particles of its own, and some repeated in the middle.
+
+    Args:
+        count: points; their number is best a power of two.
+        parameters, effects: of the model.
+        measurement: folder of a set; None: the made-up world of PlowSand-v0.
+        reconstruction: of the set; made and kept where there is none.
+        preset, device: of the solver.
+        seed: of points and particles.
+        repeats: simulations in the middle of the prior that differ in their particles only, after the others.
+        executor: where; in this process by default.
+        progress: called with (done, all).
+
+    Returns:
+        The simulations, and the database that keeps them in the user's cache.
+    """
+    problem, world = _problem(parameters, effects, measurement, reconstruction, preset, device)
+    model = {
+        **world,
+        "effects": sorted(effects),
+        "preset": preset,
+        "device": device.split(":")[0],
+        "version": splatsoil.__version__,
+        "code": code_digest((*FORWARD,), others=[name for name in effects if name.endswith(".py")]),
+        "loss": LOSS,
+    }
+    points = sobol(count, len(problem.space), seed)
+    jobs = jobs_at(problem.space, np.concatenate([points, np.zeros((repeats, len(problem.space)))]), seed)
+    file = cache_folder() / "simulations" / f"{digest({**model, 'parameters': list(parameters)})[:16]}.db"
+    with writer_lock(file.parent), EvaluationStore(file) as store:
+        records = run_campaign(
+            problem,
+            jobs,
+            store,
+            model,
+            {"agent": "simulations", "parameters": list(parameters), "count": count, "seed": seed, "repeats": repeats},
+            executor=executor,
+            after_evaluation=None if progress is None else lambda done, _: progress(done, len(jobs)),
+        )
+    places, sensor = getattr(problem, "places", None), float(getattr(problem, "sensor_std", 0.0))
+    return Data.from_records(problem.space, records, places, sensor), file
+
+
+def jobs_at(space: ParameterSpace, points: FloatArray, seed: int) -> list[Job]:
+    """One evaluation at each point (k, n) of [-1, 1]^n, no two with the same particles."""
+    seeds = np.random.SeedSequence([seed, 9]).generate_state(len(points)) % 2**31
+    return [Job(space.to_dict(space.from_unit(p)), int(s)) for p, s in zip(points, seeds, strict=True)]
+
+
+def _problem(
+    parameters: Sequence[str],
+    effects: Sequence[str],
+    measurement: Path | None,
+    reconstruction: Path | None,
+    preset: str,
+    device: str,
+) -> tuple[Problem, dict[str, Any]]:
+    if measurement is None:
+        world = SyntheticProblem(parameters, effects, preset=preset, device=device)
+        world.begin(WORLD)
+        source = Path(splatsoil.__file__).parents[1] / "envs" / "synthetic.py"
+        return world, {"world": "synthetic", "seed": WORLD, "source": code_digest((), [source])}
+    problem = MeasuredProblem.load(
+        measurement, parameters, effects, preset=preset, device=device, reconstruction=reconstruction
+    )
+    return problem, {"measurement": problem.model.measurement.hash, "reconstruction": str(reconstruction)}
