@@ -47,7 +47,7 @@ DRAWS, BINS = 199, 10
 def folds(data: Data, truths: int, count: int = FOLDS) -> list[tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]]:
     """(train, test) indices: each of the first ``truths`` simulations is tested once, by an emulator without it."""
     every = np.arange(len(data.points))
-    return [(np.setdiff1d(every, test), test) for test in np.array_split(every[:truths][::1], count)]
+    return [(np.setdiff1d(every, test), test) for test in np.array_split(every[:truths], count)]
 
 
 def calibrate(
@@ -141,7 +141,7 @@ def table(result: dict[str, Any]) -> str:
     """The result as Markdown."""
     lines = [
         f"{result['world']}, preset `{result['preset']}`, {result['device']}: {result['truths']} truths, each a "
-        f"simulation of its own, emulators trained on {result['training']} other simulations; {result['seconds']:.0f} s.",
+        f"simulation of its own, emulators trained on {result['training']} others; {result['seconds']:.0f} s.",
         "",
         "| parameter | 50 % intervals hold | 90 % intervals hold | ranks uniform, p | rms z | width / prior |",
         "|---|---|---|---|---|---|",
