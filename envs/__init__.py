@@ -10,4 +10,8 @@ def register() -> None:
     import gymnasium
 
     if PLOW_SAND not in gymnasium.registry:
-        gymnasium.register(id=PLOW_SAND, entry_point="splatsoil.envs.plow_sand:PlowSandEnv")
+        gymnasium.register(
+            id=PLOW_SAND,
+            entry_point="splatsoil.envs.plow_sand:PlowSandEnv",
+            vector_entry_point="splatsoil.envs.vector:PlowSandVectorEnv",
+        )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -146,14 +147,18 @@ class MeasuredProblem:
             SimulationError: the simulation could not go on.
         """
         began = time.perf_counter()
-        prediction, comparison = self.predict(parameters, seed)
+        evaluation = self.judge(self.model.predict(parameters, seed, self.progress).images)
+        return replace(evaluation, seconds=time.perf_counter() - began)
+
+    def judge(self, images: Mapping[tuple[str, int], Image]) -> Evaluation:
+        """Predicted pictures, by camera and frame, compared with the measured ones."""
+        comparison = self.comparator.compare(images)
         return Evaluation(
             loss=min(comparison.loss, self.worst_loss),
             blocks=comparison.blocks,
             extras={"rgb": comparison.rgb},
-            seconds=time.perf_counter() - began,
             observed=self.observed_image(),
-            predicted=prediction.images[self._shown],
+            predicted=images[self._shown],
         )
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -6,16 +6,17 @@ the observed ones and pays minus the loss; the episode ends when the budget of g
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
-from splatsoil.errors import ParameterError, SimulationError
+from splatsoil.errors import ParameterError
 
 from .problem import Evaluation, Image, Problem
+from .together import attempt
 
 Observation = dict[str, npt.NDArray[np.float32]]
 
@@ -77,7 +78,7 @@ class PlowSandEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             raise ParameterError(f"render_mode: must be rgb_array or None, not {render_mode}")
         self.render_mode = render_mode
         self.budget = int(budget)
-        self.problem = problem or _make_problem(measurement, parameters, effects, preset, device, reconstruction)
+        self.problem = problem or make_problem(measurement, parameters, effects, preset, device, reconstruction)
         n, b = len(self.problem.space), self.problem.block_count
         box = gym.spaces.Box
         self.action_space = box(-1.0, 1.0, (n,), np.float32)
@@ -126,6 +127,11 @@ class PlowSandEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             gymnasium.error.ResetNeeded: the episode is over or hasn't begun.
             ParameterError: the action isn't n finite numbers; one beyond [-1, 1] is clipped.
         """
+        guess, parameters, seed = self.plan(action)
+        return self.settle(guess, parameters, seed, attempt(self.problem, parameters, seed))
+
+    def plan(self, action: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.float32], dict[str, float], int]:
+        """The first half of a step: the guess (n,) as it counts, its physical values, and the simulation's seed."""
         if self._left <= 0:
             raise gym.error.ResetNeeded("the budget of evaluations is spent; call reset() to start another episode")
         guess = np.array(action, dtype=np.float32).reshape(-1)
@@ -133,14 +139,18 @@ class PlowSandEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             raise ParameterError(f"action: expected {len(self.problem.space)} finite numbers, got {action}")
         guess = np.clip(guess, -1.0, 1.0)
         parameters = self.problem.space.to_dict(self.problem.space.from_unit(guess))
-        seed = self.simulation_seed(self.budget - self._left)
-        evaluation = self._evaluate(parameters, seed)
+        return guess, parameters, self.simulation_seed(self.budget - self._left)
+
+    def settle(
+        self, guess: npt.NDArray[np.float32], parameters: Mapping[str, float], seed: int, evaluation: Evaluation
+    ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """The second half of a step: take note of the evaluation of a planned guess, and pay for it."""
         self._left -= 1
         self._last_action, self.last_evaluation = guess, evaluation
         if evaluation.loss is not None and (self._best_loss is None or evaluation.loss < self._best_loss):
             self._best_action, self._best_loss = guess, evaluation.loss
         info: dict[str, Any] = {
-            "parameters": parameters,
+            "parameters": dict(parameters),
             "status": "ok" if evaluation.loss is not None else "failed",
             "message": evaluation.message,
             "seed": seed,
@@ -155,12 +165,6 @@ class PlowSandEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
     def simulation_seed(self, step: int) -> int:
         """Seed of the simulation in this step of this episode: no two share their chance."""
         return int(np.random.SeedSequence([self._episode_seed, step]).generate_state(1)[0] % 2**31)
-
-    def _evaluate(self, parameters: dict[str, float], seed: int) -> Evaluation:
-        try:
-            return self.problem.evaluate(parameters, seed)
-        except SimulationError as error:
-            return Evaluation(None, np.zeros(self.problem.block_count), message=str(error))
 
     def _observation(self) -> Observation:
         worst = self.problem.worst_loss
@@ -197,7 +201,7 @@ def signed_difference(observed: Image, predicted: Image) -> Image:
     return np.clip(0.5 + (observed - predicted), 0.0, 1.0).astype(np.float32)
 
 
-def _make_problem(
+def make_problem(
     measurement: str | None,
     parameters: Sequence[str],
     effects: Sequence[str],
@@ -205,6 +209,7 @@ def _make_problem(
     device: str,
     reconstruction: str | None,
 ) -> Problem:
+    """The simulate-and-compare that the environment's options describe."""
     if measurement is None:
         from .synthetic import SyntheticProblem
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -137,6 +138,16 @@ def compare(observed: Image, predicted: Image, still: Image) -> tuple[float, Flo
     return loss, 255.0 * patches.mean(axis=(2, 4, 5)).reshape(-1)
 
 
+@dataclass(frozen=True)
+class Patch:
+    """Where a block residual is taken: camera, frame, and place in the picture, in patches."""
+
+    camera: str
+    frame: int
+    x: float
+    y: float
+
+
 class SyntheticProblem:
     """Simulate-and-compare against a hidden truth.
 
@@ -154,6 +165,8 @@ class SyntheticProblem:
     worst_loss = 10.0
     image_size = (HEIGHT, WIDTH)
     block_count = 2 * len(COMPARED) * BLOCKS[0] * BLOCKS[1]
+    #: Of a block residual, grey levels of 255.
+    sensor_std = 255.0 * SENSOR_NOISE / (WIDTH * HEIGHT / (BLOCKS[0] * BLOCKS[1]) * 3) ** 0.5
 
     def __init__(
         self,
@@ -201,10 +214,30 @@ class SyntheticProblem:
         if self._truth is None:
             raise RuntimeError("begin() has to be called before anything is observed")
         if self._observed is None:
-            clean = self.predict(self._truth, self._truth_seed)
-            noise = np.random.default_rng([self._truth_seed, 1]).standard_normal(clean.shape)
-            self._observed = np.clip(clean + SENSOR_NOISE * noise, 0.0, 1.0).astype(np.float32)
+            self.record(self.predict(self._truth, self._truth_seed))
+        assert self._observed is not None
         return self._observed
+
+    def unobserved(self) -> tuple[Mapping[str, float], int] | None:
+        """Values and seed of the world's own simulation, as long as it hasn't been made."""
+        return (self._truth, self._truth_seed) if self._observed is None and self._truth is not None else None
+
+    def record(self, clean: Image) -> None:
+        """Take pictures (k, h, w, 3) of the world's own simulation as what the cameras saw, but for their noise."""
+        noise = np.random.default_rng([self._truth_seed, 1]).standard_normal(clean.shape)
+        self._observed = np.clip(clean + SENSOR_NOISE * noise, 0.0, 1.0).astype(np.float32)
+
+    @property
+    def places(self) -> tuple[Patch, ...]:
+        """Where each block residual is taken."""
+        rows, columns = BLOCKS
+        return tuple(
+            Patch(camera, frame, float(column), float(row))
+            for camera in cameras()
+            for frame in COMPARED
+            for row in range(rows)
+            for column in range(columns)
+        )
 
     def observed_image(self) -> Image:
         """The left camera's last picture."""
@@ -217,35 +250,45 @@ class SyntheticProblem:
             SimulationError: the simulation could not go on.
         """
         began = time.perf_counter()
+        self.observed()
+        evaluation = self.judge(self.predict(parameters, seed))
+        return replace(evaluation, seconds=time.perf_counter() - began)
+
+    def judge(self, predicted: Image) -> Evaluation:
+        """Predicted pictures (k, h, w, 3) compared with the observed ones."""
         observed = self.observed()
         if self._still is None:
-            self._still = self._world.still()
-        predicted = self.predict(parameters, seed)
+            self._still = self.world.still()
         loss, blocks = compare(observed, predicted, self._still)
         shown = len(COMPARED) - 1
         return Evaluation(
             loss=min(loss, self.worst_loss),
             blocks=blocks,
             extras={"rgb": float(np.mean((observed - predicted) ** 2))},
-            seconds=time.perf_counter() - began,
             observed=observed[shown],
             predicted=predicted[shown],
         )
 
     def predict(self, parameters: Mapping[str, float], seed: int) -> Image:
         """Pictures (k, h, w, 3), camera by camera, of a bed of other particles (by ``seed``) with these parameters."""
-        world = self._world
+        world = self.world
         particles = world.particles(seed)
         trajectory = world.simulate(particles, parameters)
         return world.pictures(particles, trajectory.positions, trajectory.deformations)
 
+    def share(self, other: SyntheticProblem) -> None:
+        """Use another problem's solver and scene, if they are for the same law, preset and device."""
+        if (self.effects, self.preset, self.device) == (other.effects, other.preset, other.device):
+            self.world = other.world
+
     @cached_property
-    def _world(self) -> World:
+    def world(self) -> World:
+        """What all simulations share."""
         return World(self.effects, self.preset, self.device)
 
     def __getstate__(self) -> dict[str, Any]:
         # Solver and scene are made again from their names: kernels and meshes don't travel between processes.
-        return {key: value for key, value in self.__dict__.items() if key != "_world"}
+        return {key: value for key, value in self.__dict__.items() if key != "world"}
 
 
 class World:
@@ -263,6 +306,7 @@ class World:
         self.law = Law(find_effects(effects))
         self.resolution = Resolution.derive(self.measurement, preset)
         self.device = device
+        self.recorded = COMPARED
         self.light = Light.from_angles(200.0, 50.0, np.full(3, 0.35))
         bed = self.measurement.bed
         self.surface = HeightField.over(bed.lower, bed.upper, 0.005, DEPTH)

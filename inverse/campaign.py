@@ -5,9 +5,7 @@ One process writes the run database; workers only compute. What is there already
 
 from __future__ import annotations
 
-import math
 import pickle
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor, Future, as_completed
 from dataclasses import dataclass, replace
@@ -16,8 +14,8 @@ from typing import Any
 
 import numpy as np
 from splatsoil.envs.problem import Evaluation, Problem
+from splatsoil.envs.together import attempt
 
-from splatsoil.errors import SimulationError
 from splatsoil.parameters import ParameterSpace
 
 from .evaluations import EvaluationRecord, EvaluationStore, digest
@@ -48,18 +46,6 @@ class Shipped:
 @lru_cache(maxsize=2)
 def _unpack(packed: bytes) -> Shipped:
     return Shipped(pickle.loads(packed))
-
-
-def attempt(problem: Problem, parameters: Mapping[str, float], seed: int) -> Evaluation:
-    """An evaluation, a failed simulation being one too."""
-    began = time.perf_counter()
-    try:
-        evaluation = problem.evaluate(parameters, seed)
-        if evaluation.loss is not None and not math.isfinite(evaluation.loss):
-            raise SimulationError(f"the loss is {evaluation.loss}")
-    except SimulationError as error:
-        evaluation = Evaluation(None, np.zeros(problem.block_count), message=str(error))
-    return replace(evaluation, seconds=time.perf_counter() - began)
 
 
 def _work(shipped: Shipped, parameters: Mapping[str, float], seed: int) -> Evaluation:

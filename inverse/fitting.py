@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 from splatsoil.envs.plow_sand import PlowSandEnv
 from splatsoil.envs.problem import Evaluation, Image, Problem
+from splatsoil.envs.together import attempt
 
 from splatsoil.errors import RunError
 from splatsoil.parameters import Parameter, ParameterSpace
 
 from .bayesopt import START, Episode, optimise
-from .campaign import Job, attempt, make_record
+from .campaign import Job, make_record
 from .evaluations import EvaluationRecord, EvaluationStore, digest
 from .run_folder import RunFolder
 from .surrogate import Minimum, Surrogate
