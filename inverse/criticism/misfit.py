@@ -11,13 +11,11 @@ from scipy.stats import chi2
 
 from splatsoil.experiment.features import Layout
 
-from .noise import Noise, Solver
+from .noise import Noise, Solver, smooth_waves
 
 FloatArray = npt.NDArray[np.float64]
 
 DRAWS = 1000
-WAVES_IN_TIME = 4
-WAVES_IN_SPACE = 3
 FEWEST = 4
 """Features that a block needs."""
 
@@ -48,29 +46,8 @@ class Omnibus:
 
 
 def smooth_basis(layout: Layout, noise: Noise) -> FloatArray:
-    """(n, k) slow waves over time, and over the plane for each instrument, in units of each feature's noise."""
-    times, sites = layout.shape
-    rows = _cosines(np.linspace(0.0, 1.0, times), min(WAVES_IN_TIME, times))
-    channel = layout.channel_numbers()
-    columns = []
-    for c in range(len(layout.channels)):
-        mine = channel == c
-        place = np.array([[site.x, site.y] for site in layout.sites])[mine]
-        if mine.sum() == 1 or not np.isfinite(place).all():
-            waves = np.ones((mine.sum(), 1))
-        else:
-            low, high = place.min(axis=0), place.max(axis=0)
-            unit = (place - low) / np.maximum(high - low, 1e-9)
-            along, across = (_cosines(unit[:, i], WAVES_IN_SPACE if high[i] > low[i] else 1) for i in (0, 1))
-            waves = (along[:, :, None] * across[:, None, :]).reshape(mine.sum(), -1)
-        wide = np.zeros((sites, waves.shape[1]))
-        wide[mine] = waves
-        columns.append(wide)
-    space = np.concatenate(columns, axis=1)
-    table = (rows[:, None, :, None] * space[None, :, None, :]).reshape(times, sites, -1)
-    basis = table[noise.seen] * noise.scale[:, None]
-    left, singular, _ = np.linalg.svd(basis / noise.scale[:, None], full_matrices=False)
-    return left[:, singular > 1e-6 * singular[0]] * noise.scale[:, None]
+    """(n, k) slow waves in units of each feature's noise."""
+    return smooth_waves(layout, noise.seen) * noise.scale[:, None]
 
 
 def omnibus(noise: Noise, nuisance: FloatArray, residual: FloatArray, basis: FloatArray) -> Omnibus:
@@ -174,10 +151,6 @@ def _drawn(nuisance: FloatArray, generator: np.random.Generator) -> FloatArray:
     if not nuisance.size:
         return np.zeros((len(nuisance), DRAWS))
     return nuisance @ generator.standard_normal((nuisance.shape[1], DRAWS))
-
-
-def _cosines(unit: FloatArray, count: int) -> FloatArray:
-    return np.cos(np.pi * unit[:, None] * np.arange(count)[None])
 
 
 def grouped(found: tuple[Block, ...]) -> Mapping[tuple[str, str], list[Block]]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +24,15 @@ BoolArray = npt.NDArray[np.bool_]
 
 MOST_MEMORY = 0.98
 """Largest correlation of neighbouring times."""
+WAVES_IN_TIME = 4
+WAVES_IN_SPACE = 3
+"""Slow waves in each direction: what effects look like, where the noise must be known best."""
+FEWEST_TO_JUDGE = 3
+"""Samples from which each can be judged by the others."""
+MEMORY_OF_SCALE = 1.5
+"""Width of the local mean of variances in steps of time."""
+REACH = 0.5
+"""Width of the local mean of variances, in spacings of sites: disturbed soil has sharp edges."""
 RIDGE = 1e-6
 """Added to the diagonal of a correlation, for its Cholesky factor's sake."""
 
@@ -79,7 +88,28 @@ def estimate(layout: Layout, samples: FloatArray, seen: BoolArray) -> Part:
     part = _correlation(layout, np.where(seen, samples / scale, 0.0), scale)
     # How far the variance's own scatter is chance depends on the correlation, which depends on the variance: twice.
     scale = _scales(layout, samples, seen, across=part.across(layout), memory=part.memory)
-    return _correlation(layout, np.where(seen, samples / scale, 0.0), scale)
+    return _calibrated(layout, _correlation(layout, np.where(seen, samples / scale, 0.0), scale, part), samples, seen)
+
+
+def _calibrated(layout: Layout, part: Part, samples: FloatArray, seen: BoolArray) -> Part:
+    """The part, its variance corrected by what samples come to on slow waves, where effects live.
+
+    With three samples or more, each is judged by scales that the others give: a scale that is too small by chance
+    counts for more than one that is too large, and a sample cannot show that of scales it has made itself.
+    """
+    across, count = part.across(layout), len(samples)
+    waves = smooth_waves(layout, seen)
+    squares = []
+    for k in range(count):
+        scale = part.scale
+        if count >= FEWEST_TO_JUDGE:
+            others = np.delete(samples, k, axis=0)
+            scale = _scales(layout, others, seen, across=across, memory=part.memory)
+        noise = Noise.of(layout, [(1.0, replace(part, scale=scale))], seen)
+        solver = noise.solver()
+        left, _ = np.linalg.qr(solver.whiten(waves * noise.scale[:, None]))
+        squares.append(np.mean((left.T @ solver.whiten(samples[k][seen])) ** 2))
+    return replace(part, scale=part.scale * math.sqrt(float(np.mean(squares))))
 
 
 def _scales(
@@ -117,14 +147,14 @@ def _scales(
 
 
 def _neighbours(layout: Layout) -> tuple[FloatArray, FloatArray]:
-    """Weights (t, t) and (s, s) of local means: Gaussian over one step, and over the spacing of sites."""
+    """Weights (t, t) and (s, s) of local means, Gaussian in time and space."""
     steps = layout.steps()
-    in_time = np.exp(-0.5 * np.subtract.outer(steps, steps) ** 2)
+    in_time = np.exp(-0.5 * (np.subtract.outer(steps, steps) / MEMORY_OF_SCALE) ** 2)
     in_time /= in_time.sum(axis=1, keepdims=True)
     distance, spacing = layout.distances(), _spacing(layout)
     channel = layout.channel_numbers()
     same = channel[:, None] == channel[None]
-    in_space = np.where(same, np.exp(-0.5 * (distance / spacing) ** 2), 0.0)
+    in_space = np.where(same, np.exp(-0.5 * (distance / (REACH * spacing)) ** 2), 0.0)
     in_space /= in_space.sum(axis=1, keepdims=True)
     return in_time, in_space
 
@@ -139,7 +169,7 @@ def _spacing(layout: Layout) -> float:
     return float(np.median(nearest)) if nearest.size else 1.0
 
 
-def _correlation(layout: Layout, scaled: FloatArray, scale: FloatArray) -> Part:
+def _correlation(layout: Layout, scaled: FloatArray, scale: FloatArray, start: Part | None = None) -> Part:
     """Parameters of the correlation that maximise the likelihood of scaled samples (k, t, s)."""
     spacing, places = _spacing(layout), np.isfinite([site.x for site in layout.sites]).any()
     channels = len(layout.channels)
@@ -165,10 +195,50 @@ def _correlation(layout: Layout, scaled: FloatArray, scale: FloatArray) -> Part:
         logs = 2.0 * (sites * np.log(np.diag(lower_t)).sum() + times * np.log(np.diag(lower_s)).sum())
         return float(np.sum(white**2) + len(scaled) * logs)
 
-    start = np.concatenate([[0.0, 0.0, 0.0], np.zeros(len(pairs))])
-    found = minimize(loss, start, method="Nelder-Mead", options={"maxfev": 150 + 60 * len(pairs), "xatol": 0.02})
+    first = np.zeros(3 + len(pairs)) if start is None else _packed(start, spacing, pairs)
+    simplex = np.vstack([first, first + (1.0 if start is None else 0.3) * np.eye(len(first))])
+    options = {"maxfev": 120 + 40 * len(pairs), "xatol": 0.05, "fatol": 0.5, "initial_simplex": simplex}
+    found = minimize(loss, first, method="Nelder-Mead", options=options)
     memory, length, nugget, between = unpack(found.x)
     return Part(scale=scale, memory=memory, length=length, nugget=nugget, between=between)
+
+
+def _packed(part: Part, spacing: float, pairs: Sequence[tuple[int, int]]) -> FloatArray:
+    """The search's coordinates of a part's correlation."""
+    ratio = min(max(part.memory / MOST_MEMORY, 1e-3), 1.0 - 1e-3)
+    share = min(max((part.nugget - 0.01) / 0.98, 1e-3), 1.0 - 1e-3)
+    length = math.log(part.length / spacing) if part.length > 0.0 else 0.0
+    links = [] if part.between is None else [math.atanh(min(max(part.between[p], -0.99), 0.99)) for p in pairs]
+    return np.array([math.log(ratio / (1.0 - ratio)), length, math.log(share / (1.0 - share)), *links])
+
+
+def smooth_waves(layout: Layout, seen: BoolArray) -> FloatArray:
+    """(n, k) slow waves over time, and over the plane for each instrument; orthonormal columns."""
+    times, sites = layout.shape
+    rows = _cosines(np.linspace(0.0, 1.0, times), min(WAVES_IN_TIME, times))
+    channel = layout.channel_numbers()
+    columns = []
+    for c in range(len(layout.channels)):
+        mine = channel == c
+        place = np.array([[site.x, site.y] for site in layout.sites])[mine]
+        if mine.sum() == 1 or not np.isfinite(place).all():
+            waves = np.ones((int(mine.sum()), 1))
+        else:
+            low, high = place.min(axis=0), place.max(axis=0)
+            unit = (place - low) / np.maximum(high - low, 1e-9)
+            along, across = (_cosines(unit[:, i], WAVES_IN_SPACE if high[i] > low[i] else 1) for i in (0, 1))
+            waves = (along[:, :, None] * across[:, None, :]).reshape(int(mine.sum()), -1)
+        wide = np.zeros((sites, waves.shape[1]))
+        wide[mine] = waves
+        columns.append(wide)
+    space = np.concatenate(columns, axis=1)
+    table = (rows[:, None, :, None] * space[None, :, None, :]).reshape(times, sites, -1)
+    left, singular, _ = np.linalg.svd(table[seen], full_matrices=False)
+    return left[:, singular > 1e-6 * singular[0]]
+
+
+def _cosines(unit: FloatArray, count: int) -> FloatArray:
+    return np.cos(np.pi * unit[:, None] * np.arange(count)[None])
 
 
 def _time(steps: FloatArray, memory: float) -> FloatArray:

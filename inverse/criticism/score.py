@@ -61,82 +61,111 @@ class Score:
 
 
 @dataclass(frozen=True)
-class ScoreTest:
-    """All candidates against one residual.
+class Tester:
+    """All candidates against any residual with the same noise.
 
     Attributes:
-        scores: by name.
-        confusion: (m, m) correlation between the candidates' scores, in the order of ``names``.
-        names: of the candidates.
-    """
-
-    scores: Mapping[str, Score]
-    confusion: FloatArray
-    names: tuple[str, ...]
-
-    def best(self) -> Score | None:
-        """The largest predicted fall among significant effects is found elsewhere; this is the largest of all."""
-        return max(self.scores.values(), key=lambda score: score.statistic, default=None)
-
-
-def score_test(
-    noise: Noise,
-    nuisance: FloatArray,
-    residual: FloatArray,
-    directions: Mapping[str, FloatArray],
-    candidates: Sequence[Candidate],
-    *,
-    level: float = 0.05,
-    seed: int = 0,
-) -> ScoreTest:
-    """Test every candidate.
-
-    Args:
-        noise: of the residual.
-        nuisance: (n, q) derivatives by parameters and nuisances, each times its prior standard deviation.
-        residual: (n,) observed minus predicted.
-        directions: (n, k) derivatives by each candidate's parameters, in the candidate's order.
         candidates: the effects.
+        parts: where each one's parameters stand in the joined columns.
+        places: which of its parameters measures it.
+        information: (k, k) of all parameters, parameters of the model and nuisances projected out.
+        whole: (k,) information before that projection.
+        weights: (n, k) inverse covariance times derivatives: products with a residual are scores.
+        smallest: (draws,) least p-value of any candidate when there is nothing to find.
         level: family-wise level for which detectable sizes are stated.
-        seed: of the draws.
     """
-    names = tuple(c.name for c in candidates)
-    if not names:
-        return ScoreTest({}, np.zeros((0, 0)), ())
-    bare = noise.solver()
-    solver = noise.plus(nuisance).solver() if nuisance.size else bare
-    columns = [np.atleast_2d(directions[c.name].T).T for c in candidates]
-    joined = np.concatenate(columns, axis=1)
-    white = solver.whiten(joined)
-    information, gradient = white.T @ white, white.T @ solver.whiten(residual)
-    whole = np.sum(bare.whiten(joined) ** 2, axis=0)
-    ends = np.cumsum([c.shape[1] for c in columns])
-    parts = [slice(int(end) - c.shape[1], int(end)) for end, c in zip(ends, columns, strict=True)]
-    order = [[p.name for p in c.parameters].index(c.size) for c in candidates]
 
-    found = [
-        _one(candidate, place, gradient[part], information[part, part], whole[part])
-        for candidate, place, part in zip(candidates, order, parts, strict=True)
-    ]
-    adjusted = _adjust([f.p for f in found], candidates, order, parts, information, seed)
-    quantile = norm.isf(level / len(names)), norm.isf(0.5 * level / len(names))
-    scores = {}
-    for candidate, place, part, raw, p in zip(candidates, order, parts, found, adjusted, strict=True):
-        sided = quantile[0] if candidate.measure.sign else quantile[1]
-        scores[candidate.name] = Score(
+    candidates: tuple[Candidate, ...]
+    parts: tuple[slice, ...]
+    places: tuple[int, ...]
+    information: FloatArray
+    whole: FloatArray
+    weights: FloatArray
+    smallest: FloatArray
+    level: float
+
+    @classmethod
+    def of(
+        cls,
+        noise: Noise,
+        nuisance: FloatArray,
+        directions: Mapping[str, FloatArray],
+        candidates: Sequence[Candidate],
+        *,
+        level: float = 0.05,
+        seed: int = 0,
+    ) -> Tester:
+        """Prepare the test.
+
+        Args:
+            noise: of the residuals.
+            nuisance: (n, q) derivatives by parameters and nuisances, each times its prior standard deviation.
+            directions: (n, k) derivatives by each candidate's parameters, in the candidate's order.
+            candidates: the effects, at least one.
+            level: see above.
+            seed: of the draws.
+        """
+        columns = [directions[c.name].reshape(len(noise.covariance), -1) for c in candidates]
+        ends = np.cumsum([c.shape[1] for c in columns])
+        parts = tuple(slice(int(end) - c.shape[1], int(end)) for end, c in zip(ends, columns, strict=True))
+        joined = np.concatenate(columns, axis=1)
+        bare = noise.solver()
+        whole = np.sum(bare.whiten(joined) ** 2, axis=0)
+        weights = bare.solve(joined)
+        if nuisance.size:
+            solved = bare.solve(nuisance)
+            inner = np.linalg.solve(np.eye(nuisance.shape[1]) + nuisance.T @ solved, nuisance.T @ weights)
+            weights = weights - solved @ inner
+        information = joined.T @ weights
+        information = 0.5 * (information + information.T)
+        places = tuple([p.name for p in c.parameters].index(c.size) for c in candidates)
+        smallest = _smallest(candidates, places, parts, information, seed)
+        return cls(tuple(candidates), parts, places, information, whole, weights, smallest, level)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The candidates' names."""
+        return tuple(c.name for c in self.candidates)
+
+    def score(self, residual: FloatArray, *, given: str | None = None) -> dict[str, Score]:
+        """Scores by name for a residual (n,).
+
+        Args:
+            residual: observed minus predicted.
+            given: an effect taken to be on, whose parameters are projected out; it is not scored itself.
+        """
+        gradient, information = self.weights.T @ residual, self.information
+        chosen = range(len(self.candidates))
+        if given is not None:
+            part = self.parts[self.names.index(given)]
+            gain = information[:, part] @ np.linalg.pinv(information[part, part])
+            gradient, information = gradient - gain @ gradient[part], information - gain @ information[part]
+            chosen = [i for i in chosen if self.names[i] != given]
+        return {self.names[i]: self._score(i, gradient, information) for i in chosen}
+
+    def confusion(self) -> FloatArray:
+        """(m, m) correlation between the candidates' scores."""
+        return _confusion(self.information, self.parts)
+
+    def _score(self, index: int, gradient: FloatArray, information: FloatArray) -> Score:
+        candidate, part, place = self.candidates[index], self.parts[index], self.places[index]
+        raw = _one(candidate, place, gradient[part], information[part, part], self.whole[part])
+        share, count = float(np.mean(self.smallest <= raw.p)), len(self.candidates)
+        # Beyond what the draws resolve, Bonferroni's bound.
+        adjusted = share if share > 20.0 / DRAWS else min(count * raw.p, 1.0)
+        sided = norm.isf(self.level / count if candidate.measure.sign else 0.5 * self.level / count)
+        return Score(
             name=candidate.name,
             statistic=raw.statistic,
             z=raw.z,
             p=raw.p,
-            adjusted=p,
+            adjusted=adjusted,
             estimate=float(raw.estimate[place]),
             std=raw.std,
-            detectable=(sided + norm.ppf(POWER)) * raw.std,
+            detectable=float(sided + norm.ppf(POWER)) * raw.std,
             survival=raw.survival,
             steps={q.name: float(v) for q, v in zip(candidate.parameters, raw.estimate, strict=True)},
         )
-        del part
-    return ScoreTest(scores, _confusion(information, parts, order), names)
 
 
 @dataclass(frozen=True)
@@ -189,27 +218,22 @@ def tail(statistic: float, count: int, sign: int) -> float:
     return float(0.5 * chi2.sf(statistic, count) + 0.5 * lower)
 
 
-def _adjust(
-    p: Sequence[float],
+def _smallest(
     candidates: Sequence[Candidate],
-    order: Sequence[int],
+    places: Sequence[int],
     parts: Sequence[slice],
     information: FloatArray,
     seed: int,
-) -> list[float]:
-    """Westfall and Young's smallest-p adjustment; Bonferroni's beyond what the draws resolve."""
+) -> FloatArray:
+    """(draws,) least p-value of all candidates under no effect (Westfall & Young 1993)."""
     generator = np.random.default_rng(seed)
-    values, vectors = np.linalg.eigh(0.5 * (information + information.T))
+    values, vectors = np.linalg.eigh(information)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     draws = generator.standard_normal((DRAWS, len(root))) @ root.T
     smallest = np.ones(DRAWS)
-    for candidate, place, part in zip(candidates, order, parts, strict=True):
+    for candidate, place, part in zip(candidates, places, parts, strict=True):
         smallest = np.minimum(smallest, _tails(draws[:, part], information[part, part], place, candidate.measure.sign))
-    out = []
-    for value in p:
-        share = float(np.mean(smallest <= value))
-        out.append(share if share > 20.0 / DRAWS else min(len(p) * value, 1.0))
-    return out
+    return smallest
 
 
 def _tails(gradients: FloatArray, information: FloatArray, place: int, sign: int) -> FloatArray:
@@ -233,7 +257,7 @@ def _tails(gradients: FloatArray, information: FloatArray, place: int, sign: int
     return np.where(statistic <= 0.0, 1.0, out)
 
 
-def _confusion(information: FloatArray, parts: Sequence[slice], order: Sequence[int]) -> FloatArray:
+def _confusion(information: FloatArray, parts: Sequence[slice]) -> FloatArray:
     """Largest canonical correlation between the candidates' directions, signed for single parameters."""
     count = len(parts)
     out = np.eye(count)

@@ -1,0 +1,151 @@
+"""What has to be simulated before anything can be said: repeats, other numerics, derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from splatsoil.errors import SimulationError
+from splatsoil.experiment.base import Candidate, Experiment
+from splatsoil.parameters import Parameter
+
+from .simulations import Simulations
+
+FloatArray = npt.NDArray[np.float64]
+
+STEP = 4.0
+"""Steps of derivatives in smallest meaningful sizes: large enough to stand above chance."""
+REACH = 0.5
+"""Most of the way to a bound that such a step may go."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Predictions around a fit.
+
+    Attributes:
+        values: the fitted parameters.
+        mean: (t, s) mean prediction over seeds that derivatives don't share.
+        repeats: (r, t, s) deviations of those seeds from their mean, scaled to have the variance of one seed.
+        numerics: (t, s) what other numerics change, by name.
+        slopes: (t, s) derivative by each parameter of the model.
+        curves: (t, s) half the second derivative by each parameter where it was measured.
+        widths: the step of each parameter's derivative.
+        directions: (k, t, s) derivatives by each candidate's parameters.
+        steps: the step of each of these.
+        failed: candidates whose simulation could not go on, with the reason.
+    """
+
+    values: Mapping[str, float]
+    mean: FloatArray
+    repeats: FloatArray
+    numerics: Mapping[str, FloatArray]
+    slopes: Mapping[str, FloatArray]
+    curves: Mapping[str, FloatArray]
+    widths: Mapping[str, float]
+    directions: Mapping[str, FloatArray]
+    steps: Mapping[str, float]
+    failed: Mapping[str, str]
+
+
+def gather(
+    experiment: Experiment,
+    simulate: Simulations,
+    values: Mapping[str, float],
+    *,
+    repeats: int = 4,
+    progress: Callable[[float], None] | None = None,
+) -> Evidence:
+    """Simulate what a diagnosis needs.
+
+    The residual's prediction is the mean over seeds 1, 2, …; derivatives are differences at seed 0, the same for both
+    ends, so that most of chance cancels in them. Sharing a seed between the two would correlate a residual's chance
+    with the derivatives' and raise false alarms that grow with the number of features.
+    """
+    base = dict(values)
+    seeds = range(1, 1 + (repeats if experiment.chance else 1))
+    jobs = len(seeds) + len(experiment.numerics) + 2 * len(experiment.parameters) + 2 * len(experiment.candidates) + 1
+    done = 0
+
+    def run(purpose: str, at: Mapping[str, float], effects: tuple[str, ...] = (), seed: int = 0, numerics: str = ""):  # type: ignore[no-untyped-def]
+        nonlocal done
+        table = simulate(at, effects=effects, seed=seed, numerics=numerics, purpose=purpose)
+        done += 1
+        if progress is not None:
+            progress(min(done / jobs, 1.0))
+        return table
+
+    runs = np.stack([run(f"repeat {seed} of {len(seeds)}", base, seed=seed) for seed in seeds])
+    middle = run("the fit", base)
+    deviations = (runs - runs.mean(axis=0)) * np.sqrt(len(runs) / max(len(runs) - 1, 1))
+    numerics = {}
+    for name in experiment.numerics:
+        try:
+            numerics[name] = run(f"numerics: {name}", base, numerics=name) - middle
+        except SimulationError:
+            continue
+    slopes, curves, widths = {}, {}, {}
+    for parameter in experiment.parameters:
+        ends = around(parameter, base[parameter.name])
+        tables = [run(parameter.name, {**base, parameter.name: end}) for end in ends]
+        offsets = [end - base[parameter.name] for end in ends]
+        slopes[parameter.name], curve = derivatives(offsets, tables, middle)
+        widths[parameter.name] = max(abs(offset) for offset in offsets)
+        if curve is not None:
+            curves[parameter.name] = curve
+    directions, steps, failed = {}, {}, {}
+    for candidate in experiment.candidates:
+        try:
+            directions[candidate.name] = np.stack(
+                [_slope(candidate, parameter, base, middle, run, steps) for parameter in candidate.parameters]
+            )
+        except SimulationError as error:
+            failed[candidate.name] = str(error)
+    return Evidence(
+        base, runs.mean(axis=0), deviations, numerics, slopes, curves, widths, directions, steps, failed
+    )
+
+
+def around(parameter: Parameter, value: float) -> list[float]:
+    """Where a model's parameter is varied to: both sides of its value, or one where a bound is near."""
+    step = STEP * parameter.meaningful if parameter.meaningful > 0.0 else 0.05 * (parameter.upper - parameter.lower)
+    step = min(step, 0.25 * (parameter.upper - parameter.lower))
+    ends = [max(value - step, parameter.lower), min(value + step, parameter.upper)]
+    return [end for end in ends if abs(end - value) > 0.3 * step]
+
+
+def derivatives(
+    offsets: Sequence[float], tables: Sequence[FloatArray], middle: FloatArray
+) -> tuple[FloatArray, FloatArray | None]:
+    """First derivative and half the second from one or two neighbours."""
+    if len(offsets) == 1:
+        return (tables[0] - middle) / offsets[0], None
+    matrix = np.array([[offset, offset**2] for offset in offsets])
+    first, second = np.linalg.solve(matrix, np.stack([(t - middle).reshape(-1) for t in tables]))
+    return first.reshape(middle.shape), second.reshape(middle.shape)
+
+
+def step_of(parameter: Parameter) -> float:
+    """How far an effect's parameter is moved from off, in the direction in which there is room."""
+    off = parameter.off if parameter.off is not None else parameter.default
+    room = {1: parameter.upper - off, -1: off - parameter.lower}
+    side = parameter.sign or (1 if room[1] >= room[-1] else -1)
+    wanted = STEP * parameter.meaningful if parameter.meaningful > 0.0 else 0.1 * room[side]
+    return side * min(wanted, REACH * room[side])
+
+
+def _slope(candidate: Candidate, parameter: Parameter, base, middle, run, steps):  # type: ignore[no-untyped-def]
+    """Derivative by one parameter of an effect, its others at off; from both sides where it has no sign."""
+    off = {p.name: p.off for p in candidate.parameters}
+    step = step_of(parameter)
+    steps[parameter.name] = abs(step)
+    tables = []
+    # Drawing the same simulation otherwise has no chance in it: one side will do.
+    both = candidate.kind == "physics" and parameter.sign == 0 and parameter.lower <= off[parameter.name] - step <= parameter.upper
+    for offset in (step, -step) if both else (step,):
+        at = {**base, **off, parameter.name: off[parameter.name] + offset}
+        tables.append(run(f"{candidate.name}: {parameter.name}", at, (candidate.name,)))
+    return (tables[0] - tables[1]) / (2.0 * step) if both else (tables[0] - middle) / step

@@ -1,0 +1,104 @@
+"""The floor: how far observation and prediction may differ with nothing wrong, from the evidence."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from splatsoil.experiment.base import Experiment
+
+from .evidence import Evidence
+from .noise import Noise, Part, estimate, independent
+
+FloatArray = npt.NDArray[np.float64]
+
+NUMERICS_PRIOR = 1.0
+"""Standard deviation of a numerical difference pattern's amplitude, in units of the change that was tried."""
+
+
+@dataclass(frozen=True)
+class Floor:
+    """Noise and nuisances of one experiment at one fit.
+
+    Attributes:
+        noise: of observed minus the mean prediction, without nuisances.
+        single: of observed minus one prediction.
+        nuisance: (n, q) patterns that numerics can make, times their prior standard deviations.
+        parameters: (n, k) derivatives by the model's parameters (and their curvature), likewise.
+        parts: what the noise is made of: instruments, chance, numerics beyond the patterns.
+    """
+
+    noise: Noise
+    single: Noise
+    nuisance: FloatArray
+    parameters: FloatArray
+    parts: Mapping[str, Part]
+
+    @property
+    def free(self) -> FloatArray:
+        """(n, q + k) all that is projected out."""
+        return np.concatenate([self.nuisance, self.parameters], axis=1)
+
+    def share(self, name: str) -> float:
+        """A part's share of the whole variance."""
+        totals = {key: float(np.sum(part.scale[self.noise.seen] ** 2)) for key, part in self.parts.items()}
+        return totals[name] / max(sum(totals.values()), 1e-300)
+
+
+def floor_of(experiment: Experiment, evidence: Evidence) -> Floor:
+    """Assemble the floor.
+
+    Chance comes from repeated seeds. What other numerics change is projected out, pattern by pattern; what each of
+    these patterns holds beyond parameters and the other patterns is a sample of what numerics that weren't tried would
+    leave, and goes into the noise.
+    """
+    layout, seen = experiment.layout, experiment.seen
+    parts = {"instruments": independent(experiment.sensor, experiment.sensor_memory)}
+    runs = len(evidence.repeats)
+    if experiment.chance and runs > 1:
+        parts["chance"] = estimate(layout, evidence.repeats, seen)
+    prior = {p.name: (p.upper - p.lower) / np.sqrt(12.0) for p in experiment.parameters}
+    slopes = [prior[name] * table for name, table in evidence.slopes.items()]
+    slopes += [(3.0 * evidence.widths[name]) ** 2 * table for name, table in evidence.curves.items()]
+    patterns = list(evidence.numerics.values())
+    parameters = _columns(slopes, seen)
+    if patterns:
+        known = _total(layout, parts, seen, runs)[0]
+        parts["numerics"] = estimate(layout, _unexplained(known, parameters, patterns, seen), seen)
+    noise, single = _total(layout, parts, seen, runs)
+    return Floor(noise, single, NUMERICS_PRIOR * _columns(patterns, seen), parameters, parts)
+
+
+def _total(layout, parts: Mapping[str, Part], seen: npt.NDArray[np.bool_], runs: int) -> tuple[Noise, Noise]:  # type: ignore[no-untyped-def]
+    """Noise against the mean of ``runs`` predictions, and against one."""
+    factors = {"chance": (1.0 + 1.0 / runs, 2.0)}
+    averaged, alone = (
+        Noise.of(layout, [(factors.get(name, (1.0, 1.0))[i], part) for name, part in parts.items()], seen)
+        for i in (0, 1)
+    )
+    return averaged, alone
+
+
+def _unexplained(
+    noise: Noise, parameters: FloatArray, patterns: Sequence[FloatArray], seen: npt.NDArray[np.bool_]
+) -> FloatArray:
+    """(p, t, s) what each pattern holds beyond the parameters and the other patterns."""
+    columns = _columns(patterns, seen)
+    out = []
+    for k in range(columns.shape[1]):
+        others = np.concatenate([parameters, np.delete(columns, k, axis=1)], axis=1)
+        scaled = others / noise.scale[:, None]
+        size = np.linalg.norm(scaled, axis=0)
+        amplitude, *_ = np.linalg.lstsq(scaled / size, columns[:, k] / noise.scale, rcond=1e-3)
+        out.append(noise.spread(columns[:, k] - others @ (amplitude / size)))
+    return np.stack(out)
+
+
+def _columns(tables: Sequence[FloatArray], seen: npt.NDArray[np.bool_]) -> FloatArray:
+    """(n, k) of k tables."""
+    if not tables:
+        return np.zeros((int(seen.sum()), 0))
+    return np.stack([table[seen] for table in tables], axis=1)

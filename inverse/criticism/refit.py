@@ -1,0 +1,109 @@
+"""Refitting with an effect on: Gauss-Newton on whitened features, the derivatives mended by Broyden's update.
+
+A handful of simulations, enough to say how far χ² really falls; the estimate that users keep comes from a full fit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import lsq_linear
+
+from splatsoil.errors import SimulationError
+from splatsoil.parameters import Parameter
+
+FloatArray = npt.NDArray[np.float64]
+
+TRUST = 0.5
+"""First trust region, as a share of each parameter's range."""
+
+
+@dataclass(frozen=True)
+class Refit:
+    """Where a refit ended.
+
+    Attributes:
+        values: parameters by name.
+        chi2: of the whitened residual there.
+        prediction: (t, s) the features predicted there.
+        simulations: how many were tried.
+        slopes: (t, s, k) the derivatives as last mended.
+    """
+
+    values: Mapping[str, float]
+    chi2: float
+    prediction: FloatArray
+    simulations: int
+    slopes: FloatArray
+
+
+def refit(
+    predict: Callable[[Mapping[str, float]], FloatArray],
+    whiten: Callable[[FloatArray], FloatArray],
+    observed: FloatArray,
+    parameters: Sequence[Parameter],
+    start: Mapping[str, float],
+    prediction: FloatArray,
+    slopes: FloatArray,
+    *,
+    most: int = 5,
+) -> Refit:
+    """Minimise χ².
+
+    Args:
+        predict: (t, s) features by parameters.
+        whiten: a (t, s, …) table to whitened features (n, …), those only that the refit may see.
+        observed: (t, s).
+        parameters: free ones, with bounds.
+        start: their values.
+        prediction: (t, s) there.
+        slopes: (t, s, k) derivatives there.
+        most: simulations.
+    """
+    lower, upper = (np.array([getattr(p, side) for p in parameters]) for side in ("lower", "upper"))
+    span = upper - lower
+    at = np.array([start[p.name] for p in parameters])
+    slopes, here = slopes.copy(), prediction
+    chi2 = float(np.sum(whiten(observed - here) ** 2))
+    trust, tried = TRUST, 0
+    while tried < most:
+        matrix = whiten(slopes) * span
+        target = whiten(observed - here)
+        low = np.maximum((lower - at) / span, -trust)
+        high = np.minimum((upper - at) / span, trust)
+        high = np.maximum(high, low + 1e-9)
+        found = lsq_linear(matrix, target, bounds=(low, high))
+        step = np.clip(found.x, low, high)
+        predicted = chi2 - float(np.sum((target - matrix @ step) ** 2))
+        # Less than one unit of χ², or a step nobody would notice: done.
+        if predicted < max(1.0, 0.002 * chi2) or np.max(np.abs(step)) < 1e-3:
+            break
+        there = np.clip(at + step * span, lower, upper)
+        tried += 1
+        try:
+            table = predict({p.name: float(v) for p, v in zip(parameters, there, strict=True)})
+        except SimulationError:
+            trust *= 0.4
+            continue
+        moved = there - at
+        if not np.any(moved):
+            break
+        slopes = mended(slopes, table - here, moved / span**2, moved)
+        fresh = float(np.sum(whiten(observed - table) ** 2))
+        gain = (chi2 - fresh) / predicted
+        if fresh < chi2:
+            at, here, chi2 = there, table, fresh
+        trust = min(2.0 * trust, 1.0) if gain > 0.75 else trust if gain > 0.25 else 0.4 * float(np.max(np.abs(step)))
+    return Refit({p.name: float(v) for p, v in zip(parameters, at, strict=True)}, chi2, here, tried, slopes)
+
+
+def mended(slopes: FloatArray, change: FloatArray, weight: FloatArray, moved: FloatArray) -> FloatArray:
+    """Broyden's update: the least change of (t, s, k) slopes that explains the change (t, s) after a move (k,).
+
+    ``weight`` (k,) says which parameters are to blame: the move in units of their ranges.
+    """
+    missing = change - slopes @ moved
+    return slopes + missing[..., None] * (weight / float(weight @ moved))

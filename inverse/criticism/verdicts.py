@@ -1,0 +1,58 @@
+"""Verdicts from numbers: pure functions, and the only place where thresholds become words."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from splatsoil.experiment.base import Candidate
+
+from .misfit import Omnibus
+from .score import Score
+
+EffectVerdict = Literal["missing", "trivial", "absent", "cannot tell"]
+Verdict = Literal["adequate", "missing", "outside the library"]
+
+LEVEL = 0.05
+"""Family-wise chance of naming an effect when none is missing."""
+GATE = 0.01
+"""Chance below which what is left is called a remainder."""
+EQUIVALENT = 6.0
+"""Fall of χ² within which effects count as equally good."""
+LEAST_SURVIVAL = 0.05
+"""Share of an effect's information that must survive the projection of everything else."""
+ENOUGH = 0.8
+"""Share of the misfit beyond chance that effects must explain where a remainder stands."""
+
+
+def of_effect(candidate: Candidate, score: Score, *, level: float = LEVEL) -> EffectVerdict:
+    """Verdict on one effect that is off."""
+    meaningful = candidate.measure.meaningful
+    if score.adjusted < level:
+        return "missing" if abs(score.estimate) >= meaningful else "trivial"
+    if score.detectable <= meaningful and score.survival >= LEAST_SURVIVAL:
+        return "absent"
+    return "cannot tell"
+
+
+def overall(
+    named: bool, misfit: Omnibus, remainder: Omnibus | None, *, gate: float = GATE, enough: float = ENOUGH
+) -> Verdict:
+    """Verdict on the model.
+
+    Args:
+        named: some effect is significant and large enough to matter.
+        misfit: of the model as it is.
+        remainder: after the best the library can do; None where nothing was named.
+        gate: see :data:`GATE`.
+        enough: see :data:`ENOUGH`.
+    """
+    if not named or remainder is None:
+        return "adequate" if misfit.p >= gate else "outside the library"
+    if remainder.p >= gate or explained(misfit, remainder) >= enough:
+        return "missing"
+    return "outside the library"
+
+
+def explained(before: Omnibus, after: Omnibus) -> float:
+    """Share of the misfit beyond chance that is gone."""
+    return 1.0 if before.excess <= 0.0 else max(0.0, 1.0 - after.excess / before.excess)

@@ -1,0 +1,114 @@
+"""What criticism knows of an experiment, and nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from splatsoil.experiment.features import Layout
+from splatsoil.parameters import Parameter
+from splatsoil.soil.effect import Effect
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An effect that is off and could be on.
+
+    Attributes:
+        name: the effect's.
+        kind: ``observation`` for what only changes what is reported, ``physics`` for the rest.
+        parameters: those whose off value is known: the directions in which it can act.
+        size: name of the parameter that measures it.
+        note: what it is.
+    """
+
+    name: str
+    kind: Literal["physics", "observation"]
+    parameters: tuple[Parameter, ...]
+    size: str
+    note: str = ""
+
+    def __post_init__(self) -> None:
+        if self.size not in {p.name for p in self.parameters}:
+            raise ValueError(f"{self.name}: its size {self.size} is none of its parameters that can be off")
+
+    @property
+    def measure(self) -> Parameter:
+        """The parameter that measures the effect."""
+        return next(p for p in self.parameters if p.name == self.size)
+
+
+class Experiment(Protocol):
+    """Observed features, their noise, and predictions.
+
+    Attributes:
+        name: for people.
+        layout: labels of the features.
+        observed: (t, s) features; 0 where ``seen`` is False.
+        seen: (t, s) False where there is no observation (the tool hides it).
+        sensor: (t, s) standard deviation of what the instruments add, known or measured.
+        sensor_memory: correlation of that between neighbouring times, in [0, 1).
+        parameters: free parameters of the model.
+        model: names of the effects that are on.
+        candidates: effects that are off.
+        numerics: names of the ways to compute the same physics otherwise.
+        chance: True where another seed gives another prediction.
+    """
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def layout(self) -> Layout: ...
+    @property
+    def observed(self) -> FloatArray: ...
+    @property
+    def seen(self) -> npt.NDArray[np.bool_]: ...
+    @property
+    def sensor(self) -> FloatArray: ...
+    @property
+    def sensor_memory(self) -> float: ...
+    @property
+    def parameters(self) -> tuple[Parameter, ...]: ...
+    @property
+    def model(self) -> tuple[str, ...]: ...
+    @property
+    def candidates(self) -> tuple[Candidate, ...]: ...
+    @property
+    def numerics(self) -> tuple[str, ...]: ...
+    @property
+    def chance(self) -> bool: ...
+
+    def predict(
+        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
+    ) -> FloatArray:
+        """(t, s) predicted features.
+
+        Args:
+            values: parameters by name, those of ``effects`` included.
+            effects: candidates to switch on.
+            seed: of what is chance in the simulation.
+            numerics: one of ``numerics``, or nothing for the usual way.
+
+        Raises:
+            SimulationError: the simulation could not go on.
+        """
+
+
+def candidate_of(effect: Effect) -> Candidate | None:
+    """The candidate that an effect of the library makes; None when none of its parameters has an off value."""
+    testable = tuple(p for p in effect.parameters if p.off is not None)
+    if not testable:
+        return None
+    size = str(getattr(effect, "size", "") or testable[0].name)
+    observes = type(effect).observe is not Effect.observe
+    acts = type(effect).settings is not Effect.settings or any(
+        getattr(effect, place, None) is not None for place in ("strength", "flow", "start", "bodies")
+    )
+    kind: Literal["physics", "observation"] = "observation" if observes and not acts else "physics"
+    return Candidate(effect.name, kind, testable, size, effect.note)

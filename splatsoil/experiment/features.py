@@ -1,0 +1,79 @@
+"""Features: a low-dimensional table (times, sites) of what an experiment's instruments saw."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Site:
+    """Where one column of a feature table was taken.
+
+    Attributes:
+        channel: the instrument (a camera's name, ``force z``, ``volume strain``).
+        x: place in m; NaN for an instrument that has none.
+        y: place in m; NaN for an instrument that has none.
+    """
+
+    channel: str
+    x: float = math.nan
+    y: float = math.nan
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Labels of a feature table.
+
+    Attributes:
+        times: (t,) what orders the rows (frame numbers, strains, depths), increasing.
+        sites: (s,) the columns.
+        time_name: what ``times`` are ("frame", "axial strain").
+        unit: of the features ("grey levels", "1").
+        stages: (t,) the part of the experiment that each row belongs to ("pushing").
+        regions: (t, s) the part of the scene that each feature shows ("trench").
+    """
+
+    times: tuple[float, ...]
+    sites: tuple[Site, ...]
+    time_name: str
+    unit: str
+    stages: tuple[str, ...]
+    regions: npt.NDArray[np.str_]
+
+    def __post_init__(self) -> None:
+        if len(self.stages) != len(self.times) or self.regions.shape != self.shape:
+            raise ValueError("stages and regions must match times and sites")
+        if any(b <= a for a, b in zip(self.times, self.times[1:], strict=False)):
+            raise ValueError("times must increase")
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(times, sites)."""
+        return len(self.times), len(self.sites)
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """The instruments, in the order of their first site."""
+        return tuple(dict.fromkeys(site.channel for site in self.sites))
+
+    def channel_numbers(self) -> npt.NDArray[np.int64]:
+        """(s,) index of each site's instrument in ``channels``."""
+        numbers = {channel: i for i, channel in enumerate(self.channels)}
+        return np.array([numbers[site.channel] for site in self.sites], dtype=np.int64)
+
+    def steps(self) -> FloatArray:
+        """(t,) times in units of their median spacing."""
+        times = np.array(self.times)
+        return times / float(np.median(np.diff(times))) if len(times) > 1 else times
+
+    def distances(self) -> FloatArray:
+        """(s, s) distance between sites in m; 0 where either has no place."""
+        place = np.array([[site.x, site.y] for site in self.sites])
+        distance = np.linalg.norm(place[:, None] - place[None], axis=-1)
+        return np.nan_to_num(distance, nan=0.0)
