@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
@@ -28,6 +28,26 @@ NEAREST = 1e-3
 
 
 @dataclass(frozen=True)
+class Search:
+    """How an optimiser searches.
+
+    Attributes:
+        start: space-filling points before the first acquisition.
+        acquisition: ``noisy`` (log noisy expected improvement: what is best so far is itself uncertain) or ``ei`` (log
+            expected improvement over the best mean at an evaluated point).
+        random: the start is drawn uniformly, not from a Sobol sequence.
+    """
+
+    start: int = START
+    acquisition: Literal["noisy", "ei"] = "noisy"
+    random: bool = False
+
+
+#: The settings of Hsiao and Kumar: one random start, expected improvement; with 10 evaluations in [25°, 55°].
+PAPER = Search(start=1, acquisition="ei", random=True)
+
+
+@dataclass(frozen=True)
 class Told:
     """One evaluation the optimiser knows: a point of [-1, 1]^n and its loss, None where the evaluation failed."""
 
@@ -36,20 +56,29 @@ class Told:
 
 
 class BayesianOptimiser:
-    """Noisy expected improvement over a GP, after a Sobol start.
+    """Expected improvement over a GP, after a space-filling start.
 
     Args:
         dimension: number of free parameters; points live in [-1, 1]^dimension.
-        start: space-filling points before the first acquisition.
+        start: space-filling points before the first acquisition, where ``search`` doesn't say.
         noise_std: standard deviation of one evaluation's noise, where it was measured; inferred otherwise.
         seed: the same seed and evaluations give the same proposals.
+        search: how to search.
     """
 
-    def __init__(self, dimension: int, *, start: int = START, noise_std: float | None = None, seed: int = 0) -> None:
-        if dimension < 1 or start < 1:
+    def __init__(
+        self,
+        dimension: int,
+        *,
+        start: int = START,
+        noise_std: float | None = None,
+        seed: int = 0,
+        search: Search | None = None,
+    ) -> None:
+        self.search = search or Search(start=start)
+        if dimension < 1 or self.search.start < 1:
             raise ValueError("an optimiser needs at least one dimension and one starting point")
         self.dimension = dimension
-        self.start = start
         self.noise_std = noise_std
         self.seed = seed
         self.told: list[Told] = []
@@ -62,11 +91,20 @@ class BayesianOptimiser:
 
     def ask(self) -> npt.NDArray[np.float32]:
         """The next point (n,) to evaluate, in float32 as environments take it."""
+        return self.ask_batch(1)[0]
+
+    def ask_batch(self, count: int) -> npt.NDArray[np.float32]:
+        """The next ``count`` points (count, n), chosen to be evaluated side by side: together they are to improve."""
         done = len(self.told)
-        if done < self.start or not self._succeeded():
+        if done < self.search.start or not self._succeeded():
             # Beyond the start only while nothing has succeeded: keep filling the space.
-            return sobol(done + 1, self.dimension, self.seed)[done].astype(np.float32)
-        return self._acquire(self._stream(done)).astype(np.float32)
+            return self._fill(done + count)[done:].astype(np.float32)
+        return self._acquire(self._stream(done), count).astype(np.float32)
+
+    def _fill(self, count: int) -> FloatArray:
+        if self.search.random:
+            return np.random.default_rng(self._stream(2**20)).uniform(-1.0, 1.0, (count, self.dimension))
+        return sobol(count, self.dimension, self.seed)
 
     def surrogate(self) -> Surrogate:
         """The GP over every evaluation that succeeded.
@@ -93,9 +131,9 @@ class BayesianOptimiser:
         """An independent seed for each use."""
         return int(np.random.SeedSequence([self.seed, index]).generate_state(1)[0])
 
-    def _acquire(self, seed: int) -> FloatArray:
+    def _acquire(self, seed: int, count: int) -> FloatArray:
         with quiet():
-            from botorch.acquisition.logei import qLogNoisyExpectedImprovement
+            from botorch.acquisition.logei import qLogExpectedImprovement, qLogNoisyExpectedImprovement
             from botorch.optim import optimize_acqf
             from botorch.sampling.normal import SobolQMCNormalSampler
 
@@ -105,26 +143,35 @@ class BayesianOptimiser:
         losses = [worst if t.loss is None else t.loss for t in self.told]
         surrogate = Surrogate(points, losses, noise_std=self.noise_std, seed=seed)
         if surrogate.constant:
-            return self._farthest(points, seed)
+            return self._farthest(points, seed, count)
         bounds = torch.tensor([[0.0] * self.dimension, [1.0] * self.dimension], dtype=torch.float64)
+        cube = torch.from_numpy(0.5 * (points + 1.0))
+        sampler = SobolQMCNormalSampler(torch.Size([DRAWS]), seed=seed % 2**31)
+        model = surrogate.likeliest
         with seeded(seed), quiet():
-            acquisition = qLogNoisyExpectedImprovement(
-                surrogate.likeliest,
-                torch.from_numpy(0.5 * (points + 1.0)),
-                sampler=SobolQMCNormalSampler(torch.Size([DRAWS]), seed=seed % 2**31),
-                prune_baseline=True,
+            if self.search.acquisition == "noisy":
+                acquisition: Any = qLogNoisyExpectedImprovement(model, cube, sampler=sampler, prune_baseline=True)
+            else:
+                best_mean = model.posterior(cube).mean.max().detach()
+                acquisition = qLogExpectedImprovement(model, best_f=best_mean, sampler=sampler)
+            best, _ = optimize_acqf(
+                acquisition, bounds, q=count, num_restarts=RESTARTS, raw_samples=RAW, sequential=count > 1
             )
-            best, _ = optimize_acqf(acquisition, bounds, q=1, num_restarts=RESTARTS, raw_samples=RAW)
-        proposal = 2.0 * best.detach().reshape(-1).numpy() - 1.0
-        if np.min(np.max(np.abs(points - proposal), axis=1)) < NEAREST:
-            return self._beside(proposal, seed)
-        return np.clip(proposal, -1.0, 1.0)
+        chosen: list[FloatArray] = []
+        for k, proposal in enumerate(2.0 * best.detach().reshape(count, -1).numpy() - 1.0):
+            known = np.concatenate([points, *(c[None] for c in chosen)])
+            near = np.min(np.max(np.abs(known - proposal), axis=1)) < NEAREST
+            chosen.append(self._beside(proposal, seed + k) if near else np.clip(proposal, -1.0, 1.0))
+        return np.array(chosen)
 
-    def _farthest(self, points: FloatArray, seed: int) -> FloatArray:
-        """The Sobol point farthest from all evaluated ones: what is left to do when all losses are equal."""
+    def _farthest(self, points: FloatArray, seed: int, count: int) -> FloatArray:
+        """Sobol points farthest from all evaluated ones: what is left to do when all losses are equal."""
         candidates = sobol(256, self.dimension, seed % 2**31)
-        gaps = np.linalg.norm(candidates[:, None] - points[None], axis=-1).min(axis=1)
-        return candidates[np.argmax(gaps)]
+        known = points
+        for _ in range(count):
+            gaps = np.linalg.norm(candidates[:, None] - known[None], axis=-1).min(axis=1)
+            known = np.concatenate([known, candidates[[np.argmax(gaps)]]])
+        return known[len(points) :]
 
     def _beside(self, proposal: FloatArray, seed: int) -> FloatArray:
         """Close to a repeated proposal, but not on it: repetition says less about the slope than a neighbour does."""
@@ -154,6 +201,7 @@ def optimise(
     seed: int = 0,
     start: int = START,
     noise_std: float | None = None,
+    search: Search | None = None,
     replay: Sequence[npt.ArrayLike] = (),
     after_step: Callable[[int, dict[str, Any]], None] | None = None,
 ) -> Episode:
@@ -164,6 +212,7 @@ def optimise(
         seed: of environment and agent.
         start: Sobol points before the first acquisition.
         noise_std: standard deviation of one evaluation's noise, if measured.
+        search: how to search, start included; :data:`PAPER` for the paper's way.
         replay: actions of an interrupted episode, taken again before anything new is asked.
         after_step: called with the number of steps done and the step's info.
 
@@ -174,7 +223,7 @@ def optimise(
     space = env.action_space
     if not isinstance(space, gym.spaces.Box) or np.any(space.low != -1.0) or np.any(space.high != 1.0):
         raise ValueError(f"Bayesian optimisation needs actions in [-1, 1]^n, not {space}")
-    optimiser = BayesianOptimiser(int(np.prod(space.shape)), start=start, noise_std=noise_std, seed=seed)
+    optimiser = BayesianOptimiser(int(np.prod(space.shape)), start=start, noise_std=noise_std, seed=seed, search=search)
     env.reset(seed=seed)
     over = False
     while not over:

@@ -29,6 +29,7 @@ class Parameter:
         log: search on a logarithmic scale (needs ``lower > 0``).
         sign: +1 or -1 where physics allows one direction from ``off`` only, 0 otherwise.
         label: short text for figures.
+        limits: values a model takes at all, where these reach beyond the bounds of search and prior.
     """
 
     name: str
@@ -41,6 +42,7 @@ class Parameter:
     log: bool = False
     sign: int = 0
     label: str = ""
+    limits: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.lower) and math.isfinite(self.upper) and self.lower < self.upper):
@@ -59,16 +61,15 @@ class Parameter:
         return text if self.unit == "1" else f"{text} [{'°' if self.unit == 'deg' else self.unit}]"
 
     def check(self, value: float) -> float:
-        """Return ``value`` as a float, or raise ParameterError when it is not finite or outside the bounds."""
+        """Return ``value`` as a float, or raise ParameterError when it is not finite or outside limits (or bounds)."""
         number = float(value)
         if not math.isfinite(number):
             raise ParameterError(f"parameter {self.name}: {value} is not a finite number")
-        slack = 1e-9 * (self.upper - self.lower)
-        if not self.lower - slack <= number <= self.upper + slack:
-            raise ParameterError(
-                f"parameter {self.name}: {number:g} {self.unit} lies outside [{self.lower:g}, {self.upper:g}]"
-            )
-        return min(max(number, self.lower), self.upper)
+        lower, upper = self.limits or (self.lower, self.upper)
+        slack = 1e-9 * (upper - lower)
+        if not lower - slack <= number <= upper + slack:
+            raise ParameterError(f"parameter {self.name}: {number:g} {self.unit} lies outside [{lower:g}, {upper:g}]")
+        return min(max(number, lower), upper)
 
 
 class ParameterSpace:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from splatsoil.errors import ParameterError
 from splatsoil.parameters import Parameter
-from splatsoil.soil.matching import Matching
+from splatsoil.soil.matching import Matching, cone_slope
 
 FRICTION_ANGLE = Parameter(
     name="friction_angle",
@@ -17,6 +17,7 @@ FRICTION_ANGLE = Parameter(
     default=35.0,
     meaningful=1.0,
     label="friction angle",
+    limits=(20.0, 55.0),
 )
 
 
@@ -60,3 +61,17 @@ class Settings:
             raise ParameterError(f"obstacle: {self.obstacle} is not a centre and a radius in m")
         if not all(math.isfinite(g) for g in self.gravity):
             raise ParameterError(f"gravity: {self.gravity} is not finite")
+
+    def relative_slope(self, change: float, name: str) -> float:
+        """Growth of the cone's slope, relative to its own, when the friction angle changes by ``change`` degrees.
+
+        Raises:
+            ParameterError: the changed angle is outside [0, 90); ``name`` is the parameter to blame.
+        """
+        angle = self.friction_angle + change
+        if not 0.0 <= angle < 90.0:
+            raise ParameterError(
+                f"{name}: {change:g} deg on top of a friction angle of {self.friction_angle:g} deg gives {angle:g} "
+                "deg, outside [0, 90); take a smaller change"
+            )
+        return cone_slope(angle, self.matching) / cone_slope(self.friction_angle, self.matching) - 1.0

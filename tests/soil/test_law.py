@@ -156,7 +156,7 @@ def test_a_users_own_file_is_an_effect_like_any_other(tmp_path: Path) -> None:
 def test_unknown_and_absurd_parameters_are_named() -> None:
     with pytest.raises(ParameterError, match=r"cohesion.*effect is on"):
         Law().settings(BASE, {"cohesion": 100.0})
-    with pytest.raises(ParameterError, match=r"friction_angle: 80 deg lies outside \[20, 50\]"):
+    with pytest.raises(ParameterError, match=r"friction_angle: 80 deg lies outside \[20, 55\]"):
         Law().settings(BASE, {"friction_angle": 80.0})
     with pytest.raises(ParameterError, match="'magic' is unknown; known are cohesion"):
         find_effects(["magic"])
