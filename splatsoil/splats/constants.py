@@ -20,6 +20,11 @@ ANTIALIAS_MIN = 0.005
 NEAR = 0.01
 """Gaussians whose centre is nearer than this to a perspective camera's plane (m) are not drawn."""
 
+REACH_TO_EYE = 3.0
+"""Gaussians that reach a perspective camera's plane with this many standard deviations are not drawn. The linear map
+that stands for perspective fails there: a disc on the ground beside the camera would be a haze over the whole picture.
+The original code avoids some of that by a narrower limit on tangents, see below."""
+
 TANGENT_LIMIT = 3.0
 """Largest |x/z| and |y/z| at which the perspective Jacobian is evaluated. The original code takes 1.3 times the
 half-angle of the image instead, which makes a cropped picture differ from the crop of the full one; a fixed limit does

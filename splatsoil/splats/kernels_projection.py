@@ -16,6 +16,7 @@ _DILATION = wp.constant(wp.float32(constants.DILATION))
 _ALPHA_MIN = wp.constant(wp.float32(constants.ALPHA_MIN))
 _ANTIALIAS_MIN = wp.constant(wp.float32(constants.ANTIALIAS_MIN))
 _NEAR = wp.constant(wp.float32(constants.NEAR))
+_REACH_TO_EYE = wp.constant(wp.float32(constants.REACH_TO_EYE))
 _TANGENT_LIMIT = wp.constant(wp.float32(constants.TANGENT_LIMIT))
 _LARGEST = wp.constant(wp.float32(1e30))  # beyond it single precision overflows; such splats are millions of px wide
 
@@ -52,6 +53,16 @@ class Footprint:
 @wp.func
 def _clamped(value: float):
     return wp.clamp(value, -_TANGENT_LIMIT, _TANGENT_LIMIT)
+
+
+@wp.func
+def _before_camera(p: wp.vec3, covariance: wp.mat33, lens: Lens):
+    """Whether a Gaussian lies far enough before the camera's plane to be drawn; p: the mean in the camera's frame."""
+    if lens.orthographic == 1:
+        return True
+    ahead = lens.rotation[2]
+    variance = wp.dot(ahead, covariance * ahead)
+    return p[2] > _NEAR and p[2] * p[2] > _REACH_TO_EYE * _REACH_TO_EYE * variance
 
 
 @wp.func
@@ -94,7 +105,7 @@ def project_forward(
     p = lens.rotation * means[i] + lens.translation
     depths[i] = p[2]
     opacity = opacities[i]
-    if (lens.orthographic == 1 or p[2] > _NEAR) and opacity > _ALPHA_MIN:
+    if opacity > _ALPHA_MIN and _before_camera(p, covariances[i], lens):
         f = _footprint(p, covariances[i], lens)
         place = wp.vec2(p[0], p[1])
         if lens.orthographic == 0:
@@ -135,7 +146,7 @@ def project_backward(
     p = lens.rotation * means[i] + lens.translation
     opacity = opacities[i]
     v_p = wp.vec3(0.0, 0.0, v_depths[i])
-    if (lens.orthographic == 1 or p[2] > _NEAR) and opacity > _ALPHA_MIN:
+    if opacity > _ALPHA_MIN and _before_camera(p, covariances[i], lens):
         f = _footprint(p, covariances[i], lens)
         a = f.yy / f.determinant
         b = -f.xy / f.determinant

@@ -70,8 +70,11 @@ def rasterise_features(
     transmittance = torch.ones(view.height, view.width).to(means)
     finished = torch.zeros(view.height, view.width, dtype=torch.bool, device=means.device)
     image = torch.zeros(view.height, view.width, features.shape[1]).to(means)
+    ahead = torch.as_tensor(view.forward).to(means)
+    nearest = constants.REACH_TO_EYE * torch.einsum("i,nij,j->n", ahead, covariances, ahead).sqrt()
+    nearest = nearest.clamp_min(constants.NEAR)
     for i in torch.argsort(depths.detach(), stable=True).tolist():
-        if (not view.orthographic and depths[i] <= constants.NEAR) or strengths[i] <= skip_below:
+        if (not view.orthographic and depths[i] <= nearest[i]) or strengths[i] <= skip_below:
             continue
         dx, dy = columns[None, :] - centres[i, 0], rows[:, None] - centres[i, 1]
         power = 0.5 * (conics[i, 0, 0] * dx**2 + conics[i, 1, 1] * dy**2) + conics[i, 0, 1] * dx * dy

@@ -84,10 +84,10 @@ def test_two_gaussians_compose_front_to_back(camera_at: CameraMaker) -> None:
 
 
 def test_clamped_opacity_has_no_gradient_and_a_second_one_is_dropped(camera_at: CameraMaker) -> None:
-    near, far = ball(z=1.0, sigma=1.0, opacity=1.0), ball(z=3.0, sigma=3.0, opacity=1.0, colour=(0.0, 0.0, 0.0))
+    near, far = ball(z=1.0, sigma=0.3, opacity=1.0), ball(z=3.0, sigma=0.9, opacity=1.0, colour=(0.0, 0.0, 0.0))
     opacities = torch.tensor([1.0, 1.0], requires_grad=True)
     both = Gaussians.concatenate([near, far]).replace(opacities=opacities)
-    picture = rasterise(both, camera_at(width=8, height=8), background=(1.0, 1.0, 1.0))
+    picture = rasterise(both, camera_at(width=8, height=8, f=400.0), background=(1.0, 1.0, 1.0))
     # 0.99 of white; the next would leave 1e-4, so it is not blended and the background shows through the remaining 0.01
     torch.testing.assert_close(picture.alpha, torch.full((8, 8), 0.99))
     torch.testing.assert_close(picture.colour, torch.ones(8, 8, 3))
@@ -180,6 +180,28 @@ def test_orthographic_depth_map_of_a_sphere() -> None:
     error = (picture.depth - expected)[inside]
     assert float(error.abs().mean()) < 0.01
     assert float(picture.alpha[inside].min()) > 0.99
+
+
+def test_a_disc_beside_the_camera_is_no_haze(camera_at: CameraMaker) -> None:
+    """A flat disc beneath the camera, out of sight: along every ray of the picture its opacity is less than 1/255."""
+    camera = camera_at(f=64.0)
+    below, spread = 0.3, 0.08  # m; the camera's y points down, so that the disc lies in the plane y = below
+    x, y = np.meshgrid(np.arange(64) + 0.5 - 32.0, np.arange(64) + 0.5 - 32.0)
+    with np.errstate(divide="ignore"):
+        reach = np.where(y > 0, below / (y / 64.0), np.inf)
+    with np.errstate(invalid="ignore"):
+        true = 0.9 * np.exp(-0.5 * (((reach - 0.12) / spread) ** 2 + (reach * x / 64.0 / spread) ** 2))
+    assert np.nanmax(true) < 1 / 255
+    disc = Gaussians(
+        torch.tensor([[0.0, below, 0.12]]),
+        torch.tensor([[spread, 0.001, spread]]),
+        torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        torch.tensor([0.9]),
+        torch.ones(1, 3),
+    )
+    assert float(rasterise(disc, camera).alpha.max()) == 0.0
+    farther = disc.replace(means=torch.tensor([[0.0, below, 0.8]]))
+    assert float(rasterise(farther, camera).alpha.max()) > 0.8
 
 
 def test_nothing_in_view_shows_the_background(camera_at: CameraMaker, cloud: CloudMaker) -> None:
