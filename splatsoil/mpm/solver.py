@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -32,7 +33,7 @@ from splatsoil.mpm.transfer import (
     number_cells,
     particles_to_grid,
 )
-from splatsoil.soil.law import Law
+from splatsoil.soil.law import STIFFNESS, Law
 from splatsoil.soil.settings import Settings
 
 FloatArray = npt.NDArray[np.floating]
@@ -81,8 +82,14 @@ class Solver:
         device: str = "cpu",
     ) -> None:
         wp.config.quiet = True
-        self.resolution, self.law, self.device = resolution, law, device
+        self.law, self.device = law, device
         self.values = [dict(v) for v in values]
+        table = law.table(base, self.values)
+        # one step for the whole batch, as the stiffest of it needs
+        stiffest = float(table[:, STIFFNESS].max())
+        table[:, STIFFNESS] /= stiffest
+        resolution = replace(resolution, bulk=stiffest * resolution.bulk, shear=stiffest * resolution.shear)
+        self.resolution = resolution
         x = np.ascontiguousarray(positions, dtype=np.float32)
         if x.ndim != 3 or x.shape[2] != 3 or x.shape[0] != len(self.values) or x.shape[1] == 0:
             raise SimulationError(
@@ -96,8 +103,8 @@ class Solver:
         self.shape = GridShape.covering(low, high, resolution.cell)
         self.grid = self.shape.to_warp()
         self.ceiling = float(high[2] + 2.0 * resolution.cell)
-        self._table = wp.array(law.table(base, self.values).astype(np.float32), dtype=float, device=device)
-        self._stress_kernel = make_stress_kernel(law.update)
+        self._table = wp.array(table.astype(np.float32), dtype=float, device=device)
+        self._stress_kernel = make_stress_kernel(law.update, law.history)
         self._allocate(x)
         spring = resolution.bulk * resolution.spacing
         self.tool = build_tool(
@@ -107,7 +114,7 @@ class Solver:
             damping=2.0 * CONTACT_DAMPING * math.sqrt(spring * self._particles.mass),
             device=device,
         )
-        self._rest_at_overburden(x, base)
+        self._start(x, base)
         self.frame = 0
 
     def _allocate(self, x: npt.NDArray[np.float32]) -> None:
@@ -128,6 +135,9 @@ class Solver:
         p.affine = wp.zeros(n, dtype=wp.mat33, device=device)
         p.deformation = wp.array(np.tile(np.eye(3, dtype=np.float32), (n, 1, 1)), dtype=wp.mat33, device=device)
         p.elastic, p.opening, p.gap, p.cell = floats(n), floats(n), floats(n), ints(n)
+        kept = n if self.law.history else 0
+        p.history, p.depth = wp.zeros(kept, dtype=wp.vec2, device=device), floats(kept)
+        p.density = wp.ones(n, dtype=float, device=device)
         p.per_simulation = self.particles_each
         p.volume = self.resolution.spacing**3
         p.mass = p.volume * self.resolution.density
@@ -143,6 +153,9 @@ class Solver:
         c.slot, c.node, c.count = ints(count), ints(most), ints(1)
         c.volume, c.elastic, c.opening = floats(most), floats(most), floats(most)
         c.normal, c.shear, c.gradient = vectors(most), vectors(most), vectors(8 * most)
+        kept = most if self.law.history else 0
+        c.history, c.gained = (wp.zeros(kept, dtype=wp.vec2, device=device) for _ in range(2))
+        c.depth = floats(kept)
         self._cells = c
 
         self._near, self._near_count = ints(n), ints(1)
@@ -150,20 +163,39 @@ class Solver:
         self._pose = floats(13)
         self._force = vectors(self.simulations)
 
-    def _rest_at_overburden(self, x: npt.NDArray[np.float32], base: Settings) -> None:
+    def _start(self, x: npt.NDArray[np.float32], base: Settings) -> None:
         """Start from the pressure of the soil above, so that the bed does not settle when the run begins."""
         low, cell = self.shape.lower, self.shape.cell
         plan = (self.shape.nodes[0] - 1, self.shape.nodes[1] - 1)
         index = np.clip(((x[..., :2] - low[:2]) / cell[:2]).astype(int), 0, np.array(plan) - 1)
         column = index[..., 0] * plan[1] + index[..., 1]
-        strain = np.empty(x.shape[:2], dtype=np.float32)
-        weight = self.resolution.density * abs(base.gravity[2])
-        for row in range(x.shape[0]):
+        depth, strain = np.empty(x.shape[:2]), np.empty(x.shape[:2])
+        density = np.ones(x.shape[:2])
+        stiffness = self._table.numpy()[:, STIFFNESS] * self.resolution.bulk
+        for row, values in enumerate(self.values):
             top = np.full(plan[0] * plan[1], -np.inf)
             np.maximum.at(top, column[row], x[row, :, 2])
-            depth = top[column[row]] + 0.5 * self.resolution.spacing - x[row, :, 2]
-            strain[row] = -weight * depth / self.resolution.bulk
-        self._particles.elastic = wp.array(strain.reshape(-1), dtype=float, device=self.device)
+            depth[row] = top[column[row]] + 0.5 * self.resolution.spacing - x[row, :, 2]
+            above = depth[row]
+            found = self.law.density(depth[row], values)
+            if found is not None:
+                density[row] = found
+                above = self._integral(depth[row], values)
+            weight = self.resolution.density * abs(self.law.settings(base, values).gravity[2])
+            strain[row] = -weight * above / stiffness[row]
+        p = self._particles
+        p.elastic.assign(strain.reshape(-1).astype(np.float32))
+        p.density.assign(density.reshape(-1).astype(np.float32))
+        if self.law.history:
+            p.depth.assign(depth.reshape(-1).astype(np.float32))
+
+    def _integral(self, depth: npt.NDArray[np.float64], values: Mapping[str, float]) -> npt.NDArray[np.float64]:
+        """Relative density times depth, summed from the surface down to each depth (n,) in m."""
+        levels = np.linspace(0.0, float(depth.max()), 257)
+        density = self.law.density(levels, values)
+        assert density is not None
+        sums = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(levels))])
+        return np.interp(depth, levels, sums)
 
     def advance(self, poses: Sequence[Pose]) -> npt.NDArray[np.float64]:
         """Advance one frame.
@@ -234,6 +266,7 @@ class Solver:
                 self._pose,
                 self._near,
                 self._near_count,
+                r.spacing**2,
                 dt,
                 share,
                 self._table,
@@ -270,5 +303,6 @@ class Solver:
 
     def momentum(self) -> npt.NDArray[np.float64]:
         """Total momentum (simulations, 3) in kg m/s."""
-        velocity = self._particles.velocity.numpy().astype(np.float64)
-        return self._particles.mass * velocity.reshape(self.simulations, -1, 3).sum(axis=1)
+        p = self._particles
+        velocity = p.velocity.numpy().astype(np.float64) * p.density.numpy()[:, None]
+        return p.mass * velocity.reshape(self.simulations, -1, 3).sum(axis=1)

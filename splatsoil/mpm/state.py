@@ -18,13 +18,16 @@ class Particles:
         shear: deviatoric stress, off-diagonal (xy, xz, yz), Pa.
         elastic: elastic logarithmic volume strain.
         opening: logarithmic volume opened in tension.
+        history: plastic shear strain and dilated volume; empty unless the law keeps them, like ``depth``.
+        depth: below the surface at the start, m.
+        density: at the start, over the nominal one.
         cell: entry of the particle's cell among the active cells.
         gap: signed distance to the tool, m, carried through a step's substeps.
         drift: way the particle has gone relative to the tool since the step began, m.
         gap_normal: outward normal of the tool there, in the world.
         per_simulation: particles of one simulation.
         volume: initial volume of a particle, m^3.
-        mass: kg.
+        mass: kg, of a particle of nominal density.
     """
 
     position: wp.array(dtype=wp.vec3)
@@ -35,6 +38,9 @@ class Particles:
     shear: wp.array(dtype=wp.vec3)
     elastic: wp.array(dtype=float)
     opening: wp.array(dtype=float)
+    history: wp.array(dtype=wp.vec2)
+    depth: wp.array(dtype=float)
+    density: wp.array(dtype=float)
     cell: wp.array(dtype=int)
     gap: wp.array(dtype=float)
     drift: wp.array(dtype=wp.vec3)
@@ -81,6 +87,9 @@ class Cells:
         shear: deviatoric stress, off-diagonal, Pa.
         elastic: elastic logarithmic volume strain.
         opening: logarithmic volume opened in tension.
+        history: plastic shear strain and dilated volume at the start of the step; empty unless the law keeps them.
+        gained: what the step has added to the history, so that particles keep their own.
+        depth: of the cell's soil below the surface at the start, m.
     """
 
     slot: wp.array(dtype=int)
@@ -92,3 +101,6 @@ class Cells:
     shear: wp.array(dtype=wp.vec3)
     elastic: wp.array(dtype=float)
     opening: wp.array(dtype=float)
+    history: wp.array(dtype=wp.vec2)
+    gained: wp.array(dtype=wp.vec2)
+    depth: wp.array(dtype=float)

@@ -10,12 +10,23 @@ import warp as wp
 from splatsoil.mpm.grid import Grid, base_node, cell_of, corner_offset, corner_weight, local_coordinates
 from splatsoil.mpm.state import Cells, Nodes, Particles
 from splatsoil.mpm.tool import Tool, signed_distance, tool_position, tool_rotation, tool_velocity
-from splatsoil.soil.law import FLOOR_FRICTION, GRAVITY, TOOL_FRICTION, WALL_FRICTION, Stress
+from splatsoil.soil.law import (
+    FLOOR_FRICTION,
+    GRAVITY,
+    OBSTACLE,
+    STIFFNESS,
+    TOOL_ADHESION,
+    TOOL_FRICTION,
+    WALL_FRICTION,
+    Stress,
+)
 
 
 @cache
-def make_stress_kernel(update: Any) -> Any:
+def make_stress_kernel(update: Any, history: bool) -> Any:
     """Kernel that advances every active cell's stress by ``update`` and adds its force to the nodes.
+
+    ``history`` says whether the law keeps any.
 
     One stress point a cell, from the mean velocity gradient of its soil (Flanagan & Belytschko 1981): eight particles a
     cell that each held their volume would lock and make the soil too strong, the more so the stiffer it is.
@@ -44,12 +55,21 @@ def make_stress_kernel(update: Any) -> Any:
             stress.shear = cells.shear[entry]
             stress.elastic = cells.elastic[entry]
             stress.opening = cells.opening[entry]
-            stress = update(stress, gradient, bulk, shear, dt, values, base / grid.nodes)
+            row = base / grid.nodes
+            stiffness = values[row, STIFFNESS]
+            if wp.static(history):
+                kept = cells.history[entry] + cells.gained[entry]
+                stress.plastic_strain = kept[0]
+                stress.dilated = kept[1]
+                stress.depth = cells.depth[entry]
+            stress = update(stress, gradient, stiffness * bulk, stiffness * shear, dt, values, row)
+            if wp.static(history):
+                cells.gained[entry] = wp.vec2(stress.plastic_strain, stress.dilated) - cells.history[entry]
             cells.normal[entry] = stress.normal
             cells.shear[entry] = stress.shear
             cells.elastic[entry] = stress.elastic
             cells.opening[entry] = stress.opening
-            pressure = -bulk * stress.elastic
+            pressure = -stiffness * bulk * stress.elastic
             if pressure > 0.0:
                 # bulk viscosity takes the ringing out of pressure waves and never pulls
                 pressure = wp.max(pressure - viscosity * wp.trace(gradient), 0.0)
@@ -74,12 +94,15 @@ def contact_forces(
     pose: wp.array(dtype=float),
     near: wp.array(dtype=int),
     count: wp.array(dtype=int),
+    area: float,
     dt: float,
     share: float,
     values: wp.array2d(dtype=float),
     force: wp.array(dtype=wp.vec3),
 ) -> None:
     """Penalty contact with Coulomb friction between particles and tool; ``force`` (simulations) gains share * force.
+
+    ``area`` (m^2) is what one particle covers of the tool, for adhesion.
 
     A particle keeps the side of the tool it is on, so a plate thinner than a cell holds soil on both its faces, and
     what the soil feels is exactly what the tool feels.
@@ -109,7 +132,8 @@ def contact_forces(
             push = wp.max(-tool.stiffness * gap - tool.damping * closing, 0.0)
             slip -= closing * normal
             speed = wp.length(slip)
-            drag = wp.min(values[row, TOOL_FRICTION] * push, particles.mass * speed / dt)
+            hold = values[row, TOOL_FRICTION] * push + values[row, TOOL_ADHESION] * area
+            drag = wp.min(hold, particles.mass * speed / dt)
             pull = push * normal - slip * (drag / wp.max(speed, 1.0e-9))
             wp.atomic_add(force, row, -share * pull)
             for corner in range(8):
@@ -152,6 +176,15 @@ def move_nodes(nodes: Nodes, grid: Grid, dt: float, values: wp.array2d(dtype=flo
             velocity = slide(velocity, wp.vec3(0.0, 1.0, 0.0), wall)
         if iy == grid.shape[1] - 1:
             velocity = slide(velocity, wp.vec3(0.0, -1.0, 0.0), wall)
+        radius = values[row, OBSTACLE + 3]
+        if radius > 0.0:
+            # a rough stone: what touches it sticks, and friction acts within the soil around it
+            middle = 0.5 * wp.vec2(grid.cell[0] * float(grid.shape[0] - 1), grid.cell[1] * float(grid.shape[1] - 1))
+            centre = wp.vec3(
+                middle[0] + values[row, OBSTACLE], middle[1] + values[row, OBSTACLE + 1], values[row, OBSTACLE + 2]
+            )
+            if wp.length(wp.cw_mul(grid.cell, wp.vec3(float(ix), float(iy), float(iz))) - centre) < radius:
+                velocity = wp.vec3(0.0)
         nodes.velocity[i] = velocity
         nodes.displacement[i] += dt * velocity
         nodes.force[i] = wp.vec3(0.0)

@@ -39,6 +39,10 @@ def number_cells(cells: Cells) -> None:
         cells.shear[entry] = wp.vec3(0.0)
         cells.elastic[entry] = 0.0
         cells.opening[entry] = 0.0
+        if entry < cells.history.shape[0]:
+            cells.history[entry] = wp.vec2(0.0)
+            cells.gained[entry] = wp.vec2(0.0)
+            cells.depth[entry] = 0.0
         for corner in range(8):
             cells.gradient[8 * entry + corner] = wp.vec3(0.0)
 
@@ -58,11 +62,15 @@ def particles_to_grid(particles: Particles, cells: Cells, nodes: Nodes, grid: Gr
     wp.atomic_add(cells.shear, entry, volume * particles.shear[p])
     wp.atomic_add(cells.elastic, entry, volume * particles.elastic[p])
     wp.atomic_add(cells.opening, entry, volume * particles.opening[p])
+    if p < particles.history.shape[0]:
+        wp.atomic_add(cells.history, entry, volume * particles.history[p])
+        wp.atomic_add(cells.depth, entry, volume * particles.depth[p])
     v = particles.velocity[p]
     affine = particles.affine[p]
+    mass = particles.mass * particles.density[p]
     for corner in range(8):
         node = base + corner_offset(grid, corner)
-        weight = particles.mass * corner_weight(f, corner)
+        weight = mass * corner_weight(f, corner)
         offset = wp.vec3(float(corner >> 2), float((corner >> 1) & 1), float(corner & 1)) - f
         wp.atomic_add(nodes.mass, node, weight)
         wp.atomic_add(nodes.velocity, node, weight * (v + affine * wp.cw_mul(offset, grid.cell)))
@@ -84,6 +92,9 @@ def average_cells(cells: Cells, nodes: Nodes, grid: Grid, stiffness: float) -> N
         cells.shear[entry] = share * cells.shear[entry]
         cells.elastic[entry] = share * cells.elastic[entry]
         cells.opening[entry] = share * cells.opening[entry]
+        if entry < cells.history.shape[0]:
+            cells.history[entry] = share * cells.history[entry]
+            cells.depth[entry] = share * cells.depth[entry]
         for corner in range(8):
             gradient = share * cells.gradient[8 * entry + corner]
             cells.gradient[8 * entry + corner] = gradient
@@ -163,6 +174,8 @@ def grid_to_particles(
     particles.shear[p] = cells.shear[entry]
     particles.elastic[p] = cells.elastic[entry]
     particles.opening[p] = cells.opening[entry]
+    if p < particles.history.shape[0]:
+        particles.history[p] += cells.gained[entry]
 
     x += displacement
     gap = particles.gap[p]

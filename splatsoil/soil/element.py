@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 import numpy.typing as npt
@@ -79,18 +79,28 @@ class ElementTest:
         return (1.0 + self.initial_void_ratio) * np.exp(-self.volume_strain) - 1.0
 
 
+class Options(TypedDict, total=False):
+    """What all tests share.
+
+    Attributes:
+        void_ratio: at the start; 0.8 by default.
+        young: Young's modulus in Pa; 5e7 by default.
+        poisson: Poisson's ratio; 0.2 by default.
+        strain_rate: of the controlled strain, 1/s; only effects of rate feel it. 1e-5 by default.
+        largest_step: most strain in one step of the law, so that records may lie far apart; 2e-4 by default.
+        matching: of the friction cone; triaxial compression by default.
+    """
+
+    void_ratio: float
+    young: float
+    poisson: float
+    strain_rate: float
+    largest_step: float
+    matching: Matching
+
+
 def triaxial(
-    law: Law,
-    values: Values,
-    *,
-    confining: float,
-    strains: npt.ArrayLike,
-    void_ratio: float = 0.8,
-    young: float = 5.0e7,
-    poisson: float = 0.2,
-    strain_rate: float = 1.0e-5,
-    largest_step: float = 2.0e-4,
-    matching: Matching = Matching.COMPRESSION,
+    law: Law, values: Values, *, confining: float, strains: npt.ArrayLike, **options: Unpack[Options]
 ) -> ElementTest:
     """Drained triaxial test: constant stress on x and y, given strain along z.
 
@@ -99,13 +109,8 @@ def triaxial(
         values: parameters by name, one mapping or one for each set of the batch.
         confining: lateral stress in Pa, positive.
         strains: axial logarithmic strains (n,) at which to record, from the isotropic state on; positive and rising in
-            compression, negative and falling in extension, any path in between. A nominal strain s is log: -ln(1 - s).
-        void_ratio: at the start.
-        young: Young's modulus in Pa.
-        poisson: Poisson's ratio.
-        strain_rate: of the axis, 1/s; only effects of rate feel it.
-        largest_step: most axial strain in one step of the law, so that the records may lie far apart.
-        matching: of the friction cone.
+            compression, negative and falling in extension, any path in between. A nominal strain s is -ln(1 - s).
+        options: see :class:`Options`.
 
     Returns:
         The start and the n records.
@@ -118,10 +123,7 @@ def triaxial(
     path = _path(strains)
     targets = np.full((len(path), 4), confining)
     targets[:, 2], targets[:, 3] = path, 0.0
-    return _drive(
-        law, values, targets, (True, True, False), confining, void_ratio, young, poisson, strain_rate, largest_step,
-        matching,
-    )  # fmt: skip
+    return drive(law, values, targets, by_stress=(True, True, False), confining=confining, **options)
 
 
 def simple_shear(
@@ -130,19 +132,14 @@ def simple_shear(
     *,
     confining: float,
     strains: npt.ArrayLike,
-    void_ratio: float = 0.8,
-    young: float = 5.0e7,
-    poisson: float = 0.2,
-    strain_rate: float = 1.0e-5,
-    largest_step: float = 2.0e-4,
-    matching: Matching = Matching.COMPRESSION,
     constant_volume: bool = False,
+    **options: Unpack[Options],
 ) -> ElementTest:
     """Simple shear in the plane xz: constant stress along z (or constant volume), no strain along x and y.
 
     Args:
-        strains: engineering shear strains (n,) at which to record.
         confining: stress in Pa on all axes at the start, and along z throughout.
+        strains: engineering shear strains (n,) at which to record.
         constant_volume: hold the height instead of the stress along z.
 
     The other arguments, the result and the errors are those of :func:`triaxial`.
@@ -153,24 +150,11 @@ def simple_shear(
     targets[:, 3] = path
     if not constant_volume:
         targets[:, 2] = confining
-    return _drive(
-        law, values, targets, (False, False, not constant_volume), confining, void_ratio, young, poisson, strain_rate,
-        largest_step, matching,
-    )  # fmt: skip
+    return drive(law, values, targets, by_stress=(False, False, not constant_volume), confining=confining, **options)
 
 
 def isotropic_compression(
-    law: Law,
-    values: Values,
-    *,
-    confining: float,
-    pressures: npt.ArrayLike,
-    void_ratio: float = 0.8,
-    young: float = 5.0e7,
-    poisson: float = 0.2,
-    strain_rate: float = 1.0e-5,
-    largest_step: float = 2.0e-4,
-    matching: Matching = Matching.COMPRESSION,
+    law: Law, values: Values, *, confining: float, pressures: npt.ArrayLike, **options: Unpack[Options]
 ) -> ElementTest:
     """Equal stress on all three axes, from ``confining`` through ``pressures`` (n,) in Pa at which to record.
 
@@ -181,26 +165,33 @@ def isotropic_compression(
     if path.size == 0 or not (np.isfinite(path).all() and (path > 0.0).all()):
         raise ParameterError("pressures: give at least one positive number of Pa")
     targets = np.concatenate([np.repeat(path[:, None], 3, axis=1), np.zeros((len(path), 1))], axis=1)
-    return _drive(
-        law, values, targets, (True, True, True), confining, void_ratio, young, poisson, strain_rate, largest_step,
-        matching,
-    )  # fmt: skip
+    return drive(law, values, targets, by_stress=(True, True, True), confining=confining, **options)
 
 
-def _drive(
+def drive(
     law: Law,
     values: Values,
     targets: FloatArray,
+    *,
     by_stress: tuple[bool, bool, bool],
     confining: float,
-    void_ratio: float,
-    young: float,
-    poisson: float,
-    strain_rate: float,
-    largest_step: float,
-    matching: Matching,
+    void_ratio: float = 0.8,
+    young: float = 5.0e7,
+    poisson: float = 0.2,
+    strain_rate: float = 1.0e-5,
+    largest_step: float = 2.0e-4,
+    matching: Matching = Matching.COMPRESSION,
 ) -> ElementTest:
-    """Run the batch through ``targets`` (n, 4): stress or strain of x, y, z, and the shear strain xz."""
+    """Any test: from an isotropic stress through ``targets``, each axis under stress or strain.
+
+    Args:
+        targets: (n, 4) at which to record: of x, y and z the stress in Pa (compression positive) where ``by_stress``
+            says so, else the logarithmic strain (shortening positive); and the engineering shear strain xz.
+        by_stress: whether x, y and z are under stress control.
+        confining: stress on all axes at the start, Pa.
+
+    The other arguments, the result and the errors are those of :func:`triaxial`.
+    """
     _positive(void_ratio=void_ratio, young=young, strain_rate=strain_rate, largest_step=largest_step)
     if not -1.0 < poisson < 0.5:
         raise ParameterError(f"poisson: {poisson} is no Poisson's ratio; give one between -1 and 0.5")

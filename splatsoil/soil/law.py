@@ -8,7 +8,7 @@ a decomposition of F).
 
 The flow is non-associated: a plastic shear strain g (engineering measure) lowers sqrt(J2) by G g and gains the volume
 b g, which raises the pressure by K b g, so the point that ends on the cone sqrt(J2) = k + a p has
-g = (sqrt(J2) - k - a p) / (G + a b K) of the trial stress (de Souza Neto et al. 2008, box 8.9, for a linear cone).
+g = (sqrt(J2) - k - a p) / (G + a b K) of the trial stress (de Souza Neto et al. 2008, sec. 8.3).
 """
 
 from __future__ import annotations
@@ -77,6 +77,7 @@ def base_strength(state: SoilState, values: wp.array2d(dtype=float), row: int) -
     strength.dilation = 0.0
     strength.viscosity = 0.0
     strength.crush_pressure = 0.0
+    strength.crush_hardening = 0.0
     return strength
 
 
@@ -140,9 +141,10 @@ def _stress_update(strength_of: Any, history: bool) -> Any:
             dilated = stress.dilated
             crush = strength.crush_pressure
             if crush > 0.0 and pressure > crush:
-                dilated = dilated - (pressure - crush) / bulk
-                elastic = -crush / bulk
-                pressure = crush
+                lost = (pressure - crush) / (bulk + strength.crush_hardening)
+                dilated = dilated - lost
+                elastic = elastic + lost
+                pressure = -bulk * elastic
                 limit = strength.intercept + strength.slope * pressure
             if opening <= 0.0:
                 limit = limit + strength.viscosity * state.shear_rate

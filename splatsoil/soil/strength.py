@@ -37,6 +37,7 @@ class Strength:
         dilation: volume gained per plastic shear strain; negative where shear makes the soil denser.
         viscosity: sqrt(J2) gained per shear rate while the soil holds together, Pa s.
         crush_pressure: pressure above which the skeleton gives way and the soil becomes denser, Pa; none when zero.
+        crush_hardening: growth of that pressure per volume lost, Pa.
     """
 
     slope: float
@@ -45,3 +46,4 @@ class Strength:
     dilation: float
     viscosity: float
     crush_pressure: float
+    crush_hardening: float

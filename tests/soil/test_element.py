@@ -1,0 +1,100 @@
+"""The element tests themselves: strength, elasticity, speed of convergence, and what they refuse."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from splatsoil.errors import ParameterError, SimulationError
+from splatsoil.soil.element import drive, isotropic_compression, simple_shear, triaxial
+from splatsoil.soil.law import Law
+from splatsoil.soil.library import find_effects
+from splatsoil.soil.matching import Matching
+
+ANGLES = (25.0, 30.0, 35.0, 40.0, 45.0)
+
+
+@pytest.mark.parametrize("cohesion", [0.0, 300.0])
+def test_triaxial_compression_strength_to_a_thousandth(cohesion: float) -> None:
+    """sigma_1 = sigma_3 N + 2 c sqrt(N), N = tan^2(45 + phi / 2), Mohr-Coulomb; 26.90 kPa at 35 deg and 10 kPa."""
+    law = Law(find_effects(["cohesion"]))
+    sets = [{"friction_angle": a, "cohesion": cohesion} for a in ANGLES]
+    test = triaxial(law, sets, confining=1e4, strains=np.linspace(0.005, 0.05, 10), young=2e7)
+    flow = np.tan(np.radians(45.0 + np.array(ANGLES) / 2.0)) ** 2
+    expected = 1e4 * (flow - 1.0) + 2.0 * cohesion * np.sqrt(flow)
+    np.testing.assert_allclose(test.q[:, -1], expected, rtol=1e-4)
+    np.testing.assert_allclose(test.stress[..., :2], 1e4, rtol=1e-4)
+
+
+@pytest.mark.parametrize("matching", list(Matching))
+def test_every_matching_meets_its_own_closed_form(matching: Matching) -> None:
+    """sqrt(J2) / p in the test that the matching is named after (plane strain: the published value sin phi)."""
+    sine = np.sin(np.radians(ANGLES))
+    sets = [{"friction_angle": a} for a in ANGLES]
+    if matching in (Matching.COMPRESSION, Matching.EXTENSION):
+        sign = 1.0 if matching is Matching.COMPRESSION else -1.0
+        test = triaxial(Law(), sets, confining=1e4, strains=[sign * 0.05], matching=matching, young=2e7)
+        major, minor = test.stress[:, -1].max(axis=1), test.stress[:, -1].min(axis=1)
+        np.testing.assert_allclose((major - minor) / (major + minor), sine, rtol=1e-3)
+    else:
+        test = simple_shear(Law(), sets, confining=1e4, strains=[0.3], matching=matching, young=2e7)
+        wanted = sine if matching is Matching.PLANE_STRAIN else np.tan(np.radians(ANGLES))
+        np.testing.assert_allclose(test.shear_stress[:, -1] / test.p[:, -1], wanted, rtol=1e-3)
+
+
+def test_before_failure_the_sample_is_elastic() -> None:
+    young, poisson = 4.0e7, 0.3
+    test = triaxial(Law(), {"friction_angle": 45.0}, confining=1e5, strains=[1e-3, 2e-3], young=young, poisson=poisson)
+    np.testing.assert_allclose(test.q[0], [0.0, young * 1e-3, young * 2e-3], rtol=1e-3)
+    np.testing.assert_allclose(test.volume_strain[0, 1:], (1.0 - 2.0 * poisson) * test.axial_strain[0, 1:], rtol=1e-3)
+    assert test.void_ratio[0, 2] == pytest.approx(1.8 * math.exp(-test.volume_strain[0, 2]) - 1.0)
+
+
+def test_a_loading_path_may_turn_back() -> None:
+    """Unloading from failure is elastic: Young's modulus again."""
+    test = triaxial(Law(), {"friction_angle": 30.0}, confining=1e5, strains=[0.02, 0.0195], young=1e8)
+    assert test.q[0, 1] - test.q[0, 2] == pytest.approx(1e8 * 5e-4, rel=1e-3)
+
+
+def test_isotropic_compression_follows_the_bulk_modulus() -> None:
+    test = isotropic_compression(Law(), {}, confining=1e4, pressures=[2e4, 5e4, 1e4], young=3e7, poisson=0.25)
+    np.testing.assert_allclose(test.p[0], [1e4, 2e4, 5e4, 1e4], rtol=1e-4)
+    np.testing.assert_allclose(test.volume_strain[0], np.array([0.0, 1e4, 4e4, 0.0]) / 2e7, atol=2e-8)
+
+
+def test_records_do_not_hang_on_the_size_of_steps() -> None:
+    law = Law(find_effects(["dilatancy"]))
+    values = {"friction_angle": 33.0, "dilatancy_angle": 10.0, "dilatancy_strain": 0.1}
+    coarse, fine = (
+        triaxial(law, values, confining=1e5, strains=[0.05, 0.1], largest_step=step) for step in (1e-3, 5e-5)
+    )
+    np.testing.assert_allclose(coarse.q, fine.q, rtol=1e-3)
+    np.testing.assert_allclose(coarse.volume_strain, fine.volume_strain, atol=2e-4)
+
+
+def test_a_stress_that_the_soil_cannot_bear_is_an_error() -> None:
+    """At 35 deg and 10 kPa the strength is 36.90 kPa: under stress control, 36 kPa are reached and 38 kPa are not."""
+
+    def loaded(axial: float) -> float:
+        targets = np.array([[1e4, 1e4, axial, 0.0]])
+        test = drive(Law(), {"friction_angle": 35.0}, targets, by_stress=(True, True, True), confining=1e4)
+        return float(test.stress[0, -1, 2])
+
+    assert loaded(3.6e4) == pytest.approx(3.6e4, rel=1e-3)
+    with pytest.raises(SimulationError, match=r"1 of 1 parameter sets did not reach .* record 1 of 1 .*friction_angle"):
+        loaded(3.8e4)
+
+
+def test_meaningless_tests_are_refused() -> None:
+    with pytest.raises(ParameterError, match=r"confining: -1.0 is not a positive number"):
+        triaxial(Law(), {}, confining=-1.0, strains=[0.1])
+    with pytest.raises(ParameterError, match=r"strains: give at least one finite number"):
+        triaxial(Law(), {}, confining=1e4, strains=[math.nan])
+    with pytest.raises(ParameterError, match=r"poisson: 0.5"):
+        triaxial(Law(), {}, confining=1e4, strains=[0.1], poisson=0.5)
+    with pytest.raises(ParameterError, match=r"unknown parameter cohesion"):
+        triaxial(Law(), {"cohesion": 10.0}, confining=1e4, strains=[0.1])
+    with pytest.raises(ParameterError, match=r"at least one set"):
+        triaxial(Law(), [], confining=1e4, strains=[0.1])
