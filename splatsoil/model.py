@@ -111,13 +111,16 @@ class Model:
         return result
 
     def space(self, names: Iterable[str] | None = None) -> ParameterSpace:
-        """The named parameters as free ones; by default the friction angle and those of all effects that are on.
+        """The named parameters as free ones.
+
+        By default the friction angle and, of the effects that are on, the parameters that can be off: those that only
+        shape an effect (a strain over which it decays, say) keep their defaults unless they are named.
 
         Raises:
             ParameterError: a name that this model does not have.
         """
         known = {p.name: p for p in self.parameters}
-        wanted = tuple(known) if names is None else tuple(names)
+        wanted = tuple(self.law.free) if names is None else tuple(names)
         unknown = [n for n in wanted if n not in known]
         if unknown:
             raise ParameterError(f"unknown parameter {', '.join(unknown)}; this model has {', '.join(known)}")

@@ -24,7 +24,8 @@ class Parameter:
         lower: smallest value that makes sense, in ``unit``.
         upper: largest value that makes sense, in ``unit``.
         default: value used when the parameter is not free.
-        off: value at which an effect's parameter has no influence; None for parameters of the base law.
+        off: value at which an effect's parameter has no influence; None for parameters of the base law, and for those
+            that only shape an effect whose size is another parameter.
         meaningful: smallest change a user would care about, in ``unit``.
         log: search on a logarithmic scale (needs ``lower > 0``).
         sign: +1 or -1 where physics allows one direction from ``off`` only, 0 otherwise.

@@ -232,6 +232,14 @@ class Law:
                 if other in on:
                     raise ParameterError(f"effects {effect.name} and {other} cannot both be on: {reason}")
 
+    @property
+    def free(self) -> tuple[str, ...]:
+        """Parameters that a fit frees unless told otherwise: friction angle, and those of the effects with an off value."""
+        return (
+            FRICTION_ANGLE.name,
+            *(p.name for effect in self.effects for p in effect.parameters if p.off is not None),
+        )
+
     def values(self, given: Mapping[str, float]) -> dict[str, float]:
         """All parameters by name: ``given`` with bounds checked, defaults for the rest.
 
