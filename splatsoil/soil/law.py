@@ -234,7 +234,7 @@ class Law:
 
     @property
     def free(self) -> tuple[str, ...]:
-        """Parameters that a fit frees unless told otherwise: friction angle, and those of the effects with an off value."""
+        """Parameters that a fit frees unless told otherwise: friction angle, and those of effects with an off value."""
         return (
             FRICTION_ANGLE.name,
             *(p.name for effect in self.effects for p in effect.parameters if p.off is not None),
@@ -254,6 +254,24 @@ class Law:
                 " (an effect's parameters exist when the effect is on)"
             )
         return {name: p.check(given.get(name, p.default)) for name, p in known.items()}
+
+    def require_on(self, given: Mapping[str, float]) -> dict[str, float]:
+        """The same as :meth:`values`, for a model whose effects must all act.
+
+        Raises:
+            ParameterError: also when an effect is left at its off value.
+        """
+        full = self.values(given)
+        for effect in self.effects:
+            switches = [p for p in effect.parameters if p.off is not None]
+            if switches and all(full[p.name] == p.off for p in switches):
+                first = switches[0]
+                example = first.upper if first.sign >= 0 else first.lower
+                raise ParameterError(
+                    f"effect {effect.name!r} is on but all its parameters are at their off values; "
+                    f"give it one, for example --set {first.name}={0.5 * (first.off or 0.0) + 0.5 * example:g}"
+                )
+        return full
 
     def settings(self, base: Settings, values: Mapping[str, float]) -> Settings:
         """``base`` with the friction angle of ``values`` and every effect applied.

@@ -95,7 +95,7 @@ def make_set(
     if seed < 0 or (particle_seed is not None and particle_seed < 0):
         raise ParameterError(f"seeds are whole numbers from 0 on, not {seed if seed < 0 else particle_seed}")
     law = Law(find_effects(effects))
-    parameters = check_values(law, {**(values or {}), "friction_angle": friction_angle})
+    parameters = law.require_on({**(values or {}), "friction_angle": friction_angle})
     experiment = setup.experiment()
     settings = law.settings(base_settings(experiment), parameters)
     resolution = Resolution.derive(experiment, preset)
@@ -177,32 +177,6 @@ def check_device(device: str) -> str:
     if device not in ("cpu", *cuda):
         raise ParameterError(f"device {device!r} is not here; there are {', '.join(['auto', 'cpu', *cuda])}")
     return device
-
-
-def check_values(law: Law, values: Mapping[str, float]) -> dict[str, float]:
-    """All parameters of the law by name, with bounds checked and every effect really on.
-
-    Raises:
-        ParameterError: unknown names, values out of bounds, or an effect left at its off value.
-    """
-    known = {p.name: p for p in law.parameters}
-    unknown = sorted(set(values) - set(known))
-    if unknown:
-        raise ParameterError(
-            f"unknown parameter {', '.join(unknown)}; this world has {', '.join(known)}"
-            " (an effect's parameters exist when the effect is on)"
-        )
-    full = {name: p.check(values.get(name, p.default)) for name, p in known.items()}
-    for effect in law.effects:
-        switches = [p for p in effect.parameters if p.off is not None]
-        if switches and all(full[p.name] == p.off for p in switches):
-            first = switches[0]
-            example = first.upper if first.sign >= 0 else first.lower
-            raise ParameterError(
-                f"effect {effect.name!r} is on but all its parameters are at their off values; "
-                f"give it one, for example --set {first.name}={0.5 * (first.off or 0.0) + 0.5 * example:g}"
-            )
-    return full
 
 
 def truth_frames(frames: tuple[int, ...]) -> tuple[int, ...]:

@@ -1,0 +1,177 @@
+"""``splatsoil element``: a laboratory test on the soil law, at a single point."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from splatsoil.commands._output import print_json
+from splatsoil.errors import ParameterError
+
+if TYPE_CHECKING:
+    from splatsoil.soil.element import ElementTest
+    from splatsoil.soil.law import Law
+
+
+@dataclass(frozen=True)
+class Config:
+    """Test the soil law as a laboratory would: stresses, volume and void ratio over strain, as a table and a plot."""
+
+    test: Literal["triaxial", "extension", "simple-shear", "isotropic"] = "triaxial"
+    """Drained triaxial compression or extension, simple shear, or isotropic compression."""
+    confining: float = 100e3
+    """Stress at the start, and of what is held, in Pa."""
+    friction_angle: float = 35.0
+    """Of the soil, degrees."""
+    effects: Annotated[tuple[str, ...], tyro.conf.arg(name="with", metavar="EFFECT …")] = ()
+    """Effects that act, or files that define some."""
+    values: Annotated[tuple[str, ...], tyro.conf.arg(name="set", metavar="NAME=VALUE …")] = ()
+    """Parameters of the effects."""
+    strain: float = 0.2
+    """Largest logarithmic strain: of the axis, or of shear."""
+    pressure: float | None = None
+    """Largest pressure of the isotropic test in Pa; ten times the confining stress unless given."""
+    records: int = 100
+    """Points of the curve."""
+    void_ratio: float = 0.8
+    """At the start."""
+    young: float = 5.0e7
+    """Young's modulus in Pa."""
+    poisson: float = 0.2
+    """Poisson's ratio."""
+    strain_rate: float = 1.0e-5
+    """In 1/s; only effects of rate feel it."""
+    matching: Literal["compression", "extension", "plane_strain", "simple_shear"] = "compression"
+    """Where the Drucker-Prager cone agrees with Mohr-Coulomb."""
+    plot: Path = Path("element.png")
+    """File for the plot (png, svg or pdf)."""
+    json: bool = False
+    """Print one JSON object with all records instead of a table."""
+
+
+#: Lines of the table.
+ROWS = 12
+
+
+def run(config: Config) -> int:
+    """Test, print and plot."""
+    import warp as wp
+
+    wp.config.quiet = True
+    from splatsoil.commands.simulate import parse_values
+    from splatsoil.soil.law import Law
+    from splatsoil.soil.library import find_effects
+
+    values = parse_values(config.values)
+    if "friction_angle" in values:
+        raise ParameterError("the friction angle is given by --friction-angle, not by --set")
+    if config.records < 2:
+        raise ParameterError(f"--records: a curve needs at least 2 points, not {config.records}")
+    if config.plot.suffix not in (".png", ".svg", ".pdf"):
+        raise ParameterError(f"--plot {config.plot}: give a file that ends in .png, .svg or .pdf")
+    law = Law(find_effects(config.effects))
+    result = perform(law, law.require_on({**values, "friction_angle": config.friction_angle}), config)
+    columns = curve(result, config)
+    draw(columns, config)
+    if config.json:
+        print_json(
+            {
+                "ok": True,
+                "test": config.test,
+                "parameters": dict(result.values[0]),
+                "effects": [effect.name for effect in law.effects],
+                "plot": str(config.plot),
+                "records": {name: [float(v) for v in column] for name, column in columns.items()},
+            }
+        )
+    else:
+        show(columns, config)
+    return 0
+
+
+def perform(law: Law, values: dict[str, float], config: Config) -> ElementTest:
+    """The test that the options describe."""
+    import numpy as np
+
+    from splatsoil.soil.element import Options, isotropic_compression, simple_shear, triaxial
+    from splatsoil.soil.matching import Matching
+
+    if not config.strain > 0.0:
+        raise ParameterError(f"--strain: {config.strain} is not a positive strain")
+    options = Options(
+        void_ratio=config.void_ratio,
+        young=config.young,
+        poisson=config.poisson,
+        strain_rate=config.strain_rate,
+        matching=Matching(config.matching),
+    )
+    path = np.linspace(0.0, 1.0, config.records + 1)[1:]
+    if config.test == "isotropic":
+        top = 10.0 * config.confining if config.pressure is None else config.pressure
+        pressures = config.confining + path * (top - config.confining)
+        return isotropic_compression(law, values, confining=config.confining, pressures=pressures, **options)
+    if config.test == "simple-shear":
+        return simple_shear(law, values, confining=config.confining, strains=config.strain * path, **options)
+    sign = 1.0 if config.test == "triaxial" else -1.0
+    return triaxial(law, values, confining=config.confining, strains=sign * config.strain * path, **options)
+
+
+def curve(result: ElementTest, config: Config) -> dict[str, Any]:
+    """Columns of the one set of parameters, (records + 1,) each; the first is what the others are plotted over."""
+    volume = {"volume strain": result.volume_strain[0], "void ratio": result.void_ratio[0]}
+    if config.test == "isotropic":
+        return {"p [Pa]": result.p[0], **volume}
+    if config.test == "simple-shear":
+        stresses = {"shear stress [Pa]": result.shear_stress[0], "normal stress [Pa]": result.stress[0, :, 2]}
+        return {"shear strain": result.shear_strain[0], **stresses, **volume}
+    return {"axial strain": result.axial_strain[0], "q [Pa]": result.q[0], "p [Pa]": result.p[0], **volume}
+
+
+def draw(columns: dict[str, Any], config: Config) -> None:
+    """One panel for each column, over the first; written whole or not at all."""
+    import io
+
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    from splatsoil.files import write_bytes
+
+    (across, x), *others = columns.items()
+    figure = Figure(figsize=(3.2 * len(others), 2.8), layout="constrained")
+    FigureCanvasAgg(figure)
+    for axes, (name, y) in zip(figure.subplots(1, len(others), squeeze=False)[0], others, strict=True):
+        axes.plot(x, y)
+        axes.set_xlabel(across)
+        axes.set_ylabel(name)
+        axes.grid(alpha=0.3)
+    on = ", ".join(config.effects) or "base law"
+    figure.suptitle(f"{config.test}, {config.confining:g} Pa, φ = {config.friction_angle:g}°, {on}", fontsize=10)
+    stream = io.BytesIO()
+    figure.savefig(stream, format=config.plot.suffix[1:], dpi=150)
+    write_bytes(config.plot, stream.getvalue())
+
+
+def show(columns: dict[str, Any], config: Config) -> None:
+    """A dozen lines of the curve."""
+    import numpy as np
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(title=f"{config.test} test at {config.confining:g} Pa", title_justify="left")
+    for name in columns:
+        table.add_column(escape(name), justify="right")
+    total = len(next(iter(columns.values())))
+    for k in np.unique(np.linspace(0, total - 1, min(ROWS, total)).astype(int)):
+        table.add_row(*(f"{column[k]:.5g}" for column in columns.values()))
+    console = Console(highlight=False)
+    console.print(table)
+    console.print(f"plot: {escape(str(config.plot))}")
+
+
+def interrupted(config: Config) -> str:
+    """A plot is written whole or not at all."""
+    return f"the plot was not written; start again with: splatsoil element --test {config.test}"
