@@ -2,7 +2,7 @@
 
 Ten evaluations leave these open, and one best guess is overconfident: on pure noise it may call every point a valley.
 So the surrogate averages over draws from the posterior, made by emcee from starting points that importance resampling
-of the prior provides. Inputs live in [0, 1]^n, outcomes have mean 0 and standard deviation 1.
+provides. Inputs live in [0, 1]^n, outcomes have mean 0 and standard deviation 1.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import emcee
 import numpy as np
 import numpy.typing as npt
 from scipy.optimize import minimize
-from scipy.stats import norm, qmc
+from scipy.stats import multivariate_t, norm, qmc
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -118,23 +118,52 @@ def posterior(
         seed: the same seed gives the same bits.
     """
     density = Density(x, y, noise)
+    d = len(density.means)
     halvings = max(0, int(np.ceil(2.0 * np.log2(len(y) / MANY))))
     prior_points = max(LEAST_POINTS, PRIOR_POINTS >> halvings)
-    cube = qmc.Sobol(len(density.means), rng=np.random.default_rng(seed)).random(prior_points)
+    cube = qmc.Sobol(d, rng=np.random.default_rng(seed)).random(prior_points)
     points = density.means + density.stds * norm.ppf(np.clip(cube, 1e-6, 1.0 - 1e-6))
     points = np.clip(points, density.bounds[:, 0], density.bounds[:, 1])
-    likelihood = density.likelihood(points)
 
     best = points[np.argmax(density(points))]
     found = minimize(lambda p: -density(p[None])[0], best, bounds=density.bounds, method="L-BFGS-B")
     best = found.x if np.isfinite(found.fun) and found.fun < -density(best[None])[0] else best
 
+    # In several dimensions hardly a point of the prior is near the peak, so a heavy-tailed bell around it helps out;
+    # the two together are the proposal whose importance weights choose the walkers' starts.
     random = np.random.RandomState(seed)  # the kind that emcee takes
-    weights = np.exp(likelihood - likelihood.max())
-    start = points[random.choice(prior_points, count, p=weights / weights.sum())]
+    bell = multivariate_t(best, _curvature(density, best), df=4)
+    near = np.atleast_2d(bell.rvs(max(prior_points // 4, 1), random_state=random)).reshape(-1, d)
+    points = np.concatenate([points, np.clip(near, density.bounds[:, 0], density.bounds[:, 1])])
+    prior = norm.pdf(points, density.means, density.stds).prod(axis=1)
+    proposal = (prior_points * prior + len(near) * bell.pdf(points)) / len(points)
+    logs = density(points)
+    weights = np.where(np.isfinite(logs), np.exp(logs - logs.max()), 0.0) / proposal
+    start = points[random.choice(len(points), count, p=weights / weights.sum())]
     # Twins would never part: emcee's moves are along differences between walkers.
     start = start + 0.05 * density.stds * random.standard_normal(start.shape)
     start = np.clip(start, density.bounds[:, 0] + 1e-9, density.bounds[:, 1] - 1e-9)
-    sampler = emcee.EnsembleSampler(count, len(best), density, vectorize=True)
+    sampler = emcee.EnsembleSampler(count, d, density, vectorize=True)
     state = sampler.run_mcmc(emcee.State(start, random_state=random.get_state()), STEPS, skip_initial_state_check=True)
     return density.unpack(best[None]), density.unpack(np.asarray(state.coords))
+
+
+def _curvature(density: Density, peak: FloatArray) -> FloatArray:
+    """Covariance (d, d) of the bell with the density's curvature at its peak, no wider than the prior."""
+    d = len(peak)
+    step = 0.05 * density.stds
+    corners = np.array([[i, j, a, b] for i in range(d) for j in range(i, d) for a in (-1, 1) for b in (-1, 1)])
+    moved = np.repeat(peak[None], len(corners), axis=0)
+    rows = np.arange(len(corners))
+    moved[rows, corners[:, 0]] += corners[:, 2] * step[corners[:, 0]]
+    moved[rows, corners[:, 1]] += corners[:, 3] * step[corners[:, 1]]
+    # At a bound the density beyond is as at the bound: a one-sided slope then counts as curvature, which is cautious.
+    values = density(np.clip(moved, density.bounds[:, 0], density.bounds[:, 1]))
+    hessian = np.zeros((d, d))
+    for (i, j, a, b), value in zip(corners, values, strict=True):
+        hessian[i, j] -= a * b * value / (4.0 * step[i] * step[j])
+    hessian = np.triu(hessian) + np.triu(hessian, 1).T + np.diag(density.stds**-2.0)
+    eigenvalues, vectors = np.linalg.eigh(hessian)
+    floor = density.stds.max() ** -2.0
+    covariance = (vectors / np.maximum(eigenvalues, floor)) @ vectors.T
+    return 0.5 * (covariance + covariance.T)
