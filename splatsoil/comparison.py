@@ -110,6 +110,7 @@ class Comparator:
         frames: frames to compare; all from the first on by default. The first one in the video is what changes refer to
             and has no loss of its own.
         cameras: names; all by default.
+        patch: side of a block on the bed, m.
 
     Raises:
         ParameterError: a frame or camera that is not in the video, or nothing to compare.
@@ -123,8 +124,10 @@ class Comparator:
         level: float | None = None,
         frames: Iterable[int] | None = None,
         cameras: Iterable[str] | None = None,
+        patch: float = PATCH,
     ) -> None:
         self.measurement = measurement
+        self._patch = patch
         self.reference = int(measurement.frames[0])
         self.cameras = tuple(measurement.cameras) if cameras is None else tuple(cameras)
         chosen = measurement.frames if frames is None else tuple(sorted({int(f) for f in frames}))
@@ -190,6 +193,34 @@ class Comparator:
         blocks = 255.0 * np.concatenate([m.reshape(-1) for m in means])
         return Comparison(float(np.mean(list(losses.values()))), losses, squares, blocks, self.labels)
 
+    def open_shares(self) -> FloatArray:
+        """(b,) share of each block's pixels that the tool's silhouette leaves open, in the order of ``labels``."""
+        out = []
+        for camera in self.cameras:
+            patch = self._patches[camera]
+            blocks, known = int(patch.max()) + 1, patch >= 0
+            pixels = np.bincount(patch[known], minlength=blocks)
+            for frame in self.frames:
+                free = known & ~self._silhouettes[camera, frame]
+                out.append(np.bincount(patch[free], minlength=blocks) / np.maximum(pixels, 1))
+        return np.concatenate(out)
+
+    def still_blocks(self) -> dict[str, FloatArray]:
+        """(frames, blocks) changes between frames before anything moves, in grey levels, for each camera: noise alone.
+
+        Each is the frame minus the mean of the other still ones; a camera with fewer than two has none.
+        """
+        out = {}
+        for camera, still in self._still.items():
+            frames = [*still, self.observed[camera, self.reference]]
+            if len(frames) < 2:
+                continue
+            total = np.sum(frames, axis=0)
+            change = [image - (total - image) / (len(frames) - 1) for image in frames]
+            mask = self.interior[camera] & ~self._silhouettes[camera, self.reference]
+            out[camera] = 255.0 * self._block_means(camera, change, [mask] * len(frames))
+        return out
+
     def picture(self, images: Mapping[Key, Image], camera: str, frame: int, gain: float = 4.0) -> Image:
         """Observed, predicted and their difference (grey where equal, times ``gain``) side by side: (h, 3w, 3)."""
         observed, predicted = self.observed[camera, frame], images[camera, frame]
@@ -242,7 +273,7 @@ class Comparator:
     def _layout(self) -> tuple[tuple[Block, ...], dict[str, npt.NDArray[np.int64]]]:
         """Labels of all blocks, and for each camera the block (in its order) that each pixel belongs to, or -1."""
         low, high = self.measurement.bed.lower[:2], self.measurement.bed.upper[:2]
-        count = np.maximum(np.round((high - low) / PATCH).astype(int), 1)
+        count = np.maximum(np.round((high - low) / self._patch).astype(int), 1)
         size = (high - low) / count
         labels: list[Block] = []
         patches = {}

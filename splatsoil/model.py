@@ -87,6 +87,22 @@ class Model:
 
         self.recorded = self._recorded_frames()
 
+    def variant(self, *, effects: Iterable[str] | None = None, resolution: Resolution | None = None) -> Model:
+        """The same experiment with other effects on, or computed otherwise; it shares scenes where particles agree."""
+        names = tuple(e.name for e in self.law.effects) if effects is None else tuple(effects)
+        other = Model(
+            self.measurement,
+            self.reconstruction,
+            effects=names,
+            preset=self.preset,
+            device=self.device,
+            frames=self.frames,
+        )
+        other.resolution = resolution or self.resolution
+        if other.resolution.spacing == self.resolution.spacing:
+            other._scene = self._scene
+        return other
+
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """All parameters of the law with its effects."""

@@ -104,9 +104,7 @@ def gather(
             )
         except SimulationError as error:
             failed[candidate.name] = str(error)
-    return Evidence(
-        base, runs.mean(axis=0), deviations, numerics, slopes, curves, widths, directions, steps, failed
-    )
+    return Evidence(base, runs.mean(axis=0), deviations, numerics, slopes, curves, widths, directions, steps, failed)
 
 
 def around(parameter: Parameter, value: float) -> list[float]:
@@ -144,7 +142,11 @@ def _slope(candidate: Candidate, parameter: Parameter, base, middle, run, steps)
     steps[parameter.name] = abs(step)
     tables = []
     # Drawing the same simulation otherwise has no chance in it: one side will do.
-    both = candidate.kind == "physics" and parameter.sign == 0 and parameter.lower <= off[parameter.name] - step <= parameter.upper
+    both = (
+        candidate.kind == "physics"
+        and parameter.sign == 0
+        and parameter.lower <= off[parameter.name] - step <= parameter.upper
+    )
     for offset in (step, -step) if both else (step,):
         at = {**base, **off, parameter.name: off[parameter.name] + offset}
         tables.append(run(f"{candidate.name}: {parameter.name}", at, (candidate.name,)))

@@ -1,0 +1,379 @@
+"""Diagnosis: from an experiment and a fit to a verdict, with everything that led to it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from splatsoil.experiment.base import Candidate, Experiment
+
+from .evidence import Evidence, gather
+from .floor import Floor, floor_of
+from .misfit import Block, Omnibus, blocks, left_over, omnibus, shares, smooth_basis
+from .noise import Noise
+from .refit import Refit, refit
+from .score import Score, Tester
+from .simulations import Simulations
+from .verdicts import EQUIVALENT, GATE, LEVEL, EffectVerdict, Verdict, explained, of_effect, overall
+
+FloatArray = npt.NDArray[np.float64]
+Report = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class Options:
+    """How thorough a diagnosis is.
+
+    Attributes:
+        level: family-wise chance of naming an effect when none is missing.
+        repeats: simulations at the fit with other seeds.
+        refits: effects, the best ones, that are refitted.
+        refit_steps: simulations for each refit.
+        seed: of draws.
+    """
+
+    level: float = LEVEL
+    repeats: int = 4
+    refits: int = 3
+    refit_steps: int = 5
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Confirmation:
+    """An effect refitted on part of the times and judged on the others.
+
+    Attributes:
+        name: of the effect; empty for the model as it is.
+        fit: the refit.
+        chi2: of all times, numerics projected out.
+        held_out: root mean square of the residual on times the refit hasn't seen, in the features' unit.
+        floor: what noise alone leaves there.
+        remainder: what stands on slow waves.
+    """
+
+    name: str
+    fit: Refit
+    chi2: float
+    held_out: float
+    floor: float
+    remainder: Omnibus
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """All that was found.
+
+    Attributes:
+        verdict: on the model.
+        members: the equivalence class: effects that explain the misfit about equally well, the best first.
+        effects: verdict on each effect.
+        scores: of each effect, alone.
+        given: of each effect, with the best one taken to be on; empty where none was named.
+        confusion: correlation of each pair of effects' scores.
+        misfit: of the model as it is.
+        remainder: after the best effect; None where none was named.
+        explained: share of the misfit beyond chance that the best effect explains.
+        confirmations: refits by effect, the model as it is under the empty name.
+        blocks: where the model fails.
+        where: share of the best effect's evidence in each (stage, region, channel).
+        residual: (t, s) what parameters and nuisances can't take up.
+        floor: noise and nuisances.
+        evidence: the simulations.
+        simulations: how many the diagnosis needed.
+    """
+
+    verdict: Verdict
+    members: tuple[str, ...]
+    effects: Mapping[str, EffectVerdict]
+    scores: Mapping[str, Score]
+    given: Mapping[str, Score]
+    confusion: Mapping[tuple[str, str], float]
+    misfit: Omnibus
+    remainder: Omnibus | None
+    explained: float
+    confirmations: Mapping[str, Confirmation]
+    blocks: tuple[Block, ...]
+    where: Mapping[tuple[str, str, str], float]
+    residual: FloatArray
+    floor: Floor
+    evidence: Evidence
+    simulations: int = 0
+    notes: tuple[str, ...] = field(default_factory=tuple)
+
+
+def diagnose(
+    experiment: Experiment,
+    values: Mapping[str, float],
+    *,
+    simulate: Simulations | None = None,
+    options: Options | None = None,
+    progress: Report | None = None,
+) -> Diagnosis:
+    """Criticise a model at its fitted parameters.
+
+    Args:
+        experiment: what was observed, and the model.
+        values: the fitted parameters.
+        simulate: where predictions come from; the experiment itself by default.
+        options: how thorough.
+        progress: called with (what, share done).
+
+    Raises:
+        SimulationError: the fit itself can't be simulated.
+    """
+    options, simulate = options or Options(), simulate or Simulations(experiment)
+    told = progress or (lambda what, share: None)
+    evidence = gather(
+        experiment, simulate, values, repeats=options.repeats, progress=lambda share: told("simulations", 0.75 * share)
+    )
+    return judge(experiment, evidence, simulate, options=options, progress=told)
+
+
+@dataclass(frozen=True)
+class Bench:
+    """What doesn't depend on the observation, prepared once: many observations may be judged by it.
+
+    Attributes:
+        floor: noise and nuisances.
+        candidates: effects that could be simulated.
+        tester: of them; None where there are none.
+        basis: (n, k) slow waves.
+    """
+
+    floor: Floor
+    candidates: tuple[Candidate, ...]
+    tester: Tester | None
+    basis: FloatArray
+
+    @classmethod
+    def of(cls, experiment: Experiment, evidence: Evidence, options: Options) -> Bench:
+        """Prepare."""
+        floor = floor_of(experiment, evidence)
+        seen = experiment.seen
+        candidates = tuple(c for c in experiment.candidates if c.name in evidence.directions)
+        columns = {c.name: evidence.directions[c.name][:, seen].T for c in candidates}
+        tester = None
+        if candidates:
+            tester = Tester.of(floor.noise, floor.free, columns, candidates, level=options.level, seed=options.seed)
+        return cls(floor, candidates, tester, smooth_basis(experiment.layout, floor.noise))
+
+
+def judge(
+    experiment: Experiment,
+    evidence: Evidence,
+    simulate: Simulations,
+    *,
+    options: Options,
+    bench: Bench | None = None,
+    progress: Report | None = None,
+) -> Diagnosis:
+    """From evidence to a verdict; simulates only to refit the best effects."""
+    told = progress or (lambda what, share: None)
+    bench = bench or Bench.of(experiment, evidence, options)
+    floor, tester, seen = bench.floor, bench.tester, experiment.seen
+    residual = (experiment.observed - evidence.mean)[seen]
+    misfit = omnibus(floor.noise, floor.free, residual, bench.basis)
+    scores = {} if tester is None else tester.score(residual)
+    candidates = {c.name: c for c in bench.candidates}
+    strong = sorted((s for s in scores.values() if s.adjusted < options.level), key=lambda s: s.statistic, reverse=True)
+    confirmations: dict[str, Confirmation] = {}
+    members: tuple[str, ...] = ()
+    given: Mapping[str, Score] = {}
+    remainder, gone = None, 0.0
+    if strong and tester is not None:
+        chosen = [candidates[s.name] for s in strong[: options.refits]]
+        confirmations = confirm(experiment, evidence, floor, chosen, simulate, options, bench.basis, told)
+        tried = {name: c for name, c in confirmations.items() if name}
+        best = min(tried, key=lambda name: tried[name].chi2)
+        members = _equals(tried, best)
+        given = tester.score(residual, given=best)
+        remainder = _after(experiment, floor, tried[best], candidates, evidence, bench.basis, members)
+        gone = explained(confirmations[""].remainder, remainder)
+    effects = _effects(candidates, scores, given, members, confirmations, options.level)
+    named = any(effects[name] == "missing" for name in members)
+    before = confirmations[""].remainder if confirmations else misfit
+    verdict = overall(named, before if named else misfit, remainder)
+    return Diagnosis(
+        verdict=verdict,
+        members=members,
+        effects=effects,
+        scores=scores,
+        given=given,
+        confusion=_pairs(tester),
+        misfit=misfit,
+        remainder=remainder,
+        explained=gone,
+        confirmations=confirmations,
+        blocks=blocks(experiment.layout, floor.noise, floor.free, residual, seed=options.seed),
+        where=_where(experiment, floor, evidence, scores, members, residual),
+        residual=floor.noise.spread(left_over(floor.noise, floor.free, residual)),
+        floor=floor,
+        evidence=evidence,
+        simulations=simulate.asked,
+        notes=tuple(f"{name} could not be simulated: {why}" for name, why in evidence.failed.items()),
+    )
+
+
+def confirm(
+    experiment: Experiment,
+    evidence: Evidence,
+    floor: Floor,
+    chosen: Sequence[Candidate],
+    simulate: Simulations,
+    options: Options,
+    basis: FloatArray,
+    told: Report,
+) -> dict[str, Confirmation]:
+    """Refit the model as it is, and with each chosen effect, on every other time; judge on the rest."""
+    rows = np.arange(experiment.layout.shape[0])
+    shown = rows % 2 == 0
+    if not experiment.seen[~shown].any() or not experiment.seen[shown].any():
+        shown = np.ones_like(shown)
+    # Numerics are projected out of what a refit minimises, and of what it is judged by.
+    seen_by_refit = floor.single.plus(floor.nuisance).rows(shown)
+    solver = seen_by_refit.solver()
+
+    def whiten(table: FloatArray) -> FloatArray:
+        return solver.whiten(table[seen_by_refit.seen])
+
+    middle = simulate(evidence.values, seed=0)
+    model = np.stack([evidence.slopes[p.name] for p in experiment.parameters], axis=-1)
+    out = {}
+    jobs: list[Candidate | None] = [None, *chosen]
+    for number, candidate in enumerate(jobs):
+        name = "" if candidate is None else candidate.name
+        told(f"refit {name or 'of the model'}", 0.75 + 0.25 * number / len(jobs))
+        extra = () if candidate is None else candidate.parameters
+        slopes = model
+        start = dict(evidence.values)
+        if candidate is not None:
+            slopes = np.concatenate([model, np.moveaxis(evidence.directions[name], 0, -1)], axis=-1)
+            start |= {p.name: float(p.off) for p in extra if p.off is not None}
+
+        def predict(values: Mapping[str, float], name: str = name) -> FloatArray:
+            return simulate(values, effects=(name,) if name else (), purpose=f"refit {name or 'of the model'}")
+
+        fit = refit(
+            predict,
+            whiten,
+            experiment.observed,
+            [*experiment.parameters, *extra],
+            start,
+            middle,
+            slopes,
+            most=options.refit_steps if candidate is not None else max(options.refit_steps - 2, 1),
+        )
+        out[name] = _judged(experiment, floor, name, fit, ~shown if not shown.all() else shown, basis)
+    return out
+
+
+def _judged(
+    experiment: Experiment, floor: Floor, name: str, fit: Refit, hidden: npt.NDArray[np.bool_], basis: FloatArray
+) -> Confirmation:
+    left = experiment.observed - fit.prediction
+    mask = experiment.seen & hidden[:, None]
+    scale = floor.single.spread(floor.single.scale)
+    free = np.concatenate([floor.nuisance, _tangent(floor.single, fit)], axis=1)
+    whole = floor.single.plus(floor.nuisance).solver()
+    return Confirmation(
+        name=name,
+        fit=fit,
+        chi2=float(np.sum(whole.whiten(left[experiment.seen]) ** 2)),
+        held_out=float(np.sqrt(np.mean(left[mask] ** 2))),
+        floor=float(np.sqrt(np.mean(scale[mask] ** 2))),
+        remainder=omnibus(floor.single, free, left[experiment.seen], basis),
+    )
+
+
+def _tangent(noise: Noise, fit: Refit) -> FloatArray:
+    """(n, k) a refit's derivatives, each as large as a parameter's error could be: ten times the noise."""
+    columns = fit.slopes[noise.seen]
+    size = np.linalg.norm(columns / noise.scale[:, None], axis=0)
+    return columns * (10.0 * math.sqrt(len(columns)) / np.maximum(size, 1e-300))
+
+
+def _equals(tried: Mapping[str, Confirmation], best: str) -> tuple[str, ...]:
+    """Effects whose χ² after refitting lies as near to the best as equals do; wider where a misfit remains."""
+    wide = EQUIVALENT * max(1.0, tried[best].remainder.dispersion)
+    close = [name for name, c in tried.items() if c.chi2 - tried[best].chi2 < wide]
+    return tuple(sorted(close, key=lambda name: tried[name].chi2))
+
+
+def _after(
+    experiment: Experiment,
+    floor: Floor,
+    best: Confirmation,
+    candidates: Mapping[str, Candidate],
+    evidence: Evidence,
+    basis: FloatArray,
+    members: Sequence[str],
+) -> Omnibus:
+    """What the library can't explain: after the best effect, or after it and a second one that is significant."""
+    if best.remainder.p >= GATE:
+        return best.remainder
+    seen = experiment.seen
+    left = (experiment.observed - best.fit.prediction)[seen]
+    free = np.concatenate([floor.nuisance, _tangent(floor.single, best.fit)], axis=1)
+    others = [c for name, c in candidates.items() if name != best.name]
+    if not others:
+        return best.remainder
+    columns = {c.name: evidence.directions[c.name][:, seen].T for c in others}
+    second = max(Tester.of(floor.single, free, columns, others).score(left).values(), key=lambda score: score.statistic)
+    if second.adjusted >= LEVEL:
+        return best.remainder
+    size = columns[second.name]
+    scale = 10.0 * math.sqrt(len(size)) / np.linalg.norm(size / floor.single.scale[:, None], axis=0)
+    return omnibus(floor.single, np.concatenate([free, size * scale], axis=1), left, basis)
+
+
+def _effects(
+    candidates: Mapping[str, Candidate],
+    scores: Mapping[str, Score],
+    given: Mapping[str, Score],
+    members: Sequence[str],
+    confirmations: Mapping[str, Confirmation],
+    level: float,
+) -> dict[str, EffectVerdict]:
+    """A verdict for each effect: members by their refits, the others by what the best one leaves for them."""
+    out: dict[str, EffectVerdict] = {}
+    for name, candidate in candidates.items():
+        if name in members:
+            size = confirmations[name].fit.values[candidate.size] - float(candidate.measure.off or 0.0)
+            out[name] = "missing" if abs(size) >= candidate.measure.meaningful else "trivial"
+        else:
+            out[name] = of_effect(candidate, given.get(name, scores[name]), level=level)
+            if out[name] == "missing":
+                # Significant beside the best one too, or because the best one's size is off: the next round tells.
+                out[name] = "cannot tell"
+    return out
+
+
+def _pairs(tester: Tester | None) -> dict[tuple[str, str], float]:
+    if tester is None:
+        return {}
+    matrix, names = tester.confusion(), tester.names
+    return {(a, b): float(matrix[i, j]) for i, a in enumerate(names) for j, b in enumerate(names) if j < i}
+
+
+def _where(
+    experiment: Experiment,
+    floor: Floor,
+    evidence: Evidence,
+    scores: Mapping[str, Score],
+    members: Sequence[str],
+    residual: FloatArray,
+) -> dict[tuple[str, str, str], float]:
+    """Share of the best effect's evidence in each part of the data."""
+    if not members:
+        return {}
+    seen = experiment.seen
+    direction = evidence.directions[members[0]][:, seen].T @ np.array(list(scores[members[0]].steps.values()))
+    solver = floor.noise.plus(floor.free).solver()
+    parts = shares(experiment.layout, floor.noise, direction * solver.solve(residual))
+    whole = sum(parts.values())
+    return {key: value / whole for key, value in parts.items()} if whole > 0.0 else {}

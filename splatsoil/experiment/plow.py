@@ -1,0 +1,189 @@
+"""Plow images: what fixed cameras see of a tool in soil, as changes of patches since the first frame."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from splatsoil.comparison import PATCH, Block, Comparator
+from splatsoil.experiment.base import Candidate, candidate_of
+from splatsoil.experiment.features import Layout, Site
+from splatsoil.experiment.scene_parts import regions_of, stages_of
+from splatsoil.model import Model, Prediction
+from splatsoil.mpm import Resolution, Trajectory
+from splatsoil.parameters import Parameter
+from splatsoil.soil.library import library
+
+FloatArray = npt.NDArray[np.float64]
+
+MOST_ROWS = 10
+MOST_FEATURES = 1800
+"""More say no more: neighbouring patches and frames are alike, and the noise's covariance is solved with as a whole."""
+
+UNKNOWN_NOISE = 0.5
+"""Noise of a patch in grey levels where there are no frames to measure it on."""
+LEAST_NOISE = 0.05
+
+NUMERICS: Mapping[str, Callable[[Resolution], Resolution]] = {
+    "stiffness": lambda r: replace(r, bulk=3.0 * r.bulk, shear=3.0 * r.shear),
+    "step": lambda r: replace(r, steps=2 * r.steps),
+    "grid": lambda r: replace(r, cell=0.8 * r.cell, spacing=0.8 * r.spacing),
+}
+"""Other ways to compute the same physics: three times as stiff, twice as many steps, a finer grid."""
+
+
+class PlowExperiment:
+    """A measurement set and a model of it.
+
+    Features are grey levels (of 255): the change of a square of the bed, as one camera sees it, since the first frame,
+    averaged over neighbouring frames of one stage.
+
+    Args:
+        model: the model at hand; candidates are the library's effects that it doesn't have.
+        parameters: names of its free parameters.
+        candidates: names of effects to consider; all of the library by default.
+        numerics: names of other numerics to consider.
+        progress: called with (frame, last frame) while a simulation runs.
+    """
+
+    chance = True
+    sensor_memory = 0.0
+
+    def __init__(
+        self,
+        model: Model,
+        parameters: Iterable[str] | None = None,
+        *,
+        candidates: Iterable[str] | None = None,
+        numerics: Iterable[str] = tuple(NUMERICS),
+        progress: Callable[[int, int], None] | None = None,
+    ) -> None:
+        self.base = model
+        self.name = model.measurement.name
+        self.model = tuple(effect.name for effect in model.law.effects)
+        self.parameters: tuple[Parameter, ...] = tuple(model.space(parameters))
+        self.numerics = tuple(numerics)
+        self.progress = progress
+        wanted = library() if candidates is None else {name: library()[name] for name in candidates}
+        found = (
+            candidate_of(effect.for_measurement(model.measurement))
+            for name, effect in wanted.items()
+            if name not in self.model and name not in NUMERICS
+        )
+        self.candidates: tuple[Candidate, ...] = tuple(c for c in found if c is not None)
+        bed = model.measurement.bed
+        rows = min(MOST_ROWS, len(model.frames) - 1)
+        area = float(np.prod((bed.upper - bed.lower)[:2])) * len(model.measurement.cameras) * rows
+        self.comparator = Comparator(
+            model.measurement,
+            surface=model.reconstruction.surface,
+            frames=model.frames,
+            patch=max(PATCH, math.sqrt(area / MOST_FEATURES)),
+        )
+        self._kept: tuple[object, Trajectory] | None = None
+        self._bins = self._frame_bins()
+
+    @cached_property
+    def layout(self) -> Layout:
+        """Labels of the features."""
+        measurement = self.base.measurement
+        frames = tuple(float(np.mean([self.comparator.frames[i] for i in group])) for group in self._bins)
+        sites = tuple(
+            Site(camera, label.x, label.y) for camera in self.comparator.cameras for label in self._labels(camera)
+        )
+        regions = regions_of(measurement, self.base.reconstruction.surface, frames, sites)
+        return Layout(frames, sites, "frame", "grey levels", stages_of(measurement, frames), regions)
+
+    @cached_property
+    def observed(self) -> FloatArray:
+        """(t, s) zero: features are told as the prediction's distance from what was seen, see :meth:`features`."""
+        return np.zeros(self.layout.shape)
+
+    @cached_property
+    def seen(self) -> npt.NDArray[np.bool_]:
+        """(t, s) False where the tool hides most of a patch."""
+        return self._table(self.comparator.open_shares()) > 0.5
+
+    @cached_property
+    def sensor(self) -> FloatArray:
+        """(t, s) standard deviation of a patch's change by the cameras' noise, from frames before anything moves."""
+        still = self.comparator.still_blocks()
+        per_site = []
+        for camera in self.comparator.cameras:
+            count = len(self._labels(camera))
+            level = np.sqrt(np.mean(still[camera] ** 2)) if camera in still else UNKNOWN_NOISE
+            per_site.append(np.full(count, max(float(level), LEAST_NOISE)))
+        frames = np.array([len(group) for group in self._bins], dtype=np.float64)
+        return np.concatenate(per_site)[None] / np.sqrt(frames)[:, None]
+
+    def predict(
+        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
+    ) -> FloatArray:
+        """(t, s) features; see :class:`~splatsoil.experiment.base.Experiment`."""
+        return self.features(self.prediction(values, effects=effects, seed=seed, numerics=numerics).images)
+
+    def features(self, images: Mapping[tuple[str, int], npt.NDArray[np.float32]]) -> FloatArray:
+        """(t, s) predicted minus observed change; the observed side is 0.
+
+        Told as a difference because both sides leave out the same pixels: those in which either shows the tool.
+        """
+        return -self._table(self.comparator.compare(images).blocks)
+
+    def prediction(
+        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
+    ) -> Prediction:
+        """The pictures behind the features. What only changes the observation is drawn without a new simulation."""
+        names = tuple(dict.fromkeys((*self.model, *effects)))
+        model = self._variant(names, numerics)
+        reported = {p.name for p in model.observation_parameters}
+        physics = {name: value for name, value in values.items() if name not in reported}
+        moving = tuple(e.name for e in model.law.effects if not {p.name for p in e.parameters} <= reported)
+        key = (moving, numerics, seed, tuple(sorted(physics.items())))
+        began = time.perf_counter()
+        if self._kept is None or self._kept[0] != key or not set(model.recorded) <= set(self._kept[1].frames):
+            self._kept = (key, model.simulate(physics, seed, self.progress))
+        trajectory = self._kept[1]
+        simulated = time.perf_counter()
+        images = model.draw(trajectory, seed, values)
+        seconds = {"simulation": simulated - began, "drawing": time.perf_counter() - simulated}
+        return Prediction(dict(values), seed, images, trajectory, seconds)
+
+    def _variant(self, effects: tuple[str, ...], numerics: str) -> Model:
+        if effects == self.model and not numerics:
+            return self.base
+        resolution = NUMERICS[numerics](self.base.resolution) if numerics else None
+        return self.base.variant(effects=effects, resolution=resolution)
+
+    def _labels(self, camera: str) -> list[Block]:
+        """The blocks that one camera sees, in order."""
+        first = self.comparator.frames[0]
+        return [label for label in self.comparator.labels if label.camera == camera and label.frame == first]
+
+    def _frame_bins(self) -> list[list[int]]:
+        """Neighbouring compared frames (as indices) of one stage, few enough bins for ``MOST_ROWS``."""
+        frames = [float(f) for f in self.comparator.frames]
+        stages = stages_of(self.base.measurement, frames)
+        size = math.ceil(len(frames) / MOST_ROWS)
+        bins: list[list[int]] = []
+        for i, stage in enumerate(stages):
+            if bins and len(bins[-1]) < size and stages[bins[-1][-1]] == stage:
+                bins[-1].append(i)
+            else:
+                bins.append([i])
+        return bins
+
+    def _table(self, values: FloatArray) -> FloatArray:
+        """(b,) values of blocks, as the comparator orders them, to (t, s)."""
+        frames, columns, start = len(self.comparator.frames), [], 0
+        for camera in self.comparator.cameras:
+            count = len(self._labels(camera))
+            mine = values[start : start + frames * count].reshape(frames, count)
+            columns.append(np.stack([mine[group].mean(axis=0) for group in self._bins]))
+            start += frames * count
+        return np.concatenate(columns, axis=1)

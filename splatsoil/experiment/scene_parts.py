@@ -1,0 +1,84 @@
+"""Parts of a plow experiment that people have words for: stages of the motion, regions of the bed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from splatsoil.experiment.features import Site
+from splatsoil.measurement import Measurement
+from splatsoil.reconstruction.height_field import HeightField
+
+FloatArray = npt.NDArray[np.float64]
+
+SLOW = 0.02
+"""Share of the motion's greatest speed below which the tool pauses."""
+BESIDE = 0.6
+"""Widths of the tool beside its track that berms may cover."""
+AHEAD = 0.6
+"""Widths of the tool ahead of it that count as its face, and behind it as behind."""
+POINTS = 400
+"""Of the tool's surface, to know where it stands in the soil."""
+
+
+def stages_of(measurement: Measurement, frames: Sequence[float]) -> tuple[str, ...]:
+    """Lowering, pushing, pause, withdrawal or lifting at each frame."""
+    motion, rate = measurement.tool.motion, measurement.frame_rate
+    last = float(motion.times[-1])
+    velocity = []
+    for frame in frames:
+        # The step that leads to the frame: a frame at the end of a stage belongs to it.
+        end = min(max(frame / rate, 0.5 / rate), last)
+        begin = max(end - 1.0 / rate, 0.0)
+        velocity.append((motion.pose(end)[1] - motion.pose(begin)[1]) / max(end - begin, 1e-9))
+    speed = np.linalg.norm(np.diff(motion.positions, axis=0), axis=1) / np.diff(motion.times)
+    slow = SLOW * float(speed.max())
+    level = np.diff(motion.positions, axis=0)[:, :2]
+    length = np.linalg.norm(level, axis=1)
+    moving = np.flatnonzero(length > 0.5 * length.max()) if length.max() > 0.0 else []
+    forward = level[moving[0]] / length[moving[0]] if len(moving) else np.zeros(2)
+    out = []
+    for v in velocity:
+        flat = float(np.linalg.norm(v[:2]))
+        if np.linalg.norm(v) <= slow:
+            out.append("pause")
+        elif abs(v[2]) > flat:
+            out.append("lowering" if v[2] < 0.0 else "lifting")
+        else:
+            out.append("pushing" if float(v[:2] @ forward) >= 0.0 else "withdrawal")
+    return tuple(out)
+
+
+def regions_of(
+    measurement: Measurement, surface: HeightField, frames: Sequence[float], sites: Sequence[Site]
+) -> npt.NDArray[np.str_]:
+    """(t, s) tool face, behind the tool, trench, berm or undisturbed, from where the tool has been in the soil."""
+    tool, rate = measurement.tool, measurement.frame_rate
+    place = np.array([[site.x, site.y] for site in sites])
+    points = np.asarray(tool.mesh.sample(POINTS, seed=0), dtype=np.float64)
+    width = float(np.sort(tool.mesh.extents)[1])
+    moments = np.unique(np.concatenate([np.arange(0.0, max(frames) + 1.0, 2.0), frames]))
+    nearest = np.full(len(sites), np.inf)
+    out = np.full((len(frames), len(sites)), "undisturbed", dtype="<U16")
+    previous = None
+    for moment in moments:
+        rotation, position = tool.motion.pose(moment / rate)
+        at = points @ np.asarray(rotation).T + position
+        sunk = at[at[:, 2] < surface.smooth(at[:, :2])][:, :2]
+        distance = np.full(len(sites), np.inf)
+        if len(sunk):
+            distance = np.linalg.norm(place[:, None] - sunk[None], axis=-1).min(axis=1)
+            nearest = np.minimum(nearest, distance)
+        rows = [i for i, frame in enumerate(frames) if frame == moment]
+        heading = np.zeros(2) if previous is None else np.asarray(position)[:2] - previous
+        previous = np.asarray(position)[:2] if previous is None or np.linalg.norm(heading) > 0.0 else previous
+        for row in rows:
+            out[row, nearest < BESIDE * width] = "berm"
+            out[row, nearest < 0.25 * width] = "trench"
+            side = (place - np.asarray(position)[:2]) @ heading
+            close = distance < AHEAD * width
+            out[row, close & (side > 0.0)] = "tool face"
+            out[row, close & (side <= 0.0) & (nearest < 0.25 * width)] = "behind the tool"
+    return out
