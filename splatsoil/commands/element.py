@@ -44,6 +44,8 @@ class Config:
     """Poisson's ratio."""
     strain_rate: float = 1.0e-5
     """In 1/s; only effects of rate feel it."""
+    depth: float = 0.0
+    """Below the undisturbed surface in metres; only effects of depth feel it."""
     matching: Literal["compression", "extension", "plane_strain", "simple_shear"] = "compression"
     """Where the Drucker-Prager cone agrees with Mohr-Coulomb."""
     plot: Path = Path("element.png")
@@ -58,13 +60,12 @@ ROWS = 12
 
 def run(config: Config) -> int:
     """Test, print and plot."""
-    import warp as wp
-
-    wp.config.quiet = True
+    from splatsoil.commands import _stages as stage
     from splatsoil.commands.simulate import parse_values
     from splatsoil.soil.law import Law
     from splatsoil.soil.library import find_effects
 
+    stage.hush()
     values = parse_values(config.values)
     if "friction_angle" in values:
         raise ParameterError("the friction angle is given by --friction-angle, not by --set")
@@ -106,6 +107,7 @@ def perform(law: Law, values: dict[str, float], config: Config) -> ElementTest:
         young=config.young,
         poisson=config.poisson,
         strain_rate=config.strain_rate,
+        depth=config.depth,
         matching=Matching(config.matching),
     )
     path = np.linspace(0.0, 1.0, config.records + 1)[1:]

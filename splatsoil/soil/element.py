@@ -87,6 +87,7 @@ class Options(TypedDict, total=False):
         young: Young's modulus in Pa; 5e7 by default.
         poisson: Poisson's ratio; 0.2 by default.
         strain_rate: of the controlled strain, 1/s; only effects of rate feel it. 1e-5 by default.
+        depth: below the undisturbed surface in m, 0 by default; only effects of depth feel it.
         largest_step: most strain in one step of the law, so that records may lie far apart; 2e-4 by default.
         matching: of the friction cone; triaxial compression by default.
     """
@@ -95,6 +96,7 @@ class Options(TypedDict, total=False):
     young: float
     poisson: float
     strain_rate: float
+    depth: float
     largest_step: float
     matching: Matching
 
@@ -179,6 +181,7 @@ def drive(
     young: float = 5.0e7,
     poisson: float = 0.2,
     strain_rate: float = 1.0e-5,
+    depth: float = 0.0,
     largest_step: float = 2.0e-4,
     matching: Matching = Matching.COMPRESSION,
 ) -> ElementTest:
@@ -193,6 +196,8 @@ def drive(
     The other arguments, the result and the errors are those of :func:`triaxial`.
     """
     _positive(void_ratio=void_ratio, young=young, strain_rate=strain_rate, largest_step=largest_step)
+    if not (math.isfinite(depth) and depth >= 0.0):
+        raise ParameterError(f"depth: {depth} is not a depth in m; give a number >= 0")
     if not -1.0 < poisson < 0.5:
         raise ParameterError(f"poisson: {poisson} is no Poisson's ratio; give one between -1 and 0.5")
     batch = [values] if isinstance(values, Mapping) else list(values)
@@ -206,7 +211,6 @@ def drive(
     steps = np.maximum(np.ceil(way / largest_step - 1e-9), 1).astype(np.int32)
     seconds = np.maximum(way, 1.0e-12) / steps / strain_rate
 
-    wp.config.quiet = True
     sets, records = len(batch), len(targets)
     table = wp.array(law.table(base, batch).astype(np.float32), dtype=float, device="cpu")
     out = wp.zeros((sets, records, OUTPUTS), dtype=wp.float64, device="cpu")
@@ -221,6 +225,7 @@ def drive(
             wp.array(seconds.astype(np.float32), dtype=float, device="cpu"),
             wp.vec3i(*(int(s) for s in by_stress)),
             confining,
+            depth,
             bulk,
             shear,
             TOLERANCE * float(max(confining, np.abs(targets[:, :3][:, list(by_stress)]).max(initial=0.0))),
@@ -288,6 +293,7 @@ def _kernel(update: Any) -> Any:
         seconds: wp.array(dtype=float),
         by_stress: wp.vec3i,
         confining: float,
+        depth: float,
         bulk_modulus: float,
         shear_modulus: float,
         tolerance: float,
@@ -305,6 +311,7 @@ def _kernel(update: Any) -> Any:
         inverse = elastic
         stress = Stress()
         stress.elastic = -confining / bulk
+        stress.depth = depth
         total = wp.vec3d()
         sheared = wp.float64(0.0)
         before = wp.vec4d(

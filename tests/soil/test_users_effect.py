@@ -1,0 +1,128 @@
+"""An effect from a user's own file or package takes part like a built-in: element test, model, fit's parameters."""
+
+from __future__ import annotations
+
+import math
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+from splatsoil.errors import ParameterError
+from splatsoil.measurement import Bed, Camera, Frame, Measurement, Tool, ToolMotion
+from splatsoil.model import Model
+from splatsoil.reconstruction import HeightField
+from splatsoil.soil import library as found
+from splatsoil.soil.element import triaxial
+from splatsoil.soil.law import Law
+from splatsoil.soil.library import find_effects, library
+
+
+@pytest.fixture
+def suction(repository: Path) -> str:
+    return str(repository / "examples" / "effects" / "suction.py")
+
+
+def tiny(effects: list[str]) -> Model:
+    """A box of 4 cm ploughs a bed of 20 x 16 x 6 cm for three frames."""
+    bed = Bed(np.zeros(3), np.array([0.2, 0.16, 0.12]), 1600.0)
+    times = np.arange(4) / 20.0
+    x = 0.06 + 0.3 * times
+    positions = np.stack([x, np.full(4, 0.08), np.full(4, 0.06)], axis=1)
+    motion = ToolMotion(np.arange(4), times, positions, np.tile([1.0, 0.0, 0.0, 0.0], (4, 1)))
+    pose = np.eye(4)
+    pose[2, 3] = 1.0
+    view = Camera(32, 32, 50.0, 50.0, 16.0, 16.0, pose, model="PINHOLE")
+    video = tuple(Frame(view, Path(), "above", f, f / 20.0) for f in (0, 3))
+    tool = Tool(trimesh.creation.box((0.02, 0.04, 0.04)), motion)
+    measurement = Measurement(Path(), "made", np.array([0.0, 0.0, -9.81]), 20.0, bed, tool, (), video)
+    surface = HeightField.over(bed.lower, bed.upper, 0.01, 0.06)
+    return Model(measurement, SimpleNamespace(surface=surface), effects=effects, preset="tiny")  # type: ignore[arg-type]
+
+
+def test_the_example_is_the_effect_it_says_it_is(suction: str) -> None:
+    """Apparent cohesion gradient * depth * tan(phi_b), exact in a triaxial test."""
+    law = Law(find_effects([suction]))
+    values = {"friction_angle": 33.0, "suction_gradient": 1e4}
+    flow = math.tan(math.radians(45.0 + 33.0 / 2.0)) ** 2
+    for depth in (0.0, 0.1):
+        cohesion = 1e4 * depth * math.tan(math.radians(15.0))
+        test = triaxial(law, values, confining=1e3, strains=[0.01], young=1e7, depth=depth)
+        assert test.q[0, -1] == pytest.approx(1e3 * (flow - 1.0) + 2.0 * cohesion * math.sqrt(flow), rel=1e-3)
+
+
+def test_a_model_with_the_example_fits_and_simulates_it(suction: str) -> None:
+    model, base = tiny([suction]), tiny([])
+    assert model.space().names == ("friction_angle", "suction_gradient")
+    assert "suction_angle" in {p.name for p in model.parameters}
+    dry, off, held = (
+        m.simulate({"friction_angle": 30.0, **values}).positions[-1]
+        for m, values in ((base, {}), (model, {"suction_gradient": 0.0}), (model, {"suction_gradient": 5e4}))
+    )
+    chance = np.abs(off - dry).max()
+    assert chance < 2e-4
+    assert np.abs(held - dry).max() > 1e-3
+
+
+def test_the_same_file_gives_the_same_kernels_until_it_changes(suction: str, tmp_path: Path) -> None:
+    assert Law(find_effects([suction])).update is Law(find_effects([suction])).update
+    copy = tmp_path / "suction.py"
+    copy.write_text(Path(suction).read_text())
+    first = find_effects([str(copy)])[0]
+    copy.write_text(Path(suction).read_text().replace("0.0, 5e4", "0.0, 6e4"))
+    assert (first.parameters[0].upper, find_effects([str(copy)])[0].parameters[0].upper) == (5e4, 6e4)
+
+
+def test_an_installed_package_offers_its_effects(suction: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "somebodys_package.py").write_text(Path(suction).read_text())
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def installed(group: str) -> list[EntryPoint]:
+        return [EntryPoint("suction", "somebodys_package:Suction", group)]
+
+    monkeypatch.setattr(found, "entry_points", installed)
+    library.cache_clear()
+    try:
+        assert "suction" in library()
+        assert find_effects(["suction"])[0].size == "suction_gradient"
+        monkeypatch.setattr(found, "entry_points", lambda group: [EntryPoint("x", "math:pi", group)])
+        library.cache_clear()
+        with pytest.raises(ParameterError, match=r"entry point x = math:pi: .* is no subclass"):
+            library()
+    finally:
+        library.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("import nothing_of_this_name", r"cannot be imported: ModuleNotFoundError"),
+        ("x = 1", r"defines no subclass"),
+        ("from splatsoil.soil.effect import Effect\nclass E(Effect): pass", r"effect E has no name"),
+        ("from splatsoil.soil.effect import Effect\nclass E(Effect):\n name = 'e'", r"effect E has no parameters"),
+        (
+            "from splatsoil.soil.effect import Effect\nfrom splatsoil.parameters import Parameter\n"
+            "class E(Effect):\n name = 'e'\n parameters = (Parameter('a', '1', 0.0, 1.0, 0.5),)",
+            r"first parameter, a, measures its size and needs a value off",
+        ),
+    ],
+)
+def test_a_file_that_is_no_effect_says_what_is_missing(text: str, says: str, tmp_path: Path) -> None:
+    file = tmp_path / "effect.py"
+    file.write_text(text)
+    with pytest.raises(ParameterError, match=says):
+        find_effects([str(file)])
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ParameterError, match=r"nothing\.py cannot be read"):
+        find_effects([str(tmp_path / "nothing.py")])
+
+
+def test_the_documents_show_the_example_as_it_is(repository: Path, suction: str) -> None:
+    text: Any = (repository / "docs" / "effects.md").read_text()
+    assert Path(suction).read_text() in text
