@@ -205,6 +205,12 @@ class SyntheticProblem:
         self._truth_seed = seed
         self._observed = None
 
+    def place(self, truth: Mapping[str, float], seed: int) -> None:
+        """Hide this truth instead of a drawn one; the seed decides its particles and noise."""
+        self._truth = self.space.to_dict(self.space.to_vector(truth))
+        self._truth_seed = seed
+        self._observed = None
+
     def truth(self) -> Mapping[str, float] | None:
         """The hidden values."""
         return self._truth

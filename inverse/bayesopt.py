@@ -17,8 +17,9 @@ import torch
 
 from .surrogate import FloatArray, Minimum, Surrogate, quiet, seeded, sobol
 
-#: Space-filling evaluations before the first acquisition.
-START = 4
+#: Space-filling evaluations before the first acquisition: at least, and for each parameter. With fewer, a search in many
+#: dimensions runs into corners and stays there.
+START, START_EACH = 4, 3
 #: Quasi-Monte-Carlo draws, restarts and raw candidates of the acquisition function.
 DRAWS = 128
 RESTARTS = 4
@@ -60,7 +61,7 @@ class BayesianOptimiser:
 
     Args:
         dimension: number of free parameters; points live in [-1, 1]^dimension.
-        start: space-filling points before the first acquisition, where ``search`` doesn't say.
+        start: least number of space-filling points before the first acquisition, where ``search`` doesn't say.
         noise_std: standard deviation of one evaluation's noise, where it was measured; inferred otherwise.
         seed: the same seed and evaluations give the same proposals.
         search: how to search.
@@ -75,8 +76,8 @@ class BayesianOptimiser:
         seed: int = 0,
         search: Search | None = None,
     ) -> None:
-        self.search = search or Search(start=start)
-        if dimension < 1 or self.search.start < 1:
+        self.search = search or Search(start=max(start, START_EACH * dimension))
+        if dimension < 1 or start < 1 or self.search.start < 1:
             raise ValueError("an optimiser needs at least one dimension and one starting point")
         self.dimension = dimension
         self.noise_std = noise_std

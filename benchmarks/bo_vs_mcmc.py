@@ -1,0 +1,360 @@
+"""Bayesian optimisation against Markov chains: the same budgets of simulator calls, what each makes of them.
+
+    splatsoil benchmark bo-vs-mcmc --out runs/bo-vs-mcmc
+
+| way | what it does with N calls |
+|---|---|
+| `bo` | Bayesian optimisation of the loss; interval from the posterior of the minimiser |
+| `paper` | the same with Hsiao and Kumar's settings: one random start, expected improvement |
+| `mcmc` | emcee on an emulator of the features, trained on N space-filling calls |
+| `both` | emcee on an emulator trained on the N calls that `bo` chose |
+| `direct` | emcee on the simulator itself: N calls are N steps of walkers |
+
+The calls go to an emulated landscape: real simulations of the world, made once and kept, through an emulator of many
+points; chance is drawn from the measured scatter between seeds. So a thousand calls take a second, and every way meets
+the same landscape; what the emulator doesn't show of the simulator isn't tested. ``--direct-simulator`` calls the
+simulator itself instead (hours on a CPU).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+import emcee
+import numpy as np
+import numpy.typing as npt
+from splatsoil.benchmarks._common import output_options, stamp, ticker, world_options, write_result
+from splatsoil.envs.synthetic import SyntheticProblem
+from splatsoil.envs.together import attempt
+from splatsoil.inverse.bayesopt import PAPER, BayesianOptimiser, Search
+from splatsoil.inverse.emulator import FEWEST, Emulator
+from splatsoil.inverse.executors import executor
+from splatsoil.inverse.likelihood import Likelihood
+from splatsoil.inverse.mcmc import sample
+from splatsoil.inverse.simulations import simulations
+from splatsoil.inverse.surrogate import sobol
+
+from splatsoil.errors import ParameterError
+from splatsoil.parameters import ParameterSpace
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+FloatArray = npt.NDArray[np.float64]
+
+BUDGETS = (6, 10, 20)
+DIRECT_BUDGETS = (20, 100, 1000)
+WAYS = ("bo", "paper", "mcmc", "both", "direct")
+#: Truths are drawn from this part of the prior's width, in its middle.
+INNER = 0.8
+COLOURS = {"bo": "#c44e52", "paper": "#dd8452", "mcmc": "#4c72b0", "both": "#8172b3", "direct": "#55a868"}
+
+
+class World(Protocol):
+    """A simulator with an observation."""
+
+    space: ParameterSpace
+
+    def observe(self, truth: FloatArray, rng: np.random.Generator) -> None:
+        """Make an observation of a truth (n,) in [-1, 1]^n."""
+
+    def call(self, point: FloatArray, rng: np.random.Generator) -> tuple[float, FloatArray]:
+        """Simulate a point (n,): loss, and predicted minus observed features (b,)."""
+
+
+class EmulatedWorld:
+    """Calls answered by an emulator of many real simulations, with chance drawn from its measured covariance.
+
+    Features are the scores of the principal components; the loss is their mean square residual over what the prior's
+    middle would leave on average.
+    """
+
+    def __init__(self, space: ParameterSpace, emulator: Emulator) -> None:
+        self.space, self.emulator = space, emulator
+        self.factor = np.linalg.cholesky(emulator.chance + 1e-12 * np.eye(emulator.count))
+        spread = emulator.predict(sobol(256, len(space), 0))[0]
+        self.unit = float(np.mean(np.sum((spread - spread.mean(axis=0)) ** 2, axis=1)))
+        self.observed = np.zeros(emulator.count)
+
+    def observe(self, truth: FloatArray, rng: np.random.Generator) -> None:
+        self.observed = self._simulate(truth, rng)
+
+    def call(self, point: FloatArray, rng: np.random.Generator) -> tuple[float, FloatArray]:
+        residual = self._simulate(point, rng) - self.observed
+        return float(np.sum(residual**2)) / self.unit, residual
+
+    def _simulate(self, point: FloatArray, rng: np.random.Generator) -> FloatArray:
+        return self.emulator.predict(point[None])[0][0] + self.factor @ rng.standard_normal(self.emulator.count)
+
+
+class SimulatedWorld:
+    """Calls answered by the simulator of PlowSand-v0's made-up world."""
+
+    def __init__(self, parameters: Sequence[str], effects: Sequence[str], preset: str, device: str) -> None:
+        self.problem = SyntheticProblem(parameters, effects, preset=preset, device=device)
+        self.space = self.problem.space
+
+    def observe(self, truth: FloatArray, rng: np.random.Generator) -> None:
+        self.problem.place(self.space.to_dict(self.space.from_unit(truth)), int(rng.integers(2**31)))
+
+    def call(self, point: FloatArray, rng: np.random.Generator) -> tuple[float, FloatArray]:
+        values = self.space.to_dict(self.space.from_unit(point))
+        found = attempt(self.problem, values, int(rng.integers(2**31)))
+        if found.loss is None:
+            raise ParameterError(f"a simulation failed at {values} ({found.message}); choose other parameters")
+        return found.loss, -found.blocks
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a way says after some calls: estimate (n,), 90 % interval (n,) each, and seconds of its own thinking."""
+
+    estimate: FloatArray
+    low: FloatArray
+    high: FloatArray
+    seconds: float
+
+
+def play(world: World, budgets: Sequence[int], seed: int, search: Search | None) -> tuple[dict[int, Answer], Any]:
+    """Bayesian optimisation: an answer at each budget, and the calls (points, features)."""
+    rng = np.random.default_rng([seed, 31])
+    optimiser = BayesianOptimiser(len(world.space), seed=seed, search=search)
+    answers, points, features = {}, [], []
+    spent = 0.0
+    while len(points) < max(budgets):
+        began = time.perf_counter()
+        action = optimiser.ask().astype(np.float64)
+        spent += time.perf_counter() - began
+        loss, residual = world.call(action, rng)
+        optimiser.tell(action, loss)
+        points.append(action)
+        features.append(residual)
+        if len(points) in budgets:
+            began = time.perf_counter()
+            found = optimiser.result()
+            seconds = spent + time.perf_counter() - began
+            answers[len(points)] = Answer(found.estimate, found.low, found.high, seconds)
+    return answers, (np.array(points), np.array(features))
+
+
+def sample_emulated(points: FloatArray, features: FloatArray, seed: int) -> Answer:
+    """emcee on an emulator of calls (k, n), (k, b); features are residuals, so the observed ones are 0."""
+    began = time.perf_counter()
+    emulator = Emulator(points, features, seed=seed)
+    likelihood = Likelihood(emulator, np.zeros(features.shape[1]))
+    chains = sample(likelihood, likelihood.lower, likelihood.upper, seed=seed, ensembles=2, most_steps=1000)
+    low, high = np.quantile(chains.flat, [0.05, 0.95], axis=0)
+    return Answer(chains.flat.mean(axis=0), low, high, time.perf_counter() - began)
+
+
+def sample_directly(world: World, budgets: Sequence[int], seed: int, chance: FloatArray) -> dict[int, Answer]:
+    """emcee on the simulator: each density is a call. Its own chance adds to the observation's."""
+    rng = np.random.default_rng([seed, 37])
+    n = len(world.space)
+    inverse = np.linalg.pinv(2.0 * chance)
+
+    def density(point: FloatArray) -> float:
+        if np.any(np.abs(point) > 1.0):
+            return -np.inf
+        _, residual = world.call(point, rng)
+        return -0.5 * float(residual @ inverse @ residual)
+
+    walkers = max(4, 2 * n + 2)
+    sampler = emcee.EnsembleSampler(walkers, n, density)
+    start = emcee.State(sobol(walkers, n, seed), random_state=np.random.RandomState(seed).get_state())
+    steps = max(budgets) // walkers
+    began = time.perf_counter()
+    sampler.run_mcmc(start, steps, skip_initial_state_check=True)
+    seconds = time.perf_counter() - began
+    answers = {}
+    for budget in budgets:
+        kept = max(budget // walkers, 1)
+        chain = sampler.get_chain()[kept // 4 : kept].reshape(-1, n)
+        low, high = np.quantile(chain, [0.05, 0.95], axis=0)
+        answers[budget] = Answer(chain.mean(axis=0), low, high, seconds * kept / steps)
+    return answers
+
+
+def trial(
+    world: World, ways: Sequence[str], budgets: Sequence[int], direct: Sequence[int], chance: FloatArray, seed: int
+) -> dict[str, dict[int, Answer]]:
+    """All ways on one truth, drawn by the seed."""
+    n = len(world.space)
+    rng = np.random.default_rng([seed, 29])
+    world.observe(rng.uniform(-INNER, INNER, n), rng)
+    usable = [b for b in budgets if b >= n + FEWEST]
+    out: dict[str, dict[int, Answer]] = {}
+    calls = None
+    if "bo" in ways or "both" in ways:
+        answers, calls = play(world, budgets, seed, None)
+        out["bo"] = answers
+    if "paper" in ways:
+        out["paper"] = play(world, budgets, seed, PAPER)[0]
+    if "mcmc" in ways:
+        noise = np.random.default_rng([seed, 41])
+        points = sobol(max(budgets), n, seed)
+        features = np.array([world.call(p, noise)[1] for p in points])
+        out["mcmc"] = {b: sample_emulated(points[:b], features[:b], seed) for b in usable}
+    if "both" in ways and calls is not None:
+        out["both"] = {b: sample_emulated(calls[0][:b], calls[1][:b], seed) for b in usable}
+    if "direct" in ways:
+        out["direct"] = sample_directly(world, direct, seed, chance)
+    return {way: answers for way, answers in out.items() if way in ways}
+
+
+def run(
+    world: World,
+    chance: FloatArray,
+    *,
+    ways: Sequence[str] = WAYS,
+    budgets: Sequence[int] = BUDGETS,
+    direct: Sequence[int] = DIRECT_BUDGETS,
+    seeds: int = 12,
+    progress: Callable[[int, int], None] | None = None,
+) -> dict[str, Any]:
+    """Errors, widths and coverage of all ways over seeds, in physical units."""
+    space = world.space
+    rows: dict[tuple[str, int], list[dict[str, Any]]] = {}
+    for seed in range(seeds):
+        truth = np.random.default_rng([seed, 29]).uniform(-INNER, INNER, len(space))
+        for way, answers in trial(world, ways, budgets, direct, chance, seed).items():
+            for budget, answer in answers.items():
+                low, high = space.from_unit(answer.low), space.from_unit(answer.high)
+                entry = {
+                    "error": (space.from_unit(answer.estimate) - space.from_unit(truth)).tolist(),
+                    "width": (high - low).tolist(),
+                    "holds": ((answer.low <= truth) & (truth <= answer.high)).tolist(),
+                    "seconds": answer.seconds,
+                }
+                rows.setdefault((way, budget), []).append(entry)
+        if progress is not None:
+            progress(seed + 1, seeds)
+    entries = []
+    for (way, budget), found in rows.items():
+        error, width = (np.array([f[key] for f in found]) for key in ("error", "width"))
+        entries.append(
+            {
+                "way": way,
+                "calls": budget,
+                "mae": np.abs(error).mean(axis=0).tolist(),
+                "mae_std": np.abs(error).std(axis=0, ddof=1).tolist() if len(found) > 1 else [0.0] * len(space),
+                "width_90": width.mean(axis=0).tolist(),
+                "coverage_90": np.mean([f["holds"] for f in found], axis=0).tolist(),
+                "seconds": float(np.mean([f["seconds"] for f in found])),
+                "trials": found,
+            }
+        )
+    return {
+        "parameters": [{"name": p.name, "unit": p.unit} for p in space],
+        "seeds": seeds,
+        "entries": sorted(entries, key=lambda e: (WAYS.index(e["way"]), e["calls"])),
+    }
+
+
+def table(result: dict[str, Any]) -> str:
+    """The result as Markdown."""
+    lines = [f"{result['landscape']}. {result['seeds']} truths and seeds; error and width in the parameter's unit."]
+    for i, parameter in enumerate(result["parameters"]):
+        unit = "°" if parameter["unit"] == "deg" else f" {parameter['unit']}"
+        lines += [
+            "",
+            f"**{parameter['name']}**",
+            "",
+            "| way | calls | mean abs. error ± its spread | 90 % interval's width | holds the truth | own time |",
+            "|---|---|---|---|---|---|",
+        ]
+        for e in result["entries"]:
+            lines.append(
+                f"| {e['way']} | {e['calls']} | {e['mae'][i]:.3g} ± {e['mae_std'][i]:.2g}{unit} | "
+                f"{e['width_90'][i]:.3g}{unit} | {100.0 * e['coverage_90'][i]:.0f} % | {e['seconds']:.1f} s |"
+            )
+    return "\n".join(lines)
+
+
+def figure(result: dict[str, Any]) -> Figure:
+    """Error and interval width against calls, for each parameter."""
+    from matplotlib.figure import Figure
+
+    count = len(result["parameters"])
+    drawn = Figure(figsize=(8.4, 2.8 * count), layout="constrained")
+    axes = drawn.subplots(count, 2, squeeze=False)
+    for i, (row, parameter) in enumerate(zip(axes, result["parameters"], strict=True)):
+        for way in WAYS:
+            found = [e for e in result["entries"] if e["way"] == way]
+            if not found:
+                continue
+            calls = [e["calls"] for e in found]
+            standard = [e["mae_std"][i] / result["seeds"] ** 0.5 for e in found]
+            row[0].errorbar(calls, [e["mae"][i] for e in found], standard, color=COLOURS[way], marker="o", label=way)
+            row[1].plot(calls, [e["width_90"][i] for e in found], color=COLOURS[way], marker="o", label=way)
+        for axis, what in zip(row, ("mean absolute error", "90 % interval's width"), strict=True):
+            axis.set_xscale("log")
+            axis.set_yscale("log")
+            axis.set_xlabel("simulator calls")
+            axis.set_title(f"{parameter['name'].replace('_', ' ')}: {what} [{parameter['unit']}]", fontsize=9)
+        row[0].legend(fontsize=7)
+    return drawn
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Command line; exit code 0."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    world_options(parser)
+    parser.add_argument("--seeds", type=int, default=12, help="truths, each with its own chance")
+    parser.add_argument("--budgets", type=int, nargs="+", default=list(BUDGETS))
+    parser.add_argument("--ways", nargs="+", choices=WAYS, default=list(WAYS))
+    parser.add_argument("--simulations", type=int, default=64, help="behind the emulated landscape")
+    parser.add_argument("--direct-simulator", action="store_true", help="call the made-up world's simulator itself")
+    output_options(parser)
+    options = parser.parse_args(arguments)
+    if options.direct_simulator and options.set is not None:
+        raise ParameterError("--direct-simulator: the truth of a measured set is one; only the made-up world has many")
+    began = time.perf_counter()
+    with executor(options.executor) as pool:
+        data, file = simulations(
+            options.simulations,
+            options.parameters,
+            options.effects,
+            measurement=options.set,
+            reconstruction=options.reconstruction,
+            preset=options.preset,
+            device=options.device,
+            executor=pool,
+            progress=ticker("simulations"),
+        )
+    emulator = Emulator(data.points, -data.residuals)
+    if options.direct_simulator:
+        world: World = SimulatedWorld(options.parameters, options.effects, options.preset, options.device)
+        landscape = f"The simulator of the made-up world itself, preset `{options.preset}`"
+        # The scatter of features between seeds, as far as the components show it, in the features' own space.
+        chance = emulator.basis @ emulator.chance @ emulator.basis.T + np.diag(emulator.outside_variance)
+    else:
+        world, chance = EmulatedWorld(data.space, emulator), emulator.chance
+        source = "the made-up world" if options.set is None else str(options.set)
+        landscape = (
+            f"An emulated landscape: {emulator.count} components of {len(data.points)} simulations of {source}, preset "
+            f"`{options.preset}`, skill {emulator.left_out.skill.min():.2f} to {emulator.left_out.skill.max():.2f}"
+        )
+    result = {
+        "benchmark": "bo-vs-mcmc",
+        "landscape": landscape,
+        **run(
+            world, chance, ways=options.ways, budgets=options.budgets, seeds=options.seeds, progress=ticker("truths")
+        ),
+        "simulations": str(file),
+        **stamp(options.device),
+        "seconds": time.perf_counter() - began,
+    }
+    if options.out is not None:
+        write_result(options.out, result, table(result), {"bo-vs-mcmc.svg": figure(result)})
+    print(json.dumps(result, indent=1) if options.json else table(result))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
