@@ -154,8 +154,7 @@ class Solver:
         c.volume, c.elastic, c.opening = floats(most), floats(most), floats(most)
         c.normal, c.shear, c.gradient = vectors(most), vectors(most), vectors(8 * most)
         kept = most if self.law.history else 0
-        c.history, c.gained = (wp.zeros(kept, dtype=wp.vec2, device=device) for _ in range(2))
-        c.depth = floats(kept)
+        c.history, c.depth = wp.zeros(kept, dtype=wp.vec2, device=device), floats(kept)
         self._cells = c
 
         self._near, self._near_count = ints(n), ints(1)

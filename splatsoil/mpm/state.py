@@ -87,8 +87,7 @@ class Cells:
         shear: deviatoric stress, off-diagonal, Pa.
         elastic: elastic logarithmic volume strain.
         opening: logarithmic volume opened in tension.
-        history: plastic shear strain and dilated volume at the start of the step; empty unless the law keeps them.
-        gained: what the step has added to the history, so that particles keep their own.
+        history: plastic shear strain and dilated volume; empty unless the law keeps them, like ``depth``.
         depth: of the cell's soil below the surface at the start, m.
     """
 
@@ -102,5 +101,4 @@ class Cells:
     elastic: wp.array(dtype=float)
     opening: wp.array(dtype=float)
     history: wp.array(dtype=wp.vec2)
-    gained: wp.array(dtype=wp.vec2)
     depth: wp.array(dtype=float)

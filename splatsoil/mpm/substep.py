@@ -58,13 +58,12 @@ def make_stress_kernel(update: Any, history: bool) -> Any:
             row = base / grid.nodes
             stiffness = values[row, STIFFNESS]
             if wp.static(history):
-                kept = cells.history[entry] + cells.gained[entry]
-                stress.plastic_strain = kept[0]
-                stress.dilated = kept[1]
+                stress.plastic_strain = cells.history[entry][0]
+                stress.dilated = cells.history[entry][1]
                 stress.depth = cells.depth[entry]
             stress = update(stress, gradient, stiffness * bulk, stiffness * shear, dt, values, row)
             if wp.static(history):
-                cells.gained[entry] = wp.vec2(stress.plastic_strain, stress.dilated) - cells.history[entry]
+                cells.history[entry] = wp.vec2(stress.plastic_strain, stress.dilated)
             cells.normal[entry] = stress.normal
             cells.shear[entry] = stress.shear
             cells.elastic[entry] = stress.elastic

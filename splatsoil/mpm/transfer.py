@@ -41,7 +41,6 @@ def number_cells(cells: Cells) -> None:
         cells.opening[entry] = 0.0
         if entry < cells.history.shape[0]:
             cells.history[entry] = wp.vec2(0.0)
-            cells.gained[entry] = wp.vec2(0.0)
             cells.depth[entry] = 0.0
         for corner in range(8):
             cells.gradient[8 * entry + corner] = wp.vec3(0.0)
@@ -175,7 +174,7 @@ def grid_to_particles(
     particles.elastic[p] = cells.elastic[entry]
     particles.opening[p] = cells.opening[entry]
     if p < particles.history.shape[0]:
-        particles.history[p] += cells.gained[entry]
+        particles.history[p] = cells.history[entry]
 
     x += displacement
     gap = particles.gap[p]

@@ -1,0 +1,168 @@
+"""Effects in the solver: what the element test cannot show, on a small bed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import trimesh
+
+from splatsoil.mpm import Resolution, Solver
+from splatsoil.mpm.substep import make_stress_kernel
+from splatsoil.mpm.tool import Pose
+from splatsoil.soil.law import Law
+from splatsoil.soil.library import find_effects, library
+from splatsoil.soil.settings import Settings
+
+DENSITY = 1600.0
+RESOLUTION = Resolution(
+    cell=0.02, spacing=0.01, frame_time=0.02, steps=2, courant=0.5, bulk=4.2e5, shear=1.9e5, density=DENSITY
+)
+LOWER, UPPER = np.zeros(3), np.array([0.24, 0.12, 0.16])
+PLATE = trimesh.creation.box(extents=[0.012, 0.08, 0.08])
+STILL = np.array([0.0, 0.0, 0.0, 1.0])
+FAR_AWAY = Pose(np.array([9.0, 9.0, 9.0]), STILL, np.zeros(3), np.zeros(3))
+
+
+def block(lower: npt.ArrayLike, upper: npt.ArrayLike, spacing: float = 0.01) -> npt.NDArray[np.float64]:
+    axes = [np.arange(a + spacing / 2, b, spacing) for a, b in zip(np.asarray(lower), np.asarray(upper), strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+BED = block(LOWER, [0.24, 0.12, 0.08])
+
+
+def solver(
+    x: npt.NDArray[np.float64],
+    *values: Mapping[str, float],
+    effects: tuple[str, ...] = (),
+    settings: Settings | None = None,
+    mesh: trimesh.Trimesh = PLATE,
+) -> Solver:
+    batch = np.broadcast_to(x, (len(values), *x.shape))
+    law = Law(find_effects(effects))
+    return Solver(batch, LOWER, UPPER, mesh, RESOLUTION, law, settings or Settings(friction_angle=35.0), values)
+
+
+def test_effects_that_leave_strength_alone_run_the_very_same_kernel() -> None:
+    plain = Law()
+    others = [n for n, e in library().items() if e.strength is None]
+    assert {"tilt", "gravity", "stiffness", "buried_obstacle", "tool_adhesion"} <= set(others)
+    law = Law(find_effects(others))
+    assert make_stress_kernel(law.update, law.history) is make_stress_kernel(plain.update, plain.history)
+    x = block([0.0, 0.0, 0.0], [0.04, 0.04, 0.04])
+    assert solver(x, {})._particles.history.shape[0] == 0
+    assert solver(x, {}, effects=("cohesion",))._particles.history.shape[0] == len(x)
+
+
+def test_sand_on_a_tilted_floor_without_friction_slides_as_galileo_says() -> None:
+    x = block([0.04, 0.02, 0.0], [0.12, 0.10, 0.04])
+    settings = Settings(friction_angle=45.0, floor_friction=0.0)
+    run = solver(x, {"tilt_x": 10.0, "cohesion": 1500.0}, effects=("tilt", "cohesion"), settings=settings)
+    for _ in range(8):
+        run.advance([FAR_AWAY, FAR_AWAY])
+    way = (run.positions()[0] - x)[:, 0].mean()
+    assert way == pytest.approx(0.5 * 9.81 * math.sin(math.radians(10.0)) * 0.16**2, rel=0.03)
+
+
+def test_a_bed_of_growing_density_rests_and_weighs_its_integral() -> None:
+    """Mass of a column: rho (h + g h^2 / 2); the bed starts in equilibrium with that weight."""
+    run = solver(BED, {"density_gradient": 2.0}, {"density_gradient": 0.0}, effects=("density_gradient",))
+    mass = run._particles.mass * run._particles.density.numpy().reshape(2, -1).sum(axis=1)
+    assert mass[0] / mass[1] == pytest.approx(1.0 + 2.0 * 0.08 / 2.0, rel=2e-3)
+    pressure = -RESOLUTION.bulk * run._particles.elastic.numpy().reshape(2, -1)
+    depth = 0.08 - BED[:, 2]
+    np.testing.assert_allclose(pressure[0], 9.81 * DENSITY * (depth + depth**2), rtol=2e-3)
+    for _ in range(5):
+        run.advance([FAR_AWAY, FAR_AWAY])
+    assert np.abs(run.positions() - BED).max() < 1e-3
+
+
+def test_a_layer_keeps_to_the_soil_that_was_below() -> None:
+    """Weight begins below the depth, and depth stays with the particles."""
+    run = solver(BED, {"layer_depth": 0.04, "layer_density": 1.3, "layer_friction": 5.0}, effects=("layering",))
+    density = run._particles.density.numpy()
+    np.testing.assert_allclose(density, np.where(BED[:, 2] < 0.04, 1.3, 1.0))
+    depth = run._particles.depth.numpy().copy()
+    np.testing.assert_allclose(depth, 0.08 - BED[:, 2], atol=1e-6)
+    run.advance([FAR_AWAY, FAR_AWAY])
+    np.testing.assert_array_equal(run._particles.depth.numpy(), depth)
+
+
+def test_stiffer_soil_under_its_weight_settles_less_and_takes_more_steps() -> None:
+    run = solver(BED, {"stiffness_factor": 1.0}, {"stiffness_factor": 4.0}, effects=("stiffness",))
+    assert run.resolution.bulk == pytest.approx(4.0 * RESOLUTION.bulk)
+    assert run.resolution.substeps(2) == pytest.approx(2 * RESOLUTION.substeps(2), abs=1)
+    run._particles.elastic.zero_()
+    for _ in range(10):
+        run.advance([FAR_AWAY, FAR_AWAY])
+    sunk = (BED - run.positions()).reshape(2, -1, 3)[:, BED[:, 2] > 0.07, 2].mean(axis=1)
+    assert sunk[0] / sunk[1] == pytest.approx(4.0, rel=0.15)
+
+
+def ploughed(effects: tuple[str, ...], *values: Mapping[str, float], frames: int = 8) -> Solver:
+    """A plate goes 5 cm through the bed."""
+    run = solver(BED, *values, effects=effects)
+    speed = np.array([0.3, 0.0, 0.0])
+    for frame in range(frames):
+        times = [(frame + step / 2) * RESOLUTION.frame_time for step in range(2)]
+        run.advance([Pose(np.array([0.06, 0.06, 0.06]) + t * speed, STILL, speed, np.zeros(3)) for t in times])
+    return run
+
+
+def test_sheared_dense_soil_dilates_and_loose_soil_contracts() -> None:
+    """Where shear has gone far the volume gained is b g_d, and nowhere more; loose soil loses what it can."""
+    run = ploughed(("dilatancy",), {"dilatancy_angle": 0.0}, {"dilatancy_angle": 15.0})
+    strain, dilated = run._particles.history.numpy().reshape(2, -1, 2).transpose(2, 0, 1)
+    assert strain[1].max() > 0.5
+    np.testing.assert_array_equal(dilated[0], 0.0)
+    most = run.law.table(Settings(35.0), run.values)[1, -2] * 0.3
+    assert 0.5 * most < dilated[1].max() <= 1.001 * most
+    volume = np.maximum.reduceat(
+        run.positions()[:, np.lexsort((BED[:, 1], BED[:, 0])), 2], np.arange(0, len(BED), 8), 1
+    )
+    assert volume[1].mean() > volume[0].mean() + 5e-4
+    loose = ploughed(("compaction",), {"looseness": 0.05})
+    assert -0.05005 < loose._particles.history.numpy()[:, 1].min() < -0.02
+
+
+def test_an_obstacle_holds_the_soil_around_it() -> None:
+    """Soil within the sphere stays put while the free bed beside it is carried along."""
+    place = {"obstacle_x": 0.02, "obstacle_y": 0.0, "obstacle_height": 0.04}
+    run = ploughed(("buried_obstacle",), {"obstacle_radius": 0.0, **place}, {"obstacle_radius": 0.035, **place})
+    inside = np.linalg.norm(BED - np.array([0.14, 0.06, 0.04]), axis=1) < 0.02
+    moved = np.linalg.norm(run.positions() - BED, axis=2)[:, inside].max(axis=1)
+    assert moved[1] < 0.25 * moved[0]
+    assert moved[0] > 0.005
+
+
+def test_adhesion_drags_a_sliding_tool_by_its_area() -> None:
+    """A plate laid on cohesive soil and pulled along, tool friction zero: the force is adhesion times area."""
+    plate = trimesh.creation.box(extents=[0.08, 0.08, 0.02])
+    settings = Settings(friction_angle=45.0, tool_friction=0.0)
+    names = ("tool_adhesion", "cohesion")
+    values = [{"tool_adhesion": a, "cohesion": 1500.0} for a in (0.0, 300.0)]
+    run = solver(BED, *values, effects=names, settings=settings, mesh=plate)
+    speed = np.array([0.1, 0.0, 0.0])
+    forces = []
+    for frame in range(6):
+        times = [(frame + step / 2) * RESOLUTION.frame_time for step in range(2)]
+        # the lower face 5.5 mm below the surface: half a spacing brings it to the uppermost particles
+        start = np.array([0.1, 0.06, 0.09 - 0.0055])
+        forces.append(run.advance([Pose(start + t * speed, STILL, speed, np.zeros(3)) for t in times]))
+    drag = -np.mean(forces[2:], axis=0)[:, 0]
+    assert drag[1] - drag[0] == pytest.approx(300.0 * 0.08 * 0.08, rel=0.25)
+
+
+def test_all_effects_together_run_and_keep_their_momentum() -> None:
+    every = tuple(n for n, e in library().items() if n not in ("compaction", "camera_pose"))
+    values = {
+        "dilatancy_angle": 8.0, "rate_gain": 0.5, "viscosity": 5.0, "softening_angle": 4.0, "cohesion": 100.0,
+        "pressure_exponent": 0.05, "layer_friction": 2.0, "density_gradient": 0.5, "tool_adhesion": 100.0,
+        "tilt_x": 2.0, "gravity_factor": 0.9, "obstacle_radius": 0.03, "stiffness_factor": 1.5,
+    }  # fmt: skip
+    run = ploughed(every, values, frames=4)
+    assert np.isfinite(run.positions()).all() and np.isfinite(run.momentum()).all()
