@@ -41,46 +41,65 @@ class ToolPose:
     radius: float
 
 
-@wp.func
+_PLACE = """
+    const int ny = values.shape[0], nx = values.shape[1];
+    const float right = (float)nx - 1.001f, upper = (float)ny - 1.001f;
+    float u = (x - grid.x0) * grid.inverse_x, v = (y - grid.y0) * grid.inverse_y;
+    u = u > 0.0f ? u : 0.0f; u = u < right ? u : right;
+    v = v > 0.0f ? v : 0.0f; v = v < upper ? v : upper;
+    const int j = (int)u, i = (int)v;
+    const float fu = u - (float)j, fv = v - (float)i;
+"""
+
+
+@wp.func_native(
+    _PLACE
+    + """
+    const float* p = values.data + i * nx + j;
+    const float low = p[0] + fu * (p[1] - p[0]), high = p[nx] + fu * (p[nx + 1] - p[nx]);
+    return low + fv * (high - low);
+"""
+)
 def sample(values: wp.array2d(dtype=wp.float32), grid: Grid, x: float, y: float) -> float:
-    """Bilinear value of a map (ny, nx), held constant beyond its border."""
-    ny = values.shape[0]
-    nx = values.shape[1]
-    u = wp.clamp((x - grid.x0) * grid.inverse_x, 0.0, float(nx) - 1.001)
-    v = wp.clamp((y - grid.y0) * grid.inverse_y, 0.0, float(ny) - 1.001)
-    j = int(u)
-    i = int(v)
-    fu = u - float(j)
-    fv = v - float(i)
-    low = values[i, j] * (1.0 - fu) + values[i, j + 1] * fu
-    high = values[i + 1, j] * (1.0 - fu) + values[i + 1, j + 1] * fu
-    return low * (1.0 - fv) + high * fv
+    """Bilinear value of a contiguous map (ny, nx), held constant beyond its border."""
+
+
+Shade = wp.types.vector(length=8, dtype=wp.float32)
+"""What decides the light on a place: normal, share of sky, share of sun, light bounced (red, green, blue)."""
+
+
+@wp.func_native(
+    _PLACE
+    + """
+    const float* p = (const float*)values.data + 8 * (i * nx + j);
+    const float* q = p + 8 * nx;
+    wp::vec_t<8, float> out;
+    for (int k = 0; k < 8; ++k) {
+        const float low = p[k] + fu * (p[k + 8] - p[k]), high = q[k] + fu * (q[k + 8] - q[k]);
+        out[k] = low + fv * (high - low);
+    }
+    return out;
+"""
+)
+def sample_shade(values: wp.array2d(dtype=Shade), grid: Grid, x: float, y: float) -> Shade:
+    """The same for all that decides the light at once."""
 
 
 @wp.func
-def sample_vector(values: wp.array2d(dtype=wp.vec3), grid: Grid, x: float, y: float) -> wp.vec3:
-    """Bilinear vector of a map (ny, nx), held constant beyond its border."""
-    ny = values.shape[0]
-    nx = values.shape[1]
-    u = wp.clamp((x - grid.x0) * grid.inverse_x, 0.0, float(nx) - 1.001)
-    v = wp.clamp((y - grid.y0) * grid.inverse_y, 0.0, float(ny) - 1.001)
-    j = int(u)
-    i = int(v)
-    fu = u - float(j)
-    fv = v - float(i)
-    low = values[i, j] * (1.0 - fu) + values[i, j + 1] * fu
-    high = values[i + 1, j] * (1.0 - fu) + values[i + 1, j + 1] * fu
-    return low * (1.0 - fv) + high * fv
+def near_tool(tool: ToolPose, origin: wp.vec3, direction: wp.vec3, margin: float) -> bool:
+    """Whether a ray of unit direction passes within a margin of the sphere around the tool."""
+    if tool.mesh == wp.uint64(0):
+        return False
+    to = tool.centre - origin
+    along = wp.dot(to, direction)
+    radius = tool.radius + margin
+    return wp.dot(to, to) - along * along <= radius * radius and along >= -radius
 
 
 @wp.func
 def tool_hit(tool: ToolPose, origin: wp.vec3, direction: wp.vec3, reach: float) -> float:
     """Distance at which a ray meets the tool, or -1."""
-    if tool.mesh == wp.uint64(0):
-        return -1.0
-    to = tool.centre - origin
-    along = wp.dot(to, direction)
-    if wp.dot(to, to) - along * along > tool.radius * tool.radius or along < -tool.radius:
+    if not near_tool(tool, origin, direction, 0.0):
         return -1.0
     back = wp.transpose(tool.rotation)
     query = wp.mesh_query_ray(tool.mesh, back * (origin - tool.position), back * direction, reach)
@@ -163,7 +182,7 @@ def sun_visibility(
 @wp.func
 def tool_shadow(tool: ToolPose, light: Illumination, point: wp.vec3, spread: float) -> float:
     """Share of the sun that the tool lets through to a patch of half width ``spread`` around a point."""
-    if tool.mesh == wp.uint64(0):
+    if not near_tool(tool, point, light.sun, spread + 1.0e-3):
         return 1.0
     lit = float(0.0)
     for k in range(4):
@@ -265,29 +284,36 @@ def surface_depth(
         stride = wp.max(shortest, gap * closing)
         z += stride
         x = origin + ray * z
+        above = gap
         gap = x[2] - sample(height, grid, x[0], x[1])
         if gap < 0.0:
-            # Halve: at a wall, heights do not change linearly along the ray.
-            for _ in range(6):
-                stride *= 0.5
-                x = origin + ray * (z - stride)
-                if x[2] < sample(height, grid, x[0], x[1]):
-                    z -= stride
+            # Between two points that straddle the surface: regula falsi, with halved weights (Illinois) for walls.
+            before = z - stride
+            for _ in range(4):
+                stride = (z - before) * above / (above - gap)
+                x = origin + ray * (before + stride)
+                middle = x[2] - sample(height, grid, x[0], x[1])
+                if middle < 0.0:
+                    z = before + stride
+                    gap = middle
+                    above *= 0.5
+                else:
+                    before += stride
+                    above = middle
+                    gap *= 0.5
             return z
     return -1.0
 
 
 @wp.kernel(enable_backward=False)
 def illuminate(
+    first: int,
     eye: Eye,
     depth: wp.array2d(dtype=wp.float32),
     soil: wp.array2d(dtype=wp.float32),
     unhidden: wp.array2d(dtype=wp.float32),
     height: wp.array2d(dtype=wp.float32),
-    normal: wp.array2d(dtype=wp.vec3),
-    openness: wp.array2d(dtype=wp.float32),
-    visible: wp.array2d(dtype=wp.float32),
-    bounced: wp.array2d(dtype=wp.vec3),
+    shades: wp.array2d(dtype=Shade),
     grid: Grid,
     light: Illumination,
     tool: ToolPose,
@@ -305,7 +331,9 @@ def illuminate(
     the air. Soil hides the tool where both say so: the smooth surface runs on behind a blade that holds soil back, and
     single blobs stand out from the soil that a blade touches.
     """
-    i, j = wp.tid()
+    pixel = first + wp.tid()
+    i = pixel // depth.shape[1]
+    j = pixel - i * depth.shape[1]
     ray = pixel_ray(eye, float(j) + 0.5, float(i) + 0.5)
     z = depth[i, j]
     light_out[i, j] = wp.vec3(1.0, 1.0, 1.0)
@@ -315,19 +343,23 @@ def illuminate(
         if found > 0.0:
             z = found
         x = eye.position + ray * z
-        n = wp.normalize(sample_vector(normal, grid, x[0], x[1]))
-        sky = sample(openness, grid, x[0], x[1])
+        shade = sample_shade(shades, grid, x[0], x[1])
+        n = wp.normalize(wp.vec3(shade[0], shade[1], shade[2]))
         direct = wp.max(wp.dot(n, light.sun), 0.0) / light.sun[2]
         if direct > 0.0:
-            sunny = sample(visible, grid, x[0], x[1])
+            sunny = shade[4]
             if sunny > 0.01 and sunny < 0.99:
                 # An edge of a shadow, or a wall too steep for a map: look from the point itself.
                 sunny = soil_shadow(height, grid, x, light, step, top)
             direct *= sunny
         if direct > 0.0:
             direct *= tool_shadow(tool, light, x, 0.5 * z / eye.fx)
-        back = sample_vector(bounced, grid, x[0], x[1])
-        light_out[i, j] = light.ambient * sky + (wp.vec3(1.0, 1.0, 1.0) - light.ambient) * direct + back
+        back = wp.vec3(shade[5], shade[6], shade[7])
+        light_out[i, j] = light.ambient * shade[3] + (wp.vec3(1.0, 1.0, 1.0) - light.ambient) * direct + back
+    axis = wp.normalize(ray)
+    # A pixel's corner lies less than 1.5 of its width off its axis.
+    if not near_tool(tool, eye.position, axis, 1.5 * (wp.length(tool.centre - eye.position) + tool.radius) / eye.fx):
+        return
     share = float(0.0)
     radiance = wp.vec3(0.0, 0.0, 0.0)
     for k in range(4):

@@ -15,12 +15,13 @@ from torch import Tensor
 from splatsoil.measurement import Bed, Camera, Measurement
 from splatsoil.scene import kernels
 from splatsoil.scene.binding import Binding
-from splatsoil.scene.light import Light, encoded, linear
+from splatsoil.scene.kernels_colour import WIDTH, develop
+from splatsoil.scene.light import Light
 from splatsoil.scene.lit import LitRelief, ceiling, light_relief, march_step
 from splatsoil.scene.relief import Relief, grid_of, relief_of_particles
 from splatsoil.scene.tool import ToolBody, eye_of
 from splatsoil.splats import Gaussians, rasterise_features
-from splatsoil.splats.warp_torch import as_warp, launch
+from splatsoil.splats.warp_torch import as_warp, launch, launch_parts, thread_count
 
 FloatArray = npt.NDArray[np.float64]
 FloatImage = npt.NDArray[np.float32]
@@ -39,6 +40,9 @@ _HIDDEN = 2.5
 
 _REACH = 10.0
 """How far behind the splats the surface that a pixel shows is looked for, in particle spacings."""
+
+_PIXELS_PER_MILLISECOND = 5000
+"""About how many pixels one CPU core lights in a millisecond."""
 
 
 @dataclass(frozen=True)
@@ -84,10 +88,12 @@ class Layers:
 
     @property
     def image(self) -> Tensor:
-        """(h, w, 3) sRGB in [0, 1]."""
-        gain = 1.0 + self.soil[..., None] * (self.light - 1.0)
-        share = self.tool[..., 3:]
-        return encoded(linear(self.colour) * gain * (1.0 - share) + self.tool[..., :3]).clamp(0.0, 1.0)
+        """(h, w, 3) sRGB in [0, 1]: colour in its light where it is soil, behind what the tool leaves of the pixel."""
+        image = torch.empty_like(self.colour, memory_format=torch.contiguous_format)
+        count = self.soil.numel()
+        parts = [as_warp(t.reshape(-1), wp.float32) for t in (self.colour, self.soil, self.light, self.tool, image)]
+        launch(develop, -(-count // WIDTH), [count, *parts], image)
+        return image
 
 
 @dataclass(frozen=True)
@@ -271,10 +277,15 @@ def _illuminated(
     size = (camera.height, camera.width)
     light = torch.empty((*size, 3), dtype=torch.float32, device=depth.device)
     tool = torch.empty((*size, 4), dtype=torch.float32, device=depth.device)
-    maps = [as_warp(m, wp.float32) for m in (depth, soil, unhidden, relief.height)]
-    maps += [as_warp(relief.normal, wp.vec3), as_warp(lit.openness, wp.float32), as_warp(lit.visible, wp.float32)]
-    maps += [as_warp(lit.bounced, wp.vec3)]
+    shades = torch.cat([relief.normal, lit.openness[..., None], lit.visible[..., None], lit.bounced], dim=2)
+    maps = [*(as_warp(m, wp.float32) for m in (depth, soil, unhidden, relief.height)), as_warp(shades, kernels.Shade)]
     numbers = [grid_of(relief), lit.light.kernel_form(), lit.tool, wp.vec3(*tool_albedo), march_step(relief)]
     outputs = [as_warp(light, wp.vec3), as_warp(tool, wp.vec4)]
-    launch(kernels.illuminate, size, [eye_of(camera), *maps, *numbers, ceiling(relief), reach, *outputs], depth)
+    inputs = [eye_of(camera), *maps, *numbers, ceiling(relief), reach, *outputs]
+    pixels = size[0] * size[1]
+    if depth.is_cuda:
+        launch(kernels.illuminate, pixels, [0, *inputs], depth)
+    else:
+        threads = thread_count(pixels / _PIXELS_PER_MILLISECOND)
+        launch_parts(kernels.illuminate, [pixels * k // threads for k in range(threads + 1)], inputs)
     return light, tool

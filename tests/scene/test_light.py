@@ -10,7 +10,7 @@ import trimesh
 from splatsoil.errors import ParameterError
 from splatsoil.scene import Light, Relief, ToolBody, encoded, light_relief, linear
 from splatsoil.scene.lit import sun_on_points
-from splatsoil.scene.sky import sky_openness
+from splatsoil.scene.sky import _Looks, sky_openness
 
 CELL = 0.005
 
@@ -122,3 +122,29 @@ def test_impossible_lights_are_refused():
         Light(np.array([1.0, 0.0, 0.0]), np.full(3, 0.5))
     with pytest.raises(ParameterError, match="ambient"):
         Light(np.array([0.0, 0.0, 1.0]), np.full(3, 1.5))
+
+
+def test_sky_against_cell_by_cell():
+    """The kernel against the same horizon found in plain loops, with exact arc tangents; 37 columns are no multiple."""
+    generator = np.random.default_rng(2)
+    waves = generator.normal(0.0, 40.0, (2, 6))
+
+    def rough(x, y):
+        return 0.01 * np.cos(x[..., None] * waves[0] + y[..., None] * waves[1]).sum(axis=-1)
+
+    relief = surface(rough, (23, 37))
+    openness, _ = sky_openness(relief, NONE)
+    z, normal = relief.height.double().numpy(), relief.normal.double().numpy()
+    looks = _Looks.over(relief)
+    for i, j in generator.integers((0, 0), z.shape, (60, 2)):
+        total, up = 0.0, normal[i, j, 2]
+        for a, direction in enumerate(looks.directions):
+            along = normal[i, j, :2] @ direction
+            slope = -along / up
+            for row, column, inverse in zip(looks.rows[a], looks.columns[a], looks.inverses[a], strict=True):
+                there = z[min(max(i + row, 0), z.shape[0] - 1), min(max(j + column, 0), z.shape[1] - 1)]
+                slope = max(slope, (there - z[i, j]) * inverse)
+            e = np.linspace(math.atan(slope), 0.5 * math.pi, 4001)
+            total += np.trapezoid((up * np.sin(e) + along * np.cos(e)) * np.cos(e), e)
+        expected = min(max(2.0 * total / len(looks.directions), 0.0), 1.0)
+        assert float(openness[i, j]) == pytest.approx(expected, abs=3e-5)

@@ -8,20 +8,25 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+import warp as wp
 
 from splatsoil.comparison import Comparator
 from splatsoil.measurement import Bed, Camera, Measurement
 from splatsoil.scene import (
+    Layers,
     Light,
     Scene,
     ToolBody,
     bind,
     encoded,
+    kernels,
+    kernels_colour,
     linear,
     relief_of_particles,
     seen_colours,
     still_frames,
 )
+from splatsoil.scene.kernels_sky import sky_kernel
 from splatsoil.splats import Gaussians
 
 SPACING = 0.02
@@ -139,6 +144,24 @@ def test_the_same_call_gives_the_same_bits():
     bed, view = level_bed(), camera()
     scene = scene_of(bed)
     assert np.array_equal(scene.render(bed, None, None, view), scene.render(bed, None, None, view))
+
+
+def test_a_picture_is_its_layers_put_together():
+    generator = torch.Generator().manual_seed(4)
+    colour, light = (scale * torch.rand(7, 5, 3, generator=generator) for scale in (1.1, 2.0))
+    colour[:2] *= 0.03  # the straight part of the curve
+    soil, tool = torch.rand(7, 5, generator=generator), torch.rand(7, 5, 4, generator=generator)
+    tool[:4] = 0.0
+    lit = linear(colour) * (1.0 + soil[..., None] * (light - 1.0))
+    expected = encoded(lit * (1.0 - tool[..., 3:]) + tool[..., :3]).clamp(0.0, 1.0)
+    assert torch.allclose(Layers(colour, soil, soil, light, tool).image, expected, atol=2e-6)
+
+
+def test_kernels_compile_for_cuda(tmp_path):
+    """NVRTC comes with Warp, so a compiler error shows without a GPU; sm_90 is an H100 or H200."""
+    for kernel in (kernels.illuminate, kernels_colour.develop, sky_kernel(1, False), sky_kernel(3, True)):
+        (artifact,) = wp.compile_aot_module(kernel.module, arch=90, module_dir=tmp_path, use_ptx=True)
+        assert ".entry" in Path(artifact).read_text()
 
 
 @pytest.mark.cuda
