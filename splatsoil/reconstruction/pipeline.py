@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -20,7 +21,7 @@ from splatsoil.reconstruction.presets import preset_named
 from splatsoil.reconstruction.result import HeldOut, Reconstruction
 from splatsoil.reconstruction.surface import find_relief, soil_mesh, surface_through
 from splatsoil.reconstruction.training import train
-from splatsoil.reconstruction.views import Views, load_views, silhouettes, surface_points
+from splatsoil.reconstruction.views import Views, load_views, silhouettes, still_video, surface_points
 from splatsoil.splats import Gaussians, psnr, rasterise, ssim
 
 Array = NDArray[np.float64]
@@ -87,6 +88,11 @@ def _reconstruct(
     relief = find_relief(views, bed, silhouettes(views, tool), chosen, report)
     spacing = chosen.soil_spacing * max(relief.surface.cell)
     report("placing Gaussians", 0.0)
+    still = still_video(measurement, chosen.longest_side)
+    if still is not None:
+        # The fixed cameras see sides of things that no photograph needs to show.
+        views = views.joined(still)
+        relief = replace(relief, trust=views.valid * (1.0 - silhouettes(views, tool)))
     first, label = first_gaussians(views, bed, tool, relief, spacing)
     trained = train(
         first, label, views, relief.surface,

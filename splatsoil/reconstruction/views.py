@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from PIL import Image
 from scipy.ndimage import binary_closing, binary_dilation
 
 from splatsoil.errors import MeasurementError
-from splatsoil.measurement import Camera, Frame
+from splatsoil.measurement import Camera, Frame, Measurement
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.float32]
@@ -53,6 +53,25 @@ class Views:
             tuple(self.cameras[i] for i in indices),
             tuple(self.names[i] for i in indices),
         )
+
+    def joined(self, other: Views) -> Views:
+        """These views, then the other ones."""
+        size = [max(a, b) for a, b in zip(self.valid.shape[1:], other.valid.shape[1:], strict=True)]
+        return Views(
+            torch.cat([_padded(v.images, size) for v in (self, other)]),
+            torch.cat([_padded(v.valid, size) for v in (self, other)]),
+            torch.cat([self.projection, other.projection]),
+            torch.cat([self.positions, other.positions]),
+            self.cameras + other.cameras,
+            self.names + other.names,
+        )
+
+    def merged(self, groups: Sequence[Sequence[int]]) -> Views:
+        """One view for each group of views of the same camera in the same place: the mean of their pictures."""
+        chosen = self.subset([group[0] for group in groups])
+        images = torch.stack([self.images[list(group)].mean(dim=0) for group in groups])
+        valid = torch.stack([self.valid[list(group)].amin(dim=0) for group in groups])
+        return replace(chosen, images=images, valid=valid)
 
     def photograph(self, index: int) -> torch.Tensor:
         """(h, w, 3) one photograph at its own size."""
@@ -126,6 +145,22 @@ def load_views(frames: Sequence[Frame], longest_side: int) -> Views:
         cameras=tuple(cameras),
         names=tuple(frame.path.name for frame in frames),
     )
+
+
+def still_video(measurement: Measurement, longest_side: int) -> Views | None:
+    """What each fixed camera sees before anything moves, the mean of its frames up to number 0; None without any."""
+    still = [f for f in measurement.video if f.frame is not None and f.frame <= 0]
+    if not still:
+        return None
+    groups: dict[str, list[int]] = {}
+    for k, frame in enumerate(still):
+        groups.setdefault(frame.camera_name, []).append(k)
+    return load_views(still, longest_side).merged(list(groups.values()))
+
+
+def _padded(values: torch.Tensor, size: Sequence[int]) -> torch.Tensor:
+    """Maps (..., h, w) with zeros to the right and below, up to a size (rows, columns)."""
+    return torch.nn.functional.pad(values, (0, size[1] - values.shape[-1], 0, size[0] - values.shape[-2]))
 
 
 def silhouettes(views: Views, mesh: trimesh.Trimesh, margin: int = 2) -> torch.Tensor:
