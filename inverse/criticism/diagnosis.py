@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -85,6 +85,8 @@ class Diagnosis:
         floor: noise and nuisances.
         evidence: the simulations.
         simulations: how many the diagnosis needed.
+        unit: of the features.
+        notes: what went otherwise than planned.
     """
 
     verdict: Verdict
@@ -103,7 +105,8 @@ class Diagnosis:
     floor: Floor
     evidence: Evidence
     simulations: int = 0
-    notes: tuple[str, ...] = field(default_factory=tuple)
+    unit: str = ""
+    notes: tuple[str, ...] = ()
 
 
 def diagnose(
@@ -215,6 +218,7 @@ def judge(
         floor=floor,
         evidence=evidence,
         simulations=simulate.asked,
+        unit=experiment.layout.unit,
         notes=tuple(f"{name} could not be simulated: {why}" for name, why in evidence.failed.items()),
     )
 

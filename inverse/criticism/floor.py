@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
+from scipy.optimize import nnls
 
 from splatsoil.experiment.base import Experiment
 
 from .evidence import Evidence
-from .noise import Noise, Part, estimate, independent
+from .noise import Noise, Part, correlated, estimate, independent
 
 FloatArray = npt.NDArray[np.float64]
 
 NUMERICS_PRIOR = 1.0
 """Standard deviation of a numerical difference pattern's amplitude, in units of the change that was tried."""
+
+
+FEWEST_QUIET = 30
+"""Features without physics from which the instruments' errors can be told."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +33,7 @@ class Floor:
         single: of observed minus one prediction.
         nuisance: (n, q) patterns that numerics can make, times their prior standard deviations.
         parameters: (n, k) derivatives by the model's parameters (and their curvature), likewise.
-        parts: what the noise is made of: instruments, chance, numerics beyond the patterns.
+        parts: what the noise is made of: instruments, chance, reconstruction, numerics beyond the patterns.
     """
 
     noise: Noise
@@ -51,15 +56,18 @@ class Floor:
 def floor_of(experiment: Experiment, evidence: Evidence) -> Floor:
     """Assemble the floor.
 
-    Chance comes from repeated seeds. What other numerics change is projected out, pattern by pattern; what each of
-    these patterns holds beyond parameters and the other patterns is a sample of what numerics that weren't tried would
-    leave, and goes into the noise.
+    Chance comes from repeated seeds, the pictures' own errors from where physics can't act. What other numerics change
+    is projected out, pattern by pattern; what each of these patterns holds beyond parameters and the other patterns is
+    a sample of what numerics that weren't tried would leave, and goes into the noise.
     """
     layout, seen = experiment.layout, experiment.seen
     parts = {"instruments": independent(experiment.sensor, experiment.sensor_memory)}
     runs = len(evidence.repeats)
     if experiment.chance and runs > 1:
         parts["chance"] = estimate(layout, evidence.repeats, seen)
+    if np.count_nonzero(experiment.quiet) >= FEWEST_QUIET:
+        known = _total(layout, parts, seen, runs)[0]
+        parts["reconstruction"] = _instruments(experiment, evidence, known)
     prior = {p.name: (p.upper - p.lower) / np.sqrt(12.0) for p in experiment.parameters}
     slopes = [prior[name] * table for name, table in evidence.slopes.items()]
     slopes += [(3.0 * evidence.widths[name]) ** 2 * table for name, table in evidence.curves.items()]
@@ -70,6 +78,35 @@ def floor_of(experiment: Experiment, evidence: Evidence) -> Floor:
         parts["numerics"] = estimate(layout, _unexplained(known, parameters, patterns, seen), seen)
     noise, single = _total(layout, parts, seen, runs)
     return Floor(noise, single, NUMERICS_PRIOR * _columns(patterns, seen), parameters, parts)
+
+
+def _instruments(experiment: Experiment, evidence: Evidence, known: Noise) -> Part:
+    """What model and instruments get wrong without any physics, from where physics cannot act.
+
+    There, all that remains after exposure, camera poses and the like are taken out is the fault of the pictures'
+    model. Its variance is told as a constant and a share of the predicted signal's square, so that it can be said
+    elsewhere too.
+    """
+    quiet, signal = experiment.quiet, np.abs(evidence.mean)
+    rest = (experiment.observed - evidence.mean)[quiet]
+    scale = known.spread(known.scale)[quiet]
+    reported = [c.name for c in experiment.candidates if c.kind == "observation" and c.name in evidence.directions]
+    if reported:
+        columns = np.concatenate([evidence.directions[name][:, quiet] for name in reported]).T / scale[:, None]
+        size = np.linalg.norm(columns, axis=0)
+        columns = columns[:, size > 1e-9] / size[size > 1e-9]
+        amplitude, *_ = np.linalg.lstsq(columns, rest / scale, rcond=1e-3)
+        rest = rest - scale * (columns @ amplitude)
+    terms = np.stack([np.ones(rest.size), signal[quiet] ** 2], axis=1)
+    size = np.maximum(np.linalg.norm(terms, axis=0), 1e-300)
+    (level, share), _ = nnls(terms / size, np.maximum(rest**2 - scale**2, 0.0))
+    variance = level / size[0] + share / size[1] * signal**2
+    if not np.any(variance > 0.0):
+        return Part(scale=np.zeros(signal.shape))
+    whole = np.sqrt(variance)
+    table = np.zeros(signal.shape)
+    table[quiet] = rest
+    return replace(correlated(experiment.layout, table[None], np.hypot(whole, known.spread(known.scale))), scale=whole)
 
 
 def _total(layout, parts: Mapping[str, Part], seen: npt.NDArray[np.bool_], runs: int) -> tuple[Noise, Noise]:  # type: ignore[no-untyped-def]

@@ -91,6 +91,11 @@ def estimate(layout: Layout, samples: FloatArray, seen: BoolArray) -> Part:
     return _calibrated(layout, _correlation(layout, np.where(seen, samples / scale, 0.0), scale, part), samples, seen)
 
 
+def correlated(layout: Layout, samples: FloatArray, scale: FloatArray) -> Part:
+    """The part of given scale (t, s) whose correlation samples (k, t, s) suggest; zeros stand for what wasn't seen."""
+    return _correlation(layout, samples / np.maximum(scale, 1e-300), scale)
+
+
 def _calibrated(layout: Layout, part: Part, samples: FloatArray, seen: BoolArray) -> Part:
     """The part, its variance corrected by what samples come to on slow waves, where effects live.
 

@@ -11,13 +11,25 @@ from tyro.conf import Positional
 
 from splatsoil.commands._output import print_json
 
+#: Chance below which a block is called off: of any block, with nothing wrong.
+SURE = 0.05
+#: Blocks shown on the screen.
+SHOWN = 12
+
 
 @dataclass(frozen=True)
 class Config:
-    """Compare the prediction at a run's latest estimate with every frame of the video."""
+    """Compare the prediction at a run's latest estimate with every frame of the video: how far off, where and when.
+
+    What counts as far is learnt from simulations with other seeds and other numerics (about ten); they are kept.
+    """
 
     run: Positional[Path]
     """The run folder."""
+    repeats: int = 4
+    """Simulations with other seeds, to know what chance does."""
+    quick: bool = False
+    """Only pictures and losses: one simulation, and nothing said about where the model is wrong."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda:0, …"""
     json: bool = False
@@ -25,31 +37,38 @@ class Config:
 
 
 def run(config: Config) -> int:
-    """Simulate, draw, compare; pictures and losses go into the run folder."""
+    """Simulate, draw, compare; pictures, losses and the misfit by block go into the run folder."""
+    from splatsoil.commands import _criticism as criticism
     from splatsoil.commands import _stages as stage
     from splatsoil.commands._progress import stages
     from splatsoil.envs.devices import resolve_device
+    from splatsoil.inverse.criticism.diagnosis import Options
     from splatsoil.inverse.run_folder import RunFolder
-    from splatsoil.model import Model
 
     stage.hush()
+    options = Options(repeats=config.repeats)
+    criticism.check_budget(options)
     folder = RunFolder.open(config.run)
-    setup = folder.fit()["setup"]
+    folder.fit()
     device = resolve_device(config.device)
-    measurement = stage.measurement_of(folder)
+    misfit = None
     with stages(quiet=config.json) as begin:
-        reconstruction = stage.reconstructed(measurement, folder, device, begin("reconstruct"))
-        model = Model(measurement, reconstruction, effects=setup["effects"], preset=setup["preset"], device=device)
+        model = criticism.model_of(folder, device, begin("reconstruct"))
         result = stage.compared(folder, model, begin("compare"))
+        if not config.quick:
+            misfit = criticism.misfit(folder, model, options, begin("floor"))
     if config.json:
-        print_json({"ok": True, "run": str(folder.path), **result})
+        extra = {} if misfit is None else {"misfit": {k: misfit[k] for k in ("adequate", "misfit", "blocks", "floor")}}
+        print_json({"ok": True, "run": str(folder.path), **result, **extra})
     else:
         show(result, str(folder.comparison))
+        if misfit is not None:
+            show_misfit(misfit)
     return 0
 
 
 def interrupted(config: Config) -> str:
-    """A comparison is complete or it isn't there."""
+    """Simulations for the floor are kept one by one."""
     return f"the comparison was not finished; start again with: splatsoil compare {config.run}"
 
 
@@ -75,3 +94,34 @@ def show(result: Mapping[str, Any], folder: str) -> None:
     console.print(table)
     console.print(residual_sentence(result))
     console.print(f"pictures in {escape(folder)}")
+
+
+def show_misfit(misfit: Mapping[str, Any]) -> None:
+    """The worst blocks, and whether the model is adequate."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(title="residual in units of what noise leaves, the worst first", title_justify="left")
+    for column in ("stage", "region", "camera", "times noise", "p"):
+        table.add_column(column, justify="right" if column in ("times noise", "p") else "left")
+    for block in misfit["blocks"][:SHOWN]:
+        cells = (
+            block["stage"],
+            block["region"],
+            escape(block["channel"]),
+            f"{block['ratio']:.2f}",
+            f"{block['p']:.2g}",
+        )
+        table.add_row(*cells, style=None if block["p"] < SURE else "dim")
+    console = Console(highlight=False)
+    console.print(table)
+    test = misfit["misfit"]
+    off = sum(block["p"] < SURE for block in misfit["blocks"])
+    word = "[bold]adequate[/bold]" if misfit["adequate"] else "[bold]not adequate[/bold]"
+    console.print(
+        f"{word}: slow waves of the residual are {test['dispersion']:.3g} times what noise leaves (p {test['p']:.2g}); "
+        f"{off} of {len(misfit['blocks'])} blocks stand out"
+    )
+    if not misfit["adequate"]:
+        console.print("which effect is missing? splatsoil diagnose says")

@@ -3,26 +3,57 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 from splatsoil.commands._options import FitOptions
 from splatsoil.commands._output import print_json
 
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from splatsoil.commands._progress import Report
+    from splatsoil.inverse.run_folder import RunFolder
+    from splatsoil.model import Model
+
 
 @dataclass(frozen=True)
 class Config(FitOptions):
-    """All of it: check the set, reconstruct, fit, compare, write the report. Goes on where it was interrupted."""
+    """All of it: check the set, reconstruct, fit, compare, write the report. Goes on where it was interrupted.
+
+    With --criticise also: diagnose, add the effect that is missing, fit again, and so on, until the model is adequate,
+    no effect of the library explains what is left, or the limit is reached. Each round costs about as much as three
+    plain fits, so it isn't done unless asked for.
+    """
+
+    criticise: bool = False
+    """Diagnose the model, add what is missing, and go on until there is nothing more to be told."""
+    most_effects: int = 2
+    """Most effects that --criticise may add."""
+
+    def again(self, command: str) -> str:
+        """The command line that means this."""
+        words = super().again(command)
+        if self.criticise:
+            words += " --criticise" + (f" --most-effects {self.most_effects}" if self.most_effects != 2 else "")
+        return words
 
 
 def run(config: Config) -> int:
     """Each stage in turn; what the run folder has already isn't done again."""
+    from splatsoil.commands import _criticism as criticism
     from splatsoil.commands import _stages as stage
-    from splatsoil.commands import compare, fit
+    from splatsoil.commands import add, compare, fit
     from splatsoil.commands._progress import stages
     from splatsoil.envs.devices import resolve_device
+    from splatsoil.errors import ParameterError
+    from splatsoil.files import plain, read_json
     from splatsoil.model import Model
     from splatsoil.report import write_report
 
     stage.hush()
+    if config.most_effects < 0:
+        raise ParameterError(f"--most-effects: must be 0 or more, not {config.most_effects}")
+    stopped, diagnosis = "", None
     with stages(quiet=config.json) as begin:
         begin("check")("reading every image", 0.0)
         measurement, folder = stage.prepare(config)
@@ -31,16 +62,55 @@ def run(config: Config) -> int:
         model = Model(measurement, reconstruction, effects=config.effects, preset=config.preset, device=device)
         result = stage.fitted(config, measurement, folder, model, begin("fit"))
         comparison = stage.compared(folder, model, begin("compare"))
+        if config.criticise:
+            diagnosis, stopped = loop(folder, model, config.most_effects, begin)
+            result, comparison = folder.fit(), read_json(folder.comparison / "comparison.json")
         begin("report")("drawing figures", 0.0)
         page = write_report(folder.path)
     if config.json:
         losses = {key: comparison[key] for key in ("loss", "total", "noise")}
-        print_json({"ok": True, "run": str(folder.path), "report": str(page), "comparison": losses, **result})
+        extra: dict[str, Any] = {}
+        if diagnosis is not None:
+            kept = ("verdict", "class", "sentences", "effects", "simulations")
+            extra = {
+                "diagnosis": plain({key: diagnosis[key] for key in kept}),
+                "models": criticism.history(folder),
+                "stopped": stopped,
+            }
+        print_json({"ok": True, "run": str(folder.path), "report": str(page), "comparison": losses, **extra, **result})
+        return 0
+    fit.show(result, str(folder.path))
+    compare.show(comparison, str(folder.comparison))
+    if diagnosis is None:
+        print(f"Is anything missing from the model? splatsoil diagnose {folder.path}")
     else:
-        fit.show(result, str(folder.path))
-        compare.show(comparison, str(folder.comparison))
-        print(f"report: {page}")
+        if entries := criticism.history(folder):
+            add.show(entries)
+        criticism.show(diagnosis)
+        print(f"Stopped because {stopped}.")
+    print(f"report: {page}")
     return 0
+
+
+def loop(folder: RunFolder, model: Model, most: int, begin: Callable[[str], Report]) -> tuple[dict[str, Any], str]:
+    """Diagnose and add until there is nothing more to be told; the last diagnosis, and why it stopped."""
+    from splatsoil.commands import _criticism as criticism
+    from splatsoil.commands import add
+    from splatsoil.inverse.criticism.diagnosis import Options
+
+    options, count = Options(), 0
+    while True:
+        diagnosis = criticism.diagnosed(folder, model, options, begin("diagnose"))
+        if diagnosis["verdict"] == "adequate":
+            return diagnosis, "nothing stands above what noise, chance and numerics leave"
+        if diagnosis["verdict"] != "missing":
+            return diagnosis, "no effect of the library explains what is left"
+        if count == most:
+            return diagnosis, f"{most} effects have been added, which is the limit (--most-effects)"
+        best = diagnosis["class"][0]
+        add.added(folder, model, best, options, begin)
+        model = model.variant(effects=tuple(folder.fit()["setup"]["effects"]))
+        count += 1
 
 
 def interrupted(config: Config) -> str:

@@ -52,6 +52,7 @@ class Experiment(Protocol):
         layout: labels of the features.
         observed: (t, s) features; 0 where ``seen`` is False.
         seen: (t, s) False where there is no observation (the tool hides it).
+        quiet: (t, s) True where no physics of the model can act, so that what is left there is the instruments' doing.
         sensor: (t, s) standard deviation of what the instruments add, known or measured.
         sensor_memory: correlation of that between neighbouring times, in [0, 1).
         parameters: free parameters of the model.
@@ -69,6 +70,8 @@ class Experiment(Protocol):
     def observed(self) -> FloatArray: ...
     @property
     def seen(self) -> npt.NDArray[np.bool_]: ...
+    @property
+    def quiet(self) -> npt.NDArray[np.bool_]: ...
     @property
     def sensor(self) -> FloatArray: ...
     @property
@@ -105,10 +108,5 @@ def candidate_of(effect: Effect) -> Candidate | None:
     testable = tuple(p for p in effect.parameters if p.off is not None)
     if not testable:
         return None
-    size = str(getattr(effect, "size", "") or testable[0].name)
-    observes = type(effect).observe is not Effect.observe
-    acts = type(effect).settings is not Effect.settings or any(
-        getattr(effect, place, None) is not None for place in ("strength", "flow", "start", "bodies")
-    )
-    kind: Literal["physics", "observation"] = "observation" if observes and not acts else "physics"
-    return Candidate(effect.name, kind, testable, size, effect.note)
+    kind: Literal["physics", "observation"] = "observation" if type(effect).observe is not Effect.observe else "physics"
+    return Candidate(effect.name, kind, testable, effect.size, effect.note)

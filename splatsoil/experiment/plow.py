@@ -14,7 +14,7 @@ import numpy.typing as npt
 from splatsoil.comparison import PATCH, Block, Comparator
 from splatsoil.experiment.base import Candidate, candidate_of
 from splatsoil.experiment.features import Layout, Site
-from splatsoil.experiment.scene_parts import regions_of, stages_of
+from splatsoil.experiment.scene_parts import QUIET, regions_of, stages_of
 from splatsoil.model import Model, Prediction
 from splatsoil.mpm import Resolution, Trajectory
 from splatsoil.parameters import Parameter
@@ -102,8 +102,15 @@ class PlowExperiment:
 
     @cached_property
     def observed(self) -> FloatArray:
-        """(t, s) zero: features are told as the prediction's distance from what was seen, see :meth:`features`."""
-        return np.zeros(self.layout.shape)
+        """(t, s) measured changes."""
+        still = {c: self.comparator.observed[c, self.comparator.reference] for c in self.comparator.cameras}
+        frames = (self.comparator.reference, *self.comparator.frames)
+        return self._table(self.comparator.compare({(c, f): still[c] for c in still for f in frames}).blocks)
+
+    @cached_property
+    def quiet(self) -> npt.NDArray[np.bool_]:
+        """(t, s) patches far from wherever the tool has been in the soil: nothing but light changes there."""
+        return (self.layout.regions == QUIET) & self.seen
 
     @cached_property
     def seen(self) -> npt.NDArray[np.bool_]:
@@ -129,11 +136,12 @@ class PlowExperiment:
         return self.features(self.prediction(values, effects=effects, seed=seed, numerics=numerics).images)
 
     def features(self, images: Mapping[tuple[str, int], npt.NDArray[np.float32]]) -> FloatArray:
-        """(t, s) predicted minus observed change; the observed side is 0.
+        """(t, s) predicted changes.
 
-        Told as a difference because both sides leave out the same pixels: those in which either shows the tool.
+        They are the measured ones minus the difference, because both sides must leave out the same pixels: those in
+        which either shows the tool.
         """
-        return -self._table(self.comparator.compare(images).blocks)
+        return self.observed - self._table(self.comparator.compare(images).blocks)
 
     def prediction(
         self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""

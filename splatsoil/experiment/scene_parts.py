@@ -13,9 +13,11 @@ from splatsoil.reconstruction.height_field import HeightField
 
 FloatArray = npt.NDArray[np.float64]
 
+QUIET = "undisturbed"
+"""Region that the tool does not reach."""
 SLOW = 0.02
 """Share of the motion's greatest speed below which the tool pauses."""
-BESIDE = 0.6
+BESIDE = 0.75
 """Widths of the tool beside its track that berms may cover."""
 AHEAD = 0.6
 """Widths of the tool ahead of it that count as its face, and behind it as behind."""
@@ -61,7 +63,7 @@ def regions_of(
     width = float(np.sort(tool.mesh.extents)[1])
     moments = np.unique(np.concatenate([np.arange(0.0, max(frames) + 1.0, 2.0), frames]))
     nearest = np.full(len(sites), np.inf)
-    out = np.full((len(frames), len(sites)), "undisturbed", dtype="<U16")
+    out = np.full((len(frames), len(sites)), QUIET, dtype="<U16")
     previous = None
     for moment in moments:
         rotation, position = tool.motion.pose(moment / rate)

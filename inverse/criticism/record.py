@@ -1,0 +1,135 @@
+"""A diagnosis as plain data: what ``diagnosis.json`` holds."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from splatsoil.experiment.base import Candidate, Experiment
+
+from .diagnosis import Confirmation, Diagnosis
+from .misfit import Omnibus
+from .words import sentences
+
+FORMAT = "splatsoil-diagnosis/1"
+
+
+def record(experiment: Experiment, diagnosis: Diagnosis) -> dict[str, Any]:
+    """Everything a reader, a report or another command may ask for."""
+    candidates = {c.name: c for c in experiment.candidates}
+    layout = experiment.layout
+    scale = diagnosis.floor.noise.spread(diagnosis.floor.noise.scale)
+    return {
+        "format": FORMAT,
+        "experiment": experiment.name,
+        "model": list(experiment.model),
+        "verdict": diagnosis.verdict,
+        "class": list(diagnosis.members),
+        "sentences": sentences(diagnosis, candidates, diagnosis.evidence.values),
+        "effects": [_effect(diagnosis, candidates[name]) for name in _order(diagnosis)],
+        "simulations": diagnosis.simulations,
+        "values": dict(diagnosis.evidence.values),
+        "misfit": _omnibus(diagnosis.misfit),
+        "remainder": None if diagnosis.remainder is None else _omnibus(diagnosis.remainder),
+        "explained": diagnosis.explained,
+        "refits": {name or "as it is": confirmation(c) for name, c in diagnosis.confirmations.items()},
+        "confusion": [{"effects": [a, b], "correlation": round(v, 4)} for (a, b), v in diagnosis.confusion.items()],
+        "blocks": [
+            {"stage": b.stage, "region": b.region, "channel": b.channel, "ratio": b.ratio, "p": b.p, "n": b.features}
+            for b in diagnosis.blocks
+        ],
+        "where": [
+            {"stage": s, "region": r, "channel": c, "share": v}
+            for (s, r, c), v in sorted(diagnosis.where.items(), key=lambda item: -item[1])
+        ],
+        "floor": {name: diagnosis.floor.share(name) for name in diagnosis.floor.parts},
+        "unit": layout.unit,
+        "time_name": layout.time_name,
+        "times": list(layout.times),
+        "stages": list(layout.stages),
+        "sites": [[site.channel, site.x, site.y] for site in layout.sites],
+        # In units of each feature's noise; null where the tool hides it.
+        "maps": {
+            "before": _map(diagnosis.residual, scale, experiment),
+            **{
+                name: _map(experiment.observed - c.fit.prediction, scale, experiment)
+                for name, c in diagnosis.confirmations.items()
+                if name
+            },
+        },
+        "notes": list(diagnosis.notes),
+    }
+
+
+def misfit_record(experiment: Experiment, diagnosis: Diagnosis) -> dict[str, Any]:
+    """Only how far the model is from the data, where and when."""
+    whole = record(experiment, diagnosis)
+    kept = ("misfit", "blocks", "floor", "unit", "time_name", "times", "stages", "sites", "maps", "values")
+    return {
+        "format": "splatsoil-misfit/1",
+        "adequate": diagnosis.verdict == "adequate",
+        "simulations": diagnosis.simulations,
+        **{key: whole[key] for key in kept},
+    }
+
+
+def _order(diagnosis: Diagnosis) -> list[str]:
+    """Members first, the rest by how much they would explain."""
+    rest = sorted(
+        (n for n in diagnosis.effects if n not in diagnosis.members),
+        key=lambda name: diagnosis.scores[name].statistic,
+        reverse=True,
+    )
+    return [*diagnosis.members, *rest]
+
+
+def _effect(diagnosis: Diagnosis, candidate: Candidate) -> dict[str, Any]:
+    score, beside = diagnosis.scores[candidate.name], diagnosis.given.get(candidate.name)
+    measure = candidate.measure
+    off = float(measure.off or 0.0)
+    entry = {
+        "name": candidate.name,
+        "kind": candidate.kind,
+        "note": candidate.note,
+        "verdict": diagnosis.effects[candidate.name],
+        "parameter": measure.name,
+        "z": score.z,
+        "p": score.adjusted,
+        "p_alone": score.p,
+        "estimate": off + score.estimate,
+        "std": score.std,
+        "unit": measure.unit,
+        "off": off,
+        "meaningful": measure.meaningful,
+        "mde": score.detectable,
+        "predicted_fall": score.statistic,
+        "survival": score.survival,
+        "given_best": None if beside is None else {"z": beside.z, "p": beside.adjusted, "mde": beside.detectable},
+    }
+    confirmed = diagnosis.confirmations.get(candidate.name)
+    if confirmed is not None:
+        entry["estimate"] = confirmed.fit.values[measure.name]
+        entry["achieved_fall"] = diagnosis.confirmations[""].chi2 - confirmed.chi2
+    return entry
+
+
+def confirmation(c: Confirmation) -> dict[str, Any]:
+    """A refit and how it was judged."""
+    return {
+        "values": dict(c.fit.values),
+        "chi2": c.chi2,
+        "held_out": c.held_out,
+        "floor": c.floor,
+        "remainder": _omnibus(c.remainder),
+        "simulations": c.fit.simulations,
+    }
+
+
+def _omnibus(test: Omnibus) -> dict[str, float]:
+    return {"chi2": test.statistic, "freedom": test.freedom, "p": test.p, "dispersion": test.dispersion}
+
+
+def _map(residual: np.ndarray, scale: np.ndarray, experiment: Experiment) -> list[list[float | None]]:
+    ratio = np.where(experiment.seen, residual / np.maximum(scale, 1e-300), np.nan)
+    return [[None if not np.isfinite(v) else round(float(v), 2) for v in row] for row in ratio]

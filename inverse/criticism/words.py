@@ -1,0 +1,109 @@
+"""A diagnosis in plain words. Each sentence says no more than the numbers do."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from splatsoil.experiment.base import Candidate
+
+from .diagnosis import Diagnosis
+from .verdicts import GATE
+
+#: Correlation of two effects' scores from which they are called alike.
+ALIKE = 0.8
+
+
+def sentences(diagnosis: Diagnosis, candidates: Mapping[str, Candidate], base: Mapping[str, float]) -> list[str]:
+    """What was found, the most important first."""
+    if diagnosis.verdict == "missing":
+        out = _missing(diagnosis, candidates, base)
+    elif diagnosis.verdict == "adequate":
+        out = _adequate(diagnosis, candidates)
+    else:
+        out = _outside(diagnosis, candidates)
+    worst = next((b for b in diagnosis.blocks if b.p < GATE), None)
+    if worst is not None:
+        times = f"{worst.ratio:.1f} times"
+        out.append(
+            f"Before anything is added, the model is farthest off in the {worst.region} during {worst.stage}, as "
+            f"{worst.channel} sees it: {times} what noise leaves."
+        )
+    blind = [name for name, verdict in diagnosis.effects.items() if verdict == "cannot tell"]
+    if blind:
+        out.append(f"What these data cannot tell: {listed(blind)}.")
+    return out
+
+
+def _missing(diagnosis: Diagnosis, candidates: Mapping[str, Candidate], base: Mapping[str, float]) -> list[str]:
+    best = diagnosis.members[0]
+    confirmed = diagnosis.confirmations[best]
+    candidate = candidates[best]
+    size = confirmed.fit.values[candidate.size]
+    std = diagnosis.scores[best].std
+    out = [
+        f"{title(best)} is missing: about {amount(size, std, candidate.measure.unit)}. Adding it lowers the error on "
+        f"frames that the refit has not seen from {diagnosis.confirmations[''].held_out:.2g} to "
+        f"{confirmed.held_out:.2g} {diagnosis.unit}; noise alone leaves {confirmed.floor:.2g}."
+    ]
+    if diagnosis.where:
+        (stage, region, channel), share = max(diagnosis.where.items(), key=lambda item: item[1])
+        out.append(
+            f"{100.0 * share:.0f} % of the evidence comes from one part of the data: {region}, {stage}, {channel}."
+        )
+    moved = [
+        f"{name.replace('_', ' ')} from {base[name]:.4g} to {confirmed.fit.values[name]:.4g}"
+        for name in base
+        if abs(confirmed.fit.values[name] - base[name]) > 1e-6 * max(abs(base[name]), 1.0)
+    ]
+    if moved:
+        out.append(f"With it the estimate of {listed(moved)} moves: without it that was biased.")
+    if len(diagnosis.members) > 1:
+        out.append(f"{listed([title(m) for m in diagnosis.members[1:]])} would explain it nearly as well.")
+    if diagnosis.remainder is not None and diagnosis.remainder.p < GATE:
+        out.append(
+            f"It explains {100.0 * diagnosis.explained:.0f} % of the misfit beyond chance; what remains is more than "
+            "noise."
+        )
+    return out
+
+
+def _adequate(diagnosis: Diagnosis, candidates: Mapping[str, Candidate]) -> list[str]:
+    seen = [
+        f"{name.replace('_', ' ')} of {amount(diagnosis.scores[name].detectable, 0.0, candidates[name].measure.unit)}"
+        for name, verdict in diagnosis.effects.items()
+        if verdict == "absent"
+    ]
+    out = ["The model is adequate: nothing stands above what noise, chance and numerics leave."]
+    if seen:
+        out.append(f"It would have shown {listed(seen)}.")
+    return out
+
+
+def _outside(diagnosis: Diagnosis, candidates: Mapping[str, Candidate]) -> list[str]:
+    out = [
+        f"The model is not adequate, and no effect of the library explains it: the misfit on slow waves is "
+        f"{diagnosis.misfit.dispersion:.3g} times what noise leaves."
+    ]
+    if diagnosis.members:
+        best = diagnosis.members[0]
+        out.append(
+            f"The nearest is {best.replace('_', ' ')}, which explains {100.0 * diagnosis.explained:.0f} % of the "
+            "misfit beyond chance: too little to name it."
+        )
+    return out
+
+
+def title(name: str) -> str:
+    """An effect's name at the beginning of a sentence."""
+    return name.replace("_", " ").capitalize()
+
+
+def listed(words: list[str]) -> str:
+    """a, b and c."""
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+
+
+def amount(value: float, std: float, unit: str) -> str:
+    """A value with its spread and unit."""
+    symbol = {"deg": "°", "1": ""}.get(unit, f" {unit}")
+    return f"{value:.3g} ± {std:.2g}{symbol}" if std > 0.0 else f"{value:.3g}{symbol}"

@@ -1,0 +1,286 @@
+"""Stages of criticism: a run folder as an experiment, its diagnosis, and the history of what was added."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from splatsoil.errors import ParameterError, RunError
+
+if TYPE_CHECKING:
+    from splatsoil.commands._progress import Report
+    from splatsoil.experiment.plow import PlowExperiment
+    from splatsoil.inverse.criticism.diagnosis import Options
+    from splatsoil.inverse.criticism.simulations import Simulations
+    from splatsoil.inverse.run_folder import RunFolder
+    from splatsoil.model import Model
+
+
+def model_of(folder: RunFolder, device: str, report: Report) -> Model:
+    """The model that a run's latest fit is of, on one device."""
+    from splatsoil.commands import _stages as stage
+    from splatsoil.model import Model
+
+    setup = folder.fit()["setup"]
+    measurement = stage.measurement_of(folder)
+    reconstruction = stage.reconstructed(measurement, folder, device, report)
+    return Model(measurement, reconstruction, effects=setup["effects"], preset=setup["preset"], device=device)
+
+
+def experiment_of(
+    folder: RunFolder, model: Model, effects: Iterable[str] | None = None
+) -> tuple[PlowExperiment, Simulations]:
+    """The run as criticism sees it, with some effects as candidates or all, and its simulations, kept in ``features/``.
+
+    Raises:
+        ParameterError: an effect that is unknown or on already.
+    """
+    from splatsoil import __version__
+    from splatsoil.commands._stages import digest_of
+    from splatsoil.experiment.plow import PlowExperiment
+    from splatsoil.files import FORWARD, code_digest
+    from splatsoil.inverse.criticism.simulations import Simulations
+    from splatsoil.soil.library import library
+
+    wanted = None if effects is None else tuple(effects)
+    for name in wanted or ():
+        if name not in library():
+            raise ParameterError(f"effect {name!r} is unknown; known are {', '.join(library())}")
+        if name in {e.name for e in model.law.effects}:
+            raise ParameterError(f"effect {name} is on already; name one that is off")
+    fit = folder.fit()
+    experiment = PlowExperiment(model, tuple(fit["parameters"]), candidates=wanted)
+    identity = {
+        "measurement": folder.description["measurement"]["hash"],
+        "reconstruction": digest_of(model.reconstruction),
+        "model": sorted(experiment.model),
+        "preset": model.preset,
+        "device": model.device.split(":")[0],
+        "version": __version__,
+        "code": code_digest((*FORWARD, "observation.py", "experiment")),
+        "layout": list(experiment.layout.shape),
+    }
+    return experiment, Simulations(experiment, folder.path / "features", identity)
+
+
+def diagnosed(
+    folder: RunFolder, model: Model, options: Options, report: Report, effects: Iterable[str] = ()
+) -> dict[str, Any]:
+    """Diagnose the latest fit; the result is ``diagnosis.json`` and, by model, ``diagnoses/NAME.json``."""
+    from splatsoil import __version__
+    from splatsoil.files import write_json
+    from splatsoil.inverse.criticism.diagnosis import diagnose
+    from splatsoil.inverse.criticism.record import record
+    from splatsoil.report.data import estimates
+
+    began = time.perf_counter()
+    fit = folder.fit()
+    experiment, simulate = experiment_of(folder, model, tuple(effects) or None)
+    share = 0.0
+    purpose = ""
+
+    def told(what: str, done: float) -> None:
+        nonlocal share
+        share = done
+        report(purpose or what, share)
+
+    def starting(what: str) -> None:
+        nonlocal purpose
+        purpose = f"simulation {simulate.made + 1}: {what}"
+        report(purpose, share)
+
+    simulate.told = starting
+    report("reading the video", 0.0)
+    with folder.lock():
+        found = diagnose(experiment, estimates(fit), simulate=simulate, options=options, progress=told)
+        result = {
+            **record(experiment, found),
+            "fit": fit["name"],
+            "preset": model.preset,
+            "device": model.device,
+            "version": __version__,
+            "seed": options.seed,
+            "seconds": round(time.perf_counter() - began, 1),
+            "simulated_now": simulate.made,
+        }
+        write_json(folder.path / "diagnoses" / f"{fit['name']}.json", result)
+        write_json(folder.path / "diagnosis.json", result)
+    return result
+
+
+def misfit(folder: RunFolder, model: Model, options: Options, report: Report) -> dict[str, Any]:
+    """How far the model is from the data, where and when, against the floor; kept as ``comparison/misfit.json``."""
+    from splatsoil.files import plain, write_json
+    from splatsoil.inverse.criticism.diagnosis import Bench, judge
+    from splatsoil.inverse.criticism.evidence import gather
+    from splatsoil.inverse.criticism.record import misfit_record
+    from splatsoil.report.data import estimates
+
+    fit = folder.fit()
+    experiment, simulate = experiment_of(folder, model, ())
+    with folder.lock():
+        evidence = gather(
+            experiment,
+            simulate,
+            estimates(fit),
+            repeats=options.repeats,
+            progress=lambda share: report("simulations for the floor", share),
+        )
+        bench = Bench.of(experiment, evidence, options)
+        found = judge(experiment, evidence, simulate, options=options, bench=bench)
+        result = {**misfit_record(experiment, found), "fit": fit["name"]}
+        write_json(folder.comparison / "misfit.json", result)
+    return dict(plain(result))
+
+
+def confirmed(folder: RunFolder, model: Model, name: str, options: Options, report: Report) -> dict[str, Any]:
+    """The model as it is and with one effect, each refitted on every other frame and judged on the rest."""
+    from splatsoil.files import plain
+    from splatsoil.inverse.criticism.diagnosis import Bench, confirm
+    from splatsoil.inverse.criticism.evidence import gather
+    from splatsoil.inverse.criticism.record import confirmation
+    from splatsoil.report.data import estimates
+
+    experiment, simulate = experiment_of(folder, model, (name,))
+    with folder.lock():
+        evidence = gather(
+            experiment,
+            simulate,
+            estimates(folder.fit()),
+            repeats=options.repeats,
+            progress=lambda share: report("simulations", 0.7 * share),
+        )
+        if name in evidence.failed:
+            raise RunError(f"{name} cannot be added: {evidence.failed[name]}")
+        bench = Bench.of(experiment, evidence, options)
+        found = confirm(
+            experiment, evidence, bench.floor, list(bench.candidates), simulate, options, bench.basis, report
+        )
+    return {"refits": {key or "as it is": plain(confirmation(c)) for key, c in found.items()}}
+
+
+def entry(fit: dict[str, Any], refit: dict[str, Any]) -> dict[str, Any]:
+    """A model's line in the history: its fit on all frames, its error on frames that a refit has not seen."""
+    return {
+        "model": fit["name"],
+        "effects": list(fit["setup"]["effects"]),
+        "parameters": {
+            name: {key: p[key] for key in ("estimate", "std", "unit", "title")} for name, p in fit["parameters"].items()
+        },
+        "loss": fit["loss"],
+        "held_out": refit["held_out"],
+        "floor": refit["floor"],
+        "refit": dict(refit["values"]),
+    }
+
+
+def keep_pictures(folder: RunFolder) -> None:
+    """Put the comparison of the model before aside, so that before and after can be shown."""
+    import shutil
+
+    if not (folder.comparison / "comparison.json").is_file():
+        return
+    before = folder.path / "before"
+    with folder.lock():
+        shutil.rmtree(before, ignore_errors=True)
+        folder.comparison.rename(before)
+
+
+def latest_diagnosis(folder: RunFolder) -> dict[str, Any] | None:
+    """The diagnosis of the latest fit, if there is one."""
+    from splatsoil.files import read_json
+    from splatsoil.report.data import estimates
+
+    fit = folder.fit()
+    path = folder.path / "diagnoses" / f"{fit['name']}.json"
+    if not path.is_file():
+        return None
+    data = read_json(path)
+    return data if data["values"] == estimates(fit) else None
+
+
+def history(folder: RunFolder) -> list[dict[str, Any]]:
+    """The models tried so far, the first one first."""
+    from splatsoil.files import read_json
+
+    path = folder.path / "history.json"
+    return list(read_json(path)["models"]) if path.is_file() else []
+
+
+def remember(folder: RunFolder, entries: list[dict[str, Any]]) -> Path:
+    """Keep the models tried."""
+    from splatsoil.files import write_json
+
+    return write_json(folder.path / "history.json", {"format": "splatsoil-history/1", "models": entries})
+
+
+def show(result: dict[str, Any]) -> None:
+    """The verdict, why, and the table of effects."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    from splatsoil.report.words import symbol
+
+    table = Table(title=f"effects that are off, in {escape(str(result['fit']))}", title_justify="left")
+    for column in ("effect", "verdict", "z", "p", "estimate", "smallest detectable", "predicted fall", "achieved"):
+        table.add_column(column, justify="left" if column in ("effect", "verdict") else "right")
+    for e in result["effects"]:
+        unit = symbol(e["unit"])
+        achieved = f"{e['achieved_fall']:.4g}" if "achieved_fall" in e else ""
+        table.add_row(
+            escape(e["name"]),
+            e["verdict"],
+            f"{e['z']:.1f}",
+            f"{e['p']:.2g}",
+            _amount(e["estimate"], e["std"], unit),
+            _amount(e["mde"], None, unit),
+            f"{e['predicted_fall']:.4g}",
+            achieved,
+        )
+    console = Console(highlight=False)
+    console.print(table)
+    console.print(f"[bold]{result['verdict']}[/bold]")
+    for sentence in result["sentences"]:
+        console.print(escape(sentence))
+    for note in result["notes"]:
+        console.print(f"[yellow]note[/yellow] {escape(note)}")
+    console.print(
+        f"{result['simulations']} simulations, {result['simulated_now']} of them new, {result['seconds']:.0f} s"
+    )
+
+
+def _amount(value: float | None, std: float | None, unit: str) -> str:
+    from math import isfinite
+
+    if value is None or not isfinite(value):
+        return "nothing is seen"
+    if std is None:
+        return f"{value:.3g}{unit}"
+    return f"{value:.3g} ± {std:.2g}{unit}" if isfinite(std) else f"{value:.3g}{unit}"
+
+
+def check_budget(options: Options) -> None:
+    """ParameterError for numbers that make no sense.
+
+    Raises:
+        ParameterError: see above.
+    """
+    if options.repeats < 2:
+        raise ParameterError(f"--repeats: chance needs at least 2 repeats, not {options.repeats}")
+    if options.refits < 1 or options.refit_steps < 1:
+        raise ParameterError("--refits and --refit-steps: give 1 or more")
+
+
+def need_fit(folder: RunFolder) -> dict[str, Any]:
+    """The latest fit.
+
+    Raises:
+        RunError: there is none.
+    """
+    try:
+        return folder.fit()
+    except RunError as error:
+        raise RunError(f"{error}; a diagnosis starts from a fit") from error

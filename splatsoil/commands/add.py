@@ -1,0 +1,156 @@
+"""``splatsoil add``: put a missing effect into the model, fit again, and see the error fall."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tyro.conf import Positional
+
+from splatsoil.commands._options import FitOptions
+from splatsoil.commands._output import print_json
+
+if TYPE_CHECKING:
+    from splatsoil.commands._progress import Report
+    from splatsoil.inverse.criticism.diagnosis import Options
+    from splatsoil.inverse.run_folder import RunFolder
+    from splatsoil.model import Model
+
+
+@dataclass(frozen=True)
+class Config:
+    """Add effects to a run's latest model, one after the other, and fit again.
+
+    Each effect is first refitted on every other frame and judged on the rest, which gives the falling error; then all
+    frames are fitted for the estimate that is kept. Earlier fits stay.
+    """
+
+    run: Positional[Path]
+    """The run folder."""
+    effects: Positional[tuple[str, ...]]
+    """Effects to add, by name."""
+    budget: int | None = None
+    """Evaluations of each fit; 10 for each free parameter if not given."""
+    repeats: int = 4
+    """Simulations with other seeds, to know what chance does."""
+    device: str = "auto"
+    """Where to compute: auto, cpu, cuda:0, …"""
+    json: bool = False
+    """Print one JSON object instead of a table."""
+
+
+def run(config: Config) -> int:
+    """Refit with each effect, keep the history, draw the report."""
+    from splatsoil.commands import _criticism as criticism
+    from splatsoil.commands import _stages as stage
+    from splatsoil.commands._progress import stages
+    from splatsoil.envs.devices import resolve_device
+    from splatsoil.errors import ParameterError
+    from splatsoil.inverse.criticism.diagnosis import Options
+    from splatsoil.inverse.run_folder import RunFolder
+    from splatsoil.report import write_report
+    from splatsoil.soil.library import find_effects
+
+    stage.hush()
+    options = Options(repeats=config.repeats)
+    criticism.check_budget(options)
+    folder = RunFolder.open(config.run)
+    on = criticism.need_fit(folder)["setup"]["effects"]
+    if not config.effects:
+        raise ParameterError("name an effect to add, for example: splatsoil add RUN cohesion")
+    find_effects((*on, *config.effects))
+    device = resolve_device(config.device)
+    with stages(quiet=config.json) as begin:
+        for name in config.effects:
+            model = criticism.model_of(folder, device, begin("reconstruct"))
+            added(folder, model, name, options, begin, budget=config.budget)
+        begin("report")("drawing figures", 0.0)
+        page = write_report(folder.path)
+    entries = criticism.history(folder)
+    if config.json:
+        print_json({"ok": True, "run": str(folder.path), "report": str(page), "models": entries})
+    else:
+        show(entries)
+        print(f"report: {page}")
+    return 0
+
+
+def interrupted(config: Config) -> str:
+    """Simulations and evaluations are kept one by one."""
+    words = " ".join(config.effects)
+    return f"finished simulations are kept; go on with: splatsoil add {config.run} {words}"
+
+
+def added(
+    folder: RunFolder,
+    model: Model,
+    name: str,
+    options: Options,
+    begin: Callable[[str], Report],
+    *,
+    budget: int | None = None,
+) -> dict[str, Any]:
+    """One effect more: confirmation on hidden frames, full fit, comparison; returns the new entry of the history."""
+    from splatsoil.commands import _criticism as criticism
+    from splatsoil.commands import _stages as stage
+
+    before = folder.fit()
+    known = criticism.latest_diagnosis(folder)
+    if known is None or name not in known["refits"]:
+        known = criticism.confirmed(folder, model, name, options, begin(f"try {name}"))
+    entries = criticism.history(folder)
+    base, with_it = known["refits"]["as it is"], known["refits"][name]
+    if not entries or entries[-1]["model"] != before["name"]:
+        entries = [criticism.entry(before, base)]
+    entries[-1]["held_out"], entries[-1]["floor"] = base["held_out"], base["floor"]
+    setup = before["setup"]
+    effects = (*setup["effects"], name)
+    larger = model.variant(effects=effects)
+    mine = [p.name for p in next(e for e in larger.law.effects if e.name == name).parameters if p.off is not None]
+    fitting = FitOptions(
+        set=model.measurement.folder,
+        parameters=(*before["parameters"], *mine),
+        effects=effects,
+        budget=budget,
+        preset=setup["preset"],
+        device=model.device,
+        seed=folder.description["seed"],
+        run=folder.path,
+    )
+    result = stage.fitted(fitting, model.measurement, folder, larger, begin(f"fit with {name}"))
+    criticism.keep_pictures(folder)
+    stage.compared(folder, larger, begin("compare"))
+    fresh = criticism.entry(result, with_it)
+    fresh["added"] = name
+    fresh["fall"] = base["chi2"] - with_it["chi2"]
+    entries = [*entries, fresh]
+    criticism.remember(folder, entries)
+    return fresh
+
+
+def show(entries: list[dict[str, Any]]) -> None:
+    """The falling error, and how the parameters moved."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    from splatsoil.report.words import model_name, symbol, with_std
+
+    table = Table(title="error on frames that refits have not seen", title_justify="left")
+    for column in ("model", "error", "noise alone", "loss, all frames", "parameters"):
+        table.add_column(column, justify="right" if column in ("error", "noise alone", "loss, all frames") else "left")
+    for entry in entries:
+        values = []
+        for name, p in entry["parameters"].items():
+            value, std = with_std(p["estimate"], p["std"])
+            values.append(f"{name} {value} ± {std}{symbol(p['unit'])}")
+        table.add_row(
+            escape(model_name(entry["model"])),
+            f"{entry['held_out']:.3g}",
+            f"{entry['floor']:.3g}",
+            f"{entry['loss']:.3g}",
+            escape(", ".join(values)),
+        )
+    Console(highlight=False).print(table)

@@ -1,0 +1,72 @@
+"""``splatsoil diagnose``: is the model adequate, and if not, which effect is missing?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from splatsoil.commands._output import print_json
+
+
+@dataclass(frozen=True)
+class Config:
+    """Say which effect, if any, a run's latest model lacks, how sure that is, and what cannot be told.
+
+    Simulates the fit again with other seeds and other numerics, and once or twice for every effect that is off; refits
+    the best ones on every other frame and judges them on the rest. All simulations are kept: an interrupted diagnosis
+    goes on.
+    """
+
+    run: Positional[Path]
+    """The run folder."""
+    effects: tuple[str, ...] = ()
+    """Effects to consider; all of the library that are off, if not given."""
+    repeats: int = 4
+    """Simulations with other seeds, to know what chance does."""
+    refits: int = 3
+    """Effects, the best ones, to refit."""
+    refit_steps: int = 5
+    """Simulations for each refit."""
+    device: str = "auto"
+    """Where to compute: auto, cpu, cuda:0, …"""
+    json: bool = False
+    """Print one JSON object instead of a table."""
+
+
+def run(config: Config) -> int:
+    """Diagnose; the result goes into the run folder."""
+    from splatsoil.commands import _criticism as criticism
+    from splatsoil.commands import _stages as stage
+    from splatsoil.commands._progress import stages
+    from splatsoil.envs.devices import resolve_device
+    from splatsoil.inverse.criticism.diagnosis import Options
+    from splatsoil.inverse.run_folder import RunFolder
+
+    stage.hush()
+    options = Options(repeats=config.repeats, refits=config.refits, refit_steps=config.refit_steps)
+    criticism.check_budget(options)
+    folder = RunFolder.open(config.run)
+    criticism.need_fit(folder)
+    device = resolve_device(config.device)
+    with stages(quiet=config.json) as begin:
+        model = criticism.model_of(folder, device, begin("reconstruct"))
+        result = criticism.diagnosed(folder, model, options, begin("diagnose"), config.effects)
+    if config.json:
+        print_json({"ok": True, "run": str(folder.path), **_finite(result)})
+    else:
+        criticism.show(result)
+        print(f"kept in {folder.path / 'diagnosis.json'}")
+    return 0
+
+
+def interrupted(config: Config) -> str:
+    """Simulations are kept one by one."""
+    return f"finished simulations are kept; go on with: splatsoil diagnose {config.run}"
+
+
+def _finite(result: dict) -> dict:
+    from splatsoil.files import plain
+
+    return plain(result)
