@@ -131,6 +131,23 @@ def test_envelope_is_a_power_law_of_pressure() -> None:
         assert test.shear_stress[0, -1] == pytest.approx(friction(ANGLE) * 1000.0 * (p / 1000.0) ** 0.9, rel=1e-3)
 
 
+def test_a_layer_has_its_own_friction_angle_below_its_depth() -> None:
+    values = {"layer_friction": 6.0, "layer_depth": 0.05}
+    np.testing.assert_allclose(ratio(sheared("layering", values, depth=0.04))[-1], friction(ANGLE), rtol=1e-3)
+    np.testing.assert_allclose(ratio(sheared("layering", values, depth=0.06))[-1], friction(ANGLE + 6.0), rtol=1e-3)
+
+
+def test_friction_grows_with_the_logarithm_of_density() -> None:
+    """50 deg per log density: at 0.1 m and 0.5 / m it is 50 ln 1.05 deg more, to the first order in the slope."""
+    test = sheared("density_gradient", {"density_gradient": 0.5, "density_friction": 50.0}, depth=0.1)
+    assert ratio(test)[-1] == pytest.approx(friction(ANGLE + 50.0 * math.log(1.05)), rel=5e-3)
+    law = Law(find_effects(["density_gradient", "layering"]))
+    density = law.density(
+        np.array([0.0, 0.1, 0.2]), {"density_gradient": 0.5, "layer_density": 1.2, "layer_depth": 0.15}
+    )
+    np.testing.assert_allclose(density, [1.0, 1.05, 1.2 * 1.1])
+
+
 def test_cohesion_matches_mohr_coulomb_in_extension_too() -> None:
     """q = 6 (c cos phi + p sin phi) / (3 + sin phi) in extension, for a cone matched there."""
     law = Law(find_effects(["cohesion"]))

@@ -6,7 +6,6 @@ import math
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -124,5 +123,11 @@ def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
 
 
 def test_the_documents_show_the_example_as_it_is(repository: Path, suction: str) -> None:
-    text: Any = (repository / "docs" / "effects.md").read_text()
+    text = (repository / "docs" / "effects.md").read_text()
     assert Path(suction).read_text() in text
+
+
+def test_the_documents_have_the_table_of_the_library(repository: Path) -> None:
+    from splatsoil.benchmarks.effects import table
+
+    assert table() in (repository / "docs" / "effects.md").read_text()
