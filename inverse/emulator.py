@@ -64,8 +64,10 @@ class Emulator:
         self.points = np.atleast_2d(np.asarray(points, dtype=np.float64))
         features = np.asarray(features, dtype=np.float64)
         m, n = self.points.shape
-        if features.ndim != 2 or len(features) != m or not np.all(np.isfinite(features)):
-            raise ValueError(f"{m} points need finite features of shape ({m}, b), not {features.shape}")
+        if features.ndim != 2 or len(features) != m or features.shape[1] == 0:
+            raise ValueError(f"{m} points need features of shape ({m}, b), not {features.shape}")
+        if not np.all(np.isfinite(features)):
+            raise ValueError("some features are not finite")
         if m < n + FEWEST:
             raise ValueError(f"{m} evaluations are too few to emulate {n} parameters; {n + FEWEST} are needed at least")
         self.centre = features.mean(axis=0)

@@ -98,7 +98,7 @@ def sample(
     low, high = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
     d = len(low)
     count = walkers or max(WALKERS, 4 * d)
-    moves = [(emcee.moves.DEMove(), 0.8), (emcee.moves.DESnookerMove(), 0.2)]
+    moves = [(emcee.moves.DEMove(), 0.8), (emcee.moves.StretchMove(), 0.2)]
     backends = [_backend(file, identity, e) for e in range(ensembles)]
     samplers = [
         emcee.EnsembleSampler(count, d, log_density, vectorize=True, moves=moves, backend=backend)
@@ -194,7 +194,9 @@ def _start(log_density: LogDensity, low: FloatArray, high: FloatArray, count: in
     weights = np.exp(0.25 * (logs - logs.max()))
     chosen = points[rng.choice(len(points), count, p=weights / weights.sum())]
     spread = chosen + 0.02 * (high - low) * rng.standard_normal(chosen.shape)
-    return np.clip(spread, low + 1e-9 * (high - low), high - 1e-9 * (high - low))
+    # What sticks out is folded back: walkers that met at a bound would never part again.
+    share = np.abs((spread - low) / (high - low))
+    return low + (high - low) * np.where(share > 1.0, 2.0 - share, share)
 
 
 def _backend(file: Path | None, identity: str, e: int) -> emcee.backends.Backend | None:

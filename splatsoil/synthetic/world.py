@@ -19,7 +19,7 @@ import warp as wp
 from splatsoil import __version__
 from splatsoil.errors import ParameterError
 from splatsoil.measurement import Measurement, write_measurement
-from splatsoil.mpm import Resolution, Trajectory, simulate
+from splatsoil.mpm import Preset, Resolution, Trajectory, simulate
 from splatsoil.mpm.simulate import base_settings
 from splatsoil.reconstruction.filling import fill
 from splatsoil.soil.law import Law
@@ -59,7 +59,7 @@ def make_set(
     friction_angle: float = 35.0,
     effects: Iterable[str] = (),
     values: Mapping[str, float] | None = None,
-    preset: str = "small",
+    preset: Preset | str = "small",
     seed: int = 0,
     particle_seed: int | None = None,
     device: str = "cpu",
@@ -130,7 +130,7 @@ def make_set(
         "seed": seed,
         "particle_seed": particle_seed,
         "particles": len(particles),
-        "preset": preset,
+        "preset": preset if isinstance(preset, str) else preset.name,
         "resolution": asdict(resolution),
         "device": device,
         "appearance": asdict(look),
