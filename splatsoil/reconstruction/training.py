@@ -25,6 +25,8 @@ LAST_RATE = 0.1  # of the means' rate, reached exponentially
 # the surface that their Gaussians draw: by 0.4 of their spacing on ray-cast scenes, and this keeps them within 0.02.
 ANCHOR = 0.02
 FLAT = 0.02  # weight of a Gaussian's thickness over its breadth beyond a third
+# Weight of what shines through, mean of 1 − alpha: there is something behind every pixel. More costs likeness.
+OPEN = 0.02
 FAINTEST = 0.02
 
 
@@ -163,7 +165,8 @@ def train(
         if not np.isfinite(losses[-1]):
             raise SimulationError(f"training fell apart at step {step}: the loss is {losses[-1]}; try another seed")
         soil = label == SOIL
-        total = loss + ANCHOR * anchor(current.means[soil]) + FLAT * _thickness(current.scales)
+        through = ((1.0 - rendering.alpha[..., None]) * valid[k]).mean()
+        total = loss + OPEN * through + ANCHOR * anchor(current.means[soil]) + FLAT * _thickness(current.scales)
         total.backward()
         gradient = rendering.projection.centres.grad
         assert gradient is not None
