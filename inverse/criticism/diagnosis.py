@@ -198,7 +198,9 @@ def judge(
         remainder = _after(experiment, floor, tried[best], candidates, evidence, bench.basis, members)
         gone = explained(confirmations[""].remainder, remainder)
     effects = _effects(candidates, scores, given, members, confirmations, options.level)
-    named = any(effects[name] == "missing" for name in members)
+    named = any(effects[name] == "missing" for name in members) and _stands(confirmations, members[0])
+    if strong and not named:
+        effects = {n: "cannot tell" if v == "missing" else v for n, v in effects.items()}
     before = confirmations[""].remainder if confirmations else misfit
     verdict = overall(named, before if named else misfit, remainder)
     return Diagnosis(
@@ -299,6 +301,12 @@ def _tangent(noise: Noise, fit: Refit) -> FloatArray:
     columns = fit.slopes[noise.seen]
     size = np.linalg.norm(columns / noise.scale[:, None], axis=0)
     return columns * (10.0 * math.sqrt(len(columns)) / np.maximum(size, 1e-300))
+
+
+def _stands(confirmations: Mapping[str, Confirmation], best: str) -> bool:
+    """The refit bears out what the score promised: χ² falls, and the error on times it hasn't seen does too."""
+    before, after = confirmations[""], confirmations[best]
+    return before.chi2 - after.chi2 > EQUIVALENT and after.held_out < before.held_out
 
 
 def _equals(tried: Mapping[str, Confirmation], best: str) -> tuple[str, ...]:

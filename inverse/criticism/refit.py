@@ -13,7 +13,12 @@ import numpy.typing as npt
 from scipy.optimize import lsq_linear
 
 from splatsoil.errors import SimulationError
+from splatsoil.experiment.base import Experiment
 from splatsoil.parameters import Parameter
+
+from .evidence import around, derivatives
+from .noise import Noise, independent
+from .simulations import Simulations
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -107,3 +112,45 @@ def mended(slopes: FloatArray, change: FloatArray, weight: FloatArray, moved: Fl
     """
     missing = change - slopes @ moved
     return slopes + missing[..., None] * (weight / float(weight @ moved))
+
+
+def optimum(
+    experiment: Experiment, simulate: Simulations, start: Mapping[str, float], *, rounds: int = 2, most: int = 8
+) -> dict[str, float]:
+    """Least squares over the model's own parameters, for experiments that no other fit was made of.
+
+    Weighs features by the instruments' noise alone; the derivatives are measured afresh in each round.
+
+    Args:
+        experiment: what to fit.
+        simulate: its simulations.
+        start: parameters by name.
+        rounds: how often to measure derivatives.
+        most: simulations in each round, derivatives aside.
+    """
+    values = dict(start)
+    noise = Noise.of(
+        experiment.layout, [(1.0, independent(experiment.sensor, experiment.sensor_memory))], experiment.seen
+    ).solver()
+
+    def whiten(table: FloatArray) -> FloatArray:
+        return noise.whiten(table[experiment.seen])
+
+    for _ in range(rounds):
+        middle, slopes = simulate(values), []
+        for parameter in experiment.parameters:
+            ends = around(parameter, values[parameter.name])
+            tables = [simulate({**values, parameter.name: end}) for end in ends]
+            slopes.append(derivatives([end - values[parameter.name] for end in ends], tables, middle)[0])
+        found = refit(
+            simulate,
+            whiten,
+            experiment.observed,
+            experiment.parameters,
+            values,
+            middle,
+            np.stack(slopes, axis=-1),
+            most=most,
+        )
+        values = dict(found.values)
+    return values

@@ -1,0 +1,331 @@
+"""How often is the missing effect named, and how often a wrong one? Diagnoses of experiments whose truth is sealed.
+
+``python -m splatsoil.benchmarks.hidden_effects`` judges emulated plow experiments: patterns of parameters and effects
+over time and space, chance drawn for every seed, a diagnosis from nothing but its own repeated "simulations". The truth
+is drawn by a stream of random numbers of its own and opened only to score.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from splatsoil.inverse.criticism.diagnosis import Bench, Diagnosis, Options, judge
+from splatsoil.inverse.criticism.evidence import gather
+from splatsoil.inverse.criticism.noise import Noise, Part
+from splatsoil.inverse.criticism.simulations import Simulations
+
+from splatsoil.experiment.base import Candidate
+from splatsoil.experiment.emulated import EmulatedExperiment
+from splatsoil.experiment.features import Layout, Site
+from splatsoil.parameters import Parameter
+
+FloatArray = npt.NDArray[np.float64]
+
+EFFECTS = 8
+OBSERVATIONS = 2
+STRENGTHS = (0.5, 1.0, 2.0, 4.0)
+"""Sizes of single effects, in smallest detectable ones."""
+MEMORY, LENGTH, NUGGET = 0.7, 0.12, 0.1
+"""Of the emulated chance."""
+
+
+@dataclass(frozen=True)
+class Tally:
+    """One kind of truth.
+
+    Attributes:
+        name: what is hidden.
+        count: experiments.
+        named: in how many some effect was called missing.
+        physics: in how many a physical one was.
+        first: in how many the truth came first.
+        held: in how many the class held the truth.
+        members: mean size of the class where there was one.
+        verdicts: how often each verdict was given.
+        bias: mean error of the model's parameter in prior standard deviations, before and after adding.
+        error: held-out error over the floor, before and after.
+    """
+
+    name: str
+    count: int
+    named: int
+    physics: int
+    first: int
+    held: int
+    members: float
+    verdicts: dict[str, int]
+    bias: tuple[float, float]
+    error: tuple[float, float]
+
+
+def wilson(hits: int, count: int, z: float = 1.96) -> tuple[float, float]:
+    """95 % interval of a share (Wilson 1927)."""
+    if count == 0:
+        return 0.0, 1.0
+    share, scale = hits / count, 1.0 + z**2 / count
+    middle = (share + z**2 / (2 * count)) / scale
+    half = z * math.sqrt(share * (1.0 - share) / count + z**2 / (4 * count**2)) / scale
+    return max(middle - half, 0.0), min(middle + half, 1.0)
+
+
+def layout_of(times: int = 12, cameras: int = 2, across: int = 4) -> Layout:
+    """A small plow experiment: a grid of patches seen by each camera."""
+    sites = tuple(
+        Site(f"camera {c}", 0.1 * i, 0.1 * j) for c in range(cameras) for i in range(across) for j in range(across)
+    )
+    stages = tuple("pushing" if t < times // 2 else "withdrawal" for t in range(times))
+    regions = np.array([["trench" if s.x < 0.15 else "berm" for s in sites]] * times)
+    return Layout(tuple(float(t) for t in range(times)), sites, "frame", "grey levels", stages, regions)
+
+
+def emulated(seed: int, *, duplicate: bool = False) -> EmulatedExperiment:
+    """A world of smooth patterns; with ``duplicate`` the second effect is the first one under another name."""
+    layout = layout_of()
+    generator = np.random.default_rng([seed, 7])
+    x = np.array([s.x for s in layout.sites])
+    y = np.array([s.y for s in layout.sites])
+    time_axis = np.linspace(0.0, 1.0, layout.shape[0])[:, None]
+    # Chance grows where and when soil has moved.
+    moved = 0.3 + 2.0 * np.exp(-(((x - 0.15) / 0.12) ** 2))[None] * time_axis
+    chance = Part(moved, MEMORY, LENGTH, NUGGET, np.array([[1.0, 0.4], [0.4, 1.0]]))
+    root = np.linalg.cholesky(Noise.of(layout, [(1.0, chance)], np.ones(layout.shape, dtype=bool)).covariance)
+
+    def pattern() -> FloatArray:
+        phase = generator.uniform(0.0, 2.0 * np.pi, 4)
+        wave = generator.uniform(4.0, 12.0, 2)
+        table = (
+            (0.4 + time_axis ** generator.uniform(0.5, 2.0))
+            * np.sin(wave[0] * x + phase[0])
+            * np.cos(wave[1] * y + phase[1])
+        )
+        return table * (1.0 + 0.3 * np.sin(phase[2] + 3.0 * time_axis)) * moved
+
+    slopes = {"angle": 0.5 * pattern()}
+    curves = {"angle": 0.02 * pattern()}
+    candidates = []
+    for k in range(EFFECTS):
+        kind = "observation" if k >= EFFECTS - OBSERVATIONS else "physics"
+        name = f"effect {k + 1}"
+        parameter = Parameter(name, "1", 0.0 if k % 2 else -50.0, 50.0, 0.0, off=0.0, meaningful=0.25, sign=k % 2)
+        candidates.append(Candidate(name, kind, (parameter,), name))  # type: ignore[arg-type]
+        slopes[name] = slopes["effect 1"] if duplicate and k == 1 else pattern()
+        curves[name] = 0.02 * pattern()
+    angle = Parameter("angle", "deg", -10.0, 10.0, 0.0, meaningful=0.5)
+    return EmulatedExperiment(
+        layout=layout,
+        middle=4.0 * pattern(),
+        home={"angle": 0.0},
+        slopes=slopes,
+        curves=curves,
+        parameters=(angle,),
+        candidates=tuple(candidates),
+        chance_root=root,
+        sensor=np.full(layout.shape, 0.1),
+        observed=np.zeros(layout.shape),
+        patterns={"grid": pattern(), "step": 0.5 * pattern()},
+    )
+
+
+def outside(experiment: EmulatedExperiment, generator: np.random.Generator, size: float) -> FloatArray:
+    """(t, s) a smooth pattern that no effect has, ``size`` times the noise."""
+    layout = experiment.layout
+    x, y = (np.array([getattr(s, a) for s in layout.sites]) for a in "xy")
+    phase = generator.uniform(0.0, 2.0 * np.pi, 3)
+    when = np.cos(np.linspace(0.0, np.pi, layout.shape[0]) + phase[0])[:, None]
+    table = (
+        when * np.cos(generator.uniform(4.0, 12.0) * x + phase[1]) * np.sin(generator.uniform(4.0, 12.0) * y + phase[2])
+    )
+    scale = np.sqrt(np.diag(experiment.chance_root @ experiment.chance_root.T)).reshape(layout.shape)
+    return size * table * scale
+
+
+def one(
+    world: int,
+    truth: dict[str, float],
+    extra: FloatArray | None,
+    options: Options,
+    base: EmulatedExperiment | None = None,
+) -> Diagnosis:
+    """Diagnose one experiment with a hidden truth; the analysis sees the observation and its own simulations only."""
+    experiment = base or emulated(world)
+    observed = experiment.measured(truth, [world, 99], extra)
+    experiment = replace(experiment, observed=observed)
+    # A fit of the base model: least squares over its one parameter.
+    values = {"angle": fitted(experiment)}
+    simulate = Simulations(experiment)
+    evidence = gather(experiment, simulate, values, repeats=options.repeats)
+    return judge(experiment, evidence, simulate, options=options, bench=Bench.of(experiment, evidence, options))
+
+
+def fitted(experiment: EmulatedExperiment) -> float:
+    """Where a fit to images would end: least squares over the angle, in units of chance."""
+    scale = np.sqrt(np.diag(experiment.chance_root @ experiment.chance_root.T)).reshape(experiment.layout.shape)
+    angles = np.linspace(-9.5, 9.5, 191)
+    losses = [np.sum(((experiment.observed - experiment.predict({"angle": a}, seed=0)) / scale) ** 2) for a in angles]
+    return float(angles[int(np.argmin(losses))])
+
+
+def detectable(world: int, options: Options) -> dict[str, float]:
+    """Smallest detectable size of each effect, from a diagnosis of data with nothing hidden."""
+    found = one(world, {"angle": 0.0}, None, options)
+    return {name: score.detectable for name, score in found.scores.items()}
+
+
+def tally(
+    name: str,
+    truths: Sequence[Sequence[str]],
+    found: Sequence[Diagnosis],
+    angles: Sequence[float],
+    kinds: dict[str, str],
+) -> Tally:
+    """Open the truths and count."""
+    verdicts = {"adequate": 0, "missing": 0, "outside the library": 0}
+    named = physics = first = held = 0
+    sizes, before, after, errors = [], [], [], []
+    for truth, diagnosis, angle in zip(truths, found, angles, strict=True):
+        verdicts[diagnosis.verdict] += 1
+        before.append(abs(diagnosis.evidence.values["angle"] - angle))
+        if diagnosis.verdict != "missing":
+            continue
+        named += 1
+        members = diagnosis.members
+        physics += kinds[members[0]] == "physics"
+        first += members[0] in truth
+        held += any(m in truth for m in members)
+        sizes.append(len(members))
+        best = diagnosis.confirmations[members[0]]
+        after.append(abs(best.fit.values["angle"] - angle))
+        errors.append((diagnosis.confirmations[""].held_out / best.floor, best.held_out / best.floor))
+    error = tuple(np.mean(errors, axis=0)) if errors else (math.nan, math.nan)
+    return Tally(
+        name,
+        len(found),
+        named,
+        physics,
+        first,
+        held,
+        float(np.mean(sizes)) if sizes else 0.0,
+        verdicts,
+        (float(np.mean(before)), float(np.mean(after)) if after else math.nan),
+        (float(error[0]), float(error[1])),
+    )
+
+
+def run(count: int = 40, *, seed: int = 1, repeats: int = 4) -> dict[str, Any]:
+    """All kinds of truth, ``count`` experiments each; a JSON-able result."""
+    began = time.perf_counter()
+    options = Options(repeats=repeats)
+    kinds = {c.name: c.kind for c in emulated(0).candidates}
+    physics = [name for name, kind in kinds.items() if kind == "physics"]
+    reported = [name for name, kind in kinds.items() if kind == "observation"]
+    rows = []
+
+    def series(name: str, hide: Any, beyond: float = 0.0, *, drop: bool = False, twin: bool = False) -> None:
+        truths, found, angles = [], [], []
+        for k in range(count):
+            world = seed * 100_000 + len(rows) * 1_000 + k
+            sealed = np.random.default_rng([world, 2])
+            angle = float(sealed.uniform(-2.0, 2.0))
+            hidden = hide(sealed, detectable(world, options)) if hide is not None else {}
+            base = emulated(world, duplicate=twin)
+            extra = outside(base, sealed, beyond) if beyond else None
+            truth = {"angle": angle, **hidden}
+            if drop:
+                observed = base.measured(truth, [world, 99])
+                base = replace(base, candidates=tuple(c for c in base.candidates if c.name not in hidden))
+                extra = observed - base.measured({"angle": angle}, [world, 99])
+                truth = {"angle": angle}
+            found.append(one(world, truth, extra, options, base))
+            truths.append(tuple(hidden))
+            angles.append(angle)
+        rows.append(tally(name, truths, found, angles, kinds))
+
+    def single(names: Sequence[str], times: float) -> Any:
+        def hide(sealed: np.random.Generator, sizes: dict[str, float]) -> dict[str, float]:
+            name = str(sealed.choice(list(names)))
+            return {name: times * sizes[name]}
+
+        return hide
+
+    def pair(sealed: np.random.Generator, sizes: dict[str, float]) -> dict[str, float]:
+        return {str(name): 3.0 * sizes[str(name)] for name in sealed.choice(physics, 2, replace=False)}
+
+    series("nothing", None)
+    for times in STRENGTHS:
+        series(f"one effect, {times:g} × smallest detectable", single(physics, times))
+    series("observation only, 3 ×", single(reported, 3.0))
+    series("two effects, 3 × each", pair)
+    series("outside the library, 1 × noise", None, 1.0)
+    series("outside the library, 2 × noise", None, 2.0)
+    series("control: the truth taken out of the library, 4 ×", single(physics, 4.0), drop=True)
+    series("control: effect 1 there twice, 4 ×", single(["effect 1"], 4.0), twin=True)
+    return {
+        "count": count,
+        "seed": seed,
+        "repeats": repeats,
+        "seconds": time.perf_counter() - began,
+        "rows": [
+            {
+                **row.__dict__,
+                "named_interval": wilson(row.named, row.count),
+                "held_interval": wilson(row.held, row.count),
+            }
+            for row in rows
+        ],
+    }
+
+
+def table(result: dict[str, Any]) -> str:
+    """The result as Markdown."""
+    lines = [
+        "| hidden | experiments | some effect named | a physical one | truth first | class holds it | mean class "
+        "| adequate / missing / outside | error over floor, before → after | angle's error, before → after |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for row in result["rows"]:
+        low, high = row["named_interval"]
+        first, last = row["held_interval"]
+        n = row["count"]
+        verdicts = " / ".join(str(row["verdicts"][v]) for v in ("adequate", "missing", "outside the library"))
+        lines.append(
+            f"| {row['name']} | {n} | {100 * row['named'] / n:.0f} % ({100 * low:.0f}–{100 * high:.0f}) "
+            f"| {100 * row['physics'] / n:.0f} % | {100 * row['first'] / n:.0f} % "
+            f"| {100 * row['held'] / n:.0f} % ({100 * first:.0f}–{100 * last:.0f}) | {row['members']:.1f} | {verdicts} "
+            f"| {_pair(row['error'])} | {_pair(row['bias'])} |"
+        )
+    return "\n".join(lines)
+
+
+def _pair(values: Sequence[float]) -> str:
+    return " → ".join("–" if not math.isfinite(v) else f"{v:.2f}" for v in values)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Command line; exit code 0."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--count", type=int, default=40, help="experiments of each kind")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--repeats", type=int, default=4)
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args(arguments)
+    result = run(options.count, seed=options.seed, repeats=options.repeats)
+    if options.json:
+        from splatsoil.files import plain
+
+        print(json.dumps(plain(result), indent=1))
+    else:
+        print(table(result))
+        print(f"\n{options.count} of each kind, {result['repeats']} repeats, {result['seconds']:.0f} s")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
