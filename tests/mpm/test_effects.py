@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 import numpy.typing as npt
 import pytest
+import torch
 import trimesh
 
 from splatsoil.mpm import Resolution, Solver
@@ -41,10 +42,11 @@ def solver(
     effects: tuple[str, ...] = (),
     settings: Settings | None = None,
     mesh: trimesh.Trimesh = PLATE,
+    device: str = "cpu",
 ) -> Solver:
     batch = np.broadcast_to(x, (len(values), *x.shape))
     law = Law(find_effects(effects))
-    return Solver(batch, LOWER, UPPER, mesh, RESOLUTION, law, settings or Settings(friction_angle=35.0), values)
+    return Solver(batch, LOWER, UPPER, mesh, RESOLUTION, law, settings or Settings(friction_angle=35.0), values, device)
 
 
 def test_effects_that_leave_strength_alone_run_the_very_same_kernel() -> None:
@@ -103,9 +105,9 @@ def test_stiffer_soil_under_its_weight_settles_less_and_takes_more_steps() -> No
     assert sunk[0] / sunk[1] == pytest.approx(4.0, rel=0.15)
 
 
-def ploughed(effects: tuple[str, ...], *values: Mapping[str, float], frames: int = 8) -> Solver:
+def ploughed(effects: tuple[str, ...], *values: Mapping[str, float], frames: int = 8, device: str = "cpu") -> Solver:
     """A plate goes 5 cm through the bed."""
-    run = solver(BED, *values, effects=effects)
+    run = solver(BED, *values, effects=effects, device=device)
     speed = np.array([0.3, 0.0, 0.0])
     for frame in range(frames):
         times = [(frame + step / 2) * RESOLUTION.frame_time for step in range(2)]
@@ -127,6 +129,21 @@ def test_sheared_dense_soil_dilates_and_loose_soil_contracts() -> None:
     assert volume[1].mean() > volume[0].mean() + 5e-4
     loose = ploughed(("compaction",), {"looseness": 0.05})
     assert -0.05005 < loose._particles.history.numpy()[:, 1].min() < -0.02
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("dilatancy", {"dilatancy_angle": 15.0}), ("compaction", {"looseness": 0.05})]
+)
+def test_volume_in_the_books_is_volume_in_space(name: str, value: dict[str, float]) -> None:
+    """What det F of the particles' own motion gained over the base law is what the law booked as plastic volume."""
+    off = dict.fromkeys(value, 0.0)
+    run = ploughed((name,), off, value)
+    p = run._particles
+    booked = p.history.numpy()[:, 1] + p.opening.numpy() + p.elastic.numpy()
+    in_books = np.exp(booked.astype(np.float64)).reshape(2, -1).sum(axis=1)
+    in_space = np.linalg.det(p.deformation.numpy().astype(np.float64)).reshape(2, -1).sum(axis=1)
+    assert abs(in_books[1] - in_books[0]) > 30.0
+    assert in_space[1] - in_space[0] == pytest.approx(in_books[1] - in_books[0], rel=0.08)
 
 
 def test_an_obstacle_holds_the_soil_around_it() -> None:
@@ -157,12 +174,26 @@ def test_adhesion_drags_a_sliding_tool_by_its_area() -> None:
     assert drag[1] - drag[0] == pytest.approx(300.0 * 0.08 * 0.08, rel=0.25)
 
 
-def test_all_effects_together_run_and_keep_their_momentum() -> None:
-    every = tuple(n for n, e in library().items() if n not in ("compaction", "camera_pose"))
-    values = {
-        "dilatancy_angle": 8.0, "rate_gain": 0.5, "viscosity": 5.0, "softening_angle": 4.0, "cohesion": 100.0,
-        "pressure_exponent": 0.05, "layer_friction": 2.0, "density_gradient": 0.5, "tool_adhesion": 100.0,
-        "tilt_x": 2.0, "gravity_factor": 0.9, "obstacle_radius": 0.03, "stiffness_factor": 1.5,
-    }  # fmt: skip
-    run = ploughed(every, values, frames=4)
+EVERY = tuple(n for n in library() if n not in ("compaction", "camera_pose"))
+EVERY_VALUE = {
+    "dilatancy_angle": 8.0, "rate_gain": 0.5, "viscosity": 5.0, "softening_angle": 4.0, "cohesion": 100.0,
+    "pressure_exponent": 0.05, "layer_friction": 2.0, "density_gradient": 0.5, "tool_adhesion": 100.0,
+    "tilt_x": 2.0, "gravity_factor": 0.9, "obstacle_radius": 0.03, "stiffness_factor": 1.5,
+}  # fmt: skip
+
+
+def test_all_effects_together_run() -> None:
+    run = ploughed(EVERY, EVERY_VALUE, frames=4)
     assert np.isfinite(run.positions()).all() and np.isfinite(run.momentum()).all()
+    assert run._particles.history.numpy()[:, 0].max() > 0.1
+
+
+@pytest.mark.cuda
+def test_all_effects_are_the_same_on_cuda() -> None:
+    if not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    one, other = (ploughed(EVERY, EVERY_VALUE, frames=2, device=device) for device in ("cpu", "cuda:0"))
+    assert np.abs(one.positions() - other.positions()).max() < 5e-4
+    np.testing.assert_allclose(
+        one._particles.history.numpy().mean(axis=0), other._particles.history.numpy().mean(axis=0), rtol=0.02
+    )
