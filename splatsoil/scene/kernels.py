@@ -60,7 +60,7 @@ _PLACE = """
     return low + fv * (high - low);
 """
 )
-def sample(values: wp.array2d(dtype=wp.float32), grid: Grid, x: float, y: float) -> float:
+def sample(values: wp.array2d(dtype=wp.float32), grid: Grid, x: float, y: float) -> float:  # type: ignore[empty-body]
     """Bilinear value of a contiguous map (ny, nx), held constant beyond its border."""
 
 
