@@ -64,7 +64,8 @@ def floor_of(experiment: Experiment, evidence: Evidence) -> Floor:
     parts = {"instruments": independent(experiment.sensor, experiment.sensor_memory)}
     runs = len(evidence.repeats)
     if experiment.chance and runs > 1:
-        parts["chance"] = estimate(layout, evidence.repeats, seen)
+        tables = [*evidence.slopes.values(), *(t for d in evidence.directions.values() for t in d)]
+        parts["chance"] = estimate(layout, evidence.repeats, seen, _columns(tables, seen))
     if np.count_nonzero(experiment.quiet) >= FEWEST_QUIET:
         known = _total(layout, parts, seen, runs)[0]
         parts["reconstruction"] = _instruments(experiment, evidence, known)

@@ -29,9 +29,9 @@ WAVES_IN_SPACE = 3
 """Slow waves in each direction: what effects look like, where the noise must be known best."""
 FEWEST_TO_JUDGE = 3
 """Samples from which each can be judged by the others."""
-MEMORY_OF_SCALE = 1.5
+MEMORY_OF_SCALE = 2.0
 """Width of the local mean of variances in steps of time."""
-REACH = 0.5
+REACH = 0.6
 """Width of the local mean of variances, in spacings of sites: disturbed soil has sharp edges."""
 RIDGE = 1e-6
 """Added to the diagonal of a correlation, for its Cholesky factor's sake."""
@@ -74,12 +74,13 @@ def independent(scale: FloatArray, memory: float = 0.0) -> Part:
     return Part(scale=scale, memory=memory, nugget=1.0)
 
 
-def estimate(layout: Layout, samples: FloatArray, seen: BoolArray) -> Part:
+def estimate(layout: Layout, samples: FloatArray, seen: BoolArray, directions: FloatArray | None = None) -> Part:
     """The part that samples (k, t, s) of it, with mean zero, suggest.
 
     Scales are pooled over each instrument, and vary over time and place as far as the samples show that they do more
     than chance would (empirical Bayes on the logarithm of the variance). The correlation's parameters maximise the
-    Gaussian likelihood of the scaled samples.
+    Gaussian likelihood of the scaled samples. The whole is then corrected so that scores along directions (n, k) of
+    interest, and along slow waves, scatter as they should.
     """
     samples = np.where(seen, samples, 0.0)
     if not np.any(samples):
@@ -88,7 +89,8 @@ def estimate(layout: Layout, samples: FloatArray, seen: BoolArray) -> Part:
     part = _correlation(layout, np.where(seen, samples / scale, 0.0), scale)
     # How far the variance's own scatter is chance depends on the correlation, which depends on the variance: twice.
     scale = _scales(layout, samples, seen, across=part.across(layout), memory=part.memory)
-    return _calibrated(layout, _correlation(layout, np.where(seen, samples / scale, 0.0), scale, part), samples, seen)
+    part = _correlation(layout, np.where(seen, samples / scale, 0.0), scale, part)
+    return _calibrated(layout, part, samples, seen, directions)
 
 
 def correlated(layout: Layout, samples: FloatArray, scale: FloatArray) -> Part:
@@ -96,15 +98,17 @@ def correlated(layout: Layout, samples: FloatArray, scale: FloatArray) -> Part:
     return _correlation(layout, samples / np.maximum(scale, 1e-300), scale)
 
 
-def _calibrated(layout: Layout, part: Part, samples: FloatArray, seen: BoolArray) -> Part:
-    """The part, its variance corrected by what samples come to on slow waves, where effects live.
+def _calibrated(
+    layout: Layout, part: Part, samples: FloatArray, seen: BoolArray, directions: FloatArray | None
+) -> Part:
+    """The part, its variance corrected by what samples come to where effects live.
 
     With three samples or more, each is judged by scales that the others give: a scale that is too small by chance
-    counts for more than one that is too large, and a sample cannot show that of scales it has made itself.
+    weighs more than one that is too large, and a sample cannot show that of scales it has made itself.
     """
     across, count = part.across(layout), len(samples)
     waves = smooth_waves(layout, seen)
-    squares = []
+    on_waves, along = [], []
     for k in range(count):
         scale = part.scale
         if count >= FEWEST_TO_JUDGE:
@@ -113,8 +117,13 @@ def _calibrated(layout: Layout, part: Part, samples: FloatArray, seen: BoolArray
         noise = Noise.of(layout, [(1.0, replace(part, scale=scale))], seen)
         solver = noise.solver()
         left, _ = np.linalg.qr(solver.whiten(waves * noise.scale[:, None]))
-        squares.append(np.mean((left.T @ solver.whiten(samples[k][seen])) ** 2))
-    return replace(part, scale=part.scale * math.sqrt(float(np.mean(squares))))
+        sample = solver.whiten(samples[k][seen])
+        on_waves.append(np.mean((left.T @ sample) ** 2))
+        if directions is not None and directions.size:
+            columns = solver.whiten(directions)
+            along.append(np.mean((columns.T @ sample) ** 2 / np.maximum(np.sum(columns**2, axis=0), 1e-300)))
+    factor = max(float(np.mean(on_waves)), float(np.mean(along)) if along else 0.0)
+    return replace(part, scale=part.scale * math.sqrt(factor))
 
 
 def _scales(
