@@ -1,0 +1,30 @@
+"""``splatsoil benchmark``: whatever module stands in the package can be listed and run."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from splatsoil import cli
+
+
+def test_listed_are_the_modules_of_the_folder(repository: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["benchmark", "--json"]) == 0
+    listed = json.loads(capsys.readouterr().out)["benchmarks"]
+    modules = {p.stem.replace("_", "-") for p in (repository / "benchmarks").glob("[!_]*.py")}
+    assert set(listed) == modules and {"bo-vs-mcmc", "calibration", "paper-table", "numerics"} <= modules
+    assert all(listed.values())
+
+
+@pytest.mark.parametrize("name", ["bo-vs-mcmc", "calibration", "paper-table", "landscape"])
+def test_options_behind_the_name_are_the_benchmarks_own(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["benchmark", name, "--help"]) == 0
+    assert f"usage: splatsoil benchmark {name}" in capsys.readouterr().out
+    assert cli.main(["benchmark", name, "--no-such-option"]) == 2
+
+
+def test_an_unknown_name_is_told_the_known_ones(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["benchmark", "nix"]) == 2
+    assert "bo-vs-mcmc" in capsys.readouterr().err

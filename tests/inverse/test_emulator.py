@@ -1,0 +1,102 @@
+"""The emulator on features whose law is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import RBF
+from splatsoil.inverse.emulator import Emulator, _Process
+from splatsoil.inverse.surrogate import sobol
+
+DIRECTIONS = np.linalg.qr(np.random.default_rng(0).normal(size=(40, 3)))[0]
+CHANCE = 0.3
+
+
+def scores(points: np.ndarray) -> np.ndarray:
+    x, y = points.T
+    return np.stack([5.0 * x + x**2, 3.0 * y + x * y, np.sin(2.0 * x)], axis=1)
+
+
+def simulated(points: np.ndarray, seed: int) -> np.ndarray:
+    """40 features along three directions, with chance along the first."""
+    rng = np.random.default_rng(seed)
+    return scores(points) @ DIRECTIONS.T + CHANCE * rng.normal(size=(len(points), 1)) * DIRECTIONS[:, 0]
+
+
+@pytest.fixture(scope="module")
+def emulator() -> Emulator:
+    points = np.concatenate([sobol(24, 2, 0), np.zeros((6, 2))])
+    return Emulator(points, simulated(points, 1))
+
+
+def test_features_elsewhere_are_predicted_within_the_quoted_variance(emulator: Emulator) -> None:
+    points = np.random.default_rng(3).uniform(-0.9, 0.9, (300, 2))
+    truth = scores(points) @ DIRECTIONS.T
+    mean, variance = emulator.predict(points)
+    z = (emulator.project(truth) - mean) / np.sqrt(variance)
+    assert 0.5 < np.sqrt(np.mean(z**2)) < 1.5
+    assert np.sqrt(np.mean((emulator.features(points) - truth) ** 2)) < 0.1 * truth.std()
+
+
+def test_chance_is_the_scatter_between_seeds(emulator: Emulator) -> None:
+    assert np.sqrt(np.trace(emulator.chance)) == pytest.approx(CHANCE, rel=0.4)
+
+
+def test_left_out_points_are_predicted_and_covered(emulator: Emulator) -> None:
+    assert emulator.left_out.skill[0] > 0.95
+    assert 0.6 < np.sqrt(np.mean(emulator.left_out.z**2)) < 1.4
+    assert emulator.left_out.coverage > 0.8
+
+
+def test_basis_is_orthonormal_and_the_remainder_outside_it(emulator: Emulator) -> None:
+    np.testing.assert_allclose(emulator.basis.T @ emulator.basis, np.eye(emulator.count), atol=1e-12)
+    some = np.random.default_rng(4).normal(size=40)
+    np.testing.assert_allclose(emulator.basis.T @ emulator.remainder(some), 0.0, atol=1e-12)
+    again = emulator.centre + emulator.project(some) @ emulator.basis.T + emulator.remainder(some)
+    np.testing.assert_allclose(again, some, atol=1e-12)
+
+
+def test_leaving_out_in_closed_form_is_leaving_out() -> None:
+    """Against scikit-learn, trained anew without each group, hyperparameter draw by draw."""
+    points = np.concatenate([sobol(7, 1, 2), np.zeros((2, 1))])
+    values = np.sin(2.0 * points[:, 0]) + 0.05 * np.random.default_rng(5).normal(size=9)
+    process = _Process(points, values, seed=0)
+    errors, stds = process.left_out()
+    for group in (np.array([3]), np.array([7, 8])):
+        rest = np.setdiff1d(np.arange(9), group)
+        found, variances = [], []
+        for length, noise, mean in zip(
+            process.settings.lengths[:, 0], process.settings.noise[:, 0], process.settings.mean, strict=True
+        ):
+            other = GaussianProcessRegressor(RBF(length, "fixed"), alpha=noise + 1e-8, optimizer=None)
+            other.fit(process.x[rest], process.y[rest] - mean)
+            predicted, std = other.predict(process.x[group], return_std=True)
+            found.append(process.y[group] - mean - predicted)
+            variances.append(std**2 + noise + 1e-8)
+        np.testing.assert_allclose(errors[group], process.scale * np.mean(found, axis=0), atol=1e-6)
+        total = np.mean(variances, axis=0) + np.var(found, axis=0)
+        np.testing.assert_allclose(stds[group], process.scale * np.sqrt(total), rtol=1e-5)
+
+
+def test_features_that_are_all_chance_have_no_skill() -> None:
+    points = sobol(32, 1, 0)
+    emulator = Emulator(points, np.random.default_rng(6).normal(size=(32, 10)))
+    # Of ten components of pure chance, some look predictable by chance; none is.
+    assert emulator.count <= 3
+    assert emulator.left_out.skill.max() < 0.5
+
+
+@pytest.mark.parametrize(
+    ("points", "features", "says"),
+    [
+        (np.zeros((3, 1)), np.ones((3, 5)), "too few"),
+        (np.zeros((9, 1)), np.ones((9, 5)), "the same"),
+        (np.zeros((9, 1)), np.full((9, 5), np.nan), "not finite"),
+        (np.zeros((9, 1)), np.ones((8, 5)), "need features"),
+        (np.zeros((9, 1)), np.ones((9, 0)), "need features"),
+    ],
+)
+def test_what_cannot_be_emulated_is_refused(points: np.ndarray, features: np.ndarray, says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        Emulator(points, features)
