@@ -16,7 +16,7 @@ from .floor import Floor, floor_of
 from .misfit import Block, Omnibus, blocks, left_over, omnibus, shares, smooth_basis
 from .noise import Noise
 from .refit import Refit, refit
-from .score import Score, Tester
+from .score import Score, Scorer
 from .simulations import Simulations
 from .verdicts import EQUIVALENT, GATE, LEVEL, EffectVerdict, Verdict, explained, of_effect, overall
 
@@ -144,13 +144,13 @@ class Bench:
     Attributes:
         floor: noise and nuisances.
         candidates: effects that could be simulated.
-        tester: of them; None where there are none.
+        scorer: of them; None where there are none.
         basis: (n, k) slow waves.
     """
 
     floor: Floor
     candidates: tuple[Candidate, ...]
-    tester: Tester | None
+    scorer: Scorer | None
     basis: FloatArray
 
     @classmethod
@@ -160,10 +160,10 @@ class Bench:
         seen = experiment.seen
         candidates = tuple(c for c in experiment.candidates if c.name in evidence.directions)
         columns = {c.name: evidence.directions[c.name][:, seen].T for c in candidates}
-        tester = None
+        scorer = None
         if candidates:
-            tester = Tester.of(floor.noise, floor.free, columns, candidates, level=options.level, seed=options.seed)
-        return cls(floor, candidates, tester, smooth_basis(experiment.layout, floor.noise))
+            scorer = Scorer.of(floor.noise, floor.free, columns, candidates, level=options.level, seed=options.seed)
+        return cls(floor, candidates, scorer, smooth_basis(experiment.layout, floor.noise))
 
 
 def judge(
@@ -178,23 +178,23 @@ def judge(
     """From evidence to a verdict; simulates only to refit the best effects."""
     told = progress or (lambda what, share: None)
     bench = bench or Bench.of(experiment, evidence, options)
-    floor, tester, seen = bench.floor, bench.tester, experiment.seen
+    floor, scorer, seen = bench.floor, bench.scorer, experiment.seen
     residual = (experiment.observed - evidence.mean)[seen]
     misfit = omnibus(floor.noise, floor.free, residual, bench.basis)
-    scores = {} if tester is None else tester.score(residual)
+    scores = {} if scorer is None else scorer.score(residual)
     candidates = {c.name: c for c in bench.candidates}
     strong = sorted((s for s in scores.values() if s.adjusted < options.level), key=lambda s: s.statistic, reverse=True)
     confirmations: dict[str, Confirmation] = {}
     members: tuple[str, ...] = ()
     given: Mapping[str, Score] = {}
     remainder, gone = None, 0.0
-    if strong and tester is not None:
+    if strong and scorer is not None:
         chosen = [candidates[s.name] for s in strong[: options.refits]]
         confirmations = confirm(experiment, evidence, floor, chosen, simulate, options, bench.basis, told)
         tried = {name: c for name, c in confirmations.items() if name}
         best = min(tried, key=lambda name: tried[name].chi2)
         members = _equals(tried, best)
-        given = tester.score(residual, given=best)
+        given = scorer.score(residual, given=best)
         remainder = _after(experiment, floor, tried[best], candidates, evidence, bench.basis, members)
         gone = explained(confirmations[""].remainder, remainder)
     effects = _effects(candidates, scores, given, members, confirmations, options.level)
@@ -209,7 +209,7 @@ def judge(
         effects=effects,
         scores=scores,
         given=given,
-        confusion=_pairs(tester),
+        confusion=_pairs(scorer),
         misfit=misfit,
         remainder=remainder,
         explained=gone,
@@ -335,7 +335,7 @@ def _after(
     if not others:
         return best.remainder
     columns = {c.name: evidence.directions[c.name][:, seen].T for c in others}
-    second = max(Tester.of(floor.single, free, columns, others).score(left).values(), key=lambda score: score.statistic)
+    second = max(Scorer.of(floor.single, free, columns, others).score(left).values(), key=lambda score: score.statistic)
     if second.adjusted >= LEVEL:
         return best.remainder
     size = columns[second.name]
@@ -365,10 +365,10 @@ def _effects(
     return out
 
 
-def _pairs(tester: Tester | None) -> dict[tuple[str, str], float]:
-    if tester is None:
+def _pairs(scorer: Scorer | None) -> dict[tuple[str, str], float]:
+    if scorer is None:
         return {}
-    matrix, names = tester.confusion(), tester.names
+    matrix, names = scorer.confusion(), scorer.names
     return {(a, b): float(matrix[i, j]) for i, a in enumerate(names) for j, b in enumerate(names) if j < i}
 
 

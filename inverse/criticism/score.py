@@ -61,7 +61,7 @@ class Score:
 
 
 @dataclass(frozen=True)
-class Tester:
+class Scorer:
     """All candidates against any residual with the same noise.
 
     Attributes:
@@ -94,7 +94,7 @@ class Tester:
         *,
         level: float = 0.05,
         seed: int = 0,
-    ) -> Tester:
+    ) -> Scorer:
         """Prepare the test.
 
         Args:

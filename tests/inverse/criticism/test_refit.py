@@ -1,0 +1,80 @@
+"""Gauss-Newton with few simulations against SciPy's least squares."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from splatsoil.inverse.criticism.refit import mended, refit
+
+from splatsoil.errors import SimulationError
+from splatsoil.parameters import Parameter
+
+PARAMETERS = (Parameter("a", "1", 0.0, 10.0, 2.0), Parameter("b", "1", -5.0, 5.0, 0.0))
+PLACES = np.linspace(0.0, 1.0, 24).reshape(6, 4)
+
+
+def model(values: Mapping[str, float]) -> np.ndarray:
+    return values["a"] * np.exp(-2.0 * PLACES) + np.sin(values["b"]) * PLACES + 0.05 * values["a"] ** 2 * PLACES**2
+
+
+def start_of(values: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray]:
+    middle = model(values)
+    slopes = [(model({**values, n: values[n] + 0.1}) - middle) / 0.1 for n in ("a", "b")]
+    return middle, np.stack(slopes, axis=-1)
+
+
+def test_it_ends_where_least_squares_does() -> None:
+    observed = model({"a": 7.0, "b": 1.0}) + 0.05 * np.random.default_rng(0).normal(size=PLACES.shape)
+    start = {"a": 2.0, "b": 0.0}
+    middle, slopes = start_of(start)
+    found = refit(
+        model,
+        lambda t: t.reshape(PLACES.size, -1).squeeze() / 0.05,
+        observed,
+        PARAMETERS,
+        start,
+        middle,
+        slopes,
+        most=12,
+    )
+    oracle = least_squares(lambda p: ((model({"a": p[0], "b": p[1]}) - observed) / 0.05).ravel(), [2.0, 0.0])
+    assert found.chi2 == pytest.approx(2.0 * oracle.cost, rel=0.05)
+    assert found.values["a"] == pytest.approx(oracle.x[0], abs=0.1)
+    assert found.simulations <= 12
+    assert np.array_equal(found.prediction, model(found.values))
+
+
+def test_bounds_hold_and_failed_simulations_only_cost() -> None:
+    observed = model({"a": 14.0, "b": 0.0})
+
+    def brittle(values: Mapping[str, float]) -> np.ndarray:
+        if values["a"] > 9.99:
+            raise SimulationError("blew up")
+        return model(values)
+
+    start = {"a": 6.0, "b": 0.0}
+    middle, slopes = start_of(start)
+    found = refit(
+        brittle,
+        lambda t: t.reshape(PLACES.size, -1).squeeze() / 0.05,
+        observed,
+        PARAMETERS,
+        start,
+        middle,
+        slopes,
+        most=6,
+    )
+    assert 6.0 < found.values["a"] < 9.99
+    assert found.chi2 < np.sum(((middle - observed) / 0.05) ** 2)
+
+
+def test_the_mended_slopes_explain_the_step_just_made_and_leave_others_alone() -> None:
+    generator = np.random.default_rng(1)
+    slopes, change = generator.normal(size=(3, 2, 2)), generator.normal(size=(3, 2))
+    moved = np.array([0.5, 0.0])
+    fresh = mended(slopes, change, moved, moved)
+    assert np.allclose(fresh @ moved, change)
+    assert np.array_equal(fresh[..., 1], slopes[..., 1])
