@@ -124,7 +124,9 @@ def play(world: World, budgets: Sequence[int], seed: int, search: Search | None)
     """Bayesian optimisation: an answer at each budget, and the calls (points, features)."""
     rng = np.random.default_rng([seed, 31])
     optimiser = BayesianOptimiser(len(world.space), seed=seed, search=search)
-    answers, points, features = {}, [], []
+    answers: dict[int, Answer] = {}
+    points: list[FloatArray] = []
+    features: list[FloatArray] = []
     spent = 0.0
     while len(points) < max(budgets):
         began = time.perf_counter()

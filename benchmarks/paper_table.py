@@ -148,7 +148,7 @@ def search(sight: Sight, way: str, evaluations: int, seed: int) -> dict[str, Any
         if found is not None:
             blocks.append(found["blocks"])
     result = optimiser.result()
-    trial = {
+    trial: dict[str, Any] = {
         way: {
             "estimate": float(SPACE.from_unit(result.estimate)[0]),
             "std": float(result.std[0]) * 15.0,

@@ -112,11 +112,11 @@ class PlowSandVectorEnv(VectorEnv[Observation, npt.NDArray[np.float32], Any]):
             infos = self._add_info(infos, info, k)
         return self._batched(observations), rewards, terminated, truncated, infos
 
-    def render(self) -> tuple[npt.NDArray[np.uint8] | None, ...]:
+    def render(self) -> tuple[Any, ...] | None:
         """Each sub-environment's picture."""
         return tuple(env.render() for env in self.envs)
 
     def _batched(self, observations: Sequence[Observation]) -> Observation:
-        out = create_empty_array(self.single_observation_space, n=self.num_envs, fn=np.zeros)
+        out: Any = create_empty_array(self.single_observation_space, n=self.num_envs, fn=np.zeros)
         batch: Any = concatenate(self.single_observation_space, observations, out)
         return batch

@@ -119,11 +119,11 @@ def executor(where: str = "serial") -> Iterator[Executor]:
     if kind == "serial" and not detail:
         yield Serial()
     elif kind == "processes" and detail.isdigit():
-        pool = Processes(int(detail))
+        workers = Processes(int(detail))
         try:
-            yield pool
+            yield workers
         finally:
-            pool.shutdown(cancel_futures=True)
+            workers.shutdown(cancel_futures=True)
     elif kind == "dask" and detail:
         with _dask(detail) as pool:
             yield pool

@@ -132,7 +132,7 @@ def sample(
     )
 
 
-class _Blocks(emcee.backends.HDFBackend):  # type: ignore[misc]
+class _Blocks(emcee.backends.HDFBackend):
     """emcee's HDF5 file, written a stride at a time: opening it for each step costs more than the step."""
 
     def __init__(self, file: str, name: str) -> None:

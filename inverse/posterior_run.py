@@ -45,7 +45,7 @@ class Effort:
 def setup_of(described: Mapping[str, Any]) -> FitSetup:
     """The setup that ``fit.json`` describes."""
     names = FitSetup.__dataclass_fields__
-    known = {k: tuple(v) if isinstance(v, list) else v for k, v in described.items() if k in names}
+    known: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in described.items() if k in names}
     return FitSetup(**known)
 
 

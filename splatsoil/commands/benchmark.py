@@ -51,10 +51,13 @@ def run(config: Config) -> int:
 
 
 def _execute(name: str, module: str, arguments: tuple[str, ...]) -> int:
-    """``python -m MODULE ARGUMENTS`` in this process; its exit code."""
+    """A module's ``main`` (or all of it, as ``python -m`` would) with these arguments; its exit code."""
     before = sys.argv
     sys.argv = [f"splatsoil benchmark {name}", *arguments]
     try:
+        main = getattr(importlib.import_module(module), "main", None)
+        if main is not None:
+            return int(main(list(arguments)))
         runpy.run_module(module, run_name="__main__")
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else int(end.code is not None)

@@ -62,6 +62,7 @@ def test_coverage_and_ranks_are_counted() -> None:
     assert piled["p_uniform"] < 1e-6 and piled["coverage"]["0.9"] == 0.0
 
 
+@pytest.mark.slow
 def test_a_known_world_is_calibrated() -> None:
     entries = calibration.calibrate(made_up(16), 16, sensor_std=0.1)
     held = np.mean([e["within"]["0.9"][0] for e in entries])
