@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,8 @@ from splatsoil.files import read_json
 
 FIT_FORMAT = "splatsoil-fit/1"
 COMPARISON_FORMAT = "splatsoil-comparison/1"
+DIAGNOSIS_FORMAT = "splatsoil-diagnosis/1"
+HISTORY_FORMAT = "splatsoil-history/1"
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,9 @@ class RunData:
         fit: ``fit.json``, the latest fit.
         fits: every finished fit by name.
         comparison: ``comparison/comparison.json`` when it belongs to the latest fit.
+        before: the comparison of the model before the latest effect was added, from ``before/``.
+        diagnosis: the latest fit's diagnosis.
+        history: models tried by adding effects, the first one first.
         reconstruction: ``reconstruction/reconstruction.json``.
         surface: the reconstructed surface.
     """
@@ -50,6 +55,9 @@ class RunData:
     fit: Mapping[str, Any]
     fits: Mapping[str, Mapping[str, Any]]
     comparison: Mapping[str, Any] | None
+    before: Mapping[str, Any] | None
+    diagnosis: Mapping[str, Any] | None
+    history: Sequence[Mapping[str, Any]]
     reconstruction: Mapping[str, Any] | None
     surface: Surface | None
 
@@ -73,6 +81,9 @@ def load(folder: str | Path) -> RunData:
         fit=fit,
         fits=fits or {str(fit["name"]): fit},
         comparison=_comparison(path / "comparison", fit),
+        before=_before(path / "before"),
+        diagnosis=_diagnosis(path / "diagnoses", fits or {str(fit["name"]): fit}, fit),
+        history=_history(path / "history.json"),
         reconstruction=_reconstruction(path / "reconstruction"),
         surface=_surface(path / "reconstruction" / "surface.npz"),
     )
@@ -97,6 +108,31 @@ def _comparison(folder: Path, fit: Mapping[str, Any]) -> dict[str, Any] | None:
     data = _checked(folder / "comparison.json", COMPARISON_FORMAT)
     same = data["fit"] == fit["name"] and data["parameters"] == estimates(fit)
     return data if same else None
+
+
+def _before(folder: Path) -> dict[str, Any] | None:
+    path = folder / "comparison.json"
+    return _checked(path, COMPARISON_FORMAT) if path.is_file() else None
+
+
+def _diagnosis(folder: Path, fits: Mapping[str, Any], fit: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The diagnosis of the latest fit or, where it has none, of the model that it was made from."""
+    found = {}
+    for name, other in fits.items():
+        path = folder / f"{name}.json"
+        if path.is_file():
+            data = _checked(path, DIAGNOSIS_FORMAT)
+            if data["values"] == estimates(other):
+                found[name] = data
+    if fit["name"] in found:
+        return found[str(fit["name"])]
+    mine = set(fit["setup"]["effects"]) if "setup" in fit else set()
+    smaller = [d for d in found.values() if set(d["model"]) < mine]
+    return max(smaller, key=lambda d: len(d["model"]), default=None)
+
+
+def _history(path: Path) -> list[dict[str, Any]]:
+    return list(_checked(path, HISTORY_FORMAT)["models"]) if path.is_file() else []
 
 
 def _reconstruction(folder: Path) -> dict[str, Any] | None:

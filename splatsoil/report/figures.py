@@ -141,5 +141,69 @@ def history(fits: Mapping[str, Mapping[str, Any]], order: Sequence[str]) -> str:
     return _draw(draw, (SIZE[0], 0.8 + 0.36 * len(order)))
 
 
+def falling(models: Sequence[Mapping[str, Any]], names: Sequence[str]) -> str:
+    """The error on hidden frames as effects are added, above what noise alone leaves."""
+
+    def draw(_: Figure, axes: Axes) -> None:
+        places = np.arange(len(models))
+        errors = [entry["held_out"] for entry in models]
+        axes.bar(places, errors, color=ACCENT, alpha=0.75, width=0.55)
+        for place, error in zip(places, errors, strict=True):
+            axes.text(place, error, f"{error:.2g}", ha="center", va="bottom", color=INK)
+        floors = [entry["floor"] for entry in models]
+        axes.step(
+            [-0.45, *(places + 0.5)],
+            [floors[0], *floors],
+            color=SECOND,
+            linestyle="--",
+            linewidth=1.4,
+            label="noise alone",
+        )
+        axes.set_xticks(places, names)
+        axes.set_xlim(-0.5, len(models) - 0.5)
+        axes.set_ylim(0.0, 1.18 * max(*errors, *floors))
+        axes.set_ylabel("error, grey levels")
+        axes.legend(fontsize=8)
+
+    return _draw(draw)
+
+
+def plan_maps(diagnosis: Mapping[str, Any], which: str) -> str:
+    """Residual over noise from above, one row for each stage, one column for each instrument."""
+    table = np.array(diagnosis["maps"][which], dtype=np.float64)
+    sites, stages = diagnosis["sites"], diagnosis["stages"]
+    channels = list(dict.fromkeys(site[0] for site in sites))
+    names = list(dict.fromkeys(stages))
+    limit = max(3.0, min(float(np.nanpercentile(np.abs(table), 99.0)), 15.0))
+
+    def draw(figure: Figure, axes: Axes) -> None:
+        axes.remove()
+        grid = figure.subplots(len(names), len(channels), squeeze=False, sharex=True, sharey=True)
+        shown = None
+        for row, name in enumerate(names):
+            rows = table[[i for i, stage in enumerate(stages) if stage == name]]
+            for column, channel in enumerate(channels):
+                mine = [i for i, site in enumerate(sites) if site[0] == channel]
+                part = rows[:, mine]
+                count = np.sum(np.isfinite(part), axis=0)
+                value = np.where(count > 0, np.nansum(part, axis=0) / np.maximum(count, 1), np.nan)
+                x, y = np.array([sites[i][1:] for i in mine], dtype=np.float64).T
+                xs, ys = np.unique(x.round(6)), np.unique(y.round(6))
+                image = np.full((len(ys), len(xs)), np.nan)
+                image[np.searchsorted(ys, y.round(6)), np.searchsorted(xs, x.round(6))] = value
+                place = grid[row][column]
+                shown = place.pcolormesh(xs, ys, image, cmap="RdBu_r", vmin=-limit, vmax=limit, rasterized=False)
+                place.set_aspect("equal")
+                if row == 0:
+                    place.set_title(channel, fontsize=9)
+                if column == 0:
+                    place.set_ylabel(name, fontsize=8)
+                place.tick_params(labelsize=7)
+        bar = figure.colorbar(shown, ax=grid.ravel().tolist(), shrink=0.8, pad=0.02)
+        bar.set_label("residual / noise")
+
+    return _draw(draw, (SIZE[0], 0.5 + 1.05 * len(names)))
+
+
 def _cycle() -> list[str]:
     return [ACCENT, SECOND, INK, FAINT] * 20

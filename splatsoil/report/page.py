@@ -46,7 +46,15 @@ def render(data: RunData) -> str:
     environment.filters["duration"] = words.duration
     environment.filters["symbol"] = words.symbol
     environment.filters["model"] = words.model_name
-    comparison = data.comparison
+    environment.filters["estimate"] = words.estimate
+    comparison, diagnosis = data.comparison, data.diagnosis
+    pictures = None if comparison is None else _pictures(data.folder / "comparison", comparison)
+    kinds = list(KINDS)
+    if pictures is not None and data.before is not None:
+        # Observed, before, after, difference: what the added effect changed.
+        earlier = _pictures(data.folder / "before", data.before)
+        if _join(pictures, earlier):
+            kinds.insert(1, "before")
     order = sorted(data.fits, key=lambda name: (name != "base", -data.fits[name]["loss"]))
     return environment.get_template("page.html").render(
         style=Markup((HERE / "page.css").read_text(encoding="utf-8")),
@@ -60,8 +68,13 @@ def render(data: RunData) -> str:
         at_the_noise=words.AT_THE_NOISE,
         surrogates={name: Markup(figures.surrogate(data.fit, name)) for name in data.fit["parameters"]},
         losses=None if comparison is None else Markup(figures.losses(comparison)),
-        pictures=None if comparison is None else _pictures(data.folder / "comparison", comparison),
-        kinds=KINDS,
+        pictures=pictures,
+        kinds=kinds,
+        titles={"predicted": "after"} if "before" in kinds else {},
+        diagnosis=diagnosis,
+        verdict=None if diagnosis is None else words.verdict(diagnosis),
+        maps=None if diagnosis is None else _maps(diagnosis),
+        falling=Markup(figures.falling(data.history, words.steps(data.history))) if len(data.history) > 1 else None,
         surface=None if data.surface is None else Markup(figures.surface_map(data.surface)),
         order=order,
         history=Markup(figures.history(data.fits, order)) if len(order) > 1 else None,
@@ -86,6 +99,26 @@ def _pictures(folder: Path, comparison: Mapping[str, Any]) -> list[dict[str, Any
         }
         for camera in comparison["cameras"]
     ]
+
+
+def _join(pictures: list[dict[str, Any]], earlier: list[dict[str, Any]]) -> bool:
+    """Put each frame's earlier prediction beside the present one; False where the two don't match."""
+    known = {(c["camera"], f["frame"]): f["predicted"] for c in earlier for f in c["frames"]}
+    wanted = [(c["camera"], f) for c in pictures for f in c["frames"]]
+    if any((camera, frame["frame"]) not in known for camera, frame in wanted):
+        return False
+    for camera, frame in wanted:
+        frame["before"] = known[camera, frame["frame"]]
+    return True
+
+
+def _maps(diagnosis: Mapping[str, Any]) -> list[tuple[str, Any]]:
+    """Plan views of the residual, before anything is added and with the best effect."""
+    from markupsafe import Markup
+
+    shown = [("The model as it is", "before")]
+    shown += [(f"With {name.replace('_', ' ')}", name) for name in diagnosis["class"][:1] if name in diagnosis["maps"]]
+    return [(title, Markup(figures.plan_maps(diagnosis, which))) for title, which in shown]
 
 
 def data_url(path: Path) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -98,6 +98,37 @@ def residual_sentence(comparison: Mapping[str, Any] | None) -> str:
         f"{said} Part of the rest is the chance of where grains fall; the other part is the model's, the "
         "reconstruction's or the light's, and this page cannot tell which."
     )
+
+
+VERDICTS = {
+    "adequate": "The model is adequate.",
+    "missing": "An effect is missing.",
+    "outside the library": "Something is missing that the library does not have.",
+}
+
+
+def verdict(diagnosis: Mapping[str, Any]) -> str:
+    """The diagnosis in one line."""
+    if diagnosis["verdict"] == "missing" and diagnosis["class"]:
+        names = [name.replace("_", " ") for name in diagnosis["class"]]
+        return f"Missing: {' or '.join(names)}."
+    return VERDICTS.get(str(diagnosis["verdict"]), str(diagnosis["verdict"]))
+
+
+def steps(models: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Short names of models that grow by one effect each: base, + cohesion, + dilatancy."""
+    first = str(models[0]["model"]).replace("_", " ") if models else ""
+    return [first, *(f"+ {str(entry.get('added', '?')).replace('_', ' ')}" for entry in models[1:])]
+
+
+def estimate(value: Any, std: Any, unit: str) -> str:
+    """An estimate that may not exist."""
+    if value is None:
+        return "–"
+    if std is None:
+        return "nothing of it is seen"
+    number, spread = with_std(float(value), float(std))
+    return f"{number} ± {spread}{symbol(unit)}"
 
 
 def percent(share: float) -> str:
