@@ -17,8 +17,8 @@ import torch
 
 from .surrogate import FloatArray, Minimum, Surrogate, quiet, seeded, sobol
 
-#: Space-filling evaluations before the first acquisition: at least, and for each parameter. With fewer, a search in many
-#: dimensions runs into corners and stays there.
+#: Space-filling evaluations before the first acquisition: at least, and for each parameter. With fewer, a search in
+#: many dimensions runs into corners and stays there.
 START, START_EACH = 4, 3
 #: Quasi-Monte-Carlo draws, restarts and raw candidates of the acquisition function.
 DRAWS = 128
