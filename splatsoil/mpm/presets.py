@@ -26,7 +26,8 @@ class Preset:
             skeleton allows long steps.
         poisson: Poisson's ratio.
         courant: sound-wave Courant number of a substep.
-        transport: most cells the tool may travel in one step of the particles.
+        transport: most cells the tool may travel in one step of the particles. An exchange with the grid dissipates a
+            little, so less isn't better: it goes with the cell, see docs/numerics.md.
     """
 
     name: str
@@ -42,8 +43,8 @@ PRESETS: dict[str, Preset] = {
     preset.name: preset
     for preset in (
         Preset("tiny", cells_across_tool=3.0, young=2.0e5, transport=0.2),
-        Preset("small", cells_across_tool=6.0),
-        Preset("fine", cells_across_tool=8.0, young=1.0e6),
+        Preset("small", cells_across_tool=6.0, transport=1.0 / 15.0),
+        Preset("fine", cells_across_tool=8.0, transport=0.05),
         Preset("paper", cells_across_tool=3.2, young=1.0e6, poisson=0.2),
     )
 }
