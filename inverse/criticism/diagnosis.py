@@ -192,8 +192,9 @@ def judge(
         chosen = [candidates[s.name] for s in strong[: options.refits]]
         confirmations = confirm(experiment, evidence, floor, chosen, simulate, options, bench.basis, told)
         tried = {name: c for name, c in confirmations.items() if name}
-        best = min(tried, key=lambda name: tried[name].chi2)
-        members = _equals(tried, best)
+        costs = {name: c.chi2 + price(candidates[name], misfit.freedom) for name, c in tried.items()}
+        best = min(costs, key=lambda name: costs[name])
+        members = _equals(costs, best, tried[best].remainder)
         given = scorer.score(residual, given=best)
         remainder = _after(experiment, floor, tried[best], candidates, evidence, bench.basis, members)
         gone = explained(confirmations[""].remainder, remainder)
@@ -309,11 +310,16 @@ def _stands(confirmations: Mapping[str, Confirmation], best: str) -> bool:
     return before.chi2 - after.chi2 > EQUIVALENT and after.held_out < before.held_out
 
 
-def _equals(tried: Mapping[str, Confirmation], best: str) -> tuple[str, ...]:
+def price(candidate: Candidate, freedom: int) -> float:
+    """χ² that an effect's parameters beyond its first must bring in (Schwarz 1978, over as many slow waves)."""
+    return (len(candidate.parameters) - 1) * math.log(max(freedom, 2))
+
+
+def _equals(costs: Mapping[str, float], best: str, remainder: Omnibus) -> tuple[str, ...]:
     """Effects whose χ² after refitting lies as near to the best as equals do; wider where a misfit remains."""
-    wide = EQUIVALENT * max(1.0, tried[best].remainder.dispersion)
-    close = [name for name, c in tried.items() if c.chi2 - tried[best].chi2 < wide]
-    return tuple(sorted(close, key=lambda name: tried[name].chi2))
+    wide = EQUIVALENT * max(1.0, remainder.dispersion)
+    close = [name for name, cost in costs.items() if cost - costs[best] < wide]
+    return tuple(sorted(close, key=lambda name: costs[name]))
 
 
 def _after(

@@ -51,12 +51,12 @@ def _missing(diagnosis: Diagnosis, candidates: Mapping[str, Candidate], base: Ma
             f"{100.0 * share:.0f} % of the evidence comes from one part of the data: {region}, {stage}, {channel}."
         )
     moved = [
-        f"{name.replace('_', ' ')} from {base[name]:.4g} to {confirmed.fit.values[name]:.4g}"
+        f"{name.replace('_', ' ')} from {base[name]:.3g} to {confirmed.fit.values[name]:.3g}"
         for name in base
         if abs(confirmed.fit.values[name] - base[name]) > 1e-6 * max(abs(base[name]), 1.0)
     ]
     if moved:
-        out.append(f"With it the estimate of {listed(moved)} moves: without it that was biased.")
+        out.append(f"With it the refit moves {listed(moved)}: that much was bias.")
     if len(diagnosis.members) > 1:
         out.append(f"{listed([title(m) for m in diagnosis.members[1:]])} would explain it nearly as well.")
     if diagnosis.remainder is not None and diagnosis.remainder.p < GATE:

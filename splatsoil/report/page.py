@@ -63,7 +63,7 @@ def render(data: RunData) -> str:
         data=data,
         fit=data.fit,
         answers=words.answers(data.fit),
-        residual=words.residual_sentence(comparison),
+        residual=words.residual_sentence(comparison, diagnosed=diagnosis is not None),
         ratio=words.ratio_to_noise(comparison),
         at_the_noise=words.AT_THE_NOISE,
         surrogates={name: Markup(figures.surrogate(data.fit, name)) for name in data.fit["parameters"]},

@@ -77,7 +77,7 @@ def ratio_to_noise(comparison: Mapping[str, Any] | None) -> float | None:
     return None if not noise else float(comparison["total"][name]) / float(noise)
 
 
-def residual_sentence(comparison: Mapping[str, Any] | None) -> str:
+def residual_sentence(comparison: Mapping[str, Any] | None, *, diagnosed: bool = False) -> str:
     """How far the prediction is from the pictures, and what that does and doesn't mean."""
     if comparison is None:
         return "The prediction has not been compared with the pictures frame by frame yet."
@@ -94,6 +94,8 @@ def residual_sentence(comparison: Mapping[str, Any] | None) -> str:
         return f"The residual is {ratio:.1f} × what the cameras' noise alone leaves: nothing more to explain here."
     above = f"{ratio:.{1 if ratio < 10.0 else 0}f} × what the cameras' noise alone leaves"
     said = f"{left}; that is {above}." if left else f"The residual is {above}."
+    if diagnosed:
+        return said
     return (
         f"{said} Part of the rest is the chance of where grains fall; the other part is the model's, the "
         "reconstruction's or the light's, and this page cannot tell which."
