@@ -12,7 +12,7 @@ import numpy as np
 from splatsoil.envs.problem import Problem
 
 from splatsoil.errors import RunError
-from splatsoil.files import write_json
+from splatsoil.files import plain, write_json
 
 from .campaign import Job, run_campaign
 from .evaluations import EvaluationRecord, digest
@@ -125,7 +125,7 @@ def run_posterior(
                 file=run.path / "posterior" / "chains.h5",
                 progress=lambda done, most: report(f"chains, step {done}", 0.95),
             )
-    result = _told(posterior, records, checked, setup, time.perf_counter() - began)
+    result: dict[str, Any] = plain(_told(posterior, records, checked, setup, time.perf_counter() - began))
     write_inference_data(posterior, run.path / "posterior" / "posterior.nc")
     result["figures"] = write_figures(posterior, run.path / "posterior")
     write_json(run.path / "posterior.json", result)
