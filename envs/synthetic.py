@@ -182,7 +182,11 @@ class SyntheticProblem:
 
         if preset not in PRESETS:
             raise ParameterError(f"preset {preset!r} is unknown; known are {', '.join(PRESETS)}")
-        known = {p.name: p for p in Law(find_effects(effects)).parameters}
+        law = Law(find_effects(effects))
+        seen = [effect.name for effect in law.effects if effect.observes]
+        if seen:
+            raise ParameterError(f"the made-up world has no {seen[0]}: it is seen as it is; give a measurement set")
+        known = {p.name: p for p in law.parameters}
         unknown = [name for name in parameters if name not in known]
         if unknown:
             raise ParameterError(f"unknown parameter {', '.join(unknown)}; this model has {', '.join(known)}")

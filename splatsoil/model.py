@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -13,18 +12,15 @@ import numpy.typing as npt
 
 from splatsoil.errors import ParameterError
 from splatsoil.measurement import Measurement
-from splatsoil.mpm import Resolution, Trajectory, simulate
+from splatsoil.mpm import Resolution, Trajectory, frames_around, simulate
 from splatsoil.observation import Observation
 from splatsoil.parameters import Parameter, ParameterSpace
 from splatsoil.reconstruction import Reconstruction, fill
 from splatsoil.scene import Scene
-from splatsoil.soil.effect import Effect
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
 
 Image = npt.NDArray[np.float32]
-
-State = tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]
 
 SCENES_KEPT = 4
 """Scenes, one for each particle seed, that a model keeps at hand."""
@@ -111,7 +107,7 @@ class Model:
     @property
     def observation_parameters(self) -> tuple[Parameter, ...]:
         """Those of effects that change what the cameras report: `draw` needs no new simulation for them."""
-        return tuple(p for e in self.law.effects if type(e).observe is not Effect.observe for p in e.parameters)
+        return tuple(p for e in self.law.effects if e.observes for p in e.parameters)
 
     def observation(self, values: Mapping[str, float] | None = None) -> Observation:
         """What the cameras report under ``values`` (by name; defaults for those left out).
@@ -119,12 +115,7 @@ class Model:
         Raises:
             ParameterError: values out of bounds.
         """
-        given = values or {}
-        full = {p.name: p.check(given.get(p.name, p.default)) for p in self.parameters}
-        result = Observation()
-        for effect in self.law.effects:
-            result = effect.observe(result, full)
-        return result
+        return self.law.observation(values or {})
 
     def space(self, names: Iterable[str] | None = None) -> ParameterSpace:
         """The named parameters as free ones.
@@ -208,7 +199,7 @@ class Model:
         for frame in self.frames:
             moment = frame + observation.time_offset * rate
             tool = observation.tool(motion.pose(moment / rate))
-            posed = scene.pose(*state_at(trajectory, moment), tool)
+            posed = scene.pose(*trajectory.at(moment), tool)
             for name, camera in cameras.items():
                 images[name, frame] = observation.image(scene.picture(posed, camera), frame / rate)
         return images
@@ -242,33 +233,4 @@ class Model:
             max(abs(self.observation({p.name: bound}).time_offset) for bound in (p.lower, p.upper))
             for p in self.observation_parameters
         )
-        around = math.ceil(round(late * self.measurement.frame_rate, 6))
-        return tuple(sorted({max(f + k, 0) for f in self.frames for k in range(-around, around + 1)}))
-
-
-def state_at(trajectory: Trajectory, moment: float) -> State:
-    """Positions (n, 3) in m and deformations (n, 3, 3) at a moment in frames, linear between neighbouring frames.
-
-    Before frame 0 everything rests.
-
-    Raises:
-        ParameterError: the trajectory holds neither that frame nor the two around it.
-    """
-    wanted = round(max(moment, 0.0), 6)
-    index = {frame: k for k, frame in enumerate(trajectory.frames)}
-    before = math.floor(wanted)
-    share = wanted - before
-    missing = [f for f in (before, before + (share > 0.0)) if f not in index]
-    if missing:
-        raise ParameterError(
-            f"the trajectory has no frame {missing[0]}, which pictures at frame {wanted:g} need; "
-            "simulate with the effect that shifts time on"
-        )
-    k = index[before]
-    if share == 0.0:
-        return trajectory.positions[k], trajectory.deformations[k]
-    weight = np.float32(share)
-    return (
-        (1 - weight) * trajectory.positions[k] + weight * trajectory.positions[k + 1],
-        (1 - weight) * trajectory.deformations[k] + weight * trajectory.deformations[k + 1],
-    )
+        return frames_around(self.frames, late * self.measurement.frame_rate)

@@ -103,11 +103,15 @@ class Observation:
 
     def image(self, image: Image, time: float) -> Image:
         """A picture (h, w, 3), sRGB in [0, 1], that the lens sees at ``time`` in s, as the camera reports it."""
-        gain = self.gain * math.exp(self.drift * time)
-        if gain == 1.0 and self.offset == 0.0 and self.blur == 0.0:
+        if self.gain == 1.0 and self.drift == 0.0 and self.offset == 0.0 and self.blur == 0.0:
             return image
-        colour = blurred(_linear(image.astype(np.float64)), self.blur)
-        return _encoded(np.clip(gain * colour + self.offset, 0.0, 1.0)).astype(np.float32)
+        colour = self.exposed(_linear(image.astype(np.float64)), time)
+        return _encoded(np.clip(colour, 0.0, 1.0)).astype(np.float32)
+
+    def exposed(self, colour: FloatArray, time: float) -> FloatArray:
+        """Linear colour (h, w, 3) that the lens sees at ``time`` in s, as the sensor takes it."""
+        gain = self.gain * math.exp(self.drift * max(time, 0.0))
+        return gain * blurred(colour, self.blur) + self.offset
 
 
 def blurred(image: FloatArray, sigma: float) -> FloatArray:

@@ -11,7 +11,7 @@ from skimage.registration import phase_cross_correlation
 
 from splatsoil.errors import ParameterError
 from splatsoil.measurement import Bed, Camera, Frame, Measurement, Tool, ToolMotion
-from splatsoil.model import Model, state_at
+from splatsoil.model import Model
 from splatsoil.mpm.simulate import Trajectory
 from splatsoil.reconstruction import HeightField
 from splatsoil.scene import Light, Scene, ToolBody, bind, encoded, linear, relief_of_particles
@@ -133,10 +133,10 @@ def test_between_frames_soil_is_interpolated(measurement, scene, still):
     drift = (0.003, 0.0, -0.001)
     trajectory = trajectory_of(model, still, drift)
     for moment in (0.0, 0.37, 3.63, 8.0, 8.4):
-        x, f = state_at(trajectory, moment)
+        x, f = trajectory.at(moment)
         assert np.allclose(x, still + moment * np.array(drift), atol=1e-6)
         assert np.allclose(f, np.eye(3))
-    assert np.array_equal(state_at(trajectory, -0.4)[0], still)
+    assert np.array_equal(trajectory.at(-0.4)[0], still)
     plain = model_of(measurement, scene)
     assert plain.recorded == plain.frames == (0, 4, 8)
     with pytest.raises(ParameterError, match="frame 1"):

@@ -108,5 +108,14 @@ def candidate_of(effect: Effect) -> Candidate | None:
     testable = tuple(p for p in effect.parameters if p.off is not None)
     if not testable:
         return None
-    kind: Literal["physics", "observation"] = "observation" if type(effect).observe is not Effect.observe else "physics"
+    kind: Literal["physics", "observation"] = "observation" if effect.observes else "physics"
     return Candidate(effect.name, kind, testable, effect.size, effect.note)
+
+
+def candidates_of(effects: Iterable[Effect], on: Iterable[Effect]) -> tuple[Candidate, ...]:
+    """The candidates among effects, for a model that has some on: those that are off and don't exclude any of them."""
+    present = list(on)
+    names = {effect.name for effect in present}
+    excluded = {other for effect in present for other in effect.conflicts}
+    free = (e for e in effects if e.name not in names | excluded and not names & set(e.conflicts))
+    return tuple(c for c in map(candidate_of, free) if c is not None)

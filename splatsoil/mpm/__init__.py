@@ -1,7 +1,7 @@
 """The material point method: sand in a bed, a tool on its measured path, pictures' worth of recorded frames."""
 
 from splatsoil.mpm.presets import PRESETS, Preset, Resolution
-from splatsoil.mpm.simulate import Trajectory, simulate
+from splatsoil.mpm.simulate import Trajectory, frames_around, simulate
 from splatsoil.mpm.solver import Solver
 
-__all__ = ["PRESETS", "Preset", "Resolution", "Solver", "Trajectory", "simulate"]
+__all__ = ["PRESETS", "Preset", "Resolution", "Solver", "Trajectory", "frames_around", "simulate"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -9,12 +10,15 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from splatsoil.errors import ParameterError
 from splatsoil.measurement import Measurement, ToolMotion
 from splatsoil.mpm.presets import Preset, Resolution
 from splatsoil.mpm.solver import Solver
 from splatsoil.mpm.tool import Pose
 from splatsoil.soil.law import Law
 from splatsoil.soil.settings import FRICTION_ANGLE, Settings
+
+State = tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]
 
 
 @dataclass(frozen=True)
@@ -36,6 +40,39 @@ class Trajectory:
     force: npt.NDArray[np.float64]
     spacing: float
     resolution: Resolution
+
+    def at(self, moment: float) -> State:
+        """Positions (n, 3) in m and deformations (n, 3, 3) at a moment in frames, linear between neighbouring frames.
+
+        Before frame 0 everything rests.
+
+        Raises:
+            ParameterError: the trajectory holds neither that frame nor the two around it.
+        """
+        wanted = round(max(moment, 0.0), 6)
+        index = {frame: k for k, frame in enumerate(self.frames)}
+        before = math.floor(wanted)
+        share = wanted - before
+        missing = [f for f in (before, before + (share > 0.0)) if f not in index]
+        if missing:
+            raise ParameterError(
+                f"the trajectory has no frame {missing[0]}, which pictures at frame {wanted:g} need; "
+                "simulate with the effect that shifts time on"
+            )
+        k = index[before]
+        if share == 0.0:
+            return self.positions[k], self.deformations[k]
+        weight = np.float32(share)
+        return (
+            (1 - weight) * self.positions[k] + weight * self.positions[k + 1],
+            (1 - weight) * self.deformations[k] + weight * self.deformations[k + 1],
+        )
+
+
+def frames_around(frames: Iterable[int], late: float) -> tuple[int, ...]:
+    """Frames to record so that moments up to ``late`` frames before and after the given ones can be interpolated."""
+    around = math.ceil(round(abs(late), 6))
+    return tuple(sorted({max(f + k, 0) for f in frames for k in range(-around, around + 1)}))
 
 
 def base_settings(measurement: Measurement) -> Settings:

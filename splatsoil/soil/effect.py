@@ -45,6 +45,11 @@ class Effect:
     conflicts: ClassVar[Mapping[str, str]] = {}
 
     @property
+    def observes(self) -> bool:
+        """Whether it changes what the cameras report, and so no simulation."""
+        return type(self).observe is not Effect.observe
+
+    @property
     def size(self) -> str:
         """Name of the parameter that measures the effect."""
         return self.parameters[0].name

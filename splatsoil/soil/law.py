@@ -22,6 +22,7 @@ import numpy as np
 import warp as wp
 
 from splatsoil.errors import ParameterError
+from splatsoil.observation import Observation
 from splatsoil.parameters import FloatArray, Parameter
 from splatsoil.soil.effect import Effect
 from splatsoil.soil.matching import cone_intercept, cone_slope
@@ -283,6 +284,18 @@ class Law:
         result = replace(base, friction_angle=full["friction_angle"]) if "friction_angle" in values else base
         for effect in self.effects:
             result = effect.settings(result, full)
+        return result
+
+    def observation(self, values: Mapping[str, float]) -> Observation:
+        """What the cameras report under ``values``.
+
+        Raises:
+            ParameterError: an unknown name or a value outside its bounds.
+        """
+        full = self.values(values)
+        result = Observation()
+        for effect in self.effects:
+            result = effect.observe(result, full)
         return result
 
     def table(self, base: Settings, batch: Sequence[Mapping[str, float]]) -> FloatArray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +11,7 @@ import trimesh
 
 from splatsoil.measurement import Camera, Picture
 from splatsoil.mpm import Trajectory
+from splatsoil.observation import Observation
 from splatsoil.synthetic.appearance import Appearance
 from splatsoil.synthetic.setups import Setup
 from splatsoil.synthetic.soil_surface import soil_surface
@@ -41,6 +42,7 @@ class Photographer:
         seed: of light paths and sensor noise.
         device: Warp device name.
         progress: called with the share of the pictures that is done.
+        observation: how the video cameras, their light and the drawn tool differ from what the set will say.
     """
 
     setup: Setup
@@ -49,6 +51,7 @@ class Photographer:
     seed: int
     device: str = "cpu"
     progress: Callable[[float], None] = lambda share: None
+    observation: Observation = field(default_factory=Observation)
     _done: int = field(default=0, init=False)
 
     def take(self) -> tuple[list[Picture], list[Picture]]:
@@ -58,27 +61,37 @@ class Photographer:
         colours = self.look.sand_albedo(rest, setup.bed)
         views: list[Picture] = []
         video: list[Picture] = []
+        stage = self.stage(setup.frames[0], colours, Observation())
+        for i, camera in enumerate(setup.views):
+            views.append(Picture(camera, self._expose(self._light(stage, camera, 0, i), 0, i)))
         for frame in setup.frames:
-            stage = self.stage(frame, colours)
-            if frame == setup.frames[0]:
-                for i, camera in enumerate(setup.views):
-                    views.append(Picture(camera, self._expose(self._light(stage, camera, 0, i), 0, i)))
+            if frame != setup.frames[0] or self.observation != Observation():
+                stage = self.stage(frame, colours, self.observation)
             # Nothing moves in the pre-roll, but it has its own light paths: it measures all of the pictures' noise.
             numbers = (*setup.pre_roll, frame) if frame == setup.frames[0] else (frame,)
             for which, camera in enumerate(setup.video.values(), start=1):
+                stands = self.observation.camera(camera, which - 1)
                 for number in numbers:
-                    exposed = self._expose(self._light(stage, camera, which, number), which, number)
-                    video.append(Picture(camera, exposed, number, number / setup.frame_rate))
+                    time = number / setup.frame_rate
+                    light = self.observation.exposed(self._light(stage, stands, which, number), time)
+                    video.append(Picture(camera, self._expose(light, which, number), number, time))
         order = {name: k for k, name in enumerate(setup.video)}
         video.sort(key=lambda picture: (picture.frame, order[picture.camera.name]))
         return views, video
 
-    def stage(self, frame: int, colours: FloatArray) -> Stage:
-        """Soil, tool, bin and ground at one recorded frame; particle albedo (n, 3), linear."""
-        setup, look = self.setup, self.look
-        particles = self.trajectory.positions[self.trajectory.frames.index(frame)]
+    def stage(self, frame: int, colours: FloatArray, seen: Observation) -> Stage:
+        """Soil, tool, bin and ground of one frame of the video; particle albedo (n, 3), linear."""
+        setup = self.setup
+        look = replace(
+            self.look,
+            azimuth=self.look.azimuth + seen.sun_azimuth,
+            elevation=self.look.elevation + seen.sun_elevation,
+            sky_share=self.look.sky_share + seen.sky_share,
+        )
+        moment = frame + seen.time_offset * setup.frame_rate
+        particles, _ = self.trajectory.at(moment)
         soil = soil_surface(particles, colours, self.trajectory.spacing, setup.bed, sides=not setup.walls)
-        rotation, position = setup.tool.motion.pose(frame / setup.frame_rate)
+        rotation, position = seen.tool(setup.tool.motion.pose(moment / setup.frame_rate))
         tool = setup.tool.mesh
         placed = trimesh.Trimesh(tool.vertices @ rotation.T + position, tool.faces, process=False)
         walls, ground = bin_of(setup)

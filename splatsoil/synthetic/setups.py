@@ -12,7 +12,7 @@ import numpy.typing as npt
 import trimesh
 
 from splatsoil.errors import ParameterError
-from splatsoil.measurement import Bed, Camera, Measurement, Tool, ToolMotion
+from splatsoil.measurement import Bed, Camera, Frame, Measurement, Tool, ToolMotion
 from splatsoil.reconstruction.height_field import HeightField
 
 FloatArray = npt.NDArray[np.float64]
@@ -66,7 +66,7 @@ class Setup:
     walls: bool = True
 
     def experiment(self) -> Measurement:
-        """The experiment as the solver takes it, without pictures."""
+        """The experiment as the solver takes it; the pictures of its video are yet to be taken."""
         return Measurement(
             folder=Path(),
             name="synthetic",
@@ -75,7 +75,11 @@ class Setup:
             bed=self.bed,
             tool=self.tool,
             views=(),
-            video=(),
+            video=tuple(
+                Frame(camera, Path(), name, frame, frame / self.frame_rate)
+                for frame in self.frames
+                for name, camera in self.video.items()
+            ),
         )
 
     def resized(self, factor: float) -> Setup:

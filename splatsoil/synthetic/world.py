@@ -19,7 +19,7 @@ import warp as wp
 from splatsoil import __version__
 from splatsoil.errors import ParameterError
 from splatsoil.measurement import Measurement, write_measurement
-from splatsoil.mpm import Preset, Resolution, Trajectory, simulate
+from splatsoil.mpm import Preset, Resolution, Trajectory, frames_around, simulate
 from splatsoil.mpm.simulate import base_settings
 from splatsoil.reconstruction.filling import fill
 from splatsoil.soil.law import Law
@@ -94,9 +94,10 @@ def make_set(
     device = check_device(device)
     if seed < 0 or (particle_seed is not None and particle_seed < 0):
         raise ParameterError(f"seeds are whole numbers from 0 on, not {seed if seed < 0 else particle_seed}")
-    law = Law(find_effects(effects))
-    parameters = law.require_on({**(values or {}), "friction_angle": friction_angle})
     experiment = setup.experiment()
+    law = Law(effect.for_measurement(experiment) for effect in find_effects(effects))
+    parameters = law.require_on({**(values or {}), "friction_angle": friction_angle})
+    observation = law.observation(parameters)
     settings = law.settings(base_settings(experiment), parameters)
     resolution = Resolution.derive(experiment, preset)
     look = appearance or Appearance.drawn(seed)
@@ -106,19 +107,22 @@ def make_set(
 
     began = time.perf_counter()
     kept = truth_frames(setup.frames)
-    last = max(int(setup.tool.motion.frames[-1]), setup.frames[-1])
+    recorded = frames_around(setup.frames, observation.time_offset * setup.frame_rate)
+    last = max(int(setup.tool.motion.frames[-1]), recorded[-1])
     trajectory = simulate(
         experiment,
         particles,
         parameters,
         law=law,
         resolution=resolution,
-        frames={*setup.frames, last},
+        frames={*recorded, last},
         device=device,
         progress=lambda frame, end: report("sand", frame / max(end, 1)),
     )[0]
     simulated = time.perf_counter()
-    photographer = Photographer(setup, trajectory, look, seed, device, lambda share: report("pictures", share))
+    photographer = Photographer(
+        setup, trajectory, look, seed, device, lambda share: report("pictures", share), observation
+    )
     views, video = photographer.take()
     drawn = time.perf_counter()
 

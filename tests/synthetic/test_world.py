@@ -117,6 +117,41 @@ def test_the_same_seed_gives_the_same_bytes(world: World, tmp_path: Path) -> Non
         assert (again.measurement.folder / name).read_bytes() == (world.measurement.folder / name).read_bytes()
 
 
+def test_what_cameras_report_changes_the_video_and_nothing_else(world: World, tmp_path: Path) -> None:
+    """A gain of 0.6, a pan by a pixel of the left camera, pictures that come half a frame late."""
+    per_pixel = float(np.degrees(1.0 / short().video["left"].fx))
+    seen = make_set(
+        tmp_path / "seen",
+        short(),
+        friction_angle=31.0,
+        preset="tiny",
+        effects=("exposure", "camera_pose", "time_offset"),
+        values={"exposure_gain": 0.6, "camera_1_pan": per_pixel, "time_offset": 0.01},
+    )
+    assert seen.truth["parameters"]["camera_1_pan"] == per_pixel
+    for frame in truth_frames(world.measurement.frames):
+        np.testing.assert_array_equal(
+            particles(seen.measurement.folder, frame), particles(world.measurement.folder, frame)
+        )
+    for ours, theirs in zip(seen.measurement.views, world.measurement.views, strict=True):
+        np.testing.assert_array_equal(ours.image(), theirs.image())
+
+    def linear(set_: World, camera: str, frame: int) -> np.ndarray:
+        image = set_.measurement.video_frame(camera, frame).image().astype(np.float64)
+        return np.where(image <= 0.04045, image / 12.92, ((image + 0.055) / 1.055) ** 2.4)
+
+    for camera, shift in (("left", 1), ("right", 0)):
+        before, after = linear(world, camera, -1), linear(seen, camera, -1)
+        expected = 0.6 * np.roll(before, -shift, axis=1)[:, 4:-4]
+        found = after[:, 4:-4]
+        assert np.median(found / expected) == pytest.approx(1.0, abs=0.02)
+        still = np.abs(found - 0.6 * before[:, 4:-4]).mean()
+        assert shift == 0 or np.abs(found - expected).mean() < 0.7 * still
+    assert Measurement.load(seen.measurement.folder).cameras["left"].camera_to_world == pytest.approx(
+        world.measurement.cameras["left"].camera_to_world
+    ), "the set says nothing of the bump"
+
+
 def test_cohesion_acts(world: World, tmp_path: Path) -> None:
     """With all else equal, it moves the sand by far more than rounding, and the plate needs more force."""
     damp = make_set(
