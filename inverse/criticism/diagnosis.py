@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from splatsoil.experiment.base import Candidate, Experiment
 
-from .evidence import Evidence, gather
+from .evidence import Evidence, around, gather
 from .floor import Floor, floor_of
 from .misfit import Block, Omnibus, blocks, left_over, omnibus, shares, smooth_basis
 from .noise import Noise
@@ -265,18 +265,27 @@ def confirm(
         def predict(values: Mapping[str, float], name: str = name) -> FloatArray:
             return simulate(values, effects=(name,) if name else (), purpose=f"refit {name or 'of the model'}")
 
-        fit = refit(
-            predict,
-            whiten,
-            experiment.observed,
-            [*experiment.parameters, *extra],
-            start,
-            middle,
-            slopes,
-            most=options.refit_steps if candidate is not None else max(options.refit_steps - 2, 1),
-        )
+        free = [*experiment.parameters, *extra]
+        most = options.refit_steps if candidate is not None else max(options.refit_steps - 2, 1)
+        fit = refit(predict, whiten, experiment.observed, free, start, middle, slopes, most=most)
+        if candidate is not None and any(fit.values[p.name] != start[p.name] for p in extra):
+            # With the effect on, the model's own parameters act otherwise than they did without it.
+            slopes = _afresh(experiment, predict, fit)
+            fit = refit(
+                predict, whiten, experiment.observed, free, fit.values, fit.prediction, slopes, most=max(most - 2, 2)
+            )
         out[name] = _judged(experiment, floor, name, fit, ~shown if not shown.all() else shown, basis)
     return out
+
+
+def _afresh(experiment: Experiment, predict: Callable[[Mapping[str, float]], FloatArray], fit: Refit) -> FloatArray:
+    """(t, s, k) a refit's derivatives, those by the model's own parameters measured anew where it ended."""
+    slopes = fit.slopes.copy()
+    for index, parameter in enumerate(experiment.parameters):
+        value = fit.values[parameter.name]
+        end = around(parameter, value)[0]
+        slopes[..., index] = (predict({**fit.values, parameter.name: end}) - fit.prediction) / (end - value)
+    return slopes
 
 
 def _judged(

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatsoil.comparison import PATCH, Block, Comparator
-from splatsoil.experiment.base import Candidate, candidate_of
+from splatsoil.experiment.base import Candidate, candidates_of
 from splatsoil.experiment.features import Layout, Site
 from splatsoil.experiment.scene_parts import QUIET, regions_of, stages_of
 from splatsoil.model import Model, Prediction
@@ -71,12 +71,10 @@ class PlowExperiment:
         self.numerics = tuple(numerics)
         self.progress = progress
         wanted = library() if candidates is None else {name: library()[name] for name in candidates}
-        found = (
-            candidate_of(effect.for_measurement(model.measurement))
-            for name, effect in wanted.items()
-            if name not in self.model and name not in NUMERICS
+        self.candidates: tuple[Candidate, ...] = candidates_of(
+            (e.for_measurement(model.measurement) for name, e in wanted.items() if name not in NUMERICS),
+            model.law.effects,
         )
-        self.candidates: tuple[Candidate, ...] = tuple(c for c in found if c is not None)
         bed = model.measurement.bed
         rows = min(MOST_ROWS, len(model.frames) - 1)
         area = float(np.prod((bed.upper - bed.lower)[:2])) * len(model.measurement.cameras) * rows

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatsoil.errors import MeasurementError, SimulationError
-from splatsoil.experiment.base import Candidate, candidate_of
+from splatsoil.experiment.base import candidates_of
 from splatsoil.experiment.features import Layout, Site
 from splatsoil.parameters import Parameter
 from splatsoil.soil.element import triaxial
@@ -111,10 +111,7 @@ class TriaxialExperiment:
         self.parameters: tuple[Parameter, ...] = tuple(
             p for p in law.parameters if p.off is not None or p.name == "friction_angle"
         )
-        clashes = {other for e in law.effects for other in e.conflicts}
-        acting = (e for n, e in library().items() if n not in self.model and e.strength is not None)
-        found = (candidate_of(e) for e in acting if e.name not in clashes and not set(e.conflicts) & set(self.model))
-        self.candidates: tuple[Candidate, ...] = tuple(c for c in found if c is not None)
+        self.candidates = candidates_of((e for e in library().values() if e.strength is not None), law.effects)
         count = len(curve.strain)
         middle = 0.5 * float(curve.strain[-1])
         self.layout = Layout(

@@ -1,0 +1,43 @@
+"""A plate pressed into soil as an experiment."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from splatsoil.inverse.criticism.diagnosis import diagnose
+from splatsoil.inverse.criticism.simulations import Simulations
+
+from splatsoil.errors import ParameterError
+from splatsoil.experiment.plate import PlateExperiment
+
+DEPTHS = np.array([0.004, 0.006, 0.008, 0.010, 0.013, 0.016])
+
+
+def plate(forces: np.ndarray | list[float], preset: str = "tiny") -> PlateExperiment:
+    return PlateExperiment(0.1, DEPTHS, forces, 0.05 * np.abs(forces) + 0.2, preset=preset)
+
+
+def test_force_grows_with_depth_and_with_friction_and_repeats_itself() -> None:
+    experiment = plate(np.ones(6))
+    weak, strong = (experiment.predict({"friction_angle": angle})[:, 0] for angle in (28.0, 42.0))
+    assert weak[-1] > weak[0] > 0.0
+    assert strong.sum() > 1.1 * weak.sum()
+    assert np.array_equal(strong, experiment.predict({"friction_angle": 42.0})[:, 0])
+    assert not np.array_equal(strong, experiment.predict({"friction_angle": 42.0}, seed=1)[:, 0])
+
+
+def test_a_test_without_sense_is_refused() -> None:
+    for depths, forces in (([0.01], [3.0]), ([0.02, 0.01], [1.0, 2.0]), ([0.01, 0.02], [1.0])):
+        with pytest.raises(ParameterError, match="depths"):
+            PlateExperiment(0.1, depths, forces, 0.1)
+
+
+def test_six_forces_do_not_claim_what_they_cannot_tell() -> None:
+    truth = plate(np.ones(6)).predict({"friction_angle": 33.0, "cohesion": 600.0}, effects=("cohesion",), seed=99)
+    experiment = plate(truth[:, 0])
+    found = diagnose(experiment, {"friction_angle": 33.0}, simulate=Simulations(experiment))
+    score = found.scores["cohesion"]
+    # Friction and cohesion both lift the whole curve: the truth is inside what is stated, and below what would be seen.
+    assert found.effects["cohesion"] == "cannot tell"
+    assert abs(score.estimate - 600.0) < 2.0 * score.std
+    assert score.detectable > 600.0 and score.survival < 0.3
