@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -115,6 +115,7 @@ def diagnose(
     *,
     simulate: Simulations | None = None,
     options: Options | None = None,
+    replays: FloatArray | None = None,
     progress: Report | None = None,
 ) -> Diagnosis:
     """Criticise a model at its fitted parameters.
@@ -124,6 +125,7 @@ def diagnose(
         values: the fitted parameters.
         simulate: where predictions come from; the experiment itself by default.
         options: how thorough.
+        replays: (k, t, s) see :class:`~splatsoil.inverse.criticism.evidence.Evidence`.
         progress: called with (what, share done).
 
     Raises:
@@ -134,7 +136,7 @@ def diagnose(
     evidence = gather(
         experiment, simulate, values, repeats=options.repeats, progress=lambda share: told("simulations", 0.75 * share)
     )
-    return judge(experiment, evidence, simulate, options=options, progress=told)
+    return judge(experiment, replace(evidence, replays=replays), simulate, options=options, progress=told)
 
 
 @dataclass(frozen=True)

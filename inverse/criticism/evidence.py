@@ -36,6 +36,7 @@ class Evidence:
         widths: the step of each parameter's derivative.
         directions: (k, t, s) derivatives by each candidate's parameters.
         steps: the step of each of these.
+        replays: (k, t, s) residuals of known soils that went through the whole chain of pictures and reconstruction.
         failed: candidates whose simulation could not go on, with the reason.
     """
 
@@ -49,6 +50,7 @@ class Evidence:
     directions: Mapping[str, FloatArray]
     steps: Mapping[str, float]
     failed: Mapping[str, str]
+    replays: FloatArray | None = None
 
 
 def gather(

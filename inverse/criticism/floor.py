@@ -69,6 +69,8 @@ def floor_of(experiment: Experiment, evidence: Evidence) -> Floor:
     if np.count_nonzero(experiment.quiet) >= FEWEST_QUIET:
         known = _total(layout, parts, seen, runs)[0]
         parts["reconstruction"] = _instruments(experiment, evidence, known)
+    if evidence.replays is not None:
+        parts["reconstruction"] = _replayed(experiment, evidence.replays, parts)
     prior = {p.name: (p.upper - p.lower) / np.sqrt(12.0) for p in experiment.parameters}
     slopes = [prior[name] * table for name, table in evidence.slopes.items()]
     slopes += [(3.0 * evidence.widths[name]) ** 2 * table for name, table in evidence.curves.items()]
@@ -108,6 +110,21 @@ def _instruments(experiment: Experiment, evidence: Evidence, known: Noise) -> Pa
     table = np.zeros(signal.shape)
     table[quiet] = rest
     return replace(correlated(experiment.layout, table[None], np.hypot(whole, known.spread(known.scale))), scale=whole)
+
+
+def _replayed(experiment: Experiment, replays: FloatArray, parts: Mapping[str, Part]) -> Part:
+    """What known soils leave that went through the whole chain, beyond chance and the cameras' noise.
+
+    Where the undisturbed part of the real pictures is worse than the replay's, the real one counts.
+    """
+    whole = estimate(experiment.layout, replays, experiment.seen)
+    known = parts["instruments"].scale ** 2
+    if "chance" in parts:
+        known = known + 2.0 * parts["chance"].scale ** 2
+    variance = np.maximum(whole.scale**2 - known, 0.0)
+    if "reconstruction" in parts:
+        variance = np.maximum(variance, parts["reconstruction"].scale ** 2)
+    return replace(whole, scale=np.sqrt(variance))
 
 
 def _total(layout, parts: Mapping[str, Part], seen: npt.NDArray[np.bool_], runs: int) -> tuple[Noise, Noise]:  # type: ignore[no-untyped-def]

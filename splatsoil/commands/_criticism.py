@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatsoil.errors import ParameterError, RunError
 
 if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
     from splatsoil.commands._progress import Report
     from splatsoil.experiment.plow import PlowExperiment
     from splatsoil.inverse.criticism.diagnosis import Options
     from splatsoil.inverse.criticism.simulations import Simulations
     from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.model import Model
+
+    FloatArray = npt.NDArray[np.float64]
 
 
 def model_of(folder: RunFolder, device: str, report: Report) -> Model:
@@ -59,14 +64,42 @@ def experiment_of(
         "preset": model.preset,
         "device": model.device.split(":")[0],
         "version": __version__,
-        "code": code_digest((*FORWARD, "observation.py", "experiment")),
+        "code": code_digest((*FORWARD, "observation.py", "experiment/plow.py", "experiment/scene_parts.py")),
         "layout": list(experiment.layout.shape),
     }
     return experiment, Simulations(experiment, folder.path / "features", identity)
 
 
+def replayed(
+    folder: RunFolder, experiment: PlowExperiment, simulate: Simulations, values: dict[str, float], report: Report
+) -> FloatArray:
+    """The replay control (1, t, s), made once for a model and its values and kept in ``features/``."""
+    import io
+
+    import numpy as np
+
+    from splatsoil.experiment.replay import replay
+    from splatsoil.files import write_bytes
+    from splatsoil.inverse.evaluations import digest
+
+    # What pictures get wrong hardly hangs on a few degrees: one replay serves all estimates of a model.
+    path = folder.path / "features" / f"replay-{digest(simulate.identity)[:24]}.npy"
+    if not path.is_file():
+        stream = io.BytesIO()
+        made = replay(experiment, values, folder.path / "replay", progress=report)
+        np.save(stream, made, allow_pickle=False)
+        write_bytes(path, stream.getvalue())
+    return np.load(path, allow_pickle=False)[None]
+
+
 def diagnosed(
-    folder: RunFolder, model: Model, options: Options, report: Report, effects: Iterable[str] = ()
+    folder: RunFolder,
+    model: Model,
+    options: Options,
+    begin: Callable[[str], Report],
+    effects: Iterable[str] = (),
+    *,
+    with_replay: bool = True,
 ) -> dict[str, Any]:
     """Diagnose the latest fit; the result is ``diagnosis.json`` and, by model, ``diagnoses/NAME.json``."""
     from splatsoil import __version__
@@ -78,8 +111,11 @@ def diagnosed(
     began = time.perf_counter()
     fit = folder.fit()
     experiment, simulate = experiment_of(folder, model, tuple(effects) or None)
-    share = 0.0
-    purpose = ""
+    share, purpose = 0.0, ""
+    begun: list[Report] = []
+
+    def report(what: str, done: float) -> None:
+        begun[-1](what, done)
 
     def told(what: str, done: float) -> None:
         nonlocal share
@@ -92,9 +128,12 @@ def diagnosed(
         report(purpose, share)
 
     simulate.told = starting
-    report("reading the video", 0.0)
     with folder.lock():
-        found = diagnose(experiment, estimates(fit), simulate=simulate, options=options, progress=told)
+        replays = None
+        if with_replay:
+            replays = replayed(folder, experiment, simulate, estimates(fit), begin("replay"))
+        begun.append(begin("diagnose"))
+        found = diagnose(experiment, estimates(fit), simulate=simulate, options=options, replays=replays, progress=told)
         result = {
             **record(experiment, found),
             "fit": fit["name"],

@@ -29,6 +29,9 @@ class Config:
     """Effects, the best ones, to refit."""
     refit_steps: int = 5
     """Simulations for each refit."""
+    replay: bool = True
+    """Also photograph a made-up bed of the same soil and go through the whole chain with it, to know what pictures and
+    reconstruction get wrong by themselves. Without it, their errors can pass for soil."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda:0, …"""
     json: bool = False
@@ -52,7 +55,7 @@ def run(config: Config) -> int:
     device = resolve_device(config.device)
     with stages(quiet=config.json) as begin:
         model = criticism.model_of(folder, device, begin("reconstruct"))
-        result = criticism.diagnosed(folder, model, options, begin("diagnose"), config.effects)
+        result = criticism.diagnosed(folder, model, options, begin, config.effects, with_replay=config.replay)
     if config.json:
         print_json({"ok": True, "run": str(folder.path), **_finite(result)})
     else:

@@ -100,7 +100,7 @@ def loop(folder: RunFolder, model: Model, most: int, begin: Callable[[str], Repo
 
     options, count = Options(), 0
     while True:
-        diagnosis = criticism.diagnosed(folder, model, options, begin("diagnose"))
+        diagnosis = criticism.diagnosed(folder, model, options, begin)
         if diagnosis["verdict"] == "adequate":
             return diagnosis, "nothing stands above what noise, chance and numerics leave"
         if diagnosis["verdict"] != "missing":
