@@ -180,7 +180,10 @@ def _advance(
         start = emcee.State(_start(log_density, low, high, sampler.nwalkers, seed, e), random_state=random.get_state())
     sampler.run_mcmc(start, until - done, skip_initial_state_check=True)
     if isinstance(sampler.backend, _Blocks):
-        sampler.backend.flush()
+        try:
+            sampler.backend.flush()
+        except OSError as error:
+            raise RunError(f"{sampler.backend.filename}: cannot be written ({error}); free some space") from error
 
 
 def _start(log_density: LogDensity, low: FloatArray, high: FloatArray, count: int, seed: int, e: int) -> FloatArray:
