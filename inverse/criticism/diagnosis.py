@@ -18,7 +18,7 @@ from .noise import Noise
 from .refit import Refit, refit
 from .score import Score, Scorer
 from .simulations import Simulations
-from .verdicts import EQUIVALENT, GATE, LEVEL, EffectVerdict, Verdict, explained, of_effect, overall
+from .verdicts import CLEAN, EQUIVALENT, LEVEL, EffectVerdict, Verdict, explained, of_effect, overall
 
 FloatArray = npt.NDArray[np.float64]
 Report = Callable[[str, float], None]
@@ -343,7 +343,7 @@ def _after(
     members: Sequence[str],
 ) -> Omnibus:
     """What the library can't explain: after the best effect, or after it and a second one that is significant."""
-    if best.remainder.p >= GATE:
+    if best.remainder.p >= CLEAN:
         return best.remainder
     seen = experiment.seen
     left = (experiment.observed - best.fit.prediction)[seen]

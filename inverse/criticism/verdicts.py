@@ -16,6 +16,8 @@ LEVEL = 0.05
 """Family-wise chance of naming an effect when none is missing."""
 GATE = 0.01
 """Chance below which what is left is called a remainder."""
+CLEAN = 0.05
+"""Chance that what is left after an effect must have for the effect to be all that was missing."""
 EQUIVALENT = 6.0
 """Fall of χ² within which effects count as equally good."""
 LEAST_SURVIVAL = 0.05
@@ -35,7 +37,13 @@ def of_effect(candidate: Candidate, score: Score, *, level: float = LEVEL) -> Ef
 
 
 def overall(
-    named: bool, misfit: Omnibus, remainder: Omnibus | None, *, gate: float = GATE, enough: float = ENOUGH
+    named: bool,
+    misfit: Omnibus,
+    remainder: Omnibus | None,
+    *,
+    gate: float = GATE,
+    clean: float = CLEAN,
+    enough: float = ENOUGH,
 ) -> Verdict:
     """Verdict on the model.
 
@@ -44,11 +52,12 @@ def overall(
         misfit: of the model as it is.
         remainder: after the best the library can do; None where nothing was named.
         gate: see :data:`GATE`.
+        clean: see :data:`CLEAN`.
         enough: see :data:`ENOUGH`.
     """
     if not named or remainder is None:
         return "adequate" if misfit.p >= gate else "outside the library"
-    if remainder.p >= gate or explained(misfit, remainder) >= enough:
+    if remainder.p >= clean or explained(misfit, remainder) >= enough:
         return "missing"
     return "outside the library"
 
