@@ -57,7 +57,7 @@ class Solver:
         positions: particles (simulations, n, 3) in m.
         lower: lower corner (3,) of the bed in m.
         upper: upper corner (3,) of the space that soil may use, in m.
-        mesh: the tool in its own frame, m.
+        mesh: the tool in its own frame, m; None for soil that is left alone.
         resolution: lengths, steps and stiffness.
         law: the soil law; its effects' parameters are columns of ``values``.
         base: settings of the experiment, before any effect.
@@ -74,7 +74,7 @@ class Solver:
         positions: FloatArray,
         lower: npt.ArrayLike,
         upper: npt.ArrayLike,
-        mesh: trimesh.Trimesh,
+        mesh: trimesh.Trimesh | None,
         resolution: Resolution,
         law: Law,
         base: Settings,
@@ -107,12 +107,16 @@ class Solver:
         self._stress_kernel = make_stress_kernel(law.update, law.history)
         self._allocate(x)
         spring = resolution.bulk * resolution.spacing
-        self.tool = build_tool(
-            mesh,
-            margin=1.5 * resolution.cell,
-            stiffness=spring,
-            damping=2.0 * CONTACT_DAMPING * math.sqrt(spring * self._particles.mass),
-            device=device,
+        self.tool = (
+            None
+            if mesh is None
+            else build_tool(
+                mesh,
+                margin=1.5 * resolution.cell,
+                stiffness=spring,
+                damping=2.0 * CONTACT_DAMPING * math.sqrt(spring * self._particles.mass),
+                device=device,
+            )
         )
         self._start(x, base)
         self.frame = 0
@@ -196,11 +200,12 @@ class Solver:
         sums = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(levels))])
         return np.interp(depth, levels, sums)
 
-    def advance(self, poses: Sequence[Pose]) -> npt.NDArray[np.float64]:
+    def advance(self, poses: Sequence[Pose] | int) -> npt.NDArray[np.float64]:
         """Advance one frame.
 
         Args:
-            poses: the tool at the start of each of the frame's steps; their number sets the step.
+            poses: the tool at the start of each of the frame's steps; their number sets the step. Without a tool, the
+                number alone.
 
         Returns:
             Mean force (simulations, 3) of the soil on the tool over the frame, N.
@@ -208,11 +213,14 @@ class Solver:
         Raises:
             SimulationError: soil left the grid or the state is not finite.
         """
-        steps = len(poses)
+        moves: Sequence[Pose | None] = [None] * poses if isinstance(poses, int) else poses
+        if not moves or (self.tool is None) != isinstance(poses, int):
+            raise SimulationError("advance() takes the tool's poses, or a number of steps where there is no tool")
+        steps = len(moves)
         substeps = self.resolution.substeps(steps)
         step_time = self.resolution.frame_time / steps
         self._force.zero_()
-        for pose in poses:
+        for pose in moves:
             self._step(pose, step_time, substeps, 1.0 / (steps * substeps))
         self.frame += 1
         total = self.simulations * self.particles_each
@@ -225,13 +233,12 @@ class Solver:
             )
         return self._force.numpy().astype(np.float64)
 
-    def _step(self, pose: Pose, step_time: float, substeps: int, share: float) -> None:
+    def _step(self, pose: Pose | None, step_time: float, substeps: int, share: float) -> None:
         p, c, g, grid, device = self._particles, self._cells, self._nodes, self.grid, self.device
         r = self.resolution
         dt = step_time / substeps
         modulus = r.bulk + 4.0 * r.shear / 3.0
         n, node_count, cell_count = p.position.shape[0], g.mass.shape[0], c.node.shape[0]
-        self._pose.assign(pose.row().astype(np.float32))
         for array in (g.mass, g.inertia, g.velocity, g.force, g.displacement, g.count, c.count, self._near_count):
             array.zero_()
         c.slot.fill_(-1)
@@ -241,11 +248,7 @@ class Solver:
         wp.launch(particles_to_grid, dim=n, inputs=[p, c, g, grid], device=device)
         wp.launch(average_cells, dim=cells, inputs=[c, g, grid, INERTIA_MARGIN * modulus * dt * dt], device=device)
         wp.launch(momentum_to_velocity, dim=node_count, inputs=[g], device=device)
-        reach = r.cell
-        wp.launch(
-            find_gaps, dim=n, inputs=[p, self.tool, self._pose, reach, self._near, self._near_count], device=device
-        )
-        nodes, near = self._size(g.count, node_count), self._size(self._near_count, n)
+        nodes = self._size(g.count, node_count)
         viscosity = BULK_VISCOSITY * r.density * r.wave_speed * r.cell
         stress = wp.launch(
             self._stress_kernel,
@@ -254,18 +257,39 @@ class Solver:
             device=device,
             record_cmd=True,
         )
-        contact = wp.launch(
+        contact = None if pose is None else self._contact(pose, dt, share)
+        move = wp.launch(move_nodes, dim=nodes, inputs=[g, grid, dt, self._table], device=device, record_cmd=True)
+        for _ in range(substeps):
+            stress.launch()
+            if contact is not None:
+                contact.launch()
+            move.launch()
+        wp.launch(
+            grid_to_particles,
+            dim=n,
+            inputs=[p, c, g, grid, self.ceiling, r.wave_speed, self._broken, self._strays],
+            device=device,
+        )
+
+    def _contact(self, pose: Pose, dt: float, share: float) -> wp.Launch:
+        """Find the particles near the tool, and make ready the launch of what runs in every substep."""
+        p, device, reach = self._particles, self.device, self.resolution.cell
+        n = p.position.shape[0]
+        self._pose.assign(pose.row().astype(np.float32))
+        near = [self.tool, self._pose, reach, self._near, self._near_count]
+        wp.launch(find_gaps, dim=n, inputs=[p, *near], device=device)
+        return wp.launch(
             contact_forces,
-            dim=max(near, 1),
+            dim=self._size(self._near_count, n),
             inputs=[
                 p,
-                g,
-                grid,
+                self._nodes,
+                self.grid,
                 self.tool,
                 self._pose,
                 self._near,
                 self._near_count,
-                r.spacing**2,
+                self.resolution.spacing**2,
                 dt,
                 share,
                 self._table,
@@ -273,17 +297,6 @@ class Solver:
             ],
             device=device,
             record_cmd=True,
-        )
-        move = wp.launch(move_nodes, dim=nodes, inputs=[g, grid, dt, self._table], device=device, record_cmd=True)
-        for _ in range(substeps):
-            stress.launch()
-            contact.launch()
-            move.launch()
-        wp.launch(
-            grid_to_particles,
-            dim=n,
-            inputs=[p, c, g, grid, self.ceiling, r.wave_speed, self._broken, self._strays],
-            device=device,
         )
 
     def _size(self, count: wp.array, most: int) -> int:

@@ -13,7 +13,7 @@ from splatsoil.errors import SimulationError
 
 FAR = 1.0e6
 SAMPLES_ACROSS = 4
-"""Distance samples across the thinnest extent of the tool, so that a thin plate keeps both its faces."""
+"""Distance samples across the tool where it is thin, so that a plate keeps both its faces."""
 MOST_SAMPLES = 160
 
 
@@ -90,7 +90,9 @@ def build_tool(mesh: trimesh.Trimesh, *, margin: float, stiffness: float, dampin
     if not mesh.is_volume:
         raise SimulationError("the tool's mesh encloses no volume; close its holes and orient its faces outward")
     extents = mesh.bounds[1] - mesh.bounds[0]
-    spacing = float(max(extents.min() / SAMPLES_ACROSS, (extents.max() + 2.0 * margin) / MOST_SAMPLES))
+    # a raked or curved plate is thinner than its box: volume over area tells, 3/2 of a flat plate's thickness
+    thinnest = min(extents.min(), 3.0 * mesh.volume / mesh.area)
+    spacing = float(max(thinnest / SAMPLES_ACROSS, (extents.max() + 2.0 * margin) / MOST_SAMPLES))
     lower = mesh.bounds[0] - margin
     shape = tuple(int(n) for n in np.ceil((extents + 2.0 * margin) / spacing).astype(int) + 1)
     surface = wp.Mesh(
