@@ -100,19 +100,35 @@ class Truth:
 
 @dataclass(frozen=True)
 class Scan:
-    """Heights (angles, frames, ny, nx) over friction angles, averaged over seeds, with their scatter in m."""
+    """Heights over friction angles.
+
+    Attributes:
+        angles: (n,) in degrees, increasing.
+        heights: (n, frames, ny, nx) in m, averaged over seeds.
+        chance: scatter of the heights between seeds, m.
+        volume: lowest and highest mean height over the frames, relative to frame 0: most of a loss, most of a gain.
+    """
 
     angles: FloatArray
     heights: FloatArray
     chance: float
-    volume_gain: float
+    volume: tuple[float, float]
 
-    def best(self, other: FloatArray) -> float:
-        """Angle whose heights lie nearest to ``other`` (frames, ny, nx) in patches."""
+    def best(self, other: FloatArray, slopes: bool = False) -> float:
+        """Angle whose heights, or their slopes, lie nearest to ``other`` (frames, ny, nx) in patches."""
+        fine, loss = self._loss(other, slopes)
+        return float(fine[np.argmin(loss)])
+
+    def residual(self, other: FloatArray) -> float:
+        """Difference in patches, m, that no angle takes away."""
+        return float(np.sqrt(max(self._loss(other, slopes=False)[1].min(), 0.0)))
+
+    def _loss(self, other: FloatArray, slopes: bool) -> tuple[FloatArray, FloatArray]:
+        """Mean square difference by angle, interpolated by a cubic spline."""
         smooth = gaussian_filter(self.heights - other, (0, 0, PATCH, PATCH))
-        loss = np.mean(smooth**2, axis=(1, 2, 3))
+        square = sum(np.gradient(smooth, axis=k) ** 2 for k in (2, 3)) if slopes else smooth**2
         fine = np.linspace(self.angles[0], self.angles[-1], 2001)
-        return float(fine[np.argmin(CubicSpline(self.angles, loss)(fine))])
+        return fine, CubicSpline(self.angles, np.mean(square, axis=(1, 2, 3)))(fine)
 
 
 def scan(truth: Truth, resolution: Resolution, angles: Sequence[float], seeds: Sequence[int], device: str) -> Scan:
@@ -121,7 +137,7 @@ def scan(truth: Truth, resolution: Resolution, angles: Sequence[float], seeds: S
     batch = [{**truth.values, "friction_angle": float(a)} for a in angles]
     law = Law(find_effects(truth.effects))
     volume = resolution.spacing**3
-    everything, gains = [], []
+    everything, volumes = [], []
     for seed in seeds:
         x = truth.start(resolution.spacing, seed)
         groups = [batch] if device != "cpu" else [[values] for values in batch]
@@ -133,11 +149,17 @@ def scan(truth: Truth, resolution: Resolution, angles: Sequence[float], seeds: S
             )
         ]
         everything.append([[truth.heights(p, volume) for p in run.positions] for run in runs])
-        start = truth.heights(x, volume).mean()
-        gains.append(max(h.mean() for h in everything[-1][len(angles) // 2]) / start - 1.0)
+        volumes.append(volume_range(truth.heights(x, volume), np.array(everything[-1][len(angles) // 2])))
     heights = np.array(everything)
     scatter = float(np.sqrt(heights.var(axis=0, ddof=1).mean())) if len(seeds) > 1 else 0.0
-    return Scan(np.asarray(angles, dtype=np.float64), heights.mean(axis=0), scatter, float(np.mean(gains)))
+    low, high = np.mean(volumes, axis=0)
+    return Scan(np.asarray(angles, dtype=np.float64), heights.mean(axis=0), scatter, (float(low), float(high)))
+
+
+def volume_range(start: FloatArray, heights: FloatArray) -> tuple[float, float]:
+    """Lowest and highest mean of ``heights`` (frames, ny, nx) over the frames, relative to that of ``start``."""
+    relative = heights.mean(axis=(1, 2)) / start.mean() - 1.0
+    return float(relative.min()), float(relative.max())
 
 
 def variants(base: Resolution) -> dict[str, Resolution]:
@@ -172,7 +194,7 @@ def run(
             "best_angle": found.best(observed),
             "rmse_mm": {str(f): round(1e3 * float(e), 2) for f, e in zip(frames, rmse, strict=True)},
             "chance_mm": round(1e3 * found.chance, 2),
-            "volume_gain": found.volume_gain,
+            "volume": found.volume,
             "shifts": {},
         }
         for name, resolution in variants(base).items() if shifts else ():
@@ -187,14 +209,14 @@ def table(result: dict[str, Any]) -> str:
     lines = [
         f"Preset `{result['preset']}`, {result['seeds']} particle seeds, {result['device']}.",
         "",
-        "| set | true φ | best φ of the scan | height RMSE at the truth, mm (frames) | chance, mm | volume gain |",
+        "| set | true φ | best φ of the scan | height RMSE at the truth, mm (frames) | chance, mm | volume |",
         "|---|---|---|---|---|---|",
     ]
     for name, entry in result["sets"].items():
         errors = ", ".join(f"{e:.1f} ({f})" for f, e in entry["rmse_mm"].items())
         lines.append(
             f"| {name} | {entry['true_angle']:.1f}° | {entry['best_angle']:.1f}° | {errors} "
-            f"| {entry['chance_mm']:.1f} | {100 * entry['volume_gain']:+.2f} % |"
+            f"| {entry['chance_mm']:.1f} | {100 * entry['volume'][0]:+.2f} to {100 * entry['volume'][1]:+.2f} % |"
         )
     if any(entry["shifts"] for entry in result["sets"].values()):
         names = list(result["sets"])

@@ -1,0 +1,182 @@
+"""The scene of a measurement set in Newton's implicit MPM (https://github.com/newton-physics/newton)."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+from splatsoil.benchmarks.numerics import FloatArray, Truth
+
+from splatsoil.errors import MeasurementError, RunError, SimulationError
+from splatsoil.mpm.simulate import step_poses
+from splatsoil.soil.matching import cone_intercept, cone_slope
+
+YIELD_PRESSURE = 1.0e8
+"""Pa; high enough never to be met, low enough that single precision still resolves the cohesion's share of it."""
+WALL = 0.1
+"""Half the thickness of a wall, m."""
+
+
+@dataclass(frozen=True)
+class Numerics:
+    """Of a run.
+
+    Attributes:
+        voxel: edge of the cells, m.
+        substeps: in a frame.
+        iterations: most of the Gauss-Seidel solver in a substep.
+    """
+
+    voxel: float
+    substeps: int
+    iterations: int
+
+    @classmethod
+    def of(cls, folder: Path) -> Numerics:
+        """Those that made the measurement set; MeasurementError when ``truth.json`` doesn't tell."""
+        file = folder / "truth.json"
+        told = json.loads(file.read_text())
+        try:
+            return cls(float(told["voxel"]), int(told["sub"]), int(told["iterations"]))
+        except KeyError as error:
+            raise MeasurementError(
+                "the benchmark needs the numerics that the set was made with", file=file, field=str(error)
+            ) from error
+
+
+@dataclass(frozen=True)
+class World:
+    """Soil to plough.
+
+    Attributes:
+        label: what it is called in the table.
+        angle: friction angle, degrees.
+        particles: (n, 3) at frame 0, m.
+        spacing: edge of the cube of soil that a particle stands for, m.
+        young: Young's modulus, Pa.
+    """
+
+    label: str
+    angle: float
+    particles: FloatArray = field(repr=False)
+    spacing: float
+    young: float = 1.0e7
+
+
+def load_newton() -> Any:
+    """The package; RunError when it isn't installed."""
+    try:
+        return importlib.import_module("newton")
+    except ModuleNotFoundError as error:
+        raise RunError("the package newton is missing; install it: pip install 'splatsoil[independent]'") from error
+
+
+def plough(
+    truth: Truth, worlds: Sequence[World], numerics: Numerics, device: str = "cpu"
+) -> list[dict[int, FloatArray]]:
+    """Run the worlds side by side, in boxes of their own, to the last of the truth's frames.
+
+    Returns:
+        For each world its particles (n, 3) in m by frame.
+
+    Raises:
+        RunError: the ``newton`` package is missing.
+        SimulationError: particles left the numbers.
+    """
+    newton = load_newton()
+    measurement = truth.measurement
+    # whole voxels, so that every box lies on the grid as the first one does
+    pitch = math.ceil((measurement.bed.upper - measurement.bed.lower)[1] / numerics.voxel + 4.0 * WALL / numerics.voxel)
+    shifts = np.array([[0.0, k * pitch * numerics.voxel, 0.0] for k in range(len(worlds))])
+    model = _model(newton, truth, worlds, shifts, device)
+    config = newton.solvers.SolverImplicitMPM.Config()
+    config.voxel_size, config.max_iterations, config.tolerance = numerics.voxel, numerics.iterations, 1.0e-4
+    solver = newton.solvers.SolverImplicitMPM(model, config=config)
+    now, following = model.state(), model.state()
+    frame_time = 1.0 / measurement.frame_rate
+    step = frame_time / numerics.substeps
+    wanted = sorted(f for f in truth.particles if f > 0)
+    ends = np.cumsum([len(w.particles) for w in worlds])[:-1]
+    found: list[dict[int, FloatArray]] = [{} for _ in worlds]
+    for frame in range(1, wanted[-1] + 1):
+        for pose in step_poses(measurement.tool.motion, (frame - 1) * frame_time, frame_time, numerics.substeps):
+            # Both calls carry the tool on by its velocity from its pose at the step's start: from the pose at the end,
+            # the projection would push soil a step too far ahead.
+            places = np.array([[*(pose.position + shift), *pose.quaternion] for shift in shifts], dtype=np.float32)
+            twists = np.array([[*pose.velocity, *pose.spin]] * len(worlds), dtype=np.float32)
+            for state in (now, following):
+                state.body_q.assign(places)
+                state.body_qd.assign(twists)
+            solver.step(now, following, None, None, step)
+            solver.project_outside(following, following, step)
+            now, following = following, now
+        if frame in wanted:
+            x = now.particle_q.numpy().astype(np.float64)
+            if not np.isfinite(x).all():
+                raise SimulationError(f"newton: particles are no numbers at frame {frame} with {numerics}")
+            for k, part in enumerate(np.split(x, ends)):
+                found[k][frame] = part - shifts[k]
+    return found
+
+
+def _model(newton: Any, truth: Truth, worlds: Sequence[World], shifts: FloatArray, device: str) -> Any:
+    """Newton's model: one floor; walls, a tool and soil for every world."""
+    bed, tool = truth.measurement.bed, truth.measurement.tool
+    builder = newton.ModelBuilder()
+    newton.solvers.SolverImplicitMPM.register_custom_attributes(builder)
+    surface = newton.ModelBuilder.ShapeConfig
+    builder.add_ground_plane(height=float(bed.lower[2]), cfg=surface(mu=bed.floor_friction, density=0.0))
+    mesh = newton.Mesh(np.asarray(tool.mesh.vertices), np.asarray(tool.mesh.faces).ravel(), compute_inertia=False)
+    for world, shift in zip(worlds, shifts, strict=True):
+        for centre, half in _walls(bed.lower + shift, bed.upper + shift):
+            place = wp.transform(wp.vec3(*centre), wp.quat_identity())
+            smooth = surface(mu=bed.wall_friction, density=0.0)
+            builder.add_shape_box(body=-1, cfg=smooth, xform=place, hx=half[0], hy=half[1], hz=half[2])
+        body = builder.add_body()
+        builder.add_shape_mesh(body=body, mesh=mesh, cfg=surface(mu=tool.friction, density=0.0))
+        n = len(world.particles)
+        builder.add_particles(
+            pos=(world.particles + shift).tolist(),
+            vel=[(0.0, 0.0, 0.0)] * n,
+            mass=[bed.density * world.spacing**3] * n,
+            radius=[world.spacing / 2.0] * n,
+        )
+    model = builder.finalize(device=device)
+    model.set_gravity(tuple(float(g) for g in truth.measurement.gravity))
+    counts = [len(w.particles) for w in worlds]
+
+    def each(values: Sequence[float]) -> npt.NDArray[np.float32]:
+        return np.repeat(np.asarray(values, dtype=np.float32), counts)
+
+    material, slopes = model.mpm, [cone_slope(w.angle) for w in worlds]
+    material.young_modulus.assign(each([w.young for w in worlds]))
+    material.poisson_ratio.fill_(0.3)
+    material.friction.assign(each(slopes))
+    if cohesion := truth.values.get("cohesion", 0.0):
+        shear = [cone_intercept(w.angle, cohesion) for w in worlds]
+        material.yield_stress.assign(each(shear))
+        material.yield_pressure.fill_(YIELD_PRESSURE)
+        tension = [k / (a * YIELD_PRESSURE) for k, a in zip(shear, slopes, strict=True)]
+        material.tensile_yield_ratio.assign(each(tension))
+    return model
+
+
+def _walls(lower: FloatArray, upper: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+    """Centre and half extents (3,) of four walls, as high again as the box."""
+    middle, half = (upper + lower) / 2.0, (upper - lower) / 2.0 * np.array([1.0, 1.0, 3.0])
+    found = []
+    for axis in (0, 1):
+        for side in (-1.0, 1.0):
+            centre, extent = middle.copy(), half.copy()
+            centre[axis] += side * (half[axis] + WALL)
+            extent[axis] = WALL
+            found.append((centre, extent))
+    return found

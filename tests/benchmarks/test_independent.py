@@ -1,0 +1,91 @@
+"""The independent solver's scene: what its solver is handed, held against what the tool and the bed must do."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from splatsoil.benchmarks._newton import Numerics, World, plough
+from splatsoil.benchmarks.independent import judge
+from splatsoil.benchmarks.numerics import Scan, Truth, volume_range
+
+SPACING, COARSE = 0.02, Numerics(voxel=0.04, substeps=2, iterations=60)
+
+
+def test_the_set_tells_the_numerics_it_was_made_with(plow_dry: Path) -> None:
+    assert Numerics.of(plow_dry) == Numerics(voxel=0.02, substeps=2, iterations=120)
+
+
+def test_a_world_between_two_angles_is_estimated_between_them() -> None:
+    # a ridge that grows with the angle by 1 mm a degree, and its copies a fixed 2 mm higher
+    ridge = 1e-3 * np.exp(-((np.arange(40) - 20.0) ** 2) / 50.0) * np.ones((1, 30, 1))
+    angles = np.array([27.0, 30.0, 33.0, 36.0, 39.0])
+    found = Scan(angles, angles[:, None, None, None] * ridge, 0.0, (0.0, 0.0))
+    told = judge(34.3 * ridge, {"small": found}, found)
+    for estimate in (told["presets"]["small"], told["own"]):
+        assert estimate["heights"] == pytest.approx(34.3, abs=0.01)
+        assert estimate["slopes"] == pytest.approx(34.3, abs=0.01)
+        assert estimate["residual_mm"] == pytest.approx(0.0, abs=1e-3)
+    raised = judge(34.3 * ridge + 2e-3, {"small": found}, None)
+    assert raised["own"] is None
+    assert raised["presets"]["small"]["slopes"] == pytest.approx(34.3, abs=0.01), "slopes know nothing of a level"
+    assert raised["presets"]["small"]["heights"] > 36.0
+
+
+def test_volume_is_told_as_the_most_of_a_loss_and_of_a_gain() -> None:
+    start = np.full((3, 4), 0.1)
+    frames = start * np.array([0.996, 0.987, 1.002])[:, None, None]
+    assert volume_range(start, frames) == pytest.approx((-0.013, 0.002))
+
+
+@pytest.fixture(scope="module")
+def ploughed() -> tuple[Truth, list[dict[int, npt.NDArray[np.float64]]]]:
+    """Two coarse worlds, ten frames into the push."""
+    pytest.importorskip("newton")
+    truth = Truth.load(Path(__file__).parents[2] / "examples" / "plow-damp")
+    x = truth.start(SPACING, 0)
+    short = replace(truth, particles={0: x, 5: x, 35: x}, volume=SPACING**3)
+    worlds = [World("true", 33.0, x, SPACING), World("weak", 20.0, x, SPACING)]
+    return short, plough(short, worlds, COARSE)
+
+
+@pytest.mark.slow
+def test_before_the_tool_arrives_the_bed_rests(
+    ploughed: tuple[Truth, list[dict[int, npt.NDArray[np.float64]]]],
+) -> None:
+    truth, runs = ploughed
+    for run in runs:
+        assert np.abs(run[5] - truth.particles[0]).max() < 0.5e-3
+
+
+@pytest.mark.slow
+def test_soil_reaches_the_plate_and_no_further(
+    ploughed: tuple[Truth, list[dict[int, npt.NDArray[np.float64]]]],
+) -> None:
+    truth, runs = ploughed
+    tool = truth.measurement.tool
+    lower, upper = tool.mesh.bounds
+    rotation, position = tool.motion.pose(35 / truth.measurement.frame_rate)
+    for run in runs:
+        local = (run[35] - position) @ rotation
+        before = local[(np.abs(local[:, 1]) < upper[1] - 0.01) & (local[:, 2] > lower[2] + 0.01) & (local[:, 0] > 0.0)]
+        gap = before[:, 0].min() - upper[0]
+        # the solver lets particles a hundredth of a voxel in; a step of the tool is 2 mm, half the wrong side's worth
+        assert abs(gap) < 0.6e-3
+
+
+@pytest.mark.slow
+def test_worlds_beside_each_other_differ_by_their_soil_alone(
+    ploughed: tuple[Truth, list[dict[int, npt.NDArray[np.float64]]]],
+) -> None:
+    truth, runs = ploughed
+    alone = plough(replace(truth, particles={f: truth.particles[f] for f in (0, 5)}), [_weak(truth)], COARSE)[0]
+    assert np.abs(alone[5] - runs[1][5]).max() < 0.05e-3
+    assert np.abs(runs[0][35] - runs[1][35]).max() > 1e-3
+
+
+def _weak(truth: Truth) -> World:
+    return World("weak", 20.0, truth.particles[0], SPACING)
