@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Candidate, Experiment
 
 from .evidence import Evidence, around, gather
@@ -18,7 +19,7 @@ from .noise import Noise
 from .refit import Refit, refit
 from .score import Score, Scorer
 from .simulations import Simulations
-from .verdicts import CLEAN, EQUIVALENT, LEVEL, EffectVerdict, Verdict, explained, of_effect, overall
+from .verdicts import CLEAN, ENOUGH, EQUIVALENT, LEVEL, EffectVerdict, Verdict, explained, of_effect, overall
 
 FloatArray = npt.NDArray[np.float64]
 Report = Callable[[str, float], None]
@@ -189,7 +190,7 @@ def judge(
     confirmations: dict[str, Confirmation] = {}
     members: tuple[str, ...] = ()
     given: Mapping[str, Score] = {}
-    remainder, gone = None, 0.0
+    remainder, gone, before = None, 0.0, misfit
     if strong and scorer is not None:
         chosen = [candidates[s.name] for s in strong[: options.refits]]
         confirmations = confirm(experiment, evidence, floor, chosen, simulate, options, bench.basis, told)
@@ -198,13 +199,16 @@ def judge(
         best = min(costs, key=lambda name: costs[name])
         members = _equals(costs, best, tried[best].remainder)
         given = scorer.score(residual, given=best)
-        remainder = _after(experiment, floor, tried[best], candidates, evidence, bench.basis, members)
-        gone = explained(confirmations[""].remainder, remainder)
+        remainder = _after(experiment, floor, tried[best], candidates, evidence, bench.basis)
+        before = confirmations[""].remainder
+        if remainder.p < CLEAN and explained(before, remainder) < ENOUGH:
+            told("the floor with the effect on", 0.97)
+            before, remainder = _on_its_own_floor(experiment, evidence, tried[best], simulate, residual)
+        gone = explained(before, remainder)
     effects = _effects(candidates, scores, given, members, confirmations, options.level)
     named = any(effects[name] == "missing" for name in members) and _stands(confirmations, members[0])
     if strong and not named:
         effects = {n: "cannot tell" if v == "missing" else v for n, v in effects.items()}
-    before = confirmations[""].remainder if confirmations else misfit
     verdict = overall(named, before if named else misfit, remainder)
     return Diagnosis(
         verdict=verdict,
@@ -340,7 +344,6 @@ def _after(
     candidates: Mapping[str, Candidate],
     evidence: Evidence,
     basis: FloatArray,
-    members: Sequence[str],
 ) -> Omnibus:
     """What the library can't explain: after the best effect, or after it and a second one that is significant."""
     if best.remainder.p >= CLEAN:
@@ -358,6 +361,45 @@ def _after(
     size = columns[second.name]
     scale = 10.0 * math.sqrt(len(size)) / np.linalg.norm(size / floor.single.scale[:, None], axis=0)
     return omnibus(floor.single, np.concatenate([free, size * scale], axis=1), left, basis)
+
+
+def _on_its_own_floor(
+    experiment: Experiment,
+    evidence: Evidence,
+    best: Confirmation,
+    simulate: Simulations,
+    residual: FloatArray,
+) -> tuple[Omnibus, Omnibus]:
+    """Misfit of the model as it is and with its best effect, by the chance and numerics of soil that has the effect.
+
+    Cohesive soil falls by chance where dry soil flows, and numerics move it farther: what remains after an effect is
+    added has to be judged by what such soil leaves.
+    """
+    values, name = best.fit.values, best.name
+
+    def run(seed: int = 0, numerics: str = "") -> FloatArray:
+        purpose = f"floor with {name}"
+        return simulate(values, effects=(name,), seed=seed, numerics=numerics, purpose=purpose)
+
+    runs = np.stack([run(seed) for seed in range(1, 1 + len(evidence.repeats))])
+    patterns = {}
+    for kind in experiment.numerics:
+        try:
+            patterns[kind] = run(numerics=kind) - best.fit.prediction
+        except SimulationError:
+            continue
+    deviations = (runs - runs.mean(axis=0)) * np.sqrt(len(runs) / max(len(runs) - 1, 1))
+    there = replace(
+        evidence, mean=runs.mean(axis=0), repeats=deviations, numerics=patterns, slopes={}, curves={}, widths={}
+    )
+    floor, seen = floor_of(experiment, there), experiment.seen
+    basis = smooth_basis(experiment.layout, floor.noise)
+    free = np.concatenate([floor.nuisance, _tangent(floor.noise, best.fit)], axis=1)
+    left = (experiment.observed - there.mean)[seen]
+    model = len(experiment.parameters)
+    bare = replace(best.fit, slopes=best.fit.slopes[..., :model])
+    without = np.concatenate([floor.nuisance, _tangent(floor.noise, bare)], axis=1)
+    return omnibus(floor.noise, without, residual, basis), omnibus(floor.noise, free, left, basis)
 
 
 def _effects(
