@@ -81,14 +81,19 @@ def _adequate(diagnosis: Diagnosis, candidates: Mapping[str, Candidate]) -> list
 
 def _outside(diagnosis: Diagnosis, candidates: Mapping[str, Candidate]) -> list[str]:
     out = [
-        f"The model is not adequate, and no effect of the library explains it: the misfit on slow waves is "
+        f"The model is not adequate, and no effect of the library explains all of it: the misfit on slow waves is "
         f"{diagnosis.misfit.dispersion:.3g} times what noise leaves."
     ]
     if diagnosis.members:
         best = diagnosis.members[0]
+        confirmed, before = diagnosis.confirmations[best], diagnosis.confirmations[""]
+        candidate = candidates[best]
+        size = amount(confirmed.fit.values[candidate.size], diagnosis.scores[best].std, candidate.measure.unit)
         out.append(
-            f"The nearest is {best.replace('_', ' ')}, which explains {100.0 * diagnosis.explained:.0f} % of the "
-            "misfit beyond chance: too little to name it."
+            f"The nearest is {best.replace('_', ' ')} ({size}): with it the error on frames that the refit has not "
+            f"seen goes from {before.held_out:.2g} to {confirmed.held_out:.2g} {diagnosis.unit} (noise alone leaves "
+            f"{confirmed.floor:.2g}), which is {100.0 * diagnosis.explained:.0f} % of the misfit beyond chance. What "
+            "remains is more than noise, so it is not all that is missing."
         )
     return out
 

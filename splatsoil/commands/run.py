@@ -104,7 +104,9 @@ def loop(folder: RunFolder, model: Model, most: int, begin: Callable[[str], Repo
         if diagnosis["verdict"] == "adequate":
             return diagnosis, "nothing stands above what noise, chance and numerics leave"
         if diagnosis["verdict"] != "missing":
-            return diagnosis, "no effect of the library explains what is left"
+            nearest = diagnosis["class"][0] if diagnosis["class"] else ""
+            hint = f"; the nearest is {nearest}: splatsoil add {folder.path} {nearest} tries it" if nearest else ""
+            return diagnosis, f"no effect of the library explains all that is left{hint}"
         if count == most:
             return diagnosis, f"{most} effects have been added, which is the limit (--most-effects)"
         best = diagnosis["class"][0]

@@ -114,6 +114,13 @@ def verdict(diagnosis: Mapping[str, Any]) -> str:
     if diagnosis["verdict"] == "missing" and diagnosis["class"]:
         names = [name.replace("_", " ") for name in diagnosis["class"]]
         return f"Missing: {' or '.join(names)}."
+    if diagnosis["verdict"] == "outside the library" and diagnosis["class"]:
+        nearest = str(diagnosis["class"][0]).replace("_", " ")
+        return (
+            f"Something is missing: {nearest} explains most, not all of it."
+            if diagnosis["explained"] > 0.5
+            else (f"Something is missing that the library does not have; {nearest} comes nearest.")
+        )
     return VERDICTS.get(str(diagnosis["verdict"]), str(diagnosis["verdict"]))
 
 
