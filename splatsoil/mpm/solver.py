@@ -307,6 +307,10 @@ class Solver:
         """Particles now, (simulations, n, 3) in m."""
         return self._particles.position.numpy().reshape(self.simulations, -1, 3).copy()
 
+    def velocities(self) -> npt.NDArray[np.float32]:
+        """Velocities now, (simulations, n, 3) in m/s."""
+        return self._particles.velocity.numpy().reshape(self.simulations, -1, 3).copy()
+
     def deformations(self) -> npt.NDArray[np.float32]:
         """Visual deformation since frame 0, (simulations, n, 3, 3), its singular values bounded."""
         p = self._particles
@@ -318,3 +322,7 @@ class Solver:
         p = self._particles
         velocity = p.velocity.numpy().astype(np.float64) * p.density.numpy()[:, None]
         return p.mass * velocity.reshape(self.simulations, -1, 3).sum(axis=1)
+
+    def mass(self) -> npt.NDArray[np.float64]:
+        """Mass (simulations,) in kg that the grid held in the last step."""
+        return self._nodes.mass.numpy().astype(np.float64).reshape(self.simulations, -1).sum(axis=1)

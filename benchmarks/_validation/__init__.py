@@ -1,0 +1,1 @@
+"""Parts of ``splatsoil benchmark validate``: each compares the soil with an exact answer or with a laboratory."""

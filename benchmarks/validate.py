@@ -1,0 +1,119 @@
+"""The soil against exact answers, laboratories and real sand: the table of docs/validation.md."""
+
+from __future__ import annotations
+
+import argparse
+import io
+import os
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import warp as wp
+from splatsoil.benchmarks._validation import basics, blades, columns, element, inclines, plates, refinement, sand
+from splatsoil.benchmarks._validation.page import Section, page, table
+
+from splatsoil.errors import SplatsoilError
+from splatsoil.files import code_digest, plain, read_json, write_bytes, write_json, write_text
+
+MEASURED = "SPLATSOIL_MEASURED"
+"""Environment variable that names the folder of measured data."""
+
+
+def parts(measured: Path | None, device: str) -> dict[str, Callable[[], Section]]:
+    """All parts by name, in the page's order; those on real sand only where there are data."""
+    result: dict[str, Callable[[], Section]] = {
+        "element": element.validate,
+        "basics": lambda: basics.validate(device),
+        "columns": lambda: columns.validate(device),
+        "blades": lambda: blades.validate(device),
+        "inclines": lambda: inclines.validate(device),
+        "refinement": lambda: refinement.validate(device),
+    }
+    if measured is not None:
+        result["sand"] = lambda: sand.validate(measured)
+        result["plates"] = lambda: plates.validate(measured, device)
+    return result
+
+
+def digest() -> str:
+    """Of all code that the numbers may hang on."""
+    others = sorted((Path(__file__).parent / "_validation").glob("*.py"))
+    return code_digest(("soil", "mpm", "experiment"), others)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the parts that are asked for and not done yet, and write the page of all that are done."""
+    parser = argparse.ArgumentParser(prog="splatsoil benchmark validate", description=__doc__)
+    parser.add_argument("--only", nargs="+", metavar="PART", help="parts to run; all by default")
+    parser.add_argument("--measured", type=Path, help=f"folder of measured data; default: {MEASURED}, else none")
+    parser.add_argument(
+        "--out", type=Path, default=Path("runs/validation"), help="results of the parts, to resume from"
+    )
+    parser.add_argument("--page", type=Path, help="write the page (.md) here and its pictures beside it")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--again", action="store_true", help="run parts that are done already")
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of tables")
+    options = parser.parse_args(arguments)
+    wp.config.log_level = wp.LOG_ERROR
+    known = os.environ.get(MEASURED)
+    measured = options.measured or (Path(known) if known else None)
+    todo = parts(measured, options.device)
+    unknown = sorted(set(options.only or ()) - set(todo))
+    if unknown:
+        parser.error(f"part {unknown[0]!r} is not among {', '.join(todo)} (real sand needs --measured or {MEASURED})")
+    code, done = digest(), {}
+    for name, validate in todo.items():
+        if not options.only or name in options.only:
+            done[name] = _part(name, validate, options.out, code, options.device, options.again, options.json)
+    if options.json:
+        from splatsoil.commands._output import print_json
+
+        print_json({"ok": True, "parts": plain({name: section["section"] for name, section in done.items()})})
+    if options.page:
+        _write_page(options.page, options.out, list(todo), options.device)
+    return 0
+
+
+def _part(
+    name: str, validate: Callable[[], Section], out: Path, code: str, device: str, again: bool, quiet: bool
+) -> Mapping[str, Any]:
+    """A part's result: from disk where the same code made it, else run and written."""
+    file = out / f"{name}.json"
+    if file.is_file() and not again:
+        stored = read_json(file)
+        if stored.get("code") == code and stored.get("device") == device:
+            return stored
+    before = time.monotonic()
+    try:
+        section = validate()
+    except SplatsoilError as error:
+        raise type(error)(f"part {name}: {error}") from error
+    if section.figure is not None:
+        stream = io.BytesIO()
+        section.figure.savefig(stream, format="png", dpi=110)
+        write_bytes(out / f"validation-{name}.png", stream.getvalue())
+    result = {"code": code, "device": device, "section": section.data(), "seconds": time.monotonic() - before}
+    write_json(file, result)
+    if not quiet:
+        print(f"\n{section.title}\n\n{table(section.rows)}")
+        print(f"{name}: {result['seconds']:.0f} s", file=sys.stderr, flush=True)
+    return result
+
+
+def _write_page(file: Path, out: Path, names: Sequence[str], device: str) -> None:
+    """The page of all parts on disk, and their pictures beside it."""
+    found = {}
+    for name in names:
+        if (out / f"{name}.json").is_file():
+            data = read_json(out / f"{name}.json")["section"]
+            found[name] = (Section.restored(data), bool(data["figure"]))
+            if data["figure"]:
+                write_bytes(file.parent / f"validation-{name}.png", (out / f"validation-{name}.png").read_bytes())
+    write_text(file, page(found, "splatsoil benchmark validate --page docs/validation.md", device))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
