@@ -28,7 +28,7 @@ def sentences(diagnosis: Diagnosis, candidates: Mapping[str, Candidate], base: M
             f"Before anything is added, the model is farthest off in the {worst.region} during {worst.stage}, as "
             f"{worst.channel} sees it: {times} what noise leaves."
         )
-    blind = [name for name, verdict in diagnosis.effects.items() if verdict == "cannot tell"]
+    blind = [name.replace("_", " ") for name, verdict in diagnosis.effects.items() if verdict == "cannot tell"]
     if blind:
         out.append(f"What these data cannot tell: {listed(blind)}.")
     return out

@@ -215,6 +215,18 @@ def entry(fit: dict[str, Any], refit: dict[str, Any]) -> dict[str, Any]:
     }
 
 
+def pictured(folder: RunFolder) -> bool:
+    """Whether there are pictures at the latest fit's estimate."""
+    from splatsoil.files import read_json
+    from splatsoil.report.data import estimates
+
+    path, fit = folder.comparison / "comparison.json", folder.fit()
+    if not path.is_file():
+        return False
+    data = read_json(path)
+    return bool(data["fit"] == fit["name"] and data["parameters"] == estimates(fit))
+
+
 def keep_pictures(folder: RunFolder) -> None:
     """Put the comparison of the model before aside, so that before and after can be shown."""
     import shutil

@@ -119,6 +119,8 @@ def added(
         seed=folder.description["seed"],
         run=folder.path,
     )
+    if not criticism.pictured(folder):
+        stage.compared(folder, model, begin("compare"))
     result = stage.fitted(fitting, model.measurement, folder, larger, begin(f"fit with {name}"))
     criticism.keep_pictures(folder)
     stage.compared(folder, larger, begin("compare"))

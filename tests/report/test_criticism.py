@@ -132,7 +132,7 @@ def test_the_verdict_stands_on_top_with_its_reasons(run: Path, diagnosis: dict[s
     assert text.index("Missing: effect 2.") < text.index("The error falls") < text.index("Where it fails")
     for sentence in diagnosis["sentences"]:
         assert sentence in text
-    for phrase in ("5.2", "1.3", "noise alone", "Effects that are off", "What a parameter has moved by"):
+    for phrase in ("5.2", "1.3", "noise alone", "Effects that are off", "has moved by is the bias"):
         assert phrase in text, phrase
 
 
