@@ -72,7 +72,9 @@ def gather(
     jobs = len(seeds) + len(experiment.numerics) + 2 * len(experiment.parameters) + 2 * len(experiment.candidates) + 1
     done = 0
 
-    def run(purpose: str, at: Mapping[str, float], effects: tuple[str, ...] = (), seed: int = 0, numerics: str = ""):  # type: ignore[no-untyped-def]
+    def run(
+        purpose: str, at: Mapping[str, float], effects: tuple[str, ...] = (), seed: int = 0, numerics: str = ""
+    ) -> FloatArray:
         nonlocal done
         table = simulate(at, effects=effects, seed=seed, numerics=numerics, purpose=purpose)
         done += 1
@@ -137,9 +139,16 @@ def step_of(parameter: Parameter) -> float:
     return side * min(wanted, REACH * room[side])
 
 
-def _slope(candidate: Candidate, parameter: Parameter, base, middle, run, steps):  # type: ignore[no-untyped-def]
+def _slope(
+    candidate: Candidate,
+    parameter: Parameter,
+    base: Mapping[str, float],
+    middle: FloatArray,
+    run: Callable[..., FloatArray],
+    steps: dict[str, float],
+) -> FloatArray:
     """Derivative by one parameter of an effect, its others at off; from both sides where it has no sign."""
-    off = {p.name: p.off for p in candidate.parameters}
+    off = {p.name: float(p.off or 0.0) for p in candidate.parameters}
     step = step_of(parameter)
     steps[parameter.name] = abs(step)
     tables = []

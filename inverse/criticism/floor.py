@@ -10,6 +10,7 @@ import numpy.typing as npt
 from scipy.optimize import nnls
 
 from splatsoil.experiment.base import Experiment
+from splatsoil.experiment.features import Layout
 
 from .evidence import Evidence
 from .noise import Noise, Part, correlated, estimate, independent
@@ -127,7 +128,7 @@ def _replayed(experiment: Experiment, replays: FloatArray, parts: Mapping[str, P
     return replace(whole, scale=np.sqrt(variance))
 
 
-def _total(layout, parts: Mapping[str, Part], seen: npt.NDArray[np.bool_], runs: int) -> tuple[Noise, Noise]:  # type: ignore[no-untyped-def]
+def _total(layout: Layout, parts: Mapping[str, Part], seen: npt.NDArray[np.bool_], runs: int) -> tuple[Noise, Noise]:
     """Noise against the mean of ``runs`` predictions, and against one."""
     factors = {"chance": (1.0 + 1.0 / runs, 2.0)}
     averaged, alone = (
