@@ -55,6 +55,8 @@ class PlowSandEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         device: ``auto``, ``cpu`` or ``cuda:N``.
         reconstruction: folder of a saved reconstruction of the measurement; made (minutes) when there is none.
         render_mode: ``rgb_array`` shows observed | predicted | difference.
+        same_particles: simulate all of an episode with the same particles, so that two losses differ by their
+            parameters and hardly by chance (common random numbers); by default each has its own.
         problem: a simulate-and-compare of one's own instead of all of the above but the budget.
     """
 
@@ -70,6 +72,7 @@ class PlowSandEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         device: str = "cpu",
         reconstruction: str | None = None,
         render_mode: str | None = None,
+        same_particles: bool = False,
         problem: Problem | None = None,
     ) -> None:
         if budget < 2:
@@ -78,6 +81,7 @@ class PlowSandEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             raise ParameterError(f"render_mode: must be rgb_array or None, not {render_mode}")
         self.render_mode = render_mode
         self.budget = int(budget)
+        self.same_particles = bool(same_particles)
         self.problem = problem or make_problem(measurement, parameters, effects, preset, device, reconstruction)
         n, b = len(self.problem.space), self.problem.block_count
         box = gym.spaces.Box
@@ -163,8 +167,9 @@ class PlowSandEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         return self._observation(), reward, False, self._left == 0, info
 
     def simulation_seed(self, step: int) -> int:
-        """Seed of the simulation in this step of this episode: no two share their chance."""
-        return int(np.random.SeedSequence([self._episode_seed, step]).generate_state(1)[0] % 2**31)
+        """Seed of the simulation in this step of this episode."""
+        which = 0 if self.same_particles else step
+        return int(np.random.SeedSequence([self._episode_seed, which]).generate_state(1)[0] % 2**31)
 
     def _observation(self) -> Observation:
         worst = self.problem.worst_loss

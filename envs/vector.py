@@ -49,6 +49,7 @@ class PlowSandVectorEnv(VectorEnv[Observation, npt.NDArray[np.float32], Any]):
         device: str = "cpu",
         reconstruction: str | None = None,
         render_mode: str | None = None,
+        same_particles: bool = False,
         problems: Sequence[Problem] | None = None,
     ) -> None:
         if num_envs < 1:
@@ -66,7 +67,10 @@ class PlowSandVectorEnv(VectorEnv[Observation, npt.NDArray[np.float32], Any]):
             raise ParameterError(f"problems: {len(problems)} do not make {num_envs} environments")
         self.num_envs = num_envs
         self.render_mode = render_mode
-        self.envs = [PlowSandEnv(problem=p, budget=budget, render_mode=render_mode) for p in problems]
+        self.envs = [
+            PlowSandEnv(problem=p, budget=budget, render_mode=render_mode, same_particles=same_particles)
+            for p in problems
+        ]
         self.single_action_space = self.envs[0].action_space
         self.single_observation_space = self.envs[0].observation_space
         self.action_space = batch_space(self.single_action_space, num_envs)

@@ -158,3 +158,12 @@ def test_pickled_in_the_middle_of_an_episode(env: PlowSandEnv) -> None:
 def test_options_that_make_no_sense(analytic: ModuleType, options: dict, says: str) -> None:
     with pytest.raises(ParameterError, match=says):
         PlowSandEnv(problem=analytic.AnalyticProblem(), **options)
+
+
+def test_particles_are_each_steps_own_or_all_of_an_episodes(analytic: ModuleType) -> None:
+    """The analytic problem's chance hangs on the seed, as a simulation's does on its particles."""
+    for same, kinds in ((False, 3), (True, 1)):
+        env = PlowSandEnv(problem=analytic.AnalyticProblem(noise=0.1), budget=3, same_particles=same)
+        env.reset(seed=0)
+        steps = [env.step(np.zeros(1, dtype=np.float32)) for _ in range(3)]
+        assert len({reward for _, reward, *_ in steps}) == kinds == len({info["seed"] for *_, info in steps})
