@@ -73,7 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
         print_json({"ok": True, "parts": plain({name: section["section"] for name, section in done.items()})})
     if options.page:
-        _write_page(options.page, options.out, list(todo), options.device)
+        _write_page(options.page, options.out, list(todo), code, options.device)
     return 0
 
 
@@ -103,16 +103,18 @@ def _part(
     return result
 
 
-def _write_page(file: Path, out: Path, names: Sequence[str], device: str) -> None:
-    """The page of all parts on disk, and their pictures beside it."""
+def _write_page(file: Path, out: Path, names: Sequence[str], code: str, device: str) -> None:
+    """The page of all parts on disk that this code made on this device, and their pictures beside it."""
     found = {}
     for name in names:
-        if (out / f"{name}.json").is_file():
-            data = read_json(out / f"{name}.json")["section"]
+        stored = read_json(out / f"{name}.json") if (out / f"{name}.json").is_file() else {}
+        if stored.get("code") == code and stored.get("device") == device:
+            data = stored["section"]
             found[name] = (Section.restored(data), bool(data["figure"]))
             if data["figure"]:
                 write_bytes(file.parent / f"validation-{name}.png", (out / f"validation-{name}.png").read_bytes())
-    write_text(file, page(found, "splatsoil benchmark validate --page docs/validation.md", device))
+    command = f"{MEASURED}=FOLDER splatsoil benchmark validate --page docs/validation.md"
+    write_text(file, page(found, command, device))
 
 
 if __name__ == "__main__":

@@ -168,7 +168,8 @@ def validate(device: str) -> Section:
         "channel with smooth walls, per metre. Narrow: McKyes' side crescents, 1 + 2s/3w. Matching in plane strain.",
         tuple(rows),
         "Friction on an upright blade is where a straight slip plane overestimates most; log-spiral planes give a "
-        "smaller passive pressure there (Caquot & Kérisel 1948). A blade of few cells bears too much: the cell that holds "
+        "smaller passive pressure there (Caquot & Kérisel 1948). A blade of few cells bears too much: the cell "
+        "that holds "
         "its foot acts like extra depth, which adds the more, the shallower the blade, and so lowers n.",
         _figure(curves),
     )

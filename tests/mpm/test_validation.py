@@ -1,0 +1,108 @@
+"""The quick part of ``splatsoil benchmark validate``: laboratories and closed forms, on coarse grids."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from splatsoil.benchmarks._validation import basics, columns, inclines, plates
+from splatsoil.benchmarks._validation.blades import SCATTER, Blade, mckyes
+from splatsoil.benchmarks._validation.page import Row, Section, page
+from splatsoil.benchmarks._validation.refinement import runout
+from splatsoil.benchmarks.validate import main
+
+from splatsoil.errors import MeasurementError, SimulationError
+from splatsoil.mpm.tool import build_tool
+from splatsoil.soil.matching import Matching
+
+MEASURED = Path(os.environ.get("SPLATSOIL_MEASURED", "nowhere"))
+
+
+def test_momentum_and_mass_are_kept_under_weight_and_tool() -> None:
+    momentum, mass = basics.strike("cpu", 0.25)
+    assert momentum < 1e-3
+    assert mass < 1e-6
+
+
+def test_a_column_runs_out_as_in_the_laboratory_and_strong_sand_does_not() -> None:
+    """Lube et al. (2004): 1.24 a, within 20 %; sand with a stress ratio of 1.30 stays far short of it."""
+    assert runout("cpu") == pytest.approx(1.24, rel=0.2)
+    strong = columns.column(1.0, 55.0, planar=False, matching=Matching.COMPRESSION, particles=2000.0)
+    assert columns.collapse(strong, 1.0, False, "cpu")[0] < 0.8 * 1.24
+
+
+@pytest.mark.parametrize(("angles", "factor"), [((90, 0, 35), 1.8451), ((90, 20, 35), 4.162), ((60, 20, 35), 1.820)])
+def test_mckyes_factors_are_the_published_ones(angles: tuple[int, int, int], factor: float) -> None:
+    assert mckyes(*angles)[0] == pytest.approx(factor, rel=1e-3)
+
+
+@pytest.mark.parametrize("blade", [Blade(0.08), Blade(0.08, rake=60.0), Blade(0.08, friction_angle=25.0)])
+def test_a_smooth_blade_bears_passive_pressure(blade: Blade) -> None:
+    assert blade.force("cpu") == pytest.approx(blade.expected, rel=SCATTER)
+
+
+def test_a_raked_plate_keeps_its_thickness() -> None:
+    """A plate turned by 45 degrees in its own frame: its middle lies half its thickness inside."""
+    plate = trimesh.creation.box(extents=[0.01, 0.2, 0.2])
+    plate.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 4, [0.0, 1.0, 0.0]))
+    tool = build_tool(plate, margin=0.02, stiffness=1.0, damping=0.0, device="cpu")
+    assert tool.distance.numpy().min() == pytest.approx(-0.005, rel=0.1)
+    assert tool.spacing < 0.01
+
+
+def test_a_scene_without_a_tool_takes_a_number_of_steps_and_one_with_a_tool_takes_poses() -> None:
+    scene = columns.column(1.0, 31.0, planar=False, matching=Matching.COMPRESSION, particles=300.0)
+    run = scene.solver("cpu")
+    np.testing.assert_array_equal(run.advance(2), 0.0)
+    for wrong in (0, []):
+        with pytest.raises(SimulationError, match="number of steps where there is no tool"):
+            run.advance(wrong)
+
+
+@pytest.mark.slow
+def test_a_layer_flows_down_an_incline_as_bagnold_says() -> None:
+    found, _, _ = inclines.ratio(inclines.Chute(24.0), "cpu")
+    assert found == pytest.approx(1.0, abs=inclines.ALLOWED)
+
+
+def test_forces_at_equal_depth_over_diameter_grow_with_the_cube() -> None:
+    depths = np.array(plates.DEPTHS)
+    assert plates.similar(1e5 * depths, 0.12) == pytest.approx(8.0 * 1e5 * depths[-1] / 2.0)
+
+
+@pytest.mark.skipif(not (MEASURED / "cmu_plates").is_dir(), reason="SPLATSOIL_MEASURED names no cmu_plates")
+def test_measured_plates_are_read_as_their_authors_processed_them() -> None:
+    """Mean forces at 5/10/15/18 mm by the authors' own touch-down, which lies up to half a millimetre from ours."""
+    published = {0.06: (13.3, 25.1, 39.9, 50.1), 0.08: (26.3, 57.5, 96.4, 121.8), 0.1: (51.0, 119.0, 207.0, 267.0)}
+    for diameter, forces in published.items():
+        np.testing.assert_allclose(plates.measured(MEASURED, diameter).mean(axis=0), forces, rtol=0.12)
+
+
+def test_missing_plates_are_named(tmp_path: Path) -> None:
+    with pytest.raises(MeasurementError, match="no trials of the plate of 60 mm"):
+        plates.measured(tmp_path, 0.06)
+
+
+def test_the_page_counts_and_lists_what_fails() -> None:
+    rows = (Row("one", "1", "1", True), Row("two", "3", "2", False), Row("three", "4", "any"))
+    text = page({"part": (Section("A part", "before", rows), False)}, "the command", "cpu")
+    assert "1 of 2 comparisons hold" in text
+    assert "- A part: two: 3 (2)" in text
+    assert text.count("**fails**") == 1
+
+
+def test_the_command_writes_the_page_and_resumes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["--only", "element", "--out", str(tmp_path / "out"), "--page", str(tmp_path / "page.md")]
+    assert main(arguments) == 0
+    assert "The law at one point" in capsys.readouterr().out
+    text = (tmp_path / "page.md").read_text()
+    assert "26.902" in text and "11 of 11 comparisons hold" in text
+    assert main([*arguments, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["parts"]["element"]["title"] == "The law at one point"
+    with pytest.raises(SystemExit):
+        main(["--only", "alchemy"])

@@ -1,0 +1,40 @@
+"""Real sand in a laboratory's triaxial cell: Wichtmann & Triantafyllidis (2016), where the data are at hand."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+from splatsoil.benchmarks._validation.element import ALLOWED, strength
+from splatsoil.benchmarks._validation.sand import CRITICAL, TESTS, fit
+
+from splatsoil.experiment.triaxial import TriaxialExperiment, read_triaxial
+from splatsoil.soil.matching import Matching
+
+FILE = Path(os.environ.get("SPLATSOIL_MEASURED", "")) / "karlsruhe_triaxial" / "tmd2_loose_tmd22_dense_subset.csv"
+
+
+@pytest.mark.parametrize("matching", list(Matching))
+@pytest.mark.parametrize("cohesion", [0.0, 300.0])
+def test_strength_is_exact_in_the_test_a_matching_is_named_after(matching: Matching, cohesion: float) -> None:
+    found, exact = strength(matching, cohesion)
+    assert found == pytest.approx(exact, rel=ALLOWED)
+
+
+@pytest.mark.skipif(not FILE.is_file(), reason="SPLATSOIL_MEASURED names no folder with karlsruhe_triaxial")
+def test_the_base_law_is_rejected_by_dense_sand_in_its_volume_and_effects_mend_it() -> None:
+    curves = read_triaxial(FILE)
+    name, void_ratio = TESTS["loose (TMD2)"]
+    loose = fit(TriaxialExperiment(curves[name], void_ratio=void_ratio))
+    assert loose.volume < 1.0
+    assert loose.values["friction_angle"] == pytest.approx(CRITICAL, abs=2.0)
+    name, void_ratio = TESTS["dense (TMD22)"]
+    fits = [
+        fit(TriaxialExperiment(curves[name], effects, void_ratio=void_ratio))
+        for effects in ((), ("dilatancy",), ("dilatancy", "softening"))
+    ]
+    assert fits[0].volume > 50.0 and fits[0].volume > fits[0].strength
+    assert fits[1].volume < 1.0
+    errors = [f.volume + f.strength for f in fits]
+    assert errors[0] > 5.0 * errors[1] and errors[1] > 1.1 * errors[2]
