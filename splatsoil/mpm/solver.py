@@ -33,7 +33,7 @@ from splatsoil.mpm.transfer import (
     number_cells,
     particles_to_grid,
 )
-from splatsoil.soil.law import STIFFNESS, Law
+from splatsoil.soil.law import OBSTACLE, STIFFNESS, Law
 from splatsoil.soil.settings import Settings
 
 FloatArray = npt.NDArray[np.floating]
@@ -65,7 +65,7 @@ class Solver:
         device: Warp device name.
 
     Raises:
-        SimulationError: particles outside the bed, or arrays of the wrong shape.
+        SimulationError: particles outside the bed, arrays of the wrong shape, an obstacle that the grid cannot see.
         ParameterError: parameters that are unknown or out of bounds.
     """
 
@@ -101,6 +101,7 @@ class Solver:
             raise SimulationError("some particles start outside the bed's box or at positions that are not finite")
         self.simulations, self.particles_each = x.shape[0], x.shape[1]
         self.shape = GridShape.covering(low, high, resolution.cell)
+        self._refuse_unseen(table[:, OBSTACLE : OBSTACLE + 4])
         self.grid = self.shape.to_warp()
         self.ceiling = float(high[2] + 2.0 * resolution.cell)
         self._table = wp.array(table.astype(np.float32), dtype=float, device=device)
@@ -120,6 +121,18 @@ class Solver:
         )
         self._start(x, base)
         self.frame = 0
+
+    def _refuse_unseen(self, obstacles: npt.NDArray[np.float64]) -> None:
+        """SimulationError when a sphere (x, y from the middle, height, radius) holds no node of the grid."""
+        cell, last = self.shape.cell, np.array(self.shape.nodes) - 1
+        centres = obstacles[:, :3] + np.array([0.5, 0.5, 0.0]) * last * cell
+        nearest = cell * np.clip(np.rint(centres / cell), 0, last)
+        unseen = (obstacles[:, 3] > 0.0) & (np.linalg.norm(centres - nearest, axis=1) >= obstacles[:, 3])
+        if unseen.any():
+            raise SimulationError(
+                f"an obstacle of radius {obstacles[unseen][0, 3]:g} m holds no node of the grid, whose cells measure "
+                f"{cell.max():.3g} m, and would not be felt; make it larger, keep it in the bed or take a finer preset"
+            )
 
     def _allocate(self, x: npt.NDArray[np.float32]) -> None:
         n, count, device = x.shape[0] * x.shape[1], self.simulations * self.grid.nodes, self.device

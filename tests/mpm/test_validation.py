@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -61,6 +63,21 @@ def test_a_scene_without_a_tool_takes_a_number_of_steps_and_one_with_a_tool_take
     for wrong in (0, []):
         with pytest.raises(SimulationError, match="number of steps where there is no tool"):
             run.advance(wrong)
+
+
+def test_an_obstacle_that_the_grid_cannot_see_is_refused() -> None:
+    """A sphere in the middle of a cell reaches its corners when its radius is half the cell's diagonal."""
+    scene = columns.column(1.0, 31.0, planar=False, matching=Matching.COMPRESSION, particles=300.0)
+    cell = scene.resolution.cell
+    half = {"obstacle_x": 0.5 * cell, "obstacle_y": 0.5 * cell, "obstacle_height": 0.5 * cell}
+    odd = round(scene.upper[0] / cell) % 2
+    if odd:
+        half |= {"obstacle_x": 0.0, "obstacle_y": 0.0}
+    reach = 0.5 * math.sqrt(3.0) * cell
+    seen = replace(scene, effects=("buried_obstacle",), values={**half, "obstacle_radius": 1.02 * reach})
+    seen.solver("cpu").advance(1)
+    with pytest.raises(SimulationError, match=r"holds no node of the grid.*finer preset"):
+        replace(seen, values={**half, "obstacle_radius": 0.98 * reach}).solver("cpu")
 
 
 @pytest.mark.slow
