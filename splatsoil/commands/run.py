@@ -16,13 +16,18 @@ if TYPE_CHECKING:
     from splatsoil.model import Model
 
 
+#: Share of the misfit that an effect must explain for it to be put in although something else is missing, too: the
+#: falling error then says what it is worth, and the verdict stays what it is.
+WORTH_TRYING = 0.5
+
+
 @dataclass(frozen=True)
 class Config(FitOptions):
     """All of it: check the set, reconstruct, fit, compare, write the report. Goes on where it was interrupted.
 
-    With --criticise also: diagnose, add the effect that is missing, fit again, and so on, until the model is adequate,
-    no effect of the library explains what is left, or the limit is reached. Each round costs about as much as three
-    plain fits, so it isn't done unless asked for.
+    With --criticise also: diagnose, add the effect that is missing (or the nearest, where it explains half of the
+    misfit), fit again, and so on, until the model is adequate, no effect of the library explains what is left, or the
+    limit is reached. Each round costs about as much as three plain fits, so it isn't done unless asked for.
     """
 
     criticise: bool = False
@@ -103,7 +108,7 @@ def loop(folder: RunFolder, model: Model, most: int, begin: Callable[[str], Repo
         diagnosis = criticism.diagnosed(folder, model, options, begin)
         if diagnosis["verdict"] == "adequate":
             return diagnosis, "nothing stands above what noise, chance and numerics leave"
-        if diagnosis["verdict"] != "missing":
+        if diagnosis["verdict"] != "missing" and diagnosis["explained"] < WORTH_TRYING:
             nearest = diagnosis["class"][0] if diagnosis["class"] else ""
             hint = f"; the nearest is {nearest}: splatsoil add {folder.path} {nearest} tries it" if nearest else ""
             return diagnosis, f"no effect of the library explains all that is left{hint}"
