@@ -23,10 +23,9 @@ def sentences(diagnosis: Diagnosis, candidates: Mapping[str, Candidate], base: M
         out = _outside(diagnosis, candidates)
     worst = next((b for b in diagnosis.blocks if b.p < GATE), None)
     if worst is not None:
-        times = f"{worst.ratio:.1f} times"
         out.append(
-            f"Before anything is added, the model is farthest off in the {worst.region} during {worst.stage}, as "
-            f"{worst.channel} sees it: {times} what noise leaves."
+            f"Before anything is added, the model is farthest off here: {worst.region}, {worst.stage}, "
+            f"{worst.channel}, with {worst.ratio:.1f} times what noise leaves."
         )
     blind = [name.replace("_", " ") for name, verdict in diagnosis.effects.items() if verdict == "cannot tell"]
     if blind:
