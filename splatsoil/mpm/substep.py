@@ -21,6 +21,9 @@ from splatsoil.soil.law import (
     Stress,
 )
 
+# Of a particle's spacing: soil that slides along the tool chatters on the contact spring, and clings all the while.
+ADHESION_REACH = wp.constant(0.05)
+
 
 @cache
 def make_stress_kernel(update: Any, history: bool) -> Any:
@@ -127,11 +130,12 @@ def contact_forces(
             place = x + particles.drift[p] - tool_position(pose)
             gap = signed_distance(tool, wp.quat_rotate_inv(tool_rotation(pose), place))
         particles.gap[p] = gap
-        if gap < 0.0:
-            push = wp.max(-tool.stiffness * gap - tool.damping * closing, 0.0)
+        adhesion = values[row, TOOL_ADHESION] * area
+        if gap < 0.0 or (adhesion > 0.0 and gap < ADHESION_REACH * wp.sqrt(area)):
+            push = wp.where(gap < 0.0, wp.max(-tool.stiffness * gap - tool.damping * closing, 0.0), 0.0)
             slip -= closing * normal
             speed = wp.length(slip)
-            hold = values[row, TOOL_FRICTION] * push + values[row, TOOL_ADHESION] * area
+            hold = values[row, TOOL_FRICTION] * push + adhesion
             drag = wp.min(hold, particles.mass * speed / dt)
             pull = push * normal - slip * (drag / wp.max(speed, 1.0e-9))
             wp.atomic_add(force, row, -share * pull)
