@@ -77,7 +77,8 @@ on the page, with the reason as far as it is known. A dash marks a number that i
 
 def percent(found: float, expected: float) -> str:
     """Relative deviation, signed."""
-    return f"{100.0 * (found / expected - 1.0):+.1f} %"
+    deviation = 100.0 * (found / expected - 1.0)
+    return f"{deviation:+.2f} %" if abs(deviation) < 1.0 else f"{deviation:+.1f} %"
 
 
 def page(parts: Mapping[str, tuple[Section, bool]], command: str, device: str) -> str:

@@ -117,7 +117,7 @@ def test_the_command_writes_the_page_and_resumes(tmp_path: Path, capsys: pytest.
     assert main(arguments) == 0
     assert "The law at one point" in capsys.readouterr().out
     text = (tmp_path / "page.md").read_text()
-    assert "26.902" in text and "11 of 11 comparisons hold" in text
+    assert "14.639, 20.000, 26.902, 35.989, 48.284 kPa" in text and "11 of 11 comparisons hold" in text
     assert main([*arguments, "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["parts"]["element"]["title"] == "The law at one point"
