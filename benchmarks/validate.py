@@ -38,11 +38,15 @@ def parts(measured: Path | None, device: str) -> dict[str, Callable[[], Section]
     return result
 
 
-def digest() -> str:
-    """Of all code that the numbers may hang on."""
-    # how the page is written changes no number
-    others = sorted(f for f in (Path(__file__).parent / "_validation").glob("*.py") if f.name != "page.py")
-    return code_digest(("soil", "mpm", "experiment"), others)
+#: Files of ``_validation`` that a part's numbers hang on, beside its own and ``scene.py``.
+BESIDE = {"basics": ("columns",), "refinement": ("blades", "columns")}
+
+
+def digest(name: str) -> str:
+    """Of all code that a part's numbers may hang on."""
+    folder = Path(__file__).parent / "_validation"
+    package = ("soil", "mpm", "experiment") if name == "sand" else ("soil", "mpm")
+    return code_digest(package, [folder / f"{file}.py" for file in ("scene", name, *BESIDE.get(name, ()))])
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -65,24 +69,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     unknown = sorted(set(options.only or ()) - set(todo))
     if unknown:
         parser.error(f"part {unknown[0]!r} is not among {', '.join(todo)} (real sand needs --measured or {MEASURED})")
-    code, done = digest(), {}
+    done = {}
     for name, validate in todo.items():
         if not options.only or name in options.only:
-            done[name] = _part(name, validate, options.out, code, options.device, options.again, options.json)
+            done[name] = _part(name, validate, options.out, options.device, options.again, options.json)
     if options.json:
         from splatsoil.commands._output import print_json
 
         print_json({"ok": True, "parts": plain({name: section["section"] for name, section in done.items()})})
     if options.page:
-        _write_page(options.page, options.out, list(todo), code, options.device)
+        _write_page(options.page, options.out, list(todo), options.device)
     return 0
 
 
 def _part(
-    name: str, validate: Callable[[], Section], out: Path, code: str, device: str, again: bool, quiet: bool
+    name: str, validate: Callable[[], Section], out: Path, device: str, again: bool, quiet: bool
 ) -> Mapping[str, Any]:
     """A part's result: from disk where the same code made it, else run and written."""
-    file = out / f"{name}.json"
+    file, code = out / f"{name}.json", digest(name)
     if file.is_file() and not again:
         stored = read_json(file)
         if stored.get("code") == code and stored.get("device") == device:
@@ -104,12 +108,12 @@ def _part(
     return result
 
 
-def _write_page(file: Path, out: Path, names: Sequence[str], code: str, device: str) -> None:
+def _write_page(file: Path, out: Path, names: Sequence[str], device: str) -> None:
     """The page of all parts on disk that this code made on this device, and their pictures beside it."""
     found = {}
     for name in names:
         stored = read_json(out / f"{name}.json") if (out / f"{name}.json").is_file() else {}
-        if stored.get("code") == code and stored.get("device") == device:
+        if stored.get("code") == digest(name) and stored.get("device") == device:
             data = stored["section"]
             found[name] = (Section.restored(data), bool(data["figure"]))
             if data["figure"]:

@@ -95,7 +95,7 @@ class Blade:
         # rows of particles lean as the blade does, so that soil lies against both its faces from the start
         lean = bed / math.tan(rake)
         margin = 0.5 * cell * math.ceil(2.0 * lean / cell)
-        x = lattice([-margin, 0.0, 0.0], [length + margin, wide, bed], 0.5 * cell, self.seed, 0.0)
+        x = lattice([-margin, 0.0, 0.0], [length + margin, wide, bed], 0.5 * cell, self.seed)
         across = x[:, 0] - start[0]
         inside = (across < 0.0) & (across > -cell) & (x[:, 2] > start[2]) & (x[:, 1] < 0.5 * span)
         x[:, 0] -= (x[:, 2] - start[2]) / math.tan(rake)
