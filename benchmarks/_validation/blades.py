@@ -21,7 +21,7 @@ YOUNG = 2.0e6
 WINDOW = (0.1, 0.25)
 """Ways over depth between which a force is averaged: soil has failed, and what the blade heaps up is still small."""
 SCATTER = 0.25
-"""Allowed: straight slip planes and the sides of narrow blades are known to this much (McKyes 1985, ch. 4)."""
+"""Allowed: straight slip planes and the sides of narrow blades are crude (McKyes 1985, ch. 4); our estimate."""
 
 
 def mckyes(rake: float, tool_angle: float, friction_angle: float) -> tuple[float, float]:
