@@ -47,6 +47,20 @@ def write_bytes(path: str | Path, data: bytes) -> Path:
     return target
 
 
+def check_folder(path: str | Path) -> None:
+    """See that results can go into a folder, which need not exist yet, before hours are spent on them; writes nothing.
+
+    Raises:
+        RunError: a file is in the way, or the folder can't be written to.
+    """
+    folder = Path(path).absolute()
+    there = next(place for place in (folder, *folder.parents) if place.exists())
+    if not there.is_dir():
+        raise RunError(f"{path}: {there} is a file and no folder; choose another folder for the result")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise RunError(f"{path}: cannot be written (Permission denied); choose a folder you may write to")
+
+
 def write_text(path: str | Path, text: str) -> Path:
     """Write ``text`` as UTF-8, whole or not at all."""
     return write_bytes(path, text.encode())

@@ -32,11 +32,10 @@ def plow_damp() -> Path:
 
 @pytest.fixture(scope="session")
 def measured_data() -> Path:
-    """Real measurements, too large to ship: $SPLATSOIL_MEASURED_DATA, or shared/data/measured beside the sources."""
-    given = os.environ.get("SPLATSOIL_MEASURED_DATA")
-    folder = Path(given) if given else REPOSITORY.parent / "shared" / "data" / "measured"
+    """Real measurements, too large to ship, in the folder that $SPLATSOIL_MEASURED names."""
+    folder = Path(os.environ.get("SPLATSOIL_MEASURED", "nowhere"))
     if not folder.is_dir():
-        pytest.skip("no measured data here (SPLATSOIL_MEASURED_DATA)")
+        pytest.skip("SPLATSOIL_MEASURED names no folder of measured data")
     return folder
 
 

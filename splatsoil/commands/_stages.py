@@ -45,8 +45,8 @@ def prepare(options: FitOptions) -> tuple[Measurement, RunFolder]:
 
     if options.budget is not None and options.budget < 2:
         raise ParameterError(f"--budget: a fit needs at least 2 evaluations, not {options.budget}")
-    if options.seed < 0:
-        raise ParameterError(f"--seed: must be 0 or more, not {options.seed}")
+    if not 0 <= options.seed < 2**63:
+        raise ParameterError(f"--seed: must be 0 or more and less than 2^63, not {options.seed}")
     effects = find_effects(options.effects)
     resolve_device(options.device)
     measurement = Measurement.load(options.set)

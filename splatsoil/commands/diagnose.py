@@ -30,8 +30,8 @@ class Config:
     refit_steps: int = 5
     """Simulations for each refit."""
     replay: bool = True
-    """Also photograph a made-up bed of the same soil and go through the whole chain with it, to know what pictures and
-    reconstruction get wrong by themselves. Without it, their errors can pass for soil."""
+    """Leave out the control: a made-up bed of the same soil, photographed and taken through the whole chain, that
+    tells what pictures and reconstruction get wrong by themselves. Without it, their errors can pass for soil."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda:0, …"""
     json: bool = False

@@ -35,18 +35,20 @@ class Config:
 
 
 def run(config: Config) -> int:
-    """Reconstruct, save, print; MeasurementError when the set breaks the format's rules."""
-    import torch
-
+    """Reconstruct, save, print; an error before any work when set, options or the folder for the result are no good."""
+    from splatsoil.envs.devices import resolve_device
+    from splatsoil.errors import ParameterError
+    from splatsoil.files import check_folder
     from splatsoil.measurement import Measurement
     from splatsoil.reconstruction import reconstruct
     from splatsoil.reconstruction.progress import progress_bar
 
+    if not 0 <= config.seed < 2**63:
+        raise ParameterError(f"--seed: must be 0 or more and less than 2^63, not {config.seed}")
+    device = resolve_device(config.device)
     measurement = Measurement.load(config.set)
     out = config.out or Path("runs") / f"{measurement.name}-reconstruction"
-    device = config.device
-    if device == "auto":
-        device = "cuda:0" if torch.cuda.is_available() else "cpu"
+    check_folder(out)
     with progress_bar(quiet=config.json) as report:
         result = reconstruct(
             measurement, seed=config.seed, device=device, preset=config.preset, holdout=config.holdout, progress=report
