@@ -140,7 +140,7 @@ def _gain(bare: Solver, nuisance: FloatArray) -> FloatArray:
     if not nuisance.size:
         return np.zeros((0, len(nuisance)))
     solved = bare.solve(nuisance)
-    return np.linalg.solve(nuisance.T @ solved + np.eye(nuisance.shape[1]), solved.T)
+    return np.asarray(np.linalg.solve(nuisance.T @ solved + np.eye(nuisance.shape[1]), solved.T), dtype=np.float64)
 
 
 def _project(nuisance: FloatArray, gain: FloatArray, columns: FloatArray) -> FloatArray:

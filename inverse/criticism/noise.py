@@ -57,7 +57,7 @@ class Part:
 
     def correlation(self, layout: Layout) -> FloatArray:
         """(t s, t s) correlation of the features."""
-        return np.kron(_time(layout.steps(), self.memory), self.across(layout))
+        return np.asarray(np.kron(_time(layout.steps(), self.memory), self.across(layout)), dtype=np.float64)
 
     def across(self, layout: Layout) -> FloatArray:
         """(s, s) correlation between sites at one time."""
