@@ -96,7 +96,8 @@ def emulated(seed: int, *, duplicate: bool = False) -> EmulatedExperiment:
     # Chance grows where and when soil has moved.
     moved = 0.3 + 2.0 * np.exp(-(((x - 0.15) / 0.12) ** 2))[None] * time_axis
     chance = Part(moved, MEMORY, LENGTH, NUGGET, np.array([[1.0, 0.4], [0.4, 1.0]]))
-    root = np.linalg.cholesky(Noise.of(layout, [(1.0, chance)], np.ones(layout.shape, dtype=bool)).covariance)
+    covariance = Noise.of(layout, [(1.0, chance)], np.ones(layout.shape, dtype=bool)).covariance
+    root = np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
 
     def pattern() -> FloatArray:
         phase = generator.uniform(0.0, 2.0 * np.pi, 4)
@@ -223,10 +224,10 @@ def run(count: int = 40, *, seed: int = 1, repeats: int = 4) -> dict[str, Any]:
     """All kinds of truth, ``count`` experiments each; a JSON-able result."""
     began = time.perf_counter()
     options = Options(repeats=repeats)
-    kinds = {c.name: c.kind for c in emulated(0).candidates}
+    kinds: dict[str, str] = {c.name: c.kind for c in emulated(0).candidates}
     physics = [name for name, kind in kinds.items() if kind == "physics"]
     reported = [name for name, kind in kinds.items() if kind == "observation"]
-    rows = []
+    rows: list[Tally] = []
 
     def series(name: str, hide: Any, beyond: float = 0.0, *, drop: bool = False, twin: bool = False) -> None:
         truths, found, angles = [], [], []

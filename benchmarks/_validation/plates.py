@@ -169,12 +169,12 @@ def validate(folder: Path, device: str) -> Section:
         best = fit(model, forces[DIAMETERS[0]], device, 15 * len(MODELS[model][0]))
         rows.append(Row(f"**{model}**, fitted on 60 mm", _values(best), "angle of repose 29°"))
         for d in DIAMETERS:
-            found = replace(best, diameter=d).measure(device)
-            curves[model, d] = found
-            error = found / forces[d] - 1.0
+            pressed = replace(best, diameter=d).measure(device)
+            curves[model, d] = pressed
+            error = pressed / forces[d] - 1.0
             worst = float(np.abs(error).max())
             held = None if d == DIAMETERS[0] else worst <= TARGET
-            text = "/".join(f"{f:.1f}" for f in found)
+            text = "/".join(f"{f:.1f}" for f in pressed)
             errors = "/".join(f"{100 * e:+.0f}" for e in error)
             name = "fit" if d == DIAMETERS[0] else "prediction"
             rows.append(Row(f"{model}, {1000 * d:.0f} mm ({name})", f"{text} N ({errors} %)", "each ± 15 %", held))

@@ -104,9 +104,13 @@ def push(
     Returns:
         Ways gone (n,) in m, forces of the soil on the tool (n, 3) in N, each the mean over a step, and the solver.
     """
-    run, place, speed = scene.solver(device), np.asarray(start, dtype=float), np.asarray(velocity, dtype=float)
+    run, place, speed = (
+        scene.solver(device),
+        np.asarray(start, dtype=np.float64),
+        np.asarray(velocity, dtype=np.float64),
+    )
     step = scene.resolution.frame_time
     count = math.ceil(travel / (float(np.linalg.norm(speed)) * step))
     force = [run.advance([Pose(place + k * step * speed, STILL, speed, np.zeros(3))])[0] for k in range(count)]
-    way = float(np.linalg.norm(speed)) * step * (np.arange(count) + 0.5)
-    return way, np.array(force), run
+    way = np.asarray(float(np.linalg.norm(speed)) * step * (np.arange(count) + 0.5), dtype=np.float64)
+    return way, np.array(force, dtype=np.float64), run

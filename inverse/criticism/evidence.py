@@ -100,7 +100,9 @@ def gather(
         widths[parameter.name] = max(abs(offset) for offset in offsets)
         if curve is not None:
             curves[parameter.name] = curve
-    directions, steps, failed = {}, {}, {}
+    directions: dict[str, FloatArray] = {}
+    steps: dict[str, float] = {}
+    failed: dict[str, str] = {}
     for candidate in experiment.candidates:
         try:
             directions[candidate.name] = np.stack(

@@ -135,7 +135,7 @@ class Scorer:
             given: an effect taken to be on, whose parameters are projected out; it is not scored itself.
         """
         gradient, information = self.weights.T @ residual, self.information
-        chosen = range(len(self.candidates))
+        chosen = list(range(len(self.candidates)))
         if given is not None:
             part = self.parts[self.names.index(given)]
             gain = information[:, part] @ np.linalg.pinv(information[part, part])

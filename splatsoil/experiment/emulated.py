@@ -49,14 +49,14 @@ class EmulatedExperiment:
     observed: FloatArray
     curves: Mapping[str, FloatArray] = field(default_factory=dict)
     patterns: Mapping[str, FloatArray] = field(default_factory=dict)
-    quiet: npt.NDArray[np.bool_] | None = None  # type: ignore[assignment]
+    quiet: npt.NDArray[np.bool_] = field(default_factory=lambda: np.zeros((0, 0), dtype=bool))
     name: str = "emulated"
     model: tuple[str, ...] = ()
     chance: bool = True
     sensor_memory: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.quiet is None:
+        if self.quiet.size == 0:
             object.__setattr__(self, "quiet", np.zeros(self.layout.shape, dtype=bool))
 
     @property

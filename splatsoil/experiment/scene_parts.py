@@ -39,7 +39,7 @@ def stages_of(measurement: Measurement, frames: Sequence[float]) -> tuple[str, .
     slow = SLOW * float(speed.max())
     level = np.diff(motion.positions, axis=0)[:, :2]
     length = np.linalg.norm(level, axis=1)
-    moving = np.flatnonzero(length > 0.5 * length.max()) if length.max() > 0.0 else []
+    moving = np.flatnonzero(length > 0.5 * length.max()) if length.max() > 0.0 else np.zeros(0, dtype=np.int64)
     forward = level[moving[0]] / length[moving[0]] if len(moving) else np.zeros(2)
     out = []
     for v in velocity:

@@ -78,8 +78,8 @@ def read_triaxial(path: str | Path) -> dict[str, Curve]:
             raise MeasurementError(f"line {number} has a number that is not finite", file=file)
         tests.setdefault(row["test_id"], []).append(values)
     out = {}
-    for name, values in tests.items():
-        table = np.array(values)
+    for name, records in tests.items():
+        table = np.array(records)
         table = table[table[:, 0] > 0.0]
         radial, axial = 1e3 * table[:, 2], 1e3 * table[:, 3]
         ratio = (axial - radial) / ((axial + 2.0 * radial) / 3.0)

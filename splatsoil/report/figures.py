@@ -149,7 +149,7 @@ def falling(models: Sequence[Mapping[str, Any]], names: Sequence[str]) -> str:
         errors = [entry["held_out"] for entry in models]
         axes.bar(places, errors, color=ACCENT, alpha=0.75, width=0.55)
         for place, error in zip(places, errors, strict=True):
-            axes.text(place, error, f"{error:.2g}", ha="center", va="bottom", color=INK)
+            axes.text(float(place), error, f"{error:.2g}", ha="center", va="bottom", color=INK)
         floors = [entry["floor"] for entry in models]
         axes.step(
             [-0.45, *(places + 0.5)],
@@ -199,6 +199,7 @@ def plan_maps(diagnosis: Mapping[str, Any], which: str) -> str:
                 if column == 0:
                     place.set_ylabel(name, fontsize=8)
                 place.tick_params(labelsize=7)
+        assert shown is not None
         bar = figure.colorbar(shown, ax=grid.ravel().tolist(), shrink=0.8, pad=0.02)
         bar.set_label("residual / noise")
 

@@ -73,7 +73,8 @@ class Photographer:
                 stands = self.observation.camera(camera, which - 1)
                 for number in numbers:
                     time = number / setup.frame_rate
-                    light = self.observation.exposed(self._light(stage, stands, which, number), time)
+                    seen = self._light(stage, stands, which, number).astype(np.float64)
+                    light = self.observation.exposed(seen, time).astype(np.float32)
                     video.append(Picture(camera, self._expose(light, which, number), number, time))
         order = {name: k for k, name in enumerate(setup.video)}
         video.sort(key=lambda picture: (picture.frame, order[picture.camera.name]))
