@@ -17,6 +17,7 @@ from splatsoil.observation import Observation
 from splatsoil.parameters import Parameter, ParameterSpace
 from splatsoil.reconstruction import Reconstruction, fill
 from splatsoil.scene import Scene
+from splatsoil.soil.effect import Effect
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
 
@@ -65,14 +66,15 @@ class Model:
         measurement: Measurement,
         reconstruction: Reconstruction,
         *,
-        effects: Iterable[str] = (),
+        effects: Iterable[str | Effect] = (),
         preset: str = "small",
         device: str = "cpu",
         frames: Iterable[int] | None = None,
     ) -> None:
         self.measurement, self.reconstruction = measurement, reconstruction
         self.preset, self.device = preset, device
-        self.law = Law(effect.for_measurement(measurement) for effect in find_effects(effects))
+        self.effects = find_effects(effects)
+        self.law = Law(effect.for_measurement(measurement) for effect in self.effects)
         self.resolution = Resolution.derive(measurement, preset)
         measured = tuple(int(f) for f in measurement.frames)
         self.frames = measured if frames is None else tuple(sorted({int(f) for f in frames}))
@@ -84,12 +86,16 @@ class Model:
         self.recorded = self._recorded_frames()
 
     def variant(self, *, effects: Iterable[str] | None = None, resolution: Resolution | None = None) -> Model:
-        """The same experiment with other effects on, or computed otherwise; it shares scenes where particles agree."""
-        names = tuple(e.name for e in self.law.effects) if effects is None else tuple(effects)
+        """The same experiment with other effects on, or computed otherwise; it shares scenes where particles agree.
+
+        An effect that is on already keeps its name here, wherever it came from.
+        """
+        on = {effect.name: effect for effect in self.effects}
+        chosen = self.effects if effects is None else tuple(on.get(name, name) for name in effects)
         other = Model(
             self.measurement,
             self.reconstruction,
-            effects=names,
+            effects=chosen,
             preset=self.preset,
             device=self.device,
             frames=self.frames,

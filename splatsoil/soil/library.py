@@ -36,15 +36,17 @@ def library() -> dict[str, Effect]:
     return dict(sorted(found.items()))
 
 
-def find_effects(names: Iterable[str]) -> tuple[Effect, ...]:
-    """Effects by name, or from ``path/to/file.py`` (every Effect subclass the file defines).
+def find_effects(names: Iterable[str | Effect]) -> tuple[Effect, ...]:
+    """Effects by name, or from ``path/to/file.py`` (every Effect subclass the file defines); effects stay themselves.
 
     Raises:
         ParameterError: an unknown name, a file without effects, or an effect named twice.
     """
     chosen: list[Effect] = []
     for name in names:
-        if name.endswith(".py"):
+        if isinstance(name, Effect):
+            chosen.append(name)
+        elif name.endswith(".py"):
             chosen.extend(_effects_of(_load_file(Path(name))))
         elif name in library():
             chosen.append(library()[name])

@@ -54,6 +54,14 @@ def test_the_example_is_the_effect_it_says_it_is(suction: str) -> None:
         assert test.q[0, -1] == pytest.approx(1e3 * (flow - 1.0) + 2.0 * cohesion * math.sqrt(flow), rel=1e-3)
 
 
+def test_a_variant_of_a_model_keeps_an_effect_from_a_file(suction: str) -> None:
+    """Criticism names effects; those of a user's file are in no library."""
+    model = tiny([suction])
+    more = model.variant(effects=("suction", "cohesion"))
+    assert [effect.name for effect in more.law.effects] == ["suction", "cohesion"]
+    assert [effect.name for effect in model.variant().law.effects] == ["suction"]
+
+
 def test_a_model_with_the_example_fits_and_simulates_it(suction: str) -> None:
     model, base = tiny([suction]), tiny([])
     assert model.space().names == ("friction_angle", "suction_gradient")
