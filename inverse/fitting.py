@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -62,7 +63,9 @@ class FitSetup:
     @property
     def name(self) -> str:
         """Short name of the model that is fitted: ``base``, or its effects joined by plus signs."""
-        return "+".join(sorted(self.effects)) or "base"
+        # A user's effect is known by its file's name; a path would lead out of the run folder.
+        names = (Path(effect).stem if effect.endswith(".py") else effect for effect in self.effects)
+        return "+".join(sorted(names)) or "base"
 
     def model(self) -> dict[str, Any]:
         """What decides a single evaluation, but its parameters and seed. One CUDA device is like another."""

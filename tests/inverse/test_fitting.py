@@ -134,6 +134,11 @@ def test_a_fit_with_another_seed_or_effect_shares_the_folder_but_no_evaluation(
         assert len(store.descriptions()) == 2
 
 
+def test_a_fit_is_named_by_its_effects_and_stays_in_the_run_folder(analytic: ModuleType) -> None:
+    assert analytic.SETUP.name == "base"
+    assert replace(analytic.SETUP, effects=("/my/suction.py", "cohesion")).name == "cohesion+suction"
+
+
 def test_other_code_simulates_again(analytic: ModuleType, tmp_path: Path) -> None:
     run = analytic.prepare(tmp_path)
     problem = analytic.AnalyticProblem()
