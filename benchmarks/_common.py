@@ -16,6 +16,8 @@ from splatsoil.files import code_digest, write_bytes, write_json, write_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from splatsoil.inverse.executors import Executor
+    from splatsoil.inverse.posterior import Data
 
 #: Everything that a benchmark's numbers may hang on.
 ALL = ("measurement", "splats", "reconstruction", "soil", "mpm", "scene", "synthetic")
@@ -30,6 +32,24 @@ def world_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--preset", default="tiny")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--executor", default="serial", help="serial, processes:N or dask:ADDRESS")
+
+
+def simulated(options: argparse.Namespace, count: int, pool: Executor, seed: int = 0) -> tuple[Data, Path]:
+    """Simulations at ``count`` Sobol points of the world that `world_options` chose, and where they are kept."""
+    from splatsoil.inverse.simulations import simulations
+
+    return simulations(
+        count,
+        options.parameters,
+        options.effects,
+        measurement=options.set,
+        reconstruction=options.reconstruction,
+        preset=options.preset,
+        device=options.device,
+        seed=seed,
+        executor=pool,
+        progress=ticker("simulations"),
+    )
 
 
 def output_options(parser: argparse.ArgumentParser) -> None:

@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import emcee
 import numpy as np
 import numpy.typing as npt
-from splatsoil.benchmarks._common import output_options, stamp, ticker, world_options, write_result
+from splatsoil.benchmarks._common import output_options, simulated, stamp, ticker, world_options, write_result
 from splatsoil.envs.synthetic import SyntheticProblem
 from splatsoil.envs.together import attempt
 from splatsoil.inverse.bayesopt import PAPER, BayesianOptimiser, Search
@@ -36,7 +36,6 @@ from splatsoil.inverse.emulator import FEWEST, Emulator
 from splatsoil.inverse.executors import executor
 from splatsoil.inverse.likelihood import Likelihood
 from splatsoil.inverse.mcmc import sample
-from splatsoil.inverse.simulations import simulations
 from splatsoil.inverse.surrogate import sobol
 
 from splatsoil.errors import ParameterError
@@ -318,17 +317,7 @@ def main(arguments: list[str] | None = None) -> int:
         raise ParameterError("--direct-simulator: the truth of a measured set is one; only the made-up world has many")
     began = time.perf_counter()
     with executor(options.executor) as pool:
-        data, file = simulations(
-            options.simulations,
-            options.parameters,
-            options.effects,
-            measurement=options.set,
-            reconstruction=options.reconstruction,
-            preset=options.preset,
-            device=options.device,
-            executor=pool,
-            progress=ticker("simulations"),
-        )
+        data, file = simulated(options, options.simulations, pool)
     emulator = Emulator(data.points, -data.residuals)
     if options.direct_simulator:
         world: World = SimulatedWorld(options.parameters, options.effects, options.preset, options.device)

@@ -23,14 +23,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 from scipy.stats import binom, chisquare
-from splatsoil.benchmarks._common import output_options, stamp, ticker, world_options, write_result
+from splatsoil.benchmarks._common import output_options, simulated, stamp, ticker, world_options, write_result
 from splatsoil.inverse.emulator import Emulator
 from splatsoil.inverse.executors import executor
 from splatsoil.inverse.likelihood import Likelihood
 from splatsoil.inverse.mcmc import sample
 from splatsoil.inverse.misfit import measure
 from splatsoil.inverse.posterior import Data
-from splatsoil.inverse.simulations import simulations
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -193,18 +192,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     began = time.perf_counter()
     with executor(options.executor) as pool:
-        data, file = simulations(
-            options.truths,
-            options.parameters,
-            options.effects,
-            measurement=options.set,
-            reconstruction=options.reconstruction,
-            preset=options.preset,
-            device=options.device,
-            seed=options.seed,
-            executor=pool,
-            progress=ticker("simulations"),
-        )
+        data, file = simulated(options, options.truths, pool, options.seed)
     data = replace(data, sensor_std=options.sensor)
     truths = min(options.truths, len(data.points))
     entries = calibrate(

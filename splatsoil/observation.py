@@ -14,6 +14,7 @@ from scipy.ndimage import correlate1d
 from scipy.spatial.transform import Rotation
 from scipy.special import ive
 
+from splatsoil.colour import encoded, linear
 from splatsoil.errors import ParameterError
 from splatsoil.measurement import Camera
 
@@ -105,8 +106,8 @@ class Observation:
         """A picture (h, w, 3), sRGB in [0, 1], that the lens sees at ``time`` in s, as the camera reports it."""
         if self.gain == 1.0 and self.drift == 0.0 and self.offset == 0.0 and self.blur == 0.0:
             return image
-        colour = self.exposed(_linear(image.astype(np.float64)), time)
-        return _encoded(np.clip(colour, 0.0, 1.0)).astype(np.float32)
+        colour = self.exposed(linear(image.astype(np.float64)), time)
+        return encoded(np.clip(colour, 0.0, 1.0)).astype(np.float32)
 
     def exposed(self, colour: FloatArray, time: float) -> FloatArray:
         """Linear colour (h, w, 3) that the lens sees at ``time`` in s, as the sensor takes it."""
@@ -128,14 +129,3 @@ def blurred(image: FloatArray, sigma: float) -> FloatArray:
     for axis in (0, 1):
         image = correlate1d(image, weights, axis=axis, mode="nearest")
     return image
-
-
-def _linear(srgb: FloatArray) -> FloatArray:
-    """IEC 61966-2-1, decoded."""
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((np.maximum(srgb, 0.04045) + 0.055) / 1.055) ** 2.4)
-
-
-def _encoded(colour: FloatArray) -> FloatArray:
-    """IEC 61966-2-1, encoded."""
-    low = colour <= 0.0031308
-    return np.where(low, 12.92 * colour, 1.055 * np.maximum(colour, 0.0031308) ** (1.0 / 2.4) - 0.055)

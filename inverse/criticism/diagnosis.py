@@ -9,14 +9,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Candidate, Experiment
 
-from .evidence import Evidence, around, gather
+from .confirmation import Confirmation, confirm, on_its_own_floor, remainder_of
+from .evidence import Evidence, gather
 from .floor import Floor, floor_of
 from .misfit import Block, Omnibus, blocks, left_over, omnibus, shares, smooth_basis
-from .noise import Noise
-from .refit import Refit, refit
 from .score import Score, Scorer
 from .simulations import Simulations
 from .verdicts import CLEAN, ENOUGH, EQUIVALENT, LEVEL, EffectVerdict, Verdict, explained, of_effect, overall
@@ -42,27 +40,6 @@ class Options:
     refits: int = 3
     refit_steps: int = 5
     seed: int = 0
-
-
-@dataclass(frozen=True)
-class Confirmation:
-    """An effect refitted on part of the times and judged on the others.
-
-    Attributes:
-        name: of the effect; empty for the model as it is.
-        fit: the refit.
-        chi2: of all times, numerics projected out.
-        held_out: root mean square of the residual on times the refit hasn't seen, in the features' unit.
-        floor: what noise alone leaves there.
-        remainder: what stands on slow waves.
-    """
-
-    name: str
-    fit: Refit
-    chi2: float
-    held_out: float
-    floor: float
-    remainder: Omnibus
 
 
 @dataclass(frozen=True)
@@ -193,17 +170,17 @@ def judge(
     remainder, gone, before = None, 0.0, misfit
     if strong and scorer is not None:
         chosen = [candidates[s.name] for s in strong[: options.refits]]
-        confirmations = confirm(experiment, evidence, floor, chosen, simulate, options, bench.basis, told)
+        confirmations = confirm(experiment, evidence, floor, chosen, simulate, options.refit_steps, bench.basis, told)
         tried = {name: c for name, c in confirmations.items() if name}
         costs = {name: c.chi2 + price(candidates[name], misfit.freedom) for name, c in tried.items()}
         best = min(costs, key=lambda name: costs[name])
         members = _equals(costs, best, tried[best].remainder)
         given = scorer.score(residual, given=best)
-        remainder = _after(experiment, floor, tried[best], candidates, evidence, bench.basis)
+        remainder = remainder_of(experiment, floor, tried[best], candidates, evidence, bench.basis)
         before = confirmations[""].remainder
         if remainder.p < CLEAN and explained(before, remainder) < ENOUGH:
             told("the floor with the effect on", 0.97)
-            before, remainder = _on_its_own_floor(experiment, evidence, tried[best], simulate, residual)
+            before, remainder = on_its_own_floor(experiment, evidence, tried[best], simulate, residual)
         gone = explained(before, remainder)
     effects = _effects(candidates, scores, given, members, confirmations, options.level)
     named = any(effects[name] == "missing" for name in members) and _stands(confirmations, members[0])
@@ -232,93 +209,6 @@ def judge(
     )
 
 
-def confirm(
-    experiment: Experiment,
-    evidence: Evidence,
-    floor: Floor,
-    chosen: Sequence[Candidate],
-    simulate: Simulations,
-    options: Options,
-    basis: FloatArray,
-    told: Report,
-) -> dict[str, Confirmation]:
-    """Refit the model as it is, and with each chosen effect, on every other time; judge on the rest."""
-    rows = np.arange(experiment.layout.shape[0])
-    shown = rows % 2 == 0
-    if not experiment.seen[~shown].any() or not experiment.seen[shown].any():
-        shown = np.ones_like(shown)
-    # Numerics are projected out of what a refit minimises, and of what it is judged by.
-    seen_by_refit = floor.single.plus(floor.nuisance).rows(shown)
-    solver = seen_by_refit.solver()
-
-    def whiten(table: FloatArray) -> FloatArray:
-        return solver.whiten(table[seen_by_refit.seen])
-
-    middle = simulate(evidence.values, seed=0)
-    model = np.stack([evidence.slopes[p.name] for p in experiment.parameters], axis=-1)
-    out = {}
-    jobs: list[Candidate | None] = [None, *chosen]
-    for number, candidate in enumerate(jobs):
-        name = "" if candidate is None else candidate.name
-        told(f"refit {name or 'of the model'}", 0.75 + 0.25 * number / len(jobs))
-        extra = () if candidate is None else candidate.parameters
-        slopes = model
-        start = dict(evidence.values)
-        if candidate is not None:
-            slopes = np.concatenate([model, np.moveaxis(evidence.directions[name], 0, -1)], axis=-1)
-            start |= {p.name: float(p.off) for p in extra if p.off is not None}
-
-        def predict(values: Mapping[str, float], name: str = name) -> FloatArray:
-            return simulate(values, effects=(name,) if name else (), purpose=f"refit {name or 'of the model'}")
-
-        free = [*experiment.parameters, *extra]
-        most = options.refit_steps if candidate is not None else max(options.refit_steps - 2, 1)
-        fit = refit(predict, whiten, experiment.observed, free, start, middle, slopes, most=most)
-        if candidate is not None and any(fit.values[p.name] != start[p.name] for p in extra):
-            # With the effect on, the model's own parameters act otherwise than they did without it.
-            slopes = _afresh(experiment, predict, fit)
-            fit = refit(
-                predict, whiten, experiment.observed, free, fit.values, fit.prediction, slopes, most=max(most - 2, 2)
-            )
-        out[name] = _judged(experiment, floor, name, fit, ~shown if not shown.all() else shown, basis)
-    return out
-
-
-def _afresh(experiment: Experiment, predict: Callable[[Mapping[str, float]], FloatArray], fit: Refit) -> FloatArray:
-    """(t, s, k) a refit's derivatives, those by the model's own parameters measured anew where it ended."""
-    slopes = fit.slopes.copy()
-    for index, parameter in enumerate(experiment.parameters):
-        value = fit.values[parameter.name]
-        end = around(parameter, value)[0]
-        slopes[..., index] = (predict({**fit.values, parameter.name: end}) - fit.prediction) / (end - value)
-    return slopes
-
-
-def _judged(
-    experiment: Experiment, floor: Floor, name: str, fit: Refit, hidden: npt.NDArray[np.bool_], basis: FloatArray
-) -> Confirmation:
-    left = experiment.observed - fit.prediction
-    mask = experiment.seen & hidden[:, None]
-    scale = floor.single.spread(floor.single.scale)
-    free = np.concatenate([floor.nuisance, _tangent(floor.single, fit)], axis=1)
-    whole = floor.single.plus(floor.nuisance).solver()
-    return Confirmation(
-        name=name,
-        fit=fit,
-        chi2=float(np.sum(whole.whiten(left[experiment.seen]) ** 2)),
-        held_out=float(np.sqrt(np.mean(left[mask] ** 2))),
-        floor=float(np.sqrt(np.mean(scale[mask] ** 2))),
-        remainder=omnibus(floor.single, free, left[experiment.seen], basis),
-    )
-
-
-def _tangent(noise: Noise, fit: Refit) -> FloatArray:
-    """(n, k) a refit's derivatives, each as large as a parameter's error could be: ten times the noise."""
-    columns = fit.slopes[noise.seen]
-    size = np.linalg.norm(columns / noise.scale[:, None], axis=0)
-    return columns * (10.0 * math.sqrt(len(columns)) / np.maximum(size, 1e-300))
-
-
 def _stands(confirmations: Mapping[str, Confirmation], best: str) -> bool:
     """The refit bears out what the score promised: χ² falls, and the error on times it hasn't seen does too."""
     before, after = confirmations[""], confirmations[best]
@@ -335,71 +225,6 @@ def _equals(costs: Mapping[str, float], best: str, remainder: Omnibus) -> tuple[
     wide = EQUIVALENT * max(1.0, remainder.dispersion)
     close = [name for name, cost in costs.items() if cost - costs[best] < wide]
     return tuple(sorted(close, key=lambda name: costs[name]))
-
-
-def _after(
-    experiment: Experiment,
-    floor: Floor,
-    best: Confirmation,
-    candidates: Mapping[str, Candidate],
-    evidence: Evidence,
-    basis: FloatArray,
-) -> Omnibus:
-    """What the library can't explain: after the best effect, or after it and a second one that is significant."""
-    if best.remainder.p >= CLEAN:
-        return best.remainder
-    seen = experiment.seen
-    left = (experiment.observed - best.fit.prediction)[seen]
-    free = np.concatenate([floor.nuisance, _tangent(floor.single, best.fit)], axis=1)
-    others = [c for name, c in candidates.items() if name != best.name]
-    if not others:
-        return best.remainder
-    columns = {c.name: evidence.directions[c.name][:, seen].T for c in others}
-    second = max(Scorer.of(floor.single, free, columns, others).score(left).values(), key=lambda score: score.statistic)
-    if second.adjusted >= LEVEL:
-        return best.remainder
-    size = columns[second.name]
-    scale = 10.0 * math.sqrt(len(size)) / np.linalg.norm(size / floor.single.scale[:, None], axis=0)
-    return omnibus(floor.single, np.concatenate([free, size * scale], axis=1), left, basis)
-
-
-def _on_its_own_floor(
-    experiment: Experiment,
-    evidence: Evidence,
-    best: Confirmation,
-    simulate: Simulations,
-    residual: FloatArray,
-) -> tuple[Omnibus, Omnibus]:
-    """Misfit of the model as it is and with its best effect, by the chance and numerics of soil that has the effect.
-
-    Cohesive soil falls by chance where dry soil flows, and numerics move it farther: what remains after an effect is
-    added has to be judged by what such soil leaves.
-    """
-    values, name = best.fit.values, best.name
-
-    def run(seed: int = 0, numerics: str = "") -> FloatArray:
-        purpose = f"floor with {name}"
-        return simulate(values, effects=(name,), seed=seed, numerics=numerics, purpose=purpose)
-
-    runs = np.stack([run(seed) for seed in range(1, 1 + len(evidence.repeats))])
-    patterns = {}
-    for kind in experiment.numerics:
-        try:
-            patterns[kind] = run(numerics=kind) - best.fit.prediction
-        except SimulationError:
-            continue
-    deviations = (runs - runs.mean(axis=0)) * np.sqrt(len(runs) / max(len(runs) - 1, 1))
-    there = replace(
-        evidence, mean=runs.mean(axis=0), repeats=deviations, numerics=patterns, slopes={}, curves={}, widths={}
-    )
-    floor, seen = floor_of(experiment, there), experiment.seen
-    basis = smooth_basis(experiment.layout, floor.noise)
-    free = np.concatenate([floor.nuisance, _tangent(floor.noise, best.fit)], axis=1)
-    left = (experiment.observed - there.mean)[seen]
-    model = len(experiment.parameters)
-    bare = replace(best.fit, slopes=best.fit.slopes[..., :model])
-    without = np.concatenate([floor.nuisance, _tangent(floor.noise, bare)], axis=1)
-    return omnibus(floor.noise, without, residual, basis), omnibus(floor.noise, free, left, basis)
 
 
 def _effects(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -151,11 +150,3 @@ def _drawn(nuisance: FloatArray, generator: np.random.Generator) -> FloatArray:
     if not nuisance.size:
         return np.zeros((len(nuisance), DRAWS))
     return nuisance @ generator.standard_normal((nuisance.shape[1], DRAWS))
-
-
-def grouped(found: tuple[Block, ...]) -> Mapping[tuple[str, str], list[Block]]:
-    """Blocks by (stage, region)."""
-    out: dict[tuple[str, str], list[Block]] = {}
-    for block in found:
-        out.setdefault((block.stage, block.region), []).append(block)
-    return out

@@ -8,7 +8,8 @@ import numpy as np
 
 from splatsoil.experiment.base import Candidate, Experiment
 
-from .diagnosis import Confirmation, Diagnosis
+from .confirmation import Confirmation
+from .diagnosis import Diagnosis
 from .misfit import Omnibus
 from .words import sentences
 

@@ -177,7 +177,8 @@ def misfit(folder: RunFolder, model: Model, options: Options, report: Report) ->
 def confirmed(folder: RunFolder, model: Model, name: str, options: Options, report: Report) -> dict[str, Any]:
     """The model as it is and with one effect, each refitted on every other frame and judged on the rest."""
     from splatsoil.files import plain
-    from splatsoil.inverse.criticism.diagnosis import Bench, confirm
+    from splatsoil.inverse.criticism.confirmation import confirm
+    from splatsoil.inverse.criticism.diagnosis import Bench
     from splatsoil.inverse.criticism.evidence import gather
     from splatsoil.inverse.criticism.record import confirmation
     from splatsoil.report.data import estimates
@@ -195,7 +196,14 @@ def confirmed(folder: RunFolder, model: Model, name: str, options: Options, repo
             raise RunError(f"{name} cannot be added: {evidence.failed[name]}")
         bench = Bench.of(experiment, evidence, options)
         found = confirm(
-            experiment, evidence, bench.floor, list(bench.candidates), simulate, options, bench.basis, report
+            experiment,
+            evidence,
+            bench.floor,
+            list(bench.candidates),
+            simulate,
+            options.refit_steps,
+            bench.basis,
+            report,
         )
     return {"refits": {key or "as it is": plain(confirmation(c)) for key, c in found.items()}}
 

@@ -73,23 +73,25 @@ def prepare(options: FitOptions) -> tuple[Measurement, RunFolder]:
 def reconstructed(measurement: Measurement, run: RunFolder, device: str, report: Report) -> Reconstruction:
     """The run's reconstruction: from the folder, or made and kept there."""
     from splatsoil import __version__
-    from splatsoil.files import RECONSTRUCTING, code_digest, read_json, write_json
+    from splatsoil.files import RECONSTRUCTING, code_digest
     from splatsoil.reconstruction import Reconstruction, reconstruct
 
-    made_by = run.reconstruction / "code.json"
-    code = {"code": code_digest(RECONSTRUCTING)}
     preset, seed = run.description["preset"], run.description["seed"]
-    wanted = {"measurement_hash": measurement.hash, "preset": preset, "seed": seed, "version": __version__}
-    if (run.reconstruction / "reconstruction.json").is_file() and made_by.is_file() and read_json(made_by) == code:
+    wanted = {
+        "measurement_hash": measurement.hash,
+        "preset": preset,
+        "seed": seed,
+        "version": __version__,
+        "code": code_digest(RECONSTRUCTING),
+    }
+    if (run.reconstruction / "reconstruction.json").is_file():
         report("reading", 0.0)
         kept = Reconstruction.load(run.reconstruction)
         if all(kept.metadata.get(key) == value for key, value in wanted.items()):
             return kept
     made = reconstruct(measurement, seed=seed, device=device, preset=preset, progress=report)
     with run.lock():
-        made_by.unlink(missing_ok=True)
         made.save(run.reconstruction)
-        write_json(made_by, code)
     # Read back: float32 on disk is what every later command will start from.
     return Reconstruction.load(run.reconstruction)
 

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from splatsoil import __version__
 from splatsoil.errors import MeasurementError, ParameterError
+from splatsoil.files import RECONSTRUCTING, code_digest
 from splatsoil.measurement import Bed, Measurement
 from splatsoil.reconstruction.height_field import HeightField
 from splatsoil.reconstruction.initial import TOOL, first_gaussians
@@ -113,6 +114,7 @@ def _reconstruct(
             "measurement": measurement.name,
             "measurement_hash": measurement.hash,
             "version": __version__,
+            "code": code_digest(RECONSTRUCTING),
             "preset": preset,
             "seed": seed,
             "device": device,

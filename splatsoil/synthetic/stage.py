@@ -14,6 +14,7 @@ import numpy.typing as npt
 import trimesh
 import warp as wp
 
+from splatsoil.colour import encoded
 from splatsoil.errors import ParameterError
 from splatsoil.measurement import Camera
 from splatsoil.splats.warp_torch import launch_parts, thread_count
@@ -178,7 +179,5 @@ class Stage:
 def photograph(radiance: FloatImage, noise: float, generator: np.random.Generator) -> npt.NDArray[np.uint8]:
     """What a sensor makes of linear radiance: (h, w, 3) sRGB, uint8, with Gaussian noise of ``noise`` in [0, 1]."""
     clipped = np.clip(radiance.astype(np.float64), 0.0, 1.0)
-    # IEC 61966-2-1
-    encoded = np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * np.maximum(clipped, 1e-9) ** (1 / 2.4) - 0.055)
-    noisy = encoded + noise * generator.standard_normal(encoded.shape)
+    noisy = encoded(clipped) + noise * generator.standard_normal(clipped.shape)
     return np.round(255.0 * np.clip(noisy, 0.0, 1.0)).astype(np.uint8)

@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -118,15 +119,15 @@ def test_the_same_seed_gives_the_same_bytes(world: World, tmp_path: Path) -> Non
 
 
 def test_what_cameras_report_changes_the_video_and_nothing_else(world: World, tmp_path: Path) -> None:
-    """A gain of 0.6, a pan by a pixel of the left camera, pictures that come half a frame late."""
+    """A gain of 0.6, and a pan of the left camera by a pixel."""
     per_pixel = float(np.degrees(1.0 / short().video["left"].fx))
     seen = make_set(
         tmp_path / "seen",
         short(),
         friction_angle=31.0,
         preset="tiny",
-        effects=("exposure", "camera_pose", "time_offset"),
-        values={"exposure_gain": 0.6, "camera_1_pan": per_pixel, "time_offset": 0.01},
+        effects=("exposure", "camera_pose"),
+        values={"exposure_gain": 0.6, "camera_1_pan": per_pixel},
     )
     assert seen.truth["parameters"]["camera_1_pan"] == per_pixel
     for frame in truth_frames(world.measurement.frames):
@@ -150,6 +151,28 @@ def test_what_cameras_report_changes_the_video_and_nothing_else(world: World, tm
     assert Measurement.load(seen.measurement.folder).cameras["left"].camera_to_world == pytest.approx(
         world.measurement.cameras["left"].camera_to_world
     ), "the set says nothing of the bump"
+
+
+def test_a_late_video_shows_soil_and_tool_as_they_are_later(tmp_path: Path) -> None:
+    """Late by two frames of 0.02 s, the picture of frame 38 is that of frame 40, when nothing is late."""
+
+    def seen(name: str, frame: int, **effects: Any) -> Measurement:
+        setup = replace(short(views=2), frames=(0, frame))
+        return make_set(tmp_path / name, setup, friction_angle=31.0, preset="tiny", **effects).measurement
+
+    late = seen("late", 38, effects=("time_offset",), values={"time_offset": 0.04})
+    in_time, later = seen("in-time", 38), seen("later", 40)
+
+    def apart(one: Measurement, first: int, other: Measurement, second: int) -> float:
+        """Root of the mean of the largest twentieth of squared differences: where the tool moves."""
+        square = np.square(
+            np.subtract(one.video_frame("left", first).image(), other.video_frame("left", second).image())
+        )
+        return float(np.sqrt(np.mean(np.sort(square, axis=None)[-square.size // 20 :])))
+
+    noise = apart(late, -2, late, -1)
+    assert apart(late, 38, later, 40) < 1.2 * noise
+    assert apart(in_time, 38, later, 40) > 1.4 * noise, "in time, the tool would stand elsewhere"
 
 
 def test_cohesion_acts(world: World, tmp_path: Path) -> None:
