@@ -3,20 +3,34 @@
 from __future__ import annotations
 
 import inspect
+import os
 import re
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from splatsoil.envs.plow_sand import PlowSandEnv
 from splatsoil.envs.synthetic import SyntheticProblem
 
 
 def test_the_example_runs(repository: Path) -> None:
     text = (repository / "docs" / "environment.md").read_text()
-    (example,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    example = re.findall(r"```python\n(.*?)```", text, re.DOTALL)[0]
     done = subprocess.run([sys.executable, "-c", example], capture_output=True, text=True, timeout=300, check=True)
     assert done.stdout.count("friction_angle") == 5 and "the truth was" in done.stdout
+
+
+def test_the_recording_example_runs(repository: Path, tmp_path: Path) -> None:
+    pytest.importorskip("minari")
+    text = (repository / "docs" / "environment.md").read_text()
+    example = re.findall(r"```python\n(.*?)```", text, re.DOTALL)[1]
+    environment = os.environ | {"MINARI_DATASETS_PATH": str(tmp_path)}
+    done = subprocess.run(
+        [sys.executable, "-c", example], capture_output=True, text=True, timeout=300, check=True, env=environment
+    )
+    assert "friction_angle" in done.stdout
+    assert (tmp_path / "plow-sand" / "random-v0" / "data" / "main_data.hdf5").is_file()
 
 
 def test_the_page_names_every_option_and_key(repository: Path) -> None:
