@@ -11,12 +11,13 @@ import numpy.typing as npt
 
 from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Candidate, Experiment
+from splatsoil.parameters import Parameter
 
-from .evidence import Evidence, around
+from .evidence import Evidence, around, step_of
 from .floor import Floor, floor_of
 from .misfit import Omnibus, omnibus, smooth_basis
 from .noise import Noise
-from .refit import Refit, refit
+from .refit import ROUNDS, Refit, Start, settle
 from .score import Scorer
 from .simulations import Simulations
 from .verdicts import CLEAN, LEVEL
@@ -32,6 +33,7 @@ class Confirmation:
     Attributes:
         name: of the effect; empty for the model as it is.
         fit: the refit.
+        stds: standard deviations of its estimates, by parameter.
         chi2: of all times, numerics projected out.
         held_out: root mean square of the residual on times the refit hasn't seen, in the features' unit.
         floor: what noise alone leaves there.
@@ -40,6 +42,7 @@ class Confirmation:
 
     name: str
     fit: Refit
+    stds: Mapping[str, float]
     chi2: float
     held_out: float
     floor: float
@@ -71,62 +74,106 @@ def confirm(
     def whiten(table: FloatArray) -> FloatArray:
         return solver.whiten(table[seen_by_refit.seen])
 
-    middle = simulate(evidence.values, seed=0)
-    model = np.stack([evidence.slopes[p.name] for p in experiment.parameters], axis=-1)
     out = {}
     jobs: list[Candidate | None] = [None, *chosen]
     for number, candidate in enumerate(jobs):
         name = "" if candidate is None else candidate.name
-        told(f"refit {name or 'of the model'}", 0.75 + 0.25 * number / len(jobs))
-        extra = () if candidate is None else candidate.parameters
-        slopes = model
-        start = dict(evidence.values)
-        if candidate is not None:
-            slopes = np.concatenate([model, np.moveaxis(evidence.directions[name], 0, -1)], axis=-1)
-            start |= {p.name: float(p.off) for p in extra if p.off is not None}
+        told(f"refit {name or 'of the model'}", 0.75 + 0.2 * number / len(jobs))
 
         def predict(values: Mapping[str, float], name: str = name) -> FloatArray:
             return simulate(values, effects=(name,) if name else (), purpose=f"refit {name or 'of the model'}")
 
-        free = [*experiment.parameters, *extra]
-        most = steps if candidate is not None else max(steps - 2, 1)
-        fit = refit(predict, whiten, experiment.observed, free, start, middle, slopes, most=most)
-        if candidate is not None and any(fit.values[p.name] != start[p.name] for p in extra):
-            # With the effect on, the model's own parameters act otherwise than they did without it.
-            slopes = _afresh(experiment, predict, fit)
-            fit = refit(
-                predict, whiten, experiment.observed, free, fit.values, fit.prediction, slopes, most=max(most - 2, 2)
-            )
-        out[name] = _judged(experiment, floor, name, fit, ~shown if not shown.all() else shown, basis)
+        free = [*experiment.parameters, *(() if candidate is None else candidate.parameters)]
+        fit = settle(
+            predict,
+            whiten,
+            experiment.observed,
+            free,
+            _starts(experiment, evidence, candidate, simulate, predict),
+            renewed=[p.name for p in experiment.parameters] + ([] if candidate is None else [candidate.size]),
+            most=steps if candidate is not None else max(steps - 2, 1),
+            rounds=ROUNDS if candidate is not None else 0,
+        )
+        shown_columns = whiten(fit.slopes)
+        out[name] = _judged(
+            experiment, floor, name, fit, ~shown if not shown.all() else shown, basis, free, shown_columns
+        )
     return out
 
 
-def _afresh(experiment: Experiment, predict: Callable[[Mapping[str, float]], FloatArray], fit: Refit) -> FloatArray:
-    """(t, s, k) a refit's derivatives, those by the model's own parameters measured anew where it ended."""
-    slopes = fit.slopes.copy()
-    for index, parameter in enumerate(experiment.parameters):
-        value = fit.values[parameter.name]
-        end = around(parameter, value)[0]
-        slopes[..., index] = (predict({**fit.values, parameter.name: end}) - fit.prediction) / (end - value)
-    return slopes
+def _starts(
+    experiment: Experiment,
+    evidence: Evidence,
+    candidate: Candidate | None,
+    simulate: Simulations,
+    predict: Callable[[Mapping[str, float]], FloatArray],
+) -> list[Start]:
+    """Where a refit begins: at the fit, and at the defaults too where the fit has run into a bound.
+
+    A fit on a bound is one that the missing effect has pushed there: its derivatives are those of another regime. From
+    the defaults the effect starts at a plausible size instead of off.
+    """
+    extra = () if candidate is None else candidate.parameters
+    off = {p.name: float(p.off) for p in extra if p.off is not None}
+    model = np.stack([evidence.slopes[p.name] for p in experiment.parameters], axis=-1)
+    added = [] if candidate is None else [np.moveaxis(evidence.directions[candidate.name], 0, -1)]
+    middle = simulate(evidence.values, seed=0)
+    starts = [Start({**evidence.values, **off}, middle, np.concatenate([model, *added], axis=-1))]
+    bound = [p for p in experiment.parameters if len(around(p, evidence.values[p.name])) == 1]
+    if candidate is None or not bound:
+        return starts
+    measure = candidate.measure
+    there = {**evidence.values, **{p.name: p.default for p in bound}, **off}
+    there[measure.name] = off[measure.name] + step_of(measure)
+    try:
+        fresh = predict(there)
+        slopes = model.copy()
+        for index, parameter in enumerate(experiment.parameters):
+            end = around(parameter, there[parameter.name])[0]
+            moved = predict({**there, parameter.name: end})
+            slopes[..., index] = (moved - fresh) / (end - there[parameter.name])
+    except SimulationError:
+        return starts
+    return [*starts, Start(there, fresh, np.concatenate([slopes, *added], axis=-1))]
 
 
 def _judged(
-    experiment: Experiment, floor: Floor, name: str, fit: Refit, hidden: npt.NDArray[np.bool_], basis: FloatArray
+    experiment: Experiment,
+    floor: Floor,
+    name: str,
+    fit: Refit,
+    hidden: npt.NDArray[np.bool_],
+    basis: FloatArray,
+    free: Sequence[Parameter],
+    columns: FloatArray,
 ) -> Confirmation:
+    """Judge a refit of ``free`` parameters on the times hidden from it; ``columns`` (n, k) are its whitened slopes."""
     left = experiment.observed - fit.prediction
     mask = experiment.seen & hidden[:, None]
     scale = floor.single.spread(floor.single.scale)
-    free = np.concatenate([floor.nuisance, _tangent(floor.single, fit)], axis=1)
+    tangent = np.concatenate([floor.nuisance, _tangent(floor.single, fit)], axis=1)
     whole = floor.single.plus(floor.nuisance).solver()
+    remainder = omnibus(floor.single, tangent, left[experiment.seen], basis)
     return Confirmation(
         name=name,
         fit=fit,
+        stds=_stds(free, columns, remainder),
         chi2=float(np.sum(whole.whiten(left[experiment.seen]) ** 2)),
         held_out=float(np.sqrt(np.mean(left[mask] ** 2))),
         floor=float(np.sqrt(np.mean(scale[mask] ** 2))),
-        remainder=omnibus(floor.single, free, left[experiment.seen], basis),
+        remainder=remainder,
     )
+
+
+def _stds(free: Sequence[Parameter], columns: FloatArray, remainder: Omnibus) -> dict[str, float]:
+    """Standard deviations of a refit's estimates, each parameter's range being its prior.
+
+    Where more than noise remains, they are widened by the root of its dispersion (Birge 1932).
+    """
+    prior = np.array([math.sqrt(12.0) / (p.upper - p.lower) for p in free])
+    covariance = np.linalg.inv(columns.T @ columns + np.diag(prior**2))
+    widened = math.sqrt(max(1.0, remainder.dispersion))
+    return {p.name: widened * math.sqrt(float(v)) for p, v in zip(free, np.diag(covariance), strict=True)}
 
 
 def _tangent(noise: Noise, fit: Refit) -> FloatArray:

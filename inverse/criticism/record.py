@@ -110,7 +110,7 @@ def _effect(diagnosis: Diagnosis, candidate: Candidate) -> dict[str, Any]:
     }
     confirmed = diagnosis.confirmations.get(candidate.name)
     if confirmed is not None:
-        entry["estimate"] = confirmed.fit.values[measure.name]
+        entry["estimate"], entry["std"] = confirmed.fit.values[measure.name], confirmed.stds[measure.name]
         entry["achieved_fall"] = diagnosis.confirmations[""].chi2 - confirmed.chi2
     return entry
 
@@ -119,6 +119,7 @@ def confirmation(c: Confirmation) -> dict[str, Any]:
     """A refit and how it was judged."""
     return {
         "values": dict(c.fit.values),
+        "stds": dict(c.stds),
         "chi2": c.chi2,
         "held_out": c.held_out,
         "floor": c.floor,

@@ -1,12 +1,12 @@
 """Refitting with an effect on: Gauss-Newton on whitened features, the derivatives mended by Broyden's update.
 
-A handful of simulations, enough to say how far χ² really falls; the estimate that users keep comes from a full fit.
+Some ten simulations, enough to say how far χ² really falls; the estimate that users keep comes from a full fit.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +24,10 @@ FloatArray = npt.NDArray[np.float64]
 
 TRUST = 0.5
 """First trust region, as a share of each parameter's range."""
+LEAST_FALL, LEAST_SHARE = 1.0, 0.002
+"""Falls of χ² below one unit, or below this share of it, are not worth a simulation: noise is larger."""
+ROUNDS = 3
+"""Most times that derivatives are measured anew where a refit stands."""
 
 
 @dataclass(frozen=True)
@@ -83,8 +87,8 @@ def refit(
         found = lsq_linear(matrix, target, bounds=(low, high))
         step = np.clip(found.x, low, high)
         predicted = chi2 - float(np.sum((target - matrix @ step) ** 2))
-        # Less than one unit of χ², or a step nobody would notice: done.
-        if predicted < max(1.0, 0.002 * chi2) or np.max(np.abs(step)) < 1e-3:
+        # A fall below the noise, or a step nobody would notice: done.
+        if predicted < least_fall(chi2) or np.max(np.abs(step)) < 1e-3:
             break
         there = np.clip(at + step * span, lower, upper)
         tried += 1
@@ -103,6 +107,85 @@ def refit(
             at, here, chi2 = there, table, fresh
         trust = min(2.0 * trust, 1.0) if gain > 0.75 else trust if gain > 0.25 else 0.4 * float(np.max(np.abs(step)))
     return Refit({p.name: float(v) for p, v in zip(parameters, at, strict=True)}, chi2, here, tried, slopes)
+
+
+def least_fall(chi2: float) -> float:
+    """Fall of χ² that is worth a simulation."""
+    return max(LEAST_FALL, LEAST_SHARE * chi2)
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where a refit may begin.
+
+    Attributes:
+        values: parameters by name.
+        prediction: (t, s) features there.
+        slopes: (t, s, k) derivatives there.
+    """
+
+    values: Mapping[str, float]
+    prediction: FloatArray
+    slopes: FloatArray
+
+
+def settle(
+    predict: Callable[[Mapping[str, float]], FloatArray],
+    whiten: Callable[[FloatArray], FloatArray],
+    observed: FloatArray,
+    parameters: Sequence[Parameter],
+    starts: Sequence[Start],
+    *,
+    renewed: Sequence[str],
+    most: int = 5,
+    rounds: int = ROUNDS,
+) -> Refit:
+    """Minimise χ² from several points, and go on from the best of them until it falls no more than noise does.
+
+    A fit that lacks an effect can lie on a bound, where the derivatives say little of the valley that the effect opens.
+
+    Args:
+        predict: see :func:`refit`, like the next three.
+        whiten: only what the choice may see.
+        observed: (t, s).
+        parameters: free ones.
+        starts: at least one.
+        renewed: names of the parameters whose derivatives are measured anew in each round.
+        most: simulations from each start, and two less (but two at least) in each round.
+        rounds: most of them.
+    """
+    runs = [refit(predict, whiten, observed, parameters, s.values, s.prediction, s.slopes, most=most) for s in starts]
+    best = min(runs, key=lambda run: run.chi2)
+    spent = sum(run.simulations for run in runs)
+    for _ in range(rounds):
+        if all(np.array_equal(best.prediction, s.prediction) for s in starts):
+            break
+        slopes = best.slopes.copy()
+        for index, parameter in enumerate(parameters):
+            if parameter.name not in renewed:
+                continue
+            value = best.values[parameter.name]
+            end = around(parameter, value)[0]
+            try:
+                slopes[..., index] = (predict({**best.values, parameter.name: end}) - best.prediction) / (end - value)
+            except SimulationError:
+                continue
+            finally:
+                spent += 1
+        again = refit(
+            predict,
+            whiten,
+            observed,
+            parameters,
+            best.values,
+            best.prediction,
+            slopes,
+            most=max(most - 2, 2),
+        )
+        fall, spent, best = best.chi2 - again.chi2, spent + again.simulations, again
+        if fall < least_fall(again.chi2):
+            break
+    return replace(best, simulations=spent)
 
 
 def mended(slopes: FloatArray, change: FloatArray, weight: FloatArray, moved: FloatArray) -> FloatArray:

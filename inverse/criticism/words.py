@@ -38,7 +38,7 @@ def _missing(diagnosis: Diagnosis, candidates: Mapping[str, Candidate], base: Ma
     confirmed = diagnosis.confirmations[best]
     candidate = candidates[best]
     size = confirmed.fit.values[candidate.size]
-    std = diagnosis.scores[best].std
+    std = confirmed.stds[candidate.size]
     out = [
         f"{title(best)} is missing: about {amount(size, std, candidate.measure.unit)}. Adding it lowers the error on "
         f"frames that the refit has not seen from {diagnosis.confirmations[''].held_out:.2g} to "
@@ -87,7 +87,7 @@ def _outside(diagnosis: Diagnosis, candidates: Mapping[str, Candidate]) -> list[
         best = diagnosis.members[0]
         confirmed, before = diagnosis.confirmations[best], diagnosis.confirmations[""]
         candidate = candidates[best]
-        size = amount(confirmed.fit.values[candidate.size], diagnosis.scores[best].std, candidate.measure.unit)
+        size = amount(confirmed.fit.values[candidate.size], confirmed.stds[candidate.size], candidate.measure.unit)
         out.append(
             f"The nearest is {best.replace('_', ' ')} ({size}): with it the error on frames that the refit has not "
             f"seen goes from {before.held_out:.2g} to {confirmed.held_out:.2g} {diagnosis.unit} (noise alone leaves "
