@@ -26,6 +26,8 @@ LENGTH_BOUNDS = (np.log(0.025), np.log(1e3))
 NOISE_BOUNDS = (np.log(1e-6), np.log(4.0))
 #: Added to the diagonal for the Cholesky factor's sake.
 JITTER = 1e-8
+#: Length scales, alike for all axes, from which the most probable setting is looked for besides the prior's best point.
+SMOOTH = (0.5, 1.5)
 #: Prior points for importance resampling (powers of two, for Sobol): for up to MANY outcomes; fewer beyond, down to a
 #: least number, since each costs the cube of them and more outcomes say more. Then emcee's steps.
 PRIOR_POINTS, MANY, LEAST_POINTS, STEPS = 4096, 32, 512, 60
@@ -126,8 +128,10 @@ def posterior(
     points = np.clip(points, density.bounds[:, 0], density.bounds[:, 1])
 
     best = points[np.argmax(density(points))]
-    found = minimize(lambda p: -density(p[None])[0], best, bounds=density.bounds, method="L-BFGS-B")
-    best = found.x if np.isfinite(found.fun) and found.fun < -density(best[None])[0] else best
+    for start in [best, *_smooth(density)]:
+        found = minimize(lambda p: -density(p[None])[0], start, bounds=density.bounds, method="L-BFGS-B")
+        if np.isfinite(found.fun) and found.fun < -density(best[None])[0]:
+            best = found.x
 
     # In several dimensions hardly a point of the prior is near the peak, so a heavy-tailed bell around it helps out;
     # the two together are the proposal whose importance weights choose the walkers' starts.
@@ -146,6 +150,19 @@ def posterior(
     sampler = emcee.EnsembleSampler(count, d, density, vectorize=True)
     state = sampler.run_mcmc(emcee.State(start, random_state=random.get_state()), STEPS, skip_initial_state_check=True)
     return density.unpack(best[None]), density.unpack(np.asarray(state.coords))
+
+
+def _smooth(density: Density) -> list[FloatArray]:
+    """Settings of smooth outcomes with little noise, to climb from, too: in several dimensions the best point of the
+    prior is on the slope of a lesser peak, where some axes seem not to matter."""
+    if density.n == 1:
+        return []
+    ends = [density.means.copy() for _ in SMOOTH]
+    for point, length in zip(ends, SMOOTH, strict=True):
+        point[: density.n] = np.log(length)
+        if density.noise is None:
+            point[-1] = NOISE_MEAN - NOISE_STD
+    return ends
 
 
 def _curvature(density: Density, peak: FloatArray) -> FloatArray:
