@@ -85,7 +85,7 @@ class Model:
 
         self.recorded = self._recorded_frames()
 
-    def variant(self, *, effects: Iterable[str] | None = None, resolution: Resolution | None = None) -> Model:
+    def variant(self, *, effects: Iterable[str | Effect] | None = None, resolution: Resolution | None = None) -> Model:
         """The same experiment with other effects on, or computed otherwise; it shares scenes where particles agree.
 
         An effect that is on already keeps its name here, wherever it came from.

@@ -47,15 +47,15 @@ def experiment_of(
     from splatsoil.experiment.plow import PlowExperiment
     from splatsoil.files import FORWARD, code_digest
     from splatsoil.inverse.criticism.simulations import Simulations
-    from splatsoil.soil.library import library
+    from splatsoil.soil.library import find_effects
 
-    wanted = None if effects is None else tuple(effects)
-    for name in wanted or ():
-        if name not in library():
-            raise ParameterError(f"effect {name!r} is unknown; known are {', '.join(library())}")
-        if name in {e.name for e in model.law.effects}:
-            raise ParameterError(f"effect {name} is on already; name one that is off")
+    named = None if effects is None else tuple(effects)
+    wanted = None if named is None else find_effects(named)
+    for effect in wanted or ():
+        if effect.name in {e.name for e in model.law.effects}:
+            raise ParameterError(f"effect {effect.name} is on already; name one that is off")
     fit = folder.fit()
+    own = [name for name in (*fit["setup"]["effects"], *(named or ())) if name.endswith(".py")]
     experiment = PlowExperiment(model, tuple(fit["parameters"]), candidates=wanted)
     identity = {
         "measurement": folder.description["measurement"]["hash"],
@@ -64,7 +64,7 @@ def experiment_of(
         "preset": model.preset,
         "device": model.device.split(":")[0],
         "version": __version__,
-        "code": code_digest((*FORWARD, "observation.py", "experiment/plow.py", "experiment/scene_parts.py")),
+        "code": code_digest((*FORWARD, "observation.py", "experiment/plow.py", "experiment/scene_parts.py"), own),
         "layout": list(experiment.layout.shape),
     }
     return experiment, Simulations(experiment, folder.path / "features", identity)
@@ -175,7 +175,7 @@ def misfit(folder: RunFolder, model: Model, options: Options, report: Report) ->
 
 
 def confirmed(folder: RunFolder, model: Model, name: str, options: Options, report: Report) -> dict[str, Any]:
-    """The model as it is and with one effect, each refitted on every other frame and judged on the rest."""
+    """The model as it is and with one effect (by name, or from its file), each refitted on every other frame."""
     from splatsoil.files import plain
     from splatsoil.inverse.criticism.confirmation import confirm
     from splatsoil.inverse.criticism.diagnosis import Bench
@@ -184,6 +184,7 @@ def confirmed(folder: RunFolder, model: Model, name: str, options: Options, repo
     from splatsoil.report.data import estimates
 
     experiment, simulate = experiment_of(folder, model, (name,))
+    (effect,) = (candidate.name for candidate in experiment.candidates)
     with folder.lock():
         evidence = gather(
             experiment,
@@ -192,8 +193,8 @@ def confirmed(folder: RunFolder, model: Model, name: str, options: Options, repo
             repeats=options.repeats,
             progress=lambda share: report("simulations", 0.7 * share),
         )
-        if name in evidence.failed:
-            raise RunError(f"{name} cannot be added: {evidence.failed[name]}")
+        if effect in evidence.failed:
+            raise RunError(f"{effect} cannot be added: {evidence.failed[effect]}")
         bench = Bench.of(experiment, evidence, options)
         found = confirm(
             experiment,

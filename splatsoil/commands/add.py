@@ -30,7 +30,7 @@ class Config:
     run: Positional[Path]
     """The run folder."""
     effects: Positional[tuple[str, ...]]
-    """Effects to add, by name."""
+    """Effects to add, by name, or files that define one each."""
     budget: int | None = None
     """Evaluations of each fit; 10 for each free parameter if not given."""
     repeats: int = 4
@@ -51,6 +51,7 @@ def run(config: Config) -> int:
     from splatsoil.inverse.criticism.diagnosis import Options
     from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.report import write_report
+    from splatsoil.soil.law import Law
     from splatsoil.soil.library import find_effects
 
     stage.hush()
@@ -60,7 +61,10 @@ def run(config: Config) -> int:
     on = criticism.need_fit(folder)["setup"]["effects"]
     if not config.effects:
         raise ParameterError("name an effect to add, for example: splatsoil add RUN cohesion")
-    find_effects((*on, *config.effects))
+    for name in config.effects:
+        if len(find_effects([name])) != 1:
+            raise ParameterError(f"{name} defines several effects; put each that is to be added into a file of its own")
+    Law(find_effects((*on, *config.effects)))
     device = resolve_device(config.device)
     with stages(quiet=config.json) as begin:
         for name in config.effects:
@@ -95,20 +99,24 @@ def added(
     """One effect more: confirmation on hidden frames, full fit, comparison; returns the new entry of the history."""
     from splatsoil.commands import _criticism as criticism
     from splatsoil.commands import _stages as stage
+    from splatsoil.soil.library import find_effects
 
     before = folder.fit()
     known = criticism.latest_diagnosis(folder)
-    if known is None or name not in known["refits"]:
-        known = criticism.confirmed(folder, model, name, options, begin(f"try {name}"))
+    (effect,) = find_effects([name])
+    if known is None or effect.name not in known["refits"]:
+        known = criticism.confirmed(folder, model, name, options, begin(f"try {effect.name}"))
     entries = criticism.history(folder)
-    base, with_it = known["refits"]["as it is"], known["refits"][name]
+    base, with_it = known["refits"]["as it is"], known["refits"][effect.name]
     if not entries or entries[-1]["model"] != before["name"]:
         entries = [criticism.entry(before, base)]
     entries[-1]["held_out"], entries[-1]["floor"] = base["held_out"], base["floor"]
     setup = before["setup"]
     effects = (*setup["effects"], name)
     larger = model.variant(effects=effects)
-    mine = [p.name for p in next(e for e in larger.law.effects if e.name == name).parameters if p.off is not None]
+    mine = [
+        p.name for p in next(e for e in larger.law.effects if e.name == effect.name).parameters if p.off is not None
+    ]
     fitting = FitOptions(
         set=model.measurement.folder,
         parameters=(*before["parameters"], *mine),
@@ -121,11 +129,11 @@ def added(
     )
     if not criticism.pictured(folder):
         stage.compared(folder, model, begin("compare"))
-    result = stage.fitted(fitting, model.measurement, folder, larger, begin(f"fit with {name}"))
+    result = stage.fitted(fitting, model.measurement, folder, larger, begin(f"fit with {effect.name}"))
     criticism.keep_pictures(folder)
     stage.compared(folder, larger, begin("compare"))
     fresh = criticism.entry(result, with_it)
-    fresh["added"] = name
+    fresh["added"] = effect.name
     fresh["fall"] = base["chi2"] - with_it["chi2"]
     entries = [*entries, fresh]
     criticism.remember(folder, entries)

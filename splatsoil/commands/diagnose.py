@@ -22,7 +22,7 @@ class Config:
     run: Positional[Path]
     """The run folder."""
     effects: tuple[str, ...] = ()
-    """Effects to consider; all of the library that are off, if not given."""
+    """Effects to consider, by name, or files that define some; all of the library that are off, if not given."""
     repeats: int = 4
     """Simulations with other seeds, to know what chance does."""
     refits: int = 3

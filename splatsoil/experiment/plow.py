@@ -18,7 +18,8 @@ from splatsoil.experiment.scene_parts import QUIET, regions_of, stages_of
 from splatsoil.model import Model, Prediction
 from splatsoil.mpm import Resolution, Trajectory
 from splatsoil.parameters import Parameter
-from splatsoil.soil.library import library
+from splatsoil.soil.effect import Effect
+from splatsoil.soil.library import find_effects, library
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -47,7 +48,7 @@ class PlowExperiment:
     Args:
         model: the model at hand; candidates are the library's effects that it doesn't have.
         parameters: names of its free parameters.
-        candidates: names of effects to consider; all of the library by default.
+        candidates: effects to consider, by name or from a file; all of the library by default.
         numerics: names of other numerics to consider.
         progress: called with (frame, last frame) while a simulation runs.
     """
@@ -60,7 +61,7 @@ class PlowExperiment:
         model: Model,
         parameters: Iterable[str] | None = None,
         *,
-        candidates: Iterable[str] | None = None,
+        candidates: Iterable[str | Effect] | None = None,
         numerics: Iterable[str] = tuple(NUMERICS),
         progress: Callable[[int, int], None] | None = None,
     ) -> None:
@@ -70,10 +71,10 @@ class PlowExperiment:
         self.parameters: tuple[Parameter, ...] = tuple(model.space(parameters))
         self.numerics = tuple(numerics)
         self.progress = progress
-        wanted = library() if candidates is None else {name: library()[name] for name in candidates}
+        wanted = tuple(library().values()) if candidates is None else find_effects(candidates)
+        self._wanted = {effect.name: effect for effect in wanted if effect.name not in NUMERICS}
         self.candidates: tuple[Candidate, ...] = candidates_of(
-            (e.for_measurement(model.measurement) for name, e in wanted.items() if name not in NUMERICS),
-            model.law.effects,
+            (e.for_measurement(model.measurement) for e in self._wanted.values()), model.law.effects
         )
         bed = model.measurement.bed
         rows = min(MOST_ROWS, len(model.frames) - 1)
@@ -164,7 +165,9 @@ class PlowExperiment:
         if effects == self.model and not numerics:
             return self.base
         resolution = NUMERICS[numerics](self.base.resolution) if numerics else None
-        return self.base.variant(effects=effects, resolution=resolution)
+        # a candidate from a user's file is known here alone
+        chosen = [self._wanted.get(name, name) for name in effects]
+        return self.base.variant(effects=chosen, resolution=resolution)
 
     def _labels(self, camera: str) -> list[Block]:
         """The blocks that one camera sees, in order."""
