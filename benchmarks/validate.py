@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import warp as wp
-from splatsoil.benchmarks._validation import basics, blades, columns, element, inclines, plates, refinement, sand
+from splatsoil.benchmarks._validation import basics, blades, columns, costs, element, inclines, plates, refinement, sand
 from splatsoil.benchmarks._validation.page import Section, page, table
 
 from splatsoil.errors import SplatsoilError
@@ -26,6 +26,7 @@ def parts(measured: Path | None, device: str) -> dict[str, Callable[[], Section]
     """All parts by name, in the page's order; those on real sand only where there are data."""
     result: dict[str, Callable[[], Section]] = {
         "element": element.validate,
+        "costs": costs.validate,
         "basics": lambda: basics.validate(device),
         "columns": lambda: columns.validate(device),
         "blades": lambda: blades.validate(device),

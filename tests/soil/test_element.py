@@ -10,7 +10,7 @@ import pytest
 from splatsoil.errors import ParameterError, SimulationError
 from splatsoil.soil.element import drive, isotropic_compression, simple_shear, triaxial
 from splatsoil.soil.law import Law
-from splatsoil.soil.library import find_effects
+from splatsoil.soil.library import find_effects, library
 from splatsoil.soil.matching import Matching
 
 ANGLES = (25.0, 30.0, 35.0, 40.0, 45.0)
@@ -98,3 +98,37 @@ def test_meaningless_tests_are_refused() -> None:
         triaxial(Law(), {"cohesion": 10.0}, confining=1e4, strains=[0.1])
     with pytest.raises(ParameterError, match=r"at least one set"):
         triaxial(Law(), [], confining=1e4, strains=[0.1])
+
+
+@pytest.mark.parametrize("without", ["compaction", "dilatancy"])
+def test_all_effects_on_strength_work_together_anywhere_between_their_bounds(without: str) -> None:
+    """40 draws of every parameter of a law with all effects: each path ends on stresses that were asked for."""
+    law = Law(find_effects(n for n, e in library().items() if e.strength is not None and n != without))
+    rng = np.random.default_rng(1)
+    sets = []
+    for _ in range(40):
+        unit = {p: rng.random() for p in law.parameters}
+        draw = {
+            p.name: float(np.exp(np.log(p.lower) + u * np.log(p.upper / p.lower)))
+            if p.log
+            else p.lower + u * (p.upper - p.lower)
+            for p, u in unit.items()
+        }
+        if "dilatancy_angle" in draw:
+            draw["dilatancy_angle"] = min(draw["dilatancy_angle"], draw["friction_angle"])
+        sets.append(draw)
+    common = {"confining": 1e4, "depth": 0.05, "strain_rate": 1.0}
+    pressed = triaxial(law, sets, strains=[0.02, 0.2], young=2e7, **common)  # type: ignore[arg-type]
+    np.testing.assert_allclose(pressed.stress[..., :2], 1e4, rtol=1e-3)
+    assert (pressed.q[:, -1] > 0.0).all() and np.isfinite(pressed.void_ratio).all()
+    turned = simple_shear(law, sets, strains=[0.3], young=2e7, **common)  # type: ignore[arg-type]
+    np.testing.assert_allclose(turned.stress[:, -1, 2], 1e4, rtol=1e-3)
+
+
+def test_loose_soil_has_settled_under_its_first_stress_before_the_test() -> None:
+    """Ten times above the pressure of compaction, the next tenfold costs (V / 10) ln 10, as on the normal line."""
+    law = Law(find_effects(["compaction"]))
+    values = {"looseness": 0.1, "compaction_pressure": 1e3}
+    test = isotropic_compression(law, values, confining=1e4, pressures=[1e5], young=5e8, largest_step=2e-5)
+    elastic = 9e4 * 1.8 / 5e8
+    assert test.volume_strain[0, -1] == pytest.approx(0.01 * math.log(10.0) + elastic, rel=0.01)

@@ -1,0 +1,85 @@
+"""Effects and guards that need soil in a box: closed forms, and errors that say what happened."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+import trimesh
+from splatsoil.benchmarks._validation.scene import STILL, Scene, lattice, resolution
+
+from splatsoil.errors import SimulationError
+from splatsoil.mpm import Solver
+from splatsoil.mpm.tool import Pose
+from splatsoil.soil.law import Law
+from splatsoil.soil.library import find_effects
+from splatsoil.soil.settings import Settings
+
+CELL = 0.02
+RESOLUTION = resolution(CELL, 0.1, density=1600.0, young=5e5)
+
+
+def scene(x: np.ndarray, mesh: trimesh.Trimesh | None = None, **settings: float) -> Scene:
+    given = Settings(friction_angle=40.0, **settings)  # type: ignore[arg-type]
+    return Scene(x, (0.24, 0.12, 0.4), RESOLUTION, given, mesh=mesh)
+
+
+def batch(s: Scene, effects: tuple[str, ...], *values: Mapping[str, float]) -> Solver:
+    """The scene once for each set of parameters."""
+    law = Law(find_effects(effects))
+    x = np.broadcast_to(s.x, (len(values), *s.x.shape))
+    return Solver(x, np.zeros(3), s.upper, s.mesh, s.resolution, law, s.settings, values)
+
+
+def test_soil_falls_under_the_gravity_of_its_world() -> None:
+    """x = f g t^2 / 2, for the earth, the moon and twice the earth."""
+    x = lattice([0.08, 0.04, 0.26], [0.16, 0.08, 0.34], 0.5 * CELL)
+    factors = (1.0, 0.165, 2.0)
+    run = batch(scene(x), ("gravity",), *({"gravity_factor": f} for f in factors))
+    for _ in range(6):
+        run.advance(1)
+    seconds = 6 * RESOLUTION.frame_time
+    fallen = (x - run.positions())[..., 2].mean(axis=1)
+    np.testing.assert_allclose(fallen, 0.5 * 9.81 * np.array(factors) * seconds**2, rtol=0.03)
+
+
+def test_a_plate_feels_the_changed_friction() -> None:
+    """A plate pressed on coherent soil and dragged: drag over normal force grows by the change of the coefficient."""
+    plate = trimesh.creation.box(extents=[0.08, 0.08, 0.02])
+    x = lattice([0.0, 0.0, 0.0], [0.24, 0.12, 0.08], 0.5 * CELL, jitter=0.0)
+    s = scene(x, plate, tool_friction=0.2)
+    changes = (-0.3, 0.0, 0.15)
+    names = ("tool_friction", "cohesion")
+    run = batch(s, names, *({"tool_friction_change": c, "cohesion": 1500.0} for c in changes))
+    speed, start = np.array([0.1, 0.0, 0.0]), np.array([0.1, 0.06, 0.09 - 0.006])
+    step = RESOLUTION.frame_time
+    force = np.array([run.advance([Pose(start + k * step * speed, STILL, speed, np.zeros(3))]) for k in range(12)])
+    drag, normal = -force[4:, :, 0].mean(axis=0), force[4:, :, 2].mean(axis=0)
+    assert (normal > 1.0).all()
+    # a coefficient cannot fall below zero: 0.2 - 0.3 is smooth
+    np.testing.assert_allclose(drag / normal - drag[0] / normal[0], [0.0, 0.2, 0.35], atol=0.03)
+
+
+def test_soil_that_leaves_upward_is_counted() -> None:
+    """Guards name the frame, how many particles of how many, and the parameters."""
+    x = lattice([0.08, 0.04, 0.0], [0.16, 0.08, 0.04], 0.5 * CELL)
+    run = batch(scene(x), (), {"friction_angle": 33.0})
+    velocity = np.tile(np.array([0.0, 0.0, 8.0], dtype=np.float32), (len(x), 1))
+    run._particles.velocity.assign(velocity)
+    says = r"of 128 particles \d+ left the grid upward by frame \d+ \(1 steps of \d+ substeps\).*'friction_angle': 33"
+    with pytest.raises(SimulationError, match=says) as caught:
+        for _ in range(8):
+            run.advance(1)
+    count = re.search(r"particles (\d+) left", str(caught.value))
+    assert count is not None and int(count[1]) >= 1
+
+
+def test_soil_faster_than_its_waves_is_an_error() -> None:
+    x = lattice([0.08, 0.04, 0.1], [0.16, 0.08, 0.14], 0.5 * CELL)
+    run = batch(scene(x), (), {})
+    velocity = np.tile(np.array([1.1 * RESOLUTION.wave_speed, 0.0, 0.0], dtype=np.float32), (len(x), 1))
+    run._particles.velocity.assign(velocity)
+    with pytest.raises(SimulationError, match=r"of 128 particles 128 lost .* by frame 1 "):
+        run.advance(1)
