@@ -150,6 +150,24 @@ class MeasuredProblem:
         evaluation = self.judge(self.model.predict(parameters, seed, self.progress).images)
         return replace(evaluation, seconds=time.perf_counter() - began)
 
+    def cheaper(self, preset: str) -> tuple[Callable[[Mapping[str, float], int], Evaluation], float]:
+        """Evaluation by a coarser simulation of the same reconstruction, and its cost in units of a full one.
+
+        Raises:
+            ParameterError: a preset that is unknown or no cheaper.
+        """
+        from splatsoil.mpm import Resolution
+
+        from .levels import relative_cost
+
+        model = self.model
+        coarse = model.variant(resolution=Resolution.derive(model.measurement, preset))
+
+        def evaluate(parameters: Mapping[str, float], seed: int) -> Evaluation:
+            return self.judge(coarse.predict(parameters, seed, self.progress).images)
+
+        return evaluate, relative_cost(model.resolution, coarse.resolution)
+
     def judge(self, images: Mapping[tuple[str, int], Image]) -> Evaluation:
         """Predicted pictures, by camera and frame, compared with the measured ones."""
         comparison = self.comparator.compare(images)

@@ -54,6 +54,9 @@ class PlowSandEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         budget: evaluations in an episode, at least 2.
         device: ``auto``, ``cpu`` or ``cuda:N``.
         reconstruction: folder of a saved reconstruction of the measurement; made (minutes) when there is none.
+        coarse: a coarser preset that the agent may use, too: the action then has one more entry, the fidelity, and
+            where it is negative, the guess is simulated at this preset. ``info["cost"]`` says what that cost in units
+            of a full evaluation; the budget counts steps.
         render_mode: ``rgb_array`` shows observed | predicted | difference.
         same_particles: simulate all of an episode with the same particles, so that two losses differ by their
             parameters and hardly by chance (common random numbers); by default each has its own.
@@ -73,6 +76,7 @@ class PlowSandEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         reconstruction: str | None = None,
         render_mode: str | None = None,
         same_particles: bool = False,
+        coarse: str | None = None,
         problem: Problem | None = None,
     ) -> None:
         if budget < 2:
@@ -82,7 +86,7 @@ class PlowSandEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self.render_mode = render_mode
         self.budget = int(budget)
         self.same_particles = bool(same_particles)
-        self.problem = problem or make_problem(measurement, parameters, effects, preset, device, reconstruction)
+        self.problem = problem or make_problem(measurement, parameters, effects, preset, device, reconstruction, coarse)
         n, b = len(self.problem.space), self.problem.block_count
         box = gym.spaces.Box
         self.action_space = box(-1.0, 1.0, (n,), np.float32)
@@ -213,14 +217,22 @@ def make_problem(
     preset: str | None,
     device: str,
     reconstruction: str | None,
+    coarse: str | None = None,
 ) -> Problem:
     """The simulate-and-compare that the environment's options describe."""
+    problem: Problem
     if measurement is None:
         from .synthetic import SyntheticProblem
 
-        return SyntheticProblem(parameters, effects, preset=preset or "tiny", device=device)
-    from .measured import MeasuredProblem
+        problem = SyntheticProblem(parameters, effects, preset=preset or "tiny", device=device)
+    else:
+        from .measured import MeasuredProblem
 
-    return MeasuredProblem.load(
-        measurement, parameters, effects, preset=preset or "small", device=device, reconstruction=reconstruction
-    )
+        problem = MeasuredProblem.load(
+            measurement, parameters, effects, preset=preset or "small", device=device, reconstruction=reconstruction
+        )
+    if coarse is None:
+        return problem
+    from .levels import TwoLevelProblem
+
+    return TwoLevelProblem(problem, coarse)

@@ -50,12 +50,13 @@ class PlowSandVectorEnv(VectorEnv[Observation, npt.NDArray[np.float32], Any]):
         reconstruction: str | None = None,
         render_mode: str | None = None,
         same_particles: bool = False,
+        coarse: str | None = None,
         problems: Sequence[Problem] | None = None,
     ) -> None:
         if num_envs < 1:
             raise ParameterError(f"num_envs: at least one is needed, not {num_envs}")
         if problems is None:
-            chosen = (measurement, parameters, effects, preset, device, reconstruction)
+            chosen = (measurement, parameters, effects, preset, device, reconstruction, coarse)
             first = make_problem(*chosen)
             # A measured world is the same for all; a made-up one has a hidden truth for each.
             problems = (

@@ -7,9 +7,10 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+from splatsoil.envs.levels import FIDELITY, TwoLevelProblem, is_full
 from splatsoil.envs.plow_sand import PlowSandEnv
 from splatsoil.envs.problem import Evaluation, Image, Problem
 from splatsoil.envs.together import attempt
@@ -17,9 +18,10 @@ from splatsoil.envs.together import attempt
 from splatsoil.errors import RunError
 from splatsoil.parameters import Parameter, ParameterSpace
 
-from .bayesopt import START, Episode, optimise
+from .bayesopt import PAPER, START, Episode, optimise
 from .campaign import Job, make_record
 from .evaluations import EvaluationRecord, EvaluationStore, digest
+from .multifidelity import most_steps, optimise_two_levels
 from .run_folder import RunFolder
 from .surrogate import Minimum, Surrogate
 
@@ -45,6 +47,8 @@ class FitSetup:
         loss: name of the loss.
         noise_std: measured noise of one evaluation, None to infer it.
         start: Sobol points before the first acquisition.
+        search: ``usual``, or ``paper`` for Hsiao and Kumar's: one random start, expected improvement.
+        coarse: preset of cheap evaluations that the search may use, too; None: it has none.
     """
 
     measurement: str
@@ -59,6 +63,8 @@ class FitSetup:
     loss: str = ""
     noise_std: float | None = None
     start: int = START
+    search: Literal["usual", "paper"] = "usual"
+    coarse: str | None = None
 
     @property
     def name(self) -> str:
@@ -89,6 +95,8 @@ class FitSetup:
             "seed": self.seed,
             "noise_std": self.noise_std,
             "start": self.start,
+            **({} if self.search == "usual" else {"search": self.search}),
+            **({} if self.coarse is None else {"coarse": self.coarse}),
         }
 
 
@@ -196,10 +204,10 @@ def fit(
     """Fit the free parameters and write ``fit.json``; goes on where an interrupted fit of the same setup stopped.
 
     Args:
-        problem: simulate-and-compare.
+        problem: simulate-and-compare, at the resolution that counts.
         run: the run folder; only this process may write to it meanwhile.
         setup: what is fitted and how.
-        budget: evaluations, those already stored included.
+        budget: evaluations, those already stored included; with a coarse preset their cost, in full ones.
         facts: what the fit should say of how it was computed (time step, spacing, ...).
         after_evaluation: called with the number done and the record of the last.
 
@@ -210,32 +218,36 @@ def fit(
         RunError: every evaluation failed, or the run folder can't be written.
     """
     began = time.perf_counter()
+    levels = None if setup.coarse is None else TwoLevelProblem(problem, setup.coarse)
+    steps = budget if levels is None else most_steps(budget, levels.cost)
     with run.lock(), run.evaluations(writable=True) as store:
-        stored = StoredProblem(problem, store, setup)
-        earlier = sum(record.seconds for record in stored.stored[:budget])
+        stored = StoredProblem(levels or problem, store, setup)
+        earlier = sum(record.seconds for record in stored.stored[:steps])
         # Chance moves the loss of all angles together: the same particles leave a third of it between evaluations.
-        env = PlowSandEnv(problem=stored, budget=budget, same_particles=True)
+        env = PlowSandEnv(problem=stored, budget=steps, same_particles=True)
 
         def told(done: int, _: dict[str, Any]) -> None:
             if after_evaluation is not None and stored.last is not None:
                 after_evaluation(done, stored.last)
 
         try:
-            episode = optimise(
-                env,
-                seed=setup.seed,
-                start=setup.start,
-                noise_std=setup.noise_std,
-                replay=[record.action for record in stored.stored],
-                after_step=told,
-            )
+            shared: dict[str, Any] = {
+                "seed": setup.seed,
+                "noise_std": setup.noise_std,
+                "replay": [record.action for record in stored.stored],
+                "after_step": told,
+            }
+            if levels is None:
+                episode = optimise(env, start=setup.start, search=PAPER if setup.search == "paper" else None, **shared)
+            else:
+                episode = optimise_two_levels(env, cost=levels.cost, budget=budget, **shared)
         except RuntimeError as error:
             records = store.records(stored.fit)
-            if any(record.status == "ok" for record in records):
+            if any(record.status == "ok" and is_full(record.parameters) for record in records):
                 raise
             first = records[0].message if records else str(error)
-            raise RunError(f"{run.path}: all {budget} simulations failed; the first said: {first}") from error
-        records = store.records(stored.fit)[:budget]
+            raise RunError(f"{run.path}: all {len(records)} simulations failed; the first said: {first}") from error
+        records = store.records(stored.fit)[: len(episode.told)]
     seconds = earlier + time.perf_counter() - began
     result = summarise(episode, problem, setup, records, seconds=seconds)
     result["run"] = {"measurement": dict(run.description["measurement"])}
@@ -250,7 +262,8 @@ def summarise(
     """A fit in plain numbers, physical units and words."""
     minimum, space = episode.minimum, problem.space
     surrogate = episode.optimiser.surrogate()
-    done = [record for record in records if record.status == "ok"]
+    good = [record for record in records if record.status == "ok"]
+    done = [record for record in good if is_full(record.parameters)]
     best = min(done, key=lambda record: record.loss if record.loss is not None else math.inf)
     return {
         "format": FORMAT,
@@ -260,20 +273,21 @@ def summarise(
         "loss_std": minimum.loss_std,
         "noise_std": minimum.noise_std,
         "evaluations": len(records),
-        "failed": len(records) - len(done),
-        "best": {"parameters": dict(best.parameters), "loss": best.loss, "step": best.step},
+        "failed": len(records) - len(good),
+        "best": {"parameters": _without_level(best.parameters), "loss": best.loss, "step": best.step},
         "seconds": round(seconds, 3),
         "seed": setup.seed,
         "device": setup.device,
         "preset": setup.preset,
         "version": setup.version,
         "setup": setup.description(),
-        "notes": notes(minimum, space, failed=len(records) - len(done), total=len(records)),
+        "notes": notes(minimum, space, failed=len(records) - len(good), total=len(records)),
         "curves": {p.name: _curve(i, minimum, surrogate, space) for i, p in enumerate(space)},
         "history": [
             {
                 "step": record.step,
-                "parameters": dict(record.parameters),
+                "parameters": _without_level(record.parameters),
+                "level": "full" if is_full(record.parameters) else "coarse",
                 "loss": record.loss,
                 "status": record.status,
                 "message": record.message,
@@ -283,6 +297,10 @@ def summarise(
             for record in records
         ],
     }
+
+
+def _without_level(parameters: Mapping[str, float]) -> dict[str, float]:
+    return {name: value for name, value in parameters.items() if name != FIDELITY.name}
 
 
 def notes(minimum: Minimum, space: ParameterSpace, *, failed: int, total: int) -> list[str]:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from splatsoil.envs.levels import is_full
 
 from splatsoil.errors import RunError
 from splatsoil.parameters import Parameter, ParameterSpace
@@ -58,12 +59,12 @@ class Data:
         places: Sequence[Place] | None = None,
         sensor_std: float = 0.0,
     ) -> Data:
-        """The evaluations that succeeded; blocks that were hidden in any of them are left out.
+        """The evaluations that succeeded, at full resolution; blocks hidden in any of them are left out.
 
         Raises:
             RunError: too few succeeded, or nothing was seen in all of them.
         """
-        good = [r for r in records if r.status == "ok"]
+        good = [r for r in records if r.status == "ok" and is_full(r.parameters)]
         if len(good) < len(space) + FEWEST:
             raise RunError(
                 f"{len(good)} evaluations that succeeded are too few for a posterior over {len(space)} parameters; "

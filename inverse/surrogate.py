@@ -86,13 +86,22 @@ class Surrogate:
         losses: (m,) finite.
         noise_std: standard deviation of one evaluation's noise, where measured; None to infer it.
         seed: of the hyperparameters' draws.
+        levels: (m,) 1 for an evaluation of the loss itself, 0 for one of a cheap likeness of it. The two are taken as
+            values of one process with one more input (its length scale, learned with the others, says how alike they
+            are). Whatever is asked of the surrogate is about the loss itself. None: all are.
 
     Raises:
         ValueError: no evaluations, or shapes that don't agree.
     """
 
     def __init__(
-        self, points: npt.ArrayLike, losses: npt.ArrayLike, *, noise_std: float | None = None, seed: int = 0
+        self,
+        points: npt.ArrayLike,
+        losses: npt.ArrayLike,
+        *,
+        noise_std: float | None = None,
+        seed: int = 0,
+        levels: npt.ArrayLike | None = None,
     ) -> None:
         self.points = np.atleast_2d(np.asarray(points, dtype=np.float64))
         self.losses = np.asarray(losses, dtype=np.float64).reshape(-1)
@@ -104,6 +113,9 @@ class Surrogate:
         self._scale = 1.0 if self.constant else spread
         # Maximisation is BoTorch's direction; the unit cube is what the length scales' prior is meant for.
         self._x = 0.5 * (self.points + 1.0)
+        self._levels = None if levels is None else np.asarray(levels, dtype=np.float64).reshape(-1, 1)
+        if self._levels is not None:
+            self._x = np.concatenate([self._x, self._levels], axis=1)
         self._y = -(self.losses - self._shift) / self._scale
         noise = None if noise_std is None else np.full(len(self._y), (noise_std / self._scale) ** 2)
         self.best, self.settings = posterior(self._x, self._y, noise, count=SETTINGS, seed=seed)
@@ -120,7 +132,10 @@ class Surrogate:
 
     @cached_property
     def likeliest(self) -> SingleTaskGP:
-        """BoTorch model of minus the standardised loss, with the most probable hyperparameters: for acquisition."""
+        """BoTorch model of minus the standardised loss, with the most probable hyperparameters: for acquisition.
+
+        Its inputs are points of the unit cube, followed by the level where there are levels.
+        """
         return self._model(self.best)
 
     @cached_property
@@ -135,24 +150,30 @@ class Surrogate:
 
         batch = torch.Size([]) if len(settings) == 1 else torch.Size([len(settings)])
         count = len(self._y)
-        kernel = RBFKernel(ard_num_dims=self.dimension, batch_shape=batch)
+        inputs = self._x.shape[1]
+        kernel = RBFKernel(ard_num_dims=inputs, batch_shape=batch)
         with quiet():
             model = SingleTaskGP(
-                torch.from_numpy(self._x).expand(*batch, count, self.dimension),
+                torch.from_numpy(self._x).expand(*batch, count, inputs),
                 torch.from_numpy(self._y)[:, None].expand(*batch, count, 1),
                 train_Yvar=torch.from_numpy(settings.noise).reshape(*batch, count, 1),
                 covar_module=kernel.double(),
                 outcome_transform=None,
             )
-        model.covar_module.lengthscale = torch.from_numpy(settings.lengths).reshape(*batch, 1, self.dimension)
+        model.covar_module.lengthscale = torch.from_numpy(settings.lengths).reshape(*batch, 1, inputs)
         model.mean_module.constant.data = torch.from_numpy(settings.mean).reshape(batch)
         for parameter in model.parameters():
             parameter.requires_grad_(False)
         return model.eval()
 
+    def _inputs(self, points: npt.ArrayLike) -> torch.Tensor:
+        """Points (m, n) of [-1, 1]^n as the model takes them: in the unit cube, at the level of the loss itself."""
+        x = torch.from_numpy(0.5 * (np.atleast_2d(np.asarray(points, dtype=np.float64)) + 1.0))
+        return x if self._levels is None else torch.cat([x, torch.ones(len(x), 1, dtype=x.dtype)], dim=1)
+
     def mean_and_std(self, points: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Posterior mean and standard deviation (m,), (m,) of the noise-free loss at points (m, n) of [-1, 1]^n."""
-        x = torch.from_numpy(0.5 * (np.atleast_2d(np.asarray(points, dtype=np.float64)) + 1.0))
+        x = self._inputs(points)
         means, variances = [], []
         with torch.no_grad(), quiet():
             # In pieces: BoTorch makes the joint covariance of all points, for every draw of the hyperparameters.
@@ -200,11 +221,11 @@ class Surrogate:
         starts = candidates[np.argsort(mean, kind="stable")[: 1 if self.dimension == 1 else 4]]
 
         def value_and_gradient(point: FloatArray) -> tuple[float, FloatArray]:
-            x = torch.from_numpy(0.5 * (point[None] + 1.0)).requires_grad_()
+            x = self._inputs(point).requires_grad_()
             with quiet():
                 value = -self.ensemble.posterior(x).mean.mean()
             (gradient,) = torch.autograd.grad(value, x)
-            return value.item(), 0.5 * gradient.numpy().reshape(-1)
+            return value.item(), 0.5 * gradient.numpy().reshape(-1)[: self.dimension]
 
         results = [
             minimize(value_and_gradient, s, jac=True, bounds=[(-1, 1)] * self.dimension, method="L-BFGS-B")
@@ -216,7 +237,7 @@ class Surrogate:
     def _sample_minimisers_1d(self, seed: int) -> FloatArray:
         """Minimisers (k, 1) of exact joint draws on a grid."""
         grid = np.linspace(-1.0, 1.0, GRID)
-        x = torch.from_numpy(0.5 * (grid[:, None] + 1.0))
+        x = self._inputs(grid[:, None])
         with torch.no_grad(), quiet():
             given = self.ensemble.posterior(x)
             mean, covariance = given.mean, given.distribution.covariance_matrix  # type: ignore[union-attr]
@@ -233,11 +254,13 @@ class Surrogate:
             from botorch.sampling.pathwise import draw_matheron_paths
             from botorch.utils.sampling import optimize_posterior_samples
 
-        bounds = torch.tensor([[0.0] * self.dimension, [1.0] * self.dimension], dtype=torch.float64)
+        bounds = self._inputs(np.stack([np.full(self.dimension, -1.0), np.full(self.dimension, 1.0)]))
+        if self._levels is not None:
+            bounds[0, -1] -= 1e-6  # BoTorch minds rounding where two bounds are equal
         with seeded(seed), quiet():
             paths = draw_matheron_paths(self.ensemble, torch.Size([PATHS_ND]))
             best, _ = optimize_posterior_samples(paths, bounds, raw_samples=128, num_restarts=2)  # type: ignore[arg-type]
-        return 2.0 * best.detach().reshape(-1, self.dimension).numpy() - 1.0
+        return 2.0 * best.detach().reshape(-1, bounds.shape[1])[:, : self.dimension].numpy() - 1.0
 
 
 def sobol(count: int, dimension: int, seed: int) -> FloatArray:

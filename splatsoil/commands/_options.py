@@ -26,6 +26,10 @@ class FitOptions:
     """Effects to add to the base model, by name, or files that define some."""
     budget: int | None = None
     """Evaluations; 10 for each free parameter if not given."""
+    search: Literal["usual", "paper"] = "usual"
+    """How to search; paper: as Hsiao and Kumar did, from one random start by expected improvement."""
+    coarse: Literal["tiny", "small", "paper"] | None = None
+    """Let the search use cheap simulations at this coarser preset, too; the budget is then their cost in full ones."""
     preset: Literal["tiny", "small", "paper", "fine"] = "small"
     """How finely to reconstruct and simulate; small suits a laptop without a graphics card."""
     device: str = "auto"
@@ -50,6 +54,8 @@ class FitOptions:
             words += [option, *values] if values else []
         for option, value, usual in (
             ("--budget", self.budget, None),
+            ("--search", self.search, "usual"),
+            ("--coarse", self.coarse, None),
             ("--preset", self.preset, "small"),
             ("--device", self.device, "auto"),
             ("--seed", self.seed, 0),

@@ -45,6 +45,8 @@ def prepare(options: FitOptions) -> tuple[Measurement, RunFolder]:
 
     if options.budget is not None and options.budget < 2:
         raise ParameterError(f"--budget: a fit needs at least 2 evaluations, not {options.budget}")
+    if options.coarse is not None and options.search == "paper":
+        raise ParameterError("--search paper knows one resolution; leave --coarse out")
     if not 0 <= options.seed < 2**63:
         raise ParameterError(f"--seed: must be 0 or more and less than 2^63, not {options.seed}")
     effects = find_effects(options.effects)
@@ -124,6 +126,7 @@ def fitted(
 ) -> dict[str, Any]:
     """Fit, evaluation by evaluation; what is in the run folder already isn't simulated again."""
     from splatsoil import __version__
+    from splatsoil.envs.levels import is_full
     from splatsoil.envs.measured import LOSS, MeasuredProblem
     from splatsoil.files import code_digest
     from splatsoil.inverse.fitting import FitSetup, fit
@@ -141,20 +144,23 @@ def fitted(
         version=__version__,
         code=code_digest(others=[name for name in options.effects if name.endswith(".py")]),
         loss=LOSS,
+        search=options.search,
+        coarse=options.coarse,
     )
     units = {p.name: "°" if p.unit == "deg" else f" {p.unit}" for p in space}
 
-    finished = 0
+    finished, spent = 0, 0.0
 
     def told(done: int, record: EvaluationRecord) -> None:
-        nonlocal finished
-        finished = done
-        values = ", ".join(f"{name} {value:.4g}{units[name]}" for name, value in record.parameters.items())
+        nonlocal finished, spent
+        finished, spent = done, spent + record.extras.get("cost", 1.0)
+        values = ", ".join(f"{name} {record.parameters[name]:.4g}{unit}" for name, unit in units.items())
         outcome = "failed" if record.loss is None else f"loss {record.loss:.4g}"
-        report(f"{done} of {budget}: {values}, {outcome}", done / budget)
+        level = "" if is_full(record.parameters) else ", coarse"
+        report(f"{spent:.3g} of {budget}: {values}, {outcome}{level}", spent / budget)
 
     def simulating(frame: int, last: int) -> None:
-        report(f"simulation {finished + 1} of {budget}, frame {frame}", (finished + frame / (last + 1)) / budget)
+        report(f"simulation {finished + 1}, frame {frame}", min((spent + frame / (last + 1)) / budget, 1.0))
 
     report("reading the video", 0.0)
     problem = MeasuredProblem(model, space, progress=simulating)

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from splatsoil.inverse.bayesopt import PAPER, BayesianOptimiser
 from splatsoil.inverse.evaluations import EvaluationRecord, digest
 from splatsoil.inverse.fitting import fit
 
@@ -166,6 +167,16 @@ def test_failed_simulations_are_recorded_as_such_and_said(analytic: ModuleType, 
     assert result["failed"] == len(failed)
     assert any("failed" in note for note in result["notes"])
     assert result["parameters"]["friction_angle"]["estimate"] == pytest.approx(36.0, abs=2.0)
+
+
+def test_the_papers_search_starts_from_one_random_point(analytic: ModuleType, tmp_path: Path) -> None:
+    run = analytic.prepare(tmp_path)
+    usual = fit(analytic.AnalyticProblem(), run, analytic.SETUP, budget=4)
+    paper = fit(analytic.AnalyticProblem(), run, replace(analytic.SETUP, search="paper"), budget=4)
+    first = BayesianOptimiser(1, seed=analytic.SETUP.seed, search=PAPER).ask()[0]
+    assert paper["history"][0]["parameters"]["friction_angle"] == pytest.approx(35.0 + 15.0 * first)
+    assert paper["setup"]["search"] == "paper" and "search" not in usual["setup"]
+    assert paper["history"][0]["parameters"] != usual["history"][0]["parameters"]
 
 
 def test_all_simulations_fail(analytic: ModuleType, tmp_path: Path) -> None:
