@@ -9,12 +9,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Candidate, Experiment
 
 from .confirmation import Confirmation, confirm, on_its_own_floor, remainder_of
 from .evidence import Evidence, gather
 from .floor import Floor, floor_of
 from .misfit import Block, Omnibus, blocks, left_over, omnibus, shares, smooth_basis
+from .outside import StrengthReading, read_strength
 from .score import Score, Scorer
 from .simulations import Simulations
 from .verdicts import CLEAN, ENOUGH, EQUIVALENT, LEVEL, EffectVerdict, Verdict, explained, of_effect, overall
@@ -62,6 +64,7 @@ class Diagnosis:
         residual: (t, s) what parameters and nuisances can't take up.
         floor: noise and nuisances.
         evidence: the simulations.
+        strength: what a free strength says where something outside the library is missing, else None.
         simulations: how many the diagnosis needed.
         unit: of the features.
         notes: what went otherwise than planned.
@@ -82,6 +85,7 @@ class Diagnosis:
     residual: FloatArray
     floor: Floor
     evidence: Evidence
+    strength: StrengthReading | None = None
     simulations: int = 0
     unit: str = ""
     notes: tuple[str, ...] = ()
@@ -174,19 +178,29 @@ def judge(
         tried = {name: c for name, c in confirmations.items() if name}
         costs = {name: c.chi2 + price(candidates[name], misfit.freedom) for name, c in tried.items()}
         best = min(costs, key=lambda name: costs[name])
-        members = _equals(costs, best, tried[best].remainder)
-        given = scorer.score(residual, given=best)
-        remainder = remainder_of(experiment, floor, tried[best], candidates, evidence, bench.basis)
         before = confirmations[""].remainder
-        if remainder.p < CLEAN and explained(before, remainder) < ENOUGH:
-            told("the floor with the effect on", 0.97)
-            before, remainder = on_its_own_floor(experiment, evidence, tried[best], simulate, residual)
-        gone = explained(before, remainder)
+        if _stands(confirmations, best):
+            given = scorer.score(residual, given=best)
+            members = _equals(costs, best, tried[best].remainder)
+            remainder = remainder_of(experiment, floor, tried[best], candidates, evidence, bench.basis)
+            if remainder.p < CLEAN and explained(before, remainder) < ENOUGH:
+                told("the floor with the effect on", 0.97)
+                before, remainder = on_its_own_floor(experiment, evidence, tried[best], simulate, residual)
+            gone = explained(before, remainder)
     effects = _effects(candidates, scores, given, members, confirmations, options.level)
-    named = any(effects[name] == "missing" for name in members) and _stands(confirmations, members[0])
+    named = any(effects[name] == "missing" for name in members)
     if strong and not named:
         effects = {n: "cannot tell" if v == "missing" else v for n, v in effects.items()}
     verdict = overall(named, before if named else misfit, remainder)
+    notes = [f"{name} could not be simulated: {why}" for name, why in evidence.failed.items()]
+    strength = None
+    if verdict == "outside the library":
+        try:
+            strength = read_strength(
+                experiment, evidence, floor, simulate, bench.basis, misfit, progress=lambda s: told("free strength", s)
+            )
+        except SimulationError as error:
+            notes.append(f"the free strength could not be simulated: {error}")
     return Diagnosis(
         verdict=verdict,
         members=members,
@@ -203,9 +217,10 @@ def judge(
         residual=floor.noise.spread(left_over(floor.noise, floor.free, residual)),
         floor=floor,
         evidence=evidence,
+        strength=strength,
         simulations=simulate.asked,
         unit=experiment.layout.unit,
-        notes=tuple(f"{name} could not be simulated: {why}" for name, why in evidence.failed.items()),
+        notes=tuple(notes),
     )
 
 

@@ -11,6 +11,7 @@ from splatsoil.experiment.base import Candidate, Experiment
 from .confirmation import Confirmation
 from .diagnosis import Diagnosis
 from .misfit import Omnibus
+from .outside import StrengthReading
 from .words import sentences
 
 FORMAT = "splatsoil-diagnosis/1"
@@ -59,6 +60,7 @@ def record(experiment: Experiment, diagnosis: Diagnosis) -> dict[str, Any]:
                 if name
             },
         },
+        "strength": None if diagnosis.strength is None else _strength(diagnosis.strength),
         "notes": list(diagnosis.notes),
     }
 
@@ -125,6 +127,28 @@ def confirmation(c: Confirmation) -> dict[str, Any]:
         "floor": c.floor,
         "remainder": _omnibus(c.remainder),
         "simulations": c.fit.simulations,
+    }
+
+
+def _strength(found: StrengthReading) -> dict[str, Any]:
+    """A free strength: curves over what the soil went through, and what they look like."""
+    return {
+        "readings": list(found.readings),
+        "explained": found.explained,
+        "misfit": _omnibus(found.misfit),
+        "values": dict(found.held),
+        "scale": found.scale,
+        "shapes": [
+            {
+                "argument": s.argument,
+                "reading": s.reading,
+                "log_evidence": s.evidence,
+                "change": s.change,
+                "change_std": s.std,
+                **{key: [float(v) for v in getattr(s, key)] for key in ("at", "factor", "low", "high")},
+            }
+            for s in found.shapes
+        ],
     }
 
 

@@ -15,6 +15,8 @@ from splatsoil.errors import RunError
 from splatsoil.experiment.base import Experiment
 from splatsoil.files import write_bytes
 
+from .free_strength import FreeStrength
+
 FloatArray = npt.NDArray[np.float64]
 
 
@@ -47,7 +49,7 @@ class Simulations:
         self,
         values: Mapping[str, float],
         *,
-        effects: tuple[str, ...] = (),
+        effects: tuple[str | FreeStrength, ...] = (),
         seed: int = 0,
         numerics: str = "",
         purpose: str = "",
@@ -58,10 +60,11 @@ class Simulations:
             SimulationError: the simulation could not go on.
             RunError: what is kept of it is damaged.
         """
-        what = {"values": dict(values), "effects": sorted(effects), "seed": seed, "numerics": numerics}
+        names = sorted(e if isinstance(e, str) else e.identity for e in effects)
+        what = {"values": dict(values), "effects": names, "seed": seed, "numerics": numerics}
         key = digest({**self.identity, **what})
         if key not in self._known:
-            self._known[key] = self._find(key, what, purpose)
+            self._known[key] = self._find(key, {**what, "effects": effects}, purpose)
             self.asked += 1
         return self._known[key]
 

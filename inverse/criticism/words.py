@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 from splatsoil.experiment.base import Candidate
 
 from .diagnosis import Diagnosis
+from .outside import FEW, StrengthReading
 from .verdicts import GATE
 
 #: Correlation of two effects' scores from which they are called alike.
@@ -93,6 +95,28 @@ def _outside(diagnosis: Diagnosis, candidates: Mapping[str, Candidate]) -> list[
             f"seen goes from {before.held_out:.2g} to {confirmed.held_out:.2g} {diagnosis.unit} (noise alone leaves "
             f"{confirmed.floor:.2g}), which is {100.0 * diagnosis.explained:.0f} % of the misfit beyond chance. What "
             "remains is more than noise, so it is not all that is missing."
+        )
+    return out if diagnosis.strength is None else [*out, *of_strength(diagnosis.strength)]
+
+
+def of_strength(found: StrengthReading) -> list[str]:
+    """What a strength of free form looks like."""
+    seen = listed([s.argument for s in found.shapes])
+    if not found.readings:
+        if found.explained < FEW:
+            return [
+                f"Friction that depends freely on {seen} explains {100.0 * found.explained:.0f} % of the misfit beyond "
+                "chance: look for something other than strength (volume, contact, geometry, pictures)."
+            ]
+        return [f"Friction that depends freely on {seen} would explain it, but in no direction that is clear."]
+    out = []
+    for shape in sorted((s for s in found.shapes if s.reading), key=lambda s: -s.evidence):
+        first, last = (f"{shape.at[k]:.2g}{' Pa' if shape.argument == 'pressure' else ''}" for k in (0, -1))
+        times = math.exp(shape.change)
+        out.append(
+            f"What is missing looks {shape.reading}: friction at {shape.argument} {last} is {times:.2f} ± "
+            f"{times * shape.std:.2f} times that at {first}. A strength of free form explains "
+            f"{100.0 * found.explained:.0f} % of the misfit beyond chance."
         )
     return out
 

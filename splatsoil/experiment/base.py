@@ -88,13 +88,13 @@ class Experiment(Protocol):
     def chance(self) -> bool: ...
 
     def predict(
-        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
+        self, values: Mapping[str, float], *, effects: Iterable[str | Effect] = (), seed: int = 0, numerics: str = ""
     ) -> FloatArray:
         """(t, s) predicted features.
 
         Args:
             values: parameters by name, those of ``effects`` included.
-            effects: candidates to switch on.
+            effects: candidates to switch on, by name; or an effect itself that is none.
             seed: of what is chance in the simulation.
             numerics: one of ``numerics``, or nothing for the usual way.
 

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from splatsoil.experiment.base import Candidate
 from splatsoil.experiment.features import Layout
 from splatsoil.parameters import Parameter
+from splatsoil.soil.effect import Effect
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -83,7 +84,7 @@ class EmulatedExperiment:
         return out
 
     def predict(
-        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
+        self, values: Mapping[str, float], *, effects: Iterable[str | Effect] = (), seed: int = 0, numerics: str = ""
     ) -> FloatArray:
         """(t, s) features; the same seed has the same chance."""
         del effects

@@ -100,7 +100,7 @@ class PlateExperiment:
         self.resolution = Resolution.derive(self.experiment, preset)
 
     def predict(
-        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
+        self, values: Mapping[str, float], *, effects: Iterable[str | Effect] = (), seed: int = 0, numerics: str = ""
     ) -> FloatArray:
         """(t, 1) forces in N; see :class:`~splatsoil.experiment.base.Experiment`."""
         resolution = NUMERICS[numerics](self.resolution) if numerics else self.resolution

@@ -15,6 +15,7 @@ from splatsoil.comparison import PATCH, Block, Comparator
 from splatsoil.experiment.base import Candidate, candidates_of
 from splatsoil.experiment.features import Layout, Site
 from splatsoil.experiment.scene_parts import QUIET, regions_of, stages_of
+from splatsoil.experiment.states import States, plow_states
 from splatsoil.model import Model, Prediction
 from splatsoil.mpm import Resolution, Trajectory
 from splatsoil.parameters import Parameter
@@ -129,7 +130,7 @@ class PlowExperiment:
         return np.concatenate(per_site)[None] / np.sqrt(frames)[:, None]
 
     def predict(
-        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
+        self, values: Mapping[str, float], *, effects: Iterable[str | Effect] = (), seed: int = 0, numerics: str = ""
     ) -> FloatArray:
         """(t, s) features; see :class:`~splatsoil.experiment.base.Experiment`."""
         return self.features(self.prediction(values, effects=effects, seed=seed, numerics=numerics).images)
@@ -143,7 +144,7 @@ class PlowExperiment:
         return self.observed - self._table(self.comparator.compare(images).blocks)
 
     def prediction(
-        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
+        self, values: Mapping[str, float], *, effects: Iterable[str | Effect] = (), seed: int = 0, numerics: str = ""
     ) -> Prediction:
         """The pictures behind the features. What only changes the observation is drawn without a new simulation."""
         names = tuple(dict.fromkeys((*self.model, *effects)))
@@ -161,7 +162,11 @@ class PlowExperiment:
         seconds = {"simulation": simulated - began, "drawing": time.perf_counter() - simulated}
         return Prediction(dict(values), seed, images, trajectory, seconds)
 
-    def _variant(self, effects: tuple[str, ...], numerics: str) -> Model:
+    def states(self, values: Mapping[str, float]) -> States:
+        """States that the soil goes through while it yields, in a simulation of its own."""
+        return plow_states(self.base, values)
+
+    def _variant(self, effects: tuple[str | Effect, ...], numerics: str) -> Model:
         if effects == self.model and not numerics:
             return self.base
         resolution = NUMERICS[numerics](self.base.resolution) if numerics else None

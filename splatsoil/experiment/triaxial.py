@@ -1,21 +1,23 @@
-"""A drained triaxial test as an experiment: the law at a single point, no pictures, no chance."""
+"""Drained triaxial tests as an experiment: the law at a single point, no pictures, no chance."""
 
 from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from splatsoil.errors import MeasurementError, SimulationError
+from splatsoil.errors import MeasurementError, ParameterError, SimulationError
 from splatsoil.experiment.base import candidates_of
 from splatsoil.experiment.features import Layout, Site
+from splatsoil.experiment.states import States, with_history
 from splatsoil.parameters import Parameter
-from splatsoil.soil.element import triaxial
+from splatsoil.soil.effect import Effect
+from splatsoil.soil.element import ElementTest, triaxial
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects, library
 
@@ -29,6 +31,8 @@ MEMORY = 0.8
 """Correlation of neighbouring readings: a specimen that is off stays off."""
 YOUNG = 2.0e7
 """Young's modulus in Pa for a stiffness factor of 1; the factor is a parameter of the model."""
+SLOW = 1.0e-5
+"""Strain rate of a laboratory's test, 1/s."""
 COLUMNS = ("test_id", "eps_a[%]", "eps_v[%]", "sigma_r[kPa]", "sigma_v[kPa]")
 
 
@@ -42,6 +46,7 @@ class Curve:
         volume: nominal volume strain (n,).
         ratio: q/p (n,).
         confining: lateral stress in Pa.
+        strain_rate: of the axial strain, 1/s; slow unless it is told.
     """
 
     name: str
@@ -49,6 +54,7 @@ class Curve:
     volume: FloatArray
     ratio: FloatArray
     confining: float
+    strain_rate: float = SLOW
 
 
 def read_triaxial(path: str | Path) -> dict[str, Curve]:
@@ -88,63 +94,112 @@ def read_triaxial(path: str | Path) -> dict[str, Curve]:
 
 
 class TriaxialExperiment:
-    """One triaxial test and a model of it.
+    """One triaxial test, or several of the same soil, and a model of it.
 
     Features are q/p and the volume strain, each in units of its spread between specimens. The elastic stiffness is a
-    parameter of the model: a laboratory's sand is not rigid.
+    parameter of the model: a laboratory's sand is not rigid. One test at one pressure cannot tell cohesion from
+    friction, nor rate from either; a series at several pressures and rates can.
 
     Args:
-        curve: what was measured.
+        curves: what was measured; several tests need the same strains.
         effects: names of the effects that are on.
         void_ratio: at the start.
+        candidates: names of effects to consider; all that act on strength by default.
+
+    Raises:
+        ParameterError: tests whose strains differ.
     """
 
     chance = False
     sensor_memory = MEMORY
     numerics: tuple[str, ...] = ()
 
-    def __init__(self, curve: Curve, effects: Iterable[str] = (), *, void_ratio: float = 0.8) -> None:
-        self.curve, self.void_ratio = curve, void_ratio
-        self.name = curve.name
+    def __init__(
+        self,
+        curves: Curve | Sequence[Curve],
+        effects: Iterable[str] = (),
+        *,
+        void_ratio: float = 0.8,
+        candidates: Iterable[str] | None = None,
+    ) -> None:
+        self.curves = (curves,) if isinstance(curves, Curve) else tuple(curves)
+        if not self.curves or any(not np.array_equal(c.strain, self.curve.strain) for c in self.curves):
+            raise ParameterError("triaxial tests of one experiment need the same strains; interpolate their curves")
+        self.void_ratio = void_ratio
+        self.name = ", ".join(curve.name for curve in self.curves)
         self.model = tuple(dict.fromkeys(("stiffness", *effects)))
         law = Law(find_effects(self.model))
         self.parameters: tuple[Parameter, ...] = tuple(
             p for p in law.parameters if p.off is not None or p.name == "friction_angle"
         )
-        self.candidates = candidates_of((e for e in library().values() if e.strength is not None), law.effects)
-        count = len(curve.strain)
-        middle = 0.5 * float(curve.strain[-1])
+        wanted = tuple(library().values()) if candidates is None else find_effects(candidates)
+        self.candidates = candidates_of((e for e in wanted if e.strength is not None), law.effects)
+        strain = self.curve.strain
+        middle = 0.5 * float(strain[-1])
+        several = len(self.curves) > 1
+        channels = [
+            f"{what}, {curve.name}" if several else what
+            for curve in self.curves
+            for what in ("stress ratio", "volume strain")
+        ]
         self.layout = Layout(
-            times=tuple(float(100.0 * s) for s in curve.strain),
-            sites=(Site("stress ratio"), Site("volume strain")),
+            times=tuple(float(100.0 * s) for s in strain),
+            sites=tuple(Site(channel) for channel in channels),
             time_name="axial strain, %",
             unit="spreads between specimens",
-            stages=tuple("first half" if s <= middle else "second half" for s in curve.strain),
-            regions=np.full((count, 2), "specimen"),
+            stages=tuple("first half" if s <= middle else "second half" for s in strain),
+            regions=np.full((len(strain), len(channels)), "specimen"),
         )
-        self.observed = self._features(curve.ratio, curve.volume)
+        self.observed = np.concatenate([self._features(c.ratio, c.volume) for c in self.curves], axis=1)
         self.seen = np.ones(self.layout.shape, dtype=bool)
         self.quiet = np.zeros(self.layout.shape, dtype=bool)
         self.sensor = np.ones(self.layout.shape)
 
+    @property
+    def curve(self) -> Curve:
+        """The first test."""
+        return self.curves[0]
+
     def predict(
-        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
+        self,
+        values: Mapping[str, float],
+        *,
+        effects: Iterable[str | Effect] = (),
+        seed: int = 0,
+        numerics: str = "",
     ) -> FloatArray:
-        """(t, 2) features; nothing about them is chance."""
+        """(t, 2 tests) features; nothing about them is chance."""
         del seed, numerics
         law = Law(find_effects(dict.fromkeys((*self.model, *effects))))
-        test = triaxial(
+        out = []
+        for curve in self.curves:
+            test = self._test(law, values, curve)
+            ratio = (test.q / test.p)[0, 1:]
+            if not np.all(np.isfinite(ratio)):
+                raise SimulationError(f"the triaxial test with {dict(values)} came to no finite stress")
+            out.append(self._features(ratio, 1.0 - np.exp(-test.volume_strain[0, 1:])))
+        return np.concatenate(out, axis=1)
+
+    def states(self, values: Mapping[str, float]) -> States:
+        """States that the specimens go through while they yield."""
+        law = with_history(Law(find_effects(self.model)))
+        parts = []
+        for curve in self.curves:
+            test = self._test(law, values, curve)
+            seconds = np.diff(np.concatenate([[0.0], -np.log(1.0 - curve.strain)])) / curve.strain_rate
+            parts.append((test.p, test.plastic_strain, seconds))
+        return States.joined([States.of(*part) for part in parts])
+
+    def _test(self, law: Law, values: Mapping[str, float], curve: Curve) -> ElementTest:
+        return triaxial(
             law,
             dict(values),
-            confining=self.curve.confining,
-            strains=-np.log(1.0 - self.curve.strain),
+            confining=curve.confining,
+            strains=-np.log(1.0 - curve.strain),
             void_ratio=self.void_ratio,
             young=YOUNG,
+            strain_rate=curve.strain_rate,
         )
-        ratio = (test.q / test.p)[0, 1:]
-        if not np.all(np.isfinite(ratio)):
-            raise SimulationError(f"the triaxial test with {dict(values)} came to no finite stress")
-        return self._features(ratio, 1.0 - np.exp(-test.volume_strain[0, 1:]))
 
     @staticmethod
     def _features(ratio: FloatArray, volume: FloatArray) -> FloatArray:
