@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -49,17 +50,27 @@ class FitOptions:
 
     def again(self, command: str) -> str:
         """The command line that means this."""
-        words = ["splatsoil", command, str(self.set)]
-        for option, values in (("--parameters", self.parameters), ("--with", self.effects)):
-            words += [option, *values] if values else []
-        for option, value, usual in (
-            ("--budget", self.budget, None),
-            ("--search", self.search, "usual"),
-            ("--coarse", self.coarse, None),
-            ("--preset", self.preset, "small"),
-            ("--device", self.device, "auto"),
-            ("--seed", self.seed, 0),
-            ("--run", self.run, None),
-        ):
-            words += [option, str(value)] if value != usual else []
-        return shlex.join(words)
+        return command_line(
+            command,
+            (self.set,),
+            (
+                ("--parameters", self.parameters, ()),
+                ("--with", self.effects, ()),
+                ("--budget", self.budget, None),
+                ("--search", self.search, "usual"),
+                ("--coarse", self.coarse, None),
+                ("--preset", self.preset, "small"),
+                ("--device", self.device, "auto"),
+                ("--seed", self.seed, 0),
+                ("--run", self.run, None),
+            ),
+        )
+
+
+def command_line(command: str, positional: Iterable[object], options: Iterable[tuple[str, object, object]]) -> str:
+    """A command as a shell takes it; options are (name, value, usual value), and usual ones are left out."""
+    words = ["splatsoil", command, *(str(word) for word in positional)]
+    for name, value, usual in options:
+        if value != usual:
+            words += [name, *map(str, value)] if isinstance(value, tuple) else [name, str(value)]
+    return shlex.join(words)

@@ -9,6 +9,7 @@ from typing import Any
 
 from tyro.conf import Positional
 
+from splatsoil.commands._options import command_line
 from splatsoil.commands._output import print_json
 
 
@@ -89,7 +90,19 @@ def run(config: Config) -> int:
 
 def interrupted(config: Config) -> str:
     """What is kept, and the command that goes on."""
-    return f"what was simulated and sampled is kept; go on with the same command on {config.run}"
+    again = command_line(
+        "posterior",
+        (config.run,),
+        (
+            ("--design", config.design, None),
+            ("--repeats", config.repeats, 4),
+            ("--checks", config.checks, 3),
+            ("--executor", config.executor, "serial"),
+            ("--device", config.device, "auto"),
+            ("--seed", config.seed, 0),
+        ),
+    )
+    return f"what was simulated and sampled is kept; go on with: {again}"
 
 
 def show(result: Mapping[str, Any], folder: str) -> None:

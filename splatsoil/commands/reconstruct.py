@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 from tyro.conf import Positional
 
+from splatsoil.commands._options import command_line
 from splatsoil.commands._output import print_json
 
 if TYPE_CHECKING:
@@ -63,7 +64,18 @@ def run(config: Config) -> int:
 
 def interrupted(config: Config) -> str:
     """A reconstruction is written when it is complete."""
-    return f"nothing was written; start again with: splatsoil reconstruct {config.set}"
+    again = command_line(
+        "reconstruct",
+        (config.set,),
+        (
+            ("--out", config.out, None),
+            ("--preset", config.preset, "small"),
+            ("--seed", config.seed, 0),
+            ("--device", config.device, "auto"),
+            ("--holdout", config.holdout, 8),
+        ),
+    )
+    return f"nothing was written; start again with: {again}"
 
 
 def _show(result: Reconstruction, out: Path) -> None:

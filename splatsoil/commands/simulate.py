@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 from tyro.conf import Positional
 
+from splatsoil.commands._options import command_line
 from splatsoil.commands._output import print_json
 from splatsoil.errors import ParameterError
 
@@ -88,7 +89,25 @@ def run(config: Config) -> int:
 
 def interrupted(config: Config) -> str:
     """A set is written when it is complete."""
-    return f"nothing was written; start again with: splatsoil simulate {config.out}"
+    again = command_line(
+        "simulate",
+        (config.out,),
+        (
+            ("--friction-angle", config.friction_angle, 35.0),
+            ("--with", config.effects, ()),
+            ("--set", config.values, ()),
+            ("--scene", config.scene, "plow"),
+            ("--like", config.like, None),
+            ("--depth", config.depth, None),
+            ("--preset", config.preset, None),
+            ("--seed", config.seed, 0),
+            ("--particle-seed", config.particle_seed, None),
+            ("--device", config.device, "cpu"),
+            ("--views", config.views, None),
+            ("--picture-scale", config.picture_scale, 1.0),
+        ),
+    )
+    return f"nothing was written; start again with: {again}"
 
 
 def parse_values(words: Sequence[str]) -> dict[str, float]:

@@ -15,6 +15,7 @@ from splatsoil.files import read_json
 FIT_FORMAT = "splatsoil-fit/1"
 COMPARISON_FORMAT = "splatsoil-comparison/1"
 DIAGNOSIS_FORMAT = "splatsoil-diagnosis/1"
+POSTERIOR_FORMAT = "splatsoil-posterior/1"
 HISTORY_FORMAT = "splatsoil-history/1"
 
 
@@ -45,6 +46,7 @@ class RunData:
         comparison: ``comparison/comparison.json`` when it belongs to the latest fit.
         before: the comparison of the model before the latest effect was added, from ``before/``.
         diagnosis: the latest fit's diagnosis.
+        posterior: ``posterior.json`` when it was sampled for the latest fit.
         history: models tried by adding effects, the first one first.
         reconstruction: ``reconstruction/reconstruction.json``.
         surface: the reconstructed surface.
@@ -57,6 +59,7 @@ class RunData:
     comparison: Mapping[str, Any] | None
     before: Mapping[str, Any] | None
     diagnosis: Mapping[str, Any] | None
+    posterior: Mapping[str, Any] | None
     history: Sequence[Mapping[str, Any]]
     reconstruction: Mapping[str, Any] | None
     surface: Surface | None
@@ -71,18 +74,24 @@ def load(folder: str | Path) -> RunData:
     path = Path(folder)
     if not (path / "run.json").is_file():
         raise RunError(f"{path}: isn't a run folder (it has no run.json); name one made by `splatsoil fit`")
+    run = read_json(path / "run.json")
+    if not isinstance(run, dict) or "measurement" not in run:
+        raise RunError(
+            f"{path / 'run.json'}: doesn't say what the run is for; it is damaged, choose another run folder"
+        )
     if not (path / "fit.json").is_file():
         raise RunError(f"{path}: no fit has been finished here; `splatsoil fit` goes on where it stopped")
     fit = _checked(path / "fit.json", FIT_FORMAT)
     fits = {file.stem: _checked(file, FIT_FORMAT) for file in sorted((path / "fits").glob("*.json"))}
     return RunData(
         folder=path,
-        run=read_json(path / "run.json"),
+        run=run,
         fit=fit,
         fits=fits or {str(fit["name"]): fit},
         comparison=_comparison(path / "comparison", fit),
         before=_before(path / "before"),
         diagnosis=_diagnosis(path / "diagnoses", fits or {str(fit["name"]): fit}, fit),
+        posterior=_posterior(path / "posterior.json", fit),
         history=_history(path / "history.json"),
         reconstruction=_reconstruction(path / "reconstruction"),
         surface=_surface(path / "reconstruction" / "surface.npz"),
@@ -129,6 +138,14 @@ def _diagnosis(folder: Path, fits: Mapping[str, Any], fit: Mapping[str, Any]) ->
     mine = set(fit["setup"]["effects"]) if "setup" in fit else set()
     smaller = [d for d in found.values() if set(d["model"]) < mine]
     return max(smaller, key=lambda d: len(d["model"]), default=None)
+
+
+def _posterior(path: Path, fit: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The posterior, unless it was sampled for another fit."""
+    if not path.is_file():
+        return None
+    data = _checked(path, POSTERIOR_FORMAT)
+    return data if data["setup"] == fit.get("setup") else None
 
 
 def _history(path: Path) -> list[dict[str, Any]]:

@@ -90,6 +90,37 @@ def surrogate(fit: Mapping[str, Any], name: str) -> str:
     return _draw(draw, (SIZE[0], 2.9))
 
 
+def marginal(entry: Mapping[str, Any]) -> str:
+    """What the pictures leave possible of one parameter: its posterior density over its prior's, and both intervals.
+
+    The axis is the prior's, on which the prior is flat: a logarithmic one where the parameter is searched on one.
+    """
+    edges, density = np.array(entry["histogram"]["edges"]), np.array(entry["histogram"]["density"])
+    places = np.linspace(0.0, 1.0, len(edges))
+
+    def place(value: float) -> float:
+        return float(np.interp(value, edges, places))
+
+    def draw(figure: Figure, axes: Axes) -> None:
+        axes.stairs(density, places, fill=True, color=ACCENT, alpha=0.3)
+        axes.stairs(density, places, color=ACCENT, linewidth=1.2, label="posterior")
+        axes.axhline(1.0, color=FAINT, linestyle="--", linewidth=1.2, label="prior")
+        if entry["verdict"] != "not determined":
+            height = -0.06 * max(float(density.max()), 1.0)
+            axes.plot([place(entry["low"]), place(entry["high"])], [height] * 2, color=SECOND, label="90 %, 50 %")
+            axes.plot([place(entry["low_50"]), place(entry["high_50"])], [height] * 2, color=SECOND, linewidth=5.0)
+        axes.axhline(0.0, color=FAINT, linewidth=0.8)
+        ticks = np.linspace(0.0, 1.0, 5)
+        axes.set_xticks(ticks, [f"{np.interp(t, places, edges):.3g}" for t in ticks])
+        axes.set_xlim(0.0, 1.0)
+        axes.set_yticks([])
+        axes.spines["left"].set_visible(False)
+        axes.set_xlabel(entry["title"])
+        figure.legend(fontsize=8, loc="outside upper center", ncols=3, columnspacing=1.0)
+
+    return _draw(draw, (SIZE[0], 2.2))
+
+
 def losses(comparison: Mapping[str, Any]) -> str:
     """Loss of each compared frame, for each camera, with the level that noise alone leaves."""
     name = comparison["loss"]

@@ -62,6 +62,7 @@ def render(data: RunData) -> str:
         program=splatsoil.__version__,
         data=data,
         fit=data.fit,
+        coarse=sum(step.get("level") == "coarse" for step in data.fit["history"]),
         answers=words.answers(data.fit),
         residual=words.residual_sentence(comparison, diagnosed=diagnosis is not None),
         ratio=words.ratio_to_noise(comparison),
@@ -74,6 +75,7 @@ def render(data: RunData) -> str:
         diagnosis=diagnosis,
         verdict=None if diagnosis is None else words.verdict(diagnosis),
         maps=None if diagnosis is None else _maps(diagnosis),
+        posterior=None if data.posterior is None else _posterior(data.folder, data.posterior),
         falling=Markup(figures.falling(data.history, words.steps(data.history))) if len(data.history) > 1 else None,
         surface=None if data.surface is None else Markup(figures.surface_map(data.surface)),
         order=order,
@@ -110,6 +112,22 @@ def _join(pictures: list[dict[str, Any]], earlier: list[dict[str, Any]]) -> bool
     for camera, frame in wanted:
         frame["before"] = known[camera, frame["frame"]]
     return True
+
+
+def _posterior(folder: Path, posterior: Mapping[str, Any]) -> dict[str, Any]:
+    """Sentences, one figure for each parameter, and the corner picture where there are several."""
+    from markupsafe import Markup
+
+    corner = folder / "posterior" / "corner.png"
+    return {
+        "sentences": words.posterior_sentences(posterior),
+        "notes": words.posterior_notes(posterior),
+        "marginals": [Markup(figures.marginal(entry)) for entry in posterior["parameters"].values()],
+        "corner": data_url(corner) if len(posterior["parameters"]) > 1 and corner.is_file() else None,
+        "evaluations": posterior["evaluations"],
+        "evidence": posterior["evidence"],
+        "chains": posterior["chains"],
+    }
 
 
 def _maps(diagnosis: Mapping[str, Any]) -> list[tuple[str, Any]]:

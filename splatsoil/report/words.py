@@ -130,6 +130,34 @@ def steps(models: Sequence[Mapping[str, Any]]) -> list[str]:
     return [first, *(f"+ {str(entry.get('added', '?')).replace('_', ' ')}" for entry in models[1:])]
 
 
+def posterior_sentences(posterior: Mapping[str, Any]) -> list[str]:
+    """What the pictures leave possible, a sentence for each parameter; a number only where there is one to give."""
+    out = []
+    for name, entry in posterior["parameters"].items():
+        plain, unit = name.replace("_", " "), symbol(entry["unit"])
+        share = min(round(100.0 * float(entry["contraction"])), 100)
+        (low, _), (high, _) = (with_std(entry[key], 0.5 * entry["std"]) for key in ("low", "high"))
+        if entry["verdict"] == "not determined":
+            out.append(
+                f"The {plain} is not identified: its spread is still {share} % of what it was before these pictures, "
+                "so no value is given."
+            )
+        elif entry["verdict"] == "weakly determined":
+            out.append(
+                f"The {plain} is only weakly identified: with 90 % probability it lies between {low} and {high}{unit}, "
+                f"a spread of {share} % of what it was before the pictures."
+            )
+        else:
+            out.append(f"With 90 % probability the {plain} lies between {low} and {high}{unit}.")
+    return out
+
+
+def posterior_notes(posterior: Mapping[str, Any]) -> list[str]:
+    """The posterior's notes but those on what is determined, which the sentences say."""
+    said = tuple(f"{name} is " for name in posterior["parameters"])
+    return [str(note) for note in posterior["notes"] if not str(note).startswith(said)]
+
+
 def estimate(value: Any, std: Any, unit: str) -> str:
     """An estimate that may not exist."""
     if value is None:

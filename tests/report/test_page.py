@@ -305,3 +305,74 @@ def test_the_report_knows_nothing_of_how_a_fit_is_made() -> None:
     )
     out = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
     assert out.strip() == "[]"
+
+
+def marginal(verdict: str, contraction: float, title: str, unit: str) -> dict[str, Any]:
+    return {
+        "mean": 35.0,
+        "std": 1.0,
+        "median": 35.0,
+        "low": 33.41,
+        "high": 36.58,
+        "low_50": 34.3,
+        "high_50": 35.7,
+        "unit": unit,
+        "title": title,
+        "bounds": [20.0, 50.0],
+        "contraction": contraction,
+        "verdict": verdict,
+        "at_bound": [],
+        "histogram": {"edges": [20.0, 30.0, 40.0, 50.0], "density": [0.2, 2.5, 0.3]},
+    }
+
+
+def posterior(folder: Path, setup: dict[str, Any]) -> None:
+    write_json(
+        folder / "posterior.json",
+        {
+            "format": "splatsoil-posterior/1",
+            "parameters": {
+                "friction_angle": marginal("determined", 0.12, "friction angle [°]", "deg"),
+                "cohesion": marginal("not determined", 0.97, "cohesion [Pa]", "Pa"),
+            },
+            "notes": ["cohesion is not determined by this experiment: …", "The chains have not converged."],
+            "evaluations": 31,
+            "evidence": {"log": -14.4, "std": 0.1},
+            "chains": {"effective": 5268.0, "r_hat": 1.001},
+            "setup": setup,
+        },
+    )
+    (folder / "posterior").mkdir(exist_ok=True)
+    Image.new("RGB", (9, 9)).save(folder / "posterior" / "corner.png")
+
+
+def test_a_posterior_is_told_and_what_it_leaves_open_has_no_number(tmp_path: Path) -> None:
+    folder = make_run(tmp_path, setup={"agent": "bayesopt", "effects": []})
+    before = write_report(folder).read_text()
+    assert "What the pictures leave possible" not in before
+    posterior(folder, {"agent": "bayesopt", "effects": []})
+    text = write_report(folder).read_text()
+    page = Page(text)
+    told = " ".join(" ".join(page.words).split())
+    assert "With 90 % probability the friction angle lies between 33.4 and 36.6°." in told
+    assert "The cohesion is not identified: its spread is still 97 %" in told
+    (sentence,) = re.findall(r"<p class=\"reason\">(The cohesion[^<]*)</p>", text)
+    assert re.findall(r"\d+", sentence) == ["97"], "no value of what is not identified"
+    assert "The chains have not converged." in told and "cohesion is not determined by" not in told
+    # A picture for each parameter, and the corner with all of them.
+    section = text[text.index('id="posterior"') : text.index("Loss over the")]
+    assert section.count("<svg") == 2 and section.count("data:image/png;base64") == 1
+    assert all(address.startswith(("data:", "#")) for address in page.addresses)
+
+
+def test_a_posterior_of_another_fit_is_not_shown(tmp_path: Path) -> None:
+    folder = make_run(tmp_path, setup={"agent": "bayesopt", "effects": ["cohesion"]})
+    posterior(folder, {"agent": "bayesopt", "effects": []})
+    assert "What the pictures leave possible" not in write_report(folder).read_text()
+
+
+@pytest.mark.parametrize("text", ['{"format": "splatsoil-run/1", "meas', "[]", "{}"])
+def test_a_damaged_run_json_is_named_before_anything_else(tmp_path: Path, text: str) -> None:
+    (tmp_path / "run.json").write_text(text)
+    with pytest.raises(RunError, match=r"run\.json"):
+        write_report(tmp_path)
