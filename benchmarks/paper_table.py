@@ -1,6 +1,6 @@
 """The published table, again: friction angles of Hsiao and Kumar's scene from photographs of simulated sand.
 
-    splatsoil benchmark paper-table --device cuda:0 --out runs/paper-table
+    splatsoil benchmark paper-table --device cuda:0 --picture-scale 0.25 --out runs/paper-table
 
 For each angle, worlds are simulated with other particles and a finer grid, whose nodes meet the model's at the walls
 only, and photographed by the path tracer. Each is reconstructed from its views, and each trial spends 10 evaluations on
@@ -12,7 +12,9 @@ one:
 | `ours` | the robust loss, all frames | Sobol start, noisy expected improvement |
 | `features` | none: the posterior's mean, from the features of `ours`' evaluations | |
 
-The angle is searched in [25°, 55°]. Trials are kept in the folder as they end, and an interrupted benchmark goes on.
+The angle is searched in [25°, 55°]. All trials of a world go on side by side: one batch of simulations for each step.
+An error budget says what the landscapes' minima owe to reconstruction, grid, loss and chance. Every evaluation is kept
+in the folder as it ends, and an interrupted benchmark goes on.
 """
 
 from __future__ import annotations
@@ -21,185 +23,52 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
-from splatsoil.benchmarks._common import output_options, stamp, write_result
-from splatsoil.inverse.bayesopt import PAPER, BayesianOptimiser
-from splatsoil.inverse.emulator import FEWEST
-from splatsoil.inverse.posterior import Data, sample_posterior
+from splatsoil.benchmarks._common import ALL, output_options, stamp, write_result
+from splatsoil.benchmarks._paper import PUBLISHED, SEARCHES, WAYS, Protocol, Say, Sight, search, world
+from splatsoil.benchmarks._paper_budget import budget_table, error_budget
+from splatsoil.inverse.executors import executor
 
-from splatsoil.comparison import Comparator
-from splatsoil.errors import ParameterError, SimulationError
-from splatsoil.files import read_json, write_json
-from splatsoil.measurement import Measurement
-from splatsoil.model import Model
-from splatsoil.mpm import PRESETS, Preset, Resolution
-from splatsoil.parameters import ParameterSpace
-from splatsoil.reconstruction import Reconstruction, reconstruct
-from splatsoil.soil.settings import FRICTION_ANGLE
-from splatsoil.synthetic import make_set, paper
+from splatsoil.errors import ParameterError
+from splatsoil.files import code_digest, read_json, write_json
 
-FloatArray = npt.NDArray[np.float64]
-Say = Callable[[str], None]
-
-#: Mean absolute error and its standard deviation over ten trials, degrees (Hsiao and Kumar).
-PUBLISHED = {25.0: (0.64, 1.01), 30.0: (1.07, 0.71), 35.0: (1.24, 0.96), 45.0: (1.38, 1.36)}
 #: What this project set out to reach at all four, degrees.
 TARGET = (0.3, 0.3)
-FRAMES = (50, 100, 150, 199)
-SPACE = ParameterSpace([replace(FRICTION_ANGLE, lower=25.0, upper=55.0)])
-WAYS = ("published", "ours", "features")
 
 
-@dataclass(frozen=True)
-class Protocol:
-    """How the table is made.
-
-    Attributes:
-        angles: true friction angles, degrees.
-        trials: for each angle.
-        worlds: observations for each angle, which trials take in turn.
-        evaluations: in a trial.
-        cells: of the model, across the tool; 3.2 are the paper's.
-        truth_cells: of the worlds. With 4.3 a bed of 1 m has 43 cells, which share no factor with the paper's 32.
-        views: photographs before anything moves.
-        scale: size of the pictures over 1280 x 720.
-        device: of everything.
-        reconstruction: preset of the reconstruction.
-    """
-
-    angles: tuple[float, ...] = tuple(PUBLISHED)
-    trials: int = 10
-    worlds: int = 10
-    evaluations: int = 10
-    cells: float = 3.2
-    truth_cells: float = 4.3
-    views: int = 40
-    scale: float = 1.0
-    device: str = "cpu"
-    reconstruction: str = "small"
-
-    def preset(self, name: str, cells: float) -> Preset:
-        """The paper's preset with another number of cells across the tool."""
-        return replace(PRESETS["paper"], name=name, cells_across_tool=cells)
-
-
-class Sight:
-    """One world as a model sees it: reconstruction, simulator, and both losses."""
-
-    def __init__(self, measurement: Measurement, reconstruction: Reconstruction, protocol: Protocol) -> None:
-        self.model = Model(measurement, reconstruction, preset="paper", device=protocol.device)
-        self.model.resolution = Resolution.derive(measurement, protocol.preset("model", protocol.cells))
-        self.comparator = Comparator(measurement, surface=reconstruction.surface, frames=self.model.frames)
-
-    def evaluate(self, angle: float, seed: int) -> dict[str, Any] | None:
-        """Losses and block residuals at an angle; None where the simulation failed."""
-        try:
-            images = self.model.predict({"friction_angle": angle}, seed).images
-        except SimulationError:
-            return None
-        found = self.comparator.compare(images)
-        observed = self.comparator.observed
-        squares = [float(np.mean((observed[c, f] - images[c, f]) ** 2)) for c, f in self.comparator.keys if f in FRAMES]
-        return {"published": float(np.mean(squares)), "ours": found.loss, "blocks": found.blocks}
-
-
-def world(protocol: Protocol, angle: float, number: int, out: Path, say: Say) -> tuple[Measurement, Reconstruction]:
-    """An observation and its reconstruction, from the folder or made and kept there."""
-    folder = out / "worlds" / f"{angle:g}-{number}"
-    if not (folder / "truth.json").is_file():
-        say(f"{angle:g}°, world {number}: simulating and photographing")
-        setup = paper(views=protocol.views)
-        make_set(
-            folder,
-            setup if protocol.scale == 1.0 else setup.resized(protocol.scale),
-            friction_angle=angle,
-            preset=protocol.preset("truth", protocol.truth_cells),
-            seed=number,
-            particle_seed=1_000_003 * (number + 1) + round(10 * angle),
-            device=protocol.device,
-        )
-    measurement = Measurement.load(folder)
-    kept = out / "reconstructions" / folder.name
-    if not (kept / "reconstruction.json").is_file():
-        say(f"{angle:g}°, world {number}: reconstructing")
-        reconstruct(measurement, preset=protocol.reconstruction, device=protocol.device).save(kept)
-    return measurement, Reconstruction.load(kept)
-
-
-def search(sight: Sight, way: str, evaluations: int, seed: int) -> dict[str, Any]:
-    """One trial: a search over one of the losses, and what it came to."""
-    optimiser = BayesianOptimiser(1, seed=seed, search=PAPER if way == "published" else None)
-    began = time.perf_counter()
-    calls: list[dict[str, Any]] = []
-    blocks: list[FloatArray] = []
-    for k in range(evaluations):
-        action = optimiser.ask()
-        angle = float(SPACE.from_unit(action.astype(np.float64))[0])
-        particles = int(np.random.SeedSequence([seed, k, WAYS.index(way)]).generate_state(1)[0] % 2**31)
-        found = sight.evaluate(angle, particles)
-        optimiser.tell(action, None if found is None else found[way])
-        calls.append({"angle": angle, **({} if found is None else {w: found[w] for w in ("published", "ours")})})
-        if found is not None:
-            blocks.append(found["blocks"])
-    result = optimiser.result()
-    trial: dict[str, Any] = {
-        way: {
-            "estimate": float(SPACE.from_unit(result.estimate)[0]),
-            "std": float(result.std[0]) * 15.0,
-            "low": float(SPACE.from_unit(result.low)[0]),
-            "high": float(SPACE.from_unit(result.high)[0]),
-            "best": min((c for c in calls if way in c), key=lambda c: c[way])["angle"],
-        },
-        "calls": calls,
-    }
-    if way == "ours" and len(blocks) >= 1 + FEWEST and np.all(np.array(blocks) != 0.0, axis=0).any():
-        trial["features"] = _by_features(sight, calls, np.array(blocks), seed)
-    trial["seconds"] = time.perf_counter() - began
-    return trial
-
-
-def _by_features(sight: Sight, calls: list[dict[str, Any]], blocks: FloatArray, seed: int) -> dict[str, Any]:
-    """The posterior that the calls' features allow."""
-    seen = np.all(blocks != 0.0, axis=0)
-    places = tuple(p for p, s in zip(sight.comparator.labels, seen, strict=True) if s)
-    points = SPACE.to_unit(np.array([[c["angle"]] for c in calls if "ours" in c]))
-    data = Data(SPACE, points, blocks[:, seen], places, sight.comparator.block_noise())
-    values = sample_posterior(data, seed=seed, evidence=False).values[:, 0]
-    low, high = np.quantile(values, [0.05, 0.95])
-    return {"estimate": float(values.mean()), "std": float(values.std()), "low": float(low), "high": float(high)}
-
-
-def run(protocol: Protocol, out: Path, say: Say) -> dict[str, Any]:
-    """All trials, those in the folder already not again; errors of each way at each angle."""
+def run(protocol: Protocol, out: Path, pool: Executor, say: Say) -> dict[str, Any]:
+    """All trials and budgets, those in the folder already not again; errors of each way at each angle."""
     write_json(out / "protocol.json", _kept_protocol(protocol, out))
     for angle in protocol.angles:
-        sights: dict[int, Sight] = {}
-        for trial in range(protocol.trials):
-            for way in ("published", "ours"):
-                file = out / "trials" / f"{angle:g}-{trial}-{way}.json"
-                if file.is_file():
-                    continue
-                number = trial % protocol.worlds
-                if number not in sights:
-                    sights = {number: Sight(*world(protocol, angle, number, out, say), protocol)}
-                found = search(sights[number], way, protocol.evaluations, trial)
-                write_json(file, found)
-                say(f"{angle:g}°, trial {trial}, {way}: {found[way]['estimate']:.2f}° in {found['seconds']:.0f} s")
+        for number in range(protocol.worlds):
+            mine = [t for t in range(protocol.trials) if t % protocol.worlds == number]
+            missing = [
+                t for t in mine if any(not (out / "trials" / f"{angle:g}-{t}-{w}.json").is_file() for w in SEARCHES)
+            ]
+            file = out / "budget" / f"{angle:g}.json"
+            wanted = number == 0 and protocol.scan[0] > 0 and not file.is_file()
+            if not missing and not wanted:
+                continue
+            sight = Sight(*world(protocol, angle, number, out, say), protocol)
+            search(sight, angle, missing, out, f"{angle:g}-{number}", pool, say)
+            if wanted:
+                write_json(file, error_budget(sight, angle, pool, say))
     return collect(protocol, out)
 
 
 def _kept_protocol(protocol: Protocol, out: Path) -> dict[str, Any]:
     """The protocol as kept in the folder; trials and angles may grow, nothing else may change."""
-    described = {k: v for k, v in vars(protocol).items() if k not in ("angles", "trials", "device")}
+    free = ("angles", "trials", "device", "scan")
+    described = {k: v for k, v in vars(protocol).items() if k not in free}
+    described["code"] = code_digest((*ALL, "parameters.py", "model.py", "comparison.py"))
     file = out / "protocol.json"
     if file.is_file() and read_json(file) != json.loads(json.dumps(described)):
-        raise ParameterError(f"{out}: holds trials of another protocol; choose another --out")
+        raise ParameterError(f"{out}: holds trials of another protocol or other sources; choose another --out")
     return described
 
 
@@ -212,7 +81,7 @@ def collect(protocol: Protocol, out: Path) -> dict[str, Any]:
             for way in ("published", "ours"):
                 kept = read_json(out / "trials" / f"{angle:g}-{trial}-{way}.json")
                 for name in WAYS:
-                    if name in kept:
+                    if kept.get(name) is not None:
                         found[name].append(kept[name])
         for way, trials in found.items():
             if not trials:
@@ -231,7 +100,14 @@ def collect(protocol: Protocol, out: Path) -> dict[str, Any]:
                     "coverage_90": float(np.mean([t["low"] <= angle <= t["high"] for t in trials])),
                 }
             )
-    return {"benchmark": "paper-table", "protocol": vars(protocol), "published": PUBLISHED, "entries": entries}
+    budgets = [read_json(f) for a in protocol.angles if (f := out / "budget" / f"{a:g}.json").is_file()]
+    return {
+        "benchmark": "paper-table",
+        "protocol": vars(protocol),
+        "published": PUBLISHED,
+        "entries": entries,
+        "budget": budgets,
+    }
 
 
 def table(result: Mapping[str, Any]) -> str:
@@ -259,6 +135,8 @@ def table(result: Mapping[str, Any]) -> str:
             f"| {e['angle']:g}° | {e['way']} | {e['bias']:+.2f}° | {e['scatter']:.2f}° | {e['width_90']:.2f}° | "
             f"{100.0 * e['coverage_90']:.0f} % |"
         )
+    if result["budget"]:
+        lines += ["", *budget_table(result["budget"])]
     return "\n".join(lines)
 
 
@@ -275,6 +153,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--views", type=int, default=usual.views)
     parser.add_argument("--picture-scale", type=float, default=usual.scale)
     parser.add_argument("--reconstruction", default=usual.reconstruction, help="preset of the reconstruction")
+    parser.add_argument("--budget-seeds", type=int, default=usual.scan[0], help="of the error budget; 0 leaves it out")
+    parser.add_argument("--budget-points", type=int, default=usual.scan[1], help="angles of its landscapes")
+    parser.add_argument(
+        "--executor", default="serial", help="where searches think: serial, processes:N or dask:ADDRESS"
+    )
     parser.add_argument("--device", default=usual.device)
     output_options(parser)
     options = parser.parse_args(arguments)
@@ -289,6 +172,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         scale=options.picture_scale,
         device=options.device,
         reconstruction=options.reconstruction,
+        scan=(options.budget_seeds, options.budget_points),
     )
     out = options.out or Path("runs") / "paper-table"
     began = time.perf_counter()
@@ -296,7 +180,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     def say(what: str) -> None:
         print(f"{time.perf_counter() - began:7.0f} s  {what}", file=sys.stderr, flush=True)
 
-    result = {**run(protocol, out, say), **stamp(options.device), "seconds": time.perf_counter() - began}
+    with executor(options.executor) as pool:
+        result = {**run(protocol, out, pool, say), **stamp(options.device), "seconds": time.perf_counter() - began}
     write_result(out, result, table(result), {})
     print(json.dumps(result, indent=1) if options.json else table(result))
     return 0

@@ -19,6 +19,7 @@ millimetre decides what is seen. Where the tool stood at frame 0, pictures are c
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -192,6 +193,18 @@ class Comparator:
             means.append(self._block_means(camera, change, masks))
         blocks = 255.0 * np.concatenate([m.reshape(-1) for m in means])
         return Comparison(float(np.mean(list(losses.values()))), losses, squares, blocks, self.labels)
+
+    def against(self, images: Mapping[Key, Image]) -> Comparator:
+        """The same comparison with these pictures, the reference frame among them, in place of the photographs: a
+        control in which the world is known. Nothing is known of their noise."""
+        other = copy(self)
+        other.observed = {key: images[key] for key in self.observed}
+        other._still = {camera: [] for camera in self.cameras}
+        other._before = {camera: images[camera, self.reference] for camera in self.cameras}
+        other._tool_colour = {camera: other._tool_rule(camera) for camera in self.cameras}
+        other._unit = other._motionless()
+        other.noise = None
+        return other
 
     def open_shares(self) -> FloatArray:
         """(b,) share of each block's pixels that the tool's silhouette leaves open, in the order of ``labels``."""

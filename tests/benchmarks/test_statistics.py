@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from splatsoil.benchmarks import bo_vs_mcmc, calibration, paper_table
+from splatsoil.benchmarks import bo_vs_mcmc, calibration
 from splatsoil.inverse.emulator import Emulator
 from splatsoil.inverse.posterior import Data
 from splatsoil.inverse.surrogate import sobol
 
-from splatsoil.errors import ParameterError
 from splatsoil.parameters import Parameter, ParameterSpace
 
 SPACE = ParameterSpace([Parameter("friction_angle", "deg", 20.0, 50.0, 35.0)])
@@ -81,27 +80,3 @@ def test_ways_meet_the_same_world_and_more_calls_do_not_hurt() -> None:
     assert by["mcmc", 16]["mae"][0] < 5.0 and by["direct", 400]["mae"][0] < 5.0
     assert "| mcmc | 16 |" in bo_vs_mcmc.table({**found, "landscape": "A test"})
     assert bo_vs_mcmc.figure({**found, "landscape": ""}).axes
-
-
-def test_the_papers_table_counts_errors(tmp_path) -> None:  # type: ignore[no-untyped-def]
-    from splatsoil.files import write_json
-
-    protocol = paper_table.Protocol(angles=(35.0,), trials=2)
-    for trial, error in enumerate((1.0, -2.0)):
-        for way in ("published", "ours"):
-            told = {"estimate": 35.0 + error, "low": 34.5, "high": 36.5}
-            write_json(tmp_path / "trials" / f"35-{trial}-{way}.json", {way: told})
-    (first, _) = paper_table.collect(protocol, tmp_path)["entries"]
-    assert (first["mae"], first["bias"]) == (1.5, -0.5)
-    assert first["std"] == pytest.approx(0.5**0.5) and first["scatter"] == pytest.approx(4.5**0.5)
-    text = paper_table.table(paper_table.collect(protocol, tmp_path))
-    assert "| 35° | 1.24 ± 0.96° | 1.50 ± 0.71° |" in text
-
-
-def test_a_folder_keeps_one_protocol(tmp_path) -> None:  # type: ignore[no-untyped-def]
-    from splatsoil.files import write_json
-
-    write_json(tmp_path / "protocol.json", paper_table._kept_protocol(paper_table.Protocol(), tmp_path))
-    assert paper_table._kept_protocol(paper_table.Protocol(trials=3), tmp_path)
-    with pytest.raises(ParameterError, match="another protocol"):
-        paper_table._kept_protocol(paper_table.Protocol(views=8), tmp_path)
