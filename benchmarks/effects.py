@@ -1,4 +1,4 @@
-"""The library of effects: its table, what each effect does to a ploughed bed, and what it costs.
+"""The library of effects: its table, what each does to a ploughed bed, or to the video of one.
 
 Every effect has five times its smallest meaningful size; the others of its parameters have their defaults. The bed is
 that of a measurement set which carries its true particles.
@@ -7,9 +7,8 @@ that of a measurement set which carries its true particles.
 from __future__ import annotations
 
 import argparse
-import json
-import time
-from collections.abc import Mapping, Sequence
+import io
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,13 +17,13 @@ import warp as wp
 from splatsoil.benchmarks.numerics import Truth
 
 from splatsoil.files import write_bytes
+from splatsoil.measurement import Measurement
+from splatsoil.model import Model
 from splatsoil.mpm import Resolution, simulate
-from splatsoil.mpm.simulate import base_settings, step_poses
-from splatsoil.mpm.solver import BULK_VISCOSITY, Solver
-from splatsoil.mpm.substep import make_stress_kernel
 from splatsoil.parameters import Parameter
+from splatsoil.reconstruction import reconstruct
 from splatsoil.soil.effect import Effect
-from splatsoil.soil.law import Law, Stress
+from splatsoil.soil.law import Law
 from splatsoil.soil.library import library
 
 if TYPE_CHECKING:
@@ -59,7 +58,7 @@ def acting(effect: Effect) -> dict[str, float]:
 
 def simulated() -> dict[str, Effect]:
     """Those that need a simulation."""
-    return {n: e for n, e in library().items() if type(e).observe is Effect.observe}
+    return {n: e for n, e in library().items() if not e.observes}
 
 
 def pictures(truth: Truth, preset: str, angle: float, device: str, seeds: int = 3) -> dict[str, Any]:
@@ -112,74 +111,42 @@ def figure(result: Mapping[str, Any], truth: Truth) -> Figure:
     return drawn
 
 
-@wp.func
-def _unchanged(
-    stress: Stress,
-    gradient: wp.mat33,
-    bulk: float,
-    shear: float,
-    dt: float,
-    values: wp.array2d(dtype=float),  # type: ignore[valid-type]
-    row: int,
-) -> Stress:
-    return stress
+def reported(measurement: Measurement, angle: float, device: str) -> dict[str, Any]:
+    """Pictures (h, w, 3) in grey levels of the first camera half-way: as it is, and what each observation changes."""
+    frame = int(np.sort(measurement.frames)[len(measurement.frames) // 2])
+    camera = next(iter(measurement.cameras))
+    scene = reconstruct(measurement, preset="tiny", device=device)
+    names = [name for name, effect in library().items() if effect.observes]
+    model = Model(measurement, scene, effects=names, preset="tiny", device=device, frames=[frame])
+    trajectory = model.simulate({"friction_angle": angle})
+
+    def seen(values: Mapping[str, float]) -> Any:
+        return 255.0 * np.asarray(model.draw(trajectory, 0, values)[camera, frame], dtype=np.float64)
+
+    base = seen({})
+    effects = {name: library()[name].for_measurement(measurement) for name in names}
+    return {"base": base, "changes": {name: seen(acting(effect)) - base for name, effect in effects.items()}}
 
 
-def costs(truth: Truth, preset: str, frames: int = 3) -> dict[str, float]:
-    """On the CPU: share of the law in a step, and the step's time over the base law's with effects on."""
-    measurement = truth.measurement
-    resolution = Resolution.derive(measurement, preset)
-    x = truth.start(resolution.spacing, 0)
+def film(result: Mapping[str, Any]) -> Figure:
+    """The picture as it is, and beside it what each observation effect changes in brightness."""
+    from matplotlib.figure import Figure
 
-    def solver(effects: Sequence[Effect]) -> Solver:
-        values: dict[str, float] = {}
-        for effect in effects:
-            values |= acting(effect)
-        bed = measurement.bed
-        law, base = Law(effects), base_settings(measurement)
-        return Solver(x[None], bed.lower, bed.upper, measurement.tool.mesh, resolution, law, base, [values])
-
-    def advance(run: Solver) -> float:
-        start = run.frame * resolution.frame_time
-        poses = step_poses(measurement.tool.motion, start, resolution.frame_time, resolution.steps)
-        began = time.perf_counter()
-        run.advance(poses)
-        return time.perf_counter() - began
-
-    every = [e for n, e in simulated().items() if e.strength is not None and n != "compaction"]
-    runs = {"base": solver([])} | {e.name: solver([e]) for e in every} | {"all": solver(every)}
-    spent: dict[str, list[float]] = {name: [] for name in runs}
-    for k in range(frames + 1):
-        for name, run in runs.items():
-            seconds = advance(run)
-            if k > 0:
-                spent[name].append(seconds)
-    least = {name: min(seconds) for name, seconds in spent.items()}
-
-    run = runs["base"]
-    substeps = resolution.steps * resolution.substeps(resolution.steps)
-    with_law = _stress_seconds(run, run._stress_kernel)
-    without = _stress_seconds(run, make_stress_kernel(_unchanged, False))
-    result = {f"{name} / base": seconds / least["base"] for name, seconds in least.items() if name != "base"}
-    return {
-        "particles": float(len(x)),
-        "base, ms a substep": 1e3 * least["base"] / substeps,
-        "law's share of a step": (with_law - without) * substeps / least["base"],
-    } | result
-
-
-def _stress_seconds(run: Solver, kernel: Any) -> float:
-    r, c = run.resolution, run._cells
-    inputs = [c, run._nodes, run.grid, r.bulk, r.shear, BULK_VISCOSITY, 1.0e-9, run._table]
-    count = int(c.count.numpy()[0])
-    command = wp.launch(kernel, dim=count, inputs=inputs, device=run.device, record_cmd=True)
-    best = np.inf
-    for _ in range(7):
-        began = time.perf_counter()
-        for _ in range(20):
-            command.launch()
-        best = min(best, (time.perf_counter() - began) / 20)
-    return float(best)
+    changes = result["changes"]
+    rows = -(-(1 + len(changes)) // 4)
+    drawn = Figure(figsize=(12.0, 2.2 * rows), layout="constrained")
+    axes = drawn.subplots(rows, 4, squeeze=False).reshape(-1)
+    for ax in axes:
+        ax.set_axis_off()
+    axes[0].imshow(np.clip(result["base"] / 255.0, 0.0, 1.0))
+    axes[0].set_title("as it is", fontsize=9)
+    for ax, (name, change) in zip(axes[1:], changes.items(), strict=False):
+        image = ax.imshow(change.mean(axis=2), cmap="RdBu_r", vmin=-25.0, vmax=25.0)
+        p = library()[name].parameters[0]
+        (value,) = acting(library()[name]).values()
+        ax.set_title(f"{name}: {p.name} {value:g}" + ("" if p.unit == "1" else f" {p.unit}"), fontsize=9)
+        drawn.colorbar(image, ax=ax, shrink=0.7, label="change, grey levels")
+    return drawn
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -187,8 +154,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("set", type=Path, nargs="?", help="measurement set with its true particles")
     parser.add_argument("--table", action="store_true", help="print the table of all effects")
-    parser.add_argument("--costs", action="store_true", help="measure what effects cost on the CPU")
     parser.add_argument("--pictures", type=Path, metavar="FILE", help="draw what every effect does to the bed")
+    parser.add_argument("--video", type=Path, metavar="FILE", help="draw what observation effects do to a frame")
     parser.add_argument("--preset", default="tiny")
     parser.add_argument("--angle", type=float, default=35.0, help="friction angle of the pictures, degrees")
     parser.add_argument("--seeds", type=int, default=3, help="particle seeds that the pictures average over")
@@ -197,20 +164,22 @@ def main(arguments: list[str] | None = None) -> int:
     wp.config.log_level = wp.LOG_ERROR
     if options.table:
         print(table())
-    if (options.costs or options.pictures) and options.set is None:
-        parser.error("--costs and --pictures need a measurement set")
-    if options.costs:
-        print(json.dumps(costs(Truth.load(options.set), options.preset), indent=1))
+    if (options.video or options.pictures) and options.set is None:
+        parser.error("--video and --pictures need a measurement set")
+    if options.video:
+        _save(film(reported(Measurement.load(options.set), options.angle, options.device)), options.video)
     if options.pictures:
-        import io
-
         truth = Truth.load(options.set)
         result = pictures(truth, options.preset, options.angle, options.device, options.seeds)
         print(f"chance: {1e3 * result['chance']:.1f} mm")
-        stream = io.BytesIO()
-        figure(result, truth).savefig(stream, format=options.pictures.suffix[1:] or "png", dpi=110)
-        write_bytes(options.pictures, stream.getvalue())
+        _save(figure(result, truth), options.pictures)
     return 0
+
+
+def _save(drawn: Figure, file: Path) -> None:
+    stream = io.BytesIO()
+    drawn.savefig(stream, format=file.suffix[1:] or "png", dpi=110)
+    write_bytes(file, stream.getvalue())
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -20,6 +21,8 @@ THIN = 0.02 * RADIUS
 """Thickness in m under which a deposit has ended: a few grains in the laboratory."""
 ANGLE = 31.0
 """Friction angle of dry sand near its angle of repose, degrees."""
+GAIN, GRAIN = 0.69, 1.0e-3
+"""Of friction that grows with the rate of shear: glass beads (Jop et al. 2006), and a grain's diameter in m."""
 ASPECTS = (0.5, 1.0, 2.0, 4.0)
 SCATTER = 0.2
 """Allowed around Lube's fit, our estimate: Warnett et al. (2014) find that run-out hangs on the column's size too."""
@@ -101,6 +104,11 @@ def validate(device: str) -> Section:
         found, x = collapse(scene, aspect, False, device)
         profiles[f"a = {aspect:g}"] = (x, scene.resolution.cell)
         rows.append(_axisymmetric(f"axisymmetric, a = {aspect:g}, {len(x)} particles", found, aspect, True))
+    for aspect in ASPECTS:
+        scene = column(aspect, ANGLE, planar=False, matching=Matching.PLANE_STRAIN)
+        scene = replace(scene, effects=("rate_dependence",), values={"rate_gain": GAIN, "rate_grain_size": GRAIN})
+        found, _ = collapse(scene, aspect, False, device)
+        rows.append(_axisymmetric(f"with `rate_dependence`, a = {aspect:g}", found, aspect, True))
     for name, angle, matching, inside in (
         ("the same sand matched in compression, a = 1", ANGLE, Matching.COMPRESSION, True),
         ("control: friction far too large (√J₂/p = 1.30), a = 1", 55.0, Matching.COMPRESSION, False),
@@ -129,10 +137,13 @@ def validate(device: str) -> Section:
         "sand shears here, unless a row says otherwise.",
         tuple(rows),
         "The matching matters more than anything else in this part: a cone that agrees with Mohr–Coulomb in triaxial "
-        "compression is too strong when sand spreads, and holds it back. What the step and the cell do is in the "
-        "part on "
-        "grid, step and seed. The tallest column goes too far; the base law has no friction that grows with the rate "
-        "of shear, which fast sand has, and whether that is the reason was not tried.",
+        "compression is too strong when sand spreads, and holds it back. It is the default of the fits all the same, "
+        "because a friction angle from a laboratory is one in triaxial compression. The tallest column of the base law "
+        "goes too far, on finer grids too (three times the particles: the same run-out), because the base law's "
+        "friction does not grow with the rate of shear: with "
+        f"`rate_dependence` (μ₂/μₛ = {1.0 + GAIN:.2f}, I₀ = 0.279 as for glass beads, grains of {1000 * GRAIN:g} mm; "
+        "taken from the literature, not fitted) it comes into the band. What the step and the cell do is in the part "
+        "on grid, step and seed.",
         _figure(profiles),
     )
 

@@ -133,10 +133,16 @@ def element_seconds() -> float:
     return float(best)
 
 
+def _cache() -> Path:
+    """Folder of this process' compiled kernels."""
+    wp.config.log_level = wp.LOG_ERROR
+    wp.init()
+    return Path(str(wp.config.kernel_cache_dir))
+
+
 def compiling() -> dict[str, float]:
     """Run in a process of its own with an empty cache of kernels: seconds of first runs, and modules they compiled."""
-    wp.config.log_level = wp.LOG_ERROR
-    folder = Path(wp.config.kernel_cache_dir)
+    folder = _cache()
 
     def modules() -> int:
         return sum(1 for _ in folder.glob("*/*.meta"))
@@ -164,8 +170,7 @@ def compiling() -> dict[str, float]:
 
 def without_effects() -> dict[str, float]:
     """In a process that cannot import any effect: modules that the base law compiles beside those in the cache."""
-    wp.config.log_level = wp.LOG_ERROR
-    folder = Path(wp.config.kernel_cache_dir)
+    folder = _cache()
     before = set(folder.glob("*/*.meta"))
     scene = ploughed(0.06)
     advance(scene.solver("cpu"), 0)

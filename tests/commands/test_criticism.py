@@ -58,7 +58,7 @@ def place(plow_damp: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_a_run_is_compared_diagnosed_and_added_to(place: Path) -> None:
+def test_a_run_is_compared_diagnosed_and_added_to(place: Path, repository: Path) -> None:
     compared = command("compare", "run", "--repeats", "2", cwd=place)
     assert {"adequate", "misfit", "blocks", "floor"} <= compared["misfit"].keys()
     assert {"stage", "region", "channel", "ratio", "p"} <= compared["misfit"]["blocks"][0].keys()
@@ -69,6 +69,7 @@ def test_a_run_is_compared_diagnosed_and_added_to(place: Path) -> None:
         "--effects",
         "cohesion",
         "exposure",
+        str(repository / "examples" / "effects" / "suction.py"),
         "--repeats",
         "2",
         "--refit-steps",
@@ -76,7 +77,7 @@ def test_a_run_is_compared_diagnosed_and_added_to(place: Path) -> None:
         "--no-replay",
     )
     first = command(*words, cwd=place)
-    assert {e["name"] for e in first["effects"]} == {"cohesion", "exposure"}
+    assert {e["name"] for e in first["effects"]} == {"cohesion", "exposure", "suction"}
     assert first["verdict"] in ("adequate", "missing", "outside the library")
     kept = json.loads((place / "run" / "diagnosis.json").read_text())
     assert kept["effects"] == first["effects"]

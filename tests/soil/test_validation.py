@@ -7,12 +7,15 @@ from pathlib import Path
 
 import pytest
 from splatsoil.benchmarks._validation.element import ALLOWED, strength
-from splatsoil.benchmarks._validation.sand import CRITICAL, TESTS, fit
+from splatsoil.benchmarks._validation.sand import CRITICAL, TESTS, fit, mobilised
 
 from splatsoil.experiment.triaxial import TriaxialExperiment, read_triaxial
 from splatsoil.soil.matching import Matching
 
 FILE = Path(os.environ.get("SPLATSOIL_MEASURED", "")) / "karlsruhe_triaxial" / "tmd2_loose_tmd22_dense_subset.csv"
+
+PEAK = 42.14
+"""Peak friction angle of TMD22, from the data set's own table of all 25 tests, degrees."""
 
 
 @pytest.mark.parametrize("matching", list(Matching))
@@ -36,5 +39,10 @@ def test_the_base_law_is_rejected_by_dense_sand_in_its_volume_and_effects_mend_i
     ]
     assert fits[0].volume > 50.0 and fits[0].volume > fits[0].strength
     assert fits[1].volume < 1.0
+    # the effect's friction angle is the residual one: from the peak on it must be the critical angle
+    after = fit(TriaxialExperiment(curves[name], ("dilatancy", "softening"), void_ratio=void_ratio), since=0.06)
+    assert after.values["friction_angle"] == pytest.approx(CRITICAL, abs=2.0)
+    assert after.strength < 1.0 and after.volume < 1.0
+    assert mobilised(curves[name]).max() == pytest.approx(PEAK, abs=0.1)
     errors = [f.volume + f.strength for f in fits]
     assert errors[0] > 5.0 * errors[1] and errors[1] > 1.1 * errors[2]
