@@ -6,6 +6,10 @@ Over many truths, 50 % and 90 % intervals should hold the truth in 50 % and 90 %
 draws should be uniform (Talts et al. 2018, arXiv:1804.06788).
 
     splatsoil benchmark calibration --out runs/calibration
+    splatsoil benchmark calibration --full --truths 24 --device cuda:0 --executor processes:8 --out runs/full
+
+With ``--full`` nothing is shared between truths: each goes the whole way of ``splatsoil fit`` and ``splatsoil
+posterior``, with simulations for it alone. What is done is kept in the folder, and an interrupted one goes on.
 
 The world is the made-up one of PlowSand-v0 unless a set is named; every truth is a real simulation of it, and the model
 is right but for chance. What a wrong model does to a posterior is not tested here.
@@ -23,13 +27,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 from scipy.stats import binom, chisquare
+from splatsoil.benchmarks._calibration_full import one_truth
 from splatsoil.benchmarks._common import output_options, simulated, stamp, ticker, world_options, write_result
+from splatsoil.envs.synthetic import SENSOR_NOISE, SyntheticProblem
 from splatsoil.inverse.emulator import Emulator
-from splatsoil.inverse.executors import executor
+from splatsoil.inverse.executors import Executor, executor
 from splatsoil.inverse.likelihood import Likelihood
 from splatsoil.inverse.mcmc import sample
 from splatsoil.inverse.misfit import measure
 from splatsoil.inverse.posterior import Data
+
+from splatsoil.errors import ParameterError
+from splatsoil.parameters import ParameterSpace
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -108,11 +117,11 @@ def calibrate(
     return out
 
 
-def summarise(entries: Sequence[dict[str, Any]], data: Data) -> dict[str, Any]:
+def summarise(entries: Sequence[dict[str, Any]], space: ParameterSpace) -> dict[str, Any]:
     """Coverage with its 95 % binomial range when all is right, and ranks with χ²'s p-value, for each parameter."""
     count = len(entries)
     parameters = {}
-    for i, p in enumerate(data.space):
+    for i, p in enumerate(space):
         ranks = np.array([e["rank"][i] for e in entries])
         bins = np.histogram(ranks, bins=BINS, range=(-0.5, DRAWS + 0.5))[0]
         z = np.array([(e["mean"][i] - e["truth"][i]) / e["std"][i] for e in entries])
@@ -140,7 +149,7 @@ def table(result: dict[str, Any]) -> str:
     """The result as Markdown."""
     lines = [
         f"{result['world']}, preset `{result['preset']}`, {result['device']}: {result['truths']} truths, each a "
-        f"simulation of its own, emulators trained on {result['training']} others; {result['seconds']:.0f} s.",
+        f"simulation of its own, {_trained(result)}; {result['seconds']:.0f} s.",
         "",
         "| parameter | 50 % intervals hold | 90 % intervals hold | ranks uniform, p | rms z | width / prior |",
         "|---|---|---|---|---|---|",
@@ -163,6 +172,13 @@ def table(result: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def _trained(result: dict[str, Any]) -> str:
+    if result["full"]:
+        count = np.mean([entry["simulations"] for entry in result["entries"]])
+        return f"each with a fit and a posterior of its own ({count:.0f} simulations)"
+    return f"emulators trained on {result['training']} others"
+
+
 def figure(result: dict[str, Any]) -> Figure:
     """Rank histograms with the band that uniform ranks stay in."""
     from matplotlib.figure import Figure
@@ -180,6 +196,34 @@ def figure(result: dict[str, Any]) -> Figure:
     return drawn
 
 
+def through_the_simulator(
+    options: argparse.Namespace, pool: Executor
+) -> tuple[list[dict[str, Any]], ParameterSpace, dict[str, Any]]:
+    """Entries of truths drawn from the prior, each through a fit and a posterior of its own.
+
+    Raises:
+        ParameterError: a measured set, whose truth is one, or no folder to keep the runs in.
+    """
+    if options.set is not None:
+        raise ParameterError("--full: the truth of a measured set is one; only the made-up world has many")
+    if options.out is None:
+        raise ParameterError("--full: name a folder for the runs with --out")
+    space = SyntheticProblem(options.parameters, options.effects, preset=options.preset, device=options.device).space
+    truths = np.random.default_rng([options.seed, 22]).uniform(-1.0, 1.0, (options.truths, len(space)))
+    chosen = (tuple(options.parameters), tuple(options.effects), options.preset, options.device)
+    first = 10_000 * options.seed
+    waiting = [
+        pool.submit(one_truth, *chosen, t.tolist(), first + k, options.out / "truths" / str(first + k), DRAWS, LEVELS)
+        for k, t in enumerate(truths)
+    ]
+    report = ticker("truths")
+    entries = []
+    for k, future in enumerate(waiting):
+        entries.append(future.result())
+        report(k + 1, len(waiting))
+    return entries, space, {"training": None, "sensor": SENSOR_NOISE}
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Command line; exit code 0."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -187,26 +231,40 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--truths", type=int, default=128)
     parser.add_argument("--training", type=int, help="simulations for each emulator; all others by default")
     parser.add_argument("--sensor", type=float, default=1.0, help="noise added to a truth's features, grey levels")
+    parser.add_argument("--full", action="store_true", help="a fit and a posterior of its own for each truth")
     parser.add_argument("--seed", type=int, default=0)
     output_options(parser)
     options = parser.parse_args(arguments)
     began = time.perf_counter()
     with executor(options.executor) as pool:
-        data, file = simulated(options, options.truths, pool, options.seed)
-    data = replace(data, sensor_std=options.sensor)
-    truths = min(options.truths, len(data.points))
-    entries = calibrate(
-        data, truths, training=options.training, sensor_std=options.sensor, seed=options.seed, progress=ticker("truths")
-    )
+        if options.full:
+            entries, space, about = through_the_simulator(options, pool)
+        else:
+            data, file = simulated(options, options.truths, pool, options.seed)
+    if not options.full:
+        data = replace(data, sensor_std=options.sensor)
+        truths, space = min(options.truths, len(data.points)), data.space
+        entries = calibrate(
+            data,
+            truths,
+            training=options.training,
+            sensor_std=options.sensor,
+            seed=options.seed,
+            progress=ticker("truths"),
+        )
+        about = {
+            "training": options.training or len(data.points) - truths // FOLDS,
+            "sensor": options.sensor,
+            "simulations": str(file),
+        }
     result = {
         "benchmark": "calibration",
         "world": "the made-up world of PlowSand-v0" if options.set is None else str(options.set),
         "preset": options.preset,
-        "training": options.training or len(data.points) - truths // FOLDS,
-        "sensor": options.sensor,
+        "full": options.full,
         "seed": options.seed,
-        "simulations": str(file),
-        **summarise(entries, data),
+        **about,
+        **summarise(entries, space),
         **stamp(options.device),
         "seconds": time.perf_counter() - began,
         "entries": entries,

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 from splatsoil.benchmarks import bo_vs_mcmc, calibration
+from splatsoil.benchmarks._calibration_full import one_truth
 from splatsoil.inverse.emulator import Emulator
+from splatsoil.inverse.evaluations import EvaluationStore
 from splatsoil.inverse.posterior import Data
+from splatsoil.inverse.posterior_run import Effort
 from splatsoil.inverse.surrogate import sobol
 
+from splatsoil.errors import ParameterError
 from splatsoil.parameters import Parameter, ParameterSpace
 
 SPACE = ParameterSpace([Parameter("friction_angle", "deg", 20.0, 50.0, 35.0)])
@@ -53,11 +60,11 @@ def test_every_truth_is_tested_once_and_never_trained_on() -> None:
 
 def test_coverage_and_ranks_are_counted() -> None:
     entries = [entry(0.5, 20 * k + 5, (k < 5, k < 9)) for k in range(10)]
-    told = calibration.summarise(entries, made_up(8))["parameters"]["friction_angle"]
+    told = calibration.summarise(entries, SPACE)["parameters"]["friction_angle"]
     assert told["coverage"] == {"0.5": 0.5, "0.9": 0.9}
     assert told["ranks"] == [1] * 10 and told["p_uniform"] == pytest.approx(1.0)
     assert told["rms_z"] == pytest.approx(1.0)
-    piled = calibration.summarise([entry(0.5, 199, (False, False))] * 10, made_up(8))["parameters"]["friction_angle"]
+    piled = calibration.summarise([entry(0.5, 199, (False, False))] * 10, SPACE)["parameters"]["friction_angle"]
     assert piled["p_uniform"] < 1e-6 and piled["coverage"]["0.9"] == 0.0
 
 
@@ -80,3 +87,25 @@ def test_ways_meet_the_same_world_and_more_calls_do_not_hurt() -> None:
     assert by["mcmc", 16]["mae"][0] < 5.0 and by["direct", 400]["mae"][0] < 5.0
     assert "| mcmc | 16 |" in bo_vs_mcmc.table({**found, "landscape": "A test"})
     assert bo_vs_mcmc.figure({**found, "landscape": ""}).axes
+
+
+@pytest.mark.slow
+def test_a_truth_goes_the_whole_way_and_is_kept(tmp_path: Path) -> None:
+    chosen: dict[str, Any] = {"effort": Effort(design=4, repeats=2, checks=0), "budget": 5}
+    arguments = (("friction_angle",), (), "tiny", "cpu", [0.3], 7, tmp_path / "7", 199, (0.5, 0.9))
+    entry = one_truth(*arguments, **chosen)
+    assert entry["simulations"] == 11 and 0 <= entry["rank"][0] <= 199
+    assert entry["truth"] == [0.3] and set(entry["within"]) == {"0.5", "0.9"}
+    # 0.3 of [-1, 1] is 39.5 degrees; a posterior that knows nothing would have a spread of 0.58.
+    assert abs(entry["mean"][0] - 0.3) < 4.0 * entry["std"][0] and entry["std"][0] < 0.5
+    with EvaluationStore(tmp_path / "7" / "evaluations.db") as store:
+        before = len(store.records())
+    assert one_truth(*arguments, **chosen) == entry
+    with EvaluationStore(tmp_path / "7" / "evaluations.db") as store:
+        assert len(store.records()) == before == 11
+
+
+@pytest.mark.parametrize(("words", "says"), [(["--full"], "--out"), (["a-set", "--full", "--out", "x"], "one")])
+def test_options_of_the_full_calibration_that_make_no_sense(words: list[str], says: str) -> None:
+    with pytest.raises(ParameterError, match=says):
+        calibration.main(words)
