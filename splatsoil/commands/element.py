@@ -147,10 +147,13 @@ def draw(columns: dict[str, Any], config: Config) -> None:
     for axes, (name, y) in zip(figure.subplots(1, len(others), squeeze=False)[0], others, strict=True):
         axes.plot(x, y)
         axes.set_xlabel(across)
-        axes.set_ylabel(name)
+        axes.set_ylabel("volume strain, + denser" if name == "volume strain" else name)
         axes.grid(alpha=0.3)
-    on = ", ".join(config.effects) or "base law"
-    figure.suptitle(f"{config.test}, {config.confining:g} Pa, φ = {config.friction_angle:g}°, {on}", fontsize=10)
+    on = ", ".join(Path(name).stem for name in config.effects) or "base law"
+    with_values = " ".join((on, *config.values))
+    figure.suptitle(
+        f"{config.test}, {config.confining:g} Pa, φ = {config.friction_angle:g}°, {with_values}", fontsize=10
+    )
     stream = io.BytesIO()
     figure.savefig(stream, format=config.plot.suffix[1:], dpi=150)
     write_bytes(config.plot, stream.getvalue())
