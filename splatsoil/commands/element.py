@@ -56,6 +56,8 @@ class Config:
 
 #: Lines of the table.
 ROWS = 12
+#: Least height of a plot: of stresses, in parts of the largest; of volume strain and void ratio.
+LEAST_SPAN, LEAST_STRAIN = 0.02, 1.0e-3
 
 
 def run(config: Config) -> int:
@@ -136,6 +138,7 @@ def draw(columns: dict[str, Any], config: Config) -> None:
     """One panel for each column, over the first; written whole or not at all."""
     import io
 
+    import numpy as np
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -146,6 +149,13 @@ def draw(columns: dict[str, Any], config: Config) -> None:
     FigureCanvasAgg(figure)
     for axes, (name, y) in zip(figure.subplots(1, len(others), squeeze=False)[0], others, strict=True):
         axes.plot(x, y)
+        axes.ticklabel_format(useOffset=False)
+        axes.locator_params(axis="x", nbins=4)
+        # what is held is drawn as held, not its rounding
+        least = LEAST_SPAN * float(np.abs(y).max()) if "Pa" in name else LEAST_STRAIN
+        middle = 0.5 * float(y.min() + y.max())
+        if float(y.max() - y.min()) < least:
+            axes.set_ylim(middle - 0.5 * least, middle + 0.5 * least)
         axes.set_xlabel(across)
         axes.set_ylabel("volume strain, + denser" if name == "volume strain" else name)
         axes.grid(alpha=0.3)
