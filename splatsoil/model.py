@@ -90,7 +90,7 @@ class Model:
 
         An effect that is on already keeps its name here, wherever it came from.
         """
-        on = {effect.name: effect for effect in self.effects}
+        on: dict[str | Effect, Effect] = {effect.name: effect for effect in self.effects}
         chosen = self.effects if effects is None else tuple(on.get(name, name) for name in effects)
         other = Model(
             self.measurement,

@@ -101,7 +101,8 @@ class Plate:
         # contact begins where the plate's face reaches the uppermost particles
         start = np.array([0.0, 0.0, surface + 0.5 * thick])
         step = scene.resolution.frame_time
-        way, force = [], []
+        way: list[float] = []
+        force: list[float] = []
         touched = np.inf
         while not way or way[-1] - min(touched, DEPTHS[0]) < DEPTHS[-1] + 0.0005:
             k = len(way)

@@ -73,7 +73,9 @@ class PlowExperiment:
         self.numerics = tuple(numerics)
         self.progress = progress
         wanted = tuple(library().values()) if candidates is None else find_effects(candidates)
-        self._wanted = {effect.name: effect for effect in wanted if effect.name not in NUMERICS}
+        self._wanted: dict[str | Effect, Effect] = {
+            effect.name: effect for effect in wanted if effect.name not in NUMERICS
+        }
         self.candidates: tuple[Candidate, ...] = candidates_of(
             (e.for_measurement(model.measurement) for e in self._wanted.values()), model.law.effects
         )
