@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from splatsoil.benchmarks._common import hush
 from splatsoil.envs.measured import LOSS
 from splatsoil.envs.synthetic import SyntheticProblem
 from splatsoil.inverse.evaluations import digest
@@ -62,6 +63,7 @@ def one_truth(
     import torch
 
     torch.set_num_threads(1)
+    hush()
     problem = Placed(parameters, effects, preset=preset, device=device)
     space = problem.space
     point = np.asarray(truth, dtype=np.float64)

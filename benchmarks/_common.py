@@ -23,6 +23,13 @@ if TYPE_CHECKING:
 ALL = ("measurement", "splats", "reconstruction", "soil", "mpm", "scene", "synthetic")
 
 
+def hush() -> None:
+    """Keep Warp from telling which kernels it loads."""
+    import warp as wp
+
+    wp.config.log_level = wp.LOG_ERROR
+
+
 def world_options(parser: argparse.ArgumentParser) -> None:
     """Options that choose a world to simulate."""
     parser.add_argument("set", type=Path, nargs="?", help="measurement set; none: the made-up world of PlowSand-v0")

@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import emcee
 import numpy as np
 import numpy.typing as npt
-from splatsoil.benchmarks._common import output_options, simulated, stamp, ticker, world_options, write_result
+from splatsoil.benchmarks._common import hush, output_options, simulated, stamp, ticker, world_options, write_result
 from splatsoil.envs.synthetic import SyntheticProblem
 from splatsoil.envs.together import attempt
 from splatsoil.inverse.bayesopt import PAPER, BayesianOptimiser, Search
@@ -308,11 +308,15 @@ def main(arguments: list[str] | None = None) -> int:
     world_options(parser)
     parser.add_argument("--seeds", type=int, default=12, help="truths, each with its own chance")
     parser.add_argument("--budgets", type=int, nargs="+", default=list(BUDGETS))
+    parser.add_argument(
+        "--direct-budgets", type=int, nargs="+", default=list(DIRECT_BUDGETS), help="calls of emcee on the simulator"
+    )
     parser.add_argument("--ways", nargs="+", choices=WAYS, default=list(WAYS))
     parser.add_argument("--simulations", type=int, default=64, help="behind the emulated landscape")
     parser.add_argument("--direct-simulator", action="store_true", help="call the made-up world's simulator itself")
     output_options(parser)
     options = parser.parse_args(arguments)
+    hush()
     if options.direct_simulator and options.set is not None:
         raise ParameterError("--direct-simulator: the truth of a measured set is one; only the made-up world has many")
     began = time.perf_counter()
@@ -335,7 +339,13 @@ def main(arguments: list[str] | None = None) -> int:
         "benchmark": "bo-vs-mcmc",
         "landscape": landscape,
         **run(
-            world, chance, ways=options.ways, budgets=options.budgets, seeds=options.seeds, progress=ticker("truths")
+            world,
+            chance,
+            ways=options.ways,
+            budgets=options.budgets,
+            direct=options.direct_budgets,
+            seeds=options.seeds,
+            progress=ticker("truths"),
         ),
         "simulations": str(file),
         **stamp(options.device),

@@ -28,7 +28,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import binom, chisquare
 from splatsoil.benchmarks._calibration_full import one_truth
-from splatsoil.benchmarks._common import output_options, simulated, stamp, ticker, world_options, write_result
+from splatsoil.benchmarks._common import hush, output_options, simulated, stamp, ticker, world_options, write_result
 from splatsoil.envs.synthetic import SENSOR_NOISE, SyntheticProblem
 from splatsoil.inverse.emulator import Emulator
 from splatsoil.inverse.executors import Executor, executor
@@ -235,6 +235,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     output_options(parser)
     options = parser.parse_args(arguments)
+    hush()
     began = time.perf_counter()
     with executor(options.executor) as pool:
         if options.full:

@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from splatsoil.benchmarks._common import ALL, output_options, stamp, write_result
+from splatsoil.benchmarks._common import ALL, hush, output_options, stamp, write_result
 from splatsoil.benchmarks._paper import PUBLISHED, SEARCHES, WAYS, Protocol, Say, Sight, search, world
 from splatsoil.benchmarks._paper_budget import budget_table, error_budget
 from splatsoil.inverse.executors import executor
@@ -161,6 +161,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--device", default=usual.device)
     output_options(parser)
     options = parser.parse_args(arguments)
+    hush()
     protocol = Protocol(
         angles=tuple(options.angles),
         trials=options.trials,

@@ -178,6 +178,10 @@ class EvaluationStore:
         text = str(error)
         if "readonly" in text or "unable to open" in text:
             return RunError(f"{self.path}: cannot be written ({text}); choose a run folder you may write to")
+        if "full" in text or "disk I/O" in text:
+            return RunError(
+                f"{self.path}: cannot be written ({text}); free some space and run again, what is stored is kept"
+            )
         if "locked" in text:
             return RunError(f"{self.path}: is locked by another process; wait for it or choose another run folder")
         return RunError(f"{self.path}: is damaged or not a run database ({text}); move it away and fit again")

@@ -5,6 +5,7 @@ Kept in an HDF5 file as they go, so that an interrupted run goes on and comes to
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +29,8 @@ STRIDE, MOST_STEPS = 200, 6000
 LENGTHS, STEADY = 50.0, 0.1
 #: Ensembles agree below this R-hat (Vehtari et al. 2021).
 AGREE = 1.01
+#: Bytes that HDF5 may need beside the samples: indices, and chunks that are not full.
+HDF5_NEEDS = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -178,12 +181,29 @@ def _advance(
     else:
         random = np.random.RandomState(np.random.SeedSequence([seed, e]).generate_state(4))
         start = emcee.State(_start(log_density, low, high, sampler.nwalkers, seed, e), random_state=random.get_state())
+    if isinstance(sampler.backend, _Blocks):
+        check_room(Path(sampler.backend.filename), 8 * (until - done) * sampler.nwalkers * (sampler.ndim + 2))
     sampler.run_mcmc(start, until - done, skip_initial_state_check=True)
     if isinstance(sampler.backend, _Blocks):
         try:
             sampler.backend.flush()
         except OSError as error:
             raise RunError(f"{sampler.backend.filename}: cannot be written ({error}); free some space") from error
+
+
+def check_room(file: Path, size: int) -> None:
+    """Be sure that ``size`` bytes and HDF5's own needs fit on the disk: where they don't, HDF5 takes the whole process
+    down instead of raising an error.
+
+    Raises:
+        RunError: they don't.
+    """
+    free = shutil.disk_usage(file.parent).free
+    if free < size + HDF5_NEEDS:
+        raise RunError(
+            f"{file}: {free / 1e6:.1f} MB are left on its disk and {(size + HDF5_NEEDS) / 1e6:.1f} MB are needed; free "
+            "some space and run again, what is stored is kept"
+        )
 
 
 def _start(log_density: LogDensity, low: FloatArray, high: FloatArray, count: int, seed: int, e: int) -> FloatArray:
@@ -218,6 +238,7 @@ def _backend(file: Path | None, identity: str, e: int) -> emcee.backends.Backend
     try:
         if not file.exists():
             file.parent.mkdir(parents=True, exist_ok=True)
+            check_room(file, 0)
             with h5py.File(file, "w") as store:
                 store.attrs["identity"] = identity
         return _Blocks(str(file), f"ensemble{e}")

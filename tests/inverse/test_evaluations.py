@@ -173,6 +173,22 @@ def test_a_read_only_database_gets_one_sentence(tmp_path: Path) -> None:
         filled(path)
 
 
+def test_a_full_disk_is_said_and_costs_nothing_that_is_stored(tmp_path: Path) -> None:
+    with EvaluationStore(tmp_path / "evaluations.db", writable=True) as store:
+        store.register("f", {})
+        store.append(RECORD)
+        # SQLite's own stand-in for a disk without room.
+        pages = store._connection.execute("PRAGMA page_count").fetchone()[0]
+        store._connection.execute(f"PRAGMA max_page_count={pages}")
+        with pytest.raises(RunError, match=r"full.*free some space"):
+            for step in range(1, 200):
+                store.append(replace(RECORD, step=step, key=f"k{step}"))
+    with EvaluationStore(tmp_path / "evaluations.db", writable=True) as store:
+        kept = [r.step for r in store.records("f")]
+        assert kept == list(range(len(kept))) and kept
+        store.append(replace(RECORD, step=len(kept), key="last"))
+
+
 def test_one_writer_at_a_time(tmp_path: Path) -> None:
     with writer_lock(tmp_path), pytest.raises(RunError, match="another process is writing"), writer_lock(tmp_path):
         pass

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +43,18 @@ def test_chains_of_another_density_are_thrown_away(tmp_path: Path) -> None:
     file.write_bytes(file.read_bytes()[:2000])  # and one that was cut off by a kill can't be opened
     new = sample(lambda p: bell(p + 0.3), LOW, HIGH, most_steps=STRIDE, file=file, identity="other", ensembles=2)
     assert new.flat.mean() == pytest.approx(-0.3, abs=0.08)
+
+
+def test_a_full_disk_is_said_before_anything_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "chains.h5"
+    room = iter([10**9, 10**5])
+
+    def usage(_: object) -> tuple[int, int, int]:
+        return shutil._ntuple_diskusage(10**12, 0, next(room))  # type: ignore[attr-defined]
+
+    monkeypatch.setattr("splatsoil.inverse.mcmc.shutil.disk_usage", usage)
+    with pytest.raises(RunError, match=r"chains\.h5: 0\.1 MB are left .* free some space"):
+        sample(lambda p: -0.5 * np.sum(p**2, axis=1), [-5.0], [5.0], file=file, identity="a")
 
 
 def test_ensembles_that_disagree_are_not_called_converged() -> None:
