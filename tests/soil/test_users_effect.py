@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import math
+import os
+import subprocess
+import sys
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from types import SimpleNamespace
@@ -102,6 +106,27 @@ def test_an_installed_package_offers_its_effects(suction: str, tmp_path: Path, m
             library()
     finally:
         library.cache_clear()
+
+
+def test_the_command_finds_the_effect_of_an_installed_package(suction: str, tmp_path: Path) -> None:
+    """A package as pip leaves it: a module, and the metadata that docs/effects.md tells to write."""
+    (tmp_path / "my_package").mkdir()
+    (tmp_path / "my_package" / "__init__.py").touch()
+    (tmp_path / "my_package" / "suction.py").write_text(Path(suction).read_text())
+    metadata = tmp_path / "my_package-0.1.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: my-package\nVersion: 0.1\n")
+    (metadata / "entry_points.txt").write_text("[splatsoil.effects]\nsuction = my_package.suction:Suction\n")
+    words = ["element", "--with", "suction", "--set", "suction_gradient=1e4", "--depth", "0.1", "--json"]
+    done = subprocess.run(
+        [sys.executable, "-m", "splatsoil", *words, "--plot", str(tmp_path / "curve.png"), "--records", "2"],
+        env=os.environ | {"PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    assert told["effects"] == ["suction"] and told["parameters"]["suction_gradient"] == 1e4
 
 
 @pytest.mark.parametrize(
