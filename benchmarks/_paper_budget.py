@@ -9,7 +9,7 @@ The differences of their minima add up to the whole error.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Executor
+from concurrent.futures import Executor, Future
 from dataclasses import replace
 from typing import Any
 
@@ -54,7 +54,7 @@ def error_budget(sight: Sight, angle: float, pool: Executor, say: Say) -> dict[s
         looks = [None if futures is None else [future.result() for future in futures] for futures in waiting]
     out: dict[str, Any] = {"angle": angle, "range": [low, high], "seeds": seeds, "points": points}
     minima: dict[str, dict[str, list[list[float]]]] = {way: {} for way in WAYS}
-    pending = []
+    pending: list[tuple[str, str, list[Future[Any]]]] = []
     for place, (kind, _, observer) in enumerate(every):
         known = [(a, s, k[place]) for (a, s), k in zip(jobs, looks, strict=True) if k is not None]
         for way in WAYS[:2]:

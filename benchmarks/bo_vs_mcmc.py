@@ -33,7 +33,7 @@ from splatsoil.envs.synthetic import SyntheticProblem
 from splatsoil.envs.together import attempt
 from splatsoil.inverse.bayesopt import PAPER, BayesianOptimiser, Search
 from splatsoil.inverse.emulator import FEWEST, Emulator
-from splatsoil.inverse.executors import executor
+from splatsoil.inverse.executors import Executor, Serial, executor, in_order
 from splatsoil.inverse.likelihood import Likelihood
 from splatsoil.inverse.mcmc import sample
 from splatsoil.inverse.surrogate import sobol
@@ -216,14 +216,17 @@ def run(
     budgets: Sequence[int] = BUDGETS,
     direct: Sequence[int] = DIRECT_BUDGETS,
     seeds: int = 12,
+    pool: Executor | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
     """Errors, widths and coverage of all ways over seeds, in physical units."""
     space = world.space
     rows: dict[tuple[str, int], list[dict[str, Any]]] = {}
-    for seed in range(seeds):
+    pool = pool or Serial()
+    jobs = [(world, ways, budgets, direct, chance, seed) for seed in range(seeds)]
+    for seed, answers_of in enumerate(in_order(pool, trial, jobs)):
         truth = np.random.default_rng([seed, 29]).uniform(-INNER, INNER, len(space))
-        for way, answers in trial(world, ways, budgets, direct, chance, seed).items():
+        for way, answers in answers_of.items():
             for budget, answer in answers.items():
                 low, high = space.from_unit(answer.low), space.from_unit(answer.high)
                 entry = {
@@ -321,7 +324,12 @@ def main(arguments: list[str] | None = None) -> int:
         raise ParameterError("--direct-simulator: the truth of a measured set is one; only the made-up world has many")
     began = time.perf_counter()
     with executor(options.executor) as pool:
-        data, file = simulated(options, options.simulations, pool)
+        return _run(options, pool, began)
+
+
+def _run(options: argparse.Namespace, pool: Executor, began: float) -> int:
+    """Simulate, compare, write, print."""
+    data, file = simulated(options, options.simulations, pool)
     emulator = Emulator(data.points, -data.residuals)
     if options.direct_simulator:
         world: World = SimulatedWorld(options.parameters, options.effects, options.preset, options.device)
@@ -345,6 +353,7 @@ def main(arguments: list[str] | None = None) -> int:
             budgets=options.budgets,
             direct=options.direct_budgets,
             seeds=options.seeds,
+            pool=pool,
             progress=ticker("truths"),
         ),
         "simulations": str(file),

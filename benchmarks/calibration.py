@@ -31,7 +31,7 @@ from splatsoil.benchmarks._calibration_full import one_truth
 from splatsoil.benchmarks._common import hush, output_options, simulated, stamp, ticker, world_options, write_result
 from splatsoil.envs.synthetic import SENSOR_NOISE, SyntheticProblem
 from splatsoil.inverse.emulator import Emulator
-from splatsoil.inverse.executors import Executor, executor
+from splatsoil.inverse.executors import Executor, Serial, executor, in_order
 from splatsoil.inverse.likelihood import Likelihood
 from splatsoil.inverse.mcmc import sample
 from splatsoil.inverse.misfit import measure
@@ -65,6 +65,7 @@ def calibrate(
     training: int | None = None,
     sensor_std: float = 1.0,
     seed: int = 0,
+    pool: Executor | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[dict[str, Any]]:
     """One entry for each truth: its rank, and whether intervals hold it, for each parameter.
@@ -75,45 +76,63 @@ def calibrate(
         training: simulations an emulator is trained on; all others by default.
         sensor_std: noise added to a truth's features, in their unit.
         seed: of noise, training sets and chains.
+        pool: where the folds are worked on; here, one after the other, by default.
         progress: called with (done, truths).
     """
-    rng = np.random.default_rng([seed, 21])
-    out: list[dict[str, Any]] = []
+    pool = pool or Serial()
+    jobs = []
     for number, (train, test) in enumerate(folds(data, truths)):
         if training is not None and training < len(train):
             # Repeats stand at the end of the simulations: they stay, since chance is measured from them.
             inner = train[train < truths]
             keep = max(training - (len(train) - len(inner)), len(data.space) + 4)
-            train = np.concatenate([np.sort(rng.choice(inner, keep, replace=False)), train[train >= truths]])
-        emulator = Emulator(data.points[train], -data.residuals[train], seed=seed + 1000 * number)
-        for index in test:
-            observed = -data.residuals[index] + sensor_std * rng.standard_normal(data.residuals.shape[1])
-            expected = emulator.outside_variance + sensor_std**2
-            misfit = measure(emulator.remainder(observed), expected, emulator.basis, data.places)
-            likelihood = Likelihood(emulator, observed, sensor_std**2, misfit)
-            chains = sample(
-                likelihood, likelihood.lower, likelihood.upper, seed=int(index), ensembles=2, most_steps=2000
-            )
-            draws = chains.flat[:, : len(data.space)]
-            draws = draws[rng.choice(len(draws), DRAWS, replace=False)]
-            truth = data.points[index]
-            within = {}
-            for level in LEVELS:
-                low, high = np.quantile(chains.flat[:, : len(truth)], [0.5 - level / 2, 0.5 + level / 2], axis=0)
-                within[str(level)] = [bool(a <= t <= b) for a, t, b in zip(low, truth, high, strict=True)]
-            out.append(
-                {
-                    "truth": truth.tolist(),
-                    "rank": [int(r) for r in (draws < truth).sum(axis=0)],
-                    "within": within,
-                    "mean": draws.mean(axis=0).tolist(),
-                    "std": draws.std(axis=0).tolist(),
-                    "misfit": misfit.present,
-                    "converged": chains.converged,
-                }
-            )
-            if progress is not None:
-                progress(len(out), truths)
+            chosen = np.random.default_rng([seed, 21, number]).choice(inner, keep, replace=False)
+            train = np.concatenate([np.sort(chosen), train[train >= truths]])
+        jobs.append((data, train, test, sensor_std, seed, number))
+    out: list[dict[str, Any]] = []
+    for entries in in_order(pool, one_fold, jobs):
+        out += entries
+        if progress is not None:
+            progress(len(out), truths)
+    return out
+
+
+def one_fold(
+    data: Data,
+    train: npt.NDArray[np.int64],
+    test: npt.NDArray[np.int64],
+    sensor_std: float,
+    seed: int,
+    number: int,
+) -> list[dict[str, Any]]:
+    """Entries of the truths ``test``, by an emulator of the simulations ``train``; a worker's job."""
+    rng = np.random.default_rng([seed, 24, number])
+    emulator = Emulator(data.points[train], -data.residuals[train], seed=seed + 1000 * number)
+    out: list[dict[str, Any]] = []
+    for index in test:
+        observed = -data.residuals[index] + sensor_std * rng.standard_normal(data.residuals.shape[1])
+        expected = emulator.outside_variance + sensor_std**2
+        misfit = measure(emulator.remainder(observed), expected, emulator.basis, data.places)
+        likelihood = Likelihood(emulator, observed, sensor_std**2, misfit)
+        chains = sample(likelihood, likelihood.lower, likelihood.upper, seed=int(index), ensembles=2, most_steps=2000)
+        draws = chains.flat[:, : len(data.space)]
+        draws = draws[rng.choice(len(draws), DRAWS, replace=False)]
+        truth = data.points[index]
+        within = {}
+        for level in LEVELS:
+            low, high = np.quantile(chains.flat[:, : len(truth)], [0.5 - level / 2, 0.5 + level / 2], axis=0)
+            within[str(level)] = [bool(a <= t <= b) for a, t, b in zip(low, truth, high, strict=True)]
+        out.append(
+            {
+                "truth": truth.tolist(),
+                "rank": [int(r) for r in (draws < truth).sum(axis=0)],
+                "within": within,
+                "mean": draws.mean(axis=0).tolist(),
+                "std": draws.std(axis=0).tolist(),
+                "misfit": misfit.present,
+                "converged": chains.converged,
+            }
+        )
     return out
 
 
@@ -196,6 +215,19 @@ def figure(result: dict[str, Any]) -> Figure:
     return drawn
 
 
+def through_the_emulator(
+    options: argparse.Namespace, pool: Executor
+) -> tuple[list[dict[str, Any]], ParameterSpace, dict[str, Any]]:
+    """Entries of truths that share their simulations: each is recovered by an emulator of others."""
+    data, file = simulated(options, options.truths, pool, options.seed)
+    data = replace(data, sensor_std=options.sensor)
+    truths = min(options.truths, len(data.points))
+    chosen: dict[str, Any] = {"training": options.training, "sensor_std": options.sensor, "seed": options.seed}
+    entries = calibrate(data, truths, **chosen, pool=pool, progress=ticker("truths"))
+    trained = options.training or len(data.points) - truths // FOLDS
+    return entries, data.space, {"training": trained, "sensor": options.sensor, "simulations": str(file)}
+
+
 def through_the_simulator(
     options: argparse.Namespace, pool: Executor
 ) -> tuple[list[dict[str, Any]], ParameterSpace, dict[str, Any]]:
@@ -212,15 +244,15 @@ def through_the_simulator(
     truths = np.random.default_rng([options.seed, 22]).uniform(-1.0, 1.0, (options.truths, len(space)))
     chosen = (tuple(options.parameters), tuple(options.effects), options.preset, options.device)
     first = 10_000 * options.seed
-    waiting = [
-        pool.submit(one_truth, *chosen, t.tolist(), first + k, options.out / "truths" / str(first + k), DRAWS, LEVELS)
+    jobs = [
+        (*chosen, t.tolist(), first + k, options.out / "truths" / str(first + k), DRAWS, LEVELS)
         for k, t in enumerate(truths)
     ]
     report = ticker("truths")
     entries = []
-    for k, future in enumerate(waiting):
-        entries.append(future.result())
-        report(k + 1, len(waiting))
+    for entry in in_order(pool, one_truth, jobs):
+        entries.append(entry)
+        report(len(entries), len(jobs))
     return entries, space, {"training": None, "sensor": SENSOR_NOISE}
 
 
@@ -241,23 +273,7 @@ def main(arguments: list[str] | None = None) -> int:
         if options.full:
             entries, space, about = through_the_simulator(options, pool)
         else:
-            data, file = simulated(options, options.truths, pool, options.seed)
-    if not options.full:
-        data = replace(data, sensor_std=options.sensor)
-        truths, space = min(options.truths, len(data.points)), data.space
-        entries = calibrate(
-            data,
-            truths,
-            training=options.training,
-            sensor_std=options.sensor,
-            seed=options.seed,
-            progress=ticker("truths"),
-        )
-        about = {
-            "training": options.training or len(data.points) - truths // FOLDS,
-            "sensor": options.sensor,
-            "simulations": str(file),
-        }
+            entries, space, about = through_the_emulator(options, pool)
     result = {
         "benchmark": "calibration",
         "world": "the made-up world of PlowSand-v0" if options.set is None else str(options.set),

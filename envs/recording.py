@@ -113,7 +113,7 @@ class EpisodeRecorder(gym.Wrapper[Observation, npt.NDArray[np.float32], Observat
                 id=k,
                 seed=episode.seed,
                 observations=_stacked(episode.observations),
-                actions=np.stack(episode.actions),  # type: ignore[arg-type]  # Minari stores any array
+                actions=np.stack(episode.actions),
                 rewards=episode.rewards,
                 terminations=episode.terminations,
                 truncations=[*episode.truncations[:-1], not episode.terminations[-1]],

@@ -9,7 +9,7 @@ from __future__ import annotations
 import multiprocessing
 import queue
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -102,6 +102,16 @@ class Processes(Executor):
                 break
         if pool is not None:
             pool.shutdown(wait=True)
+
+
+def in_order(pool: Executor, fn: Callable[..., Any], jobs: Iterable[tuple[Any, ...]]) -> Iterator[Any]:
+    """Results of ``fn(*job)`` in the order of the jobs; in this process each is made when it is asked for."""
+    if isinstance(pool, Serial):
+        for job in jobs:
+            yield pool.submit(fn, *job).result()
+    else:
+        for future in [pool.submit(fn, *job) for job in jobs]:
+            yield future.result()
 
 
 @contextmanager

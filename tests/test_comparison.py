@@ -42,6 +42,20 @@ def test_perfect_prediction_leaves_nothing(comparator, seen):
     assert len(found.labels) == len(found.blocks) > 200
 
 
+def test_pictures_can_stand_in_for_the_photographs(comparator, seen):
+    rng = np.random.default_rng(0)
+    world = {
+        key: np.clip(image + 0.1 * rng.uniform(size=(1, 1, 3)).astype(np.float32), 0, 1) for key, image in seen.items()
+    }
+    control = comparator.against(world)
+    assert control.compare(world).loss == pytest.approx(0.0, abs=1e-9)
+    assert control.compare(world).rgb == 0.0 and control.noise is None and control.block_noise() == 0.0
+    # The photographs are as they were: each comparison knows its own world.
+    assert comparator.compare(seen).loss == pytest.approx(0.0, abs=1e-9)
+    assert comparator.compare(world).rgb == pytest.approx(control.compare(seen).rgb, rel=1e-2)
+    assert comparator.compare(world).rgb > 1e-4
+
+
 def test_no_motion_scores_about_one_and_motion_matters_more_than_noise(comparator, seen):
     still = {}
     for camera, frame in seen:  # no motion of the soil; the tool, which the unit leaves out, must not stay where it was
