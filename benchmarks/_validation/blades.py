@@ -191,10 +191,10 @@ def validate(device: str) -> Section:
         tuple(rows),
         "McKyes' plane is an upper bound for sand that dilates as much as it is strong, and overestimates most with "
         "friction on an upright blade, where log-spiral planes give a smaller passive pressure (Caquot & Kérisel "
-        "1948). Sand that keeps its volume bears less, down to the number at φ*. The cell that holds the blade's foot "
-        "acts like extra depth: forces are those of a blade about one cell deeper, on either grid. So the exponent is "
-        "too small with 4 cells over the depth and right from 12 on; coarser grids would let more of the rows above "
-        "hold, for the wrong reason. A is what a very fine grid would give.",
+        "1948). Sand that keeps its volume bears less, down to the number at φ*: that is what the rough upright blade "
+        "and the narrow one miss McKyes by. The cell that holds the blade's foot acts like extra depth, of half a cell "
+        "to one; so the exponent is too small with 4 cells over the depth and right from 12 on, and coarser grids "
+        "would let more of the rows above hold, for the wrong reason. A is what a very fine grid would give.",
         _figure(curves),
     )
 
