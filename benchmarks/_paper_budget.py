@@ -14,7 +14,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from splatsoil.benchmarks._paper import WAYS, FloatArray, Images, Say, Sight, by_features, look, threads
+from splatsoil.benchmarks._paper import WAYS, FloatArray, Images, Look, Say, Sight, by_features, look, threads
 from splatsoil.inverse.surrogate import Surrogate
 
 from splatsoil.comparison import Comparator
@@ -46,12 +46,15 @@ def error_budget(sight: Sight, angle: float, pool: Executor, say: Say) -> dict[s
     say(f"{angle:g}°: error budget, {len(jobs)} simulations and {2 * STAND_INS} stand-ins")
     observers = {"photographs": [sight.comparator], **_stand_ins(sight, angle)}
     every = [(kind, k, observer) for kind, mine in observers.items() for k, observer in enumerate(mine)]
+    looks: list[list[Look] | None] = []
     with threads(sight.protocol.device) as workers:
-        waiting = [
-            None if images is None else [workers.submit(look, o, images, True) for _, _, o in every]
-            for images in sight.drawn(sight.model, jobs)
-        ]
-        looks = [None if futures is None else [future.result() for future in futures] for futures in waiting]
+        # A seed at a time: pictures and trajectories of all of them would fill a laptop's memory.
+        for part in (jobs[k : k + points] for k in range(0, len(jobs), points)):
+            waiting = [
+                None if images is None else [workers.submit(look, o, images, True) for _, _, o in every]
+                for images in sight.drawn(sight.model, part)
+            ]
+            looks += [None if futures is None else [future.result() for future in futures] for futures in waiting]
     out: dict[str, Any] = {"angle": angle, "range": [low, high], "seeds": seeds, "points": points}
     minima: dict[str, dict[str, list[list[float]]]] = {way: {} for way in WAYS}
     pending: list[tuple[str, str, list[Future[Any]]]] = []

@@ -21,6 +21,16 @@ def test_the_example_runs(repository: Path) -> None:
     assert done.stdout.count("friction_angle") == 5 and "the truth was" in done.stdout
 
 
+def test_the_readmes_example_runs_and_comes_nearest_where_the_truth_is(repository: Path) -> None:
+    (example,) = re.findall(r"```python\n(.*?)```", (repository / "README.md").read_text(), re.DOTALL)
+    done = subprocess.run([sys.executable, "-c", example], capture_output=True, text=True, timeout=300, check=True)
+    found = re.findall(r"'friction_angle': ([\d.]+)\} loss ([\d.]+)", done.stdout)
+    (truth,) = re.findall(r"the truth was \{'friction_angle': ([\d.]+)", done.stdout)
+    angles, losses = zip(*((float(a), float(b)) for a, b in found), strict=True)
+    assert angles == pytest.approx((23.0, 35.0, 47.0))
+    assert losses.index(min(losses)) == min(range(3), key=lambda k: abs(angles[k] - float(truth)))
+
+
 def test_the_recording_example_runs(repository: Path, tmp_path: Path) -> None:
     pytest.importorskip("minari")
     text = (repository / "docs" / "environment.md").read_text()
