@@ -34,5 +34,9 @@ class SimulationError(SplatsoilError):
     """The simulation cannot go on: non-finite state, particles off the grid, a broken step limit."""
 
 
+class CombinationError(ParameterError, SimulationError):
+    """Values, each within its bounds, that have no meaning together: a search takes it for a failed simulation."""
+
+
 class RunError(SplatsoilError):
     """A run folder is missing, unreadable, or belongs to another experiment."""

@@ -67,7 +67,7 @@ class Effect:
             values: all parameters of the model by name.
 
         Raises:
-            ParameterError: values that have no meaning together.
+            CombinationError: values that have no meaning together.
         """
         del settings
         return [values[p.name] for p in self.parameters]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from splatsoil.errors import ParameterError
+from splatsoil.errors import CombinationError, ParameterError
 from splatsoil.parameters import Parameter
 from splatsoil.soil.matching import Matching, cone_slope
 
@@ -66,11 +66,11 @@ class Settings:
         """Growth of the cone's slope, relative to its own, when the friction angle changes by ``change`` degrees.
 
         Raises:
-            ParameterError: the changed angle is outside [0, 90); ``name`` is the parameter to blame.
+            CombinationError: the changed angle is outside [0, 90); ``name`` is the parameter to blame.
         """
         angle = self.friction_angle + change
         if not 0.0 <= angle < 90.0:
-            raise ParameterError(
+            raise CombinationError(
                 f"{name}: {change:g} deg on top of a friction angle of {self.friction_angle:g} deg gives {angle:g} "
                 "deg, outside [0, 90); take a smaller change"
             )

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import warp as wp
 
-from splatsoil.errors import ParameterError
+from splatsoil.errors import CombinationError
 from splatsoil.parameters import Parameter
 from splatsoil.soil.effect import Effect
 from splatsoil.soil.matching import cone_slope
@@ -47,7 +47,7 @@ class Dilatancy(Effect):
         """Slope of the plastic potential, strain."""
         angle = values["dilatancy_angle"]
         if angle > settings.friction_angle:
-            raise ParameterError(
+            raise CombinationError(
                 f"dilatancy_angle: {angle:g} deg exceeds the friction angle of {settings.friction_angle:g} deg; such a "
                 "soil would give out energy as it shears, so take a smaller one"
             )
