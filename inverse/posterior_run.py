@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from splatsoil.envs.levels import is_full
 from splatsoil.envs.problem import Problem
 
 from splatsoil.errors import RunError
@@ -85,7 +86,7 @@ def run_posterior(
     places, sensor = getattr(problem, "places", None), float(getattr(problem, "sensor_std", 0.0))
     fit = digest(setup.description())
     with run.lock(), run.evaluations(writable=True) as store:
-        fitted = store.records(fit)
+        fitted = [record for record in store.records(fit) if is_full(record.parameters)]
         if not fitted:
             raise RunError(f"{run.path}: has no evaluations of this fit by this version of splatsoil; fit again first")
         finished = 0

@@ -197,3 +197,38 @@ def test_a_folder_keeps_one_protocol(tmp_path: Path) -> None:
     assert paper_table._kept_protocol(Protocol(trials=3, angles=(30.0,), scan=(0, 9)), tmp_path)
     with pytest.raises(ParameterError, match="another protocol"):
         paper_table._kept_protocol(Protocol(views=8), tmp_path)
+
+
+def test_the_budget_tells_apart_what_was_put_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Photographs whose landscape is lowest at 38.5°, a finer grid's at 36.5°, the model's own at 35.2 and 34.8°."""
+
+    def observer(lowest: float) -> Any:
+        return SimpleNamespace(lowest=lowest, labels=(), block_noise=lambda: 0.0)
+
+    def seen(at: Any, images: Any, whole: bool) -> Look:
+        loss = ((images["angle"] - at.lowest) / 10.0) ** 2
+        return Look(loss, 2.0 * loss, np.array([images["angle"] - at.lowest]))
+
+    batches: list[int] = []
+
+    def drawn(_: Any, jobs: Sequence[tuple[float, int]]) -> Any:
+        batches.append(len(jobs))
+        # The last simulation of each landscape fails.
+        yield from [None if k == len(jobs) - 1 else {"angle": a} for k, (a, _) in enumerate(jobs)]
+
+    monkeypatch.setattr(_paper_budget, "look", seen)
+    monkeypatch.setattr(
+        _paper_budget, "_by_features", lambda space, angles, blocks, *_: float((angles - blocks[:, 0])[0])
+    )
+    stand_ins = {"grid": [observer(36.5), observer(36.5)], "same": [observer(35.2), observer(34.8)]}
+    monkeypatch.setattr(_paper_budget, "_stand_ins", lambda *_: stand_ins)
+    sight: Any = SimpleNamespace(protocol=Protocol(scan=(2, 7)), model=None, comparator=observer(38.5), drawn=drawn)
+    told = _paper_budget.error_budget(sight, 35.0, Serial(), quiet)
+    assert batches == [7, 7] and told["range"] == [27.0, 43.0]
+    for way in ("published", "ours", "features"):
+        parts = told["ways"][way]
+        assert parts["reconstruction"] == pytest.approx(2.0, abs=0.2)
+        assert parts["grid"] == pytest.approx(1.5, abs=0.2)
+        assert parts["loss"] == pytest.approx(0.0, abs=0.2)
+        assert parts["total"] == pytest.approx(3.5, abs=0.2)
+    assert [len(mine) for mine in told["ways"]["ours"]["minima"]["same"]] == [2, 2]
