@@ -112,8 +112,11 @@ def figure(result: Mapping[str, Any], truth: Truth) -> Figure:
 
 
 def reported(measurement: Measurement, angle: float, device: str) -> dict[str, Any]:
-    """Pictures (h, w, 3) in grey levels of the first camera half-way: as it is, and what each observation changes."""
-    frame = int(np.sort(measurement.frames)[len(measurement.frames) // 2])
+    """Pictures (h, w, 3) of the first camera while the tool is fast, in grey levels: as is, and what effects change."""
+    motion = measurement.tool.motion
+    speed = np.linalg.norm(np.gradient(motion.positions, motion.times, axis=0), axis=1)
+    at = {int(f): float(np.interp(f / measurement.frame_rate, motion.times, speed)) for f in measurement.frames}
+    frame = max(at, key=lambda f: (round(at[f], 3), f))
     camera = next(iter(measurement.cameras))
     scene = reconstruct(measurement, preset="tiny", device=device)
     names = [name for name, effect in library().items() if effect.observes]
