@@ -82,7 +82,7 @@ def validate(folder: Path) -> Section:
     """Fit every model to both tests."""
     curves = read_triaxial(folder / "karlsruhe_triaxial" / "tmd2_loose_tmd22_dense_subset.csv")
     rows: list[Row] = []
-    figure = Figure(figsize=(9, 3.2), layout="constrained")
+    figure = Figure(figsize=(11, 3.2), layout="constrained")
     panels = figure.subplots(1, 4)
     for k, (name, (test, void_ratio)) in enumerate(TESTS.items()):
         fits = {}
