@@ -19,6 +19,7 @@ from .misfit import Block, Omnibus, blocks, left_over, omnibus, shares, smooth_b
 from .outside import StrengthReading, read_strength
 from .score import Score, Scorer
 from .simulations import Simulations
+from .strokes import StrokeAdvice, advise
 from .verdicts import CLEAN, ENOUGH, EQUIVALENT, LEVEL, EffectVerdict, Verdict, explained, of_effect, overall
 
 FloatArray = npt.NDArray[np.float64]
@@ -65,7 +66,8 @@ class Diagnosis:
         floor: noise and nuisances.
         evidence: the simulations.
         strength: what a free strength says where something outside the library is missing, else None.
-        simulations: how many the diagnosis needed.
+        strokes: which stroke would tell the class's members apart.
+        simulations: how many the diagnosis needed, coarse ones of other strokes aside.
         unit: of the features.
         notes: what went otherwise than planned.
     """
@@ -86,6 +88,7 @@ class Diagnosis:
     floor: Floor
     evidence: Evidence
     strength: StrengthReading | None = None
+    strokes: tuple[StrokeAdvice, ...] = ()
     simulations: int = 0
     unit: str = ""
     notes: tuple[str, ...] = ()
@@ -201,6 +204,14 @@ def judge(
             )
         except SimulationError as error:
             notes.append(f"the free strength could not be simulated: {error}")
+    strokes: tuple[StrokeAdvice, ...] = ()
+    if len(members) > 1:
+        fitted = {**confirmations[members[0]].fit.values}
+        for name in members[1:]:
+            fitted |= {p.name: confirmations[name].fit.values[p.name] for p in candidates[name].parameters}
+        strokes = advise(
+            experiment, fitted, [candidates[name] for name in members], progress=lambda s: told("other strokes", s)
+        )
     return Diagnosis(
         verdict=verdict,
         members=members,
@@ -218,6 +229,7 @@ def judge(
         floor=floor,
         evidence=evidence,
         strength=strength,
+        strokes=strokes,
         simulations=simulate.asked,
         unit=experiment.layout.unit,
         notes=tuple(notes),

@@ -61,6 +61,7 @@ def record(experiment: Experiment, diagnosis: Diagnosis) -> dict[str, Any]:
             },
         },
         "strength": None if diagnosis.strength is None else _strength(diagnosis.strength),
+        "strokes": [{"effects": list(s.pair), "alike": dict(s.alike), "best": s.best} for s in diagnosis.strokes],
         "notes": list(diagnosis.notes),
     }
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 
 from splatsoil.experiment.base import Candidate
+from splatsoil.experiment.strokes import MEASURED
 
 from .diagnosis import Diagnosis
 from .outside import FEW, StrengthReading
@@ -23,6 +24,7 @@ def sentences(diagnosis: Diagnosis, candidates: Mapping[str, Candidate], base: M
         out = _adequate(diagnosis, candidates)
     else:
         out = _outside(diagnosis, candidates)
+    out += of_strokes(diagnosis)
     worst = next((b for b in diagnosis.blocks if b.p < GATE), None)
     if worst is not None:
         out.append(
@@ -97,6 +99,25 @@ def _outside(diagnosis: Diagnosis, candidates: Mapping[str, Candidate]) -> list[
             "remains is more than noise, so it is not all that is missing."
         )
     return out if diagnosis.strength is None else [*out, *of_strength(diagnosis.strength)]
+
+
+def of_strokes(diagnosis: Diagnosis) -> list[str]:
+    """What would tell the class's members apart."""
+    out = []
+    for advice in diagnosis.strokes:
+        first, second = (name.replace("_", " ") for name in advice.pair)
+        now = advice.alike[MEASURED]
+        if advice.best:
+            out.append(
+                f"The same experiment {advice.best} would tell {first} and {second} apart better: their traces "
+                f"correlate {advice.alike[advice.best]:.2f} there, {now:.2f} as measured."
+            )
+        else:
+            out.append(
+                f"None of {len(advice.alike) - 1} other ways to do it would tell {first} and {second} apart "
+                f"much better: their traces correlate {now:.2f} as measured."
+            )
+    return out
 
 
 def of_strength(found: StrengthReading) -> list[str]:

@@ -16,6 +16,7 @@ from splatsoil.experiment.base import Candidate, candidates_of
 from splatsoil.experiment.features import Layout, Site
 from splatsoil.experiment.scene_parts import QUIET, regions_of, stages_of
 from splatsoil.experiment.states import States, plow_states
+from splatsoil.experiment.strokes import Predict, plow_strokes
 from splatsoil.model import Model, Prediction
 from splatsoil.mpm import Resolution, Trajectory
 from splatsoil.parameters import Parameter
@@ -167,6 +168,10 @@ class PlowExperiment:
     def states(self, values: Mapping[str, float]) -> States:
         """States that the soil goes through while it yields, in a simulation of its own."""
         return plow_states(self.base, values)
+
+    def strokes(self) -> Mapping[str, Predict]:
+        """Heights of the surface in other strokes of the tool, simulated coarsely."""
+        return plow_strokes(self.base)
 
     def _variant(self, effects: tuple[str | Effect, ...], numerics: str) -> Model:
         if effects == self.model and not numerics:

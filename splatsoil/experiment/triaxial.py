@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from splatsoil.errors import MeasurementError, ParameterError, SimulationError
 from splatsoil.experiment.base import candidates_of
 from splatsoil.experiment.features import Layout, Site
 from splatsoil.experiment.states import States, with_history
+from splatsoil.experiment.strokes import MEASURED, Predict
 from splatsoil.parameters import Parameter
 from splatsoil.soil.effect import Effect
 from splatsoil.soil.element import ElementTest, triaxial
@@ -189,6 +190,24 @@ class TriaxialExperiment:
             seconds = np.diff(np.concatenate([[0.0], -np.log(1.0 - curve.strain)])) / curve.strain_rate
             parts.append((test.p, test.plastic_strain, seconds))
         return States.joined([States.of(*part) for part in parts])
+
+    def strokes(self) -> Mapping[str, Predict]:
+        """The same tests under other pressures and at other rates: what a plow's strokes are to a laboratory."""
+
+        def other(pressure: float, rate: float) -> Predict:
+            curves = [
+                replace(c, confining=pressure * c.confining, strain_rate=rate * c.strain_rate) for c in self.curves
+            ]
+            # Beside the tests that were made: a test at another pressure tells something only together with them.
+            both = TriaxialExperiment([*self.curves, *curves], self.model, void_ratio=self.void_ratio, candidates=())
+            return lambda values, effects: both.predict(values, effects=effects).reshape(-1)
+
+        return {
+            MEASURED: other(1.0, 1.0),
+            "at a fifth of the pressure": other(0.2, 1.0),
+            "at five times the pressure": other(5.0, 1.0),
+            "a thousand times as fast": other(1.0, 1.0e3),
+        }
 
     def _test(self, law: Law, values: Mapping[str, float], curve: Curve) -> ElementTest:
         return triaxial(

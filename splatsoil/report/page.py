@@ -10,7 +10,7 @@ from typing import Any
 import splatsoil
 from splatsoil.errors import RunError
 from splatsoil.files import write_text
-from splatsoil.report import figures, words
+from splatsoil.report import figures, strength, words
 from splatsoil.report.data import RunData, load
 
 HERE = Path(__file__).parent
@@ -76,6 +76,7 @@ def render(data: RunData) -> str:
         verdict=None if diagnosis is None else words.verdict(diagnosis),
         maps=None if diagnosis is None else _maps(diagnosis),
         posterior=None if data.posterior is None else _posterior(data.folder, data.posterior),
+        strength=[] if diagnosis is None else _strength(diagnosis),
         falling=Markup(figures.falling(data.history, words.steps(data.history))) if len(data.history) > 1 else None,
         surface=None if data.surface is None else Markup(figures.surface_map(data.surface)),
         order=order,
@@ -137,6 +138,14 @@ def _maps(diagnosis: Mapping[str, Any]) -> list[tuple[str, Any]]:
     shown = [("The model as it is", "before")]
     shown += [(f"With {name.replace('_', ' ')}", name) for name in diagnosis["class"][:1] if name in diagnosis["maps"]]
     return [(title, Markup(figures.plan_maps(diagnosis, which))) for title, which in shown]
+
+
+def _strength(diagnosis: Mapping[str, Any]) -> list[tuple[str, Any]]:
+    """Curves of a free strength, the argument and what it looks like above each."""
+    from markupsafe import Markup
+
+    found = diagnosis.get("strength")
+    return [] if found is None else [(s["reading"], Markup(strength.curve(s))) for s in found["shapes"]]
 
 
 def data_url(path: Path) -> str:

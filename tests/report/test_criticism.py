@@ -161,6 +161,23 @@ def test_a_run_without_criticism_says_nothing_of_it(run: Path) -> None:
     assert "Missing" not in text and "The error falls" not in text and "Observed, predicted, difference" in text
 
 
+def test_a_free_strength_is_drawn_over_what_was_visited(run: Path, diagnosis: dict[str, Any]) -> None:
+    at = np.geomspace(100.0, 2000.0, 9)
+    shape = {"argument": "pressure", "reading": "cohesion-like", "at": list(at), "factor": list(at**-0.1)}
+    shape |= {"low": list(0.9 * at**-0.1), "high": list(1.1 * at**-0.1)}
+    found = {"explained": 0.93, "readings": ["cohesion-like"], "shapes": [shape]}
+    write_json(run / "diagnoses" / "base.json", {**diagnosis, "verdict": "outside the library", "strength": found})
+    page = write_report(run).read_text()
+    text = words_of(page)
+    assert "What the missing strength looks like" in text and "cohesion-like" in text and "93 %" in text
+    assert "too little to read" not in text and "pressure [Pa]" in page
+    faint = {**found, "explained": 0.2, "shapes": [{**shape, "reading": ""}]}
+    write_json(run / "diagnoses" / "base.json", {**diagnosis, "strength": faint})
+    assert "too little to read anything into them" in words_of(write_report(run).read_text())
+    write_json(run / "diagnoses" / "base.json", {**diagnosis, "strength": None})
+    assert "What the missing strength" not in words_of(write_report(run).read_text())
+
+
 def test_a_diagnosis_of_another_estimate_is_not_shown(run: Path, diagnosis: dict[str, Any]) -> None:
     write_json(run / "diagnoses" / "base.json", {**diagnosis, "values": {"angle": 9.0}})
     assert "Missing" not in words_of(write_report(run).read_text())
