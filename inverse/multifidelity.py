@@ -79,8 +79,20 @@ class TwoLevelOptimiser(BayesianOptimiser):
 
     def tell_level(self, action: npt.ArrayLike, level: int, loss: float | None) -> None:
         """Learn the loss (None: the evaluation failed) at a point (n,) and a level."""
-        self.tell(action, loss)
+        super().tell(action, loss)
         self.levels.append(int(level))
+
+    def tell(self, action: npt.ArrayLike, loss: float | None) -> None:
+        """Learn the full loss at a point."""
+        self.tell_level(action, FULL, loss)
+
+    def ask_batch(self, count: int) -> npt.NDArray[np.float32]:
+        """Not here: a proposal has a level.
+
+        Raises:
+            NotImplementedError: always; `ask_level` proposes.
+        """
+        raise NotImplementedError("a two-level optimiser proposes points with their level: call ask_level()")
 
     def ask_level(self) -> Ask:
         """The next point and level."""

@@ -118,6 +118,14 @@ def test_failures_of_either_level_are_left_out() -> None:
     assert optimiser.result().estimate[0] == pytest.approx(0.2, abs=0.05)
 
 
+def test_a_loss_without_a_level_is_the_full_one() -> None:
+    optimiser = TwoLevelOptimiser(1, cost=COST, budget=5)
+    optimiser.tell([0.0], 1.0)
+    assert optimiser.levels == [FULL] and optimiser.spent == 1.0
+    with pytest.raises(NotImplementedError, match="ask_level"):
+        optimiser.ask()
+
+
 @pytest.mark.parametrize(("cost", "error"), [(0.0, ValueError), (1.0, ValueError), (0.9, ParameterError)])
 def test_costs_and_budgets_that_make_no_sense(cost: float, error: type) -> None:
     with pytest.raises(error):
