@@ -21,7 +21,9 @@ from splatsoil.parameters import Parameter, ParameterSpace
 from .bayesopt import PAPER, START, Episode, optimise
 from .campaign import Job, make_record
 from .evaluations import EvaluationRecord, EvaluationStore, digest
+from .feature_fit import by_features
 from .multifidelity import most_steps, optimise_two_levels
+from .posterior import Data
 from .run_folder import RunFolder
 from .surrogate import Minimum, Surrogate
 
@@ -260,15 +262,18 @@ def summarise(
     episode: Episode, problem: Problem, setup: FitSetup, records: list[EvaluationRecord], *, seconds: float
 ) -> dict[str, Any]:
     """A fit in plain numbers, physical units and words."""
-    minimum, space = episode.minimum, problem.space
+    space = problem.space
     surrogate = episode.optimiser.surrogate()
     good = [record for record in records if record.status == "ok"]
+    told = _from_features(problem, records, surrogate, episode.minimum, setup.seed)
+    minimum = told or episode.minimum
     done = [record for record in good if is_full(record.parameters)]
     best = min(done, key=lambda record: record.loss if record.loss is not None else math.inf)
     return {
         "format": FORMAT,
         "name": setup.name,
         "parameters": {p.name: _estimate(p, i, minimum, space) for i, p in enumerate(space)},
+        "estimated_from": "loss" if told is None else "features",
         "loss": minimum.loss,
         "loss_std": minimum.loss_std,
         "noise_std": minimum.noise_std,
@@ -297,6 +302,18 @@ def summarise(
             for record in records
         ],
     }
+
+
+def _from_features(
+    problem: Problem, records: list[EvaluationRecord], surrogate: Surrogate, fallback: Minimum, seed: int
+) -> Minimum | None:
+    """The minimum by the emulated features; None where evaluations are too few or too unlike each other for that."""
+    places, sensor = getattr(problem, "places", None), float(getattr(problem, "sensor_std", 0.0))
+    try:
+        data = Data.from_records(problem.space, records, places, sensor)
+        return by_features(data, surrogate, fallback, seed=seed)
+    except RunError:
+        return None
 
 
 def _without_level(parameters: Mapping[str, float]) -> dict[str, float]:

@@ -207,7 +207,7 @@ class Surrogate:
             loss=float(loss[0]),
             loss_std=float(loss_std[0]),
             noise_std=self.noise_std,
-            at_bound=tuple(_bound(value) for value in estimate),
+            at_bound=tuple(bound_of(value) for value in estimate),
             determined=tuple(bool(d) for d in determined),
         )
 
@@ -269,7 +269,7 @@ def sobol(count: int, dimension: int, seed: int) -> FloatArray:
     return 2.0 * engine.draw(count, dtype=torch.float64).numpy() - 1.0
 
 
-def _bound(value: float) -> Literal["lower", "upper"] | None:
+def bound_of(value: float) -> Literal["lower", "upper"] | None:
     if value <= -1.0 + 2.0 * AT_BOUND:
         return "lower"
     return "upper" if value >= 1.0 - 2.0 * AT_BOUND else None

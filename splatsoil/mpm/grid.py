@@ -87,6 +87,24 @@ def corner_gradient(f: wp.vec3, corner: int, inverse: wp.vec3) -> wp.vec3:
 
 
 @wp.func
+def corner_twist(f: wp.vec3, corner: int) -> wp.vec3:
+    """Mixed second derivatives (yz, xz, xy) of :func:`corner_weight`, per cell and cell."""
+    wx = wp.where((corner & 4) == 0, 1.0 - f[0], f[0])
+    wy = wp.where((corner & 2) == 0, 1.0 - f[1], f[1])
+    wz = wp.where((corner & 1) == 0, 1.0 - f[2], f[2])
+    sx = wp.where((corner & 4) == 0, -1.0, 1.0)
+    sy = wp.where((corner & 2) == 0, -1.0, 1.0)
+    sz = wp.where((corner & 1) == 0, -1.0, 1.0)
+    return wp.vec3(wx * sy * sz, sx * wy * sz, sx * sy * wz)
+
+
+@wp.func
+def corner_sign(corner: int) -> float:
+    """Third mixed derivative (xyz) of :func:`corner_weight`, per cell, cell and cell."""
+    return wp.where((((corner >> 2) + (corner >> 1) + corner) & 1) == 0, -1.0, 1.0)
+
+
+@wp.func
 def corner_offset(grid: Grid, corner: int) -> int:
     """Node number of a corner relative to the cell's lowest node."""
     return ((corner >> 2) * grid.shape[1] + ((corner >> 1) & 1)) * grid.shape[2] + (corner & 1)

@@ -26,8 +26,8 @@ class Preset:
             skeleton allows long steps.
         poisson: Poisson's ratio.
         courant: sound-wave Courant number of a substep.
-        transport: most cells the tool may travel in one step of the particles. An exchange with the grid dissipates a
-            little, so less isn't better: it goes with the cell, see docs/numerics.md.
+        transport: most cells the tool may travel in one step of the particles; and the way, in cells, over which
+            hourglass modes are damped and contact gives way, see :attr:`Resolution.relaxation`.
     """
 
     name: str
@@ -63,6 +63,9 @@ class Resolution:
         bulk: bulk modulus in Pa.
         shear: shear modulus in Pa.
         density: bulk density in kg/m^3.
+        relaxation: exchanges between particles and grid a second of which hourglass modes and the tool's contact shall
+            know, whatever the number of ``steps``: the former are damped as that many plain APIC exchanges would, soil
+            sunk into the tool comes out at this rate. 0 for as many as there are.
     """
 
     cell: float
@@ -73,12 +76,15 @@ class Resolution:
     bulk: float
     shear: float
     density: float
+    relaxation: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("cell", "spacing", "frame_time", "steps", "courant", "bulk", "shear", "density"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
                 raise SimulationError(f"resolution: {name} = {value} must be a positive number")
+        if not (math.isfinite(self.relaxation) and self.relaxation >= 0.0):
+            raise SimulationError(f"resolution: relaxation = {self.relaxation} must be 0 or a positive number")
         if self.courant > COURANT_LIMIT:
             raise SimulationError(
                 f"resolution: a Courant number of {self.courant} breaks the wave-speed limit of {COURANT_LIMIT}"
@@ -109,7 +115,8 @@ class Resolution:
         motion = measurement.tool.motion
         travel = np.linalg.norm(np.diff(motion.positions, axis=0), axis=1) / np.diff(motion.times)
         frame_time = 1.0 / measurement.frame_rate
-        steps = max(1, math.ceil(float(travel.max()) * frame_time / (preset.transport * cell) - 1e-6))
+        relaxation = float(travel.max()) / (preset.transport * cell)
+        steps = max(1, math.ceil(relaxation * frame_time - 1e-6))
         return cls(
             cell=cell,
             spacing=cell / preset.particles_per_edge,
@@ -119,4 +126,5 @@ class Resolution:
             bulk=preset.young / (3.0 * (1.0 - 2.0 * preset.poisson)),
             shear=preset.young / (2.0 * (1.0 + preset.poisson)),
             density=measurement.bed.density,
+            relaxation=relaxation,
         )

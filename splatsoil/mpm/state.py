@@ -13,6 +13,9 @@ class Particles:
         position: m.
         velocity: m/s.
         affine: APIC velocity gradient, 1/s.
+        bilinear: of the velocity's field in the particle's cell, the coefficients of yz, xz and xy (columns) about the
+            particle, in m/s per cell and cell.
+        trilinear: that of xyz, in m/s per cell, cell and cell.
         deformation: visual deformation since frame 0 (rotation and bounded stretch).
         normal: deviatoric stress, diagonal, Pa.
         shear: deviatoric stress, off-diagonal (xy, xz, yz), Pa.
@@ -33,6 +36,8 @@ class Particles:
     position: wp.array(dtype=wp.vec3)
     velocity: wp.array(dtype=wp.vec3)
     affine: wp.array(dtype=wp.mat33)
+    bilinear: wp.array(dtype=wp.mat33)
+    trilinear: wp.array(dtype=wp.vec3)
     deformation: wp.array(dtype=wp.mat33)
     normal: wp.array(dtype=wp.vec3)
     shear: wp.array(dtype=wp.vec3)

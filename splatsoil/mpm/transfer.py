@@ -10,6 +10,8 @@ from splatsoil.mpm.grid import (
     cell_of,
     corner_gradient,
     corner_offset,
+    corner_sign,
+    corner_twist,
     corner_weight,
     local_coordinates,
 )
@@ -48,7 +50,12 @@ def number_cells(cells: Cells) -> None:
 
 @wp.kernel
 def particles_to_grid(particles: Particles, cells: Cells, nodes: Nodes, grid: Grid) -> None:
-    """Add each particle's mass and momentum (APIC, Jiang et al. 2015) to nodes, its stress and shape to its cell."""
+    """Add each particle's mass and momentum to nodes, its stress and shape to its cell.
+
+    A particle carries the whole trilinear field of velocity around it, not the affine part alone (APIC, Jiang et al.
+    2015; PolyPIC, Fu et al. 2017): what it takes from the nodes it gives back to them, and an exchange loses nothing
+    unless it is told to.
+    """
     p = wp.tid()
     x = particles.position[p]
     f = local_coordinates(grid, x, cell_of(grid, x))
@@ -66,13 +73,17 @@ def particles_to_grid(particles: Particles, cells: Cells, nodes: Nodes, grid: Gr
         wp.atomic_add(cells.depth, entry, volume * particles.depth[p])
     v = particles.velocity[p]
     affine = particles.affine[p]
+    bilinear = particles.bilinear[p]
+    trilinear = particles.trilinear[p]
     mass = particles.mass * particles.density[p]
     for corner in range(8):
         node = base + corner_offset(grid, corner)
         weight = mass * corner_weight(f, corner)
         offset = wp.vec3(float(corner >> 2), float((corner >> 1) & 1), float(corner & 1)) - f
         wp.atomic_add(nodes.mass, node, weight)
-        wp.atomic_add(nodes.velocity, node, weight * (v + affine * wp.cw_mul(offset, grid.cell)))
+        mixed = wp.vec3(offset[1] * offset[2], offset[0] * offset[2], offset[0] * offset[1])
+        there = v + affine * wp.cw_mul(offset, grid.cell) + bilinear * mixed + (offset[0] * mixed[0]) * trilinear
+        wp.atomic_add(nodes.velocity, node, weight * there)
         wp.atomic_add(cells.gradient, 8 * entry + corner, volume * corner_gradient(f, corner, grid.inverse))
 
 
@@ -141,10 +152,16 @@ def grid_to_particles(
     grid: Grid,
     ceiling: float,
     limit: float,
+    keep: float,
+    release: float,
     broken: wp.array(dtype=int),
     strays: wp.array(dtype=int),
 ) -> None:
-    """Move particles with the step's displacement; take over velocity (APIC), stress and volume of the cell.
+    """Move particles with the step's displacement; take over velocity, stress and volume of the cell.
+
+    The mean gradient of a cell doesn't see the bilinear and trilinear parts of its velocity, so stress can't resist
+    them (hourglass modes); a particle keeps the fraction ``keep`` of them. A particle that has sunk into the tool is
+    moved out by the fraction ``release`` of its depth.
 
     A particle faster than ``limit`` (m/s) or without a finite state counts as ``broken``; one that rises above
     ``ceiling`` (m) counts as a stray, loses its velocity and falls back.
@@ -158,16 +175,22 @@ def grid_to_particles(
     displacement = wp.vec3(0.0)
     affine = wp.mat33(0.0)
     stretch = wp.mat33(0.0)
+    bilinear = wp.mat33(0.0)
+    trilinear = wp.vec3(0.0)
     for corner in range(8):
         node = base + corner_offset(grid, corner)
         weight = corner_weight(f, corner)
         gradient = corner_gradient(f, corner, grid.inverse)
+        bilinear += wp.outer(nodes.velocity[node], corner_twist(f, corner))
+        trilinear += corner_sign(corner) * nodes.velocity[node]
         velocity += weight * nodes.velocity[node]
         displacement += weight * nodes.displacement[node]
         affine += wp.outer(nodes.velocity[node], gradient)
         stretch += wp.outer(nodes.displacement[node], gradient)
     particles.velocity[p] = velocity
     particles.affine[p] = affine
+    particles.bilinear[p] = keep * bilinear
+    particles.trilinear[p] = keep * trilinear
     particles.deformation[p] += stretch * particles.deformation[p]
     particles.normal[p] = cells.normal[entry]
     particles.shear[p] = cells.shear[entry]
@@ -176,10 +199,15 @@ def grid_to_particles(
     if p < particles.history.shape[0]:
         particles.history[p] = cells.history[entry]
 
+    # the midpoint rule: with the displacement where it starts, turning soil would swell and shearing soil shrink
+    half = f + 0.5 * wp.cw_mul(displacement, grid.inverse)
+    displacement = wp.vec3(0.0)
+    for corner in range(8):
+        displacement += corner_weight(half, corner) * nodes.displacement[base + corner_offset(grid, corner)]
     x += displacement
     gap = particles.gap[p]
     if gap < 0.0 and gap > -FAR:
-        x -= gap * particles.gap_normal[p]
+        x -= release * gap * particles.gap_normal[p]
     low = grid.origin
     high = low + wp.cw_mul(
         grid.cell, wp.vec3(float(grid.shape[0] - 1), float(grid.shape[1] - 1), float(grid.shape[2] - 1))
@@ -193,6 +221,8 @@ def grid_to_particles(
         wp.atomic_add(strays, 0, 1)
         particles.velocity[p] = wp.vec3(0.0)
         particles.affine[p] = wp.mat33(0.0)
+        particles.bilinear[p] = wp.mat33(0.0)
+        particles.trilinear[p] = wp.vec3(0.0)
         x = wp.vec3(x[0], x[1], ceiling)
     particles.position[p] = wp.vec3(
         wp.clamp(x[0], low[0] + margin[0], high[0] - margin[0]),

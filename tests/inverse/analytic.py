@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 from splatsoil.envs.problem import Evaluation, Image
 from splatsoil.inverse.fitting import FitSetup, fit
 from splatsoil.inverse.run_folder import RunFolder
@@ -20,6 +21,8 @@ from splatsoil.parameters import Parameter, ParameterSpace
 
 FRICTION = Parameter("friction_angle", "deg", 20.0, 50.0, 35.0)
 COHESION = Parameter("cohesion", "Pa", 0.0, 1000.0, 0.0, off=0.0)
+#: What one degree, 500 Pa and the model's own error do to the blocks.
+DIRECTIONS = np.linalg.qr(np.random.default_rng(7).normal(size=(24, 3)))[0].T
 SETUP = FitSetup(
     measurement="m" * 64,
     reconstruction="r" * 64,
@@ -36,7 +39,7 @@ class AnalyticProblem:
     """Loss = 0.1 + ((φ − 36)/10)² (+ a term in cohesion) + noise that depends on the seed; fails where told to."""
 
     worst_loss = 100.0
-    block_count = 3
+    block_count = DIRECTIONS.shape[1]
     image_size = (4, 6)
 
     def __init__(
@@ -72,11 +75,17 @@ class AnalyticProblem:
         picture = np.full((*self.image_size, 3), 0.5, dtype=np.float32)
         return Evaluation(
             loss=0.5 if self.constant else float(max(loss, 0.0)),
-            blocks=np.array([angle - self.target + self._chance(seed), 0.0, 1.0]),
+            blocks=self._blocks(parameters, seed),
             extras={"rgb": 0.01},
             observed=picture,
             predicted=picture + 0.1,
         )
+
+    def _blocks(self, parameters: Mapping[str, float], seed: int) -> npt.NDArray[np.float64]:
+        off = [parameters["friction_angle"] - self.target + self._chance(seed), 0.0, 1.0]
+        if "cohesion" in parameters:
+            off[1] = 10.0 * (parameters["cohesion"] - 300.0) / 500.0
+        return (np.array([0.0, 0.0, 1.0]) if self.constant else np.array(off)) @ DIRECTIONS
 
     def _chance(self, seed: int) -> float:
         return self.feature_noise * float(np.random.default_rng([seed, 1]).normal())

@@ -1,0 +1,103 @@
+"""The estimate from all features at once, instead of from their sum of squares.
+
+A loss adds up thousands of features and keeps one number; chance (lumps that fall here or there) moves its minimum by a
+degree. An emulator of the features themselves, through the same evaluations, tells what varies with the parameters
+from what doesn't: emulated residuals are smooth in the parameters, and their least squares are where the pictures
+agree best. The spread is the sandwich of least squares under errors of known covariance,
+
+    (JᵀJ)⁻¹ Jᵀ (chance + emulator + misfit) J (JᵀJ)⁻¹,
+
+J the scores' derivative (White 1980, Econometrica 48:817).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import minimize
+
+from .likelihood import Likelihood
+from .posterior import Data, likelihood_of
+from .surrogate import RESOLUTION, UNIFORM_STD, UNINFORMED, Minimum, Surrogate, bound_of, sobol
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Share of the scores' variance that points left out must be predicted with, or the loss is the better guide.
+LEAST_SKILL = 0.6
+#: Candidates from which the least squares start, the evaluations besides.
+CANDIDATES = 1024
+#: Half the step of the derivatives, of an axis from -1 to 1.
+STEP = 0.01
+#: Central 90 % of a normal distribution, in standard deviations.
+CENTRAL_90 = 1.6449
+
+
+def by_features(data: Data, surrogate: Surrogate, fallback: Minimum, *, seed: int = 0) -> Minimum | None:
+    """Where the emulated residuals' sum of squares is least.
+
+    Args:
+        data: evaluations with their residuals.
+        surrogate: of the loss, for the loss at the estimate.
+        fallback: the loss' own minimum; what features say nothing of is taken from it.
+        seed: of the emulator and the candidates.
+
+    Returns:
+        The minimum; None where the features vary in fewer ways than there are parameters, or points left out aren't
+        predicted well enough to trust the emulator.
+
+    Raises:
+        RunError: too few evaluations, or they don't differ.
+    """
+    likelihood = likelihood_of(data, seed=seed)
+    emulator = likelihood.emulator
+    if emulator.count < emulator.dimension:
+        return None
+    weight = emulator.scores.var(axis=0)
+    if float(weight @ emulator.left_out.skill) < LEAST_SKILL * float(weight.sum()):
+        return None
+    estimate = _least_squares(likelihood, data.points, seed)
+    std = np.maximum(_spread(likelihood, estimate), RESOLUTION)
+    determined = std < UNINFORMED * UNIFORM_STD
+    loss, loss_std = surrogate.mean_and_std(estimate[None])
+    return replace(
+        fallback,
+        estimate=estimate,
+        std=np.where(determined, std, np.minimum(std, UNIFORM_STD)),
+        low=np.maximum(estimate - CENTRAL_90 * std, -1.0),
+        high=np.minimum(estimate + CENTRAL_90 * std, 1.0),
+        loss=float(loss[0]),
+        loss_std=float(loss_std[0]),
+        at_bound=tuple(bound_of(value) for value in estimate),
+        determined=tuple(bool(d) for d in determined),
+    )
+
+
+def _least_squares(likelihood: Likelihood, points: FloatArray, seed: int) -> FloatArray:
+    """Minimiser (n,) of the squared distance between emulated and observed scores."""
+
+    def squares(where: FloatArray) -> FloatArray:
+        found, _ = likelihood.emulator.predict(where)
+        return np.asarray(np.sum((found - likelihood.scores) ** 2, axis=1))
+
+    dimension = likelihood.emulator.dimension
+    candidates = np.concatenate([sobol(CANDIDATES, dimension, seed), points])
+    start = candidates[np.argmin(squares(candidates))]
+    polished = minimize(lambda x: float(squares(x[None])[0]), start, bounds=[(-1.0, 1.0)] * dimension)
+    return np.clip(polished.x, -1.0, 1.0)
+
+
+def _spread(likelihood: Likelihood, estimate: FloatArray) -> FloatArray:
+    """Standard deviation (n,) of the least squares' minimiser."""
+    emulator = likelihood.emulator
+    steps = STEP * np.eye(emulator.dimension)
+    ahead, _ = emulator.predict(estimate + steps)
+    behind, _ = emulator.predict(estimate - steps)
+    slope = (ahead - behind).T / (2.0 * STEP)
+    _, variance = emulator.predict(estimate[None])
+    covariance = emulator.chance + np.diag(variance[0])
+    if likelihood.misfit is not None:
+        covariance = covariance + likelihood.misfit.covariance
+    bread = np.linalg.pinv(slope.T @ slope) @ slope.T
+    return np.sqrt(np.maximum(np.diag(bread @ covariance @ bread.T), 0.0))
