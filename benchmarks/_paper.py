@@ -100,12 +100,10 @@ class Sight:
     def __init__(self, measurement: Measurement, reconstruction: Reconstruction, protocol: Protocol) -> None:
         self.protocol = protocol
         resolution = Resolution.derive(measurement, protocol.preset("model", protocol.cells))
-        options: dict[str, Any] = {"preset": "paper", "device": protocol.device}
-        self.model = Model(measurement, reconstruction, **options)
+        self.model = Model(measurement, reconstruction, preset="paper", device=protocol.device)
         self.model.resolution = resolution
         # The published loss looks at four frames: no others are drawn for it.
-        self.few = Model(measurement, reconstruction, frames=(0, *FRAMES), **options)
-        self.few.resolution = resolution
+        self.few = self.model.variant(frames=(0, *FRAMES))
         # Patches of two cells: what is smaller is chance.
         self.comparator = Comparator(
             measurement, surface=reconstruction.surface, frames=self.model.frames, patch=2.0 * resolution.cell

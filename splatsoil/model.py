@@ -85,8 +85,15 @@ class Model:
 
         self.recorded = self._recorded_frames()
 
-    def variant(self, *, effects: Iterable[str | Effect] | None = None, resolution: Resolution | None = None) -> Model:
-        """The same experiment with other effects on, or computed otherwise; it shares scenes where particles agree.
+    def variant(
+        self,
+        *,
+        effects: Iterable[str | Effect] | None = None,
+        resolution: Resolution | None = None,
+        frames: Iterable[int] | None = None,
+    ) -> Model:
+        """The same experiment with other effects on, computed otherwise, or at other frames; it shares scenes where
+        particles agree.
 
         An effect that is on already keeps its name here, wherever it came from.
         """
@@ -98,7 +105,7 @@ class Model:
             effects=chosen,
             preset=self.preset,
             device=self.device,
-            frames=self.frames,
+            frames=self.frames if frames is None else frames,
         )
         other.resolution = resolution or self.resolution
         if other.resolution.spacing == self.resolution.spacing:
