@@ -76,7 +76,9 @@ def run(config: Config) -> int:
     if config.plot.suffix not in (".png", ".svg", ".pdf"):
         raise ParameterError(f"--plot {config.plot}: give a file that ends in .png, .svg or .pdf")
     law = Law(find_effects(config.effects))
-    result = perform(law, law.require_on({**values, "friction_angle": config.friction_angle}), config)
+    full = law.require_on({**values, "friction_angle": config.friction_angle})
+    refuse_idle(law, full)
+    result = perform(law, full, config)
     columns = curve(result, config)
     draw(columns, config)
     if config.json:
@@ -93,6 +95,21 @@ def run(config: Config) -> int:
     else:
         show(columns, config)
     return 0
+
+
+def refuse_idle(law: Law, values: dict[str, float]) -> None:
+    """ParameterError for effects that a specimen cannot feel: tools, gravity and cameras are not in the laboratory."""
+    from splatsoil.soil.law import INTERCEPT_PER_COHESION, SLOPE, STIFFNESS, Law
+    from splatsoil.soil.settings import Settings
+
+    felt = [int(SLOPE), int(INTERCEPT_PER_COHESION), int(STIFFNESS)]
+    angle = {"friction_angle": values["friction_angle"]}
+    base = Settings(friction_angle=values["friction_angle"])
+    for effect in law.effects:
+        mine = {p.name: values[p.name] for p in effect.parameters} | angle
+        with_it, without = Law([effect]).table(base, [mine])[0, felt], Law().table(base, [angle])[0, felt]
+        if effect.strength is None and (with_it == without).all():
+            raise ParameterError(f"effect {effect.name} does not act on a specimen; leave it out of the element test")
 
 
 def perform(law: Law, values: dict[str, float], config: Config) -> ElementTest:

@@ -53,6 +53,8 @@ def test_the_other_tests(
         (["--confining", "-5"], "confining: -5.0 is not a positive number"),
         (["--with", "dilatancy", "compaction"], "cannot both be on"),
         (["--set", "cohesion=5"], "unknown parameter cohesion"),
+        (["--with", "tilt", "--set", "tilt_x=5"], "effect tilt does not act on a specimen"),
+        (["--with", "exposure", "--set", "exposure_gain=1.1"], "effect exposure does not act on a specimen"),
         (["--plot", "curve.txt"], "ends in .png, .svg or .pdf"),
         (["--records", "1"], "--records: a curve needs at least 2 points"),
     ],
