@@ -250,14 +250,19 @@ def summarise(posterior: Posterior) -> dict[str, Any]:
     }
 
 
+def verdicts(unit: FloatArray) -> list[str]:
+    """Of samples (k, n) in [-1, 1]: whether each parameter is determined, by its spread over the prior's."""
+    return [
+        "determined" if c < DETERMINED else "weakly determined" if c < UNDETERMINED else "not determined"
+        for c in unit.std(axis=0) * np.sqrt(3.0)
+    ]
+
+
 def _marginal(p: Parameter, values: FloatArray, unit: FloatArray, space: ParameterSpace, index: int) -> dict[str, Any]:
     low, low50, median, high50, high = (float(q) for q in np.quantile(values, [0.05, 0.25, 0.5, 0.75, 0.95]))
     # Compared on the axis that the prior is uniform on: the logarithmic one where the parameter is.
     contraction = float(unit.std() * np.sqrt(3.0))
-    if contraction < DETERMINED:
-        verdict = "determined"
-    else:
-        verdict = "weakly determined" if contraction < UNDETERMINED else "not determined"
+    (verdict,) = verdicts(unit[:, None])
     bounds = [
         name
         for name, near in (("lower", unit < -1.0 + 2.0 * BESIDE), ("upper", unit > 1.0 - 2.0 * BESIDE))

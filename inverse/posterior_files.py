@@ -15,6 +15,8 @@ import numpy.typing as npt
 from splatsoil.errors import RunError
 from splatsoil.files import write_bytes
 
+from .posterior import verdicts
+
 if TYPE_CHECKING:
     import arviz
     from matplotlib.figure import Figure
@@ -99,7 +101,7 @@ def write_figures(posterior: Posterior, folder: Path) -> list[str]:
 
 
 def corner_figure(posterior: Posterior) -> Figure:
-    """Every parameter and every pair; the frame is the prior."""
+    """Every parameter and every pair; the frame is the prior, and what is not determined gets no number."""
     import corner
     from matplotlib.figure import Figure
 
@@ -112,10 +114,14 @@ def corner_figure(posterior: Posterior) -> Figure:
         range=[(p.lower, p.upper) for p in space],
         axes_scale=["log" if p.log else "linear" for p in space],
         quantiles=[0.05, 0.5, 0.95],
-        show_titles=True,
         bins=40,
         quiet=True,
     )
+    axes = np.array(figure.axes).reshape(len(space), len(space))
+    for i, (p, verdict) in enumerate(zip(space, verdicts(posterior.unit), strict=True)):
+        low, median, high = (f"{q:.4g}" for q in np.quantile(posterior.values[:, i], [0.05, 0.5, 0.95]))
+        told = "not identified" if verdict == "not determined" else f"{median} ({low} to {high})"
+        axes[i, i].set_title(f"{p.label or p.name.replace('_', ' ')}: {told}", fontsize=8)
     return figure
 
 

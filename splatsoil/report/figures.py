@@ -111,7 +111,7 @@ def marginal(entry: Mapping[str, Any]) -> str:
             axes.plot([place(entry["low_50"]), place(entry["high_50"])], [height] * 2, color=SECOND, linewidth=5.0)
         axes.axhline(0.0, color=FAINT, linewidth=0.8)
         ticks = np.linspace(0.0, 1.0, 5)
-        axes.set_xticks(ticks, [f"{np.interp(t, places, edges):.3g}" for t in ticks])
+        axes.set_xticks(ticks, [f"{np.interp(t, places, edges):.4g}" for t in ticks])
         axes.set_xlim(0.0, 1.0)
         axes.set_yticks([])
         axes.spines["left"].set_visible(False)

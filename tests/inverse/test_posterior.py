@@ -14,6 +14,7 @@ from splatsoil.inverse.fitting import fit
 from splatsoil.inverse.likelihood import Likelihood
 from splatsoil.inverse.mcmc import sample
 from splatsoil.inverse.posterior import Data, sample_posterior, summarise
+from splatsoil.inverse.posterior_files import corner_figure
 from splatsoil.inverse.posterior_run import Effort, run_posterior, setup_of
 from splatsoil.inverse.surrogate import sobol
 
@@ -56,6 +57,9 @@ def test_what_no_feature_depends_on_is_said_to_be_undetermined(posterior) -> Non
     assert any("cohesion is not determined" in note for note in told["notes"])
     assert angle["low"] < angle["low_50"] < angle["median"] < angle["high_50"] < angle["high"]
     assert told["misfit"]["std"] == 0.0 and told["chains"]["converged"]
+    titles = [axis.get_title() for axis in corner_figure(posterior).axes if axis.get_title()]
+    assert len(titles) == 2 and titles[1] == "cohesion: not identified"
+    assert titles[0].startswith("friction angle: ") and " to " in titles[0]
     # Densities integrate to the prior's.
     assert np.mean(cohesion["histogram"]["density"]) == pytest.approx(1.0, abs=0.01)
 
