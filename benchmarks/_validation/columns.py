@@ -17,6 +17,8 @@ RADIUS = 0.1
 DENSITY = 1600.0
 PARTICLES = 8_000
 ROUGH = 10.0
+WAY = 0.1
+"""Cells that the fastest soil goes between two exchanges with the grid, and while hourglass modes are damped."""
 THIN = 0.02 * RADIUS
 """Thickness in m under which a deposit has ended: a few grains in the laboratory."""
 ANGLE = 31.0
@@ -38,7 +40,7 @@ def column(
     matching: Matching,
     particles: float = PARTICLES,
     seed: int = 0,
-    transport: float = 0.1,
+    transport: float = WAY,
     young: float = 5.0e5,
 ) -> Scene:
     """A quarter of a cylinder, or half of a planar column, between smooth walls that stand for its symmetry."""
@@ -62,7 +64,7 @@ def column(
     return Scene(
         np.clip(x, 1e-6, None),
         (reach, width, height + 2 * cell),
-        resolution(cell, fastest, density=DENSITY, young=young, transport=transport),
+        resolution(cell, fastest, density=DENSITY, young=young, transport=transport, way=WAY),
         settings,
     )
 

@@ -14,6 +14,8 @@ from splatsoil.soil.matching import Matching
 from splatsoil.soil.settings import Settings
 
 STATIC, FAST, INERTIAL = math.tan(math.radians(20.9)), math.tan(math.radians(32.8)), 0.279
+WAY = 0.2
+"""Cells that the fastest soil goes between two exchanges with the grid, and while hourglass modes are damped."""
 GRAIN_DENSITY, SOLID = 2500.0, 0.6
 
 
@@ -27,7 +29,7 @@ class Chute:
     layers: int = 8
     length: float = 0.7
     seconds: float = 0.8
-    transport: float = 0.2
+    transport: float = WAY
     young: float = 1.0e5
     rate: bool = True
 
@@ -67,7 +69,7 @@ class Chute:
         scene = Scene(
             x,
             (self.length, cell, 3.0 * self.height),
-            resolution(cell, fastest, density=density, young=self.young, transport=self.transport),
+            resolution(cell, fastest, density=density, young=self.young, transport=self.transport, way=WAY),
             settings,
             ("rate_dependence",) if self.rate else (),
             values if self.rate else {},

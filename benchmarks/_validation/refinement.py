@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 from splatsoil.benchmarks._validation.blades import Blade
-from splatsoil.benchmarks._validation.columns import ANGLE, PARTICLES, collapse, column
+from splatsoil.benchmarks._validation.columns import ANGLE, PARTICLES, WAY, collapse, column
 from splatsoil.benchmarks._validation.page import Row, Section, percent
 
 from splatsoil.soil.matching import Matching
@@ -17,7 +17,7 @@ CHANGE = 0.1
 
 
 def runout(
-    device: str, *, particles: float = PARTICLES, seed: int = 0, transport: float = 0.1, young: float = 5e5
+    device: str, *, particles: float = PARTICLES, seed: int = 0, transport: float = WAY, young: float = 5e5
 ) -> float:
     """Run-out of an axisymmetric column of height R0; eight times the particles halve the cell."""
     scene = column(
@@ -45,8 +45,8 @@ def validate(device: str) -> Section:
     base, chance = float(np.mean(runs)), float(np.std(runs, ddof=1))
     rows.append(Row(f"column a = 1, run-out: mean of {SEEDS} seeds", f"{base:.3f}, scatter {chance:.3f}", "reported"))
     rows.append(_change("half the cell (8 times the particles)", runout(device, particles=8.0 * PARTICLES), base, ""))
-    rows.append(_change("half the step of the particles", runout(device, transport=0.05), base, ""))
-    rows.append(_change("double step", runout(device, transport=0.2), base, ""))
+    rows.append(_change("half the step of the particles", runout(device, transport=0.5 * WAY), base, ""))
+    rows.append(_change("double step", runout(device, transport=2.0 * WAY), base, ""))
     rows.append(_change("4 times as stiff", runout(device, young=2e6), base, ""))
     blade = Blade(0.08)
     forces = [replace(blade, seed=seed).force(device) for seed in range(SEEDS)]
@@ -64,6 +64,5 @@ def validate(device: str) -> Section:
         "The column and the blade of the parts above, one piece of the numerics changed at a time. See "
         "[numerics.md](numerics.md) for the ploughed beds.",
         tuple(rows),
-        "Fast falls are where an exchange between particles and grid shows most: what it dissipates holds the run-out "
-        "back.",
+        "Hourglass modes are damped over the same way in all rows, as in the presets, whatever the step.",
     )

@@ -43,8 +43,12 @@ def resolution(
     poisson: float = 0.3,
     transport: float = 0.1,
     courant: float = 0.5,
+    way: float | None = None,
 ) -> Resolution:
-    """Two particles along a cell's edge, one step a frame; soil at ``fastest`` m/s goes ``transport`` cells in it."""
+    """Two particles along a cell's edge, one step a frame; soil at ``fastest`` m/s goes ``transport`` cells in it.
+
+    ``way`` is how many cells it goes while hourglass modes are damped once; as many as in a step by default.
+    """
     return Resolution(
         cell=cell,
         spacing=0.5 * cell,
@@ -54,6 +58,7 @@ def resolution(
         bulk=young / (3.0 * (1.0 - 2.0 * poisson)),
         shear=young / (2.0 * (1.0 + poisson)),
         density=density,
+        relaxation=fastest / ((way or transport) * cell),
     )
 
 
