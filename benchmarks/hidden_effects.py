@@ -11,7 +11,7 @@ import argparse
 import json
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -33,6 +33,8 @@ EFFECTS = 8
 OBSERVATIONS = 2
 STRENGTHS = (0.5, 1.0, 2.0, 4.0)
 """Sizes of single effects, in smallest detectable ones."""
+HALF, MOST = 0.6745, 1.6449
+"""Standard deviations on either side that hold 50 % and 90 %."""
 MEMORY, LENGTH, NUGGET = 0.7, 0.12, 0.1
 """Of the emulated chance."""
 
@@ -52,6 +54,8 @@ class Tally:
         verdicts: how often each verdict was given.
         bias: mean error of the model's parameter in prior standard deviations, before and after adding.
         error: held-out error over the floor, before and after.
+        inside: how many intervals of 50 % and of 90 % held the truth, angle and size, where the right effect was added.
+        intervals: how many there were.
     """
 
     name: str
@@ -64,6 +68,8 @@ class Tally:
     verdicts: dict[str, int]
     bias: tuple[float, float]
     error: tuple[float, float]
+    inside: tuple[int, int]
+    intervals: int
 
 
 def wilson(hits: int, count: int, z: float = 1.96) -> tuple[float, float]:
@@ -182,18 +188,21 @@ def detectable(world: int, options: Options) -> dict[str, float]:
 
 def tally(
     name: str,
-    truths: Sequence[Sequence[str]],
+    truths: Sequence[Mapping[str, float]],
     found: Sequence[Diagnosis],
     angles: Sequence[float],
-    kinds: dict[str, str],
+    kinds: Mapping[str, str],
+    parameter: str = "angle",
+    sizes_of: Mapping[str, str] | None = None,
 ) -> Tally:
-    """Open the truths and count."""
+    """Open the truths and count; ``parameter`` is the model's own, ``sizes_of`` the effects' where named otherwise."""
     verdicts = {"adequate": 0, "missing": 0, "outside the library": 0}
     named = physics = first = held = 0
     sizes, before, after, errors = [], [], [], []
+    misses: list[float] = []
     for truth, diagnosis, angle in zip(truths, found, angles, strict=True):
         verdicts[diagnosis.verdict] += 1
-        before.append(abs(diagnosis.evidence.values["angle"] - angle))
+        before.append(abs(diagnosis.evidence.values[parameter] - angle))
         if diagnosis.verdict != "missing":
             continue
         named += 1
@@ -203,7 +212,10 @@ def tally(
         held += any(m in truth for m in members)
         sizes.append(len(members))
         best = diagnosis.confirmations[members[0]]
-        after.append(abs(best.fit.values["angle"] - angle))
+        after.append(abs(best.fit.values[parameter] - angle))
+        if [name for name in truth if name in diagnosis.scores] == [members[0]]:
+            known = {parameter: angle, **{(sizes_of or {}).get(n, n): size for n, size in truth.items()}}
+            misses += [abs(best.fit.values[key] - value) / best.stds[key] for key, value in known.items()]
         errors.append((diagnosis.confirmations[""].held_out / best.floor, best.held_out / best.floor))
     error = tuple(np.mean(errors, axis=0)) if errors else (math.nan, math.nan)
     return Tally(
@@ -217,22 +229,29 @@ def tally(
         verdicts,
         (float(np.mean(before)), float(np.mean(after)) if after else math.nan),
         (float(error[0]), float(error[1])),
+        (sum(miss < HALF for miss in misses), sum(miss < MOST for miss in misses)),
+        len(misses),
     )
 
 
-def run(count: int = 40, *, seed: int = 1, repeats: int = 4) -> dict[str, Any]:
-    """All kinds of truth, ``count`` experiments each; a JSON-able result."""
+def run(count: int = 40, *, seed: int = 1, repeats: int = 4, only: str = "") -> dict[str, Any]:
+    """All kinds of truth (or those with ``only`` in their name), ``count`` experiments each; a JSON-able result."""
     began = time.perf_counter()
     options = Options(repeats=repeats)
     kinds: dict[str, str] = {c.name: c.kind for c in emulated(0).candidates}
     physics = [name for name, kind in kinds.items() if kind == "physics"]
     reported = [name for name, kind in kinds.items() if kind == "observation"]
     rows: list[Tally] = []
+    kind = 0
 
     def series(name: str, hide: Any, beyond: float = 0.0, *, drop: bool = False, twin: bool = False) -> None:
+        nonlocal kind
         truths, found, angles = [], [], []
+        kind += 1
+        if only not in name:
+            return
         for k in range(count):
-            world = seed * 100_000 + len(rows) * 1_000 + k
+            world = seed * 100_000 + (kind - 1) * 1_000 + k
             sealed = np.random.default_rng([world, 2])
             angle = float(sealed.uniform(-2.0, 2.0))
             hidden = hide(sealed, detectable(world, options)) if hide is not None else {}
@@ -245,7 +264,7 @@ def run(count: int = 40, *, seed: int = 1, repeats: int = 4) -> dict[str, Any]:
                 extra = observed - base.measured({"angle": angle}, [world, 99])
                 truth = {"angle": angle}
             found.append(one(world, truth, extra, options, base))
-            truths.append(tuple(hidden))
+            truths.append(hidden)
             angles.append(angle)
         rows.append(tally(name, truths, found, angles, kinds))
 
@@ -273,23 +292,23 @@ def run(count: int = 40, *, seed: int = 1, repeats: int = 4) -> dict[str, Any]:
         "seed": seed,
         "repeats": repeats,
         "seconds": time.perf_counter() - began,
-        "rows": [
-            {
-                **row.__dict__,
-                "named_interval": wilson(row.named, row.count),
-                "held_interval": wilson(row.held, row.count),
-            }
-            for row in rows
-        ],
+        "rows": [entry(row) for row in rows],
     }
+
+
+def entry(row: Tally) -> dict[str, Any]:
+    """A row with its intervals."""
+    intervals = {"named_interval": wilson(row.named, row.count), "held_interval": wilson(row.held, row.count)}
+    return {**row.__dict__, **intervals}
 
 
 def table(result: dict[str, Any]) -> str:
     """The result as Markdown."""
     lines = [
         "| hidden | experiments | some effect named | a physical one | truth first | class holds it | mean class "
-        "| adequate / missing / outside | error over floor, before → after | angle's error, before → after |",
-        "|---|---|---|---|---|---|---|---|---|---|",
+        "| adequate / missing / outside | error over floor, before → after | angle's error, before → after "
+        "| truth inside 50 % / 90 % |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for row in result["rows"]:
         low, high = row["named_interval"]
@@ -300,7 +319,7 @@ def table(result: dict[str, Any]) -> str:
             f"| {row['name']} | {n} | {100 * row['named'] / n:.0f} % ({100 * low:.0f}–{100 * high:.0f}) "
             f"| {100 * row['physics'] / n:.0f} % | {100 * row['first'] / n:.0f} % "
             f"| {100 * row['held'] / n:.0f} % ({100 * first:.0f}–{100 * last:.0f}) | {row['members']:.1f} | {verdicts} "
-            f"| {_pair(row['error'])} | {_pair(row['bias'])} |"
+            f"| {_pair(row['error'])} | {_pair(row['bias'])} | {_inside(row['inside'], row['intervals'])} |"
         )
     return "\n".join(lines)
 
@@ -309,15 +328,20 @@ def _pair(values: Sequence[float]) -> str:
     return " → ".join("–" if not math.isfinite(v) else f"{v:.2f}" for v in values)
 
 
+def _inside(hits: Sequence[int], count: int) -> str:
+    return "–" if not count else " / ".join(f"{100 * h / count:.0f}" for h in hits) + f" % of {count}"
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Command line; exit code 0."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=40, help="experiments of each kind")
+    parser.add_argument("--only", default="", help="only the kinds whose name has this in it")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--repeats", type=int, default=4)
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args(arguments)
-    result = run(options.count, seed=options.seed, repeats=options.repeats)
+    result = run(options.count, seed=options.seed, repeats=options.repeats, only=options.only)
     if options.json:
         from splatsoil.files import plain
 

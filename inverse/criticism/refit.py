@@ -24,8 +24,9 @@ FloatArray = npt.NDArray[np.float64]
 
 TRUST = 0.5
 """First trust region, as a share of each parameter's range."""
-LEAST_FALL, LEAST_SHARE = 1.0, 0.002
-"""Falls of χ² below one unit, or below this share of it, are not worth a simulation: noise is larger."""
+LEAST_FALL, LEAST_SHARE = 0.1, 2e-4
+"""Falls of χ² below this, or below this share of it, are not worth a simulation: an estimate that is one standard
+deviation off costs one unit."""
 ROUNDS = 3
 """Most times that derivatives are measured anew where a refit stands."""
 
