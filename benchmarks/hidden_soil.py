@@ -85,7 +85,7 @@ class Bed:
 
     def observed(self, truth: dict[str, float], effects: Sequence[str], seed: int) -> FloatArray:
         """(t, s) what the cameras would report of a truth."""
-        simulate = Simulations(self.whole, self.keep / "features", self.identity)  # type: ignore[arg-type]
+        simulate = Simulations(self.whole, self.keep / "features", self.identity)
         told = simulate(truth, effects=tuple(effects), seed=FIRST_SEED + seed)
         noise = np.random.default_rng([seed, 1]).standard_normal(told.shape) * self.whole.sensor
         return np.where(self.whole.seen, told + noise, 0.0)

@@ -11,10 +11,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from splatsoil.measurement import Measurement
+from splatsoil.measurement import Measurement, ToolMotion
 
 if TYPE_CHECKING:
     from splatsoil.model import Model
+    from splatsoil.soil.effect import Effect
 
 FloatArray = npt.NDArray[np.float64]
 Predict = Callable[[Mapping[str, float], tuple[str, ...]], FloatArray]
@@ -57,15 +58,15 @@ def motions(measurement: Measurement, surface: float) -> dict[str, Measurement]:
     lowest = np.array([float((corners @ r.as_matrix().T)[:, 2].min()) for r in turn])
     low = motion.positions[:, 2] + lowest
 
-    def moved(**changes: FloatArray) -> Measurement:
-        return replace(measurement, tool=replace(measurement.tool, motion=replace(motion, **changes)))
+    def along(other: ToolMotion) -> Measurement:
+        return replace(measurement, tool=replace(measurement.tool, motion=other))
 
     def deeper(factor: float) -> Measurement:
         shift = np.where(low < surface, (factor - 1.0) * (low - surface), 0.0)
-        return moved(positions=motion.positions + shift[:, None] * np.array([0.0, 0.0, 1.0]))
+        return along(replace(motion, positions=motion.positions + shift[:, None] * np.array([0.0, 0.0, 1.0])))
 
     def faster(factor: float) -> Measurement:
-        quick = moved(times=motion.times / factor)
+        quick = along(replace(motion, times=motion.times / factor))
         return replace(quick, frame_rate=measurement.frame_rate * factor)
 
     def leaning(angle: float) -> Measurement:
@@ -77,7 +78,7 @@ def motions(measurement: Measurement, surface: float) -> dict[str, Measurement]:
         new = np.array([float((corners @ r.as_matrix().T)[:, 2].min()) for r in bent])
         positions = motion.positions.copy()
         positions[:, 2] += lowest - new
-        return moved(positions=positions, quaternions=np.roll(bent.as_quat(), 1, axis=1))
+        return along(replace(motion, positions=positions, quaternions=np.roll(bent.as_quat(), 1, axis=1)))
 
     out = {MEASURED: measurement, "half as deep": deeper(0.5)}
     floor = float(measurement.bed.lower[2])
@@ -95,7 +96,7 @@ def _heights(
     from splatsoil.model import Model
     from splatsoil.mpm import simulate
 
-    on = tuple(dict.fromkeys((*model.effects, *effects)))
+    on: tuple[str | Effect, ...] = (*model.effects, *effects)
     frames = np.unique(np.linspace(0, model.frames[-1], MOMENTS + 1).astype(int))
     coarse = Model(measurement, model.reconstruction, effects=on, preset=PRESET, device=model.device, frames=[0])
     run = simulate(
