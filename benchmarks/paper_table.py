@@ -93,9 +93,9 @@ def collect(protocol: Protocol, out: Path) -> dict[str, Any]:
                     "way": way,
                     "trials": len(trials),
                     "mae": float(np.abs(errors).mean()),
-                    "std": float(np.abs(errors).std(ddof=1)) if len(trials) > 1 else 0.0,
+                    "std": float(np.abs(errors).std(ddof=1)) if len(trials) > 1 else None,
                     "bias": float(errors.mean()),
-                    "scatter": float(errors.std(ddof=1)) if len(trials) > 1 else 0.0,
+                    "scatter": float(errors.std(ddof=1)) if len(trials) > 1 else None,
                     "width_90": float(np.mean([t["high"] - t["low"] for t in trials])),
                     "coverage_90": float(np.mean([t["low"] <= angle <= t["high"] for t in trials])),
                 }
@@ -125,19 +125,25 @@ def table(result: Mapping[str, Any]) -> str:
         cells = []
         for way in WAYS:
             entry = next((e for e in result["entries"] if e["angle"] == angle and e["way"] == way), None)
-            cells.append("–" if entry is None else f"{entry['mae']:.2f} ± {entry['std']:.2f}°")
+            cells.append("–" if entry is None else f"{entry['mae']:.2f}{_spread(entry['std'])}°")
         known = PUBLISHED.get(angle)
         printed = "–" if known is None else f"{known[0]:.2f} ± {known[1]:.2f}°"
         lines.append(f"| {angle:g}° | {printed} | {' | '.join(cells)} | {TARGET[0]:g} ± {TARGET[1]:g}° |")
     lines += ["", "| true angle | way | bias | scatter | 90 % interval's width | holds the truth |", "|---" * 6 + "|"]
     for e in result["entries"]:
+        scatter = "–" if e["scatter"] is None else f"{e['scatter']:.2f}°"
         lines.append(
-            f"| {e['angle']:g}° | {e['way']} | {e['bias']:+.2f}° | {e['scatter']:.2f}° | {e['width_90']:.2f}° | "
+            f"| {e['angle']:g}° | {e['way']} | {e['bias']:+.2f}° | {scatter} | {e['width_90']:.2f}° | "
             f"{100.0 * e['coverage_90']:.0f} % |"
         )
     if result["budget"]:
         lines += ["", *budget_table(result["budget"])]
     return "\n".join(lines)
+
+
+def _spread(value: float | None) -> str:
+    """Of several trials; one has none."""
+    return "" if value is None else f" ± {value:.2f}"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -168,6 +168,8 @@ def test_errors_are_counted(tmp_path: Path) -> None:
     assert first["std"] == pytest.approx(0.5**0.5) and first["scatter"] == pytest.approx(4.5**0.5)
     text = paper_table.table(paper_table.collect(protocol, tmp_path))
     assert "| 35° | 1.24 ± 0.96° | 1.50 ± 0.71° |" in text
+    one = paper_table.collect(Protocol(angles=(35.0,), trials=1), tmp_path)
+    assert "| 35° | 1.24 ± 0.96° | 1.00° |" in paper_table.table(one), "one trial has no spread"
 
 
 def test_the_parts_of_the_error_add_up() -> None:
