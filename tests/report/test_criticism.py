@@ -54,6 +54,7 @@ def fit(name: str, angle: float, effects: list[str], extra: dict[str, float]) ->
         "name": name,
         "parameters": parameters,
         "loss": 0.2,
+        "estimated_from": "features",
         "loss_std": 0.01,
         "noise_std": 0.01,
         "evaluations": 1,

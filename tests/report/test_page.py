@@ -42,6 +42,7 @@ def fit(name: str = "base", **changes: Any) -> dict[str, Any]:
             }
         },
         "loss": 0.123,
+        "estimated_from": "loss",
         "loss_std": 0.01,
         "noise_std": 0.02,
         "evaluations": 3,
