@@ -62,21 +62,21 @@ def floor_of(experiment: Experiment, evidence: Evidence) -> Floor:
     a sample of what numerics that weren't tried would leave, and goes into the noise.
     """
     layout, seen = experiment.layout, experiment.seen
+    prior = {p.name: (p.upper - p.lower) / np.sqrt(12.0) for p in experiment.parameters}
+    slopes = [prior[name] * table for name, table in evidence.slopes.items()]
+    slopes += [(3.0 * evidence.widths[name]) ** 2 * table for name, table in evidence.curves.items()]
+    parameters = _columns(slopes, seen)
     parts = {"instruments": independent(experiment.sensor, experiment.sensor_memory)}
     runs = len(evidence.repeats)
     if experiment.chance and runs > 1:
-        tables = [*evidence.slopes.values(), *(t for d in evidence.directions.values() for t in d)]
-        parts["chance"] = estimate(layout, evidence.repeats, seen, _columns(tables, seen))
+        tables = [table for direction in evidence.directions.values() for table in direction]
+        parts["chance"] = estimate(layout, evidence.repeats, seen, _columns(tables, seen), parameters)
     if np.count_nonzero(experiment.quiet) >= FEWEST_QUIET:
         known = _total(layout, parts, seen, runs)[0]
         parts["reconstruction"] = _instruments(experiment, evidence, known)
     if evidence.replays is not None:
         parts["reconstruction"] = _replayed(experiment, evidence.replays, parts)
-    prior = {p.name: (p.upper - p.lower) / np.sqrt(12.0) for p in experiment.parameters}
-    slopes = [prior[name] * table for name, table in evidence.slopes.items()]
-    slopes += [(3.0 * evidence.widths[name]) ** 2 * table for name, table in evidence.curves.items()]
     patterns = list(evidence.numerics.values())
-    parameters = _columns(slopes, seen)
     if patterns:
         known = _total(layout, parts, seen, runs)[0]
         parts["numerics"] = estimate(layout, _unexplained(known, parameters, patterns, seen), seen)

@@ -74,13 +74,20 @@ def independent(scale: FloatArray, memory: float = 0.0) -> Part:
     return Part(scale=scale, memory=memory, nugget=1.0)
 
 
-def estimate(layout: Layout, samples: FloatArray, seen: BoolArray, directions: FloatArray | None = None) -> Part:
+def estimate(
+    layout: Layout,
+    samples: FloatArray,
+    seen: BoolArray,
+    directions: FloatArray | None = None,
+    free: FloatArray | None = None,
+) -> Part:
     """The part that samples (k, t, s) of it, with mean zero, suggest.
 
     Scales are pooled over each instrument, and vary over time and place as far as the samples show that they do more
     than chance would (empirical Bayes on the logarithm of the variance). The correlation's parameters maximise the
     Gaussian likelihood of the scaled samples. The whole is then corrected so that scores along directions (n, k) of
-    interest, and along slow waves, scatter as they should.
+    interest, and along slow waves, scatter as they should once what ``free`` (n, q; times prior spreads) can take up is
+    gone: a seed that acts like another friction angle is no noise where the angle is fitted.
     """
     samples = np.where(seen, samples, 0.0)
     if not np.any(samples):
@@ -90,7 +97,7 @@ def estimate(layout: Layout, samples: FloatArray, seen: BoolArray, directions: F
     # How far the variance's own scatter is chance depends on the correlation, which depends on the variance: twice.
     scale = _scales(layout, samples, seen, across=part.across(layout), memory=part.memory)
     part = _correlation(layout, np.where(seen, samples / scale, 0.0), scale, part)
-    return _calibrated(layout, part, samples, seen, directions)
+    return _calibrated(layout, part, samples, seen, directions, free)
 
 
 def correlated(layout: Layout, samples: FloatArray, scale: FloatArray) -> Part:
@@ -99,7 +106,12 @@ def correlated(layout: Layout, samples: FloatArray, scale: FloatArray) -> Part:
 
 
 def _calibrated(
-    layout: Layout, part: Part, samples: FloatArray, seen: BoolArray, directions: FloatArray | None
+    layout: Layout,
+    part: Part,
+    samples: FloatArray,
+    seen: BoolArray,
+    directions: FloatArray | None,
+    free: FloatArray | None,
 ) -> Part:
     """The part, its variance corrected by what samples come to where effects live.
 
@@ -115,7 +127,7 @@ def _calibrated(
             others = np.delete(samples, k, axis=0)
             scale = _scales(layout, others, seen, across=across, memory=part.memory)
         noise = Noise.of(layout, [(1.0, replace(part, scale=scale))], seen)
-        solver = noise.solver()
+        solver = (noise if free is None else noise.plus(free)).solver()
         left, _ = np.linalg.qr(solver.whiten(waves * noise.scale[:, None]))
         sample = solver.whiten(samples[k][seen])
         on_waves.append(np.mean((left.T @ sample) ** 2))
