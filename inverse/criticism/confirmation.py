@@ -61,7 +61,7 @@ def confirm(
 ) -> dict[str, Confirmation]:
     """Refit the model as it is, and with each chosen effect, on every other time; judge on the rest.
 
-    ``steps`` is the number of simulations for each refit.
+    ``steps`` is the number of simulations from each point where a refit starts.
     """
     rows = np.arange(experiment.layout.shape[0])
     shown = rows % 2 == 0

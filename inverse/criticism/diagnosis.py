@@ -34,7 +34,7 @@ class Options:
         level: family-wise chance of naming an effect when none is missing.
         repeats: simulations at the fit with other seeds.
         refits: effects, the best ones, that are refitted.
-        refit_steps: simulations for each refit.
+        refit_steps: simulations from each point where a refit starts; rounds of derivatives and steps follow.
         seed: of draws.
     """
 
