@@ -155,8 +155,8 @@ def validate(device: str) -> Section:
         tuple(rows),
         "Near the angle of rest the speed hangs on small differences: at 23° friction off by 1 % changes it by "
         f"{abs(_sensitivity(23.0)):.0f} %, at 25° by {abs(_sensitivity(25.0)):.0f} %. The layer has come to its speed "
-        "and its ends do not matter, as the longer run shows; what is left goes with step and cell, so it is numerics. "
-        "Steeper runs are out of reach without a periodic "
+        "and its ends matter little, as the longer run shows; a finer grid makes it faster, not slower, and why is not "
+        "known. Steeper runs are out of reach without a periodic "
         "boundary: the layer drains from its upper end and thins.",
         figure,
     )
