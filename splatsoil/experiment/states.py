@@ -25,13 +25,14 @@ MOST_STATES = 200_000
 
 @dataclass(frozen=True)
 class States:
-    """States of yielding soil, each with the plastic shear strain spent in it.
+    """States of yielding soil, each with the share of plastic work that is done in it.
 
     Attributes:
         pressure: (n,) mean stress, Pa.
         rate: (n,) rate of plastic shear strain, 1/s.
         strain: (n,) plastic shear strain so far.
-        weight: (n,) plastic shear strain spent in this state, summing to 1.
+        weight: (n,) pressure times plastic shear strain spent in this state, summing to 1: soil that falls loosely
+            strains much, but its strength does nothing.
     """
 
     pressure: FloatArray
@@ -46,13 +47,9 @@ class States:
         yields = spent > 1e-6
         rate = spent / seconds
         middle = 0.5 * (strain[:, 1:] + strain[:, :-1])
-        weight = spent[yields]
-        if not weight.size:
-            empty = np.zeros(0)
-            return cls(empty, empty, empty, empty)
-        return cls(
-            np.maximum(pressure[:, 1:][yields], LEAST_PRESSURE), rate[yields], middle[yields], weight / weight.sum()
-        )
+        bears = np.maximum(pressure[:, 1:][yields], LEAST_PRESSURE)
+        weight = bears * spent[yields]
+        return cls(bears, rate[yields], middle[yields], weight / max(float(weight.sum()), 1e-300))
 
     @classmethod
     def joined(cls, parts: Sequence[States]) -> States:
