@@ -65,7 +65,7 @@ class Resolution:
         density: bulk density in kg/m^3.
         relaxation: exchanges between particles and grid a second of which hourglass modes and the tool's contact shall
             know, whatever the number of ``steps``: the former are damped as that many plain APIC exchanges would, soil
-            sunk into the tool comes out at this rate. 0 for as many as there are.
+            sunk into the tool comes out at twice the rate. 0 for as many as there are.
     """
 
     cell: float

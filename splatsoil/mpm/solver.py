@@ -44,6 +44,8 @@ INERTIA_MARGIN = 1.2
 """Inertia of nearly empty nodes over the central-difference stability limit; 2/3 is marginal for a full cell."""
 CONTACT_DAMPING = 0.2
 """Fraction of critical damping of the contact spring of one particle."""
+CONTACT_RELEASE = 2.0
+"""Rate, over :attr:`Resolution.relaxation`, at which soil sunk into the tool's contact springs comes out of them."""
 MOST_STRAYS = 1.0e-3
 """Fraction of a batch's particles that may have risen above the bed's space before the run is given up."""
 AFFINE_SHARE = 7.0 / 16.0
@@ -285,7 +287,7 @@ class Solver:
         )
         contact = None if pose is None else self._contact(pose, dt, share)
         exchanges = step_time * (r.relaxation or 1.0 / step_time)
-        keep, release = hourglass_share(exchanges), 1.0 - math.exp(-exchanges)
+        keep, release = hourglass_share(exchanges), 1.0 - math.exp(-CONTACT_RELEASE * exchanges)
         move = wp.launch(move_nodes, dim=nodes, inputs=[g, grid, dt, self._table], device=device, record_cmd=True)
         for _ in range(substeps):
             stress.launch()
