@@ -46,6 +46,8 @@ CONTACT_DAMPING = 0.2
 """Fraction of critical damping of the contact spring of one particle."""
 CONTACT_RELEASE = 2.0
 """Rate, over :attr:`Resolution.relaxation`, at which soil sunk into the tool's contact springs comes out of them."""
+DEEPEST = 0.25
+"""Of a particle's spacing: soil deeper in the tool, as where a tool starts in the soil, comes out at once."""
 MOST_STRAYS = 1.0e-3
 """Fraction of a batch's particles that may have risen above the bed's space before the run is given up."""
 AFFINE_SHARE = 7.0 / 16.0
@@ -297,7 +299,10 @@ class Solver:
         wp.launch(
             grid_to_particles,
             dim=n,
-            inputs=[p, c, g, grid, self.ceiling, r.wave_speed, keep, release, self._broken, self._strays],
+            inputs=[
+                *(p, c, g, grid, self.ceiling, r.wave_speed),
+                *(keep, release, DEEPEST * r.spacing, self._broken, self._strays),
+            ],
             device=device,
         )
 
@@ -320,6 +325,7 @@ class Solver:
                 self._near,
                 self._near_count,
                 self.resolution.spacing**2,
+                DEEPEST * self.resolution.spacing,
                 dt,
                 share,
                 self._table,

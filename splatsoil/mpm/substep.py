@@ -97,6 +97,7 @@ def contact_forces(
     near: wp.array(dtype=int),
     count: wp.array(dtype=int),
     area: float,
+    deepest: float,
     dt: float,
     share: float,
     values: wp.array2d(dtype=float),
@@ -104,7 +105,8 @@ def contact_forces(
 ) -> None:
     """Penalty contact with Coulomb friction between particles and tool; ``force`` (simulations) gains share * force.
 
-    ``area`` (m^2) is what one particle covers of the tool, for adhesion.
+    ``area`` (m^2) is what one particle covers of the tool, for adhesion; a spring is loaded no further than ``deepest``
+    (m), so that soil in which a tool starts is not shot out of it.
 
     A particle keeps the side of the tool it is on, so a plate thinner than a cell holds soil on both its faces, and
     what the soil feels is exactly what the tool feels.
@@ -132,7 +134,8 @@ def contact_forces(
         particles.gap[p] = gap
         adhesion = values[row, TOOL_ADHESION] * area
         if gap < 0.0 or (adhesion > 0.0 and gap < ADHESION_REACH * wp.sqrt(area)):
-            push = wp.where(gap < 0.0, wp.max(-tool.stiffness * gap - tool.damping * closing, 0.0), 0.0)
+            depth = wp.min(-gap, deepest)
+            push = wp.where(gap < 0.0, wp.max(tool.stiffness * depth - tool.damping * closing, 0.0), 0.0)
             slip -= closing * normal
             speed = wp.length(slip)
             hold = values[row, TOOL_FRICTION] * push + adhesion

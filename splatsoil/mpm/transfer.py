@@ -154,6 +154,7 @@ def grid_to_particles(
     limit: float,
     keep: float,
     release: float,
+    deepest: float,
     broken: wp.array(dtype=int),
     strays: wp.array(dtype=int),
 ) -> None:
@@ -161,7 +162,7 @@ def grid_to_particles(
 
     The mean gradient of a cell doesn't see the bilinear and trilinear parts of its velocity, so stress can't resist
     them (hourglass modes); a particle keeps the fraction ``keep`` of them. A particle that has sunk into the tool is
-    moved out by the fraction ``release`` of its depth.
+    moved out by the fraction ``release`` of its depth, and to ``deepest`` (m) at once.
 
     A particle faster than ``limit`` (m/s) or without a finite state counts as ``broken``; one that rises above
     ``ceiling`` (m) counts as a stray, loses its velocity and falls back.
@@ -200,14 +201,16 @@ def grid_to_particles(
         particles.history[p] = cells.history[entry]
 
     # the midpoint rule: with the displacement where it starts, turning soil would swell and shearing soil shrink
+    # (within the particle's cell, beyond which its field is another)
     half = f + 0.5 * wp.cw_mul(displacement, grid.inverse)
+    half = wp.vec3(wp.clamp(half[0], 0.0, 1.0), wp.clamp(half[1], 0.0, 1.0), wp.clamp(half[2], 0.0, 1.0))
     displacement = wp.vec3(0.0)
     for corner in range(8):
         displacement += corner_weight(half, corner) * nodes.displacement[base + corner_offset(grid, corner)]
     x += displacement
     gap = particles.gap[p]
     if gap < 0.0 and gap > -FAR:
-        x -= release * gap * particles.gap_normal[p]
+        x -= wp.min(release * gap, gap + deepest) * particles.gap_normal[p]
     low = grid.origin
     high = low + wp.cw_mul(
         grid.cell, wp.vec3(float(grid.shape[0] - 1), float(grid.shape[1] - 1), float(grid.shape[2] - 1))
