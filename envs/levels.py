@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from splatsoil.errors import ParameterError
 from splatsoil.parameters import Parameter, ParameterSpace
 
-from .problem import Evaluation, Image, Problem
+from .problem import Evaluation, Problem, WrappedProblem
 
 if TYPE_CHECKING:
     from splatsoil.mpm import Resolution
@@ -29,7 +29,7 @@ FIDELITY = Parameter("fidelity", "1", 0.0, 1.0, 1.0)
 DRAWING = 0.22
 
 
-class TwoLevelProblem:
+class TwoLevelProblem(WrappedProblem):
     """Simulate-and-compare with ``fidelity`` as the last parameter.
 
     Both levels are compared with the same observation.
@@ -44,9 +44,9 @@ class TwoLevelProblem:
     """
 
     def __init__(self, fine: Problem, coarse: str) -> None:
-        self.fine = fine
+        super().__init__(fine)
         self.coarse = coarse
-        self.space = ParameterSpace([*fine.space, FIDELITY])
+        self._space = ParameterSpace([*fine.space, FIDELITY])
         cheaper = getattr(fine, "cheaper", None)
         if cheaper is None:
             raise ParameterError(f"{type(fine).__name__} has no coarse likeness; leave the coarse preset out")
@@ -54,31 +54,9 @@ class TwoLevelProblem:
         self._cheap, self.cost = cheaper(coarse)
 
     @property
-    def block_count(self) -> int:
-        """Length of the block residuals."""
-        return self.fine.block_count
-
-    @property
-    def worst_loss(self) -> float:
-        """Larger than any loss."""
-        return self.fine.worst_loss
-
-    @property
-    def image_size(self) -> tuple[int, int]:
-        """(height, width) of the pictures."""
-        return self.fine.image_size
-
-    def begin(self, seed: int) -> None:
-        """Start an episode."""
-        self.fine.begin(seed)
-
-    def observed_image(self) -> Image:
-        """The observation as pictures show it."""
-        return self.fine.observed_image()
-
-    def truth(self) -> Mapping[str, float] | None:
-        """The hidden parameters of a synthetic experiment."""
-        return self.fine.truth()
+    def space(self) -> ParameterSpace:
+        """The free parameters, and the level."""
+        return self._space
 
     def evaluate(self, parameters: Mapping[str, float], seed: int) -> Evaluation:
         """Simulate at the level that ``fidelity`` names, and compare.
@@ -89,7 +67,7 @@ class TwoLevelProblem:
         values = {name: value for name, value in parameters.items() if name != FIDELITY.name}
         full = is_full(parameters)
         began = time.perf_counter()
-        evaluation = self.fine.evaluate(values, seed) if full else self._cheap(values, seed)
+        evaluation = self.inner.evaluate(values, seed) if full else self._cheap(values, seed)
         return replace(
             evaluation,
             seconds=time.perf_counter() - began,

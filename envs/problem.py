@@ -73,3 +73,50 @@ class Problem(Protocol):
 
     def truth(self) -> Mapping[str, float] | None:
         """The hidden parameters of a synthetic experiment, None for a measured one."""
+
+
+class WrappedProblem:
+    """A problem that does what another one does, but for what a subclass changes.
+
+    Args:
+        inner: does the work.
+    """
+
+    def __init__(self, inner: Problem) -> None:
+        self.inner = inner
+
+    @property
+    def space(self) -> ParameterSpace:
+        """The free parameters."""
+        return self.inner.space
+
+    @property
+    def block_count(self) -> int:
+        """Length of the block residuals."""
+        return self.inner.block_count
+
+    @property
+    def worst_loss(self) -> float:
+        """Larger than any loss."""
+        return self.inner.worst_loss
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """(height, width) of the pictures."""
+        return self.inner.image_size
+
+    def begin(self, seed: int) -> None:
+        """Start an episode."""
+        self.inner.begin(seed)
+
+    def evaluate(self, parameters: Mapping[str, float], seed: int) -> Evaluation:
+        """Simulate and compare; see :class:`Problem`."""
+        return self.inner.evaluate(parameters, seed)
+
+    def observed_image(self) -> Image:
+        """The observation as pictures show it."""
+        return self.inner.observed_image()
+
+    def truth(self) -> Mapping[str, float] | None:
+        """The hidden parameters of a synthetic experiment."""
+        return self.inner.truth()

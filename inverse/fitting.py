@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from splatsoil.envs.levels import FIDELITY, TwoLevelProblem, is_full
 from splatsoil.envs.plow_sand import PlowSandEnv
-from splatsoil.envs.problem import Evaluation, Image, Problem
+from splatsoil.envs.problem import Evaluation, Problem, WrappedProblem
 from splatsoil.envs.together import attempt
 
 from splatsoil.errors import RunError
@@ -102,7 +102,7 @@ class FitSetup:
         }
 
 
-class StoredProblem:
+class StoredProblem(WrappedProblem):
     """A problem whose evaluations go into the run database, and come from it when they are there.
 
     Args:
@@ -112,7 +112,7 @@ class StoredProblem:
     """
 
     def __init__(self, problem: Problem, store: EvaluationStore, setup: FitSetup) -> None:
-        self.problem = problem
+        super().__init__(problem)
         self.store = store
         self.setup = setup
         self.fit = digest(setup.description())
@@ -121,38 +121,10 @@ class StoredProblem:
         self._step = 0
         self.last: EvaluationRecord | None = None
 
-    @property
-    def space(self) -> ParameterSpace:
-        """The free parameters."""
-        return self.problem.space
-
-    @property
-    def block_count(self) -> int:
-        """Length of the block residuals."""
-        return self.problem.block_count
-
-    @property
-    def worst_loss(self) -> float:
-        """Larger than any loss."""
-        return self.problem.worst_loss
-
-    @property
-    def image_size(self) -> tuple[int, int]:
-        """(height, width) of the pictures."""
-        return self.problem.image_size
-
     def begin(self, seed: int) -> None:
         """Start an episode, from the fit's first evaluation."""
         self._step = 0
-        self.problem.begin(seed)
-
-    def observed_image(self) -> Image:
-        """The observation as pictures show it."""
-        return self.problem.observed_image()
-
-    def truth(self) -> Mapping[str, float] | None:
-        """The hidden parameters of a synthetic experiment."""
-        return self.problem.truth()
+        super().begin(seed)
 
     def evaluate(self, parameters: Mapping[str, float], seed: int) -> Evaluation:
         """The stored evaluation, or a new one, which is stored before it is returned."""
@@ -162,7 +134,7 @@ class StoredProblem:
             key = digest({**self.setup.model(), "values": dict(parameters), "seed": seed})
             found = self.store.find(key)
             if found is None:
-                evaluation = attempt(self.problem, parameters, seed)
+                evaluation = attempt(self.inner, parameters, seed)
                 job = Job(dict(parameters), seed)
                 record = make_record(self.fit, self._step, key, job, evaluation, self.space, self.setup.model())
             else:
@@ -308,10 +280,8 @@ def _from_features(
     problem: Problem, records: list[EvaluationRecord], surrogate: Surrogate, fallback: Minimum, seed: int
 ) -> Minimum | None:
     """The minimum by the emulated features; None where evaluations are too few or too unlike each other for that."""
-    places, sensor = getattr(problem, "places", None), float(getattr(problem, "sensor_std", 0.0))
     try:
-        data = Data.from_records(problem.space, records, places, sensor)
-        return by_features(data, surrogate, fallback, seed=seed)
+        return by_features(Data.of(problem, records), surrogate, fallback, seed=seed)
     except RunError:
         return None
 

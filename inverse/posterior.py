@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from splatsoil.envs.levels import is_full
+from splatsoil.envs.problem import Problem
 
 from splatsoil.errors import RunError
 from splatsoil.parameters import Parameter, ParameterSpace
@@ -50,6 +51,12 @@ class Data:
     residuals: FloatArray
     places: tuple[Place, ...] | None = None
     sensor_std: float = 0.0
+
+    @classmethod
+    def of(cls, problem: Problem, records: Sequence[EvaluationRecord]) -> Data:
+        """The same as :meth:`from_records`, with what the problem knows of its features' places and noise."""
+        places, sensor = getattr(problem, "places", None), float(getattr(problem, "sensor_std", 0.0))
+        return cls.from_records(problem.space, records, places, sensor)
 
     @classmethod
     def from_records(

@@ -83,7 +83,6 @@ def run_posterior(
     space = problem.space
     count = effort.design if effort.design is not None else DESIGN_EACH * len(space) + DESIGN_ALL
     planned = count + effort.repeats + effort.checks
-    places, sensor = getattr(problem, "places", None), float(getattr(problem, "sensor_std", 0.0))
     fit = digest(setup.description())
     with run.lock(), run.evaluations(writable=True) as store:
         fitted = [record for record in store.records(fit) if is_full(record.parameters)]
@@ -109,7 +108,7 @@ def run_posterior(
         records = [*fitted, *evaluate("design", design(space, count, seed))]
         records += evaluate("repeat", repeats(estimate, effort.repeats, seed))
         posterior = sample_posterior(
-            Data.from_records(space, records, places, sensor),
+            Data.of(problem, records),
             seed=seed,
             file=run.path / "posterior" / "chains-first.h5" if effort.checks else run.path / "posterior" / "chains.h5",
             evidence=not effort.checks,
@@ -118,10 +117,10 @@ def run_posterior(
         checked: list[dict[str, Any]] = []
         if effort.checks:
             new = evaluate("check", checks(posterior, effort.checks, seed))
-            checked = _judged(posterior, records, new, places, sensor)
+            checked = _judged(posterior, records, new, problem)
             records += new
             posterior = sample_posterior(
-                Data.from_records(space, records, places, sensor),
+                Data.of(problem, records),
                 seed=seed,
                 file=run.path / "posterior" / "chains.h5",
                 progress=lambda done, most: report(f"chains, step {done}", 0.95),
@@ -141,15 +140,14 @@ def _judged(
     posterior: Posterior,
     records: list[EvaluationRecord],
     new: list[EvaluationRecord],
-    places: Any,
-    sensor: float,
+    problem: Problem,
 ) -> list[dict[str, Any]]:
     """Each check's χ² per component by the emulator that had not seen it."""
     good = [r for r in new if r.status == "ok"]
     if not good:
         return []
     # Only blocks that all evaluations see: the same ones for emulator and checks.
-    both = Data.from_records(posterior.data.space, [*records, *good], places, sensor)
+    both = Data.of(problem, [*records, *good])
     known = len(both.points) - len(good)
     data = replace(both, points=both.points[:known], residuals=both.residuals[:known])
     if data.residuals.shape == posterior.data.residuals.shape:

@@ -81,8 +81,7 @@ def simulations(
             executor=executor,
             after_evaluation=None if progress is None else lambda done, _: progress(done, len(jobs)),
         )
-    places, sensor = getattr(problem, "places", None), float(getattr(problem, "sensor_std", 0.0))
-    return Data.from_records(problem.space, records, places, sensor), file
+    return Data.of(problem, records), file
 
 
 def jobs_at(space: ParameterSpace, points: FloatArray, seed: int) -> list[Job]:

@@ -204,14 +204,7 @@ def judge(
             )
         except SimulationError as error:
             notes.append(f"the free strength could not be simulated: {error}")
-    strokes: tuple[StrokeAdvice, ...] = ()
-    if len(members) > 1:
-        fitted = {**confirmations[members[0]].fit.values}
-        for name in members[1:]:
-            fitted |= {p.name: confirmations[name].fit.values[p.name] for p in candidates[name].parameters}
-        strokes = advise(
-            experiment, fitted, [candidates[name] for name in members], progress=lambda s: told("other strokes", s)
-        )
+    strokes = _advice(experiment, members, candidates, confirmations, told)
     return Diagnosis(
         verdict=verdict,
         members=members,
@@ -234,6 +227,23 @@ def judge(
         unit=experiment.layout.unit,
         notes=tuple(notes),
     )
+
+
+def _advice(
+    experiment: Experiment,
+    members: Sequence[str],
+    candidates: Mapping[str, Candidate],
+    confirmations: Mapping[str, Confirmation],
+    told: Report,
+) -> tuple[StrokeAdvice, ...]:
+    """Which other stroke tells the members of a class apart, each at the size that its refit found."""
+    if len(members) < 2:
+        return ()
+    fitted = dict(confirmations[members[0]].fit.values)
+    for name in members[1:]:
+        fitted |= {p.name: confirmations[name].fit.values[p.name] for p in candidates[name].parameters}
+    chosen = [candidates[name] for name in members]
+    return advise(experiment, fitted, chosen, progress=lambda share: told("other strokes", share))
 
 
 def _stands(confirmations: Mapping[str, Confirmation], best: str) -> bool:

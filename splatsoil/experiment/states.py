@@ -109,9 +109,7 @@ def plow_states(model: Model, values: Mapping[str, float], seed: int = 0) -> Sta
         if frame:
             start = (frame - 1) * resolution.frame_time
             solver.advance(step_poses(motion, start, resolution.frame_time, resolution.steps))
-        # The solver's own arrays: nothing else holds what a stress point has been through.
-        held = solver._particles
-        pressure.append(-solver.resolution.bulk * held.elastic.numpy().astype(np.float64))
-        strain.append(held.history.numpy()[:, 0].astype(np.float64))
+        pressure.append(solver.pressures()[0])
+        strain.append(solver.plastic_strains()[0])
     every = max(1, particles.shape[1] * last // MOST_STATES)
     return States.of(np.array(pressure).T[::every], np.array(strain).T[::every], np.full(last, resolution.frame_time))

@@ -42,5 +42,5 @@ def test_both_levels_are_held_against_the_same_world() -> None:
     assert losses[1] < losses[0] and abs(losses[0] - losses[2]) < 0.5 * (losses[0] - losses[1])
     # A full evaluation is the one-level environment's.
     alone = SyntheticProblem(preset="small")
-    alone.place(truth, env.unwrapped.problem.fine._truth_seed)  # type: ignore[attr-defined]
+    alone.place(truth, env.unwrapped.problem.inner._truth_seed)  # type: ignore[attr-defined]
     assert alone.evaluate({"friction_angle": 35.0}, steps[1][4]["seed"]).loss == pytest.approx(losses[1], rel=1e-6)

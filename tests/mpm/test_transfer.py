@@ -1,4 +1,4 @@
-"""The exchange between particles and grid: what it keeps, and how fast it damps what it is told to."""
+"""The exchange between particles and grid: what it keeps, how fast it damps what it is told to, where it moves soil."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 
 from splatsoil.mpm import Resolution, Solver
+from splatsoil.mpm.tool import Pose
 from splatsoil.soil.law import Law
 from splatsoil.soil.settings import Settings
 
@@ -66,3 +68,42 @@ def test_without_a_rate_they_are_damped_as_by_affine_particles(steps: int) -> No
     """Affine particles at 1/4 and 3/4 of a cell leave 7/16 of a bilinear mode, but for the last step's own velocity."""
     left = amplitude_after_a_frame(steps, relaxation=0.0)
     assert left == pytest.approx((7.0 / 16.0) ** (steps - 1), rel=0.01)
+
+
+def test_a_step_turns_a_lump_without_swelling_it() -> None:
+    """By 0.1 rad: where the step's displacement starts it would grow by 0.1^2 / 2 (explicit Euler)."""
+    upper = np.full(3, 0.16)
+    axis = np.arange(0.045, 0.12, 0.01)
+    x = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    resolution = replace(RESOLUTION, steps=1, relaxation=1e-6)
+    still = Settings(friction_angle=35.0, gravity=(0.0, 0.0, 0.0))
+    run = Solver(x[None], np.zeros(3), upper, None, resolution, Law(), still, [{"friction_angle": 35.0}])
+    spin = np.zeros((3, 3))
+    spin[0, 1], spin[1, 0] = -5.0, 5.0
+    middle = np.full(3, 0.08)
+    run._particles.velocity.assign(((x - middle) @ spin.T).astype(np.float32))
+    run._particles.affine.assign(np.broadcast_to(spin, (len(x), 3, 3)).astype(np.float32))
+    run.advance(1)
+    before, after = (np.linalg.norm((y - middle)[:, :2], axis=1) for y in (x, run.positions()[0].astype(np.float64)))
+    turned = run.positions()[0] - x
+    assert np.linalg.norm(turned[:, :2], axis=1).mean() == pytest.approx(0.1 * before.mean(), rel=0.02)
+    # explicit Euler: 5e-3 on average
+    assert abs(float(np.mean(after / before)) - 1.0) < 1e-3
+
+
+@pytest.mark.parametrize("steps", [1, 4, 16])
+def test_soil_sunk_into_a_tool_comes_out_by_the_second(steps: int) -> None:
+    """At twice the relaxation: exp(-2 * 25 / s * 0.02 s) of the depth is left; what is deeper than a quarter of the
+    particles' spacing comes out at once. Springs as soft as these don't matter."""
+    plate = trimesh.creation.box([0.04, 0.2, 0.2])
+    depths = np.array([1.0e-3, 2.0e-3, 6.0e-3])
+    x = np.array([[0.10 - d, 0.05 + 0.04 * k, 0.09] for k, d in enumerate(depths)])
+    resolution = replace(RESOLUTION, steps=steps, relaxation=25.0, bulk=1.0, shear=0.5)
+    still = Settings(friction_angle=35.0, gravity=(0.0, 0.0, 0.0))
+    run = Solver(x[None], np.zeros(3), np.full(3, 0.2), plate, resolution, Law(), still, [{"friction_angle": 35.0}])
+    held = Pose(np.array([0.08, 0.1, 0.1]), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), np.zeros(3))
+    run.advance([held] * steps)
+    left = 0.10 - run.positions()[0][:, 0]
+    share = np.exp(-2.0 * 25.0 * 0.02)
+    np.testing.assert_allclose(left[:2], share * depths[:2], rtol=0.05)
+    assert left[2] < 2.5e-3
