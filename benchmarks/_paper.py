@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from splatsoil.envs.together import simulate_together
-from splatsoil.inverse.bayesopt import PAPER, BayesianOptimiser
+from splatsoil.inverse.bayesopt import PAPER, BayesianOptimiser, Told
 from splatsoil.inverse.emulator import FEWEST
 from splatsoil.inverse.posterior import Data, sample_posterior
 
@@ -181,10 +181,13 @@ class Trial:
     looks: list[Look | None] = field(default_factory=list)
 
     @property
-    def told(self) -> list[tuple[float, float | None]]:
-        """Points in [-1, 1] and losses, as an optimiser is told."""
-        points = SPACE.to_unit(np.array(self.angles)[:, None])[:, 0] if self.angles else np.zeros(0)
-        return [(float(p), None if k is None else k.loss(self.way)) for p, k in zip(points, self.looks, strict=True)]
+    def told(self) -> list[Told]:
+        """What an optimiser is told."""
+        points = SPACE.to_unit(np.array(self.angles)[:, None]) if self.angles else np.zeros((0, 1))
+        return [
+            Told(p, None if k is None else k.loss(self.way), None if k is None else k.blocks)
+            for p, k in zip(points, self.looks, strict=True)
+        ]
 
     def seed(self, step: int) -> int:
         """Of the particles in a step."""
@@ -192,25 +195,25 @@ class Trial:
         return int(sequence.generate_state(1)[0] % 2**31)
 
 
-def optimiser_of(way: str, seed: int, told: Sequence[tuple[float, float | None]]) -> BayesianOptimiser:
+def optimiser_of(way: str, seed: int, told: Sequence[Told]) -> BayesianOptimiser:
     """The search of a way, with what it has been told."""
     optimiser = BayesianOptimiser(1, seed=seed, search=PAPER if way == "published" else None)
-    for point, loss in told:
-        optimiser.tell([point], loss)
+    for t in told:
+        optimiser.tell(t.action, t.loss, t.residuals)
     return optimiser
 
 
-def propose(way: str, seed: int, told: Sequence[tuple[float, float | None]]) -> float:
+def propose(way: str, seed: int, told: Sequence[Told]) -> float:
     """The angle to try next; a worker's job."""
     return float(SPACE.from_unit(optimiser_of(way, seed, told).ask().astype(np.float64))[0])
 
 
-def conclude(way: str, seed: int, told: Sequence[tuple[float, float | None]]) -> dict[str, float]:
+def conclude(way: str, seed: int, told: Sequence[Told]) -> dict[str, float]:
     """What a search came to; a worker's job."""
     result = optimiser_of(way, seed, told).result()
-    best = min((t for t in told if t[1] is not None), key=lambda t: t[1] if t[1] is not None else np.inf)[0]
+    best = min(told, key=lambda t: np.inf if t.loss is None else t.loss).action
     estimate, low, high, luckiest = (
-        float(SPACE.from_unit(p)[0]) for p in (result.estimate, result.low, result.high, np.array([best]))
+        float(SPACE.from_unit(p)[0]) for p in (result.estimate, result.low, result.high, best)
     )
     return {"estimate": estimate, "std": float(result.std[0]) * 15.0, "low": low, "high": high, "best": luckiest}
 

@@ -132,7 +132,7 @@ def play(world: World, budgets: Sequence[int], seed: int, search: Search | None)
         action = optimiser.ask().astype(np.float64)
         spent += time.perf_counter() - began
         loss, residual = world.call(action, rng)
-        optimiser.tell(action, loss)
+        optimiser.tell(action, loss, residual)
         points.append(action)
         features.append(residual)
         if len(points) in budgets:

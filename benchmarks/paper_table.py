@@ -9,7 +9,7 @@ one:
 | way | loss | search |
 |---|---|---|
 | `published` | mean square colour difference, four frames, whole pictures | one random start, expected improvement |
-| `ours` | the robust loss, all frames | Sobol start, noisy expected improvement |
+| `ours` | the robust loss, all frames | Sobol start, expected improvement of the features |
 | `features` | none: the posterior's mean, from the features of `ours`' evaluations | |
 
 The angle is searched in [25°, 55°]. All trials of a world go on side by side: one batch of simulations for each step.

@@ -6,7 +6,7 @@ evaluations of an interrupted one goes on as that one would have.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -16,6 +16,7 @@ import numpy.typing as npt
 import torch
 
 from .surrogate import FloatArray, Minimum, Surrogate, quiet, seeded, sobol
+from .target_search import propose
 
 #: Space-filling evaluations before the first acquisition: at least, and for each parameter. With fewer, a search in
 #: many dimensions runs into corners and stays there.
@@ -37,23 +38,33 @@ class Search:
         acquisition: ``noisy`` (log noisy expected improvement: what is best so far is itself uncertain) or ``ei`` (log
             expected improvement over the best mean at an evaluated point).
         random: the start is drawn uniformly, not from a Sobol sequence.
+        features: where every evaluation came with residuals, it is their sum of squares that is expected to improve, by
+            an emulator of each (:func:`splatsoil.inverse.target_search.propose`); the loss is the fallback.
     """
 
     start: int = START
     acquisition: Literal["noisy", "ei"] = "noisy"
     random: bool = False
+    features: bool = True
 
 
 #: The settings of Hsiao and Kumar: one random start, expected improvement; with 10 evaluations in [25°, 55°].
-PAPER = Search(start=1, acquisition="ei", random=True)
+PAPER = Search(start=1, acquisition="ei", random=True, features=False)
 
 
 @dataclass(frozen=True)
 class Told:
-    """One evaluation the optimiser knows: a point of [-1, 1]^n and its loss, None where the evaluation failed."""
+    """One evaluation the optimiser knows.
+
+    Attributes:
+        action: (n,) in [-1, 1].
+        loss: None where the evaluation failed.
+        residuals: (b,) of its features, 0 where hidden; None where only the loss is known.
+    """
 
     action: FloatArray
     loss: float | None
+    residuals: FloatArray | None = None
 
 
 class BayesianOptimiser:
@@ -84,11 +95,12 @@ class BayesianOptimiser:
         self.seed = seed
         self.told: list[Told] = []
 
-    def tell(self, action: npt.ArrayLike, loss: float | None) -> None:
-        """Learn the loss (None: the evaluation failed) at a point (n,) of [-1, 1]^n."""
+    def tell(self, action: npt.ArrayLike, loss: float | None, residuals: npt.ArrayLike | None = None) -> None:
+        """Learn the loss (None: the evaluation failed) at a point (n,) of [-1, 1]^n, and residuals if there are any."""
         point = np.array(action, dtype=np.float64).reshape(self.dimension)
         usable = loss is not None and np.isfinite(loss)
-        self.told.append(Told(point, float(loss) if usable and loss is not None else None))
+        features = None if residuals is None else np.array(residuals, dtype=np.float64).reshape(-1)
+        self.told.append(Told(point, float(loss) if usable and loss is not None else None, features))
 
     def ask(self) -> npt.NDArray[np.float32]:
         """The next point (n,) to evaluate, in float32 as environments take it."""
@@ -100,7 +112,11 @@ class BayesianOptimiser:
         if done < self.search.start or not self._succeeded():
             # Beyond the start only while nothing has succeeded: keep filling the space.
             return self._fill(done + count)[done:].astype(np.float32)
-        return self._acquire(self._stream(done), count).astype(np.float32)
+        seed = self._stream(done)
+        proposals = self._by_features(seed, count)
+        if proposals is None:
+            proposals = self._by_loss(seed, count)
+        return self._apart(proposals, seed).astype(np.float32)
 
     def _fill(self, count: int) -> FloatArray:
         if self.search.random:
@@ -132,7 +148,14 @@ class BayesianOptimiser:
         """An independent seed for each use."""
         return int(np.random.SeedSequence([self.seed, index]).generate_state(1)[0])
 
-    def _acquire(self, seed: int, count: int) -> FloatArray:
+    def _by_features(self, seed: int, count: int) -> FloatArray | None:
+        """Proposals by emulated features; None where some aren't known, or evaluations failed: the loss keeps clear."""
+        residuals = [t.residuals for t in self.told if t.residuals is not None and t.loss is not None]
+        if not self.search.features or len(residuals) < len(self.told):
+            return None
+        return propose(np.array([t.action for t in self.told]), np.array(residuals), count, seed=seed % 2**31)
+
+    def _by_loss(self, seed: int, count: int) -> FloatArray:
         with quiet():
             from botorch.acquisition.logei import qLogExpectedImprovement, qLogNoisyExpectedImprovement
             from botorch.optim import optimize_acqf
@@ -158,8 +181,13 @@ class BayesianOptimiser:
             best, _ = optimize_acqf(
                 acquisition, bounds, q=count, num_restarts=RESTARTS, raw_samples=RAW, sequential=count > 1
             )
+        return 2.0 * np.asarray(best.detach().reshape(count, -1).numpy()) - 1.0
+
+    def _apart(self, proposals: FloatArray, seed: int) -> FloatArray:
+        """Proposals (count, n), those moved that come too close to evaluated points or to each other."""
+        points = np.array([t.action for t in self.told])
         chosen: list[FloatArray] = []
-        for k, proposal in enumerate(2.0 * best.detach().reshape(count, -1).numpy() - 1.0):
+        for k, proposal in enumerate(proposals):
             known = np.concatenate([points, *(c[None] for c in chosen)])
             near = np.min(np.max(np.abs(known - proposal), axis=1)) < NEAREST
             chosen.append(self._beside(proposal, seed + k) if near else np.clip(proposal, -1.0, 1.0))
@@ -209,7 +237,8 @@ def optimise(
     """Play one episode of an environment whose reward is minus a loss, until it truncates or terminates.
 
     Args:
-        env: action space Box(-1, 1, (n,)); ``info["status"] == "failed"`` marks an evaluation without a loss.
+        env: action space Box(-1, 1, (n,)); ``info["status"] == "failed"`` marks an evaluation without a loss. Where its
+            observation holds ``block_residuals``, these guide the search.
         seed: of environment and agent.
         start: Sobol points before the first acquisition.
         noise_std: standard deviation of one evaluation's noise, if measured.
@@ -230,9 +259,10 @@ def optimise(
     while not over:
         done = len(optimiser.told)
         action = np.asarray(replay[done] if done < len(replay) else optimiser.ask(), dtype=np.float32)
-        _, reward, terminated, truncated, info = env.step(action.reshape(space.shape))
+        observation, reward, terminated, truncated, info = env.step(action.reshape(space.shape))
         failed = info.get("status") == "failed"
-        optimiser.tell(action, None if failed else -float(reward))
+        residuals = observation.get("block_residuals") if isinstance(observation, Mapping) else None
+        optimiser.tell(action, None if failed else -float(reward), residuals)
         over = terminated or truncated
         if after_step is not None:
             after_step(done + 1, info)

@@ -23,6 +23,8 @@ VARIANCE, MOST = 0.995, 10
 DRAWS = 16
 #: A component predicted worse than this (share of its variance, points left out) says nothing of the parameters.
 LEAST_SKILL = 0.1
+#: Share of the scores' variance that points left out must be predicted with, or the loss is the better guide.
+TRUSTED_SKILL = 0.6
 #: Fewest training evaluations, beyond one for each parameter.
 FEWEST = 4
 
@@ -98,6 +100,13 @@ class Emulator:
     def count(self) -> int:
         """Number of components p."""
         return self.basis.shape[1]
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the features vary in as many ways as there are parameters, and points left out are predicted well."""
+        weight = self.scores.var(axis=0)
+        skilled = float(weight @ self.left_out.skill) >= TRUSTED_SKILL * float(weight.sum())
+        return self.count >= self.dimension and skilled
 
     @property
     def outside_variance(self) -> FloatArray:

@@ -12,26 +12,20 @@ J the scores' derivative (White 1980, Econometrica 48:817).
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import numpy.typing as npt
 from scipy.optimize import minimize
 
 from .likelihood import Likelihood
 from .posterior import Data, likelihood_of
-from .surrogate import RESOLUTION, UNIFORM_STD, UNINFORMED, Minimum, Surrogate, bound_of, sobol
+from .surrogate import Minimum, Surrogate, sobol
 
 FloatArray = npt.NDArray[np.float64]
 
-#: Share of the scores' variance that points left out must be predicted with, or the loss is the better guide.
-LEAST_SKILL = 0.6
 #: Candidates from which the least squares start, the evaluations besides.
 CANDIDATES = 1024
 #: Half the step of the derivatives, of an axis from -1 to 1.
 STEP = 0.01
-#: Central 90 % of a normal distribution, in standard deviations.
-CENTRAL_90 = 1.6449
 
 
 def by_features(data: Data, surrogate: Surrogate, fallback: Minimum, *, seed: int = 0) -> Minimum | None:
@@ -52,26 +46,10 @@ def by_features(data: Data, surrogate: Surrogate, fallback: Minimum, *, seed: in
     """
     likelihood = likelihood_of(data, seed=seed)
     emulator = likelihood.emulator
-    if emulator.count < emulator.dimension:
-        return None
-    weight = emulator.scores.var(axis=0)
-    if float(weight @ emulator.left_out.skill) < LEAST_SKILL * float(weight.sum()):
+    if not emulator.trusted:
         return None
     estimate = _least_squares(likelihood, data.points, seed)
-    std = np.maximum(_spread(likelihood, estimate), RESOLUTION)
-    determined = std < UNINFORMED * UNIFORM_STD
-    loss, loss_std = surrogate.mean_and_std(estimate[None])
-    return replace(
-        fallback,
-        estimate=estimate,
-        std=np.where(determined, std, np.minimum(std, UNIFORM_STD)),
-        low=np.maximum(estimate - CENTRAL_90 * std, -1.0),
-        high=np.minimum(estimate + CENTRAL_90 * std, 1.0),
-        loss=float(loss[0]),
-        loss_std=float(loss_std[0]),
-        at_bound=tuple(bound_of(value) for value in estimate),
-        determined=tuple(bool(d) for d in determined),
-    )
+    return fallback.moved(estimate, _spread(likelihood, estimate), surrogate)
 
 
 def _least_squares(likelihood: Likelihood, points: FloatArray, seed: int) -> FloatArray:

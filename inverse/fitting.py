@@ -25,7 +25,7 @@ from .feature_fit import by_features
 from .multifidelity import most_steps, optimise_two_levels
 from .posterior import Data
 from .run_folder import RunFolder
-from .surrogate import Minimum, Surrogate
+from .surrogate import FloatArray, Minimum, Surrogate
 
 FORMAT = "splatsoil-fit/1"
 #: Points of the GP's curve kept for the figure.
@@ -173,6 +173,7 @@ def fit(
     *,
     budget: int = 10,
     facts: Mapping[str, Any] | None = None,
+    refitted: Mapping[str, tuple[float, float]] | None = None,
     after_evaluation: Callable[[int, EvaluationRecord], None] | None = None,
 ) -> dict[str, Any]:
     """Fit the free parameters and write ``fit.json``; goes on where an interrupted fit of the same setup stopped.
@@ -183,6 +184,8 @@ def fit(
         setup: what is fitted and how.
         budget: evaluations, those already stored included; with a coarse preset their cost, in full ones.
         facts: what the fit should say of how it was computed (time step, spacing, ...).
+        refitted: estimate and standard deviation of each parameter by a refit that weighed features by their chance and
+            numerics, as a diagnosis makes it; it is then the fit's estimate, and the evaluations tell the loss around.
         after_evaluation: called with the number done and the record of the last.
 
     Returns:
@@ -223,7 +226,7 @@ def fit(
             raise RunError(f"{run.path}: all {len(records)} simulations failed; the first said: {first}") from error
         records = store.records(stored.fit)[: len(episode.told)]
     seconds = earlier + time.perf_counter() - began
-    result = summarise(episode, problem, setup, records, seconds=seconds)
+    result = summarise(episode, problem, setup, records, seconds=seconds, refitted=refitted)
     result["run"] = {"measurement": dict(run.description["measurement"])}
     result["facts"] = dict(facts or {})
     run.write_fit(setup.name, result)
@@ -231,21 +234,31 @@ def fit(
 
 
 def summarise(
-    episode: Episode, problem: Problem, setup: FitSetup, records: list[EvaluationRecord], *, seconds: float
+    episode: Episode,
+    problem: Problem,
+    setup: FitSetup,
+    records: list[EvaluationRecord],
+    *,
+    seconds: float,
+    refitted: Mapping[str, tuple[float, float]] | None = None,
 ) -> dict[str, Any]:
     """A fit in plain numbers, physical units and words."""
     space = problem.space
     surrogate = episode.optimiser.surrogate()
     good = [record for record in records if record.status == "ok"]
-    told = _from_features(problem, records, surrogate, episode.minimum, setup.seed)
-    minimum = told or episode.minimum
+    if refitted is not None:
+        source, minimum = "refit", episode.minimum.moved(*_unit(space, refitted), surrogate)
+    elif (told := _from_features(problem, records, surrogate, episode.minimum, setup.seed)) is not None:
+        source, minimum = "features", told
+    else:
+        source, minimum = "loss", episode.minimum
     done = [record for record in good if is_full(record.parameters)]
     best = min(done, key=lambda record: record.loss if record.loss is not None else math.inf)
     return {
         "format": FORMAT,
         "name": setup.name,
         "parameters": {p.name: _estimate(p, i, minimum, space) for i, p in enumerate(space)},
-        "estimated_from": "loss" if told is None else "features",
+        "estimated_from": source,
         "loss": minimum.loss,
         "loss_std": minimum.loss_std,
         "noise_std": minimum.noise_std,
@@ -284,6 +297,18 @@ def _from_features(
         return by_features(Data.of(problem, records), surrogate, fallback, seed=seed)
     except RunError:
         return None
+
+
+def _unit(space: ParameterSpace, told: Mapping[str, tuple[float, float]]) -> tuple[FloatArray, FloatArray]:
+    """Estimates (n,) and standard deviations (n,) in [-1, 1]^n."""
+    values = np.array([told[p.name][0] for p in space])
+    stds = np.array([told[p.name][1] for p in space])
+    lower, upper = np.array([p.lower for p in space]), np.array([p.upper for p in space])
+    ends = [np.clip(values + side * stds, lower, upper) for side in (-1.0, 1.0)]
+    width = np.maximum(ends[1] - ends[0], 1e-300)
+    # A bound that cuts an end off does not make the estimate any surer.
+    low, high = (space.to_unit(end) for end in ends)
+    return space.to_unit(values), 0.5 * (high - low) * (2.0 * stds / width)
 
 
 def _without_level(parameters: Mapping[str, float]) -> dict[str, float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -122,9 +123,18 @@ def facts(model: Model) -> dict[str, str]:
 
 
 def fitted(
-    options: FitOptions, measurement: Measurement, run: RunFolder, model: Model, report: Report
+    options: FitOptions,
+    measurement: Measurement,
+    run: RunFolder,
+    model: Model,
+    report: Report,
+    *,
+    refitted: Mapping[str, tuple[float, float]] | None = None,
 ) -> dict[str, Any]:
-    """Fit, evaluation by evaluation; what is in the run folder already isn't simulated again."""
+    """Fit, evaluation by evaluation; what is in the run folder already isn't simulated again.
+
+    ``refitted`` is the estimate and its std of a diagnosis' refit, where there is one: it is kept as the fit's.
+    """
     from splatsoil import __version__
     from splatsoil.envs.levels import is_full
     from splatsoil.envs.measured import LOSS, MeasuredProblem
@@ -164,7 +174,7 @@ def fitted(
 
     report("reading the video", 0.0)
     problem = MeasuredProblem(model, space, progress=simulating)
-    return fit(problem, run, setup, budget=budget, facts=facts(model), after_evaluation=told)
+    return fit(problem, run, setup, budget=budget, facts=facts(model), refitted=refitted, after_evaluation=told)
 
 
 def compared(run: RunFolder, model: Model, report: Report) -> dict[str, Any]:

@@ -23,8 +23,9 @@ if TYPE_CHECKING:
 class Config:
     """Add effects to a run's latest model, one after the other, and fit again.
 
-    Each effect is first refitted on every other frame and judged on the rest, which gives the falling error; then all
-    frames are fitted for the estimate that is kept. Earlier fits stay.
+    Each effect is first refitted on every other frame, features weighed by their chance and cleared of what numerics
+    could do; that is the estimate kept, and it is judged on the other frames, which gives the falling error. Then the
+    loss is searched over all parameters, for the report. Earlier fits stay.
     """
 
     run: Positional[Path]
@@ -129,7 +130,9 @@ def added(
     )
     if not criticism.pictured(folder):
         stage.compared(folder, model, begin("compare"))
-    result = stage.fitted(fitting, model.measurement, folder, larger, begin(f"fit with {effect.name}"))
+    refitted = {name: (with_it["values"][name], with_it["stds"][name]) for name in fitting.parameters}
+    begun = begin(f"fit with {effect.name}")
+    result = stage.fitted(fitting, model.measurement, folder, larger, begun, refitted=refitted)
     criticism.keep_pictures(folder)
     stage.compared(folder, larger, begin("compare"))
     fresh = criticism.entry(result, with_it)

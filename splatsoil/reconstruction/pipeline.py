@@ -17,6 +17,7 @@ from splatsoil.errors import MeasurementError, ParameterError
 from splatsoil.files import RECONSTRUCTING, code_digest
 from splatsoil.measurement import Bed, Measurement
 from splatsoil.reconstruction.height_field import HeightField
+from splatsoil.reconstruction.hidden import reaching_into_soil
 from splatsoil.reconstruction.initial import TOOL, first_gaussians
 from splatsoil.reconstruction.presets import preset_named
 from splatsoil.reconstruction.result import HeldOut, Reconstruction
@@ -96,14 +97,18 @@ def _reconstruct(
         relief = replace(relief, trust=views.valid * (1.0 - silhouettes(views, tool)))
     first, label = first_gaussians(views, bed, tool, relief, spacing)
     trained = train(
-        first, label, views, relief.surface,
+        first, label, views, relief.surface, float(bed.lower[2]),
         iterations=chosen.iterations, growth=chosen.growth, seed=seed, device=device, report=report,
     )  # fmt: skip
     soil, on_tool = segments(trained.gaussians, trained.label, relief.surface, bed, tool)
     surface = surface_through(trained.gaussians[soil], relief.surface)
-    held_out = judged(trained.gaussians.to(device), every.subset(aside), trained.background)
+    around = torch.nonzero(~soil & ~on_tool)[:, 0]
+    kept = torch.ones(len(soil), dtype=torch.bool)
+    kept[around] = ~reaching_into_soil(trained.gaussians[around], surface, float(bed.lower[2]))
+    gaussians, soil, on_tool = trained.gaussians[kept], soil[kept], on_tool[kept]
+    held_out = judged(gaussians.to(device), every.subset(aside), trained.background)
     return Reconstruction(
-        gaussians=trained.gaussians,
+        gaussians=gaussians,
         soil=soil,
         tool=on_tool,
         surface=surface,

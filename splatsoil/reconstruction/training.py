@@ -11,7 +11,8 @@ from torch import Tensor
 
 from splatsoil.errors import SimulationError
 from splatsoil.reconstruction.height_field import HeightField
-from splatsoil.reconstruction.initial import SOIL
+from splatsoil.reconstruction.hidden import reaching_into_soil
+from splatsoil.reconstruction.initial import SOIL, SURROUNDINGS
 from splatsoil.reconstruction.views import Views
 from splatsoil.splats import Gaussians, rasterise, ssim
 
@@ -28,6 +29,7 @@ FLAT = 0.02  # weight of a Gaussian's thickness over its breadth beyond a third
 # Weight of what shines through, mean of 1 − alpha: there is something behind every pixel. More costs likeness.
 OPEN = 0.02
 FAINTEST = 0.02
+GROWING = 0.75  # share of the steps after which Gaussians are only dropped
 
 
 @dataclass(frozen=True)
@@ -112,6 +114,7 @@ def train(
     label: Tensor,
     views: Views,
     surface: HeightField,
+    floor: float,
     *,
     iterations: int,
     growth: float,
@@ -126,6 +129,7 @@ def train(
         label: (n,) int8 what each belongs to; the soil's are held near `surface`.
         views: photographs to fit.
         surface: the measured surface and its standard deviations.
+        floor: height of the bed's floor, m; from there to the surface there is only soil.
         iterations: steps, one photograph each.
         growth: at most this many times the first number of Gaussians.
         seed: of the order of photographs and of what splitting draws.
@@ -175,8 +179,10 @@ def train(
         hits += seen
         progress = step / max(iterations - 1, 1)
         state.step({**RATES, "means": RATES["means"] * LAST_RATE**progress})
-        if (step + 1) % every == 0 and 0.1 < progress < 0.75:
-            label = _grow_and_prune(state, label, pull / hits.clamp_min(1.0), most, generator)
+        if (step + 1) % every == 0 and progress > 0.1:
+            stray = _stray(state.gaussians().detach(), label, surface, floor)
+            limit = most if progress < GROWING else 0
+            label = _grow_and_prune(state, label, pull / hits.clamp_min(1.0), stray, limit, generator)
             pull = torch.zeros(len(label), device=device)
             hits = torch.zeros(len(label), device=device)
     with torch.no_grad():
@@ -218,11 +224,21 @@ class _Anchor:
         return (away**2 / (1.0 + away**2 / 25.0)).mean()
 
 
+def _stray(gaussians: Gaussians, label: Tensor, surface: HeightField, floor: float) -> Tensor:
+    """Which (n,) are of the surroundings and reach into the soil: others are to take their place outside."""
+    out = torch.zeros(len(label), dtype=torch.bool, device=label.device)
+    around = torch.nonzero(label == SURROUNDINGS)[:, 0]
+    out[around] = reaching_into_soil(gaussians[around], surface, floor)
+    return out
+
+
 @torch.no_grad()
-def _grow_and_prune(state: _Optimiser, label: Tensor, pull: Tensor, most: int, generator: torch.Generator) -> Tensor:
-    """Split the Gaussians that the pictures pull hardest on, drop the faint ones; the new labels."""
+def _grow_and_prune(
+    state: _Optimiser, label: Tensor, pull: Tensor, stray: Tensor, most: int, generator: torch.Generator
+) -> Tensor:
+    """Split the Gaussians that the pictures pull hardest on, drop the faint and the stray; the new labels."""
     opacity = torch.sigmoid(state.values["opacities"].detach())
-    visible = opacity > FAINTEST
+    visible = (opacity > FAINTEST) & ~stray
     room = most - int(visible.sum())
     share = min(max(room, 0), int(0.08 * len(pull)))
     threshold = pull[visible].sort(descending=True).values[share] if share else torch.inf

@@ -98,6 +98,24 @@ class Relief:
         gap = self.sample(self.height, points) - points[:, 2]
         return gap * self.sample(self.normal[..., 2], points)
 
+    def within(self, depth: float, points: Tensor) -> Tensor:
+        """Which points (n,) lie above the surface or nearer to it than a depth in m, in whatever direction.
+
+        What lies behind a steep wall is near to it, however far below the rim. The surface is eroded by a ball of that
+        radius; the bed's own walls are no surface.
+        """
+        reach = [int(depth / self.cell[k]) for k in (0, 1)]
+        wide = functional.pad(self.height[None, None], (reach[0], reach[0], reach[1], reach[1]), value=math.inf)[0, 0]
+        ny, nx = self.height.shape
+        eroded = torch.full_like(self.height, math.inf)
+        for row in range(-reach[1], reach[1] + 1):
+            for column in range(-reach[0], reach[0] + 1):
+                left = depth**2 - (row * self.cell[1]) ** 2 - (column * self.cell[0]) ** 2
+                if left >= 0.0:
+                    shifted = wide[reach[1] + row : reach[1] + row + ny, reach[0] + column : reach[0] + column + nx]
+                    eroded = torch.minimum(eroded, shifted - math.sqrt(left))
+        return points[:, 2] > self.sample(eroded, points)
+
 
 def grid_of(relief: Relief) -> Any:
     """Where the relief's maps lie, in the kernels' form."""

@@ -36,7 +36,7 @@ TOOL_OPACITY = 0.95
 """Of the discs that stand for the tool; from this weight on a pixel's tool counts as unhidden."""
 
 _HIDDEN = 2.5
-"""Particles this many spacings below the surface are not drawn."""
+"""Particles this many spacings from the surface are not drawn."""
 
 _REACH = 10.0
 """How far behind the splats the surface that a pixel shows is looked for, in particle spacings."""
@@ -165,7 +165,7 @@ class Scene:
     def shown(self, relief: Relief, centres: Tensor, particles: Tensor) -> tuple[Tensor, Tensor]:
         """Which soil Gaussians and which particles lie near enough to the surface to be drawn: masks (s,) and (p,)."""
         limit = _HIDDEN * self.spacing
-        return relief.depth_below(centres) < limit, relief.depth_below(particles) < limit
+        return relief.within(limit, centres), relief.within(limit, particles)
 
     def pose(self, positions: Any, deformations: Any, tool: Pose | None) -> Posed:
         """Move, hide and light everything for one moment.

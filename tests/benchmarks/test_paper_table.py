@@ -127,8 +127,11 @@ def test_failed_simulations_are_left_out(tmp_path: Path) -> None:
 
 
 def test_what_is_asked_hangs_on_what_was_told_alone() -> None:
-    trial = Trial(3, "ours", [30.0, 50.0], [Look(1.0, 1.21), None])
-    assert trial.told == [(pytest.approx(-2.0 / 3.0), 1.21), (pytest.approx(2.0 / 3.0), None)]
+    blocks = np.array([0.5, -0.25])
+    trial = Trial(3, "ours", [30.0, 50.0], [Look(1.0, 1.21, blocks), None])
+    first, second = trial.told
+    assert first.action == pytest.approx(-2.0 / 3.0) and first.loss == 1.21 and first.residuals is blocks
+    assert second.action == pytest.approx(2.0 / 3.0) and second.loss is None
     assert _paper.propose("ours", 3, trial.told) == _paper.propose("ours", 3, trial.told)
 
 

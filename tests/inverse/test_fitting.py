@@ -62,6 +62,21 @@ def test_what_is_returned_is_what_is_on_disk(analytic: ModuleType, tmp_path: Pat
     assert json.loads((tmp_path / "fits" / "base.json").read_text()) == run.fit()
 
 
+def test_a_refit_that_knew_more_is_the_estimate(analytic: ModuleType, tmp_path: Path) -> None:
+    run = analytic.prepare(tmp_path)
+    parameters = (analytic.FRICTION, analytic.COHESION)
+    setup = replace(analytic.SETUP, parameters=("friction_angle", "cohesion"))
+    told = {"friction_angle": (33.5, 0.4), "cohesion": (10.0, 25.0)}
+    result = fit(analytic.AnalyticProblem(parameters), run, setup, budget=8, refitted=told)
+    assert result["estimated_from"] == "refit"
+    for name, (estimate, std) in told.items():
+        found = result["parameters"][name]
+        assert found["estimate"] == pytest.approx(estimate) and found["std"] == pytest.approx(std, rel=1e-6), name
+    # the bound cuts the interval and not the spread
+    assert result["parameters"]["cohesion"]["low"] == 0.0 and result["parameters"]["cohesion"]["at_bound"] == "lower"
+    assert run.fit()["history"], "the search's evaluations are kept beside it"
+
+
 class StopError(Exception):
     """What ends a fit in the tests below."""
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import cKDTree
 
 from splatsoil.scene import Relief, relief_of_particles
 
@@ -48,6 +49,24 @@ def test_depth_below_is_measured_along_the_normal():
     relief = Relief.of_heights((0.5 * x).repeat(30, 1), (0.0, 0.0), (0.01, 0.01))
     depth = relief.depth_below(torch.tensor([[0.2, 0.15, 0.1 - 0.03]]))
     assert float(depth) == pytest.approx(0.03 / np.hypot(1.0, 0.5), rel=1e-4)
+
+
+def test_what_lies_behind_a_steep_wall_is_near_the_surface():
+    """Against the distance from every point to every point of the air above a terrace with a pit."""
+    x, y = (torch.arange(n) * 0.004 for n in (60, 50))
+    height = torch.where(x[None] < 0.12, 0.1, 0.03) * torch.ones((50, 1))
+    height[20:30, 10:20] = 0.05
+    relief = Relief.of_heights(height, (0.0, 0.0), (0.004, 0.004))
+    rng = np.random.default_rng(2)
+    points = rng.uniform([0.03, 0.03, 0.0], [0.2, 0.16, 0.1], (300, 3))
+    z = np.arange(0.0, 0.14, 0.002)
+    air = np.array([(a, b, c) for j, b in enumerate(y) for i, a in enumerate(x) for c in z if c >= height[j, i]])
+    distance, _ = cKDTree(air).query(points)
+    shown = relief.within(0.025, torch.tensor(points, dtype=torch.float32)).numpy()
+    sure = np.abs(distance - 0.025) > 0.004  # a cell
+    assert np.array_equal(shown[sure], distance[sure] < 0.025)
+    behind = (points[:, 0] < 0.12) & (relief.depth_below(torch.tensor(points).float()).numpy() > 0.03) & sure
+    assert shown[behind].any(), "some are near a wall though far below the rim"
 
 
 def test_the_same_particles_give_the_same_bits():
