@@ -7,6 +7,7 @@ A worker that dies (killed, out of memory) costs the one evaluation it was at, w
 from __future__ import annotations
 
 import multiprocessing
+import os
 import queue
 import threading
 from collections.abc import Callable, Iterable, Iterator
@@ -19,6 +20,8 @@ from splatsoil.errors import ParameterError, RunError
 
 #: A job whose worker dies this often is to blame itself.
 ATTEMPTS = 4
+#: What decides how many threads a worker's libraries start.
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 class Serial(Executor):
@@ -47,6 +50,10 @@ class Processes(Executor):
     def __init__(self, workers: int) -> None:
         if workers < 1:
             raise ParameterError(f"processes:{workers}: at least one worker is needed")
+        # Each worker's libraries would start a thread for every core, and stand in each other's way. What the user has
+        # set stays.
+        if not any(name in os.environ for name in THREADS):
+            os.environ.update(dict.fromkeys(THREADS, str(max(1, (os.cpu_count() or 1) // workers))))
         # A fresh interpreter each: forking a process that has threads or a CUDA context breaks both.
         self._context = multiprocessing.get_context("spawn")
         self._jobs: queue.SimpleQueue[tuple[Future[Any], Callable[..., Any], tuple[Any, ...], dict[str, Any]] | None]

@@ -15,7 +15,7 @@ import pytest
 from splatsoil.envs.problem import Evaluation
 from splatsoil.inverse.campaign import Job, run_campaign
 from splatsoil.inverse.evaluations import EvaluationRecord, EvaluationStore
-from splatsoil.inverse.executors import Processes, Serial, executor
+from splatsoil.inverse.executors import THREADS, Processes, Serial, executor
 
 from splatsoil.errors import ParameterError, RunError
 
@@ -131,6 +131,25 @@ def test_killed_twenty_times_at_random_moments(analytic: ModuleType, tmp_path: P
     records = run(problem, 40, file)
     assert problem.calls == 40 - kept
     assert essence(records) == essence(run(analytic.AnalyticProblem(), 40, tmp_path / "whole.db"))
+
+
+def threads_of_worker() -> int:
+    import torch
+
+    return torch.get_num_threads()
+
+
+def test_workers_share_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in THREADS:
+        monkeypatch.delenv(name, raising=False)
+    workers = max(2, os.cpu_count() or 1)
+    with executor(f"processes:{workers}") as pool:
+        assert pool.submit(threads_of_worker).result() == 1
+    for name in THREADS:
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv(THREADS[0], "2")
+    with executor(f"processes:{workers}") as pool:
+        assert pool.submit(threads_of_worker).result() == min(2, os.cpu_count() or 1), "what the user has set stays"
 
 
 @pytest.mark.parametrize("name", ["", "threads", "processes:", "processes:two", "dask:", "serial:1"])
