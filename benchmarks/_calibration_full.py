@@ -3,6 +3,7 @@ for this truth alone."""
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -70,7 +71,7 @@ def one_truth(
     values = space.to_dict(space.from_unit(point))
     world = {"values": values, "number": number, "preset": preset, "device": device.split(":")[0]}
     problem.place(values, 1_000_003 + number)
-    source = Path(splatsoil.__file__).parents[1] / "envs" / "synthetic.py"
+    source = Path(inspect.getfile(SyntheticProblem))
     setup = FitSetup(
         measurement=digest(world),
         reconstruction="",

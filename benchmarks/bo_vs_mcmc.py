@@ -4,7 +4,7 @@
 
 | way | what it does with N calls |
 |---|---|
-| `bo` | Bayesian optimisation of the loss; interval from the posterior of the minimiser |
+| `bo` | what `splatsoil fit` does: expected improvement of the features' misfit, their least squares |
 | `paper` | the same with Hsiao and Kumar's settings: one random start, expected improvement |
 | `mcmc` | emcee on an emulator of the features, trained on N space-filling calls |
 | `both` | emcee on an emulator trained on the N calls that `bo` chose |
@@ -34,11 +34,13 @@ from splatsoil.envs.together import attempt
 from splatsoil.inverse.bayesopt import PAPER, BayesianOptimiser, Search
 from splatsoil.inverse.emulator import FEWEST, Emulator
 from splatsoil.inverse.executors import Executor, Serial, executor, in_order
+from splatsoil.inverse.feature_fit import by_features
 from splatsoil.inverse.likelihood import Likelihood
 from splatsoil.inverse.mcmc import sample
-from splatsoil.inverse.surrogate import sobol
+from splatsoil.inverse.posterior import Data
+from splatsoil.inverse.surrogate import Minimum, Surrogate, sobol
 
-from splatsoil.errors import ParameterError
+from splatsoil.errors import ParameterError, RunError
 from splatsoil.parameters import ParameterSpace
 
 if TYPE_CHECKING:
@@ -138,9 +140,27 @@ def play(world: World, budgets: Sequence[int], seed: int, search: Search | None)
         if len(points) in budgets:
             began = time.perf_counter()
             found = optimiser.result()
+            if search is None:
+                found = _as_fitted(world, optimiser.surrogate(), found, points, features, seed)
             seconds = spent + time.perf_counter() - began
             answers[len(points)] = Answer(found.estimate, found.low, found.high, seconds)
     return answers, (np.array(points), np.array(features))
+
+
+def _as_fitted(
+    world: World,
+    surrogate: Surrogate,
+    found: Minimum,
+    points: Sequence[FloatArray],
+    features: Sequence[FloatArray],
+    seed: int,
+) -> Minimum:
+    """What `splatsoil fit` says after these calls: the features' estimate where there is one, else the loss' own."""
+    data = Data(world.space, np.array(points), -np.array(features))
+    try:
+        return by_features(data, surrogate, found, seed=seed) or found
+    except RunError:  # too few calls
+        return found
 
 
 def sample_emulated(points: FloatArray, features: FloatArray, seed: int) -> Answer:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
@@ -101,7 +102,7 @@ def _problem(
     if measurement is None:
         world = SyntheticProblem(parameters, effects, preset=preset, device=device)
         world.begin(WORLD)
-        source = Path(splatsoil.__file__).parents[1] / "envs" / "synthetic.py"
+        source = Path(inspect.getfile(SyntheticProblem))
         return world, {"world": "synthetic", "seed": WORLD, "source": code_digest((), [source])}
     problem = MeasuredProblem.load(
         measurement, parameters, effects, preset=preset, device=device, reconstruction=reconstruction

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -19,9 +20,15 @@ FOLDERS = ("splatsoil", "envs", "inverse", "benchmarks")
 FILES = ("pyproject.toml", "README.md", "LICENSE")
 
 
-def run(*words: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
+def run(*words: str | Path, cwd: Path, **variables: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [str(word) for word in words], cwd=cwd, capture_output=True, text=True, timeout=300, check=False
+        [str(word) for word in words],
+        cwd=cwd,
+        env={**os.environ, **variables},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
     )
 
 
@@ -143,3 +150,14 @@ def test_the_command_line_works(elsewhere: Path, plow_dry: Path, project: dict[s
     checked = run(elsewhere / "venv/bin/python", "-m", "splatsoil", "check", plow_dry, "--json", cwd=elsewhere)
     assert checked.returncode == 0, checked.stderr
     assert json.loads(checked.stdout)["views"] == 40
+
+
+def test_the_made_up_world_finds_its_own_source(elsewhere: Path, tmp_path: Path) -> None:
+    """Its source is part of what a kept simulation is known by; installed, it lies elsewhere than in the repository."""
+    code = (
+        "from splatsoil.inverse.simulations import simulations\n"
+        "data, file = simulations(4, repeats=2)\n"
+        "assert file.is_file() and data.residuals.shape[0] == 6\n"
+    )
+    done = run(elsewhere / "venv/bin/python", "-c", code, cwd=tmp_path, XDG_CACHE_HOME=str(tmp_path))
+    assert done.returncode == 0, done.stderr

@@ -20,7 +20,7 @@ from .outside import StrengthReading, read_strength
 from .score import Score, Scorer
 from .simulations import Simulations
 from .strokes import StrokeAdvice, advise
-from .verdicts import CLEAN, ENOUGH, EQUIVALENT, LEVEL, EffectVerdict, Verdict, explained, of_effect, overall
+from .verdicts import CLEAN, ENOUGH, EQUIVALENT, GATE, LEVEL, EffectVerdict, Verdict, explained, of_effect, overall
 
 FloatArray = npt.NDArray[np.float64]
 Report = Callable[[str, float], None]
@@ -182,7 +182,7 @@ def judge(
         costs = {name: c.chi2 + price(candidates[name], misfit.freedom) for name, c in tried.items()}
         best = min(costs, key=lambda name: costs[name])
         before = confirmations[""].remainder
-        if _stands(confirmations, best):
+        if _stands(confirmations, best, misfit):
             given = scorer.score(residual, given=best)
             members = _equals(costs, best, tried[best].remainder)
             remainder = remainder_of(experiment, floor, tried[best], candidates, evidence, bench.basis)
@@ -246,10 +246,15 @@ def _advice(
     return advise(experiment, fitted, chosen, progress=lambda share: told("other strokes", share))
 
 
-def _stands(confirmations: Mapping[str, Confirmation], best: str) -> bool:
-    """The refit bears out what the score promised: χ² falls, and the error on times it hasn't seen does too."""
+def _stands(confirmations: Mapping[str, Confirmation], best: str, misfit: Omnibus) -> bool:
+    """Something is to be explained, and the refit does: χ² falls, and the error on times it hasn't seen falls too.
+
+    A model whose error there is no larger than noise, and whose slow waves show no more than chance, lacks nothing that
+    these data could show, whatever a single direction among dozens seems to say.
+    """
     before, after = confirmations[""], confirmations[best]
-    return before.chi2 - after.chi2 > EQUIVALENT and after.held_out < before.held_out
+    wanting = before.held_out > before.floor or misfit.p < GATE
+    return wanting and before.chi2 - after.chi2 > EQUIVALENT and after.held_out < before.held_out
 
 
 def price(candidate: Candidate, freedom: int) -> float:

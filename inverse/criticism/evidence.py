@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -11,8 +12,6 @@ import numpy.typing as npt
 from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Candidate, Experiment
 from splatsoil.parameters import Parameter
-
-from .simulations import Simulations
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -55,7 +54,7 @@ class Evidence:
 
 def gather(
     experiment: Experiment,
-    simulate: Simulations,
+    simulate: Callable[..., FloatArray],
     values: Mapping[str, float],
     *,
     repeats: int = 4,
@@ -111,6 +110,18 @@ def gather(
         except SimulationError as error:
             failed[candidate.name] = str(error)
     return Evidence(base, runs.mean(axis=0), deviations, numerics, slopes, curves, widths, directions, steps, failed)
+
+
+def needed(experiment: Experiment, values: Mapping[str, float], *, repeats: int = 4) -> list[dict[str, Any]]:
+    """What :func:`gather` will ask of its simulations, in order, as their keyword arguments."""
+    asked: list[dict[str, Any]] = []
+
+    def noted(at: Mapping[str, float], *, purpose: str = "", **others: Any) -> FloatArray:
+        asked.append({"values": dict(at), **others})
+        return np.zeros(experiment.layout.shape)
+
+    gather(experiment, noted, values, repeats=repeats)
+    return asked
 
 
 def around(parameter: Parameter, value: float) -> list[float]:

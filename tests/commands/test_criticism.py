@@ -35,7 +35,8 @@ def cut(source: Path, folder: Path) -> Path:
     return folder
 
 
-def command(*words: str, cwd: Path) -> dict[str, Any]:
+def command(*words: str, cwd: Path, cores: int | None = None) -> dict[str, Any]:
+    mine = sorted(os.sched_getaffinity(0))[:cores]
     done = subprocess.run(
         [sys.executable, "-m", "splatsoil", *words, "--json"],
         cwd=cwd,
@@ -44,6 +45,7 @@ def command(*words: str, cwd: Path) -> dict[str, Any]:
         env=os.environ | {"OMP_NUM_THREADS": "1"},
         timeout=900,
         check=False,
+        preexec_fn=lambda: os.sched_setaffinity(0, mine),
     )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
@@ -76,7 +78,12 @@ def test_a_run_is_compared_diagnosed_and_added_to(place: Path, repository: Path)
         "2",
         "--no-replay",
     )
+    shutil.copytree(place / "run", place / "alone")
+    alone = command(words[0], "alone", *words[2:], cwd=place, cores=1)
     first = command(*words, cwd=place)
+    assert first["effects"] == alone["effects"], "a second core changes nothing"
+    if len(os.sched_getaffinity(0)) > 1:
+        assert first["simulated_now"] < alone["simulated_now"], "and takes some of the work"
     assert {e["name"] for e in first["effects"]} == {"cohesion", "exposure", "suction"}
     assert first["verdict"] in ("adequate", "missing", "outside the library")
     kept = json.loads((place / "run" / "diagnosis.json").read_text())
