@@ -194,7 +194,8 @@ def judge(
     named = any(effects[name] == "missing" for name in members)
     if strong and not named:
         effects = {n: "cannot tell" if v == "missing" else v for n, v in effects.items()}
-    verdict = overall(named, before if named else misfit, remainder)
+    error = confirmations[members[0]].held_out / confirmations[members[0]].floor if members else 1.0
+    verdict = overall(named, before if named else misfit, remainder, error=error)
     notes = [f"{name} could not be simulated: {why}" for name, why in evidence.failed.items()]
     strength = None
     if verdict == "outside the library":

@@ -138,6 +138,11 @@ def test_verdicts_on_the_model(named: bool, misfit: Omnibus, remainder: Omnibus 
     assert overall(named, misfit, remainder) == verdict
 
 
+@pytest.mark.parametrize(("error", "verdict"), [(1.1, "missing"), (1.5, "outside the library")])
+def test_an_effect_that_leaves_more_than_noise_is_not_all_that_is_missing(error: float, verdict: str) -> None:
+    assert overall(True, OFF, CLEAN, error=error) == verdict
+
+
 def test_verdicts_on_an_effect(sizes: dict[str, float]) -> None:
     found = one(WORLD, {"angle": 0.0}, None, OPTIONS)
     candidate = emulated(WORLD).candidates[1]
