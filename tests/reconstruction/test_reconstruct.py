@@ -13,6 +13,7 @@ from splatsoil.cli import main
 from splatsoil.errors import MeasurementError, ParameterError, RunError
 from splatsoil.measurement import Measurement, Picture, write_measurement
 from splatsoil.reconstruction import HeightField, Reconstruction, reconstruct
+from splatsoil.reconstruction.hidden import reaching_into_soil
 from splatsoil.reconstruction.initial import SOIL, Seeds, discs
 from splatsoil.reconstruction.surface import surface_through
 from splatsoil.splats import load_ply, rasterise
@@ -79,6 +80,13 @@ def test_gaussians_are_told_apart(scene, measurement, result):
     blue = colour[result.tool.numpy()]
     sand = colour[result.soil.numpy()]
     assert np.median(blue[:, 2] - blue[:, 0]) > 0.1 > np.median(sand[:, 2] - sand[:, 0])
+
+
+def test_nothing_but_soil_reaches_into_the_bed(measurement, result):
+    around = ~result.soil & ~result.tool
+    assert around.any()
+    floor = float(measurement.bed.lower[2])
+    assert not reaching_into_soil(result.gaussians[around], result.surface, floor).any()
 
 
 def test_the_surface_through_discs_is_theirs(scene):

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from splatsoil.benchmarks.hidden_effects import detectable, emulated, fitted, one, outside, wilson
-from splatsoil.inverse.criticism.diagnosis import Options, diagnose
+from splatsoil.inverse.criticism.diagnosis import Options, _stands, diagnose
+from splatsoil.inverse.criticism.evidence import gather, needed
 from splatsoil.inverse.criticism.misfit import Omnibus
 from splatsoil.inverse.criticism.record import record
 from splatsoil.inverse.criticism.simulations import Simulations
@@ -141,6 +142,32 @@ def test_verdicts_on_the_model(named: bool, misfit: Omnibus, remainder: Omnibus 
 @pytest.mark.parametrize(("error", "verdict"), [(1.1, "missing"), (1.5, "outside the library")])
 def test_an_effect_that_leaves_more_than_noise_is_not_all_that_is_missing(error: float, verdict: str) -> None:
     assert overall(True, OFF, CLEAN, error=error) == verdict
+
+
+@pytest.mark.parametrize(
+    ("error", "misfit", "named"), [(0.7, CLEAN, False), (0.7, OFF, True), (1.5, CLEAN, True), (1.5, OFF, True)]
+)
+def test_nothing_is_missing_where_nothing_is_to_be_explained(
+    sizes: dict[str, float], error: float, misfit: Omnibus, named: bool
+) -> None:
+    """One convincing refit; the error before it is below noise or above, the slow waves are chance or not."""
+    found = one(WORLD, {"angle": 1.0, "effect 2": 5.0 * sizes["effect 2"]}, None, OPTIONS).confirmations
+    before, after = found[""], found["effect 2"]
+    floor = before.held_out / error
+    told = {"": replace(before, floor=floor), "effect 2": replace(after, floor=floor)}
+    assert _stands(told, "effect 2", misfit) is named
+
+
+def test_what_will_be_needed_is_known_before_anything_is_simulated() -> None:
+    experiment = emulated(3)
+    asked: list[dict[str, object]] = []
+
+    def simulate(values: dict[str, float], *, purpose: str = "", **others: object) -> np.ndarray:
+        asked.append({"values": dict(values), **others})
+        return experiment.predict(values, **others)
+
+    gather(experiment, simulate, {"angle": 0.5}, repeats=3)
+    assert needed(experiment, {"angle": 0.5}, repeats=3) == asked and len(asked) > 10
 
 
 def test_verdicts_on_an_effect(sizes: dict[str, float]) -> None:
