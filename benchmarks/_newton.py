@@ -33,11 +33,14 @@ class Numerics:
         voxel: edge of the cells, m.
         substeps: in a frame.
         iterations: most of the Gauss-Seidel solver in a substep.
+        late: soil is pushed out of where the tool stood when the substep began, not of where it ends. In the example
+            sets soil stands one substep's way deep in the moving tool, so they were made so.
     """
 
     voxel: float
     substeps: int
     iterations: int
+    late: bool = True
 
     @classmethod
     def of(cls, folder: Path) -> Numerics:
@@ -108,14 +111,15 @@ def plough(
     found: list[dict[int, FloatArray]] = [{} for _ in worlds]
     for frame in range(1, wanted[-1] + 1):
         for pose in step_poses(measurement.tool.motion, (frame - 1) * frame_time, frame_time, numerics.substeps):
-            # Both calls carry the tool on by its velocity from its pose at the step's start: from the pose at the end,
-            # the projection would push soil a step too far ahead.
+            # Both calls carry the tool on by its velocity from its pose at the step's start.
             places = np.array([[*(pose.position + shift), *pose.quaternion] for shift in shifts], dtype=np.float32)
             twists = np.array([[*pose.velocity, *pose.spin]] * len(worlds), dtype=np.float32)
             for state in (now, following):
                 state.body_q.assign(places)
                 state.body_qd.assign(twists)
             solver.step(now, following, None, None, step)
+            if numerics.late:
+                following.body_qd.zero_()
             solver.project_outside(following, following, step)
             now, following = following, now
         if frame in wanted:

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 import trimesh
 from numpy.typing import NDArray
+from scipy.ndimage import binary_propagation, distance_transform_edt
 from scipy.spatial import cKDTree
 
 from splatsoil.measurement import Bed
@@ -25,6 +26,7 @@ RIM = 0.04  # width of what is taken to border the bed (a bin's wall), in square
 # How many times better the soil's level must explain the surroundings than the bed's floor, to be their height.
 LEVEL_GAIN = 1.5
 NEIGHBOURS = 24  # Gaussians that a height is drawn from
+DOUBTFUL = 3.0  # times the median standard deviation: at the bed's border, the height of something behind it
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,8 @@ def find_relief(views: Views, bed: Bed, tool_silhouettes: torch.Tensor, preset: 
         views, cells, trust, everything, np.linspace(bed.lower[2], bed.upper[2], preset.candidates), sigma=1.5
     )
     report("refining heights", 0.4)
-    height, _ = refine(views, cells, trust, everything, height, sigma=1.0, reach=step, length=length)
+    height, deviation = refine(views, cells, trust, everything, height, sigma=1.0, reach=step, length=length)
+    height, _ = without_backdrop(height, deviation, length)
 
     fine = HeightField.over(bed.lower, bed.upper, cell)
     where = fine.points[..., :2].reshape(-1, 2)
@@ -95,9 +98,33 @@ def find_relief(views: Views, bed: Bed, tool_silhouettes: torch.Tensor, preset: 
         height, deviation = refine(
             views, Cells.of(now), trust, seen, height, reach=0.5 * step, length=length, iterations=6 if last else 3
         )
+        height, deviation = without_backdrop(height, deviation, length)
     surface = HeightField(fine.x, fine.y, np.clip(height, bed.lower[2], None), deviation)
     occluder = with_rim(surface, bed, rim)
     return Relief(surface, occluder, ground_level(views, bed, surface, occluder, rim), trust, rim)
+
+
+def without_backdrop(height: Array, deviation: Array, length: float) -> tuple[Array, Array]:
+    """Heights (ny, nx) in which doubtful cells that reach in from the border repeat their nearest sure neighbour.
+
+    Photographs that look past a corner of the bed agree on the plain ground behind it at any height, so a corner may
+    be drawn up to a spire. It is known several times worse than sand; inside the bed the curvature prior bridges what
+    is, here nothing lies beyond.
+
+    Args:
+        height: (ny, nx) in m.
+        deviation: (ny, nx) standard deviations in m.
+        length: the bed's, m: the standard deviation of a height that was replaced.
+
+    Returns:
+        Heights and their standard deviations.
+    """
+    doubtful = ~(deviation <= DOUBTFUL * np.median(deviation))
+    border = np.ones_like(doubtful)
+    border[1:-1, 1:-1] = False
+    reached = binary_propagation(border & doubtful, mask=doubtful)
+    nearest = distance_transform_edt(reached, return_distances=False, return_indices=True)
+    return height[tuple(nearest)], np.where(reached, length, deviation)
 
 
 def with_rim(surface: HeightField, bed: Bed, rim: float, *, level: float | None = None) -> HeightField:

@@ -12,7 +12,7 @@ import trimesh
 from splatsoil.measurement import Camera
 from splatsoil.reconstruction import PRESETS, HeightField
 from splatsoil.reconstruction.stereo import Smoothness, visibility
-from splatsoil.reconstruction.surface import find_relief, with_rim
+from splatsoil.reconstruction.surface import find_relief, with_rim, without_backdrop
 from splatsoil.reconstruction.views import Views, projection_matrix, silhouettes
 
 
@@ -121,3 +121,26 @@ def test_a_plate_bends_no_plane_and_stops_at_the_border():
     np.testing.assert_allclose(filled[mask], plane[mask], atol=1e-5)
     spoilt = np.where(mask, plane, 1e3)
     np.testing.assert_allclose(Smoothness(mask).plate(known, spoilt, 100.0, 0.0)[mask], plane[mask], atol=1e-5)
+
+
+def test_a_spire_at_a_corner_is_cut_off_and_a_hole_inside_is_left_to_the_prior() -> None:
+    rows, columns = np.mgrid[:20, :30]
+    plane = 0.1 + 0.001 * rows
+    height, deviation = plane.copy(), np.full(plane.shape, 2e-4)
+    corner = (rows >= 16) & (columns >= 25)
+    # sure of itself in places, but never as sure as sand
+    height[corner] += 0.08
+    deviation[corner] = np.where((rows + columns)[corner] % 2 == 0, 1e-3, 1.0)
+    deviation[5:8, 10:14] = 1.0
+    found, known = without_backdrop(height, deviation, 0.5)
+    assert np.array_equal(found[~corner], plane[~corner])
+    assert np.abs(found - plane).max() < 0.005
+    assert (known[corner] == 0.5).all()
+    assert np.array_equal(known[~corner], deviation[~corner])
+
+
+def test_a_bed_known_alike_everywhere_is_left_alone() -> None:
+    height = np.random.default_rng(0).normal(size=(6, 7))
+    found, known = without_backdrop(height, np.full(height.shape, 1e-4), 0.5)
+    assert np.array_equal(found, height)
+    assert (known == 1e-4).all()
