@@ -165,11 +165,11 @@ def _model(newton: Any, truth: Truth, worlds: Sequence[World], shifts: FloatArra
     material.poisson_ratio.fill_(0.3)
     material.friction.assign(each(slopes))
     if cohesion := truth.values.get("cohesion", 0.0):
-        shear = [cone_intercept(w.angle, cohesion) for w in worlds]
-        material.yield_stress.assign(each(shear))
+        # Newton's strength is yield_stress + friction (p + tension): the cone's apex alone makes the whole cohesion,
+        # and a yield stress beside it would double that.
         material.yield_pressure.fill_(YIELD_PRESSURE)
-        tension = [k / (a * YIELD_PRESSURE) for k, a in zip(shear, slopes, strict=True)]
-        material.tensile_yield_ratio.assign(each(tension))
+        apex = [cone_intercept(w.angle, cohesion) / a for w, a in zip(worlds, slopes, strict=True)]
+        material.tensile_yield_ratio.assign(each([tension / YIELD_PRESSURE for tension in apex]))
     return model
 
 

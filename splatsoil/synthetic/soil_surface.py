@@ -14,8 +14,9 @@ from splatsoil.synthetic.stage import Body
 
 FloatArray = npt.NDArray[np.float64]
 
-LEVEL = 0.45
-"""The surface is where the blurred filling falls to this share of the bulk's."""
+LEVEL = 0.5
+"""The surface is where the blurred filling falls to this share of the bulk's: half, so that level soil ends where its
+volume does. At 0.45 it would stand an eighth of a spacing higher, and there would seem to be more soil."""
 BLUR = 1.0
 """Standard deviation of the blur, in particle spacings."""
 CELLS = 2
@@ -30,7 +31,7 @@ def soil_surface(
 ) -> Body:
     """The soil's surface with the albedo of the particles beneath it.
 
-    Particles are counted on a grid, the counts blurred by one particle spacing and cut at 0.45 of the bulk. The bed's
+    Particles are counted on a grid, the counts blurred by one particle spacing and cut at half of the bulk. The bed's
     walls and floor mirror the soil, so that its surface meets them as it would go on.
 
     Args:
