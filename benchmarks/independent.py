@@ -56,7 +56,7 @@ def changed(truth: Truth, numerics: Numerics) -> list[tuple[Numerics, list[World
     side_by_side = [other, replace(world("Young's modulus 1 MPa"), young=1.0e6), world("particles x 27/8", 2 / 3)]
     return [
         (numerics, side_by_side),
-        (replace(numerics, late=not numerics.late), [world("projection " + ("punctual" if numerics.late else "late"))]),
+        (replace(numerics, late=False), [world("projection at the substep's end")]),
         (replace(numerics, substeps=2 * numerics.substeps), [world("substeps x 2")]),
         (replace(numerics, iterations=4 * numerics.iterations), [world("iterations x 4")]),
         (finer[0], [world("voxel x 2/3", 2 / 3)]),
