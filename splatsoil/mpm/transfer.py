@@ -18,6 +18,9 @@ from splatsoil.mpm.grid import (
 from splatsoil.mpm.state import Cells, Nodes, Particles
 from splatsoil.mpm.tool import FAR, Tool, distance_normal, signed_distance, tool_position, tool_rotation
 
+RUNAWAY = wp.constant(1.0e3)
+"""Most that the visual deformation's norm comes to between two frames."""
+
 
 @wp.kernel
 def mark_cells(particles: Particles, cells: Cells, grid: Grid) -> None:
@@ -192,7 +195,9 @@ def grid_to_particles(
     particles.affine[p] = affine
     particles.bilinear[p] = keep * bilinear
     particles.trilinear[p] = keep * trilinear
-    particles.deformation[p] += stretch * particles.deformation[p]
+    # bounded when a frame is recorded; what tumbles freely until then must not outgrow single precision
+    grown = particles.deformation[p] + stretch * particles.deformation[p]
+    particles.deformation[p] = grown * wp.min(1.0, RUNAWAY / wp.sqrt(wp.ddot(grown, grown)))
     particles.normal[p] = cells.normal[entry]
     particles.shear[p] = cells.shear[entry]
     particles.elastic[p] = cells.elastic[entry]
