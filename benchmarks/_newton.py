@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,14 +13,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import warp as wp
-from splatsoil.benchmarks.numerics import FloatArray, Truth
+from splatsoil.benchmarks.numerics import FloatArray
 
 from splatsoil.errors import MeasurementError, RunError, SimulationError
+from splatsoil.measurement import Measurement
 from splatsoil.mpm.simulate import step_poses
 from splatsoil.soil.matching import cone_intercept, cone_slope
 
 YIELD_PRESSURE = 1.0e8
 """Pa; high enough never to be met, low enough that single precision still resolves the cohesion's share of it."""
+ROUGH = 1.0
+"""Friction of an obstacle: soil sticks to it and shears within itself."""
 WALL = 0.1
 """Half the thickness of a wall, m."""
 
@@ -61,17 +64,29 @@ class World:
 
     Attributes:
         label: what it is called in the table.
-        angle: friction angle, degrees.
+        angle: friction angle, degrees; one, or (n,) one a particle.
         particles: (n, 3) at frame 0, m.
         spacing: edge of the cube of soil that a particle stands for, m.
         young: Young's modulus, Pa.
+        cohesion: Pa; of the whole soil, with one friction angle.
+        dilatancy: slope of the plastic potential over that of the yield surface: 1 is associated flow.
+        viscosity: Pa s.
+        tool_friction: None for the measurement's.
+        tool_adhesion: Pa.
+        obstacle: centre (x, y, z) and radius in m of a fixed sphere in the bed; None for none.
     """
 
     label: str
-    angle: float
+    angle: float | FloatArray
     particles: FloatArray = field(repr=False)
     spacing: float
     young: float = 1.0e7
+    cohesion: float = 0.0
+    dilatancy: float = 0.0
+    viscosity: float = 0.0
+    tool_friction: float | None = None
+    tool_adhesion: float = 0.0
+    obstacle: tuple[float, float, float, float] | None = None
 
 
 def load_newton() -> Any:
@@ -83,9 +98,25 @@ def load_newton() -> Any:
 
 
 def plough(
-    truth: Truth, worlds: Sequence[World], numerics: Numerics, device: str = "cpu"
+    measurement: Measurement,
+    worlds: Sequence[World],
+    numerics: Numerics,
+    frames: Iterable[int],
+    device: str = "cpu",
+    *,
+    gravity: Sequence[float] | None = None,
+    progress: Callable[[float], None] = lambda share: None,
 ) -> list[dict[int, FloatArray]]:
-    """Run the worlds side by side, in boxes of their own, to the last of the truth's frames.
+    """Run the worlds side by side, in boxes of their own, to the last frame.
+
+    Args:
+        measurement: bed, tool and motion.
+        worlds: their soil.
+        numerics: of the solver.
+        frames: to keep, of those from 1 on.
+        device: Warp device name.
+        gravity: (3,) m/s^2; the measurement's by default.
+        progress: called with the share that is done.
 
     Returns:
         For each world its particles (n, 3) in m by frame.
@@ -95,18 +126,18 @@ def plough(
         SimulationError: particles left the numbers.
     """
     newton = load_newton()
-    measurement = truth.measurement
     # whole voxels, so that every box lies on the grid as the first one does
     pitch = math.ceil((measurement.bed.upper - measurement.bed.lower)[1] / numerics.voxel + 4.0 * WALL / numerics.voxel)
     shifts = np.array([[0.0, k * pitch * numerics.voxel, 0.0] for k in range(len(worlds))])
-    model = _model(newton, truth, worlds, shifts, device)
+    model = _model(newton, measurement, worlds, shifts, device)
+    model.set_gravity(tuple(float(g) for g in (measurement.gravity if gravity is None else gravity)))
     config = newton.solvers.SolverImplicitMPM.Config()
     config.voxel_size, config.max_iterations, config.tolerance = numerics.voxel, numerics.iterations, 1.0e-4
     solver = newton.solvers.SolverImplicitMPM(model, config=config)
     now, following = model.state(), model.state()
     frame_time = 1.0 / measurement.frame_rate
     step = frame_time / numerics.substeps
-    wanted = sorted(f for f in truth.particles if f > 0)
+    wanted = sorted(f for f in frames if f > 0)
     ends = np.cumsum([len(w.particles) for w in worlds])[:-1]
     found: list[dict[int, FloatArray]] = [{} for _ in worlds]
     for frame in range(1, wanted[-1] + 1):
@@ -128,12 +159,13 @@ def plough(
                 raise SimulationError(f"newton: particles are no numbers at frame {frame} with {numerics}")
             for k, part in enumerate(np.split(x, ends)):
                 found[k][frame] = part - shifts[k]
+        progress(frame / wanted[-1])
     return found
 
 
-def _model(newton: Any, truth: Truth, worlds: Sequence[World], shifts: FloatArray, device: str) -> Any:
+def _model(newton: Any, measurement: Measurement, worlds: Sequence[World], shifts: FloatArray, device: str) -> Any:
     """Newton's model: one floor; walls, a tool and soil for every world."""
-    bed, tool = truth.measurement.bed, truth.measurement.tool
+    bed, tool = measurement.bed, measurement.tool
     builder = newton.ModelBuilder()
     newton.solvers.SolverImplicitMPM.register_custom_attributes(builder)
     surface = newton.ModelBuilder.ShapeConfig
@@ -144,8 +176,13 @@ def _model(newton: Any, truth: Truth, worlds: Sequence[World], shifts: FloatArra
             place = wp.transform(wp.vec3(*centre), wp.quat_identity())
             smooth = surface(mu=bed.wall_friction, density=0.0)
             builder.add_shape_box(body=-1, cfg=smooth, xform=place, hx=half[0], hy=half[1], hz=half[2])
+        if world.obstacle is not None:
+            place = wp.transform(wp.vec3(*(np.array(world.obstacle[:3]) + shift)), wp.quat_identity())
+            builder.add_shape_sphere(body=-1, cfg=surface(mu=ROUGH, density=0.0), xform=place, radius=world.obstacle[3])
+        friction = tool.friction if world.tool_friction is None else world.tool_friction
+        sticky = {"mpm:collider_adhesion": world.tool_adhesion}
         body = builder.add_body()
-        builder.add_shape_mesh(body=body, mesh=mesh, cfg=surface(mu=tool.friction, density=0.0))
+        builder.add_shape_mesh(body=body, mesh=mesh, cfg=surface(mu=friction, density=0.0), custom_attributes=sticky)
         n = len(world.particles)
         builder.add_particles(
             pos=(world.particles + shift).tolist(),
@@ -154,23 +191,31 @@ def _model(newton: Any, truth: Truth, worlds: Sequence[World], shifts: FloatArra
             radius=[world.spacing / 2.0] * n,
         )
     model = builder.finalize(device=device)
-    model.set_gravity(tuple(float(g) for g in truth.measurement.gravity))
-    counts = [len(w.particles) for w in worlds]
 
-    def each(values: Sequence[float]) -> npt.NDArray[np.float32]:
-        return np.repeat(np.asarray(values, dtype=np.float32), counts)
+    def each(values: Sequence[float | FloatArray]) -> npt.NDArray[np.float32]:
+        parts = [np.broadcast_to(value, len(w.particles)) for value, w in zip(values, worlds, strict=True)]
+        return np.concatenate(parts).astype(np.float32)
 
-    material, slopes = model.mpm, [cone_slope(w.angle) for w in worlds]
+    material = model.mpm
     material.young_modulus.assign(each([w.young for w in worlds]))
     material.poisson_ratio.fill_(0.3)
-    material.friction.assign(each(slopes))
-    if cohesion := truth.values.get("cohesion", 0.0):
+    material.friction.assign(each([np.vectorize(cone_slope)(w.angle) for w in worlds]))
+    material.dilatancy.assign(each([w.dilatancy for w in worlds]))
+    material.viscosity.assign(each([w.viscosity for w in worlds]))
+    if any(w.cohesion for w in worlds):
         # Newton's strength is yield_stress + friction (p + tension): the cone's apex alone makes the whole cohesion,
         # and a yield stress beside it would double that.
         material.yield_pressure.fill_(YIELD_PRESSURE)
-        apex = [cone_intercept(w.angle, cohesion) / a for w, a in zip(worlds, slopes, strict=True)]
-        material.tensile_yield_ratio.assign(each([tension / YIELD_PRESSURE for tension in apex]))
+        material.tensile_yield_ratio.assign(each([_tension(w) / YIELD_PRESSURE for w in worlds]))
     return model
+
+
+def _tension(world: World) -> float:
+    """Pressure of the cone's apex, Pa."""
+    if not world.cohesion:
+        return 0.0
+    angle = float(world.angle)
+    return cone_intercept(angle, world.cohesion) / cone_slope(angle)
 
 
 def _walls(lower: FloatArray, upper: FloatArray) -> list[tuple[FloatArray, FloatArray]]:

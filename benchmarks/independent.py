@@ -36,23 +36,24 @@ OTHER_SEED = 5
 
 def base_worlds(truth: Truth, angles: Sequence[float]) -> list[World]:
     """The set's own first particles at these angles."""
-    spacing = truth.volume ** (1.0 / 3.0)
-    return [World(f"{a:g}°", float(a), truth.particles[0], spacing) for a in angles]
+    spacing, cohesion = truth.volume ** (1.0 / 3.0), truth.values.get("cohesion", 0.0)
+    return [World(f"{a:g}°", float(a), truth.particles[0], spacing, cohesion=cohesion) for a in angles]
 
 
 def changed(truth: Truth, numerics: Numerics) -> list[tuple[Numerics, list[World]]]:
     """The true angle with one piece of numerics changed; worlds in one entry can run side by side."""
     angle, spacing = truth.values["friction_angle"], truth.volume ** (1.0 / 3.0)
+    cohesion = truth.values.get("cohesion", 0.0)
 
     def world(label: str, scale: float = 1.0) -> World:
         particles = truth.particles[0] if scale == 1.0 else truth.start(scale * spacing, 0)
-        return World(label, angle, particles, scale * spacing)
+        return World(label, angle, particles, scale * spacing, cohesion=cohesion)
 
     finer = [
         replace(numerics, voxel=numerics.voxel * 2 / 3, iterations=round(numerics.iterations * 1.5)),
         replace(numerics, voxel=numerics.voxel / 2, iterations=2 * numerics.iterations),
     ]
-    other = World("other particles", angle, truth.start(spacing, OTHER_SEED), spacing)
+    other = replace(world("other particles"), particles=truth.start(spacing, OTHER_SEED))
     side_by_side = [other, replace(world("Young's modulus 1 MPa"), young=1.0e6), world("particles x 27/8", 2 / 3)]
     return [
         (numerics, side_by_side),
@@ -116,7 +117,7 @@ class Campaign:
         """The independent solver's scan, ours with every preset, and what they say of each other and of the set."""
         truth, start = self.truth, time.perf_counter()
         worlds = base_worlds(truth, self.angles)
-        runs = plough(truth, worlds, self.numerics, self.device)
+        runs = plough(truth.measurement, worlds, self.numerics, truth.particles, self.device)
         scanned = np.array([heights(truth, run, truth.volume) for run in runs])
         nearest = int(np.argmin(np.abs(np.array(self.angles) - self.entry["true_angle"])))
         volume = volume_range(truth.heights(truth.particles[0], truth.volume), scanned[nearest])
@@ -138,7 +139,7 @@ class Campaign:
         """Worlds with numerics of their own, after the base; one that can't be computed is entered as failed."""
         start = time.perf_counter()
         try:
-            runs = plough(self.truth, worlds, numerics, self.device)
+            runs = plough(self.truth.measurement, worlds, numerics, self.truth.particles, self.device)
         except SimulationError as error:
             for world in worlds:
                 self.entry["worlds"][world.label] = {"angle": world.angle, "failed": str(error)}

@@ -4,7 +4,7 @@ from splatsoil.synthetic.appearance import Appearance
 from splatsoil.synthetic.setups import Setup, like, paper, plow
 from splatsoil.synthetic.soil_surface import soil_surface
 from splatsoil.synthetic.stage import Body, Light, Stage, photograph
-from splatsoil.synthetic.world import World, make_set
+from splatsoil.synthetic.world import World, make_set, photograph_run
 
 __all__ = [
     "Appearance",
@@ -17,6 +17,7 @@ __all__ = [
     "make_set",
     "paper",
     "photograph",
+    "photograph_run",
     "plow",
     "soil_surface",
 ]

@@ -21,6 +21,7 @@ from splatsoil.errors import ParameterError
 from splatsoil.measurement import Measurement, write_measurement
 from splatsoil.mpm import Preset, Resolution, Trajectory, frames_around, simulate
 from splatsoil.mpm.simulate import base_settings
+from splatsoil.observation import Observation
 from splatsoil.reconstruction.filling import fill
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
@@ -106,7 +107,6 @@ def make_set(
     particles = fill(setup.surface, setup.bed, resolution.spacing, seed=particle_seed)
 
     began = time.perf_counter()
-    kept = truth_frames(setup.frames)
     recorded = frames_around(setup.frames, observation.time_offset * setup.frame_rate)
     last = max(int(setup.tool.motion.frames[-1]), recorded[-1])
     trajectory = simulate(
@@ -120,12 +120,6 @@ def make_set(
         progress=lambda frame, end: report("sand", frame / max(end, 1)),
     )[0]
     simulated = time.perf_counter()
-    photographer = Photographer(
-        setup, trajectory, look, seed, device, lambda share: report("pictures", share), observation
-    )
-    views, video = photographer.take()
-    drawn = time.perf_counter()
-
     truth: dict[str, Any] = {
         "made_by": f"splatsoil {__version__}",
         "parameters": parameters,
@@ -140,8 +134,55 @@ def make_set(
         "appearance": asdict(look),
         "sensor_noise": NOISE,
     }
+    measurement = photograph_run(
+        target,
+        setup,
+        trajectory,
+        truth,
+        appearance=look,
+        observation=observation,
+        seed=seed,
+        device=device,
+        progress=lambda share: report("pictures", share),
+    )
+    seconds = {"simulation": simulated - began, "pictures": time.perf_counter() - simulated}
+    return World(measurement, truth, len(particles), seconds)
+
+
+def photograph_run(
+    out: str | Path,
+    setup: Setup,
+    trajectory: Trajectory,
+    truth: Mapping[str, Any],
+    *,
+    appearance: Appearance,
+    observation: Observation | None = None,
+    seed: int = 0,
+    device: str = "cpu",
+    progress: Callable[[float], None] = lambda share: None,
+) -> Measurement:
+    """Make a measurement set from a run of any simulator; the folder appears whole or not at all.
+
+    Args:
+        out: the set's folder; must not exist, or be empty.
+        setup: bed, surface, tool, motion and cameras.
+        trajectory: particles at all frames of the video; without force where it has none of any frame.
+        truth: what ``truth.json`` is to say.
+        appearance: looks.
+        observation: how the cameras err; not at all by default.
+        seed: of light paths and noise.
+        device: Warp device name.
+        progress: called with the share of the pictures that is done.
+
+    Raises:
+        ParameterError: a place that is taken or cannot be written.
+    """
+    target = Path(out)
+    check_place(target)
+    photographer = Photographer(setup, trajectory, appearance, seed, device, progress, observation or Observation())
+    views, video = photographer.take()
     frames = np.arange(1, len(trajectory.force) + 1)
-    force = np.column_stack([frames, frames / setup.frame_rate, trajectory.force])
+    force = np.column_stack([frames, frames / setup.frame_rate, trajectory.force]) if len(frames) else None
     with _whole(target) as place:
         write_measurement(
             place,
@@ -155,9 +196,8 @@ def make_set(
             quality=QUALITY,
             truth=truth,
         )
-        save_particles(place / "truth_particles.npz", trajectory, kept)
-    seconds = {"simulation": simulated - began, "pictures": drawn - simulated}
-    return World(Measurement.load(target), truth, len(particles), seconds)
+        save_particles(place / "truth_particles.npz", trajectory, truth_frames(setup.frames))
+    return Measurement.load(target)
 
 
 def check_place(target: Path) -> None:

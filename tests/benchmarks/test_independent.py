@@ -48,8 +48,8 @@ def ploughed() -> tuple[Truth, list[dict[int, npt.NDArray[np.float64]]]]:
     truth = Truth.load(Path(__file__).parents[2] / "examples" / "plow-damp")
     x = truth.start(SPACING, 0)
     short = replace(truth, particles={0: x, 5: x, 35: x}, volume=SPACING**3)
-    worlds = [World("true", 33.0, x, SPACING), World("weak", 20.0, x, SPACING)]
-    return short, plough(short, worlds, COARSE)
+    worlds = [World("true", 33.0, x, SPACING, cohesion=300.0), World("weak", 20.0, x, SPACING, cohesion=300.0)]
+    return short, plough(short.measurement, worlds, COARSE, (5, 35))
 
 
 @pytest.mark.slow
@@ -84,11 +84,8 @@ def test_worlds_beside_each_other_differ_by_their_soil_alone(
     ploughed: tuple[Truth, list[dict[int, npt.NDArray[np.float64]]]],
 ) -> None:
     truth, runs = ploughed
-    alone = plough(replace(truth, particles={f: truth.particles[f] for f in (0, 5)}), [_weak(truth)], COARSE)[0]
+    weak = World("weak", 20.0, truth.particles[0], SPACING, cohesion=300.0)
+    alone = plough(truth.measurement, [weak], COARSE, (5,))[0]
     # 0.1 mm was measured, against 0.7 mm between the two soils, at that frame
     assert np.percentile(np.linalg.norm(alone[5] - runs[1][5], axis=1), 99) < 0.2e-3
     assert np.percentile(np.linalg.norm(runs[0][5] - runs[1][5], axis=1), 99) > 0.4e-3
-
-
-def _weak(truth: Truth) -> World:
-    return World("weak", 20.0, truth.particles[0], SPACING)

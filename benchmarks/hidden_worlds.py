@@ -1,0 +1,374 @@
+"""Hidden effects in an independent solver's worlds: does the whole chain name the right one?
+
+Each world is one run of Newton's implicit MPM (extra ``independent``) with one thing that its measurement set doesn't
+tell, or with nothing, photographed by the path tracer. ``splatsoil fit`` and ``diagnose`` then get the set alone.
+Truths (what is hidden, how much, the friction angle, the surface, looks) are drawn by a stream of random numbers of
+their own, and opened only to score. What was made is kept in the folder, and a second call goes on from there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from splatsoil.benchmarks._common import hush, stamp
+from splatsoil.benchmarks._newton import Numerics, World, plough
+from splatsoil.benchmarks.hidden_effects import wilson
+from splatsoil.benchmarks.numerics import FloatArray
+
+from splatsoil.files import plain, write_json
+from splatsoil.mpm import Resolution, Trajectory, frames_around
+from splatsoil.observation import Observation
+from splatsoil.reconstruction import HeightField, fill
+from splatsoil.soil.law import Law
+from splatsoil.soil.library import find_effects
+from splatsoil.synthetic import Appearance, Setup, photograph_run, plow
+
+NUMERICS = Numerics(voxel=0.02, substeps=2, iterations=120)
+SPACING = 0.01
+"""Of the independent solver's particles, m."""
+ANGLES = (30.0, 40.0)
+"""Range of the true friction angle, degrees."""
+NOTHING, FIELD = "nothing", "friction field"
+"""Kinds without an effect of the library: nothing is hidden, or something that the library doesn't have."""
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """The truth of one world.
+
+    Attributes:
+        kind: name of the effect that is hidden, or one of the kinds without.
+        number: of the world of its kind.
+        angle: friction angle, degrees.
+        size: of what is hidden, in the effect's unit where it has one.
+        seed: of surface, looks, particles and noise.
+        soil: what differs from plain sand, for the solver.
+        gravity: (3,) m/s^2; None for what the set says.
+        values: parameters of an effect on what cameras report.
+    """
+
+    kind: str
+    number: int
+    angle: float
+    size: float
+    seed: int
+    soil: Mapping[str, Any] = field(default_factory=dict)
+    gravity: tuple[float, float, float] | None = None
+    values: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """Of its folders."""
+        return f"{self.kind.replace(' ', '-')}-{self.number}"
+
+    def observation(self) -> Observation:
+        """How the cameras err."""
+        if not self.values:
+            return Observation()
+        law = Law(find_effects([self.kind]))
+        return law.observation(law.require_on(dict(self.values)))
+
+
+def _cohesion(rng: np.random.Generator, hidden: Hidden) -> Hidden:
+    size = rng.uniform(150.0, 500.0)
+    return replace(hidden, size=size, soil={"cohesion": size})
+
+
+def _dilatancy(rng: np.random.Generator, hidden: Hidden) -> Hidden:
+    share = rng.uniform(0.15, 0.35)
+    return replace(hidden, size=share * hidden.angle, soil={"dilatancy": share})
+
+
+def _viscosity(rng: np.random.Generator, hidden: Hidden) -> Hidden:
+    size = rng.uniform(50.0, 200.0)
+    return replace(hidden, size=size, soil={"viscosity": size})
+
+
+def _tool_friction(rng: np.random.Generator, hidden: Hidden) -> Hidden:
+    size = rng.uniform(0.6, 0.9)
+    return replace(hidden, size=size, soil={"tool_friction": size})
+
+
+def _tool_adhesion(rng: np.random.Generator, hidden: Hidden) -> Hidden:
+    size = rng.uniform(200.0, 600.0)
+    return replace(hidden, size=size, soil={"tool_adhesion": size})
+
+
+def _tilt(rng: np.random.Generator, hidden: Hidden) -> Hidden:
+    size = rng.uniform(3.0, 6.0) * rng.choice([-1.0, 1.0])
+    lean = np.radians(size)
+    return replace(hidden, size=size, gravity=(9.81 * np.sin(lean), 0.0, -9.81 * np.cos(lean)))
+
+
+def _gravity(rng: np.random.Generator, hidden: Hidden) -> Hidden:
+    size = rng.uniform(0.3, 0.6)
+    return replace(hidden, size=size, gravity=(0.0, 0.0, -9.81 * size))
+
+
+def _layering(rng: np.random.Generator, hidden: Hidden) -> Hidden:
+    size = rng.uniform(-12.0, -7.0)
+    return replace(hidden, size=size, soil={"layer": (size, rng.uniform(0.03, 0.06))})
+
+
+def _buried_obstacle(rng: np.random.Generator, hidden: Hidden) -> Hidden:
+    size = rng.uniform(0.03, 0.045)
+    # beside the tool's way, which it must not touch
+    y = 0.25 + rng.choice([-1.0, 1.0]) * (0.07 + size)
+    return replace(hidden, size=size, soil={"obstacle": (rng.uniform(0.32, 0.45), y, 0.06, size)})
+
+
+def _exposure(rng: np.random.Generator, hidden: Hidden) -> Hidden:
+    size = rng.uniform(0.85, 0.93)
+    return replace(hidden, size=size, values={"exposure_gain": size})
+
+
+def _time_offset(rng: np.random.Generator, hidden: Hidden) -> Hidden:
+    size = rng.uniform(0.02, 0.035) * rng.choice([-1.0, 1.0])
+    return replace(hidden, size=size, values={"time_offset": size})
+
+
+def _friction_field(rng: np.random.Generator, hidden: Hidden) -> Hidden:
+    size = rng.uniform(6.0, 10.0) * rng.choice([-1.0, 1.0])
+    return replace(hidden, size=size, soil={"across": size})
+
+
+KINDS: dict[str, Callable[[np.random.Generator, Hidden], Hidden]] = {
+    NOTHING: lambda rng, hidden: hidden,
+    "cohesion": _cohesion,
+    "dilatancy": _dilatancy,
+    "viscosity": _viscosity,
+    "tool_friction": _tool_friction,
+    "tool_adhesion": _tool_adhesion,
+    "tilt": _tilt,
+    "gravity": _gravity,
+    "layering": _layering,
+    "buried_obstacle": _buried_obstacle,
+    "exposure": _exposure,
+    "time_offset": _time_offset,
+    FIELD: _friction_field,
+}
+OBSERVATION = ("exposure", "time_offset")
+
+
+def draw(kind: str, number: int, seed: int) -> Hidden:
+    """A sealed truth."""
+    rng = np.random.default_rng([seed, list(KINDS).index(kind), number])
+    angle = float(rng.uniform(*ANGLES))
+    return KINDS[kind](rng, Hidden(kind, number, angle, 0.0, int(rng.integers(1000, 2**20))))
+
+
+def soil_of(hidden: Hidden, setup: Setup) -> World:
+    """What the solver ploughs."""
+    told = dict(hidden.soil)
+    x = fill(setup.surface, setup.bed, SPACING, seed=hidden.seed)
+    angle: float | FloatArray = hidden.angle
+    if "layer" in told:
+        excess, below = told.pop("layer")
+        angle = hidden.angle + np.where(_height(setup.surface, x) - x[:, 2] > below, excess, 0.0)
+    if "across" in told:
+        middle, half = setup.bed.lower[1] + 0.5 * setup.bed.extents[1], 0.5 * setup.bed.extents[1]
+        angle = hidden.angle + told.pop("across") * (x[:, 1] - middle) / half
+    if "obstacle" in told:
+        keep = np.linalg.norm(x - np.array(told["obstacle"][:3]), axis=1) > told["obstacle"][3]
+        x = x[keep]
+    return World(hidden.name, angle, x, SPACING, **told)
+
+
+def _height(surface: HeightField, x: FloatArray) -> FloatArray:
+    columns = [
+        np.clip(np.searchsorted(axis, x[:, k]), 0, len(axis) - 1) for k, axis in ((1, surface.y), (0, surface.x))
+    ]
+    return np.asarray(surface.height[columns[0], columns[1]])
+
+
+def make_worlds(truths: Sequence[Hidden], out: Path, device: str, say: Callable[[str], None]) -> None:
+    """Simulate and photograph the worlds that the folder doesn't have, those under one gravity side by side."""
+    missing = [h for h in truths if not (out / "sets" / h.name / "truth.json").is_file()]
+    for gravity in dict.fromkeys(h.gravity for h in missing):
+        group = [h for h in missing if h.gravity == gravity]
+        setups = [plow(h.seed) for h in group]
+        seen = [h.observation() for h in group]
+        rate = setups[0].frame_rate
+        frames = sorted({f for o in seen for f in frames_around(setups[0].frames, o.time_offset * rate)})
+        began = time.perf_counter()
+        soils = [soil_of(h, s) for h, s in zip(group, setups, strict=True)]
+        runs = plough(setups[0].experiment(), soils, NUMERICS, frames, device, gravity=gravity)
+        say(f"{len(group)} worlds ploughed in {time.perf_counter() - began:.0f} s: {', '.join(h.name for h in group)}")
+        for hidden, setup, soil, run, observation in zip(group, setups, soils, runs, seen, strict=True):
+            positions = np.stack([soil.particles, *(run[f] for f in frames if f > 0)]).astype(np.float32)
+            still = np.broadcast_to(np.eye(3, dtype=np.float32), (*positions.shape, 3))
+            trajectory = Trajectory(
+                frames=tuple(frames),
+                positions=positions,
+                deformations=still,
+                force=np.zeros((0, 3)),
+                spacing=SPACING,
+                resolution=Resolution.derive(setup.experiment(), "small"),
+            )
+            photograph_run(
+                out / "sets" / hidden.name,
+                setup,
+                trajectory,
+                plain(
+                    {"hidden": hidden.kind, "size": hidden.size, "friction_angle": hidden.angle, "seed": hidden.seed}
+                ),
+                appearance=Appearance.drawn(hidden.seed),
+                observation=observation,
+                seed=hidden.seed,
+                device=device,
+            )
+            say(f"{hidden.name} photographed, {time.perf_counter() - began:.0f} s")
+
+
+def criticise(name: str, out: Path, preset: str, device: str, say: Callable[[str], None]) -> None:
+    """Fit and diagnose by the command line, unless that is done; what it says is kept beside its run."""
+    run = out / "runs" / name
+    if (run / "diagnosis.json").is_file():
+        return
+    run.mkdir(parents=True, exist_ok=True)
+    began = time.perf_counter()
+    commands = (
+        ["fit", str(out / "sets" / name), "--run", str(run), "--preset", preset, "--device", device],
+        ["diagnose", str(run), "--device", device],
+    )
+    with (out / "runs" / f"{name}.log").open("a") as log:
+        codes = [
+            subprocess.run([sys.executable, "-m", "splatsoil", *words], stdout=log, stderr=log, check=False).returncode
+            for words in commands
+        ]
+    say(f"{name}: {'done' if not any(codes) else f'exit codes {codes}'}, {time.perf_counter() - began:.0f} s")
+
+
+def score(hidden: Hidden, fit: Mapping[str, Any], told: Mapping[str, Any]) -> dict[str, Any]:
+    """What fit and diagnosis said of a world, beside the truth; the best effect's refit is what ``add`` keeps."""
+    refits = told["refits"]
+    base, best = refits["as it is"], refits.get(told["class"][0]) if told["class"] else None
+    last = best or base
+    named = told["class"] if told["verdict"] == "missing" else []
+    return {
+        "hidden": hidden.kind,
+        "size": hidden.size,
+        "angle": hidden.angle,
+        "verdict": told["verdict"],
+        "class": told["class"],
+        "explained": told["explained"],
+        "right": hidden.kind in named if hidden.kind not in (NOTHING, FIELD) else not named,
+        "nearest": hidden.kind in told["class"],
+        "fit": [fit["parameters"]["friction_angle"][key] for key in ("estimate", "std")],
+        "before": [base["values"]["friction_angle"], base["stds"]["friction_angle"]],
+        "after": [last["values"]["friction_angle"], last["stds"]["friction_angle"]],
+        "sizes": {k: [v, last["stds"][k]] for k, v in last["values"].items() if k != "friction_angle"},
+        "held_out": [base["held_out"], last["held_out"]],
+        "floor": last["floor"],
+        "z": {e["name"]: e["z"] for e in told["effects"]},
+        "seconds": [fit["seconds"], told["seconds"]],
+    }
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """All worlds and what they come to, as Markdown."""
+    lines = [
+        "| hidden | size | verdict | class | share explained | size found | error over floor, before → after | "
+        "angle: true; fit, refit → with the best effect |",
+        "|---" * 8 + "|",
+    ]
+    for r in rows:
+        size = "–" if r["hidden"] == NOTHING else f"{r['size']:.3g}"
+        found = ", ".join(f"{k} {v:.3g} ± {std:.2g}" for k, (v, std) in r["sizes"].items()) or "–"
+        errors = " → ".join(f"{e / r['floor']:.2f}" for e in r["held_out"])
+        angles = f"{r['angle']:.1f}°; {r['fit'][0]:.1f}, {r['before'][0]:.1f}"
+        if r["sizes"]:
+            angles += f" → {r['after'][0]:.1f}"
+        angles += f" ± {r['after'][1]:.1f}°"
+        members = ", ".join(r["class"]) or "–"
+        cells = (r["hidden"], size, r["verdict"], members, f"{100 * r['explained']:.0f} %", found, errors, angles)
+        lines.append("| " + " | ".join(cells) + " |")
+
+    def share(what: str, among: Sequence[Mapping[str, Any]], test: Callable[[Mapping[str, Any]], bool]) -> None:
+        if among:
+            hits = sum(map(test, among))
+            low, high = wilson(hits, len(among))
+            lines.append(f"- {what}: {hits} of {len(among)} ({100 * low:.0f}–{100 * high:.0f} %)")
+
+    lines.append("")
+    library = [r for r in rows if r["hidden"] not in (NOTHING, FIELD)]
+    right = [r for r in library if r["class"][:1] == [r["hidden"]] and r["hidden"] not in OBSERVATION]
+    plain_sand = [r for r in rows if r["hidden"] == NOTHING]
+    outside = [r for r in rows if r["hidden"] == FIELD]
+    share("some effect named where nothing is hidden", plain_sand, lambda r: not r["right"])
+    share("the class of what is missing holds the truth", library, lambda r: r["right"])
+    share("the same, or the truth is the nearest of the library", library, lambda r: r["nearest"])
+    share("another effect named", library, lambda r: r["verdict"] == "missing" and not r["right"])
+    share("something named that is outside the library", outside, lambda r: not r["right"])
+    share("the right effect of soil or tool first: angle within 2.5° after", right, _near)
+    share("the same: error ends within 1.2 × the floor", right, lambda r: r["held_out"][-1] <= 1.2 * r["floor"])
+    share("nothing hidden: angle within 2.5°", plain_sand, _near)
+    if rows:
+        off = np.array([r["after"][0] - r["angle"] for r in rows])
+        lines.append(f"- error of the last angle: {off.mean():+.1f} ± {off.std(ddof=min(1, len(rows) - 1)):.1f}°")
+    return "\n".join(lines)
+
+
+def _near(row: Mapping[str, Any]) -> bool:
+    return bool(abs(row["after"][0] - row["angle"]) <= 2.5)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Command line; exit code 0 when every world was judged."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=list(KINDS), metavar="KIND")
+    parser.add_argument(
+        "--count", type=int, default=1, help="worlds of each kind; three times as many without anything"
+    )
+    parser.add_argument("--seed", type=int, default=1, help="of the truths")
+    parser.add_argument("--preset", default="small")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--side-by-side", type=int, default=1, help="chains at a time")
+    parser.add_argument("--worlds-only", action="store_true", help="make the sets and stop")
+    parser.add_argument("--out", type=Path, default=Path("runs/hidden-worlds"))
+    options = parser.parse_args(arguments)
+    hush()
+    began = time.perf_counter()
+
+    def say(what: str) -> None:
+        print(f"{time.perf_counter() - began:6.0f} s  {what}", file=sys.stderr, flush=True)
+
+    truths = [
+        draw(kind, k, options.seed)
+        for kind in options.kinds
+        for k in range((3 if kind == NOTHING else 1) * options.count)
+    ]
+    make_worlds(truths, options.out, options.device, say)
+    if options.worlds_only:
+        return 0
+    threads = max(1, (os.cpu_count() or 1) // options.side_by_side)
+    os.environ.setdefault("OMP_NUM_THREADS", str(threads))
+    with ThreadPoolExecutor(options.side_by_side) as pool:
+        for future in [
+            pool.submit(criticise, h.name, options.out, options.preset, options.device, say) for h in truths
+        ]:
+            future.result()
+    rows = []
+    for hidden in truths:
+        run = options.out / "runs" / hidden.name
+        if (run / "diagnosis.json").is_file():
+            fit, told = (json.loads((run / file).read_text()) for file in ("fit.json", "diagnosis.json"))
+            rows.append(score(hidden, fit, told))
+    write_json(options.out / "result.json", plain({"made_by": stamp(options.device), "rows": rows}))
+    print(table(rows))
+    return 0 if len(rows) == len(truths) else 1
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
