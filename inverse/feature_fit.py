@@ -24,6 +24,8 @@ FloatArray = npt.NDArray[np.float64]
 
 #: Candidates from which the least squares start, the evaluations besides.
 CANDIDATES = 1024
+#: How far outside of the evaluations' range the least squares may look, of an axis from -1 to 1.
+BEYOND = 0.1
 #: Half the step of the derivatives, of an axis from -1 to 1.
 STEP = 0.01
 
@@ -53,17 +55,23 @@ def by_features(data: Data, surrogate: Surrogate, fallback: Minimum, *, seed: in
 
 
 def _least_squares(likelihood: Likelihood, points: FloatArray, seed: int) -> FloatArray:
-    """Minimiser (n,) of the squared distance between emulated and observed scores."""
+    """Minimiser (n,) of the squared distance between emulated and observed scores, near the points.
+
+    Far from them (where simulations failed, say) an emulator falls back to its mean, which may lie anywhere.
+    """
 
     def squares(where: FloatArray) -> FloatArray:
         found, _ = likelihood.emulator.predict(where)
         return np.asarray(np.sum((found - likelihood.scores) ** 2, axis=1))
 
-    dimension = likelihood.emulator.dimension
-    candidates = np.concatenate([sobol(CANDIDATES, dimension, seed), points])
+    low = np.maximum(points.min(axis=0) - BEYOND, -1.0)
+    high = np.minimum(points.max(axis=0) + BEYOND, 1.0)
+    spread = low + 0.5 * (sobol(CANDIDATES, likelihood.emulator.dimension, seed) + 1.0) * (high - low)
+    candidates = np.concatenate([spread, points])
     start = candidates[np.argmin(squares(candidates))]
-    polished = minimize(lambda x: float(squares(x[None])[0]), start, bounds=[(-1.0, 1.0)] * dimension)
-    return np.clip(polished.x, -1.0, 1.0)
+    bounds = list(zip(low, high, strict=True))
+    polished = minimize(lambda x: float(squares(x[None])[0]), start, bounds=bounds)
+    return np.clip(polished.x, low, high)
 
 
 def _spread(likelihood: Likelihood, estimate: FloatArray) -> FloatArray:

@@ -200,8 +200,8 @@ def fit(
     with run.lock(), run.evaluations(writable=True) as store:
         stored = StoredProblem(levels or problem, store, setup)
         earlier = sum(record.seconds for record in stored.stored[:steps])
-        # Chance moves the loss of all angles together: the same particles leave a third of it between evaluations.
-        env = PlowSandEnv(problem=stored, budget=steps, same_particles=True)
+        # Each evaluation has particles of its own: chance that all of them shared would shift the estimate, unseen.
+        env = PlowSandEnv(problem=stored, budget=steps)
 
         def told(done: int, _: dict[str, Any]) -> None:
             if after_evaluation is not None and stored.last is not None:
