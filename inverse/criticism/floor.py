@@ -13,7 +13,7 @@ from splatsoil.experiment.base import Experiment
 from splatsoil.experiment.features import Layout
 
 from .evidence import Evidence
-from .noise import Noise, Part, correlated, estimate, independent
+from .noise import Noise, Part, correlated, estimate, extra_noise, independent
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -68,9 +68,9 @@ def floor_of(experiment: Experiment, evidence: Evidence) -> Floor:
     parameters = _columns(slopes, seen)
     parts = {"instruments": independent(experiment.sensor, experiment.sensor_memory)}
     runs = len(evidence.repeats)
+    directions = _columns([table for direction in evidence.directions.values() for table in direction], seen)
     if experiment.chance and runs > 1:
-        tables = [table for direction in evidence.directions.values() for table in direction]
-        parts["chance"] = estimate(layout, evidence.repeats, seen, _columns(tables, seen), parameters)
+        parts["chance"] = estimate(layout, evidence.repeats, seen, directions, parameters)
     if np.count_nonzero(experiment.quiet) >= FEWEST_QUIET:
         known = _total(layout, parts, seen, runs)[0]
         parts["reconstruction"] = _instruments(experiment, evidence, known)
@@ -81,6 +81,10 @@ def floor_of(experiment: Experiment, evidence: Evidence) -> Floor:
         known = _total(layout, parts, seen, runs)[0]
         parts["numerics"] = estimate(layout, _unexplained(known, parameters, patterns, seen), seen)
     noise, single = _total(layout, parts, seen, runs)
+    for name, part in parts.items():
+        columns = extra_noise(layout, part, seen, directions if name == "chance" else None)
+        averaged, alone = (np.sqrt(factor) for factor in _factors(name, runs))
+        noise, single = noise.plus(averaged * columns), single.plus(alone * columns)
     return Floor(noise, single, NUMERICS_PRIOR * _columns(patterns, seen), parameters, parts)
 
 
@@ -128,12 +132,15 @@ def _replayed(experiment: Experiment, replays: FloatArray, parts: Mapping[str, P
     return replace(whole, scale=np.sqrt(variance))
 
 
+def _factors(name: str, runs: int) -> tuple[float, float]:
+    """On a part's variance, in observed minus the mean of ``runs`` predictions, and minus one."""
+    return (1.0 + 1.0 / runs, 2.0) if name == "chance" else (1.0, 1.0)
+
+
 def _total(layout: Layout, parts: Mapping[str, Part], seen: npt.NDArray[np.bool_], runs: int) -> tuple[Noise, Noise]:
     """Noise against the mean of ``runs`` predictions, and against one."""
-    factors = {"chance": (1.0 + 1.0 / runs, 2.0)}
     averaged, alone = (
-        Noise.of(layout, [(factors.get(name, (1.0, 1.0))[i], part) for name, part in parts.items()], seen)
-        for i in (0, 1)
+        Noise.of(layout, [(_factors(name, runs)[i], part) for name, part in parts.items()], seen) for i in (0, 1)
     )
     return averaged, alone
 

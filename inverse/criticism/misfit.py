@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import chi2
+from scipy.stats import chi2, f
 
 from splatsoil.experiment.features import Layout
 
@@ -50,14 +51,19 @@ def smooth_basis(layout: Layout, noise: Noise) -> FloatArray:
 
 
 def omnibus(noise: Noise, nuisance: FloatArray, residual: FloatArray, basis: FloatArray) -> Omnibus:
-    """χ² of a residual (n,) on a basis (n, k), with nuisances (n, q; times their prior std) projected out."""
+    """χ² of a residual (n,) on a basis (n, k), with nuisances (n, q; times their prior std) projected out.
+
+    The noise's size is itself known from a few samples only, so the statistic over its degrees of freedom is F.
+    """
     solver = (noise.plus(nuisance) if nuisance.size else noise).solver()
     white = solver.whiten(basis)
     left, singular, _ = np.linalg.svd(white, full_matrices=False)
     left = left[:, singular > 1e-6 * singular[0]]
     statistic = float(np.sum((left.T @ solver.whiten(residual)) ** 2))
     freedom = left.shape[1]
-    return Omnibus(statistic, freedom, float(chi2.sf(statistic, freedom)))
+    if not math.isfinite(noise.freedom):
+        return Omnibus(statistic, freedom, float(chi2.sf(statistic, freedom)))
+    return Omnibus(statistic, freedom, float(f.sf(statistic / max(freedom, 1), freedom, noise.freedom)))
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,8 @@ MEMORY_OF_SCALE = 2.0
 """Width of the local mean of variances in steps of time."""
 REACH = 0.6
 """Width of the local mean of variances, in spacings of sites: disturbed soil has sharp edges."""
+FEWEST_FREEDOM = 8.0
+"""Least degrees of freedom of a part's variance: few samples scatter too little or too much by chance."""
 RIDGE = 1e-6
 """Added to the diagonal of a correlation, for its Cholesky factor's sake."""
 
@@ -47,6 +49,9 @@ class Part:
         length: of the Matérn correlation, m; 0 for none.
         nugget: share of the variance that is not correlated in space.
         between: (c, c) correlation between instruments.
+        on_waves: factor on the variance of slow waves, beyond what all of this gives there.
+        on_directions: the same along directions of interest.
+        freedom: degrees of freedom that the variance on slow waves is known with.
     """
 
     scale: FloatArray
@@ -54,6 +59,9 @@ class Part:
     length: float = 0.0
     nugget: float = 0.0
     between: FloatArray | None = None
+    on_waves: float = 1.0
+    on_directions: float = 1.0
+    freedom: float = math.inf
 
     def correlation(self, layout: Layout) -> FloatArray:
         """(t s, t s) correlation of the features."""
@@ -85,9 +93,12 @@ def estimate(
 
     Scales are pooled over each instrument, and vary over time and place as far as the samples show that they do more
     than chance would (empirical Bayes on the logarithm of the variance). The correlation's parameters maximise the
-    Gaussian likelihood of the scaled samples. The whole is then corrected so that scores along directions (n, k) of
-    interest, and along slow waves, scatter as they should once what ``free`` (n, q; times prior spreads) can take up is
-    gone: a seed that acts like another friction angle is no noise where the angle is fitted.
+    Gaussian likelihood of the scaled samples.
+
+    Such a part is too plain: soil that falls otherwise by chance does so where effects act, and other numerics change
+    what is smooth. So how much more scores along slow waves and along directions (n, k) of interest scatter is noted,
+    for `extra_noise`, once what ``free`` (n, q; times prior spreads) can take up is gone: a seed that acts like another
+    friction angle is no noise where the angle is fitted.
     """
     samples = np.where(seen, samples, 0.0)
     if not np.any(samples):
@@ -113,7 +124,7 @@ def _calibrated(
     directions: FloatArray | None,
     free: FloatArray | None,
 ) -> Part:
-    """The part, its variance corrected by what samples come to where effects live.
+    """The part, with what samples come to on slow waves and along directions.
 
     With three samples or more, each is judged by scales that the others give: a scale that is too small by chance
     weighs more than one that is too large, and a sample cannot show that of scales it has made itself.
@@ -134,8 +145,42 @@ def _calibrated(
         if directions is not None and directions.size:
             columns = solver.whiten(directions)
             along.append(np.mean((columns.T @ sample) ** 2 / np.maximum(np.sum(columns**2, axis=0), 1e-300)))
-    factor = max(float(np.mean(on_waves)), float(np.mean(along)) if along else 0.0)
-    return replace(part, scale=part.scale * math.sqrt(factor))
+    factor = float(np.mean(on_waves))
+    # A mean of χ² over its ν degrees of freedom has the relative variance 2 / ν.
+    doubt = float(np.var(on_waves, ddof=1)) / count / factor**2 if count > 1 else 2.0
+    return replace(
+        part,
+        on_waves=max(factor, 1.0),
+        on_directions=max(float(np.mean(along)), 1.0) if along else 1.0,
+        freedom=max(2.0 / max(doubt, 1e-12), FEWEST_FREEDOM),
+    )
+
+
+def extra_noise(layout: Layout, part: Part, seen: BoolArray, directions: FloatArray | None = None) -> FloatArray:
+    """(n, r) low-rank noise by which a part has the variance that was found on slow waves and along directions (n, k).
+
+    Everywhere else the part's own stays as it is.
+    """
+    nothing = np.zeros((int(seen.sum()), 0))
+    if not np.any(part.scale[seen]):
+        return nothing
+    noise = Noise.of(layout, [(1.0, part)], seen)
+    solver = noise.solver()
+    chosen = _orthonormal(solver.whiten(nothing if directions is None else directions))
+    waves = solver.whiten(smooth_waves(layout, seen) * noise.scale[:, None])
+    waves = _orthonormal(waves - chosen @ (chosen.T @ waves))
+    parts = [math.sqrt(part.on_directions - 1.0) * chosen, math.sqrt(part.on_waves - 1.0) * waves]
+    return np.tril(solver.factor[0]) @ np.concatenate(parts, axis=1)
+
+
+def _orthonormal(columns: FloatArray) -> FloatArray:
+    """(n, r) of the span of columns (n, k), whatever their lengths."""
+    size = np.linalg.norm(columns, axis=0)
+    columns = columns[:, size > 1e-9 * max(float(size.max(initial=0.0)), 1e-300)]
+    if not columns.size:
+        return np.zeros((len(columns), 0))
+    left, singular, _ = np.linalg.svd(columns / np.linalg.norm(columns, axis=0), full_matrices=False)
+    return np.asarray(left[:, singular > 1e-6 * singular[0]])
 
 
 def _scales(
@@ -301,10 +346,12 @@ class Noise:
     Attributes:
         covariance: (n, n).
         seen: (t, s) which features those are.
+        freedom: degrees of freedom that it is known with.
     """
 
     covariance: FloatArray
     seen: BoolArray
+    freedom: float = math.inf
 
     @classmethod
     def of(cls, layout: Layout, parts: Sequence[tuple[float, Part]], seen: BoolArray) -> Noise:
@@ -315,7 +362,11 @@ class Noise:
             total += factor * part.covariance(layout)[np.ix_(index, index)]
         ridge = RIDGE * float(np.mean(np.diag(total)))
         total[np.diag_indices_from(total)] += ridge
-        return cls(total, seen)
+        # Welch (1947) and Satterthwaite: a sum of variances, each known with its own degrees of freedom.
+        variances = np.array([factor * float(np.mean(part.scale[seen] ** 2)) for factor, part in parts])
+        doubt = float(np.sum(variances**2 / np.array([part.freedom for _, part in parts])))
+        freedom = float(variances.sum()) ** 2 / doubt if doubt > 0.0 else math.inf
+        return cls(total, seen, freedom)
 
     def pick(self, table: FloatArray) -> FloatArray:
         """(..., t, s) to the features that were seen (..., n)."""
@@ -334,13 +385,13 @@ class Noise:
 
     def plus(self, columns: FloatArray) -> Noise:
         """With low-rank noise (n, k) added: columns times independent standard normal numbers."""
-        return Noise(self.covariance + columns @ columns.T, self.seen)
+        return replace(self, covariance=self.covariance + columns @ columns.T)
 
     def rows(self, chosen: BoolArray) -> Noise:
         """Only the features of some times (t,)."""
         keep = self.seen & chosen[:, None]
         inner = keep[self.seen]
-        return Noise(self.covariance[np.ix_(inner, inner)], keep)
+        return Noise(self.covariance[np.ix_(inner, inner)], keep, self.freedom)
 
     def solver(self) -> Solver:
         """Its Cholesky factor."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from splatsoil.inverse.criticism.misfit import omnibus, smooth_basis
-from splatsoil.inverse.criticism.noise import Noise, Part, estimate, independent
+from splatsoil.inverse.criticism.noise import Noise, Part, estimate, extra_noise, independent
 
 from splatsoil.experiment.features import Layout, Site
 
@@ -97,3 +97,42 @@ def test_correlated_noise_raises_few_false_alarms_and_independent_pixels_nearly_
     assert rates(pixels, 12) > 0.8
     # 5 % nominal; with 25 draws, more than 5 alarms have a chance of 0.1 % at that rate.
     assert rates(ours, 25) <= 0.2
+
+
+def scores(noise: Noise, direction: np.ndarray, samples: np.ndarray) -> float:
+    """Mean square of standardised scores along a direction (n,): 1 where the noise is right."""
+    solver = noise.solver()
+    column = solver.whiten(direction)
+    white = solver.whiten(samples.reshape(len(samples), -1).T)
+    return float(np.mean((column @ white) ** 2) / (column @ column))
+
+
+def test_chance_that_acts_like_an_effect_widens_its_scores_and_nothing_else() -> None:
+    generator = np.random.default_rng(3)
+    act, elsewhere = np.zeros(LAYOUT.shape), np.zeros(LAYOUT.shape)
+    act[3:6, 5:7], elsewhere[8:11, 24:26] = 1.0, 1.0
+
+    def with_it(count: int, seed: int) -> np.ndarray:
+        return draw(TRUE, count, seed) + 8.0 * generator.standard_normal((count, 1, 1)) * act
+
+    part = estimate(LAYOUT, with_it(12, 1), SEEN, act.reshape(-1, 1))
+    plain = Noise.of(LAYOUT, [(1.0, part)], SEEN)
+    whole = plain.plus(extra_noise(LAYOUT, part, SEEN, act.reshape(-1, 1)))
+    fresh = with_it(300, 2)
+    assert scores(plain, act.reshape(-1), fresh) > 5.0
+    # never too sure; twice too wide is what scales judged by the other samples cost
+    assert 0.25 < scores(whole, act.reshape(-1), fresh) < 1.5
+    assert 0.6 < scores(whole, elsewhere.reshape(-1), fresh) < 1.5
+    # the part's own size stays what samples come to, wherever they are
+    assert np.sqrt(np.mean(part.scale**2)) == pytest.approx(np.sqrt(np.mean(fresh**2)), rel=0.15)
+
+
+def test_a_noise_known_from_few_samples_makes_a_misfit_less_sure() -> None:
+    noise = Noise.of(LAYOUT, [(1.0, TRUE)], SEEN)
+    residual = 1.25 * draw(TRUE, 1, 7)[0][SEEN]
+    basis, nothing = smooth_basis(LAYOUT, noise), np.zeros((residual.size, 0))
+    sure = omnibus(noise, nothing, residual, basis)
+    doubtful = omnibus(Noise(noise.covariance, SEEN, freedom=10.0), nothing, residual, basis)
+    assert sure.statistic == doubtful.statistic
+    # F and χ² tables: the former's tail is the heavier
+    assert doubtful.p > 2.0 * sure.p
