@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -71,59 +70,6 @@ def experiment_of(
     return experiment, Simulations(experiment, folder.path / "features", identity)
 
 
-@contextmanager
-def second_core(
-    folder: RunFolder, model: Model, effects: Iterable[str], jobs: Sequence[Mapping[str, Any]]
-) -> Iterator[None]:
-    """While the block runs, another process makes simulations that it will ask for, beginning with the last.
-
-    Both keep what they make in ``features/`` and find it there: the results are those of one process, bit for bit, and
-    one that dies costs nothing but its help. Nothing is started on a GPU, on one core, or for what is there already.
-
-    Args:
-        folder: the run folder, locked by this process.
-        model: of the latest fit.
-        effects: the candidates, as `experiment_of` takes them; none for all.
-        jobs: keyword arguments of the simulations.
-    """
-    import multiprocessing
-    import os
-
-    if model.device != "cpu" or len(os.sched_getaffinity(0)) < 2:
-        yield
-        return
-    # A fresh interpreter: forking a process that has threads breaks them.
-    worker = multiprocessing.get_context("spawn").Process(
-        target=_simulate_ahead, args=(folder.path, tuple(effects), [dict(job) for job in reversed(jobs)]), daemon=True
-    )
-    worker.start()
-    try:
-        yield
-    finally:
-        worker.terminate()
-        worker.join()
-
-
-def _simulate_ahead(path: Path, effects: tuple[str, ...], jobs: Sequence[Mapping[str, Any]]) -> None:
-    """The work of the second process. Whatever goes wrong, the first one meets it too, and says so."""
-    import contextlib
-    import signal
-
-    from splatsoil.commands import _stages as stage
-    from splatsoil.errors import SimulationError, SplatsoilError
-    from splatsoil.inverse.run_folder import RunFolder
-
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process ends this one
-    stage.hush()
-    with contextlib.suppress(SplatsoilError, OSError):
-        folder = RunFolder.open(path)
-        model = model_of(folder, "cpu", lambda what, share: None)
-        _, simulate = experiment_of(folder, model, effects or None)
-        for job in jobs:
-            with contextlib.suppress(SimulationError):
-                simulate(**job)
-
-
 def replayed(
     folder: RunFolder, experiment: PlowExperiment, simulate: Simulations, values: dict[str, float], report: Report
 ) -> FloatArray:
@@ -157,6 +103,7 @@ def diagnosed(
 ) -> dict[str, Any]:
     """Diagnose the latest fit; the result is ``diagnosis.json`` and, by model, ``diagnoses/NAME.json``."""
     from splatsoil import __version__
+    from splatsoil.commands._ahead import simulated_ahead
     from splatsoil.files import write_json
     from splatsoil.inverse.criticism.diagnosis import diagnose
     from splatsoil.inverse.criticism.evidence import needed
@@ -189,7 +136,7 @@ def diagnosed(
             replays = replayed(folder, experiment, simulate, estimates(fit), begin("replay"))
         begun.append(begin("diagnose"))
         values = estimates(fit)
-        with second_core(folder, model, effects, needed(experiment, values, repeats=options.repeats)):
+        with simulated_ahead(folder, model, effects, needed(experiment, values, repeats=options.repeats)):
             found = diagnose(experiment, values, simulate=simulate, options=options, replays=replays, progress=told)
         result = {
             **record(experiment, found),

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pytest
-from splatsoil.benchmarks._newton import Numerics, World, plough
+from splatsoil.benchmarks._newton import Numerics, World, _model, plough
 from splatsoil.benchmarks.independent import judge
 from splatsoil.benchmarks.numerics import Scan, Truth, volume_range
 
@@ -39,6 +39,22 @@ def test_volume_is_told_as_the_most_of_a_loss_and_of_a_gain() -> None:
     start = np.full((3, 4), 0.1)
     frames = start * np.array([0.996, 0.987, 1.002])[:, None, None]
     assert volume_range(start, frames) == pytest.approx((-0.013, 0.002))
+
+
+def test_cohesion_is_the_whole_strength_without_pressure_and_counted_once() -> None:
+    newton = pytest.importorskip("newton")
+    truth = Truth.load(Path(__file__).parents[2] / "examples" / "plow-damp")
+    x = truth.start(SPACING, 0)
+    worlds = [World("damp", 33.0, x, SPACING, cohesion=300.0), World("dry", 30.0, x, SPACING)]
+    soil = _model(newton, truth.measurement, worlds, np.zeros((2, 3)), "cpu").mpm
+    # Newton's shear strength is yield_stress + friction (p + tension)
+    tension = soil.yield_pressure.numpy() * soil.tensile_yield_ratio.numpy()
+    strength = soil.yield_stress.numpy() + soil.friction.numpy() * tension
+    sine = np.sin(np.radians(33.0))
+    # Drucker-Prager matched to triaxial compression, in sqrt(J2): 6 c cos / (sqrt(3) (3 - sin))
+    exact = 6.0 * 300.0 * np.cos(np.radians(33.0)) / (np.sqrt(3.0) * (3.0 - sine))
+    assert strength[: len(x)] == pytest.approx(exact, rel=1e-3)
+    assert not strength[len(x) :].any()
 
 
 @pytest.fixture(scope="module")
