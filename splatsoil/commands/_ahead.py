@@ -55,6 +55,7 @@ def _simulate(path: Path, effects: tuple[str, ...], jobs: Sequence[Mapping[str, 
     """A helper's work. Whatever goes wrong, the first process meets it too, and says so."""
     import contextlib
     import signal
+    from multiprocessing import parent_process
 
     from splatsoil.commands import _criticism as criticism
     from splatsoil.commands import _stages as stage
@@ -67,6 +68,9 @@ def _simulate(path: Path, effects: tuple[str, ...], jobs: Sequence[Mapping[str, 
         folder = RunFolder.open(path)
         model = criticism.model_of(folder, "cpu", lambda what, share: None)
         _, simulate = criticism.experiment_of(folder, model, effects or None)
+        parent = parent_process()
         for job in jobs:
+            if parent is None or not parent.is_alive():
+                return  # it was killed, and nobody waits for these
             with contextlib.suppress(SimulationError):
                 simulate(**job)

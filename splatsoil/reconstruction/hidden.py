@@ -6,13 +6,17 @@ come to light where a tool digs down to them. But the bed holds soil and nothing
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
+import numpy.typing as npt
 import torch
-from scipy.optimize import lsq_linear
 from torch import Tensor
 
 from splatsoil.reconstruction.height_field import HeightField
 from splatsoil.splats import Gaussians
+
+FloatArray = npt.NDArray[np.float64]
 
 _VISIBLE = 0.02
 """Opacity in the soil from which a Gaussian reaches into it. Measured on both example sets with their true particles:
@@ -50,11 +54,36 @@ def reaching_into_soil(gaussians: Gaussians, surface: HeightField, floor: float)
     away = np.linalg.norm(means - np.clip(means, low, highest), axis=1)
     near = np.flatnonzero(away < _REACH * scales.max(axis=1, initial=0.0))
     turned = gaussians[torch.from_numpy(near).to(gaussians.means.device)].rotations().detach().cpu().numpy()
-    opacities = gaussians.opacities.detach().cpu().numpy()
+    # Where in the box the Gaussian is densest: the squared distance is measured by its inverse covariance.
+    whitening = np.swapaxes(turned.astype(np.float64), 1, 2) / scales[near][:, :, None]
+    metric = np.swapaxes(whitening, 1, 2) @ whitening
+    square = _nearest_square(metric, low - means[near], highest[near] - means[near])
+    densest = gaussians.opacities.detach().cpu().numpy()[near] * np.exp(-0.5 * square)
     out = np.zeros(len(means), dtype=bool)
-    for which, rotation in zip(near, turned.astype(np.float64), strict=True):
-        # The place in the box where the Gaussian is densest.
-        whitening = rotation.T / scales[which][:, None]
-        found = lsq_linear(whitening, whitening @ means[which], bounds=(low, highest[which]))
-        out[which] = opacities[which] * np.exp(-found.cost) > _VISIBLE
+    out[near] = densest > _VISIBLE
     return torch.from_numpy(out).to(gaussians.means.device)
+
+
+def _nearest_square(metric: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+    """Least x'Mx (n,) over boxes: metrics M (n, 3, 3), positive definite; corners (n, 3).
+
+    A convex function is least in the box where it is least on one of the box's 27 faces (itself, its sides, edges and
+    corners), taken as unbounded, at a place that lies in the box.
+    """
+    best = np.full(len(metric), np.inf)
+    for sides in itertools.product((None, low, high), repeat=3):
+        fixed = [axis for axis, side in enumerate(sides) if side is not None]
+        free = [axis for axis, side in enumerate(sides) if side is None]
+        x = np.zeros_like(low)
+        for axis in fixed:
+            side = sides[axis]
+            assert side is not None
+            x[:, axis] = side[:, axis]
+        if free:
+            inner, across = metric[:, free][:, :, free], metric[:, free][:, :, fixed]
+            x[:, free] = -np.linalg.solve(inner, across @ x[:, fixed, None])[..., 0]
+        slack = 1e-9 * (high - low)
+        inside = np.all((x >= low - slack) & (x <= high + slack), axis=1)
+        square = np.einsum("ni,nij,nj->n", x, metric, x)
+        best = np.where(inside, np.minimum(best, square), best)
+    return best

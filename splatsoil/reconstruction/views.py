@@ -171,11 +171,13 @@ def silhouettes(views: Views, mesh: trimesh.Trimesh, margin: int = 2) -> torch.T
     """
     height, width = views.images.shape[-2:]
     result = np.zeros((len(views), height, width), dtype=np.float32)
-    centre = mesh.bounds.mean(axis=0)
+    centre, reach = mesh.bounds.mean(axis=0), float(np.ptp(mesh.bounds, axis=0).max())
+    footprint = min(
+        (max(float(np.linalg.norm(c.position - centre)) - reach, 1e-3) / max(c.fx, c.fy) for c in views.cameras),
+        default=reach,
+    )
+    points, _ = surface_points(mesh, max(0.7 * footprint, (mesh.area / 400_000) ** 0.5))
     for k, camera in enumerate(views.cameras):
-        distance = max(float(np.linalg.norm(camera.position - centre)) - float(np.ptp(mesh.bounds, axis=0).max()), 1e-3)
-        footprint = distance / max(camera.fx, camera.fy)
-        points, _ = surface_points(mesh, max(0.7 * footprint, (mesh.area / 400_000) ** 0.5))
         pixels, depth = camera.project(points)
         whole = np.floor(np.nan_to_num(pixels, nan=-1.0)).astype(int)
         seen = (depth > 0) & (whole >= 0).all(1) & (whole[:, 0] < camera.width) & (whole[:, 1] < camera.height)
