@@ -62,7 +62,9 @@ def test_dilatancy_is_named_where_it_is_hidden() -> None:
 def test_dilatancy_is_named_on_dense_real_sand_and_not_on_loose() -> None:
     tests = read_triaxial(KARLSRUHE)
     dense = criticised(tests["TMD22"], 0.7351)
-    assert dense.verdict == "missing" and dense.members[0] == "dilatancy"
+    assert dense.members == ("dilatancy",) and dense.effects["dilatancy"] == "missing" and dense.explained > 0.9
+    # Dense sand also softens: 2.7 spreads between specimens remain, so dilatancy is not said to be all.
+    assert dense.verdict == "outside the library"
     # Published: 16.7° at most; the law's angle is that at the start, before it decays.
     assert 10.0 < dense.confirmations["dilatancy"].fit.values["dilatancy_angle"] < 25.0
     assert dense.confirmations["dilatancy"].held_out < 0.4 * dense.confirmations[""].held_out
