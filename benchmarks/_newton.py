@@ -129,8 +129,7 @@ def plough(
     # whole voxels, so that every box lies on the grid as the first one does
     pitch = math.ceil((measurement.bed.upper - measurement.bed.lower)[1] / numerics.voxel + 4.0 * WALL / numerics.voxel)
     shifts = np.array([[0.0, k * pitch * numerics.voxel, 0.0] for k in range(len(worlds))])
-    model = _model(newton, measurement, worlds, shifts, device)
-    model.set_gravity(tuple(float(g) for g in (measurement.gravity if gravity is None else gravity)))
+    model = _model(newton, measurement, worlds, shifts, device, gravity)
     config = newton.solvers.SolverImplicitMPM.Config()
     config.voxel_size, config.max_iterations, config.tolerance = numerics.voxel, numerics.iterations, 1.0e-4
     solver = newton.solvers.SolverImplicitMPM(model, config=config)
@@ -163,7 +162,14 @@ def plough(
     return found
 
 
-def _model(newton: Any, measurement: Measurement, worlds: Sequence[World], shifts: FloatArray, device: str) -> Any:
+def _model(
+    newton: Any,
+    measurement: Measurement,
+    worlds: Sequence[World],
+    shifts: FloatArray,
+    device: str,
+    gravity: Sequence[float] | None = None,
+) -> Any:
     """Newton's model: one floor; walls, a tool and soil for every world."""
     bed, tool = measurement.bed, measurement.tool
     builder = newton.ModelBuilder()
@@ -191,6 +197,7 @@ def _model(newton: Any, measurement: Measurement, worlds: Sequence[World], shift
             radius=[world.spacing / 2.0] * n,
         )
     model = builder.finalize(device=device)
+    model.set_gravity(tuple(float(g) for g in (measurement.gravity if gravity is None else gravity)))
 
     def each(values: Sequence[float | FloatArray]) -> npt.NDArray[np.float32]:
         parts = [np.broadcast_to(value, len(w.particles)) for value, w in zip(values, worlds, strict=True)]

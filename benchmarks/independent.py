@@ -132,7 +132,7 @@ class Campaign:
             self.entry["presets"][preset] = {"chance_mm": 1e3 * found.chance, "volume": found.volume}
             self.entry["seconds"][preset] = time.perf_counter() - start
         for world, surface in zip(worlds, scanned, strict=True):
-            self._enter(world.label, world.angle, surface, None)
+            self._enter(world.label, float(world.angle), surface, None)
         self._enter("the set itself", self.entry["true_angle"], heights(truth, truth.particles, truth.volume), self.own)
 
     def change(self, numerics: Numerics, worlds: Sequence[World]) -> None:
@@ -142,10 +142,10 @@ class Campaign:
             runs = plough(self.truth.measurement, worlds, numerics, self.truth.particles, self.device)
         except SimulationError as error:
             for world in worlds:
-                self.entry["worlds"][world.label] = {"angle": world.angle, "failed": str(error)}
+                self.entry["worlds"][world.label] = {"angle": float(world.angle), "failed": str(error)}
             return
         for world, run in zip(worlds, runs, strict=True):
-            self._enter(world.label, world.angle, heights(self.truth, run, world.spacing**3), self.own)
+            self._enter(world.label, float(world.angle), heights(self.truth, run, world.spacing**3), self.own)
         self.entry["seconds"][", ".join(w.label for w in worlds)] = time.perf_counter() - start
 
     def _enter(self, label: str, angle: float, surface: FloatArray, own: Scan | None) -> None:

@@ -61,8 +61,9 @@ def _window(scene: Plough, newton: object, start: int) -> list[float]:
     measurement = truth.measurement
     numerics = Numerics.of(measurement.folder)
     angle = scene.values["friction_angle"]
-    world = World("speed", angle, truth.particles[start], truth.volume ** (1.0 / 3.0))
-    model = _model(newton, truth, [world], np.zeros((1, 3)), "cpu")
+    cohesion = scene.values.get("cohesion", 0.0)
+    world = World("speed", angle, truth.particles[start], truth.volume ** (1.0 / 3.0), cohesion=cohesion)
+    model = _model(newton, measurement, [world], np.zeros((1, 3)), "cpu")
     config = newton.solvers.SolverImplicitMPM.Config()  # type: ignore[attr-defined]
     config.voxel_size, config.max_iterations, config.tolerance = numerics.voxel, numerics.iterations, 1.0e-4
     solver = newton.solvers.SolverImplicitMPM(model, config=config)  # type: ignore[attr-defined]
