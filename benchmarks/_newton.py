@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -105,7 +105,6 @@ def plough(
     device: str = "cpu",
     *,
     gravity: Sequence[float] | None = None,
-    progress: Callable[[float], None] = lambda share: None,
 ) -> list[dict[int, FloatArray]]:
     """Run the worlds side by side, in boxes of their own, to the last frame.
 
@@ -116,7 +115,6 @@ def plough(
         frames: to keep, of those from 1 on.
         device: Warp device name.
         gravity: (3,) m/s^2; the measurement's by default.
-        progress: called with the share that is done.
 
     Returns:
         For each world its particles (n, 3) in m by frame.
@@ -158,7 +156,6 @@ def plough(
                 raise SimulationError(f"newton: particles are no numbers at frame {frame} with {numerics}")
             for k, part in enumerate(np.split(x, ends)):
                 found[k][frame] = part - shifts[k]
-        progress(frame / wanted[-1])
     return found
 
 

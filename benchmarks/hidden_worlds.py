@@ -29,7 +29,7 @@ from splatsoil.benchmarks.numerics import FloatArray
 from splatsoil.files import plain, write_json
 from splatsoil.mpm import Resolution, Trajectory, frames_around
 from splatsoil.observation import Observation
-from splatsoil.reconstruction import HeightField, fill
+from splatsoil.reconstruction import fill
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
 from splatsoil.synthetic import Appearance, Setup, photograph_run, plow
@@ -175,7 +175,7 @@ def soil_of(hidden: Hidden, setup: Setup) -> World:
     angle: float | FloatArray = hidden.angle
     if "layer" in told:
         excess, below = told.pop("layer")
-        angle = hidden.angle + np.where(_height(setup.surface, x) - x[:, 2] > below, excess, 0.0)
+        angle = hidden.angle + np.where(setup.surface.sample(x[:, :2]) - x[:, 2] > below, excess, 0.0)
     if "across" in told:
         middle, half = setup.bed.lower[1] + 0.5 * setup.bed.extents[1], 0.5 * setup.bed.extents[1]
         angle = hidden.angle + told.pop("across") * (x[:, 1] - middle) / half
@@ -183,13 +183,6 @@ def soil_of(hidden: Hidden, setup: Setup) -> World:
         keep = np.linalg.norm(x - np.array(told["obstacle"][:3]), axis=1) > told["obstacle"][3]
         x = x[keep]
     return World(hidden.name, angle, x, SPACING, **told)
-
-
-def _height(surface: HeightField, x: FloatArray) -> FloatArray:
-    columns = [
-        np.clip(np.searchsorted(axis, x[:, k]), 0, len(axis) - 1) for k, axis in ((1, surface.y), (0, surface.x))
-    ]
-    return np.asarray(surface.height[columns[0], columns[1]])
 
 
 def make_worlds(truths: Sequence[Hidden], out: Path, device: str, say: Callable[[str], None]) -> None:

@@ -11,7 +11,8 @@ from scipy.stats import chi2, f
 
 from splatsoil.experiment.features import Layout
 
-from .noise import Noise, Solver, smooth_waves
+from .noise import Noise, Solver
+from .waves import smooth_waves
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -19,14 +19,13 @@ from scipy.optimize import minimize
 
 from splatsoil.experiment.features import Layout
 
+from .waves import smooth_waves
+
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 
 MOST_MEMORY = 0.98
 """Largest correlation of neighbouring times."""
-WAVES_IN_TIME = 4
-WAVES_IN_SPACE = 3
-"""Slow waves in each direction: what effects look like, where the noise must be known best."""
 FEWEST_TO_JUDGE = 3
 """Samples from which each can be judged by the others."""
 MEMORY_OF_SCALE = 2.0
@@ -281,35 +280,6 @@ def _packed(part: Part, spacing: float, pairs: Sequence[tuple[int, int]]) -> Flo
     length = math.log(part.length / spacing) if part.length > 0.0 else 0.0
     links = [] if part.between is None else [math.atanh(min(max(part.between[p], -0.99), 0.99)) for p in pairs]
     return np.array([math.log(ratio / (1.0 - ratio)), length, math.log(share / (1.0 - share)), *links])
-
-
-def smooth_waves(layout: Layout, seen: BoolArray) -> FloatArray:
-    """(n, k) slow waves over time, and over the plane for each instrument; orthonormal columns."""
-    times, sites = layout.shape
-    rows = _cosines(np.linspace(0.0, 1.0, times), min(WAVES_IN_TIME, times))
-    channel = layout.channel_numbers()
-    columns = []
-    for c in range(len(layout.channels)):
-        mine = channel == c
-        place = np.array([[site.x, site.y] for site in layout.sites])[mine]
-        if mine.sum() == 1 or not np.isfinite(place).all():
-            waves = np.ones((int(mine.sum()), 1))
-        else:
-            low, high = place.min(axis=0), place.max(axis=0)
-            unit = (place - low) / np.maximum(high - low, 1e-9)
-            along, across = (_cosines(unit[:, i], WAVES_IN_SPACE if high[i] > low[i] else 1) for i in (0, 1))
-            waves = (along[:, :, None] * across[:, None, :]).reshape(int(mine.sum()), -1)
-        wide = np.zeros((sites, waves.shape[1]))
-        wide[mine] = waves
-        columns.append(wide)
-    space = np.concatenate(columns, axis=1)
-    table = (rows[:, None, :, None] * space[None, :, None, :]).reshape(times, sites, -1)
-    left, singular, _ = np.linalg.svd(table[seen], full_matrices=False)
-    return left[:, singular > 1e-6 * singular[0]]
-
-
-def _cosines(unit: FloatArray, count: int) -> FloatArray:
-    return np.cos(np.pi * unit[:, None] * np.arange(count)[None])
 
 
 def _time(steps: FloatArray, memory: float) -> FloatArray:

@@ -1,0 +1,52 @@
+"""Hidden worlds: sealed truths, the soil that they make, and how a verdict is scored."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from splatsoil.benchmarks.hidden_worlds import ANGLES, FIELD, KINDS, NOTHING, OBSERVATION, draw, score, soil_of, table
+
+from splatsoil.soil.library import library
+from splatsoil.synthetic import plow
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_truth_is_drawn_by_seed_and_is_an_effect_of_the_library(kind: str) -> None:
+    hidden, again, other = draw(kind, 0, 1), draw(kind, 0, 1), draw(kind, 1, 1)
+    assert hidden == again and hidden.angle != other.angle
+    assert ANGLES[0] <= hidden.angle <= ANGLES[1]
+    assert kind in library() or kind in (NOTHING, FIELD)
+    assert (hidden.observation() != draw(NOTHING, 0, 1).observation()) == (kind in OBSERVATION)
+
+
+def test_a_layer_lies_below_its_depth_and_a_stone_holds_no_sand() -> None:
+    setup = plow(3)
+    layered = soil_of(replace(draw("layering", 0, 1), soil={"layer": (-8.0, 0.05)}), setup)
+    weak = np.asarray(layered.angle) < draw("layering", 0, 1).angle - 7.9
+    top = float(setup.surface.height.max())
+    assert weak[layered.particles[:, 2] < 0.02].all(), "the soil is 8 cm deep and more"
+    assert not weak[layered.particles[:, 2] > top - 0.05].any()
+    stone = draw("buried_obstacle", 0, 1)
+    x, y, z, radius = stone.soil["obstacle"]
+    assert np.linalg.norm(soil_of(stone, setup).particles - [x, y, z], axis=1).min() > radius
+
+
+def judged(kind: str, verdict: str, members: list[str]) -> dict[str, object]:
+    refit = {"values": {"friction_angle": 34.0}, "stds": {"friction_angle": 0.5}, "held_out": 2.0, "floor": 2.5}
+    told = {"refits": {"as it is": refit, **dict.fromkeys(members, refit)}, "verdict": verdict, "class": members}
+    told |= {"explained": 0.5, "effects": [], "seconds": 1.0}
+    fit = {"parameters": {"friction_angle": {"estimate": 35.0, "std": 0.5}}, "seconds": 1.0}
+    return score(draw(kind, 0, 1), fit, told)
+
+
+def test_right_is_what_names_the_truth_or_nothing_where_nothing_is() -> None:
+    assert judged(NOTHING, "adequate", [])["right"]
+    assert not judged(NOTHING, "missing", ["tilt"])["right"]
+    assert judged("tilt", "missing", ["gravity", "tilt"])["right"]
+    nearest = judged("tilt", "outside the library", ["tilt"])
+    assert nearest["nearest"] and not nearest["right"]
+    assert judged(FIELD, "outside the library", ["tilt"])["right"]
+    rows = [judged("tilt", "missing", ["gravity"]), judged(NOTHING, "adequate", [])]
+    assert "another effect named: 1 of 1" in table(rows)
