@@ -90,7 +90,8 @@ def confirm(
             experiment.observed,
             free,
             _starts(experiment, evidence, candidate, simulate, predict),
-            renewed=[p.name for p in experiment.parameters] + ([] if candidate is None else [candidate.size]),
+            chance=experiment.chance,
+            renewed=[p.name for p in experiment.parameters] + _renewed(candidate),
             most=steps if candidate is not None else max(steps - 2, 1),
             rounds=ROUNDS if candidate is not None else 0,
         )
@@ -99,6 +100,13 @@ def confirm(
             experiment, floor, name, fit, ~shown if not shown.all() else shown, basis, free, shown_columns
         )
     return out
+
+
+def _renewed(candidate: Candidate | None) -> list[str]:
+    """Parameters of an effect whose derivatives change on the way; what cameras report is nearly linear."""
+    if candidate is None:
+        return []
+    return [p.name for p in candidate.parameters] if candidate.kind == "physics" else [candidate.size]
 
 
 def _starts(

@@ -26,7 +26,7 @@ from .evidence import Evidence, around
 from .floor import Floor
 from .free_strength import NODES, FreeStrength, Range, coordinates, hats, ranges
 from .misfit import Omnibus, omnibus
-from .refit import mended
+from .refit import measured_over, mended
 from .simulations import Simulations
 from .verdicts import explained
 
@@ -218,6 +218,7 @@ def _fit(
         step = at - home
         return float(np.sum(whiten(experiment.observed - table) ** 2) + step @ precision @ step)
 
+    widths = np.array([*measured_over(parameters, home[: len(wide)]), *(STEP for _ in effect.parameters)])
     at, here = home, run(home)
     for _ in range(rounds):
         slopes = _slopes((*parameters, *effect.parameters), at, here, run)
@@ -236,7 +237,7 @@ def _fit(
                 share *= 0.4
                 continue
             moved = there - at
-            slopes = mended(slopes, table - here, moved / (upper - lower) ** 2, moved)
+            slopes = mended(slopes, table - here, moved, widths, chance=experiment.chance)
             if (fresh := cost(table, there)) < best:
                 at, here, best = there, table, fresh
             else:

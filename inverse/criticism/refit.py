@@ -1,4 +1,4 @@
-"""Refitting with an effect on: Gauss-Newton on whitened features, the derivatives mended by Broyden's update.
+"""Refitting with an effect on: Gauss-Newton on whitened features, the derivatives mended by what each step shows.
 
 Some ten simulations, enough to say how far χ² really falls; the estimate that users keep comes from a full fit.
 """
@@ -59,6 +59,7 @@ def refit(
     prediction: FloatArray,
     slopes: FloatArray,
     *,
+    chance: bool,
     most: int = 5,
 ) -> Refit:
     """Minimise χ².
@@ -71,11 +72,13 @@ def refit(
         start: their values.
         prediction: (t, s) there.
         slopes: (t, s, k) derivatives there.
+        chance: whether predictions hold some.
         most: simulations.
     """
     lower, upper = (np.array([getattr(p, side) for p in parameters]) for side in ("lower", "upper"))
     span = upper - lower
     at = np.array([start[p.name] for p in parameters])
+    widths = measured_over(parameters, at)
     slopes, here = slopes.copy(), prediction
     chi2 = float(np.sum(whiten(observed - here) ** 2))
     trust, tried = TRUST, 0
@@ -101,7 +104,7 @@ def refit(
         moved = there - at
         if not np.any(moved):
             break
-        slopes = mended(slopes, table - here, moved / span**2, moved)
+        slopes = mended(slopes, table - here, moved, widths, chance=chance)
         fresh = float(np.sum(whiten(observed - table) ** 2))
         gain = (chi2 - fresh) / predicted
         if fresh < chi2:
@@ -137,6 +140,7 @@ def settle(
     parameters: Sequence[Parameter],
     starts: Sequence[Start],
     *,
+    chance: bool,
     renewed: Sequence[str],
     most: int = 5,
     rounds: int = ROUNDS,
@@ -151,11 +155,15 @@ def settle(
         observed: (t, s).
         parameters: free ones.
         starts: at least one.
+        chance: whether predictions hold some.
         renewed: names of the parameters whose derivatives are measured anew in each round.
         most: simulations from each start, and two less (but two at least) in each round.
         rounds: most of them.
     """
-    runs = [refit(predict, whiten, observed, parameters, s.values, s.prediction, s.slopes, most=most) for s in starts]
+    runs = [
+        refit(predict, whiten, observed, parameters, s.values, s.prediction, s.slopes, chance=chance, most=most)
+        for s in starts
+    ]
     best = min(runs, key=lambda run: run.chi2)
     spent = sum(run.simulations for run in runs)
     for _ in range(rounds):
@@ -181,6 +189,7 @@ def settle(
             best.values,
             best.prediction,
             slopes,
+            chance=chance,
             most=max(most - 2, 2),
         )
         fall, spent, best = best.chi2 - again.chi2, spent + again.simulations, again
@@ -189,13 +198,23 @@ def settle(
     return replace(best, simulations=spent)
 
 
-def mended(slopes: FloatArray, change: FloatArray, weight: FloatArray, moved: FloatArray) -> FloatArray:
-    """Broyden's update: the least change of (t, s, k) slopes that explains the change (t, s) after a move (k,).
+def mended(
+    slopes: FloatArray, change: FloatArray, moved: FloatArray, widths: FloatArray, *, chance: bool
+) -> FloatArray:
+    """The (t, s, k) slopes after a move (k,) that changed the features by ``change`` (t, s).
 
-    ``weight`` (k,) says which parameters are to blame: the move in units of their ranges.
+    Broyden's update, which trusts the last step alone, where predictions are exact. With chance in them, a slope taken
+    over a short step is mostly that: old slopes and the new one then count in proportion to the squares of what they
+    were taken over, ``widths`` (k,) and the move (Kalman's gain), or a parameter that hardly moved would seem known.
     """
+    weight = moved / widths**2
     missing = change - slopes @ moved
-    return slopes + missing[..., None] * (weight / float(weight @ moved))
+    return slopes + missing[..., None] * (weight / (float(chance) + float(weight @ moved)))
+
+
+def measured_over(parameters: Sequence[Parameter], at: FloatArray) -> FloatArray:
+    """(k,) the steps that derivatives at a point (k,) are measured over."""
+    return np.array([abs(around(p, float(v))[0] - float(v)) for p, v in zip(parameters, at, strict=True)])
 
 
 def optimum(
@@ -234,6 +253,7 @@ def optimum(
             values,
             middle,
             np.stack(slopes, axis=-1),
+            chance=experiment.chance,
             most=most,
         )
         values = dict(found.values)

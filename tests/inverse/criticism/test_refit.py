@@ -38,6 +38,7 @@ def test_it_ends_where_least_squares_does() -> None:
         start,
         middle,
         slopes,
+        chance=False,
         most=12,
     )
     oracle = least_squares(lambda p: ((model({"a": p[0], "b": p[1]}) - observed) / 0.05).ravel(), [2.0, 0.0])
@@ -65,16 +66,30 @@ def test_bounds_hold_and_failed_simulations_only_cost() -> None:
         start,
         middle,
         slopes,
+        chance=False,
         most=6,
     )
     assert 6.0 < found.values["a"] < 9.99
     assert found.chi2 < np.sum(((middle - observed) / 0.05) ** 2)
 
 
-def test_the_mended_slopes_explain_the_step_just_made_and_leave_others_alone() -> None:
+def test_a_long_step_tells_the_slope_and_a_short_one_hardly_anything() -> None:
     generator = np.random.default_rng(1)
     slopes, change = generator.normal(size=(3, 2, 2)), generator.normal(size=(3, 2))
-    moved = np.array([0.5, 0.0])
-    fresh = mended(slopes, change, moved, moved)
-    assert np.allclose(fresh @ moved, change)
+    widths = np.array([0.1, 0.2])
+    long, short = np.array([5.0, 0.0]), np.array([1e-4, 0.0])
+    fresh = mended(slopes, change, long, widths, chance=True)
+    assert np.allclose(fresh @ long, change, atol=0.01)
     assert np.array_equal(fresh[..., 1], slopes[..., 1])
+    exact = mended(slopes, change, short, widths, chance=False)
+    assert np.allclose(exact @ short, change), "without chance the last step tells"
+    assert np.allclose(mended(slopes, slopes @ short + 0.01, short, widths, chance=True), slopes, atol=2e-4)
+
+
+def test_slopes_from_two_steps_with_noise_are_the_weighted_mean_of_both() -> None:
+    """Against the least squares of a line through the middle that both differences were taken from."""
+    widths, moved, first, second = 0.3, 0.2, 0.7, 0.5
+    told, wide = np.array([moved]), np.array([widths])
+    ours = mended(np.full((1, 1, 1), first / widths), np.full((1, 1), second), told, wide, chance=True)
+    line = np.linalg.lstsq(np.array([[widths], [moved]]), np.array([first, second]), rcond=None)[0]
+    assert ours.item() == pytest.approx(line.item())
