@@ -113,6 +113,15 @@ class Comparator:
         cameras: names; all by default.
         patch: side of a block on the bed, m.
 
+    Attributes:
+        observed: (h, w, 3) undistorted photographs by camera and frame.
+        before: (h, w, 3) by camera, the mean of all frames before anything moves.
+        interior: (h, w) by camera, pixels inside the bed.
+        plane: (h, w, 2) by camera, where each pixel's ray meets the surface's level, m.
+        silhouettes: (h, w) by camera and frame, the tool's, a little wider.
+        patches: (h, w) by camera, the block that a pixel is in, or -1.
+        noise: the robust loss that the cameras' noise alone leaves; None where it can't be told.
+
     Raises:
         ParameterError: a frame or camera that is not in the video, or nothing to compare.
     """
@@ -149,15 +158,15 @@ class Comparator:
         if level is None:
             middle = np.mean([measurement.bed.lower[2], measurement.bed.upper[2]])
             level = float(middle if surface is None else np.nanmean(surface.height))
-        self._plane = {c: _on_plane(camera, level) for c, camera in self._views.items()}
+        self.plane = {c: _on_plane(camera, level) for c, camera in self._views.items()}
         self.interior = {c: self._inside(c) for c in self.cameras}
         self._still = {
             c: [f.undistorted_image() for f in measurement.pre_roll if f.camera_name == c] for c in self.cameras
         }
-        self._before = {c: np.mean([*self._still[c], self.observed[c, self.reference]], axis=0) for c in self.cameras}
-        self._silhouettes = self._tool_silhouettes()
+        self.before = {c: np.mean([*self._still[c], self.observed[c, self.reference]], axis=0) for c in self.cameras}
+        self.silhouettes = self._tool_silhouettes()
         self._tool_colour = {c: self._tool_rule(c) for c in self.cameras}
-        self.labels, self._patches = self._layout()
+        self.labels, self.patches = self._layout()
         self._unit = self._motionless()
         self.noise = self._noise()
 
@@ -181,7 +190,7 @@ class Comparator:
                 )
         losses, squares, means = {}, {}, []
         for camera in self.cameras:
-            still = self._before[camera] - images[camera, self.reference]
+            still = self.before[camera] - images[camera, self.reference]
             still[self._shows_tool(camera, self.reference, images[camera, self.reference])] = 0.0
             masks = [self.interior[camera] & ~self._shows_tool(camera, f, images[camera, f]) for f in self.frames]
             change = [self.observed[camera, f] - images[camera, f] - still for f in self.frames]
@@ -200,7 +209,7 @@ class Comparator:
         other = copy(self)
         other.observed = {key: images[key] for key in self.observed}
         other._still = {camera: [] for camera in self.cameras}
-        other._before = {camera: images[camera, self.reference] for camera in self.cameras}
+        other.before = {camera: images[camera, self.reference] for camera in self.cameras}
         other._tool_colour = {camera: other._tool_rule(camera) for camera in self.cameras}
         other._unit = other._motionless()
         other.noise = None
@@ -210,11 +219,11 @@ class Comparator:
         """(b,) share of each block's pixels that the tool's silhouette leaves open, in the order of ``labels``."""
         out = []
         for camera in self.cameras:
-            patch = self._patches[camera]
+            patch = self.patches[camera]
             blocks, known = int(patch.max()) + 1, patch >= 0
             pixels = np.bincount(patch[known], minlength=blocks)
             for frame in self.frames:
-                free = known & ~self._silhouettes[camera, frame]
+                free = known & ~self.silhouettes[camera, frame]
                 out.append(np.bincount(patch[free], minlength=blocks) / np.maximum(pixels, 1))
         return np.concatenate(out)
 
@@ -230,7 +239,7 @@ class Comparator:
                 continue
             total = np.sum(frames, axis=0)
             change = [image - (total - image) / (len(frames) - 1) for image in frames]
-            mask = self.interior[camera] & ~self._silhouettes[camera, self.reference]
+            mask = self.interior[camera] & ~self.silhouettes[camera, self.reference]
             out[camera] = 255.0 * self._block_means(camera, change, [mask] * len(frames))
         return out
 
@@ -244,7 +253,7 @@ class Comparator:
         """Pixels whose ray meets the level of the bed's surface inside its walls."""
         low, high = self.measurement.bed.lower[:2], self.measurement.bed.upper[:2]
         margin = min(MARGIN, 0.1 * float(np.min(high - low)))
-        point = self._plane[camera]
+        point = self.plane[camera]
         with np.errstate(invalid="ignore"):
             return np.all((point > low + margin) & (point < high - margin), axis=-1)
 
@@ -261,8 +270,8 @@ class Comparator:
     def _tool_rule(self, camera: str) -> tuple[FloatArray, float] | None:
         """A linear rule (weights (2,), threshold) on log colour ratios that tells tool from soil, whatever the light on
         them; None where their colours are too alike."""
-        shape = self._silhouettes[camera, self.reference]
-        ratios = _log_ratios(self._before[camera])
+        shape = self.silhouettes[camera, self.reference]
+        ratios = _log_ratios(self.before[camera])
         tool = ratios[binary_erosion(shape, iterations=4)]
         soil = ratios[self.interior[camera] & ~shape]
         if len(tool) < 20 or len(soil) < 20:
@@ -276,7 +285,7 @@ class Comparator:
 
     def _shows_tool(self, camera: str, frame: int, predicted: Image) -> BoolImage:
         """Pixels in which either picture shows the tool, and near ones; its silhouette where colours don't tell."""
-        shape = self._silhouettes[camera, frame]
+        shape = self.silhouettes[camera, frame]
         rule = self._tool_colour[camera]
         if rule is None:
             return shape
@@ -293,7 +302,7 @@ class Comparator:
         for camera in self.cameras:
             inside = self.interior[camera]
             cell = np.full((*inside.shape, 2), -1)
-            cell[inside] = np.clip(((self._plane[camera][inside] - low) / size).astype(int), 0, count - 1)
+            cell[inside] = np.clip(((self.plane[camera][inside] - low) / size).astype(int), 0, count - 1)
             flat = np.where(inside, cell[..., 1] * count[0] + cell[..., 0], -1)
             pixels = np.bincount(flat[inside], minlength=int(np.prod(count)))
             kept = np.flatnonzero(pixels >= _FEWEST)
@@ -306,7 +315,7 @@ class Comparator:
 
     def _block_means(self, camera: str, change: list[Image], masks: list[BoolImage]) -> FloatArray:
         """(frames, blocks) mean residual over the pixels of each block that count."""
-        patch = self._patches[camera]
+        patch = self.patches[camera]
         blocks = int(patch.max()) + 1
         out = np.zeros((len(change), blocks))
         for k, (residual, mask) in enumerate(zip(change, masks, strict=True)):
@@ -325,7 +334,7 @@ class Comparator:
 
     def _pixels_per_metre(self, camera: str) -> float:
         """Of the bed's middle in the image."""
-        view, point = self._views[camera], self._plane[camera]
+        view, point = self._views[camera], self.plane[camera]
         inside = point[self.interior[camera]]
         if len(inside) == 0:
             raise ParameterError(f"camera {camera!r} does not see the inside of the bed")
@@ -339,7 +348,7 @@ class Comparator:
             first = self.observed[camera, self.reference]
             hidden = self._shows_tool(camera, self.reference, first)
             masks = [self.interior[camera] & ~hidden & ~self._shows_tool(camera, f, first) for f in self.frames]
-            change = [self.observed[camera, f] - self._before[camera] for f in self.frames]
+            change = [self.observed[camera, f] - self.before[camera] for f in self.frames]
             out[camera] = np.maximum(self._scaled_losses(camera, change, masks).mean(axis=0), 1e-12)
         return out
 
@@ -350,8 +359,8 @@ class Comparator:
         for camera, still in self._still.items():
             frames = [*still, self.observed[camera, self.reference]]
             if len(frames) > 1:
-                masks = [self.interior[camera] & ~self._silhouettes[camera, self.reference]] * len(frames)
-                means = self._block_means(camera, [f - self._before[camera] for f in frames], masks)
+                masks = [self.interior[camera] & ~self.silhouettes[camera, self.reference]] * len(frames)
+                means = self._block_means(camera, [f - self.before[camera] for f in frames], masks)
                 # A later frame's own noise, and that of the mean it is compared with.
                 variances.append(np.sum(means**2, axis=0).mean() / (len(frames) - 1) * (1.0 + 1.0 / len(frames)))
         return 255.0 * float(np.mean(variances)) ** 0.5 if variances else 0.0
@@ -365,7 +374,7 @@ class Comparator:
                 continue
             total = np.sum(frames, axis=0)
             change = [image - (total - image) / (len(frames) - 1) for image in frames]
-            mask = self.interior[camera] & ~self._silhouettes[camera, self.reference]
+            mask = self.interior[camera] & ~self.silhouettes[camera, self.reference]
             scaled = self._scaled_losses(camera, change, [mask] * len(frames)) / self._unit[camera]
             found.append(float(scaled.mean()))
         return float(np.mean(found)) if found else None

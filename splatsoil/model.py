@@ -91,9 +91,10 @@ class Model:
         effects: Iterable[str | Effect] | None = None,
         resolution: Resolution | None = None,
         frames: Iterable[int] | None = None,
+        scene: Scene | None = None,
     ) -> Model:
-        """The same experiment with other effects on, computed otherwise, or at other frames; it shares scenes where
-        particles agree.
+        """The same experiment with other effects on, computed otherwise, at other frames, or drawn with another scene;
+        it shares scenes where particles agree.
 
         An effect that is on already keeps its name here, wherever it came from.
         """
@@ -110,6 +111,8 @@ class Model:
         other.resolution = resolution or self.resolution
         if other.resolution.spacing == self.resolution.spacing:
             other._scene = self._scene
+        if scene is not None:
+            other._scene = lru_cache(maxsize=SCENES_KEPT)(lambda seed: scene)
         return other
 
     @property

@@ -24,13 +24,13 @@ def seen(comparator):
     """What a perfect model would predict but for noise: the frames, and before anything moved their mean."""
     images = {key: image.copy() for key, image in comparator.observed.items()}
     for camera in comparator.cameras:
-        images[camera, 0] = comparator._before[camera].astype(np.float32)
+        images[camera, 0] = comparator.before[camera].astype(np.float32)
     return images
 
 
 def patch_of(comparator, camera, x, y):
     """Pixels of the bed near a place."""
-    return np.linalg.norm(comparator._plane[camera] - [x, y], axis=-1) < 0.06
+    return np.linalg.norm(comparator.plane[camera] - [x, y], axis=-1) < 0.06
 
 
 def test_perfect_prediction_leaves_nothing(comparator, seen):

@@ -15,9 +15,10 @@ from splatsoil.parameters import Parameter
 
 from .evidence import Evidence, around, step_of
 from .floor import Floor, floor_of
+from .known import precision_of
 from .misfit import Omnibus, omnibus, smooth_basis
-from .noise import Noise
-from .refit import ROUNDS, Refit, Start, settle
+from .noise import Noise, Solver, orthonormal
+from .refit import ROUNDS, Known, Refit, Start, settle
 from .score import Scorer
 from .simulations import Simulations
 from .verdicts import CLEAN, LEVEL
@@ -34,7 +35,8 @@ class Confirmation:
         name: of the effect; empty for the model as it is.
         fit: the refit.
         stds: standard deviations of its estimates, by parameter.
-        chi2: of all times, numerics projected out.
+        chi2: of all times, as far as these tell of anything; see :class:`Sight`.
+        fall: by how much that is less than the model's as it is.
         held_out: root mean square of the residual on times the refit hasn't seen, in the features' unit.
         floor: what noise alone leaves there.
         remainder: what stands on slow waves.
@@ -44,6 +46,7 @@ class Confirmation:
     fit: Refit
     stds: Mapping[str, float]
     chi2: float
+    fall: float
     held_out: float
     floor: float
     remainder: Omnibus
@@ -63,27 +66,19 @@ def confirm(
 
     ``steps`` is the number of simulations from each point where a refit starts.
     """
-    rows = np.arange(experiment.layout.shape[0])
-    shown = rows % 2 == 0
-    if not experiment.seen[~shown].any() or not experiment.seen[shown].any():
-        shown = np.ones_like(shown)
-    # Numerics are projected out of what a refit minimises, and of what it is judged by.
-    seen_by_refit = floor.single.plus(floor.nuisance).rows(shown)
-    solver = seen_by_refit.solver()
-
-    def whiten(table: FloatArray) -> FloatArray:
-        return solver.whiten(table[seen_by_refit.seen])
-
-    out = {}
+    shown, hidden = _split(experiment)
+    out: dict[str, Confirmation] = {}
     jobs: list[Candidate | None] = [None, *chosen]
     for number, candidate in enumerate(jobs):
         name = "" if candidate is None else candidate.name
         told(f"refit {name or 'of the model'}", 0.75 + 0.2 * number / len(jobs))
+        whiten = Sight.of(experiment, floor, name, basis, shown)
 
         def predict(values: Mapping[str, float], name: str = name) -> FloatArray:
             return simulate(values, effects=(name,) if name else (), purpose=f"refit {name or 'of the model'}")
 
         free = [*experiment.parameters, *(() if candidate is None else candidate.parameters)]
+        known = _known(evidence, free)
         fit = settle(
             predict,
             whiten,
@@ -91,15 +86,64 @@ def confirm(
             free,
             _starts(experiment, evidence, candidate, simulate, predict),
             chance=experiment.chance,
+            known=known,
             renewed=[p.name for p in experiment.parameters] + _renewed(candidate),
             most=steps if candidate is not None else max(steps - 2, 1),
             rounds=ROUNDS if candidate is not None else 0,
         )
-        shown_columns = whiten(fit.slopes)
-        out[name] = _judged(
-            experiment, floor, name, fit, ~shown if not shown.all() else shown, basis, free, shown_columns
-        )
+        out[name] = _judged(experiment, floor, name, fit, hidden, basis, free, known, whiten(fit.slopes), out.get(""))
     return out
+
+
+@dataclass(frozen=True)
+class Sight:
+    """Whitened features as far as they tell of parameters, effects and slow waves.
+
+    Two simulations differ by chance in every feature. Their χ² over all of them, which is what a refit would compare,
+    scatters by tens; in the directions in which anything acts, by few. Numerics and other effects in trivial sizes
+    are projected out. Experiments without chance are looked at as a whole.
+
+    Attributes:
+        noise: of the features looked at.
+        solver: of that noise.
+        directions: (n, d) orthonormal, in which to look; None for all of the features.
+    """
+
+    noise: Noise
+    solver: Solver
+    directions: FloatArray | None
+
+    @classmethod
+    def of(
+        cls, experiment: Experiment, floor: Floor, effect: str, basis: FloatArray, rows: npt.NDArray[np.bool_]
+    ) -> Sight:
+        """For one effect (or none) and some times (t,)."""
+        if not experiment.chance:
+            noise = floor.single.plus(floor.nuisance).rows(rows)
+            return cls(noise, noise.solver(), None)
+        noise = floor.single.plus(floor.besides(effect)).rows(rows)
+        solver = noise.solver()
+        inside = (experiment.seen & rows[:, None])[experiment.seen]
+        columns = np.concatenate([floor.parameters, *floor.trivial.values(), basis], axis=1)[inside]
+        return cls(noise, solver, orthonormal(solver.whiten(columns)))
+
+    def __call__(self, table: FloatArray) -> FloatArray:
+        """Of a table (t, s, …): (d, …), of noise alone independent with variance 1."""
+        white = self.solver.whiten(table[self.noise.seen])
+        return white if self.directions is None else self.directions.T @ white
+
+
+def _split(experiment: Experiment) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+    """Times that a refit sees, and those hidden from it: every other one, or all where that leaves nothing."""
+    shown = np.arange(experiment.layout.shape[0]) % 2 == 0
+    if not experiment.seen[~shown].any() or not experiment.seen[shown].any():
+        return np.ones_like(shown), np.ones_like(shown)
+    return shown, ~shown
+
+
+def _noise_on(noise: Noise, mask: npt.NDArray[np.bool_]) -> float:
+    """Root mean square of a noise over some features."""
+    return float(np.sqrt(np.mean(noise.spread(noise.scale)[mask] ** 2)))
 
 
 def _renewed(candidate: Candidate | None) -> list[str]:
@@ -107,6 +151,16 @@ def _renewed(candidate: Candidate | None) -> list[str]:
     if candidate is None:
         return []
     return [p.name for p in candidate.parameters] if candidate.kind == "physics" else [candidate.size]
+
+
+def _known(evidence: Evidence, free: Sequence[Parameter]) -> Known:
+    """What a calibration says of the parameters that a refit has."""
+    precision, centre = precision_of(evidence.calibration, [p.name for p in free])
+    told = np.flatnonzero(np.diag(precision) > 0.0)
+    root = np.zeros((len(told), len(free)))
+    if told.size:
+        root[:, told] = np.linalg.cholesky(precision[np.ix_(told, told)]).T
+    return Known(root, centre + np.array([p.off or 0.0 for p in free]))
 
 
 def _starts(
@@ -153,22 +207,28 @@ def _judged(
     hidden: npt.NDArray[np.bool_],
     basis: FloatArray,
     free: Sequence[Parameter],
+    known: Known,
     columns: FloatArray,
+    before: Confirmation | None,
 ) -> Confirmation:
     """Judge a refit of ``free`` parameters on the times hidden from it; ``columns`` (n, k) are its whitened slopes."""
     left = experiment.observed - fit.prediction
     mask = experiment.seen & hidden[:, None]
-    scale = floor.single.spread(floor.single.scale)
     tangent = np.concatenate([floor.nuisance, _tangent(floor.single, fit)], axis=1)
-    whole = floor.single.plus(floor.nuisance).solver()
+    whole = Sight.of(experiment, floor, name, basis, np.ones(len(left), dtype=bool))
+    at, off = (np.array([values.get(p.name, p.off or 0.0) for p in free]) for values in (fit.values, {}))
+    chi2, fall = float(np.sum(whole(left) ** 2)) + known.chi2(at), 0.0
+    if before is not None:
+        fall = float(np.sum(whole(experiment.observed - before.fit.prediction) ** 2)) + known.chi2(off) - chi2
     remainder = omnibus(floor.single, tangent, left[experiment.seen], basis)
     return Confirmation(
         name=name,
         fit=fit,
-        stds=_stds(free, columns, remainder),
-        chi2=float(np.sum(whole.whiten(left[experiment.seen]) ** 2)),
+        stds=_stds(free, np.concatenate([columns, known.root]), remainder),
+        chi2=chi2,
+        fall=fall,
         held_out=float(np.sqrt(np.mean(left[mask] ** 2))),
-        floor=float(np.sqrt(np.mean(scale[mask] ** 2))),
+        floor=_noise_on(floor.single, mask),
         remainder=remainder,
     )
 
@@ -209,7 +269,8 @@ def remainder_of(
     if not others:
         return best.remainder
     columns = {c.name: evidence.directions[c.name][:, seen].T for c in others}
-    second = max(Scorer.of(floor.single, free, columns, others).score(left).values(), key=lambda score: score.statistic)
+    scorer = Scorer.of(floor.single, free, columns, others, calibration=evidence.calibration)
+    second = max(scorer.score(left).values(), key=lambda score: score.statistic)
     if second.adjusted >= LEVEL:
         return best.remainder
     size = columns[second.name]
@@ -223,8 +284,9 @@ def on_its_own_floor(
     best: Confirmation,
     simulate: Simulations,
     residual: FloatArray,
-) -> tuple[Omnibus, Omnibus]:
-    """Misfit of the model as it is and with its best effect, by the chance and numerics of soil that has the effect.
+) -> tuple[Omnibus, Omnibus, float]:
+    """Misfit of the model as it is and with its best effect, by the chance and numerics of soil that has the effect,
+    and what these leave on times hidden from refits.
 
     Cohesive soil falls by chance where dry soil flows, and numerics move it farther: what remains after an effect is
     added has to be judged by what such soil leaves.
@@ -253,4 +315,5 @@ def on_its_own_floor(
     model = len(experiment.parameters)
     bare = replace(best.fit, slopes=best.fit.slopes[..., :model])
     without = np.concatenate([floor.nuisance, _tangent(floor.noise, bare)], axis=1)
-    return omnibus(floor.noise, without, residual, basis), omnibus(floor.noise, free, left, basis)
+    noise = _noise_on(floor.single, seen & _split(experiment)[1][:, None])
+    return omnibus(floor.noise, without, residual, basis), omnibus(floor.noise, free, left, basis), noise

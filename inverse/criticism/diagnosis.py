@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +20,23 @@ from .outside import StrengthReading, read_strength
 from .score import Score, Scorer
 from .simulations import Simulations
 from .strokes import StrokeAdvice, advise
-from .verdicts import CLEAN, ENOUGH, EQUIVALENT, GATE, LEVEL, EffectVerdict, Verdict, explained, of_effect, overall
+from .verdicts import (
+    CLEAN,
+    ENOUGH,
+    EQUIVALENT,
+    GATE,
+    LEVEL,
+    RELEVANT,
+    WITHIN,
+    EffectVerdict,
+    Verdict,
+    explained,
+    of_effect,
+    overall,
+)
+
+if TYPE_CHECKING:
+    from splatsoil.experiment.base import Calibration
 
 FloatArray = npt.NDArray[np.float64]
 Report = Callable[[str, float], None]
@@ -101,6 +117,7 @@ def diagnose(
     simulate: Simulations | None = None,
     options: Options | None = None,
     replays: FloatArray | None = None,
+    calibration: Calibration | None = None,
     progress: Report | None = None,
 ) -> Diagnosis:
     """Criticise a model at its fitted parameters.
@@ -111,6 +128,7 @@ def diagnose(
         simulate: where predictions come from; the experiment itself by default.
         options: how thorough.
         replays: (k, t, s) see :class:`~splatsoil.inverse.criticism.evidence.Evidence`.
+        calibration: likewise.
         progress: called with (what, share done).
 
     Raises:
@@ -121,7 +139,13 @@ def diagnose(
     evidence = gather(
         experiment, simulate, values, repeats=options.repeats, progress=lambda share: told("simulations", 0.75 * share)
     )
-    return judge(experiment, replace(evidence, replays=replays), simulate, options=options, progress=told)
+    return judge(
+        experiment,
+        replace(evidence, replays=replays, calibration=calibration),
+        simulate,
+        options=options,
+        progress=told,
+    )
 
 
 @dataclass(frozen=True)
@@ -149,7 +173,15 @@ class Bench:
         columns = {c.name: evidence.directions[c.name][:, seen].T for c in candidates}
         scorer = None
         if candidates:
-            scorer = Scorer.of(floor.noise, floor.free, columns, candidates, level=options.level, seed=options.seed)
+            scorer = Scorer.of(
+                floor.noise,
+                floor.free,
+                columns,
+                candidates,
+                calibration=evidence.calibration,
+                level=options.level,
+                seed=options.seed,
+            )
         return cls(floor, candidates, scorer, smooth_basis(experiment.layout, floor.noise))
 
 
@@ -170,31 +202,34 @@ def judge(
     misfit = omnibus(floor.noise, floor.free, residual, bench.basis)
     scores = {} if scorer is None else scorer.score(residual)
     candidates = {c.name: c for c in bench.candidates}
-    strong = sorted((s for s in scores.values() if s.adjusted < options.level), key=lambda s: s.statistic, reverse=True)
+    strong = _strong(scores, scorer, options.level)
     confirmations: dict[str, Confirmation] = {}
     members: tuple[str, ...] = ()
     given: Mapping[str, Score] = {}
-    remainder, gone, before = None, 0.0, misfit
+    remainder, gone, before, error = None, 0.0, misfit, 1.0
     if strong and scorer is not None:
         chosen = [candidates[s.name] for s in strong[: options.refits]]
         confirmations = confirm(experiment, evidence, floor, chosen, simulate, options.refit_steps, bench.basis, told)
         tried = {name: c for name, c in confirmations.items() if name}
-        costs = {name: c.chi2 + price(candidates[name], misfit.freedom) for name, c in tried.items()}
+        costs = {name: c.chi2 + scorer.price(candidates[name]) for name, c in tried.items()}
         best = min(costs, key=lambda name: costs[name])
         before = confirmations[""].remainder
-        if _stands(confirmations, best, misfit):
+        if _stands(confirmations, best, misfit, scores[best].dispersion):
             given = scorer.score(residual, given=best)
-            members = _equals(costs, best, tried[best].remainder)
+            members = _equals(costs, best, max(tried[best].remainder.dispersion, scores[best].dispersion))
             remainder = remainder_of(experiment, floor, tried[best], candidates, evidence, bench.basis)
-            if remainder.p < CLEAN and explained(before, remainder) < ENOUGH:
+            error = tried[best].held_out / tried[best].floor
+            more = remainder.p < CLEAN and explained(before, remainder) < ENOUGH
+            if experiment.chance and (more or error > WITHIN):
                 told("the floor with the effect on", 0.97)
-                before, remainder = on_its_own_floor(experiment, evidence, tried[best], simulate, residual)
+                *mended, noise = on_its_own_floor(experiment, evidence, tried[best], simulate, residual)
+                error = tried[best].held_out / noise
+                before, remainder = mended if more else (before, remainder)
             gone = explained(before, remainder)
     effects = _effects(candidates, scores, given, members, confirmations, options.level)
     named = any(effects[name] == "missing" for name in members)
     if strong and not named:
         effects = {n: "cannot tell" if v == "missing" else v for n, v in effects.items()}
-    error = confirmations[members[0]].held_out / confirmations[members[0]].floor if members else 1.0
     verdict = overall(named, before if named else misfit, remainder, error=error)
     notes = [f"{name} could not be simulated: {why}" for name, why in evidence.failed.items()]
     strength = None
@@ -247,25 +282,31 @@ def _advice(
     return advise(experiment, fitted, chosen, progress=lambda share: told("other strokes", share))
 
 
-def _stands(confirmations: Mapping[str, Confirmation], best: str, misfit: Omnibus) -> bool:
+def _stands(confirmations: Mapping[str, Confirmation], best: str, misfit: Omnibus, dispersion: float) -> bool:
     """Something is to be explained, and the refit does: χ² falls, and the error on times it hasn't seen falls too.
 
     A model whose error there is no larger than noise, and whose slow waves show no more than chance, lacks nothing that
-    these data could show, whatever a single direction among dozens seems to say.
+    these data could show, whatever a single direction among dozens seems to say; unless the effect takes away a
+    relevant share of that error, which shows that the noise was overrated.
     """
     before, after = confirmations[""], confirmations[best]
-    wanting = before.held_out > before.floor or misfit.p < GATE
-    return wanting and before.chi2 - after.chi2 > EQUIVALENT and after.held_out < before.held_out
+    relevant = after.held_out**2 < (1.0 - RELEVANT) * before.held_out**2
+    wanting = before.held_out > before.floor or misfit.p < GATE or relevant
+    return wanting and after.fall > EQUIVALENT * dispersion and after.held_out < before.held_out
 
 
-def price(candidate: Candidate, freedom: int) -> float:
-    """χ² that an effect's parameters beyond its first must bring in (Schwarz 1978, over as many slow waves)."""
-    return (len(candidate.parameters) - 1) * math.log(max(freedom, 2))
+def _strong(scores: Mapping[str, Score], scorer: Scorer | None, level: float) -> list[Score]:
+    """Significant effects, those first that explain most for their parameters."""
+    if scorer is None:
+        return []
+    prices = {c.name: scorer.price(c) for c in scorer.candidates}
+    found = [s for s in scores.values() if s.adjusted < level]
+    return sorted(found, key=lambda s: s.statistic - prices[s.name], reverse=True)
 
 
-def _equals(costs: Mapping[str, float], best: str, remainder: Omnibus) -> tuple[str, ...]:
+def _equals(costs: Mapping[str, float], best: str, dispersion: float) -> tuple[str, ...]:
     """Effects whose χ² after refitting lies as near to the best as equals do; wider where a misfit remains."""
-    wide = EQUIVALENT * max(1.0, remainder.dispersion)
+    wide = EQUIVALENT * max(1.0, dispersion)
     close = [name for name, cost in costs.items() if cost - costs[best] < wide]
     return tuple(sorted(close, key=lambda name: costs[name]))
 
@@ -312,7 +353,8 @@ def _where(
         return {}
     seen = experiment.seen
     direction = evidence.directions[members[0]][:, seen].T @ np.array(list(scores[members[0]].steps.values()))
-    solver = floor.noise.plus(floor.free).solver()
+    free = np.concatenate([floor.besides(members[0]), floor.parameters], axis=1)
+    solver = floor.noise.plus(free).solver()
     parts = shares(experiment.layout, floor.noise, direction * solver.solve(residual))
     whole = sum(parts.values())
     return {key: value / whole for key, value in parts.items()} if whole > 0.0 else {}

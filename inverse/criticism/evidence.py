@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +12,9 @@ import numpy.typing as npt
 from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Candidate, Experiment
 from splatsoil.parameters import Parameter
+
+if TYPE_CHECKING:
+    from splatsoil.experiment.base import Calibration
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -36,6 +39,7 @@ class Evidence:
         directions: (k, t, s) derivatives by each candidate's parameters.
         steps: the step of each of these.
         replays: (k, t, s) residuals of known soils that went through the whole chain of pictures and reconstruction.
+        calibration: what pictures say of cameras, light, clock and tool where soil plays no part.
         failed: candidates whose simulation could not go on, with the reason.
     """
 
@@ -50,6 +54,7 @@ class Evidence:
     steps: Mapping[str, float]
     failed: Mapping[str, str]
     replays: FloatArray | None = None
+    calibration: Calibration | None = None
 
 
 def gather(

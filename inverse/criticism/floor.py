@@ -13,6 +13,7 @@ from splatsoil.experiment.base import Experiment
 from splatsoil.experiment.features import Layout
 
 from .evidence import Evidence
+from .known import trivial_of
 from .noise import Noise, Part, correlated, estimate, extra_noise, independent
 
 FloatArray = npt.NDArray[np.float64]
@@ -34,6 +35,7 @@ class Floor:
         single: of observed minus one prediction.
         nuisance: (n, q) patterns that numerics can make, times their prior standard deviations.
         parameters: (n, k) derivatives by the model's parameters (and their curvature), likewise.
+        trivial: (n, k) what each effect does in sizes too small to matter, by its name.
         parts: what the noise is made of: instruments, chance, reconstruction, numerics beyond the patterns.
     """
 
@@ -41,12 +43,17 @@ class Floor:
     single: Noise
     nuisance: FloatArray
     parameters: FloatArray
+    trivial: Mapping[str, FloatArray]
     parts: Mapping[str, Part]
 
     @property
     def free(self) -> FloatArray:
-        """(n, q + k) all that is projected out."""
+        """(n, q + k) what numerics and the model's parameters can do."""
         return np.concatenate([self.nuisance, self.parameters], axis=1)
+
+    def besides(self, effect: str = "") -> FloatArray:
+        """(n, q) what numerics can do, and effects in sizes too small to matter, but for one that is looked at."""
+        return np.concatenate([self.nuisance, *(t for name, t in self.trivial.items() if name != effect)], axis=1)
 
     def share(self, name: str) -> float:
         """A part's share of the whole variance."""
@@ -85,7 +92,12 @@ def floor_of(experiment: Experiment, evidence: Evidence) -> Floor:
         columns = extra_noise(layout, part, seen, directions if name == "chance" else None)
         averaged, alone = (np.sqrt(factor) for factor in _factors(name, runs))
         noise, single = noise.plus(averaged * columns), single.plus(alone * columns)
-    return Floor(noise, single, NUMERICS_PRIOR * _columns(patterns, seen), parameters, parts)
+    trivial = {
+        c.name: _columns(evidence.directions[c.name], seen) @ trivial_of(evidence, c.parameters)
+        for c in experiment.candidates
+        if c.name in evidence.directions
+    }
+    return Floor(noise, single, NUMERICS_PRIOR * _columns(patterns, seen), parameters, trivial, parts)
 
 
 def _instruments(experiment: Experiment, evidence: Evidence, known: Noise) -> Part:
@@ -160,8 +172,8 @@ def _unexplained(
     return np.stack(out)
 
 
-def _columns(tables: Sequence[FloatArray], seen: npt.NDArray[np.bool_]) -> FloatArray:
+def _columns(tables: Sequence[FloatArray] | FloatArray, seen: npt.NDArray[np.bool_]) -> FloatArray:
     """(n, k) of k tables."""
-    if not tables:
+    if not len(tables):
         return np.zeros((int(seen.sum()), 0))
     return np.stack([table[seen] for table in tables], axis=1)

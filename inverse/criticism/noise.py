@@ -165,14 +165,14 @@ def extra_noise(layout: Layout, part: Part, seen: BoolArray, directions: FloatAr
         return nothing
     noise = Noise.of(layout, [(1.0, part)], seen)
     solver = noise.solver()
-    chosen = _orthonormal(solver.whiten(nothing if directions is None else directions))
+    chosen = orthonormal(solver.whiten(nothing if directions is None else directions))
     waves = solver.whiten(smooth_waves(layout, seen) * noise.scale[:, None])
-    waves = _orthonormal(waves - chosen @ (chosen.T @ waves))
+    waves = orthonormal(waves - chosen @ (chosen.T @ waves))
     parts = [math.sqrt(part.on_directions - 1.0) * chosen, math.sqrt(part.on_waves - 1.0) * waves]
     return np.tril(solver.factor[0]) @ np.concatenate(parts, axis=1)
 
 
-def _orthonormal(columns: FloatArray) -> FloatArray:
+def orthonormal(columns: FloatArray) -> FloatArray:
     """(n, r) of the span of columns (n, k), whatever their lengths."""
     size = np.linalg.norm(columns, axis=0)
     columns = columns[:, size > 1e-9 * max(float(size.max(initial=0.0)), 1e-300)]

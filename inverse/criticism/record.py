@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,6 +13,9 @@ from .diagnosis import Diagnosis
 from .misfit import Omnibus
 from .outside import StrengthReading
 from .words import sentences
+
+if TYPE_CHECKING:
+    from splatsoil.experiment.base import Calibration
 
 FORMAT = "splatsoil-diagnosis/1"
 
@@ -46,6 +49,7 @@ def record(experiment: Experiment, diagnosis: Diagnosis) -> dict[str, Any]:
             for (s, r, c), v in sorted(diagnosis.where.items(), key=lambda item: -item[1])
         ],
         "floor": {name: diagnosis.floor.share(name) for name in diagnosis.floor.parts},
+        "calibration": _calibration(experiment, diagnosis.evidence.calibration),
         "unit": layout.unit,
         "time_name": layout.time_name,
         "times": list(layout.times),
@@ -114,7 +118,7 @@ def _effect(diagnosis: Diagnosis, candidate: Candidate) -> dict[str, Any]:
     confirmed = diagnosis.confirmations.get(candidate.name)
     if confirmed is not None:
         entry["estimate"], entry["std"] = confirmed.fit.values[measure.name], confirmed.stds[measure.name]
-        entry["achieved_fall"] = diagnosis.confirmations[""].chi2 - confirmed.chi2
+        entry["achieved_fall"] = confirmed.fall
     return entry
 
 
@@ -124,11 +128,30 @@ def confirmation(c: Confirmation) -> dict[str, Any]:
         "values": dict(c.fit.values),
         "stds": dict(c.stds),
         "chi2": c.chi2,
+        "fall": c.fall,
         "held_out": c.held_out,
         "floor": c.floor,
         "remainder": _omnibus(c.remainder),
         "simulations": c.fit.simulations,
     }
+
+
+def _calibration(experiment: Experiment, found: Calibration | None) -> list[dict[str, Any]]:
+    """What the pictures say of parameters of observation where soil plays no part."""
+    if found is None:
+        return []
+    known = {p.name: p for c in experiment.candidates for p in c.parameters}
+    spread = np.sqrt(np.diag(found.covariance))
+    return [
+        {
+            "parameter": name,
+            "estimate": float(known[name].off or 0.0) + float(value),
+            "std": float(std),
+            "unit": known[name].unit,
+            "meaningful": known[name].meaningful,
+        }
+        for name, value, std in zip(found.names, found.estimate, spread, strict=True)
+    ]
 
 
 def _strength(found: StrengthReading) -> dict[str, Any]:

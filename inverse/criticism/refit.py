@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -50,6 +51,28 @@ class Refit:
     slopes: FloatArray
 
 
+@dataclass(frozen=True)
+class Known:
+    """What other measurements say of parameters: normal about a centre.
+
+    Attributes:
+        root: (m, k) whose product with a distance from the centre has independent errors of variance 1.
+        centre: (k,).
+    """
+
+    root: FloatArray
+    centre: FloatArray
+
+    @classmethod
+    def nothing(cls, count: int) -> Known:
+        """Of ``count`` parameters nothing is known."""
+        return cls(np.zeros((0, count)), np.zeros(count))
+
+    def chi2(self, at: FloatArray) -> float:
+        """Of parameters (k,)."""
+        return float(np.sum((self.root @ (self.centre - at)) ** 2))
+
+
 def refit(
     predict: Callable[[Mapping[str, float]], FloatArray],
     whiten: Callable[[FloatArray], FloatArray],
@@ -60,6 +83,7 @@ def refit(
     slopes: FloatArray,
     *,
     chance: bool,
+    known: Known | None = None,
     most: int = 5,
 ) -> Refit:
     """Minimise χ².
@@ -73,6 +97,7 @@ def refit(
         prediction: (t, s) there.
         slopes: (t, s, k) derivatives there.
         chance: whether predictions hold some.
+        known: what other measurements say of the parameters.
         most: simulations.
     """
     lower, upper = (np.array([getattr(p, side) for p in parameters]) for side in ("lower", "upper"))
@@ -80,11 +105,12 @@ def refit(
     at = np.array([start[p.name] for p in parameters])
     widths = measured_over(parameters, at)
     slopes, here = slopes.copy(), prediction
-    chi2 = float(np.sum(whiten(observed - here) ** 2))
+    other = known or Known.nothing(len(at))
+    chi2 = float(np.sum(whiten(observed - here) ** 2) + other.chi2(at))
     trust, tried = TRUST, 0
     while tried < most:
-        matrix = whiten(slopes) * span
-        target = whiten(observed - here)
+        matrix = np.concatenate([whiten(slopes), other.root]) * span
+        target = np.concatenate([whiten(observed - here), other.root @ (other.centre - at)])
         low = np.maximum((lower - at) / span, -trust)
         high = np.minimum((upper - at) / span, trust)
         high = np.maximum(high, low + 1e-9)
@@ -105,7 +131,7 @@ def refit(
         if not np.any(moved):
             break
         slopes = mended(slopes, table - here, moved, widths, chance=chance)
-        fresh = float(np.sum(whiten(observed - table) ** 2))
+        fresh = float(np.sum(whiten(observed - table) ** 2) + other.chi2(there))
         gain = (chi2 - fresh) / predicted
         if fresh < chi2:
             at, here, chi2 = there, table, fresh
@@ -141,6 +167,7 @@ def settle(
     starts: Sequence[Start],
     *,
     chance: bool,
+    known: Known | None = None,
     renewed: Sequence[str],
     most: int = 5,
     rounds: int = ROUNDS,
@@ -156,12 +183,14 @@ def settle(
         parameters: free ones.
         starts: at least one.
         chance: whether predictions hold some.
+        known: see :func:`refit`.
         renewed: names of the parameters whose derivatives are measured anew in each round.
         most: simulations from each start, and two less (but two at least) in each round.
         rounds: most of them.
     """
+    told: dict[str, Any] = {"chance": chance, "known": known}
     runs = [
-        refit(predict, whiten, observed, parameters, s.values, s.prediction, s.slopes, chance=chance, most=most)
+        refit(predict, whiten, observed, parameters, s.values, s.prediction, s.slopes, most=most, **told)
         for s in starts
     ]
     best = min(runs, key=lambda run: run.chi2)
@@ -189,8 +218,8 @@ def settle(
             best.values,
             best.prediction,
             slopes,
-            chance=chance,
             most=max(most - 2, 2),
+            **told,
         )
         fall, spent, best = best.chi2 - again.chi2, spent + again.simulations, again
         if fall < least_fall(again.chi2):

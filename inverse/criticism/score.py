@@ -6,6 +6,7 @@ spread as low-rank noise, which projects them out) and G the derivatives of the 
     U = GᵀΣ⁻¹r,   I = GᵀΣ⁻¹G,   estimate I⁻¹U,   LM = UᵀI⁻¹U
 
 LM is the fall of χ² that switching the effect on would bring if the model were linear (Rao 1948; Breusch & Pagan 1980).
+The other effects may be there in sizes too small to matter, and what stands along them widens the scores: `joint`.
 """
 
 from __future__ import annotations
@@ -13,14 +14,21 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import chi2, norm
+from scipy.stats import chi2, f, norm
+from scipy.stats import t as student
 
 from splatsoil.experiment.base import Candidate
 
+from .joint import BELIEF, SEEN_AT_ALL, Joint, dispersion
+from .known import precision_of
 from .noise import Noise
+
+if TYPE_CHECKING:
+    from splatsoil.experiment.base import Calibration
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -46,6 +54,7 @@ class Score:
         detectable: smallest size that is found with 80 % power at the level used.
         survival: share of the effect's information that parameters and nuisances leave.
         steps: estimates of all its parameters, as distances from off.
+        dispersion: by which the remainder along the other effects exceeds noise; z, p and std allow for it.
     """
 
     name: str
@@ -58,6 +67,7 @@ class Score:
     detectable: float
     survival: float
     steps: Mapping[str, float]
+    dispersion: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -66,21 +76,21 @@ class Scorer:
 
     Attributes:
         candidates: the effects.
-        parts: where each one's parameters stand in the joined columns.
-        places: which of its parameters measures it.
-        information: (k, k) of all parameters, parameters of the model and nuisances projected out.
-        whole: (k,) information before that projection.
+        joint: what is known of their parameters together.
+        places: which of its parameters measures each one.
+        whole: (k,) information before anything was projected out.
         weights: (n, k) inverse covariance times derivatives: products with a residual are scores.
+        told: (k,) scores that a calibration adds.
         smallest: (draws,) least p-value of any candidate when there is nothing to find.
         level: family-wise level for which detectable sizes are stated.
     """
 
     candidates: tuple[Candidate, ...]
-    parts: tuple[slice, ...]
+    joint: Joint
     places: tuple[int, ...]
-    information: FloatArray
     whole: FloatArray
     weights: FloatArray
+    told: FloatArray
     smallest: FloatArray
     level: float
 
@@ -92,6 +102,7 @@ class Scorer:
         directions: Mapping[str, FloatArray],
         candidates: Sequence[Candidate],
         *,
+        calibration: Calibration | None = None,
         level: float = 0.05,
         seed: int = 0,
     ) -> Scorer:
@@ -102,6 +113,7 @@ class Scorer:
             nuisance: (n, q) derivatives by parameters and nuisances, each times its prior standard deviation.
             directions: (n, k) derivatives by each candidate's parameters, in the candidate's order.
             candidates: the effects, at least one.
+            calibration: what other pictures say of their parameters.
             level: see above.
             seed: of the draws.
         """
@@ -117,10 +129,15 @@ class Scorer:
             inner = np.linalg.solve(np.eye(nuisance.shape[1]) + nuisance.T @ solved, nuisance.T @ weights)
             weights = weights - solved @ inner
         information = joined.T @ weights
+        precision, centre = precision_of(calibration, [p.name for c in candidates for p in c.parameters])
         information = 0.5 * (information + information.T)
         places = tuple([p.name for p in c.parameters].index(c.size) for c in candidates)
-        smallest = _smallest(candidates, places, parts, information, seed)
-        return cls(tuple(candidates), parts, places, information, whole, weights, smallest, level)
+        trivial = np.array([p.meaningful for c in candidates for p in c.parameters])
+        joint = Joint(information, trivial, parts, precision)
+        smallest = _smallest(candidates, places, joint, seed)
+        return cls(
+            tuple(candidates), joint, places, whole + np.diag(precision), weights, precision @ centre, smallest, level
+        )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -134,65 +151,84 @@ class Scorer:
             residual: observed minus predicted.
             given: an effect taken to be on, whose parameters are projected out; it is not scored itself.
         """
-        gradient, information = self.weights.T @ residual, self.information
-        chosen = list(range(len(self.candidates)))
-        if given is not None:
-            part = self.parts[self.names.index(given)]
-            gain = information[:, part] @ np.linalg.pinv(information[part, part])
-            gradient, information = gradient - gain @ gradient[part], information - gain @ information[part]
-            chosen = [i for i in chosen if self.names[i] != given]
-        return {self.names[i]: self._score(i, gradient, information) for i in chosen}
+        number = None if given is None else self.names.index(given)
+        seen = self.weights.T @ residual
+        gradient = seen + self.told
+        raws = {i: self._one(i, gradient, number) for i in range(len(self.candidates)) if i != number}
+        if not raws:
+            return {}
+        best = number
+        if best is None:
+            best = max(raws, key=lambda i: raws[i].statistic - self.price(self.candidates[i]))
+        rest = self.joint.rest(best) @ self.joint.unexpected(seen, self.told)
+        scale, freedom = float(dispersion(np.sum(rest**2), len(rest))), _freedom(len(rest))
+        return {self.names[i]: self._score(i, raw, scale, freedom) for i, raw in raws.items()}
+
+    def price(self, candidate: Candidate) -> float:
+        """χ² that an effect's parameters beyond its first must bring in (Schwarz 1978, over as many directions)."""
+        return _price(candidate, len(self.whole))
 
     def confusion(self) -> FloatArray:
         """(m, m) correlation between the candidates' scores."""
-        return _confusion(self.information, self.parts)
+        return _confusion(self.joint.whole, self.joint.parts)
 
-    def _score(self, index: int, gradient: FloatArray, information: FloatArray) -> Score:
-        candidate, part, place = self.candidates[index], self.parts[index], self.places[index]
-        raw = _one(candidate, place, gradient[part], information[part, part], self.whole[part])
-        share, count = float(np.mean(self.smallest <= raw.p)), len(self.candidates)
+    def _one(self, index: int, gradient: FloatArray, given: int | None) -> _Raw:
+        """One candidate, before the remainder and multiplicity."""
+        candidate, place = self.candidates[index], self.places[index]
+        own, information = self.joint.alone(index, given)
+        whole = self.whole[self.joint.parts[index]]
+        if not np.all(np.isfinite(information)) or np.any(
+            np.diag(information) <= SEEN_AT_ALL * np.maximum(whole, 1e-300)
+        ):
+            # Nothing of it is seen: an estimate of nothing, known to nothing.
+            return _Raw(0.0, 0.0, np.zeros(len(own)), math.inf, 0.0)
+        scores = own @ gradient
+        statistic, estimate = constrained(scores, information, place, candidate.measure.sign)
+        std = math.sqrt(max(float(np.linalg.pinv(information, hermitian=True)[place, place]), 0.0)) or math.inf
+        ratio = float(scores[0]) / math.sqrt(float(information[0, 0])) if len(scores) == 1 else math.nan
+        survival = float(1.0 / (std**2 * whole[place])) if whole[place] > 0.0 and math.isfinite(std) else 0.0
+        return _Raw(statistic, ratio, estimate, std, min(survival, 1.0))
+
+    def _score(self, index: int, raw: _Raw, scale: float, freedom: float) -> Score:
+        candidate, place = self.candidates[index], self.places[index]
+        sign, count = candidate.measure.sign, len(self.candidates)
+        p = float(tail(raw.statistic, len(candidate.parameters), sign, scale, freedom))
+        share = float(np.mean(self.smallest <= p))
         # Beyond what the draws resolve, Bonferroni's bound.
-        adjusted = share if share > 20.0 / DRAWS else min(count * raw.p, 1.0)
-        sided = norm.isf(self.level / count if candidate.measure.sign else 0.5 * self.level / count)
+        adjusted = share if share > 20.0 / DRAWS else min(count * p, 1.0)
+        sided = student.isf(self.level / count if sign else 0.5 * self.level / count, freedom)
+        z = raw.ratio / math.sqrt(scale)
+        if math.isnan(z):
+            z = math.copysign(float(norm.isf(max(0.5 * p, 1e-300))), float(raw.estimate[place]) or 1.0)
+        std = raw.std * math.sqrt(scale)
         return Score(
             name=candidate.name,
             statistic=raw.statistic,
-            z=raw.z,
-            p=raw.p,
+            z=z,
+            p=p,
             adjusted=adjusted,
             estimate=float(raw.estimate[place]),
-            std=raw.std,
-            detectable=float(sided + norm.ppf(POWER)) * raw.std,
+            std=std,
+            detectable=float(sided + norm.ppf(POWER)) * std,
             survival=raw.survival,
             steps={q.name: float(v) for q, v in zip(candidate.parameters, raw.estimate, strict=True)},
+            dispersion=scale,
         )
 
 
 @dataclass(frozen=True)
 class _Raw:
+    """One candidate's LM, single parameter's score over its spread (NaN for several), estimate, std and survival."""
+
     statistic: float
-    z: float
-    p: float
+    ratio: float
     estimate: FloatArray
     std: float
     survival: float
 
 
-def _one(candidate: Candidate, place: int, gradient: FloatArray, information: FloatArray, whole: FloatArray) -> _Raw:
-    """One candidate, before multiplicity."""
-    if not np.all(np.isfinite(information)) or np.any(np.diag(information) <= 1e-12 * np.maximum(whole, 1e-300)):
-        # Nothing of it is seen: an estimate of nothing, known to nothing.
-        return _Raw(0.0, 0.0, 1.0, np.zeros(len(gradient)), math.inf, 0.0)
-    statistic, estimate = constrained(gradient, information, place, candidate.measure.sign)
-    inverse = np.linalg.pinv(information)
-    std = math.sqrt(max(float(inverse[place, place]), 0.0)) or math.inf
-    p = tail(statistic, len(gradient), candidate.measure.sign)
-    if len(gradient) == 1:
-        z = float(gradient[0]) / math.sqrt(float(information[0, 0]))
-    else:
-        z = math.copysign(float(norm.isf(max(0.5 * p, 1e-300))), float(estimate[place]) or 1.0)
-    survival = float(1.0 / (std**2 * whole[place])) if whole[place] > 0.0 and math.isfinite(std) else 0.0
-    return _Raw(statistic, z, p, estimate, std, min(survival, 1.0))
+def _price(candidate: Candidate, freedom: int) -> float:
+    return (len(candidate.parameters) - 1) * math.log(max(freedom, 2))
 
 
 def constrained(gradient: FloatArray, information: FloatArray, place: int, sign: int) -> tuple[float, FloatArray]:
@@ -208,53 +244,64 @@ def constrained(gradient: FloatArray, information: FloatArray, place: int, sign:
     return float(gradient @ estimate), estimate
 
 
-def tail(statistic: float, count: int, sign: int) -> float:
-    """Chance of a larger LM with ``count`` parameters: χ², or half of it where one parameter keeps to one side."""
-    if statistic <= 0.0:
-        return 1.0
-    if not sign:
-        return float(chi2.sf(statistic, count))
-    lower = chi2.sf(statistic, count - 1) if count > 1 else 0.0
-    return float(0.5 * chi2.sf(statistic, count) + 0.5 * lower)
+def tail(statistic: float | FloatArray, count: int, sign: int, scale: float | FloatArray, freedom: float) -> FloatArray:
+    """Chance of a larger LM with ``count`` parameters, or half of it where one parameter keeps to one side.
+
+    LM over its parameters and the remainder's ``scale`` is F, the scale being known with ``freedom``.
+    """
+    ratio = np.asarray(statistic) / scale
+
+    def beyond(parameters: int) -> FloatArray:
+        if math.isinf(freedom):
+            return np.asarray(chi2.sf(ratio, parameters))
+        return np.asarray(f.sf(ratio / parameters, parameters, freedom))
+
+    out = beyond(count)
+    if sign:
+        out = 0.5 * out + (0.5 * beyond(count - 1) if count > 1 else 0.0)
+    return np.where(ratio <= 0.0, 1.0, out)
 
 
-def _smallest(
-    candidates: Sequence[Candidate],
-    places: Sequence[int],
-    parts: Sequence[slice],
-    information: FloatArray,
-    seed: int,
-) -> FloatArray:
-    """(draws,) least p-value of all candidates under no effect (Westfall & Young 1993)."""
-    generator = np.random.default_rng(seed)
-    values, vectors = np.linalg.eigh(information)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
-    draws = generator.standard_normal((DRAWS, len(root))) @ root.T
+def _freedom(directions: int) -> float:
+    """Degrees of freedom of the remainder's dispersion; without a remainder the noise is taken as known."""
+    return directions + BELIEF if directions else math.inf
+
+
+def _smallest(candidates: Sequence[Candidate], places: Sequence[int], joint: Joint, seed: int) -> FloatArray:
+    """(draws,) least p-value of all candidates when none is there in a size that matters (Westfall & Young 1993)."""
+    sizes, seen, told = joint.draw(np.random.default_rng(seed), DRAWS)
+    scores, unexpected = seen + told, joint.unexpected(seen, told)
+    falls = np.zeros((DRAWS, len(candidates)))
+    for k, (candidate, place, part) in enumerate(zip(candidates, places, joint.parts, strict=True)):
+        own, information = joint.alone(k)
+        # Each is tested for being off: its own trivial size isn't in its score.
+        mine = scores @ own.T - sizes[:, part] @ information
+        falls[:, k] = _falls(mine, information, place, candidate.measure.sign)
+    best = np.argmax(falls - [_price(c, len(joint.trivial)) for c in candidates], axis=1)
     smallest = np.ones(DRAWS)
-    for candidate, place, part in zip(candidates, places, parts, strict=True):
-        smallest = np.minimum(smallest, _tails(draws[:, part], information[part, part], place, candidate.measure.sign))
+    for b in np.unique(best):
+        rows, rest = best == b, joint.rest(int(b))
+        scale, freedom = dispersion(np.sum((unexpected[rows] @ rest.T) ** 2, axis=1), len(rest)), _freedom(len(rest))
+        for k, candidate in enumerate(candidates):
+            p = tail(falls[rows, k], len(candidate.parameters), candidate.measure.sign, scale, freedom)
+            smallest[rows] = np.minimum(smallest[rows], p)
     return smallest
 
 
-def _tails(gradients: FloatArray, information: FloatArray, place: int, sign: int) -> FloatArray:
-    """p-values (d,) of many score vectors (d, k)."""
-    count = gradients.shape[1]
+def _falls(gradients: FloatArray, information: FloatArray, place: int, sign: int) -> FloatArray:
+    """LM (d,) of many score vectors (d, k)."""
     if np.any(np.diag(information) <= 0.0):
-        return np.ones(len(gradients))
-    inverse = np.linalg.pinv(information)
+        return np.zeros(len(gradients))
+    count, inverse = gradients.shape[1], np.linalg.pinv(information)
     statistic = np.einsum("di,ij,dj->d", gradients, inverse, gradients)
     if not sign:
-        return chi2.sf(statistic, count)
-    wrong = sign * (gradients @ inverse[place]) < 0.0
+        return statistic
+    less = np.zeros(len(gradients))
     rest = [i for i in range(count) if i != place]
     if rest:
         part = np.linalg.pinv(information[np.ix_(rest, rest)])
         less = np.einsum("di,ij,dj->d", gradients[:, rest], part, gradients[:, rest])
-    else:
-        less = np.zeros(len(gradients))
-    statistic = np.where(wrong, less, statistic)
-    out = 0.5 * chi2.sf(statistic, count) + (0.5 * chi2.sf(statistic, count - 1) if count > 1 else 0.0)
-    return np.where(statistic <= 0.0, 1.0, out)
+    return np.where(sign * (gradients @ inverse[place]) < 0.0, less, statistic)
 
 
 def _confusion(information: FloatArray, parts: Sequence[slice]) -> FloatArray:

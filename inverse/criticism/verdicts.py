@@ -20,6 +20,9 @@ CLEAN = 0.05
 """Chance that what is left after an effect must have for the effect to be all that was missing."""
 EQUIVALENT = 6.0
 """Fall of χ² within which effects count as equally good."""
+RELEVANT = 0.1
+"""Share of the squared error on times that a refit hasn't seen which an effect must take away where that error is no
+larger than noise."""
 LEAST_SURVIVAL = 0.05
 """Share of an effect's information that must survive the projection of everything else."""
 ENOUGH = 0.8

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from splatsoil.commands._progress import Report
+    from splatsoil.experiment.base import Calibration
     from splatsoil.experiment.plow import PlowExperiment
     from splatsoil.inverse.criticism.diagnosis import Options
     from splatsoil.inverse.criticism.simulations import Simulations
@@ -92,6 +93,34 @@ def replayed(
     return np.load(path, allow_pickle=False)[None]
 
 
+def calibrated(
+    folder: RunFolder, experiment: PlowExperiment, simulate: Simulations, values: dict[str, float]
+) -> Calibration | None:
+    """What pictures say of cameras, light, clock and tool where soil plays no part, made once and kept in
+    ``features/``."""
+    import io
+
+    import numpy as np
+
+    from splatsoil.experiment.base import Calibration
+    from splatsoil.files import code_digest, write_bytes
+    from splatsoil.inverse.evaluations import digest
+
+    names = [p.name for c in experiment.candidates if c.kind == "observation" for p in c.parameters]
+    code = code_digest(("experiment/calibration.py",))
+    what = {**simulate.identity, "values": values, "calibrated": names, "calibration code": code}
+    path = folder.path / "features" / f"calibration-{digest(what)[:24]}.npz"
+    if not path.is_file():
+        found = experiment.calibrate(values)
+        if found is None:
+            return None
+        stream = io.BytesIO()
+        np.savez(stream, names=np.array(found.names), estimate=found.estimate, covariance=found.covariance)
+        write_bytes(path, stream.getvalue())
+    with np.load(path, allow_pickle=False) as kept:
+        return Calibration(tuple(str(name) for name in kept["names"]), kept["estimate"], kept["covariance"])
+
+
 def diagnosed(
     folder: RunFolder,
     model: Model,
@@ -137,7 +166,17 @@ def diagnosed(
         begun.append(begin("diagnose"))
         values = estimates(fit)
         with simulated_ahead(folder, model, effects, needed(experiment, values, repeats=options.repeats)):
-            found = diagnose(experiment, values, simulate=simulate, options=options, replays=replays, progress=told)
+            report("where soil plays no part", 0.0)
+            calibration = calibrated(folder, experiment, simulate, values)
+            found = diagnose(
+                experiment,
+                values,
+                simulate=simulate,
+                options=options,
+                replays=replays,
+                calibration=calibration,
+                progress=told,
+            )
         result = {
             **record(experiment, found),
             "fit": fit["name"],
@@ -180,6 +219,8 @@ def misfit(folder: RunFolder, model: Model, options: Options, report: Report) ->
 
 def confirmed(folder: RunFolder, model: Model, name: str, options: Options, report: Report) -> dict[str, Any]:
     """The model as it is and with one effect (by name, or from its file), each refitted on every other frame."""
+    from dataclasses import replace
+
     from splatsoil.files import plain
     from splatsoil.inverse.criticism.confirmation import confirm
     from splatsoil.inverse.criticism.diagnosis import Bench
@@ -199,6 +240,7 @@ def confirmed(folder: RunFolder, model: Model, name: str, options: Options, repo
         )
         if effect in evidence.failed:
             raise RunError(f"{effect} cannot be added: {evidence.failed[effect]}")
+        evidence = replace(evidence, calibration=calibrated(folder, experiment, simulate, estimates(folder.fit())))
         bench = Bench.of(experiment, evidence, options)
         found = confirm(
             experiment,

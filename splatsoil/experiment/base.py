@@ -44,6 +44,27 @@ class Candidate:
         return next(p for p in self.parameters if p.name == self.size)
 
 
+@dataclass(frozen=True)
+class Calibration:
+    """What pictures without moved soil tell of parameters of observation.
+
+    Attributes:
+        names: parameters, in the order asked for.
+        estimate: (k,) distance from each parameter's off value, in its unit.
+        covariance: (k, k), positive definite, 0 between parameters of different effects; very large for what the
+            pictures don't tell.
+    """
+
+    names: tuple[str, ...]
+    estimate: FloatArray
+    covariance: FloatArray
+
+    @property
+    def deviation(self) -> FloatArray:
+        """(k,) standard deviations."""
+        return np.sqrt(np.diag(self.covariance))
+
+
 class Experiment(Protocol):
     """Observed features, their noise, and predictions.
 

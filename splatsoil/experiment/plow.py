@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +23,9 @@ from splatsoil.mpm import Resolution, Trajectory
 from splatsoil.parameters import Parameter
 from splatsoil.soil.effect import Effect
 from splatsoil.soil.library import find_effects, library
+
+if TYPE_CHECKING:
+    from splatsoil.experiment.base import Calibration
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -150,20 +154,36 @@ class PlowExperiment:
         self, values: Mapping[str, float], *, effects: Iterable[str | Effect] = (), seed: int = 0, numerics: str = ""
     ) -> Prediction:
         """The pictures behind the features. What only changes the observation is drawn without a new simulation."""
-        names = tuple(dict.fromkeys((*self.model, *effects)))
-        model = self._variant(names, numerics)
-        reported = {p.name for p in model.observation_parameters}
-        physics = {name: value for name, value in values.items() if name not in reported}
-        moving = tuple(e.name for e in model.law.effects if not {p.name for p in e.parameters} <= reported)
-        key = (moving, numerics, seed, tuple(sorted(physics.items())))
+        model = self._variant(tuple(dict.fromkeys((*self.model, *effects))), numerics)
         began = time.perf_counter()
-        if self._kept is None or self._kept[0] != key or not set(model.recorded) <= set(self._kept[1].frames):
-            self._kept = (key, model.simulate(physics, seed, self.progress))
-        trajectory = self._kept[1]
+        trajectory = self._trajectory(model, values, seed, numerics)
         simulated = time.perf_counter()
         images = model.draw(trajectory, seed, values)
         seconds = {"simulation": simulated - began, "drawing": time.perf_counter() - simulated}
         return Prediction(dict(values), seed, images, trajectory, seconds)
+
+    def calibrate(self, values: Mapping[str, float]) -> Calibration | None:
+        """What pictures say of cameras, light, clock and tool where soil plays no part; None if no candidate asks."""
+        from splatsoil.experiment.calibration import calibrate
+
+        chosen = [c for c in self.candidates if c.kind == "observation"]
+        if not chosen:
+            return None
+        effects = [self._wanted.get(c.name, c.name) for c in chosen]
+        model = self._variant((*self.model, *effects), "")
+        trajectory = self._trajectory(model, values, 0, "")
+        parameters = [p for c in chosen for p in c.parameters]
+        return calibrate(model, self.comparator, parameters, trajectory)
+
+    def _trajectory(self, model: Model, values: Mapping[str, float], seed: int, numerics: str) -> Trajectory:
+        """A simulation, or the last one where it differs in nothing but what is reported."""
+        reported = {p.name for p in model.observation_parameters}
+        physics = {name: value for name, value in values.items() if name not in reported}
+        moving = tuple(e.name for e in model.law.effects if not {p.name for p in e.parameters} <= reported)
+        key = (moving, numerics, seed, tuple(sorted(physics.items())))
+        if self._kept is None or self._kept[0] != key or not set(model.recorded) <= set(self._kept[1].frames):
+            self._kept = (key, model.simulate(physics, seed, self.progress))
+        return self._kept[1]
 
     def states(self, values: Mapping[str, float]) -> States:
         """States that the soil goes through while it yields, in a simulation of its own."""
