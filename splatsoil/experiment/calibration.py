@@ -117,9 +117,8 @@ def calibrate(
         spread[np.ix_(free, free)] = shaped(variance, inner) + mixed[:, known] @ lean.T
     estimate, covariance = bench.reported(value, spread)
     # How errors of different effects go together isn't known: what each one says stands for itself.
-    owner = np.array(
-        [next(e.name for e in bench.effects if p.name in {q.name for q in e.parameters}) for p in parameters]
-    )
+    mine = {p.name: e.name for e in bench.effects for p in _of(e, model.measurement)}
+    owner = np.array([mine[p.name] for p in parameters])
     covariance = np.where(owner[:, None] == owner[None], covariance, 0.0)
     return Calibration(tuple(p.name for p in parameters), estimate, covariance)
 
