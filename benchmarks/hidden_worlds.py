@@ -246,7 +246,11 @@ def criticise(name: str, out: Path, preset: str, device: str, say: Callable[[str
 def score(hidden: Hidden, fit: Mapping[str, Any], told: Mapping[str, Any]) -> dict[str, Any]:
     """What fit and diagnosis said of a world, beside the truth; the best effect's refit is what ``add`` keeps."""
     refits = told["refits"]
-    base, best = refits["as it is"], refits.get(told["class"][0]) if told["class"] else None
+    angle = fit["parameters"]["friction_angle"]
+    # Without any significant effect nothing was refitted.
+    asis = {"values": {"friction_angle": angle["estimate"]}, "stds": {"friction_angle": angle["std"]}}
+    base = refits.get("as it is", asis)
+    best = refits.get(told["class"][0]) if told["class"] else None
     last = best or base
     named = told["class"] if told["verdict"] == "missing" else []
     return {
@@ -262,8 +266,8 @@ def score(hidden: Hidden, fit: Mapping[str, Any], told: Mapping[str, Any]) -> di
         "before": [base["values"]["friction_angle"], base["stds"]["friction_angle"]],
         "after": [last["values"]["friction_angle"], last["stds"]["friction_angle"]],
         "sizes": {k: [v, last["stds"][k]] for k, v in last["values"].items() if k != "friction_angle"},
-        "held_out": [base["held_out"], last["held_out"]],
-        "floor": last["floor"],
+        "held_out": [base.get("held_out"), last.get("held_out")],
+        "floor": last.get("floor"),
         "z": {e["name"]: e["z"] for e in told["effects"]},
         "seconds": [fit["seconds"], told["seconds"]],
     }
@@ -279,7 +283,7 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
     for r in rows:
         size = "–" if r["hidden"] == NOTHING else f"{r['size']:.3g}"
         found = ", ".join(f"{k} {v:.3g} ± {std:.2g}" for k, (v, std) in r["sizes"].items()) or "–"
-        errors = " → ".join(f"{e / r['floor']:.2f}" for e in r["held_out"])
+        errors = " → ".join(f"{e / r['floor']:.2f}" for e in r["held_out"]) if r["floor"] else "–"
         angles = f"{r['angle']:.1f}°; {r['fit'][0]:.1f}, {r['before'][0]:.1f}"
         if r["sizes"]:
             angles += f" → {r['after'][0]:.1f}"

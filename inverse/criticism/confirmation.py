@@ -67,12 +67,12 @@ def confirm(
     ``steps`` is the number of simulations from each point where a refit starts.
     """
     shown, hidden = _split(experiment)
+    whiten = Sight.of(experiment, floor, basis, shown)
     out: dict[str, Confirmation] = {}
     jobs: list[Candidate | None] = [None, *chosen]
     for number, candidate in enumerate(jobs):
         name = "" if candidate is None else candidate.name
         told(f"refit {name or 'of the model'}", 0.75 + 0.2 * number / len(jobs))
-        whiten = Sight.of(experiment, floor, name, basis, shown)
 
         def predict(values: Mapping[str, float], name: str = name) -> FloatArray:
             return simulate(values, effects=(name,) if name else (), purpose=f"refit {name or 'of the model'}")
@@ -100,8 +100,8 @@ class Sight:
     """Whitened features as far as they tell of parameters, effects and slow waves.
 
     Two simulations differ by chance in every feature. Their χ² over all of them, which is what a refit would compare,
-    scatters by tens; in the directions in which anything acts, by few. Numerics and other effects in trivial sizes
-    are projected out. Experiments without chance are looked at as a whole.
+    scatters by tens; in the directions in which anything acts, by few. Experiments without chance are looked at as a
+    whole. Numerics are projected out.
 
     Attributes:
         noise: of the features looked at.
@@ -114,17 +114,14 @@ class Sight:
     directions: FloatArray | None
 
     @classmethod
-    def of(
-        cls, experiment: Experiment, floor: Floor, effect: str, basis: FloatArray, rows: npt.NDArray[np.bool_]
-    ) -> Sight:
-        """For one effect (or none) and some times (t,)."""
-        if not experiment.chance:
-            noise = floor.single.plus(floor.nuisance).rows(rows)
-            return cls(noise, noise.solver(), None)
-        noise = floor.single.plus(floor.besides(effect)).rows(rows)
+    def of(cls, experiment: Experiment, floor: Floor, basis: FloatArray, rows: npt.NDArray[np.bool_]) -> Sight:
+        """For some times (t,)."""
+        noise = floor.single.plus(floor.nuisance).rows(rows)
         solver = noise.solver()
+        if not experiment.chance:
+            return cls(noise, solver, None)
         inside = (experiment.seen & rows[:, None])[experiment.seen]
-        columns = np.concatenate([floor.parameters, *floor.trivial.values(), basis], axis=1)[inside]
+        columns = np.concatenate([floor.parameters, floor.directions, basis], axis=1)[inside]
         return cls(noise, solver, orthonormal(solver.whiten(columns)))
 
     def __call__(self, table: FloatArray) -> FloatArray:
@@ -215,7 +212,7 @@ def _judged(
     left = experiment.observed - fit.prediction
     mask = experiment.seen & hidden[:, None]
     tangent = np.concatenate([floor.nuisance, _tangent(floor.single, fit)], axis=1)
-    whole = Sight.of(experiment, floor, name, basis, np.ones(len(left), dtype=bool))
+    whole = Sight.of(experiment, floor, basis, np.ones(len(left), dtype=bool))
     at, off = (np.array([values.get(p.name, p.off or 0.0) for p in free]) for values in (fit.values, {}))
     chi2, fall = float(np.sum(whole(left) ** 2)) + known.chi2(at), 0.0
     if before is not None:

@@ -227,7 +227,8 @@ def judge(
                 before, remainder = mended if more else (before, remainder)
             gone = explained(before, remainder)
     effects = _effects(candidates, scores, given, members, confirmations, options.level)
-    named = any(effects[name] == "missing" for name in members)
+    # Where the best explanation is too small to matter, so is what is missing.
+    named = bool(members) and effects[members[0]] == "missing"
     if strong and not named:
         effects = {n: "cannot tell" if v == "missing" else v for n, v in effects.items()}
     verdict = overall(named, before if named else misfit, remainder, error=error)
@@ -323,14 +324,19 @@ def _effects(
     out: dict[str, EffectVerdict] = {}
     for name, candidate in candidates.items():
         if name in members:
-            size = confirmations[name].fit.values[candidate.size] - float(candidate.measure.off or 0.0)
-            out[name] = "missing" if abs(size) >= candidate.measure.meaningful else "trivial"
+            out[name] = "missing" if _matters(candidate, confirmations[name].fit.values) else "trivial"
         else:
             out[name] = of_effect(candidate, given.get(name, scores[name]), level=level)
             if out[name] == "missing":
                 # Significant beside the best one too, or because the best one's size is off: the next round tells.
                 out[name] = "cannot tell"
     return out
+
+
+def _matters(candidate: Candidate, values: Mapping[str, float]) -> bool:
+    """Whether any of an effect's parameters is at least of its smallest meaningful size."""
+    sizes = [(abs(values[p.name] - float(p.off or 0.0)), p.meaningful) for p in candidate.parameters]
+    return any(size >= least and size > 0.0 for size, least in sizes)
 
 
 def _pairs(scorer: Scorer | None) -> dict[tuple[str, str], float]:
@@ -353,8 +359,7 @@ def _where(
         return {}
     seen = experiment.seen
     direction = evidence.directions[members[0]][:, seen].T @ np.array(list(scores[members[0]].steps.values()))
-    free = np.concatenate([floor.besides(members[0]), floor.parameters], axis=1)
-    solver = floor.noise.plus(free).solver()
+    solver = floor.noise.plus(floor.free).solver()
     parts = shares(experiment.layout, floor.noise, direction * solver.solve(residual))
     whole = sum(parts.values())
     return {key: value / whole for key, value in parts.items()} if whole > 0.0 else {}

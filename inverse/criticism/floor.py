@@ -13,7 +13,6 @@ from splatsoil.experiment.base import Experiment
 from splatsoil.experiment.features import Layout
 
 from .evidence import Evidence
-from .known import trivial_of
 from .noise import Noise, Part, correlated, estimate, extra_noise, independent
 
 FloatArray = npt.NDArray[np.float64]
@@ -24,6 +23,10 @@ NUMERICS_PRIOR = 1.0
 
 FEWEST_QUIET = 30
 """Features without physics from which the instruments' errors can be told."""
+OUTLYING = 3.0
+"""Standard deviations beyond which a quiet feature counts as no farther out."""
+ROBUST_ROUNDS = 8
+"""Of reweighting quiet features."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +38,7 @@ class Floor:
         single: of observed minus one prediction.
         nuisance: (n, q) patterns that numerics can make, times their prior standard deviations.
         parameters: (n, k) derivatives by the model's parameters (and their curvature), likewise.
-        trivial: (n, k) what each effect does in sizes too small to matter, by its name.
+        directions: (n, k) in which effects act.
         parts: what the noise is made of: instruments, chance, reconstruction, numerics beyond the patterns.
     """
 
@@ -43,17 +46,13 @@ class Floor:
     single: Noise
     nuisance: FloatArray
     parameters: FloatArray
-    trivial: Mapping[str, FloatArray]
+    directions: FloatArray
     parts: Mapping[str, Part]
 
     @property
     def free(self) -> FloatArray:
-        """(n, q + k) what numerics and the model's parameters can do."""
+        """(n, q + k) all that is projected out."""
         return np.concatenate([self.nuisance, self.parameters], axis=1)
-
-    def besides(self, effect: str = "") -> FloatArray:
-        """(n, q) what numerics can do, and effects in sizes too small to matter, but for one that is looked at."""
-        return np.concatenate([self.nuisance, *(t for name, t in self.trivial.items() if name != effect)], axis=1)
 
     def share(self, name: str) -> float:
         """A part's share of the whole variance."""
@@ -92,12 +91,7 @@ def floor_of(experiment: Experiment, evidence: Evidence) -> Floor:
         columns = extra_noise(layout, part, seen, directions if name == "chance" else None)
         averaged, alone = (np.sqrt(factor) for factor in _factors(name, runs))
         noise, single = noise.plus(averaged * columns), single.plus(alone * columns)
-    trivial = {
-        c.name: _columns(evidence.directions[c.name], seen) @ trivial_of(evidence, c.parameters)
-        for c in experiment.candidates
-        if c.name in evidence.directions
-    }
-    return Floor(noise, single, NUMERICS_PRIOR * _columns(patterns, seen), parameters, trivial, parts)
+    return Floor(noise, single, NUMERICS_PRIOR * _columns(patterns, seen), parameters, directions, parts)
 
 
 def _instruments(experiment: Experiment, evidence: Evidence, known: Noise) -> Part:
@@ -119,13 +113,17 @@ def _instruments(experiment: Experiment, evidence: Evidence, known: Noise) -> Pa
         rest = rest - scale * (columns @ amplitude)
     terms = np.stack([np.ones(rest.size), signal[quiet] ** 2], axis=1)
     size = np.maximum(np.linalg.norm(terms, axis=0), 1e-300)
-    (level, share), _ = nnls(terms / size, np.maximum(rest**2 - scale**2, 0.0))
-    variance = level / size[0] + share / size[1] * signal**2
+    squares = rest**2
+    for _ in range(ROBUST_ROUNDS):
+        (level, share), _ = nnls(terms / size, np.maximum(squares - scale**2, 0.0))
+        variance = level / size[0] + share / size[1] * signal**2
+        # Soil may have moved where none was expected to: that is no fault of the pictures.
+        squares = np.minimum(rest**2, OUTLYING**2 * (variance[quiet] + scale**2))
     if not np.any(variance > 0.0):
         return Part(scale=np.zeros(signal.shape))
     whole = np.sqrt(variance)
     table = np.zeros(signal.shape)
-    table[quiet] = rest
+    table[quiet] = np.sign(rest) * np.sqrt(squares)
     return replace(correlated(experiment.layout, table[None], np.hypot(whole, known.spread(known.scale))), scale=whole)
 
 
@@ -160,7 +158,11 @@ def _total(layout: Layout, parts: Mapping[str, Part], seen: npt.NDArray[np.bool_
 def _unexplained(
     noise: Noise, parameters: FloatArray, patterns: Sequence[FloatArray], seen: npt.NDArray[np.bool_]
 ) -> FloatArray:
-    """(p, t, s) what each pattern holds beyond the parameters and the other patterns."""
+    """(p, t, s) what each pattern holds beyond the parameters and the other patterns.
+
+    None counts as larger than the middle one of them: one that is, is projected out itself, and says nothing of what
+    numerics that weren't tried would leave.
+    """
     columns = _columns(patterns, seen)
     out = []
     for k in range(columns.shape[1]):
@@ -169,7 +171,9 @@ def _unexplained(
         size = np.linalg.norm(scaled, axis=0)
         amplitude, *_ = np.linalg.lstsq(scaled / size, columns[:, k] / noise.scale, rcond=1e-3)
         out.append(noise.spread(columns[:, k] - others @ (amplitude / size)))
-    return np.stack(out)
+    left = np.stack(out)
+    size = np.sqrt(np.mean(left[:, seen] ** 2, axis=1))
+    return left * np.minimum(1.0, np.median(size) / np.maximum(size, 1e-300))[:, None, None]
 
 
 def _columns(tables: Sequence[FloatArray] | FloatArray, seen: npt.NDArray[np.bool_]) -> FloatArray:

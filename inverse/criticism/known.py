@@ -1,4 +1,4 @@
-"""What a calibration says of parameters, in the forms that scores, floors and refits need it."""
+"""What a calibration says of parameters, in the form that scores and refits need it."""
 
 from __future__ import annotations
 
@@ -8,12 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from splatsoil.parameters import Parameter
-
 if TYPE_CHECKING:
     from splatsoil.experiment.base import Calibration
-
-    from .evidence import Evidence
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -30,13 +26,3 @@ def precision_of(calibration: Calibration | None, names: Sequence[str]) -> tuple
         precision[np.ix_(there, there)] = np.linalg.inv(calibration.covariance[np.ix_(theirs, theirs)])
         centre[there] = calibration.estimate[theirs]
     return precision, centre
-
-
-def trivial_of(evidence: Evidence, parameters: Sequence[Parameter]) -> FloatArray:
-    """(k, k) root of the covariance that an effect's parameters have in sizes too small to matter, or smaller where a
-    calibration says so."""
-    size = np.array([p.meaningful for p in parameters])
-    precision, _ = precision_of(evidence.calibration, [p.name for p in parameters])
-    # (D⁻¹ + P)⁻¹ = S (1 + S P S)⁻¹ S with D = S², which lets sizes be 0.
-    inner = np.linalg.inv(np.eye(len(size)) + size[:, None] * precision * size[None])
-    return np.asarray(size[:, None] * np.linalg.cholesky(0.5 * (inner + inner.T)))

@@ -144,7 +144,8 @@ def _calibrated(
         if directions is not None and directions.size:
             columns = solver.whiten(directions)
             along.append(np.mean((columns.T @ sample) ** 2 / np.maximum(np.sum(columns**2, axis=0), 1e-300)))
-    factor = float(np.mean(on_waves))
+    # One sample that is far larger than the others there says that it is another kind of thing.
+    factor = float(np.median(on_waves))
     # A mean of χ² over its ν degrees of freedom has the relative variance 2 / ν.
     doubt = float(np.var(on_waves, ddof=1)) / count / factor**2 if count > 1 else 2.0
     return replace(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from splatsoil.inverse.criticism.joint import Joint, dispersion
-from splatsoil.inverse.criticism.known import precision_of, trivial_of
+from splatsoil.inverse.criticism.known import precision_of
 from splatsoil.inverse.criticism.noise import Noise
 from splatsoil.inverse.criticism.refit import Known, refit
 from splatsoil.inverse.criticism.score import Scorer
@@ -138,13 +138,3 @@ def test_what_is_known_of_some_parameters_leaves_the_others_alone() -> None:
     assert precision[np.ix_([2, 0], [2, 0])] == pytest.approx(np.linalg.inv(covariance))
     assert not precision[1].any() and list(centre) == [-0.3, 0.0, 0.5]
     assert precision_of(None, ["p"])[0] == 0.0
-
-
-def test_trivial_sizes_are_no_larger_than_a_calibration_allows() -> None:
-    class Told:
-        calibration = Calibration(("p",), np.zeros(1), np.array([[0.01]]))
-
-    known = Parameter("p", "1", -1.0, 1.0, 0.0, off=0.0, meaningful=0.2)
-    free = Parameter("q", "1", -1.0, 1.0, 0.0, off=0.0, meaningful=0.2)
-    root = trivial_of(Told(), [known, free])  # type: ignore[arg-type]
-    assert root @ root.T == pytest.approx(np.diag([1.0 / (1.0 / 0.04 + 1.0 / 0.01), 0.04]))
