@@ -202,14 +202,14 @@ def judge(
     misfit = omnibus(floor.noise, floor.free, residual, bench.basis)
     scores = {} if scorer is None else scorer.score(residual)
     candidates = {c.name: c for c in bench.candidates}
-    strong = _strong(scores, scorer, options.level)
+    chosen = _chosen(scores, scorer, residual, misfit, options)
     confirmations: dict[str, Confirmation] = {}
     members: tuple[str, ...] = ()
     given: Mapping[str, Score] = {}
     remainder, gone, before, error = None, 0.0, misfit, 1.0
-    if strong and scorer is not None:
-        chosen = [candidates[s.name] for s in strong[: options.refits]]
-        confirmations = confirm(experiment, evidence, floor, chosen, simulate, options.refit_steps, bench.basis, told)
+    if chosen and scorer is not None:
+        trials = [candidates[name] for name in chosen]
+        confirmations = confirm(experiment, evidence, floor, trials, simulate, options.refit_steps, bench.basis, told)
         tried = {name: c for name, c in confirmations.items() if name}
         costs = {name: c.chi2 + scorer.price(candidates[name]) for name, c in tried.items()}
         best = min(costs, key=lambda name: costs[name])
@@ -229,7 +229,7 @@ def judge(
     effects = _effects(candidates, scores, given, members, confirmations, options.level)
     # Where the best explanation is too small to matter, so is what is missing.
     named = bool(members) and effects[members[0]] == "missing"
-    if strong and not named:
+    if chosen and not named:
         effects = {n: "cannot tell" if v == "missing" else v for n, v in effects.items()}
     verdict = overall(named, before if named else misfit, remainder, error=error)
     notes = [f"{name} could not be simulated: {why}" for name, why in evidence.failed.items()]
@@ -296,13 +296,21 @@ def _stands(confirmations: Mapping[str, Confirmation], best: str, misfit: Omnibu
     return wanting and after.fall > EQUIVALENT * dispersion and after.held_out < before.held_out
 
 
-def _strong(scores: Mapping[str, Score], scorer: Scorer | None, level: float) -> list[Score]:
-    """Significant effects, those first that explain most for their parameters."""
+def _chosen(
+    scores: Mapping[str, Score], scorer: Scorer | None, residual: FloatArray, misfit: Omnibus, options: Options
+) -> list[str]:
+    """Effects to refit: significant ones, those first that explain most for their parameters.
+
+    Where there is a misfit, those too that would explain most if they were alone: beside other effects, at a fit that
+    a missing one has led astray, the right one needn't stand out.
+    """
     if scorer is None:
         return []
     prices = {c.name: scorer.price(c) for c in scorer.candidates}
-    found = [s for s in scores.values() if s.adjusted < level]
-    return sorted(found, key=lambda s: s.statistic - prices[s.name], reverse=True)
+    found = [s for s in scores.values() if s.adjusted < options.level]
+    strong = [s.name for s in sorted(found, key=lambda s: s.statistic - prices[s.name], reverse=True)]
+    alone = scorer.ranked(residual) if misfit.p < GATE else []
+    return list(dict.fromkeys([*strong[: options.refits], *alone[: options.refits]]))
 
 
 def _equals(costs: Mapping[str, float], best: str, dispersion: float) -> tuple[str, ...]:

@@ -164,6 +164,14 @@ class Scorer:
         scale, freedom = float(dispersion(np.sum(rest**2), len(rest))), _freedom(len(rest))
         return {self.names[i]: self._score(i, raw, scale, freedom) for i, raw in raws.items()}
 
+    def ranked(self, residual: FloatArray) -> list[str]:
+        """Names by how much each effect would explain with all the others off, for its parameters; the best first."""
+        gradient, falls = self.weights.T @ residual + self.told, {}
+        for candidate, place, part in zip(self.candidates, self.places, self.joint.parts, strict=True):
+            fall, _ = constrained(gradient[part], self.joint.whole[part, part], place, candidate.measure.sign)
+            falls[candidate.name] = fall - self.price(candidate)
+        return sorted(falls, key=lambda name: falls[name], reverse=True)
+
     def price(self, candidate: Candidate) -> float:
         """χ² that an effect's parameters beyond its first must bring in (Schwarz 1978, over as many directions)."""
         return _price(candidate, len(self.whole))
