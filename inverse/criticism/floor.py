@@ -25,7 +25,7 @@ FEWEST_QUIET = 30
 """Features without physics from which the instruments' errors can be told."""
 OUTLYING = 3.0
 """Standard deviations beyond which a quiet feature counts as no farther out."""
-ROBUST_ROUNDS = 8
+ROBUST_ROUNDS = 30
 """Of reweighting quiet features."""
 
 

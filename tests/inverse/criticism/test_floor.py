@@ -1,0 +1,72 @@
+"""The floor against the noise that its evidence was drawn with, and what must not raise it."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from splatsoil.inverse.criticism.evidence import Evidence
+from splatsoil.inverse.criticism.floor import floor_of
+
+from splatsoil.experiment.features import Layout, Site
+
+SITES = tuple(Site(f"c{c}", 0.1 * i, 0.1 * j) for c in range(2) for i in range(4) for j in range(4))
+LAYOUT = Layout(
+    tuple(float(t) for t in range(10)),
+    SITES,
+    "frame",
+    "grey levels",
+    ("push",) * 10,
+    np.full((10, len(SITES)), "bed"),
+)
+SENSOR, ERROR = 0.1, 0.8
+
+
+def looked(observed: np.ndarray, quiet: np.ndarray) -> Any:
+    """An experiment that nobody simulates: its evidence is made up."""
+    seen, sensor = np.ones(LAYOUT.shape, dtype=bool), np.full(LAYOUT.shape, SENSOR)
+    told = {
+        "layout": LAYOUT,
+        "sensor": sensor,
+        "sensor_memory": 0.0,
+        "parameters": (),
+        "candidates": (),
+        "chance": True,
+    }
+    return SimpleNamespace(observed=observed, quiet=quiet, seen=seen, **told)
+
+
+def evidence(generator: np.random.Generator, patterns: dict[str, np.ndarray]) -> Evidence:
+    repeats = 0.3 * generator.standard_normal((4, *LAYOUT.shape))
+    nothing: dict[str, Any] = {"slopes": {}, "curves": {}, "widths": {}, "directions": {}, "steps": {}, "failed": {}}
+    return Evidence({}, np.zeros(LAYOUT.shape), repeats, patterns, **nothing)
+
+
+def floor_with(moved: float = 0.0, wild: float = 1.0) -> tuple[float, float]:
+    """Root mean squares of the errors of reconstruction and of numerics that are found, with some soil that moved in
+    quiet places, and one numerics pattern that is so many times as large."""
+    generator = np.random.default_rng(3)
+    quiet = np.zeros(LAYOUT.shape, dtype=bool)
+    quiet[:, :20] = True
+    observed = ERROR * generator.standard_normal(LAYOUT.shape)
+    observed[4:, :2] += moved
+    patterns = {name: generator.standard_normal(LAYOUT.shape) for name in ("stiffness", "step", "grid")}
+    patterns["grid"] = wild * patterns["grid"]
+    parts = floor_of(looked(observed, quiet), evidence(generator, patterns)).parts
+    return tuple(float(np.sqrt(np.mean(parts[n].scale ** 2))) for n in ("reconstruction", "numerics"))  # type: ignore[return-value]
+
+
+def test_errors_of_pictures_are_as_large_as_they_were_made() -> None:
+    # What is left beside chance (five quarters of its variance) and the sensor's.
+    assert floor_with()[0] == pytest.approx(np.sqrt(ERROR**2 - 1.25 * 0.3**2 - SENSOR**2), rel=0.12)
+
+
+def test_soil_that_moved_where_none_was_expected_is_no_fault_of_the_pictures() -> None:
+    assert floor_with(moved=40.0)[0] < 1.8 * floor_with()[0]
+
+
+def test_a_wild_numerics_pattern_does_not_stand_for_those_not_tried() -> None:
+    assert floor_with(wild=30.0)[1] < 1.3 * floor_with()[1]
+    assert floor_with(wild=30.0)[1] > 0.5
