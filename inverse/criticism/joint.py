@@ -91,7 +91,8 @@ class Joint:
     def draw(self, generator: np.random.Generator, count: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Trivial sizes (d, k), and the scores (d, k) of features and of a calibration that they and noise make."""
         sizes = generator.standard_normal((count, len(self.trivial))) * self.trivial
-        return sizes, *(_scores(generator, sizes, known) for known in (self.information, self.precision))
+        seen, told = (_scores(generator, sizes, known) for known in (self.information, self.precision))
+        return sizes, seen, told
 
     def _others(self, without: Sequence[int]) -> npt.NDArray[np.int64]:
         """Parameters of the other candidates, those that are seen at all."""
@@ -118,6 +119,6 @@ def _scores(generator: np.random.Generator, sizes: FloatArray, information: Floa
     return np.asarray(generator.standard_normal(sizes.shape) @ root.T + sizes @ information)
 
 
-def dispersion(squares: FloatArray, freedom: int) -> FloatArray:
+def dispersion(squares: npt.ArrayLike, freedom: int) -> FloatArray:
     """How far a remainder's sum of squares over ``freedom`` directions exceeds that of noise, and 1 at least."""
-    return np.maximum((squares + BELIEF) / (freedom + BELIEF), 1.0)
+    return np.maximum((np.asarray(squares) + BELIEF) / (freedom + BELIEF), 1.0)
