@@ -15,7 +15,7 @@ from splatsoil.parameters import Parameter
 
 from .evidence import Evidence, around, step_of
 from .floor import Floor, floor_of
-from .known import precision_of
+from .joint import precision_of
 from .misfit import Omnibus, omnibus, smooth_basis
 from .noise import Noise, Solver, orthonormal
 from .refit import ROUNDS, Known, Refit, Start, settle

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from splatsoil.errors import SimulationError
-from splatsoil.experiment.base import Candidate, Experiment
+from splatsoil.experiment.base import Calibration, Candidate, Experiment
 
 from .confirmation import Confirmation, confirm, on_its_own_floor, remainder_of
 from .evidence import Evidence, gather
@@ -34,9 +33,6 @@ from .verdicts import (
     of_effect,
     overall,
 )
-
-if TYPE_CHECKING:
-    from splatsoil.experiment.base import Calibration
 
 FloatArray = npt.NDArray[np.float64]
 Report = Callable[[str, float], None]

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from splatsoil.errors import SimulationError
-from splatsoil.experiment.base import Candidate, Experiment
+from splatsoil.experiment.base import Calibration, Candidate, Experiment
 from splatsoil.parameters import Parameter
-
-if TYPE_CHECKING:
-    from splatsoil.experiment.base import Calibration
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -16,6 +16,8 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from splatsoil.experiment.base import Calibration
+
 FloatArray = npt.NDArray[np.float64]
 
 BELIEF = 10.0
@@ -122,3 +124,17 @@ def _scores(generator: np.random.Generator, sizes: FloatArray, information: Floa
 def dispersion(squares: npt.ArrayLike, freedom: int) -> FloatArray:
     """How far a remainder's sum of squares over ``freedom`` directions exceeds that of noise, and 1 at least."""
     return np.maximum((np.asarray(squares) + BELIEF) / (freedom + BELIEF), 1.0)
+
+
+def precision_of(calibration: Calibration | None, names: Sequence[str]) -> tuple[FloatArray, FloatArray]:
+    """Inverse covariance (k, k) and centre (k,), as distances from off, of the named parameters; 0 where nothing is
+    known of one, and the others not asked for marginalised."""
+    precision, centre = np.zeros((len(names), len(names))), np.zeros(len(names))
+    if calibration is None:
+        return precision, centre
+    there = [k for k, name in enumerate(names) if name in calibration.names]
+    theirs = [calibration.names.index(names[k]) for k in there]
+    if there:
+        precision[np.ix_(there, there)] = np.linalg.inv(calibration.covariance[np.ix_(theirs, theirs)])
+        centre[there] = calibration.estimate[theirs]
+    return precision, centre

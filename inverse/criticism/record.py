@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from splatsoil.experiment.base import Candidate, Experiment
+from splatsoil.experiment.base import Calibration, Candidate, Experiment
 
 from .confirmation import Confirmation
 from .diagnosis import Diagnosis
 from .misfit import Omnibus
 from .outside import StrengthReading
 from .words import sentences
-
-if TYPE_CHECKING:
-    from splatsoil.experiment.base import Calibration
 
 FORMAT = "splatsoil-diagnosis/1"
 
@@ -141,7 +138,6 @@ def _calibration(experiment: Experiment, found: Calibration | None) -> list[dict
     if found is None:
         return []
     known = {p.name: p for c in experiment.candidates for p in c.parameters}
-    spread = np.sqrt(np.diag(found.covariance))
     return [
         {
             "parameter": name,
@@ -150,7 +146,7 @@ def _calibration(experiment: Experiment, found: Calibration | None) -> list[dict
             "unit": known[name].unit,
             "meaningful": known[name].meaningful,
         }
-        for name, value, std in zip(found.names, found.estimate, spread, strict=True)
+        for name, value, std in zip(found.names, found.estimate, found.deviation, strict=True)
     ]
 
 

@@ -14,21 +14,16 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 from scipy.stats import chi2, f, norm
 from scipy.stats import t as student
 
-from splatsoil.experiment.base import Candidate
+from splatsoil.experiment.base import Calibration, Candidate
 
-from .joint import BELIEF, SEEN_AT_ALL, Joint, dispersion
-from .known import precision_of
+from .joint import BELIEF, SEEN_AT_ALL, Joint, dispersion, precision_of
 from .noise import Noise
-
-if TYPE_CHECKING:
-    from splatsoil.experiment.base import Calibration
 
 FloatArray = npt.NDArray[np.float64]
 

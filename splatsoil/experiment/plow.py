@@ -7,13 +7,12 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from splatsoil.comparison import PATCH, Block, Comparator
-from splatsoil.experiment.base import Candidate, candidates_of
+from splatsoil.experiment.base import Calibration, Candidate, candidates_of
 from splatsoil.experiment.features import Layout, Site
 from splatsoil.experiment.scene_parts import QUIET, regions_of, stages_of
 from splatsoil.experiment.states import States, plow_states
@@ -23,9 +22,6 @@ from splatsoil.mpm import Resolution, Trajectory
 from splatsoil.parameters import Parameter
 from splatsoil.soil.effect import Effect
 from splatsoil.soil.library import find_effects, library
-
-if TYPE_CHECKING:
-    from splatsoil.experiment.base import Calibration
 
 FloatArray = npt.NDArray[np.float64]
 

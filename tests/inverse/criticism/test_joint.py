@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from splatsoil.inverse.criticism.joint import Joint, dispersion
-from splatsoil.inverse.criticism.known import precision_of
+from splatsoil.inverse.criticism.joint import Joint, dispersion, precision_of
 from splatsoil.inverse.criticism.noise import Noise
 from splatsoil.inverse.criticism.refit import Known, refit
 from splatsoil.inverse.criticism.score import Scorer
