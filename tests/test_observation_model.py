@@ -14,8 +14,7 @@ from splatsoil.measurement import Bed, Camera, Frame, Measurement, Tool, ToolMot
 from splatsoil.model import Model
 from splatsoil.mpm.simulate import Trajectory
 from splatsoil.reconstruction import HeightField
-from splatsoil.scene import Light, Scene, ToolBody, bind, encoded, linear, relief_of_particles
-from splatsoil.splats import Gaussians
+from splatsoil.scene import linear
 
 SPACING, DEPTH, RATE, FOCAL, SPEED = 0.02, 0.1, 10.0, 150.0, 0.2
 BED = Bed(np.zeros(3), np.array([0.4, 0.4, 0.2]), 1600.0)
@@ -49,31 +48,10 @@ def still():
 
 
 @pytest.fixture(scope="module")
-def scene(measurement, still):
+def scene(measurement, still, spotted):
     """Level, spotted soil under a steep sun."""
-    particles = torch.from_numpy(still)
-    relief = relief_of_particles(particles, SPACING, BED.lower, BED.upper)
-    y, x = torch.meshgrid(torch.arange(0.004, 0.4, 0.008), torch.arange(0.004, 0.4, 0.008), indexing="ij")
-    flat = torch.stack([x.reshape(-1), y.reshape(-1)], dim=1)
-    centres = torch.cat([flat, relief.sample(relief.height, flat)[:, None]], dim=1)
-    shade = 0.3 + 0.3 * torch.rand(len(centres), 1, generator=torch.Generator().manual_seed(0))
-    none = Gaussians(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, 4), torch.zeros(0), torch.zeros(0, 3))
     # Spots that hardly overlap: of overlapping ones at the same depth, a turn changes which comes first.
-    shape = torch.diag(torch.tensor([0.002, 0.002, 0.001]) ** 2).expand(len(centres), 3, 3).contiguous()
-    return Scene(
-        soil=bind(centres, shape, particles, SPACING),
-        soil_opacity=torch.full((len(centres),), 0.95),
-        soil_albedo=encoded(shade * torch.tensor([1.0, 0.8, 0.6])),
-        grain_albedo=encoded(torch.tensor([0.45, 0.36, 0.27])).expand(len(particles), 3).contiguous(),
-        surroundings=none,
-        surrounding_shapes=torch.zeros(0, 3, 3),
-        light=Light.from_angles(180.0, 60.0, [0.4, 0.5, 0.6]),
-        tool=ToolBody(measurement.tool.mesh),
-        tool_albedo=np.array([0.05, 0.1, 0.9]),
-        bed=BED,
-        spacing=SPACING,
-        background=np.zeros(3),
-    )
+    return spotted(still, SPACING, BED, 0.002, measurement.tool.mesh)
 
 
 def model_of(measurement, scene, *effects):
