@@ -74,17 +74,30 @@ class Processes(Executor):
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Let the workers finish what is queued (or only what they are at), and end them."""
         self._closed = True
-        while cancel_futures:
-            try:
-                job = self._jobs.get_nowait()
-            except queue.Empty:
-                break
-            if job is not None:
-                job[0].cancel()
+        if cancel_futures:
+            self._forget()
         for _ in self._threads:
             self._jobs.put(None)
         for thread in self._threads if wait else ():
             thread.join()
+
+    def kill(self) -> None:
+        """End the workers, and with them all other child processes, without waiting for what they are at."""
+        self._closed = True
+        self._forget()
+        for child in multiprocessing.active_children():
+            child.terminate()
+        self.shutdown()
+
+    def _forget(self) -> None:
+        """Cancel what is queued."""
+        while True:
+            try:
+                job = self._jobs.get_nowait()
+            except queue.Empty:
+                return
+            if job is not None:
+                job[0].cancel()
 
     def _work(self) -> None:
         pool: ProcessPoolExecutor | None = None
@@ -99,7 +112,7 @@ class Processes(Executor):
                 except BrokenProcessPool:
                     pool.shutdown(wait=False)
                     pool = None
-                    if attempt < ATTEMPTS:
+                    if attempt < ATTEMPTS and not self._closed:
                         continue
                     future.set_exception(
                         RunError(f"a worker died {ATTEMPTS} times at the same evaluation; is there enough memory?")

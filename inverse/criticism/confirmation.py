@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,13 +15,14 @@ from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Candidate, Experiment
 from splatsoil.parameters import Parameter
 
-from .evidence import Evidence, around, step_of
+from .evidence import Evidence, Vantage
 from .floor import Floor, floor_of
 from .joint import precision_of
 from .misfit import Omnibus, omnibus, smooth_basis
-from .noise import Noise, Solver, orthonormal
+from .noise import Noise
 from .refit import ROUNDS, Known, Refit, Start, settle
 from .score import Scorer
+from .sight import Sight
 from .simulations import Simulations
 from .verdicts import CLEAN, LEVEL
 
@@ -35,8 +38,9 @@ class Confirmation:
         name: of the effect; empty for the model as it is.
         fit: the refit.
         stds: standard deviations of its estimates, by parameter.
-        chi2: of all times, as far as these tell of anything; see :class:`Sight`.
+        chi2: of all times, as far as these tell of anything; see :class:`~splatsoil.inverse.criticism.sight.Sight`.
         fall: by how much that is less than the model's as it is.
+        unseen: likewise, on times the refit hasn't seen alone.
         held_out: root mean square of the residual on times the refit hasn't seen, in the features' unit.
         floor: what noise alone leaves there.
         remainder: what stands on slow waves.
@@ -47,6 +51,7 @@ class Confirmation:
     stds: Mapping[str, float]
     chi2: float
     fall: float
+    unseen: float
     held_out: float
     floor: float
     remainder: Omnibus
@@ -61,73 +66,76 @@ def confirm(
     steps: int,
     basis: FloatArray,
     told: Report,
+    vantage: Vantage | None = None,
 ) -> dict[str, Confirmation]:
     """Refit the model as it is, and with each chosen effect, on every other time; judge on the rest.
 
-    ``steps`` is the number of simulations from each point where a refit starts.
+    ``steps`` is the number of simulations from each point where a refit starts; ``vantage`` is another such point.
     """
     shown, hidden = _split(experiment)
-    whiten = Sight.of(experiment, floor, basis, shown)
-    out: dict[str, Confirmation] = {}
+    whiten = Sight.of(experiment, floor, basis, vantage, shown)
     jobs: list[Candidate | None] = [None, *chosen]
-    for number, candidate in enumerate(jobs):
+    done = 0
+
+    def refitted(candidate: Candidate | None) -> Refit:
+        nonlocal done
         name = "" if candidate is None else candidate.name
-        told(f"refit {name or 'of the model'}", 0.75 + 0.2 * number / len(jobs))
+        purpose = f"refit {name or 'of the model'}"
+        told(purpose, 0.75 + 0.2 * done / len(jobs))
 
-        def predict(values: Mapping[str, float], name: str = name) -> FloatArray:
-            return simulate(values, effects=(name,) if name else (), purpose=f"refit {name or 'of the model'}")
+        def predict(values: Mapping[str, float]) -> FloatArray:
+            return simulate(values, effects=(name,) if name else (), purpose=purpose)
 
-        free = [*experiment.parameters, *(() if candidate is None else candidate.parameters)]
-        known = _known(evidence, free)
+        free = _free(experiment, candidate)
         fit = settle(
             predict,
             whiten,
             experiment.observed,
             free,
-            _starts(experiment, evidence, candidate, simulate, predict),
+            _starts(experiment, evidence, candidate, simulate, vantage),
             chance=experiment.chance,
-            known=known,
+            known=_known(evidence, free),
             renewed=[p.name for p in experiment.parameters] + _renewed(candidate),
             most=steps if candidate is not None else max(steps - 2, 1),
             rounds=ROUNDS if candidate is not None else 0,
         )
-        out[name] = _judged(experiment, floor, name, fit, hidden, basis, free, known, whiten(fit.slopes), out.get(""))
+        done += 1
+        return fit
+
+    fits = simulate.side_by_side([partial(refitted, candidate) for candidate in jobs])
+    whole = Sight.of(experiment, floor, basis, vantage)
+    apart = whole if shown.all() else Sight.of(experiment, floor, basis, vantage, hidden)
+    before = experiment.observed - fits[0].prediction
+    out: dict[str, Confirmation] = {}
+    for candidate, fit in zip(jobs, fits, strict=True):
+        free = _free(experiment, candidate)
+        known = _known(evidence, free)
+        at, off = (np.array([values.get(p.name, p.off or 0.0) for p in free]) for values in (fit.values, {}))
+        left, mask = experiment.observed - fit.prediction, experiment.seen & hidden[:, None]
+        tangent = np.concatenate([floor.nuisance, _tangent(floor.single, fit)], axis=1)
+        remainder = omnibus(floor.single, tangent, left[experiment.seen], basis)
+        chi2 = _chi2(whole, left) + known.chi2(at)
+        out["" if candidate is None else candidate.name] = Confirmation(
+            name="" if candidate is None else candidate.name,
+            fit=fit,
+            stds=_stds(free, np.concatenate([whiten(fit.slopes), known.root]), remainder),
+            chi2=chi2,
+            fall=0.0 if candidate is None else _chi2(whole, before) + known.chi2(off) - chi2,
+            unseen=_chi2(apart, before) - _chi2(apart, left),
+            held_out=float(np.sqrt(np.mean(left[mask] ** 2))),
+            floor=_noise_on(floor.single, mask),
+            remainder=remainder,
+        )
     return out
 
 
-@dataclass(frozen=True)
-class Sight:
-    """Whitened features as far as they tell of parameters, effects and slow waves.
+def _free(experiment: Experiment, candidate: Candidate | None) -> list[Parameter]:
+    """Parameters of a refit."""
+    return [*experiment.parameters, *(() if candidate is None else candidate.parameters)]
 
-    Two simulations differ by chance in every feature. Their χ² over all of them, which is what a refit would compare,
-    scatters by tens; in the directions in which anything acts, by few. Experiments without chance are looked at as a
-    whole. Numerics are projected out.
 
-    Attributes:
-        noise: of the features looked at.
-        solver: of that noise.
-        directions: (n, d) orthonormal, in which to look; None for all of the features.
-    """
-
-    noise: Noise
-    solver: Solver
-    directions: FloatArray | None
-
-    @classmethod
-    def of(cls, experiment: Experiment, floor: Floor, basis: FloatArray, rows: npt.NDArray[np.bool_]) -> Sight:
-        """For some times (t,)."""
-        noise = floor.single.plus(floor.nuisance).rows(rows)
-        solver = noise.solver()
-        if not experiment.chance:
-            return cls(noise, solver, None)
-        inside = (experiment.seen & rows[:, None])[experiment.seen]
-        columns = np.concatenate([floor.parameters, floor.directions, basis], axis=1)[inside]
-        return cls(noise, solver, orthonormal(solver.whiten(columns)))
-
-    def __call__(self, table: FloatArray) -> FloatArray:
-        """Of a table (t, s, …): (d, …), of noise alone independent with variance 1."""
-        white = self.solver.whiten(table[self.noise.seen])
-        return white if self.directions is None else self.directions.T @ white
+def _chi2(sight: Sight, left: FloatArray) -> float:
+    return float(np.sum(sight(left) ** 2))
 
 
 def _split(experiment: Experiment) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
@@ -165,69 +173,21 @@ def _starts(
     evidence: Evidence,
     candidate: Candidate | None,
     simulate: Simulations,
-    predict: Callable[[Mapping[str, float]], FloatArray],
+    vantage: Vantage | None,
 ) -> list[Start]:
-    """Where a refit begins: at the fit, and at the defaults too where the fit has run into a bound.
-
-    A fit on a bound is one that the missing effect has pushed there: its derivatives are those of another regime. From
-    the defaults the effect starts at a plausible size instead of off.
-    """
+    """Where a refit begins: at the fit, and at the second look's point for an effect that was switched on there."""
     extra = () if candidate is None else candidate.parameters
-    off = {p.name: float(p.off) for p in extra if p.off is not None}
-    model = np.stack([evidence.slopes[p.name] for p in experiment.parameters], axis=-1)
-    added = [] if candidate is None else [np.moveaxis(evidence.directions[candidate.name], 0, -1)]
-    middle = simulate(evidence.values, seed=0)
-    starts = [Start({**evidence.values, **off}, middle, np.concatenate([model, *added], axis=-1))]
-    bound = [p for p in experiment.parameters if len(around(p, evidence.values[p.name])) == 1]
-    if candidate is None or not bound:
-        return starts
-    measure = candidate.measure
-    there = {**evidence.values, **{p.name: p.default for p in bound}, **off}
-    there[measure.name] = off[measure.name] + step_of(measure)
-    try:
-        fresh = predict(there)
-        slopes = model.copy()
-        for index, parameter in enumerate(experiment.parameters):
-            end = around(parameter, there[parameter.name])[0]
-            moved = predict({**there, parameter.name: end})
-            slopes[..., index] = (moved - fresh) / (end - there[parameter.name])
-    except SimulationError:
-        return starts
-    return [*starts, Start(there, fresh, np.concatenate([slopes, *added], axis=-1))]
+    off = {p.name: p.off if p.off is not None else p.default for p in extra}
 
+    def start(values: Mapping[str, float], prediction: FloatArray, seen: Evidence | Vantage) -> Start:
+        model = np.stack([seen.slopes[p.name] for p in experiment.parameters], axis=-1)
+        added = [] if candidate is None else [np.moveaxis(seen.directions[candidate.name], 0, -1)]
+        return Start({**values, **off}, prediction, np.concatenate([model, *added], axis=-1))
 
-def _judged(
-    experiment: Experiment,
-    floor: Floor,
-    name: str,
-    fit: Refit,
-    hidden: npt.NDArray[np.bool_],
-    basis: FloatArray,
-    free: Sequence[Parameter],
-    known: Known,
-    columns: FloatArray,
-    before: Confirmation | None,
-) -> Confirmation:
-    """Judge a refit of ``free`` parameters on the times hidden from it; ``columns`` (n, k) are its whitened slopes."""
-    left = experiment.observed - fit.prediction
-    mask = experiment.seen & hidden[:, None]
-    tangent = np.concatenate([floor.nuisance, _tangent(floor.single, fit)], axis=1)
-    whole = Sight.of(experiment, floor, basis, np.ones(len(left), dtype=bool))
-    at, off = (np.array([values.get(p.name, p.off or 0.0) for p in free]) for values in (fit.values, {}))
-    chi2, fall = float(np.sum(whole(left) ** 2)) + known.chi2(at), 0.0
-    if before is not None:
-        fall = float(np.sum(whole(experiment.observed - before.fit.prediction) ** 2)) + known.chi2(off) - chi2
-    remainder = omnibus(floor.single, tangent, left[experiment.seen], basis)
-    return Confirmation(
-        name=name,
-        fit=fit,
-        stds=_stds(free, np.concatenate([columns, known.root]), remainder),
-        chi2=chi2,
-        fall=fall,
-        held_out=float(np.sqrt(np.mean(left[mask] ** 2))),
-        floor=_noise_on(floor.single, mask),
-        remainder=remainder,
-    )
+    starts = [start(evidence.values, simulate(evidence.values, seed=0), evidence)]
+    if candidate is not None and vantage is not None and candidate.name in vantage.directions:
+        starts.append(start(vantage.values, vantage.prediction, vantage))
+    return starts
 
 
 def _stds(free: Sequence[Parameter], columns: FloatArray, remainder: Omnibus) -> dict[str, float]:
@@ -288,19 +248,20 @@ def on_its_own_floor(
     Cohesive soil falls by chance where dry soil flows, and numerics move it farther: what remains after an effect is
     added has to be judged by what such soil leaves.
     """
-    values, name = best.fit.values, best.name
+    seeds = range(1, 1 + len(evidence.repeats))
 
-    def run(seed: int = 0, numerics: str = "") -> FloatArray:
-        purpose = f"floor with {name}"
-        return simulate(values, effects=(name,), seed=seed, numerics=numerics, purpose=purpose)
+    def spread(ask: Callable[..., FloatArray]) -> tuple[FloatArray, dict[str, FloatArray]]:
+        told: dict[str, Any] = {"effects": (best.name,), "purpose": f"floor with {best.name}"}
+        patterns = {}
+        for kind in experiment.numerics:
+            try:
+                patterns[kind] = ask(best.fit.values, numerics=kind, **told) - best.fit.prediction
+            except SimulationError:
+                continue
+        return np.stack([ask(best.fit.values, seed=seed, **told) for seed in seeds]), patterns
 
-    runs = np.stack([run(seed) for seed in range(1, 1 + len(evidence.repeats))])
-    patterns = {}
-    for kind in experiment.numerics:
-        try:
-            patterns[kind] = run(numerics=kind) - best.fit.prediction
-        except SimulationError:
-            continue
+    simulate.ahead(spread)
+    runs, patterns = spread(simulate)
     deviations = (runs - runs.mean(axis=0)) * np.sqrt(len(runs) / max(len(runs) - 1, 1))
     there = replace(
         evidence, mean=runs.mean(axis=0), repeats=deviations, numerics=patterns, slopes={}, curves={}, widths={}

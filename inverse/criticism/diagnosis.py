@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import zip_longest
 
 import numpy as np
 import numpy.typing as npt
@@ -11,12 +12,14 @@ import numpy.typing as npt
 from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Calibration, Candidate, Experiment
 
+from .afresh import look_afresh, promising
 from .confirmation import Confirmation, confirm, on_its_own_floor, remainder_of
-from .evidence import Evidence, gather
+from .evidence import Evidence, Vantage, gather
 from .floor import Floor, floor_of
 from .misfit import Block, Omnibus, blocks, left_over, omnibus, shares, smooth_basis
 from .outside import StrengthReading, read_strength
 from .score import Score, Scorer
+from .sight import Sight
 from .simulations import Simulations
 from .strokes import StrokeAdvice, advise
 from .verdicts import (
@@ -180,6 +183,10 @@ class Bench:
             )
         return cls(floor, candidates, scorer, smooth_basis(experiment.layout, floor.noise))
 
+    def misfit(self, residual: FloatArray) -> Omnibus:
+        """What of a residual (n,) stands on slow waves."""
+        return omnibus(self.floor.noise, self.floor.free, residual, self.basis)
+
 
 def judge(
     experiment: Experiment,
@@ -195,17 +202,20 @@ def judge(
     bench = bench or Bench.of(experiment, evidence, options)
     floor, scorer, seen = bench.floor, bench.scorer, experiment.seen
     residual = (experiment.observed - evidence.mean)[seen]
-    misfit = omnibus(floor.noise, floor.free, residual, bench.basis)
+    misfit = bench.misfit(residual)
     scores = {} if scorer is None else scorer.score(residual)
     candidates = {c.name: c for c in bench.candidates}
-    chosen = _chosen(scores, scorer, residual, misfit, options)
+    vantage = None if scorer is None else look_afresh(experiment, evidence, misfit, simulate)
+    chosen = _chosen(experiment, bench, scores, residual, misfit, vantage, options)
     confirmations: dict[str, Confirmation] = {}
     members: tuple[str, ...] = ()
     given: Mapping[str, Score] = {}
     remainder, gone, before, error = None, 0.0, misfit, 1.0
     if chosen and scorer is not None:
         trials = [candidates[name] for name in chosen]
-        confirmations = confirm(experiment, evidence, floor, trials, simulate, options.refit_steps, bench.basis, told)
+        confirmations = confirm(
+            experiment, evidence, floor, trials, simulate, options.refit_steps, bench.basis, told, vantage
+        )
         tried = {name: c for name, c in confirmations.items() if name}
         costs = {name: c.chi2 + scorer.price(candidates[name]) for name, c in tried.items()}
         best = min(costs, key=lambda name: costs[name])
@@ -289,24 +299,40 @@ def _stands(confirmations: Mapping[str, Confirmation], best: str, misfit: Omnibu
     before, after = confirmations[""], confirmations[best]
     relevant = after.held_out**2 < (1.0 - RELEVANT) * before.held_out**2
     wanting = before.held_out > before.floor or misfit.p < GATE or relevant
-    return wanting and after.fall > EQUIVALENT * dispersion and after.held_out < before.held_out
+    return wanting and after.fall > EQUIVALENT * dispersion and after.unseen > 0.0
 
 
 def _chosen(
-    scores: Mapping[str, Score], scorer: Scorer | None, residual: FloatArray, misfit: Omnibus, options: Options
+    experiment: Experiment,
+    bench: Bench,
+    scores: Mapping[str, Score],
+    residual: FloatArray,
+    misfit: Omnibus,
+    vantage: Vantage | None,
+    options: Options,
 ) -> list[str]:
     """Effects to refit: significant ones, those first that explain most for their parameters.
 
-    Where there is a misfit, those too that would explain most if they were alone: beside other effects, at a fit that
-    a missing one has led astray, the right one needn't stand out.
+    Where there is a misfit, those too that would explain most if they were alone, as seen from soil as one would guess
+    it where the fit is far from that: at a fit that a missing effect has led astray, it needn't stand out.
     """
+    scorer = bench.scorer
     if scorer is None:
         return []
     prices = {c.name: scorer.price(c) for c in scorer.candidates}
     found = [s for s in scores.values() if s.adjusted < options.level]
     strong = [s.name for s in sorted(found, key=lambda s: s.statistic - prices[s.name], reverse=True)]
-    alone = scorer.ranked(residual) if misfit.p < GATE else []
-    return list(dict.fromkeys([*strong[: options.refits], *alone[: options.refits]]))
+    alone: list[str] = []
+    if vantage is not None:
+        sight = Sight.of(experiment, bench.floor, bench.basis, vantage)
+        alone = promising(experiment, vantage, sight, bench.candidates, scorer.price)
+    elif misfit.p < GATE:
+        alone = scorer.ranked(residual)
+    if not alone:
+        return strong[: options.refits]
+    # The two orders take turns, and one more is tried than either would have.
+    turns = [name for pair in zip_longest(strong, alone) for name in pair if name is not None]
+    return list(dict.fromkeys(turns))[: options.refits + 1]
 
 
 def _equals(costs: Mapping[str, float], best: str, dispersion: float) -> tuple[str, ...]:

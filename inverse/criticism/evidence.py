@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,11 +13,37 @@ from splatsoil.experiment.base import Calibration, Candidate, Experiment
 from splatsoil.parameters import Parameter
 
 FloatArray = npt.NDArray[np.float64]
+Run = Callable[..., FloatArray]
 
 STEP = 4.0
 """Steps of derivatives in smallest meaningful sizes: large enough to stand above chance."""
 REACH = 0.5
 """Most of the way to a bound that such a step may go."""
+
+
+@dataclass(frozen=True)
+class Vantage:
+    """Predictions around one point.
+
+    Attributes:
+        values: the model's parameters there.
+        prediction: (t, s) features there.
+        slopes: (t, s) derivative by each parameter of the model.
+        curves: (t, s) half the second derivative by each parameter where it was measured.
+        widths: the step of each parameter's derivative.
+        directions: (k, t, s) derivatives by each candidate's parameters, at off.
+        steps: the step of each of these.
+        failed: candidates whose simulation could not go on, with the reason.
+    """
+
+    values: Mapping[str, float]
+    prediction: FloatArray
+    slopes: Mapping[str, FloatArray]
+    curves: Mapping[str, FloatArray]
+    widths: Mapping[str, float]
+    directions: Mapping[str, FloatArray]
+    steps: Mapping[str, float]
+    failed: Mapping[str, str]
 
 
 @dataclass(frozen=True)
@@ -92,6 +117,37 @@ def gather(
             numerics[name] = run(f"numerics: {name}", base, numerics=name) - middle
         except SimulationError:
             continue
+    found = look_from(experiment, base, experiment.candidates, run)
+    return Evidence(
+        base,
+        runs.mean(axis=0),
+        deviations,
+        numerics,
+        found.slopes,
+        found.curves,
+        found.widths,
+        found.directions,
+        found.steps,
+        found.failed,
+    )
+
+
+def look_from(
+    experiment: Experiment, values: Mapping[str, float], candidates: Sequence[Candidate], run: Run
+) -> Vantage:
+    """Simulate a point and its neighbours.
+
+    Args:
+        experiment: whose parameters are varied.
+        values: of these, at the point.
+        candidates: effects that are switched on there, one at a time.
+        run: called with (purpose, parameters by name) and, where an effect is on, its name in a tuple.
+
+    Raises:
+        SimulationError: the point or a neighbour without an effect can't be simulated.
+    """
+    base = dict(values)
+    middle = run("the point", base)
     slopes, curves, widths = {}, {}, {}
     for parameter in experiment.parameters:
         ends = around(parameter, base[parameter.name])
@@ -104,26 +160,14 @@ def gather(
     directions: dict[str, FloatArray] = {}
     steps: dict[str, float] = {}
     failed: dict[str, str] = {}
-    for candidate in experiment.candidates:
+    for candidate in candidates:
         try:
             directions[candidate.name] = np.stack(
                 [_slope(candidate, parameter, base, middle, run, steps) for parameter in candidate.parameters]
             )
         except SimulationError as error:
             failed[candidate.name] = str(error)
-    return Evidence(base, runs.mean(axis=0), deviations, numerics, slopes, curves, widths, directions, steps, failed)
-
-
-def needed(experiment: Experiment, values: Mapping[str, float], *, repeats: int = 4) -> list[dict[str, Any]]:
-    """What :func:`gather` will ask of its simulations, in order, as their keyword arguments."""
-    asked: list[dict[str, Any]] = []
-
-    def noted(at: Mapping[str, float], *, purpose: str = "", **others: Any) -> FloatArray:
-        asked.append({"values": dict(at), **others})
-        return np.zeros(experiment.layout.shape)
-
-    gather(experiment, noted, values, repeats=repeats)
-    return asked
+    return Vantage(base, middle, slopes, curves, widths, directions, steps, failed)
 
 
 def around(parameter: Parameter, value: float) -> list[float]:
@@ -159,7 +203,7 @@ def _slope(
     parameter: Parameter,
     base: Mapping[str, float],
     middle: FloatArray,
-    run: Callable[..., FloatArray],
+    run: Run,
     steps: dict[str, float],
 ) -> FloatArray:
     """Derivative by one parameter of an effect, its others at off; from both sides where it has no sign."""

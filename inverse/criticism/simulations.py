@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from threading import Lock
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +22,21 @@ from splatsoil.files import write_bytes
 from .free_strength import FreeStrength
 
 FloatArray = npt.NDArray[np.float64]
+Simulate = Callable[..., FloatArray]
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Helpers:
+    """Other processes that simulate the same experiment and keep what they make in the same folder.
+
+    Attributes:
+        count: of them.
+        submit: a simulation's keyword arguments to a future that is done when it is kept, or could not be made.
+    """
+
+    count: int
+    submit: Callable[[Mapping[str, Any]], Future[Any]]
 
 
 class Simulations:
@@ -41,9 +60,17 @@ class Simulations:
         self.identity, self.told = dict(identity or {}), told
         self.made = 0
         """Simulations made, not read."""
-        self.asked = 0
-        """Different simulations that were needed."""
-        self._known: dict[str, FloatArray] = {}
+        self._tables: dict[str, Future[FloatArray]] = {}
+        self._planned: dict[str, Future[Any]] = {}
+        self._helpers: Helpers | None = None
+        # One simulation at a time in this process, whatever the number of its threads.
+        self._here, self._guard = Lock(), Lock()
+        self._stopped = False
+
+    @property
+    def asked(self) -> int:
+        """Different simulations that were needed, and could be made."""
+        return sum(table.done() and table.exception() is None for table in self._tables.values())
 
     def __call__(
         self,
@@ -54,35 +81,118 @@ class Simulations:
         numerics: str = "",
         purpose: str = "",
     ) -> FloatArray:
-        """(t, s) predicted features.
+        """(t, s) predicted features. Threads may call it side by side.
 
         Raises:
             SimulationError: the simulation could not go on.
             RunError: what is kept of it is damaged.
         """
-        names = sorted(e if isinstance(e, str) else e.identity for e in effects)
-        what = {"values": dict(values), "effects": names, "seed": seed, "numerics": numerics}
-        key = digest({**self.identity, **what})
-        if key not in self._known:
-            self._known[key] = self._find(key, {**what, "effects": effects}, purpose)
-            self.asked += 1
-        return self._known[key]
+        what = {"values": dict(values), "effects": effects, "seed": seed, "numerics": numerics}
+        key = self._key(what)
+        with self._guard:
+            table, mine = self._tables.get(key), key not in self._tables
+            if table is None:
+                table = self._tables[key] = Future()
+        if mine:
+            try:
+                table.set_result(self._find(key, what, purpose))
+            except BaseException as error:
+                table.set_exception(error)
+        return table.result()
+
+    @contextmanager
+    def helped(self, helpers: Helpers) -> Iterator[None]:
+        """While the block runs, others simulate, too."""
+        self._helpers = helpers
+        try:
+            yield
+        finally:
+            self._helpers, self._planned = None, {}
+
+    def ahead(self, work: Callable[[Simulate], object]) -> None:
+        """Have the helpers make what some work will ask for, from the last on; the first ones are made here.
+
+        Args:
+            work: asks its argument for simulations, as it would ask this, and gets zeros.
+        """
+        if self._helpers is None:
+            return
+        asked: list[dict[str, Any]] = []
+
+        def noted(values: Mapping[str, float], *, purpose: str = "", **others: Any) -> FloatArray:
+            asked.append({"values": dict(values), "effects": (), "seed": 0, "numerics": "", **others})
+            return np.zeros(self.experiment.layout.shape)
+
+        work(noted)
+        for what in reversed(asked):
+            key = self._key(what)
+            if key not in self._tables and key not in self._planned and self._kept(key) is None:
+                self._planned[key] = self._helpers.submit(what)
+
+    def side_by_side(self, jobs: Iterable[Callable[[], T]]) -> list[T]:
+        """Results of jobs that wait for simulations, in order, as many at a time as there are processes."""
+        if self._helpers is None:
+            return [job() for job in jobs]
+        pool = ThreadPoolExecutor(1 + self._helpers.count)
+        try:
+            return [future.result() for future in [pool.submit(job) for job in jobs]]
+        except BaseException:
+            self._stopped = True
+            raise
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+    def _key(self, what: Mapping[str, Any]) -> str:
+        names = sorted(e if isinstance(e, str) else e.identity for e in what["effects"])
+        return digest({**self.identity, **what, "effects": names})
+
+    def _path(self, key: str) -> Path | None:
+        return None if self.folder is None else self.folder / f"{key[:32]}.npy"
+
+    def _kept(self, key: str) -> FloatArray | None:
+        path = self._path(key)
+        if path is None or not path.is_file():
+            return None
+        try:
+            table: FloatArray = np.load(path, allow_pickle=False)
+        except (OSError, ValueError) as error:
+            raise RunError(f"{path}: cannot be read ({error}); delete it and run the command again") from error
+        return table if table.shape == self.experiment.layout.shape else None
 
     def _find(self, key: str, what: Mapping[str, Any], purpose: str) -> FloatArray:
-        path = None if self.folder is None else self.folder / f"{key[:32]}.npy"
-        if path is not None and path.is_file():
-            try:
-                table = np.load(path, allow_pickle=False)
-            except (OSError, ValueError) as error:
-                raise RunError(f"{path}: cannot be read ({error}); delete it and run the command again") from error
-            if table.shape == self.experiment.layout.shape:
-                return table
+        planned = self._planned.pop(key, None)
+        kept = self._kept(key)
+        if kept is not None and planned is None:
+            return kept
+        if self._stopped:
+            raise CancelledError
+        with self._guard:
+            self.made += 1
         if self.told is not None:
             self.told(purpose)
-        made = self.experiment.predict(
-            what["values"], effects=tuple(what["effects"]), seed=what["seed"], numerics=what["numerics"]
-        )
-        self.made += 1
+        if planned is not None and not planned.cancel():
+            planned.result()
+            kept = self._kept(key)
+        return self._make(key, what) if kept is None else kept
+
+    def _make(self, key: str, what: Mapping[str, Any]) -> FloatArray:
+        """A new simulation: here, or by a helper while this process is at another one."""
+        free = self._here.acquire(blocking=False)
+        if not free and self._helpers is not None and all(isinstance(e, str) for e in what["effects"]):
+            self._helpers.submit(what).result()
+            kept = self._kept(key)
+            if kept is not None:
+                return kept
+        if not free:
+            # Whatever went wrong there, it will be met here, too, and said.
+            self._here.acquire()
+        try:
+            made = self.experiment.predict(
+                what["values"], effects=tuple(what["effects"]), seed=what["seed"], numerics=what["numerics"]
+            )
+        finally:
+            self._here.release()
+        path = self._path(key)
         if path is not None:
             stream = io.BytesIO()
             np.save(stream, made, allow_pickle=False)

@@ -132,10 +132,10 @@ def diagnosed(
 ) -> dict[str, Any]:
     """Diagnose the latest fit; the result is ``diagnosis.json`` and, by model, ``diagnoses/NAME.json``."""
     from splatsoil import __version__
-    from splatsoil.commands._ahead import simulated_ahead
+    from splatsoil.commands._crew import crew
     from splatsoil.files import write_json
     from splatsoil.inverse.criticism.diagnosis import diagnose
-    from splatsoil.inverse.criticism.evidence import needed
+    from splatsoil.inverse.criticism.evidence import gather
     from splatsoil.inverse.criticism.record import record
     from splatsoil.report.data import estimates
 
@@ -165,7 +165,8 @@ def diagnosed(
             replays = replayed(folder, experiment, simulate, estimates(fit), begin("replay"))
         begun.append(begin("diagnose"))
         values = estimates(fit)
-        with simulated_ahead(folder, model, effects, needed(experiment, values, repeats=options.repeats)):
+        with crew(folder, model, effects, simulate):
+            simulate.ahead(lambda ask: gather(experiment, ask, values, repeats=options.repeats))
             report("where soil plays no part", 0.0)
             calibration = calibrated(folder, experiment, simulate, values)
             found = diagnose(
@@ -194,6 +195,7 @@ def diagnosed(
 
 def misfit(folder: RunFolder, model: Model, options: Options, report: Report) -> dict[str, Any]:
     """How far the model is from the data, where and when, against the floor; kept as ``comparison/misfit.json``."""
+    from splatsoil.commands._crew import crew
     from splatsoil.files import plain, write_json
     from splatsoil.inverse.criticism.diagnosis import Bench, judge
     from splatsoil.inverse.criticism.evidence import gather
@@ -202,11 +204,13 @@ def misfit(folder: RunFolder, model: Model, options: Options, report: Report) ->
 
     fit = folder.fit()
     experiment, simulate = experiment_of(folder, model, ())
-    with folder.lock():
+    values = estimates(fit)
+    with folder.lock(), crew(folder, model, (), simulate):
+        simulate.ahead(lambda ask: gather(experiment, ask, values, repeats=options.repeats))
         evidence = gather(
             experiment,
             simulate,
-            estimates(fit),
+            values,
             repeats=options.repeats,
             progress=lambda share: report("simulations for the floor", share),
         )
@@ -221,7 +225,9 @@ def confirmed(folder: RunFolder, model: Model, name: str, options: Options, repo
     """The model as it is and with one effect (by name, or from its file), each refitted on every other frame."""
     from dataclasses import replace
 
+    from splatsoil.commands._crew import crew
     from splatsoil.files import plain
+    from splatsoil.inverse.criticism.afresh import look_afresh
     from splatsoil.inverse.criticism.confirmation import confirm
     from splatsoil.inverse.criticism.diagnosis import Bench
     from splatsoil.inverse.criticism.evidence import gather
@@ -230,18 +236,21 @@ def confirmed(folder: RunFolder, model: Model, name: str, options: Options, repo
 
     experiment, simulate = experiment_of(folder, model, (name,))
     (effect,) = (candidate.name for candidate in experiment.candidates)
-    with folder.lock():
+    values = estimates(folder.fit())
+    with folder.lock(), crew(folder, model, (name,), simulate):
+        simulate.ahead(lambda ask: gather(experiment, ask, values, repeats=options.repeats))
         evidence = gather(
             experiment,
             simulate,
-            estimates(folder.fit()),
+            values,
             repeats=options.repeats,
             progress=lambda share: report("simulations", 0.7 * share),
         )
         if effect in evidence.failed:
             raise RunError(f"{effect} cannot be added: {evidence.failed[effect]}")
-        evidence = replace(evidence, calibration=calibrated(folder, experiment, simulate, estimates(folder.fit())))
+        evidence = replace(evidence, calibration=calibrated(folder, experiment, simulate, values))
         bench = Bench.of(experiment, evidence, options)
+        left = (experiment.observed - evidence.mean)[experiment.seen]
         found = confirm(
             experiment,
             evidence,
@@ -251,6 +260,7 @@ def confirmed(folder: RunFolder, model: Model, name: str, options: Options, repo
             options.refit_steps,
             bench.basis,
             report,
+            look_afresh(experiment, evidence, bench.misfit(left), simulate),
         )
     return {"refits": {key or "as it is": plain(confirmation(c)) for key, c in found.items()}}
 

@@ -82,7 +82,7 @@ def regression(
         heavy, whole, pull = [], np.zeros((k, k + others)), np.zeros(k)
         for slopes, residual in flat:
             left = residual - (step @ slopes[:k]).reshape(residual.shape)
-            level = np.maximum(1.4826 * np.median(np.abs(left), axis=1, keepdims=True), 1e-5)
+            level = np.maximum(1.4826 * _usual(np.abs(left), slopes[:k]), 1e-5)
             weight = gain / level**2 * np.minimum(1.0, HUBER * level / np.maximum(np.abs(left), 1e-12))
             heavy.append(slopes[:k] * weight.reshape(-1))
             whole, pull = whole + heavy[-1] @ slopes.T, pull + heavy[-1] @ left.reshape(-1)
@@ -108,6 +108,18 @@ def regression(
     scale = np.sqrt(variance.max(axis=0) / np.maximum(variance[0], 1e-300))
     lean: FloatArray = np.asarray(-inverse @ whole[:, k:])
     return step, spreads[0] * np.outer(scale, scale) + inverse, lean, inner
+
+
+def _usual(off: FloatArray, slopes: FloatArray) -> FloatArray:
+    """(b, 1) median of what pixels (b, n) are off, each counted by how much it tells: most of a picture may have no
+    edges, and those of a tool that is off are no outliers.
+    """
+    power = slopes.reshape(len(slopes), *off.shape) ** 2
+    weight = np.sum(power / np.maximum(power.mean(axis=-1, keepdims=True), 1e-300), axis=0)
+    order = np.argsort(off, axis=1)
+    reached = np.cumsum(np.take_along_axis(weight, order, axis=1), axis=1)
+    place = np.argmax(reached >= 0.5 * reached[:, -1:], axis=1)[:, None]
+    return np.take_along_axis(np.take_along_axis(off, order, axis=1), place, axis=1)
 
 
 def squares_of(place: FloatArray) -> IntArray:

@@ -29,7 +29,7 @@ from splatsoil.experiment.bands import SCALES, Rows, misfit, regression, rows_of
 from splatsoil.experiment.base import Calibration
 from splatsoil.experiment.features import Site
 from splatsoil.experiment.scene_parts import QUIET, regions_of
-from splatsoil.measurement import Frame, Measurement
+from splatsoil.measurement import Camera, Frame, Measurement
 from splatsoil.model import Model
 from splatsoil.mpm import Trajectory
 from splatsoil.observation import Observation
@@ -52,12 +52,18 @@ VAGUE = 10.0
 """Standard deviation of what nothing tells, in units of a parameter's range."""
 CONTROLS = 8
 """Photographs, at most, that are treated as if they were the video."""
+FEWEST_CONTROLS = 5
+"""From which on their mean is taken for the drawing's own."""
 MOMENTS = 5
 """Frames, at most, in which the tool, or what it leaves alone, is looked at."""
 CLEAR, AROUND = 0.01, 0.03
 """Height above all soil near the tool from which on it is looked at, and how far away soil is near it, m."""
 EDGE, FEWEST = 5, 60
 """Pixels around the tool that count as its edges, and pixels that a look at it needs."""
+BLUNT = 0.1
+"""Pixels by which all edges of the tool may be drawn off together, beside what they tell of each other."""
+UNEVEN = 0.001
+"""Most that the tool may stray from an even motion around a frame that tells the clock, m."""
 SHADE = 1.0 / 255.0
 """Change of a pixel (sRGB) by a step of the tool from which on it is left out before anything moves."""
 
@@ -82,9 +88,11 @@ def calibrate(
     for kind, look in (("still", bench.bed), ("tool", bench.tool), ("drift", bench.quiet)):
         free = [k for k, found in enumerate(bench.kinds) if found == kind]
         known: list[int] = []
-        best = (np.inf, value)
         if not free:
             continue
+        if kind == "tool" and bench.clocks:
+            value = min(bench.early_and_late(value), key=bench.tool_misfit)
+        best = (np.inf, value)
         for number, bands in enumerate(ROUNDS[kind], start=1):
             if kind == "tool" and bands == len(SCALES):
                 known = bench.poses
@@ -111,7 +119,12 @@ def calibrate(
             continue
         variance = np.diag(covariance).copy()
         if kind == "still":
-            variance += _errors_of_photographs(model, bench)[free]
+            # What photographs show of a camera that is right is the drawing's, and no camera's.
+            bias, error = _errors_of_photographs(model, bench)
+            value[free] -= bias[free]
+            variance += error[free]
+        if kind == "tool":
+            variance += bench.errors_of_edges(value, free)
         mixed = lean @ spread[known]
         spread[free], spread[:, free] = mixed, mixed.T
         spread[np.ix_(free, free)] = shaped(variance, inner) + mixed[:, known] @ lean.T
@@ -130,6 +143,7 @@ class _Bench:
         kinds: ``still``, ``tool`` or ``drift``: what tells each parameter.
         cameras: names of those whose pictures each parameter changes.
         poses: places of the parameters that move cameras.
+        clocks: places of those that shift time.
         vague: (k,) standard deviation of each value where nothing tells it.
     """
 
@@ -158,6 +172,7 @@ class _Bench:
         views = {name: view.undistorted() for name, view in model.measurement.cameras.items()}
         own = [{c for i, (c, view) in enumerate(views.items()) if o.camera(view, i) is not view} for o in changed]
         self.cameras, self.poses = [c or set(views) for c in own], [k for k, c in enumerate(own) if c]
+        self.clocks = [k for k, o in enumerate(changed) if o.time_offset != plain.time_offset]
         self.low, self.high = (np.array([getattr(p, e) - _off(p) for p in parameters]) for e in ("lower", "upper"))
         self.low, self.high = (np.where(self.squared, np.maximum(v, 0.0) ** 2, v) for v in (self.low, self.high))
         self.vague = VAGUE * (self.high - self.low)
@@ -230,7 +245,7 @@ class _Bench:
         """The tool where it stands clear of the soil, and its edges, at a few moments."""
         seen, rows = self.comparator, []
         if self._moments is None:
-            every = [f for f in (seen.reference, *seen.frames) if self._clear(value, f)]
+            every = [f for f in (seen.reference, *seen.frames) if self._steady(f) and self._clear(value, f)]
             self._moments = [every[i] for i in _few(len(every))]
         drawn = self.draw(value, self._moments) if self._moments else {}
         slopes = self.slopes(value, wanted, drawn) if drawn else {}
@@ -249,31 +264,79 @@ class _Bench:
                 rows.append(rows_of(residual @ mixture, slopes[camera, frame] @ mixture, mask, groups, aside))
         return rows
 
-    def _clear(self, value: FloatArray, frame: int) -> dict[str, tuple[FloatArray, BoolImage]]:
-        """Share of each pixel that the tool takes above all soil near it, and where it or its edges show, by camera."""
+    def tool_misfit(self, value: FloatArray) -> float:
+        """How far the tool's pictures are off; 0 where it is never seen."""
+        rows = self.tool(value, [])
+        return misfit(rows) if rows else 0.0
+
+    def early_and_late(self, value: FloatArray) -> list[FloatArray]:
+        """Values (k,) with the clock right, early and late: a tool that is pixels away isn't found from its edges."""
+        out = [value]
+        for k in self.clocks:
+            for share in (-2 / 3, -1 / 3, 1 / 3, 2 / 3):
+                there = value.copy()
+                there[k] = share * (self.high[k] if share > 0.0 else -self.low[k])
+                out.append(there)
+        return out
+
+    def _steady(self, frame: int) -> bool:
+        """Whether the tool moves evenly around a frame: where it starts or turns, early looks other than late."""
+        reach = max((max(-self.low[k], self.high[k]) for k in self.clocks), default=0.0)
+        middle = frame / self.model.measurement.frame_rate
+        before, here, after = (
+            self.model.measurement.tool.motion.matrix(middle + side * reach)[:3, 3] for side in (-1, 0, 1)
+        )
+        return bool(np.linalg.norm(before - 2.0 * here + after) < UNEVEN)
+
+    def errors_of_edges(self, value: FloatArray, wanted: Sequence[int]) -> FloatArray:
+        """(k,) squares of what moves the tool in pictures by as much as all its edges may be drawn off together."""
+
+        def seen(at: FloatArray) -> FloatArray:
+            pixels = []
+            for frame in self._moments or []:
+                corners, cameras = self._placed(at, frame)[:2]
+                pixels += [camera.project(corners)[0] for camera in cameras.values()]
+            return np.array(pixels)
+
+        here, out = seen(value), np.zeros(len(wanted))
+        for place, k in enumerate(wanted):
+            there = value.copy()
+            there[k] += (step := _step(self.parameters[k]))
+            way = np.sqrt(np.nanmean(np.sum((seen(there) - here) ** 2, axis=-1)))
+            out[place] = (BLUNT * step / max(float(way), 1e-9)) ** 2
+        return out
+
+    def _placed(self, value: FloatArray, frame: int) -> tuple[FloatArray, dict[str, Camera], float]:
+        """The tool's corners (n, 3) at a frame, cameras by name, and the moment in frames that the frame shows."""
         measurement, seen = self.model.measurement, self.model.observation(self.named(value))
         moment = frame + seen.time_offset * measurement.frame_rate
         rotation, position = seen.tool(measurement.tool.motion.pose(moment / measurement.frame_rate))
         corners = np.asarray(measurement.tool.mesh.vertices) @ np.asarray(rotation).T + position
+        views = enumerate(measurement.cameras.items())
+        return corners, {name: seen.camera(view.undistorted(), i) for i, (name, view) in views}, moment
+
+    def _clear(self, value: FloatArray, frame: int) -> dict[str, tuple[FloatArray, BoolImage]]:
+        """Share of each pixel that the tool takes above all soil near it, and where it or its edges show, by camera."""
+        corners, cameras, moment = self._placed(value, frame)
         soil, found = self.trajectory.at(moment)[0], {}
         low, high = corners.min(axis=0) - AROUND, corners.max(axis=0) + AROUND
         near = soil[np.all((soil > low)[:, :2] & (soil < high)[:, :2], axis=1), 2]
         level = np.array([0.0, 0.0, near.max(initial=-1e3) + CLEAR])
-        for i, (camera, view) in enumerate(measurement.cameras.items()):
+        for name, camera in cameras.items():
             shapes = []
             for up in (1.0, -1.0):
                 part = trimesh.intersections.slice_faces_plane(
-                    corners, measurement.tool.mesh.faces, np.array([0.0, 0.0, up]), level
+                    corners, self.model.measurement.tool.mesh.faces, np.array([0.0, 0.0, up]), level
                 )
                 body = ToolBody(trimesh.Trimesh(part[0], part[1], process=False) if len(part[1]) else None)
-                shapes.append(silhouette(body.at(np.eye(3), np.zeros(3)), seen.camera(view.undistorted(), i)).numpy())
+                shapes.append(silhouette(body.at(np.eye(3), np.zeros(3)), camera).numpy())
             share = gaussian_filter(shapes[0].astype(np.float64), 0.5)
             mask = binary_dilation(shapes[0], iterations=EDGE) & ~binary_dilation(shapes[1], iterations=2)
             if (
-                camera in self.comparator.cameras
+                name in self.comparator.cameras
                 and min((mask & (share > 0.9)).sum(), (mask & (share < 0.1)).sum()) >= FEWEST
             ):
-                found[camera] = (share, mask)
+                found[name] = (share, mask)
         return found
 
     def quiet(self, value: FloatArray, wanted: Sequence[int]) -> list[Rows]:
@@ -331,8 +394,8 @@ def _scene_of_photographs(model: Model, seed: int) -> Scene:
     )
 
 
-def _errors_of_photographs(model: Model, bench: _Bench) -> FloatArray:
-    """(k,) mean squares of what is found of photographs with which nothing is wrong.
+def _errors_of_photographs(model: Model, bench: _Bench) -> tuple[FloatArray, FloatArray]:
+    """(k,) mean, and (k,) mean square error about it, of what is found of photographs with which nothing is wrong.
 
     Each photograph is one camera by itself, and what it says of light and exposure is taken for the error of all
     cameras together: their errors are alike.
@@ -343,9 +406,9 @@ def _errors_of_photographs(model: Model, bench: _Bench) -> FloatArray:
         for f in (0, 1)
         for i, v in enumerate(aside)
     ]
-    out = np.zeros(len(bench.parameters))
+    bias, error = np.zeros(len(bench.parameters)), np.zeros(len(bench.parameters))
     if not aside:
-        return out
+        return bias, error
     mock = Model(replace(seen, video=tuple(video)), model.reconstruction, preset=model.preset, device=model.device)
     mock.resolution = model.resolution
     comparator = Comparator(mock.measurement, surface=model.reconstruction.surface)
@@ -360,15 +423,24 @@ def _errors_of_photographs(model: Model, bench: _Bench) -> FloatArray:
         part = replace(row, slopes=row.slopes[mine])
         vague = control.vague[[still[i] for i in mine]]
         found.append(regression([part], len(SCALES), vague, np.zeros(len(mine)))[0])
-    # of a Gaussian whose variance is known from so few
-    squares = np.sum(np.square(found), axis=0) / max(len(found) - 2, 1)
+    count, table = len(found), np.array(found)
+    if count < FEWEST_CONTROLS:
+        # too few to tell what is common to all
+        means, squares = np.zeros(table.shape[1]), np.sum(table**2, axis=0) / max(count - 2, 1)
+    else:
+        # One more draw, predicted from so few (Student).
+        means = table.mean(axis=0)
+        squares = table.var(axis=0, ddof=1) * (1.0 + 1.0 / count) * (count - 1) / (count - 3)
     names = [p.name for p in bench.parameters]
     for camera in bench.comparator.cameras:
         mine = [k for k, kind in enumerate(real.kinds) if kind == "still" and camera in real.cameras[k]]
-        for square, k in zip(squares, mine, strict=True):
+        for mean, square, k in zip(means, squares, mine, strict=True):
             if whole[k].name in names:
-                out[names.index(whole[k].name)] += square / (1 if k in real.poses else len(bench.comparator.cameras))
-    return out
+                share = 1 if k in real.poses else len(bench.comparator.cameras)
+                place = names.index(whole[k].name)
+                bias[place] += mean / share
+                error[place] += square / share
+    return bias, error
 
 
 def _of(effect: Effect, measurement: Measurement) -> tuple[Parameter, ...]:

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from splatsoil.benchmarks.hidden_effects import detectable, emulated, fitted, one, outside, wilson
 from splatsoil.inverse.criticism.diagnosis import Options, _stands, diagnose
-from splatsoil.inverse.criticism.evidence import gather, needed
 from splatsoil.inverse.criticism.misfit import Omnibus
 from splatsoil.inverse.criticism.record import record
 from splatsoil.inverse.criticism.simulations import Simulations
@@ -145,37 +144,26 @@ def test_an_effect_that_leaves_more_than_noise_is_not_all_that_is_missing(error:
 
 
 @pytest.mark.parametrize(
-    ("error", "misfit", "left", "named"),
+    ("error", "misfit", "left", "unseen", "named"),
     [
-        (0.7, CLEAN, 0.97, False),
-        (0.7, CLEAN, 0.8, True),
-        (0.7, OFF, 0.97, True),
-        (1.5, CLEAN, 0.97, True),
-        (1.5, OFF, 0.97, True),
-        (1.5, OFF, 1.03, False),
+        (0.7, CLEAN, 0.97, 9.0, False),
+        (0.7, CLEAN, 0.8, 9.0, True),
+        (0.7, OFF, 0.97, 9.0, True),
+        (1.5, CLEAN, 0.97, 9.0, True),
+        (1.5, OFF, 0.97, 9.0, True),
+        (1.5, OFF, 0.97, -1.0, False),
     ],
 )
 def test_nothing_is_missing_where_nothing_is_to_be_explained(
-    sizes: dict[str, float], error: float, misfit: Omnibus, left: float, named: bool
+    sizes: dict[str, float], error: float, misfit: Omnibus, left: float, unseen: float, named: bool
 ) -> None:
     """A refit that explains much; error on hidden times and slow waves may be chance before it, and so much is left."""
     found = one(WORLD, {"angle": 1.0, "effect 2": 5.0 * sizes["effect 2"]}, None, OPTIONS).confirmations
     before, after = found[""], found["effect 2"]
     floor = before.held_out / error
-    told = {"": replace(before, floor=floor), "effect 2": replace(after, floor=floor, held_out=left * before.held_out)}
+    held_out = left * before.held_out
+    told = {"": replace(before, floor=floor), "effect 2": replace(after, floor=floor, held_out=held_out, unseen=unseen)}
     assert _stands(told, "effect 2", misfit, 1.0) is named
-
-
-def test_what_will_be_needed_is_known_before_anything_is_simulated() -> None:
-    experiment = emulated(3)
-    asked: list[dict[str, object]] = []
-
-    def simulate(values: dict[str, float], *, purpose: str = "", **others: object) -> np.ndarray:
-        asked.append({"values": dict(values), **others})
-        return experiment.predict(values, **others)
-
-    gather(experiment, simulate, {"angle": 0.5}, repeats=3)
-    assert needed(experiment, {"angle": 0.5}, repeats=3) == asked and len(asked) > 10
 
 
 def test_verdicts_on_an_effect(sizes: dict[str, float]) -> None:

@@ -1,0 +1,136 @@
+"""Simulations shared out between processes: the same tables, each made once, whatever a helper does."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from splatsoil.benchmarks.hidden_effects import emulated
+from splatsoil.inverse.criticism.evidence import gather
+from splatsoil.inverse.criticism.simulations import Helpers, Simulations
+
+from splatsoil.errors import SimulationError
+
+AT = {"angle": 0.5}
+
+
+class Watched:
+    """An experiment that notes who asks it for what, and minds being asked twice at a time."""
+
+    def __init__(self, fails: Callable[[Mapping[str, float]], bool] = lambda values: False) -> None:
+        self.inner, self.fails = emulated(3), fails
+        self.calls: list[Mapping[str, float]] = []
+        self.threads: set[int] = set()
+        self.busy = False
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.inner, name)
+
+    def predict(self, values: Mapping[str, float], **others: Any) -> np.ndarray:
+        assert not self.busy
+        self.busy = True
+        self.calls.append(values)
+        self.threads.add(threading.get_ident())
+        time.sleep(0.005)
+        self.busy = False
+        if self.fails(values):
+            raise SimulationError("blew up")
+        return self.inner.predict(values, **others)
+
+
+@contextmanager
+def helper(experiment: Watched, folder: Path) -> Iterator[Helpers]:
+    """One, of whom nothing is heard but what it keeps in the folder."""
+    theirs = Simulations(experiment, folder)
+
+    def work(job: Mapping[str, Any]) -> None:
+        try:
+            theirs(**job)
+        except SimulationError:
+            return
+
+    with ThreadPoolExecutor(1) as pool:
+        yield Helpers(1, lambda job: pool.submit(work, job))
+
+
+def test_what_will_be_asked_for_is_made_by_both_and_only_once(tmp_path: Path) -> None:
+    alone = gather(emulated(3), Simulations(emulated(3)), AT, repeats=3)
+    mine, theirs = Watched(), Watched()
+    simulate = Simulations(mine, tmp_path)
+    with helper(theirs, tmp_path) as helpers, simulate.helped(helpers):
+        simulate.ahead(lambda ask: gather(mine, ask, AT, repeats=3))
+        together = gather(mine, simulate, AT, repeats=3)
+    assert mine.calls and theirs.calls
+    assert len(mine.calls) + len(theirs.calls) == simulate.asked == simulate.made
+    for name in ("mean", "repeats"):
+        assert np.array_equal(getattr(alone, name), getattr(together, name))
+    for name in ("slopes", "directions", "numerics"):
+        assert getattr(alone, name).keys() == getattr(together, name).keys()
+        assert all(np.array_equal(table, getattr(together, name)[key]) for key, table in getattr(alone, name).items())
+
+
+def test_jobs_that_wait_for_simulations_run_side_by_side_and_come_back_in_order(tmp_path: Path) -> None:
+    mine, theirs = Watched(), Watched()
+    simulate = Simulations(mine, tmp_path)
+
+    def job(start: float) -> Callable[[], float]:
+        def run() -> float:
+            found = [simulate({"angle": start + 0.1 * step})[0, 0] for step in range(4)]
+            return float(simulate(AT)[0, 0] + sum(found))
+
+        return run
+
+    starts = (-2.0, 0.0, 2.0)
+    with helper(theirs, tmp_path) as helpers, simulate.helped(helpers):
+        together = simulate.side_by_side([job(start) for start in starts])
+    simulate = Simulations(emulated(3))
+    assert together == [job(start)() for start in starts]
+    assert mine.calls and theirs.calls
+    assert len(mine.calls) + len(theirs.calls) == 13  # what all three asked for was made once
+
+
+def test_a_helper_that_fails_or_dies_costs_nothing_but_its_help(tmp_path: Path) -> None:
+    def dead(job: Mapping[str, Any]) -> Future[None]:
+        done: Future[None] = Future()
+        done.set_result(None)
+        return done
+
+    mine = Watched(lambda values: values["angle"] > 1.0)
+    simulate = Simulations(mine, tmp_path)
+    with simulate.helped(Helpers(1, dead)):
+        simulate.ahead(lambda ask: [ask(AT), ask({"angle": 2.0})])
+        assert np.array_equal(simulate(AT), emulated(3).predict(AT))
+        for _ in range(2):
+            with pytest.raises(SimulationError, match="blew up"):
+                simulate({"angle": 2.0})
+    assert len(mine.calls) == 2 and simulate.asked == 1
+
+
+def test_the_failure_of_one_job_ends_the_others(tmp_path: Path) -> None:
+    mine, theirs = Watched(), Watched()
+    simulate = Simulations(mine, tmp_path)
+    begun, ended = threading.Event(), []
+
+    def broken() -> None:
+        begun.wait()
+        raise RuntimeError("no")
+
+    def long() -> None:
+        try:
+            for step in range(1000):
+                begun.set()
+                simulate({"angle": 0.001 * step})
+        except CancelledError:
+            ended.append(True)
+            raise
+
+    with helper(theirs, tmp_path) as helpers, simulate.helped(helpers), pytest.raises(RuntimeError, match="no"):
+        simulate.side_by_side([broken, long])
+    assert ended and len(mine.calls) + len(theirs.calls) < 100
