@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy import stats
 
 from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Candidate, Experiment
@@ -41,6 +42,8 @@ class Confirmation:
         chi2: of all times, as far as these tell of anything; see :class:`~splatsoil.inverse.criticism.sight.Sight`.
         fall: by how much that is less than the model's as it is.
         unseen: likewise, on times the refit hasn't seen alone.
+        told: chance of what other pictures say of its parameters if they were off; see
+            :class:`~splatsoil.experiment.base.Calibration`.
         held_out: root mean square of the residual on times the refit hasn't seen, in the features' unit.
         floor: what noise alone leaves there.
         remainder: what stands on slow waves.
@@ -52,6 +55,7 @@ class Confirmation:
     chi2: float
     fall: float
     unseen: float
+    told: float
     held_out: float
     floor: float
     remainder: Omnibus
@@ -122,6 +126,7 @@ def confirm(
             chi2=chi2,
             fall=0.0 if candidate is None else _chi2(whole, before) + known.chi2(off) - chi2,
             unseen=_chi2(apart, before) - _chi2(apart, left),
+            told=float(stats.chi2.sf(known.chi2(off), len(known.root))) if len(known.root) else 1.0,
             held_out=float(np.sqrt(np.mean(left[mask] ** 2))),
             floor=_noise_on(floor.single, mask),
             remainder=remainder,

@@ -23,6 +23,7 @@ from .sight import Sight
 from .simulations import Simulations
 from .strokes import StrokeAdvice, advise
 from .verdicts import (
+    CERTAIN,
     CLEAN,
     ENOUGH,
     EQUIVALENT,
@@ -217,7 +218,8 @@ def judge(
             experiment, evidence, floor, trials, simulate, options.refit_steps, bench.basis, told, vantage
         )
         tried = {name: c for name, c in confirmations.items() if name}
-        costs = {name: c.chi2 + scorer.price(candidates[name]) for name, c in tried.items()}
+        # Not by what is left of χ²: an effect that stays off leaves what other pictures say of it unexplained.
+        costs = {name: scorer.price(candidates[name]) - c.fall for name, c in tried.items()}
         best = min(costs, key=lambda name: costs[name])
         before = confirmations[""].remainder
         if _stands(confirmations, best, misfit, scores[best].dispersion):
@@ -290,16 +292,20 @@ def _advice(
 
 
 def _stands(confirmations: Mapping[str, Confirmation], best: str, misfit: Omnibus, dispersion: float) -> bool:
-    """Something is to be explained, and the refit does: χ² falls, and the error on times it hasn't seen falls too.
+    """Something is to be explained, and the refit does: χ² falls, on times that it hasn't seen too.
 
-    A model whose error there is no larger than noise, and whose slow waves show no more than chance, lacks nothing that
-    these data could show, whatever a single direction among dozens seems to say; unless the effect takes away a
-    relevant share of that error, which shows that the noise was overrated.
+    Where slow waves show no more than chance, the effect must take away a relevant share of the squared error on those
+    times, whatever a single direction among dozens seems to say. What other pictures say of an effect beyond doubt
+    needs no more of the features than that they don't speak against it.
     """
     before, after = confirmations[""], confirmations[best]
+    least = EQUIVALENT * dispersion
+    if after.fall <= least:
+        return False
+    if after.told < CERTAIN:
+        return after.unseen > -least
     relevant = after.held_out**2 < (1.0 - RELEVANT) * before.held_out**2
-    wanting = before.held_out > before.floor or misfit.p < GATE or relevant
-    return wanting and after.fall > EQUIVALENT * dispersion and after.unseen > 0.0
+    return (misfit.p < GATE or relevant) and after.unseen > 0.0
 
 
 def _chosen(

@@ -16,13 +16,15 @@ LEVEL = 0.05
 """Family-wise chance of naming an effect when none is missing."""
 GATE = 0.01
 """Chance below which what is left is called a remainder."""
+CERTAIN = 1e-4
+"""Chance below which what pictures say of an effect where soil plays no part needs no confirmation by soil."""
 CLEAN = 0.05
 """Chance that what is left after an effect must have for the effect to be all that was missing."""
 EQUIVALENT = 6.0
 """Fall of χ² within which effects count as equally good."""
 RELEVANT = 0.1
-"""Share of the squared error on times that a refit hasn't seen which an effect must take away where that error is no
-larger than noise."""
+"""Share of the squared error on times that a refit hasn't seen which an effect must take away where slow waves show
+no misfit."""
 LEAST_SURVIVAL = 0.05
 """Share of an effect's information that must survive the projection of everything else."""
 ENOUGH = 0.8

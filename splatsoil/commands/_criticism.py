@@ -107,7 +107,7 @@ def calibrated(
     from splatsoil.inverse.evaluations import digest
 
     names = [p.name for c in experiment.candidates if c.kind == "observation" for p in c.parameters]
-    code = code_digest(("experiment/bands.py", "experiment/calibration.py"))
+    code = code_digest(("experiment/bands.py", "experiment/calibration.py", "experiment/calibration_bench.py"))
     what = {**simulate.identity, "values": values, "calibrated": names, "calibration code": code}
     path = folder.path / "features" / f"calibration-{digest(what)[:24]}.npz"
     if not path.is_file():

@@ -11,7 +11,7 @@ from PIL import Image
 
 from splatsoil.comparison import Comparator
 from splatsoil.errors import ParameterError
-from splatsoil.experiment import calibration
+from splatsoil.experiment import calibration, calibration_bench
 from splatsoil.experiment.calibration import calibrate
 from splatsoil.measurement import Bed, Camera, Frame, Measurement, Tool, ToolMotion
 from splatsoil.model import Model
@@ -159,6 +159,27 @@ def test_nothing_wrong_is_nothing_found(quiet_world):
     assert np.abs(z).max() < 3.0, dict(zip(found.names, z.round(1), strict=True))
 
 
+@pytest.mark.parametrize("late", [-0.035, 0.035])
+def test_a_clock_that_is_pixels_off_is_found_and_no_tool_blamed(world, late):
+    model, trajectory = world({"time_offset": late})
+    found = calibrate(model, compared(model), asked(model, ("tool_pose", "time_offset")), trajectory)
+    told = dict(zip(found.names, zip(found.estimate, found.deviation, strict=True), strict=True))
+    assert told["time_offset"][0] == pytest.approx(late, abs=0.004)
+    assert told["time_offset"][1] < 0.005
+    assert max(abs(told[name][0] / told[name][1]) for name in ("tool_x", "tool_y", "tool_z")) < 3.0
+
+
+def test_what_drawing_gets_wrong_in_every_picture_is_no_cameras(quiet_world, monkeypatch, scenes):
+    """Soil drawn a tenth too dark looks like longer exposure, in photographs as in the video."""
+    dark = scenes[0].replace(soil_albedo=0.95 * scenes[0].soil_albedo)
+    monkeypatch.setattr(calibration, "_scene_of_photographs", lambda model, seed: dark)
+    model, trajectory = quiet_world
+    found = calibrate(model, compared(model), asked(model), trajectory)
+    told = dict(zip(found.names, zip(found.estimate, found.deviation, strict=True), strict=True))
+    assert abs(told["exposure_gain"][0]) < min(3.0 * told["exposure_gain"][1], 0.03)
+    assert told["exposure_gain"][1] < USEFUL["exposure_gain"]
+
+
 def test_what_nothing_tells_stays_open(quiet_world):
     model, trajectory = quiet_world
     parameters = asked(model, ("camera_pose",))
@@ -174,7 +195,7 @@ def test_what_nothing_tells_stays_open(quiet_world):
 
 def test_a_tool_that_is_hidden_tells_nothing(quiet_world, monkeypatch):
     model, trajectory = quiet_world
-    monkeypatch.setattr(calibration, "CLEAR", 1.0)
+    monkeypatch.setattr(calibration_bench, "CLEAR", 1.0)
     parameters = asked(model, ("tool_pose", "time_offset"))
     found = calibrate(model, compared(model), parameters, trajectory)
     assert np.array_equal(found.estimate, np.zeros(5))

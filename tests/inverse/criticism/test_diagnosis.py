@@ -149,7 +149,8 @@ def test_an_effect_that_leaves_more_than_noise_is_not_all_that_is_missing(error:
         (0.7, CLEAN, 0.97, 9.0, False),
         (0.7, CLEAN, 0.8, 9.0, True),
         (0.7, OFF, 0.97, 9.0, True),
-        (1.5, CLEAN, 0.97, 9.0, True),
+        (1.5, CLEAN, 0.97, 9.0, False),
+        (1.5, CLEAN, 0.8, 9.0, True),
         (1.5, OFF, 0.97, 9.0, True),
         (1.5, OFF, 0.97, -1.0, False),
     ],
@@ -164,6 +165,17 @@ def test_nothing_is_missing_where_nothing_is_to_be_explained(
     held_out = left * before.held_out
     told = {"": replace(before, floor=floor), "effect 2": replace(after, floor=floor, held_out=held_out, unseen=unseen)}
     assert _stands(told, "effect 2", misfit, 1.0) is named
+
+
+@pytest.mark.parametrize(("told", "unseen", "named"), [(1e-5, -1.0, True), (1e-5, -9.0, False), (1e-3, -1.0, False)])
+def test_what_other_pictures_say_beyond_doubt_the_soil_need_only_not_deny(
+    sizes: dict[str, float], told: float, unseen: float, named: bool
+) -> None:
+    found = one(WORLD, {"angle": 1.0, "effect 2": 5.0 * sizes["effect 2"]}, None, OPTIONS).confirmations
+    floor = found[""].held_out / 0.7
+    after = replace(found["effect 2"], floor=floor, held_out=found[""].held_out, unseen=unseen, told=told)
+    told_of = {"": replace(found[""], floor=floor), "effect 2": after}
+    assert _stands(told_of, "effect 2", Omnibus(60.0, 72, 0.5), 1.0) is named
 
 
 def test_verdicts_on_an_effect(sizes: dict[str, float]) -> None:
