@@ -149,6 +149,18 @@ class PlowSandEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         parameters = self.problem.space.to_dict(self.problem.space.from_unit(guess))
         return guess, parameters, self.simulation_seed(self.budget - self._left)
 
+    def ahead(self, actions: Sequence[npt.ArrayLike]) -> list[tuple[dict[str, float], int]]:
+        """Physical values and simulation seeds of the next steps if they take these actions, as far as the budget goes:
+        for agents that have several evaluated side by side."""
+        left, jobs = self._left, []
+        try:
+            for action in list(actions)[:left]:
+                jobs.append(self.plan(np.asarray(action, dtype=np.float32))[1:])
+                self._left -= 1
+        finally:
+            self._left = left
+        return jobs
+
     def settle(
         self, guess: npt.NDArray[np.float32], parameters: Mapping[str, float], seed: int, evaluation: Evaluation
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:

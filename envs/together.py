@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from .synthetic import SyntheticProblem
 
 Job = tuple[Mapping[str, float], int]
+_BUILT: set[tuple[str, ...]] = set()
+"""Combinations of effects whose kernels were built in this process."""
 
 
 def attempt(problem: Problem, parameters: Mapping[str, float], seed: int) -> Evaluation:
@@ -146,7 +148,10 @@ def simulate_together(
     # Warp's CPU kernels are serial and let other Python threads run meanwhile. The first simulation of a kind builds
     # its kernels, which is no work for two threads at once.
     singles = [k for rows in groups.values() for k in rows]
-    run(singles[:1])
-    with ThreadPoolExecutor(max(1, os.cpu_count() or 1)) as threads:
-        list(threads.map(run, [[k] for k in singles[1:]]))
+    kind = tuple(effect.name for effect in world.law.effects)
+    if kind not in _BUILT:
+        run([singles.pop(0)])
+        _BUILT.add(kind)
+    with ThreadPoolExecutor(max(1, len(os.sched_getaffinity(0)))) as threads:
+        list(threads.map(run, [[k] for k in singles]))
     return out

@@ -232,6 +232,8 @@ def optimise(
     noise_std: float | None = None,
     search: Search | None = None,
     replay: Sequence[npt.ArrayLike] = (),
+    at_once: int = 1,
+    before_batch: Callable[[Sequence[npt.ArrayLike]], None] | None = None,
     after_step: Callable[[int, dict[str, Any]], None] | None = None,
 ) -> Episode:
     """Play one episode of an environment whose reward is minus a loss, until it truncates or terminates.
@@ -244,6 +246,8 @@ def optimise(
         noise_std: standard deviation of one evaluation's noise, if measured.
         search: how to search, start included; :data:`PAPER` for the paper's way.
         replay: actions of an interrupted episode, taken again before anything new is asked.
+        at_once: points that are chosen together.
+        before_batch: called with actions chosen together before the first of them is taken, unless all are replayed.
         after_step: called with the number of steps done and the step's info.
 
     Raises:
@@ -255,10 +259,15 @@ def optimise(
         raise ValueError(f"Bayesian optimisation needs actions in [-1, 1]^n, not {space}")
     optimiser = BayesianOptimiser(int(np.prod(space.shape)), start=start, noise_std=noise_std, seed=seed, search=search)
     env.reset(seed=seed)
-    over = False
+    over, batch = False, list[npt.ArrayLike]()
     while not over:
         done = len(optimiser.told)
-        action = np.asarray(replay[done] if done < len(replay) else optimiser.ask(), dtype=np.float32)
+        if not batch:
+            known = list(replay[done : done + at_once])
+            batch = [*known, *(optimiser.ask_batch(at_once)[len(known) :] if len(known) < at_once else ())]
+            if before_batch is not None and len(known) < at_once:
+                before_batch(batch)
+        action = np.asarray(batch.pop(0), dtype=np.float32)
         observation, reward, terminated, truncated, info = env.step(action.reshape(space.shape))
         failed = info.get("status") == "failed"
         residuals = observation.get("block_residuals") if isinstance(observation, Mapping) else None

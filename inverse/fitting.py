@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -13,7 +13,7 @@ import numpy as np
 from splatsoil.envs.levels import FIDELITY, TwoLevelProblem, is_full
 from splatsoil.envs.plow_sand import PlowSandEnv
 from splatsoil.envs.problem import Evaluation, Problem, WrappedProblem
-from splatsoil.envs.together import attempt
+from splatsoil.envs.together import attempt, evaluate_together
 
 from splatsoil.errors import RunError
 from splatsoil.parameters import Parameter, ParameterSpace
@@ -51,6 +51,7 @@ class FitSetup:
         start: Sobol points before the first acquisition.
         search: ``usual``, or ``paper`` for Hsiao and Kumar's: one random start, expected improvement.
         coarse: preset of cheap evaluations that the search may use, too; None: it has none.
+        at_once: evaluations that are chosen, and simulated, together.
     """
 
     measurement: str
@@ -67,6 +68,7 @@ class FitSetup:
     start: int = START
     search: Literal["usual", "paper"] = "usual"
     coarse: str | None = None
+    at_once: int = 1
 
     @property
     def name(self) -> str:
@@ -99,6 +101,7 @@ class FitSetup:
             "start": self.start,
             **({} if self.search == "usual" else {"search": self.search}),
             **({} if self.coarse is None else {"coarse": self.coarse}),
+            **({} if self.at_once == 1 else {"at_once": self.at_once}),
         }
 
 
@@ -119,6 +122,7 @@ class StoredProblem(WrappedProblem):
         self.store.register(self.fit, setup.description())
         self.stored = self.store.records(self.fit)
         self._step = 0
+        self._ready: dict[str, Evaluation] = {}
         self.last: EvaluationRecord | None = None
 
     def begin(self, seed: int) -> None:
@@ -131,10 +135,10 @@ class StoredProblem(WrappedProblem):
         if self._step < len(self.stored):
             record, evaluation = self._replay(parameters, seed)
         else:
-            key = digest({**self.setup.model(), "values": dict(parameters), "seed": seed})
+            key = self._key(parameters, seed)
             found = self.store.find(key)
             if found is None:
-                evaluation = attempt(self.inner, parameters, seed)
+                evaluation = self._ready.pop(key) if key in self._ready else attempt(self.inner, parameters, seed)
                 job = Job(dict(parameters), seed)
                 record = make_record(self.fit, self._step, key, job, evaluation, self.space, self.setup.model())
             else:
@@ -144,6 +148,17 @@ class StoredProblem(WrappedProblem):
         self._step += 1
         self.last = record
         return evaluation
+
+    def prepare(self, jobs: Sequence[tuple[Mapping[str, float], int]]) -> None:
+        """Simulate side by side what the next steps will ask for (parameters and seeds), as far as it isn't stored."""
+        ahead = jobs[max(len(self.stored) - self._step, 0) :]
+        fresh = [job for job in ahead if self.store.find(self._key(*job)) is None]
+        if len(fresh) > 1:
+            done = evaluate_together([self.inner] * len(fresh), fresh)
+            self._ready = {self._key(*job): evaluation for job, evaluation in zip(fresh, done, strict=True)}
+
+    def _key(self, parameters: Mapping[str, float], seed: int) -> str:
+        return digest({**self.setup.model(), "values": dict(parameters), "seed": seed})
 
     def _replay(self, parameters: Mapping[str, float], seed: int) -> tuple[EvaluationRecord, Evaluation]:
         """The stored evaluation of this step."""
@@ -215,7 +230,14 @@ def fit(
                 "after_step": told,
             }
             if levels is None:
-                episode = optimise(env, start=setup.start, search=PAPER if setup.search == "paper" else None, **shared)
+                episode = optimise(
+                    env,
+                    start=setup.start,
+                    search=PAPER if setup.search == "paper" else None,
+                    at_once=setup.at_once,
+                    before_batch=lambda actions: stored.prepare(env.ahead(actions)),
+                    **shared,
+                )
             else:
                 episode = optimise_two_levels(env, cost=levels.cost, budget=budget, **shared)
         except RuntimeError as error:

@@ -159,14 +159,12 @@ def diagnosed(
         report(purpose, share)
 
     simulate.told = starting
+    values = estimates(fit)
     with folder.lock():
-        replays = None
-        if with_replay:
-            replays = replayed(folder, experiment, simulate, estimates(fit), begin("replay"))
-        begun.append(begin("diagnose"))
-        values = estimates(fit)
         with crew(folder, model, effects, simulate):
             simulate.ahead(lambda ask: gather(experiment, ask, values, repeats=options.repeats))
+            replays = replayed(folder, experiment, simulate, values, begin("replay")) if with_replay else None
+            begun.append(begin("diagnose"))
             report("where soil plays no part", 0.0)
             calibration = calibrated(folder, experiment, simulate, values)
             found = diagnose(

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 #: Differences are shown this many times as strong as they are.
 GAIN = 4.0
+#: Evaluations of a fit that are chosen and simulated together: as many cores as a small laptop has.
+TOGETHER = 2
 
 
 def hush() -> None:
@@ -156,6 +158,7 @@ def fitted(
         loss=LOSS,
         search=options.search,
         coarse=options.coarse,
+        at_once=1 if options.coarse is not None or options.search == "paper" else TOGETHER,
     )
     units = {p.name: "°" if p.unit == "deg" else f" {p.unit}" for p in space}
 

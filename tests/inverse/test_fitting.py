@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from splatsoil.inverse import fitting
 from splatsoil.inverse.bayesopt import PAPER, BayesianOptimiser
 from splatsoil.inverse.evaluations import EvaluationRecord, digest
 from splatsoil.inverse.fitting import fit
@@ -96,6 +97,48 @@ def test_an_interrupted_fit_goes_on_to_the_same_end(
     result = fit(problem, analytic.prepare(tmp_path / "run"), analytic.SETUP, budget=BUDGET, facts={"spacing": 0.01})
     assert problem.calls == BUDGET - stop_after
     assert without_times(result) == without_times(uninterrupted)
+
+
+@pytest.fixture(scope="module")
+def pairs(analytic: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], list[int]]:
+    """A fit whose evaluations are chosen two at a time, and how many were made together."""
+    sizes: list[int] = []
+    made = fitting.evaluate_together
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            fitting, "evaluate_together", lambda problems, jobs: sizes.append(len(jobs)) or made(problems, jobs)
+        )
+        run = analytic.prepare(tmp_path_factory.mktemp("runs") / "pairs")
+        found = fit(analytic.AnalyticProblem(), run, replace(analytic.SETUP, at_once=2), budget=BUDGET)
+    return found, sizes
+
+
+def test_evaluations_chosen_together_are_made_together_and_none_beyond_the_budget(
+    analytic: ModuleType, uninterrupted: dict[str, Any], pairs: tuple[dict[str, Any], list[int]]
+) -> None:
+    found, sizes = pairs
+    assert sizes == [2, 2, 2] and found["evaluations"] == BUDGET
+    assert found["parameters"]["friction_angle"]["estimate"] == pytest.approx(36.0, abs=0.1)
+    start = analytic.SETUP.start
+    first = [[step["parameters"], step["loss"]] for step in found["history"][:start]]
+    assert first == [[step["parameters"], step["loss"]] for step in uninterrupted["history"][:start]]
+
+
+@pytest.mark.parametrize("stop_after", [1, 4, 5])
+def test_a_fit_interrupted_between_two_evaluations_goes_on_to_the_same_end(
+    analytic: ModuleType, tmp_path: Path, pairs: tuple[dict[str, Any], list[int]], stop_after: int
+) -> None:
+    def stop(done: int, _: EvaluationRecord) -> None:
+        if done == stop_after:
+            raise StopError
+
+    setup = replace(analytic.SETUP, at_once=2)
+    with pytest.raises(StopError):
+        fit(analytic.AnalyticProblem(), analytic.prepare(tmp_path), setup, budget=BUDGET, after_evaluation=stop)
+    problem = analytic.AnalyticProblem()
+    result = fit(problem, analytic.prepare(tmp_path), setup, budget=BUDGET)
+    assert problem.calls == BUDGET - stop_after
+    assert without_times(result) == without_times(pairs[0])
 
 
 def test_killed_and_started_again(analytic: ModuleType, tmp_path: Path, uninterrupted: dict[str, Any]) -> None:
