@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import math
-import os
 import time
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
+from threading import Event
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from splatsoil.errors import SimulationError
 
+from .devices import cores
 from .problem import Evaluation, Problem
 
 if TYPE_CHECKING:
@@ -90,7 +92,7 @@ def _measured(problem: MeasuredProblem, jobs: Sequence[Job]) -> list[Evaluation]
     began = time.perf_counter()
     model = problem.model
     particles = [model.particles(seed) for _, seed in jobs]
-    found = simulate_together(model.measurement, particles, [v for v, _ in jobs], model)
+    found = simulate_together(model.measurement, particles, [v for v, _ in jobs], model, problem.progress)
     out = []
     for (values, seed), trajectory in zip(jobs, found, strict=True):
         if isinstance(trajectory, SimulationError):
@@ -102,7 +104,11 @@ def _measured(problem: MeasuredProblem, jobs: Sequence[Job]) -> list[Evaluation]
 
 
 def simulate_together(
-    measurement: Any, particles: Sequence[Any], values: Sequence[Mapping[str, float]], world: Any
+    measurement: Any,
+    particles: Sequence[Any],
+    values: Sequence[Mapping[str, float]],
+    world: Any,
+    progress: Callable[[int, int], None] | None = None,
 ) -> list[Trajectory | SimulationError]:
     """Trajectories of simulations that share a scene: on a GPU one batch, on a CPU one thread for each core's share.
 
@@ -111,10 +117,18 @@ def simulate_together(
         particles: (n, 3) for each simulation; those with the same n go together.
         values: parameters by name for each.
         world: has ``law``, ``resolution``, ``device`` and the ``recorded`` frames.
+        progress: called with (frame, last frame) of the first one.
     """
     from splatsoil.mpm import simulate
 
     out: list[Trajectory | SimulationError] = [SimulationError("not run")] * len(values)
+    stopped = Event()
+
+    def told(job: int, frame: int, last: int) -> None:
+        if stopped.is_set():
+            raise SimulationError("interrupted")
+        if job == 0 and progress is not None:
+            progress(frame, last)
 
     def run(rows: Sequence[int]) -> None:
         stack = np.stack([particles[k] for k in rows])
@@ -127,6 +141,7 @@ def simulate_together(
                 resolution=world.resolution,
                 frames=world.recorded,
                 device=world.device,
+                progress=partial(told, rows[0]),
             )
         except SimulationError as error:
             if len(rows) > 1:
@@ -152,6 +167,10 @@ def simulate_together(
     if kind not in _BUILT:
         run([singles.pop(0)])
         _BUILT.add(kind)
-    with ThreadPoolExecutor(max(1, len(os.sched_getaffinity(0)))) as threads:
-        list(threads.map(run, [[k] for k in singles]))
+    with ThreadPoolExecutor(cores()) as threads:
+        try:
+            list(threads.map(run, [[k] for k in singles]))
+        except BaseException:
+            stopped.set()  # whoever interrupts this doesn't want to wait for the others
+            raise
     return out

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from splatsoil.benchmarks._common import ALL, stamp
 from splatsoil.benchmarks._validation.costs import processor
+from splatsoil.envs.devices import cores
 
 from splatsoil.files import code_digest
 
@@ -25,14 +26,6 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:
             continue
     return found
-
-
-def cores() -> int:
-    """That this process may use."""
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:  # not on macOS
-        return os.cpu_count() or 1
 
 
 def memory() -> float:

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 from splatsoil.benchmarks._speed.clock import repeated, side_by_side, timed
-from splatsoil.benchmarks._speed.machine import cores
 from splatsoil.benchmarks._speed.rows import Group, Row, Sample, had, judged, missing
 from splatsoil.benchmarks._speed.scenes import Plough, height_error, paper_scene
+from splatsoil.envs.devices import cores
 
 from splatsoil.errors import SimulationError
 

@@ -13,9 +13,9 @@ from typing import Any
 
 import torch
 from splatsoil.benchmarks._speed.clock import on_threads, repeated
-from splatsoil.benchmarks._speed.machine import cores
 from splatsoil.benchmarks._speed.rows import Group, Row, Sample, at_least, had, judged
 from splatsoil.benchmarks.rasteriser import LEAVES, scene
+from splatsoil.envs.devices import cores
 
 from splatsoil.measurement import Camera, Measurement
 from splatsoil.reconstruction import Reconstruction, reconstruct

@@ -31,14 +31,13 @@ def crew(folder: RunFolder, model: Model, effects: Iterable[str], simulate: Simu
         effects: the candidates, as `experiment_of` takes them; none for all.
         simulate: what is helped.
     """
-    import os
-
     import torch
 
+    from splatsoil.envs.devices import cores
     from splatsoil.inverse.criticism.simulations import Helpers
     from splatsoil.inverse.executors import Processes
 
-    count = min(len(os.sched_getaffinity(0)) - 1, MOST_HELPERS)
+    count = min(cores() - 1, MOST_HELPERS)
     if count < 1:
         yield
         return

@@ -173,7 +173,9 @@ def fitted(
         report(f"{spent:.3g} of {budget}: {values}, {outcome}{level}", spent / budget)
 
     def simulating(frame: int, last: int) -> None:
-        report(f"simulation {finished + 1}, frame {frame}", min((spent + frame / (last + 1)) / budget, 1.0))
+        report(
+            f"simulation {finished + 1}, frame {frame}", min((spent + setup.at_once * frame / (last + 1)) / budget, 1.0)
+        )
 
     report("reading the video", 0.0)
     problem = MeasuredProblem(model, space, progress=simulating)
