@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from splatsoil.model import Model
 
 MOST_HELPERS = 3
-"""Each holds a reconstruction and a scene: half a GiB, and on a GPU a context of its own."""
+SHARE = {"cpu": 2.0, "cuda": 4.0}
+"""Memory that each process is to have, GiB: it holds a reconstruction, a scene and soil."""
 
 
 @contextmanager
@@ -37,28 +38,41 @@ def crew(folder: RunFolder, model: Model, effects: Iterable[str], simulate: Simu
     from splatsoil.inverse.criticism.simulations import Helpers
     from splatsoil.inverse.executors import Processes
 
-    count = min(cores() - 1, MOST_HELPERS)
-    if count < 1:
-        yield
-        return
-    threads, named = torch.get_num_threads(), tuple(effects)
+    room = _memory(model.device) / SHARE[model.device.split(":")[0]]
+    count, named = int(min(cores(), 1 + MOST_HELPERS, room)) - 1, tuple(effects)
+    threads, workers = torch.get_num_threads(), Processes(count) if count > 0 else None
     torch.set_num_threads(1)
-    workers = Processes(count)
-
-    def submit(job: Mapping[str, Any]) -> Any:
-        return workers.submit(_simulate, folder.path, model.device, named, dict(job))
-
-    finished = False
     try:
+        if workers is None:
+            yield
+            return
+
+        def submit(job: Mapping[str, Any]) -> Any:
+            return workers.submit(_simulate, folder.path, model.device, named, dict(job))
+
         with simulate.helped(Helpers(count, submit)):
             yield
-        finished = True
+        workers.shutdown(cancel_futures=True)
+    except BaseException:
+        if workers is not None:
+            workers.kill()
+        raise
     finally:
         torch.set_num_threads(threads)
-        if finished:
-            workers.shutdown(cancel_futures=True)
-        else:
-            workers.kill()
+
+
+def _memory(device: str) -> float:
+    """GiB: the machine's whole, or what is free on a GPU."""
+    import os
+
+    import torch
+
+    if device != "cpu":
+        return float(torch.cuda.mem_get_info(device)[0]) / 2**30
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    except (AttributeError, ValueError, OSError):  # not every system tells
+        return float("inf")
 
 
 _known: dict[tuple[Path, str, tuple[str, ...]], Simulations] = {}
