@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -171,7 +171,7 @@ class Simulations:
         if self.told is not None:
             self.told(purpose)
         if planned is not None and not planned.cancel():
-            planned.result()
+            wait([planned])
             kept = self._kept(key)
         return self._make(key, what) if kept is None else kept
 
@@ -179,7 +179,7 @@ class Simulations:
         """A new simulation: here, or by a helper while this process is at another one."""
         free = self._here.acquire(blocking=False)
         if not free and self._helpers is not None and all(isinstance(e, str) for e in what["effects"]):
-            self._helpers.submit(what).result()
+            wait([self._helpers.submit(what)])
             kept = self._kept(key)
             if kept is not None:
                 return kept

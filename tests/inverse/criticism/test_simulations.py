@@ -16,7 +16,7 @@ from splatsoil.benchmarks.hidden_effects import emulated
 from splatsoil.inverse.criticism.evidence import gather
 from splatsoil.inverse.criticism.simulations import Helpers, Simulations
 
-from splatsoil.errors import SimulationError
+from splatsoil.errors import RunError, SimulationError
 
 AT = {"angle": 0.5}
 
@@ -96,10 +96,11 @@ def test_jobs_that_wait_for_simulations_run_side_by_side_and_come_back_in_order(
     assert len(mine.calls) + len(theirs.calls) == 13  # what all three asked for was made once
 
 
-def test_a_helper_that_fails_or_dies_costs_nothing_but_its_help(tmp_path: Path) -> None:
+@pytest.mark.parametrize("error", [None, RunError("a worker died 4 times")])
+def test_a_helper_that_fails_or_dies_costs_nothing_but_its_help(tmp_path: Path, error: Exception | None) -> None:
     def dead(job: Mapping[str, Any]) -> Future[None]:
         done: Future[None] = Future()
-        done.set_result(None)
+        done.set_exception(error) if error else done.set_result(None)
         return done
 
     mine = Watched(lambda values: values["angle"] > 1.0)
