@@ -212,10 +212,10 @@ def tally(
         held += any(m in truth for m in members)
         sizes.append(len(members))
         best = diagnosis.confirmations[members[0]]
-        after.append(abs(best.fit.values[parameter] - angle))
+        after.append(abs(best.values[parameter] - angle))
         if [name for name in truth if name in diagnosis.scores] == [members[0]]:
             known = {parameter: angle, **{(sizes_of or {}).get(n, n): size for n, size in truth.items()}}
-            misses += [abs(best.fit.values[key] - value) / best.stds[key] for key, value in known.items()]
+            misses += [abs(best.values[key] - value) / best.stds[key] for key, value in known.items()]
         errors.append((diagnosis.confirmations[""].held_out / best.floor, best.held_out / best.floor))
     error = tuple(np.mean(errors, axis=0)) if errors else (math.nan, math.nan)
     return Tally(

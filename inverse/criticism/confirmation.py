@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -16,11 +17,12 @@ from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Candidate, Experiment
 from splatsoil.parameters import Parameter
 
-from .evidence import Evidence, Vantage
+from .evidence import Evidence, Vantage, Visit, ignorance
 from .floor import Floor, floor_of
 from .joint import precision_of
 from .misfit import Omnibus, omnibus, smooth_basis
 from .noise import Noise
+from .reading import MOST, explored, read
 from .refit import ROUNDS, Known, Refit, Start, settle
 from .score import Scorer
 from .sight import Sight
@@ -37,8 +39,9 @@ class Confirmation:
 
     Attributes:
         name: of the effect; empty for the model as it is.
-        fit: the refit.
-        stds: standard deviations of its estimates, by parameter.
+        fit: the refit, by which the effect is judged.
+        values: the parameters by all times.
+        stds: standard deviations of these.
         chi2: of all times, as far as these tell of anything; see :class:`~splatsoil.inverse.criticism.sight.Sight`.
         fall: by how much that is less than the model's as it is.
         unseen: likewise, on times the refit hasn't seen alone.
@@ -51,6 +54,7 @@ class Confirmation:
 
     name: str
     fit: Refit
+    values: Mapping[str, float]
     stds: Mapping[str, float]
     chi2: float
     fall: float
@@ -81,37 +85,44 @@ def confirm(
     jobs: list[Candidate | None] = [None, *chosen]
     done = 0
 
-    def refitted(candidate: Candidate | None) -> Refit:
+    def refitted(candidate: Candidate | None) -> tuple[Refit, list[Visit]]:
         nonlocal done
-        name = "" if candidate is None else candidate.name
-        purpose = f"refit {name or 'of the model'}"
+        on = () if candidate is None else (candidate.name,)
+        purpose = f"refit {candidate.name if candidate else 'of the model'}"
         told(purpose, 0.75 + 0.2 * done / len(jobs))
 
         def predict(values: Mapping[str, float]) -> FloatArray:
-            return simulate(values, effects=(name,) if name else (), purpose=purpose)
+            table = simulate(values, effects=on, purpose=purpose)
+            visits.append(Visit(dict(values), on, table))
+            return table
 
+        visits = [v for p in (evidence, vantage) if p is not None for v in p.visits if v.effects in ((), on)]
         free = _free(experiment, candidate)
+        known, emulated = _known(evidence, free), _emulated(experiment, candidate)
         fit = settle(
             predict,
             whiten,
             experiment.observed,
             free,
-            _starts(experiment, evidence, candidate, simulate, vantage),
+            _starts(experiment, evidence, candidate, vantage),
             chance=experiment.chance,
-            known=_known(evidence, free),
+            known=known,
             renewed=[p.name for p in experiment.parameters] + _renewed(candidate),
             most=steps if candidate is not None else max(steps - 2, 1),
-            rounds=ROUNDS if candidate is not None else 0,
+            rounds=0 if candidate is None or emulated else ROUNDS,
         )
+        if emulated:
+            shapes = () if candidate is None else candidate.shapes
+            fit = explored(predict, visits, whiten, experiment.observed, free, known, fit, shapes)
         done += 1
-        return fit
+        return fit, visits
 
-    fits = simulate.side_by_side([partial(refitted, candidate) for candidate in jobs])
+    refits = simulate.side_by_side([partial(refitted, candidate) for candidate in jobs])
     whole = Sight.of(experiment, floor, basis, vantage)
     apart = whole if shown.all() else Sight.of(experiment, floor, basis, vantage, hidden)
-    before = experiment.observed - fits[0].prediction
+    before = experiment.observed - refits[0][0].prediction
     out: dict[str, Confirmation] = {}
-    for candidate, fit in zip(jobs, fits, strict=True):
+    for candidate, (fit, visits) in zip(jobs, refits, strict=True):
         free = _free(experiment, candidate)
         known = _known(evidence, free)
         at, off = (np.array([values.get(p.name, p.off or 0.0) for p in free]) for values in (fit.values, {}))
@@ -119,10 +130,17 @@ def confirm(
         tangent = np.concatenate([floor.nuisance, _tangent(floor.single, fit)], axis=1)
         remainder = omnibus(floor.single, tangent, left[experiment.seen], basis)
         chi2 = _chi2(whole, left) + known.chi2(at)
+        values, stds = fit.values, _stds(free, fit, np.concatenate([whiten(fit.slopes), known.root]), remainder)
+        if _emulated(experiment, candidate):
+            # A surface that isn't one tells nothing more than the last derivatives do.
+            with suppress(ValueError):
+                reading = read(visits, whole, experiment.observed, free, known)
+                values, stds = reading.values, reading.stds
         out["" if candidate is None else candidate.name] = Confirmation(
             name="" if candidate is None else candidate.name,
             fit=fit,
-            stds=_stds(free, np.concatenate([whiten(fit.slopes), known.root]), remainder),
+            values=values,
+            stds=stds,
             chi2=chi2,
             fall=0.0 if candidate is None else _chi2(whole, before) + known.chi2(off) - chi2,
             unseen=_chi2(apart, before) - _chi2(apart, left),
@@ -136,7 +154,13 @@ def confirm(
 
 def _free(experiment: Experiment, candidate: Candidate | None) -> list[Parameter]:
     """Parameters of a refit."""
-    return [*experiment.parameters, *(() if candidate is None else candidate.parameters)]
+    return [*experiment.parameters, *(() if candidate is None else candidate.refitted)]
+
+
+def _emulated(experiment: Experiment, candidate: Candidate | None) -> bool:
+    """Whether a refit reads the parameters off all simulations: where these cost and have chance in them."""
+    reported = candidate is not None and candidate.kind == "observation"
+    return experiment.chance and not reported and len(_free(experiment, candidate)) <= MOST
 
 
 def _chi2(sight: Sight, left: FloatArray) -> float:
@@ -160,7 +184,7 @@ def _renewed(candidate: Candidate | None) -> list[str]:
     """Parameters of an effect whose derivatives change on the way; what cameras report is nearly linear."""
     if candidate is None:
         return []
-    return [p.name for p in candidate.parameters] if candidate.kind == "physics" else [candidate.size]
+    return [p.name for p in candidate.refitted] if candidate.kind == "physics" else [candidate.size]
 
 
 def _known(evidence: Evidence, free: Sequence[Parameter]) -> Known:
@@ -174,34 +198,32 @@ def _known(evidence: Evidence, free: Sequence[Parameter]) -> Known:
 
 
 def _starts(
-    experiment: Experiment,
-    evidence: Evidence,
-    candidate: Candidate | None,
-    simulate: Simulations,
-    vantage: Vantage | None,
+    experiment: Experiment, evidence: Evidence, candidate: Candidate | None, vantage: Vantage | None
 ) -> list[Start]:
     """Where a refit begins: at the fit, and at the second look's point for an effect that was switched on there."""
-    extra = () if candidate is None else candidate.parameters
+    extra = () if candidate is None else candidate.refitted
     off = {p.name: p.off if p.off is not None else p.default for p in extra}
 
-    def start(values: Mapping[str, float], prediction: FloatArray, seen: Evidence | Vantage) -> Start:
-        model = np.stack([seen.slopes[p.name] for p in experiment.parameters], axis=-1)
-        added = [] if candidate is None else [np.moveaxis(seen.directions[candidate.name], 0, -1)]
-        return Start({**values, **off}, prediction, np.concatenate([model, *added], axis=-1))
+    def start(point: Vantage) -> Start:
+        model = np.stack([point.slopes[p.name] for p in experiment.parameters], axis=-1)
+        added = [] if candidate is None else [np.moveaxis(point.directions[candidate.name], 0, -1)]
+        # While the effect is off, its shape changes nothing.
+        shapes = np.zeros((*model.shape[:2], 0 if candidate is None else len(candidate.shapes)))
+        return Start({**point.values, **off}, point.prediction, np.concatenate([model, *added, shapes], axis=-1))
 
-    starts = [start(evidence.values, simulate(evidence.values, seed=0), evidence)]
+    points: list[Vantage] = [evidence]
     if candidate is not None and vantage is not None and candidate.name in vantage.directions:
-        starts.append(start(vantage.values, vantage.prediction, vantage))
-    return starts
+        points.append(vantage)
+    return [start(point) for point in points]
 
 
-def _stds(free: Sequence[Parameter], columns: FloatArray, remainder: Omnibus) -> dict[str, float]:
+def _stds(free: Sequence[Parameter], fit: Refit, columns: FloatArray, remainder: Omnibus) -> dict[str, float]:
     """Standard deviations of a refit's estimates, each parameter's range being its prior.
 
     Where more than noise remains, they are widened by the root of its dispersion (Birge 1932).
     """
-    prior = np.array([math.sqrt(12.0) / (p.upper - p.lower) for p in free])
-    covariance = np.linalg.inv(columns.T @ columns + np.diag(prior**2))
+    prior = np.array([ignorance(p, fit.values[p.name]) for p in free])
+    covariance = np.linalg.inv(columns.T @ columns + np.diag(prior**-2.0))
     widened = math.sqrt(max(1.0, remainder.dispersion))
     return {p.name: widened * math.sqrt(float(v)) for p, v in zip(free, np.diag(covariance), strict=True)}
 

@@ -219,7 +219,7 @@ def judge(
         )
         tried = {name: c for name, c in confirmations.items() if name}
         # Not by what is left of χ²: an effect that stays off leaves what other pictures say of it unexplained.
-        costs = {name: scorer.price(candidates[name]) - c.fall for name, c in tried.items()}
+        costs = {name: scorer.price(candidates[name], refitted=True) - c.fall for name, c in tried.items()}
         best = min(costs, key=lambda name: costs[name])
         before = confirmations[""].remainder
         if _stands(confirmations, best, misfit, scores[best].dispersion):
@@ -284,9 +284,9 @@ def _advice(
     """Which other stroke tells the members of a class apart, each at the size that its refit found."""
     if len(members) < 2:
         return ()
-    fitted = dict(confirmations[members[0]].fit.values)
+    fitted = dict(confirmations[members[0]].values)
     for name in members[1:]:
-        fitted |= {p.name: confirmations[name].fit.values[p.name] for p in candidates[name].parameters}
+        fitted |= {p.name: confirmations[name].values[p.name] for p in candidates[name].refitted}
     chosen = [candidates[name] for name in members]
     return advise(experiment, fitted, chosen, progress=lambda share: told("other strokes", share))
 
@@ -360,7 +360,7 @@ def _effects(
     out: dict[str, EffectVerdict] = {}
     for name, candidate in candidates.items():
         if name in members:
-            out[name] = "missing" if _matters(candidate, confirmations[name].fit.values) else "trivial"
+            out[name] = "missing" if _matters(candidate, confirmations[name].values) else "trivial"
         else:
             out[name] = of_effect(candidate, given.get(name, scores[name]), level=level)
             if out[name] == "missing":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -22,6 +23,21 @@ REACH = 0.5
 
 
 @dataclass(frozen=True)
+class Visit:
+    """One simulation.
+
+    Attributes:
+        values: its parameters, by name.
+        effects: names of the candidates that were on.
+        table: (t, s) features.
+    """
+
+    values: Mapping[str, float]
+    effects: tuple[str, ...]
+    table: FloatArray
+
+
+@dataclass(frozen=True)
 class Vantage:
     """Predictions around one point.
 
@@ -34,6 +50,7 @@ class Vantage:
         directions: (k, t, s) derivatives by each candidate's parameters, at off.
         steps: the step of each of these.
         failed: candidates whose simulation could not go on, with the reason.
+        visits: all simulations that were made, with the same particles.
     """
 
     values: Mapping[str, float]
@@ -44,37 +61,24 @@ class Vantage:
     directions: Mapping[str, FloatArray]
     steps: Mapping[str, float]
     failed: Mapping[str, str]
+    visits: tuple[Visit, ...]
 
 
 @dataclass(frozen=True)
-class Evidence:
-    """Predictions around a fit.
+class Evidence(Vantage):
+    """Predictions around a fit, and how far they can be believed.
 
     Attributes:
-        values: the fitted parameters.
         mean: (t, s) mean prediction over seeds that derivatives don't share.
         repeats: (r, t, s) deviations of those seeds from their mean, scaled to have the variance of one seed.
         numerics: (t, s) what other numerics change, by name.
-        slopes: (t, s) derivative by each parameter of the model.
-        curves: (t, s) half the second derivative by each parameter where it was measured.
-        widths: the step of each parameter's derivative.
-        directions: (k, t, s) derivatives by each candidate's parameters.
-        steps: the step of each of these.
         replays: (k, t, s) residuals of known soils that went through the whole chain of pictures and reconstruction.
         calibration: what pictures say of cameras, light, clock and tool where soil plays no part.
-        failed: candidates whose simulation could not go on, with the reason.
     """
 
-    values: Mapping[str, float]
     mean: FloatArray
     repeats: FloatArray
     numerics: Mapping[str, FloatArray]
-    slopes: Mapping[str, FloatArray]
-    curves: Mapping[str, FloatArray]
-    widths: Mapping[str, float]
-    directions: Mapping[str, FloatArray]
-    steps: Mapping[str, float]
-    failed: Mapping[str, str]
     replays: FloatArray | None = None
     calibration: Calibration | None = None
 
@@ -109,27 +113,15 @@ def gather(
         return table
 
     runs = np.stack([run(f"repeat {seed} of {len(seeds)}", base, seed=seed) for seed in seeds])
-    middle = run("the fit", base)
     deviations = (runs - runs.mean(axis=0)) * np.sqrt(len(runs) / max(len(runs) - 1, 1))
+    found = look_from(experiment, base, experiment.candidates, run)
     numerics = {}
     for name in experiment.numerics:
         try:
-            numerics[name] = run(f"numerics: {name}", base, numerics=name) - middle
+            numerics[name] = run(f"numerics: {name}", base, numerics=name) - found.prediction
         except SimulationError:
             continue
-    found = look_from(experiment, base, experiment.candidates, run)
-    return Evidence(
-        base,
-        runs.mean(axis=0),
-        deviations,
-        numerics,
-        found.slopes,
-        found.curves,
-        found.widths,
-        found.directions,
-        found.steps,
-        found.failed,
-    )
+    return Evidence(**vars(found), mean=runs.mean(axis=0), repeats=deviations, numerics=numerics)
 
 
 def look_from(
@@ -147,12 +139,19 @@ def look_from(
         SimulationError: the point or a neighbour without an effect can't be simulated.
     """
     base = dict(values)
-    middle = run("the point", base)
+    visits: list[Visit] = []
+
+    def visit(purpose: str, at: Mapping[str, float], effects: tuple[str, ...] = ()) -> FloatArray:
+        visits.append(Visit(dict(at), effects, run(purpose, at, effects)))
+        return visits[-1].table
+
+    middle = visit("the point", base)
     slopes, curves, widths = {}, {}, {}
     for parameter in experiment.parameters:
-        ends = around(parameter, base[parameter.name])
-        tables = [run(parameter.name, {**base, parameter.name: end}) for end in ends]
-        offsets = [end - base[parameter.name] for end in ends]
+        value = base[parameter.name]
+        ends = around(parameter, value)
+        tables = [visit(parameter.name, {**base, parameter.name: end}) for end in ends]
+        offsets = [distance(parameter, value, end) for end in ends]
         slopes[parameter.name], curve = derivatives(offsets, tables, middle)
         widths[parameter.name] = max(abs(offset) for offset in offsets)
         if curve is not None:
@@ -163,19 +162,42 @@ def look_from(
     for candidate in candidates:
         try:
             directions[candidate.name] = np.stack(
-                [_slope(candidate, parameter, base, middle, run, steps) for parameter in candidate.parameters]
+                [_slope(candidate, parameter, base, middle, visit, steps) for parameter in candidate.parameters]
             )
         except SimulationError as error:
             failed[candidate.name] = str(error)
-    return Vantage(base, middle, slopes, curves, widths, directions, steps, failed)
+    return Vantage(base, middle, slopes, curves, widths, directions, steps, failed, tuple(visits))
 
 
 def around(parameter: Parameter, value: float) -> list[float]:
     """Where a model's parameter is varied to: both sides of its value, or one where a bound is near."""
-    step = STEP * parameter.meaningful if parameter.meaningful > 0.0 else 0.05 * (parameter.upper - parameter.lower)
-    step = min(step, 0.25 * (parameter.upper - parameter.lower))
-    ends = [max(value - step, parameter.lower), min(value + step, parameter.upper)]
-    return [end for end in ends if abs(end - value) > 0.3 * step]
+    whole = distance(parameter, parameter.lower, parameter.upper) / rate(parameter, parameter.lower)
+    step = STEP * parameter.meaningful / rate(parameter, value) if parameter.meaningful > 0.0 else 0.05 * whole
+    step = min(step, 0.25 * whole)
+    ends = [moved(parameter, value, side * step) for side in (-1.0, 1.0)]
+    return [end for end in ends if abs(distance(parameter, value, end)) > 0.3 * step * rate(parameter, value)]
+
+
+def rate(parameter: Parameter, value: float) -> float:
+    """How fast a parameter grows along its scale: 1, or the value itself on a logarithmic one."""
+    return value if parameter.log else 1.0
+
+
+def distance(parameter: Parameter, value: float, end: float) -> float:
+    """From a value to another along the parameter's scale, in its unit at the value."""
+    return value * math.log(end / value) if parameter.log else end - value
+
+
+def moved(parameter: Parameter, value: float, step: float) -> float:
+    """A value moved along its scale (by a logarithm, where that is logarithmic), within the bounds."""
+    end = value * math.exp(step) if parameter.log else value + step
+    return min(max(end, parameter.lower), parameter.upper)
+
+
+def ignorance(parameter: Parameter, value: float) -> float:
+    """Standard deviation of a parameter of which only the bounds are known, in its unit at a value."""
+    whole = distance(parameter, parameter.lower, parameter.upper) / rate(parameter, parameter.lower)
+    return whole * rate(parameter, value) / math.sqrt(12.0)
 
 
 def derivatives(

@@ -12,7 +12,7 @@ from scipy.optimize import nnls
 from splatsoil.experiment.base import Experiment
 from splatsoil.experiment.features import Layout
 
-from .evidence import Evidence
+from .evidence import Evidence, ignorance
 from .noise import Noise, Part, correlated, estimate, extra_noise, independent
 
 FloatArray = npt.NDArray[np.float64]
@@ -68,8 +68,8 @@ def floor_of(experiment: Experiment, evidence: Evidence) -> Floor:
     a sample of what numerics that weren't tried would leave, and goes into the noise.
     """
     layout, seen = experiment.layout, experiment.seen
-    prior = {p.name: (p.upper - p.lower) / np.sqrt(12.0) for p in experiment.parameters}
-    slopes = [prior[name] * table for name, table in evidence.slopes.items()]
+    prior = {p.name: p for p in experiment.parameters}
+    slopes = [ignorance(prior[name], evidence.values[name]) * table for name, table in evidence.slopes.items()]
     slopes += [(3.0 * evidence.widths[name]) ** 2 * table for name, table in evidence.curves.items()]
     parameters = _columns(slopes, seen)
     parts = {"instruments": independent(experiment.sensor, experiment.sensor_memory)}

@@ -22,7 +22,7 @@ from splatsoil.experiment.base import Experiment
 from splatsoil.experiment.states import States, Strained
 from splatsoil.parameters import Parameter
 
-from .evidence import Evidence, around
+from .evidence import Evidence, around, ignorance
 from .floor import Floor
 from .free_strength import NODES, FreeStrength, Range, coordinates, hats, ranges
 from .misfit import Omnibus, omnibus
@@ -193,7 +193,7 @@ def _fit(
         np.array([getattr(p, side) for p in (*parameters, *effect.parameters)]) for side in ("lower", "upper")
     )
     home = np.array([*(evidence.values[p.name] for p in parameters), *(0.0 for _ in effect.parameters)])
-    wide = [(p.upper - p.lower) / math.sqrt(12.0) for p in parameters]
+    wide = [ignorance(p, evidence.values[p.name]) for p in parameters]
     root = _prior_root(effect.spans, PRIOR)
     precision = np.zeros((len(home), len(home)))
     precision[: len(wide), : len(wide)] = np.diag(np.array(wide) ** -2.0)
@@ -218,7 +218,7 @@ def _fit(
         step = at - home
         return float(np.sum(whiten(experiment.observed - table) ** 2) + step @ precision @ step)
 
-    widths = np.array([*measured_over(parameters, home[: len(wide)]), *(STEP for _ in effect.parameters)])
+    widths = np.array([*measured_over(parameters, evidence.values), *(STEP for _ in effect.parameters)])
     at, here = home, run(home)
     for _ in range(rounds):
         slopes = _slopes((*parameters, *effect.parameters), at, here, run)

@@ -114,7 +114,7 @@ def _effect(diagnosis: Diagnosis, candidate: Candidate) -> dict[str, Any]:
     }
     confirmed = diagnosis.confirmations.get(candidate.name)
     if confirmed is not None:
-        entry["estimate"], entry["std"] = confirmed.fit.values[measure.name], confirmed.stds[measure.name]
+        entry["estimate"], entry["std"] = confirmed.values[measure.name], confirmed.stds[measure.name]
         entry["achieved_fall"] = confirmed.fall
     return entry
 
@@ -122,7 +122,7 @@ def _effect(diagnosis: Diagnosis, candidate: Candidate) -> dict[str, Any]:
 def confirmation(c: Confirmation) -> dict[str, Any]:
     """A refit and how it was judged."""
     return {
-        "values": dict(c.fit.values),
+        "values": dict(c.values),
         "stds": dict(c.stds),
         "chi2": c.chi2,
         "fall": c.fall,

@@ -5,6 +5,7 @@ Some ten simulations, enough to say how far χ² really falls; the estimate that
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -15,9 +16,9 @@ from scipy.optimize import lsq_linear
 
 from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Experiment
-from splatsoil.parameters import Parameter
+from splatsoil.parameters import Parameter, ParameterSpace
 
-from .evidence import around, derivatives
+from .evidence import around, derivatives, distance, ignorance
 from .noise import Noise, independent
 from .simulations import Simulations
 
@@ -68,6 +69,12 @@ class Known:
         """Of ``count`` parameters nothing is known."""
         return cls(np.zeros((0, count)), np.zeros(count))
 
+    def scaled(self, space: ParameterSpace, about: Mapping[str, float]) -> Known:
+        """The same of parameters in [-1, 1]; along logarithmic scales as they are at some values."""
+        scale = half_ranges(space.parameters, about)
+        here = space.to_vector(about)
+        return Known(self.root * scale, space.to_unit(here) + (self.centre - here) / scale)
+
     def chi2(self, at: FloatArray) -> float:
         """Of parameters (k,)."""
         return float(np.sum((self.root @ (self.centre - at)) ** 2))
@@ -100,30 +107,28 @@ def refit(
         known: what other measurements say of the parameters.
         most: simulations.
     """
-    lower, upper = (np.array([getattr(p, side) for p in parameters]) for side in ("lower", "upper"))
-    span = upper - lower
-    at = np.array([start[p.name] for p in parameters])
-    widths = measured_over(parameters, at)
-    slopes, here = slopes.copy(), prediction
-    other = known or Known.nothing(len(at))
+    space = ParameterSpace(parameters)
+    at = space.to_unit(space.to_vector(start))
+    scale = half_ranges(parameters, start)
+    widths = measured_over(parameters, start) / scale
+    slopes, here = slopes * scale, prediction
+    other = (known or Known.nothing(len(at))).scaled(space, start)
     chi2 = float(np.sum(whiten(observed - here) ** 2) + other.chi2(at))
-    trust, tried = TRUST, 0
+    trust, tried = 2.0 * TRUST, 0
     while tried < most:
-        matrix = np.concatenate([whiten(slopes), other.root]) * span
+        matrix = np.concatenate([whiten(slopes), other.root])
         target = np.concatenate([whiten(observed - here), other.root @ (other.centre - at)])
-        low = np.maximum((lower - at) / span, -trust)
-        high = np.minimum((upper - at) / span, trust)
+        low, high = np.maximum(-1.0 - at, -trust), np.minimum(1.0 - at, trust)
         high = np.maximum(high, low + 1e-9)
-        found = lsq_linear(matrix, target, bounds=(low, high))
-        step = np.clip(found.x, low, high)
+        step = np.clip(lsq_linear(matrix, target, bounds=(low, high)).x, low, high)
         predicted = chi2 - float(np.sum((target - matrix @ step) ** 2))
         # A fall below the noise, or a step nobody would notice: done.
-        if predicted < least_fall(chi2) or np.max(np.abs(step)) < 1e-3:
+        if predicted < least_fall(chi2) or np.max(np.abs(step)) < 2e-3:
             break
-        there = np.clip(at + step * span, lower, upper)
+        there = np.clip(at + step, -1.0, 1.0)
         tried += 1
         try:
-            table = predict({p.name: float(v) for p, v in zip(parameters, there, strict=True)})
+            table = predict(space.to_dict(space.from_unit(there)))
         except SimulationError:
             trust *= 0.4
             continue
@@ -135,8 +140,9 @@ def refit(
         gain = (chi2 - fresh) / predicted
         if fresh < chi2:
             at, here, chi2 = there, table, fresh
-        trust = min(2.0 * trust, 1.0) if gain > 0.75 else trust if gain > 0.25 else 0.4 * float(np.max(np.abs(step)))
-    return Refit({p.name: float(v) for p, v in zip(parameters, at, strict=True)}, chi2, here, tried, slopes)
+        trust = min(2.0 * trust, 2.0) if gain > 0.75 else trust if gain > 0.25 else 0.4 * float(np.max(np.abs(step)))
+    values = space.to_dict(space.from_unit(at))
+    return Refit(values, chi2, here, tried, slopes / half_ranges(parameters, values))
 
 
 def least_fall(chi2: float) -> float:
@@ -205,7 +211,8 @@ def settle(
             value = best.values[parameter.name]
             end = around(parameter, value)[0]
             try:
-                slopes[..., index] = (predict({**best.values, parameter.name: end}) - best.prediction) / (end - value)
+                change = predict({**best.values, parameter.name: end}) - best.prediction
+                slopes[..., index] = change / distance(parameter, value, end)
             except SimulationError:
                 continue
             finally:
@@ -241,9 +248,15 @@ def mended(
     return slopes + missing[..., None] * (weight / (float(chance) + float(weight @ moved)))
 
 
-def measured_over(parameters: Sequence[Parameter], at: FloatArray) -> FloatArray:
-    """(k,) the steps that derivatives at a point (k,) are measured over."""
-    return np.array([abs(around(p, float(v))[0] - float(v)) for p, v in zip(parameters, at, strict=True)])
+def measured_over(parameters: Sequence[Parameter], at: Mapping[str, float]) -> FloatArray:
+    """(k,) the steps that derivatives at a point are measured over."""
+    values = [(p, float(at[p.name])) for p in parameters]
+    return np.array([abs(distance(p, value, around(p, value)[0])) for p, value in values])
+
+
+def half_ranges(parameters: Sequence[Parameter], at: Mapping[str, float]) -> FloatArray:
+    """(k,) what a step of 1 in [-1, 1] is in each parameter's unit at a point."""
+    return np.array([math.sqrt(3.0) * ignorance(p, float(at[p.name])) for p in parameters])
 
 
 def optimum(
@@ -273,7 +286,8 @@ def optimum(
         for parameter in experiment.parameters:
             ends = around(parameter, values[parameter.name])
             tables = [simulate({**values, parameter.name: end}) for end in ends]
-            slopes.append(derivatives([end - values[parameter.name] for end in ends], tables, middle)[0])
+            offsets = [distance(parameter, values[parameter.name], end) for end in ends]
+            slopes.append(derivatives(offsets, tables, middle)[0])
         found = refit(
             simulate,
             whiten,

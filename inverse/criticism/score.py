@@ -167,9 +167,13 @@ class Scorer:
             falls[candidate.name] = fall - self.price(candidate)
         return sorted(falls, key=lambda name: falls[name], reverse=True)
 
-    def price(self, candidate: Candidate) -> float:
-        """χ² that an effect's parameters beyond its first must bring in (Schwarz 1978, over as many directions)."""
-        return _price(candidate, len(self.whole))
+    def price(self, candidate: Candidate, *, refitted: bool = False) -> float:
+        """χ² that an effect's parameters beyond its first must bring in (Schwarz 1978, over as many directions).
+
+        A refit frees those that shape it, too.
+        """
+        shapes = len(candidate.shapes) if refitted else 0
+        return _price(len(candidate.parameters) + shapes, len(self.whole))
 
     def confusion(self) -> FloatArray:
         """(m, m) correlation between the candidates' scores."""
@@ -230,8 +234,8 @@ class _Raw:
     survival: float
 
 
-def _price(candidate: Candidate, freedom: int) -> float:
-    return (len(candidate.parameters) - 1) * math.log(max(freedom, 2))
+def _price(parameters: int, freedom: int) -> float:
+    return (parameters - 1) * math.log(max(freedom, 2))
 
 
 def constrained(gradient: FloatArray, information: FloatArray, place: int, sign: int) -> tuple[float, FloatArray]:
@@ -280,7 +284,7 @@ def _smallest(candidates: Sequence[Candidate], places: Sequence[int], joint: Joi
         # Each is tested for being off: its own trivial size isn't in its score.
         mine = scores @ own.T - sizes[:, part] @ information
         falls[:, k] = _falls(mine, information, place, candidate.measure.sign)
-    best = np.argmax(falls - [_price(c, len(joint.trivial)) for c in candidates], axis=1)
+    best = np.argmax(falls - [_price(len(c.parameters), len(joint.trivial)) for c in candidates], axis=1)
     smallest = np.ones(DRAWS)
     for b in np.unique(best):
         rows, rest = best == b, joint.rest(int(b))

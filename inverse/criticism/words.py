@@ -41,7 +41,7 @@ def _missing(diagnosis: Diagnosis, candidates: Mapping[str, Candidate], base: Ma
     best = diagnosis.members[0]
     confirmed = diagnosis.confirmations[best]
     candidate = candidates[best]
-    size = confirmed.fit.values[candidate.size]
+    size = confirmed.values[candidate.size]
     std = confirmed.stds[candidate.size]
     out = [
         f"{title(best)} is missing: about {amount(size, std, candidate.measure.unit)}. Adding it lowers the error on "
@@ -54,9 +54,9 @@ def _missing(diagnosis: Diagnosis, candidates: Mapping[str, Candidate], base: Ma
             f"{100.0 * share:.0f} % of the evidence comes from one part of the data: {region}, {stage}, {channel}."
         )
     moved = [
-        f"{name.replace('_', ' ')} from {base[name]:.3g} to {confirmed.fit.values[name]:.3g}"
+        f"{name.replace('_', ' ')} from {base[name]:.3g} to {confirmed.values[name]:.3g}"
         for name in base
-        if abs(confirmed.fit.values[name] - base[name]) > 1e-6 * max(abs(base[name]), 1.0)
+        if abs(confirmed.values[name] - base[name]) > 1e-6 * max(abs(base[name]), 1.0)
     ]
     if moved:
         out.append(f"With it the refit moves {listed(moved)}: that much was bias.")
@@ -91,7 +91,7 @@ def _outside(diagnosis: Diagnosis, candidates: Mapping[str, Candidate]) -> list[
         best = diagnosis.members[0]
         confirmed, before = diagnosis.confirmations[best], diagnosis.confirmations[""]
         candidate = candidates[best]
-        size = amount(confirmed.fit.values[candidate.size], confirmed.stds[candidate.size], candidate.measure.unit)
+        size = amount(confirmed.values[candidate.size], confirmed.stds[candidate.size], candidate.measure.unit)
         out.append(
             f"The nearest is {best.replace('_', ' ')} ({size}): with it the error on frames that the refit has not "
             f"seen goes from {before.held_out:.2g} to {confirmed.held_out:.2g} {diagnosis.unit} (noise alone leaves "

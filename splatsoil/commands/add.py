@@ -115,9 +115,8 @@ def added(
     setup = before["setup"]
     effects = (*setup["effects"], name)
     larger = model.variant(effects=effects)
-    mine = [
-        p.name for p in next(e for e in larger.law.effects if e.name == effect.name).parameters if p.off is not None
-    ]
+    own = next(e for e in larger.law.effects if e.name == effect.name)
+    mine = [p.name for p in own.parameters if p.off is not None or p.name in own.shapes]
     fitting = FitOptions(
         set=model.measurement.folder,
         parameters=(*before["parameters"], *mine),

@@ -26,6 +26,7 @@ class Candidate:
         parameters: those whose off value is known: the directions in which it can act.
         size: name of the parameter that measures it.
         note: what it is.
+        shapes: parameters that mean nothing while the effect is off, and that data can tell once it is on.
     """
 
     name: str
@@ -33,6 +34,7 @@ class Candidate:
     parameters: tuple[Parameter, ...]
     size: str
     note: str = ""
+    shapes: tuple[Parameter, ...] = ()
 
     def __post_init__(self) -> None:
         if self.size not in {p.name for p in self.parameters}:
@@ -42,6 +44,11 @@ class Candidate:
     def measure(self) -> Parameter:
         """The parameter that measures the effect."""
         return next(p for p in self.parameters if p.name == self.size)
+
+    @property
+    def refitted(self) -> tuple[Parameter, ...]:
+        """All that is free once the effect is on."""
+        return (*self.parameters, *self.shapes)
 
 
 @dataclass(frozen=True)
@@ -130,7 +137,8 @@ def candidate_of(effect: Effect) -> Candidate | None:
     if not testable:
         return None
     kind: Literal["physics", "observation"] = "observation" if effect.observes else "physics"
-    return Candidate(effect.name, kind, testable, effect.size, effect.note)
+    shapes = tuple(p for p in effect.parameters if p.name in effect.shapes)
+    return Candidate(effect.name, kind, testable, effect.size, effect.note, shapes)
 
 
 def candidates_of(effects: Iterable[Effect], on: Iterable[Effect]) -> tuple[Candidate, ...]:

@@ -32,6 +32,7 @@ class Effect:
         name: identifier used by the command line and every file.
         parameters: the effect's parameters. The first is its size: at its ``off`` value the effect does nothing. Others
             have an ``off`` value too where they act on their own, and None where they only shape the effect.
+        shapes: names of those that only shape it and that data can tell once it is on: diagnoses and ``add`` free them.
         note: what it is, in one or two sentences.
         source: paper or textbook with equation.
         conflicts: effects that cannot be on at the same time, with the reason.
@@ -39,6 +40,7 @@ class Effect:
 
     name: ClassVar[str]
     parameters: ClassVar[tuple[Parameter, ...]]
+    shapes: ClassVar[tuple[str, ...]] = ()
     note: ClassVar[str] = ""
     source: ClassVar[str] = ""
     strength: ClassVar[Any | None] = None

@@ -54,7 +54,7 @@ def test_dilatancy_is_named_where_it_is_hidden() -> None:
     assert found.verdict == "missing"
     assert found.members[0] == "dilatancy"
     best = found.confirmations["dilatancy"]
-    assert best.fit.values["dilatancy_angle"] == pytest.approx(12.0, abs=2.0)
+    assert best.values["dilatancy_angle"] == pytest.approx(12.0, abs=2.0)
     assert best.held_out < 0.2 * found.confirmations[""].held_out
 
 
@@ -66,7 +66,7 @@ def test_dilatancy_is_named_on_dense_real_sand_and_not_on_loose() -> None:
     # Dense sand also softens: 2.7 spreads between specimens remain, so dilatancy is not said to be all.
     assert dense.verdict == "outside the library"
     # Published: 16.7° at most; the law's angle is that at the start, before it decays.
-    assert 10.0 < dense.confirmations["dilatancy"].fit.values["dilatancy_angle"] < 25.0
+    assert 10.0 < dense.confirmations["dilatancy"].values["dilatancy_angle"] < 25.0
     assert dense.confirmations["dilatancy"].held_out < 0.4 * dense.confirmations[""].held_out
     loose = criticised(tests["TMD2"], 0.9753)
     assert "dilatancy" not in loose.members

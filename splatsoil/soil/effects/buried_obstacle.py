@@ -23,6 +23,7 @@ class BuriedObstacle(Effect):
         Parameter("obstacle_y", "m", -1.0, 1.0, 0.0, meaningful=0.02, label="obstacle, y from the middle"),
         Parameter("obstacle_height", "m", -0.2, 1.0, 0.04, meaningful=0.01, label="obstacle, height above the floor"),
     )
+    shapes = ("obstacle_x", "obstacle_y")
     note = (
         "A stone or root that the tool's bow wave meets: a sphere that does not move and to which soil sticks, placed "
         "from the middle of the bed and its floor. The tool itself passes through it."

@@ -46,6 +46,7 @@ class Compaction(Effect):
         Parameter("compaction_strain", "1", 0.1, 3.0, 0.4, meaningful=0.1, log=True, label="strain of compaction"),
         Parameter("compaction_pressure", "Pa", 1e2, 1e7, 2e4, meaningful=1e3, log=True, label="pressure of compaction"),
     )
+    shapes = ("compaction_strain",)
     note = (
         "Soil looser than its critical state collapses into its voids when it is sheared, and under more pressure than "
         "it ever bore. Berms stay small, trenches deep, and the tool leaves a hollow."

@@ -33,9 +33,10 @@ class Dilatancy(Effect):
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("dilatancy_angle", "deg", 0.0, 25.0, 0.0, off=0.0, meaningful=2.0, sign=1, label="angle of dilation"),
         Parameter(
-            "dilatancy_strain", "1", 0.02, 2.0, 0.3, meaningful=0.1, log=True, label="strain to the critical state"
+            "dilatancy_strain", "1", 0.02, 20.0, 0.3, meaningful=0.1, log=True, label="strain to the critical state"
         ),
     )
+    shapes = ("dilatancy_strain",)
     note = (
         "Grains of dense soil must climb over each other: shear gains volume at the angle of dilation, less and less "
         "as the soil nears its critical state. Berms become taller, trenches shallower."

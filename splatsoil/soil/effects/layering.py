@@ -36,6 +36,7 @@ class Layering(Effect):
             "layer_density", "1", 0.7, 1.4, 1.0, off=1.0, meaningful=0.05, label="density of the layer, relative"
         ),
     )
+    shapes = ("layer_depth",)
     note = (
         "A firmer or weaker, heavier or lighter layer begins below a depth under the undisturbed surface; its soil "
         "keeps its properties wherever the tool takes it."

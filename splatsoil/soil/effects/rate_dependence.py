@@ -35,6 +35,7 @@ class RateDependence(Effect):
         Parameter("rate_grain_size", "m", 1e-5, 2e-2, 1e-3, meaningful=2e-4, log=True, label="grain diameter"),
         Parameter("rate_grain_density", "kg/m^3", 1000.0, 5000.0, 2500.0, meaningful=100.0, label="grain density"),
     )
+    shapes = ("rate_inertial_number",)
     note = (
         "Grains that are sheared fast for the pressure on them collide more: friction rises from its value at rest to "
         "a second one in fast flow, as the inertial number says."

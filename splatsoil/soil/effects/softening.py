@@ -38,8 +38,9 @@ class Softening(Effect):
             sign=1,
             label="friction angle above residual",
         ),
-        Parameter("softening_strain", "1", 0.02, 2.0, 0.3, meaningful=0.1, log=True, label="strain of softening"),
+        Parameter("softening_strain", "1", 0.02, 20.0, 0.3, meaningful=0.1, log=True, label="strain of softening"),
     )
+    shapes = ("softening_strain",)
     note = (
         "Undisturbed dense soil is stronger than disturbed soil: friction starts at its peak and decays to the "
         "residual angle with plastic shear strain. Slip bands form; steep faces stand until they move."

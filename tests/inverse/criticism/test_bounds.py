@@ -48,7 +48,7 @@ def test_the_truth_is_found_from_a_fit_on_the_bound(experiment: Stiffening) -> N
     assert found.members[0] == "effect 2"
     best = found.confirmations["effect 2"]
     for name, value in TRUTH.items():
-        assert abs(best.fit.values[name] - value) < 2.5 * best.stds[name], name
+        assert abs(best.values[name] - value) < 2.5 * best.stds[name], name
     assert best.stds["effect 2"] < 0.2 * TRUTH["effect 2"]
     assert best.held_out < 1.2 * best.floor
 

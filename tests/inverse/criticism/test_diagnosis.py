@@ -34,8 +34,8 @@ def test_a_large_hidden_effect_is_named_its_size_found_and_the_error_falls(sizes
     assert found.verdict == "missing"
     assert found.members[0] == "effect 2"
     best, before = found.confirmations["effect 2"], found.confirmations[""]
-    assert best.fit.values["effect 2"] == pytest.approx(size, rel=0.3)
-    assert abs(best.fit.values["angle"] - 1.0) < abs(found.evidence.values["angle"] - 1.0) + 0.3
+    assert best.values["effect 2"] == pytest.approx(size, rel=0.3)
+    assert abs(best.values["angle"] - 1.0) < abs(found.evidence.values["angle"] - 1.0) + 0.3
     assert best.held_out < before.held_out
     assert best.held_out / best.floor < 1.3
     # What was promised is about what came.

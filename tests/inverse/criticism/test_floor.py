@@ -40,8 +40,17 @@ def looked(observed: np.ndarray, quiet: np.ndarray) -> Any:
 
 def evidence(generator: np.random.Generator, patterns: dict[str, np.ndarray]) -> Evidence:
     repeats = 0.3 * generator.standard_normal((4, *LAYOUT.shape))
-    nothing: dict[str, Any] = {"slopes": {}, "curves": {}, "widths": {}, "directions": {}, "steps": {}, "failed": {}}
-    return Evidence({}, np.zeros(LAYOUT.shape), repeats, patterns, **nothing)
+    nothing: dict[str, Any] = {
+        "slopes": {},
+        "curves": {},
+        "widths": {},
+        "directions": {},
+        "steps": {},
+        "failed": {},
+        "visits": (),
+    }
+    flat = np.zeros(LAYOUT.shape)
+    return Evidence(values={}, prediction=flat, **nothing, mean=flat, repeats=repeats, numerics=patterns)
 
 
 def floor_with(moved: float = 0.0, wild: float = 1.0) -> tuple[float, float]:

@@ -1,0 +1,190 @@
+"""What all simulations with an effect on say of the parameters together.
+
+Derivatives that a refit measures hold the chance of two simulations, which looks like information: along a valley in
+which two parameters make up for each other there is little else. An emulator through all simulations that were made
+knows its own doubt. So the parameters' distribution is sampled on it, further simulations are made where that says that
+they may lie, and estimate and spread are what it ends with.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import minimize
+from scipy.stats import qmc
+
+from splatsoil.errors import SimulationError
+from splatsoil.parameters import Parameter, ParameterSpace
+
+from .evidence import Visit, around
+from .refit import Known, Refit
+from .surface import Surface
+
+FloatArray = npt.NDArray[np.float64]
+
+MOST = 4
+"""Parameters, beyond which a dozen simulations make no emulator."""
+TURNS, POINTS = 6, 2048
+"""Boxes at most, and points in each."""
+FAR, ENOUGH = 9.0, 300
+"""Log density below the largest that counts as nothing; points above it that are enough."""
+ABROAD = 0.5
+"""How far outside of the simulations' range to simulate, of an axis from -1 to 1."""
+ONE_STD = 0.683
+"""Share of a normal distribution within a standard deviation."""
+DRAWS = 500
+"""Kept of the points."""
+BATCHES, FEWEST, TOGETHER = 4, 2, 3
+"""Simulations where the parameters may lie: so many times at most and at least, so many."""
+UNKNOWN = 0.1
+"""Share of what is possible that may lie where too little was simulated."""
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Parameters by all simulations.
+
+    Attributes:
+        values: where χ² is expected to be least, by name.
+        stds: distance from these that holds 68.3 % of the draws, by name.
+        draws: (k, n) of the parameters, in [-1, 1].
+        unknown: (k,) True where the surface is in doubt there by more than the noise in some direction.
+        dispersion: by which the observation is farther from all that was emulated than noise.
+    """
+
+    values: Mapping[str, float]
+    stds: Mapping[str, float]
+    draws: FloatArray
+    unknown: npt.NDArray[np.bool_]
+    dispersion: float
+
+
+def explored(
+    predict: Callable[[Mapping[str, float]], FloatArray],
+    visits: Sequence[Visit],
+    whiten: Callable[[FloatArray], FloatArray],
+    observed: FloatArray,
+    parameters: Sequence[Parameter],
+    known: Known,
+    start: Refit,
+    shapes: Sequence[Parameter] = (),
+) -> Refit:
+    """Simulate where the parameters may lie by what is known so far, then at the most probable ones, and go there if
+    that is better.
+
+    Args:
+        predict: (t, s) features by parameters; adds a visit.
+        visits: see :func:`read`, like the next four.
+        whiten: only what the choice may see.
+        observed: (t, s).
+        parameters: free ones.
+        known: what other measurements say of them.
+        start: a refit of them, and what is returned where nothing changes the features.
+        shapes: those that no simulation has varied yet.
+    """
+    space, before = ParameterSpace(parameters), len(visits)
+
+    def visit(values: Mapping[str, float]) -> None:
+        # Where nothing can be simulated nothing is learned.
+        with suppress(SimulationError):
+            predict(values)
+
+    for shape in shapes:
+        for end in around(shape, float(start.values[shape.name])):
+            visit({**start.values, shape.name: end})
+    try:
+        for batch in range(BATCHES):
+            found = read(visits, whiten, observed, parameters, known, seed=batch, bold=True)
+            if batch >= FEWEST and np.mean(found.unknown) < UNKNOWN:
+                break
+            # What isn't known first.
+            for draw in found.draws[np.argsort(~found.unknown, kind="stable")][:TOGETHER]:
+                visit(space.to_dict(space.from_unit(draw)))
+        values = read(visits, whiten, observed, parameters, known, seed=BATCHES).values
+        table = predict(values)
+    except (SimulationError, ValueError):
+        return start
+    chi2 = float(np.sum(whiten(observed - table) ** 2) + known.chi2(space.to_vector(values)))
+    better = start if chi2 > start.chi2 else replace(start, values=values, chi2=chi2, prediction=table)
+    return replace(better, simulations=start.simulations + len(visits) - before)
+
+
+def read(
+    visits: Sequence[Visit],
+    whiten: Callable[[FloatArray], FloatArray],
+    observed: FloatArray,
+    parameters: Sequence[Parameter],
+    known: Known,
+    *,
+    seed: int = 0,
+    bold: bool = False,
+) -> Reading:
+    """Sample the parameters.
+
+    Args:
+        visits: simulations, three at least; parameters that they lack are at their off value or default.
+        whiten: a (t, s) table to independent features (d,) of variance 1.
+        observed: (t, s).
+        parameters: asked for, four at most.
+        known: what other measurements say of them.
+        seed: of the draws.
+        bold: look outside of the simulations' range, too: to find out where to simulate.
+
+    Raises:
+        ValueError: too few simulations, or the features are the same wherever they were made.
+    """
+    space = ParameterSpace(parameters)
+    rest = {p.name: p.off if p.off is not None else p.default for p in parameters}
+    points = np.stack([space.to_unit(space.to_vector({n: {**rest, **v.values}[n] for n in rest})) for v in visits])
+    surface = Surface.through(points, np.stack([whiten(v.table) for v in visits]))
+    target = whiten(observed)
+    outside, scores = surface.remainder(target), surface.project(target)
+    wide = max(1.0, float(outside @ outside) / max(len(target) - len(scores), 1))
+
+    def told(where: FloatArray) -> FloatArray:
+        return np.asarray(np.sum(((space.from_unit(where) - known.centre) @ known.root.T) ** 2, axis=1))
+
+    def log_density(where: FloatArray) -> FloatArray:
+        mean, variance = surface.predict(where)
+        total = wide + variance
+        return -0.5 * np.asarray(np.sum((scores - mean) ** 2 / total + np.log(total), axis=1) + told(where))
+
+    def expected_chi2(where: FloatArray) -> FloatArray:
+        # Doubt makes a place possible, and a poor choice.
+        mean, variance = surface.predict(where)
+        return np.asarray(np.sum((scores - mean) ** 2 + variance, axis=1) / wide + told(where))
+
+    # Far from all simulations the surface falls back to its mean, which says nothing.
+    beyond = ABROAD if bold else 0.0
+    low, high = np.maximum(points.min(axis=0) - beyond, -1.0), np.minimum(points.max(axis=0) + beyond, 1.0)
+    draws = _sample(log_density, low, high, seed)
+    likely = np.concatenate([draws, points])
+    start = likely[np.argmin(expected_chi2(likely))]
+    best = minimize(lambda x: float(expected_chi2(x[None])[0]), start, bounds=list(zip(low, high, strict=True))).x
+    values = space.from_unit(np.clip(best, low, high))
+    # A root mean square would be ruled by the few draws in a gap between simulations.
+    spread = np.quantile(np.abs(space.from_unit(draws) - values), ONE_STD, axis=0)
+    unknown = np.any(surface.predict(draws)[1] > wide, axis=1)
+    return Reading(space.to_dict(values), dict(zip(space.names, map(float, spread), strict=True)), draws, unknown, wide)
+
+
+def _sample(
+    log_density: Callable[[FloatArray], FloatArray], low: FloatArray, high: FloatArray, seed: int
+) -> FloatArray:
+    """Draws (k, n) in a box, by importance in boxes that close in."""
+    for turn in range(TURNS):
+        cube = qmc.Sobol(len(low), rng=np.random.default_rng([seed, turn])).random(POINTS)
+        points = low + cube * (high - low)
+        logs = log_density(points)
+        near = points[logs > logs.max() - FAR]
+        if len(near) > ENOUGH:
+            break
+        margin = 0.1 * (high - low)
+        low, high = np.maximum(near.min(axis=0) - margin, low), np.minimum(near.max(axis=0) + margin, high)
+    weights = np.exp(logs - logs.max())
+    chosen = np.random.default_rng([seed, TURNS]).choice(len(points), DRAWS, p=weights / weights.sum())
+    return np.asarray(points[chosen])

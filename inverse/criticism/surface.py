@@ -1,0 +1,135 @@
+"""Features over parameters, through simulations that were made for other ends: a response surface with its own doubt.
+
+Few directions of the features vary by more than the chance of a simulation; singular values tell which (Gavish &
+Donoho 2014, IEEE Trans. Inf. Theory 60:5040). Each is a parabola in the parameters, and a Gaussian process about that.
+All share length scales, the parabola's share and noise, which some twenty simulations then determine well enough to
+take the most probable ones, in a tenth of a second; :class:`~splatsoil.inverse.emulator.Emulator` gives each component
+its own and averages over them, in seconds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import minimize
+from splatsoil.inverse.hyperparameters import LENGTH_BOUNDS, LENGTH_MEAN, LENGTH_STD
+
+FloatArray = npt.NDArray[np.float64]
+
+MOST = 10
+"""Directions of the features."""
+LEAST = 1e-4
+"""Variance of a simulation's chance at least, of features whose own noise has a variance of 1."""
+TREND = 2.0
+"""Standard deviation of the logarithm of the parabola's share."""
+FREEDOM = 0.5
+"""Standard deviation of the logarithms of signal and noise about what the singular values say."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Emulated features.
+
+    Attributes:
+        centre: (d,) mean features.
+        basis: (d, p) orthonormal directions that vary.
+        points: (m, n) of the simulations, in [-1, 1].
+        lengths: (n,) of the processes, in halves of the parameters' ranges.
+        trend: variance of a parabola's coefficients over that of the process.
+        signal: (p,) variance of each direction's process.
+        noise: variance of one simulation's chance in any direction.
+        modes: (m, m) eigenvectors of the points' correlation.
+        strengths: (m,) its eigenvalues.
+        scores: (m, p) simulations along the directions, in those modes.
+        doubt: (p,) by which simulations left out are farther off, squared, than what is quoted; 1 at least.
+    """
+
+    centre: FloatArray
+    basis: FloatArray
+    points: FloatArray
+    lengths: FloatArray
+    trend: float
+    signal: FloatArray
+    noise: float
+    modes: FloatArray
+    strengths: FloatArray
+    scores: FloatArray
+    doubt: FloatArray
+
+    @classmethod
+    def through(cls, points: FloatArray, features: FloatArray) -> Surface:
+        """Through simulations.
+
+        Args:
+            points: (m, n) in [-1, 1].
+            features: (m, d) of the simulations there, in units of their noise.
+
+        Raises:
+            ValueError: fewer than three simulations, or all alike.
+        """
+        m, n = points.shape
+        if m < 3:
+            raise ValueError(f"{m} simulations make no surface")
+        centre = features.mean(axis=0)
+        left, size, right = np.linalg.svd(features - centre, full_matrices=False)
+        count = int(np.clip(np.sum(size > _edge(size, features.shape)), 1, min(MOST, m - 2)))
+        if size[0] <= 1e-12 * max(1.0, float(np.abs(centre).max())):
+            raise ValueError("the features are the same wherever they were simulated")
+        scores = left[:, :count] * size[:count]
+        noise = max(float(np.sum(size[count:] ** 2)) / max((m - 1 - count) * (features.shape[1] - count), 1), LEAST)
+        signal = np.maximum(np.mean(scores**2, axis=0) - noise, 1e-3 * noise)
+
+        def cost(at: FloatArray) -> float:
+            strengths, modes = np.linalg.eigh(_kernel(points, points, np.exp(at[:n]), np.exp(at[n])))
+            variance = np.exp(at[n + 1]) * signal * np.maximum(strengths, 0.0)[:, None] + np.exp(at[n + 2]) * noise
+            fit = np.sum(np.log(variance) + (modes.T @ scores) ** 2 / variance)
+            return 0.5 * float(fit + np.sum(((at - middle) / spread) ** 2))
+
+        # The prior is that of the unit cube, half as wide.
+        middle = np.array([np.log(2.0) + LENGTH_MEAN + 0.5 * np.log(n)] * n + [0.0] * 3)
+        spread = np.array([LENGTH_STD] * n + [TREND, *[FREEDOM] * 2])
+        bounds = [LENGTH_BOUNDS] * n + [(-8.0, 8.0)] * 3
+        starts = [np.array([np.log(length)] * n + [0.0] * 3) for length in (0.5, 2.0)]
+        best = min((minimize(cost, s, bounds=bounds, method="L-BFGS-B") for s in starts), key=lambda found: found.fun).x
+        lengths, trend = np.exp(best[:n]), float(np.exp(best[n]))
+        strengths, modes = np.linalg.eigh(_kernel(points, points, lengths, trend))
+        signal, noise = np.exp(best[n + 1]) * signal, float(np.exp(best[n + 2]) * noise)
+        strengths, turned = np.maximum(strengths, 0.0), modes.T @ scores
+        # Errors of those left out are K⁻¹y / diag(K⁻¹), their variances 1 / diag(K⁻¹).
+        inverse = 1.0 / (strengths[:, None] * signal + noise)
+        z2 = (modes @ (inverse * turned)) ** 2 / (modes**2 @ inverse)
+        doubt = np.maximum(z2.mean(axis=0), 1.0)
+        return cls(centre, right[:count].T, points, lengths, trend, signal, noise, modes, strengths, turned, doubt)
+
+    def project(self, features: FloatArray) -> FloatArray:
+        """Features (…, d) along the directions (…, p)."""
+        return np.asarray((features - self.centre) @ self.basis)
+
+    def remainder(self, features: FloatArray) -> FloatArray:
+        """What of features (…, d) no parameter varies."""
+        return np.asarray(features - self.centre - self.project(features) @ self.basis.T)
+
+    def predict(self, where: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Mean features over seeds along the directions, and its variance, (q, p) each, at points (q, n)."""
+        seen = _kernel(where, self.points, self.lengths, self.trend) @ self.modes
+        gain = self.signal / (self.strengths[:, None] * self.signal + self.noise)
+        alone = 1.0 + self.trend * (np.sum(where**2, axis=1) + 0.5 * np.sum(where**2, axis=1) ** 2)
+        variance = self.doubt * self.signal * (alone[:, None] - seen**2 @ gain)
+        return seen @ (gain * self.scores), np.maximum(variance, 0.0)
+
+
+def _kernel(a: FloatArray, b: FloatArray, lengths: FloatArray, trend: float) -> FloatArray:
+    """(q, m) covariance at two sets of points, over the process' variance."""
+    product = a @ b.T
+    near = np.exp(-0.5 * np.sum(((a[:, None] - b[None]) / lengths) ** 2, axis=-1))
+    return near + trend * (product + 0.5 * product**2)
+
+
+def _edge(size: FloatArray, shape: tuple[int, int]) -> float:
+    """Singular value up to which a matrix of that shape may be noise, by the middle one."""
+    few, many = sorted(shape)
+    ratio = few / many
+    # The centre is taken off, so the last one is 0.
+    return float((0.56 * ratio**3 - 0.95 * ratio**2 + 1.82 * ratio + 1.43) * np.median(size[:-1]))

@@ -1,0 +1,166 @@
+"""Parameters read off all simulations of a refit, against least squares in closed form."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+from splatsoil.inverse.criticism.evidence import Visit, around, distance
+from splatsoil.inverse.criticism.reading import explored, read
+from splatsoil.inverse.criticism.refit import Known, Refit, refit
+from splatsoil.inverse.criticism.surface import Surface
+
+from splatsoil.errors import SimulationError
+from splatsoil.parameters import Parameter
+
+ANGLE = Parameter("angle", "deg", 20.0, 50.0, 35.0, meaningful=1.0)
+STICK = Parameter("stick", "Pa", 0.0, 1000.0, 0.0, off=0.0, meaningful=50.0, sign=1)
+SHAPE = Parameter("shape", "1", 0.02, 20.0, 0.3, meaningful=0.1, log=True)
+FREE = (ANGLE, STICK)
+NOTHING = Known.nothing(2)
+FEATURES = 120
+START = {"angle": 38.0, "stick": 100.0}
+
+
+class World:
+    """Features that are linear in two parameters, which nearly make up for each other; simulations have chance."""
+
+    def __init__(self, seed: int, *, alike: float = 0.98, chance: float = 0.0, size: float = 12.0) -> None:
+        generator = np.random.default_rng(seed)
+        one, other = np.linalg.qr(generator.standard_normal((FEATURES, 2)))[0].T
+        self.slopes = size * np.stack([one / 5.0, (alike * one + np.sqrt(1.0 - alike**2) * other) / 100.0], axis=1)
+        self.generator, self.chance = generator, chance
+        self.truth = {"angle": generator.uniform(32.0, 40.0), "stick": generator.uniform(150.0, 500.0)}
+        self.observed = self.mean(self.truth) + generator.standard_normal((1, FEATURES))
+
+    def mean(self, values: Mapping[str, float]) -> np.ndarray:
+        return (self.slopes @ np.array([values["angle"] - 35.0, values["stick"]]))[None]
+
+    def __call__(self, values: Mapping[str, float]) -> np.ndarray:
+        return self.mean(values) + self.chance * self.generator.standard_normal((1, FEATURES))
+
+    def visits(self, count: int) -> list[Visit]:
+        near = [
+            {"angle": self.generator.uniform(28.0, 45.0), "stick": self.generator.uniform(0.0, 700.0)}
+            for _ in range(count)
+        ]
+        return [Visit(values, ("stick",), self(values)) for values in near]
+
+
+def whiten(table: np.ndarray) -> np.ndarray:
+    """Of (t, s, …), the first two axes."""
+    return table.reshape(-1, *table.shape[2:])
+
+
+def test_a_surface_predicts_where_nothing_was_simulated_and_knows_its_error() -> None:
+    generator = np.random.default_rng(1)
+    points = generator.uniform(-1.0, 1.0, (30, 2))
+    basis = np.linalg.qr(generator.standard_normal((60, 3)))[0]
+
+    def scores(at: np.ndarray) -> np.ndarray:
+        x, y = at.T
+        return np.stack([30.0 * x - 20.0 * y, 15.0 * np.sin(x) * y, 10.0 * x**2], axis=1)
+
+    surface = Surface.through(points, scores(points) @ basis.T + 0.5 * generator.standard_normal((30, 60)))
+    elsewhere = generator.uniform(-0.9, 0.9, (200, 2))
+    mean, variance = surface.predict(elsewhere)
+    error = surface.centre + mean @ surface.basis.T - scores(elsewhere) @ basis.T
+    assert surface.basis.shape[1] == 3
+    assert np.sqrt(surface.noise) == pytest.approx(0.5, rel=0.2)
+    assert np.sqrt(np.mean(np.sum(error**2, axis=1))) < 2.0
+    z = (error @ surface.basis) / np.sqrt(variance)
+    assert 0.5 < np.sqrt(np.mean(z**2)) < 1.6
+
+
+def test_estimate_and_spread_are_those_of_least_squares() -> None:
+    for seed in range(3):
+        world = World(seed, alike=0.8)
+        found = read(world.visits(15), whiten, world.observed, FREE, NOTHING)
+        target = world.observed[0]
+        exact = np.linalg.lstsq(world.slopes, target, rcond=None)[0] + [35.0, 0.0]
+        std = np.sqrt(np.diag(np.linalg.inv(world.slopes.T @ world.slopes)))
+        for k, p in enumerate(FREE):
+            assert found.values[p.name] == pytest.approx(exact[k], abs=0.1 * std[k])
+            assert found.stds[p.name] == pytest.approx(std[k], rel=0.15)
+
+
+def test_what_is_known_of_a_parameter_counts_as_a_measurement() -> None:
+    world = World(4, alike=0.9)
+    root = np.array([[0.0, 1.0 / 30.0]])
+    found = read(world.visits(15), whiten, world.observed, FREE, Known(root, np.array([0.0, 220.0])))
+    columns = np.concatenate([world.slopes, root])
+    target = np.concatenate([world.observed[0], root @ np.array([0.0, 220.0])])
+    exact = np.linalg.lstsq(columns, target, rcond=None)[0]
+    assert found.values["stick"] == pytest.approx(exact[1], abs=3.0)
+    assert found.stds["stick"] == pytest.approx(np.linalg.inv(columns.T @ columns)[1, 1] ** 0.5, rel=0.2)
+
+
+def test_along_a_valley_chance_is_no_information() -> None:
+    """Slopes that hold chance look as if they told the two parameters apart: the truth is far outside their spread."""
+    inside, by_slopes = [], []
+    for seed in range(24):
+        world = World(seed, alike=0.995, chance=0.7, size=8.0)
+        here, slopes, visits = world(START), [], []
+        for p in FREE:
+            end = around(p, START[p.name])[-1]
+            visits.append(Visit({**START, p.name: end}, ("stick",), world({**START, p.name: end})))
+            slopes.append((visits[-1].table - here) / distance(p, START[p.name], end))
+
+        def predict(values: Mapping[str, float], world: World = world, visits: list[Visit] = visits) -> np.ndarray:
+            visits.append(Visit(dict(values), ("stick",), world(values)))
+            return visits[-1].table
+
+        columns = np.stack(slopes, axis=-1)
+        fit = refit(predict, whiten, world.observed, FREE, START, here, columns, chance=True)
+        visits.append(Visit(START, ("stick",), here))
+        explored(predict, visits, whiten, world.observed, FREE, NOTHING, fit)
+        found = read(visits, whiten, world.observed, FREE, NOTHING)
+        off = abs(found.values["stick"] - world.truth["stick"])
+        inside.append(off < 1.645 * found.stds["stick"])
+        white = whiten(fit.slopes)
+        std = np.linalg.inv(white.T @ white)[1, 1] ** 0.5
+        by_slopes.append(abs(fit.values["stick"] - world.truth["stick"]) < 1.645 * std)
+    assert np.mean(inside) >= 0.75
+    assert np.mean(by_slopes) < np.mean(inside) - 0.15
+
+
+def test_a_shape_is_found_though_no_slope_tells_of_it() -> None:
+    generator = np.random.default_rng(0)
+    one, other = np.linalg.qr(generator.standard_normal((FEATURES, 2)))[0].T
+    free = (ANGLE, STICK, SHAPE)
+
+    def features(values: Mapping[str, float]) -> np.ndarray:
+        if values["shape"] > 10.0:
+            raise SimulationError("too far")
+        early = np.exp(-1.0 / values["shape"])
+        size = values["stick"] / 5.0
+        return ((values["angle"] - 35.0) * one + size * (early * other + (1.0 - early) * np.roll(other, 9)))[None]
+
+    observed = features({"angle": 33.0, "stick": 400.0, "shape": 2.0}) + generator.standard_normal((1, FEATURES))
+    start = {"angle": 35.0, "stick": 300.0, "shape": 0.3}
+    places = [(35.0, 0.0), (31.0, 0.0), (39.0, 0.0), (35.0, 200.0), (35.0, 300.0), (32.0, 400.0)]
+    visits = [
+        Visit({"angle": a, "stick": s}, ("stick",), features({"angle": a, "stick": s, "shape": 0.3})) for a, s in places
+    ]
+
+    def predict(values: Mapping[str, float]) -> np.ndarray:
+        table = features(values)
+        visits.append(Visit(dict(values), ("stick",), table))
+        return table
+
+    first = float(np.sum((observed - features(start)) ** 2))
+    begun = Refit(start, first, features(start), 0, np.zeros((1, FEATURES, 3)))
+    fit = explored(predict, visits, whiten, observed, free, Known.nothing(3), begun, (SHAPE,))
+    assert fit.chi2 < 0.2 * first
+    assert fit.values["shape"] == pytest.approx(2.0, rel=0.5)
+    assert fit.values["stick"] == pytest.approx(400.0, rel=0.2)
+    assert fit.simulations == len(visits) - len(places)
+
+
+def test_simulations_that_are_all_alike_tell_nothing() -> None:
+    visits = [Visit({"angle": 30.0 + k}, (), np.ones((1, FEATURES))) for k in range(5)]
+    with pytest.raises(ValueError, match="the same"):
+        read(visits, whiten, np.zeros((1, FEATURES)), FREE, NOTHING)
+    begun = Refit({"angle": 30.0, "stick": 0.0}, 1.0, np.ones((1, FEATURES)), 0, np.zeros((1, FEATURES, 2)))
+    assert explored(lambda v: np.ones((1, FEATURES)), visits, whiten, visits[0].table, FREE, NOTHING, begun) is begun
