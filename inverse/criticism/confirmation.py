@@ -130,12 +130,12 @@ def confirm(
         tangent = np.concatenate([floor.nuisance, _tangent(floor.single, fit)], axis=1)
         remainder = omnibus(floor.single, tangent, left[experiment.seen], basis)
         chi2 = _chi2(whole, left) + known.chi2(at)
-        values, stds = fit.values, _stds(free, fit, np.concatenate([whiten(fit.slopes), known.root]), remainder)
+        values, stds = dict(fit.values), _stds(free, fit, np.concatenate([whiten(fit.slopes), known.root]), remainder)
         if _emulated(experiment, candidate):
             # A surface that isn't one tells nothing more than the last derivatives do.
             with suppress(ValueError):
                 reading = read(visits, whole, experiment.observed, free, known)
-                values, stds = reading.values, reading.stds
+                values, stds = dict(reading.values), dict(reading.stds)
         out["" if candidate is None else candidate.name] = Confirmation(
             name="" if candidate is None else candidate.name,
             fit=fit,

@@ -32,6 +32,9 @@ TURNS, POINTS = 6, 2048
 """Boxes at most, and points in each."""
 FAR, ENOUGH = 9.0, 300
 """Log density below the largest that counts as nothing; points above it that are enough."""
+PRIOR = 0.5
+"""Standard deviation of a parameter about its default, of an axis from -1 to 1, before anything is known: where data
+leave a long valley open, its modest end is the likelier one."""
 ABROAD = 0.5
 """How far outside of the simulations' range to simulate, of an axis from -1 to 1."""
 ONE_STD = 0.683
@@ -145,8 +148,11 @@ def read(
     outside, scores = surface.remainder(target), surface.project(target)
     wide = max(1.0, float(outside @ outside) / max(len(target) - len(scores), 1))
 
+    home = space.to_unit(space.to_vector({p.name: p.default for p in parameters}))
+
     def told(where: FloatArray) -> FloatArray:
-        return np.asarray(np.sum(((space.from_unit(where) - known.centre) @ known.root.T) ** 2, axis=1))
+        measured = (space.from_unit(where) - known.centre) @ known.root.T
+        return np.asarray(np.sum(measured**2, axis=1) + np.sum(((where - home) / PRIOR) ** 2, axis=1))
 
     def log_density(where: FloatArray) -> FloatArray:
         mean, variance = surface.predict(where)

@@ -82,12 +82,12 @@ class Surface:
         signal = np.maximum(np.mean(scores**2, axis=0) - noise, 1e-3 * noise)
 
         def cost(at: FloatArray) -> float:
-            strengths, modes = np.linalg.eigh(_kernel(points, points, np.exp(at[:n]), np.exp(at[n])))
+            strengths, modes = np.linalg.eigh(_kernel(points, points, np.exp(at[:n]), float(np.exp(at[n]))))
             variance = np.exp(at[n + 1]) * signal * np.maximum(strengths, 0.0)[:, None] + np.exp(at[n + 2]) * noise
             fit = np.sum(np.log(variance) + (modes.T @ scores) ** 2 / variance)
             return 0.5 * float(fit + np.sum(((at - middle) / spread) ** 2))
 
-        # The prior is that of the unit cube, half as wide.
+        # The prior is the unit cube's, whose sides are half as long.
         middle = np.array([np.log(2.0) + LENGTH_MEAN + 0.5 * np.log(n)] * n + [0.0] * 3)
         spread = np.array([LENGTH_STD] * n + [TREND, *[FREEDOM] * 2])
         bounds = [LENGTH_BOUNDS] * n + [(-8.0, 8.0)] * 3

@@ -48,6 +48,17 @@ class World:
         return [Visit(values, ("stick",), self(values)) for values in near]
 
 
+HOME, PRIOR = np.array([35.0, 0.0]), np.diag([1.0 / 7.5, 1.0 / 250.0])
+"""Defaults, and the inverse of a quarter of each range: what is believed before anything is measured."""
+
+
+def solved(columns: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Estimate and standard deviations by least squares, the prior being a measurement; columns act from HOME."""
+    columns = np.concatenate([columns, PRIOR])
+    target = np.concatenate([target, np.zeros(2)])
+    return np.linalg.lstsq(columns, target, rcond=None)[0] + HOME, np.linalg.inv(columns.T @ columns).diagonal() ** 0.5
+
+
 def whiten(table: np.ndarray) -> np.ndarray:
     """Of (t, s, …), the first two axes."""
     return table.reshape(-1, *table.shape[2:])
@@ -77,12 +88,10 @@ def test_estimate_and_spread_are_those_of_least_squares() -> None:
     for seed in range(3):
         world = World(seed, alike=0.8)
         found = read(world.visits(15), whiten, world.observed, FREE, NOTHING)
-        target = world.observed[0]
-        exact = np.linalg.lstsq(world.slopes, target, rcond=None)[0] + [35.0, 0.0]
-        std = np.sqrt(np.diag(np.linalg.inv(world.slopes.T @ world.slopes)))
+        exact, std = solved(world.slopes, world.observed[0])
         for k, p in enumerate(FREE):
             assert found.values[p.name] == pytest.approx(exact[k], abs=0.1 * std[k])
-            assert found.stds[p.name] == pytest.approx(std[k], rel=0.15)
+            assert found.stds[p.name] == pytest.approx(std[k], rel=0.25)
 
 
 def test_what_is_known_of_a_parameter_counts_as_a_measurement() -> None:
@@ -90,10 +99,9 @@ def test_what_is_known_of_a_parameter_counts_as_a_measurement() -> None:
     root = np.array([[0.0, 1.0 / 30.0]])
     found = read(world.visits(15), whiten, world.observed, FREE, Known(root, np.array([0.0, 220.0])))
     columns = np.concatenate([world.slopes, root])
-    target = np.concatenate([world.observed[0], root @ np.array([0.0, 220.0])])
-    exact = np.linalg.lstsq(columns, target, rcond=None)[0]
+    exact, std = solved(columns, np.concatenate([world.observed[0], root @ np.array([0.0, 220.0])]))
     assert found.values["stick"] == pytest.approx(exact[1], abs=3.0)
-    assert found.stds["stick"] == pytest.approx(np.linalg.inv(columns.T @ columns)[1, 1] ** 0.5, rel=0.2)
+    assert found.stds["stick"] == pytest.approx(std[1], rel=0.2)
 
 
 def test_along_a_valley_chance_is_no_information() -> None:
