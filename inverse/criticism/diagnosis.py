@@ -17,19 +17,17 @@ from .confirmation import Confirmation, confirm, on_its_own_floor, remainder_of
 from .evidence import Evidence, Vantage, gather
 from .floor import Floor, floor_of
 from .misfit import Block, Omnibus, blocks, left_over, omnibus, shares, smooth_basis
+from .naming import members_of
 from .outside import StrengthReading, read_strength
 from .score import Score, Scorer
 from .sight import Sight
 from .simulations import Simulations
 from .strokes import StrokeAdvice, advise
 from .verdicts import (
-    CERTAIN,
     CLEAN,
     ENOUGH,
-    EQUIVALENT,
     GATE,
     LEVEL,
-    RELEVANT,
     WITHIN,
     EffectVerdict,
     Verdict,
@@ -220,11 +218,11 @@ def judge(
         tried = {name: c for name, c in confirmations.items() if name}
         # Not by what is left of χ²: an effect that stays off leaves what other pictures say of it unexplained.
         costs = {name: scorer.price(candidates[name], refitted=True) - c.fall for name, c in tried.items()}
-        best = min(costs, key=lambda name: costs[name])
+        members = members_of(confirmations, costs, misfit, scores)
         before = confirmations[""].remainder
-        if _stands(confirmations, best, misfit, scores[best].dispersion):
+        if members:
+            best = members[0]
             given = scorer.score(residual, given=best)
-            members = _equals(costs, best, max(tried[best].remainder.dispersion, scores[best].dispersion))
             remainder = remainder_of(experiment, floor, tried[best], candidates, evidence, bench.basis)
             error = tried[best].held_out / tried[best].floor
             more = remainder.p < CLEAN and explained(before, remainder) < ENOUGH
@@ -291,23 +289,6 @@ def _advice(
     return advise(experiment, fitted, chosen, progress=lambda share: told("other strokes", share))
 
 
-def _stands(confirmations: Mapping[str, Confirmation], best: str, misfit: Omnibus, dispersion: float) -> bool:
-    """Something is to be explained, and the refit does: χ² falls, on times that it hasn't seen too.
-
-    Where slow waves show no more than chance, the effect must take away a relevant share of the squared error on those
-    times, whatever a single direction among dozens seems to say. What other pictures say of an effect beyond doubt
-    needs no more of the features than that they don't speak against it.
-    """
-    before, after = confirmations[""], confirmations[best]
-    least = EQUIVALENT * dispersion
-    if after.fall <= least:
-        return False
-    if after.told < CERTAIN:
-        return after.unseen > -least
-    relevant = after.held_out**2 < (1.0 - RELEVANT) * before.held_out**2
-    return (misfit.p < GATE or relevant) and after.unseen > 0.0
-
-
 def _chosen(
     experiment: Experiment,
     bench: Bench,
@@ -339,13 +320,6 @@ def _chosen(
     # The two orders take turns, and one more is tried than either would have.
     turns = [name for pair in zip_longest(strong, alone) for name in pair if name is not None]
     return list(dict.fromkeys(turns))[: options.refits + 1]
-
-
-def _equals(costs: Mapping[str, float], best: str, dispersion: float) -> tuple[str, ...]:
-    """Effects whose χ² after refitting lies as near to the best as equals do; wider where a misfit remains."""
-    wide = EQUIVALENT * max(1.0, dispersion)
-    close = [name for name, cost in costs.items() if cost - costs[best] < wide]
-    return tuple(sorted(close, key=lambda name: costs[name]))
 
 
 def _effects(

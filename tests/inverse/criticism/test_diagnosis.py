@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from splatsoil.benchmarks.hidden_effects import detectable, emulated, fitted, one, outside, wilson
-from splatsoil.inverse.criticism.diagnosis import Options, _stands, diagnose
+from splatsoil.inverse.criticism.diagnosis import Options, diagnose
 from splatsoil.inverse.criticism.misfit import Omnibus
+from splatsoil.inverse.criticism.naming import members_of, stands
 from splatsoil.inverse.criticism.record import record
 from splatsoil.inverse.criticism.simulations import Simulations
 from splatsoil.inverse.criticism.verdicts import of_effect, overall
@@ -164,7 +165,7 @@ def test_nothing_is_missing_where_nothing_is_to_be_explained(
     floor = before.held_out / error
     held_out = left * before.held_out
     told = {"": replace(before, floor=floor), "effect 2": replace(after, floor=floor, held_out=held_out, unseen=unseen)}
-    assert _stands(told, "effect 2", misfit, 1.0) is named
+    assert stands(told, "effect 2", misfit, 1.0) is named
 
 
 @pytest.mark.parametrize(("told", "unseen", "named"), [(1e-5, -1.0, True), (1e-5, -9.0, False), (1e-3, -1.0, False)])
@@ -175,7 +176,20 @@ def test_what_other_pictures_say_beyond_doubt_the_soil_need_only_not_deny(
     floor = found[""].held_out / 0.7
     after = replace(found["effect 2"], floor=floor, held_out=found[""].held_out, unseen=unseen, told=told)
     told_of = {"": replace(found[""], floor=floor), "effect 2": after}
-    assert _stands(told_of, "effect 2", Omnibus(60.0, 72, 0.5), 1.0) is named
+    assert stands(told_of, "effect 2", Omnibus(60.0, 72, 0.5), 1.0) is named
+
+
+def test_what_other_pictures_say_beyond_doubt_is_named_before_what_soil_shows(sizes: dict[str, float]) -> None:
+    found = one(WORLD, {"angle": 1.0, "effect 2": 5.0 * sizes["effect 2"]}, None, OPTIONS)
+    big = found.confirmations["effect 2"]
+    told = {"": found.confirmations[""], "effect 2": big, "clock": replace(big, fall=0.5 * big.fall, told=1e-9)}
+    scores = {**found.scores, "clock": found.scores["effect 2"]}
+    costs = {name: -c.fall for name, c in told.items() if name}
+    assert members_of(told, costs, found.misfit, scores) == ("clock",)
+    doubtful = {**told, "clock": replace(told["clock"], told=0.01)}
+    assert members_of(doubtful, costs, found.misfit, scores)[0] == "effect 2"
+    denied = {**told, "clock": replace(told["clock"], unseen=-50.0)}
+    assert members_of(denied, costs, found.misfit, scores)[0] == "effect 2"
 
 
 def test_verdicts_on_an_effect(sizes: dict[str, float]) -> None:

@@ -1,0 +1,60 @@
+"""Which of the refitted effects are named."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from .confirmation import Confirmation
+from .misfit import Omnibus
+from .score import Score
+from .verdicts import CERTAIN, EQUIVALENT, GATE, RELEVANT
+
+
+def members_of(
+    confirmations: Mapping[str, Confirmation],
+    costs: Mapping[str, float],
+    misfit: Omnibus,
+    scores: Mapping[str, Score],
+) -> tuple[str, ...]:
+    """The equivalence class, the best effect first; empty where the best one doesn't stand.
+
+    What other pictures say of an effect beyond doubt comes first, even if another one would explain more of what soil
+    shows: the next diagnosis, with the first one on, tells of that.
+
+    Args:
+        confirmations: of the model as it is, under the empty name, and with each effect.
+        costs: χ² by effect, up to a constant.
+        misfit: of the model as it is.
+        scores: of each effect.
+    """
+    standing = [name for name in costs if stands(confirmations, name, misfit, scores[name].dispersion)]
+    certain = {name: costs[name] for name in standing if confirmations[name].told < CERTAIN}
+    among = certain or costs
+    best = min(among, key=lambda name: among[name])
+    if best not in standing:
+        return ()
+    return _equals(among, best, max(confirmations[best].remainder.dispersion, scores[best].dispersion))
+
+
+def stands(confirmations: Mapping[str, Confirmation], best: str, misfit: Omnibus, dispersion: float) -> bool:
+    """Something is to be explained, and the refit does: χ² falls, on times that it hasn't seen too.
+
+    Where slow waves show no more than chance, the effect must take away a relevant share of the squared error on those
+    times, whatever a single direction among dozens seems to say. What other pictures say of an effect beyond doubt
+    needs no more of the features than that they don't speak against it.
+    """
+    before, after = confirmations[""], confirmations[best]
+    least = EQUIVALENT * dispersion
+    if after.fall <= least:
+        return False
+    if after.told < CERTAIN:
+        return after.unseen > -least
+    relevant = after.held_out**2 < (1.0 - RELEVANT) * before.held_out**2
+    return (misfit.p < GATE or relevant) and after.unseen > 0.0
+
+
+def _equals(costs: Mapping[str, float], best: str, dispersion: float) -> tuple[str, ...]:
+    """Effects whose χ² after refitting lies as near to the best as equals do; wider where a misfit remains."""
+    wide = EQUIVALENT * max(1.0, dispersion)
+    close = [name for name, cost in costs.items() if cost - costs[best] < wide]
+    return tuple(sorted(close, key=lambda name: costs[name]))
