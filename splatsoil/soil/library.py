@@ -81,6 +81,9 @@ def _checked(kind: Any, where: str) -> Effect:
             f"{what}: its first parameter, {parameters[0].name}, measures its size and needs a value off=... at which "
             "the effect does nothing"
         )
+    strange = [name for name in kind.shapes if name not in {p.name for p in parameters if p.off is None}]
+    if strange:
+        raise ParameterError(f"{what}: {', '.join(strange)} among its shapes is none of its parameters without off=...")
     return kind()
 
 

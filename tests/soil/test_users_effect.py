@@ -141,6 +141,12 @@ def test_the_command_finds_the_effect_of_an_installed_package(suction: str, tmp_
             "class E(Effect):\n name = 'e'\n parameters = (Parameter('a', '1', 0.0, 1.0, 0.5),)",
             r"first parameter, a, measures its size and needs a value off",
         ),
+        (
+            "from splatsoil.soil.effect import Effect\nfrom splatsoil.parameters import Parameter\n"
+            "class E(Effect):\n name = 'e'\n parameters = (Parameter('a', '1', 0.0, 1.0, 0.0, off=0.0),)\n"
+            " shapes = ('a', 'b')",
+            r"a, b among its shapes is none of its parameters without off",
+        ),
     ],
 )
 def test_a_file_that_is_no_effect_says_what_is_missing(text: str, says: str, tmp_path: Path) -> None:
