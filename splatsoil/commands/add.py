@@ -24,8 +24,8 @@ class Config:
     """Add effects to a run's latest model, one after the other, and fit again.
 
     Each effect is first refitted on every other frame, features weighed by their chance and cleared of what numerics
-    could do; that is the estimate kept, and it is judged on the other frames, which gives the falling error. Then the
-    loss is searched over all parameters, for the report. Earlier fits stay.
+    could do, and judged on the other frames, which gives the falling error. What its simulations say by all frames is
+    the estimate kept. Then the loss is searched over all parameters, for the report. Earlier fits stay.
     """
 
     run: Positional[Path]
