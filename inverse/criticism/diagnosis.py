@@ -48,7 +48,7 @@ class Options:
         level: family-wise chance of naming an effect when none is missing.
         repeats: simulations at the fit with other seeds.
         refits: effects, the best ones, that are refitted.
-        refit_steps: simulations from each point where a refit starts; rounds of derivatives and steps follow.
+        refit_steps: simulations from each point where a refit starts; some ten to twenty more follow.
         seed: of draws.
     """
 

@@ -28,7 +28,7 @@ class Config:
     refits: int = 3
     """Effects, the best ones, to refit."""
     refit_steps: int = 5
-    """Simulations from each point where a refit starts; it goes on while it gains, with about three times as many."""
+    """Simulations from each point where a refit starts; some ten to twenty more follow."""
     replay: bool = True
     """Leave out the control: a made-up bed of the same soil, photographed and taken through the whole chain, that
     tells what pictures and reconstruction get wrong by themselves. Without it, their errors can pass for soil."""
