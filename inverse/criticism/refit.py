@@ -1,6 +1,7 @@
 """Refitting with an effect on: Gauss-Newton on whitened features, the derivatives mended by what each step shows.
 
-Some ten simulations, enough to say how far χ² really falls; the estimate that users keep comes from a full fit.
+Some ten simulations, enough to say how far χ² really falls; :mod:`.reading` goes on from there where simulations have
+chance in them.
 """
 
 from __future__ import annotations
