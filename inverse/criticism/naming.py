@@ -36,14 +36,14 @@ def members_of(
     return _equals(among, best, max(confirmations[best].remainder.dispersion, scores[best].dispersion))
 
 
-def stands(confirmations: Mapping[str, Confirmation], best: str, misfit: Omnibus, dispersion: float) -> bool:
+def stands(confirmations: Mapping[str, Confirmation], name: str, misfit: Omnibus, dispersion: float) -> bool:
     """Something is to be explained, and the refit does: χ² falls, on times that it hasn't seen too.
 
     Where slow waves show no more than chance, the effect must take away a relevant share of the squared error on those
     times, whatever a single direction among dozens seems to say. What other pictures say of an effect beyond doubt
     needs no more of the features than that they don't speak against it.
     """
-    before, after = confirmations[""], confirmations[best]
+    before, after = confirmations[""], confirmations[name]
     least = EQUIVALENT * dispersion
     if after.fall <= least:
         return False
