@@ -189,7 +189,12 @@ class Model:
         )[0]
 
     def draw(
-        self, trajectory: Trajectory, seed: int = 0, values: Mapping[str, float] | None = None
+        self,
+        trajectory: Trajectory,
+        seed: int = 0,
+        values: Mapping[str, float] | None = None,
+        *,
+        albedo: int | None = None,
     ) -> dict[tuple[str, int], Image]:
         """Pictures of a trajectory by (camera, frame), as cameras without distortion report it.
 
@@ -197,12 +202,13 @@ class Model:
             trajectory: from `simulate` of this model; one serves all values of `observation_parameters`.
             seed: of the trajectory's particles.
             values: by name; of these only observation effects' count. Everything is reported as it is by default.
+            albedo: seed of another guess of the colour of soil beneath the surface, which photographs leave open.
 
         Raises:
             ParameterError: values out of bounds, or a trajectory without the frames that a time offset needs.
         """
         observation = self.observation(values)
-        scene = self.scene(seed)
+        scene = self.scene(seed) if albedo is None else self.scene(seed).with_other_albedo(albedo)
         if observation.changes_light:
             light = scene.light.changed(observation.sun_azimuth, observation.sun_elevation, observation.sky_share)
             scene = scene.replace(light=light)

@@ -161,3 +161,19 @@ def test_exposure_and_blur_reach_the_pictures(measurement, scene, still):
     assert soft[lit].std(axis=(0, 1)).max() < 0.7 * plain["left", 8][lit].std(axis=(0, 1)).min()
     with pytest.raises(ParameterError, match="blur"):
         model.draw(trajectory, 0, {"blur": 99.0})
+
+
+def test_another_guess_of_buried_colours_shows_where_soil_was_turned_over(measurement, scene, still):
+    model = model_of(measurement, scene)
+    turned = still.copy()
+    turned[:, 2] = np.where(still[:, 0] > 0.2, DEPTH - still[:, 2], still[:, 2])
+    eye = np.tile(np.eye(3, dtype=np.float32), (3, len(still), 1, 1))
+    soil = np.stack([still, turned, turned])
+    over = Trajectory(model.recorded, soil, eye, np.zeros((10, 3)), SPACING, model.resolution)
+    best, again, other = model.draw(over), model.draw(over, albedo=1), model.draw(over, albedo=2)
+    changes = {frame: np.abs(again["left", frame] - best["left", frame]).mean(axis=2) for frame in (0, 8)}
+    left, right = np.s_[15:75, 8:30], np.s_[15:75, 52:80]
+    # a little of the uppermost particles always shines through
+    assert changes[8][right].mean() > 2.5 * max(changes[8][left].mean(), changes[0][right].mean())
+    assert np.array_equal(model.draw(over, albedo=1)["left", 8], again["left", 8])
+    assert np.abs(other["left", 8] - again["left", 8])[right].mean() > 0.5 * changes[8][right].mean()

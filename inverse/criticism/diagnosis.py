@@ -279,7 +279,7 @@ def _advice(
     confirmations: Mapping[str, Confirmation],
     told: Report,
 ) -> tuple[StrokeAdvice, ...]:
-    """Which other stroke tells the members of a class apart, each at the size that its refit found."""
+    """Which other stroke tells the members of a class apart, each in the size and shape that its refit found."""
     if len(members) < 2:
         return ()
     fitted = dict(confirmations[members[0]].values)

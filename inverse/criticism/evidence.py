@@ -72,6 +72,7 @@ class Evidence(Vantage):
         mean: (t, s) mean prediction over seeds that derivatives don't share.
         repeats: (r, t, s) deviations of those seeds from their mean, scaled to have the variance of one seed.
         numerics: (t, s) what other numerics change, by name.
+        guesses: (g, t, s) what other guesses of what no instrument shows change.
         replays: (k, t, s) residuals of known soils that went through the whole chain of pictures and reconstruction.
         calibration: what pictures say of cameras, light, clock and tool where soil plays no part.
     """
@@ -79,6 +80,7 @@ class Evidence(Vantage):
     mean: FloatArray
     repeats: FloatArray
     numerics: Mapping[str, FloatArray]
+    guesses: FloatArray
     replays: FloatArray | None = None
     calibration: Calibration | None = None
 
@@ -99,7 +101,14 @@ def gather(
     """
     base = dict(values)
     seeds = range(1, 1 + (repeats if experiment.chance else 1))
-    jobs = len(seeds) + len(experiment.numerics) + 2 * len(experiment.parameters) + 2 * len(experiment.candidates) + 1
+    jobs = (
+        len(seeds)
+        + len(experiment.guesses)
+        + len(experiment.numerics)
+        + 2 * len(experiment.parameters)
+        + 2 * len(experiment.candidates)
+        + 1
+    )
     done = 0
 
     def run(
@@ -114,14 +123,17 @@ def gather(
 
     runs = np.stack([run(f"repeat {seed} of {len(seeds)}", base, seed=seed) for seed in seeds])
     deviations = (runs - runs.mean(axis=0)) * np.sqrt(len(runs) / max(len(runs) - 1, 1))
+    # Before the point itself: they are other drawings of its simulation.
+    guesses = [run(f"guess: {name}", base, numerics=name) for name in experiment.guesses]
     found = look_from(experiment, base, experiment.candidates, run)
+    changes = np.stack(guesses) - found.prediction if guesses else np.zeros((0, *experiment.layout.shape))
     numerics = {}
     for name in experiment.numerics:
         try:
             numerics[name] = run(f"numerics: {name}", base, numerics=name) - found.prediction
         except SimulationError:
             continue
-    return Evidence(**vars(found), mean=runs.mean(axis=0), repeats=deviations, numerics=numerics)
+    return Evidence(**vars(found), mean=runs.mean(axis=0), repeats=deviations, numerics=numerics, guesses=changes)
 
 
 def look_from(

@@ -39,7 +39,7 @@ class Floor:
         nuisance: (n, q) patterns that numerics can make, times their prior standard deviations.
         parameters: (n, k) derivatives by the model's parameters (and their curvature), likewise.
         directions: (n, k) in which effects act.
-        parts: what the noise is made of: instruments, chance, reconstruction, numerics beyond the patterns.
+        parts: what the noise is made of: instruments, chance, guesses, reconstruction, numerics beyond the patterns.
     """
 
     noise: Noise
@@ -63,7 +63,8 @@ class Floor:
 def floor_of(experiment: Experiment, evidence: Evidence) -> Floor:
     """Assemble the floor.
 
-    Chance comes from repeated seeds, the pictures' own errors from where physics can't act. What other numerics change
+    Chance comes from repeated seeds, what no instrument shows from other guesses of it, the pictures' own errors from
+    where physics can't act. What other numerics change
     is projected out, pattern by pattern; what each of these patterns holds beyond parameters and the other patterns is
     a sample of what numerics that weren't tried would leave, and goes into the noise.
     """
@@ -77,6 +78,8 @@ def floor_of(experiment: Experiment, evidence: Evidence) -> Floor:
     directions = _columns([table for direction in evidence.directions.values() for table in direction], seen)
     if experiment.chance and runs > 1:
         parts["chance"] = estimate(layout, evidence.repeats, seen, directions, parameters)
+    if len(evidence.guesses):
+        parts["guesses"] = estimate(layout, evidence.guesses, seen, directions, parameters)
     if np.count_nonzero(experiment.quiet) >= FEWEST_QUIET:
         known = _total(layout, parts, seen, runs)[0]
         parts["reconstruction"] = _instruments(experiment, evidence, known)
@@ -88,7 +91,7 @@ def floor_of(experiment: Experiment, evidence: Evidence) -> Floor:
         parts["numerics"] = estimate(layout, _unexplained(known, parameters, patterns, seen), seen)
     noise, single = _total(layout, parts, seen, runs)
     for name, part in parts.items():
-        columns = extra_noise(layout, part, seen, directions if name == "chance" else None)
+        columns = extra_noise(layout, part, seen, directions if name in ("chance", "guesses") else None)
         averaged, alone = (np.sqrt(factor) for factor in _factors(name, runs))
         noise, single = noise.plus(averaged * columns), single.plus(alone * columns)
     return Floor(noise, single, NUMERICS_PRIOR * _columns(patterns, seen), parameters, directions, parts)
@@ -128,7 +131,7 @@ def _instruments(experiment: Experiment, evidence: Evidence, known: Noise) -> Pa
 
 
 def _replayed(experiment: Experiment, replays: FloatArray, parts: Mapping[str, Part]) -> Part:
-    """What known soils leave that went through the whole chain, beyond chance and the cameras' noise.
+    """What known soils leave that went through the whole chain, beyond chance, guesses and the cameras' noise.
 
     Where the undisturbed part of the real pictures is worse than the replay's, the real one counts.
     """
@@ -136,6 +139,8 @@ def _replayed(experiment: Experiment, replays: FloatArray, parts: Mapping[str, P
     known = parts["instruments"].scale ** 2
     if "chance" in parts:
         known = known + 2.0 * parts["chance"].scale ** 2
+    if "guesses" in parts:
+        known = known + parts["guesses"].scale ** 2
     variance = np.maximum(whole.scale**2 - known, 0.0)
     if "reconstruction" in parts:
         variance = np.maximum(variance, parts["reconstruction"].scale ** 2)

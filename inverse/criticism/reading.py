@@ -21,7 +21,7 @@ from splatsoil.errors import SimulationError
 from splatsoil.parameters import Parameter, ParameterSpace
 
 from .evidence import Visit, around
-from .refit import Known, Refit
+from .refit import Known, Refit, half_ranges
 from .surface import Surface
 
 FloatArray = npt.NDArray[np.float64]
@@ -56,14 +56,12 @@ class Reading:
         stds: distance from these that holds 68.3 % of the draws, by name.
         draws: (k, n) of the parameters, in [-1, 1].
         unknown: (k,) True where the surface is in doubt there by more than the noise in some direction.
-        dispersion: by which the observation is farther from all that was emulated than noise.
     """
 
     values: Mapping[str, float]
     stds: Mapping[str, float]
     draws: FloatArray
     unknown: npt.NDArray[np.bool_]
-    dispersion: float
 
 
 def explored(
@@ -77,7 +75,7 @@ def explored(
     shapes: Sequence[Parameter] = (),
 ) -> Refit:
     """Simulate where the parameters may lie by what is known so far, then at the most probable ones, and go there if
-    that is better.
+    that is better. Slopes are those of the surface where the refit then stands.
 
     Args:
         predict: (t, s) features by parameters; adds a visit.
@@ -89,7 +87,7 @@ def explored(
         start: a refit of them, and what is returned where nothing changes the features.
         shapes: those that no simulation has varied yet.
     """
-    space, before = ParameterSpace(parameters), len(visits)
+    space, before, better = ParameterSpace(parameters), len(visits), start
 
     def visit(values: Mapping[str, float]) -> None:
         # Where nothing can be simulated nothing is learned.
@@ -108,12 +106,36 @@ def explored(
             for draw in found.draws[np.argsort(~found.unknown, kind="stable")][:TOGETHER]:
                 visit(space.to_dict(space.from_unit(draw)))
         values = read(visits, whiten, observed, parameters, known, seed=BATCHES).values
-        table = predict(values)
-    except (SimulationError, ValueError):
+        with suppress(SimulationError):
+            table = predict(values)
+            chi2 = float(np.sum(whiten(observed - table) ** 2) + known.chi2(space.to_vector(values)))
+            if chi2 <= start.chi2:
+                better = replace(start, values=values, chi2=chi2, prediction=table)
+        slopes = tangent(visits, whiten, parameters, better.values)
+    except ValueError:
         return start
-    chi2 = float(np.sum(whiten(observed - table) ** 2) + known.chi2(space.to_vector(values)))
-    better = start if chi2 > start.chi2 else replace(start, values=values, chi2=chi2, prediction=table)
-    return replace(better, simulations=start.simulations + len(visits) - before)
+    return replace(better, simulations=start.simulations + len(visits) - before, slopes=slopes)
+
+
+def tangent(
+    visits: Sequence[Visit],
+    whiten: Callable[[FloatArray], FloatArray],
+    parameters: Sequence[Parameter],
+    values: Mapping[str, float],
+) -> FloatArray:
+    """(t, s, k) derivatives by the parameters at some values, of the surface through all simulations.
+
+    Raises:
+        ValueError: see :func:`read`.
+    """
+    space, surface = ParameterSpace(parameters), _surface(visits, whiten, parameters)
+    tables = np.stack([visit.table for visit in visits])
+    # The surface has seen its few directions of the whitened features alone. What these are in tables, those that were
+    # simulated tell: regressed on their scores, which are orthogonal.
+    scores = surface.modes @ surface.scores
+    patterns = np.tensordot((scores / np.sum(scores**2, axis=0)).T, tables - tables.mean(axis=0), axes=1)
+    slopes = np.tensordot(surface.slopes(space.to_unit(space.to_vector(values))), patterns, axes=1)
+    return np.moveaxis(slopes, 0, -1) / half_ranges(parameters, values)
 
 
 def read(
@@ -140,11 +162,7 @@ def read(
     Raises:
         ValueError: too few simulations, or the features are the same wherever they were made.
     """
-    space = ParameterSpace(parameters)
-    rest = {p.name: p.off if p.off is not None else p.default for p in parameters}
-    points = np.stack([space.to_unit(space.to_vector({n: {**rest, **v.values}[n] for n in rest})) for v in visits])
-    surface = Surface.through(points, np.stack([whiten(v.table) for v in visits]))
-    target = whiten(observed)
+    space, surface, target = ParameterSpace(parameters), _surface(visits, whiten, parameters), whiten(observed)
     outside, scores = surface.remainder(target), surface.project(target)
     wide = max(1.0, float(outside @ outside) / max(len(target) - len(scores), 1))
 
@@ -164,8 +182,9 @@ def read(
         mean, variance = surface.predict(where)
         return np.asarray(np.sum((scores - mean) ** 2 + variance, axis=1) / wide + told(where))
 
-    # Far from all simulations the surface falls back to its mean, which says nothing.
+    # Far from all simulations the surface falls back to its parabola, which says little.
     beyond = ABROAD if bold else 0.0
+    points = surface.points
     low, high = np.maximum(points.min(axis=0) - beyond, -1.0), np.minimum(points.max(axis=0) + beyond, 1.0)
     draws = _sample(log_density, low, high, seed)
     likely = np.concatenate([draws, points])
@@ -175,7 +194,17 @@ def read(
     # A root mean square would be ruled by the few draws in a gap between simulations.
     spread = np.quantile(np.abs(space.from_unit(draws) - values), ONE_STD, axis=0)
     unknown = np.any(surface.predict(draws)[1] > wide, axis=1)
-    return Reading(space.to_dict(values), dict(zip(space.names, map(float, spread), strict=True)), draws, unknown, wide)
+    return Reading(space.to_dict(values), dict(zip(space.names, map(float, spread), strict=True)), draws, unknown)
+
+
+def _surface(
+    visits: Sequence[Visit], whiten: Callable[[FloatArray], FloatArray], parameters: Sequence[Parameter]
+) -> Surface:
+    """Through all simulations."""
+    space = ParameterSpace(parameters)
+    rest = {p.name: p.off if p.off is not None else p.default for p in parameters}
+    points = np.stack([space.to_unit(space.to_vector({n: {**rest, **v.values}[n] for n in rest})) for v in visits])
+    return Surface.through(points, np.stack([whiten(v.table) for v in visits]))
 
 
 def _sample(

@@ -43,7 +43,7 @@ class Refit:
         chi2: of the whitened residual there.
         prediction: (t, s) the features predicted there.
         simulations: how many were tried.
-        slopes: (t, s, k) the derivatives as last mended.
+        slopes: (t, s, k) the derivatives there: as last mended, or of the surface that the parameters were read off.
     """
 
     values: Mapping[str, float]

@@ -95,7 +95,8 @@ def _traces(
         size = values.get(measure.name, off[measure.name])
         if abs(size - off[measure.name]) < measure.meaningful:
             size = off[measure.name] + step_of(measure)
-        trace = predict({**base, **off, measure.name: size}, (candidate.name,)) - middle
+        shapes = {p.name: values[p.name] for p in candidate.shapes if p.name in values}
+        trace = predict({**base, **off, **shapes, measure.name: size}, (candidate.name,)) - middle
         out[candidate.name] = trace - basis @ (basis.T @ trace)
     return out
 

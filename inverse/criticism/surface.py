@@ -113,11 +113,19 @@ class Surface:
 
     def predict(self, where: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Mean features over seeds along the directions, and its variance, (q, p) each, at points (q, n)."""
-        seen = _kernel(where, self.points, self.lengths, self.trend) @ self.modes
-        gain = self.signal / (self.strengths[:, None] * self.signal + self.noise)
+        seen, gain = _kernel(where, self.points, self.lengths, self.trend) @ self.modes, self._gain
         alone = 1.0 + self.trend * (np.sum(where**2, axis=1) + 0.5 * np.sum(where**2, axis=1) ** 2)
         variance = self.doubt * self.signal * (alone[:, None] - seen**2 @ gain)
         return seen @ (gain * self.scores), np.maximum(variance, 0.0)
+
+    def slopes(self, where: FloatArray) -> FloatArray:
+        """Derivatives (n, p) of the mean features along the directions, at one point (n,)."""
+        return _kernel_slopes(where, self.points, self.lengths, self.trend) @ self.modes @ (self._gain * self.scores)
+
+    @property
+    def _gain(self) -> FloatArray:
+        """(m, p) what a mode's score counts for in a prediction."""
+        return np.asarray(self.signal / (self.strengths[:, None] * self.signal + self.noise))
 
 
 def _kernel(a: FloatArray, b: FloatArray, lengths: FloatArray, trend: float) -> FloatArray:
@@ -125,6 +133,13 @@ def _kernel(a: FloatArray, b: FloatArray, lengths: FloatArray, trend: float) -> 
     product = a @ b.T
     near = np.exp(-0.5 * np.sum(((a[:, None] - b[None]) / lengths) ** 2, axis=-1))
     return near + trend * (product + 0.5 * product**2)
+
+
+def _kernel_slopes(where: FloatArray, b: FloatArray, lengths: FloatArray, trend: float) -> FloatArray:
+    """(n, m) derivatives of the same at a point (n,)."""
+    apart = where - b
+    near = np.exp(-0.5 * np.sum((apart / lengths) ** 2, axis=1))
+    return np.asarray((trend * (1.0 + b @ where)[:, None] * b - near[:, None] * apart / lengths**2).T)
 
 
 def _edge(size: FloatArray, shape: tuple[int, int]) -> float:

@@ -102,24 +102,25 @@ def added(
     from splatsoil.commands import _stages as stage
     from splatsoil.soil.library import find_effects
 
-    before = folder.fit()
-    known = criticism.latest_diagnosis(folder)
-    (effect,) = find_effects([name])
-    if known is None or effect.name not in known["refits"]:
+    before, (effect,) = folder.fit(), find_effects([name])
+    setup = before["setup"]
+    effects = (*setup["effects"], name)
+    larger = model.variant(effects=effects)
+    own = next(e for e in larger.law.effects if e.name == effect.name)
+    mine = [p.name for p in own.parameters if p.off is not None or p.name in own.shapes]
+    free = (*before["parameters"], *mine)
+    known = criticism.latest_diagnosis(folder) or {"refits": {}}
+    # One that was kept may be of a time when other parameters of the effect were free.
+    if {*known["refits"].get(effect.name, {"values": ()})["values"]} != {*free}:
         known = criticism.confirmed(folder, model, name, options, begin(f"try {effect.name}"))
     entries = criticism.history(folder)
     base, with_it = known["refits"]["as it is"], known["refits"][effect.name]
     if not entries or entries[-1]["model"] != before["name"]:
         entries = [criticism.entry(before, base)]
     entries[-1]["held_out"], entries[-1]["floor"] = base["held_out"], base["floor"]
-    setup = before["setup"]
-    effects = (*setup["effects"], name)
-    larger = model.variant(effects=effects)
-    own = next(e for e in larger.law.effects if e.name == effect.name)
-    mine = [p.name for p in own.parameters if p.off is not None or p.name in own.shapes]
     fitting = FitOptions(
         set=model.measurement.folder,
-        parameters=(*before["parameters"], *mine),
+        parameters=free,
         effects=effects,
         budget=budget,
         preset=setup["preset"],

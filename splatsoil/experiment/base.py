@@ -87,6 +87,7 @@ class Experiment(Protocol):
         model: names of the effects that are on.
         candidates: effects that are off.
         numerics: names of the ways to compute the same physics otherwise.
+        guesses: names of other guesses of what no instrument shows (the colour of buried soil).
         chance: True where another seed gives another prediction.
     """
 
@@ -113,6 +114,8 @@ class Experiment(Protocol):
     @property
     def numerics(self) -> tuple[str, ...]: ...
     @property
+    def guesses(self) -> tuple[str, ...]: ...
+    @property
     def chance(self) -> bool: ...
 
     def predict(
@@ -124,7 +127,7 @@ class Experiment(Protocol):
             values: parameters by name, those of ``effects`` included.
             effects: candidates to switch on, by name; or an effect itself that is none.
             seed: of what is chance in the simulation.
-            numerics: one of ``numerics``, or nothing for the usual way.
+            numerics: one of ``numerics`` or ``guesses``, or nothing for the usual way.
 
         Raises:
             SimulationError: the simulation could not go on.

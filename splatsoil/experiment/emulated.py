@@ -35,6 +35,7 @@ class EmulatedExperiment:
         sensor: (t, s) standard deviation of the instruments.
         observed: (t, s).
         patterns: (t, s) what other numerics add, by name.
+        guessed: (t, s) what other guesses of what no instrument shows add, by name.
         quiet: (t, s) where no physics acts.
         name: for people.
     """
@@ -50,6 +51,7 @@ class EmulatedExperiment:
     observed: FloatArray
     curves: Mapping[str, FloatArray] = field(default_factory=dict)
     patterns: Mapping[str, FloatArray] = field(default_factory=dict)
+    guessed: Mapping[str, FloatArray] = field(default_factory=dict)
     quiet: npt.NDArray[np.bool_] = field(default_factory=lambda: np.zeros((0, 0), dtype=bool))
     name: str = "emulated"
     model: tuple[str, ...] = ()
@@ -70,6 +72,11 @@ class EmulatedExperiment:
         """Names of the other numerics."""
         return tuple(self.patterns)
 
+    @property
+    def guesses(self) -> tuple[str, ...]:
+        """Names of the other guesses."""
+        return tuple(self.guessed)
+
     def expected(self, values: Mapping[str, float], numerics: str = "") -> FloatArray:
         """(t, s) features without chance."""
         out = self.middle.copy()
@@ -80,7 +87,7 @@ class EmulatedExperiment:
             if name in self.curves:
                 out += 0.5 * step**2 * self.curves[name]
         if numerics:
-            out += self.patterns[numerics]
+            out += {**self.patterns, **self.guessed}[numerics]
         return out
 
     def predict(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -18,6 +19,12 @@ FloatArray = npt.NDArray[np.float64]
 
 BRIGHTEST = 2.0
 """Largest linear albedo, in units of level sunlit soil's mean; only errors lie beyond."""
+
+OUTLYING = 3.0
+"""Standard deviations beyond which a place counts as no farther from the median."""
+
+WAVES = 256
+"""Of a random field."""
 
 
 def correlation_length(points: Tensor, values: Tensor, longest: float) -> float:
@@ -73,14 +80,63 @@ def grain_albedo(
         (p, 3) linear.
     """
     mean = albedo.mean(dim=0)
+    share = torch.exp(-depth.clamp_min(0.0) / length)[:, None]
+    return mean + share * (albedo_above(grains, centres, albedo, spacing) - mean)
+
+
+def albedo_above(grains: Tensor, centres: Tensor, albedo: Tensor, spacing: float) -> Tensor:
+    """Albedo (p, 3) of the surface over each particle, averaged over about a particle; arguments of `grain_albedo`."""
     k = min(16, len(centres))
     away, index = cKDTree(centres[:, :2].cpu().numpy()).query(grains[:, :2].cpu().numpy(), k=k)
     distance = torch.from_numpy(away.reshape(len(grains), k)).to(grains.device)
     weight = torch.exp(-0.5 * (distance.square() - distance[:, :1].square()) / (0.5 * spacing) ** 2).float()
     near = albedo[torch.from_numpy(index.reshape(len(grains), k)).to(grains.device)]
-    above = (weight[..., None] * near).sum(dim=1) / weight.sum(dim=1, keepdim=True)
-    share = torch.exp(-depth.clamp_min(0.0) / length)[:, None]
-    return mean + share * (above - mean)
+    return (weight[..., None] * near).sum(dim=1) / weight.sum(dim=1, keepdim=True)
+
+
+def other_grain_albedo(
+    grains: Tensor, depth: Tensor, guess: Tensor, above: Tensor, length: float, generator: np.random.Generator
+) -> Tensor:
+    """Albedo that particles could have just as well as the guess.
+
+    Beneath the surface blotches go on that no photograph shows. The guess is multiplied with a random field of the
+    surface's own variance and an exponential correlation, of which the share 1 − exp(−2 d/length) of the variance is
+    left open at a depth d: together with the guess, the correlation of `grain_albedo`.
+
+    Args:
+        grains: (p, 3) particles, m.
+        depth: (p,) below the surface, m.
+        guess: (p, 3) linear albedo from `grain_albedo`; its mean is kept.
+        above: (p, 3) linear albedo of the surface above each.
+        length: correlation length of the surface's albedo, m.
+        generator: of the field.
+
+    Returns:
+        (p, 3) linear.
+    """
+    values, vectors = np.linalg.eigh(_log_covariance(above.cpu().numpy().astype(np.float64)))
+    mixing = torch.from_numpy(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T).float().to(grains.device)
+    field = torch.stack([_random_field(grains, length, generator) for _ in range(3)], dim=1) @ mixing
+    open_variance = (1.0 - torch.exp(-2.0 * depth.clamp_min(0.0) / length))[:, None]
+    variance = open_variance * mixing.square().sum(dim=0)
+    return guess * torch.exp(open_variance.sqrt() * field - 0.5 * variance)
+
+
+def _log_covariance(albedo: FloatArray) -> FloatArray:
+    """(3, 3) covariance of the logarithm of albedo (n, 3), of which walls and tool may have spoilt a part."""
+    logs = np.log(np.maximum(albedo, 1e-3))
+    logs -= np.median(logs, axis=0)
+    most = OUTLYING * 1.4826 * np.median(np.abs(logs), axis=0)
+    return np.asarray(np.cov(np.clip(logs, -most, most).T), dtype=np.float64)
+
+
+def _random_field(points: Tensor, length: float, generator: np.random.Generator) -> Tensor:
+    """(n,) Gaussian field of variance 1 and correlation exp(-distance/length) at points (n, 3), m: a sum of waves."""
+    # exp(-|x|) in space is the characteristic function of Cauchy's distribution there
+    waves = generator.standard_normal((WAVES, 3)) / np.abs(generator.standard_normal((WAVES, 1))) / length
+    phases = generator.uniform(0.0, 2.0 * np.pi, WAVES)
+    turns, starts = (torch.from_numpy(a).float().to(points.device) for a in (waves.T.copy(), phases))
+    return math.sqrt(2.0 / WAVES) * torch.cos(points @ turns + starts).sum(dim=1)
 
 
 def refined(

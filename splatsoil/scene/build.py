@@ -107,9 +107,30 @@ def rebound(scene: Scene, particles: Any) -> Scene:
     return scene.replace(soil=bind(rest, scene.soil.covariances, x, scene.spacing), grain_albedo=grains)
 
 
+def reguessed(scene: Scene, seed: int) -> Scene:
+    """See `Scene.with_other_albedo`."""
+    x, rest, surface = scene.soil.particles, scene.soil.rest, linear(scene.soil_albedo)
+    relief = relief_of_particles(x, scene.spacing, scene.bed.lower, scene.bed.upper)
+    above = albedos.albedo_above(x, rest, surface, scene.spacing)
+    others = albedos.other_grain_albedo(
+        x,
+        relief.depth_below(x),
+        linear(scene.grain_albedo),
+        above,
+        _length(rest, surface),
+        np.random.default_rng(seed),
+    )
+    return scene.replace(grain_albedo=encoded(others.clamp(0.0, albedos.BRIGHTEST)))
+
+
+def _length(centres: Tensor, albedo: Tensor) -> float:
+    """Correlation length of the linear albedo (n, 3) of soil Gaussians, m."""
+    return albedos.correlation_length(centres, albedo.clamp_min(1e-3).log().mean(dim=1), _LONGEST)
+
+
 def _grains(centres: Tensor, albedo: Tensor, relief: Relief, grains: Tensor, spacing: float) -> Tensor:
     """Albedo (p, 3), sRGB-encoded, of particles beneath soil Gaussians of a linear albedo (n, 3)."""
-    length = albedos.correlation_length(centres, albedo.clamp_min(1e-3).log().mean(dim=1), _LONGEST)
+    length = _length(centres, albedo)
     return encoded(albedos.grain_albedo(grains, relief.depth_below(grains), centres, albedo, spacing, length))
 
 

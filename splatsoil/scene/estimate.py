@@ -3,7 +3,8 @@
 Albedo varies from place to place and its blotches look like slopes; where a shadow ends, or a slope turns, brightness
 changes over millimetres while the albedo does not know of it. So differences of log brightness over a short distance
 are compared with those that a light predicts, with a robust loss: the tool's shadow, where there is one, gives the
-sun's direction and the sky's share by its edge, and slopes add what they know.
+sun's direction by its edge and the sky's share by what is left inside it, and slopes add what they know. Photographs
+blur a shadow's edge, which would look like more sky: for the share, the edge itself is left out.
 """
 
 from __future__ import annotations
@@ -15,13 +16,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 import torch
+import torch.nn.functional as functional
 import warp as wp
 from scipy.optimize import minimize, minimize_scalar
 from torch import Tensor
 
 from splatsoil.measurement import Frame, Measurement
 from splatsoil.scene import kernels
-from splatsoil.scene.light import SOIL_REFLECTANCE, Light, linear
+from splatsoil.scene.light import Light, linear
 from splatsoil.scene.lit import LitRelief, ceiling, direct_light, march_step, sun_on_points
 from splatsoil.scene.relief import Relief, grid_of
 from splatsoil.scene.sky import sky_openness
@@ -41,6 +43,15 @@ _MARGIN = 0.03
 
 _LAG = 3
 """Distance of compared cells: a shadow's edge is blurred over about two."""
+
+_BLUR = 1.5
+"""How far photographs blur an edge, in their pixels: the eye's pixel and the interpolation between pixels."""
+
+_IN_THE_WAY = 0.1
+"""Light that comes from where the tool hides the sky: half of level ground's on a tool that sends a fifth of it back.
+
+The tool's colour is not known yet; from black to bright metal this moves the sky's share by 0.01.
+"""
 
 
 @dataclass(frozen=True)
@@ -100,7 +111,7 @@ def seen_colours(
         visible = (seen.cpu().numpy() > 0.5) & inside
         image = linear(torch.from_numpy(np.ascontiguousarray(frame.image())))
         normalised = torch.from_numpy(2.0 * pixels[visible] / [camera.width, camera.height] - 1.0).float()
-        picked = torch.nn.functional.grid_sample(
+        picked = functional.grid_sample(
             image.permute(2, 0, 1)[None], normalised[None, None], mode="bilinear", align_corners=False
         )
         samples[k, torch.from_numpy(visible)] = picked[0, :, 0].T
@@ -122,10 +133,15 @@ def estimate_light(measurement: Measurement, relief: Relief, body: ToolBody) -> 
     points, shape = _cells(relief, lower, upper)
     colours, count = seen_colours(points, still_frames(measurement), relief, tool)
     colours[count < 2] = math.nan
-    return fit_light(points, colours, shape, relief, tool)
+    middle = 0.5 * (lower + upper)
+    pixel = float(np.median([np.linalg.norm(v.camera.position - middle) / v.camera.fx for v in measurement.views]))
+    across = float((points[1] - points[0]).norm())
+    return fit_light(points, colours, shape, relief, tool, blur=max(1, math.ceil(_BLUR * pixel / across)))
 
 
-def fit_light(points: Tensor, colours: Tensor, shape: tuple[int, int], relief: Relief, tool: object) -> LightEstimate:
+def fit_light(
+    points: Tensor, colours: Tensor, shape: tuple[int, int], relief: Relief, tool: object, *, blur: int = 1
+) -> LightEstimate:
     """The light that explains the colours of a grid of points on a surface.
 
     Args:
@@ -134,6 +150,7 @@ def fit_light(points: Tensor, colours: Tensor, shape: tuple[int, int], relief: R
         shape: rows and columns.
         relief: the surface.
         tool: the tool's pose in the kernels' form.
+        blur: half width of a shadow's edge in the photographs, in rows and columns.
     """
     problem = _Problem(points, colours, shape, relief, tool)
     grey = problem.brightness.mean(dim=1)
@@ -151,16 +168,17 @@ def fit_light(points: Tensor, colours: Tensor, shape: tuple[int, int], relief: R
         method="Nelder-Mead",
         options={"initial_simplex": simplex, "xatol": 0.02, "fatol": 1e-6, "maxfev": 250},
     )
-    azimuth, elevation, _ = found.x
+    azimuth, elevation = float(found.x[0]), float(np.clip(found.x[1], 5.0, 89.9))
+    beside = problem.beside_edges(azimuth, elevation, blur)
     ambient = [
         minimize_scalar(
-            lambda a, c=channel: problem.cost(problem.brightness[:, c], azimuth, elevation, a),
+            lambda a, c=channel: beside.cost(beside.brightness[:, c], azimuth, elevation, a),
             bounds=(0.02, 0.98), method="bounded", options={"xatol": 1e-3},
         ).x
         for channel in range(3)
     ]  # fmt: skip
     level = torch.nanmedian(colours, dim=0).values.clamp_min(1e-3).cpu().numpy().astype(np.float64)
-    light = Light.from_angles(float(azimuth), float(np.clip(elevation, 5.0, 89.9)), np.array(ambient), level=level)
+    light = Light.from_angles(azimuth, elevation, np.array(ambient), level=level)
     nothing = float(problem.spread(problem.differences(grey)))
     shadowed = float(1.0 - problem.tool_light(light).mean())
     return LightEstimate(light, 1.0 - float(found.fun) / max(nothing, 1e-12), shadowed)
@@ -169,8 +187,16 @@ def fit_light(points: Tensor, colours: Tensor, shape: tuple[int, int], relief: R
 class _Problem:
     """Robust fit of log-brightness differences on a grid."""
 
-    def __init__(self, points: Tensor, colours: Tensor, shape: tuple[int, int], relief: Relief, tool: object) -> None:
-        self.points, self.shape, self.relief, self.tool = points, shape, relief, tool
+    def __init__(
+        self,
+        points: Tensor,
+        colours: Tensor,
+        shape: tuple[int, int],
+        relief: Relief,
+        tool: object,
+        lag: int = _LAG,
+    ) -> None:
+        self.points, self.shape, self.relief, self.tool, self.lag = points, shape, relief, tool, lag
         self.brightness = colours.clamp_min(1e-4).log()
         self.openness = relief.sample(sky_openness(relief, tool)[0], points)
         self._known: tuple[float, float, Tensor] | None = None
@@ -180,8 +206,16 @@ class _Problem:
 
     def differences(self, values: Tensor) -> Tensor:
         """Differences over the lag along both axes of the grid."""
-        grid = values.reshape(self.shape)
-        return torch.cat([(grid[_LAG:] - grid[:-_LAG]).reshape(-1), (grid[:, _LAG:] - grid[:, :-_LAG]).reshape(-1)])
+        grid, lag = values.reshape(self.shape), self.lag
+        return torch.cat([(grid[lag:] - grid[:-lag]).reshape(-1), (grid[:, lag:] - grid[:, :-lag]).reshape(-1)])
+
+    def beside_edges(self, azimuth: float, elevation: float, blur: int) -> _Problem:
+        """The same without the shadow's edge, its blur taken off both sides, by differences that reach across."""
+        sun = self.tool_light(Light.from_angles(azimuth, elevation, 0.5)).reshape(1, 1, *self.shape)
+        highest, lowest = (functional.max_pool2d(sign * sun, 2 * blur + 1, 1, blur) for sign in (1.0, -1.0))
+        colours = self.brightness.exp()
+        colours[(highest + lowest > 0.02).reshape(-1)] = math.nan
+        return _Problem(self.points, colours, self.shape, self.relief, self.tool, lag=2 * blur + _LAG)
 
     def spread(self, residual: Tensor) -> Tensor:
         """Mean pseudo-Huber loss of the residuals that are known."""
@@ -193,7 +227,7 @@ class _Problem:
         if not 5.0 <= elevation <= 89.9 or not 0.02 <= ambient <= 0.98:
             return 1e3
         direct = self._direct(azimuth, elevation)
-        e = ambient * self.openness + (1.0 - ambient) * direct + 0.5 * SOIL_REFLECTANCE * (1.0 - self.openness)
+        e = ambient * self.openness + (1.0 - ambient) * direct + _IN_THE_WAY * (1.0 - self.openness)
         return float(self.spread(self.differences(brightness - e.clamp_min(1e-3).log())))
 
     def tool_light(self, light: Light) -> Tensor:

@@ -80,6 +80,55 @@ _WEDGE = """[](float slope, float up, float along) {
     }"""
 
 
+_SLOPES_SNIPPET = """
+    constexpr int W = WIDTH, CHANNELS = 3;
+    const int ny = height.shape[0], nx = height.shape[1], across = wide.shape[1];
+    const int plane = wide.shape[0] * across, start = (row + margin_y) * across + margin_x + first;
+    float here[W], nx_[W], ny_[W], up[W], along[W], slope[W], before[W], sum[W], light[CHANNELS][W];
+    for (int l = 0; l < W; ++l) {
+        const int j = first + l < nx ? first + l : nx - 1;
+        here[l] = height.data[row * nx + j];
+        const float* n = (const float*)normal.data + 3 * (row * nx + j);
+        nx_[l] = n[0]; ny_[l] = n[1]; up[l] = n[2];
+        sum[l] = 0.0f;
+        for (int c = 0; c < CHANNELS; ++c) light[c][l] = 0.0f;
+    }
+    for (int a = 0; a < azimuths; ++a) {
+        for (int l = 0; l < W; ++l) {
+            along[l] = directions.data[2 * a] * nx_[l] + directions.data[2 * a + 1] * ny_[l];
+            slope[l] = -along[l] / up[l];
+            before[l] = WEDGE(slope[l], up[l], along[l]);
+        }
+        for (int k = a * looks; k < (a + 1) * looks; ++k) {
+            const int place = start + offsets.data[k], last = k > a * looks ? start + offsets.data[k - 1] : start;
+            const float inverse = inverses.data[k];
+            for (int l = 0; l < W; ++l) {
+                const float rise = (wide.data[place + l] - here[l]) * inverse;
+                slope[l] = rise > slope[l] ? rise : slope[l];
+                const float upto = WEDGE(slope[l], up[l], along[l]);
+                const float part = upto - before[l];
+                before[l] = upto;
+                sum[l] += part;
+                for (int c = 0; c < CHANNELS; ++c) {
+                    const float* p = sent.data + c * plane + l;
+                    light[c][l] += 0.5f * part * (p[place] + p[last]);
+                }
+            }
+        }
+    }
+    for (int l = 0; l < W && first + l < nx; ++l) {
+        const float share = sum[l] > 1.0e-5f ? 1.0f / sum[l] : 0.0f;
+        for (int c = 0; c < CHANNELS; ++c) result.data[(c * ny + row) * nx + first + l] = share * light[c][l];
+    }
+"""
+
+
+def _source(snippet: str) -> str:
+    """A snippet with its width, and what its wedges are."""
+    text = snippet.replace("WEDGE(", "wedge(").replace("WIDTH", str(WIDTH))
+    return f"    const auto wedge = {_WEDGE};\n{text}"
+
+
 @cache
 def sky_kernel(stride: int, tool: bool) -> Any:
     """Kernel over (rows, groups of `WIDTH`) of every ``stride``-th row and column of a map.
@@ -87,10 +136,9 @@ def sky_kernel(stride: int, tool: bool) -> Any:
     It sums, over the azimuths, the sky that soil leaves open to a cell, or what of that a tool takes; maps with margins
     are wide enough for every look and ``WIDTH · stride`` columns more.
     """
-    text = _SNIPPET.replace("WEDGE(", "wedge(").replace("WIDTH", str(WIDTH)).replace("STRIDE", str(stride))
-    text = text.replace("NOTHING", f"{_NOTHING!r}f").replace("TOOL", "true" if tool else "false")
+    text = _source(_SNIPPET).replace("STRIDE", str(stride))
 
-    @wp.func_native(f"    const auto wedge = {_WEDGE};\n{text}")
+    @wp.func_native(text.replace("NOTHING", f"{_NOTHING!r}f").replace("TOOL", "true" if tool else "false"))
     def sky_of_cells(
         row: int,
         first: int,
@@ -145,3 +193,61 @@ def sky_kernel(stride: int, tool: bool) -> Any:
         )
 
     return sky
+
+
+@wp.func_native(_source(_SLOPES_SNIPPET))
+def _slopes_of_cells(
+    row: int,
+    first: int,
+    height: wp.array2d(dtype=wp.float32),
+    normal: wp.array2d(dtype=wp.vec3),
+    wide: wp.array2d(dtype=wp.float32),
+    sent: wp.array3d(dtype=wp.float32),
+    margin_x: int,
+    margin_y: int,
+    directions: wp.array(dtype=wp.float32),
+    offsets: wp.array(dtype=wp.int32),
+    inverses: wp.array(dtype=wp.float32),
+    azimuths: int,
+    looks: int,
+    result: wp.array3d(dtype=wp.float32),
+): ...
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def light_of_slopes(
+    height: wp.array2d(dtype=wp.float32),
+    normal: wp.array2d(dtype=wp.vec3),
+    wide: wp.array2d(dtype=wp.float32),
+    sent: wp.array3d(dtype=wp.float32),
+    margin_x: int,
+    margin_y: int,
+    directions: wp.array(dtype=wp.float32),
+    offsets: wp.array(dtype=wp.int32),
+    inverses: wp.array(dtype=wp.float32),
+    azimuths: int,
+    looks: int,
+    result: wp.array3d(dtype=wp.float32),
+):
+    """Over (rows, groups of `WIDTH` cells): the mean of three maps over the soil in the sky's way of a cell.
+
+    What rises above the horizon at a look shows the soil between that look and the one before. Maps with margins are
+    wide enough for every look and ``WIDTH`` columns more; 0 where nothing stands in the way.
+    """
+    row, group = wp.tid()
+    _slopes_of_cells(
+        row,
+        group * wp.static(WIDTH),
+        height,
+        normal,
+        wide,
+        sent,
+        margin_x,
+        margin_y,
+        directions,
+        offsets,
+        inverses,
+        azimuths,
+        looks,
+        result,
+    )

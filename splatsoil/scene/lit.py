@@ -15,7 +15,7 @@ from torch import Tensor
 from splatsoil.scene import kernels
 from splatsoil.scene.light import Light
 from splatsoil.scene.relief import Relief, grid_of
-from splatsoil.scene.sky import sky_openness
+from splatsoil.scene.sky import light_from_slopes, sky_openness
 from splatsoil.splats.warp_torch import as_warp, launch
 
 FloatArray = npt.NDArray[np.float64]
@@ -23,10 +23,7 @@ FloatArray = npt.NDArray[np.float64]
 _COARSE = 2
 """Cells between which light is sent back and forth, in cells of the relief."""
 
-_NEIGHBOURHOOD = 0.03
-"""Standard deviation of the patch of soil whose light a point receives instead of sky, m: about half a trench."""
-
-_BOUNCES = 3
+_BOUNCES = 2
 """How often light is sent back and forth between the soil's slopes."""
 
 _TOOL_LIGHT = 0.5
@@ -79,38 +76,20 @@ def light_relief(relief: Relief, light: Light, tool: Any, tool_colour: npt.Array
 
 
 def _bounced(lit: LitRelief, hidden: Tensor, tool_reflectance: FloatArray) -> Tensor:
-    """Light (ny, nx, 3) that comes from the soil around each cell and from the tool, instead of sky.
-
-    The soil that a cell sees is stood for by the mean of its neighbourhood, as seen from above.
-    """
+    """Light (ny, nx, 3) that comes from the soil around each cell and from the tool, instead of sky."""
     relief = lit.relief
     rough = _coarser(relief)
     points = rough.points.reshape(-1, 3)
     first = lit.irradiance(points, 0.5 * rough.cell[0]).T.reshape(3, *rough.height.shape)
-    share = [_resized(m, (rough.height.shape[0], rough.height.shape[1])) for m in (lit.openness, hidden)]
-    by_soil = (1.0 - share[0] - share[1]).clamp_min(0.0) * _row(lit.light.reflectance(lit.light.level), relief)[
-        :, None, None
-    ]
-    by_tool = share[1] * _TOOL_LIGHT * _row(tool_reflectance, relief)[:, None, None]
-    bounced = torch.zeros_like(first)
-    for _ in range(_BOUNCES):
-        around = _blurred(first + bounced, _NEIGHBOURHOOD / rough.cell[1], _NEIGHBOURHOOD / rough.cell[0])
-        bounced = by_soil * around + by_tool
-    full = functional.interpolate(bounced[None], relief.height.shape, mode="bilinear", align_corners=False)[0]
-    return full.permute(1, 2, 0).contiguous()
-
-
-def _blurred(maps: Tensor, rows: float, columns: float) -> Tensor:
-    """Gaussian blur of (k, ny, nx) by standard deviations in cells, the border held."""
-    for axis, sigma in ((1, rows), (2, columns)):
-        radius = min(max(1, round(2.5 * sigma)), maps.shape[axis] - 1)
-        offsets = torch.arange(-radius, radius + 1, device=maps.device, dtype=torch.float32)
-        weights = torch.exp(-0.5 * (offsets / sigma) ** 2)
-        padding = (0, 0, radius, radius) if axis == 1 else (radius, radius, 0, 0)
-        shape = (1, 1, -1, 1) if axis == 1 else (1, 1, 1, -1)
-        padded = functional.pad(maps[:, None], padding, mode="replicate")
-        maps = functional.conv2d(padded, (weights / weights.sum()).reshape(shape))[:, 0]
-    return maps
+    ground = _row(lit.light.reflectance(lit.light.level), relief)[:, None, None]
+    tool = _TOOL_LIGHT * _row(tool_reflectance, relief)[:, None, None]
+    by_soil = (1.0 - lit.openness - hidden).clamp_min(0.0)
+    share, by_tool = (_resized(m, (rough.height.shape[0], rough.height.shape[1])) for m in (by_soil, hidden))
+    around = light_from_slopes(rough, ground * first)
+    for _ in range(_BOUNCES - 1):
+        around = light_from_slopes(rough, ground * (first + share * around + by_tool * tool))
+    around = functional.interpolate(around[None], relief.height.shape, mode="bilinear", align_corners=False)[0]
+    return (by_soil * around + hidden * tool).permute(1, 2, 0).contiguous()
 
 
 def _row(values: npt.ArrayLike, relief: Relief) -> Tensor:

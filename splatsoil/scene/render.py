@@ -158,6 +158,12 @@ class Scene:
 
         return rebound(self, particles)
 
+    def with_other_albedo(self, seed: int) -> Scene:
+        """The same soil, coloured otherwise beneath its surface, where photographs leave the colour open."""
+        from splatsoil.scene.build import reguessed
+
+        return reguessed(self, seed)
+
     def replace(self, **changes: Any) -> Scene:
         """A copy with some parts replaced."""
         return replace(self, **changes)

@@ -1,4 +1,4 @@
-"""How much of the sky each place of a relief sees."""
+"""How much of the sky each place of a relief sees, and what soil it sees instead."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import warp as wp
 from torch import Tensor
 
 from splatsoil.scene import kernels
-from splatsoil.scene.kernels_sky import WIDTH, sky_kernel
+from splatsoil.scene.kernels_sky import WIDTH, light_of_slopes, sky_kernel
 from splatsoil.scene.relief import Relief, grid_of
 from splatsoil.splats.warp_torch import as_warp, launch
 
@@ -51,6 +51,30 @@ def sky_openness(relief: Relief, tool: Any) -> tuple[Tensor, Tensor]:
     return (scale * (total - hidden)).clamp(0.0, 1.0), (scale * hidden).clamp(0.0, 1.0)
 
 
+def light_from_slopes(relief: Relief, sent: Tensor) -> Tensor:
+    """What each cell sees of a light that the soil sends back, averaged over the soil in the sky's way.
+
+    Slopes in view are those that face a cell: a sunlit trench wall sees the shaded one (horizon-based indirect light,
+    after Bavoil and Sainz, 2009).
+
+    Args:
+        relief: the surface.
+        sent: (3, ny, nx) light sent back by each cell, the same in all directions.
+
+    Returns:
+        (3, ny, nx) its mean over the soil seen, weighted as light on the cell is; 0 where no soil stands in the way.
+    """
+    z = relief.height
+    ny, nx = z.shape
+    looks = _Looks.over(relief)
+    wide, *planes = (_padded(m, looks.margin, WIDTH, "replicate") for m in (z, *sent))
+    result = sent.new_empty(sent.shape)
+    inputs = [as_warp(z, wp.float32), as_warp(relief.normal, wp.vec3), as_warp(wide, wp.float32)]
+    inputs += [as_warp(torch.stack(planes), wp.float32), *looks.tables(wide), *looks.rows.shape]
+    launch(light_of_slopes, (ny, -(-nx // WIDTH)), [*inputs, as_warp(result, wp.float32)], z)
+    return result
+
+
 @dataclass(frozen=True)
 class _Looks:
     """Where a cell looks: the same distances in every direction.
@@ -74,6 +98,19 @@ class _Looks:
         columns, rows = (np.round(away[:, k] / relief.cell[k]).astype(np.int64) for k in (0, 1))
         return cls(directions, rows, columns, 1.0 / np.hypot(columns * relief.cell[0], rows * relief.cell[1]))
 
+    @property
+    def margin(self) -> tuple[int, int]:
+        """Most columns and rows that a cell looks on."""
+        return int(np.abs(self.columns).max()), int(np.abs(self.rows).max())
+
+    def tables(self, wide: Tensor) -> list[Any]:
+        """Margins, directions, offsets in a map with these margins, and inverses, as the kernels take them."""
+        offsets = (self.rows * wide.shape[1] + self.columns).astype(np.int32)
+        parts = (self.directions.astype(np.float32), offsets, self.inverses.astype(np.float32))
+        on = [torch.from_numpy(part.reshape(-1)).to(wide.device) for part in parts]
+        kinds = (wp.float32, wp.int32, wp.float32)
+        return [*self.margin, *(as_warp(table, kind) for table, kind in zip(on, kinds, strict=True))]
+
 
 def _sum(relief: Relief, looks: _Looks, tool: tuple[Tensor, Tensor] | None, stride: int) -> Tensor:
     """Sum over the azimuths of the sky that soil leaves open to every so many cells, or of what the tool takes of it.
@@ -86,23 +123,17 @@ def _sum(relief: Relief, looks: _Looks, tool: tuple[Tensor, Tensor] | None, stri
     """
     z = relief.height
     ny, nx = z.shape
-    margin = [int(np.abs(cells).max()) for cells in (looks.columns, looks.rows)]
     beyond = stride * WIDTH
-    wide = below = above = _padded(z, margin, beyond, "replicate")
+    wide = below = above = _padded(z, looks.margin, beyond, "replicate")
     if tool is not None:
         below, above = (
-            _padded(part, margin, beyond, "constant", value)
+            _padded(part, looks.margin, beyond, "constant", value)
             for part, value in zip(tool, (_NOTHING, -_NOTHING), strict=True)
         )
-    tables = (looks.directions.astype(np.float32), (looks.rows * wide.shape[1] + looks.columns).astype(np.int32))
-    directions, offsets, inverses = (
-        torch.from_numpy(t.reshape(-1)).to(z.device) for t in (*tables, looks.inverses.astype(np.float32))
-    )
     result = z.new_empty((-(-ny // stride), -(-nx // stride)))
     inputs = [as_warp(z, wp.float32), as_warp(relief.normal, wp.vec3)]
     inputs += [as_warp(m, wp.float32) for m in (wide, below, above)]
-    inputs += [margin[0], margin[1], as_warp(directions, wp.float32), as_warp(offsets, wp.int32)]
-    inputs += [as_warp(inverses, wp.float32), *looks.rows.shape, as_warp(result, wp.float32)]
+    inputs += [*looks.tables(wide), *looks.rows.shape, as_warp(result, wp.float32)]
     launch(sky_kernel(stride, tool is not None), (result.shape[0], -(-result.shape[1] // WIDTH)), inputs, z)
     return result
 
@@ -128,7 +159,7 @@ def _distances(relief: Relief) -> list[float]:
     return out
 
 
-def _padded(values: Tensor, margin: list[int], beyond: int, mode: str, value: float = 0.0) -> Tensor:
+def _padded(values: Tensor, margin: tuple[int, int], beyond: int, mode: str, value: float = 0.0) -> Tensor:
     """A map with ``margin`` columns and rows more on every side, and ``beyond`` more columns on the right."""
     wider = (margin[0], margin[0] + beyond, margin[1], margin[1])
     padded = functional.pad(values[None, None], wider, mode=mode, value=value if mode == "constant" else None)

@@ -33,6 +33,7 @@ class Effect:
         parameters: the effect's parameters. The first is its size: at its ``off`` value the effect does nothing. Others
             have an ``off`` value too where they act on their own, and None where they only shape the effect.
         shapes: names of those that only shape it and that data can tell once it is on: diagnoses and ``add`` free them.
+            Not for an effect that observes.
         note: what it is, in one or two sentences.
         source: paper or textbook with equation.
         conflicts: effects that cannot be on at the same time, with the reason.

@@ -84,6 +84,9 @@ def _checked(kind: Any, where: str) -> Effect:
     strange = [name for name in kind.shapes if name not in {p.name for p in parameters if p.off is None}]
     if strange:
         raise ParameterError(f"{what}: {', '.join(strange)} among its shapes is none of its parameters without off=...")
+    if kind.shapes and kind.observe is not Effect.observe:
+        # Calibrations pin the sizes of such effects in their default shape.
+        raise ParameterError(f"{what} changes what cameras report: it cannot have shapes; leave them at their defaults")
     return kind()
 
 

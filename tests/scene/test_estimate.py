@@ -9,11 +9,11 @@ from scipy.ndimage import gaussian_filter
 from splatsoil.scene import Light, Relief, ToolBody, light_relief
 from splatsoil.scene.estimate import fit_light
 
+AZIMUTHS = [(145.0, 53.0, 0.6), (-60.0, 35.0, 0.4), (20.0, 65.0, 0.5)]
 
-@pytest.mark.parametrize(
-    ("azimuth", "elevation", "ambient"), [(145.0, 53.0, 0.6), (-60.0, 35.0, 0.4), (20.0, 65.0, 0.5)]
-)
-def test_light_is_found_from_slopes_and_a_shadow(azimuth, elevation, ambient):
+
+def seen(azimuth, elevation, ambient, blur=0.0):
+    """A light, and what photographs tell of a bed with slopes, blotches and the shadow of a plate."""
     generator = np.random.default_rng(4)
     ny, nx, cell = 110, 160, 0.005
     heights = 0.1 + 0.06 * gaussian_filter(generator.normal(size=(ny, nx)), 10.0) / 0.03 * 0.12
@@ -25,12 +25,28 @@ def test_light_is_found_from_slopes_and_a_shadow(azimuth, elevation, ambient):
     albedo = np.exp(0.12 * blotches / blotches.std())[..., None] * np.array([0.69, 0.55, 0.37])
     points = relief.points.reshape(-1, 3)
     light = light_relief(relief, truth, place).irradiance(points, 0.001).numpy()
-    noise = 1.0 + 0.01 * generator.normal(size=(len(points), 3))
-    colours = torch.tensor(albedo.reshape(-1, 3) * light * noise, dtype=torch.float32)
-    found = fit_light(points, colours, (ny, nx), relief, place)
+    shown = gaussian_filter(albedo * light.reshape(ny, nx, 3), (blur, blur, 0.0))
+    noise = 1.0 + 0.01 * generator.normal(size=shown.shape)
+    colours = torch.tensor((shown * noise).reshape(-1, 3), dtype=torch.float32)
+    return truth, (points, colours, (ny, nx), relief, place), tool
+
+
+@pytest.mark.parametrize(("azimuth", "elevation", "ambient"), AZIMUTHS)
+def test_light_is_found_from_slopes_and_a_shadow(azimuth, elevation, ambient):
+    truth, what, _tool = seen(azimuth, elevation, ambient)
+    found = fit_light(*what)
     angle = np.degrees(np.arccos(np.clip(found.light.direction @ truth.direction, -1.0, 1.0)))
     assert angle < 1.5
     assert np.allclose(found.light.ambient, truth.ambient, atol=0.05)
     assert np.allclose(found.light.level, [0.69, 0.55, 0.37], rtol=0.12)
     assert found.explained > 0.05
     assert 0.01 < found.shadowed < 0.2
+
+
+def test_a_blurred_shadow_is_not_taken_for_more_sky():
+    errors = []
+    for light in AZIMUTHS:
+        truth, what, _tool = seen(*light, blur=0.8)
+        errors.append(fit_light(*what).light.ambient - truth.ambient)
+    # with the shadow's edge among what is compared it was 0.07
+    assert abs(np.mean(errors)) < 0.02

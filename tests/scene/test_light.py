@@ -8,9 +8,11 @@ import torch
 import trimesh
 
 from splatsoil.errors import ParameterError
+from splatsoil.measurement import Camera
 from splatsoil.scene import Light, Relief, ToolBody, encoded, light_relief, linear
 from splatsoil.scene.lit import sun_on_points
 from splatsoil.scene.sky import _Looks, sky_openness
+from splatsoil.synthetic import stage as synthetic
 
 CELL = 0.005
 
@@ -115,6 +117,55 @@ def test_trench_walls_light_each_other_in_the_soils_colour():
     assert float(outside[0]) < 0.01
     # more than in proportion to the colour: light that has been back and forth has it twice
     assert float(inside[0] / inside[2]) > 3.0
+
+
+def test_a_bowl_lights_itself_as_a_piece_of_a_sphere_does():
+    # Every place of a sphere sees every other alike: of a part f of it under an even sky, each place sends back
+    # reflectance times f times what it gets, to each place (integrating sphere; two bounces).
+    radius, f = 0.15, 0.4
+    lowest = 2.0 * radius * f
+    middle = radius - lowest
+    rim = math.sqrt(radius**2 - middle**2)
+
+    def bowl(x, y):
+        r2 = x**2 + y**2
+        return np.where(r2 < rim**2, middle - np.sqrt(np.maximum(radius**2 - r2, 0.0)), 0.0)
+
+    lit = light_relief(surface(bowl), Light.from_angles(0.0, 60.0, 1.0), NONE)
+    reflected = 0.4 * f
+    for x, y in ((0.0, 0.0), (0.04, 0.02), (-0.03, 0.08)):
+        assert at(lit.relief, lit.bounced[..., 1].contiguous(), x, y) == pytest.approx(
+            (1.0 - f) * (reflected + reflected**2), rel=0.05
+        )
+
+
+def test_a_trench_in_the_sun_against_the_path_tracer():
+    """Slopes that face each other, one in the sun and one in shade: each gets the other's light, not the mean's."""
+    depth, albedo, azimuth, elevation = 0.06, 0.4, 0.0, 50.0
+    trench = surface(lambda x, y: np.minimum(1.2 * np.abs(x) - depth, 0.0))
+    light = Light.from_angles(azimuth, elevation, 0.4, level=np.full(3, albedo))
+    lit = light_relief(trench, light, NONE)
+    points, (ny, nx) = trench.points.reshape(-1, 3).double().numpy(), trench.height.shape
+    first = (np.arange(ny - 1)[:, None] * nx + np.arange(nx - 1)).reshape(-1)
+    faces = np.concatenate(
+        [np.stack([first, first + 1, first + nx], 1), np.stack([first + 1, first + nx + 1, first + nx], 1)]
+    )
+    normals = trench.normal.reshape(-1, 3).double().numpy()
+    body = synthetic.Body(points, faces, normals, np.full((len(points), 3), albedo))
+    sun = 0.6 / math.sin(math.radians(elevation))
+    stage = synthetic.Stage([body], synthetic.Light.from_angles(azimuth, elevation, sun, 0.4), ground=-0.1)
+    above = np.eye(4)
+    above[2, 3] = 4.0
+    pixels = 61
+    camera = Camera(pixels, 3, 4.0 / CELL, 4.0 / CELL, pixels / 2, 1.5, above)
+    traced = stage.radiance(camera, seed=1, side=24)[1, :, 1] / albedo
+    across = (np.arange(pixels) - pixels // 2) * CELL
+    ours = lit.irradiance(torch.tensor(np.stack([across, 0.0 * across, 0.0 * across], 1), dtype=torch.float32))
+    shade, sunlit = (np.abs(across - side * 0.025) < 0.012 for side in (1.0, -1.0))
+    assert traced[shade].max() < 0.45 < 1.05 < traced[sunlit].min()  # as meant
+    # with light from the mean of both slopes it was 0.05 too little in the shade and 0.08 too much in the sun
+    assert np.mean((ours[:, 1].numpy() - traced)[shade]) == pytest.approx(0.0, abs=0.02)
+    assert np.mean((ours[:, 1].numpy() - traced)[sunlit]) == pytest.approx(0.0, abs=0.02)
 
 
 def test_impossible_lights_are_refused():

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from splatsoil.benchmarks.hidden_effects import detectable, emulated, fitted, one, outside, wilson
 from splatsoil.inverse.criticism.diagnosis import Options, diagnose
@@ -18,8 +19,10 @@ from splatsoil.inverse.criticism.simulations import Simulations
 from splatsoil.inverse.criticism.verdicts import of_effect, overall
 
 from splatsoil.errors import RunError
+from splatsoil.experiment.emulated import EmulatedExperiment
 from splatsoil.files import plain
 
+FloatArray = npt.NDArray[np.float64]
 OPTIONS = Options()
 WORLD = 77
 
@@ -71,6 +74,36 @@ def test_numerics_are_not_blamed_on_physics() -> None:
     assert found.verdict == "adequate"
     bare = one(WORLD, {"angle": 0.0}, 4.0 * base.patterns["grid"], OPTIONS, replace(base, patterns={}))
     assert bare.verdict != "adequate", "the pattern must be one that would be seen if numerics weren't known"
+
+
+def unseen(base: EmulatedExperiment, seed: list[int]) -> FloatArray:
+    """(t, s) a pattern that comes to light as time goes on, four times as strong as chance: buried soil's colours."""
+    generator = np.random.default_rng(seed)
+    place = np.array([[site.x, site.y] for site in base.layout.sites])
+    waves, phases = generator.standard_normal((24, 2)) / 0.06, generator.uniform(0.0, 2.0 * np.pi, 24)
+    pattern = np.sqrt(2.0 / 24) * np.cos(place @ waves.T + phases).sum(axis=1)
+    chance = np.sqrt(np.mean(np.diag(base.chance_root @ base.chance_root.T)))
+    return np.asarray(4.0 * chance * np.linspace(0.0, 1.0, base.layout.shape[0])[:, None] * pattern)
+
+
+def test_what_no_instrument_shows_is_not_blamed_on_effects() -> None:
+    worlds, adequate, bare = range(800, 806), 0, 0
+    for world in worlds:
+        base = emulated(world)
+        extra = unseen(base, [world, 0])
+        guessed = {f"guess {k}": unseen(base, [world, k]) for k in range(1, 7)}
+        adequate += one(world, {"angle": 0.3}, extra, OPTIONS, replace(base, guessed=guessed)).verdict == "adequate"
+        bare += one(world, {"angle": 0.3}, extra, OPTIONS, base).verdict == "adequate"
+    assert adequate >= 5
+    assert bare <= 2, "it must be something that would be seen if nothing were known of it"
+
+
+def test_a_large_effect_is_named_beside_what_no_instrument_shows(sizes: dict[str, float]) -> None:
+    base = emulated(WORLD)
+    guessed = {f"guess {k}": unseen(base, [WORLD, k]) for k in range(1, 7)}
+    truth = {"angle": 1.0, "effect 2": 15.0 * sizes["effect 2"]}
+    found = one(WORLD, truth, unseen(base, [WORLD, 0]), OPTIONS, replace(base, guessed=guessed))
+    assert found.members[0] == "effect 2"
 
 
 @pytest.mark.slow

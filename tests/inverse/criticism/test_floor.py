@@ -50,7 +50,8 @@ def evidence(generator: np.random.Generator, patterns: dict[str, np.ndarray]) ->
         "visits": (),
     }
     flat = np.zeros(LAYOUT.shape)
-    return Evidence(values={}, prediction=flat, **nothing, mean=flat, repeats=repeats, numerics=patterns)
+    none = np.zeros((0, *LAYOUT.shape))
+    return Evidence(values={}, prediction=flat, **nothing, mean=flat, repeats=repeats, numerics=patterns, guesses=none)
 
 
 def floor_with(moved: float = 0.0, wild: float = 1.0) -> tuple[float, float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import pytest
@@ -82,6 +82,9 @@ def test_a_surface_predicts_where_nothing_was_simulated_and_knows_its_error() ->
     assert np.sqrt(np.mean(np.sum(error**2, axis=1))) < 2.0
     z = (error @ surface.basis) / np.sqrt(variance)
     assert 0.5 < np.sqrt(np.mean(z**2)) < 1.6
+    for at in elsewhere[:5]:
+        ahead, behind = (surface.predict(at + side * 1e-4 * np.eye(2))[0] for side in (1.0, -1.0))
+        assert surface.slopes(at) == pytest.approx((ahead - behind) / 2e-4, rel=1e-4, abs=1e-4)
 
 
 def test_estimate_and_spread_are_those_of_least_squares() -> None:
@@ -133,37 +136,88 @@ def test_along_a_valley_chance_is_no_information() -> None:
     assert np.mean(by_slopes) < np.mean(inside) - 0.15
 
 
-def test_a_shape_is_found_though_no_slope_tells_of_it() -> None:
-    generator = np.random.default_rng(0)
-    one, other = np.linalg.qr(generator.standard_normal((FEATURES, 2)))[0].T
-    free = (ANGLE, STICK, SHAPE)
+class Shaped:
+    """Features of an effect that turns, as its shape grows, from one pattern into another."""
 
-    def features(values: Mapping[str, float]) -> np.ndarray:
+    free = (ANGLE, STICK, SHAPE)
+    start: Mapping[str, float] = {"angle": 35.0, "stick": 300.0, "shape": 0.3}
+
+    def __init__(self) -> None:
+        generator = np.random.default_rng(0)
+        self.one, self.other = np.linalg.qr(generator.standard_normal((FEATURES, 2)))[0].T
+        self.observed = self({"angle": 33.0, "stick": 400.0, "shape": 2.0}) + generator.standard_normal((1, FEATURES))
+        places = [(35.0, 0.0), (31.0, 0.0), (39.0, 0.0), (35.0, 200.0), (35.0, 300.0), (32.0, 400.0)]
+        # Nobody has varied the shape.
+        self.visits = [
+            Visit({"angle": a, "stick": s}, ("stick",), self({**self.start, "angle": a, "stick": s})) for a, s in places
+        ]
+        first = float(np.sum((self.observed - self(self.start)) ** 2))
+        self.begun = Refit(self.start, first, self(self.start), 0, np.zeros((1, FEATURES, 3)))
+
+    def __call__(self, values: Mapping[str, float]) -> np.ndarray:
         if values["shape"] > 10.0:
             raise SimulationError("too far")
         early = np.exp(-1.0 / values["shape"])
-        size = values["stick"] / 5.0
-        return ((values["angle"] - 35.0) * one + size * (early * other + (1.0 - early) * np.roll(other, 9)))[None]
+        both = early * self.other + (1.0 - early) * np.roll(self.other, 9)
+        return ((values["angle"] - 35.0) * self.one + values["stick"] / 5.0 * both)[None]
 
-    observed = features({"angle": 33.0, "stick": 400.0, "shape": 2.0}) + generator.standard_normal((1, FEATURES))
-    start = {"angle": 35.0, "stick": 300.0, "shape": 0.3}
-    places = [(35.0, 0.0), (31.0, 0.0), (39.0, 0.0), (35.0, 200.0), (35.0, 300.0), (32.0, 400.0)]
-    visits = [
-        Visit({"angle": a, "stick": s}, ("stick",), features({"angle": a, "stick": s, "shape": 0.3})) for a, s in places
-    ]
-
-    def predict(values: Mapping[str, float]) -> np.ndarray:
-        table = features(values)
-        visits.append(Visit(dict(values), ("stick",), table))
+    def predict(self, values: Mapping[str, float]) -> np.ndarray:
+        table = self(values)
+        self.visits.append(Visit(dict(values), ("stick",), table))
         return table
 
-    first = float(np.sum((observed - features(start)) ** 2))
-    begun = Refit(start, first, features(start), 0, np.zeros((1, FEATURES, 3)))
-    fit = explored(predict, visits, whiten, observed, free, Known.nothing(3), begun, (SHAPE,))
+    def explored(self, predict: Callable[[Mapping[str, float]], np.ndarray], hidden: int = 0) -> Refit:
+        """A refit that does not see the last features."""
+
+        def seen(table: np.ndarray) -> np.ndarray:
+            return whiten(table)[: FEATURES - hidden]
+
+        return explored(predict, self.visits, seen, self.observed, self.free, Known.nothing(3), self.begun, (SHAPE,))
+
+    def tangent(self, values: Mapping[str, float]) -> np.ndarray:
+        """(t, s, k) exact derivatives."""
+        return np.stack(
+            [(self({**values, p.name: values[p.name] + 1e-4}) - self(values)) / 1e-4 for p in self.free], -1
+        )
+
+
+def test_a_shape_is_found_though_no_slope_tells_of_it() -> None:
+    world = Shaped()
+    known, first = len(world.visits), world.begun.chi2
+    fit = world.explored(world.predict)
     assert fit.chi2 < 0.2 * first
     assert fit.values["shape"] == pytest.approx(2.0, rel=0.5)
     assert fit.values["stick"] == pytest.approx(400.0, rel=0.2)
-    assert fit.simulations == len(visits) - len(places)
+    assert fit.simulations == len(world.visits) - known
+
+
+def off(found: np.ndarray, exact: np.ndarray) -> np.ndarray:
+    """(k,) by how much slopes are wrong, as a share of them."""
+    return np.linalg.norm(whiten(found - exact), axis=0) / np.linalg.norm(whiten(exact), axis=0)
+
+
+def test_slopes_are_those_where_the_refit_ends_in_features_too_that_it_does_not_see() -> None:
+    world = Shaped()
+    fit = world.explored(world.predict, hidden=FEATURES // 2)
+    exact, hidden = world.tangent(fit.values), slice(FEATURES // 2, None)
+    assert off(fit.slopes, exact) == pytest.approx(np.zeros(3), abs=0.15)
+    assert off(fit.slopes[:, hidden], exact[:, hidden]) == pytest.approx(np.zeros(3), abs=0.15)
+    # What the effect does has turned on the way, and so have its slopes.
+    assert off(world.tangent(world.start), exact)[1] > 0.5
+
+
+def test_slopes_are_right_where_a_refit_stays() -> None:
+    world = Shaped()
+    for shape in (0.15, 0.6):
+        world.predict({**world.start, "shape": shape})
+
+    def nowhere(values: Mapping[str, float]) -> np.ndarray:
+        raise SimulationError("no simulation comes to an end")
+
+    fit = world.explored(nowhere)
+    assert (fit.values, fit.chi2, fit.simulations) == (world.begun.values, world.begun.chi2, 0)
+    # From eight simulations.
+    assert off(fit.slopes, world.tangent(fit.values)) == pytest.approx(np.zeros(3), abs=0.4)
 
 
 def test_simulations_that_are_all_alike_tell_nothing() -> None:

@@ -61,6 +61,31 @@ def test_a_stroke_that_is_no_better_is_not_suggested() -> None:
     assert advice.best == "" and advice.alike["again"] == pytest.approx(advice.alike[MEASURED])
 
 
+def test_effects_are_compared_in_the_shape_that_their_refits_found() -> None:
+    names, asked = ("cohesion", "softening"), []
+
+    class Watched(TriaxialExperiment):
+        def strokes(self) -> Mapping[str, object]:  # type: ignore[override]
+            def predict(values: Mapping[str, float], effects: tuple[str, ...]) -> np.ndarray:
+                asked.append((effects, values.get("softening_strain")))
+                return made[MEASURED](values, effects)
+
+            made = super().strokes()
+            return {MEASURED: predict}
+
+    found = {}
+    for strain in (None, 0.3, 3.0):
+        asked.clear()
+        values = VALUES if strain is None else {**VALUES, "softening_strain": strain}
+        watched = Watched(CURVE, candidates=names)
+        (advice,) = advise(watched, values, watched.candidates)
+        assert {at for effects, at in asked if effects == ("softening",)} == {strain}
+        assert {at for effects, at in asked if effects != ("softening",)} == {None}
+        found[strain] = advice.alike[MEASURED]
+    assert found[0.3] == found[None], "0.3 is the default"
+    assert abs(found[3.0] - found[0.3]) > 0.02
+
+
 def test_strokes_do_what_their_names_say(repository: Path) -> None:
     measurement = Measurement.load(repository / "examples" / "plow-dry")
     surface = float(measurement.bed.lower[2]) + 0.7 * float((measurement.bed.upper - measurement.bed.lower)[2])
