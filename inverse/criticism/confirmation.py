@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
 
 from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Candidate, Experiment
@@ -47,6 +46,7 @@ class Confirmation:
         unseen: likewise, on times the refit hasn't seen alone.
         told: chance of what other pictures say of its parameters if they were off; see
             :class:`~splatsoil.experiment.base.Calibration`.
+        agrees: likewise, if they were as refitted.
         held_out: root mean square of the residual on times the refit hasn't seen, in the features' unit.
         floor: what noise alone leaves there.
         remainder: what stands on slow waves.
@@ -60,6 +60,7 @@ class Confirmation:
     fall: float
     unseen: float
     told: float
+    agrees: float
     held_out: float
     floor: float
     remainder: Omnibus
@@ -144,7 +145,8 @@ def confirm(
             chi2=chi2,
             fall=0.0 if candidate is None else _chi2(whole, before) + known.chi2(off) - chi2,
             unseen=_chi2(apart, before) - _chi2(apart, left),
-            told=float(stats.chi2.sf(known.chi2(off), len(known.root))) if len(known.root) else 1.0,
+            told=known.chance(off),
+            agrees=known.chance(at),
             held_out=float(np.sqrt(np.mean(left[mask] ** 2))),
             floor=_noise_on(floor.single, mask),
             remainder=remainder,

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy import stats
 from scipy.optimize import lsq_linear
 
 from splatsoil.errors import SimulationError
@@ -79,6 +80,10 @@ class Known:
     def chi2(self, at: FloatArray) -> float:
         """Of parameters (k,)."""
         return float(np.sum((self.root @ (self.centre - at)) ** 2))
+
+    def chance(self, at: FloatArray) -> float:
+        """Of what is known, or more, if the parameters were (k,)."""
+        return float(stats.chi2.sf(self.chi2(at), len(self.root))) if len(self.root) else 1.0
 
 
 def refit(

@@ -10,7 +10,7 @@ from splatsoil.experiment.strokes import MEASURED
 
 from .diagnosis import Diagnosis
 from .outside import FEW, StrengthReading
-from .verdicts import GATE
+from .verdicts import CERTAIN, GATE
 
 #: Correlation of two effects' scores from which they are called alike.
 ALIKE = 0.8
@@ -24,6 +24,11 @@ def sentences(diagnosis: Diagnosis, candidates: Mapping[str, Candidate], base: M
         out = _adequate(diagnosis, candidates)
     else:
         out = _outside(diagnosis, candidates)
+    ruled_out = [title(name) for name, c in diagnosis.confirmations.items() if name and c.agrees < CERTAIN]
+    if ruled_out:
+        out.append(
+            f"What soil shows would ask for more of {listed(ruled_out)} than pictures allow where soil plays no part."
+        )
     out += of_strokes(diagnosis)
     worst = next((b for b in diagnosis.blocks if b.p < GATE), None)
     if worst is not None:

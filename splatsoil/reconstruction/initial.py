@@ -9,6 +9,7 @@ import torch
 import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from torch.nn import functional
 
 from splatsoil.measurement import Bed
 from splatsoil.reconstruction.height_field import HeightField
@@ -126,7 +127,7 @@ def seed_far(views: Views, bed: Bed, relief: Relief) -> Seeds:
     """
     length = scale_of(bed)
     centre = np.array([*(bed.lower + bed.upper)[:2] / 2, relief.ground])
-    radius = FAR * max(length, float(np.linalg.norm(views.positions.numpy() - centre, axis=1).max()))
+    radius = FAR * max(length, float(np.linalg.norm(views.positions.cpu().numpy() - centre, axis=1).max()))
     points, normals, spacings = [], [], []
     for camera in views.cameras:
         columns = np.arange((0.5 - BEYOND) * camera.width, (0.5 + BEYOND) * camera.width, PIXELS)
@@ -177,27 +178,26 @@ def colours_seen(views: Views, relief: Relief, seeds: Seeds, *, batch: int = 819
 
     Discs that none sees get the colour of the nearest one that is seen.
     """
-    n = len(seeds.points)
+    n, device = len(seeds.points), views.images.device
     colour, count = np.zeros((n, 3)), np.zeros(n)
     # The occluder is as coarse as its cells: step out of it before asking what hides a disc.
     cell = max(relief.occluder.cell)
     lifted = seeds.points + 1.5 * cell * seeds.normals
     for start in range(0, n, batch):
         part = slice(start, start + batch)
-        points = torch.tensor(seeds.points[part], dtype=torch.float32)
-        homogeneous = torch.cat([points, torch.ones(len(points), 1)], dim=1)[None]
-        tool = torch.tensor(seeds.label[part] == TOOL)
+        points = torch.tensor(seeds.points[part], dtype=torch.float32, device=device)
+        normals = torch.tensor(seeds.normals[part], dtype=torch.float32, device=device)
+        homogeneous = functional.pad(points, (0, 1), value=1.0)[None]
+        tool = torch.tensor(seeds.label[part] == TOOL, device=device)
         drawn, seen = draw(views, homogeneous, relief.trust)
         drawn_tool, seen_tool = draw(views, homogeneous, views.valid)
         colours = torch.where(tool[None, None, None], drawn_tool, drawn)[:, :, 0]
         weight = torch.where(tool[None], seen_tool[:, 0], seen[:, 0])
-        facing = ((views.positions[:, None] - points) * torch.tensor(seeds.normals[part], dtype=torch.float32)).sum(
-            -1
-        ) > 0
+        facing = ((views.positions[:, None] - points) * normals).sum(-1) > 0
         weight = weight * facing * visibility(views, lifted[part], relief.occluder, clearance=0.5 * cell)
         known = torch.where((weight > 0)[:, None], colours, torch.nan)
-        colour[part] = torch.nanmedian(known, dim=0).values.T.numpy()
-        count[part] = (weight > 0).sum(0).numpy()
+        colour[part] = torch.nanmedian(known, dim=0).values.T.cpu().numpy()
+        count[part] = (weight > 0).sum(0).cpu().numpy()
     blind = count == 0
     if blind.all():
         colour[:] = 0.5

@@ -87,15 +87,15 @@ def _reconstruct(
     tool = measurement.tool.mesh.copy()
     tool.apply_transform(measurement.tool.motion.matrix(float(measurement.tool.motion.times[0])))
     report("finding the tool", 0.0)
-    relief = find_relief(views, bed, silhouettes(views, tool), chosen, report)
+    relief = find_relief(views.to(device), bed, silhouettes(views, tool), chosen, report)
     spacing = chosen.soil_spacing * max(relief.surface.cell)
     report("placing Gaussians", 0.0)
     still = still_video(measurement, chosen.longest_side)
     if still is not None:
         # The fixed cameras see sides of things that no photograph needs to show.
         views = views.joined(still)
-        relief = replace(relief, trust=views.valid * (1.0 - silhouettes(views, tool)))
-    first, label = first_gaussians(views, bed, tool, relief, spacing)
+        relief = replace(relief, trust=(views.valid * (1.0 - silhouettes(views, tool))).to(device))
+    first, label = first_gaussians(views.to(device), bed, tool, relief, spacing)
     trained = train(
         first, label, views, relief.surface, float(bed.lower[2]),
         iterations=chosen.iterations, growth=chosen.growth, seed=seed, device=device, report=report,

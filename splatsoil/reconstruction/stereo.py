@@ -51,9 +51,9 @@ class Cells:
     mask: torch.Tensor
 
     @classmethod
-    def of(cls, field: HeightField, mask: NDArray[np.bool_] | None = None) -> Cells:
+    def of(cls, field: HeightField, mask: NDArray[np.bool_] | None = None, device: torch.device | str = "cpu") -> Cells:
         inside = np.ones(field.height.shape, dtype=bool) if mask is None else mask
-        return cls(field.x, field.y, torch.tensor(inside, dtype=torch.float32))
+        return cls(field.x, field.y, torch.tensor(inside, dtype=torch.float32, device=device))
 
     @property
     def size(self) -> float:
@@ -62,9 +62,8 @@ class Cells:
 
     def points(self, height: torch.Tensor) -> torch.Tensor:
         """(ny, nx, 4) homogeneous points on a surface of heights (ny, nx)."""
-        y, x = torch.meshgrid(
-            torch.tensor(self.y, dtype=torch.float32), torch.tensor(self.x, dtype=torch.float32), indexing="ij"
-        )
+        axes = (torch.tensor(axis, dtype=torch.float32, device=height.device) for axis in (self.y, self.x))
+        y, x = torch.meshgrid(*axes, indexing="ij")
         return torch.stack([x, y, height, torch.ones_like(height)], dim=-1)
 
 
@@ -77,7 +76,7 @@ def _window(sigma: float) -> torch.Tensor:
 
 def _blur(values: torch.Tensor, window: torch.Tensor) -> torch.Tensor:
     """Separable convolution of the last two axes, zero beyond the border."""
-    shape = values.shape
+    shape, window = values.shape, window.to(values.device)
     reach = len(window) // 2
     flat = values.reshape(-1, 1, shape[-2], shape[-1])
     flat = functional.conv2d(flat, window.view(1, 1, 1, -1), padding=(0, reach))
@@ -205,12 +204,12 @@ def sweep(
         error, left = disagreement(views, cells, level, trust, weight, sigma)
         costs.append((left * torch.log1p(error / scale)).sum(0))
         counts.append(left.sum(0))
-    total, count = torch.stack(costs).numpy().astype(float), torch.stack(counts).numpy().astype(float)
+    total, count = (torch.stack(parts).cpu().numpy().astype(float) for parts in (costs, counts))
     # Two photographs agree by chance more easily than twenty: shrink towards what disagreement is usual.
     usual = total.sum() / max(count.sum(), 1.0)
     cost = (total + FEWEST_VIEWS * usual) / (count + FEWEST_VIEWS)
     step = float(heights[1] - heights[0])
-    inside = cells.mask.numpy() > 0
+    inside = cells.mask.cpu().numpy() > 0
     smoothness = Smoothness(inside)
     depth = np.maximum(np.median(cost, axis=0) - cost.min(axis=0), 0.0)
     trusted = np.where(inside, depth, 0.0) ** 2
@@ -253,7 +252,7 @@ def refine(
     Returns:
         (ny, nx) heights and (ny, nx) their standard deviations, metres.
     """
-    inside = cells.mask.numpy() > 0
+    inside = cells.mask.cpu().numpy() > 0
     smoothness = Smoothness(inside)
     bend = CURVATURE / length * cells.size**2
     prior = 1.0 / bend**2
@@ -266,16 +265,16 @@ def refine(
         width = sigma * 2.0 ** (1.0 - progress)
         trials = []
         for offset in (-delta, 0.0, delta):
-            level = torch.tensor(current + offset, dtype=torch.float32)
+            level = torch.tensor(current + offset, dtype=torch.float32, device=cells.mask.device)
             trials.append(disagreement(views, cells, level, trust, weight, width))
         error, left = trials[1]
         known = torch.where(left > 0, error, torch.nan)
         middle = torch.nan_to_num(torch.nanmedian(known, dim=0).values, nan=0.0)
-        typical = float(middle[torch.tensor(inside)].median())
+        typical = float(middle[cells.mask > 0].median())
         variance = max(typical, (views.noise**2) * 3.0 / 4.0)
         spread = middle.clamp_min(variance)
         robust = left / (1.0 + error / (4.0 * spread)) ** 2
-        below, here, above = [((robust * e).sum(0) / spread).numpy().astype(np.float64) for e, _ in trials]
+        below, here, above = [((robust * e).sum(0) / spread).cpu().numpy().astype(np.float64) for e, _ in trials]
         # Half the sum of squares over the variance per channel is the negative log-likelihood.
         slope = 3.0 * (above - below) / (4.0 * delta)
         information = np.maximum(3.0 * (above - 2.0 * here + below) / (2.0 * delta**2), 0.0)
@@ -301,13 +300,13 @@ def visibility(views: Views, points: Array, surface: HeightField, *, clearance: 
         clearance: how far above the ray the surface must rise to count, metres.
         steps: samples between the point and where its ray leaves the surface's highest level.
     """
-    top = float(np.nanmax(surface.height)) + clearance
-    grid = torch.tensor(np.nan_to_num(surface.height, nan=-1e9), dtype=torch.float32)[None, None]
+    top, device = float(np.nanmax(surface.height)) + clearance, views.positions.device
+    grid = torch.tensor(np.nan_to_num(surface.height, nan=-1e9), dtype=torch.float32, device=device)[None, None]
     low = np.array([surface.x[0], surface.y[0]]) - np.array(surface.cell) / 2
     high = np.array([surface.x[-1], surface.y[-1]]) + np.array(surface.cell) / 2
-    start = torch.tensor(points, dtype=torch.float32)
-    fraction = ((torch.arange(steps) + 0.5) / steps) ** 1.5
-    result = torch.ones(len(views), len(points))
+    start = torch.tensor(points, dtype=torch.float32, device=device)
+    fraction = ((torch.arange(steps, device=device) + 0.5) / steps) ** 1.5
+    result = torch.ones(len(views), len(points), device=device)
     for k in range(len(views)):
         direction = views.positions[k] - start
         rise = direction[:, 2].clamp_min(1e-6)

@@ -63,19 +63,19 @@ def find_relief(views: Views, bed: Bed, tool_silhouettes: torch.Tensor, preset: 
     """Heights of the soil over the bed's box.
 
     Args:
-        views: the photographs to use.
+        views: the photographs to use; the work is done where they are.
         bed: the box that holds the soil.
         tool_silhouettes: (v, h, w) 1 where the tool hides what is behind it.
         preset: how much work.
         report: called with what is being done and how much of it is done.
     """
-    length = scale_of(bed)
+    length, device = scale_of(bed), views.images.device
     cell = max(length / preset.cells**0.5, 1.2 * footprint(views, bed))
-    trust = views.valid * (1.0 - tool_silhouettes)
+    trust = views.valid * (1.0 - tool_silhouettes.to(device))
     step = float(bed.upper[2] - bed.lower[2]) / (preset.candidates - 1)
     coarse = HeightField.over(bed.lower, bed.upper, 2.0 * cell)
-    cells = Cells.of(coarse)
-    everything = torch.ones(len(views), *cells.mask.shape)
+    cells = Cells.of(coarse, device=device)
+    everything = torch.ones(len(views), *cells.mask.shape, device=device)
     report("sweeping the bed's height", 0.0)
     height = sweep(
         views, cells, trust, everything, np.linspace(bed.lower[2], bed.upper[2], preset.candidates), sigma=1.5
@@ -96,7 +96,14 @@ def find_relief(views: Views, bed: Bed, tool_silhouettes: torch.Tensor, preset: 
             len(views), *height.shape
         )
         height, deviation = refine(
-            views, Cells.of(now), trust, seen, height, reach=0.5 * step, length=length, iterations=6 if last else 3
+            views,
+            Cells.of(now, device=device),
+            trust,
+            seen,
+            height,
+            reach=0.5 * step,
+            length=length,
+            iterations=6 if last else 3,
         )
         height, deviation = without_backdrop(height, deviation, length)
     surface = HeightField(fine.x, fine.y, np.clip(height, bed.lower[2], None), deviation)
@@ -150,7 +157,7 @@ def ground_level(views: Views, bed: Bed, surface: HeightField, occluder: HeightF
     outer = HeightField.over(bed.lower[:2] - 0.4 * length, bed.upper[:2] + 0.4 * length, length / 60.0)
     xs, ys = np.meshgrid(outer.x, outer.y)
     beyond = np.maximum.reduce([bed.lower[0] - xs, xs - bed.upper[0], bed.lower[1] - ys, ys - bed.upper[1]])
-    cells = Cells.of(outer, beyond > rim)
+    cells = Cells.of(outer, beyond > rim, views.images.device)
     misfit = []
     for z in (floor, level):
         plane = np.stack([xs, ys, np.full_like(xs, z)], axis=-1).reshape(-1, 3)

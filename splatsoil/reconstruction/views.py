@@ -42,9 +42,14 @@ class Views:
     def __len__(self) -> int:
         return len(self.cameras)
 
+    def to(self, device: torch.device | str) -> Views:
+        """The same on a device."""
+        moved = {name: getattr(self, name).to(device) for name in ("images", "valid", "projection", "positions")}
+        return replace(self, **moved)
+
     def subset(self, indices: Sequence[int]) -> Views:
         """The views at the given places, in that order."""
-        index = torch.as_tensor(list(indices), dtype=torch.long)
+        index = torch.as_tensor(list(indices), dtype=torch.long, device=self.images.device)
         return Views(
             self.images[index],
             self.valid[index],
@@ -85,7 +90,7 @@ class Views:
         Immerkær's operator (CVIU 64, 1996) with a median in place of the mean, so that edges do not count.
         """
         grey = self.images.mean(dim=1)
-        operator = torch.tensor([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]])
+        operator = torch.tensor([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]], device=grey.device)
         response = torch.nn.functional.conv2d(grey[:, None], operator[None, None])
         grey_noise = float(response.abs().median()) / 0.6745 / 6.0
         return max(grey_noise * 3.0**0.5, 1.0 / 255.0)

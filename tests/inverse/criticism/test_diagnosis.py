@@ -17,8 +17,10 @@ from splatsoil.inverse.criticism.naming import members_of, stands
 from splatsoil.inverse.criticism.record import record
 from splatsoil.inverse.criticism.simulations import Simulations
 from splatsoil.inverse.criticism.verdicts import of_effect, overall
+from splatsoil.inverse.criticism.words import sentences
 
 from splatsoil.errors import RunError
+from splatsoil.experiment.base import Calibration
 from splatsoil.experiment.emulated import EmulatedExperiment
 from splatsoil.files import plain
 
@@ -223,6 +225,19 @@ def test_what_other_pictures_say_beyond_doubt_is_named_before_what_soil_shows(si
     assert members_of(doubtful, costs, found.misfit, scores)[0] == "effect 2"
     denied = {**told, "clock": replace(told["clock"], unseen=-50.0)}
     assert members_of(denied, costs, found.misfit, scores)[0] == "effect 2"
+
+
+def test_what_other_pictures_rule_out_is_not_named_however_well_it_explains_soil(sizes: dict[str, float]) -> None:
+    size = sizes["effect 8"]
+    base = emulated(WORLD)
+    experiment = replace(base, observed=base.measured({"angle": 1.0, "effect 8": 8.0 * size}, [WORLD, 99]))
+    assert diagnose(experiment, {"angle": fitted(experiment)}).members == ("effect 8",)
+    nearly_off = Calibration(("effect 8",), np.array([0.5 * size]), np.array([[(0.5 * size) ** 2]]))
+    found = diagnose(experiment, {"angle": fitted(experiment)}, calibration=nearly_off)
+    assert found.confirmations["effect 8"].values["effect 8"] > 3.0 * size
+    assert "effect 8" not in found.members
+    told = sentences(found, {c.name: c for c in experiment.candidates}, {})
+    assert "What soil shows would ask for more of Effect 8 than pictures allow where soil plays no part." in told
 
 
 def test_verdicts_on_an_effect(sizes: dict[str, float]) -> None:
