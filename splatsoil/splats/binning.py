@@ -28,7 +28,7 @@ class Bins:
     Attributes:
         tiles_x: tiles per row.
         tiles_y: rows of tiles.
-        order: (v,) int32, index of the Gaussian of each rank; v are visible.
+        order: (v,) int32, index of the Gaussian of each rank; v are visible, or all, the others last and in no tile.
         rows: (v, HEADER + k) float32, a Gaussian's numbers packed by rank.
         ends: (v,) int32, one past the last entry of each rank.
         starts: (tiles + 1,) int32, where each tile's list begins in ``ranks`` and ``entries``.
@@ -74,7 +74,7 @@ def bin_by_tile(projection: Projection, features: Tensor, view: View) -> Bins:
 
 
 def _depth_order(projection: Projection) -> Tensor:
-    """Indices (v,) int32 of the visible Gaussians, nearest first."""
+    """Indices (v,) int32 of the Gaussians, nearest first: the visible ones, on CUDA followed by the others."""
     depths = projection.depths.detach()
     if depths.is_cuda:
         return _depth_order_torch(projection)
@@ -86,9 +86,9 @@ def _depth_order(projection: Projection) -> Tensor:
 
 
 def _depth_order_torch(projection: Projection) -> Tensor:
-    """`_depth_order` by torch's own sort, for CUDA."""
-    visible = torch.nonzero(projection.visible).squeeze(1)
-    return visible[torch.argsort(projection.depths.detach()[visible], stable=True)].to(torch.int32)
+    """`_depth_order` by torch's own sort, for CUDA; counting the visible ones would make the host wait."""
+    depths = torch.where(projection.visible, projection.depths.detach(), torch.inf)
+    return torch.argsort(depths, stable=True).to(torch.int32)
 
 
 def _sort_by_tile(tiles: Tensor, owners: Tensor, tile_count: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -103,7 +103,6 @@ def _sort_by_tile(tiles: Tensor, owners: Tensor, tile_count: int) -> tuple[Tenso
 
 def _sort_by_tile_torch(tiles: Tensor, owners: Tensor, tile_count: int) -> tuple[Tensor, Tensor, Tensor]:
     """`_sort_by_tile` by torch's own sort, for CUDA."""
-    entries = torch.argsort(tiles, stable=True)
-    starts = torch.zeros(tile_count + 1, dtype=torch.int32, device=tiles.device)
-    starts[1:] = torch.bincount(tiles, minlength=tile_count).cumsum(0)
-    return starts, owners[entries], entries.to(torch.int32)
+    ordered, entries = torch.sort(tiles, stable=True)
+    numbers = torch.arange(tile_count + 1, dtype=torch.int32, device=tiles.device)
+    return torch.searchsorted(ordered, numbers, out_int32=True), owners[entries], entries.to(torch.int32)

@@ -103,9 +103,12 @@ def pack(
     rows: wp.array2d(dtype=float),
     counts: wp.array(dtype=wp.int32),
 ):
-    """Write a rank's row, and count the tiles it touches."""
+    """Write a rank's row, and count the tiles it touches; none, and no row, for what can't be seen."""
     rank = wp.tid()
     i = order[rank]
+    if reaches[i][0] <= 0.0:
+        counts[rank] = 0
+        return
     conic = conics[i]
     rows[rank, 0] = centres[i][0]
     rows[rank, 1] = centres[i][1]
@@ -147,6 +150,8 @@ def list_tiles(
     entry = wp.int32(0)
     if rank > 0:
         entry = ends[rank - 1]
+    if entry == ends[rank]:
+        return
     ellipse = _ellipse(rows, rank)
     band = _tile_rows(ellipse, tiles_y)
     for tile_row in range(band[0], band[1]):
