@@ -13,6 +13,7 @@ import numpy.typing as npt
 from splatsoil.benchmarks._common import hush
 from splatsoil.envs.measured import LOSS
 from splatsoil.envs.synthetic import SyntheticProblem
+from splatsoil.envs.synthetic_world import World
 from splatsoil.inverse.evaluations import digest
 from splatsoil.inverse.fitting import FitSetup, fit
 from splatsoil.inverse.posterior_run import Effort, run_posterior
@@ -71,7 +72,7 @@ def one_truth(
     values = space.to_dict(space.from_unit(point))
     world = {"values": values, "number": number, "preset": preset, "device": device.split(":")[0]}
     problem.place(values, 1_000_003 + number)
-    source = Path(inspect.getfile(SyntheticProblem))
+    sources = [inspect.getfile(part) for part in (SyntheticProblem, World)]
     setup = FitSetup(
         measurement=digest(world),
         reconstruction="",
@@ -81,7 +82,7 @@ def one_truth(
         device=problem.device,
         seed=number,
         version=splatsoil.__version__,
-        code=code_digest(others=[source]),
+        code=code_digest(others=sources),
         loss=LOSS,
     )
     key, file = digest({**setup.description(), "effort": str(effort), "budget": budget}), folder / "calibration.json"

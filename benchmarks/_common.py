@@ -69,7 +69,7 @@ def stamp(device: str) -> dict[str, Any]:
     """What made a result."""
     return {
         "version": __version__,
-        "code": code_digest((*ALL, "parameters.py", "model.py", "comparison.py")),
+        "code": code_digest((*ALL, "parameters.py", "model.py", "comparison.py", "robust_loss.py")),
         "device": device.split(":")[0],
         "machine": platform.machine(),
         "made": datetime.now(UTC).isoformat(timespec="seconds"),

@@ -65,7 +65,7 @@ def _kept_protocol(protocol: Protocol, out: Path) -> dict[str, Any]:
     """The protocol as kept in the folder; trials and angles may grow, nothing else may change."""
     free = ("angles", "trials", "device", "scan")
     described = {k: v for k, v in vars(protocol).items() if k not in free}
-    described["code"] = code_digest((*ALL, "parameters.py", "model.py", "comparison.py"))
+    described["code"] = code_digest((*ALL, "parameters.py", "model.py", "comparison.py", "robust_loss.py"))
     file = out / "protocol.json"
     if file.is_file() and read_json(file) != json.loads(json.dumps(described)):
         raise ParameterError(f"{out}: holds trials of another protocol or other sources; choose another --out")

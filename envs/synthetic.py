@@ -1,4 +1,4 @@
-"""A small experiment made up on the spot: a blade dips into a patterned bed and pushes, two cameras watch.
+"""Simulate-and-compare against a hidden truth of the experiment that `synthetic_world` makes up.
 
 The same solver and the same renderer make the observation and the predictions, with other particles, so that the best
 loss is chance and not zero. It is a toy for trying agents on; an answer about real soil needs a measurement set.
@@ -7,11 +7,10 @@ loss is chance and not zero. It is a toy for trying agents on; an answer about r
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -22,26 +21,10 @@ from splatsoil.parameters import ParameterSpace
 
 from .devices import resolve_device
 from .problem import Evaluation, Image
-
-if TYPE_CHECKING:
-    from splatsoil.measurement import Camera, Measurement
-    from splatsoil.mpm import Trajectory
-    from splatsoil.scene import Scene
+from .synthetic_world import COMPARED, HEIGHT, WIDTH, World, cameras
 
 FloatArray = npt.NDArray[np.float64]
 
-#: The bed's box and the soil's depth, m.
-BED = (0.36, 0.24, 0.16)
-DEPTH = 0.06
-#: The blade: thickness, width, height, m; how far its edge dips and how far it pushes.
-BLADE = (0.012, 0.12, 0.08)
-DIP, PUSH = 0.035, 0.16
-#: Frames a second; the blade dips for the first frames and pushes for the rest.
-FRAME_RATE = 10
-DIP_FRAMES, PUSH_FRAMES = 3, 7
-COMPARED = (4, 7, 10)
-#: Pictures.
-WIDTH, HEIGHT = 96, 72
 #: Standard deviation of the observation's sensor noise, sRGB.
 SENSOR_NOISE = 0.006
 #: Hidden values are drawn from this middle part of a parameter's range.
@@ -50,69 +33,6 @@ HIDDEN_RANGE = (0.2, 0.8)
 BLUR = 1.5
 #: Patches of residuals along each picture's height and width.
 BLOCKS = (3, 4)
-
-
-def blade_motion() -> tuple[FloatArray, FloatArray]:
-    """Times (n,) and positions (n, 3) of the blade's centre."""
-    frames = np.arange(DIP_FRAMES + PUSH_FRAMES + 1)
-    dip = np.clip(frames / DIP_FRAMES, 0.0, 1.0)
-    push = np.clip((frames - DIP_FRAMES) / PUSH_FRAMES, 0.0, 1.0)
-    above = DEPTH + 0.5 * BLADE[2] + 0.004
-    x = 0.1 + PUSH * push
-    z = above - (DIP + 0.004) * dip
-    return frames / FRAME_RATE, np.stack([x, np.full(len(frames), 0.5 * BED[1]), z], axis=1)
-
-
-def look_at(eye: Sequence[float], target: Sequence[float]) -> FloatArray:
-    """Camera-to-world (4, 4) with OpenGL axes and the world's z up in the picture."""
-    back = np.subtract(eye, target)
-    back = back / np.linalg.norm(back)
-    right = np.cross([0.0, 0.0, 1.0], back)
-    right /= np.linalg.norm(right)
-    matrix = np.eye(4)
-    matrix[:3] = np.stack([right, np.cross(back, right), back, np.asarray(eye, dtype=np.float64)], axis=1)
-    return matrix
-
-
-def experiment() -> Measurement:
-    """Bed, blade and motion; there are no photographs."""
-    import trimesh
-
-    from splatsoil.measurement import Bed, Measurement, Tool, ToolMotion
-
-    times, positions = blade_motion()
-    motion = ToolMotion(np.arange(len(times)), times, positions, np.tile([1.0, 0.0, 0.0, 0.0], (len(times), 1)))
-    return Measurement(
-        folder=Path(),
-        name="synthetic",
-        gravity=np.array([0.0, 0.0, -9.81]),
-        frame_rate=float(FRAME_RATE),
-        bed=Bed(np.zeros(3), np.array(BED), density=1600.0),
-        tool=Tool(trimesh.creation.box(BLADE), motion, friction=0.3),
-        views=(),
-        video=(),
-    )
-
-
-def cameras() -> dict[str, Camera]:
-    """Two cameras, from the left and from the right of the furrow; the bed's ragged edges are out of sight."""
-    from splatsoil.measurement import Camera
-
-    target = (0.2, 0.12, 0.06)
-    return {
-        name: Camera(WIDTH, HEIGHT, 170.0, 170.0, WIDTH / 2, HEIGHT / 2, look_at(eye, target), name=name)
-        for name, eye in {"left": (0.0, -0.2, 0.35), "right": (0.5, 0.4, 0.3)}.items()
-    }
-
-
-def pattern(points: FloatArray) -> FloatArray:
-    """Albedo (n, 3) in sRGB of the soil at places (n, 3): sand with darker spots, the same in every world."""
-    generator = np.random.default_rng(7)
-    waves = generator.normal(0.0, 260.0, (24, 3))
-    phases = generator.uniform(0.0, 2.0 * np.pi, 24)
-    speckle = np.cos(points @ waves.T + phases).sum(axis=1) / np.sqrt(12.0)
-    shade = np.clip(1.0 + 0.05 * speckle, 0.5, 1.3)
-    return np.clip(shade[:, None] * np.array([0.72, 0.6, 0.43]), 0.0, 1.0)
 
 
 def compare(observed: Image, predicted: Image, still: Image) -> tuple[float, FloatArray]:
@@ -316,91 +236,3 @@ class SyntheticProblem:
     def __getstate__(self) -> dict[str, Any]:
         # Solver and scene are made again from their names: kernels and meshes don't travel between processes.
         return {key: value for key, value in self.__dict__.items() if key != "world"}
-
-
-class World:
-    """The unchanging part: bed, blade, cameras, surface, light."""
-
-    def __init__(self, effects: Sequence[str], preset: str, device: str) -> None:
-        from splatsoil.mpm import Resolution
-        from splatsoil.reconstruction import HeightField
-        from splatsoil.scene import Light
-        from splatsoil.soil.law import Law
-        from splatsoil.soil.library import find_effects
-
-        self.measurement = experiment()
-        self.cameras = cameras()
-        self.law = Law(find_effects(effects))
-        self.resolution = Resolution.derive(self.measurement, preset)
-        self.device = device
-        self.recorded = COMPARED
-        self.light = Light.from_angles(200.0, 50.0, np.full(3, 0.35))
-        bed = self.measurement.bed
-        self.surface = HeightField.over(bed.lower, bed.upper, 0.005, DEPTH)
-
-    def particles(self, seed: int) -> FloatArray:
-        """Particles (n, 3) that fill the bed."""
-        from splatsoil.reconstruction import fill
-
-        return fill(self.surface, self.measurement.bed, self.resolution.spacing, seed=seed)
-
-    def simulate(self, particles: FloatArray, parameters: Mapping[str, float]) -> Trajectory:
-        """The compared frames."""
-        from splatsoil.mpm import simulate
-
-        return simulate(
-            self.measurement,
-            particles,
-            parameters,
-            law=self.law,
-            resolution=self.resolution,
-            frames=COMPARED,
-            device=self.device,
-        )[0]
-
-    def still(self) -> Image:
-        """Pictures (k, h, w, 3) of soil that doesn't move while the blade does."""
-        particles = self.particles(0)
-        return self.pictures(particles, [particles] * len(COMPARED), [None] * len(COMPARED))
-
-    def pictures(self, particles: FloatArray, positions: Iterable[Any], deformations: Iterable[Any]) -> Image:
-        """Pictures (k, h, w, 3), camera by camera, of particles that have moved and deformed."""
-        scene = self.scene(particles)
-        motion = self.measurement.tool.motion
-        posed = [
-            scene.pose(x, f, motion.pose(frame / FRAME_RATE))
-            for frame, x, f in zip(COMPARED, positions, deformations, strict=True)
-        ]
-        return np.stack([scene.picture(moment, camera) for camera in self.cameras.values() for moment in posed])
-
-    def scene(self, particles: FloatArray) -> Scene:
-        """Gaussians of the undisturbed surface, bound to these particles."""
-        import torch
-
-        from splatsoil.scene import Scene, ToolBody, bind
-        from splatsoil.splats import Gaussians
-
-        def tensor(array: npt.ArrayLike) -> torch.Tensor:
-            return torch.as_tensor(np.asarray(array), dtype=torch.float32).to(self.device).contiguous()
-
-        cell = self.surface.cell[0]
-        points = self.surface.points.reshape(-1, 3) - np.array([0.0, 0.0, 0.2 * cell])
-        rest = tensor(particles)
-        covariance = (
-            torch.diag(tensor([0.6 * cell, 0.6 * cell, 0.2 * cell]) ** 2).expand(len(points), 3, 3).contiguous()
-        )
-        empty = tensor(np.zeros((0, 3)))
-        return Scene(
-            soil=bind(tensor(points), covariance, rest, self.resolution.spacing),
-            soil_opacity=torch.full((len(points),), 0.95, device=self.device),
-            soil_albedo=tensor(pattern(points)),
-            grain_albedo=tensor(pattern(particles)),
-            surroundings=Gaussians(empty, empty, tensor(np.zeros((0, 4))), tensor(np.zeros(0)), empty),
-            surrounding_shapes=tensor(np.zeros((0, 3, 3))),
-            light=self.light,
-            tool=ToolBody(self.measurement.tool.mesh, self.device),
-            tool_albedo=np.array([0.08, 0.16, 0.5]),
-            bed=self.measurement.bed,
-            spacing=self.resolution.spacing,
-            background=np.array([0.75, 0.77, 0.8]),
-        )

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from splatsoil.envs.measured import LOSS, MeasuredProblem, cache_folder
 from splatsoil.envs.problem import Problem
 from splatsoil.envs.synthetic import SyntheticProblem
+from splatsoil.envs.synthetic_world import World
 
 import splatsoil
 from splatsoil.files import FORWARD, code_digest
@@ -102,8 +103,8 @@ def _problem(
     if measurement is None:
         world = SyntheticProblem(parameters, effects, preset=preset, device=device)
         world.begin(WORLD)
-        source = Path(inspect.getfile(SyntheticProblem))
-        return world, {"world": "synthetic", "seed": WORLD, "source": code_digest((), [source])}
+        sources = [inspect.getfile(part) for part in (SyntheticProblem, World)]
+        return world, {"world": "synthetic", "seed": WORLD, "source": code_digest((), sources)}
     problem = MeasuredProblem.load(
         measurement, parameters, effects, preset=preset, device=device, reconstruction=reconstruction
     )

@@ -24,14 +24,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-import torch
-from kornia.filters import gaussian_blur2d
 from scipy.ndimage import binary_dilation, binary_erosion
-from torch import Tensor
 
 from splatsoil.errors import ParameterError
 from splatsoil.measurement import Camera, Measurement
 from splatsoil.reconstruction.height_field import HeightField
+from splatsoil.robust_loss import robust_losses
 from splatsoil.scene import ToolBody, silhouette
 
 FloatArray = npt.NDArray[np.float64]
@@ -39,12 +37,6 @@ Image = npt.NDArray[np.float32]
 BoolImage = npt.NDArray[np.bool_]
 Key = tuple[str, int]
 """Camera and frame."""
-
-SCALES = (0.0125, 0.025)
-"""Standard deviations of the averaging, m on the bed: about the size of chance lumps, and twice that."""
-
-SATURATION = 0.05
-"""sRGB difference (averaged over centimetres) beyond which the robust loss grows linearly."""
 
 PATCH = 0.04
 """Side of a block on the bed, m."""
@@ -327,10 +319,7 @@ class Comparator:
 
     def _scaled_losses(self, camera: str, change: list[Image], masks: list[BoolImage]) -> FloatArray:
         """(frames, scales) the robust loss of residual changes, before it is put into units."""
-        residual = torch.from_numpy(np.stack(change).astype(np.float32)).permute(0, 3, 1, 2)
-        weight = torch.from_numpy(np.stack(masks)).float()[:, None]
-        pixels = self._pixels_per_metre(camera)
-        return np.stack([_robust(*_averaged(residual, weight, scale * pixels)).numpy() for scale in SCALES], axis=1)
+        return robust_losses(change, masks, self._pixels_per_metre(camera))
 
     def _pixels_per_metre(self, camera: str) -> float:
         """Of the bed's middle in the image."""
@@ -399,26 +388,3 @@ def _log_ratios(image: Image) -> FloatArray:
     """(…, 2) log red/green and blue/green: colour without brightness."""
     logs = np.log(np.maximum(image.astype(np.float64), 0.02))
     return np.stack([logs[..., 0] - logs[..., 1], logs[..., 2] - logs[..., 1]], axis=-1)
-
-
-def _averaged(residual: Tensor, weight: Tensor, sigma: float) -> tuple[Tensor, Tensor]:
-    """Gaussian mean (n, 3, h', w') of what counts of a residual (n, 3, h, w), and the share (n, 1, h', w') that does.
-
-    Pixels are pooled first where the Gaussian is wide enough not to notice.
-    """
-    factor = max(1, int(sigma / 2.0))
-    both = torch.cat([residual * weight, weight], dim=1)
-    both = torch.nn.functional.avg_pool2d(both, factor, ceil_mode=True, count_include_pad=False)
-    width = sigma / factor
-    size = 2 * max(1, round(3.0 * width)) + 1
-    size = min(size, 2 * ((min(both.shape[2:]) - 1) // 2) + 1)
-    both = gaussian_blur2d(both, (size, size), (width, width), border_type="constant")
-    share = both[:, 3:]
-    return both[:, :3] / share.clamp_min(1e-6), share
-
-
-def _robust(mean: Tensor, share: Tensor) -> Tensor:
-    """(n,) loss of averaged residuals: quadratic where small, linear where large, weighted by what counts."""
-    square = mean.square().mean(dim=1, keepdim=True)
-    loss = SATURATION**2 * (torch.sqrt(1.0 + 2.0 * square / SATURATION**2) - 1.0)
-    return (loss * share).sum(dim=(1, 2, 3)).double() / share.sum(dim=(1, 2, 3)).clamp_min(1e-6).double()

@@ -57,7 +57,7 @@ def describe(device: str) -> dict[str, str]:
     told = {
         "made": str(made["made"]),
         "splatsoil": str(made["version"]),
-        "code": code_digest((*ALL, "parameters.py", "model.py", "comparison.py"), own),
+        "code": code_digest((*ALL, "parameters.py", "model.py", "comparison.py", "robust_loss.py"), own),
         "device": device.split(":")[0],
         "processor": processor(),
         "cores": str(cores()),

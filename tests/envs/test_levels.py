@@ -6,7 +6,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from splatsoil.envs.levels import DRAWING, relative_cost
-from splatsoil.envs.synthetic import SyntheticProblem, experiment
+from splatsoil.envs.synthetic import SyntheticProblem
+from splatsoil.envs.synthetic_world import experiment
 
 from splatsoil.errors import ParameterError
 from splatsoil.mpm import Resolution

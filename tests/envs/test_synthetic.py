@@ -16,7 +16,8 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 from splatsoil.envs import register
 from splatsoil.envs.plow_sand import PlowSandEnv
-from splatsoil.envs.synthetic import BLOCKS, HEIGHT, WIDTH, SyntheticProblem, compare, pattern
+from splatsoil.envs.synthetic import BLOCKS, SyntheticProblem, compare
+from splatsoil.envs.synthetic_world import HEIGHT, WIDTH, pattern
 
 import splatsoil
 from splatsoil.errors import ParameterError
