@@ -26,7 +26,7 @@ from .refit import ROUNDS, Known, Refit, Start, settle
 from .score import Scorer
 from .sight import Sight
 from .simulations import Simulations
-from .verdicts import CLEAN, LEVEL
+from .verdicts import CERTAIN, CLEAN, LEVEL
 
 FloatArray = npt.NDArray[np.float64]
 Report = Callable[[str, float], None]
@@ -64,6 +64,11 @@ class Confirmation:
     held_out: float
     floor: float
     remainder: Omnibus
+
+    @property
+    def ruled_out(self) -> bool:
+        """Other pictures deny the size that soil asks for, and don't ask for the effect themselves."""
+        return self.agrees < CERTAIN <= self.told
 
 
 def confirm(
@@ -279,7 +284,7 @@ def on_its_own_floor(
     """
     seeds = range(1, 1 + len(evidence.repeats))
 
-    def spread(ask: Callable[..., FloatArray]) -> tuple[FloatArray, dict[str, FloatArray]]:
+    def spread(ask: Callable[..., FloatArray]) -> tuple[FloatArray, dict[str, FloatArray], list[FloatArray]]:
         told: dict[str, Any] = {"effects": (best.name,), "purpose": f"floor with {best.name}"}
         patterns = {}
         for kind in experiment.numerics:
@@ -287,13 +292,21 @@ def on_its_own_floor(
                 patterns[kind] = ask(best.fit.values, numerics=kind, **told) - best.fit.prediction
             except SimulationError:
                 continue
-        return np.stack([ask(best.fit.values, seed=seed, **told) for seed in seeds]), patterns
+        guesses = [ask(best.fit.values, numerics=name, **told) - best.fit.prediction for name in experiment.guesses]
+        return np.stack([ask(best.fit.values, seed=seed, **told) for seed in seeds]), patterns, guesses
 
     simulate.ahead(spread)
-    runs, patterns = spread(simulate)
+    runs, patterns, guesses = spread(simulate)
     deviations = (runs - runs.mean(axis=0)) * np.sqrt(len(runs) / max(len(runs) - 1, 1))
     there = replace(
-        evidence, mean=runs.mean(axis=0), repeats=deviations, numerics=patterns, slopes={}, curves={}, widths={}
+        evidence,
+        mean=runs.mean(axis=0),
+        repeats=deviations,
+        numerics=patterns,
+        guesses=np.stack(guesses) if guesses else evidence.guesses,
+        slopes={},
+        curves={},
+        widths={},
     )
     floor, seen = floor_of(experiment, there), experiment.seen
     basis = smooth_basis(experiment.layout, floor.noise)

@@ -19,8 +19,8 @@ def members_of(
     """The equivalence class, the best effect first; empty where the best one doesn't stand.
 
     What other pictures say of an effect beyond doubt comes first, even if another one would explain more of what soil
-    shows: the next diagnosis, with the first one on, tells of that. What they rule out in the size that soil asks for
-    isn't it, however well it explains soil.
+    shows: the next diagnosis, with the first one on, tells of that. What they rule out isn't it, however well it
+    explains soil.
 
     Args:
         confirmations: of the model as it is, under the empty name, and with each effect.
@@ -28,7 +28,7 @@ def members_of(
         misfit: of the model as it is.
         scores: of each effect.
     """
-    costs = {name: cost for name, cost in costs.items() if confirmations[name].agrees >= CERTAIN}
+    costs = {name: cost for name, cost in costs.items() if not confirmations[name].ruled_out}
     if not costs:
         return ()
     standing = [name for name in costs if stands(confirmations, name, misfit, scores[name].dispersion)]

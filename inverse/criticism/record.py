@@ -126,6 +126,8 @@ def confirmation(c: Confirmation) -> dict[str, Any]:
         "stds": dict(c.stds),
         "chi2": c.chi2,
         "fall": c.fall,
+        "told": c.told,
+        "agrees": c.agrees,
         "held_out": c.held_out,
         "floor": c.floor,
         "remainder": _omnibus(c.remainder),

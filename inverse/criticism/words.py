@@ -10,7 +10,7 @@ from splatsoil.experiment.strokes import MEASURED
 
 from .diagnosis import Diagnosis
 from .outside import FEW, StrengthReading
-from .verdicts import CERTAIN, GATE
+from .verdicts import GATE
 
 #: Correlation of two effects' scores from which they are called alike.
 ALIKE = 0.8
@@ -24,11 +24,9 @@ def sentences(diagnosis: Diagnosis, candidates: Mapping[str, Candidate], base: M
         out = _adequate(diagnosis, candidates)
     else:
         out = _outside(diagnosis, candidates)
-    ruled_out = [title(name) for name, c in diagnosis.confirmations.items() if name and c.agrees < CERTAIN]
+    ruled_out = [title(name) for name, c in diagnosis.confirmations.items() if c.ruled_out]
     if ruled_out:
-        out.append(
-            f"What soil shows would ask for more of {listed(ruled_out)} than pictures allow where soil plays no part."
-        )
+        out.append(f"Soil would ask for {listed(ruled_out)} of a size that pictures rule out where soil plays no part.")
     out += of_strokes(diagnosis)
     worst = next((b for b in diagnosis.blocks if b.p < GATE), None)
     if worst is not None:

@@ -46,7 +46,6 @@ def experiment_of(
     from splatsoil import __version__
     from splatsoil.commands._stages import digest_of
     from splatsoil.experiment.plow import PlowExperiment
-    from splatsoil.files import FORWARD, code_digest
     from splatsoil.inverse.criticism.simulations import Simulations
     from splatsoil.soil.library import find_effects
 
@@ -56,7 +55,6 @@ def experiment_of(
         if effect.name in {e.name for e in model.law.effects}:
             raise ParameterError(f"effect {effect.name} is on already; name one that is off")
     fit = folder.fit()
-    own = [name for name in (*fit["setup"]["effects"], *(named or ())) if name.endswith(".py")]
     experiment = PlowExperiment(model, tuple(fit["parameters"]), candidates=wanted)
     identity = {
         "measurement": folder.description["measurement"]["hash"],
@@ -65,10 +63,18 @@ def experiment_of(
         "preset": model.preset,
         "device": model.device.split(":")[0],
         "version": __version__,
-        "code": code_digest((*FORWARD, "observation.py", "experiment/plow.py", "experiment/scene_parts.py"), own),
+        "code": code_of((*fit["setup"]["effects"], *(named or ()))),
         "layout": list(experiment.layout.shape),
     }
     return experiment, Simulations(experiment, folder.path / "features", identity)
+
+
+def code_of(effects: Iterable[str]) -> str:
+    """Digest of the code that decides features, users' own effects in it."""
+    from splatsoil.files import FORWARD, code_digest
+
+    own = [name for name in effects if name.endswith(".py")]
+    return code_digest((*FORWARD, "observation.py", "experiment/plow.py", "experiment/scene_parts.py"), own)
 
 
 def replayed(
@@ -182,6 +188,7 @@ def diagnosed(
             "preset": model.preset,
             "device": model.device,
             "version": __version__,
+            "code": simulate.identity["code"],
             "seed": options.seed,
             "seconds": round(time.perf_counter() - began, 1),
             "simulated_now": simulate.made,
@@ -302,8 +309,8 @@ def keep_pictures(folder: RunFolder) -> None:
         folder.comparison.rename(before)
 
 
-def latest_diagnosis(folder: RunFolder) -> dict[str, Any] | None:
-    """The diagnosis of the latest fit, if there is one."""
+def latest_diagnosis(folder: RunFolder, effect: str) -> dict[str, Any] | None:
+    """The diagnosis of the latest fit by the code as it is, an effect or its file among it, if there is one."""
     from splatsoil.files import read_json
     from splatsoil.report.data import estimates
 
@@ -312,7 +319,8 @@ def latest_diagnosis(folder: RunFolder) -> dict[str, Any] | None:
     if not path.is_file():
         return None
     data = read_json(path)
-    return data if data["values"] == estimates(fit) else None
+    code = code_of((*fit["setup"]["effects"], effect))
+    return data if data["values"] == estimates(fit) and data.get("code") == code else None
 
 
 def history(folder: RunFolder) -> list[dict[str, Any]]:
@@ -328,52 +336,6 @@ def remember(folder: RunFolder, entries: list[dict[str, Any]]) -> Path:
     from splatsoil.files import write_json
 
     return write_json(folder.path / "history.json", {"format": "splatsoil-history/1", "models": entries})
-
-
-def show(result: dict[str, Any]) -> None:
-    """The verdict, why, and the table of effects."""
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
-
-    from splatsoil.report.words import symbol
-
-    table = Table(title=f"effects that are off, in {escape(str(result['fit']))}", title_justify="left")
-    for column in ("effect", "verdict", "z", "p", "estimate", "smallest detectable", "predicted fall", "achieved"):
-        table.add_column(column, justify="left" if column in ("effect", "verdict") else "right")
-    for e in result["effects"]:
-        unit = symbol(e["unit"])
-        achieved = f"{e['achieved_fall']:.4g}" if "achieved_fall" in e else ""
-        table.add_row(
-            escape(e["name"]),
-            e["verdict"],
-            f"{e['z']:.1f}",
-            f"{e['p']:.2g}",
-            _amount(e["estimate"], e["std"], unit),
-            _amount(e["mde"], None, unit),
-            f"{e['predicted_fall']:.4g}",
-            achieved,
-        )
-    console = Console(highlight=False)
-    console.print(table)
-    console.print(f"[bold]{result['verdict']}[/bold]")
-    for sentence in result["sentences"]:
-        console.print(escape(sentence))
-    for note in result["notes"]:
-        console.print(f"[yellow]note[/yellow] {escape(note)}")
-    console.print(
-        f"{result['simulations']} simulations, {result['simulated_now']} of them new, {result['seconds']:.0f} s"
-    )
-
-
-def _amount(value: float | None, std: float | None, unit: str) -> str:
-    from math import isfinite
-
-    if value is None or not isfinite(value):
-        return "nothing is seen"
-    if std is None:
-        return f"{value:.3g}{unit}"
-    return f"{value:.3g} ± {std:.2g}{unit}" if isfinite(std) else f"{value:.3g}{unit}"
 
 
 def check_budget(options: Options) -> None:

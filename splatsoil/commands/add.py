@@ -109,7 +109,7 @@ def added(
     own = next(e for e in larger.law.effects if e.name == effect.name)
     mine = [p.name for p in own.parameters if p.off is not None or p.name in own.shapes]
     free = (*before["parameters"], *mine)
-    known = criticism.latest_diagnosis(folder) or {"refits": {}}
+    known = criticism.latest_diagnosis(folder, name) or {"refits": {}}
     # One that was kept may be of a time when other parameters of the effect were free.
     if {*known["refits"].get(effect.name, {"values": ()})["values"]} != {*free}:
         known = criticism.confirmed(folder, model, name, options, begin(f"try {effect.name}"))

@@ -42,6 +42,7 @@ def run(config: Config) -> int:
     """Diagnose; the result goes into the run folder."""
     from splatsoil.commands import _criticism as criticism
     from splatsoil.commands import _stages as stage
+    from splatsoil.commands._diagnosis_table import show
     from splatsoil.commands._progress import stages
     from splatsoil.envs.devices import resolve_device
     from splatsoil.inverse.criticism.diagnosis import Options
@@ -59,7 +60,7 @@ def run(config: Config) -> int:
     if config.json:
         print_json({"ok": True, "run": str(folder.path), **_finite(result)})
     else:
-        criticism.show(result)
+        show(result)
         print(f"kept in {folder.path / 'diagnosis.json'}")
     return 0
 

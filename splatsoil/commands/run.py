@@ -48,6 +48,7 @@ def run(config: Config) -> int:
     from splatsoil.commands import _criticism as criticism
     from splatsoil.commands import _stages as stage
     from splatsoil.commands import add, compare, fit
+    from splatsoil.commands._diagnosis_table import show
     from splatsoil.commands._progress import stages
     from splatsoil.envs.devices import resolve_device
     from splatsoil.errors import ParameterError
@@ -91,7 +92,7 @@ def run(config: Config) -> int:
     else:
         if entries := criticism.history(folder):
             add.show(entries)
-        criticism.show(diagnosis)
+        show(diagnosis)
         print(f"Stopped because {stopped}.")
     print(f"report: {page}")
     return 0

@@ -45,7 +45,7 @@ def reconstruct(
     Args:
         measurement: the set; its `views` show the bed and the tool at the first pose of its motion.
         seed: the same seed on the CPU gives the same bits.
-        device: where the Gaussians are trained, as torch names it.
+        device: where the work is done, as torch names it.
         preset: how much work; see `presets.PRESETS`.
         holdout: every so many views one is set aside, the first among them, to judge by; 0 sets none aside.
         progress: called with what is being done and how much of that is done (0 to 1).

@@ -114,7 +114,7 @@ def reguessed(scene: Scene, seed: int) -> Scene:
     above = albedos.albedo_above(x, rest, surface, scene.spacing)
     others = albedos.other_grain_albedo(
         x,
-        relief.depth_below(x),
+        relief.depth_below(x) - scene.spacing,  # photographs show the uppermost layer
         linear(scene.grain_albedo),
         above,
         _length(rest, surface),

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from splatsoil.measurement import Frame, Measurement
 from splatsoil.scene import kernels
-from splatsoil.scene.light import Light, linear
+from splatsoil.scene.light import SOIL_REFLECTANCE, Light, linear
 from splatsoil.scene.lit import LitRelief, ceiling, direct_light, march_step, sun_on_points
 from splatsoil.scene.relief import Relief, grid_of
 from splatsoil.scene.sky import sky_openness
@@ -47,11 +47,11 @@ _LAG = 3
 _BLUR = 1.5
 """How far photographs blur an edge, in their pixels: the eye's pixel and the interpolation between pixels."""
 
-_IN_THE_WAY = 0.1
-"""Light that comes from where the tool hides the sky: half of level ground's on a tool that sends a fifth of it back.
+_TOOL_REFLECTANCE = 0.2
+"""The tool's colour is not known yet; from black to bright metal this moves the sky's share by 0.01."""
 
-The tool's colour is not known yet; from black to bright metal this moves the sky's share by 0.01.
-"""
+_FEWEST_SHADED = 30
+"""Cells in the tool's shadow, beside its edge, from which the sky's share can be told."""
 
 
 @dataclass(frozen=True)
@@ -198,7 +198,10 @@ class _Problem:
     ) -> None:
         self.points, self.shape, self.relief, self.tool, self.lag = points, shape, relief, tool, lag
         self.brightness = colours.clamp_min(1e-4).log()
-        self.openness = relief.sample(sky_openness(relief, tool)[0], points)
+        openness, hidden = (relief.sample(share, points) for share in sky_openness(relief, tool))
+        # The soil and the tool in the sky's way send back half of level ground's light.
+        self.openness = openness
+        self.returned = 0.5 * (SOIL_REFLECTANCE * (1.0 - openness - hidden) + _TOOL_REFLECTANCE * hidden)
         self._known: tuple[float, float, Tensor] | None = None
         self.scale = 1.0
         grey = self.differences(self.brightness.mean(dim=1))
@@ -210,12 +213,20 @@ class _Problem:
         return torch.cat([(grid[lag:] - grid[:-lag]).reshape(-1), (grid[:, lag:] - grid[:, :-lag]).reshape(-1)])
 
     def beside_edges(self, azimuth: float, elevation: float, blur: int) -> _Problem:
-        """The same without the shadow's edge, its blur taken off both sides, by differences that reach across."""
+        """The same without the shadow's edge, its blur taken off both sides, by differences that reach across.
+
+        Of a shadow too narrow for that, less is taken off; nothing where hardly any shadow is left then.
+        """
         sun = self.tool_light(Light.from_angles(azimuth, elevation, 0.5)).reshape(1, 1, *self.shape)
-        highest, lowest = (functional.max_pool2d(sign * sun, 2 * blur + 1, 1, blur) for sign in (1.0, -1.0))
-        colours = self.brightness.exp()
-        colours[(highest + lowest > 0.02).reshape(-1)] = math.nan
-        return _Problem(self.points, colours, self.shape, self.relief, self.tool, lag=2 * blur + _LAG)
+        known = torch.isfinite(self.brightness).all(dim=1).reshape(self.shape)
+        for width in range(min(blur, (min(self.shape) // 2 - _LAG) // 2), 0, -1):
+            highest, lowest = (functional.max_pool2d(sign * sun, 2 * width + 1, 1, width) for sign in (1.0, -1.0))
+            edge = (highest + lowest > 0.02)[0, 0]
+            if int(((sun[0, 0] < 0.02) & ~edge & known).sum()) >= _FEWEST_SHADED:
+                colours = self.brightness.exp()
+                colours[edge.reshape(-1)] = math.nan
+                return _Problem(self.points, colours, self.shape, self.relief, self.tool, lag=2 * width + _LAG)
+        return self
 
     def spread(self, residual: Tensor) -> Tensor:
         """Mean pseudo-Huber loss of the residuals that are known."""
@@ -227,7 +238,7 @@ class _Problem:
         if not 5.0 <= elevation <= 89.9 or not 0.02 <= ambient <= 0.98:
             return 1e3
         direct = self._direct(azimuth, elevation)
-        e = ambient * self.openness + (1.0 - ambient) * direct + _IN_THE_WAY * (1.0 - self.openness)
+        e = ambient * self.openness + (1.0 - ambient) * direct + self.returned
         return float(self.spread(self.differences(brightness - e.clamp_min(1e-3).log())))
 
     def tool_light(self, light: Light) -> Tensor:

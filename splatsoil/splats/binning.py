@@ -50,9 +50,9 @@ def bin_by_tile(projection: Projection, features: Tensor, view: View) -> Bins:
     """Sort by depth, pack, list tiles, sort by tile; ``features`` is (n, k). Nothing here carries gradients."""
     tiles_x, tiles_y = -(-view.width // constants.TILE), -(-view.height // constants.TILE)
     order = _depth_order(projection)
-    visible = order.shape[0]
-    rows = features.new_empty((visible, kernels.HEADER + features.shape[1]))
-    ends = torch.empty(visible, dtype=torch.int32, device=features.device)
+    count = order.shape[0]
+    rows = features.new_empty((count, kernels.HEADER + features.shape[1]))
+    ends = torch.empty(count, dtype=torch.int32, device=features.device)
     inputs = [
         as_warp(order, wp.int32),
         as_warp(projection.centres, wp.vec2),
@@ -62,13 +62,13 @@ def bin_by_tile(projection: Projection, features: Tensor, view: View) -> Bins:
         as_warp(features, wp.float32),
     ]
     packed = as_warp(rows, wp.float32)
-    launch(kernels.pack, visible, [*inputs, tiles_x, tiles_y, packed, as_warp(ends, wp.int32)], features)
+    launch(kernels.pack, count, [*inputs, tiles_x, tiles_y, packed, as_warp(ends, wp.int32)], features)
     ends = ends.cumsum(0, dtype=torch.int32)
-    total = int(ends[-1]) if visible else 0
+    total = int(ends[-1]) if count else 0
     tiles = torch.empty(total, dtype=torch.int32, device=features.device)
     owners = torch.empty_like(tiles)
     lists = [as_warp(tiles, wp.int32), as_warp(owners, wp.int32)]
-    launch(kernels.list_tiles, visible, [packed, as_warp(ends, wp.int32), tiles_x, tiles_y, *lists], features)
+    launch(kernels.list_tiles, count, [packed, as_warp(ends, wp.int32), tiles_x, tiles_y, *lists], features)
     starts, ranks, entries = _sort_by_tile(tiles, owners, tiles_x * tiles_y)
     return Bins(tiles_x, tiles_y, order, rows, ends, starts, ranks, entries)
 

@@ -185,6 +185,8 @@ def gather_kernel(channels: int):
         begin = wp.int32(0)
         if rank > 0:
             begin = ends[rank - 1]
+        if begin == ends[rank]:
+            return
         s = Row()
         for e in range(begin, ends[rank]):
             s += gradients[e]

@@ -16,7 +16,7 @@ def as_warp(tensor: Tensor, dtype: Any) -> Any:
     """A float32 or int32 tensor as kernels take an array of ``dtype`` (scalar, vector, matrix), over its memory.
 
     It is Warp's descriptor of an array and not an array, which takes three times as long to make: a picture needs
-    thirty.
+    thirty. Kernels check neither its device nor its number of dimensions.
     """
     return wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=False, return_ctype=True)
 
@@ -24,6 +24,7 @@ def as_warp(tensor: Tensor, dtype: Any) -> Any:
 def launch(kernel: Any, count: int | tuple[int, ...], inputs: list[Any], like: Tensor, block: int = 256) -> None:
     """Run ``count`` threads (along one or more axes) of a kernel where ``like`` lives, on torch's current stream."""
     if like.is_cuda:
+        wp.init()  # a stream can't be asked for before; making descriptors doesn't do it
         stream = wp.stream_from_torch(like.device)
         wp.launch(kernel, dim=count, inputs=inputs, device=stream.device, stream=stream, block_dim=block)
     else:

@@ -14,6 +14,7 @@ from splatsoil.inverse.criticism.diagnosis import Options
 from splatsoil.commands import _criticism, _stages
 from splatsoil.commands._options import FitOptions
 from splatsoil.commands.add import added
+from splatsoil.files import write_json
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
 
@@ -81,7 +82,7 @@ def refit(values: Mapping[str, float], chi2: float) -> dict[str, Any]:
 @pytest.fixture
 def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
     made = Bench({"as it is": refit({"friction_angle": 30.0}, 50.0)})
-    monkeypatch.setattr(_criticism, "latest_diagnosis", lambda folder: {"refits": made.refits})
+    monkeypatch.setattr(_criticism, "latest_diagnosis", lambda folder, effect: {"refits": made.refits})
     monkeypatch.setattr(_criticism, "confirmed", lambda *others: {"refits": made.confirmed})
     monkeypatch.setattr(_criticism, "history", lambda folder: made.history)
     monkeypatch.setattr(_criticism, "remember", lambda folder, entries: setattr(made, "history", entries))
@@ -120,6 +121,18 @@ def test_what_shapes_an_effect_is_fitted_with_it(
     assert entry == bench.history[-1]
     assert (entry["added"], entry["fall"]) == (known.name, 30.0)
     assert {name: p["estimate"] for name, p in entry["parameters"].items()} == found
+
+
+def test_a_diagnosis_by_other_code_is_none(tmp_path: Path) -> None:
+    fit = {"name": "base", "setup": {"effects": []}, "parameters": {"friction_angle": {"estimate": 30.0}}}
+    folder = cast(Any, SimpleNamespace(fit=lambda: fit, path=tmp_path))
+    assert _criticism.latest_diagnosis(folder, "cohesion") is None
+    data = {"values": {"friction_angle": 30.0}, "code": _criticism.code_of(())}
+    for change, known in ({}, True), ({"code": "of yesterday"}, False), ({"values": {"friction_angle": 31.0}}, False):
+        write_json(tmp_path / "diagnoses" / "base.json", {**data, **change})
+        assert (_criticism.latest_diagnosis(folder, "cohesion") is not None) is known
+    (tmp_path / "own.py").write_text(OWN)
+    assert _criticism.latest_diagnosis(folder, str(tmp_path / "own.py")) is None
 
 
 @pytest.mark.parametrize("kept", [None, ("friction_angle", "dilatancy_angle")], ids=["none", "before-shapes"])

@@ -12,14 +12,14 @@ from splatsoil.scene.estimate import fit_light
 AZIMUTHS = [(145.0, 53.0, 0.6), (-60.0, 35.0, 0.4), (20.0, 65.0, 0.5)]
 
 
-def seen(azimuth, elevation, ambient, blur=0.0):
+def seen(azimuth, elevation, ambient, blur=0.0, size=(110, 160), plate=(0.4, 0.27, 0.21)):
     """A light, and what photographs tell of a bed with slopes, blotches and the shadow of a plate."""
     generator = np.random.default_rng(4)
-    ny, nx, cell = 110, 160, 0.005
+    (ny, nx), cell = size, 0.005
     heights = 0.1 + 0.06 * gaussian_filter(generator.normal(size=(ny, nx)), 10.0) / 0.03 * 0.12
     relief = Relief.of_heights(torch.tensor(heights, dtype=torch.float32), (0.0, 0.0), (cell, cell))
     tool = ToolBody(trimesh.creation.box((0.012, 0.12, 0.12)))
-    place = tool.at(np.eye(3), (0.4, 0.27, 0.21))
+    place = tool.at(np.eye(3), plate)
     truth = Light.from_angles(azimuth, elevation, [ambient, ambient + 0.03, ambient + 0.08])
     blotches = gaussian_filter(generator.normal(size=(ny, nx)), 3.0)
     albedo = np.exp(0.12 * blotches / blotches.std())[..., None] * np.array([0.69, 0.55, 0.37])
@@ -50,3 +50,14 @@ def test_a_blurred_shadow_is_not_taken_for_more_sky():
         errors.append(fit_light(*what).light.ambient - truth.ambient)
     # with the shadow's edge among what is compared it was 0.07
     assert abs(np.mean(errors)) < 0.02
+
+
+@pytest.mark.parametrize("blur", [2, 3, 6])
+def test_a_shadow_too_narrow_for_the_blur_still_tells_the_sky(blur):
+    truth, what, _tool = seen(90.0, 53.0, 0.6)  # the sun looks along the plate
+    assert np.allclose(fit_light(*what, blur=blur).light.ambient, truth.ambient, atol=0.03)
+
+
+def test_a_few_cells_with_a_wide_blur_tell_what_they_can():
+    truth, what, _tool = seen(145.0, 53.0, 0.6, size=(14, 16), plate=(0.04, 0.03, 0.16))
+    assert np.allclose(fit_light(*what, blur=8).light.ambient, truth.ambient, atol=0.1)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -145,6 +147,23 @@ def test_cuda_kernels_compile(channels: int, tmp_path: Path) -> None:
         if "splat" in kernel.key:
             assert "vote.sync" in text
             assert "local_depot" not in text, "sums that should stay in registers spill to memory"
+
+
+def test_a_launch_on_a_gpu_is_the_first_that_warp_hears_of() -> None:
+    """In a fresh process, as a command has it: Warp must know its devices before a stream is asked for."""
+    code = """
+import sys
+from types import SimpleNamespace
+import warp as wp
+from splatsoil.splats import warp_torch
+
+def stream(device):
+    sys.exit(0 if wp.get_devices.__globals__["runtime"] is not None else 1)
+
+wp.stream_from_torch = stream
+warp_torch.launch(None, 1, [], SimpleNamespace(is_cuda=True, device="cuda:0"))
+"""
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 @on_gpu

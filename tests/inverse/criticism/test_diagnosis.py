@@ -237,7 +237,10 @@ def test_what_other_pictures_rule_out_is_not_named_however_well_it_explains_soil
     assert found.confirmations["effect 8"].values["effect 8"] > 3.0 * size
     assert "effect 8" not in found.members
     told = sentences(found, {c.name: c for c in experiment.candidates}, {})
-    assert "What soil shows would ask for more of Effect 8 than pictures allow where soil plays no part." in told
+    assert "Soil would ask for Effect 8 of a size that pictures rule out where soil plays no part." in told
+    # pictures that are sure of it, but of half the size, don't rule it out
+    surely_on = Calibration(("effect 8",), np.array([4.0 * size]), np.array([[(0.5 * size) ** 2]]))
+    assert diagnose(experiment, {"angle": fitted(experiment)}, calibration=surely_on).members == ("effect 8",)
 
 
 def test_verdicts_on_an_effect(sizes: dict[str, float]) -> None:

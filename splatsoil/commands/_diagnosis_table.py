@@ -1,0 +1,51 @@
+"""A diagnosis on the terminal."""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+def show(result: dict[str, Any]) -> None:
+    """The verdict, why, and the table of effects."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    from splatsoil.report.words import symbol
+
+    table = Table(title=f"effects that are off, in {escape(str(result['fit']))}", title_justify="left")
+    for column in ("effect", "verdict", "z", "p", "estimate", "smallest detectable", "predicted fall", "achieved"):
+        table.add_column(column, justify="left" if column in ("effect", "verdict") else "right")
+    for e in result["effects"]:
+        unit = symbol(e["unit"])
+        achieved = f"{e['achieved_fall']:.4g}" if "achieved_fall" in e else ""
+        table.add_row(
+            escape(e["name"]),
+            e["verdict"],
+            f"{e['z']:.1f}",
+            f"{e['p']:.2g}",
+            _amount(e["estimate"], e["std"], unit),
+            _amount(e["mde"], None, unit),
+            f"{e['predicted_fall']:.4g}",
+            achieved,
+        )
+    console = Console(highlight=False)
+    console.print(table)
+    console.print(f"[bold]{result['verdict']}[/bold]")
+    for sentence in result["sentences"]:
+        console.print(escape(sentence))
+    for note in result["notes"]:
+        console.print(f"[yellow]note[/yellow] {escape(note)}")
+    console.print(
+        f"{result['simulations']} simulations, {result['simulated_now']} of them new, {result['seconds']:.0f} s"
+    )
+
+
+def _amount(value: float | None, std: float | None, unit: str) -> str:
+    from math import isfinite
+
+    if value is None or not isfinite(value):
+        return "nothing is seen"
+    if std is None:
+        return f"{value:.3g}{unit}"
+    return f"{value:.3g} ± {std:.2g}{unit}" if isfinite(std) else f"{value:.3g}{unit}"
