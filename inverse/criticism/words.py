@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 from splatsoil.experiment.base import Candidate
 from splatsoil.experiment.strokes import MEASURED
+from splatsoil.report.words import symbol, with_std
 
 from .diagnosis import Diagnosis
 from .outside import FEW, StrengthReading
@@ -156,6 +157,5 @@ def listed(words: list[str]) -> str:
 
 
 def amount(value: float, std: float, unit: str) -> str:
-    """A value with its spread and unit."""
-    symbol = {"deg": "°", "1": ""}.get(unit, f" {unit}")
-    return f"{value:.3g} ± {std:.2g}{symbol}" if std > 0.0 else f"{value:.3g}{symbol}"
+    """A value with its spread, if it has one, and unit."""
+    return (" ± ".join(with_std(value, std)) if 0.0 < std < math.inf else f"{value:.3g}") + symbol(unit)

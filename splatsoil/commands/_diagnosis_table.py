@@ -44,8 +44,10 @@ def show(result: dict[str, Any]) -> None:
 def _amount(value: float | None, std: float | None, unit: str) -> str:
     from math import isfinite
 
+    from splatsoil.report.words import with_std
+
     if value is None or not isfinite(value):
         return "nothing is seen"
     if std is None:
         return f"{value:.3g}{unit}"
-    return f"{value:.3g} ± {std:.2g}{unit}" if isfinite(std) else f"{value:.3g}{unit}"
+    return (" ± ".join(with_std(value, std)) if isfinite(std) else f"{value:.3g}") + unit

@@ -39,7 +39,7 @@ def with_std(value: float, std: float) -> tuple[str, str]:
     leading = std / 10.0**exponent
     decimals = -exponent + (1 if leading < 2.95 else 0)
     if decimals >= 0:
-        return f"{value:.{decimals}f}", f"{std:.{decimals}f}"
+        return f"{round(value, decimals) + 0.0:.{decimals}f}", f"{std:.{decimals}f}"  # + 0.0: no "-0.0"
     return f"{round(value, decimals):.0f}", f"{round(std, decimals):.0f}"
 
 

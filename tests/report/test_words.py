@@ -1,6 +1,9 @@
 from __future__ import annotations
 
+import math
+
 import pytest
+from splatsoil.inverse.criticism.words import amount
 
 from splatsoil.report import words
 
@@ -16,10 +19,17 @@ from splatsoil.report import words
         (298.4, 0.0, ("298.4", "0")),
         (35.6321, 0.0996, ("35.63", "0.10")),
         (12345.0, 1234.0, ("12300", "1200")),
+        (-1.1e-5, 5.1e-4, ("0.0000", "0.0005")),
     ],
 )
 def test_a_value_is_quoted_to_the_digits_its_std_allows(value: float, std: float, expected: tuple[str, str]) -> None:
     assert words.with_std(value, std) == expected
+
+
+def test_amounts_have_as_many_digits_as_are_known() -> None:
+    assert amount(553.73, 160.7, "Pa") == "550 ± 160 Pa"
+    assert amount(37.19, 2.53, "deg") == "37.2 ± 2.5°"
+    assert amount(33.2, 0.0, "Pa") == amount(33.2, math.inf, "Pa") == "33.2 Pa"
 
 
 def comparison(total: float, noise: float | None) -> dict:
