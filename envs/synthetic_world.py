@@ -43,17 +43,6 @@ def blade_motion() -> tuple[FloatArray, FloatArray]:
     return frames / FRAME_RATE, np.stack([x, np.full(len(frames), 0.5 * BED[1]), z], axis=1)
 
 
-def look_at(eye: Sequence[float], target: Sequence[float]) -> FloatArray:
-    """Camera-to-world (4, 4) with OpenGL axes and the world's z up in the picture."""
-    back = np.subtract(eye, target)
-    back = back / np.linalg.norm(back)
-    right = np.cross([0.0, 0.0, 1.0], back)
-    right /= np.linalg.norm(right)
-    matrix = np.eye(4)
-    matrix[:3] = np.stack([right, np.cross(back, right), back, np.asarray(eye, dtype=np.float64)], axis=1)
-    return matrix
-
-
 def experiment() -> Measurement:
     """Bed, blade and motion; there are no photographs."""
     import trimesh
@@ -77,6 +66,7 @@ def experiment() -> Measurement:
 def cameras() -> dict[str, Camera]:
     """Two cameras, from the left and from the right of the furrow; the bed's ragged edges are out of sight."""
     from splatsoil.measurement import Camera
+    from splatsoil.synthetic.setups import look_at
 
     target = (0.2, 0.12, 0.06)
     return {

@@ -87,6 +87,7 @@ def test_a_run_is_compared_diagnosed_and_added_to(place: Path, repository: Path)
     assert {e["name"] for e in first["effects"]} == {"cohesion", "exposure", "suction"}
     assert first["verdict"] in ("adequate", "missing", "outside the library")
     kept = json.loads((place / "run" / "diagnosis.json").read_text())
+    assert kept["floor"]["guesses"] > 0.0
     assert kept["effects"] == first["effects"]
     again = command(*words, cwd=place)
     assert again["simulated_now"] == 0, "everything was kept"
