@@ -22,6 +22,7 @@ from splatsoil.benchmarks._speed import (
     mpm,
     page,
     pictures,
+    run_to_run,
     whole,
 )
 from splatsoil.benchmarks._speed.rows import Group, missing, text
@@ -80,6 +81,7 @@ def gpu_parts(task: Task) -> dict[str, Callable[[], Group]]:
         "inversion": lambda: whole.inversion(folder, preset, device, task.work),
         "diagnosis": lambda: whole.diagnosis(folder, preset, device, task.work),
         "gsplat": lambda: pictures.against_gsplat(device, repeats),
+        "run-to-run": lambda: run_to_run.compare(folder, preset, device, repeats),
     }
 
 

@@ -17,6 +17,7 @@ def synchronise(device: str) -> None:
         import torch
         import warp as wp
 
+        wp.init()
         wp.synchronize_device(device)
         torch.cuda.synchronize(device)
 

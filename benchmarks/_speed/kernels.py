@@ -35,7 +35,7 @@ OFTEN = ("stress_forces", "move_nodes", "contact_forces")
 """Kernels of a substep; the others run once a step of the particles."""
 
 
-ALL = (*NAMES, "average_cells", "momentum_to_velocity", "mark_cells", "number_cells", "bound_stretch")
+ALL = (*NAMES, "average_cells", "momentum_to_velocity", "mark_cells", "list_cells", "number_cells", "bound_stretch")
 
 
 def known(name: str) -> str:

@@ -36,7 +36,7 @@ class FitOptions:
     device: str = "auto"
     """Where to compute: auto, cpu, cuda:0, …"""
     seed: int = 0
-    """Of everything random; the same seed on the CPU gives the same bits."""
+    """Of everything random; the same seed on the CPU gives the same bits (on a GPU with SPLATSOIL_DETERMINISTIC=1)."""
     run: Path | None = None
     """Run folder; runs/NAME-PRESET if not given, with the seed when it isn't 0. A fit that was interrupted goes on."""
     json: bool = False

@@ -28,6 +28,7 @@ from splatsoil.mpm.transfer import (
     bound_stretch,
     find_gaps,
     grid_to_particles,
+    list_cells,
     mark_cells,
     momentum_to_velocity,
     number_cells,
@@ -273,6 +274,7 @@ class Solver:
             array.zero_()
         c.slot.fill_(-1)
         wp.launch(mark_cells, dim=n, inputs=[p, c, grid], device=device)
+        wp.launch(list_cells, dim=node_count, inputs=[c], device=device)
         cells = self._size(c.count, cell_count)
         wp.launch(number_cells, dim=cells, inputs=[c], device=device)
         wp.launch(particles_to_grid, dim=n, inputs=[p, c, g, grid], device=device)

@@ -125,11 +125,12 @@ def contact_forces(
         normal = particles.gap_normal[p]
         slip = velocity - tool_velocity(pose, x)
         closing = wp.dot(slip, normal)
-        particles.drift[p] += dt * slip
+        drift = particles.drift[p] + dt * slip
+        particles.drift[p] = drift
         gap = particles.gap[p] + dt * closing
         if gap < 0.0:
             # the flat estimate would push on where a particle has slid off an edge: measure
-            place = x + particles.drift[p] - tool_position(pose)
+            place = x + drift - tool_position(pose)
             gap = signed_distance(tool, wp.quat_rotate_inv(tool_rotation(pose), place))
         particles.gap[p] = gap
         adhesion = values[row, TOOL_ADHESION] * area
@@ -192,5 +193,5 @@ def move_nodes(nodes: Nodes, grid: Grid, dt: float, values: wp.array2d(dtype=flo
             if wp.length(wp.cw_mul(grid.cell, wp.vec3(float(ix), float(iy), float(iz))) - centre) < radius:
                 velocity = wp.vec3(0.0)
         nodes.velocity[i] = velocity
-        nodes.displacement[i] += dt * velocity
+        nodes.displacement[i] = nodes.displacement[i] + dt * velocity
         nodes.force[i] = wp.vec3(0.0)

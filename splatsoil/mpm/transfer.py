@@ -22,18 +22,25 @@ RUNAWAY = wp.constant(1.0e3)
 """Most that the visual deformation's norm comes to between two frames."""
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def mark_cells(particles: Particles, cells: Cells, grid: Grid) -> None:
-    """List every cell that holds a particle once, and note for each particle the lowest node of its cell."""
+    """Mark every cell that holds a particle, and note for each particle the lowest node of its cell."""
     p = wp.tid()
     cell = cell_of(grid, particles.position[p])
     node = (p / particles.per_simulation) * grid.nodes + base_node(grid, cell)
-    if wp.atomic_cas(cells.slot, node, -1, 0) == -1:
-        cells.node[wp.atomic_add(cells.count, 0, 1)] = node
+    cells.slot[node] = 0
     particles.cell[p] = node
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
+def list_cells(cells: Cells) -> None:
+    """Pack the marked cells."""
+    node = wp.tid()
+    if cells.slot[node] == 0:
+        cells.node[wp.atomic_add(cells.count, 0, 1)] = node
+
+
+@wp.kernel(enable_backward=False)
 def number_cells(cells: Cells) -> None:
     """Write each active cell's entry back into the map and clear its sums."""
     entry = wp.tid()
@@ -51,7 +58,7 @@ def number_cells(cells: Cells) -> None:
             cells.gradient[8 * entry + corner] = wp.vec3(0.0)
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def particles_to_grid(particles: Particles, cells: Cells, nodes: Nodes, grid: Grid) -> None:
     """Add each particle's mass and momentum to nodes, its stress and shape to its cell.
 
@@ -90,7 +97,7 @@ def particles_to_grid(particles: Particles, cells: Cells, nodes: Nodes, grid: Gr
         wp.atomic_add(cells.gradient, 8 * entry + corner, volume * corner_gradient(f, corner, grid.inverse))
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def average_cells(cells: Cells, nodes: Nodes, grid: Grid, stiffness: float) -> None:
     """Sums to means; ``stiffness`` = c (K + 4G/3) dt^2 turns a node's share of stiffness into the least stable inertia.
 
@@ -115,7 +122,7 @@ def average_cells(cells: Cells, nodes: Nodes, grid: Grid, stiffness: float) -> N
             wp.atomic_add(nodes.inertia, node, stiffness * volume * wp.length_sq(gradient))
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def momentum_to_velocity(nodes: Nodes) -> None:
     """Divide by mass, and pack the nodes that have any."""
     i = wp.tid()
@@ -126,7 +133,7 @@ def momentum_to_velocity(nodes: Nodes) -> None:
         nodes.active[wp.atomic_add(nodes.count, 0, 1)] = i
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def find_gaps(
     particles: Particles,
     tool: Tool,
@@ -147,7 +154,7 @@ def find_gaps(
         near[wp.atomic_add(count, 0, 1)] = p
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def grid_to_particles(
     particles: Particles,
     cells: Cells,
@@ -239,7 +246,7 @@ def grid_to_particles(
     )
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def bound_stretch(particles: Particles, least: float, most: float) -> None:
     """Clamp the singular values of the visual deformation, so that flowing sand does not become needles."""
     p = wp.tid()

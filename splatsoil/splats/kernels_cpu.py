@@ -23,6 +23,9 @@ import warp as wp
 from splatsoil.splats import constants
 from splatsoil.splats.kernels_binning import HEADER, MOMENTS
 
+PARTS = 1
+"""Rows of gradients for every entry: a tile is one task."""
+
 _COMMON = """
     typedef float v8 __attribute__((ext_vector_type(8)));
     typedef int i8 __attribute__((ext_vector_type(8)));

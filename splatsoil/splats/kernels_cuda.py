@@ -6,7 +6,7 @@ The same arguments and arithmetic as `splatsoil.splats.kernels_cpu`. A warp (two
 together and leaves it together; in the backward pass it sums its pixels' gradients in registers before one lane adds
 them to the entry's row. Written in Warp but for three warp-wide operations, which on a CPU are those of a warp of one
 lane: so these kernels run, slowly, on a CPU, too, and are tested there. On CUDA the order in which the eight warps of a
-tile add is not fixed, so the last bits of gradients vary from run to run.
+tile add is not fixed, so the last bits of gradients vary from run to run, unless each warp has a row of its own.
 """
 
 from __future__ import annotations
@@ -16,14 +16,21 @@ from typing import Any
 
 import warp as wp
 
+from splatsoil import deterministic
 from splatsoil.splats import constants
 from splatsoil.splats.kernels_binning import HEADER, MOMENTS
 
 THREADS = constants.TILE * constants.TILE
 """Threads per tile."""
+WARPS = THREADS // 32
+"""Warps per tile."""
+PARTS = WARPS if deterministic.wanted() else 1
+"""Rows of gradients for every entry: one, to which a tile's warps add in any order, or one for each warp."""
 
 _TILE = wp.constant(wp.int32(constants.TILE))
 _THREADS = wp.constant(wp.int32(THREADS))
+_PARTS = wp.constant(wp.int32(PARTS))
+_LANES = wp.constant(wp.int32(32))
 _LN2 = wp.constant(wp.float32(0.6931471805599453))
 _ALPHA_MAX = wp.constant(wp.float32(constants.ALPHA_MAX))
 _ALPHA_MIN = wp.constant(wp.float32(constants.ALPHA_MIN))
@@ -130,11 +137,19 @@ def forward_kernel(channels: int) -> Any:
 
 @cache
 def backward_kernel(channels: int) -> Any:
-    """Kernel over pixels that adds moments and feature gradients to one row for every entry."""
+    """Kernel over pixels that adds moments and feature gradients to the rows of every entry.
+
+    An entry has `PARTS` rows, one after the other.
+    """
     Features = wp.types.vector(length=channels, dtype=float)
     Row = wp.types.vector(length=MOMENTS + channels, dtype=float)
 
-    @wp.kernel(enable_backward=False, module="unique")
+    # its additions have an order where one is wanted: nothing for Warp to sort
+    @wp.kernel(
+        enable_backward=False,
+        module="unique",
+        module_options={"deterministic": wp.DeterministicMode.NOT_GUARANTEED},
+    )
     def splat_backward_cuda(
         first: int,
         width: int,
@@ -152,6 +167,7 @@ def backward_kernel(channels: int) -> Any:
     ):
         place = _pixel(first, wp.tid(), tiles_x)
         tile = place[0]
+        part = (wp.tid() % _THREADS) // _LANES % _PARTS
         x = float(place[1]) + 0.5
         y = float(place[2]) + 0.5
         t = wp.float32(-1.0)
@@ -196,7 +212,7 @@ def backward_kernel(channels: int) -> Any:
                         row[5] = s * dy * dy
                     t = after
             if any_lane(drawn) != 0:
-                at = entries[e] * (MOMENTS + channels)
+                at = (entries[e] * _PARTS + part) * (MOMENTS + channels)
                 for k in range(MOMENTS + channels):
                     total = lane_sum(row[k])
                     if lane() == 0:

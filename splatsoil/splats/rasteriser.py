@@ -221,11 +221,13 @@ class _Composite(torch.autograd.Function):
         bins: Bins = ctx.bins
         view: View = ctx.view
         n, channels = conics.shape[0], image.shape[2]
-        gradients = image.new_zeros((bins.ranks.shape[0], kernels_binning.MOMENTS + channels))
+        kernels = _kernels(image)
+        gradients = image.new_zeros((bins.ranks.shape[0], kernels.PARTS, kernels_binning.MOMENTS + channels))
         tensors = (image, transmittance, v_image, v_transmittance, gradients)
         inputs = [*_tile_arguments(bins, view), as_warp(bins.entries, wp.int32)]
         inputs += [as_warp(t.reshape(-1), wp.float32) for t in tensors]
-        _launch_tiles(_kernels(image).backward_kernel(channels), bins, inputs, image)
+        _launch_tiles(kernels.backward_kernel(channels), bins, inputs, image)
+        gradients = gradients.sum(dim=1) if kernels.PARTS > 1 else gradients[:, 0]
         shapes = ((n, 2), (n, 3), (n,), (n, channels))
         outputs = [image.new_zeros(shape) for shape in shapes]
         row = wp.types.vector(length=kernels_binning.MOMENTS + channels, dtype=wp.float32)

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 import trimesh
 
+from splatsoil import deterministic
 from splatsoil.mpm import Resolution, Solver
 from splatsoil.mpm.tool import Pose
 from splatsoil.soil.law import Law
@@ -54,3 +60,68 @@ def test_cuda_agrees_with_the_cpu() -> None:
     assert np.median(moved) < 5e-4
     np.testing.assert_allclose(here.mean(axis=1), there.mean(axis=1), atol=3e-4)
     np.testing.assert_allclose(force_here[10:, :, 0].mean(axis=0), force_there[10:, :, 0].mean(axis=0), rtol=0.03)
+
+
+def in_fresh_process(code: str, device: str) -> subprocess.CompletedProcess[str]:
+    """Run code where run-to-run equality is asked for, beside this file."""
+    words = [sys.executable, "-c", f"from test_cuda import plow\nDEVICE = {device!r}\n{code}"]
+    environment = {**os.environ, deterministic.VARIABLE: "1"}
+    return subprocess.run(
+        words, cwd=Path(__file__).parent, env=environment, capture_output=True, text=True, check=False
+    )
+
+
+def test_with_run_to_run_equality_kernels_compile_for_cuda() -> None:
+    """Warp refuses kernels whose additions it can't put in order; its compiler needs no GPU."""
+    done = in_fresh_process(
+        """
+import tempfile
+import warp as wp
+from splatsoil.mpm import substep, transfer
+from splatsoil.scene import relief
+from splatsoil.soil.law import Law
+
+assert wp.config.deterministic == wp.DeterministicMode.RUN_TO_RUN
+wp.init()
+stress = substep.make_stress_kernel(Law().update, True)
+for module in (transfer, substep, stress.module, relief):
+    (artifact,) = wp.compile_aot_module(module, arch=90, module_dir=tempfile.mkdtemp(), use_ptx=True)
+    # additions take a place in a list, which is then sorted, by compare and swap; ours have none of their own
+    assert "atom.global.cas" in open(artifact).read(), "nothing is put in order"
+""",
+        "cpu",
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_with_run_to_run_equality_cuda_gives_the_same_bits() -> None:
+    done = in_fresh_process(
+        """
+import numpy as np
+import torch
+from splatsoil.measurement import Camera
+from splatsoil.splats import Gaussians, rasterise
+
+(one, pull), (other, same_pull) = (plow(DEVICE, 25) for _ in range(2))
+assert np.array_equal(one, other) and np.array_equal(pull, same_pull)
+
+random = torch.Generator().manual_seed(0)
+def rand(*shape):
+    return torch.rand(*shape, generator=random)
+count = 2000
+made = [3.0 * rand(count, 3) - 1.5 + torch.tensor([0, 0, 4.0]), 0.05 + 0.1 * rand(count, 3), rand(count, 4) - 0.5]
+made += [0.1 + 0.5 * rand(count), rand(count, 3)]
+camera = Camera(96, 80, 60.0, 60.0, 48.0, 40.0, np.diag([1.0, -1.0, -1.0, 1.0]))
+weight = rand(80, 96, 3).to(DEVICE)
+def gradients():
+    leaves = [t.to(DEVICE).requires_grad_() for t in made]
+    return torch.autograd.grad((weight * rasterise(Gaussians(*leaves), camera).colour).sum(), leaves)
+for _ in range(5):
+    assert all(torch.equal(a, b) for a, b in zip(gradients(), gradients(), strict=True))
+assert gradients()[0].abs().sum() > 0
+""",
+        "cuda:0",
+    )
+    assert done.returncode == 0, done.stderr

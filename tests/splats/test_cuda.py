@@ -114,8 +114,15 @@ def launch_pixels(kernel: Any, bins: binning.Bins, inputs: list[Any], like: Tens
     wp.launch(kernel, dim=bins.tiles_x * bins.tiles_y * kernels_cuda.THREADS, inputs=[0, *inputs], device="cpu")
 
 
-def test_cuda_kernels_on_the_cpu(monkeypatch: pytest.MonkeyPatch, camera_at: CameraMaker, cloud: CloudMaker) -> None:
+@pytest.mark.parametrize("parts", [1, kernels_cuda.WARPS])
+def test_cuda_kernels_on_the_cpu(
+    parts: int, monkeypatch: pytest.MonkeyPatch, camera_at: CameraMaker, cloud: CloudMaker
+) -> None:
     """The same sorting and kernels, a warp being one lane wide: all but three warp-wide operations is tested."""
+    make = kernels_cuda.backward_kernel.__wrapped__
+    monkeypatch.setattr(kernels_cuda, "PARTS", parts)
+    monkeypatch.setattr(kernels_cuda, "_PARTS", wp.constant(wp.int32(parts)))
+    monkeypatch.setattr(kernels_cuda, "backward_kernel", make)
     for _, g, camera, antialias in scenes(camera_at, cloud):
         expected = draw_slowly(g, camera, antialias)
         with monkeypatch.context() as patch:
