@@ -1,0 +1,350 @@
+"""From photographs to a friction angle: each stage against its aim, and the table in the README.
+
+``splatsoil benchmark whole-path --page README.md`` takes about half an hour on two cores: the example sets are
+reconstructed, drawn from their true particles, simulated from them with one piece of the numerics changed at a time,
+and fitted as a user does. Parts are kept in the folder as they end, fits with all their evaluations, and a second call
+goes on from there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+from splatsoil.benchmarks import numerics
+from splatsoil.benchmarks._common import hush
+from splatsoil.benchmarks._speed import machine
+from splatsoil.benchmarks._speed.clock import repeated
+from splatsoil.benchmarks._speed.scenes import plough
+from splatsoil.benchmarks.landscape import floor
+from splatsoil.benchmarks.numerics import Truth
+from splatsoil.benchmarks.reconstruction import score
+
+from splatsoil.commands._output import only_json, print_json
+from splatsoil.comparison import Comparator
+from splatsoil.errors import RunError, SplatsoilError
+from splatsoil.files import check_folder, plain, read_json, write_json, write_text
+from splatsoil.measurement import Measurement
+from splatsoil.model import Model
+from splatsoil.mpm import PRESETS
+from splatsoil.reconstruction import reconstruct
+
+FORMAT = "splatsoil-whole-path/1"
+BEGIN = "<!-- whole path: written by `splatsoil benchmark whole-path`, what stands here is overwritten -->"
+END = "<!-- whole path: end -->"
+AWAY = 5.0
+"""Degrees by which the simulations beside the renderer's floor are wrong."""
+FIT_SEEDS = (0, 1, 2)
+EFFECT = "cohesion"
+"""What the damp set has and the base model hasn't."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table.
+
+    Attributes:
+        what: was measured.
+        measured: with units.
+        aim: in words.
+        met: whether it was reached; None: there is nothing to reach.
+    """
+
+    what: str
+    measured: str
+    aim: str = ""
+    met: bool | None = None
+
+    def line(self) -> str:
+        """In Markdown; what misses its aim is bold."""
+        shown = f"**{self.measured}**" if self.met is False else self.measured
+        return f"| {self.what} | {shown} | {self.aim} |"
+
+
+@dataclass(frozen=True)
+class Task:
+    """What parts are made with.
+
+    Attributes:
+        dry: a measurement set with true particles that the base model can explain.
+        damp: one whose soil is cohesive.
+        preset: of reconstruction and solver.
+        seeds: of the particles, for heights and shifts.
+        device: where to compute.
+        out: folder for parts and runs.
+    """
+
+    dry: Path
+    damp: Path
+    preset: str
+    seeds: int
+    device: str
+    out: Path
+
+
+def parts(task: Task) -> dict[str, Callable[[], list[Row]]]:
+    """All parts by name, in the table's order."""
+    return {
+        "reconstruction": lambda: reconstruction(task),
+        "renderer": lambda: renderer(task),
+        "solver": lambda: solver(task),
+        "simulation": lambda: simulation(task),
+        "angle": lambda: angle(task),
+        "missing-effect": lambda: missing_effect(task),
+    }
+
+
+def reconstruction(task: Task) -> list[Row]:
+    """Time, likeness to photographs that were set aside, and the surface against the true one."""
+    measurement = Measurement.load(task.dry)
+    found = score(task.dry, reconstruct(measurement, preset=task.preset, device=task.device), measurement)
+    assert found.rmse is not None and found.bias is not None
+    name, rmse, bias = measurement.name, 1e3 * found.rmse, 1e3 * found.bias
+    return [
+        Row(
+            f"reconstruction of `{name}`; photographs set aside",
+            f"{found.seconds:.0f} s; {found.psnr:.1f} dB",
+            "180 s; 30 dB",
+            found.seconds <= 180.0 and found.psnr >= 30.0,
+        ),
+        Row(
+            "its surface against the truth inside the bin: root mean square, mean",
+            f"{rmse:.1f} mm, {bias:+.1f} mm",
+            "4 mm, 1 mm",
+            rmse <= 4.0 and abs(bias) <= 1.0,
+        ),
+    ]
+
+
+def renderer(task: Task) -> list[Row]:
+    """The error of true particles drawn through the whole scene path, beside that of wrong simulations."""
+    truth = Truth.load(task.dry)
+    made = reconstruct(truth.measurement, preset=task.preset, device=task.device)
+    frames, least = floor(truth, made, task.device)
+    model = Model(truth.measurement, made, preset=task.preset, device=task.device)
+    comparator = Comparator(truth.measurement, surface=made.surface, frames=frames)
+    off = []
+    for by in (-AWAY, AWAY):
+        images = model.predict({"friction_angle": truth.values["friction_angle"] + by}, 0).images
+        off.append(comparator.compare(images))
+    shown = ", ".join(map(str, frames[1:]))
+    halves = [least.loss / wrong.loss for wrong in off]
+    return [
+        Row(
+            f"true particles drawn, frames {shown}, against simulations {AWAY:g}° too weak and too strong: loss",
+            f"{least.loss:.3f} against {off[0].loss:.3f} and {off[1].loss:.3f}",
+            "less than half",
+            max(halves) < 0.5,
+        ),
+        Row(
+            "the same, raw colour error",
+            f"{1e5 * least.rgb:.0f} against {1e5 * off[0].rgb:.0f} and {1e5 * off[1].rgb:.0f} · 10⁻⁵",
+        ),
+    ]
+
+
+def solver(task: Task) -> list[Row]:
+    """Heights and best angle against an independent solver, and how far numerics shift the angle."""
+    arguments = [([folder], task.preset, task.seeds, task.device) for folder in (task.dry, task.damp)]
+    with ProcessPoolExecutor(2, get_context("spawn")) as pool:
+        jobs = [pool.submit(numerics.run, *each) for each in arguments]
+        found = {name: entry for job in jobs for name, entry in job.result()["sets"].items()}
+    rows = []
+    for name, entry in found.items():
+        errors, true = entry["rmse_mm"].values(), entry["true_angle"]
+        gain = 100.0 * entry["volume"][1]
+        rows.append(
+            Row(
+                f"from the true particles of `{name}`: heights; best angle of a scan (true {true:g}°); volume gained",
+                f"{min(errors):.1f} to {max(errors):.1f} mm; {entry['best_angle']:.1f}°; {gain:+.2f} %",
+                "4 mm; within 2°; 0.5 %",
+                max(errors) <= 4.0 and abs(entry["best_angle"] - true) <= 2.0 and gain <= 0.5,
+            )
+        )
+    for name, entry in found.items():
+        shifts = entry["shifts"]
+        rows.append(
+            Row(
+                f"shift of the angle by {', '.join(shifts)} (`{name}`, preset `{task.preset}`)",
+                ", ".join(f"{by:+.1f}°" for by in shifts.values()),
+                "1° each",
+                all(abs(by) <= 1.0 for by in shifts.values()),
+            )
+        )
+    return rows
+
+
+def simulation(task: Task) -> list[Row]:
+    """Seconds of one run."""
+    scene = plough(task.dry, task.preset)
+    took = repeated(lambda: scene.run(task.device), 2, task.device)
+    where = "one core" if task.device == "cpu" else task.device
+    return [Row(f"one simulation, {where}", f"{took.median:.1f} s", "20 s", took.median <= 20.0)]
+
+
+def angle(task: Task) -> list[Row]:
+    """The commands that a user gives, for three seeds."""
+    true = Truth.load(task.dry).values["friction_angle"]
+    # only a run that hasn't begun can be timed
+    fresh = not (task.out / "runs" / f"{task.dry.name}-0").exists()
+    began = time.monotonic()
+    fits = []
+    seconds = 0.0
+    for seed in FIT_SEEDS:
+        fits.append(_fitted(task, task.dry, f"{task.dry.name}-{seed}", "run", "--seed", str(seed)))
+        seconds = seconds or time.monotonic() - began
+    # Linux counts in KiB, macOS in bytes
+    memory = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+    angles = [fit["parameters"]["friction_angle"] for fit in fits]
+    stds = sorted(found["std"] for found in angles)
+    estimates = ", ".join(f"{found['estimate']:.1f}" for found in angles)
+    rows = [
+        Row(
+            f"friction angle of `{task.dry.name}` from photographs alone (true {true:g}°), seeds "
+            f"{', '.join(map(str, FIT_SEEDS))}",
+            f"{estimates} ± {stds[0]:.1f} to {stds[-1]:.1f}°",
+            "within 2°",
+            all(abs(found["estimate"] - true) <= 2.0 for found in angles),
+        )
+    ]
+    if fresh:
+        rows.append(
+            Row(
+                "`splatsoil run` (what `make demo` does after the set-up); its largest process",
+                f"{seconds / 60.0:.1f} min; {memory / 2**30:.1f} GiB",
+                "8 min; 2 GiB",
+                seconds <= 480.0 and memory <= 2**31,
+            )
+        )
+    return rows
+
+
+def missing_effect(task: Task) -> list[Row]:
+    """The damp set under the base model and with what it lacks, beside the renderer's floor."""
+    name = task.damp.name
+    base = _fitted(task, task.damp, f"{name}-base", "fit")["loss"]
+    added = _fitted(task, task.damp, f"{name}-{EFFECT}", "fit", "--with", EFFECT)["loss"]
+    truth = Truth.load(task.damp)
+    least = floor(truth, reconstruct(truth.measurement, preset=task.preset, device=task.device), task.device)[1].loss
+    return [
+        Row(
+            f"loss of `{name}`: base model, with {EFFECT}, true particles drawn",
+            f"{base:.3f}, {added:.3f}, {least:.3f}",
+            f"falls with {EFFECT}, towards the last",
+            added < base and base > 1.5 * least,
+        )
+    ]
+
+
+def _fitted(task: Task, folder: Path, name: str, command: str, *options: str) -> dict[str, Any]:
+    """``fit.json`` of a command in a process of its own; one that ended already isn't repeated.
+
+    Raises:
+        RunError: the command failed.
+    """
+    run = task.out / "runs" / name
+    words = [command, str(folder), "--run", str(run), "--preset", task.preset, "--device", task.device, *options]
+    done = subprocess.run(
+        [sys.executable, "-m", "splatsoil", *words],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHONUNBUFFERED": "1"},
+    )
+    if done.returncode:
+        raise RunError(f"splatsoil {' '.join(words)}: {' '.join(done.stderr.split())[-300:]}")
+    return dict(read_json(run / "fit.json"))
+
+
+def table(rows: Sequence[Row]) -> str:
+    """Markdown."""
+    return "\n".join(["| | measured | aim |", "|---|---|---|", *(row.line() for row in rows)])
+
+
+def written(page: str, rows: Sequence[Row], made: Mapping[str, str]) -> str:
+    """A page with the table between its two lines.
+
+    Raises:
+        RunError: the page has no such lines.
+    """
+    if page.count(BEGIN) != 1 or page.count(END) != 1:
+        raise RunError(f"the page has no lines {BEGIN!r} and {END!r}, once each, to write between")
+    head, _, rest = page.partition(BEGIN)
+    tail = rest.partition(END)[2]
+    told = f"On {str(made['made'])[:10]}: {machine.sentence(dict(made))}"
+    return f"{head}{BEGIN}\n{table(rows)}\n\n{told}\n{END}{tail}"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure the parts that are asked for, print the table, and write it into a page."""
+    parser = argparse.ArgumentParser(prog="splatsoil benchmark whole-path", description=__doc__)
+    parser.add_argument("--dry", type=Path, default=Path("examples/plow-dry"), help="set that the base model explains")
+    parser.add_argument("--damp", type=Path, default=Path("examples/plow-damp"), help="set with cohesive soil")
+    parser.add_argument("--preset", default="small", choices=sorted(PRESETS))
+    parser.add_argument("--seeds", type=int, default=2, help="of the particles, for heights and shifts")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--only", nargs="+", metavar="PART", help="parts to measure; all by default")
+    parser.add_argument("--out", type=Path, default=Path("runs/whole-path"))
+    parser.add_argument("--page", type=Path, help="write the table into this page")
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+    options = parser.parse_args(arguments)
+    hush()
+    task = Task(options.dry, options.damp, options.preset, options.seeds, options.device, options.out)
+    known = parts(task)
+    unknown = sorted(set(options.only or ()) - set(known))
+    if unknown:
+        parser.error(f"part {unknown[0]!r} is not among {', '.join(known)}")
+    try:
+        with only_json() if options.json else nullcontext():
+            return _run(options, task)
+    except SplatsoilError as error:
+        parser.error(" ".join(str(error).split()))
+
+
+def _run(options: argparse.Namespace, task: Task) -> int:
+    check_folder(task.out)
+    page = None
+    if options.page:
+        try:
+            page = options.page.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise RunError(f"{options.page}: cannot be read as text ({error})") from error
+    here = machine.describe(task.device)
+    if page is not None:
+        written(page, (), here)  # a page without a place for the table fails now, not in half an hour
+    todo = parts(task)
+    for name in todo if not options.only else options.only:
+        began = time.monotonic()
+        rows = todo[name]()
+        entry = {"format": FORMAT, "machine": here, "preset": task.preset, "seeds": task.seeds}
+        seconds = time.monotonic() - began
+        write_json(task.out / f"{name}.json", {**entry, "seconds": seconds, "rows": [asdict(row) for row in rows]})
+        print(f"{name}: {seconds:.0f} s", file=sys.stderr, flush=True)
+    rows = []
+    for name in todo:
+        stored = read_json(task.out / f"{name}.json") if (task.out / f"{name}.json").is_file() else {}
+        if stored.get("format") == FORMAT and machine.same(stored["machine"], here):
+            rows += [Row(**row) for row in stored["rows"]]
+    if page is not None:
+        write_text(options.page, written(page, rows, here))
+    if options.json:
+        print_json({"ok": True, "machine": here, "rows": plain([asdict(row) for row in rows])})
+    else:
+        print(table(rows))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,84 @@
+"""``splatsoil benchmark whole-path``: its table, the page it writes into, and its parts on few particles."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from splatsoil.benchmarks import whole_path
+from splatsoil.benchmarks.whole_path import BEGIN, END, Row, Task, table, written
+
+from splatsoil.cli import main as command_line
+from splatsoil.errors import RunError
+
+MADE = {
+    "made": "2026-01-02T03:04:05", "splatsoil": "0.1.0", "code": "abc", "processor": "a processor", "cores": "2",
+    "memory": "8 GiB", "system": "Linux", "load": "0.0",
+}  # fmt: skip
+
+
+def tiny(plow_dry: Path, plow_damp: Path, out: Path) -> Task:
+    return Task(plow_dry, plow_damp, "tiny", 1, "cpu", out)
+
+
+def test_what_misses_its_aim_is_bold() -> None:
+    lines = table([Row("a", "1", "2", True), Row("b", "3", "2", False), Row("c", "4")]).splitlines()
+    assert lines[2:] == ["| a | 1 | 2 |", "| b | **3** | 2 |", "| c | 4 |  |"]
+
+
+def test_only_what_stands_between_the_lines_is_written() -> None:
+    page = f"before\n{BEGIN}\nold\n{END}\nafter\n"
+    new = written(page, [Row("a", "1", "2", True)], MADE)
+    assert new.startswith(f"before\n{BEGIN}\n| | measured | aim |") and new.endswith(f"{END}\nafter\n")
+    assert "old" not in new and "| a | 1 | 2 |" in new and "On 2026-01-02: a processor" in new
+    assert written(new, [Row("a", "1", "2", True)], MADE) == new
+    with pytest.raises(RunError, match="no lines"):
+        written("some other page", [], MADE)
+
+
+def test_the_readme_has_a_place_for_the_table() -> None:
+    page = Path(__file__).parents[2] / "README.md"
+    assert "| a | 1 |" in written(page.read_text(encoding="utf-8"), [Row("a", "1")], MADE)
+
+
+def test_a_page_without_a_place_is_told_before_anything_is_measured(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("mine")
+    assert command_line(["benchmark", "whole-path", "--page", str(page), "--out", str(tmp_path / "out")]) == 2
+    assert "no lines" in capsys.readouterr().err
+    assert page.read_text() == "mine" and not list((tmp_path / "out").glob("*.json"))
+
+
+def test_parts_are_kept_and_put_together(
+    plow_dry: Path, plow_damp: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = {"angle": [Row("second", "2")], "reconstruction": [Row("first", "1", "2", True)]}
+    monkeypatch.setattr(
+        whole_path, "parts", lambda task: {n: (lambda n=n: made[n]) for n in ("reconstruction", "angle")}
+    )
+    page = tmp_path / "page.md"
+    page.write_text(f"{BEGIN}\n{END}\n")
+    sets = ["--dry", str(plow_dry), "--damp", str(plow_damp)]
+    words = ["benchmark", "whole-path", *sets, "--out", str(tmp_path), "--page", str(page), "--only"]
+    assert command_line([*words, "angle"]) == 0
+    capsys.readouterr()
+    assert command_line([*words, "reconstruction", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert [row["what"] for row in told["rows"]] == ["first", "second"]
+    assert page.read_text().index("| first | 1 | 2 |") < page.read_text().index("| second | 2 |")
+
+
+@pytest.mark.slow
+def test_reconstruction_renderer_and_simulation_reach_their_aims_even_with_few_particles(
+    plow_dry: Path, plow_damp: Path, tmp_path: Path
+) -> None:
+    task = tiny(plow_dry, plow_damp, tmp_path)
+    rows = [*whole_path.reconstruction(task), *whole_path.simulation(task)]
+    assert len(rows) == 3 and rows[2].met
+    loss, raw = whole_path.renderer(task)
+    least, weak, strong = (float(word) for word in loss.measured.replace("and", "against").split("against"))
+    assert 0.0 < least < min(weak, strong) and loss.met == (least < 0.5 * min(weak, strong))
+    assert raw.met is None
