@@ -63,7 +63,7 @@ def _measure(folder: Path, preset: str, device: str, repeats: int, wanted: bool)
     environment = {**os.environ, deterministic.VARIABLE: str(int(wanted))}
     done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
-        raise SimulationError(f"with {deterministic.VARIABLE}={int(wanted)}: {done.stderr.strip().splitlines()[-1]}")
+        raise SimulationError(f"with {deterministic.VARIABLE}={int(wanted)}: {' '.join(done.stderr.split())[-300:]}")
     found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return found
 

@@ -125,6 +125,7 @@ def contact_forces(
         normal = particles.gap_normal[p]
         slip = velocity - tool_velocity(pose, x)
         closing = wp.dot(slip, normal)
+        # not "+=", which Warp takes for an atomic addition; each place is one thread's
         drift = particles.drift[p] + dt * slip
         particles.drift[p] = drift
         gap = particles.gap[p] + dt * closing
