@@ -3,7 +3,7 @@
 ``splatsoil benchmark whole-path --page README.md`` takes about half an hour on two cores: the example sets are
 reconstructed, drawn from their true particles, simulated from them with one piece of the numerics changed at a time,
 and fitted as a user does. Parts are kept in the folder as they end, fits with all their evaluations, and a second call
-goes on from there.
+goes on from there; a part that is asked for by name is measured again.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import resource
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
@@ -68,8 +68,8 @@ class Row:
 
     def line(self) -> str:
         """In Markdown; what misses its aim is bold."""
-        shown = f"**{self.measured}**" if self.met is False else self.measured
-        return f"| {self.what} | {shown} | {self.aim} |"
+        measured = self.measured.replace("-", "−")
+        return f"| {self.what} | {f'**{measured}**' if self.met is False else measured} | {self.aim} |"
 
 
 @dataclass(frozen=True)
@@ -157,7 +157,7 @@ def renderer(task: Task) -> list[Row]:
 def solver(task: Task) -> list[Row]:
     """Heights and best angle against an independent solver, and how far numerics shift the angle."""
     arguments = [([folder], task.preset, task.seeds, task.device) for folder in (task.dry, task.damp)]
-    with ProcessPoolExecutor(2, get_context("spawn")) as pool:
+    with ProcessPoolExecutor(2, get_context("spawn"), hush) as pool:
         jobs = [pool.submit(numerics.run, *each) for each in arguments]
         found = {name: entry for job in jobs for name, entry in job.result()["sets"].items()}
     rows = []
@@ -295,7 +295,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--preset", default="small", choices=sorted(PRESETS))
     parser.add_argument("--seeds", type=int, default=2, help="of the particles, for heights and shifts")
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--only", nargs="+", metavar="PART", help="parts to measure; all by default")
+    parser.add_argument("--only", nargs="+", metavar="PART", help="parts to measure, again if need be; all by default")
     parser.add_argument("--out", type=Path, default=Path("runs/whole-path"))
     parser.add_argument("--page", type=Path, help="write the table into this page")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
@@ -325,18 +325,15 @@ def _run(options: argparse.Namespace, task: Task) -> int:
     if page is not None:
         written(page, (), here)  # a page without a place for the table fails now, not in half an hour
     todo = parts(task)
-    for name in todo if not options.only else options.only:
+    kept = _kept(task, here, todo)
+    for name in options.only or [name for name in todo if name not in kept]:
         began = time.monotonic()
         rows = todo[name]()
         entry = {"format": FORMAT, "machine": here, "preset": task.preset, "seeds": task.seeds}
         seconds = time.monotonic() - began
         write_json(task.out / f"{name}.json", {**entry, "seconds": seconds, "rows": [asdict(row) for row in rows]})
         print(f"{name}: {seconds:.0f} s", file=sys.stderr, flush=True)
-    rows = []
-    for name in todo:
-        stored = read_json(task.out / f"{name}.json") if (task.out / f"{name}.json").is_file() else {}
-        if stored.get("format") == FORMAT and machine.same(stored["machine"], here):
-            rows += [Row(**row) for row in stored["rows"]]
+    rows = [row for found in _kept(task, here, todo).values() for row in found]
     if page is not None:
         write_text(options.page, written(page, rows, here))
     if options.json:
@@ -344,6 +341,18 @@ def _run(options: argparse.Namespace, task: Task) -> int:
     else:
         print(table(rows))
     return 0
+
+
+def _kept(task: Task, here: Mapping[str, str], names: Iterable[str]) -> dict[str, list[Row]]:
+    """Rows by part of what this code measured on this machine, with these options."""
+    found = {}
+    for name in names:
+        file = task.out / f"{name}.json"
+        stored = read_json(file) if file.is_file() else {}
+        same = stored.get("format") == FORMAT and machine.same(stored["machine"], here)
+        if same and (stored["preset"], stored["seeds"]) == (task.preset, task.seeds):
+            found[name] = [Row(**row) for row in stored["rows"]]
+    return found
 
 
 if __name__ == "__main__":

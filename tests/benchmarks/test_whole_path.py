@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -55,10 +56,14 @@ def test_a_page_without_a_place_is_told_before_anything_is_measured(
 def test_parts_are_kept_and_put_together(
     plow_dry: Path, plow_damp: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    made = {"angle": [Row("second", "2")], "reconstruction": [Row("first", "1", "2", True)]}
-    monkeypatch.setattr(
-        whole_path, "parts", lambda task: {n: (lambda n=n: made[n]) for n in ("reconstruction", "angle")}
-    )
+    made = {"reconstruction": [Row("first", "1", "2", True)], "angle": [Row("second", "-2")]}
+    done: list[str] = []
+
+    def part(name: str) -> list[Row]:
+        done.append(name)
+        return made[name]
+
+    monkeypatch.setattr(whole_path, "parts", lambda task: {name: partial(part, name) for name in made})
     page = tmp_path / "page.md"
     page.write_text(f"{BEGIN}\n{END}\n")
     sets = ["--dry", str(plow_dry), "--damp", str(plow_damp)]
@@ -68,7 +73,10 @@ def test_parts_are_kept_and_put_together(
     assert command_line([*words, "reconstruction", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert [row["what"] for row in told["rows"]] == ["first", "second"]
-    assert page.read_text().index("| first | 1 | 2 |") < page.read_text().index("| second | 2 |")
+    assert page.read_text().index("| first | 1 | 2 |") < page.read_text().index("| second | −2 |")
+    assert command_line(words[:-1]) == 0
+    assert done == ["angle", "reconstruction"], "what is there isn't measured again"
+    assert command_line([*words, "angle"]) == 0 and done[2:] == ["angle"]
 
 
 @pytest.mark.slow
