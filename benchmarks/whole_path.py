@@ -221,7 +221,7 @@ def angle(task: Task) -> list[Row]:
     if fresh:
         rows.append(
             Row(
-                "`splatsoil run` (what `make demo` does after the set-up); its largest process",
+                "all of it by `splatsoil run`, as `make demo` does after the set-up; its largest process",
                 f"{seconds / 60.0:.1f} min; {memory / 2**30:.1f} GiB",
                 "8 min; 2 GiB",
                 seconds <= 480.0 and memory <= 2**31,
@@ -315,15 +315,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(options: argparse.Namespace, task: Task) -> int:
     check_folder(task.out)
-    page = None
-    if options.page:
-        try:
-            page = options.page.read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            raise RunError(f"{options.page}: cannot be read as text ({error})") from error
     here = machine.describe(task.device)
-    if page is not None:
-        written(page, (), here)  # a page without a place for the table fails now, not in half an hour
+    if options.page:
+        written(_page(options.page), (), here)  # a page without a place for the table fails now, not in half an hour
     todo = parts(task)
     kept = _kept(task, here, todo)
     for name in options.only or [name for name in todo if name not in kept]:
@@ -334,13 +328,20 @@ def _run(options: argparse.Namespace, task: Task) -> int:
         write_json(task.out / f"{name}.json", {**entry, "seconds": seconds, "rows": [asdict(row) for row in rows]})
         print(f"{name}: {seconds:.0f} s", file=sys.stderr, flush=True)
     rows = [row for found in _kept(task, here, todo).values() for row in found]
-    if page is not None:
-        write_text(options.page, written(page, rows, here))
+    if options.page:
+        write_text(options.page, written(_page(options.page), rows, here))
     if options.json:
         print_json({"ok": True, "machine": here, "rows": plain([asdict(row) for row in rows])})
     else:
         print(table(rows))
     return 0
+
+
+def _page(file: Path) -> str:
+    try:
+        return file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise RunError(f"{file}: cannot be read as text ({error})") from error
 
 
 def _kept(task: Task, here: Mapping[str, str], names: Iterable[str]) -> dict[str, list[Row]]:

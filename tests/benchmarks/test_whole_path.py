@@ -61,6 +61,7 @@ def test_parts_are_kept_and_put_together(
 
     def part(name: str) -> list[Row]:
         done.append(name)
+        page.write_text(page.read_text() + "written meanwhile")
         return made[name]
 
     monkeypatch.setattr(whole_path, "parts", lambda task: {name: partial(part, name) for name in made})
@@ -73,6 +74,7 @@ def test_parts_are_kept_and_put_together(
     assert command_line([*words, "reconstruction", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert [row["what"] for row in told["rows"]] == ["first", "second"]
+    assert page.read_text().count("written meanwhile") == len(done)
     assert page.read_text().index("| first | 1 | 2 |") < page.read_text().index("| second | −2 |")
     assert command_line(words[:-1]) == 0
     assert done == ["angle", "reconstruction"], "what is there isn't measured again"
