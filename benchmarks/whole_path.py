@@ -10,14 +10,15 @@ from __future__ import annotations
 
 import argparse
 import os
-import resource
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
+from functools import cache
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ from splatsoil.benchmarks import numerics
 from splatsoil.benchmarks._common import hush
 from splatsoil.benchmarks._speed import machine
 from splatsoil.benchmarks._speed.clock import repeated
+from splatsoil.benchmarks._speed.page import between
 from splatsoil.benchmarks._speed.scenes import plough
 from splatsoil.benchmarks.landscape import floor
 from splatsoil.benchmarks.numerics import Truth
@@ -38,7 +40,7 @@ from splatsoil.files import check_folder, plain, read_json, write_json, write_te
 from splatsoil.measurement import Measurement
 from splatsoil.model import Model
 from splatsoil.mpm import PRESETS
-from splatsoil.reconstruction import reconstruct
+from splatsoil.reconstruction import Reconstruction, reconstruct
 
 FORMAT = "splatsoil-whole-path/1"
 BEGIN = "<!-- whole path: written by `splatsoil benchmark whole-path`, what stands here is overwritten -->"
@@ -108,7 +110,7 @@ def parts(task: Task) -> dict[str, Callable[[], list[Row]]]:
 def reconstruction(task: Task) -> list[Row]:
     """Time, likeness to photographs that were set aside, and the surface against the true one."""
     measurement = Measurement.load(task.dry)
-    found = score(task.dry, reconstruct(measurement, preset=task.preset, device=task.device), measurement)
+    found = score(task.dry, _reconstructed(task.dry, task.preset, task.device), measurement)
     assert found.rmse is not None and found.bias is not None
     name, rmse, bias = measurement.name, 1e3 * found.rmse, 1e3 * found.bias
     return [
@@ -130,7 +132,7 @@ def reconstruction(task: Task) -> list[Row]:
 def renderer(task: Task) -> list[Row]:
     """The error of true particles drawn through the whole scene path, beside that of wrong simulations."""
     truth = Truth.load(task.dry)
-    made = reconstruct(truth.measurement, preset=task.preset, device=task.device)
+    made = _reconstructed(task.dry, task.preset, task.device)
     frames, least = floor(truth, made, task.device)
     model = Model(truth.measurement, made, preset=task.preset, device=task.device)
     comparator = Comparator(truth.measurement, surface=made.surface, frames=frames)
@@ -160,6 +162,11 @@ def solver(task: Task) -> list[Row]:
     with ProcessPoolExecutor(2, get_context("spawn"), hush) as pool:
         jobs = [pool.submit(numerics.run, *each) for each in arguments]
         found = {name: entry for job in jobs for name, entry in job.result()["sets"].items()}
+    return of_solver(found, task.preset)
+
+
+def of_solver(found: Mapping[str, Any], preset: str) -> list[Row]:
+    """Rows of what `splatsoil.benchmarks.numerics` found, by set."""
     rows = []
     for name, entry in found.items():
         errors, true = entry["rmse_mm"].values(), entry["true_angle"]
@@ -176,7 +183,7 @@ def solver(task: Task) -> list[Row]:
         shifts = entry["shifts"]
         rows.append(
             Row(
-                f"shift of the angle by {', '.join(shifts)} (`{name}`, preset `{task.preset}`)",
+                f"shift of the angle by {', '.join(shifts)} (`{name}`, preset `{preset}`)",
                 ", ".join(f"{by:+.1f}°" for by in shifts.values()),
                 "1° each",
                 all(abs(by) <= 1.0 for by in shifts.values()),
@@ -198,15 +205,9 @@ def angle(task: Task) -> list[Row]:
     true = Truth.load(task.dry).values["friction_angle"]
     # only a run that hasn't begun can be timed
     fresh = not (task.out / "runs" / f"{task.dry.name}-0").exists()
-    began = time.monotonic()
-    fits = []
-    seconds = 0.0
-    for seed in FIT_SEEDS:
-        fits.append(_fitted(task, task.dry, f"{task.dry.name}-{seed}", "run", "--seed", str(seed)))
-        seconds = seconds or time.monotonic() - began
-    # Linux counts in KiB, macOS in bytes
-    memory = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
-    angles = [fit["parameters"]["friction_angle"] for fit in fits]
+    runs = [_fitted(task, task.dry, f"{task.dry.name}-{seed}", "run", "--seed", str(seed)) for seed in FIT_SEEDS]
+    seconds, memory = runs[0].seconds, runs[0].memory
+    angles = [run.fit["parameters"]["friction_angle"] for run in runs]
     stds = sorted(found["std"] for found in angles)
     estimates = ", ".join(f"{found['estimate']:.1f}" for found in angles)
     rows = [
@@ -233,10 +234,10 @@ def angle(task: Task) -> list[Row]:
 def missing_effect(task: Task) -> list[Row]:
     """The damp set under the base model and with what it lacks, beside the renderer's floor."""
     name = task.damp.name
-    base = _fitted(task, task.damp, f"{name}-base", "fit")["loss"]
-    added = _fitted(task, task.damp, f"{name}-{EFFECT}", "fit", "--with", EFFECT)["loss"]
+    base = _fitted(task, task.damp, f"{name}-base", "fit").fit["loss"]
+    added = _fitted(task, task.damp, f"{name}-{EFFECT}", "fit", "--with", EFFECT).fit["loss"]
     truth = Truth.load(task.damp)
-    least = floor(truth, reconstruct(truth.measurement, preset=task.preset, device=task.device), task.device)[1].loss
+    least = floor(truth, _reconstructed(task.damp, task.preset, task.device), task.device)[1].loss
     return [
         Row(
             f"loss of `{name}`: base model, with {EFFECT}, true particles drawn",
@@ -247,25 +248,45 @@ def missing_effect(task: Task) -> list[Row]:
     ]
 
 
-def _fitted(task: Task, folder: Path, name: str, command: str, *options: str) -> dict[str, Any]:
-    """``fit.json`` of a command in a process of its own; one that ended already isn't repeated.
+@cache
+def _reconstructed(folder: Path, preset: str, device: str) -> Reconstruction:
+    return reconstruct(Measurement.load(folder), preset=preset, device=device)
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a command left.
+
+    Attributes:
+        fit: its ``fit.json``.
+        seconds: of the whole command.
+        memory: of its largest process, bytes.
+    """
+
+    fit: Mapping[str, Any]
+    seconds: float
+    memory: int
+
+
+def _fitted(task: Task, folder: Path, name: str, command: str, *options: str) -> Run:
+    """A command in a process of its own; evaluations of a run that began before aren't repeated.
 
     Raises:
         RunError: the command failed.
     """
     run = task.out / "runs" / name
     words = [command, str(folder), "--run", str(run), "--preset", task.preset, "--device", task.device, *options]
-    done = subprocess.run(
-        [sys.executable, "-m", "splatsoil", *words],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-        check=False,
-        env={**os.environ, "PYTHONUNBUFFERED": "1"},
-    )
-    if done.returncode:
-        raise RunError(f"splatsoil {' '.join(words)}: {' '.join(done.stderr.split())[-300:]}")
-    return dict(read_json(run / "fit.json"))
+    began = time.monotonic()
+    with tempfile.TemporaryFile("w+") as errors:
+        started = subprocess.Popen(
+            [sys.executable, "-m", "splatsoil", *words], stdout=subprocess.DEVNULL, stderr=errors
+        )
+        _, status, used = os.wait4(started.pid, 0)
+        started.returncode = os.waitstatus_to_exitcode(status)
+        errors.seek(0)
+        if started.returncode:
+            raise RunError(f"splatsoil {' '.join(words)}: {' '.join(errors.read().split())[-300:]}")
+    return Run(read_json(run / "fit.json"), time.monotonic() - began, 1024 * used.ru_maxrss)  # Linux counts in KiB
 
 
 def table(rows: Sequence[Row]) -> str:
@@ -279,12 +300,8 @@ def written(page: str, rows: Sequence[Row], made: Mapping[str, str]) -> str:
     Raises:
         RunError: the page has no such lines.
     """
-    if page.count(BEGIN) != 1 or page.count(END) != 1:
-        raise RunError(f"the page has no lines {BEGIN!r} and {END!r}, once each, to write between")
-    head, _, rest = page.partition(BEGIN)
-    tail = rest.partition(END)[2]
     told = f"On {str(made['made'])[:10]}: {machine.sentence(dict(made))}"
-    return f"{head}{BEGIN}\n{table(rows)}\n\n{told}\n{END}{tail}"
+    return between(page, BEGIN, END, f"{table(rows)}\n\n{told}")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -55,11 +55,20 @@ def replaced(page: str, kind: str, new: str) -> str:
     Raises:
         RunError: the page has no place for the section.
     """
-    pattern = re.compile(f"{re.escape(begin(kind))}\n.*?{re.escape(end(kind))}", re.DOTALL)
+    return between(page, begin(kind), end(kind), new)
+
+
+def between(page: str, first: str, last: str, new: str) -> str:
+    """The page with what stands between two lines replaced.
+
+    Raises:
+        RunError: the page has no such lines.
+    """
+    pattern = re.compile(f"{re.escape(first)}\n.*?{re.escape(last)}", re.DOTALL)
     found = pattern.search(page)
     if found is None:
-        raise RunError(f"the page has no lines {begin(kind)!r} and {end(kind)!r} to write between; write another page")
-    return f"{page[: found.start()]}{begin(kind)}\n{new}\n{end(kind)}{page[found.end() :]}"
+        raise RunError(f"the page has no lines {first!r} and {last!r} to write between; write another page")
+    return f"{page[: found.start()]}{first}\n{new}\n{last}{page[found.end() :]}"
 
 
 def current(file: Path) -> str:

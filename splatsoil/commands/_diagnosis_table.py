@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import isfinite
 from typing import Any
 
 
@@ -11,21 +12,23 @@ def show(result: dict[str, Any]) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from splatsoil.report.words import symbol
+    from splatsoil.inverse.criticism.words import amount
+
+    def known(value: float | None, std: float, unit: str) -> str:
+        return "nothing is seen" if value is None or not isfinite(value) else amount(value, std, unit)
 
     table = Table(title=f"effects that are off, in {escape(str(result['fit']))}", title_justify="left")
     for column in ("effect", "verdict", "z", "p", "estimate", "smallest detectable", "predicted fall", "achieved"):
         table.add_column(column, justify="left" if column in ("effect", "verdict") else "right")
     for e in result["effects"]:
-        unit = symbol(e["unit"])
         achieved = f"{e['achieved_fall']:.4g}" if "achieved_fall" in e else ""
         table.add_row(
             escape(e["name"]),
             e["verdict"],
             f"{e['z']:.1f}",
             f"{e['p']:.2g}",
-            _amount(e["estimate"], e["std"], unit),
-            _amount(e["mde"], None, unit),
+            known(e["estimate"], e["std"] or 0.0, e["unit"]),
+            known(e["mde"], 0.0, e["unit"]),
             f"{e['predicted_fall']:.4g}",
             achieved,
         )
@@ -39,15 +42,3 @@ def show(result: dict[str, Any]) -> None:
     console.print(
         f"{result['simulations']} simulations, {result['simulated_now']} of them new, {result['seconds']:.0f} s"
     )
-
-
-def _amount(value: float | None, std: float | None, unit: str) -> str:
-    from math import isfinite
-
-    from splatsoil.report.words import with_std
-
-    if value is None or not isfinite(value):
-        return "nothing is seen"
-    if std is None:
-        return f"{value:.3g}{unit}"
-    return (" ± ".join(with_std(value, std)) if isfinite(std) else f"{value:.3g}") + unit

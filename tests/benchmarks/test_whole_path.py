@@ -81,6 +81,34 @@ def test_parts_are_kept_and_put_together(
     assert command_line([*words, "angle"]) == 0 and done[2:] == ["angle"]
 
 
+def test_what_the_solver_misses_is_seen() -> None:
+    good = {"true_angle": 36.0, "best_angle": 37.5, "rmse_mm": {"50": 1.9, "199": 3.9}, "volume": (-0.01, 0.004)}
+    shifts = {"half the step": 0.9, "finer cells": -1.0}
+    rows = whole_path.of_solver({"sand": {**good, "shifts": shifts}}, "small")
+    assert [row.met for row in rows] == [True, True]
+    for change in ({"best_angle": 38.1}, {"best_angle": 33.9}, {"rmse_mm": {"50": 4.1}}, {"volume": (0.0, 0.006)}):
+        assert whole_path.of_solver({"sand": {**good, "shifts": {}, **change}}, "small")[0].met is False, change
+    assert whole_path.of_solver({"sand": {**good, "shifts": {"a": 0.0, "b": -1.1}}}, "small")[1].met is False
+
+
+def test_what_fits_miss_is_seen(
+    plow_dry: Path, plow_damp: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def rows(estimates: tuple[float, ...], seconds: float, memory: int) -> list[bool | None]:
+        found = iter({"parameters": {"friction_angle": {"estimate": e, "std": 0.5}}} for e in estimates)
+        monkeypatch.setattr(whole_path, "_fitted", lambda *words: whole_path.Run(next(found), seconds, memory))
+        return [row.met for row in whole_path.angle(tiny(plow_dry, plow_damp, tmp_path))]
+
+    assert rows((34.1, 36.0, 37.9), 479.0, 2**31) == [True, True]
+    assert rows((34.1, 36.0, 38.1), 481.0, 2**30) == [False, False]
+    assert rows((33.9, 36.0, 36.0), 1.0, 2**31 + 1) == [False, False]
+
+
+def test_a_command_that_fails_is_told(plow_dry: Path, plow_damp: Path, tmp_path: Path) -> None:
+    with pytest.raises(RunError, match="budget"):
+        whole_path._fitted(tiny(plow_dry, plow_damp, tmp_path), plow_dry, "run", "fit", "--budget", "0")
+
+
 @pytest.mark.slow
 def test_reconstruction_renderer_and_simulation_reach_their_aims_even_with_few_particles(
     plow_dry: Path, plow_damp: Path, tmp_path: Path
