@@ -12,8 +12,9 @@ fine shape after a tool has passed is chance:
 - Each scale is measured in units of what a model without any motion would leave: 0 is perfect, 1 is as good as no
   model.
 
-Only the bed's interior counts, and pixels in which either picture shows the tool do not: where soil meets the tool, a
-millimetre decides what is seen. Where the tool stood at frame 0, pictures are compared as they are.
+Only the bed's interior counts, and the crests from which soil may stand out, and pixels in which either picture shows
+the tool do not: where soil meets the tool, a millimetre decides what is seen. Where the tool stood at frame 0, pictures
+are compared as they are.
 """
 
 from __future__ import annotations
@@ -24,13 +25,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+import torch
 from scipy.ndimage import binary_dilation, binary_erosion
 
 from splatsoil.errors import ParameterError
-from splatsoil.measurement import Camera, Measurement
+from splatsoil.measurement import Measurement
 from splatsoil.reconstruction.height_field import HeightField
 from splatsoil.robust_loss import robust_losses
-from splatsoil.scene import ToolBody, silhouette
+from splatsoil.scene import Relief, ToolBody, ground_of_pixels, silhouette
 
 FloatArray = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
@@ -43,6 +45,9 @@ PATCH = 0.04
 
 MARGIN = 0.02
 """Strip along the walls that is left out, m."""
+
+RISE = 0.5
+"""How far heaps stand out from a crest behind which nothing of the bed is seen, as a share of the tool's width."""
 
 _FEWEST = 12
 """Pixels a block needs."""
@@ -99,7 +104,7 @@ class Comparator:
     Args:
         measurement: video, cameras, bed, tool.
         surface: the undisturbed surface, to know which pixels show the bed.
-        level: its mean height in m, instead of the surface; by default the middle of the bed's box.
+        level: a height in m all over, instead of the surface; by default the middle of the bed's box.
         frames: frames to compare; all from the first on by default. The first one in the video is what changes refer to
             and has no loss of its own.
         cameras: names; all by default.
@@ -108,8 +113,9 @@ class Comparator:
     Attributes:
         observed: (h, w, 3) undistorted photographs by camera and frame.
         before: (h, w, 3) by camera, the mean of all frames before anything moves.
-        interior: (h, w) by camera, pixels inside the bed.
-        plane: (h, w, 2) by camera, where each pixel's ray meets the surface's level, m.
+        ground: (h, w, 2) by camera, where each pixel's ray meets the undisturbed surface inside the bed, or passes
+            near over a crest, m; NaN elsewhere.
+        interior: (h, w) by camera, pixels that have such a place.
         silhouettes: (h, w) by camera and frame, the tool's, a little wider.
         patches: (h, w) by camera, the block that a pixel is in, or -1.
         noise: the robust loss that the cameras' noise alone leaves; None where it can't be told.
@@ -147,11 +153,8 @@ class Comparator:
             for c in self.cameras
             for f in (self.reference, *self.frames)
         }
-        if level is None:
-            middle = np.mean([measurement.bed.lower[2], measurement.bed.upper[2]])
-            level = float(middle if surface is None else np.nanmean(surface.height))
-        self.plane = {c: _on_plane(camera, level) for c, camera in self._views.items()}
-        self.interior = {c: self._inside(c) for c in self.cameras}
+        self.ground = self._places(_relief(measurement, surface, level))
+        self.interior = {c: np.isfinite(place[..., 0]) for c, place in self.ground.items()}
         self._still = {
             c: [f.undistorted_image() for f in measurement.pre_roll if f.camera_name == c] for c in self.cameras
         }
@@ -241,13 +244,12 @@ class Comparator:
         difference = np.clip(0.5 + gain * (observed - predicted), 0.0, 1.0)
         return np.concatenate([observed, predicted, difference], axis=1).astype(np.float32)
 
-    def _inside(self, camera: str) -> BoolImage:
-        """Pixels whose ray meets the level of the bed's surface inside its walls."""
+    def _places(self, relief: Relief) -> dict[str, FloatArray]:
+        """Where each pixel looks, a strip along the walls left out."""
         low, high = self.measurement.bed.lower[:2], self.measurement.bed.upper[:2]
         margin = min(MARGIN, 0.1 * float(np.min(high - low)))
-        point = self.plane[camera]
-        with np.errstate(invalid="ignore"):
-            return np.all((point > low + margin) & (point < high - margin), axis=-1)
+        rise = RISE * float(np.sort(self.measurement.tool.mesh.extents)[1])
+        return {c: ground_of_pixels(relief, view, low + margin, high - margin, rise) for c, view in self._views.items()}
 
     def _tool_silhouettes(self) -> dict[Key, BoolImage]:
         body, motion = ToolBody(self.measurement.tool.mesh), self.measurement.tool.motion
@@ -294,7 +296,7 @@ class Comparator:
         for camera in self.cameras:
             inside = self.interior[camera]
             cell = np.full((*inside.shape, 2), -1)
-            cell[inside] = np.clip(((self.plane[camera][inside] - low) / size).astype(int), 0, count - 1)
+            cell[inside] = np.clip(((self.ground[camera][inside] - low) / size).astype(int), 0, count - 1)
             flat = np.where(inside, cell[..., 1] * count[0] + cell[..., 0], -1)
             pixels = np.bincount(flat[inside], minlength=int(np.prod(count)))
             kept = np.flatnonzero(pixels >= _FEWEST)
@@ -323,7 +325,7 @@ class Comparator:
 
     def _pixels_per_metre(self, camera: str) -> float:
         """Of the bed's middle in the image."""
-        view, point = self._views[camera], self.plane[camera]
+        view, point = self._views[camera], self.ground[camera]
         inside = point[self.interior[camera]]
         if len(inside) == 0:
             raise ParameterError(f"camera {camera!r} does not see the inside of the bed")
@@ -374,14 +376,14 @@ def compare(measurement: Measurement, images: Mapping[Key, Image], **options: ob
     return Comparator(measurement, **options).compare(images)  # type: ignore[arg-type]
 
 
-def _on_plane(camera: Camera, level: float) -> FloatArray:
-    """(h, w, 2) where each pixel's ray meets a height; NaN where it does not."""
-    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    origins, directions = camera.rays(np.stack([x, y], axis=-1).reshape(-1, 2))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        reach = (level - origins[:, 2]) / directions[:, 2]
-        reach[~(reach > 0.0)] = np.nan
-        return (origins + directions * reach[:, None])[:, :2].reshape(camera.height, camera.width, 2)
+def _relief(measurement: Measurement, surface: HeightField | None, level: float | None) -> Relief:
+    """The surface; a level one where a level is given or nothing is known."""
+    bed = measurement.bed
+    if surface is None or level is not None:
+        middle = float(np.mean([bed.lower[2], bed.upper[2]]))
+        surface = HeightField.over(bed.lower, bed.upper, PATCH, middle if level is None else level)
+    height = np.where(np.isfinite(surface.height), surface.height, np.nanmean(surface.height))
+    return Relief.of_heights(torch.from_numpy(height), (float(surface.x[0]), float(surface.y[0])), surface.cell)
 
 
 def _log_ratios(image: Image) -> FloatArray:

@@ -30,7 +30,7 @@ def seen(comparator):
 
 def patch_of(comparator, camera, x, y):
     """Pixels of the bed near a place."""
-    return np.linalg.norm(comparator.plane[camera] - [x, y], axis=-1) < 0.06
+    return np.linalg.norm(comparator.ground[camera] - [x, y], axis=-1) < 0.06
 
 
 def test_perfect_prediction_leaves_nothing(comparator, seen):

@@ -146,7 +146,7 @@ class Bench:
             mask = seen.interior[camera] & ~tool
             residual = (seen.before[camera] - drawn[camera, first]).mean(axis=-1)
             rows.append(
-                rows_of(residual, slopes[camera, first].mean(axis=-1), mask, squares_of(seen.plane[camera][mask]))
+                rows_of(residual, slopes[camera, first].mean(axis=-1), mask, squares_of(seen.ground[camera][mask]))
             )
         return rows
 
@@ -261,7 +261,7 @@ class Bench:
             for row, frame in enumerate(frames):
                 mask = np.append(quiet[row], False)[seen.patches[camera]] & ~seen.silhouettes[camera, frame]
                 change = (seen.observed[camera, frame] - drawn[camera, frame] - before).mean(axis=-1)
-                squares = squares_of(seen.plane[camera][mask])
+                squares = squares_of(seen.ground[camera][mask])
                 ways = (row, 2 * row // len(frames), number)
                 groups = np.stack([*squares, *(np.full_like(squares[0], way) for way in ways)])
                 if mask.any():

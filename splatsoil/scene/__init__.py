@@ -1,8 +1,10 @@
 """From moved particles to pictures: Gaussians that ride on particles, lit by sun and sky, with the tool among them."""
 
 from splatsoil.scene.binding import Binding, bind
-from splatsoil.scene.estimate import LightEstimate, estimate_light, seen_colours, still_frames
+from splatsoil.scene.estimate import estimate_light, seen_colours, still_frames
+from splatsoil.scene.ground import ground_of_pixels
 from splatsoil.scene.light import Light, encoded, linear
+from splatsoil.scene.light_fit import LightEstimate
 from splatsoil.scene.lit import LitRelief, light_relief
 from splatsoil.scene.relief import Relief, relief_of_particles
 from splatsoil.scene.render import Layers, Posed, Scene
@@ -21,6 +23,7 @@ __all__ = [
     "bind",
     "encoded",
     "estimate_light",
+    "ground_of_pixels",
     "light_relief",
     "linear",
     "relief_of_particles",

@@ -1,32 +1,23 @@
-"""The light estimated from photographs of the undisturbed bed.
-
-Albedo varies from place to place and its blotches look like slopes; where a shadow ends, or a slope turns, brightness
-changes over millimetres while the albedo does not know of it. So differences of log brightness over a short distance
-are compared with those that a light predicts, with a robust loss: the tool's shadow, where there is one, gives the
-sun's direction by its edge and the sky's share by what is left inside it, and slopes add what they know. Photographs
-blur a shadow's edge, which would look like more sky: for the share, the edge itself is left out.
-"""
+"""The light estimated from photographs of the undisturbed bed: what they show of points all over it."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 import torch
 import torch.nn.functional as functional
 import warp as wp
-from scipy.optimize import minimize, minimize_scalar
 from torch import Tensor
 
 from splatsoil.measurement import Frame, Measurement
 from splatsoil.scene import kernels
-from splatsoil.scene.light import SOIL_REFLECTANCE, Light, linear
-from splatsoil.scene.lit import LitRelief, ceiling, direct_light, march_step, sun_on_points
+from splatsoil.scene.light import linear
+from splatsoil.scene.light_fit import FINEST, LAG, LightEstimate, Passing, fit_light
+from splatsoil.scene.lit import ceiling, march_step
 from splatsoil.scene.relief import Relief, grid_of
-from splatsoil.scene.sky import sky_openness
 from splatsoil.scene.tool import ToolBody
 from splatsoil.splats.warp_torch import as_warp, launch
 
@@ -35,39 +26,17 @@ FloatArray = npt.NDArray[np.float64]
 _CELLS = 200
 """Cells along the longer side of the bed at which colours are compared."""
 
-_FINEST = 0.004
-"""Smallest cell, m: about a pixel of the photographs the method was measured on."""
-
 _MARGIN = 0.03
 """Strip along the walls that is left out, m: walls shade it and hide it."""
-
-_LAG = 3
-"""Distance of compared cells: a shadow's edge is blurred over about two."""
 
 _BLUR = 1.5
 """How far photographs blur an edge, in their pixels: the eye's pixel and the interpolation between pixels."""
 
-_TOOL_REFLECTANCE = 0.2
-"""The tool's colour is not known yet; from black to bright metal this moves the sky's share by 0.01."""
+_CLEARANCE = 0.002
+"""Between the tool and soil that it has not touched yet, m."""
 
-_FEWEST_SHADED = 30
-"""Cells in the tool's shadow, beside its edge, from which the sky's share can be told."""
-
-
-@dataclass(frozen=True)
-class LightEstimate:
-    """A light and how well it explains what was seen.
-
-    Attributes:
-        light: the light.
-        explained: share of the (robust) spread of brightness differences that the light explains; near 0 means that the
-            photographs show neither shadow nor slope and the light is a guess.
-        shadowed: share of the bed's area that lies in the tool's shadow.
-    """
-
-    light: Light
-    explained: float
-    shadowed: float
+_PASSING = 3
+"""Frames with the tool in the air that are looked at, at most."""
 
 
 def still_frames(measurement: Measurement) -> list[Frame]:
@@ -120,7 +89,7 @@ def seen_colours(
 
 
 def estimate_light(measurement: Measurement, relief: Relief, body: ToolBody) -> LightEstimate:
-    """Sun and sky over a measurement set, from its photographs before anything moves.
+    """Sun and sky over a measurement set, from its photographs before the soil moves.
 
     Args:
         measurement: the set; its tool stands where its motion begins.
@@ -136,134 +105,49 @@ def estimate_light(measurement: Measurement, relief: Relief, body: ToolBody) -> 
     middle = 0.5 * (lower + upper)
     pixel = float(np.median([np.linalg.norm(v.camera.position - middle) / v.camera.fx for v in measurement.views]))
     across = float((points[1] - points[0]).norm())
-    return fit_light(points, colours, shape, relief, tool, blur=max(1, math.ceil(_BLUR * pixel / across)))
+    blur = max(1, math.ceil(_BLUR * pixel / across))
+    passing = [_passing(measurement, points, relief, body, frame) for frame in in_the_air(measurement, relief, body)]
+    return fit_light(points, colours, shape, relief, tool, blur=blur, passing=passing)
 
 
-def fit_light(
-    points: Tensor, colours: Tensor, shape: tuple[int, int], relief: Relief, tool: object, *, blur: int = 1
-) -> LightEstimate:
-    """The light that explains the colours of a grid of points on a surface.
-
-    Args:
-        points: (rows · columns, 3) points of a regular grid in x and y, row by row, m.
-        colours: (rows · columns, 3) linear colours; NaN where unknown.
-        shape: rows and columns.
-        relief: the surface.
-        tool: the tool's pose in the kernels' form.
-        blur: half width of a shadow's edge in the photographs, in rows and columns.
-    """
-    problem = _Problem(points, colours, shape, relief, tool)
-    grey = problem.brightness.mean(dim=1)
-    start = min(
-        (problem.cost(grey, azimuth, elevation, share), azimuth, elevation, share)
-        for elevation in (20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0)
-        for azimuth in np.arange(-180.0, 180.0, 10.0)
-        for share in (0.4, 0.6, 0.8)
-    )
-    first = np.array(start[1:])
-    simplex = first + np.array([[0, 0, 0], [6.0, 0, 0], [0, 5.0, 0], [0, 0, -0.1]])
-    found = minimize(
-        lambda v: problem.cost(grey, *v),
-        first,
-        method="Nelder-Mead",
-        options={"initial_simplex": simplex, "xatol": 0.02, "fatol": 1e-6, "maxfev": 250},
-    )
-    azimuth, elevation = float(found.x[0]), float(np.clip(found.x[1], 5.0, 89.9))
-    beside = problem.beside_edges(azimuth, elevation, blur)
-    ambient = [
-        minimize_scalar(
-            lambda a, c=channel: beside.cost(beside.brightness[:, c], azimuth, elevation, a),
-            bounds=(0.02, 0.98), method="bounded", options={"xatol": 1e-3},
-        ).x
-        for channel in range(3)
-    ]  # fmt: skip
-    level = torch.nanmedian(colours, dim=0).values.clamp_min(1e-3).cpu().numpy().astype(np.float64)
-    light = Light.from_angles(azimuth, elevation, np.array(ambient), level=level)
-    nothing = float(problem.spread(problem.differences(grey)))
-    shadowed = float(1.0 - problem.tool_light(light).mean())
-    return LightEstimate(light, 1.0 - float(found.fun) / max(nothing, 1e-12), shadowed)
+def in_the_air(measurement: Measurement, relief: Relief, body: ToolBody) -> list[int]:
+    """Some video frames after the first up to which the tool has touched no soil."""
+    motion, rate = measurement.tool.motion, measurement.frame_rate
+    times = np.union1d(motion.times, [f / rate for f in measurement.frames])
+    free = []
+    for time in times[times >= measurement.frames[0] / rate - 1e-9] if measurement.frames else ():
+        centres, _ = body.discs(*motion.pose(float(time)))
+        if float((centres[:, 2] - relief.sample(relief.height, centres)).min()) < _CLEARANCE:
+            break
+        free.append(float(time))
+    frames = [f for f in measurement.frames[1:] if free and f / rate <= free[-1] + 1e-9]
+    return sorted({frames[round(i)] for i in np.linspace(0, len(frames) - 1, min(_PASSING, len(frames)))})
 
 
-class _Problem:
-    """Robust fit of log-brightness differences on a grid."""
-
-    def __init__(
-        self,
-        points: Tensor,
-        colours: Tensor,
-        shape: tuple[int, int],
-        relief: Relief,
-        tool: object,
-        lag: int = _LAG,
-    ) -> None:
-        self.points, self.shape, self.relief, self.tool, self.lag = points, shape, relief, tool, lag
-        self.brightness = colours.clamp_min(1e-4).log()
-        openness, hidden = (relief.sample(share, points) for share in sky_openness(relief, tool))
-        # The soil and the tool in the sky's way send back half of level ground's light.
-        self.openness = openness
-        self.returned = 0.5 * (SOIL_REFLECTANCE * (1.0 - openness - hidden) + _TOOL_REFLECTANCE * hidden)
-        self._known: tuple[float, float, Tensor] | None = None
-        self.scale = 1.0
-        grey = self.differences(self.brightness.mean(dim=1))
-        self.scale = 1.4826 * float(grey[torch.isfinite(grey)].abs().median())
-
-    def differences(self, values: Tensor) -> Tensor:
-        """Differences over the lag along both axes of the grid."""
-        grid, lag = values.reshape(self.shape), self.lag
-        return torch.cat([(grid[lag:] - grid[:-lag]).reshape(-1), (grid[:, lag:] - grid[:, :-lag]).reshape(-1)])
-
-    def beside_edges(self, azimuth: float, elevation: float, blur: int) -> _Problem:
-        """The same without the shadow's edge, its blur taken off both sides, by differences that reach across.
-
-        Of a shadow too narrow for that, less is taken off; nothing where hardly any shadow is left then.
-        """
-        sun = self.tool_light(Light.from_angles(azimuth, elevation, 0.5)).reshape(1, 1, *self.shape)
-        known = torch.isfinite(self.brightness).all(dim=1).reshape(self.shape)
-        for width in range(min(blur, (min(self.shape) // 2 - _LAG) // 2), 0, -1):
-            highest, lowest = (functional.max_pool2d(sign * sun, 2 * width + 1, 1, width) for sign in (1.0, -1.0))
-            edge = (highest + lowest > 0.02)[0, 0]
-            if int(((sun[0, 0] < 0.02) & ~edge & known).sum()) >= _FEWEST_SHADED:
-                colours = self.brightness.exp()
-                colours[edge.reshape(-1)] = math.nan
-                return _Problem(self.points, colours, self.shape, self.relief, self.tool, lag=2 * width + _LAG)
-        return self
-
-    def spread(self, residual: Tensor) -> Tensor:
-        """Mean pseudo-Huber loss of the residuals that are known."""
-        known = residual[torch.isfinite(residual)]
-        return (torch.sqrt(1.0 + (known / self.scale) ** 2) - 1.0).mean()
-
-    def cost(self, brightness: Tensor, azimuth: float, elevation: float, ambient: float) -> float:
-        """Loss of a light; the sky's share is held between 0 and 1, the sun above the horizon."""
-        if not 5.0 <= elevation <= 89.9 or not 0.02 <= ambient <= 0.98:
-            return 1e3
-        direct = self._direct(azimuth, elevation)
-        e = ambient * self.openness + (1.0 - ambient) * direct + self.returned
-        return float(self.spread(self.differences(brightness - e.clamp_min(1e-3).log())))
-
-    def tool_light(self, light: Light) -> Tensor:
-        """Share of the sun that the tool lets through to each point."""
-        return sun_on_points(self._open(light), self.points, 0.25 * _FINEST)
-
-    def _open(self, light: Light) -> LitRelief:
-        """The relief with no shadow of its own: before anything has moved it is too gentle for one."""
-        everything = torch.ones_like(self.relief.height)
-        return LitRelief(self.relief, light, self.tool, everything, everything, everything[..., None].expand(-1, -1, 3))
-
-    def _direct(self, azimuth: float, elevation: float) -> Tensor:
-        """The sun's light on each point, 1 on level open ground; that of the last direction is kept."""
-        if self._known is None or self._known[:2] != (azimuth, elevation):
-            light = Light.from_angles(azimuth, elevation, 0.5)
-            self._known = (azimuth, elevation, direct_light(self._open(light), self.points, 0.25 * _FINEST))
-        return self._known[2]
+def _passing(measurement: Measurement, points: Tensor, relief: Relief, body: ToolBody, frame: int) -> Passing:
+    """What the video's cameras say of the points at a frame, compared with the same cameras' still frames."""
+    motion, rate = measurement.tool.motion, measurement.frame_rate
+    then, rest = (body.at(*motion.pose(time)) for time in (frame / rate, float(motion.times[0])))
+    still = still_frames(measurement)
+    changes = []
+    for name in measurement.cameras:
+        before = [f for f in still if f.frame is not None and f.camera_name == name]
+        after = [f for f in measurement.video if f.frame == frame and f.camera_name == name]
+        if before and after:
+            shown, known = (
+                seen_colours(points, frames, relief, tool)[0].clamp_min(1e-4).log()
+                for frames, tool in ((after, then), (before, rest))
+            )
+            changes.append(shown - known)
+    return Passing(then, torch.stack(changes).nanmean(dim=0) if changes else torch.full_like(points, math.nan))
 
 
 def _cells(relief: Relief, lower: FloatArray, upper: FloatArray) -> tuple[Tensor, tuple[int, int]]:
     """Points of a regular grid on the surface, away from the walls."""
     extent = upper[:2] - lower[:2]
     margin = min(_MARGIN, 0.1 * float(extent.min()))
-    size = max(_FINEST, float(extent.max()) / _CELLS)
-    nx, ny = (max(4 * _LAG, int((extent[k] - 2 * margin) / size)) for k in (0, 1))
+    size = max(FINEST, float(extent.max()) / _CELLS)
+    nx, ny = (max(4 * LAG, int((extent[k] - 2 * margin) / size)) for k in (0, 1))
     x = torch.linspace(float(lower[0] + margin), float(upper[0] - margin), nx, device=relief.device)
     y = torch.linspace(float(lower[1] + margin), float(upper[1] - margin), ny, device=relief.device)
     ys, xs = torch.meshgrid(y, x, indexing="ij")

@@ -1,5 +1,7 @@
 """The light is found again from colours it has made, over soil with blotches."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -7,7 +9,10 @@ import trimesh
 from scipy.ndimage import gaussian_filter
 
 from splatsoil.scene import Light, Relief, ToolBody, light_relief
-from splatsoil.scene.estimate import fit_light
+from splatsoil.scene.estimate import in_the_air
+from splatsoil.scene.light_fit import Passing, fit_light
+from splatsoil.synthetic import paper
+from splatsoil.synthetic.setups import staged_motion
 
 AZIMUTHS = [(145.0, 53.0, 0.6), (-60.0, 35.0, 0.4), (20.0, 65.0, 0.5)]
 
@@ -61,3 +66,50 @@ def test_a_shadow_too_narrow_for_the_blur_still_tells_the_sky(blur):
 def test_a_few_cells_with_a_wide_blur_tell_what_they_can():
     truth, what, _tool = seen(145.0, 53.0, 0.6, size=(14, 16), plate=(0.04, 0.03, 0.16))
     assert np.allclose(fit_light(*what, blur=8).light.ambient, truth.ambient, atol=0.1)
+
+
+def passed(truth, what, tool, plate):
+    """The change that the plate's shadow makes somewhere else, with noise of its own."""
+    points, _, _, relief, place = what
+    there = tool.at(np.eye(3), plate)
+    then, rest = (light_relief(relief, truth, p).irradiance(points, 0.001) for p in (there, place))
+    noise = torch.tensor(0.01 * np.random.default_rng(7).normal(size=tuple(then.shape)), dtype=torch.float32)
+    return Passing(there, (then / rest).log() + noise)
+
+
+@pytest.mark.parametrize(("azimuth", "elevation", "ambient"), AZIMUTHS)
+def test_a_shadow_that_comes_later_tells_the_light(azimuth, elevation, ambient):
+    # at rest the plate stands far away, and little but blotches is seen
+    truth, what, tool = seen(azimuth, elevation, ambient, plate=(0.4, 5.0, 0.21))
+    later = [passed(truth, what, tool, (x, 0.27, 0.19)) for x in (0.3, 0.4)]
+    found = fit_light(*what, passing=later)
+    angle = np.degrees(np.arccos(np.clip(found.light.direction @ truth.direction, -1.0, 1.0)))
+    assert angle < 2.0
+    assert np.allclose(found.light.ambient, truth.ambient, atol=0.03)
+    assert found.explained > 0.1
+    without = fit_light(*what)
+    assert abs(without.light.ambient - truth.ambient).max() > 0.1
+    unknown = Passing(later[0].tool, torch.full_like(later[0].change, np.nan))
+    assert np.array_equal(fit_light(*what, passing=[unknown]).light.ambient, without.light.ambient)
+
+
+def test_frames_with_the_tool_in_the_air():
+    setup = paper().resized(0.05)
+    level = 0.2 * np.ones_like(setup.surface.height)
+    relief = Relief.of_heights(torch.tensor(level), (0.0025, 0.0025), (0.005, 0.005))
+    measurement = replace(setup.experiment(), tool=replace(setup.tool, motion=motion(0.36)))
+    # The plate, 0.1 m long and tilted by 30°, comes down by 4 mm a frame: its lower edge is at the soil after 28.
+    reach = 0.05 * np.cos(np.radians(30.0)) + 0.005 * np.sin(np.radians(30.0))
+    touches = (0.36 - reach - 0.2) / 0.004
+    body = ToolBody(setup.tool.mesh)
+    air = in_the_air(measurement, relief, body)
+    assert air == [10, 20] and 20 < touches < 30
+    lower = replace(measurement, tool=replace(setup.tool, motion=motion(0.28)))
+    assert in_the_air(lower, relief, body) == []
+    higher = replace(measurement, tool=replace(setup.tool, motion=motion(0.48)))
+    assert in_the_air(higher, relief, body) == [10, 30, 50]
+
+
+def motion(height):
+    """Straight down."""
+    return staged_motion((0.5, 0.5, height), tilt=30.0, down=0.2, push=0.0, stages=(100, 1, 1, 1))
