@@ -87,7 +87,8 @@ def grain_albedo(
 def albedo_above(grains: Tensor, centres: Tensor, albedo: Tensor, spacing: float) -> Tensor:
     """Albedo (p, 3) of the surface over each particle, averaged over about a particle; arguments of `grain_albedo`."""
     k = min(16, len(centres))
-    away, index = cKDTree(centres[:, :2].cpu().numpy()).query(grains[:, :2].cpu().numpy(), k=k)
+    tree = cKDTree(centres[:, :2].cpu().numpy())
+    away, index = tree.query(grains[:, :2].cpu().numpy(), k=k, workers=torch.get_num_threads())
     distance = torch.from_numpy(away.reshape(len(grains), k)).to(grains.device)
     weight = torch.exp(-0.5 * (distance.square() - distance[:, :1].square()) / (0.5 * spacing) ** 2).float()
     near = albedo[torch.from_numpy(index.reshape(len(grains), k)).to(grains.device)]

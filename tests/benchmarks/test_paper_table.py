@@ -151,13 +151,14 @@ def test_the_protocol_is_the_papers() -> None:
     assert len(scene.views) == 40 and {(c.width, c.height) for c in scene.video.values()} == {(1280, 720)}
     assert {p.lower for p in _paper.SPACE} == {25.0} and {p.upper for p in _paper.SPACE} == {55.0}
     experiment = scene.experiment()
-    model = Resolution.derive(experiment, protocol.preset("model", protocol.cells))
-    truth = Resolution.derive(experiment, protocol.preset("truth", protocol.truth_cells))
-    assert model.cell == pytest.approx(1.0 / 32.0)
+    cells = (protocol.published_cells, protocol.cells, protocol.truth_cells)
+    theirs, ours, truth = (Resolution.derive(experiment, protocol.preset("some", c)) for c in cells)
+    assert theirs.cell == pytest.approx(1.0 / 32.0)
     # Finer, and no node of the one's is a node of the other's inside the bed.
-    assert truth.cell < 0.8 * model.cell
-    nodes = [np.arange(1, round(1.0 / r.cell)) * r.cell for r in (model, truth)]
-    assert np.abs(nodes[0][:, None] - nodes[1][None]).min() > 1e-4
+    assert truth.cell < 0.8 * ours.cell
+    for model in (theirs, ours):
+        nodes = [np.arange(1, round(1.0 / r.cell)) * r.cell for r in (model, truth)]
+        assert np.abs(nodes[0][:, None] - nodes[1][None]).min() > 1e-4
 
 
 def test_errors_are_counted(tmp_path: Path) -> None:
