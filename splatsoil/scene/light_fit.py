@@ -92,7 +92,13 @@ def fit_light(
         blur: half width of a shadow's edge in the photographs, in rows and columns.
         passing: what the tool's shadow did elsewhere.
     """
-    parts = [_Passed(_Sunlit(points, relief, p.tool), p.change) for p in passing if _tells(p)]
+    # An exposure that drifts changes all of the bed alike, the shadow little of it.
+    drifts = [p.change.nanmedian(dim=0).values for p in passing]
+    parts = [
+        _Passed(_Sunlit(points, relief, p.tool), p.change - d)
+        for p, d in zip(passing, drifts, strict=True)
+        if _tells(p)
+    ]
     problem = _Problem(_Sunlit(points, relief, tool), colours.clamp_min(1e-4).log(), shape, parts)
     start = min(
         (problem.cost(None, azimuth, elevation, share), azimuth, elevation, share)

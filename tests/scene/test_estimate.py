@@ -87,6 +87,8 @@ def test_a_shadow_that_comes_later_tells_the_light(azimuth, elevation, ambient):
     assert angle < 2.0
     assert np.allclose(found.light.ambient, truth.ambient, atol=0.03)
     assert found.explained > 0.1
+    brighter = [replace(p, change=p.change + 0.05) for p in later]
+    assert np.allclose(fit_light(*what, passing=brighter).light.ambient, found.light.ambient, atol=1e-3)
     without = fit_light(*what)
     assert abs(without.light.ambient - truth.ambient).max() > 0.1
     unknown = Passing(later[0].tool, torch.full_like(later[0].change, np.nan))
