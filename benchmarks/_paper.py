@@ -104,8 +104,8 @@ class Sight:
         resolution = Resolution.derive(measurement, protocol.preset("model", protocol.cells))
         self.model = Model(measurement, reconstruction, preset="paper", device=protocol.device)
         self.model.resolution = resolution
-        # The published loss looks at four frames: no others are drawn for it.
         coarser = Resolution.derive(measurement, protocol.preset("published", protocol.published_cells))
+        # The published loss looks at four frames: no others are drawn for it.
         self.few = self.model.variant(frames=(0, *FRAMES), resolution=coarser)
         # Patches of two cells: what is smaller is chance.
         self.comparator = Comparator(

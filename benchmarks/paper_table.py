@@ -1,6 +1,6 @@
 """The published table, again: friction angles of Hsiao and Kumar's scene from photographs of simulated sand.
 
-    splatsoil benchmark paper-table --device cuda:0 --picture-scale 0.25 --out runs/paper-table
+    splatsoil benchmark paper-table --device cuda:0 --picture-scale 0.5 --out runs/paper-table
 
 For each angle, worlds are simulated with other particles and a finer grid, whose nodes meet the model's at the walls
 only, and photographed by the path tracer. Each is reconstructed from its views, and each trial spends 10 evaluations on

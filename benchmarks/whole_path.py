@@ -9,10 +9,8 @@ goes on from there; a part that is asked for by name is measured again.
 from __future__ import annotations
 
 import argparse
-import os
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -248,6 +246,15 @@ def missing_effect(task: Task) -> list[Row]:
     ]
 
 
+# A process is said to be as large as the one that it began as a copy of, so a small one begins the command.
+_COUNTED = """
+import resource, subprocess, sys
+code = subprocess.run(sys.argv[1:], stdout=subprocess.DEVNULL).returncode
+print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
+sys.exit(code)
+"""
+
+
 @cache
 def _reconstructed(folder: Path, preset: str, device: str) -> Reconstruction:
     return reconstruct(Measurement.load(folder), preset=preset, device=device)
@@ -277,16 +284,13 @@ def _fitted(task: Task, folder: Path, name: str, command: str, *options: str) ->
     run = task.out / "runs" / name
     words = [command, str(folder), "--run", str(run), "--preset", task.preset, "--device", task.device, *options]
     began = time.monotonic()
-    with tempfile.TemporaryFile("w+") as errors:
-        started = subprocess.Popen(
-            [sys.executable, "-m", "splatsoil", *words], stdout=subprocess.DEVNULL, stderr=errors
-        )
-        _, status, used = os.wait4(started.pid, 0)
-        started.returncode = os.waitstatus_to_exitcode(status)
-        errors.seek(0)
-        if started.returncode:
-            raise RunError(f"splatsoil {' '.join(words)}: {' '.join(errors.read().split())[-300:]}")
-    return Run(read_json(run / "fit.json"), time.monotonic() - began, 1024 * used.ru_maxrss)  # Linux counts in KiB
+    counted = [sys.executable, "-c", _COUNTED, sys.executable, "-m", "splatsoil", *words]
+    done = subprocess.run(counted, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RunError(f"splatsoil {' '.join(words)}: {' '.join(done.stderr.split())[-300:]}")
+    # Linux counts in KiB, macOS in bytes
+    memory = int(done.stdout) * (1 if sys.platform == "darwin" else 1024)
+    return Run(read_json(run / "fit.json"), time.monotonic() - began, memory)
 
 
 def table(rows: Sequence[Row]) -> str:

@@ -26,7 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 import torch
-from scipy.ndimage import binary_dilation, binary_erosion
+from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_edt
 
 from splatsoil.errors import ParameterError
 from splatsoil.measurement import Measurement
@@ -80,7 +80,7 @@ class Comparison:
     Attributes:
         loss: the robust loss, all cameras and frames; 0 is perfect, 1 is as good as predicting no motion.
         losses: the robust loss by camera and frame; their mean is ``loss``.
-        rgb_mse: mean square colour difference (sRGB in [0, 1]) in the bed by camera and frame.
+        rgb_mse: mean square colour difference (sRGB in [0, 1]) in the bed and over its crests by camera and frame.
         blocks: (b,) mean change observed minus mean change predicted of each block, in grey levels of 255; 0 where a
             block cannot be seen (the tool hides it).
         labels: the blocks' places, in the same order.
@@ -116,6 +116,7 @@ class Comparator:
         ground: (h, w, 2) by camera, where each pixel's ray meets the undisturbed surface inside the bed, or passes
             near over a crest, m; NaN elsewhere.
         interior: (h, w) by camera, pixels that have such a place.
+        bed: (h, w) by camera, those of them whose ray meets the surface; the others look past a crest.
         silhouettes: (h, w) by camera and frame, the tool's, a little wider.
         patches: (h, w) by camera, the block that a pixel is in, or -1.
         noise: the robust loss that the cameras' noise alone leaves; None where it can't be told.
@@ -153,7 +154,9 @@ class Comparator:
             for c in self.cameras
             for f in (self.reference, *self.frames)
         }
-        self.ground = self._places(_relief(measurement, surface, level))
+        relief = _relief(measurement, surface, level)
+        self.ground = self._places(relief, RISE * float(np.sort(measurement.tool.mesh.extents)[1]))
+        self.bed = {c: np.isfinite(place[..., 0]) for c, place in self._places(relief, -1.0).items()}
         self.interior = {c: np.isfinite(place[..., 0]) for c, place in self.ground.items()}
         self._still = {
             c: [f.undistorted_image() for f in measurement.pre_roll if f.camera_name == c] for c in self.cameras
@@ -244,11 +247,10 @@ class Comparator:
         difference = np.clip(0.5 + gain * (observed - predicted), 0.0, 1.0)
         return np.concatenate([observed, predicted, difference], axis=1).astype(np.float32)
 
-    def _places(self, relief: Relief) -> dict[str, FloatArray]:
+    def _places(self, relief: Relief, rise: float) -> dict[str, FloatArray]:
         """Where each pixel looks, a strip along the walls left out."""
         low, high = self.measurement.bed.lower[:2], self.measurement.bed.upper[:2]
         margin = min(MARGIN, 0.1 * float(np.min(high - low)))
-        rise = RISE * float(np.sort(self.measurement.tool.mesh.extents)[1])
         return {c: ground_of_pixels(relief, view, low + margin, high - margin, rise) for c, view in self._views.items()}
 
     def _tool_silhouettes(self) -> dict[Key, BoolImage]:
@@ -267,7 +269,7 @@ class Comparator:
         shape = self.silhouettes[camera, self.reference]
         ratios = _log_ratios(self.before[camera])
         tool = ratios[binary_erosion(shape, iterations=4)]
-        soil = ratios[self.interior[camera] & ~shape]
+        soil = ratios[self.bed[camera] & ~shape]
         if len(tool) < 20 or len(soil) < 20:
             return None
         spread = 0.5 * (np.cov(tool.T) + np.cov(soil.T)) + 1e-6 * np.eye(2)
@@ -382,7 +384,8 @@ def _relief(measurement: Measurement, surface: HeightField | None, level: float 
     if surface is None or level is not None:
         middle = float(np.mean([bed.lower[2], bed.upper[2]]))
         surface = HeightField.over(bed.lower, bed.upper, PATCH, middle if level is None else level)
-    height = np.where(np.isfinite(surface.height), surface.height, np.nanmean(surface.height))
+    nearest = distance_transform_edt(~np.isfinite(surface.height), return_distances=False, return_indices=True)
+    height = surface.height[tuple(nearest)]
     return Relief.of_heights(torch.from_numpy(height), (float(surface.x[0]), float(surface.y[0])), surface.cell)
 
 

@@ -1,6 +1,7 @@
 """Losses and block residuals of pictures made from the measured ones, so that the right answer is known."""
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from splatsoil.comparison import Comparator, compare
 from splatsoil.errors import ParameterError
 from splatsoil.measurement import Measurement
+from splatsoil.reconstruction import HeightField
 
 FOLDER = Path(os.environ.get("SPLATSOIL_EXAMPLES", Path(__file__).parents[1] / "examples")) / "plow-dry"
 FRAMES = (0, 50, 100)
@@ -152,3 +154,25 @@ def test_what_is_missing_is_named(comparator, seen):
     seen["right", 50] = np.zeros((10, 10, 3), dtype=np.float32)
     with pytest.raises(ParameterError, match="frame 50"):
         comparator.compare(seen)
+
+
+def test_pixels_look_at_the_surface(comparator):
+    """A slope: where rays meet it, by hand; cells that nobody knows are as the ones beside them."""
+    measurement = comparator.measurement
+    bed, (x, y, rise) = measurement.bed, (0.1, -0.05, 0.1)
+    slope = HeightField.over(bed.lower, bed.upper, 0.005)
+    slope = replace(slope, height=rise + x * slope.points[..., 0] + y * slope.points[..., 1])
+    torn = slope.height.copy()
+    torn[40:43, 60:63] = np.nan
+    for surface, off in ((slope, 5e-4), (replace(slope, height=torn), 5e-3)):
+        found = Comparator(measurement, surface=surface, frames=(0, 50))
+        for name in found.cameras:
+            view = measurement.cameras[name].undistorted()
+            v, u = np.nonzero(found.bed[name])
+            origins, directions = view.rays(np.stack([u, v], axis=1) + 0.5)
+            normal = np.array([-x, -y, 1.0])
+            reach = (rise - origins @ normal) / (directions @ normal)
+            expected = (origins + reach[:, None] * directions)[:, :2]
+            assert len(u) > 5000
+            assert np.abs(found.ground[name][v, u] - expected).max() < off
+            assert np.all(found.interior[name][v, u])

@@ -62,12 +62,12 @@ def between(page: str, first: str, last: str, new: str) -> str:
     """The page with what stands between two lines replaced.
 
     Raises:
-        RunError: the page has no such lines.
+        RunError: the page has no such lines, or several.
     """
     pattern = re.compile(f"{re.escape(first)}\n.*?{re.escape(last)}", re.DOTALL)
     found = pattern.search(page)
-    if found is None:
-        raise RunError(f"the page has no lines {first!r} and {last!r} to write between; write another page")
+    if found is None or page.count(first) != 1 or page.count(last) != 1:
+        raise RunError(f"the page has no lines {first!r} and {last!r}, once each, to write between; write another page")
     return f"{page[: found.start()]}{first}\n{new}\n{last}{page[found.end() :]}"
 
 

@@ -143,7 +143,7 @@ class Bench:
         slopes = self.slopes(value, wanted, drawn)
         for camera in seen.cameras:
             tool = binary_dilation(seen.silhouettes[camera, first] | self._shade[camera], iterations=3)
-            mask = seen.interior[camera] & ~tool
+            mask = seen.bed[camera] & ~tool
             residual = (seen.before[camera] - drawn[camera, first]).mean(axis=-1)
             rows.append(
                 rows_of(residual, slopes[camera, first].mean(axis=-1), mask, squares_of(seen.ground[camera][mask]))

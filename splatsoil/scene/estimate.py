@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -32,8 +33,8 @@ _MARGIN = 0.03
 _BLUR = 1.5
 """How far photographs blur an edge, in their pixels: the eye's pixel and the interpolation between pixels."""
 
-_CLEARANCE = 0.002
-"""Between the tool and soil that it has not touched yet, m."""
+_CLEARANCE = 0.005
+"""Between the tool and soil that it has not touched yet, m: more than the surface is known to."""
 
 _PASSING = 3
 """Frames with the tool in the air that are looked at, at most."""
@@ -106,30 +107,45 @@ def estimate_light(measurement: Measurement, relief: Relief, body: ToolBody) -> 
     pixel = float(np.median([np.linalg.norm(v.camera.position - middle) / v.camera.fx for v in measurement.views]))
     across = float((points[1] - points[0]).norm())
     blur = max(1, math.ceil(_BLUR * pixel / across))
-    passing = [_passing(measurement, points, relief, body, frame) for frame in in_the_air(measurement, relief, body)]
+    passing = [
+        p for frame in in_the_air(measurement, relief, body) for p in _passing(measurement, points, relief, body, frame)
+    ]
     return fit_light(points, colours, shape, relief, tool, blur=blur, passing=passing)
 
 
 def in_the_air(measurement: Measurement, relief: Relief, body: ToolBody) -> list[int]:
-    """Some video frames after the first up to which the tool has touched no soil."""
+    """Some video frames after the first up to which the tool has touched no soil, the last of them among these."""
     motion, rate = measurement.tool.motion, measurement.frame_rate
-    times = np.union1d(motion.times, [f / rate for f in measurement.frames])
-    free = []
-    for time in times[times >= measurement.frames[0] / rate - 1e-9] if measurement.frames else ():
-        centres, _ = body.discs(*motion.pose(float(time)))
-        if float((centres[:, 2] - relief.sample(relief.height, centres)).min()) < _CLEARANCE:
-            break
-        free.append(float(time))
-    frames = [f for f in measurement.frames[1:] if free and f / rate <= free[-1] + 1e-9]
-    return sorted({frames[round(i)] for i in np.linspace(0, len(frames) - 1, min(_PASSING, len(frames)))})
+    last = -math.inf
+    for start, end in pairwise(motion.times):
+        travel = float(np.linalg.norm(np.subtract(*(motion.pose(float(t))[1] for t in (start, end)))))
+        for time in np.linspace(start, end, 2 + int(travel / _CLEARANCE)):
+            if not _clear(measurement, relief, body, float(time)):
+                break
+            last = float(time)
+        else:
+            continue
+        break
+    free = [f for f in measurement.frames[1:] if f / rate <= last + 1e-9]
+    count = min(_PASSING, len(free))
+    return [free[(k + 1) * len(free) // count - 1] for k in range(count)]
 
 
-def _passing(measurement: Measurement, points: Tensor, relief: Relief, body: ToolBody, frame: int) -> Passing:
-    """What the video's cameras say of the points at a frame, compared with the same cameras' still frames."""
+def _clear(measurement: Measurement, relief: Relief, body: ToolBody, time: float) -> bool:
+    """Whether the tool is off the soil."""
+    rotation, position = measurement.tool.motion.pose(time)
+    discs, _ = body.discs(rotation, position)
+    corners = torch.as_tensor(measurement.tool.mesh.vertices @ rotation.T + position).to(discs)
+    points = torch.cat([discs, corners])
+    return float((points[:, 2] - relief.sample(relief.height, points)).min()) >= _CLEARANCE
+
+
+def _passing(measurement: Measurement, points: Tensor, relief: Relief, body: ToolBody, frame: int) -> list[Passing]:
+    """What each of the video's cameras says of the points at a frame, compared with its own still frames."""
     motion, rate = measurement.tool.motion, measurement.frame_rate
     then, rest = (body.at(*motion.pose(time)) for time in (frame / rate, float(motion.times[0])))
     still = still_frames(measurement)
-    changes = []
+    out = []
     for name in measurement.cameras:
         before = [f for f in still if f.frame is not None and f.camera_name == name]
         after = [f for f in measurement.video if f.frame == frame and f.camera_name == name]
@@ -138,8 +154,8 @@ def _passing(measurement: Measurement, points: Tensor, relief: Relief, body: Too
                 seen_colours(points, frames, relief, tool)[0].clamp_min(1e-4).log()
                 for frames, tool in ((after, then), (before, rest))
             )
-            changes.append(shown - known)
-    return Passing(then, torch.stack(changes).nanmean(dim=0) if changes else torch.full_like(points, math.nan))
+            out.append(Passing(then, shown - known))
+    return out
 
 
 def _cells(relief: Relief, lower: FloatArray, upper: FloatArray) -> tuple[Tensor, tuple[int, int]]:

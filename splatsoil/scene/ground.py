@@ -20,6 +20,13 @@ from splatsoil.splats.warp_torch import as_warp, launch
 
 FloatArray = npt.NDArray[np.float64]
 
+_FAR = 1.0e6
+"""Beyond everything, m."""
+_NOWHERE = math.nan
+
+_PROMINENCE = 0.1
+"""Behind a crest a ray must leave the surface by this share of ``rise``, or a rough plain would be full of crests."""
+
 
 def ground_of_pixels(
     relief: Relief, camera: Camera, lower: npt.ArrayLike, upper: npt.ArrayLike, rise: float = 0.0
@@ -27,15 +34,15 @@ def ground_of_pixels(
     """Where the ray of each pixel meets the surface, within a rectangle.
 
     A ray that passes over a crest, and not over the rectangle's border, at no more than ``rise`` counts there: what is
-    heaped upon the crest would be seen in this pixel. A ray that enters the rectangle beneath the surface, through the
-    soil's side, has no place.
+    heaped upon the crest would be seen in this pixel. A ray that comes through the relief's side, or that soil outside
+    the rectangle stops, has no place.
 
     Args:
         relief: the surface.
         camera: without distortion.
         lower: (2,) corner of the rectangle, m.
         upper: (2,) the opposite corner.
-        rise: m.
+        rise: m; negative for the surface alone.
 
     Returns:
         (h, w, 2) x and y in m; NaN where there is no such place.
@@ -43,15 +50,14 @@ def ground_of_pixels(
     place = torch.empty((camera.height, camera.width, 2), dtype=torch.float32, device=relief.device)
     low, high = (np.asarray(corner, dtype=np.float64) for corner in (lower, upper))
     bounds = wp.vec4(float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+    ny, nx = relief.height.shape
+    (x0, y0), (dx, dy) = relief.origin, relief.cell
+    ends = wp.vec4(x0 - 0.5 * dx, y0 - 0.5 * dy, x0 + (nx - 0.5) * dx, y0 + (ny - 0.5) * dy)
     floor = float(relief.height.min()) - march_step(relief)
-    inputs = [eye_of(camera), as_warp(relief.height, wp.float32), grid_of(relief), bounds]
+    inputs = [eye_of(camera), as_warp(relief.height, wp.float32), grid_of(relief), ends, bounds]
     inputs += [floor, march_step(relief), float(rise), as_warp(place, wp.vec2)]
     launch(_ground, (camera.height, camera.width), inputs, place)
     return place.cpu().numpy().astype(np.float64)
-
-
-_FAR = 1.0e6
-_NOWHERE = math.nan
 
 
 @wp.func
@@ -61,11 +67,19 @@ def _height_over(
     return origin[2] + t * ray[2] - kernels.sample(height, grid, origin[0] + t * ray[0], origin[1] + t * ray[1])
 
 
+@wp.func
+def _inside(bounds: wp.vec4, origin: wp.vec3, ray: wp.vec3, t: float) -> bool:
+    x = origin[0] + t * ray[0]
+    y = origin[1] + t * ray[1]
+    return x >= bounds[0] and y >= bounds[1] and x <= bounds[2] and y <= bounds[3]
+
+
 @wp.kernel(enable_backward=False)
 def _ground(
     eye: kernels.Eye,
     height: wp.array2d(dtype=wp.float32),
     grid: kernels.Grid,
+    ends: wp.vec4,
     bounds: wp.vec4,
     floor: float,
     step: float,
@@ -79,11 +93,11 @@ def _ground(
     leave = float(_FAR)
     for axis in range(2):
         if wp.abs(ray[axis]) > 1.0e-9:
-            one = (bounds[axis] - eye.position[axis]) / ray[axis]
-            other = (bounds[axis + 2] - eye.position[axis]) / ray[axis]
+            one = (ends[axis] - eye.position[axis]) / ray[axis]
+            other = (ends[axis + 2] - eye.position[axis]) / ray[axis]
             enter = wp.max(enter, wp.min(one, other))
             leave = wp.min(leave, wp.max(one, other))
-        elif eye.position[axis] < bounds[axis] or eye.position[axis] > bounds[axis + 2]:
+        elif eye.position[axis] < ends[axis] or eye.position[axis] > ends[axis + 2]:
             return
     if ray[2] < 0.0:
         leave = wp.min(leave, (floor - eye.position[2]) / ray[2])
@@ -95,13 +109,15 @@ def _ground(
     gap = _height_over(height, grid, eye.position, ray, t)
     if gap < 0.0:
         return
-    lowest = gap
-    nearest = t
+    lowest = float(_FAR)
+    nearest = float(0.0)
+    away = float(0.0)
     # Slopes of 1.2 can't be stepped over; steeper ones are met a little late.
     closing = 1.0 / wp.max(1.2 * wp.sqrt(ray[0] * ray[0] + ray[1] * ray[1]) - ray[2], 0.1)
     while t < leave:
         before = t
-        t = wp.min(t + wp.clamp(gap * closing, 0.5 * step, 4.0 * step), leave)
+        longest = wp.where(gap < 2.0 * rise, step, 4.0 * step)
+        t = wp.min(t + wp.clamp(gap * closing, 0.5 * step, longest), leave)
         gap = _height_over(height, grid, eye.position, ray, t)
         if gap < 0.0:
             for _ in range(20):
@@ -110,10 +126,13 @@ def _ground(
                     t = middle
                 else:
                     before = middle
-            place[i, j] = wp.vec2(eye.position[0] + t * ray[0], eye.position[1] + t * ray[1])
+            if _inside(bounds, eye.position, ray, t):
+                place[i, j] = wp.vec2(eye.position[0] + t * ray[0], eye.position[1] + t * ray[1])
             return
         if gap < lowest:
             lowest = gap
             nearest = t
-    if lowest <= rise and nearest > enter and nearest < leave:
+            away = gap
+        away = wp.max(away, gap)
+    if lowest <= rise and away - lowest >= _PROMINENCE * rise and _inside(bounds, eye.position, ray, nearest):
         place[i, j] = wp.vec2(eye.position[0] + nearest * ray[0], eye.position[1] + nearest * ray[1])

@@ -48,8 +48,9 @@ class LightEstimate:
 
     Attributes:
         light: the light.
-        explained: share of the (robust) spread of brightness differences that the light explains; near 0 means that the
-            photographs show neither shadow nor slope and the light is a guess.
+        explained: share of the (robust) spread of brightness differences, and of changes while the tool is in the air,
+            that the light explains; near 0 means that the pictures show neither shadow nor slope and the light is a
+            guess.
         shadowed: share of the bed's area that lies in the tool's shadow.
     """
 
@@ -60,7 +61,7 @@ class LightEstimate:
 
 @dataclass(frozen=True)
 class Passing:
-    """The tool somewhere else above the same soil.
+    """The tool somewhere else above the same soil, as one camera sees it.
 
     Attributes:
         tool: its pose in the kernels' form.
@@ -92,13 +93,7 @@ def fit_light(
         blur: half width of a shadow's edge in the photographs, in rows and columns.
         passing: what the tool's shadow did elsewhere.
     """
-    # An exposure that drifts changes all of the bed alike, the shadow little of it.
-    drifts = [p.change.nanmedian(dim=0).values for p in passing]
-    parts = [
-        _Passed(_Sunlit(points, relief, p.tool), p.change - d)
-        for p, d in zip(passing, drifts, strict=True)
-        if _tells(p)
-    ]
+    parts = [_Passed(_Sunlit(points, relief, p.tool), p.change) for p in passing if _tells(p)]
     problem = _Problem(_Sunlit(points, relief, tool), colours.clamp_min(1e-4).log(), shape, parts)
     start = min(
         (problem.cost(None, azimuth, elevation, share), azimuth, elevation, share)
@@ -185,7 +180,7 @@ class _Problem:
     ) -> None:
         self.still, self.brightness, self.shape, self.passed, self.lag = still, brightness, shape, passed, lag
         self.scale = _middle(self.differences(_channel(brightness, None)))
-        self.scales = [max(_middle(_channel(p.change, None)), _LEAST_CHANGE) for p in passed]
+        self.scales = [max(_middle(_centred(_channel(p.change, None))), _LEAST_CHANGE) for p in passed]
 
     def differences(self, values: Tensor) -> Tensor:
         """Differences over the lag along both axes of the grid."""
@@ -228,14 +223,14 @@ class _Problem:
         total = _spread(self.differences(_channel(self.brightness, channel) - rest), self.scale)
         for part, scale in zip(self.passed, self.scales, strict=True):
             predicted = part.sunlit.log_light(azimuth, elevation, ambient) - rest
-            total += _spread(_channel(part.change, channel) - predicted, scale)
+            total += _spread(_centred(_channel(part.change, channel) - predicted), scale)
         return total
 
     def nothing(self) -> float:
         """Loss of a light that is the same everywhere."""
         total = _spread(self.differences(_channel(self.brightness, None)), self.scale)
         for part, scale in zip(self.passed, self.scales, strict=True):
-            total += _spread(_channel(part.change, None), scale)
+            total += _spread(_centred(_channel(part.change, None)), scale)
         return total
 
 
@@ -248,6 +243,11 @@ def _spread(residual: Tensor, scale: float) -> float:
     """Mean pseudo-Huber loss of the residuals that are known."""
     known = residual[torch.isfinite(residual)]
     return float((torch.sqrt(1.0 + (known / scale) ** 2) - 1.0).mean())
+
+
+def _centred(values: Tensor) -> Tensor:
+    """Without what changes all of the bed alike: an exposure that drifts."""
+    return values - values.nanmedian()
 
 
 def _middle(values: Tensor) -> float:

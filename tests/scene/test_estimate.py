@@ -1,6 +1,7 @@
 """The light is found again from colours it has made, over soil with blotches."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,7 +9,8 @@ import torch
 import trimesh
 from scipy.ndimage import gaussian_filter
 
-from splatsoil.scene import Light, Relief, ToolBody, light_relief
+from splatsoil.measurement import Bed, Frame, ToolMotion
+from splatsoil.scene import Light, Relief, ToolBody, estimate, estimate_light, light_relief
 from splatsoil.scene.estimate import in_the_air
 from splatsoil.scene.light_fit import Passing, fit_light
 from splatsoil.synthetic import paper
@@ -115,3 +117,49 @@ def test_frames_with_the_tool_in_the_air():
 def motion(height):
     """Straight down."""
     return staged_motion((0.5, 0.5, height), tilt=30.0, down=0.2, push=0.0, stages=(100, 1, 1, 1))
+
+
+def test_frames_after_ploughing_are_not_in_the_air():
+    """A tool that has been through the soil and lifted out, filmed from then on."""
+    setup = paper().resized(0.05)
+    relief = Relief.of_heights(torch.full((200, 200), 0.2), (0.0025, 0.0025), (0.005, 0.005))
+    down_and_up = staged_motion((0.5, 0.5, 0.36), tilt=30.0, down=0.2, push=0.0, stages=(60, 1, 1, 1))
+    back = np.concatenate([down_and_up.positions[:61], down_and_up.positions[60::-1]])
+    frames = np.arange(len(back))
+    lifted = ToolMotion(frames, frames / 50.0, back, np.tile(down_and_up.quaternions[0], (len(back), 1)))
+    measurement = replace(setup.experiment(), tool=replace(setup.tool, motion=lifted))
+    late = replace(measurement, video=tuple(f for f in measurement.video if f.frame >= 110))
+    assert late.frames[0] == 110 and in_the_air(late, relief, ToolBody(setup.tool.mesh)) == []
+
+
+def test_the_video_tells_the_light(monkeypatch: pytest.MonkeyPatch):
+    """Colours by the light at each frame's own pose, through cameras whose exposures drift apart."""
+    truth, (_, _, shape, relief, _), _ = seen(20.0, 50.0, 0.5)
+    setup = paper().resized(0.05)
+    beside = (0.4, -0.2, 0.36)  # at rest its shadow falls outside of the bed
+    path = np.array([beside, (0.4, 0.27, 0.36), (0.4, 0.27, 0.21)])
+    way = ToolMotion(np.array([0, 10, 20]), np.array([0.0, 0.2, 0.4]), path, np.tile([1.0, 0.0, 0.0, 0.0], (3, 1)))
+    made = setup.experiment()
+    bed = Bed(np.zeros(3), np.array([0.8, 0.55, 0.3]), density=1600.0)
+    views = tuple(Frame(camera, Path(), "view") for camera in setup.views[:4])
+    video = tuple(f for f in made.video if f.frame <= 20 and (f.camera_name, f.frame) != ("right", 10))
+    measurement = replace(made, bed=bed, tool=replace(setup.tool, motion=way), views=views, video=video)
+    albedo = 0.5 * np.exp(0.1 * gaussian_filter(np.random.default_rng(1).normal(size=shape), 3.0) / 0.1).reshape(-1, 1)
+    asked = []
+
+    def colours(where, frames, relief, tool):
+        (moment,) = {0 if f.frame is None else f.frame for f in frames}
+        assert np.allclose(np.array(tool.position), way.pose(moment / 50.0)[1], atol=1e-6)
+        names = {f.camera_name for f in frames}
+        asked.append((moment, tuple(sorted(names))))
+        light = light_relief(relief, truth, tool).irradiance(where, 0.001)
+        spots = torch.tensor(np.resize(albedo, (len(where), 1)))
+        drift = 1.0 + 0.02 * moment / 10 * (1.0 if names == {"left"} else -1.0)
+        return (light * spots * drift).float(), torch.full((len(where),), 5)
+
+    monkeypatch.setattr(estimate, "seen_colours", colours)
+    found = estimate_light(measurement, relief, ToolBody(setup.tool.mesh)).light
+    angle = np.degrees(np.arccos(np.clip(found.direction @ truth.direction, -1.0, 1.0)))
+    assert angle < 2.0
+    assert np.allclose(found.ambient, truth.ambient, atol=0.04)
+    assert {(10, ("left",)), (20, ("left",)), (20, ("right",))} <= set(asked) and (10, ("right",)) not in asked

@@ -83,3 +83,28 @@ def test_soil_seen_through_its_side_has_no_place():
 def test_a_camera_that_looks_away_sees_nothing():
     found = ground_of_pixels(relief(lambda x, y: 0.0 * x), camera((0.5, 0.5, 1.0), (0.5, 0.6, 3.0)), LOWER, UPPER, 0.05)
     assert not np.isfinite(found).any()
+
+
+def test_soil_outside_the_rectangle_hides_what_is_behind_it():
+    def rim(x, y):
+        return 0.2 + np.maximum(0.07 - np.abs(y - 0.03), 0.0)
+
+    eye = camera((0.5, -0.6, 0.45))
+    origins, directions = rays(eye)
+    plain, hidden = (ground_of_pixels(relief(f), eye, LOWER, UPPER) for f in (lambda x, y: 0.2 + 0.0 * x, rim))
+    y = np.linspace(0.0, 0.1, 1001)
+    gap = origins[:, 2:] + (y - origins[:, 1:2]) / directions[:, 1:2] * directions[:, 2:] - rim(0.0, y)
+    seen, over = np.isfinite(plain[..., 0]), gap.min(axis=1).reshape(plain.shape[:2])
+    stopped, free = seen & (over < -0.01), seen & (over > 0.01)
+    assert stopped.sum() > 50 and free.sum() > 50
+    assert not np.isfinite(hidden[stopped]).any()
+    assert np.allclose(hidden[free], plain[free], atol=1e-5)
+
+
+def test_a_rough_plain_has_no_crests():
+    noise = 0.004 * np.random.default_rng(0).normal(size=(100, 100))
+    eye = camera((0.5, -0.6, 0.35))
+    rough = relief(lambda x, y: 0.2 + noise + 0.0 * x)
+    found, met = (np.isfinite(ground_of_pixels(rough, eye, LOWER, UPPER, rise)[..., 0]) for rise in (0.06, -1.0))
+    assert met.sum() > 400
+    assert (found & ~met).sum() < 0.03 * met.sum()
