@@ -102,6 +102,11 @@ class Emulator:
         return self.basis.shape[1]
 
     @property
+    def freedom(self) -> float:
+        """Degrees of freedom behind ``chance``: evaluations less what the processes' means use up, on the average."""
+        return float(np.mean([process.freedom() for process in self._processes]))
+
+    @property
     def trusted(self) -> bool:
         """Whether the features vary in as many ways as there are parameters, and points left out are predicted well."""
         weight = self.scores.var(axis=0)
@@ -181,6 +186,11 @@ class _Process:
     def noise_variance(self) -> float:
         """Of one simulation's score."""
         return float(self.settings.noise[:, 0].mean()) * self.scale**2
+
+    def freedom(self) -> float:
+        """Evaluations less the trace of the smoother K(K + noise)⁻¹ (Hastie & Tibshirani 1990, 3.5) and the mean."""
+        left = np.sum(self.settings.noise * np.diagonal(self.inverse, axis1=1, axis2=2), axis=1)
+        return max(float(left.mean()) - 1.0, 0.0)
 
     def predict(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         x = 0.5 * (points + 1.0)

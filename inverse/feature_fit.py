@@ -7,7 +7,8 @@ agree best. The spread is the sandwich of least squares under errors of known co
 
     (JᵀJ)⁻¹ Jᵀ (chance + emulator + misfit) J (JᵀJ)⁻¹,
 
-J the scores' derivative (White 1980, Econometrica 48:817).
+J the scores' derivative (White 1980, Econometrica 48:817). Chance is known from a handful of evaluations only; with ν
+degrees of freedom behind it the estimate is distributed as Student's t, ν/(ν − 2) times as wide (variance).
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ FloatArray = npt.NDArray[np.float64]
 CANDIDATES = 1024
 #: How far outside of the evaluations' range the least squares may look, of an axis from -1 to 1.
 BEYOND = 0.1
+#: Fewest degrees of freedom that chance is said to have.
+FEWEST_FREE = 3.0
 #: Half the step of the derivatives, of an axis from -1 to 1.
 STEP = 0.01
 
@@ -82,7 +85,8 @@ def _spread(likelihood: Likelihood, estimate: FloatArray) -> FloatArray:
     behind, _ = emulator.predict(estimate - steps)
     slope = (ahead - behind).T / (2.0 * STEP)
     _, variance = emulator.predict(estimate[None])
-    covariance = emulator.chance + np.diag(variance[0])
+    freedom = max(emulator.freedom, FEWEST_FREE)
+    covariance = freedom / (freedom - 2.0) * (emulator.chance + np.diag(variance[0]))
     if likelihood.misfit is not None:
         covariance = covariance + likelihood.misfit.covariance
     bread = np.linalg.pinv(slope.T @ slope) @ slope.T

@@ -79,6 +79,23 @@ def test_leaving_out_in_closed_form_is_leaving_out() -> None:
         np.testing.assert_allclose(stds[group], process.scale * np.sqrt(total), rtol=1e-5)
 
 
+@pytest.mark.parametrize("noise", [0.1, 3.0])
+def test_degrees_of_freedom_are_what_the_fit_does_not_follow(noise: float) -> None:
+    """Twenty evaluations of a straight line: by how much the fit at a point follows the outcome there, summed up."""
+    points = np.linspace(-1.0, 1.0, 20)[:, None]
+    generator = np.random.default_rng(3)
+    process = _Process(points, points[:, 0] + noise * generator.normal(size=20), 1)
+    settings, outcomes, nudge = process.settings, process.y, 1e-3
+    fitted, _ = process.predict(points)
+    followed = 0.0
+    for k in range(20):
+        nudged = outcomes + nudge * (np.arange(20) == k)
+        process.weights = np.einsum("dij,dj->di", process.inverse, nudged - settings.mean[:, None])
+        followed += float(process.predict(points)[0][k] - fitted[k]) / (nudge * process.scale)
+    assert process.freedom() == pytest.approx(20.0 - followed - 1.0, abs=0.05)
+    assert 12.0 < process.freedom() < 18.0  # two of a line, a few of bends that can't be excluded
+
+
 def test_features_that_are_all_chance_have_no_skill() -> None:
     points = sobol(32, 1, 0)
     emulator = Emulator(points, np.random.default_rng(6).normal(size=(32, 10)))

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from splatsoil.inverse.feature_fit import by_features
-from splatsoil.inverse.posterior import Data
+from splatsoil.inverse.feature_fit import FEWEST_FREE, by_features
+from splatsoil.inverse.posterior import Data, likelihood_of
 from splatsoil.inverse.surrogate import Surrogate
 
 from splatsoil.parameters import Parameter, ParameterSpace
@@ -59,6 +59,25 @@ def test_the_spread_is_that_of_repeated_worlds(surrogate: Surrogate) -> None:
         stds.append(float(told.std[0]))
     ratio = float(np.sqrt(np.mean(np.square(errors)) / np.mean(np.square(stds))))
     assert 0.5 < ratio < 1.7
+
+
+@pytest.mark.slow
+def test_intervals_after_a_few_evaluations_hold_what_they_say(surrogate: Surrogate) -> None:
+    """Chance that is itself read off eight evaluations: normal intervals of its size hold too little."""
+    errors, narrower = [], []
+    for seed in range(50):
+        generator = np.random.default_rng([seed, 5])
+        truth = float(generator.uniform(-0.6, 0.6))
+        found = data(truth, generator, chance=3.0, wrong=0.0)
+        found = replace(found, residuals=found.residuals + 3.0 * generator.normal(size=BLOCKS))
+        told = by_features(found, surrogate, surrogate.minimum(), seed=seed)
+        if told is not None:
+            freedom = max(likelihood_of(found, seed=seed).emulator.freedom, FEWEST_FREE)
+            errors.append(abs(float(told.estimate[0]) - truth) / (1.645 * float(told.std[0])))
+            narrower.append(errors[-1] * (freedom / (freedom - 2.0)) ** 0.5)
+    assert len(errors) > 40
+    assert 0.8 <= np.mean(np.array(errors) < 1.0) <= 0.98
+    assert np.mean(np.array(narrower) < 1.0) < 0.75
 
 
 def test_features_that_are_chance_leave_the_word_to_the_loss(surrogate: Surrogate) -> None:
