@@ -26,7 +26,7 @@ from splatsoil.soil.settings import FRICTION_ANGLE
 #: Half width of a landscape, degrees.
 REACH = 8.0
 #: Runs of the model that stand in for a world's, each with chance of its own.
-STAND_INS = 2
+STAND_INS = 4
 #: Seeds of stand-ins, where no prediction's are.
 FIRST = 900_001
 
@@ -35,8 +35,9 @@ def error_budget(sight: Sight, angle: float, pool: Executor, say: Say) -> dict[s
     """Mean minima of each loss on each kind of observation, and what follows.
 
     Returns:
-        For each way: ``total`` = ``loss`` + ``grid`` + ``reconstruction``, degrees, and ``chance``, the standard
-        deviation of one landscape's minimum between particle seeds.
+        For each way: ``total`` = ``loss`` + ``grid`` + ``reconstruction``, degrees; ``chance``, the standard deviation
+        of one landscape's minimum between particle seeds; ``world``, that between stand-ins, which differ by their
+        particles only. One world was photographed, so ``reconstruction`` is known no better than to ``world``.
     """
     seeds, points = sight.protocol.scan
     limits = FRICTION_ANGLE.limits or (FRICTION_ANGLE.lower, FRICTION_ANGLE.upper)
@@ -83,12 +84,15 @@ def shares(minima: Mapping[str, Sequence[Sequence[float]]], angle: float) -> dic
         return None
     photographs, grid, same = (float(np.mean(flat[kind])) for kind in ("photographs", "grid", "same"))
     spreads = [np.var(mine, ddof=1) for found in minima.values() for mine in found if len(mine) > 1]
+    means = [[float(np.mean(mine)) for mine in minima[kind] if len(mine)] for kind in ("grid", "same")]
+    worlds = [np.var(mine, ddof=1) for mine in means if len(mine) > 1]
     return {
         "total": photographs - angle,
         "loss": same - angle,
         "grid": grid - same,
         "reconstruction": photographs - grid,
         "chance": float(np.mean(spreads)) ** 0.5 if spreads else None,
+        "world": float(np.mean(worlds)) ** 0.5 if worlds else None,
         "minima": {kind: [list(mine) for mine in found] for kind, found in minima.items()},
     }
 
@@ -125,15 +129,16 @@ def _stand_ins(sight: Sight, angle: float) -> dict[str, list[Comparator]]:
 def budget_table(budgets: Sequence[Mapping[str, Any]]) -> list[str]:
     """The error budget as lines of Markdown."""
     lines = [
-        "| true angle | way | error of the landscape | = loss | + grid | + reconstruction and renderer | chance |",
-        "|---" * 7 + "|",
+        "| true angle | way | error of the landscape | = loss | + grid | + reconstruction and renderer "
+        "| chance of a search's particles | of a world's |",
+        "|---" * 8 + "|",
     ]
     for entry in budgets:
         for way in WAYS:
             found = entry["ways"][way]
             if found is None:
                 continue
-            chance = "–" if found["chance"] is None else f"± {found['chance']:.2f}°"
+            chances = " | ".join("–" if found[k] is None else f"± {found[k]:.2f}°" for k in ("chance", "world"))
             parts = " | ".join(f"{found[key]:+.2f}°" for key in ("total", "loss", "grid", "reconstruction"))
-            lines.append(f"| {entry['angle']:g}° | {way} | {parts} | {chance} |")
+            lines.append(f"| {entry['angle']:g}° | {way} | {parts} | {chances} |")
     return lines

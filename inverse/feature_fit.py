@@ -27,8 +27,6 @@ FloatArray = npt.NDArray[np.float64]
 CANDIDATES = 1024
 #: How far outside of the evaluations' range the least squares may look, of an axis from -1 to 1.
 BEYOND = 0.1
-#: Fewest degrees of freedom that chance is said to have.
-FEWEST_FREE = 3.0
 #: Half the step of the derivatives, of an axis from -1 to 1.
 STEP = 0.01
 
@@ -85,7 +83,7 @@ def _spread(likelihood: Likelihood, estimate: FloatArray) -> FloatArray:
     behind, _ = emulator.predict(estimate - steps)
     slope = (ahead - behind).T / (2.0 * STEP)
     _, variance = emulator.predict(estimate[None])
-    freedom = max(emulator.freedom, FEWEST_FREE)
+    freedom = likelihood.freedom
     covariance = freedom / (freedom - 2.0) * (emulator.chance + np.diag(variance[0]))
     if likelihood.misfit is not None:
         covariance = covariance + likelihood.misfit.covariance

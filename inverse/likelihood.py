@@ -1,11 +1,14 @@
 """How probable the observed features are at given parameters, by the emulator, with every known source of doubt in it.
 
-In the emulator's basis the observed scores z are normal about the predicted ones, with covariance
+In the emulator's basis the observed scores z lie about the predicted ones, with covariance
 
     Σ(θ) = sensor + chance (one simulation's, standing for the sand's own) + emulator(θ) + s² · misfit
 
-The misfit's size s is not known better than to a factor, so it is sampled with the parameters (log-normal prior); this
-makes the likelihood heavy-tailed, as it should be when the model is known to be wrong.
+Chance is itself read off the evaluations, and in a handful of them it may happen to look small. With ν degrees of
+freedom behind it, its size is integrated out, and z is distributed as Student's t with ν degrees of freedom and scale
+Σ (Sellentin & Heavens 2016, MNRAS 456:L132); of many evaluations that is the normal. The misfit's size s is not known
+better than to a factor, so it is sampled with the parameters (log-normal prior); this makes the likelihood
+heavy-tailed, as it should be when the model is known to be wrong.
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import gammaln
 
 from .emulator import Emulator
 from .misfit import Misfit
@@ -24,6 +28,8 @@ FloatArray = npt.NDArray[np.float64]
 #: Prior standard deviation of ln s, and the range it is sampled in.
 MISFIT_SPREAD = 0.5
 MISFIT_RANGE = (-2.0, 2.0)
+#: Fewest degrees of freedom that chance is said to have.
+FEWEST_FREE = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,11 +74,16 @@ class Likelihood:
         return self.emulator.project(self.observed)
 
     @cached_property
+    def freedom(self) -> float:
+        """Degrees of freedom behind the emulator's chance, and so of the likelihood."""
+        return max(self.emulator.freedom, FEWEST_FREE)
+
+    @cached_property
     def _fixed(self) -> FloatArray:
         return self.emulator.chance + self.sensor * np.eye(self.emulator.count)
 
     def covariance(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Predicted mean scores (k, p) and covariance (k, p, p) of the observed ones about them."""
+        """Predicted mean scores (k, p) and scale Σ (k, p, p) of the observed ones about them."""
         n = self.emulator.dimension
         mean, variance = self.emulator.predict(points[:, :n])
         total = self._fixed + variance[:, :, None] * np.eye(self.emulator.count)
@@ -87,7 +98,10 @@ class Likelihood:
         factor = np.linalg.cholesky(covariance)
         white = np.linalg.solve(factor, (self.scores - mean)[..., None])[..., 0]
         logs = np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
-        return -0.5 * np.sum(white**2, axis=1) - logs - 0.5 * self.emulator.count * np.log(2.0 * np.pi)
+        p, free = self.emulator.count, self.freedom
+        constant = gammaln(0.5 * (free + p)) - gammaln(0.5 * free) - 0.5 * p * np.log(np.pi * free)
+        tail = -0.5 * (free + p) * np.log1p(np.sum(white**2, axis=1) / free)
+        return np.asarray(constant + tail - logs, dtype=np.float64)
 
     def log_prior(self, points: npt.ArrayLike) -> FloatArray:
         """(k, d) to (k,): uniform parameters, log-normal misfit, −∞ out of bounds; not normalised."""

@@ -185,11 +185,15 @@ def test_the_parts_of_the_error_add_up() -> None:
     assert told["total"] == pytest.approx(told["loss"] + told["grid"] + told["reconstruction"])
     # Variances within each landscape's seeds: 2, 0.5, 0, 0.08, 0.
     assert told["chance"] == pytest.approx((2.58 / 5) ** 0.5)
+    # Means of the landscapes of stand-ins, which differ by their particles only: all the same here, then 36 and 38.
+    assert told["world"] == 0.0
+    apart = _paper_budget.shares({**minima, "grid": [[35.0, 37.0], [38.0]]}, 35.0)
+    assert apart is not None and apart["world"] == pytest.approx((2.0 / 2) ** 0.5)
     assert _paper_budget.shares({"photographs": [[38.0]], "grid": [[]], "same": [[35.0]]}, 35.0) is None
     text = "\n".join(
         _paper_budget.budget_table([{"angle": 35.0, "ways": {"published": told, "ours": told, "features": None}}])
     )
-    assert text.count("| 35° |") == 2 and "| +4.00° | +0.20° | +1.30° | +2.50° | ± 0.72° |" in text
+    assert text.count("| 35° |") == 2 and "| +4.00° | +0.20° | +1.30° | +2.50° | ± 0.72° | ± 0.00° |" in text
 
 
 def test_the_minimum_of_a_landscape() -> None:

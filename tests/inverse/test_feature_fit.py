@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from splatsoil.inverse.feature_fit import FEWEST_FREE, by_features
+from splatsoil.inverse.feature_fit import by_features
 from splatsoil.inverse.posterior import Data, likelihood_of
 from splatsoil.inverse.surrogate import Surrogate
 
@@ -72,7 +72,7 @@ def test_intervals_after_a_few_evaluations_hold_what_they_say(surrogate: Surroga
         found = replace(found, residuals=found.residuals + 3.0 * generator.normal(size=BLOCKS))
         told = by_features(found, surrogate, surrogate.minimum(), seed=seed)
         if told is not None:
-            freedom = max(likelihood_of(found, seed=seed).emulator.freedom, FEWEST_FREE)
+            freedom = likelihood_of(found, seed=seed).freedom
             errors.append(abs(float(told.estimate[0]) - truth) / (1.645 * float(told.std[0])))
             narrower.append(errors[-1] * (freedom / (freedom - 2.0)) ** 0.5)
     assert len(errors) > 40
