@@ -137,8 +137,8 @@ def test_a_lower_sun_lengthens_the_shadow(measurement, scene, still):
     def shadow_end(values):
         row = linear(torch.from_numpy(model.draw(trajectory, 0, values)["right", 0][43:47])).mean(dim=(0, 2)).numpy()
         bright = np.convolve(row, np.full(5, 0.2), "same")
-        dark = np.flatnonzero(bright[:85] < 0.75 * np.median(bright[60:85]))
-        # The camera stands over x = 0.24.
+        # The camera stands over x = 0.24, the bed ends at pixel 85.
+        dark = np.flatnonzero(bright[:80] < 0.75 * np.median(bright[60:80]))
         return 0.24 + (dark.max() + 0.5 - 45.0) * 0.6 / FOCAL
 
     # The upper edge that faces the sun casts the far end: 0.08 to 0.12 m above the soil, at x = 0.12.

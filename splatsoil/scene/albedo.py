@@ -168,7 +168,7 @@ def refined(
         for camera, target, mask in targets:
             features = torch.nn.functional.pad(current, (0, 1), value=1.0).requires_grad_()
             with torch.enable_grad():
-                drawn = rasterise_features(centres, covariances, opacities, features, camera)
+                drawn = rasterise_features(centres, covariances, opacities, features, camera, antialias=True)
                 image = drawn.image
             covered = drawn.alpha.detach().clamp_min(1e-3)[..., None]
             residual = (target - image[..., :3].detach() / covered) * mask[..., None]

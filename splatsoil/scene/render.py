@@ -27,8 +27,10 @@ FloatArray = npt.NDArray[np.float64]
 FloatImage = npt.NDArray[np.float32]
 Pose = tuple[npt.ArrayLike, npt.ArrayLike]
 
-PARTICLE_SIZE = 0.4
-"""Standard deviation of a particle's own Gaussian in particle spacings."""
+PARTICLE_SIZE, PARTICLE_THICKNESS = 0.4, 0.2
+"""Standard deviations of a particle's own Gaussian along the surface and across it, in particle spacings. Seen at a
+grazing angle many overlap and are opaque two standard deviations from their centres: there soil ends, half a spacing
+over its uppermost particles."""
 
 PARTICLE_OPACITY = 0.95
 
@@ -188,14 +190,14 @@ class Scene:
         lit = light_relief(relief, self.light, placed, self.tool_albedo)
         centres, covariances = self.soil.carry(x, None if f is None else f.contiguous())
         shown, near = self.shown(relief, centres, x)
-        grains = (PARTICLE_SIZE * self.spacing) ** 2 * torch.eye(3, device=self.device)
-        count = int(near.sum())
+        grains = x[near]
+        count = len(grains)
         around = self.surroundings
         parts = (
             (centres[shown], covariances[shown], self.soil_opacity[shown], self.soil_albedo[shown]),
             (
-                x[near],
-                grains.expand(count, 3, 3),
+                grains,
+                _grain_shapes(relief, grains, self.spacing),
                 x.new_full((count,), PARTICLE_OPACITY),
                 self.grain_albedo[near],
             ),
@@ -216,7 +218,7 @@ class Scene:
         features = torch.cat([posed.features, along[:, None]], dim=1)
         behind = torch.tensor([*self.background, 0.0, 0.0], dtype=torch.float32, device=self.device)
         drawn = rasterise_features(
-            posed.centres, posed.covariances, posed.opacities, features, camera, background=behind
+            posed.centres, posed.covariances, posed.opacities, features, camera, background=behind, antialias=True
         )
         covered = drawn.alpha.clamp_min(1e-3)
         depth = torch.where(drawn.alpha > 0.3, drawn.image[..., 4] / covered, 0.0).contiguous()
@@ -237,6 +239,14 @@ class Scene:
         """The picture (h, w, 3) float32 sRGB in [0, 1] of a posed scene; several cameras may share the posing."""
         with torch.no_grad():
             return self.layers(posed, camera).image.cpu().numpy().astype(np.float32)
+
+
+def _grain_shapes(relief: Relief, grains: Tensor, spacing: float) -> Tensor:
+    """Covariances (p, 3, 3) of particles' own Gaussians at (p, 3), flat along the surface over them."""
+    normal = functional.normalize(relief.sample(relief.normal, grains), dim=1)
+    along, across = (PARTICLE_SIZE * spacing) ** 2, (PARTICLE_THICKNESS * spacing) ** 2
+    whole = along * torch.eye(3, device=grains.device)
+    return (whole - (along - across) * normal[:, :, None] * normal[:, None, :]).contiguous()
 
 
 def _tool_among_splats(posed: Posed, camera: Camera) -> Tensor:
@@ -264,7 +274,7 @@ def _tool_among_splats(posed: Posed, camera: Camera) -> Tensor:
     )
     mark = torch.zeros((len(parts[0]), 1), device=out.device)
     mark[-len(centres) :] = 1.0
-    drawn = rasterise_features(*parts, mark, camera.cropped(x0, y0, width, height))
+    drawn = rasterise_features(*parts, mark, camera.cropped(x0, y0, width, height), antialias=True)
     out[y0 : y0 + height, x0 : x0 + width] = (drawn.image[..., 0] / TOOL_OPACITY).clamp_max(1.0)
     return out
 

@@ -51,7 +51,8 @@ def test_views_that_were_set_aside_are_predicted(measurement, result):
     assert result.ssim > 0.85
     # Drawn again from what is public, at the camera free of distortion.
     frame = measurement.views[8]
-    drawn = rasterise(result.gaussians, frame.camera.undistorted(), background=result.background).colour.clamp(0, 1)
+    seen = rasterise(result.gaussians, frame.camera.undistorted(), background=result.background, antialias=True)
+    drawn = seen.colour.clamp(0, 1)
     valid = frame.undistorted_mask()
     error = (drawn.numpy() - frame.undistorted_image())[valid]
     assert -10 * np.log10((error**2).mean()) == pytest.approx(result.held_out[1].psnr, abs=1e-3)

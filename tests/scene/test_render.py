@@ -204,6 +204,22 @@ def coloured_surface(measurement, particles, spacing, cell=0.004):
     return SimpleNamespace(gaussians=gaussians, soil=soil, tool=~soil, background=(0.0, 0.0, 0.0))
 
 
+def test_soil_ends_at_its_surface_when_seen_at_a_grazing_angle():
+    """A camera looks over level soil, 5° down at its far edge: where that is in the picture, geometry says."""
+    particles = level_bed()
+    scene = scene_of(particles)
+    over = 0.1 + 0.8 * np.tan(np.radians(5.0))
+    view = camera((0.2, -0.4, over), (0.2, 0.4, 0.1)).scaled(4.0)
+    image = scene.render(particles, None, None, view)
+    ((_, edge),), _ = view.project(np.array([[0.2, 0.4, 0.1]]))
+    column = image[:, 220:260].mean(axis=(1, 2))
+    bright = np.median(column[int(edge) + 12 : int(edge) + 32])
+    first = int(np.argmax(column > 0.5 * bright))
+    seen = first + 0.5 - (column[first] - 0.5 * bright) / (column[first] - column[first - 1])
+    # A pixel is 1.3 mm, a fifteenth of a particle's spacing.
+    assert seen == pytest.approx(edge, abs=2.0)
+
+
 @pytest.mark.slow
 def test_true_particles_look_like_the_measured_frames():
     """The renderer's floor, apart from any physics: an independent simulator's particles, its path-traced frames.
