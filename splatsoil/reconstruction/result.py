@@ -42,8 +42,8 @@ class Reconstruction:
     """The scene before anything moves.
 
     Attributes:
-        gaussians: everything that was seen, float32 on the CPU, world frame in metres, colours in sRGB as seen. They were
-            trained with, and are to be drawn with, ``antialias=True``.
+        gaussians: everything that was seen, float32 on the CPU, world frame in metres, colours in sRGB as seen;
+            trained with ``antialias=True``, and to be drawn so.
         soil: (n,) bool, the Gaussians on the soil's surface.
         tool: (n,) bool, those on the tool at its first pose.
         surface: the soil's surface over the bed's box.
