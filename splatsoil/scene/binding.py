@@ -39,6 +39,7 @@ class Binding:
         particles: (p, 3) the particles at rest, m.
         index: (n, k) int32 particles of each Gaussian.
         weights: (n, k) float32, rows sum to 1.
+        thickness: (n,) standard deviations at rest along the Gaussians' shortest axes, m.
     """
 
     rest: Tensor
@@ -46,6 +47,7 @@ class Binding:
     particles: Tensor
     index: Tensor
     weights: Tensor
+    thickness: Tensor
 
     def __len__(self) -> int:
         return self.rest.shape[0]
@@ -95,12 +97,14 @@ def bind(
     weights = torch.exp(-0.5 * (away.square() - away[:, :1].square()) / (REACH * spacing) ** 2)
     weights = (weights / weights.sum(dim=1, keepdim=True)).float()
     chosen = torch.from_numpy(index.reshape(len(centres), k)).to(centres.device, torch.int32)
+    smallest = torch.linalg.eigvalsh(covariances.detach().cpu().double())[:, 0].clamp_min(0.0)
     return Binding(
         centres.detach().float().contiguous(),
         covariances.detach().float().contiguous(),
         particles.detach().float().contiguous(),
         chosen.contiguous(),
         weights.contiguous(),
+        smallest.sqrt().to(centres.device, torch.float32),
     )
 
 

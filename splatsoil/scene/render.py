@@ -28,9 +28,11 @@ FloatImage = npt.NDArray[np.float32]
 Pose = tuple[npt.ArrayLike, npt.ArrayLike]
 
 PARTICLE_SIZE, PARTICLE_THICKNESS = 0.4, 0.2
-"""Standard deviations of a particle's own Gaussian along the surface and across it, in particle spacings. Seen at a
-grazing angle many overlap and are opaque two standard deviations from their centres: there soil ends, half a spacing
-over its uppermost particles."""
+"""Standard deviations of a particle's own Gaussian along the surface and across it, in particle spacings: so it ends
+where soil does, half a spacing over its uppermost particles."""
+
+_END = 2.0
+"""Standard deviations from their centres at which Gaussians end: seen along the ground many overlap, opaque so far."""
 
 PARTICLE_OPACITY = 0.95
 
@@ -193,8 +195,9 @@ class Scene:
         grains = x[near]
         count = len(grains)
         around = self.surroundings
+        settled = _settled(relief, centres[shown], covariances[shown], self.soil.thickness[shown])
         parts = (
-            (centres[shown], covariances[shown], self.soil_opacity[shown], self.soil_albedo[shown]),
+            (*settled, self.soil_opacity[shown], self.soil_albedo[shown]),
             (
                 grains,
                 _grain_shapes(relief, grains, self.spacing),
@@ -239,6 +242,25 @@ class Scene:
         """The picture (h, w, 3) float32 sRGB in [0, 1] of a posed scene; several cameras may share the posing."""
         with torch.no_grad():
             return self.layers(posed, camera).image.cpu().numpy().astype(np.float32)
+
+
+def _settled(relief: Relief, centres: Tensor, shapes: Tensor, thickness: Tensor) -> tuple[Tensor, Tensor]:
+    """Centres (n, 3) and covariances (n, 3, 3) of soil Gaussians, none of which reaches out of the surface.
+
+    Soil that is sheared turns and stretches what it carries, so that flat Gaussians stand up in it, and seen along the
+    ground a heap would end pixels too late. Those that reach out are laid flat again, as thin as at rest, and moved in.
+    """
+    normal = functional.normalize(relief.sample(relief.normal, centres), dim=1)
+    along = (shapes @ normal[:, :, None])[..., 0]
+    across = (along * normal).sum(dim=1)
+    depth = relief.depth_below(centres)
+    out = depth < _END * across.sqrt()
+    mixed = normal[:, :, None] * along[:, None, :]
+    square = normal[:, :, None] * normal[:, None, :]
+    flat = shapes - mixed - mixed.transpose(1, 2) + (across + thickness.square())[:, None, None] * square
+    excess = torch.where(out, _END * thickness - depth, 0.0).clamp_min(0.0)
+    moved = centres - excess[:, None] * normal
+    return moved.contiguous(), torch.where(out[:, None, None], flat, shapes).contiguous()
 
 
 def _grain_shapes(relief: Relief, grains: Tensor, spacing: float) -> Tensor:

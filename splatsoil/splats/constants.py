@@ -5,6 +5,10 @@ from __future__ import annotations
 DILATION = 0.3
 """Variance added to both axes of every projected Gaussian, in px²: a splat is never thinner than about half a pixel."""
 
+PIXEL_VARIANCE = 0.1
+"""The same with antialiasing: about that of a pixel's own square, 1/12 px² (Mip-splatting's value). What is added more
+sums up where thin Gaussians lie behind each other, so that soil seen at a grazing angle ends too late."""
+
 ALPHA_MAX = 0.99
 """Largest opacity a single Gaussian can have in a pixel; the gradient is zero where this limit acts."""
 

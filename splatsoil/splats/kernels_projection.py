@@ -12,7 +12,6 @@ import warp as wp
 
 from splatsoil.splats import constants
 
-_DILATION = wp.constant(wp.float32(constants.DILATION))
 _ALPHA_MIN = wp.constant(wp.float32(constants.ALPHA_MIN))
 _ANTIALIAS_MIN = wp.constant(wp.float32(constants.ANTIALIAS_MIN))
 _NEAR = wp.constant(wp.float32(constants.NEAR))
@@ -32,6 +31,7 @@ class Lens:
     size: wp.vec2
     orthographic: int
     antialias: int
+    dilation: float
 
 
 @wp.struct
@@ -82,8 +82,8 @@ def _footprint(p: wp.vec3, covariance: wp.mat33, lens: Lens):
     f.plain_xx = wp.dot(f.row_x, f.sx)
     f.plain_yy = wp.dot(f.row_y, f.sy)
     f.xy = wp.dot(f.row_x, f.sy)
-    f.xx = f.plain_xx + _DILATION
-    f.yy = f.plain_yy + _DILATION
+    f.xx = f.plain_xx + lens.dilation
+    f.yy = f.plain_yy + lens.dilation
     f.determinant = f.xx * f.yy - f.xy * f.xy
     return f
 

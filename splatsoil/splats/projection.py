@@ -9,6 +9,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from splatsoil.splats import constants
 from splatsoil.splats import kernels_projection as kernels
 from splatsoil.splats.camera import View
 from splatsoil.splats.warp_torch import as_warp, launch
@@ -46,7 +47,8 @@ def project(means: Tensor, covariances: Tensor, opacities: Tensor, view: View, a
         covariances: (n, 3, 3), m².
         opacities: (n,), in [0, 1].
         view: the camera.
-        antialias: scale opacity by √(det Σ / det Σ′), so that the dilation does not make small Gaussians heavier.
+        antialias: dilate by a pixel's own variance only, and scale opacity by √(det Σ / det Σ′), so that the dilation
+            does not make small Gaussians heavier.
     """
     return Projection(*_Project.apply(means, covariances, opacities, view, antialias))
 
@@ -65,6 +67,7 @@ def _lens(view: View, antialias: bool) -> Any:
     lens.size = wp.vec2(float(view.width), float(view.height))
     lens.orthographic = int(view.orthographic)
     lens.antialias = int(antialias)
+    lens.dilation = constants.PIXEL_VARIANCE if antialias else constants.DILATION
     return lens
 
 

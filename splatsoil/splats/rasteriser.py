@@ -71,7 +71,8 @@ def rasterise(
         gaussians: what to draw.
         camera: a pinhole camera without distortion, or an `OrthographicCamera`.
         background: colour behind everything (3,).
-        antialias: keep the total opacity of Gaussians smaller than a pixel (Mip-splatting's factor).
+        antialias: blur by a pixel's own square only, and keep the total opacity of Gaussians smaller than a pixel
+            (Mip-splatting).
         normals: blend normals, too (each Gaussian's shortest axis, facing the camera); False saves time.
     """
     view = view_of(camera)

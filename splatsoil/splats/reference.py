@@ -32,7 +32,8 @@ def project(
         jacobian = torch.stack([fx / z, zero, -fx * tx / z, zero, fy / z, -fy * ty / z], dim=1).reshape(-1, 2, 3)
     moved = jacobian @ rotation
     plain = moved @ covariances @ moved.transpose(1, 2)
-    dilated = plain + constants.DILATION * torch.eye(2).to(means)
+    dilation = constants.PIXEL_VARIANCE if antialias else constants.DILATION
+    dilated = plain + dilation * torch.eye(2).to(means)
     if antialias:
         ratio = torch.linalg.det(plain) / torch.linalg.det(dilated)
         opacities = opacities * ratio.clamp_min(constants.ANTIALIAS_MIN**2).sqrt()

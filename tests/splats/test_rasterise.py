@@ -59,12 +59,12 @@ def test_one_gaussian_in_closed_form(camera_at: CameraMaker) -> None:
 
 
 def test_antialiasing_factor_in_closed_form(camera_at: CameraMaker) -> None:
-    # √(25² / 25.3²) = 0.9881423
+    # variance 25 + 0.1 px²; √(25² / 25.1²) = 0.9960159
     picture = rasterise(ball(), camera_at(), antialias=True)
-    assert picture.projection.strengths.item() / 0.8 == pytest.approx(0.9881423, abs=2e-7)
+    assert picture.projection.strengths.item() / 0.8 == pytest.approx(0.9960159, abs=2e-7)
     # a speck keeps its total: 2π·σ²·o; the factor has a floor of 0.005
     speck = rasterise(ball(sigma=0.002), camera_at(), antialias=True)
-    assert speck.projection.strengths.item() == pytest.approx(0.8 * 0.01 / 0.31, rel=1e-4)
+    assert speck.projection.strengths.item() == pytest.approx(0.8 * 0.01 / 0.11, rel=1e-4)
     dust = rasterise(ball(sigma=1e-5, opacity=0.99), camera_at(), antialias=True)
     assert dust.projection.strengths.item() == pytest.approx(0.99 * 0.005, rel=1e-5)
 
