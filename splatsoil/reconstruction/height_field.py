@@ -92,8 +92,10 @@ class HeightField:
         spline = RectBivariateSpline(self.y, self.x, self.height, kx=order, ky=order)
         inside = np.stack([np.clip(xy[:, 0], *self.x[[0, -1]]), np.clip(xy[:, 1], *self.y[[0, -1]])], axis=1)
         value = spline.ev(inside[:, 1], inside[:, 0])
-        value += spline.ev(inside[:, 1], inside[:, 0], dy=1) * (xy[:, 0] - inside[:, 0])
-        value += spline.ev(inside[:, 1], inside[:, 0], dx=1) * (xy[:, 1] - inside[:, 1])
+        beyond = xy - inside
+        for axis, order_of in ((0, {"dy": 1}), (1, {"dx": 1})):
+            out = np.flatnonzero(beyond[:, axis])
+            value[out] += spline.ev(inside[out, 1], inside[out, 0], **order_of) * beyond[out, axis]
         return value
 
     def difference(self, other: HeightField) -> Array:

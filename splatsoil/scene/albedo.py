@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import numpy.typing as npt
 import torch
+import torch.nn.functional as functional
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -25,6 +26,12 @@ OUTLYING = 3.0
 
 WAVES = 256
 """Of a random field."""
+
+LONGEST = 0.1
+"""Blotches of albedo wider than this count as this wide, m."""
+
+_FINE = 0.33
+"""Cells of the surface's map, in particle spacings."""
 
 
 def correlation_length(points: Tensor, values: Tensor, longest: float) -> float:
@@ -59,40 +66,63 @@ def correlation_length(points: Tensor, values: Tensor, longest: float) -> float:
     return float(centre[fallen[0]]) if fallen.size else longest
 
 
-def grain_albedo(
-    grains: Tensor, depth: Tensor, centres: Tensor, albedo: Tensor, spacing: float, length: float
-) -> Tensor:
-    """Albedo of each particle, guessed from the surface above it.
-
-    The surface's blotches are taken to reach as deep as they are wide: at a depth d the guess is the mean plus
-    exp(−d/length) times what the surface above deviates from it. That is the best linear guess where the correlation
-    falls so, and it tends to the mean, as it must, where nothing is known.
+class SurfaceAlbedo:
+    """Albedo of the undisturbed surface as a map over the bed, and what it lets guess of the soil beneath.
 
     Args:
-        grains: (p, 3) particles, m.
-        depth: (p,) below the surface, m.
-        centres: (n, 3) surface Gaussians, m.
-        albedo: (n, 3) linear.
-        spacing: of the particles, m.
-        length: correlation length of the surface's albedo, m.
+        centres: (n, 3) the surface's Gaussians, m.
+        albedo: (n, 3) theirs, linear.
+        spacing: of the particles, m; the map is averaged over about a particle.
+        low: (2,) or (3,) corner of the bed, m.
+        high: the opposite corner.
+        length: how deep blotches reach, m; their correlation length by default.
 
-    Returns:
-        (p, 3) linear.
+    Attributes:
+        mean: (3,) linear.
+        length: m.
     """
-    mean = albedo.mean(dim=0)
-    share = torch.exp(-depth.clamp_min(0.0) / length)[:, None]
-    return mean + share * (albedo_above(grains, centres, albedo, spacing) - mean)
 
+    def __init__(
+        self,
+        centres: Tensor,
+        albedo: Tensor,
+        spacing: float,
+        low: npt.ArrayLike,
+        high: npt.ArrayLike,
+        length: float | None = None,
+    ) -> None:
+        if length is None:
+            length = correlation_length(centres, albedo.clamp_min(1e-3).log().mean(dim=1), LONGEST)
+        self.mean, self.length = albedo.mean(dim=0), length
+        self._low = np.asarray(low, dtype=np.float64)[:2]
+        self._extent = np.asarray(high, dtype=np.float64)[:2] - self._low
+        count = np.maximum(np.ceil(self._extent / (_FINE * spacing)).astype(int), 2)
+        x, y = (self._low[k] + (np.arange(count[k]) + 0.5) * self._extent[k] / count[k] for k in (0, 1))
+        cells = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        k = min(16, len(centres))
+        away, index = cKDTree(centres[:, :2].cpu().numpy()).query(cells, k=k, workers=torch.get_num_threads())
+        distance = torch.from_numpy(away.reshape(len(cells), k)).to(albedo.device)
+        weight = torch.exp(-0.5 * (distance.square() - distance[:, :1].square()) / (0.5 * spacing) ** 2).float()
+        near = albedo[torch.from_numpy(index.reshape(len(cells), k)).to(albedo.device)]
+        mean = (weight[..., None] * near).sum(dim=1) / weight.sum(dim=1, keepdim=True)
+        self._map = mean.T.reshape(1, 3, int(count[1]), int(count[0])).contiguous()
 
-def albedo_above(grains: Tensor, centres: Tensor, albedo: Tensor, spacing: float) -> Tensor:
-    """Albedo (p, 3) of the surface over each particle, averaged over about a particle; arguments of `grain_albedo`."""
-    k = min(16, len(centres))
-    tree = cKDTree(centres[:, :2].cpu().numpy())
-    away, index = tree.query(grains[:, :2].cpu().numpy(), k=k, workers=torch.get_num_threads())
-    distance = torch.from_numpy(away.reshape(len(grains), k)).to(grains.device)
-    weight = torch.exp(-0.5 * (distance.square() - distance[:, :1].square()) / (0.5 * spacing) ** 2).float()
-    near = albedo[torch.from_numpy(index.reshape(len(grains), k)).to(grains.device)]
-    return (weight[..., None] * near).sum(dim=1) / weight.sum(dim=1, keepdim=True)
+    def above(self, points: Tensor) -> Tensor:
+        """Linear albedo (p, 3) of the surface over points (p, 3), m."""
+        low, extent = (torch.tensor(v.tolist(), device=points.device) for v in (self._low, self._extent))
+        places = 2.0 * (points[:, :2] - low) / extent - 1.0
+        found = functional.grid_sample(self._map, places[None, None], padding_mode="border", align_corners=False)
+        return found[0, :, 0].T.contiguous()
+
+    def beneath(self, points: Tensor, depth: Tensor) -> Tensor:
+        """Linear albedo (p, 3) guessed of soil at points (p, 3), m, so deep (p,), m, below the surface.
+
+        The surface's blotches are taken to reach as deep as they are wide: at a depth d the guess is the mean plus
+        exp(−d/length) times what the surface above deviates from it. That is the best linear guess where the
+        correlation falls so, and it tends to the mean, as it must, where nothing is known.
+        """
+        share = torch.exp(-depth.clamp_min(0.0) / self.length)[:, None]
+        return self.mean + share * (self.above(points) - self.mean)
 
 
 def other_grain_albedo(
@@ -102,12 +132,12 @@ def other_grain_albedo(
 
     Beneath the surface blotches go on that no photograph shows. The guess is multiplied with a random field of the
     surface's own variance and an exponential correlation, of which the share 1 − exp(−2 d/length) of the variance is
-    left open at a depth d: together with the guess, the correlation of `grain_albedo`.
+    left open at a depth d: together with the guess, the correlation of `SurfaceAlbedo`.
 
     Args:
         grains: (p, 3) particles, m.
         depth: (p,) below the surface, m.
-        guess: (p, 3) linear albedo from `grain_albedo`; its mean is kept.
+        guess: (p, 3) linear albedo from `SurfaceAlbedo.beneath`; its mean is kept.
         above: (p, 3) linear albedo of the surface above each.
         length: correlation length of the surface's albedo, m.
         generator: of the field.
@@ -166,7 +196,7 @@ def refined(
     for _ in range(rounds):
         push, weight = torch.zeros_like(current), current.new_zeros(len(current), 1)
         for camera, target, mask in targets:
-            features = torch.nn.functional.pad(current, (0, 1), value=1.0).requires_grad_()
+            features = functional.pad(current, (0, 1), value=1.0).requires_grad_()
             with torch.enable_grad():
                 drawn = rasterise_features(centres, covariances, opacities, features, camera, antialias=True)
                 image = drawn.image

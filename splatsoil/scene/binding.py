@@ -10,7 +10,7 @@ so a rigid motion of all particles moves the Gaussian rigidly, and no deformatio
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 import warp as wp
@@ -52,6 +52,11 @@ class Binding:
     def __len__(self) -> int:
         return self.rest.shape[0]
 
+    def to_particles(self, particles: Tensor, spacing: float) -> Binding:
+        """The same Gaussians on other particles (p, 3) at rest, m, with this spacing, m."""
+        index, weights = _riders(self.rest, particles, spacing, NEIGHBOURS)
+        return replace(self, particles=particles.detach().float().contiguous(), index=index, weights=weights)
+
     def carry(self, positions: Tensor, deformations: Tensor | None) -> tuple[Tensor, Tensor]:
         """Where the Gaussians are and what shape they have.
 
@@ -90,6 +95,20 @@ def bind(
         spacing: side of the cube that a particle stands for, m.
         neighbours: particles for each Gaussian.
     """
+    index, weights = _riders(centres, particles, spacing, neighbours)
+    smallest = torch.linalg.eigvalsh(covariances.detach().cpu().double())[:, 0].clamp_min(0.0)
+    return Binding(
+        centres.detach().float().contiguous(),
+        covariances.detach().float().contiguous(),
+        particles.detach().float().contiguous(),
+        index,
+        weights,
+        smallest.sqrt().to(centres.device, torch.float32),
+    )
+
+
+def _riders(centres: Tensor, particles: Tensor, spacing: float, neighbours: int) -> tuple[Tensor, Tensor]:
+    """Particles (n, k) int32 that each Gaussian rides on, and their weights (n, k)."""
     k = min(neighbours, len(particles))
     distance, index = cKDTree(particles.detach().cpu().numpy()).query(centres.detach().cpu().numpy(), k=k)
     away = torch.from_numpy(distance.reshape(len(centres), k)).to(centres.device)
@@ -97,15 +116,7 @@ def bind(
     weights = torch.exp(-0.5 * (away.square() - away[:, :1].square()) / (REACH * spacing) ** 2)
     weights = (weights / weights.sum(dim=1, keepdim=True)).float()
     chosen = torch.from_numpy(index.reshape(len(centres), k)).to(centres.device, torch.int32)
-    smallest = torch.linalg.eigvalsh(covariances.detach().cpu().double())[:, 0].clamp_min(0.0)
-    return Binding(
-        centres.detach().float().contiguous(),
-        covariances.detach().float().contiguous(),
-        particles.detach().float().contiguous(),
-        chosen.contiguous(),
-        weights.contiguous(),
-        smallest.sqrt().to(centres.device, torch.float32),
-    )
+    return chosen.contiguous(), weights.contiguous()
 
 
 @wp.func

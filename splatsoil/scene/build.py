@@ -9,23 +9,19 @@ import torch
 from torch import Tensor
 
 from splatsoil.errors import ParameterError
-from splatsoil.measurement import Frame, Measurement
+from splatsoil.measurement import Bed, Frame, Measurement
 from splatsoil.scene import albedo as albedos
 from splatsoil.scene.binding import bind
 from splatsoil.scene.estimate import estimate_light, still_frames
 from splatsoil.scene.light import Light, encoded, linear
 from splatsoil.scene.lit import LitRelief, light_relief
-from splatsoil.scene.relief import Relief, relief_of_particles
+from splatsoil.scene.relief import relief_of_particles
 from splatsoil.scene.render import Posed, Scene
 from splatsoil.scene.tool import ToolBody
 from splatsoil.splats import Gaussians
 
 ROUNDS = 2
 """Rounds of `albedo.refined`; more follow the noise of the photographs."""
-
-_LONGEST = 0.1
-"""Blotches of albedo wider than this count as this wide, m."""
-
 
 _FOOTPRINT = 0.002
 """Half width of the patch of surface that a Gaussian's colour was seen on, m, for shadows' edges."""
@@ -94,7 +90,7 @@ def build_scene(
         posed = scene.pose(x, None, start)
         scene = scene.replace(tool_albedo=albedos.tool_albedo(frames, lambda camera: scene.layers(posed, camera).tool))
         lit = light_relief(relief, light, body.at(*start), scene.tool_albedo)
-        scene = scene.replace(**_albedo(soil, lit, x, spacing))
+        scene = scene.replace(**_albedo(soil, lit, x, spacing, measurement.bed))
         return _refined(scene, scene.pose(x, None, start), frames, rounds) if rounds > 0 else scene
 
 
@@ -102,44 +98,32 @@ def rebound(scene: Scene, particles: Any) -> Scene:
     """See `Scene.with_particles`."""
     x = torch.as_tensor(np.asarray(particles), dtype=torch.float32).to(scene.device).contiguous()
     relief = relief_of_particles(x, scene.spacing, scene.bed.lower, scene.bed.upper)
-    rest = scene.soil.rest
-    grains = _grains(rest, linear(scene.soil_albedo), relief, x, scene.spacing)
-    return scene.replace(soil=bind(rest, scene.soil.covariances, x, scene.spacing), grain_albedo=grains)
+    grains = encoded(scene.surface_albedo.beneath(x, relief.depth_below(x)))
+    return scene.replace(soil=scene.soil.to_particles(x, scene.spacing), grain_albedo=grains)
 
 
 def reguessed(scene: Scene, seed: int) -> Scene:
     """See `Scene.with_other_albedo`."""
-    x, rest, surface = scene.soil.particles, scene.soil.rest, linear(scene.soil_albedo)
+    x, surface = scene.soil.particles, scene.surface_albedo
     relief = relief_of_particles(x, scene.spacing, scene.bed.lower, scene.bed.upper)
-    above = albedos.albedo_above(x, rest, surface, scene.spacing)
     others = albedos.other_grain_albedo(
         x,
         relief.depth_below(x) - scene.spacing,  # photographs show the uppermost layer
         linear(scene.grain_albedo),
-        above,
-        _length(rest, surface),
+        surface.above(x),
+        surface.length,
         np.random.default_rng(seed),
     )
     return scene.replace(grain_albedo=encoded(others.clamp(0.0, albedos.BRIGHTEST)))
 
 
-def _length(centres: Tensor, albedo: Tensor) -> float:
-    """Correlation length of the linear albedo (n, 3) of soil Gaussians, m."""
-    return albedos.correlation_length(centres, albedo.clamp_min(1e-3).log().mean(dim=1), _LONGEST)
-
-
-def _grains(centres: Tensor, albedo: Tensor, relief: Relief, grains: Tensor, spacing: float) -> Tensor:
-    """Albedo (p, 3), sRGB-encoded, of particles beneath soil Gaussians of a linear albedo (n, 3)."""
-    length = _length(centres, albedo)
-    return encoded(albedos.grain_albedo(grains, relief.depth_below(grains), centres, albedo, spacing, length))
-
-
-def _albedo(soil: Gaussians, lit: LitRelief, grains: Tensor, spacing: float) -> dict[str, Tensor]:
+def _albedo(soil: Gaussians, lit: LitRelief, grains: Tensor, spacing: float, bed: Bed) -> dict[str, Tensor]:
     """First albedo of soil and grains: the reconstruction's colours with the light on them taken out."""
     light = lit.irradiance(soil.means.contiguous(), _FOOTPRINT).clamp_min(0.05)
     albedo = (linear(soil.colours) / light).clamp(0.0, albedos.BRIGHTEST)
-    beneath = _grains(soil.means, albedo, lit.relief, grains, spacing)
-    return {"soil_albedo": encoded(albedo), "grain_albedo": beneath}
+    surface = albedos.SurfaceAlbedo(soil.means, albedo, spacing, bed.lower, bed.upper)
+    beneath = surface.beneath(grains, lit.relief.depth_below(grains))
+    return {"soil_albedo": encoded(albedo), "grain_albedo": encoded(beneath)}
 
 
 def _refined(scene: Scene, posed: Posed, frames: list[Frame], rounds: int) -> Scene:

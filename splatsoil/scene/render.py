@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -14,9 +15,10 @@ from torch import Tensor
 
 from splatsoil.measurement import Bed, Camera, Measurement
 from splatsoil.scene import kernels
+from splatsoil.scene.albedo import SurfaceAlbedo
 from splatsoil.scene.binding import Binding
 from splatsoil.scene.kernels_colour import WIDTH, develop
-from splatsoil.scene.light import Light
+from splatsoil.scene.light import Light, linear
 from splatsoil.scene.lit import LitRelief, ceiling, light_relief, march_step
 from splatsoil.scene.relief import Relief, grid_of, relief_of_particles
 from splatsoil.scene.tool import ToolBody, eye_of
@@ -136,6 +138,12 @@ class Scene:
     def device(self) -> torch.device:
         """Where the scene is drawn."""
         return self.soil.rest.device
+
+    @cached_property
+    def surface_albedo(self) -> SurfaceAlbedo:
+        """What photographs show of the soil's albedo, as a map."""
+        rest, albedo = self.soil.rest, linear(self.soil_albedo)
+        return SurfaceAlbedo(rest, albedo, self.spacing, self.bed.lower, self.bed.upper)
 
     @classmethod
     def from_reconstruction(

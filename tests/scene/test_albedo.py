@@ -5,7 +5,7 @@ import math
 import numpy as np
 import torch
 
-from splatsoil.scene.albedo import grain_albedo, other_grain_albedo
+from splatsoil.scene.albedo import SurfaceAlbedo, other_grain_albedo
 
 LENGTH, CONTRAST = 0.03, 0.2
 
@@ -54,7 +54,10 @@ def test_best_guess_and_what_is_left_open_make_up_the_whole_variance():
     grains = torch.tensor(centres - [0.0, 0.0, depth], dtype=torch.float32)
     surface = torch.tensor(colours, dtype=torch.float32)
     deep = torch.full((len(centres),), depth)
-    best = grain_albedo(grains, deep, torch.tensor(centres, dtype=torch.float32), surface, 0.01, LENGTH)
+    corners = (-0.005, -0.005), (0.295, 0.295)
+    shown = SurfaceAlbedo(torch.tensor(centres, dtype=torch.float32), surface, 0.01, *corners, LENGTH)
+    assert torch.allclose(shown.above(grains), surface, rtol=0.08)
+    best = shown.beneath(grains, deep)
     told = np.log(best[:, 0].numpy()).var() / np.log(colours[:, 0]).var()
     opened = guesses(cloud(), depth).var() / guesses(cloud(), 10.0 * LENGTH).var()
     assert abs(told - math.exp(-1.0)) < 0.03
