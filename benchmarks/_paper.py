@@ -6,7 +6,7 @@ import io
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -207,12 +207,12 @@ def optimiser_of(way: str, seed: int, told: Sequence[Told]) -> BayesianOptimiser
 
 
 def propose(way: str, seed: int, told: Sequence[Told]) -> float:
-    """The angle to try next; a worker's job."""
+    """The angle to try next."""
     return float(SPACE.from_unit(optimiser_of(way, seed, told).ask().astype(np.float64))[0])
 
 
 def conclude(way: str, seed: int, told: Sequence[Told]) -> dict[str, float]:
-    """What a search came to; a worker's job."""
+    """What a search came to."""
     result = optimiser_of(way, seed, told).result()
     best = min(told, key=lambda t: np.inf if t.loss is None else t.loss).action
     estimate, low, high, luckiest = (
@@ -224,7 +224,7 @@ def conclude(way: str, seed: int, told: Sequence[Told]) -> dict[str, float]:
 def by_features(
     space: ParameterSpace, angles: FloatArray, blocks: FloatArray, labels: Sequence[Block], sensor: float, seed: int
 ) -> dict[str, float] | None:
-    """The posterior that features allow, None where they are too few or nothing is seen; a worker's job."""
+    """The posterior that features allow, None where they are too few or nothing is seen."""
     seen = np.all(blocks != 0.0, axis=0) if len(blocks) else np.zeros(0, dtype=bool)
     if len(blocks) < 1 + FEWEST or not seen.any():
         return None
@@ -235,13 +235,12 @@ def by_features(
     return {"estimate": float(values.mean()), "std": float(values.std()), "low": low, "high": high}
 
 
-def play(sight: Sight, trials: Sequence[Trial], folder: Path, pool: Executor, say: Say) -> None:
+def play(sight: Sight, trials: Sequence[Trial], folder: Path, say: Say) -> None:
     """Let all trials of a world take their evaluations step by step, side by side; each evaluation is kept in the
     folder, and not made again."""
     count = sight.protocol.evaluations
     for step in range(count):
-        waiting = [(t, pool.submit(propose, t.way, t.number, t.told)) for t in trials]
-        angles = [(t, float(future.result())) for t, future in waiting]
+        angles = [(t, propose(t.way, t.number, t.told)) for t in trials]
         for way in SEARCHES:
             mine = [(t, angle) for t, angle in angles if t.way == way]
             files = [folder / f"{t.number}-{way}-{step}.npz" for t, _ in mine]
@@ -258,7 +257,7 @@ def play(sight: Sight, trials: Sequence[Trial], folder: Path, pool: Executor, sa
         say(f"evaluation {step + 1} of {count} of {len(trials)} searches")
 
 
-def search(sight: Sight, angle: float, numbers: Sequence[int], out: Path, where: str, pool: Executor, say: Say) -> None:
+def search(sight: Sight, angle: float, numbers: Sequence[int], out: Path, where: str, say: Say) -> None:
     """Trials of one world that the folder doesn't have yet."""
     trials = [
         Trial(n, way)
@@ -269,24 +268,18 @@ def search(sight: Sight, angle: float, numbers: Sequence[int], out: Path, where:
     if not trials:
         return
     began = time.perf_counter()
-    play(sight, trials, out / "evaluations" / where, pool, say)
+    play(sight, trials, out / "evaluations" / where, say)
     sensor = sight.comparator.block_noise()
-    done = []
     for t in trials:
         good = [(a, k) for a, k in zip(t.angles, t.looks, strict=True) if k is not None]
-        features = None
-        if t.way == "ours":
-            angles, blocks = np.array([a for a, _ in good]), np.array([k.blocks for _, k in good])
-            features = pool.submit(by_features, SPACE, angles, blocks, sight.comparator.labels, sensor, t.number)
-        done.append((t, pool.submit(conclude, t.way, t.number, t.told) if good else None, features))
-    for t, concluded, features in done:
         calls = [
             {"angle": a, **({} if k is None else {"published": k.published, "ours": k.ours})}
             for a, k in zip(t.angles, t.looks, strict=True)
         ]
-        result: dict[str, Any] = {t.way: None if concluded is None else concluded.result(), "calls": calls}
-        if features is not None:
-            result["features"] = features.result()
+        result: dict[str, Any] = {t.way: conclude(t.way, t.number, t.told) if good else None, "calls": calls}
+        if t.way == "ours":
+            angles, blocks = np.array([a for a, _ in good]), np.array([k.blocks for _, k in good])
+            result["features"] = by_features(SPACE, angles, blocks, sight.comparator.labels, sensor, t.number)
         result["seconds"] = (time.perf_counter() - began) / len(trials)
         write_json(out / "trials" / f"{angle:g}-{t.number}-{t.way}.json", result)
     say(f"{angle:g}°: {len(trials)} searches in {time.perf_counter() - began:.0f} s")

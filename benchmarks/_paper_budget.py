@@ -9,12 +9,11 @@ The differences of their minima add up to the whole error.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Executor, Future
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from splatsoil.benchmarks._paper import WAYS, FloatArray, Images, Look, Say, Sight, by_features, look, threads
+from splatsoil.benchmarks._paper import WAYS, Images, Look, Say, Sight, by_features, look, threads
 from splatsoil.inverse.surrogate import Surrogate
 
 from splatsoil.comparison import Comparator
@@ -31,7 +30,7 @@ STAND_INS = 4
 FIRST = 900_001
 
 
-def error_budget(sight: Sight, angle: float, pool: Executor, say: Say) -> dict[str, Any]:
+def error_budget(sight: Sight, angle: float, say: Say) -> dict[str, Any]:
     """Mean minima of each loss on each kind of observation, and what follows.
 
     Returns:
@@ -58,19 +57,15 @@ def error_budget(sight: Sight, angle: float, pool: Executor, say: Say) -> dict[s
             looks += [None if futures is None else [future.result() for future in futures] for futures in waiting]
     out: dict[str, Any] = {"angle": angle, "range": [low, high], "seeds": seeds, "points": points}
     minima: dict[str, dict[str, list[list[float]]]] = {way: {} for way in WAYS}
-    pending: list[tuple[str, str, list[Future[Any]]]] = []
     for place, (kind, _, observer) in enumerate(every):
         known = [(a, s, k[place]) for (a, s), k in zip(jobs, looks, strict=True) if k is not None]
         for way in WAYS[:2]:
             groups = [[(a, k.loss(way)) for a, s, k in known if s == seed] for seed in range(1, seeds + 1)]
-            pending.append((way, kind, [pool.submit(minimum, space, g) for g in groups if len(g) > 3]))
+            minima[way].setdefault(kind, []).append([minimum(space, g) for g in groups if len(g) > 3])
         angles, blocks = np.array([a for a, _, _ in known]), np.array([k.blocks for _, _, k in known])
-        sensor = observer.block_noise()
-        pending.append(("features", kind, [pool.submit(_by_features, space, angles, blocks, observer.labels, sensor)]))
-    for way, kind, futures in pending:
-        found = [value for future in futures if (value := future.result()) is not None]
-        minima[way].setdefault(kind, []).append(found)
-    out["ways"] = {way: shares(found, angle) for way, found in minima.items()}
+        found = by_features(space, angles, blocks, observer.labels, observer.block_noise(), 0)
+        minima["features"].setdefault(kind, []).append([] if found is None else [found["estimate"]])
+    out["ways"] = {way: shares(mine, angle) for way, mine in minima.items()}
     return out
 
 
@@ -98,16 +93,9 @@ def shares(minima: Mapping[str, Sequence[Sequence[float]]], angle: float) -> dic
 
 
 def minimum(space: ParameterSpace, scan: Sequence[tuple[float, float]]) -> float:
-    """Where a landscape (angle, loss) is lowest, degrees; a worker's job."""
+    """Where a landscape (angle, loss) is lowest, degrees."""
     points = space.to_unit(np.array([[a] for a, _ in scan]))
     return float(space.from_unit(Surrogate(points, [loss for _, loss in scan]).minimum().estimate)[0])
-
-
-def _by_features(
-    space: ParameterSpace, angles: FloatArray, blocks: FloatArray, labels: Any, sensor: float
-) -> float | None:
-    found = by_features(space, angles, blocks, labels, sensor, 0)
-    return None if found is None else found["estimate"]
 
 
 def _stand_ins(sight: Sight, angle: float) -> dict[str, list[Comparator]]:

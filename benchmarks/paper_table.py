@@ -15,6 +15,9 @@ one:
 The angle is searched in [25°, 55°]. All trials of a world go on side by side: one batch of simulations for each step.
 An error budget says what the landscapes' minima owe to reconstruction, grid, loss and chance. Every evaluation is kept
 in the folder as it ends, and an interrupted benchmark goes on.
+
+On GPUs, give them enough to do: ``--device cuda:0 cuda:1 --executor processes:20`` shares worlds out, then trials and
+budgets, over twenty processes and two devices.
 """
 
 from __future__ import annotations
@@ -23,8 +26,11 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -41,24 +47,72 @@ from splatsoil.files import code_digest, read_json, write_json
 TARGET = (0.3, 0.3)
 
 
-def run(protocol: Protocol, out: Path, pool: Executor, say: Say) -> dict[str, Any]:
-    """All trials and budgets, those in the folder already not again; errors of each way at each angle."""
+@dataclass(frozen=True)
+class Clock:
+    """Says what goes on, and since when; several processes share one."""
+
+    began: float
+
+    def __call__(self, what: str) -> None:
+        print(f"{time.time() - self.began:7.0f} s  {what}", file=sys.stderr, flush=True)
+
+
+def run(
+    protocol: Protocol, out: Path, pool: Executor, say: Say, *, devices: Sequence[str] = (), parts: int = 1
+) -> dict[str, Any]:
+    """All trials and budgets, those in the folder already not again; errors of each way at each angle.
+
+    Args:
+        protocol: what to do.
+        out: folder of worlds, evaluations and results.
+        pool: where worlds are made, then searched.
+        say: told what goes on; picklable if the pool is of processes.
+        devices: that the jobs take in turn; the protocol's by default.
+        parts: jobs that a world's trials are spread over.
+    """
     write_json(out / "protocol.json", _kept_protocol(protocol, out))
+    turns = cycle([replace(protocol, device=device) for device in devices] or [protocol])
+    worlds: list[tuple[float, int]] = []
+    jobs: list[tuple[Callable[..., None], float, int, list[int]]] = []
     for angle in protocol.angles:
         for number in range(protocol.worlds):
             mine = [t for t in range(protocol.trials) if t % protocol.worlds == number]
             missing = [
                 t for t in mine if any(not (out / "trials" / f"{angle:g}-{t}-{w}.json").is_file() for w in SEARCHES)
             ]
-            file = out / "budget" / f"{angle:g}.json"
-            wanted = number == 0 and protocol.scan[0] > 0 and not file.is_file()
-            if not missing and not wanted:
-                continue
-            sight = Sight(*world(protocol, angle, number, out, say), protocol)
-            search(sight, angle, missing, out, f"{angle:g}-{number}", pool, say)
-            if wanted:
-                write_json(file, error_budget(sight, angle, pool, say))
+            wanted = number == 0 and protocol.scan[0] > 0 and not (out / "budget" / f"{angle:g}.json").is_file()
+            shares = [missing[k::parts] for k in range(parts) if missing[k::parts]]
+            if shares or wanted:
+                worlds.append((angle, number))
+            jobs += [(_search, angle, number, share) for share in shares]
+            jobs += [(_budget, angle, number, [])] if wanted else []
+    for future in [pool.submit(_world, next(turns), angle, number, out, say) for angle, number in worlds]:
+        future.result()
+    for future in [pool.submit(job, next(turns), a, number, mine, out, say) for job, a, number, mine in jobs]:
+        future.result()
     return collect(protocol, out)
+
+
+def _world(protocol: Protocol, angle: float, number: int, out: Path, say: Say) -> None:
+    """A worker's job: a world and its reconstruction, if the folder doesn't have them."""
+    world(protocol, angle, number, out, say)
+
+
+@lru_cache(maxsize=1)
+def _sight(protocol: Protocol, angle: float, number: int, out: Path, say: Say) -> Sight:
+    """A world as the model sees it; a worker that stays at one keeps it."""
+    return Sight(*world(protocol, angle, number, out, say), protocol)
+
+
+def _search(protocol: Protocol, angle: float, number: int, trials: list[int], out: Path, say: Say) -> None:
+    """A worker's job: some trials of a world."""
+    search(_sight(protocol, angle, number, out, say), angle, trials, out, f"{angle:g}-{number}", say)
+
+
+def _budget(protocol: Protocol, angle: float, number: int, trials: list[int], out: Path, say: Say) -> None:
+    """A worker's job: the error budget of an angle."""
+    found = error_budget(_sight(protocol, angle, number, out, say), angle, say)
+    write_json(out / "budget" / f"{angle:g}.json", found)
 
 
 def _kept_protocol(protocol: Protocol, out: Path) -> dict[str, Any]:
@@ -163,9 +217,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--budget-seeds", type=int, default=usual.scan[0], help="of the error budget; 0 leaves it out")
     parser.add_argument("--budget-points", type=int, default=usual.scan[1], help="angles of its landscapes")
     parser.add_argument(
-        "--executor", default="serial", help="where searches think: serial, processes:N or dask:ADDRESS"
+        "--executor", default="serial", help="where worlds are made and searched: serial, processes:N or dask:ADDRESS"
     )
-    parser.add_argument("--device", default=usual.device)
+    parser.add_argument("--device", nargs="+", default=[usual.device], help="or several, which jobs take in turn")
     output_options(parser)
     options = parser.parse_args(arguments)
     hush()
@@ -179,18 +233,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         truth_cells=options.truth_cells,
         views=options.views,
         scale=options.picture_scale,
-        device=options.device,
+        device=options.device[0],
         reconstruction=options.reconstruction,
         scan=(options.budget_seeds, options.budget_points),
     )
     out = options.out or Path("runs") / "paper-table"
-    began = time.perf_counter()
-
-    def say(what: str) -> None:
-        print(f"{time.perf_counter() - began:7.0f} s  {what}", file=sys.stderr, flush=True)
-
+    began = time.time()
+    # Enough jobs for all processes at once: a world's trials in several, and its budget.
+    workers = int(options.executor.partition(":")[2]) if options.executor.startswith("processes:") else 1
+    parts = max(1, workers // (len(protocol.angles) * protocol.worlds) - (protocol.scan[0] > 0))
     with executor(options.executor) as pool:
-        result = {**run(protocol, out, pool, say), **stamp(options.device), "seconds": time.perf_counter() - began}
+        result = run(protocol, out, pool, Clock(began), devices=options.device, parts=parts)
+    result |= {**stamp(options.device[0]), "seconds": time.time() - began}
     write_result(out, result, table(result), {})
     print(json.dumps(result, indent=1) if options.json else table(result))
     return 0

@@ -53,7 +53,7 @@ def quiet(_: str) -> None:
 
 
 def run(sight: Any, out: Path) -> dict[str, Any]:
-    _paper.search(sight, TRUTH, [0, 1], out, "41-0", Serial(), quiet)
+    _paper.search(sight, TRUTH, [0, 1], out, "41-0", quiet)
     return {f.name: read_json(f) for f in sorted((out / "trials").glob("*.json"))}
 
 
@@ -110,6 +110,32 @@ def test_an_interrupted_table_makes_no_evaluation_twice(tmp_path: Path) -> None:
     for name, trial in whole.items():
         trial.pop("seconds"), again[name].pop("seconds")
     assert again == whole
+
+
+@pytest.mark.usefixtures("no_features")
+def test_trials_in_parts_on_several_devices_come_to_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    used: list[tuple[str, str]] = []
+
+    def made(protocol: Protocol, angle: float, number: int, out: Path, say: Any) -> tuple[str, str]:
+        used.append(("world", protocol.device))
+        return "measurement", "reconstruction"
+
+    def seen(measurement: str, reconstruction: str, protocol: Protocol) -> KnownSight:
+        used.append(("sight", protocol.device))
+        return KnownSight(protocol.evaluations)
+
+    monkeypatch.setattr(paper_table, "world", made)
+    monkeypatch.setattr(paper_table, "Sight", seen)
+    protocol = Protocol(angles=(TRUTH,), trials=4, evaluations=3, scan=(0, 9))
+    results = []
+    for name, devices, parts in (("whole", (), 1), ("parts", ("first", "second"), 3)):
+        used.clear()
+        out = tmp_path / name
+        results.append(paper_table.run(protocol, out, Serial(), quiet, devices=devices, parts=parts)["entries"])
+        assert len(list((out / "trials").glob("*.json"))) == 2 * 4
+    assert results[0] == results[1]
+    sights = [device for what, device in used if what == "sight"]
+    assert sights == ["second", "first", "second"], "the world took the first device"
 
 
 @pytest.mark.usefixtures("no_features")
@@ -228,12 +254,12 @@ def test_the_budget_tells_apart_what_was_put_in(monkeypatch: pytest.MonkeyPatch)
 
     monkeypatch.setattr(_paper_budget, "look", seen)
     monkeypatch.setattr(
-        _paper_budget, "_by_features", lambda space, angles, blocks, *_: float((angles - blocks[:, 0])[0])
+        _paper_budget, "by_features", lambda space, angles, blocks, *_: {"estimate": float((angles - blocks[:, 0])[0])}
     )
     stand_ins = {"grid": [observer(36.5), observer(36.5)], "same": [observer(35.2), observer(34.8)]}
     monkeypatch.setattr(_paper_budget, "_stand_ins", lambda *_: stand_ins)
     sight: Any = SimpleNamespace(protocol=Protocol(scan=(2, 7)), model=None, comparator=observer(38.5), drawn=drawn)
-    told = _paper_budget.error_budget(sight, 35.0, Serial(), quiet)
+    told = _paper_budget.error_budget(sight, 35.0, quiet)
     assert batches == [7, 7] and told["range"] == [27.0, 43.0]
     for way in ("published", "ours", "features"):
         parts = told["ways"][way]
