@@ -23,9 +23,9 @@ from splatsoil.splats.warp_torch import as_warp, launch
 
 FloatArray = npt.NDArray[np.float64]
 
-SMOOTHING = 1.2
-"""Standard deviation of the kernel in particle spacings. Less shows single particles, more rounds off the trench:
-measured on plow-dry's frames with its true particles, 0.8 to 1.2 differ by less than 10 % in image error."""
+SMOOTHING = 1.0
+"""Standard deviation of the kernel in particle spacings. Less shows single particles, more rounds off trench and heaps,
+so that soil looks weaker than it is and a fit takes it to be stronger (docs/photographs.md)."""
 
 _COARSE = 0.8
 """Cell of the density grid in particle spacings; the kernel is wide enough for it."""

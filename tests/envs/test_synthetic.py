@@ -100,7 +100,7 @@ def test_the_seed_draws_the_hidden_angle_and_only_the_end_tells() -> None:
 
 
 def test_near_the_truth_the_loss_is_smaller_than_far_from_it() -> None:
-    """Over several particle seeds, and though observation and prediction share no particle."""
+    """Whatever the particles' seed, and though observation and prediction share no particle."""
     problem = SyntheticProblem()
     problem.begin(5)
     truth = problem.truth()
@@ -113,7 +113,9 @@ def test_near_the_truth_the_loss_is_smaller_than_far_from_it() -> None:
 
     near = losses(angle)
     far = losses(angle - 9.0 if angle > 33.0 else angle + 9.0)
-    assert max(near) < min(far)
+    # One seed at a time: chance moves both alike.
+    assert len(near) == len(far) == 3
+    assert all(n < 0.9 * f for n, f in zip(near, far, strict=True))
     # Chance keeps the loss above zero; soil that doesn't move would have 1.
     assert min(near) > 0.0 and max(near) < 0.3
     assert len(set(near)) == 3

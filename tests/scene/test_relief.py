@@ -5,6 +5,8 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
+from splatsoil.measurement import Bed
+from splatsoil.reconstruction import HeightField, fill
 from splatsoil.scene import Relief, relief_of_particles
 
 LOWER, UPPER = np.zeros(3), np.array([0.4, 0.3, 0.2])
@@ -22,14 +24,31 @@ def filled(height, spacing=0.01, jitter=0.3, seed=0):
 
 @pytest.mark.parametrize("slope", [0.0, 0.15, -0.3])
 def test_plane_is_found_without_bias(slope):
-    relief = relief_of_particles(filled(lambda x, y: 0.1 + slope * (x - 0.2)), 0.01, LOWER, UPPER)
+    """With beds filled as a reconstruction's are; a lattice cut off at the plane would have steps of its own."""
+    x, y = np.linspace(0.0, 0.4, 41), np.linspace(0.0, 0.3, 31)
+    plane = HeightField(x, y, np.broadcast_to(0.1 + slope * (x - 0.2), (31, 41)))
+    particles = fill(plane, Bed(LOWER, UPPER, density=1600.0), 0.01, seed=3)
+    relief = relief_of_particles(torch.tensor(particles, dtype=torch.float32), 0.01, LOWER, UPPER)
     points = relief.points.numpy()
     inside = (np.abs(points[..., 0] - 0.2) < 0.15) & (np.abs(points[..., 1] - 0.15) < 0.12)
     error = points[..., 2] - (0.1 + slope * (points[..., 0] - 0.2))
     assert abs(error[inside].mean()) < 0.0008
-    assert error[inside].std() < 0.0012
+    assert error[inside].std() < 0.0008
     expected = np.array([-slope, 0.0, 1.0]) / np.hypot(slope, 1.0)
     assert np.allclose(relief.normal.numpy()[inside].mean(axis=0), expected, atol=0.02)
+
+
+@pytest.mark.parametrize("length", [0.06, 0.08, 0.12, 0.2])
+def test_waves_are_rounded_off_by_one_spacing_and_no_more(length):
+    """Against exp(-2 (pi s/l)^2), what a Gaussian of standard deviation s leaves of a wave of length l."""
+    particles = filled(lambda x, y: 0.1 + 0.05 * length * np.sin(2.0 * np.pi / length * x), jitter=1.0)
+    relief = relief_of_particles(particles, 0.01, LOWER, UPPER)
+    points = relief.points.numpy()
+    whole = 0.1 + length * int(0.25 / length)
+    inside = (points[..., 0] > 0.1) & (points[..., 0] < whole) & (np.abs(points[..., 1] - 0.15) < 0.12)
+    wave = np.sin(2.0 * np.pi / length * points[..., 0][inside])
+    found = np.polyfit(wave, points[..., 2][inside], 1)[0] / (0.05 * length)
+    assert found == pytest.approx(np.exp(-2.0 * (np.pi * 0.01 / length) ** 2), abs=0.05)
 
 
 def test_walls_do_not_pull_the_surface_down():
