@@ -35,9 +35,8 @@ from splatsoil.inverse.bayesopt import PAPER, BayesianOptimiser, Search
 from splatsoil.inverse.emulator import FEWEST, Emulator
 from splatsoil.inverse.executors import Executor, Serial, executor, in_order
 from splatsoil.inverse.feature_fit import by_features
-from splatsoil.inverse.likelihood import Likelihood
 from splatsoil.inverse.mcmc import sample
-from splatsoil.inverse.posterior import Data
+from splatsoil.inverse.posterior import Data, likelihood_of
 from splatsoil.inverse.surrogate import Minimum, Surrogate, sobol
 
 from splatsoil.errors import ParameterError, RunError
@@ -163,11 +162,10 @@ def _as_fitted(
         return found
 
 
-def sample_emulated(points: FloatArray, features: FloatArray, seed: int) -> Answer:
+def sample_emulated(space: ParameterSpace, points: FloatArray, features: FloatArray, seed: int) -> Answer:
     """emcee on an emulator of calls (k, n), (k, b); features are residuals, so the observed ones are 0."""
     began = time.perf_counter()
-    emulator = Emulator(points, features, seed=seed)
-    likelihood = Likelihood(emulator, np.zeros(features.shape[1]))
+    likelihood = likelihood_of(Data(space, points, -features), seed=seed)
     chains = sample(likelihood, likelihood.lower, likelihood.upper, seed=seed, ensembles=2, most_steps=1000)
     low, high = np.quantile(chains.flat, [0.05, 0.95], axis=0)
     return Answer(chains.flat.mean(axis=0), low, high, time.perf_counter() - began)
@@ -220,9 +218,9 @@ def trial(
         noise = np.random.default_rng([seed, 41])
         points = sobol(max(budgets), n, seed)
         features = np.array([world.call(p, noise)[1] for p in points])
-        out["mcmc"] = {b: sample_emulated(points[:b], features[:b], seed) for b in usable}
+        out["mcmc"] = {b: sample_emulated(world.space, points[:b], features[:b], seed) for b in usable}
     if "both" in ways and calls is not None:
-        out["both"] = {b: sample_emulated(calls[0][:b], calls[1][:b], seed) for b in usable}
+        out["both"] = {b: sample_emulated(world.space, calls[0][:b], calls[1][:b], seed) for b in usable}
     if "direct" in ways:
         out["direct"] = sample_directly(world, direct, seed, chance)
     return {way: answers for way, answers in out.items() if way in ways}

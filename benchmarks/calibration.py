@@ -30,12 +30,9 @@ from scipy.stats import binom, chisquare
 from splatsoil.benchmarks._calibration_full import one_truth
 from splatsoil.benchmarks._common import hush, output_options, simulated, stamp, ticker, world_options, write_result
 from splatsoil.envs.synthetic import SENSOR_NOISE, SyntheticProblem
-from splatsoil.inverse.emulator import Emulator
 from splatsoil.inverse.executors import Executor, Serial, executor, in_order
-from splatsoil.inverse.likelihood import Likelihood
 from splatsoil.inverse.mcmc import sample
-from splatsoil.inverse.misfit import measure
-from splatsoil.inverse.posterior import Data
+from splatsoil.inverse.posterior import Data, likelihood_of
 
 from splatsoil.errors import ParameterError
 from splatsoil.parameters import ParameterSpace
@@ -105,15 +102,15 @@ def one_fold(
     seed: int,
     number: int,
 ) -> list[dict[str, Any]]:
-    """Entries of the truths ``test``, by an emulator of the simulations ``train``; a worker's job."""
+    """Entries of the truths ``test``, by emulators of the simulations ``train``; a worker's job."""
     rng = np.random.default_rng([seed, 24, number])
-    emulator = Emulator(data.points[train], -data.residuals[train], seed=seed + 1000 * number)
     out: list[dict[str, Any]] = []
     for index in test:
         observed = -data.residuals[index] + sensor_std * rng.standard_normal(data.residuals.shape[1])
-        expected = emulator.outside_variance + sensor_std**2
-        misfit = measure(emulator.remainder(observed), expected, emulator.basis, data.places)
-        likelihood = Likelihood(emulator, observed, sensor_std**2, misfit)
+        seen = replace(
+            data, points=data.points[train], residuals=observed + data.residuals[train], sensor_std=sensor_std
+        )
+        likelihood = likelihood_of(seen, seed=seed + 1000 * number)
         chains = sample(likelihood, likelihood.lower, likelihood.upper, seed=int(index), ensembles=2, most_steps=2000)
         draws = chains.flat[:, : len(data.space)]
         draws = draws[rng.choice(len(draws), DRAWS, replace=False)]
@@ -129,7 +126,7 @@ def one_fold(
                 "within": within,
                 "mean": draws.mean(axis=0).tolist(),
                 "std": draws.std(axis=0).tolist(),
-                "misfit": misfit.present,
+                "misfit": likelihood.with_misfit,
                 "converged": chains.converged,
             }
         )

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.optimize import brentq
+from scipy.special import digamma, polygamma
 
 from .hyperparameters import JITTER, Hyperparameters, posterior
 
@@ -27,6 +29,14 @@ LEAST_SKILL = 0.1
 TRUSTED_SKILL = 0.6
 #: Fewest training evaluations, beyond one for each parameter.
 FEWEST = 4
+
+
+#: A normal distribution's standard deviation over its median distance from the middle.
+MAD = 1.4826
+#: Standard deviations of what isn't explained from which a feature counts with its distance only, and rounds of that.
+HUBER, HUBER_ROUNDS = 2.5, 30
+#: Degrees of freedom of what features have in common, from which they don't differ.
+MOST_SHARED = 1e4
 
 
 @dataclass(frozen=True)
@@ -51,10 +61,12 @@ class Emulator:
         points: (m, n) parameters in [-1, 1]; a point may repeat, with another seed.
         features: (m, b) of the simulations there.
         seed: of the hyperparameters' draws.
+        scale: (b,) units in which features are compared, such as `error_scale`; their own by default.
 
     Attributes:
         centre: (b,) mean features.
-        basis: (b, p) orthonormal directions.
+        scale: (b,) units of the features.
+        basis: (b, p) orthonormal directions of features in these units.
         chance: (p, p) covariance of one simulation's scores about the mean over seeds.
         left_out: leave-one-out diagnostics.
 
@@ -62,7 +74,9 @@ class Emulator:
         ValueError: too few points, features that aren't finite, or shapes that don't agree.
     """
 
-    def __init__(self, points: npt.ArrayLike, features: npt.ArrayLike, *, seed: int = 0) -> None:
+    def __init__(
+        self, points: npt.ArrayLike, features: npt.ArrayLike, *, seed: int = 0, scale: FloatArray | None = None
+    ) -> None:
         self.points = np.atleast_2d(np.asarray(points, dtype=np.float64))
         features = np.asarray(features, dtype=np.float64)
         m, n = self.points.shape
@@ -73,7 +87,8 @@ class Emulator:
         if m < n + FEWEST:
             raise ValueError(f"{m} evaluations are too few to emulate {n} parameters; {n + FEWEST} are needed at least")
         self.centre = features.mean(axis=0)
-        varying = features - self.centre
+        self.scale = np.ones(features.shape[1]) if scale is None else scale
+        varying = (features - self.centre) / self.scale
         left, size, right = np.linalg.svd(varying, full_matrices=False)
         share = np.cumsum(size**2) / max(float(np.sum(size**2)), 1e-300)
         count = min(int(np.searchsorted(share, VARIANCE)) + 1, MOST, m - 2)
@@ -115,17 +130,37 @@ class Emulator:
 
     @property
     def outside_variance(self) -> FloatArray:
-        """(b,) variance, over training points, of the part of each feature that the components leave out."""
+        """(b,) variance, over training points, of the part of each feature that the components leave out, in units
+        of the scale."""
         dof = max(len(self.points) - 1 - self.count, 1)
         return np.sum(self._outside**2, axis=0) / dof
 
     def project(self, features: npt.ArrayLike) -> FloatArray:
         """Scores (…, p) of features (…, b)."""
-        return (np.asarray(features, dtype=np.float64) - self.centre) @ self.basis
+        return (np.asarray(features, dtype=np.float64) - self.centre) / self.scale @ self.basis
+
+    def project_robustly(self, features: npt.ArrayLike) -> FloatArray:
+        """Scores (p,) of features (b,) of which some are far from what any parameter explains.
+
+        Huber's M-estimate by iterated weights, with the size of what isn't explained read off its median (Huber and
+        Ronchetti, Robust Statistics, 2009, 7.8): a lump that fell elsewhere, or a shadow's edge, counts with its
+        distance and not with the square of it.
+        """
+        varying = (np.asarray(features, dtype=np.float64) - self.centre) / self.scale
+        scores = varying @ self.basis
+        for _ in range(HUBER_ROUNDS):
+            off = np.abs(varying - self.basis @ scores)
+            limit = HUBER * MAD * float(np.median(off))
+            weight = np.where(off > limit, limit / np.maximum(off, 1e-300), 1.0)
+            if limit == 0.0:
+                break
+            weighted = self.basis * weight[:, None]
+            scores = np.linalg.solve(weighted.T @ self.basis, weighted.T @ varying)
+        return np.asarray(scores)
 
     def remainder(self, features: npt.ArrayLike) -> FloatArray:
-        """The part (…, b) of features that no parameter can explain: outside the basis."""
-        varying = np.asarray(features, dtype=np.float64) - self.centre
+        """The part (…, b) of features that no parameter can explain: outside the basis, in units of the scale."""
+        varying = (np.asarray(features, dtype=np.float64) - self.centre) / self.scale
         return varying - (varying @ self.basis) @ self.basis.T
 
     def predict(self, points: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -136,7 +171,12 @@ class Emulator:
 
     def features(self, points: npt.ArrayLike) -> FloatArray:
         """Mean features (q, b) at points (q, n)."""
-        return self.centre + self.predict(points)[0] @ self.basis.T
+        return self.centre + self.predict(points)[0] @ self.basis.T * self.scale
+
+    def chance_variance(self) -> FloatArray:
+        """(b,) variance of one simulation's features about the mean over seeds."""
+        within = np.einsum("bp,pq,bq->b", self.basis, self.chance, self.basis)
+        return np.asarray((within + self.outside_variance) * self.scale**2)
 
     def _measure_chance(self) -> FloatArray:
         """Scatter between seeds: from repeated points, leaning on the processes' noise where there are few of them."""
@@ -161,6 +201,60 @@ class Emulator:
             z[:, k] = error / std
             skill[k] = process.skill()
         return LeftOut(skill, z, float(np.mean(np.abs(z) < 1.6449)))
+
+
+def error_scale(points: npt.ArrayLike, features: npt.ArrayLike, observed: FloatArray, *, seed: int = 0) -> FloatArray:
+    """How far each feature may be off, over what the middle one may: units to compare features in.
+
+    Where sand slides in lumps, features differ from seed to seed far more than elsewhere, and say as much less of the
+    parameters. The model's own error comes on top, as large in one feature as in another: the larger it is, the less
+    chance matters.
+
+    Args:
+        points: (m, n) parameters in [-1, 1].
+        features: (m, b) of the simulations there.
+        observed: (b,).
+        seed: of the emulator.
+
+    Returns:
+        (b,) positive, 1 in the middle.
+
+    Raises:
+        ValueError: as `Emulator` does.
+    """
+    emulator = Emulator(points, features, seed=seed)
+    chance = moderated(emulator.chance_variance(), emulator.freedom)
+    unexplained = (MAD * float(np.median(np.abs(emulator.remainder(observed))))) ** 2
+    variance = chance + max(unexplained - float(np.median(chance)), 0.0)
+    middle = float(np.median(variance))
+    return np.sqrt(variance / middle) if middle > 0.0 else np.ones(len(variance))
+
+
+def moderated(variances: FloatArray, freedom: float) -> FloatArray:
+    """Variances of many things, each known from few samples, drawn towards what they have in common.
+
+    As far as samples of ``freedom`` degrees of freedom scatter more than such samples of one variance would, the things
+    differ (empirical Bayes with an inverse-χ² prior fitted by moments of logarithms; Smyth 2004, Stat. Appl. Genet.
+    Mol. Biol. 3:3, section 6.2).
+
+    Args:
+        variances: (b,) sampled; those of 0 stay.
+        freedom: behind each.
+
+    Returns:
+        (b,) means of the variances' posteriors' scale.
+    """
+    some = variances > 0.0
+    if np.count_nonzero(some) < 3 or freedom < 1.0:
+        return np.full(len(variances), float(np.median(variances)))
+    half = 0.5 * freedom
+    logs = np.log(variances[some]) - digamma(half) + np.log(half)
+    spread = float(np.var(logs, ddof=1)) - float(polygamma(1, half))
+    if spread <= float(polygamma(1, MOST_SHARED / 2.0)):
+        return np.where(some, np.exp(logs.mean()), 0.0)
+    prior = 2.0 * brentq(lambda x: float(polygamma(1, x)) - spread, 1e-3, MOST_SHARED / 2.0)
+    common = float(np.exp(logs.mean() + digamma(0.5 * prior) - np.log(0.5 * prior)))
+    return np.where(some, (prior * common + freedom * variances) / (prior + freedom), 0.0)
 
 
 class _Process:

@@ -70,8 +70,8 @@ class Likelihood:
 
     @cached_property
     def scores(self) -> FloatArray:
-        """(p,) the observed features in the basis."""
-        return self.emulator.project(self.observed)
+        """(p,) the observed features in the basis, those far from all that parameters explain counting less."""
+        return self.emulator.project_robustly(self.observed)
 
     @cached_property
     def freedom(self) -> float:
@@ -80,7 +80,8 @@ class Likelihood:
 
     @cached_property
     def _fixed(self) -> FloatArray:
-        return self.emulator.chance + self.sensor * np.eye(self.emulator.count)
+        basis, scale = self.emulator.basis, self.emulator.scale
+        return self.emulator.chance + self.sensor * (basis / scale[:, None] ** 2).T @ basis
 
     def covariance(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Predicted mean scores (k, p) and scale Σ (k, p, p) of the observed ones about them."""

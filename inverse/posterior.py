@@ -16,7 +16,7 @@ from splatsoil.errors import RunError
 from splatsoil.parameters import Parameter, ParameterSpace
 
 from .campaign import Job
-from .emulator import FEWEST, Emulator
+from .emulator import FEWEST, Emulator, error_scale
 from .evaluations import EvaluationRecord, digest
 from .likelihood import Likelihood
 from .mcmc import Chains, sample
@@ -147,12 +147,13 @@ def likelihood_of(data: Data, *, seed: int = 0) -> Likelihood:
         RunError: the evaluations don't differ, or there are too few.
     """
     # Residuals are observed minus predicted: the observation is where they are 0, and predictions are minus them.
+    observed = np.zeros(data.residuals.shape[1])
     try:
-        emulator = Emulator(data.points, -data.residuals, seed=seed)
+        scale = error_scale(data.points, -data.residuals, observed, seed=seed)
+        emulator = Emulator(data.points, -data.residuals, seed=seed, scale=scale)
     except ValueError as error:
         raise RunError(f"no emulator can be made: {error}") from error
-    observed = np.zeros(data.residuals.shape[1])
-    expected = emulator.outside_variance + data.sensor_std**2
+    expected = emulator.outside_variance + (data.sensor_std / scale) ** 2
     misfit = measure(emulator.remainder(observed), expected, emulator.basis, data.places)
     return Likelihood(emulator, observed, data.sensor_std**2, misfit)
 

@@ -174,9 +174,7 @@ def predictive_figure(posterior: Posterior) -> Figure:
     draws = posterior.unit[rng.choice(len(posterior.unit), PREDICTIVE)]
     predicted = emulator.features(draws)
     mean, spread = predicted.mean(axis=0), predicted.std(axis=0)
-    chance = np.sqrt(
-        np.einsum("bp,pq,bq->b", emulator.basis, emulator.chance, emulator.basis) + emulator.outside_variance
-    )
+    chance = np.sqrt(emulator.chance_variance())
     residual = posterior.likelihood.observed - mean
     cameras = sorted({p.camera for p in places})
     last = max(p.frame for p in places)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF
-from splatsoil.inverse.emulator import Emulator, _Process
+from splatsoil.inverse.emulator import HUBER, MAD, Emulator, _Process, error_scale, moderated
 from splatsoil.inverse.surrogate import sobol
 
 DIRECTIONS = np.linalg.qr(np.random.default_rng(0).normal(size=(40, 3)))[0]
@@ -117,3 +118,56 @@ def test_features_that_are_all_chance_have_no_skill() -> None:
 def test_what_cannot_be_emulated_is_refused(points: np.ndarray, features: np.ndarray, says: str) -> None:
     with pytest.raises(ValueError, match=says):
         Emulator(points, features)
+
+
+def test_robust_scores_are_hubers_by_scipy() -> None:
+    """Some features are far off; SciPy minimises the same loss by other means, with the size found here."""
+    rng = np.random.default_rng(12)
+    points = rng.uniform(-1.0, 1.0, (14, 1))
+    emulator = Emulator(points, points @ rng.normal(size=(1, 80)) + 0.05 * rng.normal(size=(14, 80)))
+    observed = emulator.features(np.array([[0.4]]))[0] + 0.1 * rng.normal(size=80)
+    observed[:9] += 4.0
+    found = emulator.project_robustly(observed)
+    off = observed - emulator.centre
+    size = HUBER * MAD * float(np.median(np.abs(off - emulator.basis @ found)))
+    expected = least_squares(
+        lambda s: off - emulator.basis @ s, np.zeros(emulator.count), loss="huber", f_scale=size, xtol=1e-12
+    ).x
+    np.testing.assert_allclose(found, expected, atol=1e-4)
+    (true,), _ = emulator.predict(np.array([[0.4]]))
+    assert np.abs(found - true).max() < 0.3 * np.abs(emulator.project(observed) - true).max()
+
+
+@pytest.mark.parametrize("freedom", [4.0, 8.0])
+def test_variances_are_drawn_together_as_far_as_they_are_the_same(freedom: float) -> None:
+    """What differs by sampling only comes out as one; an inverse-gamma prior's mean squared error is the least."""
+    rng = np.random.default_rng(13)
+
+    def sampled(true: np.ndarray) -> np.ndarray:
+        return true * rng.chisquare(freedom, len(true)) / freedom
+
+    alike = moderated(sampled(np.full(3000, 2.0)), freedom)
+    assert alike.mean() == pytest.approx(2.0, rel=0.05) and alike.std() < 0.15 * alike.mean()
+    prior, common = 5.0, 3.0
+    true = common * prior / rng.chisquare(prior, 20_000)
+    found = moderated(sampled(true), freedom)
+    # the weight of what is common follows from the prior's degrees of freedom
+    own = sampled(true)
+    np.testing.assert_allclose(moderated(own, freedom), (prior * common + freedom * own) / (prior + freedom), rtol=0.12)
+    assert np.mean(np.log(found / true) ** 2) < np.mean(np.log(own / true) ** 2)
+
+
+def test_features_that_scatter_count_less_unless_the_model_is_wrong() -> None:
+    """Against the standard deviations that they were made with."""
+    rng = np.random.default_rng(14)
+    points = np.linspace(-1.0, 1.0, 24)[:, None]
+    std = np.where(np.arange(300) < 100, 3.0, 0.5)
+    features = points @ rng.normal(size=(1, 300)) + std * rng.normal(size=(24, 300))
+    right = 0.2 * rng.normal(size=300)
+    scale = error_scale(points, features, right)
+    assert np.median(scale[:100]) / np.median(scale[100:]) == pytest.approx(6.0, rel=0.35)
+    wrong = right + 20.0 * rng.normal(size=300)
+    assert np.ptp(error_scale(points, features, wrong)) < 0.05
+    # what does not scatter at all is compared as it is
+    flat = error_scale(points, points @ rng.normal(size=(1, 300)), wrong)
+    np.testing.assert_allclose(flat, 1.0, rtol=0.05)

@@ -23,8 +23,9 @@ def likelihood() -> Likelihood:
 def test_it_is_students_t(likelihood: Likelihood) -> None:
     where = np.random.default_rng(3).uniform(-1.0, 1.0, (20, 2))
     mean, scale = likelihood.covariance(where)
-    observed = likelihood.emulator.project(likelihood.observed)
-    expected = [multivariate_t(m, s, likelihood.freedom).logpdf(observed) for m, s in zip(mean, scale, strict=True)]
+    expected = [
+        multivariate_t(m, s, likelihood.freedom).logpdf(likelihood.scores) for m, s in zip(mean, scale, strict=True)
+    ]
     np.testing.assert_allclose(likelihood.log_likelihood(where), expected, rtol=1e-9)
     # two parameters and a mean are taken from fourteen evaluations at least
     assert 3.0 <= likelihood.freedom <= 11.0
