@@ -1,9 +1,10 @@
 """Hidden effects in an independent solver's worlds: does the whole chain name the right one?
 
 Each world is one run of Newton's implicit MPM (extra ``independent``) with one thing that its measurement set doesn't
-tell, or with nothing, photographed by the path tracer. ``splatsoil fit`` and ``diagnose`` then get the set alone.
-Truths (what is hidden, how much, the friction angle, the surface, looks) are drawn by a stream of random numbers of
-their own, and opened only to score. What was made is kept in the folder, and a second call goes on from there.
+tell, or with nothing, photographed by the path tracer, or by Mitsuba 3 (``--renderer mitsuba``). ``splatsoil fit`` and
+``diagnose`` then get the set alone. Truths (what is hidden, how much, the friction angle, the surface, looks) are drawn
+by a stream of random numbers of their own, and opened only to score. What was made is kept in the folder, and a second
+call goes on from there.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from typing import Any
 
 import numpy as np
 from splatsoil.benchmarks._common import hush, stamp
+from splatsoil.benchmarks._mitsuba import MitsubaStage
 from splatsoil.benchmarks._newton import Numerics, World, plough
 from splatsoil.benchmarks.hidden_effects import wilson
 from splatsoil.benchmarks.numerics import FloatArray
@@ -32,7 +34,7 @@ from splatsoil.observation import Observation
 from splatsoil.reconstruction import fill
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
-from splatsoil.synthetic import Appearance, Setup, photograph_run, plow
+from splatsoil.synthetic import Appearance, Renderer, Setup, Stage, photograph_run, plow
 
 NUMERICS = Numerics(voxel=0.02, substeps=2, iterations=120)
 SPACING = 0.01
@@ -159,6 +161,7 @@ KINDS: dict[str, Callable[[np.random.Generator, Hidden], Hidden]] = {
     FIELD: _friction_field,
 }
 OBSERVATION = ("exposure", "time_offset")
+RENDERERS: dict[str, Callable[..., Renderer]] = {"own": Stage, "mitsuba": MitsubaStage}
 
 
 def draw(kind: str, number: int, seed: int) -> Hidden:
@@ -185,7 +188,13 @@ def soil_of(hidden: Hidden, setup: Setup) -> World:
     return World(hidden.name, angle, x, SPACING, **told)
 
 
-def make_worlds(truths: Sequence[Hidden], out: Path, device: str, say: Callable[[str], None]) -> None:
+def make_worlds(
+    truths: Sequence[Hidden],
+    out: Path,
+    device: str,
+    say: Callable[[str], None],
+    renderer: Callable[..., Renderer] = Stage,
+) -> None:
     """Simulate and photograph the worlds that the folder doesn't have, those under one gravity side by side."""
     missing = [h for h in truths if not (out / "sets" / h.name / "truth.json").is_file()]
     for gravity in dict.fromkeys(h.gravity for h in missing):
@@ -220,6 +229,7 @@ def make_worlds(truths: Sequence[Hidden], out: Path, device: str, say: Callable[
                 observation=observation,
                 seed=hidden.seed,
                 device=device,
+                renderer=renderer,
             )
             say(f"{hidden.name} photographed, {time.perf_counter() - began:.0f} s")
 
@@ -332,6 +342,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--preset", default="small")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--side-by-side", type=int, default=1, help="chains at a time")
+    parser.add_argument(
+        "--renderer", choices=list(RENDERERS), default="own", help="takes the photographs; mitsuba needs the package"
+    )
     parser.add_argument("--worlds-only", action="store_true", help="make the sets and stop")
     parser.add_argument("--out", type=Path, default=Path("runs/hidden-worlds"))
     options = parser.parse_args(arguments)
@@ -346,7 +359,7 @@ def main(arguments: list[str] | None = None) -> int:
         for kind in options.kinds
         for k in range((3 if kind == NOTHING else 1) * options.count)
     ]
-    make_worlds(truths, options.out, options.device, say)
+    make_worlds(truths, options.out, options.device, say, RENDERERS[options.renderer])
     if options.worlds_only:
         return 0
     threads = max(1, (os.cpu_count() or 1) // options.side_by_side)

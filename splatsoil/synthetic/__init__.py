@@ -1,6 +1,7 @@
 """Synthetic worlds: our own solver moves the sand, a path tracer that shares nothing with the splats photographs it."""
 
 from splatsoil.synthetic.appearance import Appearance
+from splatsoil.synthetic.pictures import Renderer
 from splatsoil.synthetic.setups import Setup, like, paper, plow
 from splatsoil.synthetic.soil_surface import soil_surface
 from splatsoil.synthetic.stage import Body, Light, Stage, photograph
@@ -10,6 +11,7 @@ __all__ = [
     "Appearance",
     "Body",
     "Light",
+    "Renderer",
     "Setup",
     "Stage",
     "World",

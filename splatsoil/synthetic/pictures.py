@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -31,6 +32,12 @@ GRAIN = 0.1
 """Contrast of the fine pattern of bin and ground."""
 
 
+class Renderer(Protocol):
+    """What pictures of a stage are taken with: takes `Stage`'s arguments, and has its `Stage.radiance`."""
+
+    def radiance(self, camera: Camera, *, seed: int = 0, side: int = 4) -> FloatImage: ...
+
+
 @dataclass
 class Photographer:
     """Takes the pictures of one simulated run.
@@ -43,6 +50,7 @@ class Photographer:
         device: Warp device name.
         progress: called with the share of the pictures that is done.
         observation: how the video cameras, their light and the drawn tool differ from what the set will say.
+        renderer: makes a stage of `Stage`'s arguments.
     """
 
     setup: Setup
@@ -52,6 +60,7 @@ class Photographer:
     device: str = "cpu"
     progress: Callable[[float], None] = lambda share: None
     observation: Observation = field(default_factory=Observation)
+    renderer: Callable[..., Renderer] = Stage
     _done: int = field(default=0, init=False)
 
     def take(self) -> tuple[list[Picture], list[Picture]]:
@@ -80,7 +89,7 @@ class Photographer:
         video.sort(key=lambda picture: (picture.frame, order[picture.camera.name]))
         return views, video
 
-    def stage(self, frame: int, colours: FloatArray, seen: Observation) -> Stage:
+    def stage(self, frame: int, colours: FloatArray, seen: Observation) -> Renderer:
         """Soil, tool, bin and ground of one frame of the video; particle albedo (n, 3), linear."""
         setup = self.setup
         look = replace(
@@ -96,7 +105,7 @@ class Photographer:
         tool = setup.tool.mesh
         placed = trimesh.Trimesh(tool.vertices @ rotation.T + position, tool.faces, process=False)
         walls, ground = bin_of(setup)
-        return Stage(
+        return self.renderer(
             [soil, Body.flat(placed, look.tool), *(Body.flat(wall, look.bin, GRAIN) for wall in walls)],
             look.light,
             ground=ground,
@@ -106,7 +115,7 @@ class Photographer:
             device=self.device,
         )
 
-    def _light(self, stage: Stage, camera: Camera, which: int, number: int) -> FloatImage:
+    def _light(self, stage: Renderer, camera: Camera, which: int, number: int) -> FloatImage:
         paths = self._generator(4, which, number).integers(2**31)
         image = stage.radiance(camera, seed=int(paths), side=PATHS)
         self._done += 1

@@ -26,8 +26,9 @@ from splatsoil.reconstruction.filling import fill
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
 from splatsoil.synthetic.appearance import Appearance
-from splatsoil.synthetic.pictures import NOISE, Photographer
+from splatsoil.synthetic.pictures import NOISE, Photographer, Renderer
 from splatsoil.synthetic.setups import Setup
+from splatsoil.synthetic.stage import Stage
 
 FloatArray = npt.NDArray[np.float64]
 Report = Callable[[str, float], None]
@@ -160,6 +161,7 @@ def photograph_run(
     seed: int = 0,
     device: str = "cpu",
     progress: Callable[[float], None] = lambda share: None,
+    renderer: Callable[..., Renderer] = Stage,
 ) -> Measurement:
     """Make a measurement set from a run of any simulator; the folder appears whole or not at all.
 
@@ -173,13 +175,16 @@ def photograph_run(
         seed: of light paths and noise.
         device: Warp device name.
         progress: called with the share of the pictures that is done.
+        renderer: makes what pictures are taken of, from `Stage`'s arguments.
 
     Raises:
         ParameterError: a place that is taken or cannot be written.
     """
     target = Path(out)
     check_place(target)
-    photographer = Photographer(setup, trajectory, appearance, seed, device, progress, observation or Observation())
+    photographer = Photographer(
+        setup, trajectory, appearance, seed, device, progress, observation or Observation(), renderer
+    )
     views, video = photographer.take()
     frames = np.arange(1, len(trajectory.force) + 1)
     force = np.column_stack([frames, frames / setup.frame_rate, trajectory.force]) if len(frames) else None
