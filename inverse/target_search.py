@@ -4,7 +4,8 @@ The emulator of the features predicts them at points not evaluated, so the sum o
 variance in closed form; the next point is where it is expected to improve most on the least so far (Uhrenholt & Jensen
 2019, AISTATS, "Efficient Bayesian optimization for target vector estimation"; here with a normal distribution of that
 mean and variance). Residuals are smooth where their sum of squares has a narrow, bent valley, so few evaluations find
-its bottom, in several parameters most of all.
+its bottom, in several parameters most of all. Features are weighed, and far-off ones count less, as in the estimate that is
+made of the evaluations in the end.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr
 
-from .emulator import Emulator
+from .emulator import Emulator, error_scale
 from .surrogate import sobol
 
 FloatArray = npt.NDArray[np.float64]
@@ -39,7 +40,8 @@ def propose(points: FloatArray, residuals: FloatArray, count: int = 1, *, seed: 
     known, chosen = points, np.empty((0, points.shape[1]))
     for k in range(count):
         try:
-            emulator = Emulator(known, features, seed=seed + k)
+            scale = error_scale(known, features, np.zeros(features.shape[1]), seed=seed + k)
+            emulator = Emulator(known, features, seed=seed + k, scale=scale)
         except ValueError:
             return None
         if not emulator.trusted:
@@ -52,7 +54,7 @@ def propose(points: FloatArray, residuals: FloatArray, count: int = 1, *, seed: 
 
 def _most_improving(emulator: Emulator, seed: int) -> FloatArray:
     """The point (n,) of the largest expected improvement of the squared distance to features of 0."""
-    target = emulator.project(np.zeros(len(emulator.centre)))
+    target = emulator.project_robustly(np.zeros(len(emulator.centre)))
 
     def squares(where: FloatArray) -> tuple[FloatArray, FloatArray]:
         mean, variance = emulator.predict(where)
