@@ -6,8 +6,9 @@ import argparse
 import io
 import platform
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,8 +20,10 @@ if TYPE_CHECKING:
     from splatsoil.inverse.executors import Executor
     from splatsoil.inverse.posterior import Data
 
-#: Everything that a benchmark's numbers may hang on.
-ALL = ("measurement", "splats", "reconstruction", "soil", "mpm", "scene", "synthetic")
+#: Everything that a benchmark's numbers may hang on: parts of the package, and packages beside it.
+PARTS = ("measurement", "splats", "reconstruction", "soil", "mpm", "scene", "synthetic")
+FILES = ("parameters.py", "model.py", "comparison.py", "robust_loss.py")
+BESIDE = ("splatsoil.envs", "splatsoil.inverse")
 
 
 def hush() -> None:
@@ -65,11 +68,18 @@ def output_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
 
 
+def sources(others: Iterable[Path] = ()) -> str:
+    """Digest of the sources behind a benchmark's numbers, from photographs to estimates, and of other files."""
+    specs = [find_spec(name) for name in BESIDE]
+    folders = [Path(p) for spec in specs if spec is not None for p in spec.submodule_search_locations or ()]
+    return code_digest((*PARTS, *FILES), [*sorted(f for d in folders for f in d.rglob("*.py")), *others])
+
+
 def stamp(device: str) -> dict[str, Any]:
     """What made a result."""
     return {
         "version": __version__,
-        "code": code_digest((*ALL, "parameters.py", "model.py", "comparison.py", "robust_loss.py")),
+        "code": sources(),
         "device": device.split(":")[0],
         "machine": platform.machine(),
         "made": datetime.now(UTC).isoformat(timespec="seconds"),

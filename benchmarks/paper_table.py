@@ -35,13 +35,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from splatsoil.benchmarks._common import ALL, hush, output_options, stamp, write_result
+from splatsoil.benchmarks._common import hush, output_options, sources, stamp, write_result
 from splatsoil.benchmarks._paper import PUBLISHED, SEARCHES, WAYS, Protocol, Say, Sight, search, world
 from splatsoil.benchmarks._paper_budget import budget_table, error_budget
 from splatsoil.inverse.executors import executor
 
 from splatsoil.errors import ParameterError
-from splatsoil.files import code_digest, read_json, write_json
+from splatsoil.files import read_json, write_json
 
 #: What this project set out to reach at all four, degrees.
 TARGET = (0.3, 0.3)
@@ -119,7 +119,7 @@ def _kept_protocol(protocol: Protocol, out: Path) -> dict[str, Any]:
     """The protocol as kept in the folder; trials and angles may grow, nothing else may change."""
     free = ("angles", "trials", "device", "scan")
     described = {k: v for k, v in vars(protocol).items() if k not in free}
-    described["code"] = code_digest((*ALL, "parameters.py", "model.py", "comparison.py", "robust_loss.py"))
+    described["code"] = sources(sorted(Path(__file__).parent.glob("_paper*.py")))
     file = out / "protocol.json"
     if file.is_file() and read_json(file) != json.loads(json.dumps(described)):
         raise ParameterError(f"{out}: holds trials of another protocol or other sources; choose another --out")

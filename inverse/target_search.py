@@ -4,8 +4,8 @@ The emulator of the features predicts them at points not evaluated, so the sum o
 variance in closed form; the next point is where it is expected to improve most on the least so far (Uhrenholt & Jensen
 2019, AISTATS, "Efficient Bayesian optimization for target vector estimation"; here with a normal distribution of that
 mean and variance). Residuals are smooth where their sum of squares has a narrow, bent valley, so few evaluations find
-its bottom, in several parameters most of all. Features are weighed, and far-off ones count less, as in the estimate that is
-made of the evaluations in the end.
+its bottom, in several parameters most of all. Features are weighed, and far-off ones count less, as in the estimate
+that is made of the evaluations in the end.
 """
 
 from __future__ import annotations

@@ -8,11 +8,9 @@ from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from splatsoil.benchmarks._common import ALL, stamp
+from splatsoil.benchmarks._common import sources, stamp
 from splatsoil.benchmarks._validation.costs import processor
 from splatsoil.envs.devices import cores
-
-from splatsoil.files import code_digest
 
 PACKAGES = ("numpy", "torch", "warp-lang", "newton", "taichi", "gsplat")
 
@@ -57,7 +55,7 @@ def describe(device: str) -> dict[str, str]:
     told = {
         "made": str(made["made"]),
         "splatsoil": str(made["version"]),
-        "code": code_digest((*ALL, "parameters.py", "model.py", "comparison.py", "robust_loss.py"), own),
+        "code": sources(own),
         "device": device.split(":")[0],
         "processor": processor(),
         "cores": str(cores()),
