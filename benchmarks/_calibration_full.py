@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from splatsoil.benchmarks._common import hush
+from splatsoil.benchmarks._common import hush, sources
 from splatsoil.envs.measured import LOSS
 from splatsoil.envs.synthetic import SyntheticProblem
 from splatsoil.envs.synthetic_world import World
@@ -72,7 +72,7 @@ def one_truth(
     values = space.to_dict(space.from_unit(point))
     world = {"values": values, "number": number, "preset": preset, "device": device.split(":")[0]}
     problem.place(values, 1_000_003 + number)
-    sources = [inspect.getfile(part) for part in (SyntheticProblem, World)]
+    world_files = [inspect.getfile(part) for part in (SyntheticProblem, World)]
     setup = FitSetup(
         measurement=digest(world),
         reconstruction="",
@@ -82,10 +82,11 @@ def one_truth(
         device=problem.device,
         seed=number,
         version=splatsoil.__version__,
-        code=code_digest(others=sources),
+        code=code_digest(others=world_files),
         loss=LOSS,
     )
-    key, file = digest({**setup.description(), "effort": str(effort), "budget": budget}), folder / "calibration.json"
+    made_by = {"effort": str(effort), "budget": budget, "sources": sources()}
+    key, file = digest({**setup.description(), **made_by}), folder / "calibration.json"
     if file.is_file():
         known: dict[str, Any] = read_json(file)
         if known["key"] == key:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import io
+import json
 import platform
 import sys
 from collections.abc import Callable, Iterable, Mapping
@@ -13,7 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatsoil import __version__
-from splatsoil.files import code_digest, write_bytes, write_json, write_text
+from splatsoil.errors import ParameterError
+from splatsoil.files import code_digest, read_json, write_bytes, write_json, write_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -73,6 +75,18 @@ def sources(others: Iterable[Path] = ()) -> str:
     specs = [find_spec(name) for name in BESIDE]
     folders = [Path(p) for spec in specs if spec is not None for p in spec.submodule_search_locations or ()]
     return code_digest((*PARTS, *FILES), [*sorted(f for d in folders for f in d.rglob("*.py")), *others])
+
+
+def keep_to_one_protocol(out: Path, described: Mapping[str, Any]) -> None:
+    """Write down in a folder what decides its results, sources included; what is there goes on only with the same.
+
+    Raises:
+        ParameterError: the folder holds results of something else.
+    """
+    file, told = out / "protocol.json", json.loads(json.dumps(dict(described)))
+    if file.is_file() and read_json(file) != told:
+        raise ParameterError(f"{out}: holds results of another protocol or other sources; choose another --out")
+    write_json(file, told)
 
 
 def stamp(device: str) -> dict[str, Any]:

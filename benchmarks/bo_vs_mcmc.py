@@ -167,8 +167,9 @@ def sample_emulated(space: ParameterSpace, points: FloatArray, features: FloatAr
     began = time.perf_counter()
     likelihood = likelihood_of(Data(space, points, -features), seed=seed)
     chains = sample(likelihood, likelihood.lower, likelihood.upper, seed=seed, ensembles=2, most_steps=1000)
-    low, high = np.quantile(chains.flat, [0.05, 0.95], axis=0)
-    return Answer(chains.flat.mean(axis=0), low, high, time.perf_counter() - began)
+    flat = chains.flat[:, : len(space)]  # without the misfit's size
+    low, high = np.quantile(flat, [0.05, 0.95], axis=0)
+    return Answer(flat.mean(axis=0), low, high, time.perf_counter() - began)
 
 
 def sample_directly(world: World, budgets: Sequence[int], seed: int, chance: FloatArray) -> dict[int, Answer]:

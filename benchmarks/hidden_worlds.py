@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from splatsoil.benchmarks._common import hush, stamp
+from splatsoil.benchmarks._common import hush, keep_to_one_protocol, sources, stamp
 from splatsoil.benchmarks._mitsuba import MitsubaStage
 from splatsoil.benchmarks._newton import Numerics, World, plough
 from splatsoil.benchmarks.hidden_effects import wilson
@@ -354,6 +354,11 @@ def main(arguments: list[str] | None = None) -> int:
     def say(what: str) -> None:
         print(f"{time.perf_counter() - began:6.0f} s  {what}", file=sys.stderr, flush=True)
 
+    own = sorted(
+        f for name in ("hidden_worlds", "_newton", "_mitsuba") for f in Path(__file__).parent.glob(f"{name}.py")
+    )
+    decides = {"seed": options.seed, "preset": options.preset, "renderer": options.renderer, "code": sources(own)}
+    keep_to_one_protocol(options.out, decides)
     truths = [
         draw(kind, k, options.seed)
         for kind in options.kinds
@@ -375,7 +380,10 @@ def main(arguments: list[str] | None = None) -> int:
         if (run / "diagnosis.json").is_file():
             fit, told = (json.loads((run / file).read_text()) for file in ("fit.json", "diagnosis.json"))
             rows.append(score(hidden, fit, told))
-    write_json(options.out / "result.json", plain({"made_by": stamp(options.device), "rows": rows}))
+    write_json(
+        options.out / "result.json",
+        plain({"made_by": stamp(options.device), "renderer": options.renderer, "rows": rows}),
+    )
     print(table(rows))
     return 0 if len(rows) == len(truths) else 1
 

@@ -35,12 +35,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from splatsoil.benchmarks._common import hush, output_options, sources, stamp, write_result
+from splatsoil.benchmarks._common import (
+    hush,
+    keep_to_one_protocol,
+    output_options,
+    sources,
+    stamp,
+    write_result,
+)
 from splatsoil.benchmarks._paper import PUBLISHED, SEARCHES, WAYS, Protocol, Say, Sight, search, world
 from splatsoil.benchmarks._paper_budget import budget_table, error_budget
 from splatsoil.inverse.executors import executor
 
-from splatsoil.errors import ParameterError
 from splatsoil.files import read_json, write_json
 
 #: What this project set out to reach at all four, degrees.
@@ -70,7 +76,7 @@ def run(
         devices: that the jobs take in turn; the protocol's by default.
         parts: jobs that a world's trials are spread over.
     """
-    write_json(out / "protocol.json", _kept_protocol(protocol, out))
+    keep_to_one_protocol(out, kept_protocol(protocol))
     turns = cycle([replace(protocol, device=device) for device in devices] or [protocol])
     worlds: list[tuple[float, int]] = []
     jobs: list[tuple[Callable[..., None], float, int, list[int]]] = []
@@ -115,14 +121,11 @@ def _budget(protocol: Protocol, angle: float, number: int, trials: list[int], ou
     write_json(out / "budget" / f"{angle:g}.json", found)
 
 
-def _kept_protocol(protocol: Protocol, out: Path) -> dict[str, Any]:
+def kept_protocol(protocol: Protocol) -> dict[str, Any]:
     """The protocol as kept in the folder; trials and angles may grow, nothing else may change."""
     free = ("angles", "trials", "device", "scan")
     described = {k: v for k, v in vars(protocol).items() if k not in free}
     described["code"] = sources(sorted(Path(__file__).parent.glob("_paper*.py")))
-    file = out / "protocol.json"
-    if file.is_file() and read_json(file) != json.loads(json.dumps(described)):
-        raise ParameterError(f"{out}: holds trials of another protocol or other sources; choose another --out")
     return described
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from scipy.optimize import brentq
-from scipy.special import digamma, polygamma
+from scipy.special import digamma, erf, polygamma
 
 from .hyperparameters import JITTER, Hyperparameters, posterior
 
@@ -37,6 +37,10 @@ MAD = 1.4826
 HUBER, HUBER_ROUNDS = 2.5, 30
 #: Degrees of freedom of what features have in common, from which they don't differ.
 MOST_SHARED = 1e4
+#: Variances below this share of the middle one are rounding's.
+ROUNDING = 1e-12
+#: A feature's error variance is at least this share of the middle one's: what hardly varies isn't known better for it.
+LEAST_ERROR = 1e-3
 
 
 @dataclass(frozen=True)
@@ -224,10 +228,23 @@ def error_scale(points: npt.ArrayLike, features: npt.ArrayLike, observed: FloatA
     """
     emulator = Emulator(points, features, seed=seed)
     chance = moderated(emulator.chance_variance(), emulator.freedom)
-    unexplained = (MAD * float(np.median(np.abs(emulator.remainder(observed))))) ** 2
-    variance = chance + max(unexplained - float(np.median(chance)), 0.0)
+    variance = chance + _beyond(chance, float(np.median(np.abs(emulator.remainder(observed)))))
     middle = float(np.median(variance))
-    return np.sqrt(variance / middle) if middle > 0.0 else np.ones(len(variance))
+    return np.sqrt(np.maximum(variance / middle, LEAST_ERROR)) if middle > 0.0 else np.ones(len(variance))
+
+
+def _beyond(chance: FloatArray, median: float) -> float:
+    """The variance, the same for all, with which normal errors beyond chance have this median distance from 0."""
+
+    def share(more: float) -> float:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return float(np.mean(np.where(chance + more > 0.0, erf(median / np.sqrt(2.0 * (chance + more))), 1.0)))
+
+    most = (MAD * median) ** 2
+    # With this much alone half of the errors are nearer; with less than nothing, all that there is, is chance.
+    if most == 0.0 or share(0.0) <= 0.5:
+        return 0.0
+    return float(brentq(lambda more: share(more) - 0.5, 0.0, 2.0 * most))
 
 
 def moderated(variances: FloatArray, freedom: float) -> FloatArray:
@@ -238,13 +255,13 @@ def moderated(variances: FloatArray, freedom: float) -> FloatArray:
     Mol. Biol. 3:3, section 6.2).
 
     Args:
-        variances: (b,) sampled; those of 0 stay.
+        variances: (b,) sampled; those of things that don't vary become 0.
         freedom: behind each.
 
     Returns:
         (b,) means of the variances' posteriors' scale.
     """
-    some = variances > 0.0
+    some = variances > ROUNDING * float(np.median(variances))
     if np.count_nonzero(some) < 3 or freedom < 1.0:
         return np.full(len(variances), float(np.median(variances)))
     half = 0.5 * freedom

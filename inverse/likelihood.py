@@ -68,6 +68,11 @@ class Likelihood:
         """(d,) upper bounds."""
         return np.array([1.0] * self.emulator.dimension + [MISFIT_RANGE[1]] * self.with_misfit)
 
+    @property
+    def middle(self) -> FloatArray:
+        """(1, d) the middle of the bounds."""
+        return 0.5 * (self.lower + self.upper)[None]
+
     @cached_property
     def scores(self) -> FloatArray:
         """(p,) the observed features in the basis, those far from all that parameters explain counting less."""

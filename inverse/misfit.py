@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -45,8 +45,10 @@ class Misfit:
     """Size and structure of the model's error.
 
     Attributes:
-        ratio: mean square of the remainder over what chance and noise leave; about 1 for a model that is right.
-        std: standard deviation σ of a block's error, in the features' unit; 0 where there is none to be seen.
+        ratio: mean square of the remainder, where parameters act, over what chance and noise leave; about 1 for a model
+            that is right.
+        std: standard deviation σ of a block's error where parameters act, in units of the remainder; 0 where there is
+            none to be seen.
         time: correlation ρ between successive frames.
         length: ℓ in m.
         cameras: correlation between cameras that see the same place.
@@ -72,14 +74,16 @@ def measure(
     """Measure the misfit.
 
     Args:
-        remainder: (b,) the residual's part outside the basis.
+        remainder: (b,) the residual's part outside the basis, in any unit.
         expected: (b,) the variance there of chance and noise.
         basis: (b, p) orthonormal.
         places: of the features. Without them, blocks are taken as independent.
     """
     p = basis.shape[1]
-    known = float(np.mean(expected))
-    square = float(np.mean(remainder**2))
+    # What is carried into the basis is the error where the basis is: most features never change, and err little.
+    leverage = np.sum(basis**2, axis=1) / p
+    known = float(leverage @ expected)
+    square = float(leverage @ remainder**2)
     ratio = square / max(known, 1e-300)
     excess = square - known
     if ratio <= TOLERANCE or excess <= 0.0:
@@ -88,22 +92,28 @@ def measure(
         return Misfit(ratio, excess**0.5, 0.0, 0.0, 0.0, excess * np.eye(p))
     lattice = _Lattice(places)
     field = lattice.spread(remainder[:, None])[..., 0]
-    time = _correlation(field[:, :-1], field[:, 1:], excess)
-    cameras = _correlation(field[:1], field[1:], excess) if len(field) > 1 else 0.0
-    neighbours, distance = lattice.neighbours()
-    beside = _correlation(field[..., neighbours[0]], field[..., neighbours[1]], excess)
+    weight = lattice.spread(leverage[:, None])[..., 0]
+
+    def correlation(one: Any, other: Any) -> float:
+        return _correlation(field[one], field[other], np.sqrt(weight[one] * weight[other]), excess)
+
+    time = correlation(np.s_[:, :-1], np.s_[:, 1:])
+    cameras = correlation(np.s_[:1], np.s_[1:]) if len(field) > 1 else 0.0
+    (here, there), distance = lattice.neighbours()
+    beside = correlation(np.s_[..., here], np.s_[..., there])
     length = distance / -np.log(max(beside, 1e-3))
     covariance = excess * lattice.project(basis, time, length, cameras)
     return Misfit(ratio, excess**0.5, time, float(length), cameras, covariance)
 
 
-def _correlation(one: FloatArray, other: FloatArray, variance: float) -> float:
+def _correlation(one: FloatArray, other: FloatArray, weight: FloatArray, variance: float) -> float:
     """Mean product of pairs over the variance; pairs of which one wasn't seen (NaN) don't count."""
     products = one * other
     good = np.isfinite(products)
-    if not good.any():
+    total = float(weight[good].sum())
+    if total == 0.0:
         return 0.0
-    return float(np.clip(np.mean(products[good]) / variance, 0.0, MOST_CORRELATED))
+    return float(np.clip(weight[good] @ products[good] / total / variance, 0.0, MOST_CORRELATED))
 
 
 class _Lattice:

@@ -16,7 +16,7 @@ from splatsoil.errors import RunError
 from splatsoil.parameters import Parameter, ParameterSpace
 
 from .campaign import Job
-from .emulator import FEWEST, Emulator, error_scale
+from .emulator import FEWEST, ROUNDING, Emulator, error_scale
 from .evaluations import EvaluationRecord, digest
 from .likelihood import Likelihood
 from .mcmc import Chains, sample
@@ -153,7 +153,9 @@ def likelihood_of(data: Data, *, seed: int = 0) -> Likelihood:
         emulator = Emulator(data.points, -data.residuals, seed=seed, scale=scale)
     except ValueError as error:
         raise RunError(f"no emulator can be made: {error}") from error
-    expected = emulator.outside_variance + (data.sensor_std / scale) ** 2
+    # Where components are as many as features, all that is left outside is rounding.
+    rounding = ROUNDING * float(np.mean(np.sum(emulator.scores**2, axis=1))) / len(scale)
+    expected = emulator.outside_variance + (data.sensor_std / scale) ** 2 + rounding
     misfit = measure(emulator.remainder(observed), expected, emulator.basis, data.places)
     return Likelihood(emulator, observed, data.sensor_std**2, misfit)
 
@@ -179,7 +181,10 @@ def sample_posterior(
         RunError: too few evaluations, or the file can't be written.
     """
     likelihood = likelihood_of(data, seed=seed)
-    identity = digest({"points": data.points, "residuals": data.residuals, "sensor": data.sensor_std, "seed": seed})
+    # Chains of another likelihood, such as an earlier version's, are not gone on with.
+    likely = {"scores": likelihood.scores, "there": likelihood.log_likelihood(likelihood.middle)}
+    data_of = {"points": data.points, "residuals": data.residuals, "sensor": data.sensor_std, "seed": seed}
+    identity = digest({**data_of, **likely})
     chains = sample(
         likelihood,
         likelihood.lower,

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from splatsoil.benchmarks import _paper, _paper_budget, paper_table
+from splatsoil.benchmarks._common import keep_to_one_protocol
 from splatsoil.benchmarks._paper import FRAMES, Look, Protocol, Trial
 from splatsoil.inverse import emulator
 from splatsoil.inverse.executors import Serial
@@ -232,21 +233,21 @@ def test_the_minimum_of_a_landscape() -> None:
 
 
 def test_a_folder_keeps_one_protocol(tmp_path: Path) -> None:
-    write_json(tmp_path / "protocol.json", paper_table._kept_protocol(Protocol(), tmp_path))
-    assert paper_table._kept_protocol(Protocol(trials=3, angles=(30.0,), scan=(0, 9)), tmp_path)
+    keep_to_one_protocol(tmp_path, paper_table.kept_protocol(Protocol()))
+    keep_to_one_protocol(tmp_path, paper_table.kept_protocol(Protocol(trials=3, angles=(30.0,), scan=(0, 9))))
     with pytest.raises(ParameterError, match="another protocol"):
-        paper_table._kept_protocol(Protocol(views=8), tmp_path)
+        keep_to_one_protocol(tmp_path, paper_table.kept_protocol(Protocol(views=8)))
 
 
 def test_trials_of_another_search_are_not_gone_on_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_json(tmp_path / "protocol.json", paper_table._kept_protocol(Protocol(), tmp_path))
+    keep_to_one_protocol(tmp_path, paper_table.kept_protocol(Protocol()))
     other = tmp_path / "inverse"
     shutil.copytree(Path(emulator.__file__).parent, other)
     changed = other / "emulator.py"
     changed.write_text(changed.read_text() + "\n# another emulator\n")
     monkeypatch.setattr(importlib.util.find_spec("splatsoil.inverse"), "submodule_search_locations", [str(other)])
     with pytest.raises(ParameterError, match="other sources"):
-        paper_table._kept_protocol(Protocol(), tmp_path)
+        keep_to_one_protocol(tmp_path, paper_table.kept_protocol(Protocol()))
 
 
 def test_the_budget_tells_apart_what_was_put_in(monkeypatch: pytest.MonkeyPatch) -> None:

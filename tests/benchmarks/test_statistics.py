@@ -12,7 +12,7 @@ from splatsoil.benchmarks import bo_vs_mcmc, calibration
 from splatsoil.benchmarks._calibration_full import one_truth
 from splatsoil.inverse.emulator import Emulator
 from splatsoil.inverse.evaluations import EvaluationStore
-from splatsoil.inverse.posterior import Data
+from splatsoil.inverse.posterior import Data, likelihood_of
 from splatsoil.inverse.posterior_run import Effort
 from splatsoil.inverse.surrogate import sobol
 
@@ -87,6 +87,23 @@ def test_ways_meet_the_same_world_and_more_calls_do_not_hurt() -> None:
     assert by["mcmc", 16]["mae"][0] < 5.0 and by["direct", 400]["mae"][0] < 5.0
     assert "| mcmc | 16 |" in bo_vs_mcmc.table({**found, "landscape": "A test"})
     assert bo_vs_mcmc.figure({**found, "landscape": ""}).axes
+
+
+def test_a_misfit_is_no_parameter_of_the_answer() -> None:
+    """What no parameter explains gives the likelihood a size of the misfit to sample, too."""
+    data = made_up(24)
+    wrong = np.random.default_rng(3).normal(0.0, 5.0, data.residuals.shape[1])
+    answer = bo_vs_mcmc.sample_emulated(SPACE, data.points, -data.residuals + wrong, 0)
+    assert answer.estimate.shape == answer.low.shape == answer.high.shape == (1,)
+
+
+def test_as_many_components_as_features_leave_no_misfit() -> None:
+    """Nothing lies outside of the basis but rounding, which isn't compared with itself."""
+    rng = np.random.default_rng(4)
+    points = sobol(16, 1, 0)
+    for _ in range(8):
+        features = np.concatenate([5.0 * points, 2.0 * points**2], axis=1) + 0.1 * rng.normal(size=(16, 2))
+        assert not likelihood_of(Data(SPACE, points, 0.3 * rng.normal(size=2) - features)).with_misfit
 
 
 @pytest.mark.slow

@@ -163,7 +163,8 @@ def test_features_that_scatter_count_less_unless_the_model_is_wrong() -> None:
     points = np.linspace(-1.0, 1.0, 24)[:, None]
     std = np.where(np.arange(300) < 100, 3.0, 0.5)
     features = points @ rng.normal(size=(1, 300)) + std * rng.normal(size=(24, 300))
-    right = 0.2 * rng.normal(size=300)
+    # observed as one more simulation would be: the model is right
+    right = std * rng.normal(size=300)
     scale = error_scale(points, features, right)
     assert np.median(scale[:100]) / np.median(scale[100:]) == pytest.approx(6.0, rel=0.35)
     wrong = right + 20.0 * rng.normal(size=300)
@@ -171,3 +172,34 @@ def test_features_that_scatter_count_less_unless_the_model_is_wrong() -> None:
     # what does not scatter at all is compared as it is
     flat = error_scale(points, points @ rng.normal(size=(1, 300)), wrong)
     np.testing.assert_allclose(flat, 1.0, rtol=0.05)
+
+
+@pytest.mark.parametrize("lumpy", [0.1, 0.45])
+def test_a_right_model_has_no_error_beyond_chance_however_much_chance_differs(lumpy: float) -> None:
+    """A true ratio of 6 between standard deviations; the mean over observations as simulations would be."""
+    ratios = []
+    for seed in range(8):
+        rng = np.random.default_rng([seed, 15])
+        points = np.linspace(-1.0, 1.0, 24)[:, None]
+        std = np.where(np.arange(300) < 300 * lumpy, 3.0, 0.5)
+        features = points @ rng.normal(size=(1, 300)) + std * rng.normal(size=(24, 300))
+        scale = error_scale(points, features, std * rng.normal(size=300), seed=seed)
+        ratios.append(np.median(scale[std > 1.0]) / np.median(scale[std < 1.0]))
+    assert np.mean(ratios) == pytest.approx(6.0, rel=0.2)
+
+
+@pytest.mark.parametrize("m", [10, 16, 20])
+def test_features_that_never_change_count_neither_for_more_nor_for_less(m: int) -> None:
+    """Some are the same in all simulations, to the bit or to rounding; the rest is as if they weren't there."""
+    rng = np.random.default_rng(16)
+    points = np.linspace(-1.0, 1.0, m)[:, None]
+    features = points @ rng.normal(size=(1, 300)) + 0.5 * rng.normal(size=(m, 300))
+    features[:, :10], features[:, 10:20] = 7.0, 7.0 + 1e-15 * rng.normal(size=(m, 10))
+    observed = 0.5 * rng.normal(size=300)
+    observed[:20] = 7.0
+    scale = error_scale(points, features, observed)
+    assert np.all(np.isfinite(scale)) and scale.min() > 0.0
+    without = error_scale(points, features[:, 20:], observed[20:])
+    np.testing.assert_allclose(scale[20:] / scale[20:].mean(), without / without.mean(), rtol=0.05)
+    emulator = Emulator(points, features, scale=scale)
+    assert np.all(np.isfinite(emulator.project_robustly(observed)))

@@ -80,3 +80,15 @@ def test_smooth_misfit_counts_for_more_than_independent_misfit() -> None:
     known = np.full(len(PLACES), 0.01)
     structured, independent = (measure(field, known, smooth, where) for where in (PLACES, None))
     assert structured.covariance[0, 0] > 10.0 * independent.covariance[0, 0]
+
+
+def test_the_misfit_counts_where_parameters_act() -> None:
+    """Most blocks never change and err little; a tenth does, and errs ten times as much: what is carried into the
+    basis is the dense covariance of that field, on the average."""
+    rng = np.random.default_rng(8)
+    active = np.arange(len(PLACES)) % 10 == 0
+    std = np.where(active, STD, 0.1 * STD)
+    basis = np.linalg.qr(rng.normal(size=(len(PLACES), 2)) * active[:, None])[0]
+    found = [measure(std * rng.normal(size=len(PLACES)), np.full(len(PLACES), 1e-4), basis, PLACES) for _ in range(20)]
+    dense = basis.T @ (std[:, None] ** 2 * basis)
+    np.testing.assert_allclose(np.mean([f.covariance for f in found], axis=0), dense, rtol=0.25, atol=0.1 * STD**2)
