@@ -302,6 +302,7 @@ def table(result: dict[str, Any]) -> str:
 def figure(result: dict[str, Any]) -> Figure:
     """Error and interval width against calls, for each parameter."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import FixedLocator, FormatStrFormatter, LogLocator, NullLocator
 
     count = len(result["parameters"])
     drawn = Figure(figsize=(8.4, 2.8 * count), layout="constrained")
@@ -318,6 +319,11 @@ def figure(result: dict[str, Any]) -> Figure:
         for axis, what in zip(row, ("mean absolute error", "90 % interval's width"), strict=True):
             axis.set_xscale("log")
             axis.set_yscale("log")
+            axis.xaxis.set_major_locator(FixedLocator(sorted({e["calls"] for e in result["entries"]})))
+            axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            for one in (axis.xaxis, axis.yaxis):
+                one.set_major_formatter(FormatStrFormatter("%g"))
+                one.set_minor_locator(NullLocator())
             axis.set_xlabel("simulator calls")
             axis.set_title(f"{parameter['name'].replace('_', ' ')}: {what} [{parameter['unit']}]", fontsize=9)
         row[0].legend(fontsize=7)
