@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 from splatsoil.benchmarks._common import hush, keep_to_one_protocol, sources, stamp
-from splatsoil.benchmarks._mitsuba import MitsubaStage
+from splatsoil.benchmarks._mitsuba import MitsubaStage, load_mitsuba
 from splatsoil.benchmarks._newton import Numerics, World, plough
 from splatsoil.benchmarks.hidden_effects import wilson
 from splatsoil.benchmarks.numerics import FloatArray
@@ -354,9 +354,9 @@ def main(arguments: list[str] | None = None) -> int:
     def say(what: str) -> None:
         print(f"{time.perf_counter() - began:6.0f} s  {what}", file=sys.stderr, flush=True)
 
-    own = sorted(
-        f for name in ("hidden_worlds", "_newton", "_mitsuba") for f in Path(__file__).parent.glob(f"{name}.py")
-    )
+    if options.renderer == "mitsuba":
+        load_mitsuba()  # says what is missing before worlds are made
+    own = [Path(__file__).with_name(f"{name}.py") for name in ("_mitsuba", "_newton", "hidden_worlds")]
     decides = {"seed": options.seed, "preset": options.preset, "renderer": options.renderer, "code": sources(own)}
     keep_to_one_protocol(options.out, decides)
     truths = [

@@ -207,6 +207,13 @@ class Emulator:
         return LeftOut(skill, z, float(np.mean(np.abs(z) < 1.6449)))
 
 
+def weighed_emulator(
+    points: npt.ArrayLike, features: npt.ArrayLike, observed: FloatArray, *, seed: int = 0
+) -> Emulator:
+    """An emulator whose features are compared in units of what each may be off; see `error_scale`."""
+    return Emulator(points, features, seed=seed, scale=error_scale(points, features, observed, seed=seed))
+
+
 def error_scale(points: npt.ArrayLike, features: npt.ArrayLike, observed: FloatArray, *, seed: int = 0) -> FloatArray:
     """How far each feature may be off, over what the middle one may: units to compare features in.
 

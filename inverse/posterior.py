@@ -16,7 +16,7 @@ from splatsoil.errors import RunError
 from splatsoil.parameters import Parameter, ParameterSpace
 
 from .campaign import Job
-from .emulator import FEWEST, ROUNDING, Emulator, error_scale
+from .emulator import FEWEST, ROUNDING, Emulator, weighed_emulator
 from .evaluations import EvaluationRecord, digest
 from .likelihood import Likelihood
 from .mcmc import Chains, sample
@@ -149,13 +149,12 @@ def likelihood_of(data: Data, *, seed: int = 0) -> Likelihood:
     # Residuals are observed minus predicted: the observation is where they are 0, and predictions are minus them.
     observed = np.zeros(data.residuals.shape[1])
     try:
-        scale = error_scale(data.points, -data.residuals, observed, seed=seed)
-        emulator = Emulator(data.points, -data.residuals, seed=seed, scale=scale)
+        emulator = weighed_emulator(data.points, -data.residuals, observed, seed=seed)
     except ValueError as error:
         raise RunError(f"no emulator can be made: {error}") from error
     # Where components are as many as features, all that is left outside is rounding.
-    rounding = ROUNDING * float(np.mean(np.sum(emulator.scores**2, axis=1))) / len(scale)
-    expected = emulator.outside_variance + (data.sensor_std / scale) ** 2 + rounding
+    rounding = ROUNDING * float(np.mean(np.sum(emulator.scores**2, axis=1))) / len(observed)
+    expected = emulator.outside_variance + (data.sensor_std / emulator.scale) ** 2 + rounding
     misfit = measure(emulator.remainder(observed), expected, emulator.basis, data.places)
     return Likelihood(emulator, observed, data.sensor_std**2, misfit)
 

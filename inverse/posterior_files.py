@@ -157,6 +157,7 @@ def scores_figure(posterior: Posterior) -> Figure:
     axis.violinplot(list(((draws - centre) / unit).T), positions=range(1, len(observed) + 1), showextrema=False)
     axis.plot(range(1, len(observed) + 1), (observed - centre) / unit, "kx", label="observed")
     axis.axhline(0.0, color="grey", linewidth=0.5)
+    axis.set_xticks(range(1, len(observed) + 1))
     axis.set_xlabel("component")
     axis.set_ylabel("predictive std")
     axis.legend(fontsize=7)
@@ -174,7 +175,7 @@ def predictive_figure(posterior: Posterior) -> Figure:
     draws = posterior.unit[rng.choice(len(posterior.unit), PREDICTIVE)]
     predicted = emulator.features(draws)
     mean, spread = predicted.mean(axis=0), predicted.std(axis=0)
-    chance = np.sqrt(emulator.chance_variance())
+    chance = np.sqrt(emulator.chance_variance() + posterior.likelihood.sensor)
     residual = posterior.likelihood.observed - mean
     cameras = sorted({p.camera for p in places})
     last = max(p.frame for p in places)
@@ -184,9 +185,9 @@ def predictive_figure(posterior: Posterior) -> Figure:
         chosen = [k for k, p in enumerate(places) if p.camera == camera and p.frame == last]
         x, y = (np.array([getattr(places[k], name) for k in chosen]) for name in ("x", "y"))
         panels = (
-            ("observed − mean prediction [grey levels]", residual[chosen], "RdBu_r"),
+            ("observed − mean [grey levels]", residual[chosen], "RdBu_r"),
             ("its spread over the posterior", spread[chosen], "viridis"),
-            ("residual / (spread and chance)", (residual / np.hypot(spread, chance))[chosen], "RdBu_r"),
+            ("residual / (spread, chance and noise)", (residual / np.hypot(spread, chance))[chosen], "RdBu_r"),
         )
         for axis, (title, shown, colours) in zip(row, panels, strict=True):
             top = float(np.abs(shown).max()) or 1.0

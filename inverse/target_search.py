@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr
 
-from .emulator import Emulator, error_scale
+from .emulator import Emulator, weighed_emulator
 from .surrogate import sobol
 
 FloatArray = npt.NDArray[np.float64]
@@ -40,8 +40,7 @@ def propose(points: FloatArray, residuals: FloatArray, count: int = 1, *, seed: 
     known, chosen = points, np.empty((0, points.shape[1]))
     for k in range(count):
         try:
-            scale = error_scale(known, features, np.zeros(features.shape[1]), seed=seed + k)
-            emulator = Emulator(known, features, seed=seed + k, scale=scale)
+            emulator = weighed_emulator(known, features, np.zeros(features.shape[1]), seed=seed + k)
         except ValueError:
             return None
         if not emulator.trusted:

@@ -2,12 +2,27 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from splatsoil.benchmarks.hidden_worlds import ANGLES, FIELD, KINDS, NOTHING, OBSERVATION, draw, score, soil_of, table
+from splatsoil.benchmarks import hidden_worlds
+from splatsoil.benchmarks.hidden_worlds import (
+    ANGLES,
+    FIELD,
+    KINDS,
+    NOTHING,
+    OBSERVATION,
+    draw,
+    main,
+    score,
+    soil_of,
+    table,
+)
 
+from splatsoil.errors import ParameterError, RunError
 from splatsoil.soil.library import library
 from splatsoil.synthetic import plow
 
@@ -50,3 +65,20 @@ def test_right_is_what_names_the_truth_or_nothing_where_nothing_is() -> None:
     assert judged(FIELD, "outside the library", ["tilt"])["right"]
     rows = [judged("tilt", "missing", ["gravity"]), judged(NOTHING, "adequate", [])]
     assert "another effect named: 1 of 1" in table(rows)
+
+
+def test_a_missing_renderer_is_said_before_anything_is_made(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(sys.modules, "mitsuba", None)
+    with pytest.raises(RunError, match="independent"):
+        main(["--renderer", "mitsuba", "--kinds", NOTHING, "--out", str(tmp_path / "worlds")])
+    assert not (tmp_path / "worlds").exists()
+
+
+def test_a_folder_keeps_one_renderer(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Worlds that the path tracer photographed aren't told as Mitsuba's."""
+    monkeypatch.setattr(hidden_worlds, "make_worlds", lambda *_: None)
+    monkeypatch.setattr(hidden_worlds, "load_mitsuba", lambda: None)
+    own = ["--kinds", NOTHING, "--worlds-only", "--out", str(tmp_path)]
+    assert main(own) == 0 and main(own) == 0
+    with pytest.raises(ParameterError, match="another --out"):
+        main([*own, "--renderer", "mitsuba"])

@@ -93,6 +93,7 @@ def test_a_misfit_is_no_parameter_of_the_answer() -> None:
     """What no parameter explains gives the likelihood a size of the misfit to sample, too."""
     data = made_up(24)
     wrong = np.random.default_rng(3).normal(0.0, 5.0, data.residuals.shape[1])
+    assert likelihood_of(Data(SPACE, data.points, data.residuals - wrong)).with_misfit
     answer = bo_vs_mcmc.sample_emulated(SPACE, data.points, -data.residuals + wrong, 0)
     assert answer.estimate.shape == answer.low.shape == answer.high.shape == (1,)
 

@@ -9,7 +9,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from splatsoil.inverse import posterior as posterior_module
+from splatsoil.inverse import emulator as emulator_module
 from splatsoil.inverse.emulator import Emulator
 from splatsoil.inverse.fitting import fit
 from splatsoil.inverse.likelihood import Likelihood
@@ -89,7 +89,7 @@ def test_chains_of_another_likelihood_are_not_gone_on_with(monkeypatch: pytest.M
     data = replace(data, residuals=data.residuals + NOISE * np.random.default_rng(2).normal(size=data.residuals.shape))
     kept = tmp_path / "chains.h5"
     with monkeypatch.context() as patch:
-        patch.setattr(posterior_module, "error_scale", lambda points, *_, **__: np.geomspace(0.1, 10.0, 30))
+        patch.setattr(emulator_module, "error_scale", lambda points, *_, **__: np.geomspace(0.1, 10.0, 30))
         before = sample_posterior(data, file=kept, evidence=False)
     after, fresh = sample_posterior(data, file=kept, evidence=False), sample_posterior(data, evidence=False)
     assert np.array_equal(after.unit, fresh.unit) and not np.array_equal(after.unit, before.unit)
