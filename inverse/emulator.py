@@ -3,12 +3,13 @@
 Features (residuals of hundreds of blocks) vary along few directions when parameters do. Principal components find
 these, and each component's score is a Gaussian process over the parameters, averaged over draws of its hyperparameters
 (Higdon et al. 2008, J. Am. Stat. Assoc. 103:570). The scatter between particle seeds is the processes' noise: what is
-predicted is the mean over seeds, and chance is reported apart.
+predicted is the mean over seeds, and chance is reported apart, as it is over the whole range of the points.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -183,25 +184,19 @@ class Emulator:
         return np.asarray((within + self.outside_variance) * self.scale**2)
 
     def _measure_chance(self) -> FloatArray:
-        """Scatter between seeds: from repeated points, leaning on the processes' noise where there are few of them."""
-        noise = np.array([process.noise_variance() for process in self._processes])
-        prior = np.diag(noise)
-        sums, freedom = np.zeros_like(prior), 0
-        for group in _groups(self.points):
-            if len(group) > 1:
-                inside = self.scores[group] - self.scores[group].mean(axis=0)
-                sums += inside.T @ inside
-                freedom += len(group) - 1
-        # As much weight for the prior as for p + 1 repeats: the fewest that make a covariance.
+        """Scatter about the processes' means wherever there are points, leaning on their noise where points are few."""
+        residuals = np.stack([process.residuals() for process in self._processes], axis=1)
+        prior = np.diag([process.noise_variance() for process in self._processes])
+        # As much weight for the prior as for p + 1 evaluations: the fewest that make a covariance.
         weight = self.count + 1.0
-        return (sums + weight * prior) / (freedom + weight)
+        return (residuals.T @ residuals + weight * prior) / (self.freedom + weight)
 
     def _leave_out(self) -> LeftOut:
         """Each point, with its repeats, predicted by all others with the same hyperparameters."""
         z = np.empty_like(self.scores)
         skill = np.empty(self.count)
         for k, process in enumerate(self._processes):
-            error, std = process.left_out()
+            error, std = process.left_out
             z[:, k] = error / std
             skill[k] = process.skill()
         return LeftOut(skill, z, float(np.mean(np.abs(z) < 1.6449)))
@@ -305,6 +300,10 @@ class _Process:
         """Of one simulation's score."""
         return float(self.settings.noise[:, 0].mean()) * self.scale**2
 
+    def residuals(self) -> FloatArray:
+        """(m,) of the scores from the means; noise K⁻¹ (y − μ), whose mean square is noise · freedom / m."""
+        return self.scale * (self.settings.noise * self.weights).mean(axis=0)
+
     def freedom(self) -> float:
         """Evaluations less the trace of the smoother K(K + noise)⁻¹ (Hastie & Tibshirani 1990, 3.5) and the mean."""
         left = np.sum(self.settings.noise * np.diagonal(self.inverse, axis1=1, axis2=2), axis=1)
@@ -319,24 +318,24 @@ class _Process:
         total = variances.mean(axis=0) + means.var(axis=0)
         return self.shift + self.scale * means.mean(axis=0), self.scale**2 * total
 
+    @cached_property
     def left_out(self) -> tuple[FloatArray, FloatArray]:
         """Errors (m,) and their quoted standard deviations when a point's own evaluations are left out.
 
         Closed form: the errors of a left-out group G are (K⁻¹)_GG⁻¹ (K⁻¹(y − μ))_G, their covariance is (K⁻¹)_GG⁻¹.
         """
-        errors = np.empty((len(self.settings), len(self.y)))
-        variances = np.empty_like(errors)
-        for d in range(len(self.settings)):
-            for group in self.groups:
-                block = np.linalg.inv(self.inverse[d][np.ix_(group, group)])
-                errors[d, group] = block @ self.weights[d, group]
-                variances[d, group] = np.diag(block)
+        variances = 1.0 / np.diagonal(self.inverse, axis1=1, axis2=2)
+        errors = variances * self.weights
+        for group in (group for group in self.groups if len(group) > 1):
+            blocks = np.linalg.inv(self.inverse[:, group[:, None], group])
+            errors[:, group] = np.einsum("dij,dj->di", blocks, self.weights[:, group])
+            variances[:, group] = np.diagonal(blocks, axis1=1, axis2=2)
         total = variances.mean(axis=0) + errors.var(axis=0)
         return self.scale * errors.mean(axis=0), self.scale * np.sqrt(total)
 
     def skill(self) -> float:
         """1 − mean square error over variance, points left out."""
-        error, _ = self.left_out()
+        error, _ = self.left_out
         return 1.0 - float(np.mean(error**2)) / self.scale**2
 
 

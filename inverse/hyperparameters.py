@@ -26,11 +26,15 @@ LENGTH_BOUNDS = (np.log(0.025), np.log(1e3))
 NOISE_BOUNDS = (np.log(1e-6), np.log(4.0))
 #: Added to the diagonal for the Cholesky factor's sake.
 JITTER = 1e-8
+#: Larger than any sum of squares of whitened outcomes, which makes a matrix bordered by them positive definite.
+CORNER = 1e100
+#: Of differences that make a slope: the square root of a double's precision.
+SLOPE_STEP = 1.5e-8
 #: Length scales, alike for all axes, from which the most probable setting is looked for besides the prior's best point.
 SMOOTH = (0.5, 1.5)
 #: Prior points for importance resampling (powers of two, for Sobol): for up to MANY outcomes; fewer beyond, down to a
 #: least number, since each costs the cube of them and more outcomes say more. Then emcee's steps.
-PRIOR_POINTS, MANY, LEAST_POINTS, STEPS = 4096, 32, 512, 60
+PRIOR_POINTS, MANY, LEAST_POINTS, STEPS = 1024, 64, 256, 60
 
 
 @dataclass(frozen=True)
@@ -79,14 +83,17 @@ class Density:
     def likelihood(self, points: FloatArray) -> FloatArray:
         """(w, d) to (w,): log marginal likelihood."""
         settings = self.unpack(points)
-        exponent = np.einsum("ijn,wn->wij", self.squares, settings.lengths**-2.0)
-        kernel = np.exp(-0.5 * exponent)
-        diagonal = np.arange(len(self.y))
-        kernel[:, diagonal, diagonal] += settings.noise + JITTER
-        factor = np.linalg.cholesky(kernel)
-        residual = self.y - settings.mean[:, None]
-        white = np.linalg.solve(factor, residual[..., None])[..., 0]
-        return -0.5 * np.sum(white**2, axis=1) - np.sum(np.log(factor[:, diagonal, diagonal]), axis=1)
+        m = len(self.y)
+        diagonal = np.arange(m)
+        # Outcomes as one more row: its part of the Cholesky factor is L⁻¹(y − mean), without a system to solve.
+        bordered = np.empty((len(points), m + 1, m + 1))
+        exponent = settings.lengths**-2.0 @ self.squares.reshape(m * m, -1).T
+        bordered[:, :m, :m] = np.exp(-0.5 * exponent).reshape(-1, m, m)
+        bordered[:, diagonal, diagonal] += settings.noise + JITTER
+        bordered[:, m, :m] = self.y - settings.mean[:, None]
+        bordered[:, m, m] = CORNER
+        factor = np.linalg.cholesky(bordered)
+        return -0.5 * np.sum(factor[:, m, :m] ** 2, axis=1) - np.sum(np.log(factor[:, diagonal, diagonal]), axis=1)
 
     def __call__(self, points: FloatArray) -> FloatArray:
         """(w, d) to (w,): log posterior density up to a constant."""
@@ -129,7 +136,7 @@ def posterior(
 
     best = points[np.argmax(density(points))]
     for start in [best, *_smooth(density)]:
-        found = minimize(lambda p: -density(p[None])[0], start, bounds=density.bounds, method="L-BFGS-B")
+        found = minimize(_downhill, start, (density,), jac=True, bounds=density.bounds, method="L-BFGS-B")
         if np.isfinite(found.fun) and found.fun < -density(best[None])[0]:
             best = found.x
 
@@ -163,6 +170,14 @@ def _smooth(density: Density) -> list[FloatArray]:
         if density.noise is None:
             point[-1] = NOISE_MEAN - NOISE_STD
     return ends
+
+
+def _downhill(point: FloatArray, density: Density) -> tuple[float, FloatArray]:
+    """Minus the density at a point (d,) and its slope, by differences within the bounds, all in one call."""
+    step = SLOPE_STEP * np.maximum(1.0, np.abs(point))
+    step = np.where(point + step > density.bounds[:, 1], -step, step)
+    values = density(point + np.concatenate([np.zeros((1, len(point))), np.diag(step)]))
+    return -float(values[0]), -(values[1:] - values[0]) / step
 
 
 def _curvature(density: Density, peak: FloatArray) -> FloatArray:

@@ -99,9 +99,11 @@ def test_ten_noisy_evaluations_find_a_minimum_in_one_dimension(noise_std: float 
 
 def test_two_dimensions() -> None:
     truth = dense_optimum(tilted_bowl, 2)
-    result = play(tilted_bowl, 2, 18, 0.005, 0).result()
-    assert np.all(np.abs(result.estimate - truth) < 0.1)
-    assert np.all(np.abs(result.estimate - truth) < 3.0 * result.std)
+    results = [play(tilted_bowl, 2, 18, 0.005, seed).result() for seed in range(3)]
+    errors = np.array([r.estimate - truth for r in results])
+    assert np.all(np.abs(errors) < 0.1)
+    # Six standardised errors: a root mean square above 1.8 has a chance of 0.4 % when stds are right.
+    assert np.sqrt(np.mean((errors / [r.std for r in results]) ** 2)) < 1.8
 
 
 def test_the_estimate_is_the_minimum_of_the_mean_not_the_luckiest_point() -> None:

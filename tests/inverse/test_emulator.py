@@ -44,6 +44,27 @@ def test_chance_is_the_scatter_between_seeds(emulator: Emulator) -> None:
     assert np.sqrt(np.trace(emulator.chance)) == pytest.approx(CHANCE, rel=0.4)
 
 
+def test_chance_is_that_of_the_whole_range_however_quiet_repeats_are() -> None:
+    """Sand may slide in lumps at some parameters and not where simulations happen to be repeated."""
+    points = np.concatenate([sobol(40, 1, 0), np.zeros((8, 1))])
+    quiet = np.repeat([1.0, 0.2], [40, 8])[:, None]
+    features = 10.0 * points @ np.ones((1, 20)) + quiet * np.random.default_rng(5).normal(size=(48, 1)) @ np.ones(
+        (1, 20)
+    )
+    emulator = Emulator(points, features)
+    true = np.mean(quiet**2) * 20.0  # along the one direction (1, …, 1)
+    assert emulator.count == 1 and emulator.chance[0, 0] == pytest.approx(true, rel=0.35)
+
+
+def test_chance_knows_which_scores_scatter_together() -> None:
+    rng = np.random.default_rng(6)
+    points = sobol(64, 2, 0)
+    scatter = rng.multivariate_normal([0.0, 0.0], [[1.0, 0.8], [0.8, 1.0]], 64)
+    emulator = Emulator(points, np.stack([8.0 * points[:, 0], 5.0 * points[:, 1]], axis=1) + scatter)
+    found = emulator.basis @ emulator.chance @ emulator.basis.T
+    assert found[0, 1] / np.sqrt(found[0, 0] * found[1, 1]) == pytest.approx(0.8, abs=0.15)
+
+
 def test_left_out_points_are_predicted_and_covered(emulator: Emulator) -> None:
     assert emulator.left_out.skill[0] > 0.95
     assert 0.6 < np.sqrt(np.mean(emulator.left_out.z**2)) < 1.4
@@ -63,7 +84,7 @@ def test_leaving_out_in_closed_form_is_leaving_out() -> None:
     points = np.concatenate([sobol(7, 1, 2), np.zeros((2, 1))])
     values = np.sin(2.0 * points[:, 0]) + 0.05 * np.random.default_rng(5).normal(size=9)
     process = _Process(points, values, seed=0)
-    errors, stds = process.left_out()
+    errors, stds = process.left_out
     for group in (np.array([3]), np.array([7, 8])):
         rest = np.setdiff1d(np.arange(9), group)
         found, variances = [], []
