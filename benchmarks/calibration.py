@@ -205,7 +205,9 @@ def figure(result: dict[str, Any]) -> Figure:
     low, high = binom.interval(0.95, result["truths"], 1.0 / BINS)
     for axis, name in zip(axes, names, strict=True):
         axis.axhspan(low, high, color="0.88", label="95 % of uniform ranks")
-        axis.bar(np.arange(BINS) + 0.5, result["parameters"][name]["ranks"], width=0.9, color="#3b6ea5")
+        ranks = result["parameters"][name]["ranks"]
+        axis.bar(np.arange(BINS) + 0.5, ranks, width=0.9, color="#3b6ea5")
+        axis.set_ylim(0.0, 1.25 * max(high, *ranks))  # room for the legend
         axis.set_xlabel(f"rank of the true {name.replace('_', ' ')}, tenths")
         axis.legend(fontsize=7)
     axes[0].set_ylabel("truths")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -195,6 +196,7 @@ class Model:
         values: Mapping[str, float] | None = None,
         *,
         albedo: int | None = None,
+        rounding: float = 1.0,
     ) -> dict[tuple[str, int], Image]:
         """Pictures of a trajectory by (camera, frame), as cameras without distortion report it.
 
@@ -203,12 +205,15 @@ class Model:
             seed: of the trajectory's particles.
             values: by name; of these only observation effects' count. Everything is reported as it is by default.
             albedo: seed of another guess of the colour of soil beneath the surface, which photographs leave open.
+            rounding: variance of the kernel that rounds off the surface, over the usual one.
 
         Raises:
             ParameterError: values out of bounds, or a trajectory without the frames that a time offset needs.
         """
         observation = self.observation(values)
         scene = self.scene(seed) if albedo is None else self.scene(seed).with_other_albedo(albedo)
+        if rounding != 1.0:
+            scene = scene.replace(smoothing=math.sqrt(rounding) * scene.smoothing)
         if observation.changes_light:
             light = scene.light.changed(observation.sun_azimuth, observation.sun_elevation, observation.sky_share)
             scene = scene.replace(light=light)

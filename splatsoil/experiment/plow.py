@@ -39,7 +39,9 @@ NUMERICS: Mapping[str, Callable[[Resolution], Resolution]] = {
     "grid": lambda r: replace(r, cell=0.8 * r.cell, spacing=0.8 * r.spacing),
 }
 """Other ways to compute the same physics: three times as stiff, twice as many steps, a finer grid."""
-
+ROUNDING = "rounding"
+"""Another drawing of the same simulation, its surface rounded off twice as much. To first order that changes features
+by as much as the drawing has done already, so that one such change is what it gets wrong."""
 
 GUESSES = tuple(f"albedo {number}" for number in range(1, 7))
 """Other colours of the soil beneath the surface."""
@@ -69,7 +71,7 @@ class PlowExperiment:
         parameters: Iterable[str] | None = None,
         *,
         candidates: Iterable[str | Effect] | None = None,
-        numerics: Iterable[str] = tuple(NUMERICS),
+        numerics: Iterable[str] = (ROUNDING, *NUMERICS),
         progress: Callable[[int, int], None] | None = None,
     ) -> None:
         self.base = model
@@ -156,12 +158,13 @@ class PlowExperiment:
     ) -> Prediction:
         """The pictures behind the features. What only changes the observation is drawn without a new simulation."""
         guess = 1 + self.guesses.index(numerics) if numerics in self.guesses else None
-        way = numerics if guess is None else ""
+        rounding = 2.0 if numerics == ROUNDING else 1.0
+        way = numerics if numerics in NUMERICS else ""
         model = self._variant(tuple(dict.fromkeys((*self.model, *effects))), way)
         began = time.perf_counter()
         trajectory = self._trajectory(model, values, seed, way)
         simulated = time.perf_counter()
-        images = model.draw(trajectory, seed, values, albedo=guess)
+        images = model.draw(trajectory, seed, values, albedo=guess, rounding=rounding)
         seconds = {"simulation": simulated - began, "drawing": time.perf_counter() - simulated}
         return Prediction(dict(values), seed, images, trajectory, seconds)
 

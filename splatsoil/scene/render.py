@@ -20,7 +20,7 @@ from splatsoil.scene.binding import Binding
 from splatsoil.scene.kernels_colour import WIDTH, develop
 from splatsoil.scene.light import Light, linear
 from splatsoil.scene.lit import LitRelief, ceiling, light_relief, march_step
-from splatsoil.scene.relief import Relief, grid_of, relief_of_particles
+from splatsoil.scene.relief import SMOOTHING, Relief, grid_of, relief_of_particles
 from splatsoil.scene.tool import ToolBody, eye_of
 from splatsoil.splats import Gaussians, rasterise_features
 from splatsoil.splats.warp_torch import as_warp, launch, launch_parts, thread_count
@@ -119,6 +119,7 @@ class Scene:
         bed: the bed's box.
         spacing: of the particles, m.
         background: (3,) sRGB where nothing is.
+        smoothing: of the surface; see `relief_of_particles`.
     """
 
     soil: Binding
@@ -133,6 +134,7 @@ class Scene:
     bed: Bed
     spacing: float
     background: FloatArray
+    smoothing: float = SMOOTHING
 
     @property
     def device(self) -> torch.device:
@@ -195,7 +197,7 @@ class Scene:
         """
         x = torch.as_tensor(positions, dtype=torch.float32, device=self.device).contiguous()
         f = None if deformations is None else torch.as_tensor(deformations, dtype=torch.float32, device=self.device)
-        relief = relief_of_particles(x, self.spacing, self.bed.lower, self.bed.upper)
+        relief = relief_of_particles(x, self.spacing, self.bed.lower, self.bed.upper, smoothing=self.smoothing)
         placed = self.tool.absent() if tool is None else self.tool.at(*tool)
         lit = light_relief(relief, self.light, placed, self.tool_albedo)
         centres, covariances = self.soil.carry(x, None if f is None else f.contiguous())

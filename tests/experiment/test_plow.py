@@ -9,10 +9,15 @@ from splatsoil.experiment.plow import PlowExperiment
 
 
 def asked(numerics: str) -> tuple[list[Any], list[Any]]:
-    """How a prediction was simulated (effects and numerics of the model, numerics) and drawn (seed, albedo)."""
+    """How a prediction was simulated (effects and numerics of the model, numerics), and drawn (seed, albedo, rounding)
+    from it."""
     simulated: list[Any] = []
     drawn: list[Any] = []
-    model = SimpleNamespace(draw=lambda trajectory, seed, values, albedo: drawn.append((seed, albedo)))
+
+    def draw(trajectory: Any, seed: int, values: Any, *, albedo: int | None, rounding: float) -> None:
+        drawn.append((seed, albedo, rounding))
+
+    model = SimpleNamespace(draw=draw)
 
     def variant(effects: tuple[str, ...], way: str) -> Any:
         simulated.append((effects, way))
@@ -29,9 +34,18 @@ def asked(numerics: str) -> tuple[list[Any], list[Any]]:
 
 
 @pytest.mark.parametrize(
-    ("numerics", "way", "albedo"), [("", "", None), ("grid", "grid", None), ("albedo 1", "", 1), ("albedo 6", "", 6)]
+    ("numerics", "way", "drawing"),
+    [
+        ("", "", (None, 1.0)),
+        ("grid", "grid", (None, 1.0)),
+        ("albedo 1", "", (1, 1.0)),
+        ("albedo 6", "", (6, 1.0)),
+        ("rounding", "", (None, 2.0)),
+    ],
 )
-def test_a_guess_is_another_drawing_of_the_same_simulation(numerics: str, way: str, albedo: int | None) -> None:
+def test_guesses_and_rounding_are_other_drawings_of_the_same_simulation(
+    numerics: str, way: str, drawing: tuple[int | None, float]
+) -> None:
     simulated, drawn = asked(numerics)
     assert simulated == [(("cohesion", "tilt"), way), way]
-    assert drawn == [(3, albedo)]
+    assert drawn == [(3, *drawing)]

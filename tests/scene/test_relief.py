@@ -51,6 +51,24 @@ def test_waves_are_rounded_off_by_one_spacing_and_no_more(length):
     assert found == pytest.approx(np.exp(-2.0 * (np.pi * 0.01 / length) ** 2), abs=0.05)
 
 
+@pytest.mark.parametrize("length", [0.08, 0.12, 0.2])
+def test_twice_the_rounding_takes_as_much_again(length):
+    """So that the difference tells what the drawing has rounded off: the whole wave, to first order."""
+
+    def height(smoothing):
+        particles = filled(lambda x, y: 0.1 + 0.05 * length * np.sin(2.0 * np.pi / length * x), jitter=1.0)
+        points = relief_of_particles(particles, 0.01, LOWER, UPPER, smoothing=smoothing).points.numpy()
+        whole = 0.1 + length * int(0.25 / length)
+        inside = (points[..., 0] > 0.1) & (points[..., 0] < whole) & (np.abs(points[..., 1] - 0.15) < 0.12)
+        wave = np.sin(2.0 * np.pi / length * points[..., 0][inside])
+        return np.polyfit(wave, points[..., 2][inside], 1)[0] / (0.05 * length)
+
+    once, twice = height(1.0), height(np.sqrt(2.0))
+    lost = 1.0 - np.exp(-2.0 * (np.pi * 0.01 / length) ** 2)
+    assert 2.0 * once - twice == pytest.approx(1.0, abs=0.05 + lost**2)
+    assert once - twice > 0.5 * lost
+
+
 def test_walls_do_not_pull_the_surface_down():
     relief = relief_of_particles(filled(lambda x, y: 0.1 + 0.0 * x), 0.01, LOWER, UPPER)
     assert abs(float(relief.height[:, 0].mean()) - float(relief.height.mean())) < 0.001
