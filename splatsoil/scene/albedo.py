@@ -78,7 +78,7 @@ class SurfaceAlbedo:
         length: how deep blotches reach, m; their correlation length by default.
 
     Attributes:
-        mean: (3,) linear.
+        mean: (3,) linear, over the bed's area.
         length: m.
     """
 
@@ -93,7 +93,7 @@ class SurfaceAlbedo:
     ) -> None:
         if length is None:
             length = correlation_length(centres, albedo.clamp_min(1e-3).log().mean(dim=1), LONGEST)
-        self.mean, self.length = albedo.mean(dim=0), length
+        self.length = length
         self._low = np.asarray(low, dtype=np.float64)[:2]
         self._extent = np.asarray(high, dtype=np.float64)[:2] - self._low
         count = np.maximum(np.ceil(self._extent / (_FINE * spacing)).astype(int), 2)
@@ -106,6 +106,8 @@ class SurfaceAlbedo:
         near = albedo[torch.from_numpy(index.reshape(len(cells), k)).to(albedo.device)]
         mean = (weight[..., None] * near).sum(dim=1) / weight.sum(dim=1, keepdim=True)
         self._map = mean.T.reshape(1, 3, int(count[1]), int(count[0])).contiguous()
+        # Over the bed's area: Gaussians stand closer where the soil is dark or patterned.
+        self.mean = self._map.mean(dim=(0, 2, 3))
 
     def above(self, points: Tensor) -> Tensor:
         """Linear albedo (p, 3) of the surface over points (p, 3), m."""

@@ -62,3 +62,13 @@ def test_best_guess_and_what_is_left_open_make_up_the_whole_variance():
     opened = guesses(cloud(), depth).var() / guesses(cloud(), 10.0 * LENGTH).var()
     assert abs(told - math.exp(-1.0)) < 0.03
     assert abs(opened - (1.0 - math.exp(-1.0))) < 0.02
+
+
+def test_the_mean_is_the_beds_however_densely_gaussians_stand_on_dark_soil():
+    rng = np.random.default_rng(2)
+    dark, bright = (rng.uniform([x, 0.0, 0.0], [x + 0.1, 0.2, 0.0], (n, 3)) for x, n in ((0.0, 4000), (0.1, 400)))
+    centres = torch.tensor(np.concatenate([dark, bright]), dtype=torch.float32)
+    colours = torch.tensor(np.repeat([0.2, 0.4], [4000, 400])[:, None] * np.ones(3), dtype=torch.float32)
+    shown = SurfaceAlbedo(centres, colours, 0.01, (0.0, 0.0), (0.2, 0.2), LENGTH)
+    deep = shown.beneath(centres, torch.full((4400,), 1.0))
+    assert torch.allclose(deep, torch.tensor(0.3), rtol=0.03)  # 0.22 by Gaussians; at the border dark ones are nearer
