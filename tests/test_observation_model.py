@@ -177,3 +177,19 @@ def test_another_guess_of_buried_colours_shows_where_soil_was_turned_over(measur
     assert changes[8][right].mean() > 2.5 * max(changes[8][left].mean(), changes[0][right].mean())
     assert np.array_equal(model.draw(over, albedo=1)["left", 8], again["left", 8])
     assert np.abs(other["left", 8] - again["left", 8])[right].mean() > 0.5 * changes[8][right].mean()
+
+
+def test_rounding_takes_shade_from_a_furrow_and_nothing_from_level_soil(measurement, scene, still):
+    model = model_of(measurement, scene)
+    furrowed = still.copy()
+    furrowed[:, 2] -= 0.03 * np.exp(-(((furrowed[:, 0] - 0.28) / 0.04) ** 2)) * (furrowed[:, 2] / DEPTH)
+    level, once, twice = (
+        model.draw(trajectory_of(model, soil), rounding=r)["left", 0].mean(axis=2)
+        for soil, r in ((still, 1.0), (furrowed, 1.0), (furrowed, 2.0))
+    )
+    # Away from the tool and its shadow; smoothed over the spots, which stay where they are.
+    part = np.s_[30:60, 45:85]
+    depth = [float(np.std((image - level)[part].mean(axis=0))) for image in (once, twice)]
+    assert 0.4 * depth[0] < depth[1] < 0.9 * depth[0]
+    again = model.draw(trajectory_of(model, still), rounding=2.0)["left", 0].mean(axis=2)
+    assert np.abs((again - level)[part].mean(axis=0)).max() < 0.1 * depth[0]

@@ -159,7 +159,7 @@ class PlowExperiment:
         """The pictures behind the features. What only changes the observation is drawn without a new simulation."""
         guess = 1 + self.guesses.index(numerics) if numerics in self.guesses else None
         rounding = 2.0 if numerics == ROUNDING else 1.0
-        way = numerics if numerics in NUMERICS else ""
+        way = "" if guess is not None or numerics == ROUNDING else numerics
         model = self._variant(tuple(dict.fromkeys((*self.model, *effects))), way)
         began = time.perf_counter()
         trajectory = self._trajectory(model, values, seed, way)

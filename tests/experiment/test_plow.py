@@ -49,3 +49,7 @@ def test_guesses_and_rounding_are_other_drawings_of_the_same_simulation(
     simulated, drawn = asked(numerics)
     assert simulated == [(("cohesion", "tilt"), way), way]
     assert drawn == [(3, *drawing)]
+
+
+def test_an_unknown_way_is_not_taken_for_the_usual_one() -> None:
+    assert asked("gird")[0] == [(("cohesion", "tilt"), "gird"), "gird"]
