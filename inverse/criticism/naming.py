@@ -37,7 +37,9 @@ def members_of(
     best = min(among, key=lambda name: among[name])
     if best not in standing:
         return ()
-    return _equals(among, best, max(confirmations[best].remainder.dispersion, scores[best].dispersion))
+    # What explains nothing equals nothing, however wide the doubt.
+    explaining = {name: cost for name, cost in among.items() if name == best or confirmations[name].fall > 0.0}
+    return _equals(explaining, best, max(confirmations[best].remainder.dispersion, scores[best].dispersion))
 
 
 def stands(confirmations: Mapping[str, Confirmation], name: str, misfit: Omnibus, dispersion: float) -> bool:

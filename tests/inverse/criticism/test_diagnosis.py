@@ -227,6 +227,16 @@ def test_what_other_pictures_say_beyond_doubt_is_named_before_what_soil_shows(si
     assert members_of(denied, costs, found.misfit, scores)[0] == "effect 2"
 
 
+def test_what_explains_nothing_is_no_equal_however_wide_the_doubt(sizes: dict[str, float]) -> None:
+    found = one(WORLD, {"angle": 1.0, "effect 2": 5.0 * sizes["effect 2"]}, None, OPTIONS)
+    best, asis = found.confirmations["effect 2"], found.confirmations[""]
+    doubt = replace(best, remainder=Omnibus(72.0 * best.fall, 72, 0.5))
+    told = {"": asis, "effect 2": doubt, "little": replace(best, fall=0.1), "nothing": replace(best, fall=0.0)}
+    scores = dict.fromkeys(told, found.scores["effect 2"])
+    costs = {name: -c.fall for name, c in told.items() if name}
+    assert members_of(told, costs, found.misfit, scores) == ("effect 2", "little")
+
+
 def test_what_other_pictures_rule_out_is_not_named_however_well_it_explains_soil(sizes: dict[str, float]) -> None:
     size = sizes["effect 8"]
     base = emulated(WORLD)
