@@ -38,7 +38,7 @@ def members_of(
     if best not in standing:
         return ()
     # What explains nothing equals nothing, however wide the doubt.
-    explaining = {name: cost for name, cost in among.items() if name == best or confirmations[name].fall > 0.0}
+    explaining = {name: cost for name, cost in among.items() if confirmations[name].fall > 0.0}
     return _equals(explaining, best, max(confirmations[best].remainder.dispersion, scores[best].dispersion))
 
 
