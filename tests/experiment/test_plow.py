@@ -53,3 +53,8 @@ def test_guesses_and_rounding_are_other_drawings_of_the_same_simulation(
 
 def test_an_unknown_way_is_not_taken_for_the_usual_one() -> None:
     assert asked("gird")[0] == [(("cohesion", "tilt"), "gird"), "gird"]
+    base = SimpleNamespace(resolution=None, variant=lambda **changes: base)
+    experiment: Any = SimpleNamespace(model=("cohesion",), base=base, _wanted={})
+    assert PlowExperiment._variant(experiment, ("cohesion",), "") is base
+    with pytest.raises(KeyError, match="gird"):
+        PlowExperiment._variant(experiment, ("cohesion",), "gird")
