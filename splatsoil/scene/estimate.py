@@ -11,6 +11,7 @@ import numpy.typing as npt
 import torch
 import torch.nn.functional as functional
 import warp as wp
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from splatsoil.measurement import Frame, Measurement
@@ -36,8 +37,12 @@ _BLUR = 1.5
 _CLEARANCE = 0.005
 """Between the tool and soil that it has not touched yet, m: more than the surface is known to."""
 
-_PASSING = 3
-"""Frames with the tool in the air that are looked at, at most."""
+_PASSING = 4
+"""Frames at which the tool's shadow on untouched soil is looked at, at most."""
+
+_WEDGE, _TOUCHED = 2.5, 1.0
+"""How far around where the tool has been in the soil that may have moved: in depths of the tool there (a passive wedge
+is tan(45° + φ/2) depths long, 2.4 at 45°), and in widths of the tool at most."""
 
 
 def still_frames(measurement: Measurement) -> list[Frame]:
@@ -107,44 +112,53 @@ def estimate_light(measurement: Measurement, relief: Relief, body: ToolBody) -> 
     pixel = float(np.median([np.linalg.norm(v.camera.position - middle) / v.camera.fx for v in measurement.views]))
     across = float((points[1] - points[0]).norm())
     blur = max(1, math.ceil(_BLUR * pixel / across))
-    passing = [
-        p for frame in in_the_air(measurement, relief, body) for p in _passing(measurement, points, relief, body, frame)
-    ]
+    passing = [p for f in _moments(measurement) for p in _passing(measurement, points, relief, body, f)]
     return fit_light(points, colours, shape, relief, tool, blur=blur, passing=passing)
 
 
-def in_the_air(measurement: Measurement, relief: Relief, body: ToolBody) -> list[int]:
-    """Some video frames after the first up to which the tool has touched no soil, the last of them among these."""
-    motion, rate = measurement.tool.motion, measurement.frame_rate
-    last = -math.inf
-    for start, end in pairwise(motion.times):
-        travel = float(np.linalg.norm(np.subtract(*(motion.pose(float(t))[1] for t in (start, end)))))
-        for time in np.linspace(start, end, 2 + int(travel / _CLEARANCE)):
-            if not _clear(measurement, relief, body, float(time)):
-                break
-            last = float(time)
-        else:
-            continue
-        break
-    free = [f for f in measurement.frames[1:] if f / rate <= last + 1e-9]
-    count = min(_PASSING, len(free))
-    return [free[(k + 1) * len(free) // count - 1] for k in range(count)]
+def _moments(measurement: Measurement) -> list[int]:
+    """Some video frames after the first, most of them early ones, when little has moved."""
+    later = measurement.frames[1:]
+    places = np.geomspace(1, len(later), min(_PASSING, len(later)))
+    return sorted({later[round(k) - 1] for k in places})
 
 
-def _clear(measurement: Measurement, relief: Relief, body: ToolBody, time: float) -> bool:
-    """Whether the tool is off the soil."""
-    rotation, position = measurement.tool.motion.pose(time)
-    discs, _ = body.discs(rotation, position)
-    corners = torch.as_tensor(measurement.tool.mesh.vertices @ rotation.T + position).to(discs)
-    points = torch.cat([discs, corners])
-    return float((points[:, 2] - relief.sample(relief.height, points)).min()) >= _CLEARANCE
+def untouched(measurement: Measurement, points: Tensor, relief: Relief, body: ToolBody, frame: int) -> Tensor:
+    """Points of the surface so far from wherever the tool has been in the soil that nothing has moved them: (n,).
+
+    Args:
+        measurement: has the tool's motion.
+        points: (n, 3), m.
+        relief: the undisturbed surface.
+        body: the tool.
+        frame: of the video, up to which the tool has moved.
+    """
+    motion, end = measurement.tool.motion, frame / measurement.frame_rate
+    times = [float(t) for t in motion.times if t < end] + [end]
+    width = float(np.sort(measurement.tool.mesh.extents)[1])
+    where, moved = points[:, :2].double().cpu().numpy(), np.zeros(len(points), dtype=bool)
+    for start, stop in pairwise([times[0], *times]):
+        travel = float(np.linalg.norm(np.subtract(*(motion.pose(t)[1] for t in (start, stop)))))
+        for time in np.linspace(start, stop, 2 + int(travel / _CLEARANCE))[1:]:
+            rotation, position = motion.pose(float(time))
+            discs, _ = body.discs(rotation, position)
+            corners = torch.as_tensor(measurement.tool.mesh.vertices @ rotation.T + position).to(discs)
+            parts = torch.cat([discs, corners])
+            depth = relief.sample(relief.height, parts) + _CLEARANCE - parts[:, 2]
+            if (depth <= 0.0).all():
+                continue
+            reach = min(_WEDGE * float(depth.max()), _TOUCHED * width)
+            sunk = cKDTree(parts[depth > 0.0, :2].double().cpu().numpy())
+            moved |= np.isfinite(sunk.query(where, distance_upper_bound=reach)[0])
+    return torch.from_numpy(~moved).to(points.device)
 
 
 def _passing(measurement: Measurement, points: Tensor, relief: Relief, body: ToolBody, frame: int) -> list[Passing]:
-    """What each of the video's cameras says of the points at a frame, compared with its own still frames."""
+    """What each of the video's cameras says of the points that nothing has moved at a frame, compared with its own
+    still frames."""
     motion, rate = measurement.tool.motion, measurement.frame_rate
     then, rest = (body.at(*motion.pose(time)) for time in (frame / rate, float(motion.times[0])))
-    still = still_frames(measurement)
+    still, moved = still_frames(measurement), ~untouched(measurement, points, relief, body, frame)
     out = []
     for name in measurement.cameras:
         before = [f for f in still if f.frame is not None and f.camera_name == name]
@@ -154,6 +168,7 @@ def _passing(measurement: Measurement, points: Tensor, relief: Relief, body: Too
                 seen_colours(points, frames, relief, tool)[0].clamp_min(1e-4).log()
                 for frames, tool in ((after, then), (before, rest))
             )
+            shown[moved] = math.nan
             out.append(Passing(then, shown - known))
     return out
 

@@ -6,7 +6,8 @@ are compared with those that a light predicts, with a robust loss: the tool's sh
 sun's direction by its edge and the sky's share by what is left inside it, and slopes add what they know. Photographs
 blur a shadow's edge, which would look like more sky: for the share, the edge itself is left out.
 
-Where the tool's shadow passes on over untouched soil, what a place loses and gains by it owes nothing to the albedo.
+Where the tool's shadow passes on over untouched soil, what a place loses and gains by it owes nothing to the albedo: a
+dark blotch in the shadow at rest would look like less sky, a pale one like more.
 """
 
 from __future__ import annotations
@@ -14,17 +15,21 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
+import numpy.typing as npt
 import torch
 import torch.nn.functional as functional
 from scipy.optimize import minimize, minimize_scalar
 from torch import Tensor
 
 from splatsoil.scene.light import SOIL_REFLECTANCE, Light
-from splatsoil.scene.lit import LitRelief, direct_light, sun_on_points
+from splatsoil.scene.lit import LitRelief, facing, normals, sun_on_points
 from splatsoil.scene.relief import Relief
 from splatsoil.scene.sky import sky_openness
+
+FloatArray = npt.NDArray[np.float64]
 
 FINEST = 0.004
 """Smallest distance of compared points, m: about a pixel of the photographs the method was measured on."""
@@ -37,6 +42,9 @@ _TOOL_REFLECTANCE = 0.2
 
 _FEWEST_SHADED = 30
 """Cells in the tool's shadow, beside its edge, from which the sky's share can be told."""
+
+_PLACES, _AROUND = 4, (-7.5, -5.0, -2.5, 0.0, 2.5, 5.0, 7.5)
+"""Of the sun's directions tried, the best, and how far around them it is looked for more closely, degrees."""
 
 _LEAST_CHANGE = 0.01
 """Changes of log brightness are not taken for better known than this."""
@@ -93,15 +101,12 @@ def fit_light(
         blur: half width of a shadow's edge in the photographs, in rows and columns.
         passing: what the tool's shadow did elsewhere.
     """
-    parts = [_Passed(_Sunlit(points, relief, p.tool), p.change) for p in passing if _tells(p)]
+    telling = [p for p in passing if _tells(p)]
+    # Cameras that look at the same moment share its light.
+    lights = {id(p.tool): _Sunlit(points, relief, p.tool) for p in telling}
+    parts = [_Passed(lights[id(p.tool)], p.change) for p in telling]
     problem = _Problem(_Sunlit(points, relief, tool), colours.clamp_min(1e-4).log(), shape, parts)
-    start = min(
-        (problem.cost(None, azimuth, elevation, share), azimuth, elevation, share)
-        for elevation in (20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0)
-        for azimuth in np.arange(-180.0, 180.0, 10.0)
-        for share in (0.4, 0.6, 0.8)
-    )
-    first = np.array(start[1:])
+    first = _start(problem)
     simplex = first + np.array([[0, 0, 0], [6.0, 0, 0], [0, 5.0, 0], [0, 0, -0.1]])
     found = minimize(
         lambda v: problem.cost(None, *v),
@@ -124,11 +129,32 @@ def fit_light(
     return LightEstimate(light, 1.0 - float(found.fun) / max(problem.nothing(), 1e-12), shadowed)
 
 
+def _start(problem: _Problem) -> FloatArray:
+    """Azimuth, elevation and the sky's share to search from: a narrow shadow is felt from a few degrees off at most."""
+    tried = sorted(
+        (problem.cost(None, azimuth, elevation, share), azimuth, elevation, share)
+        for elevation in (20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0)
+        for azimuth in np.arange(-180.0, 180.0, 10.0)
+        for share in (0.4, 0.6, 0.8)
+    )
+    best: dict[tuple[float, float], float] = {}
+    for _, azimuth, elevation, share in tried:
+        best.setdefault((azimuth, elevation), share)
+    near = [
+        (azimuth + turn, elevation + rise, share)
+        for (azimuth, elevation), share in islice(best.items(), _PLACES)
+        for turn in _AROUND
+        for rise in _AROUND
+    ]
+    return np.array(min((problem.cost(None, *at), *at) for at in near)[1:])
+
+
 class _Sunlit:
     """Light on points of a surface with the tool at one place."""
 
     def __init__(self, points: Tensor, relief: Relief, tool: object) -> None:
         self.points, self.relief, self.tool = points, relief, tool
+        self.normal = normals(relief, points)
         openness, hidden = (relief.sample(share, points) for share in sky_openness(relief, tool))
         # The soil and the tool in the sky's way send back half of level ground's light.
         self.openness = openness
@@ -139,7 +165,7 @@ class _Sunlit:
         """(n,) log of the light, 0 on level open ground; the sun's part of the last direction is kept."""
         if self._known is None or self._known[:2] != (azimuth, elevation):
             light = Light.from_angles(azimuth, elevation, 0.5)
-            self._known = (azimuth, elevation, direct_light(self._open(light), self.points, 0.25 * FINEST))
+            self._known = (azimuth, elevation, facing(light, self.normal) * self.tool_light(light))
         e = ambient * self.openness + (1.0 - ambient) * self._known[2] + self.returned
         return e.clamp_min(1e-3).log()
 
@@ -190,29 +216,21 @@ class _Problem:
     def beside_edges(self, azimuth: float, elevation: float, blur: int) -> _Problem:
         """The same without shadows' edges, their blur taken off both sides, by differences that reach across.
 
-        Of a shadow too narrow for that, less is taken off; nothing where hardly any shadow is left then.
+        Where all shadows are too narrow for that, less is taken off; nothing where hardly any shadow is left then.
         """
         light = Light.from_angles(azimuth, elevation, 0.5)
         widest = min(blur, (min(self.shape) // 2 - LAG) // 2)
-        brightness, lag = self.brightness, self.lag
         for width in range(widest, 0, -1):
             edge, shaded = self.still.edge(light, width, self.shape)
-            if _enough(shaded & ~edge, brightness):
-                brightness, lag = _without(edge, brightness), 2 * width + LAG
-                break
-        passed = []
-        for part in self.passed:
-            change = part.change
-            for width in range(widest, 0, -1):
-                edges, shadows = zip(
-                    *(s.edge(light, width, self.shape) for s in (self.still, part.sunlit)), strict=True
-                )
-                edge = edges[0] | edges[1]
-                if _enough((shadows[0] ^ shadows[1]) & ~edge, change):
-                    change = _without(edge, change)
-                    break
-            passed.append(_Passed(part.sunlit, change))
-        return _Problem(self.still, brightness, self.shape, passed, lag)
+            enough = _enough(shaded & ~edge, self.brightness)
+            passed = []
+            for part in self.passed:
+                there, then = part.sunlit.edge(light, width, self.shape)
+                enough |= _enough((shaded ^ then) & ~(edge | there), part.change)
+                passed.append(_Passed(part.sunlit, _without(edge | there, part.change)))
+            if enough:
+                return _Problem(self.still, _without(edge, self.brightness), self.shape, passed, 2 * width + LAG)
+        return self
 
     def cost(self, channel: int | None, azimuth: float, elevation: float, ambient: float) -> float:
         """Loss of a light in one colour or in grey; the sky's share is held between 0 and 1, the sun above the

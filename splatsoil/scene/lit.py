@@ -103,9 +103,18 @@ def _ambient(light: Light, like: Tensor) -> Tensor:
 
 def direct_light(lit: LitRelief, points: Tensor, spread: float = 0.0) -> Tensor:
     """The sun on points (n, 3) of the surface, (n,); 1 on level, open ground."""
-    normal = functional.normalize(lit.relief.sample(lit.relief.normal, points), dim=1)
-    sun = torch.tensor(lit.light.direction.tolist(), dtype=torch.float32, device=points.device)
-    return (normal @ sun).clamp_min(0.0) / sun[2] * sun_on_points(lit, points, spread)
+    return facing(lit.light, normals(lit.relief, points)) * sun_on_points(lit, points, spread)
+
+
+def normals(relief: Relief, points: Tensor) -> Tensor:
+    """Of the surface at points (n, 3) on it: (n, 3)."""
+    return functional.normalize(relief.sample(relief.normal, points), dim=1)
+
+
+def facing(light: Light, normal: Tensor) -> Tensor:
+    """The sun on open ground of normals (n, 3): (n,), 1 where it is level."""
+    sun = torch.tensor(light.direction.tolist(), dtype=torch.float32, device=normal.device)
+    return (normal @ sun).clamp_min(0.0) / sun[2]
 
 
 def _coarser(relief: Relief) -> Relief:

@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 
 from splatsoil.measurement import Bed, Frame, ToolMotion
 from splatsoil.scene import Light, Relief, ToolBody, estimate, estimate_light, light_relief
-from splatsoil.scene.estimate import in_the_air
+from splatsoil.scene.estimate import untouched
 from splatsoil.scene.light_fit import Passing, fit_light
 from splatsoil.synthetic import paper
 from splatsoil.synthetic.setups import staged_motion
@@ -97,53 +97,95 @@ def test_a_shadow_that_comes_later_tells_the_light(azimuth, elevation, ambient):
     assert np.array_equal(fit_light(*what, passing=[unknown]).light.ambient, without.light.ambient)
 
 
-def test_frames_with_the_tool_in_the_air():
+@pytest.fixture
+def flat():
+    """A level bed of the paper's setup, points all over it, and the setup."""
     setup = paper().resized(0.05)
-    level = 0.2 * np.ones_like(setup.surface.height)
-    relief = Relief.of_heights(torch.tensor(level), (0.0025, 0.0025), (0.005, 0.005))
-    measurement = replace(setup.experiment(), tool=replace(setup.tool, motion=motion(0.36)))
+    relief = Relief.of_heights(torch.full((200, 200), 0.2), (0.0025, 0.0025), (0.005, 0.005))
+    return setup, relief, relief.points.reshape(-1, 3)
+
+
+def left_alone(flat, motion, frame):
+    """Points of the flat bed that a tool on its way has not moved, (n, 3), and those that it may have."""
+    setup, relief, points = flat
+    measurement = replace(setup.experiment(), tool=replace(setup.tool, motion=motion))
+    rest = untouched(measurement, points, relief, ToolBody(setup.tool.mesh), frame).numpy()
+    return points[rest].numpy(), points[~rest].numpy()
+
+
+def test_soil_is_untouched_while_the_tool_is_in_the_air(flat):
     # The plate, 0.1 m long and tilted by 30°, comes down by 4 mm a frame: its lower edge is at the soil after 28.
     reach = 0.05 * np.cos(np.radians(30.0)) + 0.005 * np.sin(np.radians(30.0))
     touches = (0.36 - reach - 0.2) / 0.004
-    body = ToolBody(setup.tool.mesh)
-    air = in_the_air(measurement, relief, body)
-    assert air == [10, 20] and 20 < touches < 30
-    lower = replace(measurement, tool=replace(setup.tool, motion=motion(0.28)))
-    assert in_the_air(lower, relief, body) == []
-    higher = replace(measurement, tool=replace(setup.tool, motion=motion(0.48)))
-    assert in_the_air(higher, relief, body) == [10, 30, 50]
+    assert 20 < touches < 30
+    for frame, moved in ((20, False), (40, True)):
+        _, near = left_alone(flat, down(0.36), frame)
+        assert bool(len(near)) == moved
 
 
-def motion(height):
+def test_soil_around_the_tool_may_have_moved_as_far_as_a_wedge_of_it_reaches(flat):
+    """Beside a plate 1 and 4 cm deep: a passive wedge is tan(45° + φ/2) depths long (Rankine), 2.4 at 45°."""
+    half = 0.5 * flat[0].tool.mesh.extents[1]
+    for frame, depth in ((31, 0.01), (38, 0.04)):
+        alone, near = left_alone(flat, down(0.36), frame)
+        beyond = np.abs(near[:, 1] - 0.5).max() - half
+        assert 2.4 * depth < beyond < 4.0 * depth + 0.02
+        assert np.abs(alone[:, :2] - 0.5).max() > 0.45
+
+
+def down(height):
     """Straight down."""
     return staged_motion((0.5, 0.5, height), tilt=30.0, down=0.2, push=0.0, stages=(100, 1, 1, 1))
 
 
-def test_frames_after_ploughing_are_not_in_the_air():
-    """A tool that has been through the soil and lifted out, filmed from then on."""
-    setup = paper().resized(0.05)
-    relief = Relief.of_heights(torch.full((200, 200), 0.2), (0.0025, 0.0025), (0.005, 0.005))
-    down_and_up = staged_motion((0.5, 0.5, 0.36), tilt=30.0, down=0.2, push=0.0, stages=(60, 1, 1, 1))
-    back = np.concatenate([down_and_up.positions[:61], down_and_up.positions[60::-1]])
+def test_soil_stays_touched_when_the_tool_has_left_it(flat):
+    there = down(0.36)
+    back = np.concatenate([there.positions[:61], there.positions[60::-1]])
     frames = np.arange(len(back))
-    lifted = ToolMotion(frames, frames / 50.0, back, np.tile(down_and_up.quaternions[0], (len(back), 1)))
-    measurement = replace(setup.experiment(), tool=replace(setup.tool, motion=lifted))
-    late = replace(measurement, video=tuple(f for f in measurement.video if f.frame >= 110))
-    assert late.frames[0] == 110 and in_the_air(late, relief, ToolBody(setup.tool.mesh)) == []
+    lifted = ToolMotion(frames, frames / 50.0, back, np.tile(there.quaternions[0], (len(back), 1)))
+    alone, near = left_alone(flat, lifted, 120)
+    assert np.abs(near[:, :2] - 0.5).max() > 0.1
+    assert len(alone) > len(near) > 0
 
 
-def test_the_video_tells_the_light(monkeypatch: pytest.MonkeyPatch):
-    """Colours by the light at each frame's own pose, through cameras whose exposures drift apart."""
-    truth, (_, _, shape, relief, _), _ = seen(20.0, 50.0, 0.5)
+def filmed(height):
+    """Two frames of a plate that comes from beside a bed and goes down to a height, its way, and the plate."""
     setup = paper().resized(0.05)
     beside = (0.4, -0.2, 0.36)  # at rest its shadow falls outside of the bed
-    path = np.array([beside, (0.4, 0.27, 0.36), (0.4, 0.27, 0.21)])
+    path = np.array([beside, (0.4, 0.27, 0.36), (0.4, 0.27, height)])
     way = ToolMotion(np.array([0, 10, 20]), np.array([0.0, 0.2, 0.4]), path, np.tile([1.0, 0.0, 0.0, 0.0], (3, 1)))
     made = setup.experiment()
     bed = Bed(np.zeros(3), np.array([0.8, 0.55, 0.3]), density=1600.0)
     views = tuple(Frame(camera, Path(), "view") for camera in setup.views[:4])
     video = tuple(f for f in made.video if f.frame <= 20 and (f.camera_name, f.frame) != ("right", 10))
-    measurement = replace(made, bed=bed, tool=replace(setup.tool, motion=way), views=views, video=video)
+    return (
+        replace(made, bed=bed, tool=replace(setup.tool, motion=way), views=views, video=video),
+        way,
+        ToolBody(setup.tool.mesh),
+    )
+
+
+def test_what_the_tool_may_have_moved_tells_nothing_of_the_light(monkeypatch: pytest.MonkeyPatch):
+    _, (_, _, _, relief, _), _ = seen(20.0, 50.0, 0.5)
+    measurement, _, body = filmed(0.13)
+
+    def grey(points, *_):
+        return torch.full((len(points), 3), 0.5), torch.full((len(points),), 5)
+
+    given = {}
+    monkeypatch.setattr(estimate, "seen_colours", grey)
+    monkeypatch.setattr(estimate, "fit_light", lambda points, *_, **told: given.update(told, points=points))
+    estimate_light(measurement, relief, body)
+    moved = torch.isnan(given["passing"][-1].change).all(dim=1)
+    assert torch.equal(moved, ~untouched(measurement, given["points"], relief, body, 20))
+    assert 0.01 < moved.float().mean() < 0.5
+    assert torch.isfinite(given["passing"][0].change).all()
+
+
+def test_the_video_tells_the_light(monkeypatch: pytest.MonkeyPatch):
+    """Colours by the light at each frame's own pose, through cameras whose exposures drift apart."""
+    truth, (_, _, shape, relief, _), _ = seen(20.0, 50.0, 0.5)
+    measurement, way, body = filmed(0.21)
     albedo = 0.5 * np.exp(0.1 * gaussian_filter(np.random.default_rng(1).normal(size=shape), 3.0) / 0.1).reshape(-1, 1)
     asked = []
 
@@ -158,7 +200,7 @@ def test_the_video_tells_the_light(monkeypatch: pytest.MonkeyPatch):
         return (light * spots * drift).float(), torch.full((len(where),), 5)
 
     monkeypatch.setattr(estimate, "seen_colours", colours)
-    found = estimate_light(measurement, relief, ToolBody(setup.tool.mesh)).light
+    found = estimate_light(measurement, relief, body).light
     angle = np.degrees(np.arccos(np.clip(found.direction @ truth.direction, -1.0, 1.0)))
     assert angle < 2.0
     assert np.allclose(found.ambient, truth.ambient, atol=0.04)
