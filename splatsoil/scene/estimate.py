@@ -37,7 +37,7 @@ _BLUR = 1.5
 _CLEARANCE = 0.005
 """Between the tool and soil that it has not touched yet, m: more than the surface is known to."""
 
-_PASSING = 4
+_PASSING = 5
 """Frames at which the tool's shadow on untouched soil is looked at, at most."""
 
 _WEDGE, _TOUCHED = 2.5, 1.0
@@ -117,10 +117,10 @@ def estimate_light(measurement: Measurement, relief: Relief, body: ToolBody) -> 
 
 
 def _moments(measurement: Measurement) -> list[int]:
-    """Some video frames after the first, most of them early ones, when little has moved."""
+    """Some video frames after the first, of the first half and most of them early: later little is untouched."""
     later = measurement.frames[1:]
-    places = np.geomspace(1, len(later), min(_PASSING, len(later)))
-    return sorted({later[round(k) - 1] for k in places})
+    count = min(_PASSING, len(later))
+    return sorted({later[round(k) - 1] for k in np.geomspace(1, max(count, len(later) / 2), count)})
 
 
 def untouched(measurement: Measurement, points: Tensor, relief: Relief, body: ToolBody, frame: int) -> Tensor:
