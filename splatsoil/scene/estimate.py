@@ -1,10 +1,9 @@
-"""The light estimated from photographs of the undisturbed bed: what they show of points all over it."""
+"""The light estimated from photographs: what they show of points all over the bed that nothing has moved."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -40,9 +39,10 @@ _CLEARANCE = 0.005
 _PASSING = 5
 """Frames at which the tool's shadow on untouched soil is looked at, at most."""
 
-_WEDGE, _TOUCHED = 2.5, 1.0
-"""How far around where the tool has been in the soil that may have moved: in depths of the tool there (a passive wedge
-is tan(45° + φ/2) depths long, 2.4 at 45°), and in widths of the tool at most."""
+_WEDGE = 2.5
+"""How far around where the tool has been in the soil that counts as moved, in depths of the tool there: a passive wedge
+is tan(45° + φ/2) depths long, 2.4 at 45°. At most the tool's longest side: a deep tool doesn't push all that is
+beside it."""
 
 
 def still_frames(measurement: Measurement) -> list[Frame]:
@@ -95,7 +95,7 @@ def seen_colours(
 
 
 def estimate_light(measurement: Measurement, relief: Relief, body: ToolBody) -> LightEstimate:
-    """Sun and sky over a measurement set, from its photographs before the soil moves.
+    """Sun and sky over a measurement set, from its photographs of soil that hasn't moved.
 
     Args:
         measurement: the set; its tool stands where its motion begins.
@@ -112,53 +112,73 @@ def estimate_light(measurement: Measurement, relief: Relief, body: ToolBody) -> 
     pixel = float(np.median([np.linalg.norm(v.camera.position - middle) / v.camera.fx for v in measurement.views]))
     across = float((points[1] - points[0]).norm())
     blur = max(1, math.ceil(_BLUR * pixel / across))
-    passing = [p for f in _moments(measurement) for p in _passing(measurement, points, relief, body, f)]
+    alone = untouched(measurement, points, relief, body, _moments(measurement.frames[1:]))
+    passing = [p for frame, rest in alone.items() for p in _passing(measurement, points, relief, body, frame, rest)]
     return fit_light(points, colours, shape, relief, tool, blur=blur, passing=passing)
 
 
-def _moments(measurement: Measurement) -> list[int]:
-    """Some video frames after the first, of the first half and most of them early: later little is untouched."""
-    later = measurement.frames[1:]
+def _moments(later: Sequence[int]) -> list[int]:
+    """Some of the video's frames after the first, most of them early, when little has moved; of many, none later than
+    half way."""
+    places: list[int] = []
     count = min(_PASSING, len(later))
-    return sorted({later[round(k) - 1] for k in np.geomspace(1, max(count, len(later) / 2), count)})
+    for place in np.geomspace(1.0, max(count, len(later) / 2, 1.0), count):
+        places.append(max(round(place) - 1, places[-1] + 1 if places else 0))
+    return [later[place] for place in places]
 
 
-def untouched(measurement: Measurement, points: Tensor, relief: Relief, body: ToolBody, frame: int) -> Tensor:
-    """Points of the surface so far from wherever the tool has been in the soil that nothing has moved them: (n,).
+def untouched(
+    measurement: Measurement, points: Tensor, relief: Relief, body: ToolBody, frames: Sequence[int]
+) -> dict[int, Tensor]:
+    """Points of the surface so far from wherever the tool has been in the soil that hardly anything has moved them.
 
     Args:
         measurement: has the tool's motion.
         points: (n, 3), m.
         relief: the undisturbed surface.
         body: the tool.
-        frame: of the video, up to which the tool has moved.
+        frames: of the video, up to each of which the tool has moved.
+
+    Returns:
+        (n,) by frame, True where nothing has come near.
     """
-    motion, end = measurement.tool.motion, frame / measurement.frame_rate
-    times = [float(t) for t in motion.times if t < end] + [end]
-    width = float(np.sort(measurement.tool.mesh.extents)[1])
+    motion, rate, mesh = measurement.tool.motion, measurement.frame_rate, measurement.tool.mesh
+    ends = {frame: frame / rate for frame in sorted(frames)}
+    last = max(ends.values(), default=-math.inf)
+    first = min([float(motion.times[0]), *ends.values()])
+    times = sorted({first, *(float(t) for t in motion.times if t < last), *ends.values()})
     where, moved = points[:, :2].double().cpu().numpy(), np.zeros(len(points), dtype=bool)
-    for start, stop in pairwise([times[0], *times]):
-        travel = float(np.linalg.norm(np.subtract(*(motion.pose(t)[1] for t in (start, stop)))))
-        for time in np.linspace(start, stop, 2 + int(travel / _CLEARANCE))[1:]:
-            rotation, position = motion.pose(float(time))
-            discs, _ = body.discs(rotation, position)
-            corners = torch.as_tensor(measurement.tool.mesh.vertices @ rotation.T + position).to(discs)
-            parts = torch.cat([discs, corners])
-            depth = relief.sample(relief.height, parts) + _CLEARANCE - parts[:, 2]
-            if (depth <= 0.0).all():
-                continue
-            reach = min(_WEDGE * float(depth.max()), _TOUCHED * width)
-            sunk = cKDTree(parts[depth > 0.0, :2].double().cpu().numpy())
-            moved |= np.isfinite(sunk.query(where, distance_upper_bound=reach)[0])
-    return torch.from_numpy(~moved).to(points.device)
+
+    def corners(time: float) -> FloatArray:
+        rotation, position = motion.pose(time)
+        return np.asarray(mesh.vertices @ np.asarray(rotation).T + position, dtype=np.float64)
+
+    out, at = {}, first
+    for time in times:
+        steps = math.ceil(float(np.linalg.norm(corners(time) - corners(at), axis=1).max()) / _CLEARANCE)
+        # Logs are often denser than anything moves.
+        if steps > 1 or time in ends.values() or time == first:
+            for moment in np.linspace(at, time, max(steps, 1) + 1)[1:]:
+                discs, _ = body.discs(*motion.pose(float(moment)))
+                parts = torch.cat([discs, torch.as_tensor(corners(float(moment))).to(discs)])
+                depth = relief.sample(relief.height, parts) + _CLEARANCE - parts[:, 2]
+                if (depth > 0.0).any():
+                    reach = min(_WEDGE * float(depth.max()), float(max(mesh.extents)))
+                    sunk = cKDTree(parts[depth > 0.0, :2].double().cpu().numpy())
+                    moved |= np.isfinite(sunk.query(where, distance_upper_bound=reach)[0])
+            at = time
+        out.update({f: torch.from_numpy(~moved).to(points.device) for f, end in ends.items() if end == time})
+    return out
 
 
-def _passing(measurement: Measurement, points: Tensor, relief: Relief, body: ToolBody, frame: int) -> list[Passing]:
-    """What each of the video's cameras says of the points that nothing has moved at a frame, compared with its own
-    still frames."""
+def _passing(
+    measurement: Measurement, points: Tensor, relief: Relief, body: ToolBody, frame: int, alone: Tensor
+) -> list[Passing]:
+    """What each of the video's cameras says at a frame of the points that are left alone, compared with its own still
+    frames."""
     motion, rate = measurement.tool.motion, measurement.frame_rate
     then, rest = (body.at(*motion.pose(time)) for time in (frame / rate, float(motion.times[0])))
-    still, moved = still_frames(measurement), ~untouched(measurement, points, relief, body, frame)
+    still = still_frames(measurement)
     out = []
     for name in measurement.cameras:
         before = [f for f in still if f.frame is not None and f.camera_name == name]
@@ -168,7 +188,7 @@ def _passing(measurement: Measurement, points: Tensor, relief: Relief, body: Too
                 seen_colours(points, frames, relief, tool)[0].clamp_min(1e-4).log()
                 for frames, tool in ((after, then), (before, rest))
             )
-            shown[moved] = math.nan
+            shown[~alone] = math.nan
             out.append(Passing(then, shown - known))
     return out
 

@@ -56,7 +56,7 @@ class LightEstimate:
 
     Attributes:
         light: the light.
-        explained: share of the (robust) spread of brightness differences, and of changes while the tool is in the air,
+        explained: share of the (robust) spread of brightness differences, and of changes by the shadow that passes,
             that the light explains; near 0 means that the pictures show neither shadow nor slope and the light is a
             guess.
         shadowed: share of the bed's area that lies in the tool's shadow.
@@ -69,7 +69,7 @@ class LightEstimate:
 
 @dataclass(frozen=True)
 class Passing:
-    """The tool somewhere else above the same soil, as one camera sees it.
+    """The tool somewhere else, its shadow on soil that hasn't moved, as one camera sees it.
 
     Attributes:
         tool: its pose in the kernels' form.
@@ -103,7 +103,8 @@ def fit_light(
     """
     telling = [p for p in passing if _tells(p)]
     # Cameras that look at the same moment share its light.
-    lights = {id(p.tool): _Sunlit(points, relief, p.tool) for p in telling}
+    tools = {id(p.tool): p.tool for p in telling}
+    lights = {key: _Sunlit(points, relief, there) for key, there in tools.items()}
     parts = [_Passed(lights[id(p.tool)], p.change) for p in telling]
     problem = _Problem(_Sunlit(points, relief, tool), colours.clamp_min(1e-4).log(), shape, parts)
     first = _start(problem)
@@ -207,6 +208,8 @@ class _Problem:
         self.still, self.brightness, self.shape, self.passed, self.lag = still, brightness, shape, passed, lag
         self.scale = _middle(self.differences(_channel(brightness, None)))
         self.scales = [max(_middle(_centred(_channel(p.change, None))), _LEAST_CHANGE) for p in passed]
+        # A few places known of a moment must not weigh as much as all of the bed.
+        self.shares = [_known(p.change) / len(p.change) for p in passed]
 
     def differences(self, values: Tensor) -> Tensor:
         """Differences over the lag along both axes of the grid."""
@@ -227,9 +230,12 @@ class _Problem:
             for part in self.passed:
                 there, then = part.sunlit.edge(light, width, self.shape)
                 enough |= _enough((shaded ^ then) & ~(edge | there), part.change)
-                passed.append(_Passed(part.sunlit, _without(edge | there, part.change)))
-            if enough:
-                return _Problem(self.still, _without(edge, self.brightness), self.shape, passed, 2 * width + LAG)
+                change = _without(edge | there, part.change)
+                if _known(change) >= _FEWEST_SHADED:
+                    passed.append(_Passed(part.sunlit, change))
+            beside = _Problem(self.still, _without(edge, self.brightness), self.shape, passed, 2 * width + LAG)
+            if enough and math.isfinite(beside.scale):
+                return beside
         return self
 
     def cost(self, channel: int | None, azimuth: float, elevation: float, ambient: float) -> float:
@@ -239,16 +245,16 @@ class _Problem:
             return 1e3
         rest = self.still.log_light(azimuth, elevation, ambient)
         total = _spread(self.differences(_channel(self.brightness, channel) - rest), self.scale)
-        for part, scale in zip(self.passed, self.scales, strict=True):
+        for part, scale, share in zip(self.passed, self.scales, self.shares, strict=True):
             predicted = part.sunlit.log_light(azimuth, elevation, ambient) - rest
-            total += _spread(_centred(_channel(part.change, channel) - predicted), scale)
+            total += share * _spread(_centred(_channel(part.change, channel) - predicted), scale)
         return total
 
     def nothing(self) -> float:
         """Loss of a light that is the same everywhere."""
         total = _spread(self.differences(_channel(self.brightness, None)), self.scale)
-        for part, scale in zip(self.passed, self.scales, strict=True):
-            total += _spread(_centred(_channel(part.change, None)), scale)
+        for part, scale, share in zip(self.passed, self.scales, self.shares, strict=True):
+            total += share * _spread(_centred(_channel(part.change, None)), scale)
         return total
 
 
@@ -275,7 +281,12 @@ def _middle(values: Tensor) -> float:
 
 def _enough(chosen: Tensor, values: Tensor) -> bool:
     """Whether enough of the chosen points (rows, columns) are known."""
-    return int((chosen.reshape(-1) & torch.isfinite(values).all(dim=1)).sum()) >= _FEWEST_SHADED
+    return _known(_without(~chosen, values)) >= _FEWEST_SHADED
+
+
+def _known(values: Tensor) -> int:
+    """How many places are known."""
+    return int(torch.isfinite(values).all(dim=1).sum())
 
 
 def _without(edge: Tensor, values: Tensor) -> Tensor:
@@ -286,4 +297,4 @@ def _without(edge: Tensor, values: Tensor) -> Tensor:
 
 def _tells(passing: Passing) -> bool:
     """Whether enough is known of it."""
-    return int(torch.isfinite(passing.change).all(dim=1).sum()) >= _FEWEST_SHADED
+    return _known(passing.change) >= _FEWEST_SHADED

@@ -13,6 +13,7 @@ from splatsoil.measurement import Bed, Frame, ToolMotion
 from splatsoil.scene import Light, Relief, ToolBody, estimate, estimate_light, light_relief
 from splatsoil.scene.estimate import untouched
 from splatsoil.scene.light_fit import Passing, fit_light
+from splatsoil.scene.lit import sun_on_points
 from splatsoil.synthetic import paper
 from splatsoil.synthetic.setups import staged_motion
 
@@ -59,6 +60,15 @@ def test_a_blurred_shadow_is_not_taken_for_more_sky():
     assert abs(np.mean(errors)) < 0.02
 
 
+@pytest.mark.parametrize("azimuth", [85.0, 95.0])
+def test_a_narrow_shadow_tells_the_direction(azimuth):
+    truth, what, _tool = seen(azimuth, 45.0, 0.5)  # the sun looks along the plate, between the directions tried first
+    found = fit_light(*what).light
+    angle = np.degrees(np.arccos(np.clip(found.direction @ truth.direction, -1.0, 1.0)))
+    assert angle < 1.0
+    assert np.allclose(found.ambient, truth.ambient, atol=0.03)
+
+
 @pytest.mark.parametrize("blur", [2, 3, 6])
 def test_a_shadow_too_narrow_for_the_blur_still_tells_the_sky(blur):
     truth, what, _tool = seen(90.0, 53.0, 0.6)  # the sun looks along the plate
@@ -70,11 +80,13 @@ def test_a_few_cells_with_a_wide_blur_tell_what_they_can():
     assert np.allclose(fit_light(*what, blur=8).light.ambient, truth.ambient, atol=0.1)
 
 
-def passed(truth, what, tool, plate):
+def passed(truth, what, tool, plate, blur=0.0):
     """The change that the plate's shadow makes somewhere else, with noise of its own."""
-    points, _, _, relief, place = what
+    points, _, shape, relief, place = what
     there = tool.at(np.eye(3), plate)
-    then, rest = (light_relief(relief, truth, p).irradiance(points, 0.001) for p in (there, place))
+    lights = (light_relief(relief, truth, p).irradiance(points, 0.001).numpy() for p in (there, place))
+    blurred = (gaussian_filter(light.reshape(*shape, 3), (blur, blur, 0.0)).reshape(-1, 3) for light in lights)
+    then, rest = (torch.tensor(light) for light in blurred)
     noise = torch.tensor(0.01 * np.random.default_rng(7).normal(size=tuple(then.shape)), dtype=torch.float32)
     return Passing(there, (then / rest).log() + noise)
 
@@ -97,6 +109,43 @@ def test_a_shadow_that_comes_later_tells_the_light(azimuth, elevation, ambient):
     assert np.array_equal(fit_light(*what, passing=[unknown]).light.ambient, without.light.ambient)
 
 
+def beside_its_middle(what, truth, later):
+    """Points that a passing shadow's middle doesn't cover, and those of its blurred edge: (n,) each."""
+    light = light_relief(what[3], truth, later.tool)
+    share = sun_on_points(light, what[0], 0.001).numpy()
+    rim = (share > 0.02).reshape(what[2]) & (gaussian_filter(share.reshape(what[2]), 0.8) < 0.98)
+    return torch.tensor(share > 0.02), torch.tensor(rim.reshape(-1))
+
+
+def test_blurred_edges_of_a_shadow_on_touched_soil_are_not_taken_for_more_sky():
+    """Where its middle isn't known, what a passing shadow shows is the blur of its edge."""
+    errors = []
+    for light in AZIMUTHS:
+        truth, what, tool = seen(*light, blur=0.8)
+        later = [passed(truth, what, tool, (x, 0.27, 0.21), blur=0.8) for x in (0.25, 0.55)]
+        for part in later:
+            part.change[~beside_its_middle(what, truth, part)[0]] = np.nan
+        errors.append(fit_light(*what, passing=later).light.ambient - truth.ambient)
+    assert abs(np.mean(errors)) < 0.02
+
+
+def test_a_passing_shadow_known_at_its_edge_only_is_left_out():
+    truth, what, tool = seen(145.0, 53.0, 0.6)
+    later = passed(truth, what, tool, (0.25, 0.27, 0.21))
+    rim = beside_its_middle(what, truth, later)[1]
+    later.change[~rim] = np.nan
+    assert int(rim.sum()) >= 30
+    assert np.allclose(fit_light(*what, passing=[later]).light.ambient, truth.ambient, atol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("count", "chosen"),
+    [(0, []), (1, [0]), (2, [0, 1]), (5, [0, 1, 2, 3, 4]), (8, [0, 1, 2, 3, 4]), (20, [0, 1, 2, 5, 9])],
+)
+def test_moments_are_early_and_different(count, chosen):
+    assert estimate._moments(list(range(count))) == chosen
+
+
 @pytest.fixture
 def flat():
     """A level bed of the paper's setup, points all over it, and the setup."""
@@ -109,7 +158,7 @@ def left_alone(flat, motion, frame):
     """Points of the flat bed that a tool on its way has not moved, (n, 3), and those that it may have."""
     setup, relief, points = flat
     measurement = replace(setup.experiment(), tool=replace(setup.tool, motion=motion))
-    rest = untouched(measurement, points, relief, ToolBody(setup.tool.mesh), frame).numpy()
+    rest = untouched(measurement, points, relief, ToolBody(setup.tool.mesh), [frame])[frame].numpy()
     return points[rest].numpy(), points[~rest].numpy()
 
 
@@ -131,6 +180,27 @@ def test_soil_around_the_tool_may_have_moved_as_far_as_a_wedge_of_it_reaches(fla
         beyond = np.abs(near[:, 1] - 0.5).max() - half
         assert 2.4 * depth < beyond < 4.0 * depth + 0.02
         assert np.abs(alone[:, :2] - 0.5).max() > 0.45
+
+
+def test_a_deep_tool_moves_no_more_than_what_is_near_it(flat):
+    near = left_alone(flat, down(0.36), 60)[1]  # 13 cm deep, and no longer than 10
+    longest = flat[0].tool.mesh.extents.max()
+    beyond = np.abs(near[:, 1] - 0.5).max() - 0.5 * flat[0].tool.mesh.extents[1]
+    assert 0.8 * longest < beyond < 1.1 * longest
+
+
+def test_a_tool_that_turns_moves_what_it_sweeps(flat):
+    """An arm that turns about its own origin, by half a turn from one row of its motion to the next."""
+    setup, relief, points = flat
+    arm = trimesh.creation.box((0.02, 0.02, 0.08), transform=trimesh.transformations.translation_matrix((0.2, 0, 0)))
+    turns = np.array([[1.0, 0.0, 0.0, 0.0], [np.cos(1.5), 0.0, 0.0, np.sin(1.5)]])
+    about = ToolMotion(np.array([0, 10]), np.array([0.0, 0.2]), np.full((2, 3), (0.5, 0.5, 0.2)), turns)
+    measurement = replace(setup.experiment(), tool=replace(setup.tool, mesh=arm, motion=about))
+    alone = untouched(measurement, points, relief, ToolBody(arm), [10])[10].numpy()
+    place = points[:, :2].numpy() - 0.5
+    swept = (np.abs(np.hypot(*place.T) - 0.2) < 0.01) & (place[:, 1] > 0.02)
+    assert swept.sum() > 100 and not alone[swept].any()
+    assert alone[(np.hypot(*place.T) < 0.05) | (place[:, 1] < -0.15)].all()
 
 
 def down(height):
@@ -177,7 +247,7 @@ def test_what_the_tool_may_have_moved_tells_nothing_of_the_light(monkeypatch: py
     monkeypatch.setattr(estimate, "fit_light", lambda points, *_, **told: given.update(told, points=points))
     estimate_light(measurement, relief, body)
     moved = torch.isnan(given["passing"][-1].change).all(dim=1)
-    assert torch.equal(moved, ~untouched(measurement, given["points"], relief, body, 20))
+    assert torch.equal(moved, ~untouched(measurement, given["points"], relief, body, [20])[20])
     assert 0.01 < moved.float().mean() < 0.5
     assert torch.isfinite(given["passing"][0].change).all()
 
