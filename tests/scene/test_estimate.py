@@ -109,32 +109,13 @@ def test_a_shadow_that_comes_later_tells_the_light(azimuth, elevation, ambient):
     assert np.array_equal(fit_light(*what, passing=[unknown]).light.ambient, without.light.ambient)
 
 
-def beside_its_middle(what, truth, later):
-    """Points that a passing shadow's middle doesn't cover, and those of its blurred edge: (n,) each."""
-    light = light_relief(what[3], truth, later.tool)
-    share = sun_on_points(light, what[0], 0.001).numpy()
-    rim = (share > 0.02).reshape(what[2]) & (gaussian_filter(share.reshape(what[2]), 0.8) < 0.98)
-    return torch.tensor(share > 0.02), torch.tensor(rim.reshape(-1))
-
-
-def test_blurred_edges_of_a_shadow_on_touched_soil_are_not_taken_for_more_sky():
-    """Where its middle isn't known, what a passing shadow shows is the blur of its edge."""
-    errors = []
-    for light in AZIMUTHS:
-        truth, what, tool = seen(*light, blur=0.8)
-        later = [passed(truth, what, tool, (x, 0.27, 0.21), blur=0.8) for x in (0.25, 0.55)]
-        for part in later:
-            part.change[~beside_its_middle(what, truth, part)[0]] = np.nan
-        errors.append(fit_light(*what, passing=later).light.ambient - truth.ambient)
-    assert abs(np.mean(errors)) < 0.02
-
-
-def test_a_passing_shadow_known_at_its_edge_only_is_left_out():
+def test_a_passing_shadow_known_at_its_edge_only_hardly_counts():
     truth, what, tool = seen(145.0, 53.0, 0.6)
     later = passed(truth, what, tool, (0.25, 0.27, 0.21))
-    rim = beside_its_middle(what, truth, later)[1]
-    later.change[~rim] = np.nan
-    assert int(rim.sum()) >= 30
+    share = sun_on_points(light_relief(what[3], truth, later.tool), what[0], 0.001).numpy()
+    rim = (share > 0.02) & (gaussian_filter(share.reshape(what[2]), 0.8).reshape(-1) < 0.98)
+    later.change[~torch.tensor(rim)] = np.nan
+    assert rim.sum() >= 30
     assert np.allclose(fit_light(*what, passing=[later]).light.ambient, truth.ambient, atol=0.05)
 
 
