@@ -60,9 +60,9 @@ def test_a_blurred_shadow_is_not_taken_for_more_sky():
     assert abs(np.mean(errors)) < 0.02
 
 
-@pytest.mark.parametrize("azimuth", [85.0, 95.0])
-def test_a_narrow_shadow_tells_the_direction(azimuth):
-    truth, what, _tool = seen(azimuth, 45.0, 0.5)  # the sun looks along the plate, between the directions tried first
+def test_a_narrow_shadow_tells_the_direction():
+    # The sun looks along a plate high up: its shadow lies beside those of all directions that are tried first.
+    truth, what, _tool = seen(85.0, 65.0, 0.5, plate=(0.4, 0.2, 0.36))
     found = fit_light(*what).light
     angle = np.degrees(np.arccos(np.clip(found.direction @ truth.direction, -1.0, 1.0)))
     assert angle < 1.0
