@@ -9,11 +9,12 @@ import torch
 import trimesh
 from scipy.ndimage import gaussian_filter
 
-from splatsoil.measurement import Bed, Frame, ToolMotion
+from splatsoil.measurement import Bed, Frame, Measurement, ToolMotion
 from splatsoil.scene import Light, Relief, ToolBody, estimate, estimate_light, light_relief
 from splatsoil.scene.estimate import untouched
 from splatsoil.scene.light_fit import Passing, fit_light
 from splatsoil.scene.lit import sun_on_points
+from splatsoil.scene.relief import relief_of_particles
 from splatsoil.synthetic import paper
 from splatsoil.synthetic.setups import staged_motion
 
@@ -256,3 +257,18 @@ def test_the_video_tells_the_light(monkeypatch: pytest.MonkeyPatch):
     assert angle < 2.0
     assert np.allclose(found.ambient, truth.ambient, atol=0.04)
     assert {(10, ("left",)), (20, ("left",)), (20, ("right",))} <= set(asked) and (10, ("right",)) not in asked
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_cpu_and_cuda_read_the_same_light(plow_dry: Path):
+    measurement = Measurement.load(plow_dry)
+    with np.load(plow_dry / "truth_particles.npz") as truth:
+        soil, spacing = torch.tensor(truth["f000"] * truth["scale"], dtype=torch.float32), float(truth["spacing"])
+    found = []
+    for device in ("cpu", "cuda:0"):
+        relief = relief_of_particles(soil.to(device), spacing, measurement.bed.lower, measurement.bed.upper)
+        found.append(estimate_light(measurement, relief, ToolBody(measurement.tool.mesh, device)))
+    assert np.allclose(found[0].light.direction, found[1].light.direction, atol=2e-3)
+    assert np.allclose(found[0].light.ambient, found[1].light.ambient, atol=2e-3)
+    assert found[0].explained == pytest.approx(found[1].explained, abs=1e-3)
