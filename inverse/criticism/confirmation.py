@@ -50,6 +50,7 @@ class Confirmation:
         held_out: root mean square of the residual on times the refit hasn't seen, in the features' unit.
         floor: what noise alone leaves there.
         remainder: what stands on slow waves.
+        visits: simulations that the parameters were read off; none where the last derivatives told them.
     """
 
     name: str
@@ -64,6 +65,7 @@ class Confirmation:
     held_out: float
     floor: float
     remainder: Omnibus
+    visits: tuple[Visit, ...] = ()
 
     @property
     def ruled_out(self) -> bool:
@@ -137,11 +139,12 @@ def confirm(
         remainder = omnibus(floor.single, tangent, left[experiment.seen], basis)
         chi2 = _chi2(whole, left) + known.chi2(at)
         values, stds = dict(fit.values), _stds(free, fit, np.concatenate([whiten(fit.slopes), known.root]), remainder)
+        emulated: tuple[Visit, ...] = ()
         if _emulated(experiment, candidate):
             # A surface that isn't one tells nothing more than the last derivatives do.
             with suppress(ValueError):
                 reading = read(visits, whole, experiment.observed, free, known)
-                values, stds = dict(reading.values), dict(reading.stds)
+                values, stds, emulated = dict(reading.values), dict(reading.stds), tuple(visits)
         out["" if candidate is None else candidate.name] = Confirmation(
             name="" if candidate is None else candidate.name,
             fit=fit,
@@ -155,6 +158,7 @@ def confirm(
             held_out=float(np.sqrt(np.mean(left[mask] ** 2))),
             floor=_noise_on(floor.single, mask),
             remainder=remainder,
+            visits=emulated,
         )
     return out
 
@@ -269,18 +273,35 @@ def remainder_of(
     return omnibus(floor.single, np.concatenate([free, size * scale], axis=1), left, basis)
 
 
+@dataclass(frozen=True)
+class OwnFloor:
+    """What soil that has an effect leaves by chance and by other numerics.
+
+    Attributes:
+        before: misfit of the model as it is on that floor.
+        after: of the model with the effect.
+        noise: root mean square of what it leaves on times hidden from refits.
+        refit: with its parameters read off on that floor.
+    """
+
+    before: Omnibus
+    after: Omnibus
+    noise: float
+    refit: Confirmation
+
+
 def on_its_own_floor(
     experiment: Experiment,
     evidence: Evidence,
     best: Confirmation,
+    candidate: Candidate,
     simulate: Simulations,
     residual: FloatArray,
-) -> tuple[Omnibus, Omnibus, float]:
-    """Misfit of the model as it is and with its best effect, by the chance and numerics of soil that has the effect,
-    and what these leave on times hidden from refits.
+) -> OwnFloor:
+    """Judge the model as it is and with its best effect by the chance and numerics of soil that has the effect.
 
     Cohesive soil falls by chance where dry soil flows, and numerics move it farther: what remains after an effect is
-    added has to be judged by what such soil leaves.
+    added has to be judged by what such soil leaves, and parameters are known no better than that lets them be.
     """
     seeds = range(1, 1 + len(evidence.repeats))
 
@@ -310,10 +331,27 @@ def on_its_own_floor(
     )
     floor, seen = floor_of(experiment, there), experiment.seen
     basis = smooth_basis(experiment.layout, floor.noise)
-    free = np.concatenate([floor.nuisance, _tangent(floor.noise, best.fit)], axis=1)
+    tangent = _tangent(floor.noise, best.fit)
+    free = np.concatenate([floor.nuisance, tangent], axis=1)
     left = (experiment.observed - there.mean)[seen]
     model = len(experiment.parameters)
     bare = replace(best.fit, slopes=best.fit.slopes[..., :model])
     without = np.concatenate([floor.nuisance, _tangent(floor.noise, bare)], axis=1)
-    noise = _noise_on(floor.single, seen & _split(experiment)[1][:, None])
-    return omnibus(floor.noise, without, residual, basis), omnibus(floor.noise, free, left, basis), noise
+    after = omnibus(floor.noise, free, left, basis)
+    # Where simulations were too few for a surface at first, they still are.
+    refit = best
+    if best.visits:
+        sight = Sight.of(experiment, replace(floor, parameters=tangent), basis)
+        parameters = _free(experiment, candidate)
+        known = _known(evidence, parameters)
+        reading = read(best.visits, sight, experiment.observed, parameters, known)
+        # Draws don't leave the simulations' range, and these were made where another floor let the parameters be.
+        least = _stds(parameters, best.fit, np.concatenate([sight(best.fit.slopes), known.root]), after)
+        stds = {name: max(std, least[name]) for name, std in reading.stds.items()}
+        refit = replace(best, values=dict(reading.values), stds=stds)
+    return OwnFloor(
+        before=omnibus(floor.noise, without, residual, basis),
+        after=after,
+        noise=_noise_on(floor.single, seen & _split(experiment)[1][:, None]),
+        refit=refit,
+    )

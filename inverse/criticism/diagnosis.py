@@ -226,11 +226,14 @@ def judge(
             remainder = remainder_of(experiment, floor, tried[best], candidates, evidence, bench.basis)
             error = tried[best].held_out / tried[best].floor
             more = remainder.p < CLEAN and explained(before, remainder) < ENOUGH
-            if experiment.chance and (more or error > WITHIN):
+            if experiment.chance and (more or error > WITHIN or tried[best].visits):
                 told("the floor with the effect on", 0.97)
-                *mended, noise = on_its_own_floor(experiment, evidence, tried[best], simulate, residual)
-                error = tried[best].held_out / noise
-                before, remainder = mended if more else (before, remainder)
+                own = on_its_own_floor(experiment, evidence, tried[best], candidates[best], simulate, residual)
+                confirmations[best] = own.refit
+                if more or error > WITHIN:
+                    error = tried[best].held_out / own.noise
+                if more:
+                    before, remainder = own.before, own.after
             gone = explained(before, remainder)
     effects = _effects(candidates, scores, given, members, confirmations, options.level)
     # Where the best explanation is too small to matter, so is what is missing.

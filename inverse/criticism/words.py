@@ -15,6 +15,8 @@ from .verdicts import GATE
 
 #: Correlation of two effects' scores from which they are called alike.
 ALIKE = 0.8
+#: Standard deviations by which a parameter must have moved to be called biased before.
+SURE = 2.0
 
 
 def sentences(diagnosis: Diagnosis, candidates: Mapping[str, Candidate], base: Mapping[str, float]) -> list[str]:
@@ -57,13 +59,13 @@ def _missing(diagnosis: Diagnosis, candidates: Mapping[str, Candidate], base: Ma
         out.append(
             f"{100.0 * share:.0f} % of the evidence comes from one part of the data: {region}, {stage}, {channel}."
         )
-    moved = [
-        f"{name.replace('_', ' ')} from {base[name]:.3g} to {confirmed.values[name]:.3g}"
-        for name in base
-        if abs(confirmed.values[name] - base[name]) > 1e-6 * max(abs(base[name]), 1.0)
-    ]
+    moved = [name for name in base if abs(confirmed.values[name] - base[name]) > 1e-6 * max(abs(base[name]), 1.0)]
     if moved:
-        out.append(f"With it the refit moves {listed(moved)}: that much was bias.")
+        to = {name: amount(confirmed.values[name], confirmed.stds[name], "").rstrip() for name in moved}
+        told = [f"{name.replace('_', ' ')} from {base[name]:.3g} to {to[name]}" for name in moved]
+        # What is hardly known may as well not have moved.
+        sure = all(abs(confirmed.values[name] - base[name]) > SURE * confirmed.stds[name] for name in moved)
+        out.append(f"With it the refit moves {listed(told)}{': that much was bias' if sure else ''}.")
     if len(diagnosis.members) > 1:
         out.append(f"{listed([title(m) for m in diagnosis.members[1:]])} would explain it nearly as well.")
     if diagnosis.remainder is not None and diagnosis.remainder.p < GATE:

@@ -233,7 +233,7 @@ def confirmed(folder: RunFolder, model: Model, name: str, options: Options, repo
     from splatsoil.commands._crew import crew
     from splatsoil.files import plain
     from splatsoil.inverse.criticism.afresh import look_afresh
-    from splatsoil.inverse.criticism.confirmation import confirm
+    from splatsoil.inverse.criticism.confirmation import confirm, on_its_own_floor
     from splatsoil.inverse.criticism.diagnosis import Bench
     from splatsoil.inverse.criticism.evidence import gather
     from splatsoil.inverse.criticism.record import confirmation
@@ -267,6 +267,9 @@ def confirmed(folder: RunFolder, model: Model, name: str, options: Options, repo
             report,
             look_afresh(experiment, evidence, bench.misfit(left), simulate),
         )
+        if found[effect].visits:
+            (candidate,) = bench.candidates
+            found[effect] = on_its_own_floor(experiment, evidence, found[effect], candidate, simulate, left).refit
     return {"refits": {key or "as it is": plain(confirmation(c)) for key, c in found.items()}}
 
 

@@ -49,6 +49,25 @@ def test_a_large_hidden_effect_is_named_its_size_found_and_the_error_falls(sizes
     assert 0.4 < found.scores["effect 2"].statistic / fall < 2.5
 
 
+def test_a_move_within_its_own_spread_is_not_called_bias(sizes: dict[str, float]) -> None:
+    found = one(WORLD, {"angle": 1.0, "effect 2": 5.0 * sizes["effect 2"]}, None, OPTIONS)
+    candidates = {c.name: c for c in emulated(WORLD).candidates}
+    best = replace(found.confirmations["effect 2"], values={"angle": 1.0, "effect 2": 9.0})
+
+    def told(std: float) -> str:
+        known = replace(best, stds={"angle": std, "effect 2": 0.5})
+        confirmed = {**found.confirmations, "effect 2": known}
+        (sentence,) = (
+            s
+            for s in sentences(replace(found, confirmations=confirmed), candidates, {"angle": 4.0})
+            if "refit moves" in s
+        )
+        return sentence
+
+    assert told(1.0) == "With it the refit moves angle from 4 to 1.0 ± 1.0: that much was bias."
+    assert told(2.0) == "With it the refit moves angle from 4 to 1.0 ± 2.0."
+
+
 def test_an_observation_effect_is_named_and_not_a_physical_one(sizes: dict[str, float]) -> None:
     found = one(WORLD, {"angle": 0.0, "effect 8": 5.0 * sizes["effect 8"]}, None, OPTIONS)
     assert found.members[0] == "effect 8"
