@@ -10,13 +10,11 @@ from splatsoil.experiment.strokes import MEASURED
 from splatsoil.report.words import symbol, with_std
 
 from .diagnosis import Diagnosis
-from .outside import FEW, StrengthReading
+from .outside import CLEAR, FEW, StrengthReading
 from .verdicts import GATE
 
 #: Correlation of two effects' scores from which they are called alike.
 ALIKE = 0.8
-#: Standard deviations by which a parameter must have moved to be called biased before.
-SURE = 2.0
 
 
 def sentences(diagnosis: Diagnosis, candidates: Mapping[str, Candidate], base: Mapping[str, float]) -> list[str]:
@@ -64,7 +62,7 @@ def _missing(diagnosis: Diagnosis, candidates: Mapping[str, Candidate], base: Ma
         to = {name: amount(confirmed.values[name], confirmed.stds[name], "").rstrip() for name in moved}
         told = [f"{name.replace('_', ' ')} from {base[name]:.3g} to {to[name]}" for name in moved]
         # What is hardly known may as well not have moved.
-        sure = all(abs(confirmed.values[name] - base[name]) > SURE * confirmed.stds[name] for name in moved)
+        sure = all(abs(confirmed.values[name] - base[name]) > CLEAR * confirmed.stds[name] for name in moved)
         out.append(f"With it the refit moves {listed(told)}{': that much was bias' if sure else ''}.")
     if len(diagnosis.members) > 1:
         out.append(f"{listed([title(m) for m in diagnosis.members[1:]])} would explain it nearly as well.")

@@ -51,3 +51,13 @@ def test_the_table_ends_in_root_mean_squares() -> None:
     told = table([Score("a", 3.0, 0.3, 0.03), Score("b", 4.0, 0.4, -0.04)])
     assert told.splitlines()[-1] == "| root mean square | 3.54° | | 0.035 |"
     assert "| b | 4.00° | 0.400 | -0.040 |" in told
+
+
+@pytest.mark.slow
+def test_the_light_of_a_made_up_world_is_read(tmp_path: Path) -> None:
+    """Photographed by the path tracer, reconstructed, and read as any fit does it."""
+    assert main(["--count", "1", "--seed", "3", "--preset", "tiny", "--out", str(tmp_path)]) == 0
+    (found,) = json.loads((tmp_path / "result.json").read_text())["sets"]
+    assert found["turned"] < 2.0
+    assert abs(found["off"]) < 0.05
+    assert found["share"] == pytest.approx(Appearance.drawn(3).sky_share)

@@ -42,5 +42,5 @@ def test_numerics_of_soil_with_the_effect_shift_no_parameter_unseen() -> None:
         assert best.values[NAME] == pytest.approx(truth[NAME], rel=0.15)
     assert np.sqrt(np.mean(np.square(errors))) < 2.7
     assert np.sqrt(np.mean(np.square(np.divide(errors, stds)))) < 1.7
-    # And what no such numerics shift isn't given away.
+    # A spread as wide as what is believed before any data would hold any truth.
     assert max(stds) < SHIFT
