@@ -89,6 +89,19 @@ class World:
     obstacle: tuple[float, float, float, float] | None = None
 
 
+@dataclass(frozen=True)
+class Run:
+    """What became of a world.
+
+    Attributes:
+        particles: (n, 3) in m, by frame.
+        force: (f, 3) of the soil on the tool in N: mean over the time that leads to frames 1, 2, …, f.
+    """
+
+    particles: dict[int, FloatArray]
+    force: FloatArray
+
+
 def load_newton() -> Any:
     """The package; RunError when it isn't installed."""
     try:
@@ -105,7 +118,7 @@ def plough(
     device: str = "cpu",
     *,
     gravity: Sequence[float] | None = None,
-) -> list[dict[int, FloatArray]]:
+) -> list[Run]:
     """Run the worlds side by side, in boxes of their own, to the last frame.
 
     Args:
@@ -117,7 +130,7 @@ def plough(
         gravity: (3,) m/s^2; the measurement's by default.
 
     Returns:
-        For each world its particles (n, 3) in m by frame.
+        What became of each world.
 
     Raises:
         RunError: the ``newton`` package is missing.
@@ -137,6 +150,7 @@ def plough(
     wanted = sorted(f for f in frames if f > 0)
     ends = np.cumsum([len(w.particles) for w in worlds])[:-1]
     found: list[dict[int, FloatArray]] = [{} for _ in worlds]
+    force = np.zeros((len(worlds), wanted[-1], 3))
     for frame in range(1, wanted[-1] + 1):
         for pose in step_poses(measurement.tool.motion, (frame - 1) * frame_time, frame_time, numerics.substeps):
             # Both calls carry the tool on by its velocity from its pose at the step's start.
@@ -146,6 +160,7 @@ def plough(
                 state.body_q.assign(places)
                 state.body_qd.assign(twists)
             solver.step(now, following, None, None, step)
+            force[:, frame - 1] += _impulses(solver, following, len(worlds)) / frame_time
             if numerics.late:
                 following.body_qd.zero_()
             solver.project_outside(following, following, step)
@@ -156,7 +171,18 @@ def plough(
                 raise SimulationError(f"newton: particles are no numbers at frame {frame} with {numerics}")
             for k, part in enumerate(np.split(x, ends)):
                 found[k][frame] = part - shifts[k]
-    return found
+    return [Run(particles, of_world) for particles, of_world in zip(found, force, strict=True)]
+
+
+def _impulses(solver: Any, state: Any, bodies: int) -> FloatArray:
+    """(b, 3) N s that soil gave each body, a world's tool, in the last step."""
+    impulses, _, colliders = (array.numpy() for array in solver.collect_collider_impulses(state))
+    body_of = solver.collider_body_index.numpy()
+    there = (colliders >= 0) & (colliders < len(body_of))
+    body = np.where(there, body_of[np.where(there, colliders, 0)], -1)
+    given = np.zeros((bodies, 3))
+    np.add.at(given, body[body >= 0], impulses[body >= 0].astype(np.float64))
+    return given
 
 
 def _model(

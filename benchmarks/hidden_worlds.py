@@ -208,13 +208,13 @@ def make_worlds(
         runs = plough(setups[0].experiment(), soils, NUMERICS, frames, device, gravity=gravity)
         say(f"{len(group)} worlds ploughed in {time.perf_counter() - began:.0f} s: {', '.join(h.name for h in group)}")
         for hidden, setup, soil, run, observation in zip(group, setups, soils, runs, seen, strict=True):
-            positions = np.stack([soil.particles, *(run[f] for f in frames if f > 0)]).astype(np.float32)
+            positions = np.stack([soil.particles, *(run.particles[f] for f in frames if f > 0)]).astype(np.float32)
             still = np.broadcast_to(np.eye(3, dtype=np.float32), (*positions.shape, 3))
             trajectory = Trajectory(
                 frames=tuple(frames),
                 positions=positions,
                 deformations=still,
-                force=np.zeros((0, 3)),
+                force=run.force[: max(setup.frames)],
                 spacing=SPACING,
                 resolution=Resolution.derive(setup.experiment(), "small"),
             )

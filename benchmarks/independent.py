@@ -118,7 +118,7 @@ class Campaign:
         truth, start = self.truth, time.perf_counter()
         worlds = base_worlds(truth, self.angles)
         runs = plough(truth.measurement, worlds, self.numerics, truth.particles, self.device)
-        scanned = np.array([heights(truth, run, truth.volume) for run in runs])
+        scanned = np.array([heights(truth, run.particles, truth.volume) for run in runs])
         nearest = int(np.argmin(np.abs(np.array(self.angles) - self.entry["true_angle"])))
         volume = volume_range(truth.heights(truth.particles[0], truth.volume), scanned[nearest])
         self.own = Scan(np.array(self.angles), scanned, 0.0, volume)

@@ -47,7 +47,7 @@ class Confirmation:
         told: chance of what other pictures say of its parameters if they were off; see
             :class:`~splatsoil.experiment.base.Calibration`.
         agrees: likewise, if they were as refitted.
-        held_out: root mean square of the residual on times the refit hasn't seen, in the features' unit.
+        held_out: root mean square of the residual on times the refit hasn't seen, of features in the layout's unit.
         floor: what noise alone leaves there.
         remainder: what stands on slow waves.
         visits: simulations that the parameters were read off; none where the last derivatives told them.
@@ -134,7 +134,7 @@ def confirm(
         free = _free(experiment, candidate)
         known = _known(evidence, free)
         at, off = (np.array([values.get(p.name, p.off or 0.0) for p in free]) for values in (fit.values, {}))
-        left, mask = experiment.observed - fit.prediction, experiment.seen & hidden[:, None]
+        left, mask = experiment.observed - fit.prediction, _judged(experiment, hidden)
         tangent = np.concatenate([floor.nuisance, _tangent(floor.single, fit)], axis=1)
         remainder = omnibus(floor.single, tangent, left[experiment.seen], basis)
         chi2 = _chi2(whole, left) + known.chi2(at)
@@ -184,6 +184,11 @@ def _split(experiment: Experiment) -> tuple[npt.NDArray[np.bool_], npt.NDArray[n
     if not experiment.seen[~shown].any() or not experiment.seen[shown].any():
         return np.ones_like(shown), np.ones_like(shown)
     return shown, ~shown
+
+
+def _judged(experiment: Experiment, hidden: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    """(t, s) hidden features whose errors can be put together: those in one unit."""
+    return experiment.seen & hidden[:, None] & experiment.layout.common[None]
 
 
 def _noise_on(noise: Noise, mask: npt.NDArray[np.bool_]) -> float:
@@ -352,6 +357,6 @@ def on_its_own_floor(
     return OwnFloor(
         before=omnibus(floor.noise, without, residual, basis),
         after=after,
-        noise=_noise_on(floor.single, seen & _split(experiment)[1][:, None]),
+        noise=_noise_on(floor.single, _judged(experiment, _split(experiment)[1])),
         refit=refit,
     )

@@ -36,7 +36,8 @@ class Floor:
     Attributes:
         noise: of observed minus the mean prediction, without nuisances.
         single: of observed minus one prediction.
-        nuisance: (n, q) patterns that numerics can make, times their prior standard deviations.
+        nuisance: (n, q) patterns that numerics can make, and those by which model and instruments are known to differ,
+            times their prior standard deviations.
         parameters: (n, k) derivatives by the model's parameters (and their curvature), likewise.
         directions: (n, k) in which effects act.
         parts: what the noise is made of: instruments, chance, guesses, reconstruction, numerics beyond the patterns.
@@ -94,7 +95,8 @@ def floor_of(experiment: Experiment, evidence: Evidence) -> Floor:
         columns = extra_noise(layout, part, seen, directions if name in ("chance", "guesses") else None)
         averaged, alone = (np.sqrt(factor) for factor in _factors(name, runs))
         noise, single = noise.plus(averaged * columns), single.plus(alone * columns)
-    return Floor(noise, single, NUMERICS_PRIOR * _columns(patterns, seen), parameters, directions, parts)
+    nuisance = [NUMERICS_PRIOR * _columns(patterns, seen), _columns(experiment.systematic, seen)]
+    return Floor(noise, single, np.concatenate(nuisance, axis=1), parameters, directions, parts)
 
 
 def _instruments(experiment: Experiment, evidence: Evidence, known: Noise) -> Part:
@@ -122,6 +124,9 @@ def _instruments(experiment: Experiment, evidence: Evidence, known: Noise) -> Pa
         variance = level / size[0] + share / size[1] * signal**2
         # Soil may have moved where none was expected to: that is no fault of the pictures.
         squares = np.minimum(rest**2, OUTLYING**2 * (variance[quiet] + scale**2))
+    # Nothing is told of instruments that have nothing to say where nothing moves.
+    channel = experiment.layout.channel_numbers()
+    variance[:, ~np.isin(channel, channel[quiet.any(axis=0)])] = 0.0
     if not np.any(variance > 0.0):
         return Part(scale=np.zeros(signal.shape))
     whole = np.sqrt(variance)

@@ -34,6 +34,8 @@ REACH = 0.6
 """Width of the local mean of variances, in spacings of sites: disturbed soil has sharp edges."""
 FEWEST_FREEDOM = 8.0
 """Least degrees of freedom of a part's variance: few samples scatter too little or too much by chance."""
+FARTHEST = 500.0
+"""Distance over a correlation's length at which nothing is left of it."""
 RIDGE = 1e-6
 """Added to the diagonal of a correlation, for its Cholesky factor's sake."""
 
@@ -205,7 +207,9 @@ def _scales(
     held = np.einsum("ij,ik,jk->i", in_time, in_time, time**2).mean()
     held *= np.einsum("ij,ik,jk->i", in_space, in_space, space**2).mean()
     freedom = samples.shape[0] / held
-    relative = np.log(local / pooled)[seen]
+    # An instrument that stays the same in all samples (a force, drawn otherwise) says nothing of how others' vary.
+    varied = seen & (pooled > 1e-9 * float(pooled.max()))
+    relative = np.log(local / pooled)[varied]
     spread = float(np.var(relative)) if relative.size else 0.0
     kept = max(0.0, 1.0 - (2.0 / freedom) / spread) if spread > 0.0 else 0.0
     variance = pooled * np.exp(kept * np.log(local / pooled))
@@ -242,9 +246,11 @@ def _spacing(layout: Layout) -> float:
 
 def _correlation(layout: Layout, scaled: FloatArray, scale: FloatArray, start: Part | None = None) -> Part:
     """Parameters of the correlation that maximise the likelihood of scaled samples (k, t, s)."""
-    spacing, places = _spacing(layout), np.isfinite([site.x for site in layout.sites]).any()
-    channels = len(layout.channels)
-    pairs = [(a, b) for a in range(channels) for b in range(a)]
+    spacing, places = _spacing(layout), layout.placed.any()
+    channels, number = len(layout.channels), layout.channel_numbers()
+    # Instruments with a place and those without are never correlated.
+    placed = [bool(layout.placed[number == c].any()) for c in range(channels)]
+    pairs = [(a, b) for a in range(channels) for b in range(a) if placed[a] == placed[b]]
     times, sites = layout.shape
 
     def unpack(p: FloatArray) -> tuple[float, float, float, FloatArray]:
@@ -292,7 +298,7 @@ def _space(layout: Layout, length: float, nugget: float, between: FloatArray | N
     channel, distance = layout.channel_numbers(), layout.distances()
     link = np.eye(len(layout.channels)) if between is None else between
     if length > 0.0:
-        far = math.sqrt(3.0) * distance / length
+        far = np.minimum(math.sqrt(3.0) * distance / length, FARTHEST)
         smooth = (1.0 + far) * np.exp(-far)
     else:
         smooth = np.where(distance == 0.0, 1.0, 0.0)

@@ -51,7 +51,12 @@ def record(experiment: Experiment, diagnosis: Diagnosis) -> dict[str, Any]:
         "time_name": layout.time_name,
         "times": list(layout.times),
         "stages": list(layout.stages),
-        "sites": [[site.channel, site.x, site.y] for site in layout.sites],
+        # What has no place is drawn as curves instead.
+        "sites": [
+            [s.channel, *((s.x, s.y) if there else (None, None))]
+            for s, there in zip(layout.sites, layout.placed, strict=True)
+        ],
+        "curves": [_curve(experiment, diagnosis, column) for column, there in enumerate(layout.placed) if not there],
         # In units of each feature's noise; null where the tool hides it.
         "maps": {
             "before": _map(diagnosis.residual, scale, experiment),
@@ -70,7 +75,7 @@ def record(experiment: Experiment, diagnosis: Diagnosis) -> dict[str, Any]:
 def misfit_record(experiment: Experiment, diagnosis: Diagnosis) -> dict[str, Any]:
     """Only how far the model is from the data, where and when."""
     whole = record(experiment, diagnosis)
-    kept = ("misfit", "blocks", "floor", "unit", "time_name", "times", "stages", "sites", "maps", "values")
+    kept = ("misfit", "blocks", "floor", "unit", "time_name", "times", "stages", "sites", "curves", "maps", "values")
     return {
         "format": "splatsoil-misfit/1",
         "adequate": diagnosis.verdict == "adequate",
@@ -176,6 +181,25 @@ def _strength(found: StrengthReading) -> dict[str, Any]:
 
 def _omnibus(test: Omnibus) -> dict[str, float]:
     return {"chi2": test.statistic, "freedom": test.freedom, "p": test.p, "dispersion": test.dispersion}
+
+
+def _curve(experiment: Experiment, diagnosis: Diagnosis, column: int) -> dict[str, Any]:
+    """An instrument without a place: what it measured, what is predicted, and how far these may lie apart."""
+    layout, seen, floor = experiment.layout, experiment.seen, diagnosis.floor
+    std = floor.single.spread(floor.single.plus(floor.nuisance).scale)
+    predicted = {"before": diagnosis.evidence.mean}
+    predicted |= {name: c.fit.prediction for name, c in diagnosis.confirmations.items() if name}
+
+    def values(table: np.ndarray) -> list[float | None]:
+        return [float(v) if there else None for v, there in zip(table[:, column], seen[:, column], strict=True)]
+
+    return {
+        "channel": layout.sites[column].channel,
+        "unit": layout.sites[column].unit or layout.unit,
+        "measured": values(experiment.observed),
+        "std": values(std),
+        "predicted": {name: values(table) for name, table in predicted.items()},
+    }
 
 
 def _map(residual: np.ndarray, scale: np.ndarray, experiment: Experiment) -> list[list[float | None]]:

@@ -103,7 +103,7 @@ def show_misfit(misfit: Mapping[str, Any]) -> None:
     from rich.table import Table
 
     table = Table(title="residual in units of what noise leaves, the worst first", title_justify="left")
-    for column in ("stage", "region", "camera", "times noise", "p"):
+    for column in ("stage", "region", "instrument", "times noise", "p"):
         table.add_column(column, justify="right" if column in ("times noise", "p") else "left")
     for block in misfit["blocks"][:SHOWN]:
         cells = (

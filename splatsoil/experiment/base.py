@@ -83,6 +83,8 @@ class Experiment(Protocol):
         quiet: (t, s) True where no physics of the model can act, so that what is left there is the instruments' doing.
         sensor: (t, s) standard deviation of what the instruments add, known or measured.
         sensor_memory: correlation of that between neighbouring times, in [0, 1).
+        systematic: (k, t, s) patterns by which model and instruments are known to differ as a whole (forces that are a
+            share too small throughout), each as large as one standard deviation.
         parameters: free parameters of the model.
         model: names of the effects that are on.
         candidates: effects that are off.
@@ -105,6 +107,8 @@ class Experiment(Protocol):
     def sensor(self) -> FloatArray: ...
     @property
     def sensor_memory(self) -> float: ...
+    @property
+    def systematic(self) -> FloatArray: ...
     @property
     def parameters(self) -> tuple[Parameter, ...]: ...
     @property

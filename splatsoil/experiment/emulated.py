@@ -37,6 +37,7 @@ class EmulatedExperiment:
         patterns: (t, s) what other numerics add, by name.
         guessed: (t, s) what other guesses of what no instrument shows add, by name.
         quiet: (t, s) where no physics acts.
+        systematic: (k, t, s) patterns by which what is measured may differ as a whole.
         name: for people.
     """
 
@@ -53,6 +54,7 @@ class EmulatedExperiment:
     patterns: Mapping[str, FloatArray] = field(default_factory=dict)
     guessed: Mapping[str, FloatArray] = field(default_factory=dict)
     quiet: npt.NDArray[np.bool_] = field(default_factory=lambda: np.zeros((0, 0), dtype=bool))
+    systematic: FloatArray = field(default_factory=lambda: np.zeros((0, 0, 0)))
     name: str = "emulated"
     model: tuple[str, ...] = ()
     chance: bool = True
@@ -61,6 +63,8 @@ class EmulatedExperiment:
     def __post_init__(self) -> None:
         if self.quiet.size == 0:
             object.__setattr__(self, "quiet", np.zeros(self.layout.shape, dtype=bool))
+        if self.systematic.size == 0:
+            object.__setattr__(self, "systematic", np.zeros((0, *self.layout.shape)))
 
     @property
     def seen(self) -> npt.NDArray[np.bool_]:

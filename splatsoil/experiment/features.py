@@ -19,11 +19,13 @@ class Site:
         channel: the instrument (a camera's name, ``force z``, ``volume strain``).
         x: place in m; NaN for an instrument that has none.
         y: place in m; NaN for an instrument that has none.
+        unit: of its features; empty for the layout's.
     """
 
     channel: str
     x: float = math.nan
     y: float = math.nan
+    unit: str = ""
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,7 @@ class Layout:
         times: (t,) what orders the rows (frame numbers, strains, depths), increasing.
         sites: (s,) the columns.
         time_name: what ``times`` are ("frame", "axial strain").
-        unit: of the features ("grey levels", "1").
+        unit: of the features ("grey levels", "1"), sites that have one of their own aside.
         stages: (t,) the part of the experiment that each row belongs to ("pushing").
         regions: (t, s) the part of the scene that each feature shows ("trench").
     """
@@ -62,6 +64,16 @@ class Layout:
         """The instruments, in the order of their first site."""
         return tuple(dict.fromkeys(site.channel for site in self.sites))
 
+    @property
+    def common(self) -> npt.NDArray[np.bool_]:
+        """(s,) sites in the layout's unit."""
+        return np.array([site.unit in ("", self.unit) for site in self.sites])
+
+    @property
+    def placed(self) -> npt.NDArray[np.bool_]:
+        """(s,) sites that have a place."""
+        return np.array([math.isfinite(site.x) and math.isfinite(site.y) for site in self.sites])
+
     def channel_numbers(self) -> npt.NDArray[np.int64]:
         """(s,) index of each site's instrument in ``channels``."""
         numbers = {channel: i for i, channel in enumerate(self.channels)}
@@ -73,7 +85,9 @@ class Layout:
         return times / float(np.median(np.diff(times))) if len(times) > 1 else times
 
     def distances(self) -> FloatArray:
-        """(s, s) distance between sites in m; 0 where either has no place."""
-        place = np.array([[site.x, site.y] for site in self.sites])
+        """(s, s) distance between sites in m; 0 between two without a place, infinite where one has one."""
+        place, placed = np.array([[site.x, site.y] for site in self.sites]), self.placed
         distance = np.linalg.norm(place[:, None] - place[None], axis=-1)
-        return np.nan_to_num(distance, nan=0.0)
+        distance[~placed[:, None] & ~placed[None]] = 0.0
+        distance[placed[:, None] != placed[None]] = np.inf
+        return np.asarray(distance)

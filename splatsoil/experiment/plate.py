@@ -96,6 +96,7 @@ class PlateExperiment:
         self.observed = force[:, None]
         self.seen = np.ones(self.layout.shape, dtype=bool)
         self.quiet = np.zeros(self.layout.shape, dtype=bool)
+        self.systematic = np.zeros((0, *self.layout.shape))
         self.sensor = np.broadcast_to(np.asarray(spread, dtype=np.float64).reshape(-1), depth.shape)[:, None].copy()
         self.experiment = _set_up(diameter, float(depth[-1]), density, friction)
         self.resolution = Resolution.derive(self.experiment, preset)

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from splatsoil.comparison import PATCH, Block, Comparator
 from splatsoil.experiment.base import Calibration, Candidate, candidates_of
 from splatsoil.experiment.features import Layout, Site
+from splatsoil.experiment.forces import REGION, UNIT, ToolForces
 from splatsoil.experiment.scene_parts import QUIET, regions_of, stages_of
 from splatsoil.experiment.states import States, plow_states
 from splatsoil.experiment.strokes import Predict, plow_strokes
@@ -51,7 +52,8 @@ class PlowExperiment:
     """A measurement set and a model of it.
 
     Features are grey levels (of 255): the change of a square of the bed, as one camera sees it, since the first frame,
-    averaged over neighbouring frames of one stage.
+    averaged over neighbouring frames of one stage. Where the force on the tool was measured, it makes further columns;
+    see :class:`~splatsoil.experiment.forces.ToolForces`.
 
     Args:
         model: the model at hand; candidates are the library's effects that it doesn't have.
@@ -98,6 +100,8 @@ class PlowExperiment:
         )
         self._kept: tuple[object, Trajectory] | None = None
         self._bins = self._frame_bins()
+        rows_of_frames = [[self.comparator.frames[i] for i in group] for group in self._bins]
+        self.forces = ToolForces.of(model.measurement, rows_of_frames)
 
     @cached_property
     def layout(self) -> Layout:
@@ -108,14 +112,29 @@ class PlowExperiment:
             Site(camera, label.x, label.y) for camera in self.comparator.cameras for label in self._labels(camera)
         )
         regions = regions_of(measurement, self.base.reconstruction.surface, frames, sites)
+        if self.forces is not None:
+            channels = self.forces.channels
+            sites += tuple(Site(channel, unit=UNIT) for channel in channels)
+            regions = np.concatenate([regions, np.full((len(frames), len(channels)), REGION)], axis=1)
         return Layout(frames, sites, "frame", "grey levels", stages_of(measurement, frames), regions)
 
     @cached_property
     def observed(self) -> FloatArray:
-        """(t, s) measured changes."""
+        """(t, s) measured changes, and forces."""
+        return self._beside(self._pictured, None if self.forces is None else self.forces.observed)
+
+    @cached_property
+    def _pictured(self) -> FloatArray:
+        """Columns of ``observed`` that cameras have seen."""
         still = {c: self.comparator.observed[c, self.comparator.reference] for c in self.comparator.cameras}
         frames = (self.comparator.reference, *self.comparator.frames)
         return self._table(self.comparator.compare({(c, f): still[c] for c in still for f in frames}).blocks)
+
+    def _beside(self, pictured: FloatArray, forces: npt.ArrayLike | None) -> FloatArray:
+        """Columns of cameras, and of forces where there are any: a table (t, c), or one number for all of it."""
+        if forces is None or self.forces is None:
+            return pictured
+        return np.concatenate([pictured, np.broadcast_to(forces, self.forces.observed.shape)], axis=1)
 
     @cached_property
     def quiet(self) -> npt.NDArray[np.bool_]:
@@ -124,12 +143,15 @@ class PlowExperiment:
 
     @cached_property
     def seen(self) -> npt.NDArray[np.bool_]:
-        """(t, s) False where the tool hides most of a patch."""
-        return self._table(self.comparator.open_shares()) > 0.5
+        """(t, s) False where the tool hides most of a patch, or forces don't count."""
+        shares = self._table(self.comparator.open_shares())
+        return self._beside(shares, None if self.forces is None else self.forces.seen) > 0.5
 
     @cached_property
     def sensor(self) -> FloatArray:
-        """(t, s) standard deviation of a patch's change by the cameras' noise, from frames before anything moves."""
+        """(t, s) standard deviation of a patch's change by the cameras' noise, from frames before anything moves; and
+        of the measured force.
+        """
         still = self.comparator.still_blocks()
         per_site = []
         for camera in self.comparator.cameras:
@@ -137,21 +159,33 @@ class PlowExperiment:
             level = np.sqrt(np.mean(still[camera] ** 2)) if camera in still else UNKNOWN_NOISE
             per_site.append(np.full(count, max(float(level), LEAST_NOISE)))
         frames = np.array([len(group) for group in self._bins], dtype=np.float64)
-        return np.concatenate(per_site)[None] / np.sqrt(frames)[:, None]
+        pictured = np.concatenate(per_site)[None] / np.sqrt(frames)[:, None]
+        return self._beside(pictured, None if self.forces is None else self.forces.sensor)
+
+    @cached_property
+    def systematic(self) -> FloatArray:
+        """(k, t, s) what simulated forces get wrong of each instrument through a whole stage."""
+        if self.forces is None:
+            return np.zeros((0, *self.layout.shape))
+        pictured = np.zeros(self._pictured.shape)
+        return np.stack([self._beside(pictured, error) for error in self.forces.errors])
 
     def predict(
         self, values: Mapping[str, float], *, effects: Iterable[str | Effect] = (), seed: int = 0, numerics: str = ""
     ) -> FloatArray:
         """(t, s) features; see :class:`~splatsoil.experiment.base.Experiment`."""
-        return self.features(self.prediction(values, effects=effects, seed=seed, numerics=numerics).images)
+        return self.features(self.prediction(values, effects=effects, seed=seed, numerics=numerics))
 
-    def features(self, images: Mapping[tuple[str, int], npt.NDArray[np.float32]]) -> FloatArray:
-        """(t, s) predicted changes.
+    def features(self, prediction: Prediction) -> FloatArray:
+        """(t, s) predicted changes, and forces.
 
-        They are the measured ones minus the difference, because both sides must leave out the same pixels: those in
+        Changes are the measured ones minus the difference, because both sides must leave out the same pixels: those in
         which either shows the tool.
         """
-        return self.observed - self._table(self.comparator.compare(images).blocks)
+        pictured = self._pictured - self._table(self.comparator.compare(prediction.images).blocks)
+        return self._beside(
+            pictured, None if self.forces is None else self.forces.predicted(prediction.trajectory.force)
+        )
 
     def prediction(
         self, values: Mapping[str, float], *, effects: Iterable[str | Effect] = (), seed: int = 0, numerics: str = ""

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from splatsoil.experiment.features import Site
 from splatsoil.experiment.plow import PlowExperiment
 from splatsoil.measurement import Measurement
 from splatsoil.model import Model
@@ -73,10 +74,15 @@ def replay(
     finally:
         shutil.rmtree(folder, ignore_errors=True)
     # Squares that one of the two beds hides or cuts stay 0.
-    place = {(s.channel, round(s.x, 6), round(s.y, 6)): i for i, s in enumerate(made.layout.sites)}
+    place = {_key(site): i for i, site in enumerate(made.layout.sites)}
     out = np.zeros(experiment.layout.shape)
     for column, site in enumerate(experiment.layout.sites):
-        found = place.get((site.channel, round(site.x, 6), round(site.y, 6)))
+        found = place.get(_key(site))
         if found is not None:
             out[:, column] = left[:, found]
     return out
+
+
+def _key(site: Site) -> str:
+    """What two experiments call the same site, whether it has a place or not."""
+    return f"{site.channel} {site.x:.6f} {site.y:.6f}"

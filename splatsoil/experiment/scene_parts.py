@@ -36,11 +36,8 @@ def stages_of(measurement: Measurement, frames: Sequence[float]) -> tuple[str, .
         begin = max(end - 1.0 / rate, 0.0)
         velocity.append((motion.pose(end)[1] - motion.pose(begin)[1]) / max(end - begin, 1e-9))
     speed = np.linalg.norm(np.diff(motion.positions, axis=0), axis=1) / np.diff(motion.times)
-    slow = SLOW * float(speed.max())
-    level = np.diff(motion.positions, axis=0)[:, :2]
-    length = np.linalg.norm(level, axis=1)
-    moving = np.flatnonzero(length > 0.5 * length.max()) if length.max() > 0.0 else np.zeros(0, dtype=np.int64)
-    forward = level[moving[0]] / length[moving[0]] if len(moving) else np.zeros(2)
+    slow = SLOW * float(speed.max(initial=0.0))
+    forward = heading_of(measurement)
     out = []
     for v in velocity:
         flat = float(np.linalg.norm(v[:2]))
@@ -51,6 +48,16 @@ def stages_of(measurement: Measurement, frames: Sequence[float]) -> tuple[str, .
         else:
             out.append("pushing" if float(v[:2] @ forward) >= 0.0 else "withdrawal")
     return tuple(out)
+
+
+def heading_of(measurement: Measurement) -> FloatArray:
+    """(2,) unit vector along which the tool is first pushed; 0 where it never is."""
+    level = np.diff(measurement.tool.motion.positions, axis=0)[:, :2]
+    length = np.linalg.norm(level, axis=1)
+    if not length.max(initial=0.0) > 0.0:
+        return np.zeros(2)
+    first = int(np.argmax(length > 0.5 * length.max()))
+    return np.asarray(level[first] / length[first])
 
 
 def regions_of(

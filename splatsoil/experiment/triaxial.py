@@ -155,6 +155,7 @@ class TriaxialExperiment:
         self.observed = np.concatenate([self._features(c.ratio, c.volume) for c in self.curves], axis=1)
         self.seen = np.ones(self.layout.shape, dtype=bool)
         self.quiet = np.zeros(self.layout.shape, dtype=bool)
+        self.systematic = np.zeros((0, *self.layout.shape))
         self.sensor = np.ones(self.layout.shape)
 
     @property

@@ -200,10 +200,36 @@ def falling(models: Sequence[Mapping[str, Any]], names: Sequence[str]) -> str:
     return _draw(draw)
 
 
+def curves(diagnosis: Mapping[str, Any]) -> str:
+    """What instruments without a place measured, and what is predicted before and with the best effect."""
+    shown = [("as it is", "before", ACCENT, "-")]
+    shown += [(f"with {name.replace('_', ' ')}", name, SECOND, "--") for name in diagnosis["class"][:1]]
+    times = np.array(diagnosis["times"], dtype=np.float64)
+
+    def draw(figure: Figure, axes: Axes) -> None:
+        axes.remove()
+        panels = figure.subplots(len(diagnosis["curves"]), 1, squeeze=False, sharex=True)[:, 0]
+        for place, curve in zip(panels, diagnosis["curves"], strict=True):
+            measured, std = (np.array(curve[key], dtype=np.float64) for key in ("measured", "std"))
+            place.errorbar(times, measured, yerr=std, fmt="o", markersize=3, color=INK, capsize=2, label="measured")
+            for label, key, colour, style in shown:
+                if key in curve["predicted"]:
+                    predicted = np.array(curve["predicted"][key], dtype=np.float64)
+                    place.plot(times, predicted, color=colour, linestyle=style, label=label)
+            place.set_title(curve["channel"], fontsize=9)
+            place.set_ylabel(curve["unit"], fontsize=8)
+            place.tick_params(labelsize=7)
+        panels[0].legend(fontsize=8)
+        panels[-1].set_xlabel(diagnosis["time_name"])
+
+    return _draw(draw, (SIZE[0], 0.6 + 1.4 * len(diagnosis["curves"])))
+
+
 def plan_maps(diagnosis: Mapping[str, Any], which: str) -> str:
-    """Residual over noise from above, one row for each stage, one column for each instrument."""
-    table = np.array(diagnosis["maps"][which], dtype=np.float64)
-    sites, stages = diagnosis["sites"], diagnosis["stages"]
+    """Residual over noise from above, one row for each stage, one column for each instrument that has places."""
+    placed = [i for i, site in enumerate(diagnosis["sites"]) if site[1] is not None]
+    table = np.array(diagnosis["maps"][which], dtype=np.float64)[:, placed]
+    sites, stages = [diagnosis["sites"][i] for i in placed], diagnosis["stages"]
     channels = list(dict.fromkeys(site[0] for site in sites))
     names = list(dict.fromkeys(stages))
     limit = max(3.0, min(float(np.nanpercentile(np.abs(table), 99.0)), 15.0))

@@ -75,6 +75,7 @@ def render(data: RunData) -> str:
         diagnosis=diagnosis,
         verdict=None if diagnosis is None else words.verdict(diagnosis),
         maps=None if diagnosis is None else _maps(diagnosis),
+        curves=None if diagnosis is None or not diagnosis.get("curves") else Markup(figures.curves(diagnosis)),
         posterior=None if data.posterior is None else _posterior(data.folder, data.posterior),
         strength=[] if diagnosis is None else _strength(diagnosis),
         falling=Markup(figures.falling(data.history, words.steps(data.history))) if len(data.history) > 1 else None,

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pytest
-from splatsoil.benchmarks._newton import Numerics, World, _model, plough
+from splatsoil.benchmarks._newton import Numerics, Run, World, _model, plough
 from splatsoil.benchmarks.independent import judge
 from splatsoil.benchmarks.numerics import Scan, Truth, volume_range
 
@@ -58,7 +58,7 @@ def test_cohesion_is_the_whole_strength_without_pressure_and_counted_once() -> N
 
 
 @pytest.fixture(scope="module")
-def ploughed() -> tuple[Truth, list[dict[int, npt.NDArray[np.float64]]]]:
+def ploughed() -> tuple[Truth, list[Run]]:
     """Two coarse worlds, ten frames into the push."""
     pytest.importorskip("newton")
     truth = Truth.load(Path(__file__).parents[2] / "examples" / "plow-damp")
@@ -70,17 +70,17 @@ def ploughed() -> tuple[Truth, list[dict[int, npt.NDArray[np.float64]]]]:
 
 @pytest.mark.slow
 def test_before_the_tool_arrives_the_bed_rests(
-    ploughed: tuple[Truth, list[dict[int, npt.NDArray[np.float64]]]],
+    ploughed: tuple[Truth, list[Run]],
 ) -> None:
     truth, runs = ploughed
     for run in runs:
-        moved = np.linalg.norm(run[5] - truth.particles[0], axis=1)
+        moved = np.linalg.norm(run.particles[5] - truth.particles[0], axis=1)
         assert np.percentile(moved, 90) < 0.3e-3  # loose grains on top settle by more; free fall would be 49 mm
 
 
 @pytest.mark.slow
 def test_soil_reaches_where_the_plate_was_a_substep_ago_and_no_further(
-    ploughed: tuple[Truth, list[dict[int, npt.NDArray[np.float64]]]],
+    ploughed: tuple[Truth, list[Run]],
 ) -> None:
     truth, runs = ploughed
     tool = truth.measurement.tool
@@ -88,7 +88,7 @@ def test_soil_reaches_where_the_plate_was_a_substep_ago_and_no_further(
     now = 35 / truth.measurement.frame_rate
     rotation, position = tool.motion.pose(now - 1 / truth.measurement.frame_rate / COARSE.substeps)
     for run in runs:
-        local = (run[35] - position) @ rotation
+        local = (run.particles[35] - position) @ rotation
         before = local[(np.abs(local[:, 1]) < upper[1] - 0.01) & (local[:, 2] > lower[2] + 0.01) & (local[:, 0] > 0.0)]
         gap = before[:, 0].min() - upper[0]
         # the solver lets particles a hundredth of a voxel in; the tool's way in a substep is 2 mm
@@ -97,11 +97,29 @@ def test_soil_reaches_where_the_plate_was_a_substep_ago_and_no_further(
 
 @pytest.mark.slow
 def test_worlds_beside_each_other_differ_by_their_soil_alone(
-    ploughed: tuple[Truth, list[dict[int, npt.NDArray[np.float64]]]],
+    ploughed: tuple[Truth, list[Run]],
 ) -> None:
     truth, runs = ploughed
     weak = World("weak", 20.0, truth.particles[0], SPACING, cohesion=300.0)
     alone = plough(truth.measurement, [weak], COARSE, (5,))[0]
     # 0.1 mm was measured, against 0.7 mm between the two soils, at that frame
-    assert np.percentile(np.linalg.norm(alone[5] - runs[1][5], axis=1), 99) < 0.2e-3
-    assert np.percentile(np.linalg.norm(runs[0][5] - runs[1][5], axis=1), 99) > 0.4e-3
+    assert np.percentile(np.linalg.norm(alone.particles[5] - runs[1].particles[5], axis=1), 99) < 0.2e-3
+    assert np.percentile(np.linalg.norm(runs[0].particles[5] - runs[1].particles[5], axis=1), 99) > 0.4e-3
+
+
+@pytest.mark.slow
+def test_the_force_is_the_soils_on_the_tool(ploughed: tuple[Truth, list[Run]]) -> None:
+    """Next to nothing before it arrives; then against its way and up, more of it in stronger soil. The set's is twice
+    as large, as its soil has twice the cohesion; coarse voxels and few iterations bear still less.
+    """
+    truth, (strong, weak) = ploughed
+    force = truth.measurement.tool.force
+    assert force is not None
+    pushing = slice(29, 35)
+    ours, less = (run.force[pushing].mean(axis=0) for run in (strong, weak))
+    measured = force[pushing, 2:].mean(axis=0)
+    assert np.abs(strong.force[:5, 0]).max() < 0.05 * abs(ours[0])
+    assert np.all(np.sign(ours[[0, 2]]) == np.sign(measured[[0, 2]]))
+    assert abs(ours[1]) < 0.1 * abs(ours[0])
+    assert np.linalg.norm(less) < 0.8 * np.linalg.norm(ours)
+    assert 0.3 * np.linalg.norm(measured) < np.linalg.norm(ours) < np.linalg.norm(measured)

@@ -31,6 +31,7 @@ def looked(observed: np.ndarray, quiet: np.ndarray) -> Any:
         "layout": LAYOUT,
         "sensor": sensor,
         "sensor_memory": 0.0,
+        "systematic": np.zeros((0, *LAYOUT.shape)),
         "parameters": (),
         "candidates": (),
         "chance": True,

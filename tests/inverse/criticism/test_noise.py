@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from splatsoil.inverse.criticism.misfit import omnibus, smooth_basis
@@ -136,3 +138,39 @@ def test_a_noise_known_from_few_samples_makes_a_misfit_less_sure() -> None:
     assert sure.statistic == doubtful.statistic
     # F and χ² tables: the former's tail is the heavier
     assert doubtful.p > 2.0 * sure.p
+
+
+MIXED = replace(
+    LAYOUT,
+    sites=(*LAYOUT.sites, Site("along", unit="%"), Site("up", unit="%")),
+    regions=np.full((LAYOUT.shape[0], LAYOUT.shape[1] + 2), "bed"),
+)
+
+
+def mixed(count: int, seed: int) -> np.ndarray:
+    """Pictures as before, and two forces that go together, ten times as large, of another memory."""
+    generator = np.random.default_rng(seed)
+    forces = generator.standard_normal((count, LAYOUT.shape[0], 2)) @ np.array([[20.0, 16.0], [0.0, 12.0]])
+    return np.concatenate([draw(TRUE, count, seed), forces], axis=2)
+
+
+def test_instruments_without_a_place_are_noisy_for_themselves() -> None:
+    seen = np.ones(MIXED.shape, dtype=bool)
+    part = estimate(MIXED, mixed(30, 1), seen)
+    covariance = part.covariance(MIXED).reshape(*MIXED.shape, *MIXED.shape)
+    assert np.all(covariance[:, :32, :, 32:] == 0.0)
+    assert np.mean(part.scale[:, 32:]) == pytest.approx(20.0, rel=0.1)
+    together = covariance[5, 32, 5, 33] / np.sqrt(covariance[5, 32, 5, 32] * covariance[5, 33, 5, 33])
+    assert together == pytest.approx(0.8, abs=0.15)
+    # What the pictures' noise is found to be hardly hangs on what is beside them.
+    alone = estimate(LAYOUT, draw(TRUE, 30, 1), SEEN)
+    assert np.allclose(part.scale[:, :32], alone.scale, rtol=0.1)
+    assert part.length == pytest.approx(alone.length, rel=0.2)
+
+
+def test_an_instrument_that_never_changes_has_no_noise_and_changes_no_other() -> None:
+    samples = mixed(6, 2)
+    samples[..., 32:] = 0.0
+    part, alone = estimate(MIXED, samples, np.ones(MIXED.shape, dtype=bool)), estimate(LAYOUT, samples[..., :32], SEEN)
+    assert np.all(part.scale[:, 32:] < 1e-4)
+    assert np.allclose(part.scale[:, :32], alone.scale, rtol=0.02)

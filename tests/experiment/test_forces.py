@@ -1,0 +1,126 @@
+"""The tool's force as features: which frames, which direction, and what may be wrong with it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatsoil.experiment.forces import ALONG, ERROR, OWN, SENSOR, SHAPE, UP, ToolForces
+from splatsoil.measurement import Measurement, ToolMotion
+
+ROWS = [[frame, frame + 10] for frame in range(10, 200, 20)]
+"""Compared frames of the example set, two to a row."""
+LAST = 200
+
+
+@pytest.fixture(scope="module")
+def dry(plow_dry: Path) -> Measurement:
+    return Measurement.load(plow_dry)
+
+
+def with_force(measurement: Measurement, force: np.ndarray, first: int = 1) -> Measurement:
+    """A set whose force (f, 3) in frames ``first``, … is made up."""
+    frames = np.arange(first, first + len(force))
+    table = np.column_stack([frames, frames / measurement.frame_rate, force])
+    return replace(measurement, tool=replace(measurement.tool, force=table))
+
+
+def forces_of(measurement: Measurement, rows: list[list[int]] | None = None) -> ToolForces:
+    found = ToolForces.of(measurement, ROWS if rows is None else rows)
+    assert found is not None
+    return found
+
+
+def test_a_prediction_that_is_right_is_what_was_measured(dry: Measurement) -> None:
+    assert dry.tool.force is not None
+    found = forces_of(dry)
+    assert np.allclose(found.predicted(dry.tool.force[:, 2:])[found.seen], found.observed[found.seen])
+
+
+def test_rows_are_means_over_their_frames_in_newtons_of_the_largest(dry: Measurement) -> None:
+    assert dry.tool.force is not None
+    found = forces_of(dry)
+    assert found.channels == (ALONG, UP)
+    # The plate is pushed along x from frame 26 to 100; compared frames stand for those from 5 before to 5 after.
+    fx, fz = dry.tool.force[:, 2], dry.tool.force[:, 4]
+    row = slice(45 - 1, 64)
+    push, lift = (0.01 * found.largest * found.observed[2, k] for k in (0, 1))
+    assert push == pytest.approx(-fx[row].mean(), rel=0.02)
+    assert lift == pytest.approx(fz[row].mean(), rel=0.02)
+    assert np.linalg.norm(found.observed[found.seen[:, 0]], axis=1).max() == pytest.approx(100.0)
+
+
+def test_only_stages_count_in_which_the_tool_moves_into_soil(dry: Measurement) -> None:
+    found = forces_of(dry)
+    assert [stage for stage, seen in zip(found.stages, found.seen[:, 0], strict=True) if seen] == [
+        "lowering",
+        *["pushing"] * 4,
+    ]
+
+
+def test_where_nothing_pushes_yet_nothing_counts(dry: Measurement) -> None:
+    force = np.zeros((LAST, 3))
+    force[60:100, 0] = -50.0
+    assert forces_of(with_force(dry, force)).seen[:, 0].tolist() == [False] * 3 + [True, True] + [False] * 5
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.7, 2.5])
+def test_the_way_is_the_tools_wherever_it_heads(dry: Measurement, turn: float) -> None:
+    c, s = np.cos(turn), np.sin(turn)
+    rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    motion = dry.tool.motion
+    turned = ToolMotion(motion.frames, motion.times, motion.positions @ rotation.T, motion.quaternions)
+    assert dry.tool.force is not None
+    force = dry.tool.force.copy()
+    force[:, 2:] = force[:, 2:] @ rotation.T
+    found = forces_of(replace(dry, tool=replace(dry.tool, motion=turned, force=force)))
+    assert np.allclose(found.observed, forces_of(dry).observed)
+
+
+def test_a_tool_that_is_only_lowered_has_one_instrument(dry: Measurement) -> None:
+    motion = dry.tool.motion
+    positions = motion.positions.copy()
+    positions[:, :2] = positions[0, :2]
+    positions[:, 2] = positions[0, 2] - 0.0005 * np.arange(len(positions))
+    straight = ToolMotion(motion.frames, motion.times, positions, motion.quaternions)
+    force = np.column_stack([np.zeros(LAST), np.zeros(LAST), np.linspace(0.0, 100.0, LAST)])
+    found = forces_of(with_force(replace(dry, tool=replace(dry.tool, motion=straight)), force))
+    assert found.channels == (UP,)
+    assert found.observed[-1, 0] == pytest.approx(100.0)
+
+
+def test_a_rows_variance_is_that_of_its_four_errors(dry: Measurement) -> None:
+    """The whole, an instrument's through a stage, a row's own, and the sensor's."""
+    found = forces_of(dry)
+    variance = (found.sensor**2 + (found.errors**2).sum(axis=0))[found.seen]
+    size = np.linalg.norm(found.observed, axis=1, keepdims=True)
+    expected = (ERROR * found.observed) ** 2 + (OWN**2 + SHAPE**2) * size**2 + SENSOR**2
+    assert np.allclose(variance, expected[found.seen])
+
+
+def test_errors_of_stages_are_apart_and_the_whole_goes_through_all(dry: Measurement) -> None:
+    found = forces_of(dry)
+    whole, *own = (error[found.seen[:, 0]] for error in found.errors)
+    assert np.all(whole != 0.0)
+    # Lowering and pushing, along and up: no row and instrument is in two of them.
+    assert len(own) == 4
+    assert np.all(np.sum([table != 0.0 for table in own], axis=0) == 1)
+
+
+@pytest.mark.parametrize("frames", [(0, 0), (150, 200), (1, 12)])
+def test_forces_of_hardly_any_use_are_left_alone(dry: Measurement, frames: tuple[int, int]) -> None:
+    first, last = frames
+    force = np.tile([-50.0, 0.0, 20.0], (last - first, 1))
+    made = with_force(dry, force, first) if last else replace(dry, tool=replace(dry.tool, force=None))
+    assert ToolForces.of(made, ROWS) is None
+
+
+def test_forces_that_end_early_count_as_far_as_they_go(dry: Measurement) -> None:
+    assert dry.tool.force is not None
+    whole = forces_of(dry)
+    part = forces_of(with_force(dry, dry.tool.force[:64, 2:]))
+    assert part.seen[:, 0].tolist() == [True] * 3 + [False] * 7
+    assert np.allclose(part.largest * part.observed[:2], whole.largest * whole.observed[:2])
