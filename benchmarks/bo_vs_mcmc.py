@@ -157,7 +157,8 @@ def _as_fitted(
     """What `splatsoil fit` says after these calls: the features' estimate where there is one, else the loss' own."""
     data = Data(world.space, np.array(points), -np.array(features))
     try:
-        return by_features(data, surrogate, found, seed=seed) or found
+        told = by_features(data, surrogate, found, seed=seed)
+        return found if told is None else told.minimum
     except RunError:  # too few calls
         return found
 

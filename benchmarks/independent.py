@@ -145,7 +145,7 @@ class Campaign:
                 self.entry["worlds"][world.label] = {"angle": float(world.angle), "failed": str(error)}
             return
         for world, run in zip(worlds, runs, strict=True):
-            self._enter(world.label, float(world.angle), heights(self.truth, run, world.spacing**3), self.own)
+            self._enter(world.label, float(world.angle), heights(self.truth, run.particles, world.spacing**3), self.own)
         self.entry["seconds"][", ".join(w.label for w in worlds)] = time.perf_counter() - start
 
     def _enter(self, label: str, angle: float, surface: FloatArray, own: Scan | None) -> None:

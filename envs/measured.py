@@ -10,13 +10,16 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from splatsoil.parameters import ParameterSpace
 
 from .devices import resolve_device
-from .problem import Evaluation, Image
+from .problem import Evaluation, FloatArray, Image
 
 if TYPE_CHECKING:
     from splatsoil.comparison import Block, Comparator, Comparison
+    from splatsoil.experiment.forces import ToolForces
     from splatsoil.measurement import Measurement
     from splatsoil.model import Model, Prediction
     from splatsoil.reconstruction import Reconstruction
@@ -114,6 +117,17 @@ class MeasuredProblem:
         """Standard deviation of a block residual by the cameras' noise alone."""
         return self.comparator.block_noise()
 
+    @cached_property
+    def forces(self) -> ToolForces | None:
+        """What the force on the tool says, in percent of the largest; their residuals are among the extras."""
+        from splatsoil.experiment.forces import ToolForces
+
+        return ToolForces.of(self.model.measurement, [[frame] for frame in self.comparator.frames])
+
+    def beside(self, extras: Mapping[str, float]) -> FloatArray:
+        """(k,) residuals of instruments beside the cameras, in independent units of what they may be off."""
+        return np.zeros(0) if self.forces is None else self.forces.independent(extras)
+
     @property
     def image_size(self) -> tuple[int, int]:
         """(height, width) of the pictures."""
@@ -147,7 +161,8 @@ class MeasuredProblem:
             SimulationError: the simulation could not go on.
         """
         began = time.perf_counter()
-        evaluation = self.judge(self.model.predict(parameters, seed, self.progress).images)
+        prediction = self.model.predict(parameters, seed, self.progress)
+        evaluation = self.judge(prediction.images, prediction.trajectory.force)
         return replace(evaluation, seconds=time.perf_counter() - began)
 
     def cheaper(self, preset: str) -> tuple[Callable[[Mapping[str, float], int], Evaluation], float]:
@@ -164,17 +179,21 @@ class MeasuredProblem:
         coarse = model.variant(resolution=Resolution.derive(model.measurement, preset))
 
         def evaluate(parameters: Mapping[str, float], seed: int) -> Evaluation:
-            return self.judge(coarse.predict(parameters, seed, self.progress).images)
+            prediction = coarse.predict(parameters, seed, self.progress)
+            return self.judge(prediction.images, prediction.trajectory.force)
 
         return evaluate, relative_cost(model.resolution, coarse.resolution)
 
-    def judge(self, images: Mapping[tuple[str, int], Image]) -> Evaluation:
-        """Predicted pictures, by camera and frame, compared with the measured ones."""
+    def judge(self, images: Mapping[tuple[str, int], Image], force: FloatArray) -> Evaluation:
+        """Predicted pictures, by camera and frame, and forces (f, 3) on the tool in frames 1, 2, …, compared with the
+        measured ones.
+        """
         comparison = self.comparator.compare(images)
+        forces = {} if self.forces is None else self.forces.residuals(force)
         return Evaluation(
             loss=min(comparison.loss, self.worst_loss),
             blocks=comparison.blocks,
-            extras={"rgb": comparison.rgb},
+            extras={"rgb": comparison.rgb, **forces},
             observed=self.observed_image(),
             predicted=images[self._shown],
         )

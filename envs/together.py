@@ -98,7 +98,7 @@ def _measured(problem: MeasuredProblem, jobs: Sequence[Job]) -> list[Evaluation]
         if isinstance(trajectory, SimulationError):
             out.append(failed(problem, trajectory))
         else:
-            out.append(problem.judge(model.draw(trajectory, seed, values)))
+            out.append(problem.judge(model.draw(trajectory, seed, values), trajectory.force))
     seconds = (time.perf_counter() - began) / len(out)
     return [replace(evaluation, seconds=seconds) for evaluation in out]
 

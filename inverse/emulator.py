@@ -129,9 +129,13 @@ class Emulator:
     @property
     def trusted(self) -> bool:
         """Whether the features vary in as many ways as there are parameters, and points left out are predicted well."""
+        return self.count >= self.dimension and self.skilled
+
+    @property
+    def skilled(self) -> bool:
+        """Whether points left out are predicted well."""
         weight = self.scores.var(axis=0)
-        skilled = float(weight @ self.left_out.skill) >= TRUSTED_SKILL * float(weight.sum())
-        return self.count >= self.dimension and skilled
+        return float(weight @ self.left_out.skill) >= TRUSTED_SKILL * float(weight.sum())
 
     @property
     def outside_variance(self) -> FloatArray:

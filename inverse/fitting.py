@@ -21,13 +21,17 @@ from splatsoil.parameters import Parameter, ParameterSpace
 from .bayesopt import PAPER, START, Episode, optimise
 from .campaign import Job, make_record
 from .evaluations import EvaluationRecord, EvaluationStore, digest
-from .feature_fit import by_features
+from .feature_fit import FeatureFit, by_features
 from .multifidelity import most_steps, optimise_two_levels
 from .posterior import Data
 from .run_folder import RunFolder
 from .surrogate import FloatArray, Minimum, Surrogate
 
 FORMAT = "splatsoil-fit/1"
+FORCE_DENIED = (
+    "The measured force on the tool can't be what this model needs where the pictures agree, so it wasn't counted: its "
+    "unit, sign or zero may be off, or the model lacks an effect."
+)
 #: Points of the GP's curve kept for the figure.
 CURVE = 201
 
@@ -268,10 +272,11 @@ def summarise(
     space = problem.space
     surrogate = episode.optimiser.surrogate()
     good = [record for record in records if record.status == "ok"]
+    told = None
     if refitted is not None:
         source, minimum = "refit", episode.minimum.moved(*_unit(space, refitted), surrogate)
     elif (told := _from_features(problem, records, surrogate, episode.minimum, setup.seed)) is not None:
-        source, minimum = "features", told
+        source, minimum = told.source, told.minimum
     else:
         source, minimum = "loss", episode.minimum
     done = [record for record in good if is_full(record.parameters)]
@@ -281,6 +286,7 @@ def summarise(
         "name": setup.name,
         "parameters": {p.name: _estimate(p, i, minimum, space) for i, p in enumerate(space)},
         "estimated_from": source,
+        "force": None if told is None or told.pictures is None else _beside_force(told, space),
         "loss": minimum.loss,
         "loss_std": minimum.loss_std,
         "noise_std": minimum.noise_std,
@@ -293,7 +299,7 @@ def summarise(
         "preset": setup.preset,
         "version": setup.version,
         "setup": setup.description(),
-        "notes": notes(minimum, space, failed=len(records) - len(good), total=len(records)),
+        "notes": notes(minimum, space, failed=len(records) - len(good), total=len(records), told=told),
         "curves": {p.name: _curve(i, minimum, surrogate, space) for i, p in enumerate(space)},
         "history": [
             {
@@ -313,8 +319,8 @@ def summarise(
 
 def _from_features(
     problem: Problem, records: list[EvaluationRecord], surrogate: Surrogate, fallback: Minimum, seed: int
-) -> Minimum | None:
-    """The minimum by the emulated features; None where evaluations are too few or too unlike each other for that."""
+) -> FeatureFit | None:
+    """What the emulated features say; None where evaluations are too few or too unlike each other for that."""
     try:
         return by_features(Data.of(problem, records), surrogate, fallback, seed=seed)
     except RunError:
@@ -337,9 +343,25 @@ def _without_level(parameters: Mapping[str, float]) -> dict[str, float]:
     return {name: value for name, value in parameters.items() if name != FIDELITY.name}
 
 
-def notes(minimum: Minimum, space: ParameterSpace, *, failed: int, total: int) -> list[str]:
+def _beside_force(told: FeatureFit, space: ParameterSpace) -> dict[str, Any]:
+    """What the measured force on the tool did to the estimate."""
+    assert told.pictures is not None
+    return {
+        "agreement": told.agreement,
+        "counted": not told.denied,
+        "pictures_alone": {
+            p.name: {key: entry[key] for key in ("estimate", "std", "determined")}
+            for i, p in enumerate(space)
+            for entry in (_estimate(p, i, told.pictures, space),)
+        },
+    }
+
+
+def notes(
+    minimum: Minimum, space: ParameterSpace, *, failed: int, total: int, told: FeatureFit | None = None
+) -> list[str]:
     """What a reader must know before believing the numbers."""
-    out = []
+    out = [FORCE_DENIED] if told is not None and told.denied else []
     for parameter, determined in zip(space, minimum.determined, strict=True):
         if not determined:
             out.append(

@@ -8,7 +8,8 @@ Chance is itself read off the evaluations, and in a handful of them it may happe
 freedom behind it, its size is integrated out, and z is distributed as Student's t with ν degrees of freedom and scale
 Σ (Sellentin & Heavens 2016, MNRAS 456:L132); of many evaluations that is the normal. The misfit's size s is not known
 better than to a factor, so it is sampled with the parameters (log-normal prior); this makes the likelihood
-heavy-tailed, as it should be when the model is known to be wrong.
+heavy-tailed, as it should be when the model is known to be wrong. Instruments beside the cameras, whose errors are
+known beforehand, count as normal.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import gammaln
 
+from .beside import Beside
 from .emulator import Emulator
 from .misfit import Misfit
 
@@ -41,12 +43,14 @@ class Likelihood:
         observed: (b,) features.
         sensor: variance of an observed feature's own noise.
         misfit: the model's own error; None for none.
+        beside: other instruments than those of the features; None for none.
     """
 
     emulator: Emulator
     observed: FloatArray
     sensor: float = 0.0
     misfit: Misfit | None = None
+    beside: Beside | None = None
 
     @property
     def with_misfit(self) -> bool:
@@ -107,7 +111,8 @@ class Likelihood:
         p, free = self.emulator.count, self.freedom
         constant = gammaln(0.5 * (free + p)) - gammaln(0.5 * free) - 0.5 * p * np.log(np.pi * free)
         tail = -0.5 * (free + p) * np.log1p(np.sum(white**2, axis=1) / free)
-        return np.asarray(constant + tail - logs, dtype=np.float64)
+        other = 0.0 if self.beside is None else self.beside.log_likelihood(where[:, : self.emulator.dimension])
+        return np.asarray(constant + tail - logs + other, dtype=np.float64)
 
     def log_prior(self, points: npt.ArrayLike) -> FloatArray:
         """(k, d) to (k,): uniform parameters, log-normal misfit, −∞ out of bounds; not normalised."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from splatsoil.envs.problem import Problem
 from splatsoil.errors import RunError
 from splatsoil.parameters import Parameter, ParameterSpace
 
+from .beside import Beside
 from .campaign import Job
 from .emulator import FEWEST, ROUNDING, Emulator, weighed_emulator
 from .evaluations import EvaluationRecord, digest
@@ -44,6 +45,7 @@ class Data:
         residuals: (m, b) observed minus predicted features.
         places: of the features, None where unknown.
         sensor_std: of an observed feature's own noise.
+        beside: (m, k) residuals of other instruments, in independent units of what they may be off; None for none.
     """
 
     space: ParameterSpace
@@ -51,12 +53,20 @@ class Data:
     residuals: FloatArray
     places: tuple[Place, ...] | None = None
     sensor_std: float = 0.0
+    beside: FloatArray | None = None
 
     @classmethod
-    def of(cls, problem: Problem, records: Sequence[EvaluationRecord]) -> Data:
-        """The same as :meth:`from_records`, with what the problem knows of its features' places and noise."""
+    def of(cls, problem: Problem, records: Sequence[EvaluationRecord], *, pictures_alone: bool = False) -> Data:
+        """The same as :meth:`from_records`, with what the problem knows of its features' places and noise, and of
+        other instruments, unless these aren't to count.
+        """
         places, sensor = getattr(problem, "places", None), float(getattr(problem, "sensor_std", 0.0))
-        return cls.from_records(problem.space, records, places, sensor)
+        found = cls.from_records(problem.space, records, places, sensor)
+        told = getattr(problem, "beside", None)
+        if told is None or pictures_alone:
+            return found
+        beside = np.stack([told(record.extras) for record in _usable(records)])
+        return replace(found, beside=beside if beside.size else None)
 
     @classmethod
     def from_records(
@@ -71,7 +81,7 @@ class Data:
         Raises:
             RunError: too few succeeded, or nothing was seen in all of them.
         """
-        good = [r for r in records if r.status == "ok" and is_full(r.parameters)]
+        good = _usable(records)
         if len(good) < len(space) + FEWEST:
             raise RunError(
                 f"{len(good)} evaluations that succeeded are too few for a posterior over {len(space)} parameters; "
@@ -84,6 +94,11 @@ class Data:
             raise RunError("no block of the pictures was seen in every evaluation; there is nothing to compare")
         kept = None if places is None else tuple(p for p, s in zip(places, seen, strict=True) if s)
         return cls(space, space.to_unit(values), blocks[:, seen], kept, sensor_std)
+
+
+def _usable(records: Sequence[EvaluationRecord]) -> list[EvaluationRecord]:
+    """Those that succeeded, at full resolution."""
+    return [r for r in records if r.status == "ok" and is_full(r.parameters)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +171,8 @@ def likelihood_of(data: Data, *, seed: int = 0) -> Likelihood:
     rounding = ROUNDING * float(np.mean(np.sum(emulator.scores**2, axis=1))) / len(observed)
     expected = emulator.outside_variance + (data.sensor_std / emulator.scale) ** 2 + rounding
     misfit = measure(emulator.remainder(observed), expected, emulator.basis, data.places)
-    return Likelihood(emulator, observed, data.sensor_std**2, misfit)
+    beside = None if data.beside is None else Beside.of(data.points, data.beside, seed=seed)
+    return Likelihood(emulator, observed, data.sensor_std**2, misfit, beside)
 
 
 def sample_posterior(

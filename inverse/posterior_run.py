@@ -104,11 +104,14 @@ def run_posterior(
             finished += len(jobs)
             return found
 
-        estimate = {name: entry["estimate"] for name, entry in run.fit()["parameters"].items()}
+        fitting = run.fit()
+        estimate = {name: entry["estimate"] for name, entry in fitting["parameters"].items()}
+        # A force that the fit couldn't believe isn't believed here.
+        pictures_alone = bool(fitting["force"]) and not fitting["force"]["counted"]
         records = [*fitted, *evaluate("design", design(space, count, seed))]
         records += evaluate("repeat", repeats(estimate, effort.repeats, seed))
         posterior = sample_posterior(
-            Data.of(problem, records),
+            Data.of(problem, records, pictures_alone=pictures_alone),
             seed=seed,
             file=run.path / "posterior" / "chains-first.h5" if effort.checks else run.path / "posterior" / "chains.h5",
             evidence=not effort.checks,
@@ -120,7 +123,7 @@ def run_posterior(
             checked = _judged(posterior, records, new, problem)
             records += new
             posterior = sample_posterior(
-                Data.of(problem, records),
+                Data.of(problem, records, pictures_alone=pictures_alone),
                 seed=seed,
                 file=run.path / "posterior" / "chains.h5",
                 progress=lambda done, most: report(f"chains, step {done}", 0.95),
@@ -149,7 +152,7 @@ def _judged(
     # Only blocks that all evaluations see: the same ones for emulator and checks.
     both = Data.of(problem, [*records, *good])
     known = len(both.points) - len(good)
-    data = replace(both, points=both.points[:known], residuals=both.residuals[:known])
+    data = replace(both, points=both.points[:known], residuals=both.residuals[:known], beside=None)
     if data.residuals.shape == posterior.data.residuals.shape:
         judge = posterior
     else:

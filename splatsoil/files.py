@@ -107,7 +107,11 @@ def plain(data: Any) -> Any:
 
 #: Parts of the package that decide what a reconstruction is, and what an evaluation comes to.
 RECONSTRUCTING = ("measurement", "splats", "reconstruction")
-FORWARD = (*RECONSTRUCTING, "soil", "mpm", "scene", "parameters.py", "model.py", "comparison.py", "robust_loss.py")
+FORWARD = (
+    *RECONSTRUCTING,
+    *("soil", "mpm", "scene", "parameters.py", "model.py", "comparison.py", "robust_loss.py"),
+    *("experiment/forces.py", "experiment/scene_parts.py"),
+)
 
 
 def code_digest(parts: Iterable[str] = FORWARD, others: Iterable[str | Path] = ()) -> str:

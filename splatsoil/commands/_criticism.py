@@ -74,9 +74,7 @@ def code_of(effects: Iterable[str]) -> str:
     from splatsoil.files import FORWARD, code_digest
 
     own = [name for name in effects if name.endswith(".py")]
-    return code_digest(
-        (*FORWARD, "observation.py", "experiment/plow.py", "experiment/forces.py", "experiment/scene_parts.py"), own
-    )
+    return code_digest((*FORWARD, "observation.py", "experiment/plow.py"), own)
 
 
 def replayed(

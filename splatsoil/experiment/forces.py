@@ -6,8 +6,9 @@ along it by a factor of four (docs/numerics.md), so even a force that is believe
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -20,8 +21,9 @@ FloatArray = npt.NDArray[np.float64]
 ALONG, UP = "force along", "force up"
 """Instruments: against the way the tool is pushed, and upwards."""
 REGION, UNIT = "tool", "% of the largest force"
-MOVING = ("lowering", "pushing")
-"""Stages in which the force is believed: at rest, contact by penalties lets go of what real soil holds."""
+STAGE = "pushing"
+"""In which the force is believed. At rest, contact by penalties lets go of what real soil holds; pressed in from
+above, a plate's edge bears half of what it bears in another solver's soil (docs/numerics.md)."""
 LEAST = 0.25
 """Share of the largest force below which it isn't looked at: where soil is first touched is a matter of cells."""
 FEWEST = 2
@@ -32,7 +34,7 @@ ERROR = 0.15
 """Standard deviation of all simulated forces over their size, together: ours are 0 to 30 % off Reece's equation
 (docs/validation.md), and 0 to 25 % off another solver's, which hang on its own numerics (docs/numerics.md)."""
 OWN = 0.1
-"""Likewise of one instrument's through one stage, beside that: ours upwards are 8 to 17 % too small."""
+"""Likewise of one instrument's, beside that: ours upwards are 8 to 17 % too small."""
 SHAPE = 0.05
 """Likewise of one row's: forces shake, and grow otherwise along the way."""
 
@@ -42,13 +44,13 @@ class ToolForces:
     """Forces as features.
 
     Attributes:
-        channels: (c,) the instruments; upwards alone where the tool isn't pushed.
+        channels: (c,) the instruments.
         observed: (t, c) measured means over each row's frames, in % of the largest.
         seen: (t, c) rows in which they count.
         largest: what that is, N.
         axes: (c, 3) the instruments' directions.
         weights: (t, f) of frames 1, 2, …, f in each row.
-        stages: (t,) of the rows.
+        frames: (t,) the last of each row.
     """
 
     channels: tuple[str, ...]
@@ -57,7 +59,7 @@ class ToolForces:
     largest: float
     axes: FloatArray
     weights: FloatArray
-    stages: tuple[str, ...]
+    frames: tuple[int, ...]
 
     @classmethod
     def of(cls, measurement: Measurement, rows: Sequence[Sequence[int]]) -> ToolForces | None:
@@ -87,46 +89,56 @@ class ToolForces:
         weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1.0)
         measured = np.zeros((weights.shape[1], 3))
         measured[numbers - 1] = force[:, 2:]
-        heading = heading_of(measurement)
-        up = np.array([0.0, 0.0, 1.0])
-        axes = np.stack([np.append(-heading, 0.0), up] if heading.any() else [up])
+        axes = np.stack([np.append(-heading_of(measurement), 0.0), [0.0, 0.0, 1.0]])
         table = weights @ measured @ axes.T
         size = np.linalg.norm(table, axis=1)
-        moving = np.isin(stages, MOVING) & (weights.sum(axis=1) > 0.0)
+        moving = (np.array(stages) == STAGE) & (weights.sum(axis=1) > 0.0)
         largest = float(size[moving].max(initial=0.0))
         rows_seen = moving & (size > LEAST * largest)
         if rows_seen.sum() < FEWEST:
             return None
         seen = np.repeat(rows_seen[:, None], len(axes), axis=1)
-        channels = (ALONG, UP)[-len(axes) :]
-        return cls(channels, 100.0 * table / largest, seen, largest, axes, weights, stages)
+        last = tuple(row[-1] for row in rows)
+        return cls((ALONG, UP), 100.0 * table / largest, seen, largest, axes, weights, last)
 
     def predicted(self, force: FloatArray) -> FloatArray:
         """(t, c) features of a simulation's force (f', 3) in frames 1, 2, …; f' at least f."""
         return 100.0 * (self.weights @ force[: self.weights.shape[1]] @ self.axes.T) / self.largest
 
+    def residuals(self, force: FloatArray) -> dict[str, float]:
+        """Observed minus predicted features that count, by name, for a simulation's force (f', 3)."""
+        off = (self.observed - self.predicted(force))[self.seen]
+        return dict(zip(self.names, map(float, off), strict=True))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the features that count."""
+        return tuple(f"{self.channels[c]}, frame {self.frames[t]}" for t, c in zip(*np.nonzero(self.seen), strict=True))
+
+    def independent(self, residuals: Mapping[str, float]) -> FloatArray:
+        """(k,) combinations of named residuals whose known errors are independent, of variance 1."""
+        return np.linalg.solve(self._factor, np.array([residuals[name] for name in self.names]))
+
+    @cached_property
+    def _factor(self) -> FloatArray:
+        """Cholesky factor of the known errors' covariance."""
+        columns = self.errors[:, self.seen]
+        return np.asarray(np.linalg.cholesky(columns.T @ columns + np.diag(self.sensor[self.seen] ** 2)))
+
     @property
     def sensor(self) -> FloatArray:
         """(t, c) standard deviation of a row by itself: the instrument's, and what no stage has in common."""
-        return np.hypot(SENSOR, SHAPE * self._size)
+        return np.broadcast_to(np.hypot(SENSOR, SHAPE * self._size), self.observed.shape)
 
     @property
     def errors(self) -> FloatArray:
-        """(k, t, c) what the model may get wrong of all forces, and of each instrument's through a whole stage; one
-        standard deviation each.
+        """(k, t, c) what the model may get wrong of all forces, and of each instrument's; one standard deviation each.
 
         All forces go with their own sign, an instrument's error with the size of the whole: a force that happens to
         have no part upwards needn't have none in another solver.
         """
-        out = [ERROR * self.observed]
-        for stage in dict.fromkeys(self.stages):
-            mine = np.array([s == stage for s in self.stages])
-            for c in range(len(self.channels)):
-                table = np.zeros(self.observed.shape)
-                table[mine, c] = OWN * self._size[mine, 0]
-                if np.any(table[self.seen]):
-                    out.append(table)
-        return np.stack(out)
+        own = OWN * self._size[..., None] * np.eye(len(self.channels))
+        return np.concatenate([ERROR * self.observed[None], own.transpose(1, 0, 2)])
 
     @property
     def _size(self) -> FloatArray:

@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from splatsoil.benchmarks._newton import Numerics, Run, World, _model, plough
 from splatsoil.benchmarks.independent import judge

@@ -53,12 +53,10 @@ def test_rows_are_means_over_their_frames_in_newtons_of_the_largest(dry: Measure
     assert np.linalg.norm(found.observed[found.seen[:, 0]], axis=1).max() == pytest.approx(100.0)
 
 
-def test_only_stages_count_in_which_the_tool_moves_into_soil(dry: Measurement) -> None:
+def test_only_rows_count_in_which_the_tool_is_pushed(dry: Measurement) -> None:
+    # Pushed from frame 25 to 100.
     found = forces_of(dry)
-    assert [stage for stage, seen in zip(found.stages, found.seen[:, 0], strict=True) if seen] == [
-        "lowering",
-        *["pushing"] * 4,
-    ]
+    assert [frame for frame, seen in zip(found.frames, found.seen[:, 0], strict=True) if seen] == [40, 60, 80, 100]
 
 
 def test_where_nothing_pushes_yet_nothing_counts(dry: Measurement) -> None:
@@ -80,16 +78,14 @@ def test_the_way_is_the_tools_wherever_it_heads(dry: Measurement, turn: float) -
     assert np.allclose(found.observed, forces_of(dry).observed)
 
 
-def test_a_tool_that_is_only_lowered_has_one_instrument(dry: Measurement) -> None:
+def test_a_tool_that_is_only_lowered_tells_nothing(dry: Measurement) -> None:
     motion = dry.tool.motion
     positions = motion.positions.copy()
     positions[:, :2] = positions[0, :2]
     positions[:, 2] = positions[0, 2] - 0.0005 * np.arange(len(positions))
     straight = ToolMotion(motion.frames, motion.times, positions, motion.quaternions)
     force = np.column_stack([np.zeros(LAST), np.zeros(LAST), np.linspace(0.0, 100.0, LAST)])
-    found = forces_of(with_force(replace(dry, tool=replace(dry.tool, motion=straight)), force))
-    assert found.channels == (UP,)
-    assert found.observed[-1, 0] == pytest.approx(100.0)
+    assert ToolForces.of(with_force(replace(dry, tool=replace(dry.tool, motion=straight)), force), ROWS) is None
 
 
 def test_a_rows_variance_is_that_of_its_four_errors(dry: Measurement) -> None:
@@ -101,13 +97,22 @@ def test_a_rows_variance_is_that_of_its_four_errors(dry: Measurement) -> None:
     assert np.allclose(variance, expected[found.seen])
 
 
-def test_errors_of_stages_are_apart_and_the_whole_goes_through_all(dry: Measurement) -> None:
+def test_independent_combinations_have_the_variance_that_is_stated(dry: Measurement) -> None:
+    """Of forces that are off as is said, by draws."""
     found = forces_of(dry)
-    whole, *own = (error[found.seen[:, 0]] for error in found.errors)
-    assert np.all(whole != 0.0)
-    # Lowering and pushing, along and up: no row and instrument is in two of them.
-    assert len(own) == 4
-    assert np.all(np.sum([table != 0.0 for table in own], axis=0) == 1)
+    generator = np.random.default_rng(3)
+    parts, rows = found.errors[:, found.seen], found.sensor[found.seen]
+    drawn = generator.standard_normal((2000, len(parts))) @ parts + rows * generator.standard_normal((2000, len(rows)))
+    white = np.stack([found.independent(dict(zip(found.names, row, strict=True))) for row in drawn])
+    assert np.allclose(np.cov(white.T), np.eye(len(rows)), atol=0.12)
+
+
+def test_residuals_are_named_by_instrument_and_frame(dry: Measurement) -> None:
+    assert dry.tool.force is not None
+    found = forces_of(dry)
+    told = found.residuals(0.9 * dry.tool.force[:, 2:])
+    assert set(told) == {f"{c}, frame {f}" for c in (ALONG, UP) for f in (40, 60, 80, 100)}
+    assert told["force along, frame 100"] == pytest.approx(0.1 * found.observed[4, 0])
 
 
 @pytest.mark.parametrize("frames", [(0, 0), (150, 200), (1, 12)])
@@ -122,5 +127,5 @@ def test_forces_that_end_early_count_as_far_as_they_go(dry: Measurement) -> None
     assert dry.tool.force is not None
     whole = forces_of(dry)
     part = forces_of(with_force(dry, dry.tool.force[:64, 2:]))
-    assert part.seen[:, 0].tolist() == [True] * 3 + [False] * 7
-    assert np.allclose(part.largest * part.observed[:2], whole.largest * whole.observed[:2])
+    assert part.seen[:, 0].tolist() == [False] + [True] * 2 + [False] * 7
+    assert np.allclose(part.largest * part.observed[1:2], whole.largest * whole.observed[1:2])
