@@ -49,7 +49,7 @@ def show(result: Mapping[str, Any], folder: str) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from splatsoil.report.words import duration, model_name, symbol, with_std
+    from splatsoil.report.words import duration, force_sentence, model_name, symbol, with_std
 
     table = Table(title=escape(f"{model_name(result['name'])}"), title_justify="left")
     for column in ("parameter", "estimate", "5 to 95 %"):
@@ -60,6 +60,8 @@ def show(result: Mapping[str, Any], folder: str) -> None:
         table.add_row(escape(name), f"{value} ± {std}{unit}", f"{entry['low']:.4g} to {entry['high']:.4g}{unit}")
     console = Console(highlight=False)
     console.print(table)
+    if result["force"] and result["force"]["counted"]:
+        console.print(force_sentence(result))
     for note in result["notes"]:
         console.print(f"[yellow]note[/yellow] {escape(note)}")
     console.print(

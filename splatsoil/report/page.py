@@ -63,6 +63,7 @@ def render(data: RunData) -> str:
         data=data,
         fit=data.fit,
         coarse=sum(step.get("level") == "coarse" for step in data.fit["history"]),
+        force=words.force_sentence(data.fit),
         answers=words.answers(data.fit),
         residual=words.residual_sentence(comparison, diagnosed=diagnosis is not None),
         ratio=words.ratio_to_noise(comparison),

@@ -68,6 +68,24 @@ def answers(fit: Mapping[str, Any]) -> list[Answer]:
     return out
 
 
+def force_sentence(fit: Mapping[str, Any]) -> str:
+    """What a measured force on the tool did to the estimate; empty where there is none."""
+    force = fit.get("force")
+    if not force:
+        return ""
+    if not force["counted"]:
+        return (
+            "The measured force on the tool isn't counted: it can't be what this model needs where the pictures agree."
+        )
+    alone = []
+    for name, entry in force["pictures_alone"].items():
+        value, std = with_std(entry["estimate"], entry["std"])
+        unit = symbol(fit["parameters"][name]["unit"])
+        said = f"{value} ± {std}{unit}" if entry["determined"] else "anything"
+        alone.append(f"{said} for the {name.replace('_', ' ')}")
+    return f"The measured force on the tool is counted, too; pictures alone say {' and '.join(alone)}."
+
+
 def ratio_to_noise(comparison: Mapping[str, Any] | None) -> float | None:
     """The residual in units of what the cameras' noise alone would leave; None where it isn't known."""
     if comparison is None:

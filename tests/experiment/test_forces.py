@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatsoil.experiment.forces import ALONG, ERROR, OWN, SENSOR, SHAPE, UP, ToolForces
+from splatsoil.experiment.forces import ALONG, ERROR, GROWTH, OWN, SENSOR, SHAPE, UP, ToolForces
 from splatsoil.measurement import Measurement, ToolMotion
 
 ROWS = [[frame, frame + 10] for frame in range(10, 200, 20)]
@@ -88,13 +88,15 @@ def test_a_tool_that_is_only_lowered_tells_nothing(dry: Measurement) -> None:
     assert ToolForces.of(with_force(replace(dry, tool=replace(dry.tool, motion=straight)), force), ROWS) is None
 
 
-def test_a_rows_variance_is_that_of_its_four_errors(dry: Measurement) -> None:
-    """The whole, an instrument's through a stage, a row's own, and the sensor's."""
+def test_a_rows_variance_is_that_of_its_errors(dry: Measurement) -> None:
+    """The whole, its growth (from end to end of four rows), an instrument's, a row's own, and the sensor's."""
     found = forces_of(dry)
+    way = np.array([-1.0, -1.0 / 3.0, 1.0 / 3.0, 1.0])
     variance = (found.sensor**2 + (found.errors**2).sum(axis=0))[found.seen]
     size = np.linalg.norm(found.observed, axis=1, keepdims=True)
     expected = (ERROR * found.observed) ** 2 + (OWN**2 + SHAPE**2) * size**2 + SENSOR**2
-    assert np.allclose(variance, expected[found.seen])
+    growth = GROWTH * way[:, None] * found.observed[found.seen[:, 0]]
+    assert np.allclose(variance, (expected[found.seen[:, 0]] + growth**2).ravel())
 
 
 def test_independent_combinations_have_the_variance_that_is_stated(dry: Measurement) -> None:

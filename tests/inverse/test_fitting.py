@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -12,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from splatsoil.envs.problem import Evaluation
 from splatsoil.inverse import fitting
 from splatsoil.inverse.bayesopt import PAPER, BayesianOptimiser
 from splatsoil.inverse.evaluations import EvaluationRecord, digest
@@ -76,6 +78,33 @@ def test_a_refit_that_knew_more_is_the_estimate(analytic: ModuleType, tmp_path: 
     # the bound cuts the interval and not the spread
     assert result["parameters"]["cohesion"]["low"] == 0.0 and result["parameters"]["cohesion"]["at_bound"] == "lower"
     assert run.fit()["history"], "the search's evaluations are kept beside it"
+
+
+@pytest.mark.parametrize(("force_says", "counted"), [(37.0, True), (80.0, False)])
+def test_a_measured_force_counts_unless_it_cannot_be(
+    analytic: ModuleType, tmp_path: Path, force_says: float, counted: bool
+) -> None:
+    """Beside pictures that say 36 degrees, by features that scatter by one."""
+
+    class Pushed(analytic.AnalyticProblem):  # type: ignore[name-defined, misc]
+        def evaluate(self, parameters: Mapping[str, float], seed: int) -> Evaluation:
+            residuals = {f"force, frame {k}": force_says - parameters["friction_angle"] for k in range(3)}
+            return replace(super().evaluate(parameters, seed), extras=residuals)
+
+        def beside(self, extras: Mapping[str, float]) -> np.ndarray:
+            return np.array([extras[f"force, frame {k}"] for k in range(3)])
+
+    result = fit(Pushed(feature_noise=1.0), analytic.prepare(tmp_path), analytic.SETUP, budget=9)
+    angle, alone = result["parameters"]["friction_angle"], result["force"]["pictures_alone"]["friction_angle"]
+    assert result["force"]["counted"] is counted
+    if counted:
+        # Three numbers, each known to a degree.
+        assert alone["estimate"] < angle["estimate"] < force_says
+        assert angle["std"] < min(alone["std"], 1.0 / np.sqrt(3.0))
+        assert not result["notes"]
+    else:
+        assert angle["estimate"] == alone["estimate"]
+        assert "force" in result["notes"][0]
 
 
 class StopError(Exception):

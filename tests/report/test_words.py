@@ -61,3 +61,15 @@ def test_an_answer_that_is_none_says_so(determined: bool, at_bound: str | None, 
 @pytest.mark.parametrize(("seconds", "text"), [(48.2, "48 s"), (200.0, "3 min 20 s"), (7500.0, "2 h 5 min")])
 def test_durations(seconds: float, text: str) -> None:
     assert words.duration(seconds) == text
+
+
+def test_a_force_that_counts_is_told_with_what_pictures_say_alone() -> None:
+    fit = {"parameters": {"friction_angle": {"unit": "deg"}, "cohesion": {"unit": "Pa"}}, "force": None}
+    assert words.force_sentence(fit) == "" == words.force_sentence({"parameters": {}})
+    alone = {
+        "friction_angle": {"estimate": 38.21, "std": 0.94, "determined": True},
+        "cohesion": {"estimate": 700.0, "std": 433.0, "determined": False},
+    }
+    told = words.force_sentence({**fit, "force": {"counted": True, "pictures_alone": alone}})
+    assert "38.2 ± 0.9° for the friction angle and anything for the cohesion" in told
+    assert "isn't counted" in words.force_sentence({**fit, "force": {"counted": False, "pictures_alone": alone}})
