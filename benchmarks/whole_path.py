@@ -208,7 +208,7 @@ def angle(task: Task) -> list[Row]:
     rows = []
     forces = [run.fit["force"] for run in runs]
     read = {"photographs": [run.fit["parameters"]["friction_angle"] for run in runs]}
-    if all(forces):
+    if all(force and force["counted"] for force in forces):
         read = {
             "photographs and the force on the tool": read["photographs"],
             "photographs alone": [force["pictures_alone"]["friction_angle"] for force in forces],

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 #: Name of the loss that is fitted, part of what identifies an evaluation.
 LOSS = "robust"
+#: Rows that forces are told in: each has an error of its own, however many frames there are.
+FORCE_ROWS = 10
 
 
 class MeasuredProblem:
@@ -121,8 +123,11 @@ class MeasuredProblem:
     def forces(self) -> ToolForces | None:
         """What the force on the tool says, in percent of the largest; their residuals are among the extras."""
         from splatsoil.experiment.forces import ToolForces
+        from splatsoil.experiment.scene_parts import bins_of
 
-        return ToolForces.of(self.model.measurement, [[frame] for frame in self.comparator.frames])
+        frames = self.comparator.frames
+        rows = [[frames[i] for i in group] for group in bins_of(self.model.measurement, frames, FORCE_ROWS)]
+        return ToolForces.of(self.model.measurement, rows)
 
     def beside(self, extras: Mapping[str, float]) -> FloatArray:
         """(k,) residuals of instruments beside the cameras, in independent units of what they may be off."""

@@ -7,14 +7,10 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import chi2
 
-from .emulator import Emulator
+from .emulator import Emulator, slopes_of
 
 FloatArray = npt.NDArray[np.float64]
-
-STEP = 0.01
-"""Half the step of derivatives, of an axis from -1 to 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,10 +45,6 @@ class Beside:
         """χ² (q,) at points (q, n)."""
         return np.sum(self._whitened(points)[0] ** 2, axis=1)
 
-    def agreement(self, point: FloatArray) -> float:
-        """Chance of being as far off at a point (n,) if nothing is wrong."""
-        return float(chi2.sf(self.squares(point[None])[0], self.count))
-
     def log_likelihood(self, points: FloatArray) -> FloatArray:
         """Normal log density (q,) at points (q, n), up to a constant."""
         white, factor = self._whitened(points)
@@ -61,10 +53,8 @@ class Beside:
 
     def slopes(self, point: FloatArray) -> FloatArray:
         """(p, n) derivatives of the whitened prediction at a point (n,)."""
-        steps = STEP * np.eye(len(point))
-        ahead, behind = (self.emulator.predict(point + side * steps)[0] for side in (1.0, -1.0))
         _, factor = self._whitened(point[None])
-        return np.linalg.solve(factor[0], (ahead - behind).T / (2.0 * STEP))
+        return np.linalg.solve(factor[0], slopes_of(self.emulator, point))
 
     def _whitened(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(q, p) observation minus prediction in independent units, and Cholesky factors (q, p, p) of the covariance:

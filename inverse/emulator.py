@@ -28,6 +28,8 @@ DRAWS = 16
 LEAST_SKILL = 0.1
 #: Share of the scores' variance that points left out must be predicted with, or the loss is the better guide.
 TRUSTED_SKILL = 0.6
+#: Half the step of derivatives, of an axis from -1 to 1.
+STEP = 0.01
 #: Fewest training evaluations, beyond one for each parameter.
 FEWEST = 4
 
@@ -204,6 +206,13 @@ class Emulator:
             z[:, k] = error / std
             skill[k] = process.skill()
         return LeftOut(skill, z, float(np.mean(np.abs(z) < 1.6449)))
+
+
+def slopes_of(emulator: Emulator, point: FloatArray) -> FloatArray:
+    """(p, n) derivatives of the mean scores at a point (n,)."""
+    steps = STEP * np.eye(len(point))
+    ahead, behind = (emulator.predict(point + side * steps)[0] for side in (1.0, -1.0))
+    return np.asarray((ahead - behind).T / (2.0 * STEP))
 
 
 def weighed_emulator(

@@ -21,8 +21,11 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
+from scipy.stats import chi2
 
-from .least_squares import closest, of_pictures, score_covariance, slopes
+from .beside import Beside
+from .emulator import slopes_of
+from .least_squares import closest, of_pictures, score_covariance
 from .likelihood import Likelihood
 from .posterior import Data, likelihood_of
 from .surrogate import Minimum, Surrogate
@@ -30,8 +33,12 @@ from .surrogate import Minimum, Surrogate
 FloatArray = npt.NDArray[np.float64]
 
 DENIED = 1e-3
-"""Chance of other instruments' being so far off, below which they aren't counted: something is wrong with them, or
-with the model, that an angle mustn't be bent for."""
+"""Chance of other instruments' being so far from pictures, below which they aren't counted: something is wrong with
+them, or with the model, that an angle mustn't be bent for."""
+FORCE_DENIED = (
+    "The measured force on the tool can't be what this model needs where the pictures agree, so it wasn't counted: its "
+    "unit, sign or zero may be off, or the model lacks an effect."
+)
 UNKNOWN = 1e-3
 """Precision that every parameter has, so that there is an inverse."""
 
@@ -44,8 +51,8 @@ class FeatureFit:
         minimum: the estimate by all instruments that agree.
         source: whether pictures are in it by their features, or by their loss.
         pictures: the estimate by pictures alone; None where there is nothing else.
-        agreement: chance that the other instruments are as far off if nothing is wrong. Where it is below `DENIED` they
-            aren't counted.
+        agreement: chance that the other instruments and pictures are as far from each other if nothing is wrong. Where
+            it is below `DENIED` the others aren't counted.
     """
 
     minimum: Minimum
@@ -85,26 +92,57 @@ def by_features(data: Data, surrogate: Surrogate, fallback: Minimum, *, seed: in
     source: Literal["features", "loss"]
     # Ways that the pictures don't vary in, the other instruments may.
     if emulator.skilled and emulator.count + other.count >= emulator.dimension:
-        source, middle, precision = "features", found, known
+        source, together = "features", _together(found, known, other, data.points, seed)
     else:
-        source, middle, precision = "loss", fallback.estimate, np.diag(fallback.std**-2.0)
+        loss = np.diag(fallback.std**-2.0)
+        source, together = "loss", _together(fallback.estimate, loss, other, data.points, seed)
+    if together.agreement < DENIED:
+        return FeatureFit(minimum, "features" if emulator.trusted else "loss", minimum, together.agreement)
+    joint = fallback.moved(together.estimate, _spread(together.precision), surrogate)
+    return FeatureFit(joint, source, minimum, together.agreement)
+
+
+def agreement(data: Data, *, seed: int = 0) -> float:
+    """Chance that pictures and other instruments are as far from each other as they are if nothing is wrong; 1 where
+    there are no others.
+
+    Raises:
+        RunError: too few evaluations, or they don't differ.
+    """
+    likelihood = likelihood_of(data, seed=seed)
+    if likelihood.beside is None:
+        return 1.0
+    found = closest(of_pictures(likelihood), data.points, seed)
+    return _together(found, _precision(likelihood, found), likelihood.beside, data.points, seed).agreement
+
+
+@dataclass(frozen=True)
+class _Together:
+    """An estimate (n,) by pictures and other instruments, its inverse covariance (n, n), and how well these agree."""
+
+    estimate: FloatArray
+    precision: FloatArray
+    agreement: float
+
+
+def _together(middle: FloatArray, precision: FloatArray, other: Beside, points: FloatArray, seed: int) -> _Together:
+    """From the pictures' estimate (n,) and its inverse covariance (n, n)."""
 
     def squares(where: FloatArray) -> FloatArray:
         off = where - middle
-        return np.einsum("qi,ij,qj->q", off, precision, off) + other.squares(where)
+        return np.asarray(np.einsum("qi,ij,qj->q", off, precision, off) + other.squares(where))
 
-    estimate = closest(squares, data.points, seed)
-    agreement = other.agreement(estimate)
-    if agreement < DENIED:
-        return FeatureFit(minimum, "features" if emulator.trusted else "loss", minimum, agreement)
+    estimate = closest(squares, points, seed)
+    # What pictures don't determine can't contradict anything.
+    freedom = other.count + int(np.linalg.matrix_rank(precision, hermitian=True)) - len(middle)
+    chance = float(chi2.sf(squares(estimate[None])[0], freedom)) if freedom > 0 else 1.0
     slope = other.slopes(estimate)
-    together = fallback.moved(estimate, _spread(precision + slope.T @ slope), surrogate)
-    return FeatureFit(together, source, minimum, agreement)
+    return _Together(estimate, precision + slope.T @ slope, chance)
 
 
 def _precision(likelihood: Likelihood, estimate: FloatArray) -> FloatArray:
     """(n, n) inverse covariance of the least squares' minimiser, the sandwich above."""
-    slope = slopes(likelihood, estimate)
+    slope = slopes_of(likelihood.emulator, estimate)
     bread = slope.T @ slope
     meat = slope.T @ score_covariance(likelihood, estimate) @ slope
     return np.asarray(bread @ np.linalg.pinv(meat, hermitian=True) @ bread)

@@ -21,17 +21,13 @@ from splatsoil.parameters import Parameter, ParameterSpace
 from .bayesopt import PAPER, START, Episode, optimise
 from .campaign import Job, make_record
 from .evaluations import EvaluationRecord, EvaluationStore, digest
-from .feature_fit import FeatureFit, by_features
+from .feature_fit import FORCE_DENIED, FeatureFit, by_features
 from .multifidelity import most_steps, optimise_two_levels
 from .posterior import Data
 from .run_folder import RunFolder
 from .surrogate import FloatArray, Minimum, Surrogate
 
 FORMAT = "splatsoil-fit/1"
-FORCE_DENIED = (
-    "The measured force on the tool can't be what this model needs where the pictures agree, so it wasn't counted: its "
-    "unit, sign or zero may be off, or the model lacks an effect."
-)
 #: Points of the GP's curve kept for the figure.
 CURVE = 201
 

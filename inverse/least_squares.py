@@ -19,8 +19,6 @@ Squares = Callable[[FloatArray], FloatArray]
 CANDIDATES = 1024
 #: How far outside of the evaluations' range the least squares may look, of an axis from -1 to 1.
 BEYOND = 0.1
-#: Half the step of the derivatives, of an axis from -1 to 1.
-STEP = 0.01
 
 
 def closest(squares: Squares, points: FloatArray, seed: int) -> FloatArray:
@@ -46,14 +44,6 @@ def of_pictures(likelihood: Likelihood) -> Squares:
         return np.asarray(np.sum((found - likelihood.scores) ** 2, axis=1))
 
     return squares
-
-
-def slopes(likelihood: Likelihood, estimate: FloatArray) -> FloatArray:
-    """(p, n) derivatives of the pictures' scores."""
-    steps = STEP * np.eye(len(estimate))
-    ahead, _ = likelihood.emulator.predict(estimate + steps)
-    behind, _ = likelihood.emulator.predict(estimate - steps)
-    return np.asarray((ahead - behind).T / (2.0 * STEP))
 
 
 def score_covariance(likelihood: Likelihood, estimate: FloatArray) -> FloatArray:

@@ -17,6 +17,7 @@ from splatsoil.files import plain, write_json
 
 from .campaign import Job, run_campaign
 from .evaluations import EvaluationRecord, digest
+from .feature_fit import DENIED, FORCE_DENIED, agreement
 from .fitting import FitSetup
 from .posterior import Data, Posterior, check_scores, checks, design, repeats, sample_posterior, summarise
 from .posterior_files import write_figures, write_inference_data
@@ -104,12 +105,10 @@ def run_posterior(
             finished += len(jobs)
             return found
 
-        fitting = run.fit()
-        estimate = {name: entry["estimate"] for name, entry in fitting["parameters"].items()}
-        # A force that the fit couldn't believe isn't believed here.
-        pictures_alone = bool(fitting["force"]) and not fitting["force"]["counted"]
+        estimate = {name: entry["estimate"] for name, entry in run.fit()["parameters"].items()}
         records = [*fitted, *evaluate("design", design(space, count, seed))]
         records += evaluate("repeat", repeats(estimate, effort.repeats, seed))
+        pictures_alone = agreement(Data.of(problem, records), seed=seed) < DENIED
         posterior = sample_posterior(
             Data.of(problem, records, pictures_alone=pictures_alone),
             seed=seed,
@@ -128,7 +127,9 @@ def run_posterior(
                 file=run.path / "posterior" / "chains.h5",
                 progress=lambda done, most: report(f"chains, step {done}", 0.95),
             )
-    result: dict[str, Any] = plain(_told(posterior, records, checked, setup, time.perf_counter() - began))
+    result: dict[str, Any] = plain(
+        _told(posterior, records, checked, setup, time.perf_counter() - began, denied=pictures_alone)
+    )
     write_inference_data(posterior, run.path / "posterior" / "posterior.nc")
     result["figures"] = write_figures(posterior, run.path / "posterior")
     write_json(run.path / "posterior.json", result)
@@ -150,9 +151,9 @@ def _judged(
     if not good:
         return []
     # Only blocks that all evaluations see: the same ones for emulator and checks.
-    both = Data.of(problem, [*records, *good])
+    both = Data.of(problem, [*records, *good], pictures_alone=True)
     known = len(both.points) - len(good)
-    data = replace(both, points=both.points[:known], residuals=both.residuals[:known], beside=None)
+    data = replace(both, points=both.points[:known], residuals=both.residuals[:known])
     if data.residuals.shape == posterior.data.residuals.shape:
         judge = posterior
     else:
@@ -169,8 +170,14 @@ def _told(
     checked: list[dict[str, Any]],
     setup: FitSetup,
     seconds: float,
+    *,
+    denied: bool,
 ) -> dict[str, Any]:
     result = summarise(posterior)
+    if denied:
+        result["notes"].append(FORCE_DENIED)
+    elif posterior.data.beside is not None:
+        result["notes"].append("The measured force on the tool counts beside the pictures.")
     failed = sum(r.status == "failed" for r in records)
     if failed:
         result["notes"].append(f"{failed} of {len(records)} simulations failed and were left out.")

@@ -55,9 +55,10 @@ class Floor:
         """(n, q + k) all that is projected out."""
         return np.concatenate([self.nuisance, self.parameters], axis=1)
 
-    def share(self, name: str) -> float:
-        """A part's share of the whole variance."""
-        totals = {key: float(np.sum(part.scale[self.noise.seen] ** 2)) for key, part in self.parts.items()}
+    def share(self, name: str, sites: npt.NDArray[np.bool_]) -> float:
+        """A part's share of the whole variance at some sites (s,), whose features are in one unit."""
+        mine = self.noise.seen & sites[None]
+        totals = {key: float(np.sum(part.scale[mine] ** 2)) for key, part in self.parts.items()}
         return totals[name] / max(sum(totals.values()), 1e-300)
 
 
@@ -89,7 +90,8 @@ def floor_of(experiment: Experiment, evidence: Evidence) -> Floor:
     patterns = list(evidence.numerics.values())
     if patterns:
         known = _total(layout, parts, seen, runs)[0]
-        parts["numerics"] = estimate(layout, _unexplained(known, parameters, patterns, seen), seen)
+        left = _unexplained(known, parameters, patterns, seen, seen & layout.common[None])
+        parts["numerics"] = estimate(layout, left, seen)
     noise, single = _total(layout, parts, seen, runs)
     for name, part in parts.items():
         columns = extra_noise(layout, part, seen, directions if name in ("chance", "guesses") else None)
@@ -124,9 +126,8 @@ def _instruments(experiment: Experiment, evidence: Evidence, known: Noise) -> Pa
         variance = level / size[0] + share / size[1] * signal**2
         # Soil may have moved where none was expected to: that is no fault of the pictures.
         squares = np.minimum(rest**2, OUTLYING**2 * (variance[quiet] + scale**2))
-    # Nothing is told of instruments that have nothing to say where nothing moves.
-    channel = experiment.layout.channel_numbers()
-    variance[:, ~np.isin(channel, channel[quiet.any(axis=0)])] = 0.0
+    # Where nothing moves pictures tell of pictures alone.
+    variance[:, ~experiment.layout.common] = 0.0
     if not np.any(variance > 0.0):
         return Part(scale=np.zeros(signal.shape))
     whole = np.sqrt(variance)
@@ -166,12 +167,16 @@ def _total(layout: Layout, parts: Mapping[str, Part], seen: npt.NDArray[np.bool_
 
 
 def _unexplained(
-    noise: Noise, parameters: FloatArray, patterns: Sequence[FloatArray], seen: npt.NDArray[np.bool_]
+    noise: Noise,
+    parameters: FloatArray,
+    patterns: Sequence[FloatArray],
+    seen: npt.NDArray[np.bool_],
+    common: npt.NDArray[np.bool_],
 ) -> FloatArray:
     """(p, t, s) what each pattern holds beyond the parameters and the other patterns.
 
-    None counts as larger than the middle one of them: one that is, is projected out itself, and says nothing of what
-    numerics that weren't tried would leave.
+    None counts as larger than the middle one of them, in features (t, s) of one unit: one that is, is projected out
+    itself, and says nothing of what numerics that weren't tried would leave.
     """
     columns = _columns(patterns, seen)
     out = []
@@ -182,7 +187,7 @@ def _unexplained(
         amplitude, *_ = np.linalg.lstsq(scaled / size, columns[:, k] / noise.scale, rcond=1e-3)
         out.append(noise.spread(columns[:, k] - others @ (amplitude / size)))
     left = np.stack(out)
-    size = np.sqrt(np.mean(left[:, seen] ** 2, axis=1))
+    size = np.sqrt(np.mean(left[:, common] ** 2, axis=1))
     return left * np.minimum(1.0, np.median(size) / np.maximum(size, 1e-300))[:, None, None]
 
 

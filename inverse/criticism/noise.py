@@ -34,6 +34,8 @@ REACH = 0.6
 """Width of the local mean of variances, in spacings of sites: disturbed soil has sharp edges."""
 FEWEST_FREEDOM = 8.0
 """Least degrees of freedom of a part's variance: few samples scatter too little or too much by chance."""
+STILL = 1e-4
+"""Share of the largest standard deviation below which a feature isn't changed at all."""
 FARTHEST = 500.0
 """Distance over a correlation's length at which nothing is left of it."""
 RIDGE = 1e-6
@@ -131,6 +133,9 @@ def _calibrated(
     weighs more than one that is too large, and a sample cannot show that of scales it has made itself.
     """
     across, count = part.across(layout), len(samples)
+    alive = _alive(part, seen)
+    directions, free = (None if columns is None else columns[alive[seen]] for columns in (directions, free))
+    seen = alive
     waves = smooth_waves(layout, seen)
     on_waves, along = [], []
     for k in range(count):
@@ -163,16 +168,26 @@ def extra_noise(layout: Layout, part: Part, seen: BoolArray, directions: FloatAr
 
     Everywhere else the part's own stays as it is.
     """
-    nothing = np.zeros((int(seen.sum()), 0))
     if not np.any(part.scale[seen]):
-        return nothing
-    noise = Noise.of(layout, [(1.0, part)], seen)
+        return np.zeros((int(seen.sum()), 0))
+    alive = _alive(part, seen)
+    noise = Noise.of(layout, [(1.0, part)], alive)
     solver = noise.solver()
-    chosen = orthonormal(solver.whiten(nothing if directions is None else directions))
-    waves = solver.whiten(smooth_waves(layout, seen) * noise.scale[:, None])
+    nothing = np.zeros((int(alive.sum()), 0))
+    chosen = orthonormal(solver.whiten(nothing if directions is None else directions[alive[seen]]))
+    waves = solver.whiten(smooth_waves(layout, alive) * noise.scale[:, None])
     waves = orthonormal(waves - chosen @ (chosen.T @ waves))
     parts = [math.sqrt(part.on_directions - 1.0) * chosen, math.sqrt(part.on_waves - 1.0) * waves]
-    return np.tril(solver.factor[0]) @ np.concatenate(parts, axis=1)
+    columns = np.tril(solver.factor[0]) @ np.concatenate(parts, axis=1)
+    out = np.zeros((int(seen.sum()), columns.shape[1]))
+    out[alive[seen]] = columns
+    return out
+
+
+def _alive(part: Part, seen: BoolArray) -> BoolArray:
+    """(t, s) features that a part changes: other guesses of colours leave forces as they are, and what acts on these
+    would hide all that acts on pictures."""
+    return seen & (part.scale > STILL * float(part.scale[seen].max()))
 
 
 def orthonormal(columns: FloatArray) -> FloatArray:
@@ -340,7 +355,8 @@ class Noise:
         ridge = RIDGE * float(np.mean(np.diag(total)))
         total[np.diag_indices_from(total)] += ridge
         # Welch (1947) and Satterthwaite: a sum of variances, each known with its own degrees of freedom.
-        variances = np.array([factor * float(np.mean(part.scale[seen] ** 2)) for factor, part in parts])
+        one_unit = seen & layout.common[None]
+        variances = np.array([factor * float(np.mean(part.scale[one_unit] ** 2)) for factor, part in parts])
         doubt = float(np.sum(variances**2 / np.array([part.freedom for _, part in parts])))
         freedom = float(variances.sum()) ** 2 / doubt if doubt > 0.0 else math.inf
         return cls(total, seen, freedom)

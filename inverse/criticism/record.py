@@ -45,7 +45,7 @@ def record(experiment: Experiment, diagnosis: Diagnosis) -> dict[str, Any]:
             {"stage": s, "region": r, "channel": c, "share": v}
             for (s, r, c), v in sorted(diagnosis.where.items(), key=lambda item: -item[1])
         ],
-        "floor": {name: diagnosis.floor.share(name) for name in diagnosis.floor.parts},
+        "floor": {name: diagnosis.floor.share(name, layout.common) for name in diagnosis.floor.parts},
         "calibration": _calibration(experiment, diagnosis.evidence.calibration),
         "unit": layout.unit,
         "time_name": layout.time_name,

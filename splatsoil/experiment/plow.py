@@ -15,7 +15,7 @@ from splatsoil.comparison import PATCH, Block, Comparator
 from splatsoil.experiment.base import Calibration, Candidate, candidates_of
 from splatsoil.experiment.features import Layout, Site
 from splatsoil.experiment.forces import REGION, UNIT, ToolForces
-from splatsoil.experiment.scene_parts import QUIET, regions_of, stages_of
+from splatsoil.experiment.scene_parts import QUIET, bins_of, regions_of, stages_of
 from splatsoil.experiment.states import States, plow_states
 from splatsoil.experiment.strokes import Predict, plow_strokes
 from splatsoil.model import Model, Prediction
@@ -99,7 +99,7 @@ class PlowExperiment:
             patch=max(PATCH, math.sqrt(area / MOST_FEATURES)),
         )
         self._kept: tuple[object, Trajectory] | None = None
-        self._bins = self._frame_bins()
+        self._bins = bins_of(model.measurement, self.comparator.frames, MOST_ROWS)
         rows_of_frames = [[self.comparator.frames[i] for i in group] for group in self._bins]
         self.forces = ToolForces.of(model.measurement, rows_of_frames)
 
@@ -130,11 +130,10 @@ class PlowExperiment:
         frames = (self.comparator.reference, *self.comparator.frames)
         return self._table(self.comparator.compare({(c, f): still[c] for c in still for f in frames}).blocks)
 
-    def _beside(self, pictured: FloatArray, forces: npt.ArrayLike | None) -> FloatArray:
-        """Columns of cameras, and of forces where there are any: a table (t, c), or one number for all of it."""
-        if forces is None or self.forces is None:
-            return pictured
-        return np.concatenate([pictured, np.broadcast_to(forces, self.forces.observed.shape)], axis=1)
+    @staticmethod
+    def _beside(pictured: FloatArray, forces: FloatArray | None) -> FloatArray:
+        """Columns of cameras, and of forces (t, c) where there are any."""
+        return pictured if forces is None else np.concatenate([pictured, forces], axis=1)
 
     @cached_property
     def quiet(self) -> npt.NDArray[np.bool_]:
@@ -145,7 +144,7 @@ class PlowExperiment:
     def seen(self) -> npt.NDArray[np.bool_]:
         """(t, s) False where the tool hides most of a patch, or forces don't count."""
         shares = self._table(self.comparator.open_shares())
-        return self._beside(shares, None if self.forces is None else self.forces.seen) > 0.5
+        return self._beside(shares, None if self.forces is None else self.forces.seen.astype(float)) > 0.5
 
     @cached_property
     def sensor(self) -> FloatArray:
@@ -164,7 +163,7 @@ class PlowExperiment:
 
     @cached_property
     def systematic(self) -> FloatArray:
-        """(k, t, s) what simulated forces get wrong of each instrument through a whole stage."""
+        """(k, t, s) what simulated forces get wrong together; see :class:`~splatsoil.experiment.forces.ToolForces`."""
         if self.forces is None:
             return np.zeros((0, *self.layout.shape))
         pictured = np.zeros(self._pictured.shape)
@@ -245,19 +244,6 @@ class PlowExperiment:
         """The blocks that one camera sees, in order."""
         first = self.comparator.frames[0]
         return [label for label in self.comparator.labels if label.camera == camera and label.frame == first]
-
-    def _frame_bins(self) -> list[list[int]]:
-        """Neighbouring compared frames (as indices) of one stage, few enough bins for ``MOST_ROWS``."""
-        frames = [float(f) for f in self.comparator.frames]
-        stages = stages_of(self.base.measurement, frames)
-        size = math.ceil(len(frames) / MOST_ROWS)
-        bins: list[list[int]] = []
-        for i, stage in enumerate(stages):
-            if bins and len(bins[-1]) < size and stages[bins[-1][-1]] == stage:
-                bins[-1].append(i)
-            else:
-                bins.append([i])
-        return bins
 
     def _table(self, values: FloatArray) -> FloatArray:
         """(b,) values of blocks, as the comparator orders them, to (t, s)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -50,10 +51,26 @@ def stages_of(measurement: Measurement, frames: Sequence[float]) -> tuple[str, .
     return tuple(out)
 
 
+def bins_of(measurement: Measurement, frames: Sequence[int], most: int) -> list[list[int]]:
+    """Neighbouring compared frames (as indices) of one stage, few enough together for about ``most`` rows."""
+    stages = stages_of(measurement, [float(f) for f in frames])
+    size = math.ceil(len(frames) / most)
+    bins: list[list[int]] = []
+    for i, stage in enumerate(stages):
+        if bins and len(bins[-1]) < size and stages[bins[-1][-1]] == stage:
+            bins[-1].append(i)
+        else:
+            bins.append([i])
+    return bins
+
+
 def heading_of(measurement: Measurement) -> FloatArray:
-    """(2,) unit vector along which the tool is first pushed; 0 where it never is."""
-    level = np.diff(measurement.tool.motion.positions, axis=0)[:, :2]
-    length = np.linalg.norm(level, axis=1)
+    """(2,) unit vector along which the tool is first pushed, in the lower half of its way; 0 where it never is."""
+    positions = measurement.tool.motion.positions
+    level, height = np.diff(positions, axis=0)[:, :2], positions[:, 2]
+    # Carried through the air it isn't pushed.
+    low = 0.5 * (height[1:] + height[:-1]) <= 0.5 * (height.min() + height.max()) + 1e-9
+    length = np.where(low, np.linalg.norm(level, axis=1), 0.0)
     if not length.max(initial=0.0) > 0.0:
         return np.zeros(2)
     first = int(np.argmax(length > 0.5 * length.max()))

@@ -34,7 +34,7 @@ def remarks(measurement: Measurement) -> tuple[Remark, ...]:
         out.append(Remark("bed" if field.startswith("bed") else "tool", f"{field} is not given; {value:g} is taken."))
     out += [Remark("views", text) for text in _on_views(measurement)]
     out += [Remark("video", text) for text in _on_video(measurement)]
-    out += [Remark("tool", text) for text in _on_tool(measurement)]
+    out += [Remark("tool", text) for text in (*_on_tool(measurement), *_on_force(measurement))]
     return tuple(out)
 
 
@@ -126,6 +126,27 @@ def _on_tool(measurement: Measurement) -> list[str]:
     if gaps.size:
         first = int(tool.motion.frames[gaps[0]]) + 1
         out.append(f"The motion skips frames (first {first}); the pose is interpolated there.")
+    return out
+
+
+def _on_force(measurement: Measurement) -> list[str]:
+    force, motion = measurement.tool.force, measurement.tool.motion
+    if force is None:
+        return []
+    out = []
+    off = np.abs(force[:, 1] - force[:, 0] / measurement.frame_rate) > 0.5 / measurement.frame_rate
+    if off.any():
+        first = int(np.argmax(off))
+        out.append(
+            f"{int(off.sum())} rows of the tool's force are not where {measurement.frame_rate:g} frames a second (tool"
+            f" clock) put them, first frame {force[first, 0]:g} at {force[first, 1]:g} s; frames are what counts."
+        )
+    speed = np.linalg.norm(np.diff(motion.positions, axis=0), axis=1)
+    moving = motion.frames[1:][speed > 0.1 * speed.max(initial=0.0)]
+    if not np.isin(moving, force[:, 0]).any():
+        out.append("The tool's force was measured in no frame in which the tool moves; it tells nothing.")
+    elif not np.abs(force[:, 2:]).max() > 0.0:
+        out.append("The tool's force is 0 throughout; it tells nothing.")
     return out
 
 

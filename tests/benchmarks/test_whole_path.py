@@ -98,7 +98,11 @@ def test_what_fits_miss_is_seen(
         estimates: tuple[float, ...], seconds: float, memory: int, pictures: float | None = None
     ) -> list[bool | None]:
         told = [{"friction_angle": {"estimate": e, "std": 0.5}} for e in estimates]
-        alone = None if pictures is None else {"pictures_alone": {"friction_angle": {"estimate": pictures, "std": 1.0}}}
+        alone = (
+            None
+            if pictures is None
+            else {"counted": True, "pictures_alone": {"friction_angle": {"estimate": pictures, "std": 1.0}}}
+        )
         found = iter({"parameters": one, "force": alone} for one in told)
         monkeypatch.setattr(whole_path, "_fitted", lambda *words: whole_path.Run(next(found), seconds, memory))
         return [row.met for row in whole_path.angle(tiny(plow_dry, plow_damp, tmp_path))]

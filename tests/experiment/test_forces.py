@@ -59,6 +59,25 @@ def test_only_rows_count_in_which_the_tool_is_pushed(dry: Measurement) -> None:
     assert [frame for frame, seen in zip(found.frames, found.seen[:, 0], strict=True) if seen] == [40, 60, 80, 100]
 
 
+def test_a_way_through_the_air_is_no_push(dry: Measurement) -> None:
+    """Carried to its place first, sideways and high above the bed, faster than it is pushed."""
+    motion = dry.tool.motion
+    away = np.arange(40)
+    start = motion.positions[0] + np.array([0.0, -0.005, 0.0]) * (40 - away)[:, None]
+    positions = np.concatenate([start, motion.positions])
+    frames = np.arange(len(positions))
+    carried = ToolMotion(
+        frames, frames / dry.frame_rate, positions, np.concatenate([motion.quaternions[:40], motion.quaternions])
+    )
+    assert dry.tool.force is not None
+    force = np.concatenate([np.zeros((40, 3)), dry.tool.force[:, 2:]])
+    later = replace(dry, tool=replace(dry.tool, motion=carried))
+    found = forces_of(with_force(later, force), [[a + 40, b + 40] for a, b in ROWS])
+    whole = forces_of(dry)
+    assert found.seen.tolist() == whole.seen.tolist()
+    assert np.allclose(found.observed[found.seen], whole.observed[whole.seen])
+
+
 def test_where_nothing_pushes_yet_nothing_counts(dry: Measurement) -> None:
     force = np.zeros((LAST, 3))
     force[60:100, 0] = -50.0

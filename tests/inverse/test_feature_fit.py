@@ -6,6 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import kstest
+from splatsoil.inverse import feature_fit
+from splatsoil.inverse.beside import Beside
 from splatsoil.inverse.feature_fit import FeatureFit, by_features
 from splatsoil.inverse.posterior import Data, likelihood_of
 from splatsoil.inverse.surrogate import Surrogate
@@ -145,6 +148,20 @@ def test_pictures_that_see_all_are_hardly_bent_by_a_force_that_knows_less(surrog
     assert told is not None and told.pictures is not None
     assert abs(told.minimum.estimate[0] - 0.35) < 3.0 * told.pictures.std[0]
     assert told.minimum.std[0] <= told.pictures.std[0] * 1.001
+
+
+def test_agreement_is_a_chance() -> None:
+    """Of worlds in which nothing is wrong, as many lie below a chance as it says."""
+    chances = []
+    for seed in range(60):
+        generator = np.random.default_rng([seed, 12])
+        middle, other = 0.1 * generator.normal(), 0.1 * generator.normal()
+        beside = Beside.of(POINTS, 10.0 * (other - POINTS), seed=seed)
+        assert beside is not None
+        together = feature_fit._together(np.array([middle]), np.array([[100.0]]), beside, POINTS, seed)
+        assert together.estimate[0] == pytest.approx(0.5 * (middle + other), abs=0.02)
+        chances.append(together.agreement)
+    assert kstest(chances, "uniform").pvalue > 0.01
 
 
 def test_a_force_in_another_unit_is_not_counted() -> None:

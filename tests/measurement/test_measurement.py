@@ -223,3 +223,20 @@ def test_remarks_on_the_tools_motion(small_set: Path) -> None:
     assert "never moves" in said(still)
     jump = [row.replace(",0.2,", ",0.4,", 1) if i == 20 else row for i, row in enumerate(rows)]
     assert "jumps by 200 mm before frame 20" in said(jump)
+
+
+def test_remarks_on_the_tools_force(small_set: Path) -> None:
+    file = small_set / "tool_force.csv"
+
+    def said(rows: list[str]) -> str:
+        file.write_text("\n".join(["frame,time,fx,fy,fz", *rows]))
+        description = json.loads((small_set / "experiment.json").read_text())
+        description["tool"]["force"] = file.name
+        (small_set / "experiment.json").write_text(json.dumps(description))
+        return " ".join(remark.text for remark in remarks(Measurement.load(small_set)) if remark.about == "tool")
+
+    rate = Measurement.load(small_set).frame_rate
+    assert said([f"{k},{k / rate},-5,0,3" for k in range(1, 30)]) == ""
+    assert "0 throughout" in said([f"{k},{k / rate},0,0,0" for k in range(1, 30)])
+    assert "in no frame in which the tool moves" in said([f"{k},{k / rate},-5,0,3" for k in range(5000, 5003)])
+    assert "29 rows of the tool's force" in said([f"{k},{10.0 + k / rate},-5,0,3" for k in range(1, 30)])

@@ -174,3 +174,35 @@ def test_an_instrument_that_never_changes_has_no_noise_and_changes_no_other() ->
     part, alone = estimate(MIXED, samples, np.ones(MIXED.shape, dtype=bool)), estimate(LAYOUT, samples[..., :32], SEEN)
     assert np.all(part.scale[:, 32:] < 1e-4)
     assert np.allclose(part.scale[:, :32], alone.scale, rtol=0.02)
+
+
+def test_guesses_that_leave_an_instrument_alone_are_as_noisy_in_the_others() -> None:
+    """Directions act on the force, too, by much; guesses of colours don't."""
+    generator = np.random.default_rng(5)
+    seen = np.ones(MIXED.shape, dtype=bool)
+    waves = np.linspace(0.3, 1.3, LAYOUT.shape[0])[:, None] * np.sin(np.arange(LAYOUT.shape[1]))[None]
+    directions = np.stack([waves, np.roll(waves, 3, axis=1)])
+    samples = draw(TRUE, 6, 4) + np.tensordot(3.0 * generator.standard_normal((6, 2)), directions, axes=1)
+    alone = estimate(LAYOUT, samples, SEEN, directions[:, SEEN].T)
+    forces = np.full((2, LAYOUT.shape[0], 2), 9.0)
+    wide = np.concatenate([directions, forces], axis=2)[:, seen].T
+    still = np.concatenate([samples, np.zeros((6, LAYOUT.shape[0], 2))], axis=2)
+    beside = estimate(MIXED, still, seen, wide)
+    assert alone.on_directions > 2.0
+    assert beside.on_directions == pytest.approx(alone.on_directions, rel=0.1)
+    extra = extra_noise(MIXED, beside, seen, wide)
+    pictures = np.broadcast_to(MIXED.placed, MIXED.shape)[seen]
+    assert np.all(extra[~pictures] == 0.0)
+    first = directions[0][SEEN] / np.linalg.norm(directions[0])
+    more = [
+        np.sum((first @ e) ** 2) for e in (extra_noise(LAYOUT, alone, SEEN, directions[:, SEEN].T), extra[pictures])
+    ]
+    assert more[1] == pytest.approx(more[0], rel=0.15)
+
+
+def test_degrees_of_freedom_are_those_of_features_in_one_unit() -> None:
+    """A noise that is known well of a force, in numbers a hundred times as large, makes none of pictures known."""
+    small = replace(TRUE, scale=np.ones(MIXED.shape), freedom=8.0, between=None)
+    large = independent(np.broadcast_to(np.where(MIXED.placed, 0.01, 100.0), MIXED.shape).copy())
+    noise = Noise.of(MIXED, [(1.0, small), (1.0, large)], np.ones(MIXED.shape, dtype=bool))
+    assert noise.freedom == pytest.approx(8.0, rel=0.01)
