@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import shutil
 from pathlib import Path
 
 import gymnasium as gym
@@ -50,6 +51,31 @@ def test_a_step_is_a_simulation_compared_with_the_video(small_set: Path, reconst
     twin = pickle.loads(pickle.dumps(made.unwrapped.problem))  # type: ignore[attr-defined]
     seed = made.unwrapped.simulation_seed(0)  # type: ignore[attr-defined]
     assert twin.evaluate({"friction_angle": 35.0}, seed).loss == pytest.approx(-reward, rel=1e-12)
+
+
+@pytest.mark.slow
+def test_what_is_left_of_a_measured_force_is_told(plow_dry: Path, reconstruction: Path, tmp_path: Path) -> None:
+    """The example's own force, and one that is larger by half of it everywhere: what is left is as much larger."""
+    folder = Path(shutil.copytree(plow_dry, tmp_path / "set", copy_function=shutil.copyfile))
+    folder.chmod(0o755)
+    head, *rows = (plow_dry / "tool_force.csv").read_text().splitlines()
+    table = np.array([[float(v) for v in row.split(",")] for row in rows])
+    residuals = []
+    for factor in (1.0, 1.5):
+        scaled = table * np.array([1.0, 1.0, factor, factor, factor])
+        (folder / "tool_force.csv").write_text(
+            "\n".join([head, *(f"{int(row[0])}," + ",".join(map(str, row[1:])) for row in scaled)])
+        )
+        problem = MeasuredProblem.load(folder, preset="tiny", reconstruction=reconstruction)
+        assert problem.forces is not None
+        extras = problem.evaluate({"friction_angle": 36.0}, 0).extras
+        assert set(problem.forces.names) < set(extras)
+        assert problem.beside(extras).shape == (len(problem.forces.names),)
+        newtons = 0.01 * problem.forces.largest
+        residuals.append(newtons * np.array([extras[name] for name in problem.forces.names]))
+        measured = newtons * problem.forces.observed[problem.forces.seen]
+    assert residuals[1] - residuals[0] == pytest.approx(measured / 3.0, rel=1e-6)
+    assert np.abs(residuals[0]).max() < 0.6 * np.abs(measured).max()
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from splatsoil.benchmarks.hidden_effects import detectable, emulated, fitted
 from splatsoil.inverse.criticism.diagnosis import Diagnosis, Options, diagnose
+from splatsoil.inverse.criticism.record import record
 
 from splatsoil.experiment.emulated import EmulatedExperiment, FloatArray
 from splatsoil.experiment.features import Layout, Site
+from splatsoil.report import figures
 
 NAME = "effect 2"
 ERROR = 0.15
@@ -64,11 +66,16 @@ def weighed(made: EmulatedExperiment, share: float = 0.2) -> EmulatedExperiment:
     )
 
 
-def judged(experiment: EmulatedExperiment, truth: dict[str, float], world: int, off: float) -> Diagnosis:
-    """Diagnosis of a truth whose force is measured off by a share."""
+def measured(experiment: EmulatedExperiment, truth: dict[str, float], world: int, off: float) -> EmulatedExperiment:
+    """The world of a truth whose force is measured off by a share."""
     observed = experiment.measured(truth, [world, 99])
     observed[:, ~experiment.layout.placed] *= 1.0 + off
-    seen = replace(experiment, observed=observed)
+    return replace(experiment, observed=observed)
+
+
+def judged(experiment: EmulatedExperiment, truth: dict[str, float], world: int, off: float) -> Diagnosis:
+    """Diagnosis of it."""
+    seen = measured(experiment, truth, world, off)
     return diagnose(seen, {"angle": fitted(seen)})
 
 
@@ -100,3 +107,19 @@ def test_the_error_on_hidden_frames_is_that_of_pictures() -> None:
     found = judged(replace(weighed(emulated(1), 0.02), systematic=np.zeros((0, 12, 33))), {"angle": 0.0}, 1, 3.0)
     assert found.verdict != "adequate"
     assert found.confirmations[""].held_out < 15.0
+
+
+def test_a_record_draws_forces_as_curves_and_pictures_on_the_plan() -> None:
+    made = measured(weighed(emulated(1), 0.02), {"angle": 0.0}, 1, 1.5 * ERROR)
+    told = record(made, diagnose(made, {"angle": fitted(made)}))
+    (curve,) = told["curves"]
+    ramp = np.linspace(40.0, 100.0, made.layout.shape[0])
+    assert curve["channel"] == "force" and curve["unit"] == "%"
+    assert curve["measured"] == pytest.approx((1.0 + 1.5 * ERROR) * ramp, rel=0.1)
+    assert curve["predicted"]["before"] == pytest.approx(ramp, rel=0.15)
+    # What it may be off as a whole is in its bars.
+    assert np.all(np.array(curve["std"]) > 0.9 * ERROR * ramp)
+    places = [site[1:] for site in told["sites"]]
+    assert places[-1] == [None, None] and None not in places[0]
+    assert "force" in figures.curves(told)
+    assert ">force<" not in figures.plan_maps(told, "before")
