@@ -17,6 +17,7 @@ from splatsoil.envs.together import attempt, evaluate_together
 
 from splatsoil.errors import RunError
 from splatsoil.parameters import Parameter, ParameterSpace
+from splatsoil.threads import one_thread
 
 from .bayesopt import PAPER, START, Episode, optimise
 from .campaign import Job, make_record
@@ -181,6 +182,7 @@ def _from_record(record: EvaluationRecord) -> Evaluation:
     )
 
 
+@one_thread()
 def fit(
     problem: Problem,
     run: RunFolder,

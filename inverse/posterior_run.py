@@ -14,6 +14,7 @@ from splatsoil.envs.problem import Problem
 
 from splatsoil.errors import RunError
 from splatsoil.files import plain, write_json
+from splatsoil.threads import one_thread
 
 from .campaign import Job, run_campaign
 from .evaluations import EvaluationRecord, digest
@@ -51,6 +52,7 @@ def setup_of(described: Mapping[str, Any]) -> FitSetup:
     return FitSetup(**known)
 
 
+@one_thread()
 def run_posterior(
     problem: Problem,
     run: RunFolder,

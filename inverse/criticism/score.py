@@ -6,7 +6,9 @@ spread as low-rank noise, which projects them out) and G the derivatives of the 
     U = GᵀΣ⁻¹r,   I = GᵀΣ⁻¹G,   estimate I⁻¹U,   LM = UᵀI⁻¹U
 
 LM is the fall of χ² that switching the effect on would bring if the model were linear (Rao 1948; Breusch & Pagan 1980).
-The other effects may be there in sizes too small to matter, and what stands along them widens the scores: `joint`.
+Whether an effect is exactly absent is nobody's question: what is tested is that it is there in sizes too small to
+matter at most (Hodges & Lehmann 1954, J. R. Stat. Soc. B 16:261), by the fall of χ² beyond what such sizes bring. The
+others may be there in such sizes, too, and what stands along them widens the scores: `joint`.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.optimize import lsq_linear
 from scipy.stats import chi2, f, norm
 from scipy.stats import t as student
 
@@ -41,8 +44,8 @@ class Score:
         name: the effect's.
         statistic: LM, the predicted fall of χ²; 0 where the estimate has the wrong sign.
         z: the size's estimate in units of its standard deviation; for an effect with several parameters the normal
-            quantile of its p-value, with the sign of the size.
-        p: chance of so large a statistic without the effect.
+            quantile of the chance of so large a statistic without it, with the sign of the size.
+        p: chance of so large a fall beyond that of trivial sizes, if the effect is there in such a size.
         adjusted: chance that any effect of the library reaches so small a p.
         estimate: of the size, as its distance from off, in the parameter's unit.
         std: of that.
@@ -188,25 +191,27 @@ class Scorer:
             np.diag(information) <= SEEN_AT_ALL * np.maximum(whole, 1e-300)
         ):
             # Nothing of it is seen: an estimate of nothing, known to nothing.
-            return _Raw(0.0, 0.0, np.zeros(len(own)), math.inf, 0.0)
+            return _Raw(0.0, 0.0, 0.0, np.zeros(len(own)), math.inf, 0.0)
         scores = own @ gradient
         statistic, estimate = constrained(scores, information, place, candidate.measure.sign)
+        most = self.joint.trivial[self.joint.parts[index]]
+        trivial = fall_within(scores, information, most, place, candidate.measure.sign)
         std = math.sqrt(max(float(np.linalg.pinv(information, hermitian=True)[place, place]), 0.0)) or math.inf
         ratio = float(scores[0]) / math.sqrt(float(information[0, 0])) if len(scores) == 1 else math.nan
         survival = float(1.0 / (std**2 * whole[place])) if whole[place] > 0.0 and math.isfinite(std) else 0.0
-        return _Raw(statistic, ratio, estimate, std, min(survival, 1.0))
+        return _Raw(statistic, max(statistic - trivial, 0.0), ratio, estimate, std, min(survival, 1.0))
 
     def _score(self, index: int, raw: _Raw, scale: float, freedom: float) -> Score:
         candidate, place = self.candidates[index], self.places[index]
         sign, count = candidate.measure.sign, len(self.candidates)
-        p = float(tail(raw.statistic, len(candidate.parameters), sign, scale, freedom))
+        p, seen = (float(tail(s, len(candidate.parameters), sign, scale, freedom)) for s in (raw.beyond, raw.statistic))
         share = float(np.mean(self.smallest <= p))
         # Beyond what the draws resolve, Bonferroni's bound.
         adjusted = share if share > 20.0 / DRAWS else min(count * p, 1.0)
         sided = student.isf(self.level / count if sign else 0.5 * self.level / count, freedom)
         z = raw.ratio / math.sqrt(scale)
         if math.isnan(z):
-            z = math.copysign(float(norm.isf(max(0.5 * p, 1e-300))), float(raw.estimate[place]) or 1.0)
+            z = math.copysign(float(norm.isf(max(0.5 * seen, 1e-300))), float(raw.estimate[place]) or 1.0)
         std = raw.std * math.sqrt(scale)
         return Score(
             name=candidate.name,
@@ -216,7 +221,7 @@ class Scorer:
             adjusted=adjusted,
             estimate=float(raw.estimate[place]),
             std=std,
-            detectable=float(sided + norm.ppf(POWER)) * std,
+            detectable=candidate.measure.meaningful + float(sided + norm.ppf(POWER)) * std,
             survival=raw.survival,
             steps={q.name: float(v) for q, v in zip(candidate.parameters, raw.estimate, strict=True)},
             dispersion=scale,
@@ -225,9 +230,11 @@ class Scorer:
 
 @dataclass(frozen=True)
 class _Raw:
-    """One candidate's LM, single parameter's score over its spread (NaN for several), estimate, std and survival."""
+    """One candidate's LM, what of it is beyond trivial sizes, a single parameter's score over its spread (NaN for
+    several), estimate, std and survival."""
 
     statistic: float
+    beyond: float
     ratio: float
     estimate: FloatArray
     std: float
@@ -249,6 +256,23 @@ def constrained(gradient: FloatArray, information: FloatArray, place: int, sign:
             estimate[rest] = np.linalg.pinv(information[np.ix_(rest, rest)]) @ gradient[rest]
         return float(gradient @ estimate), estimate
     return float(gradient @ estimate), estimate
+
+
+def fall_within(gradient: FloatArray, information: FloatArray, most: FloatArray, place: int, sign: int) -> float:
+    """Largest fall of χ² by parameters (k,) no larger than ``most`` (k,), the one at ``place`` on its side of off.
+
+    The fall 2 Uᵀθ − θᵀIθ is one of least squares, here in bounds.
+    """
+    free = np.flatnonzero(most > 0.0)
+    if not free.size:
+        return 0.0
+    values, vectors = np.linalg.eigh(information[np.ix_(free, free)])
+    size = np.sqrt(np.maximum(values, SEEN_AT_ALL * values[-1]))
+    target = (vectors.T @ gradient[free]) / size
+    low, high = -most[free], most[free].copy()
+    if sign:
+        (high if sign < 0 else low)[free == place] = 0.0
+    return float(target @ target - 2.0 * lsq_linear(size[:, None] * vectors.T, target, bounds=(low, high)).cost)
 
 
 def tail(statistic: float | FloatArray, count: int, sign: int, scale: float | FloatArray, freedom: float) -> FloatArray:

@@ -25,6 +25,8 @@ EQUIVALENT = 6.0
 RELEVANT = 0.1
 """Share of the squared error on times that a refit hasn't seen which an effect must take away where slow waves show
 no misfit."""
+DENIES, SEEN = 1.645, 1.960
+"""Standard deviations within which an effect's size lies with 95 % to one side, and to both."""
 LEAST_SURVIVAL = 0.05
 """Share of an effect's information that must survive the projection of everything else."""
 ENOUGH = 0.8
@@ -36,12 +38,16 @@ lets one in five pass that imitate what the library lacks."""
 
 
 def of_effect(candidate: Candidate, score: Score, *, level: float = LEVEL) -> EffectVerdict:
-    """Verdict on one effect that is off."""
+    """Verdict on one effect that is off.
+
+    Absent or trivial, unseen or seen, is one whose estimate denies that it matters (Schuirmann 1987, J. Pharmacokinet.
+    Biopharm. 15:657).
+    """
     meaningful = candidate.measure.meaningful
     if score.adjusted < level:
         return "missing" if abs(score.estimate) >= meaningful else "trivial"
-    if score.detectable <= meaningful and score.survival >= LEAST_SURVIVAL:
-        return "absent"
+    if abs(score.estimate) + DENIES * score.std <= meaningful and score.survival >= LEAST_SURVIVAL:
+        return "trivial" if abs(score.z) > SEEN else "absent"
     return "cannot tell"
 
 

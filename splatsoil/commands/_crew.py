@@ -32,33 +32,29 @@ def crew(folder: RunFolder, model: Model, effects: Iterable[str], simulate: Simu
         effects: the candidates, as `experiment_of` takes them; none for all.
         simulate: what is helped.
     """
-    import torch
-
     from splatsoil.envs.devices import cores
     from splatsoil.inverse.criticism.simulations import Helpers
     from splatsoil.inverse.executors import Processes
+    from splatsoil.threads import one_thread
 
     room = _memory(model.device) / SHARE[model.device.split(":")[0]]
     count, named = int(min(cores(), 1 + MOST_HELPERS, room)) - 1, tuple(effects)
-    threads, workers = torch.get_num_threads(), Processes(count) if count > 0 else None
-    torch.set_num_threads(1)
-    try:
-        if workers is None:
+    with one_thread():
+        if count < 1:
             yield
             return
+        workers = Processes(count)
 
         def submit(job: Mapping[str, Any]) -> Any:
             return workers.submit(_simulate, folder.path, model.device, named, dict(job))
 
-        with simulate.helped(Helpers(count, submit)):
-            yield
-        workers.shutdown(cancel_futures=True)
-    except BaseException:
-        if workers is not None:
+        try:
+            with simulate.helped(Helpers(count, submit)):
+                yield
+            workers.shutdown(cancel_futures=True)
+        except BaseException:
             workers.kill()
-        raise
-    finally:
-        torch.set_num_threads(threads)
+            raise
 
 
 def _memory(device: str) -> float:
@@ -83,19 +79,17 @@ def _simulate(path: Path, device: str, effects: tuple[str, ...], job: Mapping[st
     import contextlib
     import signal
 
-    import torch
-
     from splatsoil.commands import _criticism as criticism
     from splatsoil.commands import _stages as stage
     from splatsoil.errors import SplatsoilError
     from splatsoil.inverse.run_folder import RunFolder
+    from splatsoil.threads import one_thread
 
     key = (path, device, effects)
-    with contextlib.suppress(SplatsoilError, OSError):
+    with one_thread(), contextlib.suppress(SplatsoilError, OSError):
         if key not in _known:
             signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process ends this one
             stage.hush()
-            torch.set_num_threads(1)
             folder = RunFolder.open(path)
             model = criticism.model_of(folder, device, lambda what, share: None)
             _known[key] = criticism.experiment_of(folder, model, effects or None)[1]

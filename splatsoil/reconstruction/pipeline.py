@@ -25,12 +25,14 @@ from splatsoil.reconstruction.surface import find_relief, soil_mesh, surface_thr
 from splatsoil.reconstruction.training import train
 from splatsoil.reconstruction.views import Views, load_views, silhouettes, still_video, surface_points
 from splatsoil.splats import Gaussians, psnr, rasterise, ssim
+from splatsoil.threads import one_thread
 
 Array = NDArray[np.float64]
 
 FEWEST_VIEWS = 3
 
 
+@one_thread()
 def reconstruct(
     measurement: Measurement,
     *,
@@ -54,14 +56,7 @@ def reconstruct(
         MeasurementError: too few views.
         ParameterError: an unknown preset, a negative holdout.
     """
-    threads = torch.get_num_threads()
-    # The tensors are small: a second thread saves little on a free machine, costs tenfold on a busy one, and one thread
-    # gives the same bits everywhere.
-    torch.set_num_threads(1)
-    try:
-        return _reconstruct(measurement, seed, device, preset, holdout, progress or (lambda what, share: None))
-    finally:
-        torch.set_num_threads(threads)
+    return _reconstruct(measurement, seed, device, preset, holdout, progress or (lambda what, share: None))
 
 
 def _reconstruct(

@@ -279,10 +279,11 @@ def test_verdicts_on_an_effect(sizes: dict[str, float]) -> None:
     meaningful = candidate.measure.meaningful
     assert of_effect(candidate, replace(score, adjusted=0.001, estimate=2.0 * meaningful)) == "missing"
     assert of_effect(candidate, replace(score, adjusted=0.001, estimate=0.5 * meaningful)) == "trivial"
-    seen = replace(score, adjusted=0.6, detectable=0.5 * meaningful, survival=0.5)
-    assert of_effect(candidate, seen) == "absent"
-    assert of_effect(candidate, replace(seen, detectable=2.0 * meaningful)) == "cannot tell"
-    assert of_effect(candidate, replace(seen, survival=0.01)) == "cannot tell"
+    denied = replace(score, adjusted=0.6, estimate=0.3 * meaningful, std=0.4 * meaningful, z=0.75, survival=0.5)
+    assert of_effect(candidate, denied) == "absent"
+    assert of_effect(candidate, replace(denied, std=0.1 * meaningful, z=3.0)) == "trivial"
+    assert of_effect(candidate, replace(denied, std=0.5 * meaningful, z=0.6)) == "cannot tell"
+    assert of_effect(candidate, replace(denied, survival=0.01)) == "cannot tell"
     assert math.isfinite(sizes["effect 1"])
 
 

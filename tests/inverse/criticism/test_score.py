@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 from splatsoil.inverse.criticism.noise import Noise
 from splatsoil.inverse.criticism.score import Score, Scorer
 
@@ -13,10 +14,17 @@ from splatsoil.parameters import Parameter
 FEATURES = 60
 
 
-def candidate(name: str, sign: int = 0, count: int = 1) -> Candidate:
+def candidate(name: str, sign: int = 0, count: int = 1, meaningful: float = 0.1) -> Candidate:
     parameters = tuple(
         Parameter(
-            f"{name}{i}", "1", 0.0 if sign else -9.0, 9.0, 0.0, off=0.0, meaningful=0.1, sign=sign if i == 0 else 0
+            f"{name}{i}",
+            "1",
+            0.0 if sign else -9.0,
+            9.0,
+            0.0,
+            off=0.0,
+            meaningful=meaningful,
+            sign=sign if i == 0 else 0,
         )
         for i in range(count)
     )
@@ -98,8 +106,10 @@ def test_given_the_true_effect_its_shadow_disappears(case: dict[str, np.ndarray]
     assert scorer.confusion()[0, 1] > 0.8
 
 
-def drawn_scores(case: dict[str, np.ndarray], count: int, size: float = 0.0) -> tuple[list[dict[str, Score]], Scorer]:
-    candidates = [candidate(name, sign=k % 2) for k, name in enumerate("abcde")]
+def drawn_scores(
+    case: dict[str, np.ndarray], count: int, size: float = 0.0, meaningful: float = 0.1
+) -> tuple[list[dict[str, Score]], Scorer]:
+    candidates = [candidate(name, sign=k % 2, meaningful=meaningful) for k, name in enumerate("abcde")]
     directions = {name: case["columns"][:, [k]] for k, name in enumerate("abcde")}
     scorer = Scorer.of(noise(case), 1e3 * case["nuisance"], directions, candidates)
     generator = np.random.default_rng(5)
@@ -119,10 +129,43 @@ def test_false_alarms_come_at_the_nominal_rate() -> None:
         "nuisance": generator.normal(size=(FEATURES, 2)),
         "columns": generator.normal(size=(FEATURES, 5)),
     }
-    found, _ = drawn_scores(case, 1000)
-    rate = np.mean([min(s.adjusted for s in scores.values()) < 0.05 for scores in found])
-    # Five binomial standard deviations around 5 %.
-    assert 0.016 < rate < 0.085
+    rates = []
+    for meaningful in (0.0, 0.1):
+        found, _ = drawn_scores(case, 1000, meaningful=meaningful)
+        rates.append(np.mean([min(s.adjusted for s in scores.values()) < 0.05 for scores in found]))
+    # Five binomial standard deviations around 5 %; less where something small might be there, and isn't.
+    assert 0.016 < rates[0] < 0.085
+    assert rates[1] < rates[0]
+
+
+def test_what_is_too_small_to_matter_is_not_missing_however_well_it_is_seen() -> None:
+    generator = np.random.default_rng(6)
+    direction = 20.0 * generator.normal(size=(FEATURES, 1))
+    plain = Noise(np.eye(FEATURES), np.ones((FEATURES, 1), dtype=bool))
+    scorer = Scorer.of(plain, np.zeros((FEATURES, 0)), {"a": direction}, [candidate("a")])
+
+    def rate(size: float) -> tuple[float, float]:
+        found = [scorer.score(size * direction[:, 0] + generator.standard_normal(FEATURES))["a"] for _ in range(1000)]
+        return float(np.mean([s.adjusted < 0.05 for s in found])), float(np.mean([s.z for s in found]))
+
+    largest, seen = rate(0.1)
+    assert seen > 10.0
+    # One of two tails is far away.
+    assert 0.005 < largest < 0.05
+    assert rate(0.09)[0] < 0.005
+    assert 0.75 < rate(scorer.score(np.zeros(FEATURES))["a"].detectable)[0] < 0.9
+
+
+def test_with_several_parameters_the_nearest_trivial_sizes_are_the_null(case: dict[str, np.ndarray]) -> None:
+    columns, target = case["columns"][:, :2], np.array([0.3, -0.9])
+    root = np.linalg.inv(case["root"])
+    scorer = Scorer.of(noise(case), np.zeros((FEATURES, 0)), {"a": columns}, [candidate("a", count=2)])
+    score = scorer.score(columns @ target)["a"]
+    ends = np.linspace(-0.1, 0.1, 201)
+    grid = np.stack(np.meshgrid(ends, ends), axis=-1).reshape(-1, 2)
+    nearest = np.min(np.sum((root @ (columns @ (target - grid).T)) ** 2, axis=0))
+    assert score.p == pytest.approx(chi2.sf(nearest, 2), rel=1e-3)
+    assert score.p > chi2.sf(score.statistic, 2)
 
 
 def test_an_effect_of_the_smallest_detectable_size_is_found_four_times_in_five(case: dict[str, np.ndarray]) -> None:
