@@ -41,7 +41,7 @@ SPACING = 0.01
 """Of the independent solver's particles, m."""
 ANGLES = (30.0, 40.0)
 """Range of the true friction angle, degrees."""
-NOTHING, FIELD = "nothing", "friction field"
+NOTHING, FIELD = "nothing", "friction_field"
 """Kinds without an effect of the library: nothing is hidden, or something that the library doesn't have."""
 
 

@@ -8,6 +8,7 @@ particular. From the law's defaults it stands out.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -15,9 +16,9 @@ from scipy.optimize import lsq_linear
 
 from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Candidate, Experiment
-from splatsoil.parameters import Parameter
 
-from .evidence import Evidence, Vantage, around, look_from
+from .evidence import Evidence, Run, Vantage, Visit, around, directions_of, look_from
+from .floor import Floor
 from .misfit import Omnibus
 from .sight import Sight
 from .simulations import Simulations
@@ -26,8 +27,23 @@ from .verdicts import GATE
 FloatArray = npt.NDArray[np.float64]
 
 
-def look_afresh(experiment: Experiment, evidence: Evidence, misfit: Omnibus, simulate: Simulations) -> Vantage | None:
+DECADE = 10.0
+"""Factor by which what shapes an effect may be off its default: where its scale is logarithmic, not even its order of
+magnitude is known beforehand."""
+
+
+def look_afresh(
+    experiment: Experiment,
+    evidence: Evidence,
+    misfit: Omnibus,
+    simulate: Simulations,
+    floor: Floor,
+    basis: FloatArray,
+) -> Vantage | None:
     """The soil's own parameters at their defaults, those of effects as fitted; effects of physics switched on there.
+
+    Each of these in the shape in which it would explain most: as by default, or a decade off. Soil that dilates without
+    end leaves other traces than soil that soon is loose.
 
     None where nothing says that the fit was led astray (no misfit on slow waves, and no bound reached), where the fit
     lies near the defaults, or where these can't be simulated.
@@ -40,17 +56,67 @@ def look_afresh(experiment: Experiment, evidence: Evidence, misfit: Omnibus, sim
     there = {**evidence.values, **own}
     candidates = [c for c in experiment.candidates if c.kind == "physics" and c.name in evidence.directions]
 
-    def look(ask: Callable[..., FloatArray]) -> Vantage:
+    def look(ask: Callable[..., FloatArray]) -> tuple[Vantage, list[_Variant]]:
         def run(purpose: str, at: Mapping[str, float], effects: tuple[str, ...] = ()) -> FloatArray:
             return ask(at, effects=effects, purpose=f"from the defaults: {purpose}")
 
-        return look_from(experiment, there, candidates, run)
+        found = look_from(experiment, there, candidates, run)
+        return found, [v for c in candidates if c.name in found.directions for v in _variants(c, found, run)]
 
     simulate.ahead(look)
     try:
-        return look(simulate)
+        found, variants = look(simulate)
     except SimulationError:
         return None
+    return _in_best_shapes(experiment, found, variants, floor, basis) if variants else found
+
+
+@dataclass(frozen=True)
+class _Variant:
+    """A candidate's directions (k, t, s) in another shape than by default, and the simulations that tell them."""
+
+    candidate: Candidate
+    shape: Mapping[str, float]
+    directions: FloatArray
+    visits: tuple[Visit, ...]
+
+
+def _variants(candidate: Candidate, point: Vantage, run: Run) -> list[_Variant]:
+    """A candidate in other shapes."""
+    out = []
+    for parameter in (p for p in candidate.shapes if p.log):
+        for factor in (1.0 / DECADE, DECADE):
+            shape = {parameter.name: float(np.clip(factor * parameter.default, parameter.lower, parameter.upper))}
+            visits: list[Visit] = []
+
+            def visit(
+                purpose: str, at: Mapping[str, float], effects: tuple[str, ...], visits: list[Visit] = visits
+            ) -> FloatArray:
+                visits.append(Visit(dict(at), effects, run(purpose, at, effects)))
+                return visits[-1].table
+
+            try:
+                directions = directions_of(candidate, {**point.values, **shape}, point.prediction, visit, {})
+            except SimulationError:
+                continue
+            out.append(_Variant(candidate, shape, directions, tuple(visits)))
+    return out
+
+
+def _in_best_shapes(
+    experiment: Experiment, point: Vantage, variants: Sequence[_Variant], floor: Floor, basis: FloatArray
+) -> Vantage:
+    """The point, with each candidate in the shape in which it explains most from there."""
+    every = {**point.directions, **{f"{v.candidate.name} {k}": v.directions for k, v in enumerate(variants)}}
+    cost = _cost(experiment, point, Sight.of(experiment, floor, basis, replace(point, directions=every)))
+    directions, shapes = dict(point.directions), {}
+    least = {v.candidate.name: cost(v.candidate, directions[v.candidate.name]) for v in variants}
+    for variant in variants:
+        name, now = variant.candidate.name, cost(variant.candidate, variant.directions)
+        if now < least[name]:
+            least[name], directions[name], shapes[name] = now, variant.directions, variant.shape
+    visits = (*point.visits, *(visit for variant in variants for visit in variant.visits))
+    return replace(point, directions=directions, shapes=shapes, visits=visits)
 
 
 def promising(
@@ -65,22 +131,25 @@ def promising(
     Least squares within the bounds, over the model's parameters and one effect's at a time; effects that bring less
     than their price are left out.
     """
+    cost = _cost(experiment, vantage, sight)
+    there = [c for c in candidates if c.name in vantage.directions]
+    costs = {c.name: cost(c, vantage.directions[c.name]) + price(c) for c in there}
+    alone = cost(None, np.zeros((0, *experiment.layout.shape)))
+    return sorted((name for name in costs if costs[name] < alone), key=lambda name: costs[name])
+
+
+def _cost(experiment: Experiment, vantage: Vantage, sight: Sight) -> Callable[[Candidate | None, FloatArray], float]:
+    """χ² that the model's parameters leave with a candidate's directions (k, t, s), or with none."""
     target = sight(experiment.observed - vantage.prediction)
     model = np.stack([sight(vantage.slopes[p.name]) for p in experiment.parameters], axis=-1)
 
-    def chi2(columns: FloatArray, free: Sequence[Parameter]) -> float:
+    def cost(candidate: Candidate | None, directions: FloatArray) -> float:
+        free = (*experiment.parameters, *(() if candidate is None else candidate.parameters))
+        columns = np.concatenate([model, sight(np.moveaxis(directions, 0, -1))], axis=-1)
         at = np.array([vantage.values.get(p.name, p.off if p.off is not None else p.default) for p in free])
         lower, upper = (np.array([getattr(p, side) for p in free]) for side in ("lower", "upper"))
         span = upper - lower
         room = np.minimum((lower - at) / span, 0.0), np.maximum((upper - at) / span, 1e-9)
         return 2.0 * float(lsq_linear(columns * span, target, bounds=room).cost)
 
-    alone = chi2(model, experiment.parameters)
-    costs = {}
-    for candidate in candidates:
-        if candidate.name not in vantage.directions:
-            continue
-        added = np.stack([sight(table) for table in vantage.directions[candidate.name]], axis=-1)
-        free = (*experiment.parameters, *candidate.parameters)
-        costs[candidate.name] = chi2(np.concatenate([model, added], axis=-1), free) + price(candidate)
-    return sorted((name for name, cost in costs.items() if cost < alone), key=lambda name: costs[name])
+    return cost

@@ -225,7 +225,10 @@ def _starts(
         added = [] if candidate is None else [np.moveaxis(point.directions[candidate.name], 0, -1)]
         # While the effect is off, its shape changes nothing.
         shapes = np.zeros((*model.shape[:2], 0 if candidate is None else len(candidate.shapes)))
-        return Start({**point.values, **off}, point.prediction, np.concatenate([model, *added, shapes], axis=-1))
+        shaped = {} if candidate is None else point.shapes.get(candidate.name, {})
+        return Start(
+            {**point.values, **off, **shaped}, point.prediction, np.concatenate([model, *added, shapes], axis=-1)
+        )
 
     points: list[Vantage] = [evidence]
     if candidate is not None and vantage is not None and candidate.name in vantage.directions:

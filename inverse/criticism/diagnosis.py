@@ -204,7 +204,7 @@ def judge(
     misfit = bench.misfit(residual)
     scores = {} if scorer is None else scorer.score(residual)
     candidates = {c.name: c for c in bench.candidates}
-    vantage = None if scorer is None else look_afresh(experiment, evidence, misfit, simulate)
+    vantage = None if scorer is None else look_afresh(experiment, evidence, misfit, simulate, floor, bench.basis)
     chosen = _chosen(experiment, bench, scores, residual, misfit, vantage, options)
     confirmations: dict[str, Confirmation] = {}
     members: tuple[str, ...] = ()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -51,6 +51,7 @@ class Vantage:
         steps: the step of each of these.
         failed: candidates whose simulation could not go on, with the reason.
         visits: all simulations that were made, with the same particles.
+        shapes: by candidate, what shapes it where its directions were measured, if not the defaults.
     """
 
     values: Mapping[str, float]
@@ -62,6 +63,7 @@ class Vantage:
     steps: Mapping[str, float]
     failed: Mapping[str, str]
     visits: tuple[Visit, ...]
+    shapes: Mapping[str, Mapping[str, float]] = field(default_factory=dict, kw_only=True)
 
 
 @dataclass(frozen=True)
@@ -173,9 +175,7 @@ def look_from(
     failed: dict[str, str] = {}
     for candidate in candidates:
         try:
-            directions[candidate.name] = np.stack(
-                [_slope(candidate, parameter, base, middle, visit, steps) for parameter in candidate.parameters]
-            )
+            directions[candidate.name] = directions_of(candidate, base, middle, visit, steps)
         except SimulationError as error:
             failed[candidate.name] = str(error)
     return Vantage(base, middle, slopes, curves, widths, directions, steps, failed, tuple(visits))
@@ -230,6 +230,13 @@ def step_of(parameter: Parameter) -> float:
     side = parameter.sign or (1 if room[1] >= room[-1] else -1)
     wanted = STEP * parameter.meaningful if parameter.meaningful > 0.0 else 0.1 * room[side]
     return side * min(wanted, REACH * room[side])
+
+
+def directions_of(
+    candidate: Candidate, base: Mapping[str, float], middle: FloatArray, run: Run, steps: dict[str, float]
+) -> FloatArray:
+    """(k, t, s) derivatives by a candidate's parameters at off, of predictions whose ``middle`` is that without it."""
+    return np.stack([_slope(candidate, p, base, middle, run, steps) for p in candidate.parameters])
 
 
 def _slope(

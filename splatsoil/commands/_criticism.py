@@ -265,7 +265,7 @@ def confirmed(folder: RunFolder, model: Model, name: str, options: Options, repo
             options.refit_steps,
             bench.basis,
             report,
-            look_afresh(experiment, evidence, bench.misfit(left), simulate),
+            look_afresh(experiment, evidence, bench.misfit(left), simulate, bench.floor, bench.basis),
         )
         if found[effect].visits:
             (candidate,) = bench.candidates

@@ -11,7 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from splatsoil.benchmarks.hidden_effects import emulated, fitted
-from splatsoil.inverse.criticism.diagnosis import Diagnosis, diagnose
+from splatsoil.inverse.criticism.afresh import look_afresh
+from splatsoil.inverse.criticism.diagnosis import Bench, Diagnosis, Options, diagnose
+from splatsoil.inverse.criticism.evidence import gather
+from splatsoil.inverse.criticism.misfit import Omnibus
+from splatsoil.inverse.criticism.simulations import Simulations
 
 from splatsoil.errors import ParameterError
 from splatsoil.experiment.emulated import EmulatedExperiment, FloatArray
@@ -23,6 +27,7 @@ IDLE = tuple(Parameter(name, "1", 0.0, 1.0, 0.5, meaningful=0.1) for name in ("i
 TURN = math.radians(70.0)
 """By how much ten times the shape turns the effect."""
 ANGLE, SIZE = 1.0, 12.0
+WORLD = 77
 HALO = """
 from splatsoil.parameters import Parameter
 from splatsoil.soil.effect import Effect
@@ -107,6 +112,25 @@ def test_slopes_are_those_of_the_effect_in_the_shape_that_was_found(world: int, 
         for rows in (slice(0, None, 2), slice(1, None, 2)):
             wrong = np.linalg.norm((fit.slopes[..., k] - exact)[rows]) / np.linalg.norm(exact[rows])
             assert wrong < 0.1, (name, rows)
+
+
+@pytest.mark.parametrize("hidden", [3.0, 0.03, 0.3])
+def test_from_the_defaults_an_effect_is_seen_in_the_shape_that_it_has(hidden: float) -> None:
+    made = turning(WORLD, (SHAPE,))
+    truth = {"angle": ANGLE, "effect 2": SIZE, SHAPE.name: hidden}
+    experiment = replace(made, observed=made.measured(truth, [WORLD, 99]))
+    simulate = Simulations(experiment)
+    evidence = gather(experiment, simulate, {"angle": 8.0})
+    bench = Bench.of(experiment, evidence, Options())
+    found = look_afresh(experiment, evidence, Omnibus(900.0, 72, 0.0), simulate, bench.floor, bench.basis)
+    assert found is not None
+    assert found.shapes == ({} if hidden == SHAPE.default else {"effect 2": {SHAPE.name: pytest.approx(hidden)}})
+    exact = made.expected({"angle": 0.0, "effect 2": 1.0, SHAPE.name: hidden}) - made.expected({"angle": 0.0})
+    (seen,) = found.directions["effect 2"]
+    assert np.linalg.norm(seen - exact) < 0.2 * np.linalg.norm(exact)
+    # All simulations with the effect are there to be read, those in other shapes, too.
+    shapes = {visit.values.get(SHAPE.name, SHAPE.default) for visit in found.visits if visit.effects == ("effect 2",)}
+    assert sorted(shapes) == pytest.approx([0.03, 0.3, 3.0])
 
 
 def test_what_cameras_report_has_no_shapes(tmp_path: Path) -> None:
