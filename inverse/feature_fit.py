@@ -109,9 +109,10 @@ def agreement(data: Data, *, seed: int = 0) -> float:
     Raises:
         RunError: too few evaluations, or they don't differ.
     """
-    likelihood = likelihood_of(data, seed=seed)
-    if likelihood.beside is None:
+    if data.beside is None:
         return 1.0
+    likelihood = likelihood_of(data, seed=seed)
+    assert likelihood.beside is not None
     found = closest(of_pictures(likelihood), data.points, seed)
     return _together(found, _precision(likelihood, found), likelihood.beside, data.points, seed).agreement
 
