@@ -56,12 +56,7 @@ def reconstruct(
         MeasurementError: too few views.
         ParameterError: an unknown preset, a negative holdout.
     """
-    return _reconstruct(measurement, seed, device, preset, holdout, progress or (lambda what, share: None))
-
-
-def _reconstruct(
-    measurement: Measurement, seed: int, device: str, preset: str, holdout: int, report: Callable[[str, float], None]
-) -> Reconstruction:
+    report = progress or (lambda what, share: None)
     started = time.monotonic()
     chosen = preset_named(preset)
     if holdout < 0 or holdout == 1:

@@ -13,11 +13,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from splatsoil.envs.problem import Evaluation
 from splatsoil.inverse import fitting
 from splatsoil.inverse.bayesopt import PAPER, BayesianOptimiser
 from splatsoil.inverse.evaluations import EvaluationRecord, digest
 from splatsoil.inverse.fitting import fit
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from splatsoil.errors import RunError
 
@@ -168,6 +170,28 @@ def test_a_fit_interrupted_between_two_evaluations_goes_on_to_the_same_end(
     result = fit(problem, analytic.prepare(tmp_path), setup, budget=BUDGET)
     assert problem.calls == BUDGET - stop_after
     assert without_times(result) == without_times(pairs[0])
+
+
+def test_a_search_keeps_to_one_thread_and_gives_them_back(analytic: ModuleType, tmp_path: Path) -> None:
+    # Sums over several threads end in other digits, and a search that goes on from them elsewhere.
+    seen: list[int] = []
+
+    def threads() -> list[int]:
+        return [torch.get_num_threads(), *(pool["num_threads"] for pool in threadpool_info())]
+
+    torch.set_num_threads(2)
+    with threadpool_limits(limits=2):
+        before = threads()
+        fit(
+            analytic.AnalyticProblem(),
+            analytic.prepare(tmp_path),
+            analytic.SETUP,
+            budget=4,
+            after_evaluation=lambda done, record: seen.extend(threads()),
+        )
+        assert max(before) == 2, "one thread from the start tells nothing"
+        assert threads() == before
+    assert set(seen) == {1}
 
 
 def test_killed_and_started_again(analytic: ModuleType, tmp_path: Path, uninterrupted: dict[str, Any]) -> None:
