@@ -21,7 +21,7 @@ from .floor import Floor, floor_of
 from .joint import precision_of
 from .misfit import Omnibus, omnibus, smooth_basis
 from .noise import Noise
-from .reading import MOST, explored, read
+from .reading import MOST, explored, read, tangent
 from .refit import ROUNDS, Known, Refit, Start, settle
 from .score import Scorer
 from .sight import Sight
@@ -135,10 +135,11 @@ def confirm(
         known = _known(evidence, free)
         at, off = (np.array([values.get(p.name, p.off or 0.0) for p in free]) for values in (fit.values, {}))
         left, mask = experiment.observed - fit.prediction, _judged(experiment, hidden)
-        tangent = np.concatenate([floor.nuisance, _tangent(floor.single, fit)], axis=1)
-        remainder = omnibus(floor.single, tangent, left[experiment.seen], basis)
+        apart_from = np.concatenate([floor.nuisance, _tangent(floor.single, fit.slopes)], axis=1)
+        remainder = omnibus(floor.single, apart_from, left[experiment.seen], basis)
         chi2 = _chi2(whole, left) + known.chi2(at)
-        values, stds = dict(fit.values), _stds(free, fit, np.concatenate([whiten(fit.slopes), known.root]), remainder)
+        columns = np.concatenate([whiten(fit.slopes), known.root])
+        values, stds = dict(fit.values), _stds(free, fit.values, columns, remainder)
         emulated: tuple[Visit, ...] = ()
         if _emulated(experiment, candidate):
             # A surface that isn't one tells nothing more than the last derivatives do.
@@ -236,20 +237,22 @@ def _starts(
     return [start(point) for point in points]
 
 
-def _stds(free: Sequence[Parameter], fit: Refit, columns: FloatArray, remainder: Omnibus) -> dict[str, float]:
+def _stds(
+    free: Sequence[Parameter], values: Mapping[str, float], columns: FloatArray, remainder: Omnibus
+) -> dict[str, float]:
     """Standard deviations of a refit's estimates, each parameter's range being its prior.
 
     Where more than noise remains, they are widened by the root of its dispersion (Birge 1932).
     """
-    prior = np.array([ignorance(p, fit.values[p.name]) for p in free])
+    prior = np.array([ignorance(p, values[p.name]) for p in free])
     covariance = np.linalg.inv(columns.T @ columns + np.diag(prior**-2.0))
     widened = math.sqrt(max(1.0, remainder.dispersion))
     return {p.name: widened * math.sqrt(float(v)) for p, v in zip(free, np.diag(covariance), strict=True)}
 
 
-def _tangent(noise: Noise, fit: Refit) -> FloatArray:
-    """(n, k) a refit's derivatives, each as large as a parameter's error could be: ten times the noise."""
-    columns = fit.slopes[noise.seen]
+def _tangent(noise: Noise, slopes: FloatArray) -> FloatArray:
+    """(n, k) derivatives (t, s, k), each as large as a parameter's error could be: ten times the noise."""
+    columns = slopes[noise.seen]
     size = np.linalg.norm(columns / noise.scale[:, None], axis=0)
     return columns * (10.0 * math.sqrt(len(columns)) / np.maximum(size, 1e-300))
 
@@ -267,7 +270,7 @@ def remainder_of(
         return best.remainder
     seen = experiment.seen
     left = (experiment.observed - best.fit.prediction)[seen]
-    free = np.concatenate([floor.nuisance, _tangent(floor.single, best.fit)], axis=1)
+    free = np.concatenate([floor.nuisance, _tangent(floor.single, best.fit.slopes)], axis=1)
     others = [c for name, c in candidates.items() if name != best.name]
     if not others:
         return best.remainder
@@ -311,18 +314,22 @@ def on_its_own_floor(
     Cohesive soil falls by chance where dry soil flows, and numerics move it farther: what remains after an effect is
     added has to be judged by what such soil leaves, and parameters are known no better than that lets them be.
     """
+    told: dict[str, Any] = {"effects": (best.name,), "purpose": f"floor with {best.name}"}
+    # Half of the times may have led a refit far along a valley from where all of them say that the parameters are.
+    at, middle = best.values, best.fit.prediction
+    try:
+        middle = simulate(at, **told)
+    except SimulationError:
+        at = best.fit.values
     seeds = range(1, 1 + len(evidence.repeats))
 
     def spread(ask: Callable[..., FloatArray]) -> tuple[FloatArray, dict[str, FloatArray], list[FloatArray]]:
-        told: dict[str, Any] = {"effects": (best.name,), "purpose": f"floor with {best.name}"}
+        guesses = [ask(at, numerics=name, **told) - middle for name in experiment.guesses]
         patterns = {}
         for kind in experiment.numerics:
-            try:
-                patterns[kind] = ask(best.fit.values, numerics=kind, **told) - best.fit.prediction
-            except SimulationError:
-                continue
-        guesses = [ask(best.fit.values, numerics=name, **told) - best.fit.prediction for name in experiment.guesses]
-        return np.stack([ask(best.fit.values, seed=seed, **told) for seed in seeds]), patterns, guesses
+            with suppress(SimulationError):
+                patterns[kind] = ask(at, numerics=kind, **told) - middle
+        return np.stack([ask(at, seed=seed, **told) for seed in seeds]), patterns, guesses
 
     simulate.ahead(spread)
     runs, patterns, guesses = spread(simulate)
@@ -339,22 +346,24 @@ def on_its_own_floor(
     )
     floor, seen = floor_of(experiment, there), experiment.seen
     basis = smooth_basis(experiment.layout, floor.noise)
-    tangent = _tangent(floor.noise, best.fit)
-    free = np.concatenate([floor.nuisance, tangent], axis=1)
-    left = (experiment.observed - there.mean)[seen]
-    model = len(experiment.parameters)
-    bare = replace(best.fit, slopes=best.fit.slopes[..., :model])
-    without = np.concatenate([floor.nuisance, _tangent(floor.noise, bare)], axis=1)
-    after = omnibus(floor.noise, free, left, basis)
+    parameters, slopes = _free(experiment, candidate), best.fit.slopes
     # Where simulations were too few for a surface at first, they still are.
+    visits = (*best.visits, Visit(dict(at), (best.name,), middle)) if best.visits else ()
+    if visits:
+        seeing = Sight.of(experiment, replace(floor, parameters=_tangent(floor.noise, slopes)), basis)
+        slopes = tangent(visits, seeing, parameters, at)
+    along = _tangent(floor.noise, slopes)
+    free = np.concatenate([floor.nuisance, along], axis=1)
+    left = (experiment.observed - there.mean)[seen]
+    without = np.concatenate([floor.nuisance, _tangent(floor.noise, slopes[..., : len(experiment.parameters)])], axis=1)
+    after = omnibus(floor.noise, free, left, basis)
     refit = best
-    if best.visits:
-        sight = Sight.of(experiment, replace(floor, parameters=tangent), basis)
-        parameters = _free(experiment, candidate)
+    if visits:
+        sight = Sight.of(experiment, replace(floor, parameters=along), basis)
         known = _known(evidence, parameters)
-        reading = read(best.visits, sight, experiment.observed, parameters, known)
+        reading = read(visits, sight, experiment.observed, parameters, known)
         # Draws don't leave the simulations' range, and these were made where another floor let the parameters be.
-        least = _stds(parameters, best.fit, np.concatenate([sight(best.fit.slopes), known.root]), after)
+        least = _stds(parameters, at, np.concatenate([sight(slopes), known.root]), after)
         stds = {name: max(std, least[name]) for name, std in reading.stds.items()}
         refit = replace(best, values=dict(reading.values), stds=stds)
     return OwnFloor(

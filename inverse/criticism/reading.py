@@ -75,7 +75,7 @@ def explored(
     shapes: Sequence[Parameter] = (),
 ) -> Refit:
     """Simulate where the parameters may lie by what is known so far, then at the most probable ones, and go there if
-    that is better. Slopes are those of the surface where the refit then stands.
+    that is better by all simulations. Slopes are those of the surface where the refit then stands.
 
     Args:
         predict: (t, s) features by parameters; adds a visit.
@@ -87,7 +87,7 @@ def explored(
         start: a refit of them, and what is returned where nothing changes the features.
         shapes: those that no simulation has varied yet.
     """
-    space, before, better = ParameterSpace(parameters), len(visits), start
+    space, first, better = ParameterSpace(parameters), len(visits), start
 
     def visit(values: Mapping[str, float]) -> None:
         # Where nothing can be simulated nothing is learned.
@@ -108,13 +108,17 @@ def explored(
         values = read(visits, whiten, observed, parameters, known, seed=BATCHES).values
         with suppress(SimulationError):
             table = predict(values)
-            chi2 = float(np.sum(whiten(observed - table) ** 2) + known.chi2(space.to_vector(values)))
-            if chi2 <= start.chi2:
+            # Not by the two simulations: the luckier one of many would win.
+            here, there = (space.to_unit(space.to_vector(at)) for at in (start.values, values))
+            belief = _Belief.of(visits, whiten, observed, parameters, known)
+            before, after = belief.expected_chi2(np.stack([here, there]))
+            if after <= before:
+                chi2 = float(np.sum(whiten(observed - table) ** 2) + known.chi2(space.to_vector(values)))
                 better = replace(start, values=values, chi2=chi2, prediction=table)
         slopes = tangent(visits, whiten, parameters, better.values)
     except ValueError:
         return start
-    return replace(better, simulations=start.simulations + len(visits) - before, slopes=slopes)
+    return replace(better, simulations=start.simulations + len(visits) - first, slopes=slopes)
 
 
 def tangent(
@@ -162,39 +166,75 @@ def read(
     Raises:
         ValueError: too few simulations, or the features are the same wherever they were made.
     """
-    space, surface, target = ParameterSpace(parameters), _surface(visits, whiten, parameters), whiten(observed)
-    outside, scores = surface.remainder(target), surface.project(target)
-    wide = max(1.0, float(outside @ outside) / max(len(target) - len(scores), 1))
-
-    home = space.to_unit(space.to_vector({p.name: p.default for p in parameters}))
-
-    def told(where: FloatArray) -> FloatArray:
-        measured = (space.from_unit(where) - known.centre) @ known.root.T
-        return np.asarray(np.sum(measured**2, axis=1) + np.sum(((where - home) / PRIOR) ** 2, axis=1))
-
-    def log_density(where: FloatArray) -> FloatArray:
-        mean, variance = surface.predict(where)
-        total = wide + variance
-        return -0.5 * np.asarray(np.sum((scores - mean) ** 2 / total + np.log(total), axis=1) + told(where))
-
-    def expected_chi2(where: FloatArray) -> FloatArray:
-        # Doubt makes a place possible, and a poor choice.
-        mean, variance = surface.predict(where)
-        return np.asarray(np.sum((scores - mean) ** 2 + variance, axis=1) / wide + told(where))
-
+    belief = _Belief.of(visits, whiten, observed, parameters, known)
+    space, surface = belief.space, belief.surface
     # Far from all simulations the surface falls back to its parabola, which says little.
     beyond = ABROAD if bold else 0.0
     points = surface.points
     low, high = np.maximum(points.min(axis=0) - beyond, -1.0), np.minimum(points.max(axis=0) + beyond, 1.0)
-    draws = _sample(log_density, low, high, seed)
+    draws = _sample(belief.log_density, low, high, seed)
     likely = np.concatenate([draws, points])
-    start = likely[np.argmin(expected_chi2(likely))]
-    best = minimize(lambda x: float(expected_chi2(x[None])[0]), start, bounds=list(zip(low, high, strict=True))).x
+    start = likely[np.argmin(belief.expected_chi2(likely))]
+    bounds = list(zip(low, high, strict=True))
+    best = minimize(lambda x: float(belief.expected_chi2(x[None])[0]), start, bounds=bounds).x
     values = space.from_unit(np.clip(best, low, high))
     # A root mean square would be ruled by the few draws in a gap between simulations.
     spread = np.quantile(np.abs(space.from_unit(draws) - values), ONE_STD, axis=0)
-    unknown = np.any(surface.predict(draws)[1] > wide, axis=1)
+    unknown = np.any(surface.predict(draws)[1] > belief.wide, axis=1)
     return Reading(space.to_dict(values), dict(zip(space.names, map(float, spread), strict=True)), draws, unknown)
+
+
+@dataclass(frozen=True)
+class _Belief:
+    """What all simulations say of the parameters, points (q, n) in [-1, 1].
+
+    Attributes:
+        space: of the parameters.
+        surface: through the simulations.
+        scores: (p,) the observation along the surface's directions.
+        wide: variance of an independent feature, 1 unless more than noise lies where no parameter reaches.
+        known: what other measurements say.
+        home: (n,) the defaults.
+    """
+
+    space: ParameterSpace
+    surface: Surface
+    scores: FloatArray
+    wide: float
+    known: Known
+    home: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        visits: Sequence[Visit],
+        whiten: Callable[[FloatArray], FloatArray],
+        observed: FloatArray,
+        parameters: Sequence[Parameter],
+        known: Known,
+    ) -> _Belief:
+        """See :func:`read`."""
+        space, surface, target = ParameterSpace(parameters), _surface(visits, whiten, parameters), whiten(observed)
+        outside, scores = surface.remainder(target), surface.project(target)
+        wide = max(1.0, float(outside @ outside) / max(len(target) - len(scores), 1))
+        home = space.to_unit(space.to_vector({p.name: p.default for p in parameters}))
+        return cls(space, surface, scores, wide, known, home)
+
+    def log_density(self, where: FloatArray) -> FloatArray:
+        """(q,) up to a constant."""
+        mean, variance = self.surface.predict(where)
+        total = self.wide + variance
+        misfit = np.sum((self.scores - mean) ** 2 / total + np.log(total), axis=1)
+        return -0.5 * np.asarray(misfit + self._beforehand(where))
+
+    def expected_chi2(self, where: FloatArray) -> FloatArray:
+        """(q,) over the surface's doubt, which makes a place possible, and a poor choice."""
+        mean, variance = self.surface.predict(where)
+        return np.asarray(np.sum((self.scores - mean) ** 2 + variance, axis=1) / self.wide + self._beforehand(where))
+
+    def _beforehand(self, where: FloatArray) -> FloatArray:
+        measured = (self.space.from_unit(where) - self.known.centre) @ self.known.root.T
+        return np.asarray(np.sum(measured**2, axis=1) + np.sum(((where - self.home) / PRIOR) ** 2, axis=1))
 
 
 def _surface(

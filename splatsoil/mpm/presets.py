@@ -66,6 +66,7 @@ class Resolution:
         relaxation: exchanges between particles and grid a second of which hourglass modes and the tool's contact shall
             know, whatever the number of ``steps``: the former are damped as that many plain APIC exchanges would, soil
             sunk into the tool comes out at twice the rate. 0 for as many as there are.
+        memory: share of its load, 0 to 1, that the tool's contact keeps when soil comes out of it.
     """
 
     cell: float
@@ -77,6 +78,7 @@ class Resolution:
     shear: float
     density: float
     relaxation: float = 0.0
+    memory: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("cell", "spacing", "frame_time", "steps", "courant", "bulk", "shear", "density"):
@@ -85,6 +87,8 @@ class Resolution:
                 raise SimulationError(f"resolution: {name} = {value} must be a positive number")
         if not (math.isfinite(self.relaxation) and self.relaxation >= 0.0):
             raise SimulationError(f"resolution: relaxation = {self.relaxation} must be 0 or a positive number")
+        if not 0.0 <= self.memory <= 1.0:
+            raise SimulationError(f"resolution: memory = {self.memory} must be between 0 and 1")
         if self.courant > COURANT_LIMIT:
             raise SimulationError(
                 f"resolution: a Courant number of {self.courant} breaks the wave-speed limit of {COURANT_LIMIT}"

@@ -28,6 +28,7 @@ class Particles:
         gap: signed distance to the tool, m, carried through a step's substeps.
         drift: way the particle has gone relative to the tool since the step began, m.
         gap_normal: outward normal of the tool there, in the world.
+        preload: what the contact spring is loaded by beyond its depth in the tool, m.
         per_simulation: particles of one simulation.
         volume: initial volume of a particle, m^3.
         mass: kg, of a particle of nominal density.
@@ -50,6 +51,7 @@ class Particles:
     gap: wp.array(dtype=float)
     drift: wp.array(dtype=wp.vec3)
     gap_normal: wp.array(dtype=wp.vec3)
+    preload: wp.array(dtype=float)
     per_simulation: int
     volume: float
     mass: float

@@ -129,15 +129,17 @@ def contact_forces(
         drift = particles.drift[p] + dt * slip
         particles.drift[p] = drift
         gap = particles.gap[p] + dt * closing
-        if gap < 0.0:
+        preload = particles.preload[p]
+        if gap < preload:
             # the flat estimate would push on where a particle has slid off an edge: measure
             place = x + drift - tool_position(pose)
             gap = signed_distance(tool, wp.quat_rotate_inv(tool_rotation(pose), place))
         particles.gap[p] = gap
+        depth = preload - gap
         adhesion = values[row, TOOL_ADHESION] * area
-        if gap < 0.0 or (adhesion > 0.0 and gap < ADHESION_REACH * wp.sqrt(area)):
-            depth = wp.min(-gap, deepest)
-            push = wp.where(gap < 0.0, wp.max(tool.stiffness * depth - tool.damping * closing, 0.0), 0.0)
+        if depth > 0.0 or (adhesion > 0.0 and gap < ADHESION_REACH * wp.sqrt(area)):
+            spring = tool.stiffness * wp.min(depth, deepest)
+            push = wp.where(depth > 0.0, wp.max(spring - tool.damping * closing, 0.0), 0.0)
             slip -= closing * normal
             speed = wp.length(slip)
             hold = values[row, TOOL_FRICTION] * push + adhesion

@@ -165,6 +165,7 @@ def grid_to_particles(
     keep: float,
     release: float,
     deepest: float,
+    memory: float,
     broken: wp.array(dtype=int),
     strays: wp.array(dtype=int),
 ) -> None:
@@ -172,7 +173,8 @@ def grid_to_particles(
 
     The mean gradient of a cell doesn't see the bilinear and trilinear parts of its velocity, so stress can't resist
     them (hourglass modes); a particle keeps the fraction ``keep`` of them. A particle that has sunk into the tool is
-    moved out by the fraction ``release`` of its depth, and to ``deepest`` (m) at once.
+    moved out by the fraction ``release`` of its depth, and to ``deepest`` (m) at once; its spring keeps the fraction
+    ``memory`` of the load that this takes off, until soil and tool part.
 
     A particle faster than ``limit`` (m/s) or without a finite state counts as ``broken``; one that rises above
     ``ceiling`` (m) counts as a stray, loses its velocity and falls back.
@@ -222,7 +224,11 @@ def grid_to_particles(
     x += displacement
     gap = particles.gap[p]
     if gap < 0.0 and gap > -FAR:
-        x -= wp.min(release * gap, gap + deepest) * particles.gap_normal[p]
+        out = -wp.min(release * gap, gap + deepest)
+        x += out * particles.gap_normal[p]
+        particles.preload[p] = wp.min(particles.preload[p] + memory * out, deepest)
+    elif gap > particles.preload[p]:
+        particles.preload[p] = 0.0
     low = grid.origin
     high = low + wp.cw_mul(
         grid.cell, wp.vec3(float(grid.shape[0] - 1), float(grid.shape[1] - 1), float(grid.shape[2] - 1))

@@ -228,14 +228,19 @@ def curves(diagnosis: Mapping[str, Any]) -> str:
     return _draw(draw, (SIZE[0], 0.6 + 1.4 * len(diagnosis["curves"])))
 
 
-def plan_maps(diagnosis: Mapping[str, Any], which: str) -> str:
-    """Residual over noise from above, one row for each stage, one column for each instrument that has places."""
+def plan_maps(diagnosis: Mapping[str, Any], which: Sequence[str]) -> list[str]:
+    """Residuals over noise from above, one row for each stage, one column for each instrument that has places; the
+    chosen maps, in colours of one scale."""
     placed = [i for i, site in enumerate(diagnosis["sites"]) if site[1] is not None]
-    table = np.array(diagnosis["maps"][which], dtype=np.float64)[:, placed]
+    tables = [np.array(diagnosis["maps"][name], dtype=np.float64)[:, placed] for name in which]
+    limit = max(3.0, min(max(float(np.nanpercentile(np.abs(table), 99.0)) for table in tables), 15.0))
+    return [_plan_map(diagnosis, placed, table, limit) for table in tables]
+
+
+def _plan_map(diagnosis: Mapping[str, Any], placed: Sequence[int], table: np.ndarray, limit: float) -> str:
     sites, stages = [diagnosis["sites"][i] for i in placed], diagnosis["stages"]
     channels = list(dict.fromkeys(site[0] for site in sites))
     names = list(dict.fromkeys(stages))
-    limit = max(3.0, min(float(np.nanpercentile(np.abs(table), 99.0)), 15.0))
 
     def draw(figure: Figure, axes: Axes) -> None:
         axes.remove()

@@ -139,7 +139,8 @@ def _maps(diagnosis: Mapping[str, Any]) -> list[tuple[str, Any]]:
 
     shown = [("The model as it is", "before")]
     shown += [(f"With {name.replace('_', ' ')}", name) for name in diagnosis["class"][:1] if name in diagnosis["maps"]]
-    return [(title, Markup(figures.plan_maps(diagnosis, which))) for title, which in shown]
+    drawn = figures.plan_maps(diagnosis, [which for _, which in shown])
+    return [(title, Markup(svg)) for (title, _), svg in zip(shown, drawn, strict=True)]
 
 
 def _strength(diagnosis: Mapping[str, Any]) -> list[tuple[str, Any]]:

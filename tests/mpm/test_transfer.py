@@ -107,3 +107,29 @@ def test_soil_sunk_into_a_tool_comes_out_by_the_second(steps: int) -> None:
     share = np.exp(-2.0 * 25.0 * 0.02)
     np.testing.assert_allclose(left[:2], share * depths[:2], rtol=0.05)
     assert left[2] < 2.5e-3
+
+
+@pytest.mark.parametrize("steps", [1, 8])
+def test_a_bed_stands_on_a_tool_whose_contact_keeps_its_load(steps: int) -> None:
+    """The contact bears the bed's weight, whose pressure p its springs balance at a depth of p * spacing / bulk. With
+    all of the load kept, the bed sinks no farther while soil comes out of the springs; without, ever on."""
+    upper, height, spacing = np.array([0.12, 0.12, 0.2]), 0.08, 0.01
+    plane = np.arange(0.5 * spacing, 0.12, spacing)
+    levels = np.arange(0.06 + 0.5 * spacing, 0.06 + height, spacing)
+    x = np.stack(np.meshgrid(plane, plane, levels, indexing="ij"), axis=-1).reshape(-1, 3)
+    plate = trimesh.creation.box([0.2, 0.2, 0.04])
+    # its upper face touches the lowest particles
+    held = Pose(np.array([0.06, 0.06, 0.045]), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), np.zeros(3))
+    smooth = Settings(friction_angle=35.0, wall_friction=0.0)
+
+    def sunk(memory: float) -> float:
+        resolution = replace(RESOLUTION, steps=steps, relaxation=100.0, memory=memory)
+        run = Solver(x[None], np.zeros(3), upper, plate, resolution, Law(), smooth, [{"friction_angle": 35.0}])
+        force = [run.advance([held] * steps)[0, 2] for _ in range(25)]
+        weight = len(x) * spacing**3 * RESOLUTION.density * 9.81
+        assert np.mean(force[-5:]) == pytest.approx(-weight, rel=1e-3)
+        return float(np.mean((x - run.positions()[0])[x[:, 2] > 0.13, 2]))
+
+    depth = RESOLUTION.density * 9.81 * height * spacing / RESOLUTION.bulk
+    assert sunk(1.0) == pytest.approx(depth, rel=0.5)
+    assert sunk(0.0) > 10.0 * depth

@@ -18,7 +18,7 @@ from splatsoil.inverse.criticism.diagnosis import diagnose
 from splatsoil.inverse.criticism.record import record
 
 from splatsoil.files import write_json
-from splatsoil.report import write_report
+from splatsoil.report import figures, write_report
 from splatsoil.report.words import steps, verdict
 
 CHROMIUM = shutil.which("chromium")
@@ -152,6 +152,16 @@ def test_before_and_after_are_side_by_side_for_every_frame(run: Path) -> None:
         assert [f["frame"] for f in camera["frames"]] == list(FRAMES)
         assert all(f["before"] != f["predicted"] for f in camera["frames"])
     assert "Observed, before, after, difference" in text
+
+
+def test_maps_before_and_after_have_colours_of_one_scale(diagnosis: dict[str, Any]) -> None:
+    before = np.array(diagnosis["maps"]["before"], dtype=np.float64)
+    there = {"before": before.tolist(), "after": (0.1 * before).tolist()}
+    one, other = (
+        {float(number) for number in re.findall(r">([-\u2212]?\d+\.?\d*)<", svg.replace("\u2212", "-"))}
+        for svg in figures.plan_maps({**diagnosis, "maps": there}, list(there))
+    )
+    assert one == other and max(one) > 0.1 * np.nanmax(np.abs(before))
 
 
 def test_a_run_without_criticism_says_nothing_of_it(run: Path) -> None:

@@ -122,4 +122,4 @@ def test_a_record_draws_forces_as_curves_and_pictures_on_the_plan() -> None:
     places = [site[1:] for site in told["sites"]]
     assert places[-1] == [None, None] and None not in places[0]
     assert "force" in figures.curves(told)
-    assert ">force<" not in figures.plan_maps(told, "before")
+    assert ">force<" not in figures.plan_maps(told, ["before"])[0]
