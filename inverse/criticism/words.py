@@ -100,7 +100,7 @@ def _outside(diagnosis: Diagnosis, candidates: Mapping[str, Candidate]) -> list[
             f"The nearest is {best.replace('_', ' ')} ({size}): with it the error on frames that the refit has not "
             f"seen goes from {before.held_out:.2g} to {confirmed.held_out:.2g} {diagnosis.unit} (noise alone leaves "
             f"{confirmed.floor:.2g}), which is {100.0 * diagnosis.explained:.0f} % of the misfit beyond chance. What "
-            "remains is more than noise, so it is not all that is missing; and what is refitted makes up for the rest as "
+            "remains is more than noise, so it is not all that is missing; what is refitted makes up for the rest as "
             "far as it can, so that it may be off by more than its ± says."
         )
     return out if diagnosis.strength is None else [*out, *of_strength(diagnosis.strength)]

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
 from splatsoil.benchmarks.hidden_effects import detectable, emulated, fitted
 from splatsoil.inverse.criticism.diagnosis import Options, diagnose
+from splatsoil.inverse.criticism.simulations import Simulations
 
 from splatsoil.experiment.emulated import EmulatedExperiment, FloatArray
 
@@ -44,3 +46,34 @@ def test_numerics_of_soil_with_the_effect_shift_no_parameter_unseen() -> None:
     assert np.sqrt(np.mean(np.square(np.divide(errors, stds)))) < 1.7
     # A spread as wide as what is believed before any data would hold any truth.
     assert max(stds) < SHIFT
+
+
+class Noted(Simulations):
+    """Simulations that remember where floors with an effect were measured."""
+
+    def __init__(self, experiment: EmulatedExperiment) -> None:
+        super().__init__(experiment)
+        self.where: list[dict[str, float]] = []
+
+    def __call__(self, values: Mapping[str, float], *, purpose: str = "", **others: Any) -> FloatArray:
+        if purpose.startswith("floor with"):
+            self.where.append(dict(values))
+        return super().__call__(values, purpose=purpose, **others)
+
+
+def test_the_floor_is_measured_where_all_times_put_the_parameters() -> None:
+    """Refits see every other time only, which by chance may lead them off; what is told is by all times."""
+    nearer = []
+    for world in range(4):
+        made = emulated(world)
+        truth = {"angle": 0.0, NAME: 4.0 * detectable(world, Options())[NAME]}
+        experiment = replace(made, observed=made.measured(truth, [world, 99]))
+        simulate = Noted(experiment)
+        best = diagnose(experiment, {"angle": fitted(experiment)}, simulate=simulate).confirmations[NAME]
+        assert all(point == simulate.where[0] for point in simulate.where)
+        far, near = (
+            np.hypot(*((point[n] - best.values[n]) / best.stds[n] for n in ("angle", NAME)))
+            for point in (best.fit.values, simulate.where[0])
+        )
+        nearer.append(near < far)
+    assert sum(nearer) >= 3
