@@ -68,6 +68,14 @@ def test_a_move_within_its_own_spread_is_not_called_bias(sizes: dict[str, float]
     assert told(2.0) == "With it the refit moves angle from 4 to 1.0 ± 2.0."
 
 
+def test_where_more_than_noise_remains_spreads_are_said_to_be_too_small(sizes: dict[str, float]) -> None:
+    found = one(WORLD, {"angle": 1.0, "effect 2": 5.0 * sizes["effect 2"]}, None, OPTIONS)
+    candidates = {c.name: c for c in emulated(WORLD).candidates}
+    for verdict, doubted in (("missing", False), ("outside the library", True)):
+        told = " ".join(sentences(replace(found, verdict=verdict), candidates, {"angle": 4.0}))
+        assert ("off by more than its ±" in told) is doubted
+
+
 def test_an_observation_effect_is_named_and_not_a_physical_one(sizes: dict[str, float]) -> None:
     found = one(WORLD, {"angle": 0.0, "effect 8": 5.0 * sizes["effect 8"]}, None, OPTIONS)
     assert found.members[0] == "effect 8"

@@ -136,6 +136,23 @@ def test_along_a_valley_chance_is_no_information() -> None:
     assert np.mean(by_slopes) < np.mean(inside) - 0.15
 
 
+def test_a_lucky_simulation_keeps_no_refit_where_it_is() -> None:
+    """One that chance made just like the observation, far from where all the others put the parameters."""
+    world = World(2, alike=0.8, chance=0.5)
+    visits = world.visits(15)
+
+    def predict(values: Mapping[str, float]) -> np.ndarray:
+        visits.append(Visit(dict(values), ("stick",), world(values)))
+        return visits[-1].table
+
+    astray = {"angle": 44.0, "stick": 650.0}
+    lucky = Refit(astray, 0.0, world.observed, 0, world.slopes[None])
+    fit = explored(predict, visits, whiten, world.observed, FREE, NOTHING, lucky)
+    exact, std = solved(world.slopes, world.observed[0])
+    for k, p in enumerate(FREE):
+        assert fit.values[p.name] == pytest.approx(exact[k], abs=2.0 * std[k])
+
+
 class Shaped:
     """Features of an effect that turns, as its shape grows, from one pattern into another."""
 
