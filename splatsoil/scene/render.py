@@ -33,6 +33,10 @@ PARTICLE_SIZE, PARTICLE_THICKNESS = 0.4, 0.2
 """Standard deviations of a particle's own Gaussian along the surface and across it, in particle spacings: so it ends
 where soil does, half a spacing over its uppermost particles."""
 
+BURIED_SIZE = 0.6
+"""Standard deviation, in particle spacings, of the Gaussian of a particle so deep that it ends beneath the surface all
+the same. A steep wall cuts layers of flat ones on edge, and what lies behind the soil would shine through."""
+
 _END = 2.0
 """Standard deviations from their centres at which Gaussians end: seen along the ground many overlap, opaque so far."""
 
@@ -274,11 +278,14 @@ def _settled(relief: Relief, centres: Tensor, shapes: Tensor, thickness: Tensor)
 
 
 def _grain_shapes(relief: Relief, grains: Tensor, spacing: float) -> Tensor:
-    """Covariances (p, 3, 3) of particles' own Gaussians at (p, 3), flat along the surface over them."""
+    """Covariances (p, 3, 3) of particles' own Gaussians at (p, 3): flat along the surface over them, round beneath."""
     normal = functional.normalize(relief.sample(relief.normal, grains), dim=1)
     along, across = (PARTICLE_SIZE * spacing) ** 2, (PARTICLE_THICKNESS * spacing) ** 2
     whole = along * torch.eye(3, device=grains.device)
-    return (whole - (along - across) * normal[:, :, None] * normal[:, None, :]).contiguous()
+    flat = whole - (along - across) * normal[:, :, None] * normal[:, None, :]
+    buried = relief.depth_below(grains) > _END * BURIED_SIZE * spacing
+    round_ = (BURIED_SIZE * spacing) ** 2 * torch.eye(3, device=grains.device)
+    return torch.where(buried[:, None, None], round_, flat).contiguous()
 
 
 def _tool_among_splats(posed: Posed, camera: Camera) -> Tensor:

@@ -60,7 +60,7 @@ _RANGES = """
                 const float last = g[9] * low + middle + __builtin_sqrtf(low_room > 0.0f ? low_room : 0.0f);
                 const float begin_row = (float)top[h], end_row = (float)bottom[h];
                 const int start = (int)__builtin_ceilf(first > begin_row ? first : begin_row);
-                from[i][h] = (low_room < 0.0f) | (high_room < 0.0f) ? 16 : start;
+                from[i][h] = ((low_room < 0.0f) | (high_room < 0.0f)) ? 16 : start;
                 to[i][h] = (int)__builtin_floorf(last < end_row ? last : end_row);
             }
         }

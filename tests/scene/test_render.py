@@ -225,6 +225,27 @@ def test_soil_ends_at_its_surface_when_seen_at_a_grazing_angle(turned):
     assert seen == pytest.approx(edge, abs=1.5)
 
 
+def test_nothing_shines_through_a_steep_wall():
+    """Soil on one half of the bed, as high as five layers of particles that lie at random: its cut face shows soil
+    alone, whatever stands behind."""
+    half = level_bed()[level_bed()[:, 1] > 0.2]
+    particles = half + 0.25 * SPACING * torch.tensor(np.random.default_rng(0).uniform(-1.0, 1.0, half.shape)).float()
+    behind = torch.diag(torch.tensor([0.3, 0.01, 0.3]) ** 2)[None]
+    blue = Gaussians(
+        torch.tensor([[0.2, 0.5, 0.05]]),
+        torch.tensor([[0.3, 0.01, 0.3]]),
+        torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        torch.tensor([0.99]),
+        torch.tensor([[0.0, 0.0, 1.0]]),
+    )
+    scene = scene_of(half).with_particles(particles).replace(surroundings=blue, surrounding_shapes=behind)
+    view = camera((0.2, -0.3, 0.12), (0.2, 0.2, 0.06)).scaled(2.0)
+    layers = scene.layers(scene.pose(particles, None, None), view)
+    face = np.array([pixel(view, (x, 0.2, z)) for x in np.linspace(0.06, 0.34, 57) for z in np.linspace(0.02, 0.08, 13)])
+    seen = layers.colour.numpy()[face[:, 0], face[:, 1]]
+    assert np.allclose(seen, encoded(ALBEDO).numpy(), atol=0.05)
+
+
 @pytest.mark.slow
 def test_true_particles_look_like_the_measured_frames():
     """The renderer's floor, apart from any physics: an independent simulator's particles, its path-traced frames.
