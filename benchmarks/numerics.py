@@ -63,12 +63,13 @@ class Truth:
         try:
             told = json.loads((folder / "truth.json").read_text())
             with np.load(folder / "truth_particles.npz") as file:
-                particles = {int(k[1:]): file[k] * float(file["scale"]) for k in file.files if k[0] == "f"}
+                low = file["origin"] if "origin" in file.files else 0.0
+                particles = {int(k[1:]): file[k] * float(file["scale"]) + low for k in file.files if k[0] == "f"}
                 volume = float(file["spacing"]) ** 3
         except OSError as error:
             raise MeasurementError("the benchmark needs true particles", file=folder) from error
-        values = {"friction_angle": float(told["phi"])}
-        if told["cohesion"]:
+        values = {"friction_angle": float(told["phi"] if "phi" in told else told["friction_angle"])}
+        if told.get("cohesion"):
             values["cohesion"] = float(told["cohesion"])
         return cls(measurement, particles, volume, values, tuple(n for n in ("cohesion",) if n in values))
 

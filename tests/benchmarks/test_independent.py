@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +17,20 @@ SPACING, COARSE = 0.02, Numerics(voxel=0.04, substeps=2, iterations=60)
 
 def test_the_set_tells_the_numerics_it_was_made_with(plow_dry: Path) -> None:
     assert Numerics.of(plow_dry) == Numerics(voxel=0.02, substeps=2, iterations=120)
+
+
+def test_true_particles_lie_where_the_set_says_whatever_the_origin(plow_dry: Path, tmp_path: Path) -> None:
+    """Our own sets store positions from below the bed on, so that none is negative."""
+    shifted = tmp_path / "shifted"
+    shutil.copytree(plow_dry, shifted)
+    with np.load(plow_dry / "truth_particles.npz") as file:
+        stored = dict(file)
+    above = np.array([0.0, 0.0, 800], dtype=np.uint16)
+    arrays = {k: v + above if k[0] == "f" else v for k, v in stored.items()}
+    origin = -above.astype(np.float64) * float(stored["scale"])
+    np.savez(shifted / "truth_particles.npz", **arrays, origin=origin)
+    there, here = Truth.load(shifted), Truth.load(plow_dry)
+    assert np.allclose(there.particles[100], here.particles[100], atol=1e-9)
 
 
 def test_a_world_between_two_angles_is_estimated_between_them() -> None:
