@@ -204,6 +204,11 @@ def test_a_reader_that_goes_away_is_no_error(plow_dry: Path) -> None:
     assert (done.returncode, done.stderr) == (0, "")
 
 
+def test_a_command_that_simulates_says_nothing_of_what_the_machine_lacks() -> None:
+    done = run("element", "--test", "triaxial", "--json")
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_the_readme_lists_the_commands_there_are(repository: Path) -> None:
     listed = re.findall(r"^\| `splatsoil ([a-z-]+)", (repository / "README.md").read_text(), flags=re.MULTILINE)
     assert sorted(listed) == sorted(cli.commands())

@@ -37,6 +37,7 @@ class Config:
 
 def run(config: Config) -> int:
     """Reconstruct, save, print; an error before any work when set, options or the folder for the result are no good."""
+    from splatsoil.commands._stages import hush
     from splatsoil.envs.devices import resolve_device
     from splatsoil.errors import ParameterError
     from splatsoil.files import check_folder
@@ -46,6 +47,7 @@ def run(config: Config) -> int:
 
     if not 0 <= config.seed < 2**63:
         raise ParameterError(f"--seed: must be 0 or more and less than 2^63, not {config.seed}")
+    hush()
     device = resolve_device(config.device)
     measurement = Measurement.load(config.set)
     out = config.out or Path("runs") / f"{measurement.name}-reconstruction"

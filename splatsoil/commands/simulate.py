@@ -57,13 +57,12 @@ def run(config: Config) -> int:
     values = parse_values(config.values)
     if "friction_angle" in values:
         raise ParameterError("the friction angle is given by --friction-angle, not by --set")
-    import warp as wp
-
-    wp.config.quiet = True
+    from splatsoil.commands._stages import hush
     from splatsoil.reconstruction.progress import progress_bar
     from splatsoil.synthetic import make_set
     from splatsoil.synthetic.world import check_place
 
+    hush()
     check_place(config.out)
     setup = choose_setup(config)
     preset = config.preset or ("paper" if config.scene == "paper" and config.like is None else "small")
