@@ -241,7 +241,9 @@ def test_nothing_shines_through_a_steep_wall():
     scene = scene_of(half).with_particles(particles).replace(surroundings=blue, surrounding_shapes=behind)
     view = camera((0.2, -0.3, 0.12), (0.2, 0.2, 0.06)).scaled(2.0)
     layers = scene.layers(scene.pose(particles, None, None), view)
-    face = np.array([pixel(view, (x, 0.2, z)) for x in np.linspace(0.06, 0.34, 57) for z in np.linspace(0.02, 0.08, 13)])
+    face = np.array(
+        [pixel(view, (x, 0.2, z)) for x in np.linspace(0.06, 0.34, 57) for z in np.linspace(0.02, 0.08, 13)]
+    )
     seen = layers.colour.numpy()[face[:, 0], face[:, 1]]
     assert np.allclose(seen, encoded(ALBEDO).numpy(), atol=0.05)
 
