@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from splatsoil.benchmarks._common import hush, sources
+from splatsoil.benchmarks._common import sources
 from splatsoil.envs.measured import LOSS
 from splatsoil.envs.synthetic import SyntheticProblem
 from splatsoil.envs.synthetic_world import World
@@ -21,6 +21,7 @@ from splatsoil.inverse.run_folder import RunFolder
 
 import splatsoil
 from splatsoil.files import code_digest, read_json, write_json
+from splatsoil.quiet import hush
 
 FloatArray = npt.NDArray[np.float64]
 

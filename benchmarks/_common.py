@@ -28,13 +28,6 @@ FILES = ("parameters.py", "model.py", "comparison.py", "robust_loss.py")
 BESIDE = ("splatsoil.envs", "splatsoil.inverse")
 
 
-def hush() -> None:
-    """Keep Warp from telling which kernels it loads."""
-    import warp as wp
-
-    wp.config.log_level = wp.LOG_ERROR
-
-
 def world_options(parser: argparse.ArgumentParser) -> None:
     """Options that choose a world to simulate."""
     parser.add_argument("set", type=Path, nargs="?", help="measurement set; none: the made-up world of PlowSand-v0")

@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import emcee
 import numpy as np
 import numpy.typing as npt
-from splatsoil.benchmarks._common import hush, output_options, simulated, stamp, ticker, world_options, write_result
+from splatsoil.benchmarks._common import output_options, simulated, stamp, ticker, world_options, write_result
 from splatsoil.envs.synthetic import SyntheticProblem
 from splatsoil.envs.together import attempt
 from splatsoil.inverse.bayesopt import PAPER, BayesianOptimiser, Search
@@ -41,6 +41,7 @@ from splatsoil.inverse.surrogate import Minimum, Surrogate, sobol
 
 from splatsoil.errors import ParameterError, RunError
 from splatsoil.parameters import ParameterSpace
+from splatsoil.quiet import hush
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

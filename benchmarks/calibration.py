@@ -28,7 +28,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import binom, chisquare
 from splatsoil.benchmarks._calibration_full import one_truth
-from splatsoil.benchmarks._common import hush, output_options, simulated, stamp, ticker, world_options, write_result
+from splatsoil.benchmarks._common import output_options, simulated, stamp, ticker, world_options, write_result
 from splatsoil.envs.synthetic import SENSOR_NOISE, SyntheticProblem
 from splatsoil.inverse.executors import Executor, Serial, executor, in_order
 from splatsoil.inverse.mcmc import sample
@@ -36,6 +36,7 @@ from splatsoil.inverse.posterior import Data, likelihood_of
 
 from splatsoil.errors import ParameterError
 from splatsoil.parameters import ParameterSpace
+from splatsoil.quiet import hush
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from splatsoil.benchmarks._common import hush, keep_to_one_protocol, sources, stamp
+from splatsoil.benchmarks._common import keep_to_one_protocol, sources, stamp
 from splatsoil.benchmarks._mitsuba import MitsubaStage, load_mitsuba
 from splatsoil.benchmarks._newton import Numerics, World, plough
 from splatsoil.benchmarks.hidden_effects import wilson
@@ -31,6 +31,7 @@ from splatsoil.benchmarks.numerics import FloatArray
 from splatsoil.files import plain, write_json
 from splatsoil.mpm import Resolution, Trajectory, frames_around
 from splatsoil.observation import Observation
+from splatsoil.quiet import hush
 from splatsoil.reconstruction import fill
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects

@@ -17,13 +17,14 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 from rich.console import Console
-from splatsoil.benchmarks._common import hush, output_options, stamp, write_result
+from splatsoil.benchmarks._common import output_options, stamp, write_result
 
 from splatsoil.commands._output import print_json
 from splatsoil.errors import MeasurementError, ParameterError
 from splatsoil.files import plain, read_json
 from splatsoil.measurement import Measurement
 from splatsoil.model import Model
+from splatsoil.quiet import hush
 from splatsoil.reconstruction import reconstruct
 from splatsoil.reconstruction.progress import progress_bar
 from splatsoil.synthetic import Appearance, make_set, plow

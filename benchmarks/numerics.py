@@ -58,7 +58,7 @@ class Truth:
 
     @classmethod
     def load(cls, folder: Path) -> Truth:
-        """Read ``truth.json`` and ``truth_particles.npz``; MeasurementError when the set has none."""
+        """Read ``truth.json`` and ``truth_particles.npz``; MeasurementError when the set has none, or other ones."""
         measurement = Measurement.load(folder)
         try:
             told = json.loads((folder / "truth.json").read_text())
@@ -68,10 +68,17 @@ class Truth:
                 volume = float(file["spacing"]) ** 3
         except OSError as error:
             raise MeasurementError("the benchmark needs true particles", file=folder) from error
-        values = {"friction_angle": float(told["phi"] if "phi" in told else told["friction_angle"])}
-        if told.get("cohesion"):
-            values["cohesion"] = float(told["cohesion"])
-        return cls(measurement, particles, volume, values, tuple(n for n in ("cohesion",) if n in values))
+        if "parameters" in told:  # a set of ours
+            values, effects = {k: float(v) for k, v in told["parameters"].items()}, tuple(told["effects"])
+        elif "phi" in told:
+            cohesion = float(told["cohesion"])
+            values, effects = {"friction_angle": float(told["phi"])}, ("cohesion",) if cohesion else ()
+            values |= {"cohesion": cohesion} if cohesion else {}
+        else:
+            raise MeasurementError(
+                "the benchmark needs the true parameters", file=folder / "truth.json", field="parameters"
+            )
+        return cls(measurement, particles, volume, values, effects)
 
     def heights(self, x: npt.NDArray[np.floating], volume: float) -> FloatArray:
         """Surface (ny, nx) in m, smoothed over one cell, whatever the particles' size."""

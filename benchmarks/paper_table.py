@@ -36,7 +36,6 @@ from typing import Any
 
 import numpy as np
 from splatsoil.benchmarks._common import (
-    hush,
     keep_to_one_protocol,
     output_options,
     sources,
@@ -48,6 +47,7 @@ from splatsoil.benchmarks._paper_budget import budget_table, error_budget
 from splatsoil.inverse.executors import executor
 
 from splatsoil.files import read_json, write_json
+from splatsoil.quiet import hush
 
 #: What this project set out to reach at all four, degrees.
 TARGET = (0.3, 0.3)

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from splatsoil.benchmarks._common import hush
 from splatsoil.benchmarks._speed import (
     against_newton,
     against_taichi,
@@ -33,6 +32,7 @@ from splatsoil.commands._output import only_json, print_json
 from splatsoil.errors import RunError, SplatsoilError
 from splatsoil.files import check_folder, plain, read_json, write_json, write_text
 from splatsoil.mpm import PRESETS
+from splatsoil.quiet import hush
 
 FORMAT = "splatsoil-speed/1"
 

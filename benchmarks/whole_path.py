@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Any
 
 from splatsoil.benchmarks import numerics
-from splatsoil.benchmarks._common import hush
 from splatsoil.benchmarks._speed import machine
 from splatsoil.benchmarks._speed.clock import repeated
 from splatsoil.benchmarks._speed.page import between
@@ -38,6 +37,7 @@ from splatsoil.files import check_folder, plain, read_json, write_json, write_te
 from splatsoil.measurement import Measurement
 from splatsoil.model import Model
 from splatsoil.mpm import PRESETS
+from splatsoil.quiet import hush
 from splatsoil.reconstruction import Reconstruction, reconstruct
 
 FORMAT = "splatsoil-whole-path/1"

@@ -204,8 +204,8 @@ def test_a_reader_that_goes_away_is_no_error(plow_dry: Path) -> None:
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_a_command_that_simulates_says_nothing_of_what_the_machine_lacks() -> None:
-    done = run("element", "--test", "triaxial", "--json")
+def test_a_command_that_simulates_says_nothing_of_what_the_machine_lacks(tmp_path: Path) -> None:
+    done = run("element", "--test", "triaxial", "--json", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
 
 

@@ -80,16 +80,16 @@ def _simulate(path: Path, device: str, effects: tuple[str, ...], job: Mapping[st
     import signal
 
     from splatsoil.commands import _criticism as criticism
-    from splatsoil.commands import _stages as stage
     from splatsoil.errors import SplatsoilError
     from splatsoil.inverse.run_folder import RunFolder
+    from splatsoil.quiet import hush
     from splatsoil.threads import one_thread
 
     key = (path, device, effects)
     with one_thread(), contextlib.suppress(SplatsoilError, OSError):
         if key not in _known:
             signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process ends this one
-            stage.hush()
+            hush()
             folder = RunFolder.open(path)
             model = criticism.model_of(folder, device, lambda what, share: None)
             _known[key] = criticism.experiment_of(folder, model, effects or None)[1]

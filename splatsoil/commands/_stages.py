@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,23 +24,6 @@ if TYPE_CHECKING:
 GAIN = 4.0
 #: Evaluations of a fit that are chosen and simulated together: as many cores as a small laptop has.
 TOGETHER = 2
-
-
-def hush() -> None:
-    """Keep Warp from telling which kernels it loads, and that it found no GPU."""
-    import warp
-
-    warp.config.log_level = warp.LOG_ERROR
-    # That there is no GPU it tells below Python, whatever the level.
-    sys.stderr.flush()
-    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(nowhere, 2)
-        warp.init()
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(nowhere)
 
 
 def prepare(options: FitOptions) -> tuple[Measurement, RunFolder]:

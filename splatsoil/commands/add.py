@@ -45,17 +45,17 @@ class Config:
 def run(config: Config) -> int:
     """Refit with each effect, keep the history, draw the report."""
     from splatsoil.commands import _criticism as criticism
-    from splatsoil.commands import _stages as stage
     from splatsoil.commands._progress import stages
     from splatsoil.envs.devices import resolve_device
     from splatsoil.errors import ParameterError
     from splatsoil.inverse.criticism.diagnosis import Options
     from splatsoil.inverse.run_folder import RunFolder
+    from splatsoil.quiet import hush
     from splatsoil.report import write_report
     from splatsoil.soil.law import Law
     from splatsoil.soil.library import find_effects
 
-    stage.hush()
+    hush()
     options = Options(repeats=config.repeats)
     criticism.check_budget(options)
     folder = RunFolder.open(config.run)

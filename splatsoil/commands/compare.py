@@ -44,8 +44,9 @@ def run(config: Config) -> int:
     from splatsoil.envs.devices import resolve_device
     from splatsoil.inverse.criticism.diagnosis import Options
     from splatsoil.inverse.run_folder import RunFolder
+    from splatsoil.quiet import hush
 
-    stage.hush()
+    hush()
     options = Options(repeats=config.repeats)
     criticism.check_budget(options)
     folder = RunFolder.open(config.run)

@@ -41,14 +41,14 @@ class Config:
 def run(config: Config) -> int:
     """Diagnose; the result goes into the run folder."""
     from splatsoil.commands import _criticism as criticism
-    from splatsoil.commands import _stages as stage
     from splatsoil.commands._diagnosis_table import show
     from splatsoil.commands._progress import stages
     from splatsoil.envs.devices import resolve_device
     from splatsoil.inverse.criticism.diagnosis import Options
     from splatsoil.inverse.run_folder import RunFolder
+    from splatsoil.quiet import hush
 
-    stage.hush()
+    hush()
     options = Options(repeats=config.repeats, refits=config.refits, refit_steps=config.refit_steps)
     criticism.check_budget(options)
     folder = RunFolder.open(config.run)

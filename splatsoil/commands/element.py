@@ -62,12 +62,12 @@ LEAST_SPAN, LEAST_STRAIN = 0.02, 1.0e-3
 
 def run(config: Config) -> int:
     """Test, print and plot."""
-    from splatsoil.commands import _stages as stage
     from splatsoil.commands.simulate import parse_values
+    from splatsoil.quiet import hush
     from splatsoil.soil.law import Law
     from splatsoil.soil.library import find_effects
 
-    stage.hush()
+    hush()
     values = parse_values(config.values)
     if "friction_angle" in values:
         raise ParameterError("the friction angle is given by --friction-angle, not by --set")

@@ -21,8 +21,9 @@ def run(config: Config) -> int:
     from splatsoil.commands._progress import stages
     from splatsoil.envs.devices import resolve_device
     from splatsoil.model import Model
+    from splatsoil.quiet import hush
 
-    stage.hush()
+    hush()
     measurement, folder = stage.prepare(config)
     device = resolve_device(config.device)
     with stages(quiet=config.json) as begin:

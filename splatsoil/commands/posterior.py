@@ -47,12 +47,13 @@ def run(config: Config) -> int:
     from splatsoil.inverse.executors import executor
     from splatsoil.inverse.posterior_run import Effort, run_posterior, setup_of
     from splatsoil.inverse.run_folder import RunFolder
+    from splatsoil.quiet import hush
 
     for name in ("design", "repeats", "checks", "seed"):
         value = getattr(config, name)
         if value is not None and value < 0:
             raise ParameterError(f"--{name}: must be 0 or more, not {value}")
-    stage.hush()
+    hush()
     folder = RunFolder.open(config.run)
     setup = setup_of(folder.fit()["setup"])
     wanted = ("cuda:0" if setup.device == "cuda" else "cpu") if config.device == "auto" else config.device

@@ -37,11 +37,11 @@ class Config:
 
 def run(config: Config) -> int:
     """Reconstruct, save, print; an error before any work when set, options or the folder for the result are no good."""
-    from splatsoil.commands._stages import hush
     from splatsoil.envs.devices import resolve_device
     from splatsoil.errors import ParameterError
     from splatsoil.files import check_folder
     from splatsoil.measurement import Measurement
+    from splatsoil.quiet import hush
     from splatsoil.reconstruction import reconstruct
     from splatsoil.reconstruction.progress import progress_bar
 

@@ -54,9 +54,10 @@ def run(config: Config) -> int:
     from splatsoil.errors import ParameterError
     from splatsoil.files import plain, read_json
     from splatsoil.model import Model
+    from splatsoil.quiet import hush
     from splatsoil.report import write_report
 
-    stage.hush()
+    hush()
     if config.most_effects < 0:
         raise ParameterError(f"--most-effects: must be 0 or more, not {config.most_effects}")
     stopped, diagnosis = "", None

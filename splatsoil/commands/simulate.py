@@ -57,7 +57,7 @@ def run(config: Config) -> int:
     values = parse_values(config.values)
     if "friction_angle" in values:
         raise ParameterError("the friction angle is given by --friction-angle, not by --set")
-    from splatsoil.commands._stages import hush
+    from splatsoil.quiet import hush
     from splatsoil.reconstruction.progress import progress_bar
     from splatsoil.synthetic import make_set
     from splatsoil.synthetic.world import check_place

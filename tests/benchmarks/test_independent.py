@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -19,8 +20,8 @@ def test_the_set_tells_the_numerics_it_was_made_with(plow_dry: Path) -> None:
     assert Numerics.of(plow_dry) == Numerics(voxel=0.02, substeps=2, iterations=120)
 
 
-def test_true_particles_lie_where_the_set_says_whatever_the_origin(plow_dry: Path, tmp_path: Path) -> None:
-    """Our own sets store positions from below the bed on, so that none is negative."""
+def test_the_truth_of_a_set_of_ours_is_read_like_that_of_the_examples(plow_dry: Path, tmp_path: Path) -> None:
+    """Ours store positions from below the bed on, so that none is negative, and parameters by name."""
     shifted = tmp_path / "shifted"
     shutil.copytree(plow_dry, shifted)
     with np.load(plow_dry / "truth_particles.npz") as file:
@@ -29,7 +30,11 @@ def test_true_particles_lie_where_the_set_says_whatever_the_origin(plow_dry: Pat
     arrays = {k: v + above if k[0] == "f" else v for k, v in stored.items()}
     origin = -above.astype(np.float64) * float(stored["scale"])
     np.savez(shifted / "truth_particles.npz", **arrays, origin=origin)
+    parameters = {"friction_angle": 36.0, "cohesion": 250.0}
+    (shifted / "truth.json").write_text(json.dumps({"parameters": parameters, "effects": ["cohesion"]}))
     there, here = Truth.load(shifted), Truth.load(plow_dry)
+    assert (there.values, there.effects) == (parameters, ("cohesion",))
+    assert (here.values, here.effects) == ({"friction_angle": 36.0}, ())
     assert np.allclose(there.particles[100], here.particles[100], atol=1e-9)
 
 

@@ -228,7 +228,8 @@ def test_soil_ends_at_its_surface_when_seen_at_a_grazing_angle(turned):
 def test_nothing_shines_through_a_steep_wall():
     """Soil on one half of the bed, as high as five layers of particles that lie at random: its cut face shows soil
     alone, whatever stands behind."""
-    half = level_bed()[level_bed()[:, 1] > 0.2]
+    bed = level_bed()
+    half = bed[bed[:, 1] > 0.2]
     particles = half + 0.25 * SPACING * torch.tensor(np.random.default_rng(0).uniform(-1.0, 1.0, half.shape)).float()
     behind = torch.diag(torch.tensor([0.3, 0.01, 0.3]) ** 2)[None]
     blue = Gaussians(
