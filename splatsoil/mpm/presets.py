@@ -67,6 +67,9 @@ class Resolution:
             know, whatever the number of ``steps``: the former are damped as that many plain APIC exchanges would, soil
             sunk into the tool comes out at twice the rate. 0 for as many as there are.
         memory: share of its load, 0 to 1, that the tool's contact keeps when soil comes out of it.
+        skin: of the spacing, how far from the faces of a plate thinner than a cell particles stop, because they stand
+            for soil half a spacing around them. Its edges, and thick bodies, need none: contact acts through the grid,
+            which widens those.
     """
 
     cell: float
@@ -79,6 +82,7 @@ class Resolution:
     density: float
     relaxation: float = 0.0
     memory: float = 0.0
+    skin: float = 0.5
 
     def __post_init__(self) -> None:
         for name in ("cell", "spacing", "frame_time", "steps", "courant", "bulk", "shear", "density"):
@@ -87,8 +91,9 @@ class Resolution:
                 raise SimulationError(f"resolution: {name} = {value} must be a positive number")
         if not (math.isfinite(self.relaxation) and self.relaxation >= 0.0):
             raise SimulationError(f"resolution: relaxation = {self.relaxation} must be 0 or a positive number")
-        if not 0.0 <= self.memory <= 1.0:
-            raise SimulationError(f"resolution: memory = {self.memory} must be between 0 and 1")
+        for name in ("memory", "skin"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise SimulationError(f"resolution: {name} = {getattr(self, name)} must be between 0 and 1")
         if self.courant > COURANT_LIMIT:
             raise SimulationError(
                 f"resolution: a Courant number of {self.courant} breaks the wave-speed limit of {COURANT_LIMIT}"

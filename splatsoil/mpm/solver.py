@@ -24,6 +24,7 @@ from splatsoil.mpm.state import Cells, Nodes, Particles
 from splatsoil.mpm.substep import contact_forces, make_stress_kernel, move_nodes
 from splatsoil.mpm.tool import Pose, build_tool
 from splatsoil.mpm.transfer import (
+    allow_start,
     average_cells,
     bound_stretch,
     find_gaps,
@@ -135,9 +136,12 @@ class Solver:
                 stiffness=spring,
                 damping=2.0 * CONTACT_DAMPING * math.sqrt(spring * self._particles.mass),
                 device=device,
+                skin=resolution.skin * resolution.spacing,
+                thin=resolution.cell,
             )
         )
         self._start(x, base)
+        self._met = False
         self.frame = 0
 
     def _refuse_unseen(self, obstacles: npt.NDArray[np.float64]) -> None:
@@ -315,6 +319,9 @@ class Solver:
         self._pose.assign(pose.row().astype(np.float32))
         near = [self.tool, self._pose, reach, self._near, self._near_count]
         wp.launch(find_gaps, dim=n, inputs=[p, *near], device=device)
+        if not self._met:
+            wp.launch(allow_start, dim=n, inputs=[p], device=device)
+            self._met = True
         return wp.launch(
             contact_forces,
             dim=self._size(self._near_count, n),

@@ -28,7 +28,8 @@ class Particles:
         gap: signed distance to the tool, m, carried through a step's substeps.
         drift: way the particle has gone relative to the tool since the step began, m.
         gap_normal: outward normal of the tool there, in the world.
-        preload: what the contact spring is loaded by beyond its depth in the tool, m.
+        preload: what the contact spring is loaded by beyond its depth in the tool, m; negative: the depth up to which
+            it isn't loaded, where the tool started in the soil.
         per_simulation: particles of one simulation.
         volume: initial volume of a particle, m^3.
         mass: kg, of a particle of nominal density.

@@ -15,6 +15,10 @@ FAR = 1.0e6
 SAMPLES_ACROSS = 4
 """Distance samples across the tool where it is thin, so that a plate keeps both its faces."""
 MOST_SAMPLES = 160
+PARALLEL = 0.9
+"""Cosine of the angle between two faces of a plate, at least."""
+SAME_PLANE = 0.1
+"""Singular values, over the largest, below which faces that meet lie in one plane."""
 
 
 @wp.struct
@@ -22,7 +26,7 @@ class Tool:
     """A rigid body's distance field in its own frame, with the penalty law of its surface.
 
     Attributes:
-        distance: signed distance in m, negative inside, on a regular lattice.
+        distance: signed distance in m from where soil stops, negative inside, on a regular lattice.
         lower: position of the first sample in the tool's frame, m.
         spacing: lattice spacing, m.
         stiffness: normal force per penetration of one particle, N/m.
@@ -81,8 +85,55 @@ def distance_normal(tool: Tool, point: wp.vec3) -> wp.vec3:
     return wp.normalize(gradient)
 
 
-def build_tool(mesh: trimesh.Trimesh, *, margin: float, stiffness: float, damping: float, device: str) -> Tool:
-    """Sample the distance field of ``mesh`` (its own frame, m) out to ``margin`` in m.
+@wp.kernel
+def _measure_thickness(
+    mesh: wp.uint64,
+    centre: wp.array(dtype=wp.vec3),
+    normal: wp.array(dtype=wp.vec3),
+    inside: float,
+    thickness: wp.array(dtype=float),
+) -> None:
+    i = wp.tid()
+    # from a little inside, or the ray would end where it begins
+    through = wp.mesh_query_ray(mesh, centre[i] - inside * normal[i], -normal[i], FAR)
+    thickness[i] = FAR
+    if through.result and wp.dot(normal[i], wp.mesh_eval_face_normal(mesh, through.face)) < -PARALLEL:
+        thickness[i] = inside + through.t
+
+
+def thickened(mesh: trimesh.Trimesh, skin: float, thin: float) -> trimesh.Trimesh:
+    """A body whose faces have moved outward by ``skin`` (m) where another one lies behind, nearly parallel and within
+    ``thin`` (m), and by less, with the square of the ratio, where it is farther. A plate's edges stay where they are.
+    """
+    surface = _surface(mesh, "cpu")
+    centres, normals = (
+        wp.array(a.astype(np.float32), dtype=wp.vec3) for a in (mesh.triangles_center, mesh.face_normals)
+    )
+    thickness = wp.zeros(len(mesh.faces), dtype=float)
+    inside = 1.0e-4 * float(mesh.extents.max())
+    wp.launch(_measure_thickness, dim=len(mesh.faces), inputs=[surface.id, centres, normals, inside, thickness])
+    moved = skin * np.minimum(thin / thickness.numpy().astype(np.float64), 1.0) ** 2
+    # each corner goes where the planes that met in it meet again
+    vertices = np.array(mesh.vertices)
+    for vertex, faces in enumerate(mesh.vertex_faces):
+        meeting = faces[faces >= 0]
+        vertices[vertex] += np.linalg.lstsq(mesh.face_normals[meeting], moved[meeting], rcond=SAME_PLANE)[0]
+    return trimesh.Trimesh(vertices, mesh.faces, process=False)
+
+
+def _surface(mesh: trimesh.Trimesh, device: str) -> wp.Mesh:
+    return wp.Mesh(
+        wp.array(np.asarray(mesh.vertices, dtype=np.float32), dtype=wp.vec3, device=device),
+        wp.array(np.asarray(mesh.faces, dtype=np.int32).reshape(-1), dtype=int, device=device),
+        support_winding_number=True,
+    )
+
+
+def build_tool(
+    mesh: trimesh.Trimesh, *, margin: float, stiffness: float, damping: float, device: str, skin: float, thin: float
+) -> Tool:
+    """Sample the distance field of ``mesh`` (its own frame, m) out to ``margin`` in m, :func:`thickened` by ``skin``
+    where it is no thicker than ``thin``.
 
     Raises:
         SimulationError: the mesh encloses no volume.
@@ -95,11 +146,7 @@ def build_tool(mesh: trimesh.Trimesh, *, margin: float, stiffness: float, dampin
     spacing = float(max(thinnest / SAMPLES_ACROSS, (extents.max() + 2.0 * margin) / MOST_SAMPLES))
     lower = mesh.bounds[0] - margin
     shape = tuple(int(n) for n in np.ceil((extents + 2.0 * margin) / spacing).astype(int) + 1)
-    surface = wp.Mesh(
-        wp.array(np.asarray(mesh.vertices, dtype=np.float32), dtype=wp.vec3, device=device),
-        wp.array(np.asarray(mesh.faces, dtype=np.int32).reshape(-1), dtype=int, device=device),
-        support_winding_number=True,
-    )
+    surface = _surface(thickened(mesh, skin, thin), device)
     distance = wp.zeros(shape, dtype=float, device=device)
     wp.launch(_measure_distance, dim=shape, inputs=[surface.id, wp.vec3(*lower), spacing, distance], device=device)
     tool = Tool()

@@ -155,6 +155,14 @@ def find_gaps(
 
 
 @wp.kernel(enable_backward=False)
+def allow_start(particles: Particles) -> None:
+    """Soil in which the tool starts doesn't load its contact, or it would be shot out of it."""
+    p = wp.tid()
+    if particles.gap[p] < 0.0 and particles.gap[p] > -FAR:
+        particles.preload[p] = particles.gap[p]
+
+
+@wp.kernel(enable_backward=False)
 def grid_to_particles(
     particles: Particles,
     cells: Cells,
@@ -226,7 +234,10 @@ def grid_to_particles(
     if gap < 0.0 and gap > -FAR:
         out = -wp.min(release * gap, gap + deepest)
         x += out * particles.gap_normal[p]
-        particles.preload[p] = wp.min(particles.preload[p] + memory * out, deepest)
+        preload = particles.preload[p]
+        if preload < 0.0:
+            preload = wp.max((1.0 - release) * preload, -deepest)
+        particles.preload[p] = wp.min(preload + memory * out, deepest)
     elif gap > particles.preload[p]:
         particles.preload[p] = 0.0
     low = grid.origin

@@ -8,7 +8,9 @@ a decomposition of F).
 
 The flow is non-associated: a plastic shear strain g (engineering measure) lowers sqrt(J2) by G g and gains the volume
 b g, which raises the pressure by K b g, so the point that ends on the cone sqrt(J2) = k + a p has
-g = (sqrt(J2) - k - a p) / (G + a b K) of the trial stress (de Souza Neto et al. 2008, sec. 8.3).
+g = (sqrt(J2) - k - a p) / (G + a b K) of the trial stress (de Souza Neto et al. 2008, sec. 8.3). Viscous soil stays
+beyond the cone by the viscosity times the plastic rate g / dt (Perzyna 1966; ibid., sec. 11.5), which adds
+viscosity / dt to G + a b K.
 """
 
 from __future__ import annotations
@@ -147,8 +149,6 @@ def _stress_update(strength_of: Any, history: bool) -> Any:
                 elastic = elastic + lost
                 pressure = -bulk * elastic
                 limit = strength.intercept + strength.slope * pressure
-            if opening <= 0.0:
-                limit = limit + strength.viscosity * state.shear_rate
             slip = 0.0
             if measure > limit:
                 gain = 0.0
@@ -156,14 +156,14 @@ def _stress_update(strength_of: Any, history: bool) -> Any:
                     # soil that has come apart is looser than any dilation makes it
                     least = LEAST_DILATION * shear / (bulk * wp.max(strength.slope, 1.0e-6))
                     gain = wp.max(strength.dilation, least)
-                slip = (measure - limit) / (shear + strength.slope * gain * bulk)
+                slip = (measure - limit) / (shear + strength.viscosity / dt + strength.slope * gain * bulk)
                 slip = wp.min(slip, measure / shear)
                 dilated = dilated + gain * slip
                 elastic = elastic - gain * slip
                 if -bulk * elastic < apex:
                     opening = opening + elastic + apex / bulk
                     elastic = -apex / bulk
-                limit = wp.max(limit + strength.slope * gain * slip * bulk, 0.0)
+                limit = wp.max(limit + (strength.viscosity / dt + strength.slope * gain * bulk) * slip, 0.0)
                 s = s * (limit / wp.max(measure, 1.0e-12))
             result.plastic_strain = stress.plastic_strain + slip
             result.dilated = dilated

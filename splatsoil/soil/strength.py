@@ -35,7 +35,7 @@ class Strength:
         intercept: sqrt(J2) at zero pressure in Pa.
         intercept_per_cohesion: intercept that a Mohr-Coulomb cohesion of 1 Pa gives at this friction angle.
         dilation: volume gained per plastic shear strain; negative where shear makes the soil denser.
-        viscosity: sqrt(J2) gained per shear rate while the soil holds together, Pa s.
+        viscosity: sqrt(J2) beyond the strength per plastic shear rate, Pa s.
         crush_pressure: pressure above which the skeleton gives way and the soil becomes denser, Pa; none when zero.
         crush_hardening: growth of that pressure per volume lost, Pa.
     """

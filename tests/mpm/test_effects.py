@@ -167,8 +167,8 @@ def test_adhesion_drags_a_sliding_tool_by_its_area() -> None:
     forces = []
     for frame in range(6):
         times = [(frame + step / 2) * RESOLUTION.frame_time for step in range(2)]
-        # the lower face 5.5 mm below the surface: half a spacing brings it to the uppermost particles
-        start = np.array([0.1, 0.06, 0.09 - 0.0055])
+        # the lower face half a millimetre below the surface
+        start = np.array([0.1, 0.06, 0.09 - 0.0005])
         forces.append(run.advance([Pose(start + t * speed, STILL, speed, np.zeros(3)) for t in times]))
     drag = -np.mean(forces[2:], axis=0)[:, 0]
     assert drag[1] - drag[0] == pytest.approx(300.0 * 0.08 * 0.08, rel=0.03)

@@ -98,7 +98,7 @@ def test_soil_sunk_into_a_tool_comes_out_by_the_second(steps: int) -> None:
     plate = trimesh.creation.box([0.04, 0.2, 0.2])
     depths = np.array([1.0e-3, 2.0e-3, 6.0e-3])
     x = np.array([[0.10 - d, 0.05 + 0.04 * k, 0.09] for k, d in enumerate(depths)])
-    resolution = replace(RESOLUTION, steps=steps, relaxation=25.0, bulk=1.0, shear=0.5)
+    resolution = replace(RESOLUTION, steps=steps, relaxation=25.0, bulk=1.0, shear=0.5, skin=0.0)
     still = Settings(friction_angle=35.0, gravity=(0.0, 0.0, 0.0))
     run = Solver(x[None], np.zeros(3), np.full(3, 0.2), plate, resolution, Law(), still, [{"friction_angle": 35.0}])
     held = Pose(np.array([0.08, 0.1, 0.1]), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), np.zeros(3))
@@ -123,7 +123,7 @@ def test_a_bed_stands_on_a_tool_whose_contact_keeps_its_load(steps: int) -> None
     smooth = Settings(friction_angle=35.0, wall_friction=0.0)
 
     def sunk(memory: float) -> float:
-        resolution = replace(RESOLUTION, steps=steps, relaxation=100.0, memory=memory)
+        resolution = replace(RESOLUTION, steps=steps, relaxation=100.0, memory=memory, skin=0.0)
         run = Solver(x[None], np.zeros(3), upper, plate, resolution, Law(), smooth, [{"friction_angle": 35.0}])
         force = [run.advance([held] * steps)[0, 2] for _ in range(25)]
         weight = len(x) * spacing**3 * RESOLUTION.density * 9.81

@@ -49,13 +49,26 @@ def test_a_smooth_blade_bears_passive_pressure(blade: Blade) -> None:
     assert blade.force("cpu") == pytest.approx(blade.expected, rel=SCATTER)
 
 
-def test_a_raked_plate_keeps_its_thickness() -> None:
-    """A plate turned by 45 degrees in its own frame: its middle lies half its thickness inside."""
+@pytest.mark.parametrize("skin", [0.0, 0.002])
+def test_a_raked_plate_keeps_its_thickness(skin: float) -> None:
+    """A plate turned by 45 degrees in its own frame: its middle lies half its thickness, and the skin, inside."""
     plate = trimesh.creation.box(extents=[0.01, 0.2, 0.2])
     plate.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 4, [0.0, 1.0, 0.0]))
-    tool = build_tool(plate, margin=0.02, stiffness=1.0, damping=0.0, device="cpu")
-    assert tool.distance.numpy().min() == pytest.approx(-0.005, rel=0.1)
+    tool = build_tool(plate, margin=0.02, stiffness=1.0, damping=0.0, device="cpu", skin=skin, thin=0.02)
+    assert tool.distance.numpy().min() == pytest.approx(-0.005 - skin, rel=0.1)
     assert tool.spacing < 0.01
+
+
+def test_soil_stops_before_a_plates_faces_and_not_before_its_edges() -> None:
+    """Distances in front of a box 1 x 20 x 20 cm: from its face less half a centimetre, from its edge whole."""
+    plate = trimesh.creation.box(extents=[0.01, 0.2, 0.2])
+    tool = build_tool(plate, margin=0.03, stiffness=1.0, damping=0.0, device="cpu", skin=0.005, thin=0.02)
+    distance, lower = tool.distance.numpy(), np.array(tool.lower)
+    axes = [lower[k] + tool.spacing * np.arange(n) for k, n in enumerate(distance.shape)]
+    middle = [int(np.argmin(np.abs(axis))) for axis in axes]
+    front, below = axes[0] > 0.006, axes[2] < -0.101
+    np.testing.assert_allclose(distance[front, middle[1], middle[2]], axes[0][front] - 0.005 - 0.005, atol=1e-6)
+    np.testing.assert_allclose(distance[middle[0], middle[1], below], -0.1 - axes[2][below], atol=1e-4)
 
 
 def test_a_scene_without_a_tool_takes_a_number_of_steps_and_one_with_a_tool_takes_poses() -> None:

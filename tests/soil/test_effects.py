@@ -114,6 +114,20 @@ def test_viscosity_adds_stress_in_proportion_to_the_rate() -> None:
     np.testing.assert_allclose(test.shear_stress[0, 1:], friction(ANGLE) * test.p[0, 1:] + 20.0 * 30.0, rtol=1e-3)
 
 
+def test_viscous_soil_sheared_back_resists_the_other_way() -> None:
+    """Bingham's law: the stress opposes the flow, whichever way that goes, by as much."""
+    test = simple_shear(
+        Law(find_effects(["viscosity"])),
+        {"friction_angle": ANGLE, "viscosity": 20.0},
+        confining=PRESSURE,
+        strains=[0.05, 0.0],
+        strain_rate=30.0,
+        matching=Matching.SIMPLE_SHEAR,
+    )
+    expected = friction(ANGLE) * test.p[0, 1:] + 20.0 * 30.0
+    np.testing.assert_allclose(test.shear_stress[0, 1:], [expected[0], -expected[1]], rtol=2e-3)
+
+
 def test_softening_goes_from_peak_to_residual() -> None:
     test = sheared("softening", {"softening_angle": 8.0, "softening_strain": 0.1})
     residual, peak = friction(ANGLE), friction(ANGLE + 8.0)

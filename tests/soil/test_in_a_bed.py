@@ -53,7 +53,7 @@ def test_a_plate_feels_the_changed_friction() -> None:
     changes = (-0.3, 0.0, 0.15)
     names = ("tool_friction", "cohesion")
     run = batch(s, names, *({"tool_friction_change": c, "cohesion": 1500.0} for c in changes))
-    speed, start = np.array([0.1, 0.0, 0.0]), np.array([0.1, 0.06, 0.09 - 0.006])
+    speed, start = np.array([0.1, 0.0, 0.0]), np.array([0.1, 0.06, 0.09 - 0.001])
     step = RESOLUTION.frame_time
     force = np.array([run.advance([Pose(start + k * step * speed, STILL, speed, np.zeros(3))]) for k in range(12)])
     drag, normal = -force[4:, :, 0].mean(axis=0), force[4:, :, 2].mean(axis=0)
