@@ -106,12 +106,13 @@ def thickened(mesh: trimesh.Trimesh, skin: float, thin: float) -> trimesh.Trimes
     ``thin`` (m), and by less, with the square of the ratio, where it is farther. A plate's edges stay where they are.
     """
     surface = _surface(mesh, "cpu")
-    centres, normals = (
-        wp.array(a.astype(np.float32), dtype=wp.vec3) for a in (mesh.triangles_center, mesh.face_normals)
-    )
-    thickness = wp.zeros(len(mesh.faces), dtype=float)
+    thickness = wp.zeros(len(mesh.faces), dtype=float, device="cpu")
+    places = [
+        wp.array(a.astype(np.float32), dtype=wp.vec3, device="cpu") for a in (mesh.triangles_center, mesh.face_normals)
+    ]
     inside = 1.0e-4 * float(mesh.extents.max())
-    wp.launch(_measure_thickness, dim=len(mesh.faces), inputs=[surface.id, centres, normals, inside, thickness])
+    inputs = [surface.id, *places, inside, thickness]
+    wp.launch(_measure_thickness, dim=len(mesh.faces), inputs=inputs, device="cpu")
     moved = skin * np.minimum(thin / thickness.numpy().astype(np.float64), 1.0) ** 2
     # each corner goes where the planes that met in it meet again
     vertices = np.array(mesh.vertices)
