@@ -97,6 +97,7 @@ def _measure_thickness(
     # from a little inside, or the ray would end where it begins
     through = wp.mesh_query_ray(mesh, centre[i] - inside * normal[i], -normal[i], FAR)
     thickness[i] = FAR
+    # a triangle without area has no normal, and its ray meets nothing
     if through.result and wp.dot(normal[i], wp.mesh_eval_face_normal(mesh, through.face)) < -PARALLEL:
         thickness[i] = inside + through.t
 
@@ -114,12 +115,13 @@ def thickened(mesh: trimesh.Trimesh, skin: float, thin: float) -> trimesh.Trimes
     inputs = [surface.id, *places, inside, thickness]
     wp.launch(_measure_thickness, dim=len(mesh.faces), inputs=inputs, device="cpu")
     moved = skin * np.minimum(thin / thickness.numpy().astype(np.float64), 1.0) ** 2
-    # each corner goes where the planes that met in it meet again
-    vertices = np.array(mesh.vertices)
-    for vertex, faces in enumerate(mesh.vertex_faces):
-        meeting = faces[faces >= 0]
-        vertices[vertex] += np.linalg.lstsq(mesh.face_normals[meeting], moved[meeting], rcond=SAME_PLANE)[0]
-    return trimesh.Trimesh(vertices, mesh.faces, process=False)
+    # each corner goes where the planes that met in it meet again: least squares, of the least length
+    matrices, targets = np.zeros((len(mesh.vertices), 3, 3)), np.zeros((len(mesh.vertices), 3))
+    for corner in np.asarray(mesh.faces).T:
+        np.add.at(matrices, corner, mesh.face_normals[:, :, None] * mesh.face_normals[:, None])
+        np.add.at(targets, corner, moved[:, None] * mesh.face_normals)
+    shifts = np.linalg.pinv(matrices, rcond=SAME_PLANE**2, hermitian=True) @ targets[:, :, None]
+    return trimesh.Trimesh(mesh.vertices + shifts[..., 0], mesh.faces, process=False)
 
 
 def _surface(mesh: trimesh.Trimesh, device: str) -> wp.Mesh:

@@ -18,7 +18,7 @@ from splatsoil.benchmarks._validation.refinement import runout
 from splatsoil.benchmarks.validate import main
 
 from splatsoil.errors import MeasurementError, SimulationError
-from splatsoil.mpm.tool import build_tool
+from splatsoil.mpm.tool import build_tool, thickened
 from splatsoil.soil.matching import Matching
 
 MEASURED = Path(os.environ.get("SPLATSOIL_MEASURED", "nowhere"))
@@ -69,6 +69,32 @@ def test_soil_stops_before_a_plates_faces_and_not_before_its_edges() -> None:
     front, below = axes[0] > 0.006, axes[2] < -0.101
     np.testing.assert_allclose(distance[front, middle[1], middle[2]], axes[0][front] - 0.005 - 0.005, atol=1e-6)
     np.testing.assert_allclose(distance[middle[0], middle[1], below], -0.1 - axes[2][below], atol=1e-4)
+
+
+def test_curved_plates_grow_across_and_blocks_hardly() -> None:
+    """A pipe 12 mm thick by the skin on either side and not along; a ball of 10 cm by the square of 2 cm over that."""
+    pipe = trimesh.creation.annulus(0.1, 0.112, 0.12, sections=96)
+    grown = thickened(pipe, skin=0.005, thin=0.02)
+    radii = np.linalg.norm(grown.vertices[:, :2], axis=1)
+    assert grown.is_volume
+    np.testing.assert_allclose([radii.min(), radii.max()], [0.095, 0.117], atol=1e-4)
+    assert grown.extents[2] == pytest.approx(0.12, abs=5e-4)
+    ball = thickened(trimesh.creation.icosphere(4, 0.05), skin=0.005, thin=0.02)
+    np.testing.assert_allclose(np.linalg.norm(ball.vertices, axis=1), 0.05 + 0.005 * 0.04, atol=2e-5)
+
+
+def test_the_flat_foot_of_a_raked_plate_stays() -> None:
+    """It isn't parallel to what lies behind it; a foot half a cell lower would bear a quarter more."""
+    plate = trimesh.creation.box(extents=[0.01, 0.2, 0.2])
+    shear = np.eye(4)
+    shear[0, 2] = -1.0 / math.tan(math.radians(60.0))
+    plate.apply_transform(shear)
+    grown = thickened(plate, skin=0.0025, thin=0.01)
+    assert grown.bounds[0, 2] == pytest.approx(plate.bounds[0, 2], abs=2e-5)
+    across = grown.face_normals[np.abs(grown.face_normals[:, 0]) > 0.5]
+    assert np.ptp(grown.triangles_center[np.abs(grown.face_normals[:, 0]) > 0.5] @ across[0]) == pytest.approx(
+        0.01 * math.sin(math.radians(60.0)) + 0.005, rel=1e-3
+    )
 
 
 def test_a_scene_without_a_tool_takes_a_number_of_steps_and_one_with_a_tool_takes_poses() -> None:
