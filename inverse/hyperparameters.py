@@ -34,7 +34,7 @@ SLOPE_STEP = 1.5e-8
 SMOOTH = (0.5, 1.5)
 #: Prior points for importance resampling (powers of two, for Sobol): for up to MANY outcomes; fewer beyond, down to a
 #: least number, since each costs the cube of them and more outcomes say more. Then emcee's steps.
-PRIOR_POINTS, MANY, LEAST_POINTS, STEPS = 1024, 64, 256, 60
+PRIOR_POINTS, MANY, LEAST_POINTS, STEPS = 4096, 32, 512, 60
 
 
 @dataclass(frozen=True)
