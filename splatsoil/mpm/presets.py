@@ -68,8 +68,8 @@ class Resolution:
             sunk into the tool comes out at twice the rate. 0 for as many as there are.
         memory: share of its load, 0 to 1, that the tool's contact keeps when soil comes out of it.
         skin: of the spacing, how far from the faces of a plate thinner than a cell particles stop, because they stand
-            for soil half a spacing around them. Its edges, and thick bodies, need none: contact acts through the grid,
-            which widens those.
+            for soil half a spacing around them. Its edges need none: contact acts through the grid, which widens them.
+            Thick bodies have none, because nothing was measured on them.
     """
 
     cell: float
