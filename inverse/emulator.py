@@ -190,16 +190,14 @@ class Emulator:
         return np.asarray((within + self.outside_variance) * self.scale**2)
 
     def _measure_chance(self) -> FloatArray:
-        """Scatter about the processes' means wherever there are points, leaning on their noise where points are few."""
-        residuals = [process.residuals() for process in self._processes]
-        means = np.stack([drawn.mean(axis=0) for drawn in residuals], axis=1)
-        squares = means.T @ means
-        # Of a mean over settings the squares are too small; between components, whose draws have no pairs, it serves.
-        np.fill_diagonal(squares, [np.sum(drawn**2, axis=1).mean() for drawn in residuals])
-        prior = np.diag([process.noise_variance() for process in self._processes])
-        # As much weight for the prior as for p + 1 evaluations: the fewest that make a covariance.
-        weight = self.count + 1.0
-        return (squares + weight * prior) / (self.freedom + weight)
+        """Variances as the processes infer them over the whole range of the points, correlations as the scatter about
+        their means shows them, leaning on none where points are few."""
+        residuals = np.stack([process.residuals() for process in self._processes], axis=1)
+        noise = np.array([process.noise_variance() for process in self._processes])
+        # As much weight for independence as for p + 1 evaluations: the fewest that make a covariance.
+        shown = residuals.T @ residuals + (self.count + 1.0) * np.diag(noise)
+        scale = np.sqrt(noise / np.diag(shown))
+        return scale[:, None] * shown * scale
 
     def _leave_out(self) -> LeftOut:
         """Each point, with its repeats, predicted by all others with the same hyperparameters."""
@@ -318,8 +316,8 @@ class _Process:
         return float(self.settings.noise[:, 0].mean()) * self.scale**2
 
     def residuals(self) -> FloatArray:
-        """(d, m) of the scores from each setting's means: noise K⁻¹ (y − μ), of mean square noise · freedom / m."""
-        return self.scale * self.settings.noise * self.weights
+        """(m,) of the scores from the means: noise K⁻¹ (y − μ)."""
+        return self.scale * (self.settings.noise * self.weights).mean(axis=0)
 
     def freedom(self) -> float:
         """Evaluations less the trace of the smoother K(K + noise)⁻¹ (Hastie & Tibshirani 1990, 3.5) and the mean."""

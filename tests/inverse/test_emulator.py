@@ -44,6 +44,17 @@ def test_chance_is_the_scatter_between_seeds(emulator: Emulator) -> None:
     assert np.sqrt(np.trace(emulator.chance)) == pytest.approx(CHANCE, rel=0.4)
 
 
+def test_chance_is_neither_too_large_nor_too_small_on_average() -> None:
+    """One feature along a line with noise of variance 1, eight evaluations: 1 over many such worlds."""
+    points = np.linspace(-0.95, 0.95, 8)[:, None]
+    found = []
+    for seed in range(60):
+        noise = np.random.default_rng([seed, 11]).normal(size=(8, 1))
+        found.append(Emulator(points, 3.0 * points + noise, seed=seed).chance[0, 0])
+    # the mean of 60 scatters by 0.08
+    assert np.mean(found) == pytest.approx(1.0, abs=0.25)
+
+
 def test_chance_is_that_of_the_whole_range_however_quiet_repeats_are() -> None:
     """Sand may slide in lumps at some parameters and not where simulations happen to be repeated."""
     points = np.concatenate([sobol(40, 1, 0), np.zeros((8, 1))])
