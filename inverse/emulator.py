@@ -4,10 +4,16 @@ Features (residuals of hundreds of blocks) vary along few directions when parame
 these, and each component's score is a Gaussian process over the parameters, averaged over draws of its hyperparameters
 (Higdon et al. 2008, J. Am. Stat. Assoc. 103:570). The scatter between particle seeds is the processes' noise: what is
 predicted is the mean over seeds, and chance is reported apart, as it is over the whole range of the points.
+
+Components are those of evaluations, chance included, and so each evaluation's own chance lies partly along them, which
+a new observation's doesn't: their scores are too large, and parameters read off them too near the middle. Scores are
+shrunk by the share that isn't chance's (Lee, Zou & Wright 2010, Ann. Stat. 38:3605, for many more features than
+evaluations).
 """
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -26,6 +32,8 @@ VARIANCE, MOST = 0.995, 10
 DRAWS = 16
 #: A component predicted worse than this (share of its variance, points left out) says nothing of the parameters.
 LEAST_SKILL = 0.1
+#: Nor does one of whose variance less than this is anything but its evaluations' own chance.
+LEAST_SHARE = 0.25
 #: Share of the scores' variance that points left out must be predicted with, or the loss is the better guide.
 TRUSTED_SKILL = 0.6
 #: Half the step of derivatives, of an axis from -1 to 1.
@@ -74,7 +82,7 @@ class Emulator:
         centre: (b,) mean features.
         scale: (b,) units of the features.
         basis: (b, p) orthonormal directions of features in these units.
-        chance: (p, p) covariance of one simulation's scores about the mean over seeds.
+        chance: (p, p) covariance of one simulation's scores about the mean over seeds, its expectation.
         left_out: leave-one-out diagnostics.
 
     Raises:
@@ -103,13 +111,15 @@ class Emulator:
             raise ValueError("the features are the same wherever they were simulated: there is nothing to emulate")
         scores = left[:, :count] * size[:count]
         processes = [_Process(self.points, scores[:, k], seed + k) for k in range(count)]
-        kept = [k for k, process in enumerate(processes) if process.skill() > LEAST_SKILL]
         # All of it chance: one component stays, so that what follows can say that nothing is determined.
-        kept = kept or [0]
-        self._processes = [processes[k] for k in kept]
+        skilful = [k for k, process in enumerate(processes) if process.skill() > LEAST_SKILL] or [0]
+        kept, share = beyond_chance(size**2, skilful, *features.shape)
+        self._tells = bool(np.all(share >= LEAST_SHARE))
+        share = np.maximum(share, LEAST_SHARE)
+        self._processes = [processes[k].shrunk(by) for k, by in zip(kept, share, strict=True)]
         self.basis = right[kept].T.copy()
-        self.scores = scores[:, kept]
-        self._outside = varying - self.scores @ self.basis.T
+        self.scores = scores[:, kept] * share
+        self._outside = varying - scores[:, kept] @ self.basis.T
         self.chance = self._measure_chance()
         self.left_out = self._leave_out()
 
@@ -128,6 +138,17 @@ class Emulator:
         """Degrees of freedom behind ``chance``: evaluations less what the processes' means use up, on the average."""
         return float(np.mean([process.freedom() for process in self._processes]))
 
+    @cached_property
+    def chance_scale(self) -> FloatArray:
+        """(p, p) scale of Student's t with `freedom` that scores have about the mean over seeds.
+
+        Variances of few samples are skewed: `chance` is their mean, and the scale the inverse of their inverses' mean,
+        which is the variance that these samples themselves have.
+        """
+        mean = np.array([process.noise_variance() for process in self._processes])
+        scale = np.sqrt(np.array([process.noise_scale() for process in self._processes]) / mean)
+        return scale[:, None] * self.chance * scale
+
     @property
     def trusted(self) -> bool:
         """Whether the features vary in as many ways as there are parameters, and points left out are predicted well."""
@@ -135,7 +156,9 @@ class Emulator:
 
     @property
     def skilled(self) -> bool:
-        """Whether points left out are predicted well."""
+        """Whether features are more than chance, and points left out are predicted well."""
+        if not self._tells:
+            return False
         weight = self.scores.var(axis=0)
         return float(weight @ self.left_out.skill) >= TRUSTED_SKILL * float(weight.sum())
 
@@ -208,6 +231,32 @@ class Emulator:
             z[:, k] = error / std
             skill[k] = process.skill()
         return LeftOut(skill, z, float(np.mean(np.abs(z) < 1.6449)))
+
+
+def beyond_chance(
+    squares: FloatArray, chosen: list[int], evaluations: int, features: int
+) -> tuple[list[int], FloatArray]:
+    """Components that are more than chance, and the share of each one's squares that isn't an evaluation's own.
+
+    What no chosen component holds is chance, alike in all directions. The squared length of one evaluation's stands in
+    the sum of squares of each component, because components are made of evaluations. The weakest are dropped, one after
+    the other, until each has `LEAST_SHARE` beyond that; the last one stays.
+
+    Args:
+        squares: sums of squares of all components.
+        chosen: indices of those that may be more than chance.
+        evaluations: m, less one of which the mean has used.
+        features: b.
+    """
+    kept = sorted(chosen)
+    while True:
+        left = (max(evaluations - 1 - len(kept), 1), max(features - len(kept), 1))
+        own = float(squares.sum() - squares[kept].sum()) * features / (left[0] * left[1])
+        share = 1.0 - own / squares[kept]
+        weakest = int(np.argmin(share))
+        if len(kept) == 1 or share[weakest] >= LEAST_SHARE:
+            return kept, share
+        del kept[weakest]
 
 
 def slopes_of(emulator: Emulator, point: FloatArray) -> FloatArray:
@@ -315,6 +364,10 @@ class _Process:
         """Of one simulation's score."""
         return float(self.settings.noise[:, 0].mean()) * self.scale**2
 
+    def noise_scale(self) -> float:
+        """Likewise, the harmonic mean."""
+        return float(1.0 / (1.0 / self.settings.noise[:, 0]).mean()) * self.scale**2
+
     def residuals(self) -> FloatArray:
         """(m,) of the scores from the means: noise K⁻¹ (y − μ)."""
         return self.scale * (self.settings.noise * self.weights).mean(axis=0)
@@ -334,8 +387,9 @@ class _Process:
         return self.shift + self.scale * means.mean(axis=0), self.scale**2 * total
 
     @cached_property
-    def left_out(self) -> tuple[FloatArray, FloatArray]:
-        """Errors (m,) and their quoted standard deviations when a point's own evaluations are left out.
+    def _left_out(self) -> tuple[FloatArray, FloatArray]:
+        """Errors (m,) and their quoted standard deviations when a point's own evaluations are left out, in units of the
+        scores' scale.
 
         Closed form: the errors of a left-out group G are (K⁻¹)_GG⁻¹ (K⁻¹(y − μ))_G, their covariance is (K⁻¹)_GG⁻¹.
         """
@@ -346,12 +400,23 @@ class _Process:
             errors[:, group] = np.einsum("dij,dj->di", blocks, self.weights[:, group])
             variances[:, group] = np.diagonal(blocks, axis1=1, axis2=2)
         total = variances.mean(axis=0) + errors.var(axis=0)
-        return self.scale * errors.mean(axis=0), self.scale * np.sqrt(total)
+        return errors.mean(axis=0), np.sqrt(total)
+
+    @property
+    def left_out(self) -> tuple[FloatArray, FloatArray]:
+        """Errors (m,) and their quoted standard deviations when a point's own evaluations are left out."""
+        error, std = self._left_out
+        return self.scale * error, self.scale * std
 
     def skill(self) -> float:
         """1 − mean square error over variance, points left out."""
-        error, _ = self.left_out
-        return 1.0 - float(np.mean(error**2)) / self.scale**2
+        return 1.0 - float(np.mean(self._left_out[0] ** 2))
+
+    def shrunk(self, share: float) -> _Process:
+        """The process of ``share`` times the scores."""
+        smaller = copy(self)
+        smaller.shift, smaller.scale = share * self.shift, share * self.scale
+        return smaller
 
 
 def _groups(points: FloatArray) -> list[npt.NDArray[np.int64]]:

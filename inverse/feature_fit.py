@@ -7,8 +7,8 @@ agree best. The spread is the sandwich of least squares under errors of known co
 
     (JᵀJ)⁻¹ Jᵀ (chance + emulator + misfit) J (JᵀJ)⁻¹,
 
-J the scores' derivative (White 1980, Econometrica 48:817). Chance is known from a handful of evaluations only; with ν
-degrees of freedom behind it the estimate is distributed as Student's t, ν/(ν − 2) times as wide (variance).
+J the scores' derivative (White 1980, Econometrica 48:817). Chance is known from a handful of evaluations only: its
+expectation counts, which is larger than what they themselves scatter by.
 
 Where the force on the tool was measured, its χ² is added to that of the pictures' estimate, taken as normal; where
 their emulator isn't to be trusted, that is the loss' minimum and its spread.
@@ -134,9 +134,9 @@ def _together(middle: FloatArray, precision: FloatArray, other: Beside, points: 
         return np.asarray(np.einsum("qi,ij,qj->q", off, precision, off) + other.squares(where))
 
     estimate = closest(squares, points, seed)
-    # What pictures don't determine can't contradict anything.
-    freedom = other.count + int(np.linalg.matrix_rank(precision, hermitian=True)) - len(middle)
-    chance = float(chi2.sf(squares(estimate[None])[0], freedom)) if freedom > 0 else 1.0
+    # What pictures don't determine can't contradict anything; an end of a parameter's range can.
+    freedom = max(other.count + int(np.linalg.matrix_rank(precision, hermitian=True)) - len(middle), 1)
+    chance = float(chi2.sf(squares(estimate[None])[0], freedom))
     slope = other.slopes(estimate)
     return _Together(estimate, precision + slope.T @ slope, chance)
 

@@ -47,9 +47,7 @@ def of_pictures(likelihood: Likelihood) -> Squares:
 
 
 def score_covariance(likelihood: Likelihood, estimate: FloatArray) -> FloatArray:
-    """(p, p) of the pictures' scores about the emulated ones: chance, known by so many evaluations only, the emulator's
-    doubt, and the misfit."""
+    """(p, p) of the pictures' scores about the emulated ones: chance, the emulator's doubt, and the misfit."""
     _, variance = likelihood.emulator.predict(estimate[None])
-    freedom = likelihood.freedom
-    covariance = freedom / (freedom - 2.0) * (likelihood.emulator.chance + np.diag(variance[0]))
+    covariance = likelihood.emulator.chance + np.diag(variance[0])
     return covariance if likelihood.misfit is None else covariance + likelihood.misfit.covariance

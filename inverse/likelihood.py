@@ -90,7 +90,7 @@ class Likelihood:
     @cached_property
     def _fixed(self) -> FloatArray:
         basis, scale = self.emulator.basis, self.emulator.scale
-        return self.emulator.chance + self.sensor * (basis / scale[:, None] ** 2).T @ basis
+        return self.emulator.chance_scale + self.sensor * (basis / scale[:, None] ** 2).T @ basis
 
     def covariance(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Predicted mean scores (k, p) and scale Σ (k, p, p) of the observed ones about them."""

@@ -45,9 +45,9 @@ def members_of(
 def stands(confirmations: Mapping[str, Confirmation], name: str, misfit: Omnibus, dispersion: float) -> bool:
     """Something is to be explained, and the refit does: χ² falls, on times that it hasn't seen too.
 
-    Where slow waves show no more than chance, the effect must take away a relevant share of the squared error on those
-    times, whatever a single direction among dozens seems to say. What other pictures say of an effect beyond doubt
-    needs no more of the features than that they don't speak against it.
+    Where slow waves show no more than chance, the model must be off by more than noise on those times, and the effect
+    take away a relevant share of the squared error there, whatever a single direction among dozens seems to say. What
+    other pictures say of an effect beyond doubt needs no more of the features than that they don't speak against it.
     """
     before, after = confirmations[""], confirmations[name]
     least = EQUIVALENT * dispersion
@@ -55,7 +55,7 @@ def stands(confirmations: Mapping[str, Confirmation], name: str, misfit: Omnibus
         return False
     if after.told < CERTAIN:
         return after.unseen > -least
-    relevant = after.held_out**2 < (1.0 - RELEVANT) * before.held_out**2
+    relevant = before.held_out > before.floor and after.held_out**2 < (1.0 - RELEVANT) * before.held_out**2
     return (misfit.p < GATE or relevant) and after.unseen > 0.0
 
 

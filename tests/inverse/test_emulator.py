@@ -55,6 +55,19 @@ def test_chance_is_neither_too_large_nor_too_small_on_average() -> None:
     assert np.mean(found) == pytest.approx(1.0, abs=0.25)
 
 
+def test_a_new_observation_scores_as_evaluations_did() -> None:
+    """Sixteen evaluations along a line, whose chance is two thirds of what 400 features vary by: scores of many new
+    ones at the same points agree with what the emulator expects there, and are not smaller."""
+    points, rng = np.linspace(-1.0, 1.0, 16)[:, None], np.random.default_rng(12)
+    slope = rng.normal(size=400)
+    emulator = Emulator(points, points * slope + rng.normal(size=(16, 400)))
+    new = np.mean([emulator.project(points * slope + rng.normal(size=(16, 400))) for _ in range(50)], axis=0)
+    expected, _ = emulator.predict(points)
+    assert emulator.count == 1
+    # Without shrinking it is 0.84.
+    assert np.polyfit(expected[:, 0], new[:, 0], 1)[0] == pytest.approx(1.0, abs=0.06)
+
+
 def test_chance_is_that_of_the_whole_range_however_quiet_repeats_are() -> None:
     """Sand may slide in lumps at some parameters and not where simulations happen to be repeated."""
     points = np.concatenate([sobol(40, 1, 0), np.zeros((8, 1))])

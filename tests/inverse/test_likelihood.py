@@ -34,10 +34,10 @@ def test_it_is_students_t(likelihood: Likelihood) -> None:
 @pytest.mark.slow
 def test_intervals_after_a_few_evaluations_hold_what_they_say() -> None:
     """Eight evaluations of hundreds of features, most of whose variance is chance; the observation has chance of its
-    own. Intervals as if chance were known hold less."""
-    told, narrower = [], []
+    own. Intervals as if chance were known hold less, and estimates lean towards neither end nor middle."""
+    told, narrower, truths, found = [], [], [], []
     points = np.array([-0.9, -0.5, -0.2, 0.0, 0.15, 0.3, 0.6, 0.95])[:, None]
-    for seed in range(60):
+    for seed in range(100):
         generator = np.random.default_rng([seed, 5])
         slope = generator.normal(size=300)
         truth = float(generator.uniform(-0.6, 0.6))
@@ -49,8 +49,13 @@ def test_intervals_after_a_few_evaluations_hold_what_they_say() -> None:
         normal = [multivariate_normal(m, s).logpdf(likelihood.scores) for m, s in zip(mean, scale, strict=True)]
         told.append(holds(likelihood(GRID), truth))
         narrower.append(holds(np.array(normal), truth))
+        truths.append(truth)
+        found.append(np.average(GRID[:, 0], weights=np.exp(likelihood(GRID))))
     assert 0.83 <= np.mean(told) <= 0.97
     assert np.mean(narrower) < np.mean(told)
+    # Of 100, the slope scatters by 0.03; without shrinking the evaluations' scores it is 0.7.
+    assert np.polyfit(truths, found, 1)[0] == pytest.approx(1.0, abs=0.09)
+    assert np.std(np.subtract(found, truths)) < 0.105
 
 
 def holds(logs: np.ndarray, truth: float) -> bool:
