@@ -7,7 +7,8 @@ import pytest
 from scipy.optimize import least_squares
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF
-from splatsoil.inverse.emulator import HUBER, MAD, Emulator, _Process, error_scale, moderated
+from splatsoil.inverse.emulator import HUBER, MAD, Emulator, error_scale, moderated
+from splatsoil.inverse.process import Process
 from splatsoil.inverse.surrogate import sobol
 
 DIRECTIONS = np.linalg.qr(np.random.default_rng(0).normal(size=(40, 3)))[0]
@@ -107,8 +108,8 @@ def test_leaving_out_in_closed_form_is_leaving_out() -> None:
     """Against scikit-learn, trained anew without each group, hyperparameter draw by draw."""
     points = np.concatenate([sobol(7, 1, 2), np.zeros((2, 1))])
     values = np.sin(2.0 * points[:, 0]) + 0.05 * np.random.default_rng(5).normal(size=9)
-    process = _Process(points, values, seed=0)
-    errors, stds = process.left_out
+    process = Process(points, values, seed=0)
+    errors, stds = (process.scale * found for found in process.left_out)
     for group in (np.array([3]), np.array([7, 8])):
         rest = np.setdiff1d(np.arange(9), group)
         found, variances = [], []
@@ -130,7 +131,7 @@ def test_degrees_of_freedom_are_what_the_fit_does_not_follow(noise: float) -> No
     """Twenty evaluations of a straight line: by how much the fit at a point follows the outcome there, summed up."""
     points = np.linspace(-1.0, 1.0, 20)[:, None]
     generator = np.random.default_rng(3)
-    process = _Process(points, points[:, 0] + noise * generator.normal(size=20), 1)
+    process = Process(points, points[:, 0] + noise * generator.normal(size=20), 1)
     settings, outcomes, nudge = process.settings, process.y, 1e-3
     fitted, _ = process.predict(points)
     followed = 0.0
