@@ -69,6 +69,17 @@ def test_a_new_observation_scores_as_evaluations_did() -> None:
     assert np.polyfit(expected[:, 0], new[:, 0], 1)[0] == pytest.approx(1.0, abs=0.06)
 
 
+def test_the_scale_of_students_t_is_the_variance_that_the_evaluations_show() -> None:
+    """Eight evaluations, noise of variance 1: five degrees of freedom or so, of whose χ² over five the middle is 0.87.
+    The expectation of the variance, 5/3 as large, would count the doubt about it twice."""
+    points = np.linspace(-0.95, 0.95, 8)[:, None]
+    found = []
+    for seed in range(40):
+        rng = np.random.default_rng([seed, 13])
+        found.append(Emulator(points, points * rng.normal(size=300) + rng.normal(size=(8, 300)), seed=seed))
+    assert np.median([emulator.chance_scale[0, 0] for emulator in found]) == pytest.approx(0.87, abs=0.3)
+
+
 def test_chance_is_that_of_the_whole_range_however_quiet_repeats_are() -> None:
     """Sand may slide in lumps at some parameters and not where simulations happen to be repeated."""
     points = np.concatenate([sobol(40, 1, 0), np.zeros((8, 1))])
