@@ -257,13 +257,17 @@ def criticise(name: str, out: Path, preset: str, device: str, say: Callable[[str
 def score(hidden: Hidden, fit: Mapping[str, Any], told: Mapping[str, Any]) -> dict[str, Any]:
     """What fit and diagnosis said of a world, beside the truth; the best effect's refit is what ``add`` keeps."""
     refits = told["refits"]
-    angle = fit["parameters"]["friction_angle"]
+    weighed = told["estimates"]["friction_angle"]
     # Without any significant effect nothing was refitted.
-    asis = {"values": {"friction_angle": angle["estimate"]}, "stds": {"friction_angle": angle["std"]}}
+    asis = {"values": {"friction_angle": weighed["value"]}, "stds": {"friction_angle": weighed["std"]}}
     base = refits.get("as it is", asis)
     best = refits.get(told["class"][0]) if told["class"] else None
     last = best or base
     named = told["class"] if told["verdict"] == "missing" else []
+    off = [(last["values"]["friction_angle"] - hidden.angle) / last["stds"]["friction_angle"]]
+    if told["class"][:1] == [hidden.kind] and hidden.kind not in OBSERVATION:
+        size = next(e["parameter"] for e in told["effects"] if e["name"] == hidden.kind)
+        off.append((last["values"][size] - hidden.size) / last["stds"][size])
     return {
         "hidden": hidden.kind,
         "size": hidden.size,
@@ -277,6 +281,7 @@ def score(hidden: Hidden, fit: Mapping[str, Any], told: Mapping[str, Any]) -> di
         "before": [base["values"]["friction_angle"], base["stds"]["friction_angle"]],
         "after": [last["values"]["friction_angle"], last["stds"]["friction_angle"]],
         "sizes": {k: [v, last["stds"][k]] for k, v in last["values"].items() if k != "friction_angle"},
+        "off": off,
         "held_out": [base.get("held_out"), last.get("held_out")],
         "floor": last.get("floor"),
         "z": {e["name"]: e["z"] for e in told["effects"]},
@@ -303,7 +308,7 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
         cells = (r["hidden"], size, r["verdict"], members, f"{100 * r['explained']:.0f} %", found, errors, angles)
         lines.append("| " + " | ".join(cells) + " |")
 
-    def share(what: str, among: Sequence[Mapping[str, Any]], test: Callable[[Mapping[str, Any]], bool]) -> None:
+    def share(what: str, among: Sequence[Any], test: Callable[[Any], bool]) -> None:
         if among:
             hits = sum(map(test, among))
             low, high = wilson(hits, len(among))
@@ -323,6 +328,10 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
     share("the same: error ends within 1.2 × the floor", right, lambda r: r["held_out"][-1] <= 1.2 * r["floor"])
     share("nothing hidden: angle within 2.5°", plain_sand, _near)
     if rows:
+        stated = [r["off"] for r in rows if r["class"][:1] == [r["hidden"]] or (r["hidden"] == NOTHING and r["right"])]
+        for times in (1.0, 2.0):
+            inside = [abs(z) <= times for of_one in stated for z in of_one]
+            share(f"last angles and right effects' sizes within {times:.0f} × their ±", inside, bool)
         off = np.array([r["after"][0] - r["angle"] for r in rows])
         lines.append(f"- error of the last angle: {off.mean():+.1f} ± {off.std(ddof=min(1, len(rows) - 1)):.1f}°")
     return "\n".join(lines)

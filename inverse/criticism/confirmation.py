@@ -16,7 +16,8 @@ from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Candidate, Experiment
 from splatsoil.parameters import Parameter
 
-from .evidence import Evidence, Vantage, Visit, ignorance
+from .estimates import prior, untried
+from .evidence import Evidence, Vantage, Visit
 from .floor import Floor, floor_of
 from .joint import precision_of
 from .misfit import Omnibus, omnibus, smooth_basis
@@ -41,6 +42,7 @@ class Confirmation:
         fit: the refit, by which the effect is judged.
         values: the parameters by all times.
         stds: standard deviations of these.
+        numerics: what of these comes of numerics that weren't tried; see :mod:`.estimates`.
         chi2: of all times, as far as these tell of anything; see :class:`~splatsoil.inverse.criticism.sight.Sight`.
         fall: by how much that is less than the model's as it is.
         unseen: likewise, on times the refit hasn't seen alone.
@@ -57,6 +59,7 @@ class Confirmation:
     fit: Refit
     values: Mapping[str, float]
     stds: Mapping[str, float]
+    numerics: Mapping[str, float]
     chi2: float
     fall: float
     unseen: float
@@ -138,19 +141,21 @@ def confirm(
         apart_from = np.concatenate([floor.nuisance, _tangent(floor.single, fit.slopes)], axis=1)
         remainder = omnibus(floor.single, apart_from, left[experiment.seen], basis)
         chi2 = _chi2(whole, left) + known.chi2(at)
-        columns = np.concatenate([whiten(fit.slopes), known.root])
-        values, stds = dict(fit.values), _stds(free, fit.values, columns, remainder)
+        precision = prior(free, fit.values) + known.root.T @ known.root
+        values, stds = dict(fit.values), _stds(free, whiten(fit.slopes), precision, remainder)
         emulated: tuple[Visit, ...] = ()
         if _emulated(experiment, candidate):
             # A surface that isn't one tells nothing more than the last derivatives do.
             with suppress(ValueError):
                 reading = read(visits, whole, experiment.observed, free, known)
                 values, stds, emulated = dict(reading.values), dict(reading.stds), tuple(visits)
+        numerics = _numerics(free, floor, fit.slopes, precision)
         out["" if candidate is None else candidate.name] = Confirmation(
             name="" if candidate is None else candidate.name,
             fit=fit,
             values=values,
-            stds=stds,
+            stds=_with(stds, numerics),
+            numerics=numerics,
             chi2=chi2,
             fall=0.0 if candidate is None else _chi2(whole, before) + known.chi2(off) - chi2,
             unseen=_chi2(apart, before) - _chi2(apart, left),
@@ -238,16 +243,25 @@ def _starts(
 
 
 def _stds(
-    free: Sequence[Parameter], values: Mapping[str, float], columns: FloatArray, remainder: Omnibus
+    free: Sequence[Parameter], columns: FloatArray, precision: FloatArray, remainder: Omnibus
 ) -> dict[str, float]:
-    """Standard deviations of a refit's estimates, each parameter's range being its prior.
+    """Standard deviations of a refit's estimates by whitened slopes (d, k) and what is known beforehand (k, k).
 
     Where more than noise remains, they are widened by the root of its dispersion (Birge 1932).
     """
-    prior = np.array([ignorance(p, values[p.name]) for p in free])
-    covariance = np.linalg.inv(columns.T @ columns + np.diag(prior**-2.0))
+    covariance = np.linalg.inv(columns.T @ columns + precision)
     widened = math.sqrt(max(1.0, remainder.dispersion))
     return {p.name: widened * math.sqrt(float(v)) for p, v in zip(free, np.diag(covariance), strict=True)}
+
+
+def _numerics(free: Sequence[Parameter], floor: Floor, slopes: FloatArray, precision: FloatArray) -> dict[str, float]:
+    """Standard deviations by numerics that weren't tried, by name."""
+    return {p.name: float(v) for p, v in zip(free, untried(floor, slopes, precision), strict=True)}
+
+
+def _with(stds: Mapping[str, float], numerics: Mapping[str, float]) -> dict[str, float]:
+    """Both together."""
+    return {name: math.hypot(std, numerics[name]) for name, std in stds.items()}
 
 
 def _tangent(noise: Noise, slopes: FloatArray) -> FloatArray:
@@ -363,9 +377,11 @@ def on_its_own_floor(
         known = _known(evidence, parameters)
         reading = read(visits, sight, experiment.observed, parameters, known)
         # Draws don't leave the simulations' range, and these were made where another floor let the parameters be.
-        least = _stds(parameters, at, np.concatenate([sight(slopes), known.root]), after)
+        precision = prior(parameters, at) + known.root.T @ known.root
+        least = _stds(parameters, sight(slopes), precision, after)
         stds = {name: max(std, least[name]) for name, std in reading.stds.items()}
-        refit = replace(best, values=dict(reading.values), stds=stds)
+        numerics = _numerics(parameters, floor, slopes, precision)
+        refit = replace(best, values=dict(reading.values), stds=_with(stds, numerics), numerics=numerics)
     return OwnFloor(
         before=omnibus(floor.noise, without, residual, basis),
         after=after,

@@ -14,6 +14,7 @@ from splatsoil.experiment.base import Calibration, Candidate, Experiment
 
 from .afresh import look_afresh, promising
 from .confirmation import Confirmation, confirm, on_its_own_floor, remainder_of
+from .estimates import Estimate, weighed
 from .evidence import Evidence, Vantage, gather
 from .floor import Floor, floor_of
 from .misfit import Block, Omnibus, blocks, left_over, omnibus, shares, smooth_basis
@@ -70,6 +71,7 @@ class Diagnosis:
         scores: of each effect, alone.
         given: of each effect, with the best one taken to be on; empty where none was named.
         confusion: correlation of each pair of effects' scores.
+        estimates: the model's own parameters as it is, all of the floor and untried numerics counted, by name.
         misfit: of the model as it is.
         remainder: after the best effect; None where none was named.
         explained: share of the misfit beyond chance that the best effect explains.
@@ -92,6 +94,7 @@ class Diagnosis:
     scores: Mapping[str, Score]
     given: Mapping[str, Score]
     confusion: Mapping[tuple[str, str], float]
+    estimates: Mapping[str, Estimate]
     misfit: Omnibus
     remainder: Omnibus | None
     explained: float
@@ -258,6 +261,7 @@ def judge(
         scores=scores,
         given=given,
         confusion=_pairs(scorer),
+        estimates=weighed(experiment, evidence, floor, bench.basis),
         misfit=misfit,
         remainder=remainder,
         explained=gone,

@@ -38,6 +38,7 @@ class Floor:
         single: of observed minus one prediction.
         nuisance: (n, q) patterns that numerics can make, and those by which model and instruments are known to differ,
             times their prior standard deviations.
+        tried: how many of these, the first ones, are other numerics.
         parameters: (n, k) derivatives by the model's parameters (and their curvature), likewise.
         directions: (n, k) in which effects act.
         parts: what the noise is made of: instruments, chance, guesses, reconstruction, numerics beyond the patterns.
@@ -46,6 +47,7 @@ class Floor:
     noise: Noise
     single: Noise
     nuisance: FloatArray
+    tried: int
     parameters: FloatArray
     directions: FloatArray
     parts: Mapping[str, Part]
@@ -98,7 +100,7 @@ def floor_of(experiment: Experiment, evidence: Evidence) -> Floor:
         averaged, alone = (np.sqrt(factor) for factor in _factors(name, runs))
         noise, single = noise.plus(averaged * columns), single.plus(alone * columns)
     nuisance = [NUMERICS_PRIOR * _columns(patterns, seen), _columns(experiment.systematic, seen)]
-    return Floor(noise, single, np.concatenate(nuisance, axis=1), parameters, directions, parts)
+    return Floor(noise, single, np.concatenate(nuisance, axis=1), len(patterns), parameters, directions, parts)
 
 
 def _instruments(experiment: Experiment, evidence: Evidence, known: Noise) -> Part:

@@ -32,6 +32,10 @@ def record(experiment: Experiment, diagnosis: Diagnosis) -> dict[str, Any]:
         "effects": [_effect(diagnosis, candidates[name]) for name in _order(diagnosis)],
         "simulations": diagnosis.simulations,
         "values": dict(diagnosis.evidence.values),
+        "estimates": {
+            name: {"value": e.value, "std": e.std, "noise": e.noise, "numerics": e.numerics}
+            for name, e in diagnosis.estimates.items()
+        },
         "misfit": _omnibus(diagnosis.misfit),
         "remainder": None if diagnosis.remainder is None else _omnibus(diagnosis.remainder),
         "explained": diagnosis.explained,
@@ -129,6 +133,7 @@ def confirmation(c: Confirmation) -> dict[str, Any]:
     return {
         "values": dict(c.values),
         "stds": dict(c.stds),
+        "numerics": dict(c.numerics),
         "chi2": c.chi2,
         "fall": c.fall,
         "told": c.told,

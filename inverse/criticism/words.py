@@ -81,6 +81,13 @@ def _adequate(diagnosis: Diagnosis, candidates: Mapping[str, Candidate]) -> list
         if verdict == "absent"
     ]
     out = ["The model is adequate: nothing stands above what noise, chance and numerics leave."]
+    for name, estimate in diagnosis.estimates.items():
+        value = amount(estimate.value, estimate.std, estimate.unit)
+        noise, numerics = (f"± {part:.2g}{symbol(estimate.unit)}" for part in (estimate.noise, estimate.numerics))
+        out.append(
+            f"With all three weighed, the {name.replace('_', ' ')} is {value}: {noise} by noise and chance, {numerics} "
+            "by numerics that weren't tried and may be as far off as those that were."
+        )
     if seen:
         out.append(f"It would have shown {listed(seen)}.")
     return out

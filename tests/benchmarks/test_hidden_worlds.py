@@ -49,11 +49,15 @@ def test_a_layer_lies_below_its_depth_and_a_stone_holds_no_sand() -> None:
 
 
 def judged(kind: str, verdict: str, members: list[str]) -> dict[str, object]:
-    refit = {"values": {"friction_angle": 34.0}, "stds": {"friction_angle": 0.5}, "held_out": 2.0, "floor": 2.5}
-    told = {"refits": {"as it is": refit, **dict.fromkeys(members, refit)}, "verdict": verdict, "class": members}
-    told |= {"explained": 0.5, "effects": [], "seconds": 1.0}
+    """A world of 32°; a tilt of 4°, if that is hidden."""
+    refit: dict[str, object] = {"values": {"friction_angle": 34.0, "tilt_x": 1.0}}
+    refit |= {"stds": {"friction_angle": 0.5, "tilt_x": 2.0}, "held_out": 2.0, "floor": 2.5}
+    refits = dict.fromkeys(["as it is", *members], refit) if members else {}
+    told = {"refits": refits, "verdict": verdict, "class": members, "explained": 0.5}
+    told |= {"effects": [{"name": "tilt", "parameter": "tilt_x", "z": 3.0}], "seconds": 1.0}
+    told["estimates"] = {"friction_angle": {"value": 31.0, "std": 1.2}}
     fit = {"parameters": {"friction_angle": {"estimate": 35.0, "std": 0.5}}, "seconds": 1.0}
-    return score(draw(kind, 0, 1), fit, told)
+    return score(replace(draw(kind, 0, 1), angle=32.0, size=4.0), fit, told)
 
 
 def test_right_is_what_names_the_truth_or_nothing_where_nothing_is() -> None:
@@ -65,6 +69,19 @@ def test_right_is_what_names_the_truth_or_nothing_where_nothing_is() -> None:
     assert judged(FIELD, "outside the library", ["tilt"])["right"]
     rows = [judged("tilt", "missing", ["gravity"]), judged(NOTHING, "adequate", [])]
     assert "another effect named: 1 of 1" in table(rows)
+
+
+def test_what_is_stated_is_held_against_the_truth() -> None:
+    """The angle that a diagnosis weighs where nothing is named, what a refit says where it is of the right effect."""
+    assert judged(NOTHING, "adequate", [])["off"] == pytest.approx([-1.0 / 1.2])
+    assert judged("tilt", "missing", ["tilt"])["off"] == pytest.approx([4.0, -1.5])
+    assert judged("tilt", "missing", ["gravity"])["off"] == pytest.approx([4.0])
+    rows = [
+        judged("tilt", "missing", ["gravity"]),
+        judged(NOTHING, "adequate", []),
+        judged("tilt", "missing", ["tilt"]),
+    ]
+    assert "within 1 × their ±: 1 of 3" in table(rows) and "within 2 × their ±: 2 of 3" in table(rows)
 
 
 def test_a_missing_renderer_is_said_before_anything_is_made(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

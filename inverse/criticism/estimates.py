@@ -1,0 +1,102 @@
+"""What a diagnosis tells of parameters: weighed by all that is noise, and by numerics that nobody tried, too.
+
+The numerics that were tried are nuisances: the data settle how much there is of each, and hardly widen an estimate. But
+another solver, and soil itself, differ from ours in other ways as well. What such a way does to an estimate is told by
+those that were tried, each in turn treated as if it hadn't been (a jackknife over numerics: the estimator that knows
+only the others is shown the one left out).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from splatsoil.experiment.base import Experiment
+from splatsoil.parameters import Parameter
+
+from .evidence import Evidence, ignorance
+from .floor import Floor
+from .sight import Sight
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A parameter with what makes it doubtful.
+
+    Attributes:
+        value: of the parameter.
+        noise: standard deviation by noise, chance and what the numerics that were tried leave.
+        numerics: standard deviation by one more way of computing, such as those that were tried.
+        unit: of all three.
+    """
+
+    value: float
+    noise: float
+    numerics: float
+    unit: str = ""
+
+    @property
+    def std(self) -> float:
+        """Standard deviation by both."""
+        return math.hypot(self.noise, self.numerics)
+
+
+def untried(floor: Floor, slopes: FloatArray, precision: FloatArray) -> FloatArray:
+    """(k,) standard deviations of parameters by numerics that weren't tried; 0 where none were.
+
+    Args:
+        floor: noise, and what the numerics that were tried change.
+        slopes: (t, s, k) derivatives by the parameters.
+        precision: (k, k) what is known of the parameters beforehand.
+    """
+    count = floor.tried
+    if not count:
+        return np.zeros(slopes.shape[-1])
+    solver = floor.noise.solver()
+    along, nuisance = solver.whiten(slopes[floor.noise.seen]), solver.whiten(floor.nuisance)
+    shifts = []
+    for k in range(count):
+        left_out, others = nuisance[:, k], np.delete(nuisance, k, axis=1)
+        # Woodbury: the others as noise.
+        gain = np.linalg.solve(np.eye(others.shape[1]) + others.T @ others, others.T @ along)
+        weights = along - others @ gain
+        shifts.append(np.linalg.solve(along.T @ weights + precision, weights.T @ left_out))
+    return np.asarray(np.sqrt(np.mean(np.square(shifts), axis=0)))
+
+
+def weighed(experiment: Experiment, evidence: Evidence, floor: Floor, basis: FloatArray) -> dict[str, Estimate]:
+    """The model's own parameters as it is, by name: one step of generalised least squares from the fit.
+
+    A fit weighs features by chance alone and knows nothing of numerics; here all of the floor counts. Where more is
+    left than noise, in the directions (slow waves (n, k) among them) in which anything acts, that widens it (Birge
+    1932).
+    """
+    parameters, values = experiment.parameters, evidence.values
+    if not parameters:
+        return {}
+    slopes = np.stack([evidence.slopes[p.name] for p in parameters], axis=-1)
+    sight = Sight.of(experiment, floor, basis)
+    along, left = sight(slopes), sight(experiment.observed - evidence.mean)
+    beforehand = prior(parameters, values)
+    information = along.T @ along + beforehand
+    step = np.linalg.solve(information, along.T @ left)
+    rest = left - along @ step
+    wide = max(1.0, float(rest @ rest) / max(len(rest) - len(step), 1))
+    noise = np.sqrt(wide * np.diag(np.linalg.inv(information)))
+    numerics = untried(floor, slopes, beforehand)
+    out = {}
+    for k, p in enumerate(parameters):
+        value = float(np.clip(values[p.name] + step[k], p.lower, p.upper))
+        out[p.name] = Estimate(value, float(noise[k]), float(numerics[k]), p.unit)
+    return out
+
+
+def prior(parameters: Sequence[Parameter], values: Mapping[str, float]) -> FloatArray:
+    """(k, k) precision of parameters of which only the bounds are known, at some values."""
+    return np.diag([ignorance(p, values[p.name]) ** -2.0 for p in parameters])

@@ -1,0 +1,73 @@
+"""What a diagnosis says of parameters, where truths are of numerics that nobody tried."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from splatsoil.benchmarks.hidden_effects import emulated, fitted, outside
+from splatsoil.inverse.criticism.estimates import untried, weighed
+from splatsoil.inverse.criticism.evidence import gather
+from splatsoil.inverse.criticism.floor import floor_of
+from splatsoil.inverse.criticism.misfit import smooth_basis
+from splatsoil.inverse.criticism.simulations import Simulations
+
+TRIED, WORLDS = 5, 40
+
+
+def worlds(size: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(w,) errors of the angle, stds by noise and by numerics, where the truth has a way of computing of its own.
+
+    It and the ways that are tried are drawn alike, ``size`` times the noise.
+    """
+    found = []
+    for world in range(WORLDS):
+        generator = np.random.default_rng([world, 5])
+        made = emulated(world)
+        tried = {f"way {k}": outside(made, generator, size) for k in range(TRIED)}
+        made = replace(made, patterns=tried)
+        observed = made.measured({"angle": 0.0}, [world, 99], outside(made, generator, size))
+        experiment = replace(made, observed=observed)
+        evidence = gather(experiment, Simulations(experiment), {"angle": fitted(experiment)})
+        floor = floor_of(experiment, evidence)
+        told = weighed(experiment, evidence, floor, smooth_basis(experiment.layout, floor.noise))["angle"]
+        assert told.std == pytest.approx(np.hypot(told.noise, told.numerics)) and told.unit == "deg"
+        found.append((told.value, told.noise, told.numerics))
+    errors, noise, numerics = np.array(found).T
+    return errors, noise, numerics
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def test_the_error_is_as_large_as_is_said_though_nobody_tried_the_truths_numerics() -> None:
+    """Without what untried numerics do, the angle is off by 1.8 times what is stated (root mean square)."""
+    errors, noise, numerics = worlds(8.0)
+    assert 0.7 < rms(errors / np.hypot(noise, numerics)) < 1.35
+    assert rms(errors / noise) > 1.5
+    # A spread as wide as what is believed before any data would hold any truth.
+    assert rms(np.hypot(noise, numerics)) < 0.8 * 20.0 / np.sqrt(12.0)
+
+
+def test_each_way_left_out_is_what_the_estimator_of_the_others_makes_of_it() -> None:
+    """Against least squares with the covariance written out."""
+    made = emulated(3)
+    tried = {f"way {k}": outside(made, np.random.default_rng(k), 2.0) for k in range(3)}
+    experiment = replace(made, patterns=tried, observed=made.measured({"angle": 0.0}, [3, 99]))
+    evidence = gather(experiment, Simulations(experiment), {"angle": 0.0})
+    floor = floor_of(experiment, evidence)
+    slopes = np.stack([experiment.slopes[name] for name in ("angle", "effect 1")], axis=-1)
+    precision = np.diag([0.1, 2.0])
+    along, ways = slopes.reshape(-1, 2), np.stack([table.reshape(-1) for table in tried.values()], axis=1)
+    shifts = []
+    for k in range(3):
+        others = np.delete(ways, k, axis=1)
+        inverse = np.linalg.inv(floor.noise.covariance + others @ others.T)
+        shifts.append(np.linalg.inv(along.T @ inverse @ along + precision) @ along.T @ inverse @ ways[:, k])
+    np.testing.assert_allclose(
+        untried(floor, slopes, precision), np.sqrt(np.mean(np.square(shifts), axis=0)), rtol=1e-6
+    )
+    alone = replace(floor, nuisance=floor.nuisance[:, :0], tried=0)
+    np.testing.assert_array_equal(untried(alone, slopes, precision), 0.0)
