@@ -258,11 +258,10 @@ def score(hidden: Hidden, fit: Mapping[str, Any], told: Mapping[str, Any]) -> di
     """What fit and diagnosis said of a world, beside the truth; the best effect's refit is what ``add`` keeps."""
     refits = told["refits"]
     weighed = told["estimates"]["friction_angle"]
-    # Without any significant effect nothing was refitted.
     asis = {"values": {"friction_angle": weighed["value"]}, "stds": {"friction_angle": weighed["std"]}}
+    # Without any significant effect nothing was refitted; without a named one the diagnosis tells the weighed estimate.
     base = refits.get("as it is", asis)
-    best = refits.get(told["class"][0]) if told["class"] else None
-    last = best or base
+    last = refits[told["class"][0]] if told["class"] else {**base, **asis}
     named = told["class"] if told["verdict"] == "missing" else []
     off = [(last["values"]["friction_angle"] - hidden.angle) / last["stds"]["friction_angle"]]
     if told["class"][:1] == [hidden.kind] and hidden.kind not in OBSERVATION:

@@ -19,8 +19,8 @@ FloatArray = npt.NDArray[np.float64]
 
 NUMERICS_PRIOR = 1.0
 """Standard deviation of a numerical difference pattern's amplitude, in units of the change that was tried."""
-
-
+ACTING = ("chance", "guesses", "numerics")
+"""Parts of soil's making, which lie where effects act more than a separable noise says."""
 FEWEST_QUIET = 30
 """Features without physics from which the instruments' errors can be told."""
 OUTLYING = 3.0
@@ -93,10 +93,10 @@ def floor_of(experiment: Experiment, evidence: Evidence) -> Floor:
     if patterns:
         known = _total(layout, parts, seen, runs)[0]
         left = _unexplained(known, parameters, patterns, seen, seen & layout.common[None])
-        parts["numerics"] = estimate(layout, left, seen)
+        parts["numerics"] = estimate(layout, left, seen, directions, parameters)
     noise, single = _total(layout, parts, seen, runs)
     for name, part in parts.items():
-        columns = extra_noise(layout, part, seen, directions if name in ("chance", "guesses") else None)
+        columns = extra_noise(layout, part, seen, directions if name in ACTING else None)
         averaged, alone = (np.sqrt(factor) for factor in _factors(name, runs))
         noise, single = noise.plus(averaged * columns), single.plus(alone * columns)
     nuisance = [NUMERICS_PRIOR * _columns(patterns, seen), _columns(experiment.systematic, seen)]

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from .confirmation import Confirmation
 from .misfit import Omnibus
 from .score import Score
-from .verdicts import CERTAIN, EQUIVALENT, GATE, RELEVANT
+from .verdicts import CERTAIN, EQUIVALENT, GATE, LEVEL, RELEVANT
 
 
 def members_of(
@@ -31,7 +31,7 @@ def members_of(
     costs = {name: cost for name, cost in costs.items() if not confirmations[name].ruled_out}
     if not costs:
         return ()
-    standing = [name for name in costs if stands(confirmations, name, misfit, scores[name].dispersion)]
+    standing = [name for name in costs if stands(confirmations, name, misfit, scores[name])]
     certain = {name: costs[name] for name in standing if confirmations[name].told < CERTAIN}
     among = certain or costs
     best = min(among, key=lambda name: among[name])
@@ -42,21 +42,22 @@ def members_of(
     return _equals(explaining, best, max(confirmations[best].remainder.dispersion, scores[best].dispersion))
 
 
-def stands(confirmations: Mapping[str, Confirmation], name: str, misfit: Omnibus, dispersion: float) -> bool:
+def stands(confirmations: Mapping[str, Confirmation], name: str, misfit: Omnibus, score: Score) -> bool:
     """Something is to be explained, and the refit does: χ² falls, on times that it hasn't seen too.
 
-    Where slow waves show no more than chance, the model must be off by more than noise on those times, and the effect
-    take away a relevant share of the squared error there, whatever a single direction among dozens seems to say. What
+    Where slow waves show no more than chance, either the effect is significant among all of the library, or the model
+    is off by more than noise on those times; and it must take away a relevant share of the squared error there. What
     other pictures say of an effect beyond doubt needs no more of the features than that they don't speak against it.
     """
     before, after = confirmations[""], confirmations[name]
-    least = EQUIVALENT * dispersion
+    least = EQUIVALENT * score.dispersion
     if after.fall <= least:
         return False
     if after.told < CERTAIN:
         return after.unseen > -least
-    relevant = before.held_out > before.floor and after.held_out**2 < (1.0 - RELEVANT) * before.held_out**2
-    return (misfit.p < GATE or relevant) and after.unseen > 0.0
+    wanting = score.adjusted < LEVEL or before.held_out > before.floor
+    relevant = after.held_out**2 < (1.0 - RELEVANT) * before.held_out**2
+    return (misfit.p < GATE or (wanting and relevant)) and after.unseen > 0.0
 
 
 def _equals(costs: Mapping[str, float], best: str, dispersion: float) -> tuple[str, ...]:

@@ -207,38 +207,43 @@ def test_an_effect_that_leaves_more_than_noise_is_not_all_that_is_missing(error:
 
 
 @pytest.mark.parametrize(
-    ("error", "misfit", "left", "unseen", "named"),
+    ("error", "misfit", "p", "left", "unseen", "named"),
     [
-        (0.7, CLEAN, 0.97, 9.0, False),
-        (0.7, CLEAN, 0.8, 9.0, False),
-        (0.7, OFF, 0.97, 9.0, True),
-        (1.5, CLEAN, 0.97, 9.0, False),
-        (1.5, CLEAN, 0.8, 9.0, True),
-        (1.5, OFF, 0.97, 9.0, True),
-        (1.5, OFF, 0.97, -1.0, False),
+        (0.7, CLEAN, 0.3, 0.97, 9.0, False),
+        (0.7, CLEAN, 0.3, 0.8, 9.0, False),
+        (0.7, CLEAN, 0.001, 0.8, 9.0, True),
+        (0.7, CLEAN, 0.001, 0.97, 9.0, False),
+        (0.7, OFF, 0.3, 0.97, 9.0, True),
+        (1.5, CLEAN, 0.3, 0.97, 9.0, False),
+        (1.5, CLEAN, 0.3, 0.8, 9.0, True),
+        (1.5, OFF, 0.3, 0.97, 9.0, True),
+        (1.5, OFF, 0.3, 0.97, -1.0, False),
     ],
 )
 def test_nothing_is_missing_where_nothing_is_to_be_explained(
-    sizes: dict[str, float], error: float, misfit: Omnibus, left: float, unseen: float, named: bool
+    sizes: dict[str, float], error: float, misfit: Omnibus, p: float, left: float, unseen: float, named: bool
 ) -> None:
-    """A refit that explains much; error on hidden times and slow waves may be chance before it, and so much is left."""
-    found = one(WORLD, {"angle": 1.0, "effect 2": 5.0 * sizes["effect 2"]}, None, OPTIONS).confirmations
+    """A refit that explains much; error on hidden times, slow waves and the effect's score may be chance before it, and
+    so much is left."""
+    diagnosed = one(WORLD, {"angle": 1.0, "effect 2": 5.0 * sizes["effect 2"]}, None, OPTIONS)
+    found, score = diagnosed.confirmations, replace(diagnosed.scores["effect 2"], adjusted=p, dispersion=1.0)
     before, after = found[""], found["effect 2"]
     floor = before.held_out / error
     held_out = left * before.held_out
     told = {"": replace(before, floor=floor), "effect 2": replace(after, floor=floor, held_out=held_out, unseen=unseen)}
-    assert stands(told, "effect 2", misfit, 1.0) is named
+    assert stands(told, "effect 2", misfit, score) is named
 
 
 @pytest.mark.parametrize(("told", "unseen", "named"), [(1e-5, -1.0, True), (1e-5, -9.0, False), (1e-3, -1.0, False)])
 def test_what_other_pictures_say_beyond_doubt_the_soil_need_only_not_deny(
     sizes: dict[str, float], told: float, unseen: float, named: bool
 ) -> None:
-    found = one(WORLD, {"angle": 1.0, "effect 2": 5.0 * sizes["effect 2"]}, None, OPTIONS).confirmations
+    diagnosed = one(WORLD, {"angle": 1.0, "effect 2": 5.0 * sizes["effect 2"]}, None, OPTIONS)
+    found, score = diagnosed.confirmations, replace(diagnosed.scores["effect 2"], adjusted=1.0, dispersion=1.0)
     floor = found[""].held_out / 0.7
     after = replace(found["effect 2"], floor=floor, held_out=found[""].held_out, unseen=unseen, told=told)
     told_of = {"": replace(found[""], floor=floor), "effect 2": after}
-    assert stands(told_of, "effect 2", Omnibus(60.0, 72, 0.5), 1.0) is named
+    assert stands(told_of, "effect 2", Omnibus(60.0, 72, 0.5), score) is named
 
 
 def test_what_other_pictures_say_beyond_doubt_is_named_before_what_soil_shows(sizes: dict[str, float]) -> None:

@@ -43,10 +43,10 @@ def rms(values: np.ndarray) -> float:
 
 
 def test_the_error_is_as_large_as_is_said_though_nobody_tried_the_truths_numerics() -> None:
-    """Without what untried numerics do, the angle is off by 1.8 times what is stated (root mean square)."""
+    """Without what untried numerics do, the angle is off by 1.5 times what is stated (root mean square)."""
     errors, noise, numerics = worlds(8.0)
     assert 0.7 < rms(errors / np.hypot(noise, numerics)) < 1.35
-    assert rms(errors / noise) > 1.5
+    assert rms(errors / noise) > 1.35
     # A spread as wide as what is believed before any data would hold any truth.
     assert rms(np.hypot(noise, numerics)) < 0.8 * 20.0 / np.sqrt(12.0)
 
