@@ -48,11 +48,21 @@ def symbol(unit: str) -> str:
     return {"deg": "°", "1": ""}.get(unit, f" {unit}")
 
 
-def answers(fit: Mapping[str, Any]) -> list[Answer]:
-    """The fitted parameters."""
-    out = []
+def weighed(fit: Mapping[str, Any], diagnosis: Mapping[str, Any] | None) -> Mapping[str, Any]:
+    """What a diagnosis that calls this very fit adequate tells of its parameters, by name; empty without one."""
+    if diagnosis is None or diagnosis["verdict"] != "adequate" or diagnosis["fit"] != fit["name"]:
+        return {}
+    known: Mapping[str, Any] = diagnosis.get("estimates", {})
+    return known
+
+
+def answers(fit: Mapping[str, Any], diagnosis: Mapping[str, Any] | None = None) -> list[Answer]:
+    """The parameters: as fitted or, where a diagnosis calls the model adequate, with all of its floor weighed."""
+    out, better = [], weighed(fit, diagnosis)
     for name, entry in fit["parameters"].items():
         value, std = with_std(entry["estimate"], entry["std"])
+        if name in better:
+            value, std = with_std(better[name]["value"], better[name]["std"])
         plain = name.replace("_", " ")
         state, remark = "determined", ""
         if not entry["determined"]:
@@ -66,6 +76,21 @@ def answers(fit: Mapping[str, Any]) -> list[Answer]:
             )
         out.append(Answer(plain, value, std, symbol(entry["unit"]), state, remark))
     return out
+
+
+def fitted_sentence(fit: Mapping[str, Any], diagnosis: Mapping[str, Any] | None) -> str:
+    """Where the answers are weighed ones: what they hold, and what the fit says by itself; otherwise empty."""
+    better = weighed(fit, diagnosis)
+    if not better:
+        return ""
+    alone = [
+        f"{name.replace('_', ' ')} {estimate(entry['estimate'], entry['std'], entry['unit'])}"
+        for name, entry in fit["parameters"].items()
+    ]
+    return (
+        "Weighed by the diagnosis: the ± holds noise, chance and what numerics that weren't tried may do, not a bias "
+        f"that the model has everywhere. The fit by itself says: {', '.join(alone)}."
+    )
 
 
 def force_sentence(fit: Mapping[str, Any]) -> str:

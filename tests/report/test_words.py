@@ -73,3 +73,14 @@ def test_a_force_that_counts_is_told_with_what_pictures_say_alone() -> None:
     told = words.force_sentence({**fit, "force": {"counted": True, "pictures_alone": alone}})
     assert "38.2 ± 0.9° for the friction angle and anything for the cohesion" in told
     assert "isn't counted" in words.force_sentence({**fit, "force": {"counted": False, "pictures_alone": alone}})
+
+
+@pytest.mark.parametrize(("of", "quoted"), [("base", "37"), ("base+tilt", "36.0")])
+def test_an_adequate_fit_is_quoted_as_its_own_diagnosis_weighs_it(of: str, quoted: str) -> None:
+    entry = {"estimate": 36.0, "std": 0.5, "unit": "deg", "at_bound": None, "determined": True}
+    fit = {"name": "base", "parameters": {"friction_angle": entry}}
+    diagnosis = {"verdict": "adequate", "fit": of, "estimates": {"friction_angle": {"value": 37.1, "std": 3.2}}}
+    (answer,) = words.answers(fit, diagnosis)
+    assert answer.value == quoted
+    assert ("36.0 ± 0.5°" in words.fitted_sentence(fit, diagnosis)) is (quoted == "37")
+    assert words.answers(fit, {**diagnosis, "verdict": "missing"})[0].value == "36.0"
