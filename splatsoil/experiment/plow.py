@@ -232,7 +232,7 @@ class PlowExperiment:
 
     def strokes(self) -> Mapping[str, Predict]:
         """Heights of the surface in other strokes of the tool, simulated coarsely."""
-        return plow_strokes(self.base)
+        return plow_strokes(self.base, self._wanted)
 
     def _variant(self, effects: tuple[str | Effect, ...], numerics: str) -> Model:
         if effects == self.model and not numerics:

@@ -42,11 +42,17 @@ class Stroked(Protocol):
         """Predictions (n,) in units of noise, by stroke, :data:`MEASURED` too; they take parameters and effects."""
 
 
-def plow_strokes(model: Model) -> dict[str, Predict]:
-    """The measured stroke deeper, shallower, slower, faster, and with the tool leaning, where the bed allows it."""
+def plow_strokes(model: Model, own: Mapping[str | Effect, Effect] | None = None) -> dict[str, Predict]:
+    """The measured stroke deeper, shallower, slower, faster, and with the tool leaning, where the bed allows it.
+
+    Args:
+        model: of the measured stroke.
+        own: effects that the library doesn't have, by name.
+    """
     surface = float(np.nanmean(model.reconstruction.surface.height))
     return {
-        name: partial(_heights, model, measurement) for name, measurement in motions(model.measurement, surface).items()
+        name: partial(_heights, model, own or {}, measurement)
+        for name, measurement in motions(model.measurement, surface).items()
     }
 
 
@@ -90,13 +96,17 @@ def motions(measurement: Measurement, surface: float) -> dict[str, Measurement]:
 
 
 def _heights(
-    model: Model, measurement: Measurement, values: Mapping[str, float], effects: tuple[str, ...]
+    model: Model,
+    own: Mapping[str | Effect, Effect],
+    measurement: Measurement,
+    values: Mapping[str, float],
+    effects: tuple[str, ...],
 ) -> FloatArray:
     """(n,) changes of the surface's height over its chance, square by square, at some frames."""
     from splatsoil.model import Model
     from splatsoil.mpm import simulate
 
-    on: tuple[str | Effect, ...] = (*model.effects, *effects)
+    on: tuple[str | Effect, ...] = (*model.effects, *(own.get(name, name) for name in effects))
     frames = np.unique(np.linspace(0, model.frames[-1], MOMENTS + 1).astype(int))
     coarse = Model(measurement, model.reconstruction, effects=on, preset=PRESET, device=model.device, frames=[0])
     run = simulate(

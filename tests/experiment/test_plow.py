@@ -1,11 +1,16 @@
 """What a plow experiment draws without simulating anew."""
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
+import numpy as np
 import pytest
 
 from splatsoil.experiment.plow import PlowExperiment
+from splatsoil.experiment.strokes import MEASURED
+from splatsoil.measurement import Measurement
+from splatsoil.soil.library import find_effects
 
 
 def asked(numerics: str) -> tuple[list[Any], list[Any]]:
@@ -58,3 +63,28 @@ def test_an_unknown_way_is_not_taken_for_the_usual_one() -> None:
     assert PlowExperiment._variant(experiment, ("cohesion",), "") is base
     with pytest.raises(KeyError, match="gird"):
         PlowExperiment._variant(experiment, ("cohesion",), "gird")
+
+
+class Asked(Exception):
+    pass
+
+
+def test_other_strokes_know_an_effect_of_ones_own(monkeypatch: pytest.MonkeyPatch, repository: Path) -> None:
+    """One from a file, which the library can't find by its name."""
+    (suction,) = find_effects([str(repository / "examples" / "effects" / "suction.py")])
+    asked: list[Any] = []
+
+    def model(*_: Any, effects: Any, **__: Any) -> None:
+        asked.append(effects)
+        raise Asked
+
+    monkeypatch.setattr("splatsoil.model.Model", model)
+    measurement = Measurement.load(repository / "examples" / "plow-dry")
+    reconstruction = SimpleNamespace(surface=SimpleNamespace(height=np.full((2, 2), 0.12)))
+    base = SimpleNamespace(
+        effects=("cohesion",), frames=(0, 6), measurement=measurement, reconstruction=reconstruction, device="cpu"
+    )
+    experiment: Any = SimpleNamespace(base=base, _wanted={"suction": suction})
+    with pytest.raises(Asked):
+        PlowExperiment.strokes(experiment)[MEASURED]({}, ("suction", "tilt"))
+    assert asked == [("cohesion", suction, "tilt")]
