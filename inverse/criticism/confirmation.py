@@ -141,7 +141,7 @@ def confirm(
         apart_from = np.concatenate([floor.nuisance, _tangent(floor.single, fit.slopes)], axis=1)
         remainder = omnibus(floor.single, apart_from, left[experiment.seen], basis)
         chi2 = _chi2(whole, left) + known.chi2(at)
-        precision = prior(free, fit.values) + known.root.T @ known.root
+        precision = _beforehand(free, fit.values, known)
         values, stds = dict(fit.values), _stds(free, whiten(fit.slopes), precision, remainder)
         emulated: tuple[Visit, ...] = ()
         if _emulated(experiment, candidate):
@@ -149,12 +149,12 @@ def confirm(
             with suppress(ValueError):
                 reading = read(visits, whole, experiment.observed, free, known)
                 values, stds, emulated = dict(reading.values), dict(reading.stds), tuple(visits)
-        numerics = _numerics(free, floor, fit.slopes, precision)
+        stds, numerics = _with_untried(stds, floor, fit.slopes, precision)
         out["" if candidate is None else candidate.name] = Confirmation(
             name="" if candidate is None else candidate.name,
             fit=fit,
             values=values,
-            stds=_with(stds, numerics),
+            stds=stds,
             numerics=numerics,
             chi2=chi2,
             fall=0.0 if candidate is None else _chi2(whole, before) + known.chi2(off) - chi2,
@@ -254,14 +254,17 @@ def _stds(
     return {p.name: widened * math.sqrt(float(v)) for p, v in zip(free, np.diag(covariance), strict=True)}
 
 
-def _numerics(free: Sequence[Parameter], floor: Floor, slopes: FloatArray, precision: FloatArray) -> dict[str, float]:
-    """Standard deviations by numerics that weren't tried, by name."""
-    return {p.name: float(v) for p, v in zip(free, untried(floor, slopes, precision), strict=True)}
+def _with_untried(
+    stds: Mapping[str, float], floor: Floor, slopes: FloatArray, precision: FloatArray
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Standard deviations by noise, in the slopes' order, widened by numerics that weren't tried, and the latter."""
+    numerics = dict(zip(stds, map(float, untried(floor, slopes, precision)), strict=True))
+    return {name: math.hypot(std, numerics[name]) for name, std in stds.items()}, numerics
 
 
-def _with(stds: Mapping[str, float], numerics: Mapping[str, float]) -> dict[str, float]:
-    """Both together."""
-    return {name: math.hypot(std, numerics[name]) for name, std in stds.items()}
+def _beforehand(free: Sequence[Parameter], values: Mapping[str, float], known: Known) -> FloatArray:
+    """(k, k) precision of parameters by their bounds and by what other measurements say."""
+    return prior(free, values) + known.root.T @ known.root
 
 
 def _tangent(noise: Noise, slopes: FloatArray) -> FloatArray:
@@ -377,11 +380,11 @@ def on_its_own_floor(
         known = _known(evidence, parameters)
         reading = read(visits, sight, experiment.observed, parameters, known)
         # Draws don't leave the simulations' range, and these were made where another floor let the parameters be.
-        precision = prior(parameters, at) + known.root.T @ known.root
+        precision = _beforehand(parameters, at, known)
         least = _stds(parameters, sight(slopes), precision, after)
         stds = {name: max(std, least[name]) for name, std in reading.stds.items()}
-        numerics = _numerics(parameters, floor, slopes, precision)
-        refit = replace(best, values=dict(reading.values), stds=_with(stds, numerics), numerics=numerics)
+        stds, numerics = _with_untried(stds, floor, slopes, precision)
+        refit = replace(best, values=dict(reading.values), stds=stds, numerics=numerics)
     return OwnFloor(
         before=omnibus(floor.noise, without, residual, basis),
         after=after,
