@@ -19,7 +19,7 @@ are compared as they are.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from copy import copy
 from dataclasses import dataclass
 
@@ -178,6 +178,22 @@ class Comparator:
         Raises:
             ParameterError: a picture is missing or has another size.
         """
+        losses, squares, means = {}, {}, []
+        for camera, change, masks in self._changes(images):
+            for frame, mask in zip(self.frames, masks, strict=True):
+                difference = (self.observed[camera, frame] - images[camera, frame])[mask]
+                squares[camera, frame] = float(np.mean(np.square(difference, dtype=np.float64))) if mask.any() else 0.0
+            scaled = self._scaled_losses(camera, change, masks) / self._unit[camera]
+            losses.update({(camera, f): float(v) for f, v in zip(self.frames, scaled.mean(axis=1), strict=True)})
+            means.append(self._block_means(camera, change, masks))
+        return Comparison(float(np.mean(list(losses.values()))), losses, squares, _in_order(means), self.labels)
+
+    def blocks(self, images: Mapping[Key, Image]) -> FloatArray:
+        """(b,) `Comparison.blocks` alone, in half the time; raises what ``compare`` does."""
+        return _in_order([self._block_means(*changed) for changed in self._changes(images)])
+
+    def _changes(self, images: Mapping[Key, Image]) -> Iterator[tuple[str, list[Image], list[BoolImage]]]:
+        """Each camera with its (h, w, 3) changes observed minus predicted, and pixels (h, w) that count, by frame."""
         for key in (*self.keys, *((c, self.reference) for c in self.cameras)):
             if key not in images:
                 raise ParameterError(f"the prediction has no picture of camera {key[0]!r} at frame {key[1]}")
@@ -186,20 +202,11 @@ class Comparator:
                     f"camera {key[0]!r}, frame {key[1]}: the prediction is {images[key].shape}, "
                     f"the photograph {self.observed[key].shape}"
                 )
-        losses, squares, means = {}, {}, []
         for camera in self.cameras:
             still = self.before[camera] - images[camera, self.reference]
             still[self._shows_tool(camera, self.reference, images[camera, self.reference])] = 0.0
             masks = [self.interior[camera] & ~self._shows_tool(camera, f, images[camera, f]) for f in self.frames]
-            change = [self.observed[camera, f] - images[camera, f] - still for f in self.frames]
-            for frame, mask in zip(self.frames, masks, strict=True):
-                difference = (self.observed[camera, frame] - images[camera, frame])[mask]
-                squares[camera, frame] = float(np.mean(np.square(difference, dtype=np.float64))) if mask.any() else 0.0
-            scaled = self._scaled_losses(camera, change, masks) / self._unit[camera]
-            losses.update({(camera, f): float(v) for f, v in zip(self.frames, scaled.mean(axis=1), strict=True)})
-            means.append(self._block_means(camera, change, masks))
-        blocks = 255.0 * np.concatenate([m.reshape(-1) for m in means])
-        return Comparison(float(np.mean(list(losses.values()))), losses, squares, blocks, self.labels)
+            yield camera, [self.observed[camera, f] - images[camera, f] - still for f in self.frames], masks
 
     def against(self, images: Mapping[Key, Image]) -> Comparator:
         """The same comparison with these pictures, the reference frame among them, in place of the photographs: a
@@ -285,8 +292,10 @@ class Comparator:
         rule = self._tool_colour[camera]
         if rule is None:
             return shape
-        seen = [_log_ratios(image) @ rule[0] > rule[1] for image in (self.observed[camera, frame], predicted)]
-        return binary_dilation(shape & (seen[0] | seen[1]), iterations=2)
+        shown = np.zeros_like(shape)
+        for image in (self.observed[camera, frame], predicted):
+            shown[shape] |= _log_ratios(image[shape]) @ rule[0] > rule[1]
+        return binary_dilation(shown, iterations=2)
 
     def _layout(self) -> tuple[tuple[Block, ...], dict[str, npt.NDArray[np.int64]]]:
         """Labels of all blocks, and for each camera the block (in its order) that each pixel belongs to, or -1."""
@@ -387,6 +396,11 @@ def _relief(measurement: Measurement, surface: HeightField | None, level: float 
     nearest = distance_transform_edt(~np.isfinite(surface.height), return_distances=False, return_indices=True)
     height = surface.height[tuple(nearest)]
     return Relief.of_heights(torch.from_numpy(height), (float(surface.x[0]), float(surface.y[0])), surface.cell)
+
+
+def _in_order(means: list[FloatArray]) -> FloatArray:
+    """(b,) mean residuals (frames, blocks) of all cameras, in grey levels, in the order of labels."""
+    return np.asarray(255.0 * np.concatenate([m.reshape(-1) for m in means]))
 
 
 def _log_ratios(image: Image) -> FloatArray:

@@ -68,7 +68,7 @@ class Part:
 
     def correlation(self, layout: Layout) -> FloatArray:
         """(t s, t s) correlation of the features."""
-        return np.asarray(np.kron(_time(layout.steps(), self.memory), self.across(layout)), dtype=np.float64)
+        return np.asarray(np.kron(_time(layout.steps, self.memory), self.across(layout)), dtype=np.float64)
 
     def across(self, layout: Layout) -> FloatArray:
         """(s, s) correlation between sites at one time."""
@@ -205,7 +205,7 @@ def _scales(
 ) -> FloatArray:
     """(t, s) standard deviations."""
     squares = np.mean(samples**2, axis=0)
-    channel = layout.channel_numbers()
+    channel = layout.channel_numbers
     pooled = np.zeros(layout.shape)
     for c in range(len(layout.channels)):
         mine = channel == c
@@ -217,7 +217,7 @@ def _scales(
     local = (in_time @ squares @ in_space.T) / np.maximum(share, 1e-9)
     local = np.maximum(np.where(share > 1e-6, local, pooled), 1e-4 * pooled)
     # Degrees of freedom of a local mean of squares whose terms are correlated.
-    time = _time(layout.steps(), memory)
+    time = _time(layout.steps, memory)
     space = np.eye(layout.shape[1]) if across is None else across
     held = np.einsum("ij,ik,jk->i", in_time, in_time, time**2).mean()
     held *= np.einsum("ij,ik,jk->i", in_space, in_space, space**2).mean()
@@ -238,11 +238,11 @@ def _scales(
 
 def _neighbours(layout: Layout) -> tuple[FloatArray, FloatArray]:
     """Weights (t, t) and (s, s) of local means, Gaussian in time and space."""
-    steps = layout.steps()
+    steps = layout.steps
     in_time = np.exp(-0.5 * (np.subtract.outer(steps, steps) / MEMORY_OF_SCALE) ** 2)
     in_time /= in_time.sum(axis=1, keepdims=True)
-    distance, spacing = layout.distances(), _spacing(layout)
-    channel = layout.channel_numbers()
+    distance, spacing = layout.distances, _spacing(layout)
+    channel = layout.channel_numbers
     same = channel[:, None] == channel[None]
     in_space = np.where(same, np.exp(-0.5 * (distance / (REACH * spacing)) ** 2), 0.0)
     in_space /= in_space.sum(axis=1, keepdims=True)
@@ -251,8 +251,8 @@ def _neighbours(layout: Layout) -> tuple[FloatArray, FloatArray]:
 
 def _spacing(layout: Layout) -> float:
     """Median distance of a site to its nearest neighbour of the same instrument, m."""
-    channel = layout.channel_numbers()
-    distance = layout.distances() + np.where(channel[:, None] == channel[None], 0.0, np.inf)
+    channel = layout.channel_numbers
+    distance = layout.distances + np.where(channel[:, None] == channel[None], 0.0, np.inf)
     distance[distance == 0.0] = np.inf
     nearest = distance.min(axis=1)
     nearest = nearest[np.isfinite(nearest)]
@@ -262,7 +262,7 @@ def _spacing(layout: Layout) -> float:
 def _correlation(layout: Layout, scaled: FloatArray, scale: FloatArray, start: Part | None = None) -> Part:
     """Parameters of the correlation that maximise the likelihood of scaled samples (k, t, s)."""
     spacing, places = _spacing(layout), layout.placed.any()
-    channels, number = len(layout.channels), layout.channel_numbers()
+    channels, number = len(layout.channels), layout.channel_numbers
     # Instruments with a place and those without are never correlated.
     placed = [bool(layout.placed[number == c].any()) for c in range(channels)]
     pairs = [(a, b) for a in range(channels) for b in range(a) if placed[a] == placed[b]]
@@ -279,7 +279,7 @@ def _correlation(layout: Layout, scaled: FloatArray, scale: FloatArray, start: P
 
     def loss(p: FloatArray) -> float:
         memory, length, nugget, between = unpack(p)
-        lower_t = np.linalg.cholesky(_time(layout.steps(), memory))
+        lower_t = np.linalg.cholesky(_time(layout.steps, memory))
         lower_s = np.linalg.cholesky(_space(layout, length, nugget, between))
         white = solve_triangular(lower_t, scaled.transpose(1, 0, 2).reshape(times, -1), lower=True)
         white = white.reshape(times, -1, sites).transpose(2, 0, 1).reshape(sites, -1)
@@ -310,7 +310,7 @@ def _time(steps: FloatArray, memory: float) -> FloatArray:
 
 
 def _space(layout: Layout, length: float, nugget: float, between: FloatArray | None) -> FloatArray:
-    channel, distance = layout.channel_numbers(), layout.distances()
+    channel, distance = layout.channel_numbers, layout.distances
     link = np.eye(len(layout.channels)) if between is None else between
     if length > 0.0:
         far = np.minimum(math.sqrt(3.0) * distance / length, FARTHEST)

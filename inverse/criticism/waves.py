@@ -19,7 +19,7 @@ def smooth_waves(layout: Layout, seen: BoolArray) -> FloatArray:
     """(n, k) slow waves over time, and over the plane for each instrument; orthonormal columns."""
     times, sites = layout.shape
     rows = _cosines(np.linspace(0.0, 1.0, times), min(WAVES_IN_TIME, times))
-    channel = layout.channel_numbers()
+    channel = layout.channel_numbers
     columns = []
     for c in range(len(layout.channels)):
         mine = channel == c

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from concurrent.futures import Future
     from pathlib import Path
 
+    from splatsoil.experiment.plow import PlowExperiment
     from splatsoil.inverse.criticism.simulations import Simulations
     from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.model import Model
@@ -18,8 +20,12 @@ SHARE = {"cpu": 2.0, "cuda": 4.0}
 """Memory that each process is to have, GiB: it holds a reconstruction, a scene and soil."""
 
 
+Calibrate = Callable[[Mapping[str, float]], "Future[None] | None"]
+"""Have a helper calibrate at these values, before all else; None where no helper can be spared."""
+
+
 @contextmanager
-def crew(folder: RunFolder, model: Model, effects: Iterable[str], simulate: Simulations) -> Iterator[None]:
+def crew(folder: RunFolder, model: Model, effects: Iterable[str], simulate: Simulations) -> Iterator[Calibrate]:
     """While the block runs, other processes simulate, too: one for every other core, as far as there is use for them.
 
     All keep what they make in ``features/`` and find it there: the results are those of one process, bit for bit, and
@@ -31,6 +37,9 @@ def crew(folder: RunFolder, model: Model, effects: Iterable[str], simulate: Simu
         model: of the latest fit.
         effects: the candidates, as `experiment_of` takes them; none for all.
         simulate: what is helped.
+
+    Yields:
+        What has a helper calibrate while this process is at something else.
     """
     from splatsoil.envs.devices import cores
     from splatsoil.inverse.criticism.simulations import Helpers
@@ -41,16 +50,21 @@ def crew(folder: RunFolder, model: Model, effects: Iterable[str], simulate: Simu
     count, named = int(min(cores(), 1 + MOST_HELPERS, room)) - 1, tuple(effects)
     with one_thread():
         if count < 1:
-            yield
+            yield lambda values: None
             return
         workers = Processes(count)
 
         def submit(job: Mapping[str, Any]) -> Any:
             return workers.submit(_simulate, folder.path, model.device, named, dict(job))
 
+        def calibrate(values: Mapping[str, float]) -> Future[None] | None:
+            if count < 2:
+                return None
+            return workers.submit(_calibrate, folder.path, model.device, named, dict(values))
+
         try:
             with simulate.helped(Helpers(count, submit)):
-                yield
+                yield calibrate
             workers.shutdown(cancel_futures=True)
         except BaseException:
             workers.kill()
@@ -71,26 +85,49 @@ def _memory(device: str) -> float:
         return float("inf")
 
 
-_known: dict[tuple[Path, str, tuple[str, ...]], Simulations] = {}
+_known: dict[tuple[Path, str, tuple[str, ...]], tuple[RunFolder, PlowExperiment, Simulations]] = {}
 
 
 def _simulate(path: Path, device: str, effects: tuple[str, ...], job: Mapping[str, Any]) -> None:
-    """A helper's work. Whatever goes wrong, the first process meets it too, and says so."""
+    """A helper's work."""
+    with _quietly():
+        _, _, simulate = _known_here(path, device, effects)
+        simulate(**job)
+
+
+def _calibrate(path: Path, device: str, effects: tuple[str, ...], values: Mapping[str, float]) -> None:
+    """A helper's work."""
+    from splatsoil.commands._criticism import calibrated
+
+    with _quietly():
+        calibrated(*_known_here(path, device, effects), values)
+
+
+@contextmanager
+def _quietly() -> Iterator[None]:
+    """Whatever goes wrong, the first process meets it too, and says so."""
     import contextlib
+
+    from splatsoil.errors import SplatsoilError
+    from splatsoil.threads import one_thread
+
+    with one_thread(), contextlib.suppress(SplatsoilError, OSError):
+        yield
+
+
+def _known_here(path: Path, device: str, effects: tuple[str, ...]) -> tuple[RunFolder, PlowExperiment, Simulations]:
+    """What a helper works with, made once."""
     import signal
 
     from splatsoil.commands import _criticism as criticism
-    from splatsoil.errors import SplatsoilError
     from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.quiet import hush
-    from splatsoil.threads import one_thread
 
     key = (path, device, effects)
-    with one_thread(), contextlib.suppress(SplatsoilError, OSError):
-        if key not in _known:
-            signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process ends this one
-            hush()
-            folder = RunFolder.open(path)
-            model = criticism.model_of(folder, device, lambda what, share: None)
-            _known[key] = criticism.experiment_of(folder, model, effects or None)[1]
-        _known[key](**job)
+    if key not in _known:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process ends this one
+        hush()
+        folder = RunFolder.open(path)
+        model = criticism.model_of(folder, device, lambda what, share: None)
+        _known[key] = (folder, *criticism.experiment_of(folder, model, effects or None))
+    return _known[key]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import wait
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -100,7 +101,7 @@ def replayed(
 
 
 def calibrated(
-    folder: RunFolder, experiment: PlowExperiment, simulate: Simulations, values: dict[str, float]
+    folder: RunFolder, experiment: PlowExperiment, simulate: Simulations, values: Mapping[str, float]
 ) -> Calibration | None:
     """What pictures say of cameras, light, clock and tool where soil plays no part, made once and kept in
     ``features/``."""
@@ -114,7 +115,7 @@ def calibrated(
 
     names = [p.name for c in experiment.candidates if c.kind == "observation" for p in c.parameters]
     code = code_digest(("experiment/bands.py", "experiment/calibration.py", "experiment/calibration_bench.py"))
-    what = {**simulate.identity, "values": values, "calibrated": names, "calibration code": code}
+    what = {**simulate.identity, "values": dict(values), "calibrated": names, "calibration code": code}
     path = folder.path / "features" / f"calibration-{digest(what)[:24]}.npz"
     if not path.is_file():
         found = experiment.calibrate(values)
@@ -167,11 +168,14 @@ def diagnosed(
     simulate.told = starting
     values = estimates(fit)
     with folder.lock():
-        with crew(folder, model, effects, simulate):
+        with crew(folder, model, effects, simulate) as calibrate:
+            calibrating = calibrate(values)
             simulate.ahead(lambda ask: gather(experiment, ask, values, repeats=options.repeats))
             replays = replayed(folder, experiment, simulate, values, begin("replay")) if with_replay else None
             begun.append(begin("diagnose"))
             report("where soil plays no part", 0.0)
+            if calibrating is not None:
+                wait([calibrating])
             calibration = calibrated(folder, experiment, simulate, values)
             found = diagnose(
                 experiment,

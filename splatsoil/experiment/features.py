@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -64,26 +65,29 @@ class Layout:
         """The instruments, in the order of their first site."""
         return tuple(dict.fromkeys(site.channel for site in self.sites))
 
-    @property
+    @cached_property
     def common(self) -> npt.NDArray[np.bool_]:
         """(s,) sites in the layout's unit."""
         return np.array([site.unit in ("", self.unit) for site in self.sites])
 
-    @property
+    @cached_property
     def placed(self) -> npt.NDArray[np.bool_]:
         """(s,) sites that have a place."""
         return np.array([math.isfinite(site.x) and math.isfinite(site.y) for site in self.sites])
 
+    @cached_property
     def channel_numbers(self) -> npt.NDArray[np.int64]:
         """(s,) index of each site's instrument in ``channels``."""
         numbers = {channel: i for i, channel in enumerate(self.channels)}
         return np.array([numbers[site.channel] for site in self.sites], dtype=np.int64)
 
+    @cached_property
     def steps(self) -> FloatArray:
         """(t,) times in units of their median spacing."""
         times = np.array(self.times)
         return times / float(np.median(np.diff(times))) if len(times) > 1 else times
 
+    @cached_property
     def distances(self) -> FloatArray:
         """(s, s) distance between sites in m; 0 between two without a place, infinite where one has one."""
         place, placed = np.array([[site.x, site.y] for site in self.sites]), self.placed

@@ -130,7 +130,7 @@ class PlowExperiment:
         """Columns of ``observed`` that cameras have seen."""
         still = {c: self.comparator.observed[c, self.comparator.reference] for c in self.comparator.cameras}
         frames = (self.comparator.reference, *self.comparator.frames)
-        return self._table(self.comparator.compare({(c, f): still[c] for c in still for f in frames}).blocks)
+        return self._table(self.comparator.blocks({(c, f): still[c] for c in still for f in frames}))
 
     @staticmethod
     def _beside(pictured: FloatArray, forces: FloatArray | None) -> FloatArray:
@@ -183,7 +183,7 @@ class PlowExperiment:
         Changes are the measured ones minus the difference, because both sides must leave out the same pixels: those in
         which either shows the tool.
         """
-        pictured = self._pictured - self._table(self.comparator.compare(prediction.images).blocks)
+        pictured = self._pictured - self._table(self.comparator.blocks(prediction.images))
         return self._beside(
             pictured, None if self.forces is None else self.forces.predicted(prediction.trajectory.force)
         )

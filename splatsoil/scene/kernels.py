@@ -196,23 +196,27 @@ def tool_shadow(tool: ToolPose, light: Illumination, point: wp.vec3, spread: flo
 
 
 @wp.kernel(enable_backward=False)
-def sun_on_points(
+def suns_on_points(
     points: wp.array(dtype=wp.vec3),
     height: wp.array2d(dtype=wp.float32),
     grid: Grid,
-    light: Illumination,
+    suns: wp.array(dtype=wp.vec3),
+    softness: float,
     tool: ToolPose,
     step: float,
     top: float,
     spread: float,
-    visible: wp.array(dtype=wp.float32),
+    visible: wp.array2d(dtype=wp.float32),
 ) -> None:
-    """Share of the sun that soil and tool let through to any points on the soil."""
-    p = wp.tid()
+    """Share of each of some suns that soil and tool let through to any points on the soil."""
+    k, p = wp.tid()
+    light = Illumination()
+    light.sun = suns[k]
+    light.softness = softness
     share = tool_shadow(tool, light, points[p], spread)
     if share > 0.0:
         share *= soil_shadow(height, grid, points[p], light, step, top)
-    visible[p] = share
+    visible[k, p] = share
 
 
 @wp.kernel(enable_backward=False)

@@ -14,8 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import islice
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -25,11 +24,13 @@ from scipy.optimize import minimize, minimize_scalar
 from torch import Tensor
 
 from splatsoil.scene.light import SOIL_REFLECTANCE, Light
-from splatsoil.scene.lit import LitRelief, facing, normals, sun_on_points
+from splatsoil.scene.lit import facing, normals, suns_on_points
 from splatsoil.scene.relief import Relief
 from splatsoil.scene.sky import sky_openness
 
 FloatArray = npt.NDArray[np.float64]
+Directions = Sequence[tuple[float, float]]
+"""Azimuths and elevations, degrees."""
 
 FINEST = 0.004
 """Smallest distance of compared points, m: about a pixel of the photographs the method was measured on."""
@@ -43,8 +44,16 @@ _TOOL_REFLECTANCE = 0.2
 _FEWEST_SHADED = 30
 """Cells in the tool's shadow, beside its edge, from which the sky's share can be told."""
 
+_ELEVATIONS, _AZIMUTHS = np.arange(20.0, 81.0, 10.0), np.arange(-180.0, 180.0, 10.0)
+_SHARES = (0.4, 0.6, 0.8)
 _PLACES, _AROUND = 4, (-7.5, -5.0, -2.5, 0.0, 2.5, 5.0, 7.5)
 """Of the sun's directions tried, the best, and how far around them it is looked for more closely, degrees."""
+
+_THINNED = 2
+"""Every so many rows and columns of what changed elsewhere are enough to find where to search."""
+
+_AT_ONCE = 1 << 20
+"""Numbers that are worked out together for many directions."""
 
 _LEAST_CHANGE = 0.01
 """Changes of log brightness are not taken for better known than this."""
@@ -104,10 +113,10 @@ def fit_light(
     telling = [p for p in passing if _tells(p)]
     # Cameras that look at the same moment share its light.
     tools = {id(p.tool): p.tool for p in telling}
-    lights = {key: _Sunlit(points, relief, there) for key, there in tools.items()}
-    parts = [_Passed(lights[id(p.tool)], p.change) for p in telling]
-    problem = _Problem(_Sunlit(points, relief, tool), colours.clamp_min(1e-4).log(), shape, parts)
-    first = _start(problem)
+    lights = {key: _Sunlit.of(points, relief, there) for key, there in tools.items()}
+    parts = [_Passed.of(lights[id(p.tool)], p.change) for p in telling]
+    problem = _Problem(_Sunlit.of(points, relief, tool), colours.clamp_min(1e-4).log(), shape, parts)
+    first = _start(problem.thinned())
     simplex = first + np.array([[0, 0, 0], [6.0, 0, 0], [0, 5.0, 0], [0, 0, -0.1]])
     found = minimize(
         lambda v: problem.cost(None, *v),
@@ -126,72 +135,110 @@ def fit_light(
     ]  # fmt: skip
     level = torch.nanmedian(colours, dim=0).values.clamp_min(1e-3).cpu().numpy().astype(np.float64)
     light = Light.from_angles(azimuth, elevation, np.array(ambient), level=level)
-    shadowed = float(1.0 - problem.still.tool_light(light).mean())
+    shadowed = float(1.0 - problem.still.tool_light([(azimuth, elevation)]).mean())
     return LightEstimate(light, 1.0 - float(found.fun) / max(problem.nothing(), 1e-12), shadowed)
 
 
 def _start(problem: _Problem) -> FloatArray:
     """Azimuth, elevation and the sky's share to search from: a narrow shadow is felt from a few degrees off at most."""
-    tried = sorted(
-        (problem.cost(None, azimuth, elevation, share), azimuth, elevation, share)
-        for elevation in (20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0)
-        for azimuth in np.arange(-180.0, 180.0, 10.0)
-        for share in (0.4, 0.6, 0.8)
-    )
-    best: dict[tuple[float, float], float] = {}
-    for _, azimuth, elevation, share in tried:
-        best.setdefault((azimuth, elevation), share)
-    near = [
-        (azimuth + turn, elevation + rise, share)
-        for (azimuth, elevation), share in islice(best.items(), _PLACES)
-        for turn in _AROUND
-        for rise in _AROUND
-    ]
-    return np.array(min((problem.cost(None, *at), *at) for at in near)[1:])
+    tried = [(azimuth, elevation) for elevation in _ELEVATIONS for azimuth in _AZIMUTHS]
+    costs = problem.costs(None, tried, _SHARES)
+    best = np.argsort(costs.min(axis=1), kind="stable")[:_PLACES]
+    near = []
+    for k in best:
+        (azimuth, elevation), share = tried[k], _SHARES[int(costs[k].argmin())]
+        around = [(azimuth + turn, elevation + rise) for turn in _AROUND for rise in _AROUND]
+        costs_there = problem.costs(None, around, [share])[:, 0]
+        near += [(cost, *at, share) for cost, at in zip(costs_there, around, strict=True)]
+    return np.array(min(near)[1:])
 
 
+@dataclass(frozen=True)
 class _Sunlit:
-    """Light on points of a surface with the tool at one place."""
+    """Light on points of a surface with the tool at one place.
 
-    def __init__(self, points: Tensor, relief: Relief, tool: object) -> None:
-        self.points, self.relief, self.tool = points, relief, tool
-        self.normal = normals(relief, points)
+    Attributes:
+        points: (n, 3), m.
+        relief: the surface.
+        tool: its pose in the kernels' form.
+        normal: (n, 3) of the surface.
+        openness: (n,) share of the sky that a point sees.
+        returned: (n,) what soil and tool in the sky's way send back: half of level ground's light.
+    """
+
+    points: Tensor
+    relief: Relief
+    tool: object
+    normal: Tensor
+    openness: Tensor
+    returned: Tensor
+
+    @classmethod
+    def of(cls, points: Tensor, relief: Relief, tool: object) -> _Sunlit:
         openness, hidden = (relief.sample(share, points) for share in sky_openness(relief, tool))
-        # The soil and the tool in the sky's way send back half of level ground's light.
-        self.openness = openness
-        self.returned = 0.5 * (SOIL_REFLECTANCE * (1.0 - openness - hidden) + _TOOL_REFLECTANCE * hidden)
-        self._known: tuple[float, float, Tensor] | None = None
+        returned = 0.5 * (SOIL_REFLECTANCE * (1.0 - openness - hidden) + _TOOL_REFLECTANCE * hidden)
+        return cls(points, relief, tool, normals(relief, points), openness, returned)
 
-    def log_light(self, azimuth: float, elevation: float, ambient: float) -> Tensor:
-        """(n,) log of the light, 0 on level open ground; the sun's part of the last direction is kept."""
-        if self._known is None or self._known[:2] != (azimuth, elevation):
-            light = Light.from_angles(azimuth, elevation, 0.5)
-            self._known = (azimuth, elevation, facing(light, self.normal) * self.tool_light(light))
-        e = ambient * self.openness + (1.0 - ambient) * self._known[2] + self.returned
-        return e.clamp_min(1e-3).log()
+    def at(self, chosen: Tensor) -> _Sunlit:
+        """On some of the points (k,)."""
+        points, normal, openness, returned = (
+            values[chosen].contiguous() for values in (self.points, self.normal, self.openness, self.returned)
+        )
+        return replace(self, points=points, normal=normal, openness=openness, returned=returned)
 
-    def tool_light(self, light: Light) -> Tensor:
-        """Share of the sun that the tool lets through to each point."""
-        return sun_on_points(self._open(light), self.points, 0.25 * FINEST)
+    def suns(self, directions: Directions) -> Tensor:
+        """(d, n) the sun on the points from directions, 1 on level open ground."""
+        return facing(self._towards(directions), self.normal) * self.tool_light(directions)
 
-    def edge(self, light: Light, width: int, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    def log_light(self, suns: Tensor, ambient: float) -> Tensor:
+        """(d, n) log of the light of suns (d, n) and a sky, 0 on level open ground."""
+        return (ambient * self.openness + (1.0 - ambient) * suns + self.returned).clamp_min(1e-3).log()
+
+    def tool_light(self, directions: Directions) -> Tensor:
+        """(d, n) share of the sun that the tool, and soil that stands higher, let through to each point."""
+        suns = self._towards(directions)
+        return suns_on_points(self.relief, self.tool, suns, self.points, 0.25 * FINEST)
+
+    def edge(self, at: tuple[float, float], width: int, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
         """(rows, columns) points nearer to a shadow's edge than so many rows or columns, and those in full shadow."""
-        sun = self.tool_light(light).reshape(1, 1, *shape)
+        sun = self.tool_light([at]).reshape(1, 1, *shape)
         highest, lowest = (functional.max_pool2d(sign * sun, 2 * width + 1, 1, width) for sign in (1.0, -1.0))
         return (highest + lowest > 0.02)[0, 0], (sun < 0.02)[0, 0]
 
-    def _open(self, light: Light) -> LitRelief:
-        """The relief with no shadow of its own: before anything has moved it is too gentle for one."""
-        everything = torch.ones_like(self.relief.height)
-        return LitRelief(self.relief, light, self.tool, everything, everything, everything[..., None].expand(-1, -1, 3))
+    def _towards(self, directions: Directions) -> Tensor:
+        """(d, 3) unit vectors."""
+        where = [Light.from_angles(azimuth, elevation, 0.5).direction for azimuth, elevation in directions]
+        return torch.tensor(np.array(where), dtype=torch.float32, device=self.points.device)
 
 
 @dataclass(frozen=True)
 class _Passed:
-    """A `Passing` and its light."""
+    """A `Passing` and its light.
+
+    Attributes:
+        sunlit: on all points of the grid.
+        change: (n, 3) of them.
+        known: (k,) the points of which it is known.
+        there: the light on these.
+    """
 
     sunlit: _Sunlit
     change: Tensor
+    known: Tensor
+    there: _Sunlit
+
+    @classmethod
+    def of(cls, sunlit: _Sunlit, change: Tensor) -> _Passed:
+        known = torch.isfinite(change).all(dim=1).nonzero()[:, 0]
+        return cls(sunlit, change, known, sunlit.at(known))
+
+    def without(self, places: Tensor) -> _Passed:
+        """With nothing known of places (rows, columns)."""
+        return _Passed.of(self.sunlit, _without(places, self.change))
+
+    def seen(self, channel: int | None) -> Tensor:
+        """(k,) change of one colour, or of all, where it is known."""
+        return _channel(self.change[self.known], channel)
 
 
 class _Problem:
@@ -207,35 +254,47 @@ class _Problem:
     ) -> None:
         self.still, self.brightness, self.shape, self.passed, self.lag = still, brightness, shape, passed, lag
         self.scale = _middle(self.differences(_channel(brightness, None)))
-        self.scales = [max(_middle(_centred(_channel(p.change, None))), _LEAST_CHANGE) for p in passed]
+        self.scales = [max(_middle(_centred(p.seen(None))), _LEAST_CHANGE) for p in passed]
         # A few places known of a moment must not weigh as much as all of the bed.
-        self.shares = [_known(p.change) / len(p.change) for p in passed]
+        self.shares = [len(p.known) / len(p.change) for p in passed]
+        self._lately: tuple[Directions, list[Tensor]] | None = None
+
+    def thinned(self) -> _Problem:
+        """The same with what changed elsewhere at fewer places, each of which weighs more."""
+        dropped = torch.ones(self.shape, dtype=torch.bool, device=self.brightness.device)
+        dropped[::_THINNED, ::_THINNED] = False
+        fewer = [part.without(dropped) for part in self.passed]
+        kept = [few if len(few.known) >= _FEWEST_SHADED else part for few, part in zip(fewer, self.passed, strict=True)]
+        thin = _Problem(self.still, self.brightness, self.shape, kept, self.lag)
+        thin.scales, thin.shares = self.scales, self.shares
+        return thin
 
     def differences(self, values: Tensor) -> Tensor:
-        """Differences over the lag along both axes of the grid."""
-        grid, lag = values.reshape(self.shape), self.lag
-        return torch.cat([(grid[lag:] - grid[:-lag]).reshape(-1), (grid[:, lag:] - grid[:, :-lag]).reshape(-1)])
+        """Differences (..., m) of values (..., n) over the lag along both axes of the grid."""
+        grid, lag = values.reshape(*values.shape[:-1], *self.shape), self.lag
+        along_y = grid[..., lag:, :] - grid[..., :-lag, :]
+        along_x = grid[..., lag:] - grid[..., :-lag]
+        return torch.cat([along_y.flatten(-2), along_x.flatten(-2)], dim=-1)
 
     def beside_edges(self, azimuth: float, elevation: float, blur: int) -> _Problem:
         """The same without shadows' edges, their blur taken off both sides, by differences that reach across.
 
         Where all shadows are too narrow for that, less is taken off; nothing where hardly any shadow is left then.
         """
-        light = Light.from_angles(azimuth, elevation, 0.5)
-        widest = min(blur, (min(self.shape) // 2 - LAG) // 2)
+        widest, at = min(blur, (min(self.shape) // 2 - LAG) // 2), (azimuth, elevation)
         for width in range(widest, 0, -1):
-            edge, shaded = self.still.edge(light, width, self.shape)
+            edge, shaded = self.still.edge(at, width, self.shape)
             enough = _enough(shaded & ~edge, self.brightness)
             passed = []
             for part in self.passed:
-                there, then = part.sunlit.edge(light, width, self.shape)
+                there, then = part.sunlit.edge(at, width, self.shape)
                 enough |= _enough((shaded ^ then) & ~(edge | there), part.change)
-                change = _without(edge | there, part.change)
-                if _known(change) >= _FEWEST_SHADED:
-                    passed.append(_Passed(part.sunlit, change))
-            beside = _Problem(self.still, _without(edge, self.brightness), self.shape, passed, 2 * width + LAG)
-            if enough and math.isfinite(beside.scale):
-                return beside
+                beside = part.without(edge | there)
+                if len(beside.known) >= _FEWEST_SHADED:
+                    passed.append(beside)
+            clear = _Problem(self.still, _without(edge, self.brightness), self.shape, passed, 2 * width + LAG)
+            if enough and math.isfinite(clear.scale):
+                return clear
         return self
 
     def cost(self, channel: int | None, azimuth: float, elevation: float, ambient: float) -> float:
@@ -243,19 +302,40 @@ class _Problem:
         horizon."""
         if not 5.0 <= elevation <= 89.9 or not 0.02 <= ambient <= 0.98:
             return 1e3
-        rest = self.still.log_light(azimuth, elevation, ambient)
-        total = _spread(self.differences(_channel(self.brightness, channel) - rest), self.scale)
-        for part, scale, share in zip(self.passed, self.scales, self.shares, strict=True):
-            predicted = part.sunlit.log_light(azimuth, elevation, ambient) - rest
-            total += share * _spread(_centred(_channel(part.change, channel) - predicted), scale)
-        return total
+        return float(self.costs(channel, [(azimuth, elevation)], [ambient])[0, 0])
+
+    def costs(self, channel: int | None, directions: Directions, shares: Sequence[float]) -> FloatArray:
+        """(d, s) loss of each of the directions with each of the sky's shares."""
+        still = self.differences(_channel(self.brightness, channel))
+        changes = [part.seen(channel) for part in self.passed]
+        chunk = max(1, _AT_ONCE // len(self.brightness))
+        out = []
+        for start in range(0, len(directions), chunk):
+            suns, *others = self._suns(directions[start : start + chunk])
+            columns = []
+            for share in shares:
+                rest = self.still.log_light(suns, share)
+                total = _spread(still - self.differences(rest), self.scale)
+                for k, part in enumerate(self.passed):
+                    predicted = part.there.log_light(others[k], share) - rest[:, part.known]
+                    total = total + self.shares[k] * _spread(_centred(changes[k] - predicted), self.scales[k])
+                columns.append(total)
+            out.append(torch.stack(columns, dim=1))
+        return torch.cat(out).cpu().numpy().astype(np.float64)
 
     def nothing(self) -> float:
         """Loss of a light that is the same everywhere."""
         total = _spread(self.differences(_channel(self.brightness, None)), self.scale)
         for part, scale, share in zip(self.passed, self.scales, self.shares, strict=True):
-            total += share * _spread(_centred(_channel(part.change, None)), scale)
-        return total
+            total = total + share * _spread(_centred(part.seen(None)), scale)
+        return float(total)
+
+    def _suns(self, directions: Directions) -> list[Tensor]:
+        """The sun on the bed at rest, and on what is known of each part; the last ones are kept."""
+        if self._lately is None or self._lately[0] != directions:
+            lit = [self.still, *(part.there for part in self.passed)]
+            self._lately = (list(directions), [where.suns(directions) for where in lit])
+        return self._lately[1]
 
 
 def _channel(values: Tensor, channel: int | None) -> Tensor:
@@ -263,15 +343,15 @@ def _channel(values: Tensor, channel: int | None) -> Tensor:
     return values.mean(dim=1) if channel is None else values[:, channel]
 
 
-def _spread(residual: Tensor, scale: float) -> float:
-    """Mean pseudo-Huber loss of the residuals that are known."""
-    known = residual[torch.isfinite(residual)]
-    return float((torch.sqrt(1.0 + (known / scale) ** 2) - 1.0).mean())
+def _spread(residual: Tensor, scale: float) -> Tensor:
+    """Mean pseudo-Huber loss along the last axis of the residuals that are known."""
+    loss = torch.sqrt(1.0 + (residual / scale) ** 2) - 1.0
+    return loss.nanmean(dim=-1)
 
 
 def _centred(values: Tensor) -> Tensor:
-    """Without what changes all of the bed alike: an exposure that drifts."""
-    return values - values.nanmedian()
+    """Without what changes all of the bed alike: an exposure that drifts. Along the last axis."""
+    return values - values.median(dim=-1, keepdim=True).values
 
 
 def _middle(values: Tensor) -> float:

@@ -13,7 +13,7 @@ import warp as wp
 from torch import Tensor
 
 from splatsoil.scene import kernels
-from splatsoil.scene.light import Light
+from splatsoil.scene.light import SUN_SOFTNESS, Light
 from splatsoil.scene.relief import Relief, grid_of
 from splatsoil.scene.sky import light_from_slopes, sky_openness
 from splatsoil.splats.warp_torch import as_warp, launch
@@ -103,7 +103,8 @@ def _ambient(light: Light, like: Tensor) -> Tensor:
 
 def direct_light(lit: LitRelief, points: Tensor, spread: float = 0.0) -> Tensor:
     """The sun on points (n, 3) of the surface, (n,); 1 on level, open ground."""
-    return facing(lit.light, normals(lit.relief, points)) * sun_on_points(lit, points, spread)
+    sun = _row(lit.light.direction, lit.relief)[None]
+    return facing(sun, normals(lit.relief, points))[0] * sun_on_points(lit, points, spread)
 
 
 def normals(relief: Relief, points: Tensor) -> Tensor:
@@ -111,10 +112,9 @@ def normals(relief: Relief, points: Tensor) -> Tensor:
     return functional.normalize(relief.sample(relief.normal, points), dim=1)
 
 
-def facing(light: Light, normal: Tensor) -> Tensor:
-    """The sun on open ground of normals (n, 3): (n,), 1 where it is level."""
-    sun = torch.tensor(light.direction.tolist(), dtype=torch.float32, device=normal.device)
-    return (normal @ sun).clamp_min(0.0) / sun[2]
+def facing(suns: Tensor, normal: Tensor) -> Tensor:
+    """Suns (k, 3) on open ground of normals (n, 3): (k, n), 1 where it is level."""
+    return (suns @ normal.T).clamp_min(0.0) / suns[:, 2:]
 
 
 def _coarser(relief: Relief) -> Relief:
@@ -137,11 +137,18 @@ def _resized(values: Tensor, size: tuple[int, int]) -> Tensor:
 
 def sun_on_points(lit: LitRelief, points: Tensor, spread: float = 0.0) -> Tensor:
     """Share of the sun (n,) that soil and tool let through to points (n, 3) on the surface."""
-    relief = lit.relief
-    visible = torch.empty(len(points), dtype=torch.float32, device=points.device)
-    inputs = [as_warp(points, wp.vec3), as_warp(relief.height, wp.float32), grid_of(relief), lit.light.kernel_form()]
-    inputs += [lit.tool, march_step(relief), ceiling(relief), float(spread), as_warp(visible, wp.float32)]
-    launch(kernels.sun_on_points, len(points), inputs, visible)
+    sun = _row(lit.light.direction, lit.relief)[None]
+    return suns_on_points(lit.relief, lit.tool, sun, points, spread, lit.light.softness)[0]
+
+
+def suns_on_points(
+    relief: Relief, tool: Any, suns: Tensor, points: Tensor, spread: float, softness: float = SUN_SOFTNESS
+) -> Tensor:
+    """Share (k, n) of suns (k, 3) that soil and tool let through to points (n, 3) on the surface."""
+    visible = torch.empty((len(suns), len(points)), dtype=torch.float32, device=points.device)
+    inputs = [as_warp(points, wp.vec3), as_warp(relief.height, wp.float32), grid_of(relief), as_warp(suns, wp.vec3)]
+    inputs += [float(softness), tool, march_step(relief), ceiling(relief), float(spread), as_warp(visible, wp.float32)]
+    launch(kernels.suns_on_points, tuple(visible.shape), inputs, visible)
     return visible
 
 
