@@ -12,7 +12,18 @@ from pathlib import Path
 from typing import Any
 
 import warp as wp
-from splatsoil.benchmarks._validation import basics, blades, columns, costs, element, inclines, plates, refinement, sand
+from splatsoil.benchmarks._validation import (
+    basics,
+    blades,
+    columns,
+    costs,
+    cuts,
+    element,
+    inclines,
+    plates,
+    refinement,
+    sand,
+)
 from splatsoil.benchmarks._validation.page import Section, page, table
 
 from splatsoil.errors import SplatsoilError
@@ -29,6 +40,7 @@ def parts(measured: Path | None, device: str) -> dict[str, Callable[[], Section]
         "costs": costs.validate,
         "basics": lambda: basics.validate(device),
         "columns": lambda: columns.validate(device),
+        "cuts": lambda: cuts.validate(device),
         "blades": lambda: blades.validate(device),
         "inclines": lambda: inclines.validate(device),
         "refinement": lambda: refinement.validate(device),

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import zip_longest
 
 import numpy as np
 import numpy.typing as npt
 
 from splatsoil.errors import SimulationError
-from splatsoil.experiment.base import Calibration, Candidate, Experiment
+from splatsoil.experiment.base import Candidate, Experiment
 
 from .afresh import look_afresh, promising
 from .confirmation import Confirmation, confirm, on_its_own_floor, remainder_of
@@ -39,6 +39,9 @@ from .verdicts import (
 
 FloatArray = npt.NDArray[np.float64]
 Report = Callable[[str, float], None]
+
+SIMULATING = 0.75
+"""Of a diagnosis' progress, the evidence's simulations."""
 
 
 @dataclass(frozen=True)
@@ -117,19 +120,15 @@ def diagnose(
     *,
     simulate: Simulations | None = None,
     options: Options | None = None,
-    replays: FloatArray | None = None,
-    calibration: Calibration | None = None,
     progress: Report | None = None,
 ) -> Diagnosis:
-    """Criticise a model at its fitted parameters.
+    """Criticise a model at its fitted parameters: `gather`, and `judge` what that gives.
 
     Args:
         experiment: what was observed, and the model.
         values: the fitted parameters.
         simulate: where predictions come from; the experiment itself by default.
         options: how thorough.
-        replays: (k, t, s) see :class:`~splatsoil.inverse.criticism.evidence.Evidence`.
-        calibration: likewise.
         progress: called with (what, share done).
 
     Raises:
@@ -138,15 +137,13 @@ def diagnose(
     options, simulate = options or Options(), simulate or Simulations(experiment)
     told = progress or (lambda what, share: None)
     evidence = gather(
-        experiment, simulate, values, repeats=options.repeats, progress=lambda share: told("simulations", 0.75 * share)
-    )
-    return judge(
         experiment,
-        replace(evidence, replays=replays, calibration=calibration),
         simulate,
-        options=options,
-        progress=told,
+        values,
+        repeats=options.repeats,
+        progress=lambda share: told("simulations", SIMULATING * share),
     )
+    return judge(experiment, evidence, simulate, options=options, progress=told)
 
 
 @dataclass(frozen=True)

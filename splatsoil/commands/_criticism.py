@@ -5,7 +5,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import wait
+from dataclasses import replace
 from pathlib import Path
+from shutil import rmtree
 from typing import TYPE_CHECKING, Any
 
 from splatsoil.errors import ParameterError, RunError
@@ -79,7 +81,7 @@ def code_of(effects: Iterable[str]) -> str:
 
 
 def replayed(
-    folder: RunFolder, experiment: PlowExperiment, simulate: Simulations, values: dict[str, float], report: Report
+    folder: RunFolder, experiment: PlowExperiment, simulate: Simulations, values: Mapping[str, float], report: Report
 ) -> FloatArray:
     """The replay control (1, t, s), made once for a model and its values and kept in ``features/``."""
     import io
@@ -141,7 +143,7 @@ def diagnosed(
     from splatsoil import __version__
     from splatsoil.commands._crew import crew
     from splatsoil.files import write_json
-    from splatsoil.inverse.criticism.diagnosis import diagnose
+    from splatsoil.inverse.criticism.diagnosis import SIMULATING, judge
     from splatsoil.inverse.criticism.evidence import gather
     from splatsoil.inverse.criticism.record import record
     from splatsoil.report.data import estimates
@@ -168,24 +170,38 @@ def diagnosed(
     simulate.told = starting
     values = estimates(fit)
     with folder.lock():
-        with crew(folder, model, effects, simulate) as calibrate:
-            calibrating = calibrate(values)
-            simulate.ahead(lambda ask: gather(experiment, ask, values, repeats=options.repeats))
-            replays = replayed(folder, experiment, simulate, values, begin("replay")) if with_replay else None
-            begun.append(begin("diagnose"))
-            report("where soil plays no part", 0.0)
-            if calibrating is not None:
-                wait([calibrating])
-            calibration = calibrated(folder, experiment, simulate, values)
-            found = diagnose(
-                experiment,
-                values,
-                simulate=simulate,
-                options=options,
-                replays=replays,
-                calibration=calibration,
-                progress=told,
-            )
+        try:
+            with crew(folder, model, effects, simulate) as replay:
+                replaying = replay(values) if with_replay else None
+                if with_replay and replaying is None:
+                    replayed(folder, experiment, simulate, values, begin("replay"))
+                simulate.ahead(lambda ask: gather(experiment, ask, values, repeats=options.repeats))
+                begun.append(begin("diagnose"))
+                report("where soil plays no part", 0.0)
+                calibration = calibrated(folder, experiment, simulate, values)
+                evidence = gather(
+                    experiment,
+                    simulate,
+                    values,
+                    repeats=options.repeats,
+                    progress=lambda done: told("simulations", SIMULATING * done),
+                )
+                if replaying is not None:
+                    report("a made-up bed through the whole chain", share)
+                    wait([replaying])
+                replays = None
+                if with_replay:
+                    replays = replayed(folder, experiment, simulate, values, lambda what, _: report(what, share))
+                found = judge(
+                    experiment,
+                    replace(evidence, replays=replays, calibration=calibration),
+                    simulate,
+                    options=options,
+                    progress=told,
+                )
+        finally:
+            # a helper that was ended at the replay couldn't tidy up
+            rmtree(folder.path / "replay", ignore_errors=True)
         result = {
             **record(experiment, found),
             "fit": fit["name"],

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from splatsoil.benchmarks._validation import basics, columns, inclines, plates
+from splatsoil.benchmarks._validation import basics, columns, cuts, inclines, plates
 from splatsoil.benchmarks._validation.blades import SCATTER, Blade, mckyes
 from splatsoil.benchmarks._validation.page import Row, Section, page
 from splatsoil.benchmarks._validation.refinement import runout
@@ -35,6 +35,13 @@ def test_a_column_runs_out_as_in_the_laboratory_and_strong_sand_does_not() -> No
     assert runout("cpu", particles=2000.0) == pytest.approx(1.24, rel=0.2)
     strong = columns.column(1.0, 55.0, planar=False, matching=Matching.COMPRESSION, particles=2000.0)
     assert columns.collapse(strong, 1.0, False, "cpu")[0] < 0.8 * 1.24
+
+
+def test_a_vertical_cut_stands_with_the_cohesion_of_limit_analysis() -> None:
+    """γ H / c = 3.83 tan(45° + φ/2) (Chen 1975), up to what soil without dilation needs more (Davis 1968)."""
+    exact, most = cuts.expected(33.0), cuts.davis(33.0)
+    assert cuts.sinks(cuts.cut(0.7 * exact, 33.0, 6), "cpu") > cuts.FALLEN
+    assert cuts.sinks(cuts.cut(most, 33.0, 6), "cpu") < cuts.FALLEN
 
 
 @pytest.mark.parametrize(("angles", "factor"), [((90, 0, 35), 1.8451), ((90, 20, 35), 4.162), ((60, 20, 35), 1.820)])
