@@ -74,7 +74,7 @@ class Plough:
             base_settings(self.measurement), [values], device,
         )  # fmt: skip
 
-    def poses(self, frame: int) -> list[Pose]:
+    def poses(self, frame: int) -> tuple[Pose, ...]:
         """The tool at the start of each step of the frame that follows ``frame``."""
         r = self.resolution
         return step_poses(self.measurement.tool.motion, frame * r.frame_time, r.frame_time, r.steps)
