@@ -106,7 +106,7 @@ class Processes(Executor):
             if not future.set_running_or_notify_cancel():
                 continue
             for attempt in range(1, ATTEMPTS + 1):
-                pool = pool or ProcessPoolExecutor(1, mp_context=self._context)
+                pool = pool or ProcessPoolExecutor(1, mp_context=self._context, initializer=_end_with_parent)
                 try:
                     future.set_result(pool.submit(fn, *args, **kwargs).result())
                 except BrokenProcessPool:
@@ -122,6 +122,19 @@ class Processes(Executor):
                 break
         if pool is not None:
             pool.shutdown(wait=True)
+
+
+def _end_with_parent() -> None:
+    """In a worker: whatever kills the process that it works for ends it, too; it would go on in a folder that is no
+    longer locked, and keep its memory."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+
+        def watch() -> None:
+            parent.join()
+            os._exit(1)
+
+        threading.Thread(target=watch, daemon=True).start()
 
 
 def in_order(pool: Executor, fn: Callable[..., Any], jobs: Iterable[tuple[Any, ...]]) -> Iterator[Any]:

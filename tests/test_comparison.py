@@ -84,6 +84,8 @@ def test_blocks_answer_linearly_and_where_the_change_is(comparator, seen):
         return comparator.compare(images)
 
     one, two = blocks(0.02), blocks(0.04)
+    darker = {key: image - 0.02 for key, image in seen.items()}
+    assert np.array_equal(comparator.blocks(darker), comparator.compare(darker).blocks)
     assert np.allclose(two.blocks, 2.0 * one.blocks, atol=1e-3)
     largest = one.labels[int(np.argmax(np.abs(one.blocks)))]
     assert (largest.camera, largest.frame) == ("left", 100)

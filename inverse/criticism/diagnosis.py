@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import zip_longest
 
 import numpy as np
 import numpy.typing as npt
 
 from splatsoil.errors import SimulationError
-from splatsoil.experiment.base import Candidate, Experiment
+from splatsoil.experiment.base import Calibration, Candidate, Experiment
 
 from .afresh import look_afresh, promising
 from .confirmation import Confirmation, confirm, on_its_own_floor, remainder_of
@@ -39,9 +39,6 @@ from .verdicts import (
 
 FloatArray = npt.NDArray[np.float64]
 Report = Callable[[str, float], None]
-
-SIMULATING = 0.75
-"""Of a diagnosis' progress, the evidence's simulations."""
 
 
 @dataclass(frozen=True)
@@ -120,15 +117,19 @@ def diagnose(
     *,
     simulate: Simulations | None = None,
     options: Options | None = None,
+    replays: Callable[[], FloatArray] | None = None,
+    calibration: Calibration | None = None,
     progress: Report | None = None,
 ) -> Diagnosis:
-    """Criticise a model at its fitted parameters: `gather`, and `judge` what that gives.
+    """Criticise a model at its fitted parameters.
 
     Args:
         experiment: what was observed, and the model.
         values: the fitted parameters.
         simulate: where predictions come from; the experiment itself by default.
         options: how thorough.
+        replays: gives those of :class:`~splatsoil.inverse.criticism.evidence.Evidence`; asked once all is simulated.
+        calibration: likewise.
         progress: called with (what, share done).
 
     Raises:
@@ -137,13 +138,15 @@ def diagnose(
     options, simulate = options or Options(), simulate or Simulations(experiment)
     told = progress or (lambda what, share: None)
     evidence = gather(
-        experiment,
-        simulate,
-        values,
-        repeats=options.repeats,
-        progress=lambda share: told("simulations", SIMULATING * share),
+        experiment, simulate, values, repeats=options.repeats, progress=lambda share: told("simulations", 0.75 * share)
     )
-    return judge(experiment, evidence, simulate, options=options, progress=told)
+    return judge(
+        experiment,
+        replace(evidence, replays=None if replays is None else replays(), calibration=calibration),
+        simulate,
+        options=options,
+        progress=told,
+    )
 
 
 @dataclass(frozen=True)

@@ -81,7 +81,7 @@ def weighed(experiment: Experiment, evidence: Evidence, floor: Floor, basis: Flo
     if not parameters:
         return {}
     slopes = np.stack([evidence.slopes[p.name] for p in parameters], axis=-1)
-    sight = Sight.of(experiment, floor, basis)
+    sight = Sight.of(experiment, floor, basis, averaged=True)
     along, left = sight(slopes), sight(experiment.observed - evidence.mean)
     beforehand = prior(parameters, values)
     information = along.T @ along + beforehand

@@ -186,6 +186,8 @@ def _unexplained(
         others = np.concatenate([parameters, np.delete(columns, k, axis=1)], axis=1)
         scaled = others / noise.scale[:, None]
         size = np.linalg.norm(scaled, axis=0)
+        # what changes nothing (an effect's shape, where the effect is off) takes up nothing
+        size = np.where(size > 0.0, size, 1.0)
         amplitude, *_ = np.linalg.lstsq(scaled / size, columns[:, k] / noise.scale, rcond=1e-3)
         out.append(noise.spread(columns[:, k] - others @ (amplitude / size)))
     left = np.stack(out)

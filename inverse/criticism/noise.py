@@ -154,7 +154,7 @@ def _calibrated(
     # One sample that is far larger than the others there says that it is another kind of thing.
     factor = float(np.median(on_waves))
     # A mean of χ² over its ν degrees of freedom has the relative variance 2 / ν.
-    doubt = float(np.var(on_waves, ddof=1)) / count / factor**2 if count > 1 else 2.0
+    doubt = float(np.var(on_waves, ddof=1)) / count / factor**2 if count > 1 and factor > 0.0 else 2.0
     return replace(
         part,
         on_waves=max(factor, 1.0),

@@ -42,10 +42,13 @@ class Sight:
         basis: FloatArray,
         vantage: Vantage | None = None,
         rows: npt.NDArray[np.bool_] | None = None,
+        *,
+        averaged: bool = False,
     ) -> Sight:
-        """For slow waves (n, k), a second look where one was taken, and some times (t,) or all."""
+        """For slow waves (n, k), a second look where one was taken, and some times (t,) or all; against one prediction,
+        or the mean of the repeats."""
         rows = np.ones(len(experiment.observed), dtype=bool) if rows is None else rows
-        noise = floor.single.plus(floor.nuisance).rows(rows)
+        noise = (floor.noise if averaged else floor.single).plus(floor.nuisance).rows(rows)
         solver = noise.solver()
         if not experiment.chance:
             return cls(noise, solver, None)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import wait
-from dataclasses import replace
 from pathlib import Path
 from shutil import rmtree
 from typing import TYPE_CHECKING, Any
@@ -80,6 +79,16 @@ def code_of(effects: Iterable[str]) -> str:
     return code_digest((*FORWARD, "observation.py", "experiment/plow.py"), own)
 
 
+def replay_path(folder: RunFolder, simulate: Simulations) -> Path:
+    """Where the replay control of a model is kept. What pictures get wrong hardly hangs on a few degrees: one serves
+    all estimates of a model."""
+    from splatsoil.files import code_digest
+    from splatsoil.inverse.evaluations import digest
+
+    what = {**simulate.identity, "replay code": code_digest(("synthetic", "experiment/replay.py"))}
+    return folder.path / "features" / f"replay-{digest(what)[:24]}.npy"
+
+
 def replayed(
     folder: RunFolder, experiment: PlowExperiment, simulate: Simulations, values: Mapping[str, float], report: Report
 ) -> FloatArray:
@@ -90,10 +99,8 @@ def replayed(
 
     from splatsoil.experiment.replay import replay
     from splatsoil.files import write_bytes
-    from splatsoil.inverse.evaluations import digest
 
-    # What pictures get wrong hardly hangs on a few degrees: one replay serves all estimates of a model.
-    path = folder.path / "features" / f"replay-{digest(simulate.identity)[:24]}.npy"
+    path = replay_path(folder, simulate)
     if not path.is_file():
         stream = io.BytesIO()
         made = replay(experiment, values, folder.path / "replay", progress=report)
@@ -143,7 +150,7 @@ def diagnosed(
     from splatsoil import __version__
     from splatsoil.commands._crew import crew
     from splatsoil.files import write_json
-    from splatsoil.inverse.criticism.diagnosis import SIMULATING, judge
+    from splatsoil.inverse.criticism.diagnosis import diagnose
     from splatsoil.inverse.criticism.evidence import gather
     from splatsoil.inverse.criticism.record import record
     from splatsoil.report.data import estimates
@@ -172,31 +179,30 @@ def diagnosed(
     with folder.lock():
         try:
             with crew(folder, model, effects, simulate) as replay:
-                replaying = replay(values) if with_replay else None
-                if with_replay and replaying is None:
-                    replayed(folder, experiment, simulate, values, begin("replay"))
+                replaying = None
+                if with_replay and not replay_path(folder, simulate).is_file():
+                    replaying = replay(values)
+                    if replaying is None:
+                        replayed(folder, experiment, simulate, values, begin("replay"))
+
+                def replays() -> FloatArray:
+                    if replaying is not None:
+                        report("a made-up bed through the whole chain", share)
+                        wait([replaying])
+                    # made here where no helper could
+                    return replayed(folder, experiment, simulate, values, lambda what, _: report(what, share))
+
                 simulate.ahead(lambda ask: gather(experiment, ask, values, repeats=options.repeats))
                 begun.append(begin("diagnose"))
                 report("where soil plays no part", 0.0)
                 calibration = calibrated(folder, experiment, simulate, values)
-                evidence = gather(
+                found = diagnose(
                     experiment,
-                    simulate,
                     values,
-                    repeats=options.repeats,
-                    progress=lambda done: told("simulations", SIMULATING * done),
-                )
-                if replaying is not None:
-                    report("a made-up bed through the whole chain", share)
-                    wait([replaying])
-                replays = None
-                if with_replay:
-                    replays = replayed(folder, experiment, simulate, values, lambda what, _: report(what, share))
-                found = judge(
-                    experiment,
-                    replace(evidence, replays=replays, calibration=calibration),
-                    simulate,
+                    simulate=simulate,
                     options=options,
+                    replays=replays if with_replay else None,
+                    calibration=calibration,
                     progress=told,
                 )
         finally:

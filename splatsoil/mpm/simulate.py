@@ -93,7 +93,7 @@ def base_settings(measurement: Measurement) -> Settings:
 def step_poses(motion: ToolMotion, start: float, frame_time: float, steps: int) -> tuple[Pose, ...]:
     """The tool at the start of each of a frame's ``steps`` steps, with the velocity that carries it to the next.
 
-    Kept, as many simulations share a motion: on a GPU these took a fifth of their time.
+    Kept, as many simulations share a motion: with a GPU the host is a fifth of a simulation's time at these.
     """
     times = start + frame_time * np.arange(steps + 1) / steps
     rotations, positions = zip(*(motion.pose(float(t)) for t in times), strict=True)

@@ -68,7 +68,7 @@ class LightEstimate:
         explained: share of the (robust) spread of brightness differences, and of changes by the shadow that passes,
             that the light explains; near 0 means that the pictures show neither shadow nor slope and the light is a
             guess.
-        shadowed: share of the bed's area that lies in the tool's shadow.
+        shadowed: share of the bed's area that lies in the shadow of the tool, and of soil that stands higher.
     """
 
     light: Light
@@ -135,7 +135,7 @@ def fit_light(
     ]  # fmt: skip
     level = torch.nanmedian(colours, dim=0).values.clamp_min(1e-3).cpu().numpy().astype(np.float64)
     light = Light.from_angles(azimuth, elevation, np.array(ambient), level=level)
-    shadowed = float(1.0 - problem.still.tool_light([(azimuth, elevation)]).mean())
+    shadowed = float(1.0 - problem.still.let_through([(azimuth, elevation)]).mean())
     return LightEstimate(light, 1.0 - float(found.fun) / max(problem.nothing(), 1e-12), shadowed)
 
 
@@ -188,20 +188,20 @@ class _Sunlit:
 
     def suns(self, directions: Directions) -> Tensor:
         """(d, n) the sun on the points from directions, 1 on level open ground."""
-        return facing(self._towards(directions), self.normal) * self.tool_light(directions)
+        return facing(self._towards(directions), self.normal) * self.let_through(directions)
 
     def log_light(self, suns: Tensor, ambient: float) -> Tensor:
         """(d, n) log of the light of suns (d, n) and a sky, 0 on level open ground."""
         return (ambient * self.openness + (1.0 - ambient) * suns + self.returned).clamp_min(1e-3).log()
 
-    def tool_light(self, directions: Directions) -> Tensor:
+    def let_through(self, directions: Directions) -> Tensor:
         """(d, n) share of the sun that the tool, and soil that stands higher, let through to each point."""
         suns = self._towards(directions)
         return suns_on_points(self.relief, self.tool, suns, self.points, 0.25 * FINEST)
 
     def edge(self, at: tuple[float, float], width: int, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
         """(rows, columns) points nearer to a shadow's edge than so many rows or columns, and those in full shadow."""
-        sun = self.tool_light([at]).reshape(1, 1, *shape)
+        sun = self.let_through([at]).reshape(1, 1, *shape)
         highest, lowest = (functional.max_pool2d(sign * sun, 2 * width + 1, 1, width) for sign in (1.0, -1.0))
         return (highest + lowest > 0.02)[0, 0], (sun < 0.02)[0, 0]
 

@@ -76,7 +76,6 @@ def test_a_run_is_compared_diagnosed_and_added_to(place: Path, repository: Path)
         "2",
         "--refit-steps",
         "2",
-        "--no-replay",
     )
     shutil.copytree(place / "run", place / "alone")
     alone = command(words[0], "alone", *words[2:], cwd=place, cores=1)
@@ -86,6 +85,10 @@ def test_a_run_is_compared_diagnosed_and_added_to(place: Path, repository: Path)
         assert first["simulated_now"] == alone["simulated_now"], "and makes nothing twice"
     assert {e["name"] for e in first["effects"]} == {"cohesion", "exposure", "suction"}
     assert first["verdict"] in ("adequate", "missing", "outside the library")
+    controls = [list((place / name / "features").glob("replay-*.npy")) for name in ("alone", "run")]
+    assert [len(files) for files in controls] == [1, 1]
+    assert controls[0][0].read_bytes() == controls[1][0].read_bytes(), "a helper makes the same control"
+    assert not (place / "run" / "replay").exists()
     kept = json.loads((place / "run" / "diagnosis.json").read_text())
     assert kept["floor"]["guesses"] > 0.0
     assert kept["effects"] == first["effects"]

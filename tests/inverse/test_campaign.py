@@ -6,6 +6,8 @@ import multiprocessing
 import os
 import random
 import signal
+import subprocess
+import sys
 import time
 from concurrent.futures import Executor
 from pathlib import Path
@@ -66,6 +68,41 @@ def test_a_killed_worker_costs_one_evaluation(tmp_path: Path) -> None:
         pool.shutdown()
     with pytest.raises(RuntimeError, match="shut down"):
         pool.submit(abs, 1)
+
+
+WORKS_ON = """
+import os, sys, time
+from splatsoil.inverse.executors import Processes
+
+if __name__ == "__main__":
+    pool = Processes(1)
+    print(pool.submit(os.getpid).result(), flush=True)
+    pool.submit(time.sleep, 600)
+    time.sleep(600)
+"""
+
+
+def test_a_worker_ends_with_the_process_it_works_for(tmp_path: Path) -> None:
+    script = tmp_path / "works_on.py"
+    script.write_text(WORKS_ON)
+    first = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True)
+    assert first.stdout is not None
+    worker = int(first.stdout.readline())
+    assert works(worker)
+    first.kill()
+    first.wait()
+    for _ in range(100):
+        if not works(worker):
+            return
+        time.sleep(0.1)
+    os.kill(worker, signal.SIGKILL)
+    pytest.fail("the worker goes on alone")
+
+
+def works(process: int) -> bool:
+    """Whether it is there, and not only because nobody has asked how it ended."""
+    told = subprocess.run(["ps", "-o", "stat=", "-p", str(process)], capture_output=True, text=True).stdout.strip()
+    return bool(told) and not told.startswith("Z")
 
 
 def test_every_executor_gives_the_same_records(analytic: ModuleType, tmp_path: Path) -> None:

@@ -52,6 +52,22 @@ def test_the_error_is_as_large_as_is_said_though_nobody_tried_the_truths_numeric
     assert rms(np.hypot(noise, numerics)) < 0.8 * 20.0 / np.sqrt(12.0)
 
 
+def test_noise_is_that_of_least_squares_that_knows_the_covariance() -> None:
+    """Four repeats have a mean whose chance is a quarter of one simulation's."""
+    ratios = []
+    for world in range(12):
+        made = replace(emulated(world), patterns={})
+        experiment = replace(made, observed=made.measured({"angle": 0.0}, [world, 99]))
+        evidence = gather(experiment, Simulations(experiment), {"angle": 0.0}, repeats=4)
+        floor = floor_of(experiment, evidence)
+        told = weighed(experiment, evidence, floor, smooth_basis(experiment.layout, floor.noise))["angle"]
+        slope = experiment.slopes["angle"].reshape(-1)
+        covariance = 1.25 * experiment.chance_root @ experiment.chance_root.T
+        covariance += np.diag(np.broadcast_to(experiment.sensor, experiment.layout.shape).reshape(-1) ** 2)
+        ratios.append(told.noise * np.sqrt(slope @ np.linalg.solve(covariance, slope)))
+    assert 0.85 < np.median(ratios) < 1.08
+
+
 def test_each_way_left_out_is_what_the_estimator_of_the_others_makes_of_it() -> None:
     """Against least squares with the covariance written out."""
     made = emulated(3)

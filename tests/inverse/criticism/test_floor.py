@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,6 +12,7 @@ from splatsoil.inverse.criticism.evidence import Evidence
 from splatsoil.inverse.criticism.floor import floor_of
 
 from splatsoil.experiment.features import Layout, Site
+from splatsoil.parameters import Parameter
 
 SITES = tuple(Site(f"c{c}", 0.1 * i, 0.1 * j) for c in range(2) for i in range(4) for j in range(4))
 LAYOUT = Layout(
@@ -81,3 +83,18 @@ def test_soil_that_moved_where_none_was_expected_is_no_fault_of_the_pictures() -
 def test_a_wild_numerics_pattern_does_not_stand_for_those_not_tried() -> None:
     assert floor_with(wild=30.0)[1] < 1.3 * floor_with()[1]
     assert floor_with(wild=30.0)[1] > 0.5
+
+
+def test_numerics_and_parameters_that_change_nothing_are_no_trouble() -> None:
+    generator = np.random.default_rng(4)
+    nothing = np.zeros(LAYOUT.shape)
+    patterns = {"step": generator.standard_normal(LAYOUT.shape), "grid": generator.standard_normal(LAYOUT.shape)}
+    experiment = looked(generator.standard_normal(LAYOUT.shape), np.zeros(LAYOUT.shape, dtype=bool))
+    experiment.parameters = (Parameter("shape", "", 0.0, 1.0, 0.5),)
+    told = evidence(generator, {**patterns, "contact": nothing})
+    told = replace(
+        told, values={"shape": 0.5}, slopes={"shape": nothing}, repeats=told.repeats * [[[1.0]], *3 * [[[0.0]]]]
+    )
+    found = floor_of(experiment, told)
+    assert np.isfinite(found.noise.covariance).all()
+    assert found.parts["numerics"].scale.max() > 0.1
