@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from splatsoil.inverse.surrogate import UNINFORMED
 
 from splatsoil.experiment.base import Experiment
 from splatsoil.parameters import Parameter
@@ -34,12 +35,14 @@ class Estimate:
         noise: standard deviation by noise, chance and what the numerics that were tried leave.
         numerics: standard deviation by one more way of computing, such as those that were tried.
         unit: of all three.
+        determined: False where it is hardly better known than by the parameter's bounds alone.
     """
 
     value: float
     noise: float
     numerics: float
     unit: str = ""
+    determined: bool = True
 
     @property
     def std(self) -> float:
@@ -93,7 +96,8 @@ def weighed(experiment: Experiment, evidence: Evidence, floor: Floor, basis: Flo
     out = {}
     for k, p in enumerate(parameters):
         value = float(np.clip(values[p.name] + step[k], p.lower, p.upper))
-        out[p.name] = Estimate(value, float(noise[k]), float(numerics[k]), p.unit)
+        told = math.hypot(noise[k], numerics[k]) < UNINFORMED * ignorance(p, values[p.name])
+        out[p.name] = Estimate(value, float(noise[k]), float(numerics[k]), p.unit, told)
     return out
 
 

@@ -33,7 +33,13 @@ def record(experiment: Experiment, diagnosis: Diagnosis) -> dict[str, Any]:
         "simulations": diagnosis.simulations,
         "values": dict(diagnosis.evidence.values),
         "estimates": {
-            name: {"value": e.value, "std": e.std, "noise": e.noise, "numerics": e.numerics}
+            name: {
+                "value": e.value,
+                "std": e.std,
+                "noise": e.noise,
+                "numerics": e.numerics,
+                "determined": bool(e.determined),
+            }
             for name, e in diagnosis.estimates.items()
         },
         "misfit": _omnibus(diagnosis.misfit),

@@ -61,13 +61,17 @@ def answers(fit: Mapping[str, Any], diagnosis: Mapping[str, Any] | None = None) 
     out, better = [], weighed(fit, diagnosis)
     for name, entry in fit["parameters"].items():
         value, std = with_std(entry["estimate"], entry["std"])
-        if name in better:
-            value, std = with_std(better[name]["value"], better[name]["std"])
         plain = name.replace("_", " ")
         state, remark = "determined", ""
-        if not entry["determined"]:
+        determined = entry["determined"]
+        if name in better:
+            value, std = with_std(better[name]["value"], better[name]["std"])
+            determined = better[name].get("determined", determined)
+        if not determined:
             state = "open"
             remark = f"These evaluations do not determine the {plain}: they hardly say where the loss is least."
+            if name in better:
+                remark = f"All that was measured doesn't determine the {plain}: its bounds say about as much."
         elif entry["at_bound"] is not None:
             state = "bound"
             remark = (

@@ -84,3 +84,11 @@ def test_an_adequate_fit_is_quoted_as_its_own_diagnosis_weighs_it(of: str, quote
     assert answer.value == quoted
     assert ("36.0 ± 0.5°" in words.fitted_sentence(fit, diagnosis)) is (quoted == "37")
     assert words.answers(fit, {**diagnosis, "verdict": "missing"})[0].value == "36.0"
+    told = {"friction_angle": {"value": 37.1, "std": 8.2, "determined": False}}
+    (wide,) = words.answers(fit, {**diagnosis, "estimates": told})
+    assert (wide.state == "open") is (quoted == "37") and ("its bounds" in wide.remark) is (quoted == "37")
+    (known,) = words.answers(
+        {**fit, "parameters": {"friction_angle": {**entry, "determined": False}}},
+        {**diagnosis, "estimates": {"friction_angle": {"value": 37.1, "std": 3.2, "determined": True}}},
+    )
+    assert (known.state == "determined") is (quoted == "37")
