@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -96,8 +96,8 @@ def weighed(experiment: Experiment, evidence: Evidence, floor: Floor, basis: Flo
     out = {}
     for k, p in enumerate(parameters):
         value = float(np.clip(values[p.name] + step[k], p.lower, p.upper))
-        told = math.hypot(noise[k], numerics[k]) < UNINFORMED * ignorance(p, values[p.name])
-        out[p.name] = Estimate(value, float(noise[k]), float(numerics[k]), p.unit, told)
+        told = Estimate(value, float(noise[k]), float(numerics[k]), p.unit)
+        out[p.name] = replace(told, determined=told.std < UNINFORMED * ignorance(p, values[p.name]))
     return out
 
 

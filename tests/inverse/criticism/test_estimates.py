@@ -61,11 +61,16 @@ def test_noise_is_that_of_least_squares_that_knows_the_covariance() -> None:
         evidence = gather(experiment, Simulations(experiment), {"angle": 0.0}, repeats=4)
         floor = floor_of(experiment, evidence)
         told = weighed(experiment, evidence, floor, smooth_basis(experiment.layout, floor.noise))["angle"]
+        assert told.determined
         slope = experiment.slopes["angle"].reshape(-1)
         covariance = 1.25 * experiment.chance_root @ experiment.chance_root.T
         covariance += np.diag(np.broadcast_to(experiment.sensor, experiment.layout.shape).reshape(-1) ** 2)
         ratios.append(told.noise * np.sqrt(slope @ np.linalg.solve(covariance, slope)))
     assert 0.85 < np.median(ratios) < 1.08
+    # bounds that say nearly as much as the measurement: uniform between them is less than twice the ± wide
+    (angle,) = experiment.parameters
+    narrow = replace(experiment, parameters=(replace(angle, lower=-told.noise, upper=told.noise),))
+    assert not weighed(narrow, evidence, floor, smooth_basis(experiment.layout, floor.noise))["angle"].determined
 
 
 def test_each_way_left_out_is_what_the_estimator_of_the_others_makes_of_it() -> None:
