@@ -21,6 +21,7 @@ from splatsoil.inverse.criticism.diagnosis import Bench, Diagnosis, Options, jud
 from splatsoil.inverse.criticism.evidence import gather
 from splatsoil.inverse.criticism.noise import Noise, Part
 from splatsoil.inverse.criticism.simulations import Simulations
+from splatsoil.inverse.criticism.verdicts import Verdict
 
 from splatsoil.experiment.base import Candidate
 from splatsoil.experiment.emulated import EmulatedExperiment
@@ -33,10 +34,15 @@ EFFECTS = 8
 OBSERVATIONS = 2
 STRENGTHS = (0.5, 1.0, 2.0, 4.0)
 """Sizes of single effects, in smallest detectable ones."""
+LARGEST = 50.0
+"""Size of an effect."""
 HALF, MOST = 0.6745, 1.6449
 """Standard deviations on either side that hold 50 % and 90 %."""
 MEMORY, LENGTH, NUGGET = 0.7, 0.12, 0.1
 """Of the emulated chance."""
+CHAOS = 0.4
+"""Share of its variance that is another one in soil that differs at all. Of the plow's (`small`) 0.1 to 0.9 is, by how
+much soil differs."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +78,57 @@ class Tally:
     intervals: int
 
 
+@dataclass(frozen=True)
+class Found:
+    """What of a diagnosis is counted.
+
+    Attributes:
+        verdict: on the model.
+        members: the equivalence class, the best first.
+        fitted: the model's own parameter as it was fitted.
+        values: parameters refitted with the best effect, empty where there is none.
+        stds: theirs.
+        error: held-out error over the floor, before and after that.
+        scored: effects that the analysis knew.
+    """
+
+    verdict: Verdict
+    members: tuple[str, ...]
+    fitted: float
+    values: Mapping[str, float]
+    stds: Mapping[str, float]
+    error: tuple[float, float]
+    scored: tuple[str, ...]
+
+    @classmethod
+    def of(cls, diagnosis: Diagnosis, parameter: str) -> Found:
+        """From a whole diagnosis; ``parameter`` is the model's own."""
+        refits, members = diagnosis.confirmations, diagnosis.members
+        values: Mapping[str, float] = {}
+        stds: Mapping[str, float] = {}
+        error = (math.nan, math.nan)
+        if members:
+            best = refits[members[0]]
+            values, stds = best.values, best.stds
+            error = (refits[""].held_out / best.floor, best.held_out / best.floor)
+        return cls(
+            diagnosis.verdict,
+            members,
+            diagnosis.evidence.values[parameter],
+            values,
+            stds,
+            error,
+            tuple(diagnosis.scores),
+        )
+
+    @classmethod
+    def from_json(cls, kept: Mapping[str, Any]) -> Found:
+        """From what ``plain(asdict(...))`` was read back as."""
+        error = [math.nan if e is None else float(e) for e in kept["error"]]
+        told = {**kept, "members": tuple(kept["members"]), "error": tuple(error), "scored": tuple(kept["scored"])}
+        return cls(**told)
+
+
 def wilson(hits: int, count: int, z: float = 1.96) -> tuple[float, float]:
     """95 % interval of a share (Wilson 1927)."""
     if count == 0:
@@ -92,8 +149,14 @@ def layout_of(times: int = 12, cameras: int = 2, across: int = 4) -> Layout:
     return Layout(tuple(float(t) for t in range(times)), sites, "frame", "grey levels", stages, regions)
 
 
-def emulated(seed: int, *, duplicate: bool = False) -> EmulatedExperiment:
-    """A world of smooth patterns; with ``duplicate`` the second effect is the first one under another name."""
+def emulated(seed: int, *, duplicate: bool = False, chaos: float = 0.0) -> EmulatedExperiment:
+    """A world of smooth patterns.
+
+    Args:
+        seed: of the patterns.
+        duplicate: the second effect is the first one under another name.
+        chaos: share of chance that is another one in soil that differs at all.
+    """
     layout = layout_of()
     generator = np.random.default_rng([seed, 7])
     x = np.array([s.x for s in layout.sites])
@@ -121,7 +184,7 @@ def emulated(seed: int, *, duplicate: bool = False) -> EmulatedExperiment:
     for k in range(EFFECTS):
         kind = "observation" if k >= EFFECTS - OBSERVATIONS else "physics"
         name = f"effect {k + 1}"
-        parameter = Parameter(name, "1", 0.0 if k % 2 else -50.0, 50.0, 0.0, off=0.0, meaningful=0.25, sign=k % 2)
+        parameter = Parameter(name, "1", 0.0 if k % 2 else -LARGEST, LARGEST, 0.0, off=0.0, meaningful=0.25, sign=k % 2)
         candidates.append(Candidate(name, kind, (parameter,), name))  # type: ignore[arg-type]
         slopes[name] = slopes["effect 1"] if duplicate and k == 1 else pattern()
         curves[name] = 0.02 * pattern()
@@ -138,6 +201,7 @@ def emulated(seed: int, *, duplicate: bool = False) -> EmulatedExperiment:
         sensor=np.full(layout.shape, 0.1),
         observed=np.zeros(layout.shape),
         patterns={"grid": pattern(), "step": 0.5 * pattern()},
+        chaos=chaos,
     )
 
 
@@ -163,8 +227,7 @@ def one(
 ) -> Diagnosis:
     """Diagnose one experiment with a hidden truth; the analysis sees the observation and its own simulations only."""
     experiment = base or emulated(world)
-    observed = experiment.measured(truth, [world, 99], extra)
-    experiment = replace(experiment, observed=observed)
+    experiment = replace(experiment, observed=experiment.measured(truth, [world, 99], extra))
     # A fit of the base model: least squares over its one parameter.
     values = {"angle": fitted(experiment)}
     simulate = Simulations(experiment)
@@ -180,16 +243,16 @@ def fitted(experiment: EmulatedExperiment) -> float:
     return float(angles[int(np.argmin(losses))])
 
 
-def detectable(world: int, options: Options) -> dict[str, float]:
+def detectable(world: int, options: Options, chaos: float = 0.0) -> dict[str, float]:
     """Smallest detectable size of each effect, from a diagnosis of data with nothing hidden."""
-    found = one(world, {"angle": 0.0}, None, options)
+    found = one(world, {"angle": 0.0}, None, options, emulated(world, chaos=chaos))
     return {name: score.detectable for name, score in found.scores.items()}
 
 
 def tally(
     name: str,
     truths: Sequence[Mapping[str, float]],
-    found: Sequence[Diagnosis],
+    found: Sequence[Found],
     angles: Sequence[float],
     kinds: Mapping[str, str],
     parameter: str = "angle",
@@ -200,23 +263,21 @@ def tally(
     named = physics = first = held = 0
     sizes, before, after, errors = [], [], [], []
     misses: list[float] = []
-    for truth, diagnosis, angle in zip(truths, found, angles, strict=True):
-        verdicts[diagnosis.verdict] += 1
-        before.append(abs(diagnosis.evidence.values[parameter] - angle))
-        if diagnosis.verdict != "missing":
+    for truth, told, angle in zip(truths, found, angles, strict=True):
+        verdicts[told.verdict] += 1
+        before.append(abs(told.fitted - angle))
+        if told.verdict != "missing":
             continue
         named += 1
-        members = diagnosis.members
-        physics += kinds[members[0]] == "physics"
-        first += members[0] in truth
-        held += any(m in truth for m in members)
-        sizes.append(len(members))
-        best = diagnosis.confirmations[members[0]]
-        after.append(abs(best.values[parameter] - angle))
-        if [name for name in truth if name in diagnosis.scores] == [members[0]]:
+        physics += kinds[told.members[0]] == "physics"
+        first += told.members[0] in truth
+        held += any(m in truth for m in told.members)
+        sizes.append(len(told.members))
+        after.append(abs(told.values[parameter] - angle))
+        if [name for name in truth if name in told.scored] == [told.members[0]]:
             known = {parameter: angle, **{(sizes_of or {}).get(n, n): size for n, size in truth.items()}}
-            misses += [abs(best.values[key] - value) / best.stds[key] for key, value in known.items()]
-        errors.append((diagnosis.confirmations[""].held_out / best.floor, best.held_out / best.floor))
+            misses += [abs(told.values[key] - value) / told.stds[key] for key, value in known.items()]
+        errors.append(told.error)
     error = tuple(np.mean(errors, axis=0)) if errors else (math.nan, math.nan)
     return Tally(
         name,
@@ -254,8 +315,8 @@ def run(count: int = 40, *, seed: int = 1, repeats: int = 4, only: str = "") -> 
             world = seed * 100_000 + (kind - 1) * 1_000 + k
             sealed = np.random.default_rng([world, 2])
             angle = float(sealed.uniform(-2.0, 2.0))
-            hidden = hide(sealed, detectable(world, options)) if hide is not None else {}
-            base = emulated(world, duplicate=twin)
+            hidden = hide(sealed, detectable(world, options, CHAOS)) if hide is not None else {}
+            base = emulated(world, duplicate=twin, chaos=CHAOS)
             extra = outside(base, sealed, beyond) if beyond else None
             truth = {"angle": angle, **hidden}
             if drop:
@@ -263,7 +324,7 @@ def run(count: int = 40, *, seed: int = 1, repeats: int = 4, only: str = "") -> 
                 base = replace(base, candidates=tuple(c for c in base.candidates if c.name not in hidden))
                 extra = observed - base.measured({"angle": angle}, [world, 99])
                 truth = {"angle": angle}
-            found.append(one(world, truth, extra, options, base))
+            found.append(Found.of(one(world, truth, extra, options, base), "angle"))
             truths.append(hidden)
             angles.append(angle)
         rows.append(tally(name, truths, found, angles, kinds))
@@ -271,12 +332,12 @@ def run(count: int = 40, *, seed: int = 1, repeats: int = 4, only: str = "") -> 
     def single(names: Sequence[str], times: float) -> Any:
         def hide(sealed: np.random.Generator, sizes: dict[str, float]) -> dict[str, float]:
             name = str(sealed.choice(list(names)))
-            return {name: times * sizes[name]}
+            return {name: min(times * sizes[name], LARGEST)}
 
         return hide
 
     def pair(sealed: np.random.Generator, sizes: dict[str, float]) -> dict[str, float]:
-        return {str(name): 3.0 * sizes[str(name)] for name in sealed.choice(physics, 2, replace=False)}
+        return {str(n): min(3.0 * sizes[str(n)], LARGEST) for n in sealed.choice(physics, 2, replace=False)}
 
     series("nothing", None)
     for times in STRENGTHS:
@@ -324,8 +385,8 @@ def table(result: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _pair(values: Sequence[float]) -> str:
-    return " → ".join("–" if not math.isfinite(v) else f"{v:.2f}" for v in values)
+def _pair(values: Sequence[float | None]) -> str:
+    return " → ".join("–" if v is None or not math.isfinite(v) else f"{v:.2f}" for v in values)
 
 
 def _inside(hits: Sequence[int], count: int) -> str:

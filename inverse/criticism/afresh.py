@@ -17,7 +17,7 @@ from scipy.optimize import lsq_linear
 from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Candidate, Experiment
 
-from .evidence import Evidence, Run, Vantage, Visit, around, directions_of, look_from
+from .evidence import STRIDE, Evidence, Run, Vantage, Visit, around, directions_of, look_from
 from .floor import Floor
 from .misfit import Omnibus
 from .sight import Sight
@@ -57,11 +57,12 @@ def look_afresh(
     candidates = [c for c in experiment.candidates if c.kind == "physics" and c.name in evidence.directions]
 
     def look(ask: Callable[..., FloatArray]) -> tuple[Vantage, list[_Variant]]:
-        def run(purpose: str, at: Mapping[str, float], effects: tuple[str, ...] = ()) -> FloatArray:
-            return ask(at, effects=effects, purpose=f"from the defaults: {purpose}")
+        def run(purpose: str, at: Mapping[str, float], effects: tuple[str, ...] = (), seed: int = 0) -> FloatArray:
+            return ask(at, effects=effects, seed=seed, purpose=f"from the defaults: {purpose}")
 
         found = look_from(experiment, there, candidates, run)
-        return found, [v for c in candidates if c.name in found.directions for v in _variants(c, found, run)]
+        on = [c for c in candidates if c.name in found.directions]
+        return found, [v for c in on for v in _variants(c, found, run, STRIDE if experiment.chance else 1.0)]
 
     simulate.ahead(look)
     try:
@@ -81,7 +82,7 @@ class _Variant:
     visits: tuple[Visit, ...]
 
 
-def _variants(candidate: Candidate, point: Vantage, run: Run) -> list[_Variant]:
+def _variants(candidate: Candidate, point: Vantage, run: Run, times: float) -> list[_Variant]:
     """A candidate in other shapes."""
     out = []
     for parameter in (p for p in candidate.shapes if p.log):
@@ -96,7 +97,7 @@ def _variants(candidate: Candidate, point: Vantage, run: Run) -> list[_Variant]:
                 return visits[-1].table
 
             try:
-                directions = directions_of(candidate, {**point.values, **shape}, point.prediction, visit, {})
+                directions = directions_of(candidate, {**point.values, **shape}, point.prediction, visit, {}, times)
             except SimulationError:
                 continue
             out.append(_Variant(candidate, shape, directions, tuple(visits)))

@@ -16,6 +16,7 @@ from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Candidate, Experiment
 from splatsoil.parameters import Parameter
 
+from .dilution import undiluted
 from .estimates import prior, untried
 from .evidence import Evidence, Vantage, Visit
 from .floor import Floor, floor_of
@@ -94,6 +95,7 @@ def confirm(
     shown, hidden = _split(experiment)
     whiten = Sight.of(experiment, floor, basis, vantage, shown)
     jobs: list[Candidate | None] = [None, *chosen]
+    starting = undiluted(evidence, floor.single.plus(floor.nuisance))
     done = 0
 
     def refitted(candidate: Candidate | None) -> tuple[Refit, list[Visit]]:
@@ -115,10 +117,10 @@ def confirm(
             whiten,
             experiment.observed,
             free,
-            _starts(experiment, evidence, candidate, vantage),
+            _starts(experiment, starting, candidate, vantage),
             chance=experiment.chance,
             known=known,
-            renewed=[p.name for p in experiment.parameters] + _renewed(candidate),
+            renewed=_renewed(experiment, candidate),
             most=steps if candidate is not None else max(steps - 2, 1),
             rounds=0 if candidate is None or emulated else ROUNDS,
         )
@@ -175,9 +177,8 @@ def _free(experiment: Experiment, candidate: Candidate | None) -> list[Parameter
 
 
 def _emulated(experiment: Experiment, candidate: Candidate | None) -> bool:
-    """Whether a refit reads the parameters off all simulations: where these cost and have chance in them."""
-    reported = candidate is not None and candidate.kind == "observation"
-    return experiment.chance and not reported and len(_free(experiment, candidate)) <= MOST
+    """Whether a refit reads the parameters off all simulations: where these have chance in them."""
+    return experiment.chance and len(_free(experiment, candidate)) <= MOST
 
 
 def _chi2(sight: Sight, left: FloatArray) -> float:
@@ -202,11 +203,15 @@ def _noise_on(noise: Noise, mask: npt.NDArray[np.bool_]) -> float:
     return float(np.sqrt(np.mean(noise.spread(noise.scale)[mask] ** 2)))
 
 
-def _renewed(candidate: Candidate | None) -> list[str]:
-    """Parameters of an effect whose derivatives change on the way; what cameras report is nearly linear."""
+def _renewed(experiment: Experiment, candidate: Candidate | None) -> list[str]:
+    """Parameters whose derivatives change on the way; what cameras report is nearly linear, and beside it those of soil
+    are better known by two seeds than anew by one."""
+    soil = [p.name for p in experiment.parameters]
     if candidate is None:
-        return []
-    return [p.name for p in candidate.refitted] if candidate.kind == "physics" else [candidate.size]
+        return soil
+    if candidate.kind == "observation":
+        return [*([] if experiment.chance else soil), candidate.size]
+    return [*soil, *(p.name for p in candidate.refitted)]
 
 
 def _known(evidence: Evidence, free: Sequence[Parameter]) -> Known:
@@ -220,7 +225,7 @@ def _known(evidence: Evidence, free: Sequence[Parameter]) -> Known:
 
 
 def _starts(
-    experiment: Experiment, evidence: Evidence, candidate: Candidate | None, vantage: Vantage | None
+    experiment: Experiment, evidence: Vantage, candidate: Candidate | None, vantage: Vantage | None
 ) -> list[Start]:
     """Where a refit begins: at the fit, and at the second look's point for an effect that was switched on there."""
     extra = () if candidate is None else candidate.refitted
@@ -292,7 +297,8 @@ def remainder_of(
     if not others:
         return best.remainder
     columns = {c.name: evidence.directions[c.name][:, seen].T for c in others}
-    scorer = Scorer.of(floor.single, free, columns, others, calibration=evidence.calibration)
+    doubts = {c.name: evidence.doubts[c.name][:, seen].T for c in others if c.name in evidence.doubts}
+    scorer = Scorer.of(floor.single, free, columns, others, doubts=doubts, calibration=evidence.calibration)
     second = max(scorer.score(left).values(), key=lambda score: score.statistic)
     if second.adjusted >= LEVEL:
         return best.remainder

@@ -172,6 +172,7 @@ class Bench:
         seen = experiment.seen
         candidates = tuple(c for c in experiment.candidates if c.name in evidence.directions)
         columns = {c.name: evidence.directions[c.name][:, seen].T for c in candidates}
+        doubts = {c.name: evidence.doubts[c.name][:, seen].T for c in candidates if c.name in evidence.doubts}
         scorer = None
         if candidates:
             scorer = Scorer.of(
@@ -179,6 +180,7 @@ class Bench:
                 floor.free,
                 columns,
                 candidates,
+                doubts=doubts,
                 calibration=evidence.calibration,
                 level=options.level,
                 seed=options.seed,

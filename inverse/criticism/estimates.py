@@ -19,6 +19,7 @@ from splatsoil.inverse.surrogate import UNINFORMED
 from splatsoil.experiment.base import Experiment
 from splatsoil.parameters import Parameter
 
+from .dilution import informed
 from .evidence import Evidence, ignorance
 from .floor import Floor
 from .sight import Sight
@@ -50,26 +51,29 @@ class Estimate:
         return math.hypot(self.noise, self.numerics)
 
 
-def untried(floor: Floor, slopes: FloatArray, precision: FloatArray) -> FloatArray:
+def untried(floor: Floor, slopes: FloatArray, precision: FloatArray, doubts: FloatArray | None = None) -> FloatArray:
     """(k,) standard deviations of parameters by numerics that weren't tried; 0 where none were.
 
     Args:
         floor: noise, and what the numerics that were tried change.
         slopes: (t, s, k) derivatives by the parameters.
         precision: (k, k) what is known of the parameters beforehand.
+        doubts: (t, s, k) chance in the derivatives, see :class:`~splatsoil.inverse.criticism.evidence.Vantage`.
     """
     count = floor.tried
     if not count:
         return np.zeros(slopes.shape[-1])
     solver = floor.noise.solver()
     along, nuisance = solver.whiten(slopes[floor.noise.seen]), solver.whiten(floor.nuisance)
+    chance = np.zeros_like(along) if doubts is None else solver.whiten(doubts[floor.noise.seen])
     shifts = []
     for k in range(count):
         left_out, others = nuisance[:, k], np.delete(nuisance, k, axis=1)
         # Woodbury: the others as noise.
-        gain = np.linalg.solve(np.eye(others.shape[1]) + others.T @ others, others.T @ along)
-        weights = along - others @ gain
-        shifts.append(np.linalg.solve(along.T @ weights + precision, weights.T @ left_out))
+        inner = np.linalg.inv(np.eye(others.shape[1]) + others.T @ others)
+        weights, unsure = (columns - others @ (inner @ (others.T @ columns)) for columns in (along, chance))
+        known = informed(along.T @ weights, chance.T @ unsure)
+        shifts.append(np.linalg.solve(known + precision, weights.T @ left_out))
     return np.asarray(np.sqrt(np.mean(np.square(shifts), axis=0)))
 
 
@@ -84,15 +88,18 @@ def weighed(experiment: Experiment, evidence: Evidence, floor: Floor, basis: Flo
     if not parameters:
         return {}
     slopes = np.stack([evidence.slopes[p.name] for p in parameters], axis=-1)
-    sight = Sight.of(experiment, floor, basis, averaged=True)
-    along, left = sight(slopes), sight(experiment.observed - evidence.mean)
-    beforehand = prior(parameters, values)
-    information = along.T @ along + beforehand
-    step = np.linalg.solve(information, along.T @ left)
+    doubts = np.stack([evidence.doubt(p.name, evidence.slopes[p.name]) for p in parameters], axis=-1)
+    # What is chance in derivatives lies in other directions by each seed: all of both are looked at.
+    columns = np.concatenate([floor.parameters, doubts[experiment.seen]], axis=1)
+    sight = Sight.of(experiment, replace(floor, parameters=columns), basis, averaged=True)
+    along, chance, left = sight(slopes), sight(doubts), sight(experiment.observed - evidence.mean)
+    beforehand, scores = prior(parameters, values), along.T @ along
+    inverse = np.linalg.inv(informed(scores, chance.T @ chance) + beforehand)
+    step = inverse @ along.T @ left
     rest = left - along @ step
     wide = max(1.0, float(rest @ rest) / max(len(rest) - len(step), 1))
-    noise = np.sqrt(wide * np.diag(np.linalg.inv(information)))
-    numerics = untried(floor, slopes, beforehand)
+    noise = np.sqrt(wide * np.diag(inverse @ (scores + beforehand) @ inverse))
+    numerics = untried(floor, slopes, beforehand, doubts)
     out = {}
     for k, p in enumerate(parameters):
         value = float(np.clip(values[p.name] + step[k], p.lower, p.upper))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,7 +17,9 @@ FloatArray = npt.NDArray[np.float64]
 Run = Callable[..., FloatArray]
 
 STEP = 4.0
-"""Steps of derivatives in smallest meaningful sizes: large enough to stand above chance."""
+"""Steps of derivatives in smallest meaningful sizes."""
+STRIDE = 2.0
+"""By how much longer steps of an effect are whose simulations have chance, to stand above it."""
 REACH = 0.5
 """Most of the way to a bound that such a step may go."""
 
@@ -52,6 +54,8 @@ class Vantage:
         failed: candidates whose simulation could not go on, with the reason.
         visits: all simulations that were made, with the same particles.
         shapes: by candidate, what shapes it where its directions were measured, if not the defaults.
+        doubts: by parameter of the model (t, s) and by candidate (k, t, s), half the difference between the derivatives
+            of two seeds, of which those above are the mean: as large as the chance in these. Empty with one seed.
     """
 
     values: Mapping[str, float]
@@ -64,6 +68,11 @@ class Vantage:
     failed: Mapping[str, str]
     visits: tuple[Visit, ...]
     shapes: Mapping[str, Mapping[str, float]] = field(default_factory=dict, kw_only=True)
+    doubts: Mapping[str, FloatArray] = field(default_factory=dict, kw_only=True)
+
+    def doubt(self, name: str, like: FloatArray) -> FloatArray:
+        """Of one name, in the shape of its derivatives; 0 where there is none."""
+        return self.doubts[name] if name in self.doubts else np.zeros_like(like)
 
 
 @dataclass(frozen=True)
@@ -97,9 +106,10 @@ def gather(
 ) -> Evidence:
     """Simulate what a diagnosis needs.
 
-    The residual's prediction is the mean over seeds 1, 2, …; derivatives are differences at seed 0, the same for both
-    ends, so that most of chance cancels in them. Sharing a seed between the two would correlate a residual's chance
-    with the derivatives' and raise false alarms that grow with the number of features.
+    The residual's prediction is the mean over seeds 1, 2, …; derivatives are differences at seed 0 and one more, the
+    same for both ends, so that a part of chance cancels in them. What is left of it looks like information: the two
+    seeds tell how much there is (`Vantage.doubts`). Sharing a seed with the residual would correlate its chance with
+    the derivatives' and raise false alarms that grow with the number of features.
     """
     base = dict(values)
     seeds = range(1, 1 + (repeats if experiment.chance else 1))
@@ -107,9 +117,7 @@ def gather(
         len(seeds)
         + len(experiment.guesses)
         + len(experiment.numerics)
-        + 2 * len(experiment.parameters)
-        + 2 * len(experiment.candidates)
-        + 1
+        + (2 if experiment.chance else 1) * (1 + 2 * len(experiment.parameters) + len(experiment.candidates))
     )
     done = 0
 
@@ -127,7 +135,8 @@ def gather(
     deviations = (runs - runs.mean(axis=0)) * np.sqrt(len(runs) / max(len(runs) - 1, 1))
     # Before the point itself: they are other drawings of its simulation.
     guesses = [run(f"guess: {name}", base, numerics=name) for name in experiment.guesses]
-    found = look_from(experiment, base, experiment.candidates, run)
+    seeds_of_slopes = (0, seeds[-1] + 1) if experiment.chance else (0,)
+    found = look_from(experiment, base, experiment.candidates, run, seeds_of_slopes)
     changes = np.stack(guesses) - found.prediction if guesses else np.zeros((0, *experiment.layout.shape))
     numerics = {}
     for name in experiment.numerics:
@@ -139,7 +148,11 @@ def gather(
 
 
 def look_from(
-    experiment: Experiment, values: Mapping[str, float], candidates: Sequence[Candidate], run: Run
+    experiment: Experiment,
+    values: Mapping[str, float],
+    candidates: Sequence[Candidate],
+    run: Run,
+    seeds: tuple[int, ...] = (0,),
 ) -> Vantage:
     """Simulate a point and its neighbours.
 
@@ -147,38 +160,92 @@ def look_from(
         experiment: whose parameters are varied.
         values: of these, at the point.
         candidates: effects that are switched on there, one at a time.
-        run: called with (purpose, parameters by name) and, where an effect is on, its name in a tuple.
+        run: called with (purpose, parameters by name), the name of an effect that is on in a tuple, and a seed.
+        seeds: one, or two whose mean derivatives are; prediction and visits are the first one's.
 
     Raises:
         SimulationError: the point or a neighbour without an effect can't be simulated.
     """
-    base = dict(values)
+    base, failed = dict(values), dict[str, str]()
+    # Other reports of the point's simulation come first, while it is at hand.
+    ordered = sorted(candidates, key=lambda c: c.kind == "physics")
+    looks = [_look(experiment, base, ordered, run, seeds[0], failed)]
+    for seed in seeds[1:]:
+        rest = [c for c in ordered if c.kind == "physics" and c.name not in failed]
+        looks.append(_look(experiment, base, rest, run, seed, failed))
+    first, doubts = looks[0], dict[str, FloatArray]()
+    slopes, directions = dict(first.slopes), dict(first.directions)
+    for other in looks[1:]:
+        for mine, theirs in ((slopes, other.slopes), (directions, other.directions)):
+            for name in theirs:
+                doubts[name] = 0.5 * (mine[name] - theirs[name])
+                mine[name] = 0.5 * (mine[name] + theirs[name])
+    curves = {name: np.mean([look.curves[name] for look in looks], axis=0) for name in first.curves}
+    directions = {c.name: directions[c.name] for c in candidates if c.name not in failed}
+    return Vantage(
+        base,
+        first.middle,
+        slopes,
+        curves,
+        first.widths,
+        directions,
+        first.steps,
+        failed,
+        tuple(first.visits),
+        doubts=doubts,
+    )
+
+
+@dataclass(frozen=True)
+class _Look:
+    """A point and its neighbours by one seed; see :class:`Vantage`."""
+
+    middle: FloatArray
+    slopes: dict[str, FloatArray] = field(default_factory=dict)
+    curves: dict[str, FloatArray] = field(default_factory=dict)
+    widths: dict[str, float] = field(default_factory=dict)
+    directions: dict[str, FloatArray] = field(default_factory=dict)
+    steps: dict[str, float] = field(default_factory=dict)
+    visits: list[Visit] = field(default_factory=list)
+
+
+def _look(
+    experiment: Experiment,
+    base: Mapping[str, float],
+    candidates: Sequence[Candidate],
+    run: Run,
+    seed: int,
+    failed: dict[str, str],
+) -> _Look:
+    """By one seed; candidates that can't be simulated are noted."""
     visits: list[Visit] = []
 
     def visit(purpose: str, at: Mapping[str, float], effects: tuple[str, ...] = ()) -> FloatArray:
-        visits.append(Visit(dict(at), effects, run(purpose, at, effects)))
+        visits.append(Visit(dict(at), effects, run(purpose, at, effects, seed)))
         return visits[-1].table
 
-    middle = visit("the point", base)
-    slopes, curves, widths = {}, {}, {}
+    look = _Look(visit("the point", base), visits=visits)
+
+    def switch_on(chosen: Iterable[Candidate]) -> None:
+        for candidate in chosen:
+            times = STRIDE if experiment.chance and candidate.kind == "physics" else 1.0
+            try:
+                look.directions[candidate.name] = directions_of(candidate, base, look.middle, visit, look.steps, times)
+            except SimulationError as error:
+                failed[candidate.name] = str(error)
+
+    switch_on(c for c in candidates if c.kind == "observation")
     for parameter in experiment.parameters:
         value = base[parameter.name]
         ends = around(parameter, value)
         tables = [visit(parameter.name, {**base, parameter.name: end}) for end in ends]
         offsets = [distance(parameter, value, end) for end in ends]
-        slopes[parameter.name], curve = derivatives(offsets, tables, middle)
-        widths[parameter.name] = max(abs(offset) for offset in offsets)
+        look.slopes[parameter.name], curve = derivatives(offsets, tables, look.middle)
+        look.widths[parameter.name] = max(abs(offset) for offset in offsets)
         if curve is not None:
-            curves[parameter.name] = curve
-    directions: dict[str, FloatArray] = {}
-    steps: dict[str, float] = {}
-    failed: dict[str, str] = {}
-    for candidate in candidates:
-        try:
-            directions[candidate.name] = directions_of(candidate, base, middle, visit, steps)
-        except SimulationError as error:
-            failed[candidate.name] = str(error)
-    return Vantage(base, middle, slopes, curves, widths, directions, steps, failed, tuple(visits))
+            look.curves[parameter.name] = curve
+    switch_on(c for c in candidates if c.kind == "physics")
+    return look
 
 
 def around(parameter: Parameter, value: float) -> list[float]:
@@ -223,20 +290,27 @@ def derivatives(
     return first.reshape(middle.shape), second.reshape(middle.shape)
 
 
-def step_of(parameter: Parameter) -> float:
-    """How far an effect's parameter is moved from off, in the direction in which there is room."""
+def step_of(parameter: Parameter, times: float = 1.0) -> float:
+    """How far an effect's parameter is moved from off, in the direction in which there is room; ``times`` as far as
+    where nothing is left to chance."""
     off = parameter.off if parameter.off is not None else parameter.default
     room = {1: parameter.upper - off, -1: off - parameter.lower}
     side = parameter.sign or (1 if room[1] >= room[-1] else -1)
-    wanted = STEP * parameter.meaningful if parameter.meaningful > 0.0 else 0.1 * room[side]
+    wanted = times * (STEP * parameter.meaningful if parameter.meaningful > 0.0 else 0.1 * room[side])
     return side * min(wanted, REACH * room[side])
 
 
 def directions_of(
-    candidate: Candidate, base: Mapping[str, float], middle: FloatArray, run: Run, steps: dict[str, float]
+    candidate: Candidate,
+    base: Mapping[str, float],
+    middle: FloatArray,
+    run: Run,
+    steps: dict[str, float],
+    times: float = 1.0,
 ) -> FloatArray:
-    """(k, t, s) derivatives by a candidate's parameters at off, of predictions whose ``middle`` is that without it."""
-    return np.stack([_slope(candidate, p, base, middle, run, steps) for p in candidate.parameters])
+    """(k, t, s) derivatives by a candidate's parameters at off, of predictions whose ``middle`` is that without it, by
+    steps ``times`` as long as where nothing is left to chance; ``steps`` gets them."""
+    return np.stack([_slope(candidate, p, base, middle, run, steps, times) for p in candidate.parameters])
 
 
 def _slope(
@@ -246,10 +320,11 @@ def _slope(
     middle: FloatArray,
     run: Run,
     steps: dict[str, float],
+    times: float,
 ) -> FloatArray:
     """Derivative by one parameter of an effect, its others at off; from both sides where it has no sign."""
     off = {p.name: float(p.off or 0.0) for p in candidate.parameters}
-    step = step_of(parameter)
+    step = step_of(parameter, times)
     steps[parameter.name] = abs(step)
     tables = []
     # Drawing the same simulation otherwise has no chance in it: one side will do.

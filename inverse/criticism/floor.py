@@ -79,7 +79,10 @@ def floor_of(experiment: Experiment, evidence: Evidence) -> Floor:
     parameters = _columns(slopes, seen)
     parts = {"instruments": independent(experiment.sensor, experiment.sensor_memory)}
     runs = len(evidence.repeats)
-    directions = _columns([table for direction in evidence.directions.values() for table in direction], seen)
+    acting = [(direction, evidence.doubt(name, direction)) for name, direction in evidence.directions.items()]
+    directions = _columns([table for direction, _ in acting for table in direction], seen)
+    # What is chance in a direction is told from what is chance in its doubt: the noise must be the same along both.
+    doubted = _columns([table for both in acting for tables in both for table in tables], seen)
     if experiment.chance and runs > 1:
         parts["chance"] = estimate(layout, evidence.repeats, seen, directions, parameters)
     if len(evidence.guesses):
@@ -96,7 +99,7 @@ def floor_of(experiment: Experiment, evidence: Evidence) -> Floor:
         parts["numerics"] = estimate(layout, left, seen, directions, parameters)
     noise, single = _total(layout, parts, seen, runs)
     for name, part in parts.items():
-        columns = extra_noise(layout, part, seen, directions if name in ACTING else None)
+        columns = extra_noise(layout, part, seen, doubted if name in ACTING else None)
         averaged, alone = (np.sqrt(factor) for factor in _factors(name, runs))
         noise, single = noise.plus(averaged * columns), single.plus(alone * columns)
     nuisance = [NUMERICS_PRIOR * _columns(patterns, seen), _columns(experiment.systematic, seen)]

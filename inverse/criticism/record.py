@@ -125,6 +125,7 @@ def _effect(diagnosis: Diagnosis, candidate: Candidate) -> dict[str, Any]:
         "mde": score.detectable,
         "predicted_fall": score.statistic,
         "survival": score.survival,
+        "reliability": score.reliability,
         "given_best": None if beside is None else {"z": beside.z, "p": beside.adjusted, "mde": beside.detectable},
     }
     confirmed = diagnosis.confirmations.get(candidate.name)

@@ -6,6 +6,7 @@ spread as low-rank noise, which projects them out) and G the derivatives of the 
     U = GᵀΣ⁻¹r,   I = GᵀΣ⁻¹G,   estimate I⁻¹U,   LM = UᵀI⁻¹U
 
 LM is the fall of χ² that switching the effect on would bring if the model were linear (Rao 1948; Breusch & Pagan 1980).
+G holds chance, too, and is taken times the share of GᵀΣ⁻¹G that isn't, column by column: `dilution`.
 Whether an effect is exactly absent is nobody's question: what is tested is that it is there in sizes too small to
 matter at most (Hodges & Lehmann 1954, J. R. Stat. Soc. B 16:261), by the fall of χ² beyond what such sizes bring. The
 others may be there in such sizes, too, and what stands along them widens the scores: `joint`.
@@ -25,8 +26,9 @@ from scipy.stats import t as student
 
 from splatsoil.experiment.base import Calibration, Candidate
 
+from .dilution import reliable
 from .joint import BELIEF, SEEN_AT_ALL, Joint, dispersion, precision_of
-from .noise import Noise
+from .noise import Noise, Solver
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -51,6 +53,7 @@ class Score:
         std: of that.
         detectable: smallest size that is found with 80 % power at the level used.
         survival: share of the effect's information that parameters and nuisances leave.
+        reliability: share of that which isn't chance in the derivatives.
         steps: estimates of all its parameters, as distances from off.
         dispersion: by which the remainder along the other effects exceeds noise; z, p and std allow for it.
     """
@@ -66,6 +69,7 @@ class Score:
     survival: float
     steps: Mapping[str, float]
     dispersion: float = 1.0
+    reliability: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -78,6 +82,7 @@ class Scorer:
         places: which of its parameters measures each one.
         whole: (k,) information before anything was projected out.
         weights: (n, k) inverse covariance times derivatives: products with a residual are scores.
+        reliability: (k,) share of each derivative's information that isn't chance.
         told: (k,) scores that a calibration adds.
         smallest: (draws,) least p-value of any candidate when there is nothing to find.
         level: family-wise level for which detectable sizes are stated.
@@ -88,6 +93,7 @@ class Scorer:
     places: tuple[int, ...]
     whole: FloatArray
     weights: FloatArray
+    reliability: FloatArray
     told: FloatArray
     smallest: FloatArray
     level: float
@@ -100,6 +106,7 @@ class Scorer:
         directions: Mapping[str, FloatArray],
         candidates: Sequence[Candidate],
         *,
+        doubts: Mapping[str, FloatArray] | None = None,
         calibration: Calibration | None = None,
         level: float = 0.05,
         seed: int = 0,
@@ -111,6 +118,7 @@ class Scorer:
             nuisance: (n, q) derivatives by parameters and nuisances, each times its prior standard deviation.
             directions: (n, k) derivatives by each candidate's parameters, in the candidate's order.
             candidates: the effects, at least one.
+            doubts: (n, k) likewise, half the differences of derivatives by two seeds, where there are two.
             calibration: what other pictures say of their parameters.
             level: see above.
             seed: of the draws.
@@ -119,13 +127,18 @@ class Scorer:
         ends = np.cumsum([c.shape[1] for c in columns])
         parts = tuple(slice(int(end) - c.shape[1], int(end)) for end, c in zip(ends, columns, strict=True))
         joined = np.concatenate(columns, axis=1)
+        unsure = np.concatenate(
+            [
+                (doubts or {}).get(c.name, np.zeros_like(g)).reshape(g.shape)
+                for c, g in zip(candidates, columns, strict=True)
+            ],
+            axis=1,
+        )
         bare = noise.solver()
         whole = np.sum(bare.whiten(joined) ** 2, axis=0)
-        weights = bare.solve(joined)
-        if nuisance.size:
-            solved = bare.solve(nuisance)
-            inner = np.linalg.solve(np.eye(nuisance.shape[1]) + nuisance.T @ solved, nuisance.T @ weights)
-            weights = weights - solved @ inner
+        weights, chance = _projected(bare, nuisance, joined), _projected(bare, nuisance, unsure)
+        reliability = reliable(np.sum(joined * weights, axis=0), np.sum(unsure * chance, axis=0))
+        joined, weights, whole = reliability * joined, reliability * weights, reliability**2 * whole
         information = joined.T @ weights
         precision, centre = precision_of(calibration, [p.name for c in candidates for p in c.parameters])
         information = 0.5 * (information + information.T)
@@ -133,8 +146,9 @@ class Scorer:
         trivial = np.array([p.meaningful for c in candidates for p in c.parameters])
         joint = Joint(information, trivial, parts, precision)
         smallest = _smallest(candidates, places, joint, seed)
+        told = precision @ centre
         return cls(
-            tuple(candidates), joint, places, whole + np.diag(precision), weights, precision @ centre, smallest, level
+            tuple(candidates), joint, places, whole + np.diag(precision), weights, reliability, told, smallest, level
         )
 
     @property
@@ -225,6 +239,7 @@ class Scorer:
             survival=raw.survival,
             steps={q.name: float(v) for q, v in zip(candidate.parameters, raw.estimate, strict=True)},
             dispersion=scale,
+            reliability=float(self.reliability[self.joint.parts[index]][place]),
         )
 
 
@@ -239,6 +254,17 @@ class _Raw:
     estimate: FloatArray
     std: float
     survival: float
+
+
+def _projected(bare: Solver, nuisance: FloatArray, columns: FloatArray) -> FloatArray:
+    """(n, k) inverse covariance, nuisances (n, q) as low-rank noise in it, times columns (n, k)."""
+    weights = bare.solve(columns)
+    if nuisance.size:
+        solved = bare.solve(nuisance)
+        weights = weights - solved @ np.linalg.solve(
+            np.eye(nuisance.shape[1]) + nuisance.T @ solved, nuisance.T @ weights
+        )
+    return weights
 
 
 def _price(parameters: int, freedom: int) -> float:

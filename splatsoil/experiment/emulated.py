@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -21,7 +23,8 @@ class EmulatedExperiment:
     """Features that are known functions of parameters, with chance and instruments' noise drawn from known covariances.
 
     A prediction is the middle, plus each parameter's (and effect's) slope times its distance from home, plus half its
-    curve times the square of that, plus chance that depends on the seed alone.
+    curve times the square of that, plus chance: a part of it depends on the seed alone, a part is another one whenever
+    soil is (what cameras report changes none).
 
     Attributes:
         layout: labels.
@@ -32,6 +35,7 @@ class EmulatedExperiment:
         parameters: free parameters of the model.
         candidates: effects that are off.
         chance_root: (t s, t s) lower Cholesky factor of one simulation's chance.
+        chaos: share of the chance's variance that is another one whenever soil is.
         sensor: (t, s) standard deviation of the instruments.
         observed: (t, s).
         patterns: (t, s) what other numerics add, by name.
@@ -59,6 +63,7 @@ class EmulatedExperiment:
     model: tuple[str, ...] = ()
     chance: bool = True
     sensor_memory: float = 0.0
+    chaos: float = 0.0
 
     def __post_init__(self) -> None:
         if self.quiet.size == 0:
@@ -97,9 +102,16 @@ class EmulatedExperiment:
     def predict(
         self, values: Mapping[str, float], *, effects: Iterable[str | Effect] = (), seed: int = 0, numerics: str = ""
     ) -> FloatArray:
-        """(t, s) features; the same seed has the same chance."""
+        """(t, s) features; the same seed has the same chance but for what is chaos."""
         del effects
-        return self.expected(values, numerics) + self.drawn(seed)
+        reported = {p.name for c in self.candidates if c.kind == "observation" for p in c.parameters}
+        off = {p.name: float(p.off or 0.0) for c in self.candidates for p in c.parameters}
+        soil = sorted((n, v) for n, v in values.items() if n not in reported and v != off.get(n))
+        own = zlib.crc32(repr((soil, numerics if numerics in self.patterns else "")).encode())
+        chance = math.sqrt(1.0 - self.chaos) * self.drawn(seed)
+        if self.chaos:
+            chance += math.sqrt(self.chaos) * self.drawn([seed, own])
+        return self.expected(values, numerics) + chance
 
     def drawn(self, seed: int | Sequence[int]) -> FloatArray:
         """(t, s) chance of one seed."""

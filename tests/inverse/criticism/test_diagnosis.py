@@ -168,10 +168,10 @@ def test_simulations_are_made_once_and_survive_an_interruption(tmp_path: Path) -
     second = diagnose(experiment, {"angle": 0.0}, simulate=again)
     assert (again.made, again.asked) == (0, whole.asked)
     assert second.scores == first.scores
+    damaged = next(iter(tmp_path.glob("*.npy")))
     other = Simulations(experiment, tmp_path, {"run": 2})
     diagnose(experiment, {"angle": 0.0}, simulate=other)
     assert other.made == other.asked
-    damaged = next(iter(tmp_path.glob("*.npy")))
     damaged.write_bytes(b"half")
     with pytest.raises(RunError, match="delete it"):
         diagnose(experiment, {"angle": 0.0}, simulate=Simulations(experiment, tmp_path, {"run": 1}))
