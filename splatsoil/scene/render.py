@@ -188,8 +188,8 @@ class Scene:
 
     def shown(self, relief: Relief, centres: Tensor, particles: Tensor) -> tuple[Tensor, Tensor]:
         """Which soil Gaussians and which particles lie near enough to the surface to be drawn: masks (s,) and (p,)."""
-        limit = _HIDDEN * self.spacing
-        return relief.within(limit, centres), relief.within(limit, particles)
+        near = relief.within(_HIDDEN * self.spacing, torch.cat([centres, particles]))
+        return near[: len(centres)], near[len(centres) :]
 
     def pose(self, positions: Any, deformations: Any, tool: Pose | None) -> Posed:
         """Move, hide and light everything for one moment.
