@@ -83,7 +83,8 @@ def _adequate(diagnosis: Diagnosis, candidates: Mapping[str, Candidate]) -> list
     out = ["The model is adequate: nothing stands above what noise, chance and numerics leave."]
     for name, estimate in diagnosis.estimates.items():
         value = amount(estimate.value, estimate.std, estimate.unit)
-        noise, numerics = (f"± {part:.2g}{symbol(estimate.unit)}" for part in (estimate.noise, estimate.numerics))
+        parts = (float(f"{part:.2g}") for part in (estimate.noise, estimate.numerics))
+        noise, numerics = (f"± {part:g}{symbol(estimate.unit)}" for part in parts)
         out.append(
             f"With all three weighed, the {name.replace('_', ' ')} is {value}: {noise} by noise and chance, {numerics} "
             "by numerics that weren't tried and may be as far off as those that were."
