@@ -226,7 +226,7 @@ def judge(place: Place, kind: Kind, number: int, seed: int, least: Mapping[str, 
     return truth, found
 
 
-def count_up(place: Place, kind: Kind, judged: Sequence[tuple[Truth, Found]], candidates: Sequence[Candidate]) -> Tally:
+def count_up(kind: Kind, judged: Sequence[tuple[Truth, Found]], candidates: Sequence[Candidate]) -> Tally:
     """A row. Truths of which the analysis knows nothing count as none."""
     return tally(
         kind.name,
@@ -279,7 +279,7 @@ def main(arguments: list[str] | None = None) -> int:
                 flush=True,
             )
     result = {
-        "rows": [entry(count_up(place, kind, judged, candidates)) for kind, judged in rows.items()],
+        "rows": [entry(count_up(kind, judged, candidates)) for kind, judged in rows.items()],
         "smallest detectable": least,
     }
     write_json(place.keep / "result.json", plain({"made_by": stamp(options.device), **decides, **result}))

@@ -11,7 +11,18 @@ from typing import Any
 import numpy as np
 import pytest
 from splatsoil.benchmarks.hidden_effects import Found, emulated, entry, table, tally
-from splatsoil.benchmarks.hidden_soil import FIRST_SEED, NOTHING, Hidden, Place, Truth, draw, judge, kinds_of, main
+from splatsoil.benchmarks.hidden_soil import (
+    FIRST_SEED,
+    NOTHING,
+    Hidden,
+    Place,
+    Truth,
+    count_up,
+    draw,
+    judge,
+    kinds_of,
+    main,
+)
 from splatsoil.inverse.criticism.diagnosis import diagnose
 
 from splatsoil.files import plain, write_json
@@ -71,6 +82,16 @@ def test_what_was_judged_is_read_and_not_judged_again(tmp_path: Path) -> None:
     assert row.named == 0 and row.bias[0] == pytest.approx(1.5)
     kept = json.loads(json.dumps(plain(entry(row))))
     assert "| nothing | 1 | 0 %" in table({"rows": [kept]}) == table({"rows": [entry(row)]}) != ""
+
+
+def test_a_truth_that_was_taken_out_of_the_library_is_not_to_be_found() -> None:
+    candidates = emulated(77).candidates
+    single, dropped = (kind for kind in kinds_of([4.0]) if kind.effects == 1 and kind.among == "physics")
+    found = Found("missing", ("effect 1",), 36.0, {"friction_angle": 33.5, "effect 1": 4.2}, {}, (2.0, 1.0), ())
+    judged = [(Truth(33.0, {"effect 1": 4.0}, 2000), found)]
+    rows = [count_up(kind, judged, candidates) for kind in (single, dropped)]
+    assert [(row.named, row.held, row.first) for row in rows] == [(1, 1, 1), (1, 0, 0)]
+    assert rows[0].bias == pytest.approx((3.0, 0.5)) and rows[0].error == (2.0, 1.0)
 
 
 def test_it_says_what_it_does(capsys: pytest.CaptureFixture[str]) -> None:
