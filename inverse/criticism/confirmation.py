@@ -18,7 +18,7 @@ from splatsoil.parameters import Parameter
 
 from .dilution import undiluted
 from .estimates import prior, untried
-from .evidence import Evidence, Vantage, Visit
+from .evidence import Evidence, Numerics, Vantage, Visit, other_numerics, pair_of
 from .floor import Floor, floor_of
 from .joint import precision_of
 from .misfit import Omnibus, omnibus, smooth_basis
@@ -346,22 +346,22 @@ def on_its_own_floor(
         at = best.fit.values
     seeds = range(1, 1 + len(evidence.repeats))
 
-    def spread(ask: Callable[..., FloatArray]) -> tuple[FloatArray, dict[str, FloatArray], list[FloatArray]]:
+    def spread(ask: Callable[..., FloatArray]) -> tuple[FloatArray, Numerics, list[FloatArray]]:
         guesses = [ask(at, numerics=name, **told) - middle for name in experiment.guesses]
-        patterns = {}
-        for kind in experiment.numerics:
-            with suppress(SimulationError):
-                patterns[kind] = ask(at, numerics=kind, **told) - middle
-        return np.stack([ask(at, seed=seed, **told) for seed in seeds]), patterns, guesses
+        numerics = other_numerics(
+            experiment, lambda name, seed: ask(at, numerics=name, seed=seed, **told), pair_of(experiment, len(seeds))
+        )
+        return np.stack([ask(at, seed=seed, **told) for seed in seeds]), numerics, guesses
 
     simulate.ahead(spread)
-    runs, patterns, guesses = spread(simulate)
+    runs, (patterns, doubts), guesses = spread(simulate)
     deviations = (runs - runs.mean(axis=0)) * np.sqrt(len(runs) / max(len(runs) - 1, 1))
     there = replace(
         evidence,
         mean=runs.mean(axis=0),
         repeats=deviations,
         numerics=patterns,
+        numerics_doubts=doubts,
         guesses=np.stack(guesses) if guesses else evidence.guesses,
         slopes={},
         curves={},

@@ -15,6 +15,7 @@ from splatsoil.parameters import Parameter
 
 FloatArray = npt.NDArray[np.float64]
 Run = Callable[..., FloatArray]
+Numerics = tuple[dict[str, FloatArray], dict[str, FloatArray]]
 
 STEP = 4.0
 """Steps of derivatives in smallest meaningful sizes."""
@@ -82,7 +83,8 @@ class Evidence(Vantage):
     Attributes:
         mean: (t, s) mean prediction over seeds that derivatives don't share.
         repeats: (r, t, s) deviations of those seeds from their mean, scaled to have the variance of one seed.
-        numerics: (t, s) what other numerics change, by name.
+        numerics: (t, s) what other numerics change, by name: the mean over two seeds where there is chance in it.
+        numerics_doubts: (t, s) half the difference between these two, as large as the chance that is left; by name.
         guesses: (g, t, s) what other guesses of what no instrument shows change.
         replays: (k, t, s) residuals of known soils that went through the whole chain of pictures and reconstruction.
         calibration: what pictures say of cameras, light, clock and tool where soil plays no part.
@@ -94,6 +96,7 @@ class Evidence(Vantage):
     guesses: FloatArray
     replays: FloatArray | None = None
     calibration: Calibration | None = None
+    numerics_doubts: Mapping[str, FloatArray] = field(default_factory=dict, kw_only=True)
 
 
 def gather(
@@ -109,15 +112,16 @@ def gather(
     The residual's prediction is the mean over seeds 1, 2, …; derivatives are differences at seed 0 and one more, the
     same for both ends, so that a part of chance cancels in them. What is left of it looks like information: the two
     seeds tell how much there is (`Vantage.doubts`). Sharing a seed with the residual would correlate its chance with
-    the derivatives' and raise false alarms that grow with the number of features.
+    the derivatives' and raise false alarms that grow with the number of features. What other numerics change is told by
+    the same two.
     """
     base = dict(values)
     seeds = range(1, 1 + (repeats if experiment.chance else 1))
     jobs = (
         len(seeds)
         + len(experiment.guesses)
-        + len(experiment.numerics)
-        + (2 if experiment.chance else 1) * (1 + 2 * len(experiment.parameters) + len(experiment.candidates))
+        + (2 if experiment.chance else 1)
+        * (2 + 2 * len(experiment.parameters) + len(experiment.candidates) + len(experiment.numerics))
     )
     done = 0
 
@@ -135,16 +139,48 @@ def gather(
     deviations = (runs - runs.mean(axis=0)) * np.sqrt(len(runs) / max(len(runs) - 1, 1))
     # Before the point itself: they are other drawings of its simulation.
     guesses = [run(f"guess: {name}", base, numerics=name) for name in experiment.guesses]
-    seeds_of_slopes = (0, seeds[-1] + 1) if experiment.chance else (0,)
-    found = look_from(experiment, base, experiment.candidates, run, seeds_of_slopes)
+    for name in experiment.redrawn:
+        run(f"numerics: {name}", base, numerics=name)
+    pair = pair_of(experiment, len(seeds))
+    found = look_from(experiment, base, experiment.candidates, run, pair)
     changes = np.stack(guesses) - found.prediction if guesses else np.zeros((0, *experiment.layout.shape))
-    numerics = {}
+    numerics, doubts = other_numerics(
+        experiment, lambda name, seed: run(f"numerics: {name or 'none'}", base, seed=seed, numerics=name), pair
+    )
+    return Evidence(
+        **vars(found),
+        mean=runs.mean(axis=0),
+        repeats=deviations,
+        numerics=numerics,
+        guesses=changes,
+        numerics_doubts=doubts,
+    )
+
+
+def pair_of(experiment: Experiment, repeats: int) -> tuple[int, ...]:
+    """Two seeds that repeats don't have, or one where there is no chance."""
+    return (0, repeats + 1) if experiment.chance else (0,)
+
+
+def other_numerics(experiment: Experiment, ask: Callable[[str, int], FloatArray], pair: tuple[int, ...]) -> Numerics:
+    """What other numerics change, by name: `Evidence.numerics` and their doubts.
+
+    Args:
+        experiment: whose numerics are tried; those that can't be simulated are left out.
+        ask: called with a name, or "" for the usual way, and a seed.
+        pair: of seeds, or one.
+    """
+    middles = {seed: ask("", seed) for seed in pair}
+    means, doubts = dict[str, FloatArray](), dict[str, FloatArray]()
     for name in experiment.numerics:
         try:
-            numerics[name] = run(f"numerics: {name}", base, numerics=name) - found.prediction
+            changes = [ask(name, seed) - middles[seed] for seed in (pair[:1] if name in experiment.redrawn else pair)]
         except SimulationError:
             continue
-    return Evidence(**vars(found), mean=runs.mean(axis=0), repeats=deviations, numerics=numerics, guesses=changes)
+        means[name] = np.mean(changes, axis=0)
+        if len(changes) > 1:
+            doubts[name] = 0.5 * (changes[0] - changes[1])
+    return means, doubts
 
 
 def look_from(

@@ -12,6 +12,7 @@ from scipy.optimize import nnls
 from splatsoil.experiment.base import Experiment
 from splatsoil.experiment.features import Layout
 
+from .dilution import reliable
 from .evidence import Evidence, ignorance
 from .noise import Noise, Part, correlated, estimate, extra_noise, independent
 
@@ -69,8 +70,8 @@ def floor_of(experiment: Experiment, evidence: Evidence) -> Floor:
 
     Chance comes from repeated seeds, what no instrument shows from other guesses of it, the pictures' own errors from
     where physics can't act. What other numerics change
-    is projected out, pattern by pattern; what each of these patterns holds beyond parameters and the other patterns is
-    a sample of what numerics that weren't tried would leave, and goes into the noise.
+    is projected out, pattern by pattern; what each of these patterns holds beyond parameters, the other patterns and
+    its own chance is a sample of what numerics that weren't tried would leave, and goes into the noise.
     """
     layout, seen = experiment.layout, experiment.seen
     prior = {p.name: p for p in experiment.parameters}
@@ -95,7 +96,8 @@ def floor_of(experiment: Experiment, evidence: Evidence) -> Floor:
     patterns = list(evidence.numerics.values())
     if patterns:
         known = _total(layout, parts, seen, runs)[0]
-        left = _unexplained(known, parameters, patterns, seen, seen & layout.common[None])
+        doubts = [evidence.numerics_doubts.get(name, np.zeros(layout.shape)) for name in evidence.numerics]
+        left = _unexplained(known, parameters, patterns, doubts, seen & layout.common[None])
         parts["numerics"] = estimate(layout, left, seen, directions, parameters)
     noise, single = _total(layout, parts, seen, runs)
     for name, part in parts.items():
@@ -175,15 +177,16 @@ def _unexplained(
     noise: Noise,
     parameters: FloatArray,
     patterns: Sequence[FloatArray],
-    seen: npt.NDArray[np.bool_],
+    doubts: Sequence[FloatArray],
     common: npt.NDArray[np.bool_],
 ) -> FloatArray:
-    """(p, t, s) what each pattern holds beyond the parameters and the other patterns.
+    """(p, t, s) what each pattern holds beyond the parameters and the other patterns, as large as it is without the
+    chance that its doubts (p tables) tell: that is a part of the noise already.
 
     None counts as larger than the middle one of them, in features (t, s) of one unit: one that is, is projected out
     itself, and says nothing of what numerics that weren't tried would leave.
     """
-    columns = _columns(patterns, seen)
+    columns, chances = _columns(patterns, noise.seen), _columns(doubts, noise.seen)
     out = []
     for k in range(columns.shape[1]):
         others = np.concatenate([parameters, np.delete(columns, k, axis=1)], axis=1)
@@ -191,9 +194,12 @@ def _unexplained(
         size = np.linalg.norm(scaled, axis=0)
         # what changes nothing (an effect's shape, where the effect is off) takes up nothing
         size = np.where(size > 0.0, size, 1.0)
-        amplitude, *_ = np.linalg.lstsq(scaled / size, columns[:, k] / noise.scale, rcond=1e-3)
-        out.append(noise.spread(columns[:, k] - others @ (amplitude / size)))
-    left = np.stack(out)
+        both = np.stack([columns[:, k], chances[:, k]], axis=1)
+        amplitude, *_ = np.linalg.lstsq(scaled / size, both / noise.scale[:, None], rcond=1e-3)
+        out.append([noise.spread(column) for column in (both - others @ (amplitude / size[:, None])).T])
+    left, chance = np.stack(out, axis=1)
+    squares, by_chance = (np.mean(tables[:, common] ** 2, axis=1) for tables in (left, chance))
+    left = np.sqrt(reliable(squares, by_chance))[:, None, None] * left
     size = np.sqrt(np.mean(left[:, common] ** 2, axis=1))
     return left * np.minimum(1.0, np.median(size) / np.maximum(size, 1e-300))[:, None, None]
 

@@ -89,6 +89,7 @@ class Experiment(Protocol):
         model: names of the effects that are on.
         candidates: effects that are off.
         numerics: names of the ways to compute the same physics otherwise.
+        redrawn: those of them that only draw the same simulation otherwise, with no chance of their own.
         guesses: names of other guesses of what no instrument shows (the colour of buried soil).
         chance: True where another seed gives another prediction.
     """
@@ -117,6 +118,8 @@ class Experiment(Protocol):
     def candidates(self) -> tuple[Candidate, ...]: ...
     @property
     def numerics(self) -> tuple[str, ...]: ...
+    @property
+    def redrawn(self) -> tuple[str, ...]: ...
     @property
     def guesses(self) -> tuple[str, ...]: ...
     @property

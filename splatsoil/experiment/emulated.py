@@ -61,6 +61,7 @@ class EmulatedExperiment:
     systematic: FloatArray = field(default_factory=lambda: np.zeros((0, 0, 0)))
     name: str = "emulated"
     model: tuple[str, ...] = ()
+    redrawn: tuple[str, ...] = ()
     chance: bool = True
     sensor_memory: float = 0.0
     chaos: float = 0.0

@@ -57,6 +57,7 @@ class PlateExperiment:
     chance = True
     sensor_memory = 0.8
     numerics = tuple(NUMERICS)
+    redrawn: tuple[str, ...] = ()
     guesses: tuple[str, ...] = ()
 
     def __init__(

@@ -83,6 +83,7 @@ class PlowExperiment:
         self.model = tuple(effect.name for effect in model.law.effects)
         self.parameters: tuple[Parameter, ...] = tuple(model.space(parameters))
         self.numerics = tuple(numerics)
+        self.redrawn = tuple(name for name in self.numerics if name == ROUNDING)
         self.progress = progress
         wanted = tuple(library().values()) if candidates is None else find_effects(candidates)
         self._wanted: dict[str | Effect, Effect] = {

@@ -114,6 +114,7 @@ class TriaxialExperiment:
     chance = False
     sensor_memory = MEMORY
     numerics: tuple[str, ...] = ()
+    redrawn: tuple[str, ...] = ()
     guesses: tuple[str, ...] = ()
 
     def __init__(

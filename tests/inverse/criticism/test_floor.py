@@ -98,3 +98,22 @@ def test_numerics_and_parameters_that_change_nothing_are_no_trouble() -> None:
     found = floor_of(experiment, told)
     assert np.isfinite(found.noise.covariance).all()
     assert found.parts["numerics"].scale.max() > 0.1
+
+
+@pytest.mark.parametrize("true", [0.0, 1.0])
+def test_chance_in_what_other_numerics_change_is_not_counted_again(true: float) -> None:
+    """Differences of two seeds each, whose chance is twice as large as what repeats show; more of it than of numerics
+    proper, or nothing else."""
+    generator = np.random.default_rng(5)
+    names = ("stiffness", "step", "grid", "contact")
+    chances = {name: 0.9 * generator.standard_normal((2, *LAYOUT.shape)) for name in names}
+    means = {name: true * generator.standard_normal(LAYOUT.shape) + chances[name].mean(axis=0) for name in names}
+    doubts = {name: 0.5 * (first - second) for name, (first, second) in chances.items()}
+    told = evidence(generator, means)
+    experiment = looked(generator.standard_normal(LAYOUT.shape), np.zeros(LAYOUT.shape, dtype=bool))
+    size = [
+        float(np.sqrt(np.mean(floor_of(experiment, each).parts["numerics"].scale ** 2)))
+        for each in (told, replace(told, numerics_doubts=doubts))
+    ]
+    assert size[0] == pytest.approx(np.hypot(true, 0.9 / np.sqrt(2.0)), rel=0.1)
+    assert size[1] == pytest.approx(true, rel=0.1, abs=0.2)
