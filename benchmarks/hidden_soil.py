@@ -23,7 +23,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 from splatsoil.benchmarks._common import keep_to_one_protocol, sources, stamp
-from splatsoil.benchmarks.hidden_effects import Found, Tally, entry, table, tally
+from splatsoil.benchmarks._tally import Found, Tally, entry, table, tally
 from splatsoil.inverse.criticism.diagnosis import Diagnosis, diagnose
 from splatsoil.inverse.criticism.simulations import Simulations
 from splatsoil.inverse.executors import executor, in_order

@@ -25,7 +25,7 @@ import numpy as np
 from splatsoil.benchmarks._common import keep_to_one_protocol, sources, stamp
 from splatsoil.benchmarks._mitsuba import MitsubaStage, load_mitsuba
 from splatsoil.benchmarks._newton import Numerics, World, plough
-from splatsoil.benchmarks.hidden_effects import wilson
+from splatsoil.benchmarks._tally import wilson
 from splatsoil.benchmarks.numerics import FloatArray
 
 from splatsoil.files import plain, write_json

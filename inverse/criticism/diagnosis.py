@@ -117,7 +117,7 @@ def diagnose(
     *,
     simulate: Simulations | None = None,
     options: Options | None = None,
-    replays: FloatArray | None = None,
+    replays: Callable[[], FloatArray] | None = None,
     calibration: Calibration | None = None,
     progress: Report | None = None,
 ) -> Diagnosis:
@@ -128,7 +128,7 @@ def diagnose(
         values: the fitted parameters.
         simulate: where predictions come from; the experiment itself by default.
         options: how thorough.
-        replays: those of :class:`~splatsoil.inverse.criticism.evidence.Evidence`.
+        replays: gives those of :class:`~splatsoil.inverse.criticism.evidence.Evidence`; asked once all is simulated.
         calibration: likewise.
         progress: called with (what, share done).
 
@@ -142,7 +142,7 @@ def diagnose(
     )
     return judge(
         experiment,
-        replace(evidence, replays=replays, calibration=calibration),
+        replace(evidence, replays=None if replays is None else replays(), calibration=calibration),
         simulate,
         options=options,
         progress=told,

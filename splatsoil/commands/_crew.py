@@ -20,12 +20,12 @@ SHARE = {"cpu": 2.0, "cuda": 4.0}
 """Memory that each process is to have, GiB: it holds a reconstruction, a scene and soil."""
 
 
-Calibrate = Callable[[Mapping[str, float]], "Future[None] | None"]
-"""Has a helper calibrate at these values; None where there is no helper."""
+Replay = Callable[[Mapping[str, float]], "Future[None] | None"]
+"""Has a helper make the replay control at these values; None where there is no helper."""
 
 
 @contextmanager
-def crew(folder: RunFolder, model: Model, effects: Iterable[str], simulate: Simulations) -> Iterator[Calibrate]:
+def crew(folder: RunFolder, model: Model, effects: Iterable[str], simulate: Simulations) -> Iterator[Replay]:
     """While the block runs, other processes simulate, too: one for every other core, as far as there is use for them.
 
     All keep what they make in ``features/`` and find it there: the results are those of one process, bit for bit, and
@@ -39,7 +39,7 @@ def crew(folder: RunFolder, model: Model, effects: Iterable[str], simulate: Simu
         simulate: what is helped.
 
     Yields:
-        What has a helper calibrate, before what it is asked for later.
+        What has a helper make the replay control, before what it is asked for later.
     """
     from splatsoil.envs.devices import cores
     from splatsoil.inverse.criticism.simulations import Helpers
@@ -57,12 +57,12 @@ def crew(folder: RunFolder, model: Model, effects: Iterable[str], simulate: Simu
         def submit(job: Mapping[str, Any]) -> Any:
             return workers.submit(_simulate, folder.path, model.device, named, dict(job))
 
-        def calibrate(values: Mapping[str, float]) -> Future[None]:
-            return workers.submit(_calibrate, folder.path, model.device, named, dict(values))
+        def replay(values: Mapping[str, float]) -> Future[None]:
+            return workers.submit(_replay, folder.path, model.device, named, dict(values))
 
         try:
             with simulate.helped(Helpers(count, submit)):
-                yield calibrate
+                yield replay
             workers.shutdown(cancel_futures=True)
         except BaseException:
             workers.kill()
@@ -93,12 +93,12 @@ def _simulate(path: Path, device: str, effects: tuple[str, ...], job: Mapping[st
         simulate(**job)
 
 
-def _calibrate(path: Path, device: str, effects: tuple[str, ...], values: Mapping[str, float]) -> None:
+def _replay(path: Path, device: str, effects: tuple[str, ...], values: Mapping[str, float]) -> None:
     """A helper's work."""
-    from splatsoil.commands._criticism import calibrated
+    from splatsoil.commands._criticism import replayed
 
     with _quietly():
-        calibrated(*_known_here(path, device, effects), values)
+        replayed(*_known_here(path, device, effects), values, lambda what, share: None)
 
 
 @contextmanager

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import wait
 from pathlib import Path
+from shutil import rmtree
 from typing import TYPE_CHECKING, Any
 
 from splatsoil.errors import ParameterError, RunError
@@ -176,29 +177,37 @@ def diagnosed(
     simulate.told = starting
     values = estimates(fit)
     with folder.lock():
-        with crew(folder, model, effects, simulate) as calibrate:
-            replaying = with_replay and not replay_path(folder, simulate).is_file()
-            calibrating = calibrate(values) if replaying else None
-            simulate.ahead(lambda ask: gather(experiment, ask, values, repeats=options.repeats))
-            if replaying:
-                # The longest of what is made once is made here, where all is loaded.
-                replayed(folder, experiment, simulate, values, begin("replay"))
-            begun.append(begin("diagnose"))
-            report("where soil plays no part", 0.0)
-            if calibrating is not None:
-                wait([calibrating])
-            # made here where no helper could
-            calibration = calibrated(folder, experiment, simulate, values)
-            replays = replayed(folder, experiment, simulate, values, report) if with_replay else None
-            found = diagnose(
-                experiment,
-                values,
-                simulate=simulate,
-                options=options,
-                replays=replays,
-                calibration=calibration,
-                progress=told,
-            )
+        try:
+            with crew(folder, model, effects, simulate) as replay:
+                replaying = None
+                if with_replay and not replay_path(folder, simulate).is_file():
+                    replaying = replay(values)
+                    if replaying is None:
+                        replayed(folder, experiment, simulate, values, begin("replay"))
+
+                def replays() -> FloatArray:
+                    if replaying is not None:
+                        report("a made-up bed through the whole chain", share)
+                        wait([replaying])
+                    # made here where no helper could
+                    return replayed(folder, experiment, simulate, values, lambda what, _: report(what, share))
+
+                simulate.ahead(lambda ask: gather(experiment, ask, values, repeats=options.repeats))
+                begun.append(begin("diagnose"))
+                report("where soil plays no part", 0.0)
+                calibration = calibrated(folder, experiment, simulate, values)
+                found = diagnose(
+                    experiment,
+                    values,
+                    simulate=simulate,
+                    options=options,
+                    replays=replays if with_replay else None,
+                    calibration=calibration,
+                    progress=told,
+                )
+        finally:
+            # a helper that was ended at the replay couldn't tidy up
+            rmtree(folder.path / "replay", ignore_errors=True)
         result = {
             **record(experiment, found),
             "fit": fit["name"],

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from splatsoil.benchmarks.hidden_effects import Found, emulated, entry, table, tally
+from splatsoil.benchmarks._tally import Found, entry, table, tally
+from splatsoil.benchmarks.hidden_effects import emulated
 from splatsoil.benchmarks.hidden_soil import (
     FIRST_SEED,
     NOTHING,

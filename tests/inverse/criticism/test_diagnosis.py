@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pytest
-from splatsoil.benchmarks.hidden_effects import detectable, emulated, fitted, one, outside, wilson
+from splatsoil.benchmarks._tally import wilson
+from splatsoil.benchmarks.hidden_effects import detectable, emulated, fitted, one, outside
 from splatsoil.inverse.criticism.diagnosis import Options, diagnose
 from splatsoil.inverse.criticism.misfit import Omnibus
 from splatsoil.inverse.criticism.naming import members_of, stands
