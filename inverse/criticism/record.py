@@ -12,7 +12,7 @@ from .confirmation import Confirmation
 from .diagnosis import Diagnosis
 from .misfit import Omnibus
 from .outside import StrengthReading
-from .words import sentences
+from .words import of_estimates, sentences
 
 FORMAT = "splatsoil-diagnosis/1"
 
@@ -86,9 +86,12 @@ def misfit_record(experiment: Experiment, diagnosis: Diagnosis) -> dict[str, Any
     """Only how far the model is from the data, where and when."""
     whole = record(experiment, diagnosis)
     kept = ("misfit", "blocks", "floor", "unit", "time_name", "times", "stages", "sites", "curves", "maps", "values")
+    adequate = diagnosis.verdict == "adequate"
     return {
         "format": "splatsoil-misfit/1",
-        "adequate": diagnosis.verdict == "adequate",
+        "adequate": adequate,
+        "estimates": whole["estimates"] if adequate else {},
+        "sentences": of_estimates(diagnosis.estimates) if adequate else [],
         "simulations": diagnosis.simulations,
         **{key: whole[key] for key in kept},
     }

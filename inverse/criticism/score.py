@@ -28,7 +28,7 @@ from splatsoil.experiment.base import Calibration, Candidate
 
 from .dilution import reliable
 from .joint import BELIEF, SEEN_AT_ALL, Joint, dispersion, precision_of
-from .noise import Noise, Solver
+from .noise import Noise
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -134,9 +134,9 @@ class Scorer:
             ],
             axis=1,
         )
-        bare = noise.solver()
-        whole = np.sum(bare.whiten(joined) ** 2, axis=0)
-        weights, chance = _projected(bare, nuisance, joined), _projected(bare, nuisance, unsure)
+        whole = np.sum(noise.solver().whiten(joined) ** 2, axis=0)
+        solver = noise.plus(nuisance).solver()
+        weights, chance = solver.solve(joined), solver.solve(unsure)
         reliability = reliable(np.sum(joined * weights, axis=0), np.sum(unsure * chance, axis=0))
         joined, weights, whole = reliability * joined, reliability * weights, reliability**2 * whole
         information = joined.T @ weights
@@ -254,17 +254,6 @@ class _Raw:
     estimate: FloatArray
     std: float
     survival: float
-
-
-def _projected(bare: Solver, nuisance: FloatArray, columns: FloatArray) -> FloatArray:
-    """(n, k) inverse covariance, nuisances (n, q) as low-rank noise in it, times columns (n, k)."""
-    weights = bare.solve(columns)
-    if nuisance.size:
-        solved = bare.solve(nuisance)
-        weights = weights - solved @ np.linalg.solve(
-            np.eye(nuisance.shape[1]) + nuisance.T @ solved, nuisance.T @ weights
-        )
-    return weights
 
 
 def _price(parameters: int, freedom: int) -> float:

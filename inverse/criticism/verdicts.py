@@ -29,12 +29,13 @@ DENIES, SEEN = 1.645, 1.960
 """Standard deviations within which an effect's size lies with 95 % to one side, and to both."""
 LEAST_SURVIVAL = 0.05
 """Share of an effect's information that must survive the projection of everything else."""
-ENOUGH = 0.8
-"""Share of the misfit beyond chance that effects must explain where a remainder stands."""
-WITHIN = 1.3
+ENOUGH = 0.6
+"""Share of the misfit beyond chance that effects must explain where a remainder stands: another solver's soil, or a
+real one, leaves one of its own. What imitates an effect is told by :data:`WITHIN`, hardly ever by this."""
+WITHIN = 1.25
 """Error on times that a refit hasn't seen, over what noise leaves there, up to which an effect can be all there is.
-Chosen on emulated worlds: 1.2 gives away a fifth of the right effects (the floor is known from a few repeats only), 1.4
-lets one in five pass that imitate what the library lacks."""
+Chosen on emulated worlds of one effect of twice the smallest detectable size: 1.2 gives away a tenth of the right ones
+(the floor is known from a few repeats only), 1.3 lets one in seven pass that imitate a truth out of the library."""
 
 
 def of_effect(candidate: Candidate, score: Score, *, level: float = LEVEL) -> EffectVerdict:

@@ -10,11 +10,14 @@ from splatsoil.experiment.strokes import MEASURED
 from splatsoil.report.words import symbol, with_std
 
 from .diagnosis import Diagnosis
+from .estimates import Estimate
 from .outside import CLEAR, FEW, StrengthReading
-from .verdicts import GATE
+from .verdicts import CLEAN, GATE
 
 #: Correlation of two effects' scores from which they are called alike.
 ALIKE = 0.8
+
+MAKES_UP = "what is refitted makes up for the rest as far as it can, so that it may be off by more than its ± says"
 
 
 def sentences(diagnosis: Diagnosis, candidates: Mapping[str, Candidate], base: Mapping[str, float]) -> list[str]:
@@ -66,10 +69,10 @@ def _missing(diagnosis: Diagnosis, candidates: Mapping[str, Candidate], base: Ma
         out.append(f"With it the refit moves {listed(told)}{': that much was bias' if sure else ''}.")
     if len(diagnosis.members) > 1:
         out.append(f"{listed([title(m) for m in diagnosis.members[1:]])} would explain it nearly as well.")
-    if diagnosis.remainder is not None and diagnosis.remainder.p < GATE:
+    if diagnosis.remainder is not None and diagnosis.remainder.p < CLEAN:
         out.append(
             f"It explains {100.0 * diagnosis.explained:.0f} % of the misfit beyond chance; what remains is more than "
-            "noise."
+            f"noise, and {MAKES_UP}."
         )
     return out
 
@@ -81,16 +84,23 @@ def _adequate(diagnosis: Diagnosis, candidates: Mapping[str, Candidate]) -> list
         if verdict == "absent"
     ]
     out = ["The model is adequate: nothing stands above what noise, chance and numerics leave."]
-    for name, estimate in diagnosis.estimates.items():
+    out += of_estimates(diagnosis.estimates)
+    if seen:
+        out.append(f"It would have shown {listed(seen)}.")
+    return out
+
+
+def of_estimates(estimates: Mapping[str, Estimate]) -> list[str]:
+    """What an adequate model's parameters are once all of the floor is weighed."""
+    out = []
+    for name, estimate in estimates.items():
         value = amount(estimate.value, estimate.std, estimate.unit)
         parts = (float(f"{part:.2g}") for part in (estimate.noise, estimate.numerics))
         noise, numerics = (f"± {part:g}{symbol(estimate.unit)}" for part in parts)
         out.append(
-            f"With all three weighed, the {name.replace('_', ' ')} is {value}: {noise} by noise and chance, {numerics} "
-            "by numerics that weren't tried and may be as far off as those that were."
+            f"With noise, chance and numerics weighed, the {name.replace('_', ' ')} is {value}: {noise} by noise and "
+            f"chance, {numerics} by numerics that weren't tried and may be as far off as those that were."
         )
-    if seen:
-        out.append(f"It would have shown {listed(seen)}.")
     return out
 
 
@@ -108,8 +118,7 @@ def _outside(diagnosis: Diagnosis, candidates: Mapping[str, Candidate]) -> list[
             f"The nearest is {best.replace('_', ' ')} ({size}): with it the error on frames that the refit has not "
             f"seen goes from {before.held_out:.2g} to {confirmed.held_out:.2g} {diagnosis.unit} (noise alone leaves "
             f"{confirmed.floor:.2g}), which is {100.0 * diagnosis.explained:.0f} % of the misfit beyond chance. What "
-            "remains is more than noise, so it is not all that is missing; what is refitted makes up for the rest as "
-            "far as it can, so that it may be off by more than its ± says."
+            f"remains is more than noise, so it is not all that is missing; {MAKES_UP}."
         )
     return out if diagnosis.strength is None else [*out, *of_strength(diagnosis.strength)]
 

@@ -15,6 +15,8 @@ from splatsoil.commands._output import print_json
 SURE = 0.05
 #: Blocks shown on the screen.
 SHOWN = 12
+#: What --json prints of the misfit.
+TOLD = ("adequate", "misfit", "estimates", "blocks", "floor")
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,7 @@ def run(config: Config) -> int:
         if not config.quick:
             misfit = criticism.misfit(folder, model, options, begin("floor"))
     if config.json:
-        extra = {} if misfit is None else {"misfit": {k: misfit[k] for k in ("adequate", "misfit", "blocks", "floor")}}
+        extra = {} if misfit is None else {"misfit": {k: misfit[k] for k in TOLD}}
         print_json({"ok": True, "run": str(folder.path), **result, **extra})
     else:
         show(result, str(folder.comparison))
@@ -124,5 +126,7 @@ def show_misfit(misfit: Mapping[str, Any]) -> None:
         f"{word}: slow waves of the residual are {test['dispersion']:.3g} times what noise leaves (p {test['p']:.2g}); "
         f"{off} of {len(misfit['blocks'])} blocks stand out"
     )
+    for sentence in misfit["sentences"]:
+        console.print(sentence)
     if not misfit["adequate"]:
         console.print("which effect is missing? splatsoil diagnose says")

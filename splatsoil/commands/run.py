@@ -78,7 +78,7 @@ def run(config: Config) -> int:
         losses = {key: comparison[key] for key in ("loss", "total", "noise")}
         extra: dict[str, Any] = {}
         if diagnosis is not None:
-            kept = ("verdict", "class", "sentences", "effects", "simulations")
+            kept = ("verdict", "class", "sentences", "effects", "estimates", "simulations")
             extra = {
                 "diagnosis": plain({key: diagnosis[key] for key in kept}),
                 "models": criticism.history(folder),
