@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from shutil import rmtree
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -67,6 +68,9 @@ def crew(folder: RunFolder, model: Model, effects: Iterable[str], simulate: Simu
         except BaseException:
             workers.kill()
             raise
+        finally:
+            # a helper that was ended at the replay couldn't tidy up
+            rmtree(folder.path / "replay", ignore_errors=True)
 
 
 def _memory(device: str) -> float:
@@ -95,10 +99,10 @@ def _simulate(path: Path, device: str, effects: tuple[str, ...], job: Mapping[st
 
 def _replay(path: Path, device: str, effects: tuple[str, ...], values: Mapping[str, float]) -> None:
     """A helper's work."""
-    from splatsoil.commands._criticism import replayed
+    from splatsoil.commands._control import replayed
 
     with _quietly():
-        replayed(*_known_here(path, device, effects), values, lambda what, share: None)
+        replayed(*_known_here(path, device, effects), values, lambda what: None)
 
 
 @contextmanager

@@ -3,27 +3,20 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping
-from concurrent.futures import wait
-from pathlib import Path
-from shutil import rmtree
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 from splatsoil.errors import ParameterError, RunError
 
 if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
+    from pathlib import Path
 
     from splatsoil.commands._progress import Report
-    from splatsoil.experiment.base import Calibration
     from splatsoil.experiment.plow import PlowExperiment
     from splatsoil.inverse.criticism.diagnosis import Options
     from splatsoil.inverse.criticism.simulations import Simulations
     from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.model import Model
-
-    FloatArray = npt.NDArray[np.float64]
 
 
 def model_of(folder: RunFolder, device: str, report: Report) -> Model:
@@ -79,64 +72,6 @@ def code_of(effects: Iterable[str]) -> str:
     return code_digest((*FORWARD, "observation.py", "experiment/plow.py"), own)
 
 
-def replay_path(folder: RunFolder, simulate: Simulations) -> Path:
-    """Where the replay control of a model is kept. What pictures get wrong hardly hangs on a few degrees: one serves
-    all estimates of a model."""
-    from splatsoil.files import code_digest
-    from splatsoil.inverse.evaluations import digest
-
-    what = {**simulate.identity, "replay code": code_digest(("synthetic", "experiment/replay.py"))}
-    return folder.path / "features" / f"replay-{digest(what)[:24]}.npy"
-
-
-def replayed(
-    folder: RunFolder, experiment: PlowExperiment, simulate: Simulations, values: Mapping[str, float], report: Report
-) -> FloatArray:
-    """The replay control (1, t, s), made once for a model and its values and kept in ``features/``."""
-    import io
-
-    import numpy as np
-
-    from splatsoil.experiment.replay import replay
-    from splatsoil.files import write_bytes
-
-    path = replay_path(folder, simulate)
-    if not path.is_file():
-        stream = io.BytesIO()
-        made = replay(experiment, values, folder.path / "replay", progress=report)
-        np.save(stream, made, allow_pickle=False)
-        write_bytes(path, stream.getvalue())
-    return np.load(path, allow_pickle=False)[None]
-
-
-def calibrated(
-    folder: RunFolder, experiment: PlowExperiment, simulate: Simulations, values: Mapping[str, float]
-) -> Calibration | None:
-    """What pictures say of cameras, light, clock and tool where soil plays no part, made once and kept in
-    ``features/``."""
-    import io
-
-    import numpy as np
-
-    from splatsoil.experiment.base import Calibration
-    from splatsoil.files import code_digest, write_bytes
-    from splatsoil.inverse.evaluations import digest
-
-    names = [p.name for c in experiment.candidates if c.kind == "observation" for p in c.parameters]
-    code = code_digest(("experiment/bands.py", "experiment/calibration.py", "experiment/calibration_bench.py"))
-    what = {**simulate.identity, "values": dict(values), "calibrated": names, "calibration code": code}
-    path = folder.path / "features" / f"calibration-{digest(what)[:24]}.npz"
-    if not path.is_file():
-        found = experiment.calibrate(values)
-        if found is None:
-            return None
-        stream = io.BytesIO()
-        np.savez(stream, names=np.array(found.names), estimate=found.estimate, covariance=found.covariance)
-        write_bytes(path, stream.getvalue())
-    with np.load(path, allow_pickle=False) as kept:
-        return Calibration(tuple(str(name) for name in kept["names"]), kept["estimate"], kept["covariance"])
-
-
 def diagnosed(
     folder: RunFolder,
     model: Model,
@@ -148,6 +83,7 @@ def diagnosed(
 ) -> dict[str, Any]:
     """Diagnose the latest fit; the result is ``diagnosis.json`` and, by model, ``diagnoses/NAME.json``."""
     from splatsoil import __version__
+    from splatsoil.commands._control import calibrated, control
     from splatsoil.commands._crew import crew
     from splatsoil.files import write_json
     from splatsoil.inverse.criticism.diagnosis import diagnose
@@ -158,11 +94,10 @@ def diagnosed(
     began = time.perf_counter()
     fit = folder.fit()
     experiment, simulate = experiment_of(folder, model, tuple(effects) or None)
-    share, purpose = 0.0, ""
-    begun: list[Report] = []
+    share, purpose, report = 0.0, "", begin("diagnose")
 
-    def report(what: str, done: float) -> None:
-        begun[-1](what, done)
+    def say(what: str) -> None:
+        report(what, share)
 
     def told(what: str, done: float) -> None:
         nonlocal share
@@ -176,38 +111,20 @@ def diagnosed(
 
     simulate.told = starting
     values = estimates(fit)
-    with folder.lock():
-        try:
-            with crew(folder, model, effects, simulate) as replay:
-                replaying = None
-                if with_replay and not replay_path(folder, simulate).is_file():
-                    replaying = replay(values)
-                    if replaying is None:
-                        replayed(folder, experiment, simulate, values, begin("replay"))
-
-                def replays() -> FloatArray:
-                    if replaying is not None:
-                        report("a made-up bed through the whole chain", share)
-                        wait([replaying])
-                    # made here where no helper could
-                    return replayed(folder, experiment, simulate, values, lambda what, _: report(what, share))
-
-                simulate.ahead(lambda ask: gather(experiment, ask, values, repeats=options.repeats))
-                begun.append(begin("diagnose"))
-                report("where soil plays no part", 0.0)
-                calibration = calibrated(folder, experiment, simulate, values)
-                found = diagnose(
-                    experiment,
-                    values,
-                    simulate=simulate,
-                    options=options,
-                    replays=replays if with_replay else None,
-                    calibration=calibration,
-                    progress=told,
-                )
-        finally:
-            # a helper that was ended at the replay couldn't tidy up
-            rmtree(folder.path / "replay", ignore_errors=True)
+    with folder.lock(), crew(folder, model, effects, simulate) as helper:
+        replays = control(folder, experiment, simulate, values, helper, say) if with_replay else None
+        simulate.ahead(lambda ask: gather(experiment, ask, values, repeats=options.repeats))
+        say("where soil plays no part")
+        calibration = calibrated(folder, experiment, simulate, values)
+        found = diagnose(
+            experiment,
+            values,
+            simulate=simulate,
+            options=options,
+            replays=replays,
+            calibration=calibration,
+            progress=told,
+        )
         result = {
             **record(experiment, found),
             "fit": fit["name"],
@@ -224,8 +141,13 @@ def diagnosed(
     return result
 
 
-def misfit(folder: RunFolder, model: Model, options: Options, report: Report) -> dict[str, Any]:
+def misfit(
+    folder: RunFolder, model: Model, options: Options, report: Report, *, with_replay: bool = True
+) -> dict[str, Any]:
     """How far the model is from the data, where and when, against the floor; kept as ``comparison/misfit.json``."""
+    from dataclasses import replace
+
+    from splatsoil.commands._control import control
     from splatsoil.commands._crew import crew
     from splatsoil.files import plain, write_json
     from splatsoil.inverse.criticism.diagnosis import Bench, judge
@@ -236,7 +158,12 @@ def misfit(folder: RunFolder, model: Model, options: Options, report: Report) ->
     fit = folder.fit()
     experiment, simulate = experiment_of(folder, model, ())
     values = estimates(fit)
-    with folder.lock(), crew(folder, model, (), simulate):
+    with folder.lock(), crew(folder, model, (), simulate) as helper:
+        replays = (
+            control(folder, experiment, simulate, values, helper, lambda what: report(what, 0.0))
+            if with_replay
+            else None
+        )
         simulate.ahead(lambda ask: gather(experiment, ask, values, repeats=options.repeats))
         evidence = gather(
             experiment,
@@ -245,6 +172,8 @@ def misfit(folder: RunFolder, model: Model, options: Options, report: Report) ->
             repeats=options.repeats,
             progress=lambda share: report("simulations for the floor", share),
         )
+        if replays is not None:
+            evidence = replace(evidence, replays=replays())
         bench = Bench.of(experiment, evidence, options)
         found = judge(experiment, evidence, simulate, options=options, bench=bench)
         result = {**misfit_record(experiment, found), "fit": fit["name"]}
@@ -256,6 +185,7 @@ def confirmed(folder: RunFolder, model: Model, name: str, options: Options, repo
     """The model as it is and with one effect (by name, or from its file), each refitted on every other frame."""
     from dataclasses import replace
 
+    from splatsoil.commands._control import calibrated, control
     from splatsoil.commands._crew import crew
     from splatsoil.files import plain
     from splatsoil.inverse.criticism.afresh import look_afresh
@@ -268,7 +198,8 @@ def confirmed(folder: RunFolder, model: Model, name: str, options: Options, repo
     experiment, simulate = experiment_of(folder, model, (name,))
     (effect,) = (candidate.name for candidate in experiment.candidates)
     values = estimates(folder.fit())
-    with folder.lock(), crew(folder, model, (name,), simulate):
+    with folder.lock(), crew(folder, model, (name,), simulate) as helper:
+        replays = control(folder, experiment, simulate, values, helper, lambda what: report(what, 0.0))
         simulate.ahead(lambda ask: gather(experiment, ask, values, repeats=options.repeats))
         evidence = gather(
             experiment,
@@ -279,7 +210,8 @@ def confirmed(folder: RunFolder, model: Model, name: str, options: Options, repo
         )
         if effect in evidence.failed:
             raise RunError(f"{effect} cannot be added: {evidence.failed[effect]}")
-        evidence = replace(evidence, calibration=calibrated(folder, experiment, simulate, values))
+        calibration = calibrated(folder, experiment, simulate, values)
+        evidence = replace(evidence, replays=replays(), calibration=calibration)
         bench = Bench.of(experiment, evidence, options)
         left = (experiment.observed - evidence.mean)[experiment.seen]
         found = confirm(

@@ -23,7 +23,8 @@ WORTH_TRYING = 0.5
 
 @dataclass(frozen=True)
 class Config(FitOptions):
-    """All of it: check the set, reconstruct, fit, compare, write the report. Goes on where it was interrupted.
+    """All of it: check the set, reconstruct, fit, compare with the noise floor, write the report. Goes on where it was
+    interrupted.
 
     With --criticise also: diagnose, add the effect that is missing (or the nearest, where it explains half of the
     misfit), fit again, and so on, until the model is adequate, no effect of the library explains what is left, or the
@@ -53,6 +54,7 @@ def run(config: Config) -> int:
     from splatsoil.envs.devices import resolve_device
     from splatsoil.errors import ParameterError
     from splatsoil.files import plain, read_json
+    from splatsoil.inverse.criticism.diagnosis import Options
     from splatsoil.model import Model
     from splatsoil.quiet import hush
     from splatsoil.report import write_report
@@ -60,7 +62,7 @@ def run(config: Config) -> int:
     hush()
     if config.most_effects < 0:
         raise ParameterError(f"--most-effects: must be 0 or more, not {config.most_effects}")
-    stopped, diagnosis = "", None
+    stopped, diagnosis, misfit = "", None, None
     with stages(quiet=config.json) as begin:
         begin("check")("reading every image", 0.0)
         measurement, folder = stage.prepare(config)
@@ -72,11 +74,13 @@ def run(config: Config) -> int:
         if config.criticise:
             diagnosis, stopped = loop(folder, model, config.most_effects, begin)
             result, comparison = folder.fit(), read_json(folder.comparison / "comparison.json")
+        else:
+            misfit = criticism.misfit(folder, model, Options(), begin("floor"))
         begin("report")("drawing figures", 0.0)
         page = write_report(folder.path)
     if config.json:
         losses = {key: comparison[key] for key in ("loss", "total", "noise")}
-        extra: dict[str, Any] = {}
+        extra: dict[str, Any] = {} if misfit is None else {"misfit": {key: misfit[key] for key in compare.TOLD}}
         if diagnosis is not None:
             kept = ("verdict", "class", "sentences", "effects", "estimates", "simulations")
             extra = {
@@ -88,9 +92,9 @@ def run(config: Config) -> int:
         return 0
     fit.show(result, str(folder.path))
     compare.show(comparison, str(folder.comparison))
-    if diagnosis is None:
-        print(f"Is anything missing from the model? splatsoil diagnose {folder.path}")
-    else:
+    if misfit is not None:
+        compare.show_misfit(misfit, str(folder.path))
+    if diagnosis is not None:
         if entries := criticism.history(folder):
             add.show(entries)
         show(diagnosis)

@@ -15,6 +15,7 @@ from splatsoil.files import read_json
 FIT_FORMAT = "splatsoil-fit/1"
 COMPARISON_FORMAT = "splatsoil-comparison/1"
 DIAGNOSIS_FORMAT = "splatsoil-diagnosis/1"
+MISFIT_FORMAT = "splatsoil-misfit/1"
 POSTERIOR_FORMAT = "splatsoil-posterior/1"
 HISTORY_FORMAT = "splatsoil-history/1"
 
@@ -45,6 +46,7 @@ class RunData:
         fits: every finished fit by name.
         comparison: ``comparison/comparison.json`` when it belongs to the latest fit.
         before: the comparison of the model before the latest effect was added, from ``before/``.
+        misfit: ``comparison/misfit.json`` when it belongs to the latest fit: it against the noise floor.
         diagnosis: the latest fit's diagnosis.
         posterior: ``posterior.json`` when it was sampled for the latest fit.
         history: models tried by adding effects, the first one first.
@@ -58,6 +60,7 @@ class RunData:
     fits: Mapping[str, Mapping[str, Any]]
     comparison: Mapping[str, Any] | None
     before: Mapping[str, Any] | None
+    misfit: Mapping[str, Any] | None
     diagnosis: Mapping[str, Any] | None
     posterior: Mapping[str, Any] | None
     history: Sequence[Mapping[str, Any]]
@@ -90,6 +93,7 @@ def load(folder: str | Path) -> RunData:
         fits=fits or {str(fit["name"]): fit},
         comparison=_comparison(path / "comparison", fit),
         before=_before(path / "before"),
+        misfit=_misfit(path / "comparison" / "misfit.json", fit),
         diagnosis=_diagnosis(path / "diagnoses", fits or {str(fit["name"]): fit}, fit),
         posterior=_posterior(path / "posterior.json", fit),
         history=_history(path / "history.json"),
@@ -117,6 +121,14 @@ def _comparison(folder: Path, fit: Mapping[str, Any]) -> dict[str, Any] | None:
     data = _checked(folder / "comparison.json", COMPARISON_FORMAT)
     same = data["fit"] == fit["name"] and data["parameters"] == estimates(fit)
     return data if same else None
+
+
+def _misfit(path: Path, fit: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The latest fit against the noise floor, unless that was another estimate."""
+    if not path.is_file():
+        return None
+    data = _checked(path, MISFIT_FORMAT)
+    return data if data["fit"] == fit["name"] and data["values"] == estimates(fit) else None
 
 
 def _before(folder: Path) -> dict[str, Any] | None:

@@ -48,6 +48,7 @@ def render(data: RunData) -> str:
     environment.filters["model"] = words.model_name
     environment.filters["estimate"] = words.estimate
     comparison, diagnosis = data.comparison, data.diagnosis
+    judged = diagnosis or data.misfit
     pictures = None if comparison is None else _pictures(data.folder / "comparison", comparison)
     kinds = list(KINDS)
     if pictures is not None and data.before is not None:
@@ -64,9 +65,9 @@ def render(data: RunData) -> str:
         fit=data.fit,
         coarse=sum(step.get("level") == "coarse" for step in data.fit["history"]),
         force=words.force_sentence(data.fit),
-        answers=words.answers(data.fit, diagnosis),
-        fitted=words.fitted_sentence(data.fit, diagnosis),
-        residual=words.residual_sentence(comparison, diagnosed=diagnosis is not None),
+        answers=words.answers(data.fit, judged),
+        fitted=words.fitted_sentence(data.fit, judged),
+        residual=words.residual_sentence(comparison, diagnosed=judged is not None),
         ratio=words.ratio_to_noise(comparison),
         at_the_noise=words.AT_THE_NOISE,
         surrogates={name: Markup(figures.surrogate(data.fit, name)) for name in data.fit["parameters"]},
@@ -76,6 +77,7 @@ def render(data: RunData) -> str:
         titles={"predicted": "after"} if "before" in kinds else {},
         diagnosis=diagnosis,
         verdict=None if diagnosis is None else words.verdict(diagnosis),
+        standing=None if diagnosis is not None or data.misfit is None else words.misfit_verdict(data.misfit),
         maps=None if diagnosis is None else _maps(diagnosis),
         curves=None if diagnosis is None or not diagnosis.get("curves") else Markup(figures.curves(diagnosis)),
         posterior=None if data.posterior is None else _posterior(data.folder, data.posterior),

@@ -48,17 +48,22 @@ def symbol(unit: str) -> str:
     return {"deg": "°", "1": ""}.get(unit, f" {unit}")
 
 
-def weighed(fit: Mapping[str, Any], diagnosis: Mapping[str, Any] | None) -> Mapping[str, Any]:
-    """What a diagnosis that calls this very fit adequate tells of its parameters, by name; empty without one."""
-    if diagnosis is None or diagnosis["verdict"] != "adequate" or diagnosis["fit"] != fit["name"]:
+def weighed(fit: Mapping[str, Any], judged: Mapping[str, Any] | None) -> Mapping[str, Any]:
+    """What a diagnosis, or a comparison with the floor, that calls this very fit adequate tells of its parameters, by
+    name; empty without one."""
+    if (
+        judged is None
+        or judged["fit"] != fit["name"]
+        or not (judged.get("verdict") == "adequate" or judged.get("adequate"))
+    ):
         return {}
-    known: Mapping[str, Any] = diagnosis.get("estimates", {})
+    known: Mapping[str, Any] = judged.get("estimates", {})
     return known
 
 
-def answers(fit: Mapping[str, Any], diagnosis: Mapping[str, Any] | None = None) -> list[Answer]:
-    """The parameters: as fitted or, where a diagnosis calls the model adequate, with all of its floor weighed."""
-    out, better = [], weighed(fit, diagnosis)
+def answers(fit: Mapping[str, Any], judged: Mapping[str, Any] | None = None) -> list[Answer]:
+    """The parameters: as fitted, or with the floor weighed where a diagnosis or a comparison calls it adequate."""
+    out, better = [], weighed(fit, judged)
     for name, entry in fit["parameters"].items():
         value, std = with_std(entry["estimate"], entry["std"])
         plain = name.replace("_", " ")
@@ -82,9 +87,9 @@ def answers(fit: Mapping[str, Any], diagnosis: Mapping[str, Any] | None = None) 
     return out
 
 
-def fitted_sentence(fit: Mapping[str, Any], diagnosis: Mapping[str, Any] | None) -> str:
+def fitted_sentence(fit: Mapping[str, Any], judged: Mapping[str, Any] | None) -> str:
     """Where the answers are weighed ones: what they hold, and what the fit says by itself; otherwise empty."""
-    better = weighed(fit, diagnosis)
+    better = weighed(fit, judged)
     if not better:
         return ""
     alone = [
@@ -92,8 +97,8 @@ def fitted_sentence(fit: Mapping[str, Any], diagnosis: Mapping[str, Any] | None)
         for name, entry in fit["parameters"].items()
     ]
     return (
-        "Weighed by the diagnosis: the ± holds noise, chance and what numerics that weren't tried may do, not a bias "
-        f"that the model has everywhere. The fit by itself says: {', '.join(alone)}."
+        "Noise, chance and numerics weighed: the ± holds these, and what numerics that weren't tried may do, not a "
+        f"bias that the model has everywhere. The fit by itself says: {', '.join(alone)}."
     )
 
 
@@ -169,6 +174,13 @@ def verdict(diagnosis: Mapping[str, Any]) -> str:
             else (f"Something is missing that the library does not have; {nearest} comes nearest.")
         )
     return VERDICTS.get(str(diagnosis["verdict"]), str(diagnosis["verdict"]))
+
+
+def misfit_verdict(misfit: Mapping[str, Any]) -> str:
+    """A comparison with the floor in one line."""
+    if misfit["adequate"]:
+        return "Nothing stands above what noise, chance and numerics leave."
+    return "More is left than noise, chance and numerics leave: an effect may be missing."
 
 
 def steps(models: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -54,7 +54,9 @@ def command(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
 
 def essence(fit: dict[str, Any]) -> dict[str, Any]:
     """A fit without what the clock or the command added."""
-    out = {k: v for k, v in fit.items() if k not in ("seconds", "ok", "run", "report", "comparison", "history")}
+    out = {
+        k: v for k, v in fit.items() if k not in ("seconds", "ok", "run", "report", "comparison", "history", "misfit")
+    }
     return out | {"history": [{k: v for k, v in step.items() if k != "seconds"} for step in fit["history"]]}
 
 
@@ -87,7 +89,12 @@ def test_one_command_leads_from_photographs_to_the_report(place: Path, whole: di
         (c, f) for c in ("left", "right") for f in (30, 50)
     }
     assert comparison["noise"]["robust"] > 0.0
-    assert "friction angle" in (run / "report.html").read_text()
+    misfit = json.loads((run / "comparison" / "misfit.json").read_text())
+    assert misfit["adequate"] is whole["misfit"]["adequate"] and misfit["blocks"] == whole["misfit"]["blocks"]
+    assert ("friction_angle" in whole["misfit"]["estimates"]) is misfit["adequate"]
+    assert len(list((run / "features").glob("replay-*.npy"))) == 1 and not (run / "replay").exists()
+    page = (run / "report.html").read_text()
+    assert "friction angle" in page and "noise, chance and numerics leave" in page
     assert (run / "reconstruction" / "gaussians.ply").is_file()
     # The loss stored of an evaluation is that of a comparison: same scale, same name.
     assert comparison["total"]["robust"] == pytest.approx(whole["loss"], rel=0.3)

@@ -75,6 +75,15 @@ def test_a_force_that_counts_is_told_with_what_pictures_say_alone() -> None:
     assert "isn't counted" in words.force_sentence({**fit, "force": {"counted": False, "pictures_alone": alone}})
 
 
+def test_an_adequate_fit_is_quoted_as_a_comparison_with_the_floor_weighs_it() -> None:
+    entry = {"estimate": 36.0, "std": 0.5, "unit": "deg", "at_bound": None, "determined": True}
+    fit = {"name": "base", "parameters": {"friction_angle": entry}}
+    misfit = {"adequate": True, "fit": "base", "estimates": {"friction_angle": {"value": 37.1, "std": 3.2}}}
+    for judged, quoted in ((misfit, "37"), ({**misfit, "adequate": False, "estimates": {}}, "36.0"), (None, "36.0")):
+        assert words.answers(fit, judged)[0].value == quoted
+    assert "missing" in words.misfit_verdict({"adequate": False}) and "missing" not in words.misfit_verdict(misfit)
+
+
 @pytest.mark.parametrize(("of", "quoted"), [("base", "37"), ("base+tilt", "36.0")])
 def test_an_adequate_fit_is_quoted_as_its_own_diagnosis_weighs_it(of: str, quoted: str) -> None:
     entry = {"estimate": 36.0, "std": 0.5, "unit": "deg", "at_bound": None, "determined": True}

@@ -1,0 +1,107 @@
+"""What of a run is measured once, beside its simulations, and kept in ``features/``: the control, the calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from concurrent.futures import wait
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from splatsoil.commands._crew import Replay
+    from splatsoil.experiment.base import Calibration
+    from splatsoil.experiment.plow import PlowExperiment
+    from splatsoil.inverse.criticism.simulations import Simulations
+    from splatsoil.inverse.run_folder import RunFolder
+
+    FloatArray = npt.NDArray[np.float64]
+
+
+def replay_path(folder: RunFolder, simulate: Simulations) -> Path:
+    """Where the replay control of a model is kept. What pictures get wrong hardly hangs on a few degrees: one serves
+    all estimates of a model."""
+    from splatsoil.files import code_digest
+    from splatsoil.inverse.evaluations import digest
+
+    what = {**simulate.identity, "replay code": code_digest(("synthetic", "experiment/replay.py"))}
+    return folder.path / "features" / f"replay-{digest(what)[:24]}.npy"
+
+
+def replayed(
+    folder: RunFolder,
+    experiment: PlowExperiment,
+    simulate: Simulations,
+    values: Mapping[str, float],
+    say: Callable[[str], None],
+) -> FloatArray:
+    """The replay control (1, t, s), made once for a model and its values and kept in ``features/``."""
+    import io
+
+    import numpy as np
+
+    from splatsoil.experiment.replay import replay
+    from splatsoil.files import write_bytes
+
+    path = replay_path(folder, simulate)
+    if not path.is_file():
+        stream = io.BytesIO()
+        made = replay(experiment, values, folder.path / "replay", progress=lambda what, _: say(what))
+        np.save(stream, made, allow_pickle=False)
+        write_bytes(path, stream.getvalue())
+    return np.load(path, allow_pickle=False)[None]
+
+
+def control(
+    folder: RunFolder,
+    experiment: PlowExperiment,
+    simulate: Simulations,
+    values: Mapping[str, float],
+    helper: Replay,
+    say: Callable[[str], None],
+) -> Callable[[], FloatArray]:
+    """Have the replay control made: by a helper, or here and now where there is none. What it returns waits for it."""
+    making = None
+    if not replay_path(folder, simulate).is_file():
+        making = helper(values)
+        if making is None:
+            replayed(folder, experiment, simulate, values, say)
+
+    def result() -> FloatArray:
+        if making is not None:
+            say("a made-up bed through the whole chain")
+            wait([making])
+        # made here where no helper could
+        return replayed(folder, experiment, simulate, values, say)
+
+    return result
+
+
+def calibrated(
+    folder: RunFolder, experiment: PlowExperiment, simulate: Simulations, values: Mapping[str, float]
+) -> Calibration | None:
+    """What pictures say of cameras, light, clock and tool where soil plays no part, made once and kept in
+    ``features/``."""
+    import io
+
+    import numpy as np
+
+    from splatsoil.experiment.base import Calibration
+    from splatsoil.files import code_digest, write_bytes
+    from splatsoil.inverse.evaluations import digest
+
+    names = [p.name for c in experiment.candidates if c.kind == "observation" for p in c.parameters]
+    code = code_digest(("experiment/bands.py", "experiment/calibration.py", "experiment/calibration_bench.py"))
+    what = {**simulate.identity, "values": dict(values), "calibrated": names, "calibration code": code}
+    path = folder.path / "features" / f"calibration-{digest(what)[:24]}.npz"
+    if not path.is_file():
+        found = experiment.calibrate(values)
+        if found is None:
+            return None
+        stream = io.BytesIO()
+        np.savez(stream, names=np.array(found.names), estimate=found.estimate, covariance=found.covariance)
+        write_bytes(path, stream.getvalue())
+    with np.load(path, allow_pickle=False) as kept:
+        return Calibration(tuple(str(name) for name in kept["names"]), kept["estimate"], kept["covariance"])
