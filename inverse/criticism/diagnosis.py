@@ -14,7 +14,7 @@ from splatsoil.experiment.base import Calibration, Candidate, Experiment
 
 from .afresh import look_afresh, promising
 from .confirmation import Confirmation, confirm, on_its_own_floor, remainder_of
-from .estimates import Estimate, weighed
+from .estimates import Estimate, weighed, weighed_there
 from .evidence import Evidence, Vantage, gather
 from .floor import Floor, floor_of
 from .misfit import Block, Omnibus, blocks, left_over, omnibus, shares, smooth_basis
@@ -255,6 +255,10 @@ def judge(
             )
         except SimulationError as error:
             notes.append(f"the free strength could not be simulated: {error}")
+    if verdict == "adequate":
+        estimates = weighed_there(experiment, evidence, floor, bench.basis, simulate)
+    else:
+        estimates = weighed(experiment, evidence, floor, bench.basis)
     strokes = _advice(experiment, members, candidates, confirmations, told)
     return Diagnosis(
         verdict=verdict,
@@ -263,7 +267,7 @@ def judge(
         scores=scores,
         given=given,
         confusion=_pairs(scorer),
-        estimates=weighed(experiment, evidence, floor, bench.basis),
+        estimates=estimates,
         misfit=misfit,
         remainder=remainder,
         explained=gone,

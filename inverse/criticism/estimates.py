@@ -9,22 +9,27 @@ only the others is shown the one left out).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 from splatsoil.inverse.surrogate import UNINFORMED
 
+from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Experiment
 from splatsoil.parameters import Parameter
 
 from .dilution import informed
-from .evidence import Evidence, ignorance
-from .floor import Floor
+from .evidence import Evidence, distance, ignorance, look_from, pair_of
+from .floor import Floor, taken_up
 from .sight import Sight
+from .simulations import Simulations
 
 FloatArray = npt.NDArray[np.float64]
+
+MOST_STEPS = 3
+"""Of Gauss and Newton."""
 
 
 @dataclass(frozen=True)
@@ -106,6 +111,45 @@ def weighed(experiment: Experiment, evidence: Evidence, floor: Floor, basis: Flo
         told = Estimate(value, float(noise[k]), float(numerics[k]), p.unit)
         out[p.name] = replace(told, determined=told.std < UNINFORMED * ignorance(p, values[p.name]))
     return out
+
+
+def weighed_there(
+    experiment: Experiment, evidence: Evidence, floor: Floor, basis: FloatArray, simulate: Simulations
+) -> dict[str, Estimate]:
+    """The same, by further steps from where one leads, as long as that is farther than derivatives were measured over.
+
+    What soil does over ten degrees isn't what two of them promise. Chance and numerics count as they are at the fit.
+    """
+    found = weighed(experiment, evidence, floor, basis)
+    for _ in range(MOST_STEPS - 1):
+        values = {name: estimate.value for name, estimate in found.items()}
+        off = {p.name: abs(distance(p, evidence.values[p.name], values[p.name])) for p in experiment.parameters}
+        if all(off[name] <= evidence.widths[name] for name in off):
+            break
+        try:
+            evidence = _moved(experiment, evidence, values, simulate)
+        except SimulationError:
+            break
+        floor = replace(floor, parameters=taken_up(experiment, evidence))
+        found = weighed(experiment, evidence, floor, basis)
+    return found
+
+
+def _moved(experiment: Experiment, evidence: Evidence, values: Mapping[str, float], simulate: Simulations) -> Evidence:
+    """The evidence with its mean prediction and the parameters' derivatives at other values."""
+    seeds = range(1, 1 + len(evidence.repeats))
+
+    def look(ask: Callable[..., FloatArray]) -> Evidence:
+        def run(purpose: str, at: Mapping[str, float], effects: tuple[str, ...] = (), seed: int = 0) -> FloatArray:
+            return ask(at, effects=effects, seed=seed, purpose=f"weighing: {purpose}")
+
+        mean = np.mean([run(f"repeat {seed} of {len(seeds)}", values, seed=seed) for seed in seeds], axis=0)
+        found = look_from(experiment, values, (), run, pair_of(experiment, len(seeds)))
+        moved = {name: getattr(found, name) for name in ("values", "prediction", "slopes", "curves", "widths")}
+        return replace(evidence, mean=mean, doubts={**evidence.doubts, **found.doubts}, **moved)
+
+    simulate.ahead(look)
+    return look(simulate)
 
 
 def prior(parameters: Sequence[Parameter], values: Mapping[str, float]) -> FloatArray:

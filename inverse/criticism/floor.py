@@ -13,7 +13,7 @@ from splatsoil.experiment.base import Experiment
 from splatsoil.experiment.features import Layout
 
 from .dilution import reliable
-from .evidence import Evidence, ignorance
+from .evidence import Evidence, Vantage, ignorance
 from .noise import Noise, Part, correlated, estimate, extra_noise, independent
 
 FloatArray = npt.NDArray[np.float64]
@@ -74,10 +74,7 @@ def floor_of(experiment: Experiment, evidence: Evidence) -> Floor:
     its own chance is a sample of what numerics that weren't tried would leave, and goes into the noise.
     """
     layout, seen = experiment.layout, experiment.seen
-    prior = {p.name: p for p in experiment.parameters}
-    slopes = [ignorance(prior[name], evidence.values[name]) * table for name, table in evidence.slopes.items()]
-    slopes += [(3.0 * evidence.widths[name]) ** 2 * table for name, table in evidence.curves.items()]
-    parameters = _columns(slopes, seen)
+    parameters = taken_up(experiment, evidence)
     parts = {"instruments": independent(experiment.sensor, experiment.sensor_memory)}
     runs = len(evidence.repeats)
     acting = [(direction, evidence.doubt(name, direction)) for name, direction in evidence.directions.items()]
@@ -106,6 +103,14 @@ def floor_of(experiment: Experiment, evidence: Evidence) -> Floor:
         noise, single = noise.plus(averaged * columns), single.plus(alone * columns)
     nuisance = [NUMERICS_PRIOR * _columns(patterns, seen), _columns(experiment.systematic, seen)]
     return Floor(noise, single, np.concatenate(nuisance, axis=1), len(patterns), parameters, directions, parts)
+
+
+def taken_up(experiment: Experiment, vantage: Vantage) -> FloatArray:
+    """(n, k) what the model's parameters can take up: `Floor.parameters`."""
+    prior = {p.name: p for p in experiment.parameters}
+    slopes = [ignorance(prior[name], vantage.values[name]) * table for name, table in vantage.slopes.items()]
+    slopes += [(3.0 * vantage.widths[name]) ** 2 * table for name, table in vantage.curves.items()]
+    return _columns(slopes, experiment.seen)
 
 
 def _instruments(experiment: Experiment, evidence: Evidence, known: Noise) -> Part:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from splatsoil.benchmarks.hidden_effects import emulated, fitted, outside
 from splatsoil.inverse.criticism.diagnosis import Bench, Options
-from splatsoil.inverse.criticism.estimates import untried, weighed
+from splatsoil.inverse.criticism.estimates import untried, weighed, weighed_there
 from splatsoil.inverse.criticism.evidence import gather
 from splatsoil.inverse.criticism.floor import floor_of
 from splatsoil.inverse.criticism.misfit import smooth_basis
@@ -71,6 +71,30 @@ def test_noise_is_that_of_least_squares_that_knows_the_covariance() -> None:
     (angle,) = experiment.parameters
     narrow = replace(experiment, parameters=(replace(angle, lower=-told.noise, upper=told.noise),))
     assert not weighed(narrow, evidence, floor, smooth_basis(experiment.layout, floor.noise))["angle"].determined
+
+
+def test_steps_go_on_where_one_would_leave_what_derivatives_were_measured_over() -> None:
+    """Soil that answers less and less to a larger angle: from a fit eight degrees off one step overshoots."""
+    once, there = [], []
+    for world in range(8):
+        made = replace(emulated(world), patterns={})
+        made = replace(made, curves={**made.curves, "angle": -0.08 * made.slopes["angle"]})
+        experiment = replace(made, observed=made.measured({"angle": 0.0}, [world, 99]))
+        simulate = Simulations(experiment)
+        evidence = gather(experiment, simulate, {"angle": 8.0})
+        floor = floor_of(experiment, evidence)
+        basis = smooth_basis(experiment.layout, floor.noise)
+        once.append(weighed(experiment, evidence, floor, basis)["angle"])
+        asked = simulate.asked
+        there.append(weighed_there(experiment, evidence, floor, basis, simulate)["angle"])
+        assert simulate.asked > asked
+        near = gather(experiment, simulate, {"angle": 0.0})
+        asked, own = simulate.asked, floor_of(experiment, near)
+        assert weighed_there(experiment, near, own, basis, simulate) == weighed(experiment, near, own, basis)
+        assert simulate.asked == asked
+    errors = {name: np.array([e.value for e in found]) for name, found in (("once", once), ("there", there))}
+    assert rms(errors["once"]) > 4.0
+    assert rms(errors["there"]) < 1.0 and rms(errors["there"] / [e.std for e in there]) < 2.0
 
 
 def test_each_way_left_out_is_what_the_estimator_of_the_others_makes_of_it() -> None:
