@@ -205,6 +205,7 @@ def run(count: int = 40, *, seed: int = 1, repeats: int = 4, only: str = "") -> 
     series("outside the library, 2 × noise", None, 2.0)
     series("control: the truth taken out of the library, 4 ×", single(physics, 4.0), drop=True)
     series("control: effect 1 there twice, 4 ×", single(["effect 1"], 4.0), twin=True)
+    series("control: the truth taken out of the library, 2 ×", single(physics, 2.0), drop=True)
     return {
         "count": count,
         "seed": seed,

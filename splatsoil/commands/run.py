@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -52,7 +53,7 @@ def run(config: Config) -> int:
     from splatsoil.commands._diagnosis_table import show
     from splatsoil.commands._progress import stages
     from splatsoil.envs.devices import resolve_device
-    from splatsoil.errors import ParameterError
+    from splatsoil.errors import ParameterError, SplatsoilError
     from splatsoil.files import plain, read_json
     from splatsoil.inverse.criticism.diagnosis import Options
     from splatsoil.model import Model
@@ -62,7 +63,7 @@ def run(config: Config) -> int:
     hush()
     if config.most_effects < 0:
         raise ParameterError(f"--most-effects: must be 0 or more, not {config.most_effects}")
-    stopped, diagnosis, misfit = "", None, None
+    stopped, diagnosis, misfit, unknown = "", None, None, ""
     with stages(quiet=config.json) as begin:
         begin("check")("reading every image", 0.0)
         measurement, folder = stage.prepare(config)
@@ -75,9 +76,14 @@ def run(config: Config) -> int:
             diagnosis, stopped = loop(folder, model, config.most_effects, begin)
             result, comparison = folder.fit(), read_json(folder.comparison / "comparison.json")
         else:
-            misfit = criticism.misfit(folder, model, Options(), begin("floor"))
+            try:
+                misfit = criticism.misfit(folder, model, Options(), begin("floor"))
+            except SplatsoilError as error:  # the fit stands all the same
+                unknown = f"the noise floor isn't known: {error}"
         begin("report")("drawing figures", 0.0)
         page = write_report(folder.path)
+    if unknown:
+        print(unknown, file=sys.stderr)
     if config.json:
         losses = {key: comparison[key] for key in ("loss", "total", "noise")}
         extra: dict[str, Any] = {} if misfit is None else {"misfit": {key: misfit[key] for key in compare.TOLD}}

@@ -19,6 +19,7 @@ from typing import Any
 import pytest
 
 from splatsoil import cli
+from splatsoil.errors import SimulationError
 
 BUDGET = 3
 
@@ -98,6 +99,21 @@ def test_one_command_leads_from_photographs_to_the_report(place: Path, whole: di
     assert (run / "reconstruction" / "gaussians.ply").is_file()
     # The loss stored of an evaluation is that of a comparison: same scale, same name.
     assert comparison["total"]["robust"] == pytest.approx(whole["loss"], rel=0.3)
+
+
+@pytest.mark.slow
+def test_a_floor_that_cannot_be_told_costs_no_report(
+    place: Path, whole: dict[str, Any], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*args: object, **options: object) -> None:
+        raise SimulationError("soil left the bin")
+
+    monkeypatch.setattr("splatsoil.commands._criticism.misfit", fails)
+    (place / "whole" / "report.html").unlink()
+    words = ["run", str(place / "set"), "--preset", "tiny", "--budget", str(BUDGET), "--run", str(place / "whole")]
+    assert cli.main(words) == 0
+    assert "the noise floor isn't known: soil left the bin" in capsys.readouterr().err
+    assert (place / "whole" / "report.html").is_file()
 
 
 @pytest.mark.slow
