@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+import weakref
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -17,7 +18,7 @@ from splatsoil.mpm import Resolution, Trajectory, frames_around, simulate
 from splatsoil.observation import Observation
 from splatsoil.parameters import Parameter, ParameterSpace
 from splatsoil.reconstruction import Reconstruction, fill
-from splatsoil.scene import Scene
+from splatsoil.scene import Posed, Scene
 from splatsoil.soil.effect import Effect
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
@@ -45,6 +46,20 @@ class Prediction:
     images: Mapping[tuple[str, int], Image]
     trajectory: Trajectory
     seconds: Mapping[str, float]
+
+
+class _Poses:
+    """Posed scenes of the trajectory drawn last: what cameras alone report otherwise looks at the same ones."""
+
+    def __init__(self) -> None:
+        self._of: tuple[weakref.ref[Trajectory], object] | None = None
+        self._made: dict[int, Posed] = {}
+
+    def of(self, trajectory: Trajectory, way: object) -> dict[int, Posed]:
+        """By frame; none yet of another trajectory, or of one posed in another way."""
+        if self._of is None or self._of[0]() is not trajectory or self._of[1] != way:
+            self._of, self._made = (weakref.ref(trajectory), way), {}
+        return self._made
 
 
 class Model:
@@ -83,7 +98,7 @@ class Model:
         if unknown or not self.frames:
             raise ParameterError(f"frames {unknown or 'none'} are not in the video; it has {measured}")
         self._scene = lru_cache(maxsize=SCENES_KEPT)(self._build_scene)
-
+        self._poses = _Poses()
         self.recorded = self._recorded_frames()
 
     def variant(
@@ -111,9 +126,9 @@ class Model:
         )
         other.resolution = resolution or self.resolution
         if other.resolution.spacing == self.resolution.spacing:
-            other._scene = self._scene
+            other._scene, other._poses = self._scene, self._poses
         if scene is not None:
-            other._scene = lru_cache(maxsize=SCENES_KEPT)(lambda seed: scene)
+            other._scene, other._poses = lru_cache(maxsize=SCENES_KEPT)(lambda seed: scene), _Poses()
         return other
 
     @property
@@ -223,12 +238,14 @@ class Model:
             for k, (name, camera) in enumerate(self.measurement.cameras.items())
         }
         images: dict[tuple[str, int], Image] = {}
+        posed = self._poses.of(trajectory, (seed, albedo, rounding, observation.of_scene))
         for frame in self.frames:
-            moment = frame + observation.time_offset * rate
-            tool = observation.tool(motion.pose(moment / rate))
-            posed = scene.pose(*trajectory.at(moment), tool)
+            if frame not in posed:
+                moment = frame + observation.time_offset * rate
+                tool = observation.tool(motion.pose(moment / rate))
+                posed[frame] = scene.pose(*trajectory.at(moment), tool)
             for name, camera in cameras.items():
-                images[name, frame] = observation.image(scene.picture(posed, camera), frame / rate)
+                images[name, frame] = observation.image(scene.picture(posed[frame], camera), frame / rate)
         return images
 
     def predict(

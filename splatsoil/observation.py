@@ -98,6 +98,11 @@ class Observation:
         return turn @ pose[0], np.asarray(pose[1]) + np.array(self.tool_shift)
 
     @property
+    def of_scene(self) -> Observation:
+        """What of it changes the scene that cameras look at: the moment, the light, the tool's place."""
+        return replace(self, cameras=(), gain=1.0, drift=0.0, offset=0.0, blur=0.0)
+
+    @property
     def changes_light(self) -> bool:
         """Whether sun and sky differ from those estimated."""
         return bool(self.sun_azimuth or self.sun_elevation or self.sky_share)
