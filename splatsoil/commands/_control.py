@@ -23,10 +23,13 @@ if TYPE_CHECKING:
 def replay_path(folder: RunFolder, simulate: Simulations) -> Path:
     """Where the replay control of a model is kept. What pictures get wrong hardly hangs on a few degrees: one serves
     all estimates of a model."""
+    from splatsoil.commands._criticism import code_of
     from splatsoil.files import code_digest
     from splatsoil.inverse.evaluations import digest
 
-    what = {**simulate.identity, "replay code": code_digest(("synthetic", "experiment/replay.py"))}
+    # Candidates, a user's own among them, are no part of it.
+    own = {"code": code_of(folder.fit()["setup"]["effects"])}
+    what = {**simulate.identity, **own, "replay code": code_digest(("synthetic", "experiment/replay.py"))}
     return folder.path / "features" / f"replay-{digest(what)[:24]}.npy"
 
 

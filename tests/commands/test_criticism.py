@@ -61,7 +61,7 @@ def place(plow_damp: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 def test_a_run_is_compared_diagnosed_and_added_to(place: Path, repository: Path) -> None:
-    compared = command("compare", "run", "--repeats", "2", cwd=place)
+    compared = command("compare", "run", "--repeats", "2", "--no-replay", cwd=place)
     assert {"adequate", "misfit", "blocks", "floor"} <= compared["misfit"].keys()
     assert {"stage", "region", "channel", "ratio", "p"} <= compared["misfit"]["blocks"][0].keys()
 
@@ -94,6 +94,9 @@ def test_a_run_is_compared_diagnosed_and_added_to(place: Path, repository: Path)
     assert kept["effects"] == first["effects"]
     again = command(*words, cwd=place)
     assert again["simulated_now"] == 0, "everything was kept"
+    judged = command("compare", "run", "--repeats", "2", cwd=place)
+    assert len(list((place / "run" / "features").glob("replay-*.npy"))) == 1, "one control for all candidates"
+    assert judged["misfit"]["floor"]["reconstruction"] != compared["misfit"]["floor"]["reconstruction"]
     assert again["effects"] == first["effects"]
 
     added = command("add", "run", "cohesion", "--budget", "3", "--repeats", "2", cwd=place)
