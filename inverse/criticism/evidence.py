@@ -167,14 +167,16 @@ def other_numerics(experiment: Experiment, ask: Callable[[str, int], FloatArray]
 
     Args:
         experiment: whose numerics are tried; those that can't be simulated are left out.
-        ask: called with a name, or "" for the usual way, and a seed.
+        ask: called with a name, or "" for the usual way, and a seed; keeps what it has answered.
         pair: of seeds, or one.
     """
-    middles = {seed: ask("", seed) for seed in pair}
     means, doubts = dict[str, FloatArray](), dict[str, FloatArray]()
-    for name in experiment.numerics:
+    # Other drawings of a simulation while it is at hand, before another seed's.
+    for name in (*experiment.redrawn, *(n for n in experiment.numerics if n not in experiment.redrawn)):
+        seeds = pair[:1] if name in experiment.redrawn else pair
+        middles = [ask("", seed) for seed in seeds]
         try:
-            changes = [ask(name, seed) - middles[seed] for seed in (pair[:1] if name in experiment.redrawn else pair)]
+            changes = [ask(name, seed) - middle for seed, middle in zip(seeds, middles, strict=True)]
         except SimulationError:
             continue
         means[name] = np.mean(changes, axis=0)

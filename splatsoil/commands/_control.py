@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import wait
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,10 +20,17 @@ if TYPE_CHECKING:
     FloatArray = npt.NDArray[np.float64]
 
 
+def code_of(effects: Iterable[str]) -> str:
+    """Digest of the code that decides features, users' own effects in it."""
+    from splatsoil.files import FORWARD, code_digest
+
+    own = [name for name in effects if name.endswith(".py")]
+    return code_digest((*FORWARD, "observation.py", "experiment/plow.py"), own)
+
+
 def replay_path(folder: RunFolder, simulate: Simulations) -> Path:
     """Where the replay control of a model is kept. What pictures get wrong hardly hangs on a few degrees: one serves
     all estimates of a model."""
-    from splatsoil.commands._criticism import code_of
     from splatsoil.files import code_digest
     from splatsoil.inverse.evaluations import digest
 

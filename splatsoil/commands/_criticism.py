@@ -39,6 +39,7 @@ def experiment_of(
         ParameterError: an effect that is unknown or on already.
     """
     from splatsoil import __version__
+    from splatsoil.commands._control import code_of
     from splatsoil.commands._stages import digest_of
     from splatsoil.experiment.plow import PlowExperiment
     from splatsoil.inverse.criticism.simulations import Simulations
@@ -62,14 +63,6 @@ def experiment_of(
         "layout": list(experiment.layout.shape),
     }
     return experiment, Simulations(experiment, folder.path / "features", identity)
-
-
-def code_of(effects: Iterable[str]) -> str:
-    """Digest of the code that decides features, users' own effects in it."""
-    from splatsoil.files import FORWARD, code_digest
-
-    own = [name for name in effects if name.endswith(".py")]
-    return code_digest((*FORWARD, "observation.py", "experiment/plow.py"), own)
 
 
 def diagnosed(
@@ -272,6 +265,7 @@ def keep_pictures(folder: RunFolder) -> None:
 
 def latest_diagnosis(folder: RunFolder, effect: str) -> dict[str, Any] | None:
     """The diagnosis of the latest fit by the code as it is, an effect or its file among it, if there is one."""
+    from splatsoil.commands._control import code_of
     from splatsoil.files import read_json
     from splatsoil.report.data import estimates
 

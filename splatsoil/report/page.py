@@ -48,7 +48,9 @@ def render(data: RunData) -> str:
     environment.filters["model"] = words.model_name
     environment.filters["estimate"] = words.estimate
     comparison, diagnosis = data.comparison, data.diagnosis
-    judged = diagnosis or data.misfit
+    # A diagnosis may be of the model that the latest one was made from.
+    own = diagnosis is not None and diagnosis["fit"] == data.fit["name"]
+    judged = diagnosis if own or data.misfit is None else data.misfit
     pictures = None if comparison is None else _pictures(data.folder / "comparison", comparison)
     kinds = list(KINDS)
     if pictures is not None and data.before is not None:

@@ -11,7 +11,7 @@ from typing import Any, cast
 import pytest
 from splatsoil.inverse.criticism.diagnosis import Options
 
-from splatsoil.commands import _criticism, _stages
+from splatsoil.commands import _control, _criticism, _stages
 from splatsoil.commands._options import FitOptions
 from splatsoil.commands.add import added
 from splatsoil.files import write_json
@@ -127,7 +127,7 @@ def test_a_diagnosis_by_other_code_is_none(tmp_path: Path) -> None:
     fit = {"name": "base", "setup": {"effects": []}, "parameters": {"friction_angle": {"estimate": 30.0}}}
     folder = cast(Any, SimpleNamespace(fit=lambda: fit, path=tmp_path))
     assert _criticism.latest_diagnosis(folder, "cohesion") is None
-    data = {"values": {"friction_angle": 30.0}, "code": _criticism.code_of(())}
+    data = {"values": {"friction_angle": 30.0}, "code": _control.code_of(())}
     for change, known in ({}, True), ({"code": "of yesterday"}, False), ({"values": {"friction_angle": 31.0}}, False):
         write_json(tmp_path / "diagnoses" / "base.json", {**data, **change})
         assert (_criticism.latest_diagnosis(folder, "cohesion") is not None) is known

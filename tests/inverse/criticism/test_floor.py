@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from splatsoil.inverse.criticism.evidence import Evidence
+from splatsoil.inverse.criticism.evidence import Evidence, other_numerics
 from splatsoil.inverse.criticism.floor import floor_of
 
+from splatsoil.errors import SimulationError
 from splatsoil.experiment.features import Layout, Site
 from splatsoil.parameters import Parameter
 
@@ -117,3 +118,21 @@ def test_chance_in_what_other_numerics_change_is_not_counted_again(true: float) 
     ]
     assert size[0] == pytest.approx(np.hypot(true, 0.9 / np.sqrt(2.0)), rel=0.1)
     assert size[1] == pytest.approx(true, rel=0.1, abs=0.2)
+
+
+def test_other_numerics_are_told_by_two_seeds_and_other_drawings_by_the_one_at_hand() -> None:
+    """By name and seed: a table is its number, and every asked one is noted."""
+    tables = {("", 0): 1.0, ("", 5): 2.0, ("drawn", 0): 4.0, ("grid", 0): 11.0, ("grid", 5): 18.0}
+    asked: list[tuple[str, int]] = []
+
+    def ask(name: str, seed: int) -> np.ndarray:
+        asked.append((name, seed))
+        if name == "broken":
+            raise SimulationError("soil left the bin")
+        return np.array(tables[name, seed])
+
+    told: Any = SimpleNamespace(numerics=("grid", "broken", "drawn"), redrawn=("drawn",))
+    means, doubts = other_numerics(told, ask, (0, 5))
+    assert means == {"drawn": 3.0, "grid": 13.0} and doubts == {"grid": -3.0}
+    assert asked.index(("drawn", 0)) < asked.index(("", 5)) and ("drawn", 5) not in asked
+    assert other_numerics(told, ask, (0,)) == ({"drawn": 3.0, "grid": 10.0}, {})
