@@ -232,6 +232,26 @@ def test_a_comparison_at_another_estimate_is_not_shown(tmp_path: Path) -> None:
     assert "has not been compared" in Page(write_report(tmp_path).read_text()).text
 
 
+def test_the_noise_floor_judges_the_estimate_that_it_was_told_at(tmp_path: Path) -> None:
+    make_run(tmp_path)
+    misfit = {
+        "format": "splatsoil-misfit/1",
+        "adequate": True,
+        "fit": "base",
+        "values": {"friction_angle": 35.62},
+        "estimates": {"friction_angle": {"value": 33.21, "std": 1.64, "determined": True}},
+    }
+    for change, verdict, quoted in (
+        ({}, "Nothing stands above", "33.2 ± 1.6°"),
+        ({"adequate": False, "estimates": {}}, "an effect may be missing", "35.6 ± 0.8°"),
+        ({"values": {"friction_angle": 33.0}}, "", "35.6 ± 0.8°"),
+    ):
+        write_json(tmp_path / "comparison" / "misfit.json", {**misfit, **change})
+        text = " ".join(Page(write_report(tmp_path).read_text()).text.split())
+        assert quoted in text and verdict in text
+        assert ("noise, chance and numerics leave" in text) is bool(verdict)
+
+
 def test_several_models_are_set_side_by_side(tmp_path: Path) -> None:
     make_run(tmp_path)
     write_json(tmp_path / "fits" / "cohesion.json", fit("cohesion", loss=0.05))
