@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from splatsoil.envs.together import simulate_together
 from splatsoil.inverse.bayesopt import PAPER, BayesianOptimiser, Told
 from splatsoil.inverse.emulator import FEWEST
 from splatsoil.inverse.posterior import Data, sample_posterior
@@ -24,7 +23,7 @@ from splatsoil.errors import SimulationError
 from splatsoil.files import write_bytes, write_json
 from splatsoil.measurement import Measurement
 from splatsoil.model import Model
-from splatsoil.mpm import PRESETS, Preset, Resolution
+from splatsoil.mpm import PRESETS, Preset, Resolution, simulate_together
 from splatsoil.parameters import ParameterSpace
 from splatsoil.reconstruction import Reconstruction, reconstruct
 from splatsoil.soil.settings import FRICTION_ANGLE

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-
 from splatsoil.errors import ParameterError
 
 
@@ -21,11 +19,3 @@ def resolve_device(name: str) -> str:
     if name not in known:
         raise ParameterError(f"there is no device {name!r} here; choose one of auto, {', '.join(known)}")
     return name
-
-
-def cores() -> int:
-    """How many cores of the CPU this process may use."""
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:  # not every system knows affinities
-        return os.cpu_count() or 1

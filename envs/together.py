@@ -4,30 +4,21 @@ from __future__ import annotations
 
 import math
 import time
-from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
-from threading import Event
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from splatsoil.errors import SimulationError
 
-from .devices import cores
 from .problem import Evaluation, Problem
 
 if TYPE_CHECKING:
-    from splatsoil.mpm import Trajectory
-
     from .measured import MeasuredProblem
     from .synthetic import SyntheticProblem
 
 Job = tuple[Mapping[str, float], int]
-_BUILT: set[tuple[str, ...]] = set()
-"""Combinations of effects whose kernels were built in this process."""
 
 
 def attempt(problem: Problem, parameters: Mapping[str, float], seed: int) -> Evaluation:
@@ -64,6 +55,8 @@ def evaluate_together(problems: Sequence[Problem], jobs: Sequence[Job]) -> list[
 
 
 def _synthetic(problems: Sequence[SyntheticProblem], jobs: Sequence[Job]) -> list[Evaluation]:
+    from splatsoil.mpm import simulate_together
+
     first = problems[0]
     for problem in problems:
         problem.share(first)
@@ -89,6 +82,8 @@ def _synthetic(problems: Sequence[SyntheticProblem], jobs: Sequence[Job]) -> lis
 
 
 def _measured(problem: MeasuredProblem, jobs: Sequence[Job]) -> list[Evaluation]:
+    from splatsoil.mpm import simulate_together
+
     began = time.perf_counter()
     model = problem.model
     particles = [model.particles(seed) for _, seed in jobs]
@@ -101,76 +96,3 @@ def _measured(problem: MeasuredProblem, jobs: Sequence[Job]) -> list[Evaluation]
             out.append(problem.judge(model.draw(trajectory, seed, values), trajectory.force))
     seconds = (time.perf_counter() - began) / len(out)
     return [replace(evaluation, seconds=seconds) for evaluation in out]
-
-
-def simulate_together(
-    measurement: Any,
-    particles: Sequence[Any],
-    values: Sequence[Mapping[str, float]],
-    world: Any,
-    progress: Callable[[int, int], None] | None = None,
-) -> list[Trajectory | SimulationError]:
-    """Trajectories of simulations that share a scene: on a GPU one batch, on a CPU one thread for each core's share.
-
-    Args:
-        measurement: bed, tool and motion.
-        particles: (n, 3) for each simulation; those with the same n go together.
-        values: parameters by name for each.
-        world: has ``law``, ``resolution``, ``device`` and the ``recorded`` frames.
-        progress: called with (frame, last frame) of the first one.
-    """
-    from splatsoil.mpm import simulate
-
-    out: list[Trajectory | SimulationError] = [SimulationError("not run")] * len(values)
-    stopped = Event()
-
-    def told(job: int, frame: int, last: int) -> None:
-        if stopped.is_set():
-            raise SimulationError("interrupted")
-        if job == 0 and progress is not None:
-            progress(frame, last)
-
-    def run(rows: Sequence[int]) -> None:
-        stack = np.stack([particles[k] for k in rows])
-        try:
-            found: Sequence[Trajectory | SimulationError] = simulate(
-                measurement,
-                stack,
-                [values[k] for k in rows],
-                law=world.law,
-                resolution=world.resolution,
-                frames=world.recorded,
-                device=world.device,
-                progress=partial(told, rows[0]),
-            )
-        except SimulationError as error:
-            if len(rows) > 1:
-                # One that fails takes its batch along: the others deserve a run of their own.
-                for row in rows:
-                    run([row])
-                return
-            found = [error]
-        for row, trajectory in zip(rows, found, strict=True):
-            out[row] = trajectory
-
-    groups: dict[int, list[int]] = defaultdict(list)
-    for k, x in enumerate(particles):
-        groups[len(x)].append(k)
-    if world.device != "cpu":
-        for rows in groups.values():
-            run(rows)
-        return out
-    # Warp's CPU kernels are serial and let other Python threads run meanwhile. The first simulation of a kind builds
-    # its kernels, which is no work for two threads at once.
-    singles = [k for rows in groups.values() for k in rows]
-    kind = tuple(effect.name for effect in world.law.effects)
-    if kind not in _BUILT:
-        run([singles.pop(0)])
-        _BUILT.add(kind)
-    with ThreadPoolExecutor(cores()) as threads:
-        try:
-            list(threads.map(run, [[k] for k in singles]))
-        except BaseException:
-            stopped.set()  # whoever interrupts this doesn't want to wait for the others
-            raise
-    return out

@@ -10,7 +10,8 @@ from pathlib import Path
 
 from splatsoil.benchmarks._common import sources, stamp
 from splatsoil.benchmarks._validation.costs import processor
-from splatsoil.envs.devices import cores
+
+from splatsoil.threads import cores
 
 PACKAGES = ("numpy", "torch", "warp-lang", "newton", "taichi", "gsplat")
 

@@ -12,9 +12,9 @@ import warp as wp
 from splatsoil.benchmarks._speed.clock import repeated, side_by_side, timed
 from splatsoil.benchmarks._speed.rows import Group, Row, Sample, had, judged, missing
 from splatsoil.benchmarks._speed.scenes import Plough, height_error, paper_scene
-from splatsoil.envs.devices import cores
 
 from splatsoil.errors import SimulationError
+from splatsoil.threads import cores
 
 RATE = 10.0
 """M particle-steps/s wanted of two cores."""

@@ -15,12 +15,12 @@ import torch
 from splatsoil.benchmarks._speed.clock import on_threads, repeated
 from splatsoil.benchmarks._speed.rows import Group, Row, Sample, at_least, had, judged
 from splatsoil.benchmarks.rasteriser import LEAVES, scene
-from splatsoil.envs.devices import cores
 
 from splatsoil.measurement import Camera, Measurement
 from splatsoil.reconstruction import Reconstruction, reconstruct
 from splatsoil.reconstruction.presets import PRESETS, preset_named
 from splatsoil.splats import Gaussians, rasterise, reference
+from splatsoil.threads import cores
 
 COUNT, SIZE = 20_000, 256
 BOTH_MS = 45.0

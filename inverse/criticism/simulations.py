@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -32,11 +32,23 @@ class Helpers:
 
     Attributes:
         count: of them.
-        submit: a simulation's keyword arguments to a future that is done when it is kept, or could not be made.
+        submit: simulations' keyword arguments to a future that is done when they are kept, or could not be made.
+        together: how many simulations are best made by one at a time.
+        prepare: has this process do for simulations what is best done for all of them at once.
     """
 
     count: int
-    submit: Callable[[Mapping[str, Any]], Future[Any]]
+    submit: Callable[[Sequence[Mapping[str, Any]]], Future[Any]]
+    together: int = 1
+    prepare: Callable[[Sequence[Mapping[str, Any]]], object] = len
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """Simulations that a helper will make, unless this process is there first."""
+
+    jobs: Mapping[str, Mapping[str, Any]]
+    future: Future[Any]
 
 
 class Simulations:
@@ -61,7 +73,7 @@ class Simulations:
         self.made = 0
         """Simulations made, not read."""
         self._tables: dict[str, Future[FloatArray]] = {}
-        self._planned: dict[str, Future[Any]] = {}
+        self._planned: dict[str, _Plan] = {}
         self._helpers: Helpers | None = None
         # One simulation at a time in this process, whatever the number of its threads.
         self._here, self._guard = Lock(), Lock()
@@ -124,10 +136,22 @@ class Simulations:
             return np.zeros(self.experiment.layout.shape)
 
         work(noted)
-        for what in reversed(asked):
+        shares: list[dict[str, dict[str, Any]]] = []
+        latest: dict[object, dict[str, dict[str, Any]]] = {}
+        seen = {*self._tables, *self._planned}
+        for what in asked:
             key = self._key(what)
-            if key not in self._tables and key not in self._planned and self._kept(key) is None:
-                self._planned[key] = self._helpers.submit(what)
+            if key in seen or self._kept(key) is not None:
+                continue
+            seen.add(key)
+            kind = (*_names(what["effects"]), what["numerics"])
+            if kind not in latest or len(latest[kind]) == self._helpers.together:
+                latest[kind] = {}
+                shares.append(latest[kind])
+            latest[kind][key] = what
+        for jobs in reversed(shares):
+            plan = _Plan(jobs, self._helpers.submit(list(jobs.values())))
+            self._planned |= dict.fromkeys(jobs, plan)
 
     def side_by_side(self, jobs: Iterable[Callable[[], T]]) -> list[T]:
         """Results of jobs that wait for simulations, in order, as many at a time as there are processes."""
@@ -143,8 +167,7 @@ class Simulations:
             pool.shutdown(cancel_futures=True)
 
     def _key(self, what: Mapping[str, Any]) -> str:
-        names = sorted(e if isinstance(e, str) else e.identity for e in what["effects"])
-        return digest({**self.identity, **what, "effects": names})
+        return digest({**self.identity, **what, "effects": _names(what["effects"])})
 
     def _path(self, key: str) -> Path | None:
         return None if self.folder is None else self.folder / f"{key[:32]}.npy"
@@ -160,9 +183,9 @@ class Simulations:
         return table if table.shape == self.experiment.layout.shape else None
 
     def _find(self, key: str, what: Mapping[str, Any], purpose: str) -> FloatArray:
-        planned = self._planned.pop(key, None)
+        plan = self._planned.pop(key, None)
         kept = self._kept(key)
-        if kept is not None and planned is None:
+        if kept is not None and plan is None:
             return kept
         if self._stopped:
             raise CancelledError
@@ -170,16 +193,29 @@ class Simulations:
             self.made += 1
         if self.told is not None:
             self.told(purpose)
-        if planned is not None and not planned.cancel():
-            wait([planned])
-            kept = self._kept(key)
-        return self._make(key, what) if kept is None else kept
+        jobs: Sequence[Mapping[str, Any]] = ()
+        if plan is not None:
+            if plan.future.cancel():
+                # all of it is this process's now
+                jobs = [job for other, job in plan.jobs.items() if other not in self._tables or other == key]
+                for other in plan.jobs:
+                    self._planned.pop(other, None)
+            else:
+                wait([plan.future])
+                kept = self._kept(key)
+        return self._make(key, what, jobs) if kept is None else kept
 
-    def _make(self, key: str, what: Mapping[str, Any]) -> FloatArray:
-        """A new simulation: here, or by a helper while this process is at another one."""
+    def _make(self, key: str, what: Mapping[str, Any], jobs: Sequence[Mapping[str, Any]]) -> FloatArray:
+        """A new simulation: here, or by a helper while this process is at another one.
+
+        Args:
+            key: its name.
+            what: arguments of ``predict``.
+            jobs: the same of those that will be made here next, itself among them; none for itself alone.
+        """
         free = self._here.acquire(blocking=False)
         if not free and self._helpers is not None and all(isinstance(e, str) for e in what["effects"]):
-            wait([self._helpers.submit(what)])
+            wait([self._helpers.submit([what])])
             kept = self._kept(key)
             if kept is not None:
                 return kept
@@ -187,6 +223,8 @@ class Simulations:
             # Whatever went wrong there, it will be met here, too, and said.
             self._here.acquire()
         try:
+            if len(jobs) > 1 and self._helpers is not None:
+                self._helpers.prepare(jobs)
             made = self.experiment.predict(
                 what["values"], effects=tuple(what["effects"]), seed=what["seed"], numerics=what["numerics"]
             )
@@ -198,3 +236,8 @@ class Simulations:
             np.save(stream, made, allow_pickle=False)
             write_bytes(path, stream.getvalue())
         return made
+
+
+def _names(effects: Iterable[str | FreeStrength]) -> list[str]:
+    """Of effects, in an order of their own."""
+    return sorted(e if isinstance(e, str) else e.identity for e in effects)

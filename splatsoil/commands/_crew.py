@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from shutil import rmtree
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from splatsoil.experiment.plow import PlowExperiment
     from splatsoil.inverse.criticism.simulations import Simulations
     from splatsoil.inverse.run_folder import RunFolder
-    from splatsoil.model import Model
 
 MOST_HELPERS = 3
 SHARE = {"cpu": 2.0, "cuda": 4.0}
@@ -26,43 +25,47 @@ Replay = Callable[[Mapping[str, float]], "Future[None] | None"]
 
 
 @contextmanager
-def crew(folder: RunFolder, model: Model, effects: Iterable[str], simulate: Simulations) -> Iterator[Replay]:
+def crew(
+    folder: RunFolder, experiment: PlowExperiment, effects: Iterable[str], simulate: Simulations
+) -> Iterator[Replay]:
     """While the block runs, other processes simulate, too: one for every other core, as far as there is use for them.
 
-    All keep what they make in ``features/`` and find it there: the results are those of one process, bit for bit, and
-    one that dies costs nothing but its help. A GPU is shared: one simulation leaves most of it idle. Each process keeps
-    to one thread, this one too: with more, they wait for each other.
+    All keep what they make in ``features/`` and find it there, and one that dies costs nothing but its help. On a CPU
+    each process keeps to one thread, this one too: the results are those of one process, bit for bit, and with more
+    they would wait for each other. A GPU is shared: simulations that are alike go in one batch, as one leaves most of
+    it idle, and cores are shared out.
 
     Args:
         folder: the run folder, locked by this process.
-        model: of the latest fit.
+        experiment: of the latest fit.
         effects: the candidates, as `experiment_of` takes them; none for all.
         simulate: what is helped.
 
     Yields:
         What has a helper make the replay control, before what it is asked for later.
     """
-    from splatsoil.envs.devices import cores
     from splatsoil.inverse.criticism.simulations import Helpers
     from splatsoil.inverse.executors import Processes
-    from splatsoil.threads import one_thread
+    from splatsoil.threads import at_most, cores
 
-    room = _memory(model.device) / SHARE[model.device.split(":")[0]]
+    device = experiment.base.device
+    room = _memory(device) / SHARE[device.split(":")[0]]
     count, named = int(min(cores(), 1 + MOST_HELPERS, room)) - 1, tuple(effects)
-    with one_thread():
+    threads = 1 if device == "cpu" else max(1, cores() // (1 + max(count, 0)))
+    with at_most(threads):
         if count < 1:
             yield lambda values: None
             return
         workers = Processes(count)
 
-        def submit(job: Mapping[str, Any]) -> Any:
-            return workers.submit(_simulate, folder.path, model.device, named, dict(job))
+        def submit(jobs: Sequence[Mapping[str, Any]]) -> Any:
+            return workers.submit(_simulate, folder.path, device, named, threads, [dict(job) for job in jobs])
 
         def replay(values: Mapping[str, float]) -> Future[None]:
-            return workers.submit(_replay, folder.path, model.device, named, dict(values))
+            return workers.submit(_replay, folder.path, device, named, threads, dict(values))
 
         try:
-            with simulate.helped(Helpers(count, submit)):
+            with simulate.helped(Helpers(count, submit, experiment.together, experiment.prepare)):
                 yield replay
             workers.shutdown(cancel_futures=True)
         except BaseException:
@@ -90,30 +93,36 @@ def _memory(device: str) -> float:
 _known: dict[tuple[Path, str, tuple[str, ...]], tuple[RunFolder, PlowExperiment, Simulations]] = {}
 
 
-def _simulate(path: Path, device: str, effects: tuple[str, ...], job: Mapping[str, Any]) -> None:
+def _simulate(
+    path: Path, device: str, effects: tuple[str, ...], threads: int, jobs: Sequence[Mapping[str, Any]]
+) -> None:
     """A helper's work."""
-    with _quietly():
-        _, _, simulate = _known_here(path, device, effects)
-        simulate(**job)
+    with _quietly(threads):
+        _, experiment, simulate = _known_here(path, device, effects)
+        if len(jobs) > 1:
+            experiment.prepare(jobs)
+        for job in jobs:
+            with _quietly(threads):
+                simulate(**job)
 
 
-def _replay(path: Path, device: str, effects: tuple[str, ...], values: Mapping[str, float]) -> None:
+def _replay(path: Path, device: str, effects: tuple[str, ...], threads: int, values: Mapping[str, float]) -> None:
     """A helper's work."""
     from splatsoil.commands._control import replayed
 
-    with _quietly():
+    with _quietly(threads):
         replayed(*_known_here(path, device, effects), values, lambda what: None)
 
 
 @contextmanager
-def _quietly() -> Iterator[None]:
+def _quietly(threads: int) -> Iterator[None]:
     """Whatever goes wrong, the first process meets it too, and says so."""
     import contextlib
 
     from splatsoil.errors import SplatsoilError
-    from splatsoil.threads import one_thread
+    from splatsoil.threads import at_most
 
-    with one_thread(), contextlib.suppress(SplatsoilError, OSError):
+    with at_most(threads), contextlib.suppress(SplatsoilError, OSError):
         yield
 
 

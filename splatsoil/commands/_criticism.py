@@ -104,7 +104,7 @@ def diagnosed(
 
     simulate.told = starting
     values = estimates(fit)
-    with folder.lock(), crew(folder, model, effects, simulate) as helper:
+    with folder.lock(), crew(folder, experiment, effects, simulate) as helper:
         replays = control(folder, experiment, simulate, values, helper, say) if with_replay else None
         simulate.ahead(lambda ask: gather(experiment, ask, values, repeats=options.repeats))
         say("where soil plays no part")
@@ -151,7 +151,7 @@ def misfit(
     fit = folder.fit()
     experiment, simulate = experiment_of(folder, model, ())
     values = estimates(fit)
-    with folder.lock(), crew(folder, model, (), simulate) as helper:
+    with folder.lock(), crew(folder, experiment, (), simulate) as helper:
         replays = (
             control(folder, experiment, simulate, values, helper, lambda what: report(what, 0.0))
             if with_replay
@@ -191,7 +191,7 @@ def confirmed(folder: RunFolder, model: Model, name: str, options: Options, repo
     experiment, simulate = experiment_of(folder, model, (name,))
     (effect,) = (candidate.name for candidate in experiment.candidates)
     values = estimates(folder.fit())
-    with folder.lock(), crew(folder, model, (name,), simulate) as helper:
+    with folder.lock(), crew(folder, experiment, (name,), simulate) as helper:
         replays = control(folder, experiment, simulate, values, helper, lambda what: report(what, 0.0))
         simulate.ahead(lambda ask: gather(experiment, ask, values, repeats=options.repeats))
         evidence = gather(

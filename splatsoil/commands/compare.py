@@ -67,7 +67,7 @@ def run(config: Config) -> int:
         extra = {} if misfit is None else {"misfit": {k: misfit[k] for k in TOLD}}
         print_json({"ok": True, "run": str(folder.path), **result, **extra})
     else:
-        show(result, str(folder.comparison), judged=misfit is not None)
+        show(result, str(folder.comparison), None if misfit is None else bool(misfit["adequate"]))
         if misfit is not None:
             show_misfit(misfit, str(folder.path))
     return 0
@@ -78,8 +78,8 @@ def interrupted(config: Config) -> str:
     return f"the comparison was not finished; start again with: splatsoil compare {config.run}"
 
 
-def show(result: Mapping[str, Any], folder: str, *, judged: bool = False) -> None:
-    """Losses of each camera, and what the whole comes to; ``judged`` if a judgement by the floor follows."""
+def show(result: Mapping[str, Any], folder: str, adequate: bool | None = None) -> None:
+    """Losses of each camera, and what the whole comes to; what a judgement by the floor that follows says of it."""
     import numpy as np
     from rich.console import Console
     from rich.markup import escape
@@ -98,7 +98,7 @@ def show(result: Mapping[str, Any], folder: str, *, judged: bool = False) -> Non
         table.add_row(escape(camera), f"{mean:.4g}", f"{worst['losses'][name]:.4g}", str(worst["frame"]), f"{rgb:.3g}")
     console = Console(highlight=False)
     console.print(table)
-    console.print(residual_sentence(result, diagnosed=judged))
+    console.print(residual_sentence(result, adequate))
     console.print(f"pictures in {escape(folder)}")
 
 

@@ -97,7 +97,12 @@ def run(config: Config) -> int:
         print_json({"ok": True, "run": str(folder.path), "report": str(page), "comparison": losses, **extra, **result})
         return 0
     fit.show(result, str(folder.path))
-    compare.show(comparison, str(folder.comparison), judged=misfit is not None or diagnosis is not None)
+    adequate: bool | None = None
+    if misfit is not None:
+        adequate = bool(misfit["adequate"])
+    elif diagnosis is not None:
+        adequate = diagnosis["verdict"] == "adequate"
+    compare.show(comparison, str(folder.comparison), adequate)
     if misfit is not None:
         compare.show_misfit(misfit, str(folder.path))
     if diagnosis is not None:

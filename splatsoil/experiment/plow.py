@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +20,7 @@ from splatsoil.experiment.scene_parts import QUIET, bins_of, regions_of, stages_
 from splatsoil.experiment.states import States, plow_states
 from splatsoil.experiment.strokes import Predict, plow_strokes
 from splatsoil.model import Model, Prediction
-from splatsoil.mpm import Resolution, Trajectory
+from splatsoil.mpm import Resolution, Trajectory, simulate_together
 from splatsoil.parameters import Parameter
 from splatsoil.soil.effect import Effect
 from splatsoil.soil.library import find_effects, library
@@ -45,6 +46,9 @@ its load while soil comes out of the tool."""
 ROUNDING = "rounding"
 """Another drawing of the same simulation, its surface rounded off twice as much. To first order that changes features
 by as much as the drawing has done already, so that one such change is what it gets wrong."""
+
+MOST_TOGETHER, MOST_PARTICLES = 8, 500_000
+"""Simulations that a GPU makes as one batch, and particles in it: one of the usual size leaves most of it idle."""
 
 GUESSES = tuple(f"albedo {number}" for number in range(1, 7))
 """Other colours of the soil beneath the surface."""
@@ -101,7 +105,7 @@ class PlowExperiment:
             frames=model.frames,
             patch=max(PATCH, math.sqrt(area / MOST_FEATURES)),
         )
-        self._kept: tuple[object, Trajectory] | None = None
+        self._kept: dict[object, Trajectory] = {}
         self._bins = bins_of(model.measurement, self.comparator.frames, MOST_ROWS)
         rows_of_frames = [[self.comparator.frames[i] for i in group] for group in self._bins]
         self.forces = ToolForces.of(model.measurement, rows_of_frames)
@@ -195,8 +199,7 @@ class PlowExperiment:
         """The pictures behind the features. What only changes the observation is drawn without a new simulation."""
         guess = 1 + self.guesses.index(numerics) if numerics in self.guesses else None
         rounding = 2.0 if numerics == ROUNDING else 1.0
-        way = "" if guess is not None or numerics == ROUNDING else numerics
-        model = self._variant(tuple(dict.fromkeys((*self.model, *effects))), way)
+        model, way = self._computed(effects, numerics)
         began = time.perf_counter()
         trajectory = self._trajectory(model, values, seed, way)
         simulated = time.perf_counter()
@@ -217,15 +220,53 @@ class PlowExperiment:
         parameters = [p for c in chosen for p in c.parameters]
         return calibrate(model, self.comparator, parameters, trajectory)
 
+    @cached_property
+    def together(self) -> int:
+        """How many simulations are best prepared at a time."""
+        if self.base.device == "cpu":
+            return 1
+        return min(max(1, MOST_PARTICLES // len(self.base.particles())), MOST_TOGETHER)
+
+    def prepare(self, jobs: Iterable[Mapping[str, Any]]) -> None:
+        """Simulate together what `predict` will be asked for next, given its keyword arguments.
+
+        One that cannot go on is left for `predict` to say so.
+        """
+        groups: dict[object, dict[object, tuple[Model, dict[str, float], int]]] = {}
+        for job in jobs:
+            model, way = self._computed(job["effects"], job["numerics"])
+            moving, physics = _without_reports(model, job["values"])
+            key = (moving, way, job["seed"], tuple(sorted(physics.items())))
+            if key not in self._kept:
+                groups.setdefault((moving, way, model.recorded), {})[key] = (model, physics, job["seed"])
+        for group in groups.values():
+            models, values, seeds = zip(*group.values(), strict=True)
+            particles = [models[0].particles(seed) for seed in seeds]
+            found = simulate_together(self.base.measurement, particles, values, models[0], self.progress)
+            for asked, trajectory in zip(group, found, strict=True):
+                if isinstance(trajectory, Trajectory):
+                    self._keep(asked, trajectory)
+
+    def _computed(self, effects: Iterable[str | Effect], numerics: str) -> tuple[Model, str]:
+        """The model with candidates on, computed in one of the numerics; what only draws otherwise is none of them."""
+        way = "" if numerics in self.guesses or numerics == ROUNDING else numerics
+        return self._variant(tuple(dict.fromkeys((*self.model, *effects))), way), way
+
     def _trajectory(self, model: Model, values: Mapping[str, float], seed: int, numerics: str) -> Trajectory:
-        """A simulation, or the last one where it differs in nothing but what is reported."""
-        reported = {p.name for p in model.observation_parameters}
-        physics = {name: value for name, value in values.items() if name not in reported}
-        moving = tuple(e.name for e in model.law.effects if not {p.name for p in e.parameters} <= reported)
+        """A simulation, or one of the last where it differs in nothing but what is reported."""
+        moving, physics = _without_reports(model, values)
         key = (moving, numerics, seed, tuple(sorted(physics.items())))
-        if self._kept is None or self._kept[0] != key or not set(model.recorded) <= set(self._kept[1].frames):
-            self._kept = (key, model.simulate(physics, seed, self.progress))
-        return self._kept[1]
+        kept = self._kept.get(key)
+        if kept is None or not set(model.recorded) <= set(kept.frames):
+            kept = model.simulate(physics, seed, self.progress)
+            self._keep(key, kept)
+        return kept
+
+    def _keep(self, key: object, trajectory: Trajectory) -> None:
+        self._kept.pop(key, None)
+        while len(self._kept) >= self.together:
+            del self._kept[next(iter(self._kept))]
+        self._kept[key] = trajectory
 
     def states(self, values: Mapping[str, float]) -> States:
         """States that the soil goes through while it yields, in a simulation of its own."""
@@ -257,3 +298,10 @@ class PlowExperiment:
             columns.append(np.stack([mine[group].mean(axis=0) for group in self._bins]))
             start += frames * count
         return np.concatenate(columns, axis=1)
+
+
+def _without_reports(model: Model, values: Mapping[str, float]) -> tuple[tuple[str, ...], dict[str, float]]:
+    """Names of the effects that move soil, and the values that do: not those of what cameras report alone."""
+    reported = {p.name for p in model.observation_parameters}
+    moving = tuple(e.name for e in model.law.effects if not {p.name for p in e.parameters} <= reported)
+    return moving, {name: value for name, value in values.items() if name not in reported}

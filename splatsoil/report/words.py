@@ -51,14 +51,17 @@ def symbol(unit: str) -> str:
 def weighed(fit: Mapping[str, Any], judged: Mapping[str, Any] | None) -> Mapping[str, Any]:
     """What a diagnosis, or a comparison with the floor, that calls this very fit adequate tells of its parameters, by
     name; empty without one."""
-    if (
-        judged is None
-        or judged["fit"] != fit["name"]
-        or not (judged.get("verdict") == "adequate" or judged.get("adequate"))
-    ):
+    if judged is None or not called_adequate(fit, judged):
         return {}
     known: Mapping[str, Any] = judged.get("estimates", {})
     return known
+
+
+def called_adequate(fit: Mapping[str, Any], judged: Mapping[str, Any] | None) -> bool:
+    """Whether a diagnosis, or a comparison with the floor, calls this very fit adequate."""
+    if judged is None or judged["fit"] != fit["name"]:
+        return False
+    return bool(judged.get("verdict") == "adequate" or judged.get("adequate"))
 
 
 def answers(fit: Mapping[str, Any], judged: Mapping[str, Any] | None = None) -> list[Answer]:
@@ -129,8 +132,13 @@ def ratio_to_noise(comparison: Mapping[str, Any] | None) -> float | None:
     return None if not noise else float(comparison["total"][name]) / float(noise)
 
 
-def residual_sentence(comparison: Mapping[str, Any] | None, *, diagnosed: bool = False) -> str:
-    """How far the prediction is from the pictures, and what that does and doesn't mean."""
+def residual_sentence(comparison: Mapping[str, Any] | None, adequate: bool | None = None) -> str:
+    """How far the prediction is from the pictures, and what that does and doesn't mean.
+
+    Args:
+        comparison: with the pictures; None where there is none.
+        adequate: what a judgement by the floor says of this very fit; None without one.
+    """
     if comparison is None:
         return "The prediction has not been compared with the pictures frame by frame yet."
     name = comparison["loss"]
@@ -146,7 +154,9 @@ def residual_sentence(comparison: Mapping[str, Any] | None, *, diagnosed: bool =
         return f"The residual is {ratio:.1f} × what the cameras' noise alone leaves: nothing more to explain here."
     above = f"{ratio:.{1 if ratio < 10.0 else 0}f} × what the cameras' noise alone leaves"
     said = f"{left}; that is {above}." if left else f"The residual is {above}."
-    if diagnosed:
+    if adequate:
+        return f"{said} Cameras are the least of it: chance, reconstruction and numerics leave as much."
+    if adequate is not None:
         return said
     return (
         f"{said} Part of the rest is the chance of where grains fall; the other part is the model's, the "

@@ -7,9 +7,12 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from splatsoil.errors import SimulationError
 from splatsoil.experiment.plow import PlowExperiment
 from splatsoil.experiment.strokes import MEASURED
 from splatsoil.measurement import Measurement
+from splatsoil.model import Model
+from splatsoil.reconstruction import HeightField
 from splatsoil.soil.library import find_effects
 
 
@@ -34,6 +37,7 @@ def asked(numerics: str) -> tuple[list[Any], list[Any]]:
     experiment = SimpleNamespace(
         model=("cohesion",), guesses=PlowExperiment.guesses, _variant=variant, _trajectory=trajectory
     )
+    experiment._computed = lambda effects, way: PlowExperiment._computed(cast(Any, experiment), effects, way)
     PlowExperiment.prediction(cast(Any, experiment), {}, effects=("tilt",), seed=3, numerics=numerics)
     return simulated, drawn
 
@@ -63,6 +67,40 @@ def test_an_unknown_way_is_not_taken_for_the_usual_one() -> None:
     assert PlowExperiment._variant(experiment, ("cohesion",), "") is base
     with pytest.raises(KeyError, match="gird"):
         PlowExperiment._variant(experiment, ("cohesion",), "gird")
+
+
+def test_soil_prepared_together_is_that_of_single_simulations(small_set: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    measurement = Measurement.load(small_set)
+    bed = measurement.bed
+    surface = HeightField.over(bed.lower, bed.upper, 0.02, 0.12)
+    model = Model(measurement, cast(Any, SimpleNamespace(surface=surface)), preset="tiny")
+    monkeypatch.setattr(Model, "draw", lambda *_, **__: {})
+
+    def experiment() -> PlowExperiment:
+        return PlowExperiment(model, candidates=("buried_obstacle", "cohesion", "exposure"))
+
+    def job(seed: int = 0, numerics: str = "", effects: tuple[str, ...] = (), **values: float) -> dict[str, Any]:
+        return {"values": {"friction_angle": 35.0, **values}, "effects": effects, "seed": seed, "numerics": numerics}
+
+    jobs = [
+        job(),
+        job(1),
+        job(numerics="albedo 2"),
+        job(effects=("exposure",), exposure_gain=0.9),
+        job(effects=("cohesion",), cohesion=300.0),
+        job(1, effects=("cohesion",), cohesion=300.0),
+    ]
+    unseen = job(effects=("buried_obstacle",), obstacle_radius=0.001)
+    alone = [experiment().prediction(**each).trajectory.positions for each in jobs]
+    prepared = experiment()
+    prepared.__dict__["together"] = 4
+    prepared.prepare([unseen, *jobs])
+    with pytest.raises(SimulationError, match="no node"):
+        prepared.prediction(**unseen)
+    monkeypatch.delattr(Model, "simulate")
+    for each, positions in zip(jobs, alone, strict=True):
+        assert np.array_equal(prepared.prediction(**each).trajectory.positions, positions)
+    assert not np.array_equal(alone[0], alone[4]) and not np.array_equal(alone[0], alone[1])
 
 
 class Asked(Exception):

@@ -47,6 +47,13 @@ def test_the_verdict_follows_the_ratio_to_the_noise() -> None:
     assert "not been compared" in words.residual_sentence(None)
 
 
+def test_a_residual_far_above_the_cameras_noise_is_no_fault_of_an_adequate_model() -> None:
+    said = words.residual_sentence(comparison(0.52, 0.01), True)
+    assert "52 ×" in said and "numerics leave as much" in said
+    short = words.residual_sentence(comparison(0.52, 0.01), False)
+    assert "52 ×" in short and "numerics" not in short
+
+
 @pytest.mark.parametrize(
     ("determined", "at_bound", "state"),
     [(True, None, "determined"), (True, "upper", "bound"), (False, "upper", "open")],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -28,6 +28,7 @@ class Watched:
         self.inner, self.fails = emulated(3), fails
         self.calls: list[Mapping[str, float]] = []
         self.threads: set[int] = set()
+        self.prepared: list[Sequence[Mapping[str, Any]]] = []
         self.busy = False
 
     def __getattr__(self, name: str) -> Any:
@@ -46,29 +47,37 @@ class Watched:
 
 
 @contextmanager
-def helper(experiment: Watched, folder: Path) -> Iterator[Helpers]:
+def helper(experiment: Watched, folder: Path, together: int = 1, mine: Watched | None = None) -> Iterator[Helpers]:
     """One, of whom nothing is heard but what it keeps in the folder."""
     theirs = Simulations(experiment, folder)
 
-    def work(job: Mapping[str, Any]) -> None:
-        try:
-            theirs(**job)
-        except SimulationError:
-            return
+    def work(jobs: Sequence[Mapping[str, Any]]) -> None:
+        experiment.prepared.append(jobs)
+        for job in jobs:
+            try:
+                theirs(**job)
+            except SimulationError:
+                continue
 
     with ThreadPoolExecutor(1) as pool:
-        yield Helpers(1, lambda job: pool.submit(work, job))
+        yield Helpers(1, lambda jobs: pool.submit(work, jobs), together, mine.prepared.append if mine else len)
 
 
-def test_what_will_be_asked_for_is_made_by_both_and_only_once(tmp_path: Path) -> None:
+@pytest.mark.parametrize("batch", [1, 4])
+def test_what_will_be_asked_for_is_made_by_both_and_only_once(batch: int, tmp_path: Path) -> None:
     alone = gather(emulated(3), Simulations(emulated(3)), AT, repeats=3)
     mine, theirs = Watched(), Watched()
     simulate = Simulations(mine, tmp_path)
-    with helper(theirs, tmp_path) as helpers, simulate.helped(helpers):
+    with helper(theirs, tmp_path, batch, mine) as helpers, simulate.helped(helpers):
         simulate.ahead(lambda ask: gather(mine, ask, AT, repeats=3))
         together = gather(mine, simulate, AT, repeats=3)
     assert mine.calls and theirs.calls
     assert len(mine.calls) + len(theirs.calls) == simulate.asked == simulate.made
+    # What goes together is alike, and no more of it than is good; what is one by itself needs no preparing.
+    for jobs in (*mine.prepared, *theirs.prepared):
+        assert len({(*job["effects"], job["numerics"]) for job in jobs}) == 1 and len(jobs) <= batch
+    assert (max(map(len, theirs.prepared)) > 1) is (batch > 1)
+    assert all(len(jobs) > 1 for jobs in mine.prepared) and bool(mine.prepared) is (batch > 1)
     for name in ("mean", "repeats"):
         assert np.array_equal(getattr(alone, name), getattr(together, name))
     for name in ("slopes", "directions", "numerics"):
@@ -98,7 +107,7 @@ def test_jobs_that_wait_for_simulations_run_side_by_side_and_come_back_in_order(
 
 @pytest.mark.parametrize("error", [None, RunError("a worker died 4 times")])
 def test_a_helper_that_fails_or_dies_costs_nothing_but_its_help(tmp_path: Path, error: Exception | None) -> None:
-    def dead(job: Mapping[str, Any]) -> Future[None]:
+    def dead(jobs: Sequence[Mapping[str, Any]]) -> Future[None]:
         done: Future[None] = Future()
         done.set_exception(error) if error else done.set_result(None)
         return done
