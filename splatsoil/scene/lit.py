@@ -16,7 +16,7 @@ from splatsoil.scene import kernels
 from splatsoil.scene.light import SUN_SOFTNESS, Light
 from splatsoil.scene.relief import Relief, grid_of
 from splatsoil.scene.sky import light_from_slopes, sky_openness
-from splatsoil.splats.warp_torch import as_warp, launch
+from splatsoil.splats.warp_torch import as_warp, launch, upload
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -94,11 +94,11 @@ def _bounced(lit: LitRelief, hidden: Tensor, tool_reflectance: FloatArray) -> Te
 
 def _row(values: npt.ArrayLike, relief: Relief) -> Tensor:
     """Three numbers as a tensor where the relief lives."""
-    return torch.tensor(np.asarray(values, dtype=np.float64).tolist(), dtype=torch.float32, device=relief.device)
+    return upload(np.asarray(values, dtype=np.float64), relief.device)
 
 
 def _ambient(light: Light, like: Tensor) -> Tensor:
-    return torch.tensor(light.ambient.tolist(), dtype=torch.float32, device=like.device)
+    return upload(light.ambient, like.device)
 
 
 def direct_light(lit: LitRelief, points: Tensor, spread: float = 0.0) -> Tensor:
@@ -159,4 +159,4 @@ def march_step(relief: Relief) -> float:
 
 def ceiling(relief: Relief) -> float:
     """A height that no soil reaches, m."""
-    return float(relief.height.max()) + 1e-3
+    return relief.range[1] + 1e-3

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -62,6 +63,12 @@ class Relief:
     def device(self) -> torch.device:
         """Where the heights live."""
         return self.height.device
+
+    @cached_property
+    def range(self) -> tuple[float, float]:
+        """Lowest and highest height, m; asked for once, because a GPU that tells a number makes the host wait."""
+        low, high = torch.stack(torch.aminmax(self.height)).tolist()
+        return low, high
 
     @property
     def points(self) -> Tensor:

@@ -23,7 +23,7 @@ from splatsoil.scene.lit import LitRelief, ceiling, light_relief, march_step
 from splatsoil.scene.relief import SMOOTHING, Relief, grid_of, relief_of_particles
 from splatsoil.scene.tool import ToolBody, eye_of
 from splatsoil.splats import Gaussians, rasterise_features
-from splatsoil.splats.warp_torch import as_warp, launch, launch_parts, thread_count
+from splatsoil.splats.warp_torch import as_warp, launch, launch_parts, thread_count, upload
 
 FloatArray = npt.NDArray[np.float64]
 FloatImage = npt.NDArray[np.float32]
@@ -76,6 +76,11 @@ class Posed:
     grains: slice
     discs: tuple[Tensor, Tensor]
     lit: LitRelief
+
+    @cached_property
+    def tool_points(self) -> FloatArray:
+        """(k, 3) the discs' centres, m."""
+        return self.discs[0].cpu().numpy().astype(np.float64)
 
 
 @dataclass(frozen=True)
@@ -199,13 +204,14 @@ class Scene:
             deformations: (p, 3, 3) visual deformation since rest, or None.
             tool: rotation (3, 3) and position (3,) of the tool's frame, or None for no tool.
         """
-        x = torch.as_tensor(positions, dtype=torch.float32, device=self.device).contiguous()
-        f = None if deformations is None else torch.as_tensor(deformations, dtype=torch.float32, device=self.device)
+        x = upload(positions, self.device).contiguous()
+        f = None if deformations is None else upload(deformations, self.device)
         relief = relief_of_particles(x, self.spacing, self.bed.lower, self.bed.upper, smoothing=self.smoothing)
         placed = self.tool.absent() if tool is None else self.tool.at(*tool)
         lit = light_relief(relief, self.light, placed, self.tool_albedo)
         centres, covariances = self.soil.carry(x, None if f is None else f.contiguous())
-        shown, near = self.shown(relief, centres, x)
+        # Numbers of what is drawn, not masks: a GPU makes the host wait for each mask that selects something.
+        shown, near = (mask.nonzero()[:, 0] for mask in self.shown(relief, centres, x))
         grains = x[near]
         count = len(grains)
         around = self.surroundings
@@ -222,18 +228,17 @@ class Scene:
         )
         is_soil = (1.0, 1.0, 0.0)
         features = torch.cat([functional.pad(p[3], (0, 1), value=v) for p, v in zip(parts, is_soil, strict=True)])
-        first = int(shown.sum())
-        grain_part = slice(first, first + count)
+        grain_part = slice(len(shown), len(shown) + count)
         discs = (x.new_zeros((0, 3)), x.new_zeros((0, 3, 3))) if tool is None else self.tool.discs(*tool)
         centres, covariances, opacities = (torch.cat([p[k] for p in parts]) for k in range(3))
         return Posed(centres, covariances, opacities, features, grain_part, discs, lit)
 
     def layers(self, posed: Posed, camera: Camera) -> Layers:
         """What a camera without distortion sees of a posed scene."""
-        view = torch.as_tensor(camera.world_to_camera, dtype=torch.float32, device=self.device)
+        view = upload(camera.world_to_camera, self.device)
         along = posed.centres @ view[2, :3] + view[2, 3]
         features = torch.cat([posed.features, along[:, None]], dim=1)
-        behind = torch.tensor([*self.background, 0.0, 0.0], dtype=torch.float32, device=self.device)
+        behind = upload([*self.background, 0.0, 0.0], self.device)
         drawn = rasterise_features(
             posed.centres, posed.covariances, posed.opacities, features, camera, background=behind, antialias=True
         )
@@ -297,7 +302,7 @@ def _tool_among_splats(posed: Posed, camera: Camera) -> Tensor:
     centres, covariances = posed.discs
     if len(centres) == 0:
         return out
-    pixels, _ = camera.project(centres.cpu().numpy())
+    pixels, _ = camera.project(posed.tool_points)
     pixels = pixels[np.isfinite(pixels).all(axis=1)]
     if len(pixels) == 0:
         return out

@@ -15,7 +15,7 @@ from torch import Tensor
 from splatsoil.scene import kernels
 from splatsoil.scene.kernels_sky import WIDTH, light_of_slopes, sky_kernel
 from splatsoil.scene.relief import Relief, grid_of
-from splatsoil.splats.warp_torch import as_warp, launch
+from splatsoil.splats.warp_torch import as_warp, launch, upload
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -106,9 +106,9 @@ class _Looks:
     def tables(self, wide: Tensor) -> list[Any]:
         """Margins, directions, offsets in a map with these margins, and inverses, as the kernels take them."""
         offsets = (self.rows * wide.shape[1] + self.columns).astype(np.int32)
-        parts = (self.directions.astype(np.float32), offsets, self.inverses.astype(np.float32))
-        on = [torch.from_numpy(part.reshape(-1)).to(wide.device) for part in parts]
-        kinds = (wp.float32, wp.int32, wp.float32)
+        parts = (self.directions, offsets, self.inverses)
+        types, kinds = (torch.float32, torch.int32, torch.float32), (wp.float32, wp.int32, wp.float32)
+        on = [upload(part.reshape(-1), wide.device, dtype) for part, dtype in zip(parts, types, strict=True)]
         return [*self.margin, *(as_warp(table, kind) for table, kind in zip(on, kinds, strict=True))]
 
 
@@ -152,7 +152,8 @@ def _between(values: Tensor, stride: int, size: tuple[int, int]) -> Tensor:
 def _distances(relief: Relief) -> list[float]:
     """How far off a cell looks: each step a fifth farther, a cell at least, for blockers far away hide little sky."""
     cell = max(relief.cell)
-    reach = max(4.0 * float(relief.height.max() - relief.height.min()), 0.15)
+    low, high = relief.range
+    reach = max(4.0 * (high - low), 0.15)
     out = [cell]
     while out[-1] < reach:
         out.append(out[-1] + max(cell, 0.2 * out[-1]))
@@ -170,7 +171,7 @@ def _tool_columns(relief: Relief, tool: Any) -> tuple[Tensor, Tensor]:
     """Lowest and highest point (ny, nx) of the tool over each cell, m; above all and below all where there is none."""
     bottom, top = torch.empty_like(relief.height), torch.empty_like(relief.height)
     reach = 1.0  # metres above and below the soil within which the tool is looked for
-    low, high = float(relief.height.min()) - reach, float(relief.height.max()) + reach
+    low, high = relief.range[0] - reach, relief.range[1] + reach
     inputs = [grid_of(relief), tool, high, low, as_warp(bottom, wp.float32), as_warp(top, wp.float32)]
     launch(kernels.tool_columns, tuple(relief.height.shape), inputs, bottom)
     return bottom, top

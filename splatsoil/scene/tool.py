@@ -13,7 +13,7 @@ from torch import Tensor
 
 from splatsoil.measurement import Camera
 from splatsoil.scene import kernels
-from splatsoil.splats.warp_torch import launch
+from splatsoil.splats.warp_torch import launch, upload
 
 _SCALE = 0.004
 """Size of the discs that stand for the tool among the splats, m; larger for large tools."""
@@ -63,8 +63,7 @@ class ToolBody:
 
     def discs(self, rotation: npt.ArrayLike, position: npt.ArrayLike) -> tuple[Tensor, Tensor]:
         """Centres (k, 3) and covariances (k, 3, 3) of the discs at a pose, world frame."""
-        r = self.centres.new_tensor(np.asarray(rotation, dtype=np.float64).tolist())
-        x = self.centres.new_tensor(np.asarray(position, dtype=np.float64).tolist())
+        r, x = (upload(np.asarray(v, dtype=np.float64), self.centres.device) for v in (rotation, position))
         return self.centres @ r.T + x, r @ self.covariances @ r.T
 
     def absent(self) -> Any:

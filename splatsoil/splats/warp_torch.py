@@ -1,4 +1,4 @@
-"""Torch tensors as Warp arrays, without copies."""
+"""Torch tensors as Warp arrays, without copies; kernels on torch's stream."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from itertools import pairwise
 from threading import Thread
 from typing import Any
 
+import numpy.typing as npt
 import torch
 import warp as wp
 from torch import Tensor
@@ -16,9 +17,21 @@ def as_warp(tensor: Tensor, dtype: Any) -> Any:
     """A float32 or int32 tensor as kernels take an array of ``dtype`` (scalar, vector, matrix), over its memory.
 
     It is Warp's descriptor of an array and not an array, which takes three times as long to make: a picture needs
-    thirty. Kernels check neither its device nor its number of dimensions.
+    thirty. Kernels check neither its device nor its number of dimensions. The memory lasts as long as the descriptor,
+    also where it is a copy made here or of a tensor that nobody else keeps.
     """
-    return wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=False, return_ctype=True)
+    source = tensor.detach().contiguous()
+    array = wp.from_torch(source, dtype=dtype, requires_grad=False, return_ctype=True)
+    array.keeps = source
+    return array
+
+
+def upload(values: npt.ArrayLike, device: torch.device, dtype: torch.dtype = torch.float32) -> Tensor:
+    """Numbers of the host as a tensor on a device; a GPU takes them when it gets there, and the host goes on.
+
+    CUDA copies ordinary memory to a buffer of its own before the call returns, so the source may go.
+    """
+    return torch.as_tensor(values, dtype=dtype).to(device, non_blocking=True)
 
 
 def launch(kernel: Any, count: int | tuple[int, ...], inputs: list[Any], like: Tensor, block: int = 256) -> None:
