@@ -106,7 +106,7 @@ class _Looks:
     def tables(self, wide: Tensor) -> list[Any]:
         """Margins, directions, offsets in a map with these margins, and inverses, as the kernels take them."""
         offsets = (self.rows * wide.shape[1] + self.columns).astype(np.int32)
-        parts = (self.directions, offsets, self.inverses)
+        parts: tuple[npt.NDArray[Any], ...] = (self.directions, offsets, self.inverses)
         types, kinds = (torch.float32, torch.int32, torch.float32), (wp.float32, wp.int32, wp.float32)
         on = [upload(part.reshape(-1), wide.device, dtype) for part, dtype in zip(parts, types, strict=True)]
         return [*self.margin, *(as_warp(table, kind) for table, kind in zip(on, kinds, strict=True))]

@@ -7,6 +7,7 @@ from itertools import pairwise
 from threading import Thread
 from typing import Any
 
+import numpy as np
 import numpy.typing as npt
 import torch
 import warp as wp
@@ -26,12 +27,16 @@ def as_warp(tensor: Tensor, dtype: Any) -> Any:
     return array
 
 
-def upload(values: npt.ArrayLike, device: torch.device, dtype: torch.dtype = torch.float32) -> Tensor:
+def upload(values: npt.ArrayLike | Tensor, device: torch.device, dtype: torch.dtype = torch.float32) -> Tensor:
     """Numbers of the host as a tensor on a device; a GPU takes them when it gets there, and the host goes on.
 
-    CUDA copies ordinary memory to a buffer of its own before the call returns, so the source may go.
+    CUDA copies ordinary memory to a buffer of its own before the call returns, so the source may go. What is there
+    already, in this type, is not copied.
     """
-    return torch.as_tensor(values, dtype=dtype).to(device, non_blocking=True)
+    if not isinstance(values, Tensor):
+        array = np.asarray(values)
+        values = torch.from_numpy(array if array.flags.writeable else array.copy())
+    return values.to(device, dtype, non_blocking=True)
 
 
 def launch(kernel: Any, count: int | tuple[int, ...], inputs: list[Any], like: Tensor, block: int = 256) -> None:
