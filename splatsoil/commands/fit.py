@@ -34,7 +34,7 @@ def run(config: Config) -> int:
         print_json({"ok": True, "run": str(folder.path), **result})
     else:
         show(result, str(folder.path))
-        print(f"The ± knows nothing of what other numerics would say: splatsoil compare {folder.path} weighs them, too.")
+        print(f"The ± leaves out what other numerics would say; splatsoil compare {folder.path} weighs them, too.")
     return 0
 
 
