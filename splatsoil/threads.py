@@ -17,14 +17,15 @@ def cores() -> int:
 
 @contextmanager
 def at_most(threads: int) -> Iterator[None]:
-    """While the block runs, torch, BLAS and OpenMP keep to a number of threads."""
+    """While the block runs, torch, BLAS and OpenMP keep to a number of threads, or to fewer where the user wants it."""
     import torch
     from threadpoolctl import threadpool_limits
 
     before = torch.get_num_threads()
-    torch.set_num_threads(threads)
+    allowed = min(threads, before)
+    torch.set_num_threads(allowed)
     try:
-        with threadpool_limits(limits=threads):
+        with threadpool_limits(limits=allowed):
             yield
     finally:
         torch.set_num_threads(before)

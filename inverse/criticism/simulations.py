@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from splatsoil.inverse.evaluations import digest
 
-from splatsoil.errors import RunError
+from splatsoil.errors import RunError, SimulationError
 from splatsoil.experiment.base import Experiment
 from splatsoil.files import write_bytes
 
@@ -24,6 +24,13 @@ from .free_strength import FreeStrength
 FloatArray = npt.NDArray[np.float64]
 Simulate = Callable[..., FloatArray]
 T = TypeVar("T")
+
+POLL = 0.05
+"""Seconds between looks for a table that another process makes."""
+
+
+def _unprepared(jobs: Sequence[Mapping[str, Any]]) -> None:
+    """Nothing is done for all of them at once."""
 
 
 @dataclass(frozen=True)
@@ -40,12 +47,12 @@ class Helpers:
     count: int
     submit: Callable[[Sequence[Mapping[str, Any]]], Future[Any]]
     together: int = 1
-    prepare: Callable[[Sequence[Mapping[str, Any]]], object] = len
+    prepare: Callable[[Sequence[Mapping[str, Any]]], object] = _unprepared
 
 
 @dataclass(frozen=True)
 class _Plan:
-    """Simulations that a helper will make, unless this process is there first."""
+    """Simulations that a helper will make, unless this process is there first, or that this process makes now."""
 
     jobs: Mapping[str, Mapping[str, Any]]
     future: Future[Any]
@@ -183,7 +190,7 @@ class Simulations:
         return table if table.shape == self.experiment.layout.shape else None
 
     def _find(self, key: str, what: Mapping[str, Any], purpose: str) -> FloatArray:
-        plan = self._planned.pop(key, None)
+        plan, mine = self._taken(key)
         kept = self._kept(key)
         if kept is not None and plan is None:
             return kept
@@ -193,43 +200,70 @@ class Simulations:
             self.made += 1
         if self.told is not None:
             self.told(purpose)
-        jobs: Sequence[Mapping[str, Any]] = ()
-        if plan is not None:
-            if plan.future.cancel():
-                # all of it is this process's now
-                jobs = [job for other, job in plan.jobs.items() if other not in self._tables or other == key]
-                for other in plan.jobs:
-                    self._planned.pop(other, None)
-            else:
-                wait([plan.future])
-                kept = self._kept(key)
-        return self._make(key, what, jobs) if kept is None else kept
+        if mine:
+            return self._made(key, {key: what} if plan is None else plan.jobs, None if plan is None else plan.future)
+        assert plan is not None
+        # Tables are there one by one, before the whole share of a helper is.
+        while kept is None and not plan.future.done():
+            wait([plan.future], timeout=POLL)
+            kept = self._kept(key)
+        kept = self._kept(key) if kept is None else kept
+        return self._made(key, {key: what}) if kept is None else kept
 
-    def _make(self, key: str, what: Mapping[str, Any], jobs: Sequence[Mapping[str, Any]]) -> FloatArray:
-        """A new simulation: here, or by a helper while this process is at another one.
+    def _taken(self, key: str) -> tuple[_Plan | None, bool]:
+        """What a simulation is planned with, and whether this process is to make all of that."""
+        with self._guard:
+            plan = self._planned.pop(key, None)
+            if plan is None or not plan.future.cancel():
+                return plan, plan is None
+            future: Future[Any] = Future()
+            future.set_running_or_notify_cancel()
+            plan = _Plan(plan.jobs, future)
+            self._planned |= dict.fromkeys(self._planned.keys() & plan.jobs.keys(), plan)
+            return plan, True
+
+    def _made(self, key: str, jobs: Mapping[str, Mapping[str, Any]], future: Future[Any] | None = None) -> FloatArray:
+        """New simulations, made here, or by a helper while this process is at another one; the one named is returned.
 
         Args:
             key: its name.
-            what: arguments of ``predict``.
-            jobs: the same of those that will be made here next, itself among them; none for itself alone.
+            jobs: arguments of ``predict`` by name, its own among them.
+            future: is done when all of them are kept, or could not be made.
         """
-        free = self._here.acquire(blocking=False)
-        if not free and self._helpers is not None and all(isinstance(e, str) for e in what["effects"]):
-            wait([self._helpers.submit([what])])
-            kept = self._kept(key)
-            if kept is not None:
-                return kept
-        if not free:
-            # Whatever went wrong there, it will be met here, too, and said.
-            self._here.acquire()
         try:
-            if len(jobs) > 1 and self._helpers is not None:
-                self._helpers.prepare(jobs)
-            made = self.experiment.predict(
-                what["values"], effects=tuple(what["effects"]), seed=what["seed"], numerics=what["numerics"]
-            )
+            free = self._here.acquire(blocking=False)
+            named = all(isinstance(e, str) for what in jobs.values() for e in what["effects"])
+            if not free and self._helpers is not None and named:
+                wait([self._helpers.submit(list(jobs.values()))])
+                kept = self._kept(key)
+                if kept is not None:
+                    return kept
+            if not free:
+                # Whatever went wrong there, it will be met here, too, and said.
+                self._here.acquire()
+            try:
+                if len(jobs) > 1 and self._helpers is not None:
+                    self._helpers.prepare(list(jobs.values()))
+                made = self._predicted(key, jobs[key])
+                for other in (name for name in jobs if name != key):
+                    if self._stopped:
+                        break
+                    # whoever asks for it meets the error
+                    with suppress(SimulationError):
+                        if self._kept(other) is None:
+                            self._predicted(other, jobs[other])
+            finally:
+                self._here.release()
         finally:
-            self._here.release()
+            if future is not None:
+                future.set_result(None)
+        return made
+
+    def _predicted(self, key: str, what: Mapping[str, Any]) -> FloatArray:
+        """A simulation made here and now, and kept."""
+        made = self.experiment.predict(
+            what["values"], effects=tuple(what["effects"]), seed=what["seed"], numerics=what["numerics"]
+        )
         path = self._path(key)
         if path is not None:
             stream = io.BytesIO()

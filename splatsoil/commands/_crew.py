@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from shutil import rmtree
 from typing import TYPE_CHECKING, Any
 
@@ -32,8 +32,8 @@ def crew(
 
     All keep what they make in ``features/`` and find it there, and one that dies costs nothing but its help. On a CPU
     each process keeps to one thread, this one too: the results are those of one process, bit for bit, and with more
-    they would wait for each other. A GPU is shared: simulations that are alike go in one batch, as one leaves most of
-    it idle, and cores are shared out.
+    they would wait for each other. A GPU is shared: each process makes simulations that are alike as one batch, as one
+    leaves most of it idle, and cores are shared out.
 
     Args:
         folder: the run folder, locked by this process.
@@ -51,7 +51,7 @@ def crew(
     device = experiment.base.device
     room = _memory(device) / SHARE[device.split(":")[0]]
     count, named = int(min(cores(), 1 + MOST_HELPERS, room)) - 1, tuple(effects)
-    threads = 1 if device == "cpu" else max(1, cores() // (1 + max(count, 0)))
+    threads = 1 if device == "cpu" or count < 1 else max(1, cores() // (1 + count))
     with at_most(threads):
         if count < 1:
             yield lambda values: None
@@ -97,12 +97,15 @@ def _simulate(
     path: Path, device: str, effects: tuple[str, ...], threads: int, jobs: Sequence[Mapping[str, Any]]
 ) -> None:
     """A helper's work."""
+    from splatsoil.errors import SplatsoilError
+
     with _quietly(threads):
         _, experiment, simulate = _known_here(path, device, effects)
         if len(jobs) > 1:
             experiment.prepare(jobs)
         for job in jobs:
-            with _quietly(threads):
+            # one that can't be made doesn't keep the others from being made
+            with suppress(SplatsoilError):
                 simulate(**job)
 
 
@@ -117,12 +120,10 @@ def _replay(path: Path, device: str, effects: tuple[str, ...], threads: int, val
 @contextmanager
 def _quietly(threads: int) -> Iterator[None]:
     """Whatever goes wrong, the first process meets it too, and says so."""
-    import contextlib
-
     from splatsoil.errors import SplatsoilError
     from splatsoil.threads import at_most
 
-    with at_most(threads), contextlib.suppress(SplatsoilError, OSError):
+    with at_most(threads), suppress(SplatsoilError, OSError):
         yield
 
 

@@ -79,7 +79,7 @@ def interrupted(config: Config) -> str:
 
 
 def show(result: Mapping[str, Any], folder: str, adequate: bool | None = None) -> None:
-    """Losses of each camera, and what the whole comes to; what a judgement by the floor that follows says of it."""
+    """Losses of each camera, and what the whole comes to; ``adequate`` is what a judgement by the floor says of it."""
     import numpy as np
     from rich.console import Console
     from rich.markup import escape

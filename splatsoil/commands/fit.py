@@ -34,7 +34,8 @@ def run(config: Config) -> int:
         print_json({"ok": True, "run": str(folder.path), **result})
     else:
         show(result, str(folder.path))
-        print(f"The ± leaves out what other numerics would say; splatsoil compare {folder.path} weighs them, too.")
+        print("The ± leaves out what other numerics would say. Where the model is adequate, they are weighed, too, by:")
+        print(f"splatsoil compare {folder.path}")
     return 0
 
 

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatsoil.comparison import PATCH, Block, Comparator
+from splatsoil.errors import SplatsoilError
 from splatsoil.experiment.base import Calibration, Candidate, candidates_of
 from splatsoil.experiment.features import Layout, Site
 from splatsoil.experiment.forces import REGION, UNIT, ToolForces
@@ -47,8 +48,11 @@ ROUNDING = "rounding"
 """Another drawing of the same simulation, its surface rounded off twice as much. To first order that changes features
 by as much as the drawing has done already, so that one such change is what it gets wrong."""
 
-MOST_TOGETHER, MOST_PARTICLES = 8, 500_000
-"""Simulations that a GPU makes as one batch, and particles in it: one of the usual size leaves most of it idle."""
+MOST_TOGETHER, MOST_PARTICLES, MOST_KEPT = 8, 500_000, 2**29
+"""Simulations that a GPU makes as one batch, particles in it, and bytes of what is kept of it: one of the usual size
+leaves most of a GPU idle."""
+_BYTES = 48
+"""Of a particle in a recorded frame."""
 
 GUESSES = tuple(f"albedo {number}" for number in range(1, 7))
 """Other colours of the soil beneath the surface."""
@@ -225,12 +229,14 @@ class PlowExperiment:
         """How many simulations are best prepared at a time."""
         if self.base.device == "cpu":
             return 1
-        return min(max(1, MOST_PARTICLES // len(self.base.particles())), MOST_TOGETHER)
+        count = len(self.base.particles())
+        room = min(MOST_PARTICLES, MOST_KEPT // (_BYTES * len(self.base.recorded)))
+        return min(max(1, room // count), MOST_TOGETHER)
 
     def prepare(self, jobs: Iterable[Mapping[str, Any]]) -> None:
         """Simulate together what `predict` will be asked for next, given its keyword arguments.
 
-        One that cannot go on is left for `predict` to say so.
+        What can't be made like this, or made at all, is left to `predict`.
         """
         groups: dict[object, dict[object, tuple[Model, dict[str, float], int]]] = {}
         for job in jobs:
@@ -242,7 +248,10 @@ class PlowExperiment:
         for group in groups.values():
             models, values, seeds = zip(*group.values(), strict=True)
             particles = [models[0].particles(seed) for seed in seeds]
-            found = simulate_together(self.base.measurement, particles, values, models[0], self.progress)
+            try:
+                found = simulate_together(self.base.measurement, particles, values, models[0], self.progress)
+            except (SplatsoilError, RuntimeError):  # no memory for all of them, or values that one of them doesn't know
+                continue
             for asked, trajectory in zip(group, found, strict=True):
                 if isinstance(trajectory, Trajectory):
                     self._keep(asked, trajectory)

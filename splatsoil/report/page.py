@@ -51,8 +51,10 @@ def render(data: RunData) -> str:
     # A diagnosis may be of the model that the latest one was made from.
     own = diagnosis is not None and diagnosis["fit"] == data.fit["name"]
     judged = diagnosis if own or data.misfit is None else data.misfit
-    adequate = words.called_adequate(data.fit, judged)
+    of_this = judged is not None and judged["fit"] == data.fit["name"]
+    adequate = words.called_adequate(data.fit, judged) if of_this else None
     ratio = words.ratio_to_noise(comparison)
+    at_the_noise = ratio is not None and ratio <= words.AT_THE_NOISE
     pictures = None if comparison is None else _pictures(data.folder / "comparison", comparison)
     kinds = list(KINDS)
     if pictures is not None and data.before is not None:
@@ -71,8 +73,8 @@ def render(data: RunData) -> str:
         force=words.force_sentence(data.fit),
         answers=words.answers(data.fit, judged),
         fitted=words.fitted_sentence(data.fit, judged),
-        residual=words.residual_sentence(comparison, None if judged is None else adequate),
-        calm=adequate or (ratio is not None and ratio <= words.AT_THE_NOISE),
+        residual=words.residual_sentence(comparison, adequate),
+        calm=at_the_noise if adequate is None else adequate,
         surrogates={name: Markup(figures.surrogate(data.fit, name)) for name in data.fit["parameters"]},
         losses=None if comparison is None else Markup(figures.losses(comparison)),
         pictures=pictures,

@@ -150,12 +150,12 @@ def residual_sentence(comparison: Mapping[str, Any] | None, adequate: bool | Non
             "How far that is above the cameras' noise is unknown: the set has no pre-roll frames to measure it on."
         )
         return f"{left}. {unknown}" if left else unknown
-    if ratio <= AT_THE_NOISE:
+    if ratio <= AT_THE_NOISE and adequate is not False:
         return f"The residual is {ratio:.1f} × what the cameras' noise alone leaves: nothing more to explain here."
     above = f"{ratio:.{1 if ratio < 10.0 else 0}f} × what the cameras' noise alone leaves"
     said = f"{left}; that is {above}." if left else f"The residual is {above}."
     if adequate:
-        return f"{said} Cameras are the least of it: chance, reconstruction and numerics leave as much."
+        return f"{said} Patches don't stand above what noise, chance and numerics leave together."
     if adequate is not None:
         return said
     return (

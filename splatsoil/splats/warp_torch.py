@@ -18,17 +18,14 @@ def as_warp(tensor: Tensor, dtype: Any) -> Any:
     """A float32 or int32 tensor as kernels take an array of ``dtype`` (scalar, vector, matrix), over its memory.
 
     It is Warp's descriptor of an array and not an array, which takes three times as long to make: a picture needs
-    thirty. Kernels check neither its device nor its number of dimensions. The memory lasts as long as the descriptor,
-    also where it is a copy made here or of a tensor that nobody else keeps.
+    thirty. Kernels check neither its device nor its number of dimensions. It keeps the tensor's memory, also that of a
+    copy made here.
     """
-    source = tensor.detach().contiguous()
-    array = wp.from_torch(source, dtype=dtype, requires_grad=False, return_ctype=True)
-    array.keeps = source
-    return array
+    return wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=False, return_ctype=True)
 
 
 def upload(values: npt.ArrayLike | Tensor, device: torch.device, dtype: torch.dtype = torch.float32) -> Tensor:
-    """Numbers of the host as a tensor on a device; a GPU takes them when it gets there, and the host goes on.
+    """Numbers of the host as a tensor on a device; the host doesn't wait until a GPU gets there.
 
     CUDA copies ordinary memory to a buffer of its own before the call returns, so the source may go. What is there
     already, in this type, is not copied.
@@ -36,7 +33,7 @@ def upload(values: npt.ArrayLike | Tensor, device: torch.device, dtype: torch.dt
     if not isinstance(values, Tensor):
         array = np.asarray(values)
         values = torch.from_numpy(array if array.flags.writeable else array.copy())
-    return values.to(device, dtype, non_blocking=True)
+    return values.to(dtype).to(device, non_blocking=device.type == "cuda")
 
 
 def launch(kernel: Any, count: int | tuple[int, ...], inputs: list[Any], like: Tensor, block: int = 256) -> None:

@@ -1,5 +1,6 @@
 """What a plow experiment draws without simulating anew."""
 
+from itertools import combinations
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 from splatsoil.errors import SimulationError
-from splatsoil.experiment.plow import PlowExperiment
+from splatsoil.experiment.plow import MOST_TOGETHER, PlowExperiment
 from splatsoil.experiment.strokes import MEASURED
 from splatsoil.measurement import Measurement
 from splatsoil.model import Model
@@ -89,18 +90,53 @@ def test_soil_prepared_together_is_that_of_single_simulations(small_set: Path, m
         job(effects=("exposure",), exposure_gain=0.9),
         job(effects=("cohesion",), cohesion=300.0),
         job(1, effects=("cohesion",), cohesion=300.0),
+        job(numerics="step"),
     ]
     unseen = job(effects=("buried_obstacle",), obstacle_radius=0.001)
     alone = [experiment().prediction(**each).trajectory.positions for each in jobs]
     prepared = experiment()
-    prepared.__dict__["together"] = 4
+    assert prepared.together == 1, "a CPU makes one at a time, and keeps one"
+    prepared.__dict__["together"] = 5
     prepared.prepare([unseen, *jobs])
+    assert len(prepared._kept) == 5
     with pytest.raises(SimulationError, match="no node"):
         prepared.prediction(**unseen)
     monkeypatch.delattr(Model, "simulate")
     for each, positions in zip(jobs, alone, strict=True):
         assert np.array_equal(prepared.prediction(**each).trajectory.positions, positions)
-    assert not np.array_equal(alone[0], alone[4]) and not np.array_equal(alone[0], alone[1])
+    different = [alone[0], alone[1], *alone[4:]]
+    assert not any(np.array_equal(a, b) for a, b in combinations(different, 2))
+    prepared.prepare([job(2)])
+    assert len(prepared._kept) == 5, "what is kept doesn't grow"
+
+
+def test_more_cannot_be_made_together_than_there_is_room_for() -> None:
+    def together(device: str, particles: int, frames: int) -> int:
+        base = SimpleNamespace(device=device, particles=lambda: np.zeros((particles, 3)), recorded=tuple(range(frames)))
+        experiment = SimpleNamespace(base=base)
+        return cast(int, PlowExperiment.together.func(cast(Any, experiment)))
+
+    assert together("cpu", 1000, 10) == 1
+    assert together("cuda:0", 1000, 10) == MOST_TOGETHER
+    assert together("cuda:0", 300_000, 10) == together("cuda:0", 50_000, 200) == 1
+
+
+def test_what_cannot_be_prepared_is_left_to_predictions(monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_memory(*_: Any) -> None:
+        raise RuntimeError("out of memory")
+
+    monkeypatch.setattr("splatsoil.experiment.plow.simulate_together", no_memory)
+    base = SimpleNamespace(
+        law=SimpleNamespace(effects=()),
+        observation_parameters=(),
+        recorded=(0,),
+        particles=lambda seed: None,
+        measurement=None,
+    )
+    experiment: Any = SimpleNamespace(base=base, progress=None, _kept={}, _computed=lambda effects, way: (base, way))
+    jobs = [{"values": {"angle": a}, "effects": (), "seed": 0, "numerics": ""} for a in (1.0, 2.0)]
+    PlowExperiment.prepare(experiment, jobs)
+    assert not experiment._kept
 
 
 class Asked(Exception):

@@ -49,9 +49,11 @@ def test_the_verdict_follows_the_ratio_to_the_noise() -> None:
 
 def test_a_residual_far_above_the_cameras_noise_is_no_fault_of_an_adequate_model() -> None:
     said = words.residual_sentence(comparison(0.52, 0.01), True)
-    assert "52 ×" in said and "numerics leave as much" in said
+    assert "52 ×" in said and "don't stand above" in said
     short = words.residual_sentence(comparison(0.52, 0.01), False)
     assert "52 ×" in short and "numerics" not in short
+    # nor does little noise hide what stands above the floor
+    assert "nothing more" not in words.residual_sentence(comparison(0.011, 0.01), False)
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -83,6 +84,39 @@ def test_what_will_be_asked_for_is_made_by_both_and_only_once(batch: int, tmp_pa
     for name in ("slopes", "directions", "numerics"):
         assert getattr(alone, name).keys() == getattr(together, name).keys()
         assert all(np.array_equal(table, getattr(together, name)[key]) for key, table in getattr(alone, name).items())
+
+
+def test_a_share_is_made_whole_by_who_takes_it_and_one_failure_in_it_is_no_other_ones(tmp_path: Path) -> None:
+    mine = Watched(lambda values: values["angle"] == 2.0)
+    simulate = Simulations(mine, tmp_path)
+    shares: list[Sequence[Mapping[str, Any]]] = []
+
+    def never(jobs: Sequence[Mapping[str, Any]]) -> Future[None]:
+        shares.append(jobs)
+        return Future()
+
+    angles = (1.0, 2.0, 3.0)
+    with simulate.helped(Helpers(1, never, 4)):
+        simulate.ahead(lambda ask: [ask({"angle": angle}) for angle in angles])
+        assert [len(jobs) for jobs in shares] == [3]
+        assert np.array_equal(simulate({"angle": 1.0}), emulated(3).predict({"angle": 1.0}))
+        assert len(list(tmp_path.iterdir())) == 2, "the third is there, too"
+        with pytest.raises(SimulationError, match="blew up"):
+            simulate({"angle": 2.0})
+        assert np.array_equal(simulate({"angle": 3.0}), emulated(3).predict({"angle": 3.0}))
+    assert [call["angle"] for call in mine.calls] == [1.0, 2.0, 3.0, 2.0]
+
+
+def test_threads_that_share_a_share_make_it_once(tmp_path: Path) -> None:
+    mine = Watched()
+    simulate = Simulations(mine, tmp_path)
+    angles = [0.1 * k for k in range(6)]
+    with simulate.helped(Helpers(5, lambda jobs: Future(), 6)):
+        simulate.ahead(lambda ask: [ask({"angle": angle}) for angle in angles])
+        found = simulate.side_by_side([partial(simulate, {"angle": angle}) for angle in angles])
+    assert len(mine.calls) == 6
+    for angle, table in zip(angles, found, strict=True):
+        assert np.array_equal(table, emulated(3).predict({"angle": angle}))
 
 
 def test_jobs_that_wait_for_simulations_run_side_by_side_and_come_back_in_order(tmp_path: Path) -> None:
