@@ -129,6 +129,10 @@ def show_misfit(misfit: Mapping[str, Any], run: str) -> None:
         f"{word}: slow waves of the residual are {test['dispersion']:.3g} times what noise leaves (p {test['p']:.2g}); "
         f"{off} of {len(misfit['blocks'])} blocks stand out"
     )
+    if misfit["adequate"] and off:
+        console.print(
+            "Blocks are judged at the fitted parameters, slow waves after what other parameters would change."
+        )
     for sentence in misfit["sentences"]:
         console.print(sentence)
     ask = "Could these data show a missing effect?" if misfit["adequate"] else "Which effect is missing?"
