@@ -191,72 +191,70 @@ class Simulations:
 
     def _find(self, key: str, what: Mapping[str, Any], purpose: str) -> FloatArray:
         plan, mine = self._taken(key)
-        kept = self._kept(key)
-        if kept is not None and plan is None:
-            return kept
-        if self._stopped:
-            raise CancelledError
-        with self._guard:
-            self.made += 1
-        if self.told is not None:
-            self.told(purpose)
-        if mine:
-            return self._made(key, {key: what} if plan is None else plan.jobs, None if plan is None else plan.future)
-        assert plan is not None
-        # Tables are there one by one, before the whole share of a helper is.
-        while kept is None and not plan.future.done():
-            wait([plan.future], timeout=POLL)
+        try:
             kept = self._kept(key)
-        kept = self._kept(key) if kept is None else kept
-        return self._made(key, {key: what}) if kept is None else kept
+            if kept is not None and plan is None:
+                return kept
+            if self._stopped:
+                raise CancelledError
+            with self._guard:
+                self.made += 1
+            if self.told is not None:
+                self.told(purpose)
+            if plan is None or mine:
+                return self._made(key, {key: what} if plan is None else plan.jobs)
+            # Tables are there one by one, before the whole share is.
+            while kept is None and not plan.future.done():
+                wait([plan.future], timeout=POLL)
+                kept = self._kept(key)
+            kept = self._kept(key) if kept is None else kept
+            return self._made(key, {key: what}) if kept is None else kept
+        finally:
+            if plan is not None and mine:
+                plan.future.set_result(None)  # whatever came of it, nobody waits for it any more
 
     def _taken(self, key: str) -> tuple[_Plan | None, bool]:
-        """What a simulation is planned with, and whether this process is to make all of that."""
+        """What a simulation is planned with, if it is, and whether this thread is to make all of that now."""
         with self._guard:
             plan = self._planned.pop(key, None)
             if plan is None or not plan.future.cancel():
-                return plan, plan is None
+                return plan, False
             future: Future[Any] = Future()
             future.set_running_or_notify_cancel()
             plan = _Plan(plan.jobs, future)
             self._planned |= dict.fromkeys(self._planned.keys() & plan.jobs.keys(), plan)
             return plan, True
 
-    def _made(self, key: str, jobs: Mapping[str, Mapping[str, Any]], future: Future[Any] | None = None) -> FloatArray:
+    def _made(self, key: str, jobs: Mapping[str, Mapping[str, Any]]) -> FloatArray:
         """New simulations, made here, or by a helper while this process is at another one; the one named is returned.
 
         Args:
             key: its name.
             jobs: arguments of ``predict`` by name, its own among them.
-            future: is done when all of them are kept, or could not be made.
         """
+        free = self._here.acquire(blocking=False)
+        named = all(isinstance(e, str) for what in jobs.values() for e in what["effects"])
+        if not free and self._helpers is not None and named:
+            wait([self._helpers.submit(list(jobs.values()))])
+            kept = self._kept(key)
+            if kept is not None:
+                return kept
+        if not free:
+            # Whatever went wrong there, it will be met here, too, and said.
+            self._here.acquire()
         try:
-            free = self._here.acquire(blocking=False)
-            named = all(isinstance(e, str) for what in jobs.values() for e in what["effects"])
-            if not free and self._helpers is not None and named:
-                wait([self._helpers.submit(list(jobs.values()))])
-                kept = self._kept(key)
-                if kept is not None:
-                    return kept
-            if not free:
-                # Whatever went wrong there, it will be met here, too, and said.
-                self._here.acquire()
-            try:
-                if len(jobs) > 1 and self._helpers is not None:
-                    self._helpers.prepare(list(jobs.values()))
-                made = self._predicted(key, jobs[key])
-                for other in (name for name in jobs if name != key):
-                    if self._stopped:
-                        break
-                    # whoever asks for it meets the error
-                    with suppress(SimulationError):
-                        if self._kept(other) is None:
-                            self._predicted(other, jobs[other])
-            finally:
-                self._here.release()
+            if len(jobs) > 1 and self._helpers is not None:
+                self._helpers.prepare(list(jobs.values()))
+            made = self._predicted(key, jobs[key])
+            for other in (name for name in jobs if name != key):
+                if self._stopped:
+                    break
+                # whoever asks for it meets the error
+                with suppress(SimulationError):
+                    if self._kept(other) is None:
+                        self._predicted(other, jobs[other])
         finally:
-            if future is not None:
-                future.set_result(None)
+            self._here.release()
         return made
 
     def _predicted(self, key: str, what: Mapping[str, Any]) -> FloatArray:

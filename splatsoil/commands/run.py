@@ -59,6 +59,7 @@ def run(config: Config) -> int:
     from splatsoil.model import Model
     from splatsoil.quiet import hush
     from splatsoil.report import write_report
+    from splatsoil.report.words import called_adequate
 
     hush()
     if config.most_effects < 0:
@@ -97,11 +98,7 @@ def run(config: Config) -> int:
         print_json({"ok": True, "run": str(folder.path), "report": str(page), "comparison": losses, **extra, **result})
         return 0
     fit.show(result, str(folder.path))
-    adequate: bool | None = None
-    if misfit is not None:
-        adequate = bool(misfit["adequate"])
-    elif diagnosis is not None:
-        adequate = diagnosis["verdict"] == "adequate"
+    adequate = called_adequate(result, diagnosis if misfit is None else misfit)
     compare.show(comparison, str(folder.comparison), adequate)
     if misfit is not None:
         compare.show_misfit(misfit, str(folder.path))

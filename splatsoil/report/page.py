@@ -51,8 +51,7 @@ def render(data: RunData) -> str:
     # A diagnosis may be of the model that the latest one was made from.
     own = diagnosis is not None and diagnosis["fit"] == data.fit["name"]
     judged = diagnosis if own or data.misfit is None else data.misfit
-    of_this = judged is not None and judged["fit"] == data.fit["name"]
-    adequate = words.called_adequate(data.fit, judged) if of_this else None
+    adequate = words.called_adequate(data.fit, judged)
     ratio = words.ratio_to_noise(comparison)
     at_the_noise = ratio is not None and ratio <= words.AT_THE_NOISE
     pictures = None if comparison is None else _pictures(data.folder / "comparison", comparison)

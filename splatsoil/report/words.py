@@ -57,10 +57,11 @@ def weighed(fit: Mapping[str, Any], judged: Mapping[str, Any] | None) -> Mapping
     return known
 
 
-def called_adequate(fit: Mapping[str, Any], judged: Mapping[str, Any] | None) -> bool:
-    """Whether a diagnosis, or a comparison with the floor, calls this very fit adequate."""
+def called_adequate(fit: Mapping[str, Any], judged: Mapping[str, Any] | None) -> bool | None:
+    """Whether a diagnosis, or a comparison with the floor, calls this very fit adequate; None where it is of another,
+    or there is none."""
     if judged is None or judged["fit"] != fit["name"]:
-        return False
+        return None
     return bool(judged.get("verdict") == "adequate" or judged.get("adequate"))
 
 

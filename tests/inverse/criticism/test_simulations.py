@@ -107,6 +107,23 @@ def test_a_share_is_made_whole_by_who_takes_it_and_one_failure_in_it_is_no_other
     assert [call["angle"] for call in mine.calls] == [1.0, 2.0, 3.0, 2.0]
 
 
+def test_nobody_waits_for_a_share_that_was_given_up(tmp_path: Path) -> None:
+    def told(purpose: str) -> None:
+        if purpose == "interrupted":
+            raise RuntimeError("no")
+
+    simulate = Simulations(Watched(), tmp_path, told=told)
+    done: list[np.ndarray] = []
+    with simulate.helped(Helpers(1, lambda jobs: Future(), 2)):
+        simulate.ahead(lambda ask: [ask({"angle": 1.0}), ask({"angle": 2.0})])
+        with pytest.raises(RuntimeError, match="no"):
+            simulate({"angle": 1.0}, purpose="interrupted")
+        other = threading.Thread(target=lambda: done.append(simulate({"angle": 2.0})), daemon=True)
+        other.start()
+        other.join(20.0)
+    assert len(done) == 1 and np.array_equal(done[0], emulated(3).predict({"angle": 2.0}))
+
+
 def test_threads_that_share_a_share_make_it_once(tmp_path: Path) -> None:
     mine = Watched()
     simulate = Simulations(mine, tmp_path)
