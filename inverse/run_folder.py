@@ -5,6 +5,7 @@
 | `run.json` | what the folder is for: measurement (name, folder, hash), preset, seed, version |
 | `reconstruction/` | Gaussians, surface, metrics |
 | `evaluations.db` | every simulate-and-compare (SQLite) |
+| `features/` | light and albedo, what criticism simulated |
 | `fits/NAME.json` | each finished fit (`base`, `cohesion`, ...), `fit.json` is the latest |
 | `comparison/` | pictures and losses at the latest estimate |
 | `report.html` | for reading |

@@ -8,6 +8,7 @@ import weakref
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +19,7 @@ from splatsoil.mpm import Resolution, Trajectory, frames_around, simulate
 from splatsoil.observation import Observation
 from splatsoil.parameters import Parameter, ParameterSpace
 from splatsoil.reconstruction import Reconstruction, fill
-from splatsoil.scene import Posed, Scene
+from splatsoil.scene import Intrinsic, Posed, Scene
 from splatsoil.soil.effect import Effect
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
@@ -72,6 +73,8 @@ class Model:
         preset: resolution of the solver.
         device: ``cpu`` or ``cuda:N``.
         frames: video frames to predict; all measured ones from frame 0 on by default.
+        intrinsic: file for the light and the albedo that photographs show, by the spacing of particles; what is there
+            isn't estimated again, and what isn't is kept there.
 
     Raises:
         ParameterError: unknown preset, effect or frame.
@@ -86,6 +89,7 @@ class Model:
         preset: str = "small",
         device: str = "cpu",
         frames: Iterable[int] | None = None,
+        intrinsic: Callable[[float], Path] | None = None,
     ) -> None:
         self.measurement, self.reconstruction = measurement, reconstruction
         self.preset, self.device = preset, device
@@ -97,6 +101,7 @@ class Model:
         unknown = sorted(set(self.frames) - set(measured))
         if unknown or not self.frames:
             raise ParameterError(f"frames {unknown or 'none'} are not in the video; it has {measured}")
+        self._intrinsic = intrinsic
         self._scene = lru_cache(maxsize=SCENES_KEPT)(self._build_scene)
         self._poses = _Poses()
         self.recorded = self._recorded_frames()
@@ -123,6 +128,7 @@ class Model:
             preset=self.preset,
             device=self.device,
             frames=self.frames if frames is None else frames,
+            intrinsic=self._intrinsic,
         )
         other.resolution = resolution or self.resolution
         if other.resolution.spacing == self.resolution.spacing:
@@ -176,13 +182,19 @@ class Model:
     def _build_scene(self, seed: int) -> Scene:
         if seed != 0:
             return self.scene(0).with_particles(self.particles(seed))
-        return Scene.from_reconstruction(
+        file = None if self._intrinsic is None else self._intrinsic(self.resolution.spacing)
+        known = None if file is None or not file.is_file() else Intrinsic.load(file)
+        scene = Scene.from_reconstruction(
             self.reconstruction,
             self.measurement,
             self.particles(0),
             self.resolution.spacing,
             device=self.device,
+            intrinsic=known,
         )
+        if file is not None and known is None:
+            Intrinsic.of(scene).save(file)
+        return scene
 
     def simulate(
         self, values: Mapping[str, float], seed: int = 0, progress: Callable[[int, int], None] | None = None

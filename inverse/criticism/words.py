@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from splatsoil.experiment.base import Candidate
 from splatsoil.experiment.strokes import MEASURED
-from splatsoil.report.words import symbol, with_std
+from splatsoil.report.words import symbol, undetermined, with_std
 
 from .diagnosis import Diagnosis
 from .estimates import Estimate
@@ -94,6 +94,9 @@ def of_estimates(estimates: Mapping[str, Estimate]) -> list[str]:
     """What an adequate model's parameters are once all of the floor is weighed."""
     out = []
     for name, estimate in estimates.items():
+        if not estimate.determined:
+            out.append(undetermined(name))
+            continue
         value = amount(estimate.value, estimate.std, estimate.unit)
         parts = (float(f"{part:.2g}") for part in (estimate.noise, estimate.numerics))
         noise, numerics = (f"± {part:g}{symbol(estimate.unit)}" for part in parts)

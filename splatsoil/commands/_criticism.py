@@ -22,12 +22,11 @@ if TYPE_CHECKING:
 def model_of(folder: RunFolder, device: str, report: Report) -> Model:
     """The model that a run's latest fit is of, on one device."""
     from splatsoil.commands import _stages as stage
-    from splatsoil.model import Model
 
     setup = folder.fit()["setup"]
     measurement = stage.measurement_of(folder)
     reconstruction = stage.reconstructed(measurement, folder, device, report)
-    return Model(measurement, reconstruction, effects=setup["effects"], preset=setup["preset"], device=device)
+    return stage.model_on(measurement, folder, reconstruction, setup["effects"], setup["preset"], device)
 
 
 def experiment_of(

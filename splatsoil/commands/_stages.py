@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -92,6 +92,35 @@ def reconstructed(measurement: Measurement, run: RunFolder, device: str, report:
         made.save(run.reconstruction)
     # Read back: float32 on disk is what every later command will start from.
     return Reconstruction.load(run.reconstruction)
+
+
+def model_on(
+    measurement: Measurement,
+    run: RunFolder,
+    reconstruction: Reconstruction,
+    effects: Iterable[str],
+    preset: str,
+    device: str,
+) -> Model:
+    """A model of a run's set. What photographs say of light and albedo is kept in the run's ``features/``: processes
+    that work side by side, and later commands, find it there."""
+    from splatsoil import __version__
+    from splatsoil.files import FORWARD, code_digest
+    from splatsoil.inverse.evaluations import digest
+    from splatsoil.model import Model
+
+    what = {
+        "measurement": measurement.hash,
+        "reconstruction": digest_of(reconstruction),
+        "device": device.split(":")[0],
+        "version": __version__,
+        "code": code_digest(FORWARD),
+    }
+
+    def file(spacing: float) -> Path:
+        return run.path / "features" / f"intrinsic-{digest({**what, 'spacing': spacing})[:24]}.npz"
+
+    return Model(measurement, reconstruction, effects=effects, preset=preset, device=device, intrinsic=file)
 
 
 def digest_of(reconstruction: Reconstruction) -> str:

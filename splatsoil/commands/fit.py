@@ -20,7 +20,6 @@ def run(config: Config) -> int:
     from splatsoil.commands import _stages as stage
     from splatsoil.commands._progress import stages
     from splatsoil.envs.devices import resolve_device
-    from splatsoil.model import Model
     from splatsoil.quiet import hush
 
     hush()
@@ -28,7 +27,7 @@ def run(config: Config) -> int:
     device = resolve_device(config.device)
     with stages(quiet=config.json) as begin:
         reconstruction = stage.reconstructed(measurement, folder, device, begin("reconstruct"))
-        model = Model(measurement, reconstruction, effects=config.effects, preset=config.preset, device=device)
+        model = stage.model_on(measurement, folder, reconstruction, config.effects, config.preset, device)
         result = stage.fitted(config, measurement, folder, model, begin("fit"))
     if config.json:
         print_json({"ok": True, "run": str(folder.path), **result})

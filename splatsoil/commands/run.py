@@ -56,7 +56,6 @@ def run(config: Config) -> int:
     from splatsoil.errors import ParameterError, SplatsoilError
     from splatsoil.files import plain, read_json
     from splatsoil.inverse.criticism.diagnosis import Options
-    from splatsoil.model import Model
     from splatsoil.quiet import hush
     from splatsoil.report import write_report
     from splatsoil.report.words import called_adequate
@@ -70,7 +69,7 @@ def run(config: Config) -> int:
         measurement, folder = stage.prepare(config)
         device = resolve_device(config.device)
         reconstruction = stage.reconstructed(measurement, folder, device, begin("reconstruct"))
-        model = Model(measurement, reconstruction, effects=config.effects, preset=config.preset, device=device)
+        model = stage.model_on(measurement, folder, reconstruction, config.effects, config.preset, device)
         result = stage.fitted(config, measurement, folder, model, begin("fit"))
         comparison = stage.compared(folder, model, begin("compare"))
         if config.criticise:

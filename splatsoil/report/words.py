@@ -80,7 +80,7 @@ def answers(fit: Mapping[str, Any], judged: Mapping[str, Any] | None = None) -> 
             state = "open"
             remark = f"These evaluations do not determine the {plain}: they hardly say where the loss is least."
             if name in better:
-                remark = f"All that was measured doesn't determine the {plain}: its bounds say about as much."
+                remark = undetermined(name)
         elif entry["at_bound"] is not None:
             state = "bound"
             remark = (
@@ -89,6 +89,11 @@ def answers(fit: Mapping[str, Any], judged: Mapping[str, Any] | None = None) -> 
             )
         out.append(Answer(plain, value, std, symbol(entry["unit"]), state, remark))
     return out
+
+
+def undetermined(name: str) -> str:
+    """Of a parameter that noise, chance and numerics leave open."""
+    return f"All that was measured doesn't determine the {name.replace('_', ' ')}: its bounds say about as much."
 
 
 def fitted_sentence(fit: Mapping[str, Any], judged: Mapping[str, Any] | None) -> str:

@@ -3,6 +3,7 @@
 from splatsoil.scene.binding import Binding, bind
 from splatsoil.scene.estimate import estimate_light, seen_colours, still_frames
 from splatsoil.scene.ground import ground_of_pixels
+from splatsoil.scene.intrinsic import Intrinsic
 from splatsoil.scene.light import Light, encoded, linear
 from splatsoil.scene.light_fit import LightEstimate
 from splatsoil.scene.lit import LitRelief, light_relief
@@ -12,6 +13,7 @@ from splatsoil.scene.tool import ToolBody, silhouette
 
 __all__ = [
     "Binding",
+    "Intrinsic",
     "Layers",
     "Light",
     "LightEstimate",

@@ -13,6 +13,7 @@ from splatsoil.measurement import Bed, Frame, Measurement
 from splatsoil.scene import albedo as albedos
 from splatsoil.scene.binding import bind
 from splatsoil.scene.estimate import estimate_light, still_frames
+from splatsoil.scene.intrinsic import Intrinsic
 from splatsoil.scene.light import Light, encoded, linear
 from splatsoil.scene.lit import LitRelief, light_relief
 from splatsoil.scene.relief import relief_of_particles
@@ -50,6 +51,7 @@ def build_scene(
     spacing: float,
     *,
     light: Light | None = None,
+    intrinsic: Intrinsic | None = None,
     device: torch.device | str = "cpu",
     rounds: int = ROUNDS,
     background: tuple[float, float, float] | None = None,
@@ -67,7 +69,9 @@ def build_scene(
         raise ParameterError("the reconstruction has no soil")
     body = ToolBody(measurement.tool.mesh, device)
     relief = relief_of_particles(x, spacing, measurement.bed.lower, measurement.bed.upper)
-    if light is None:
+    if intrinsic is not None:
+        light = intrinsic.light
+    elif light is None:
         light = estimate_light(measurement, relief, body).light
     motion = measurement.tool.motion
     start = motion.pose(float(motion.times[0]))
@@ -85,6 +89,8 @@ def build_scene(
         spacing=spacing,
         background=np.asarray(reconstruction.background if background is None else background, dtype=np.float64),
     )
+    if intrinsic is not None:
+        return intrinsic.applied(scene)
     frames = still_frames(measurement)
     with torch.no_grad():
         posed = scene.pose(x, None, start)

@@ -66,7 +66,9 @@ class Light:
             raise ParameterError(f"ambient shares lie between 0 and 1, not {ambient.tolist()}")
         if not np.all(level > 0.0):
             raise ParameterError(f"the level soil's colour must be positive, not {level.tolist()}")
-        for name, value in (("direction", direction / length), ("ambient", ambient), ("level", level)):
+        if abs(length - 1.0) > 1e-12:  # one that is normalised already keeps its bits
+            direction /= length
+        for name, value in (("direction", direction), ("ambient", ambient), ("level", level)):
             value.setflags(write=False)
             object.__setattr__(self, name, value)
 

@@ -167,7 +167,8 @@ class Scene:
             measurement: the set it was made from.
             particles: (p, 3) at rest, m: those that will move.
             spacing: side of the cube of soil a particle stands for, m.
-            options: ``light`` (a `Light`; estimated if left out), ``device``, ``rounds`` (of refining the albedo),
+            options: ``light`` (a `Light`; estimated if left out), ``intrinsic`` (light and albedo that were found
+                before, an `Intrinsic`; nothing is estimated then), ``device``, ``rounds`` (of refining the albedo),
                 ``background`` (3,) sRGB (the reconstruction's if left out).
         """
         from splatsoil.scene.build import build_scene

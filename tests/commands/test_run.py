@@ -158,12 +158,17 @@ def test_ctrl_c_keeps_what_is_done_and_the_same_command_goes_on_to_the_same_end(
 
 @pytest.mark.slow
 def test_compare_and_report_work_on_a_finished_run(
-    place: Path, whole: dict[str, Any], capsys: pytest.CaptureFixture[str]
+    place: Path, whole: dict[str, Any], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = place / "whole"
     before = json.loads((run / "comparison" / "comparison.json").read_text())
     shutil.rmtree(run / "comparison")
     (run / "report.html").unlink()
+
+    def again_and_again(*_: object) -> None:
+        raise AssertionError("the light is known")
+
+    monkeypatch.setattr("splatsoil.scene.build.estimate_light", again_and_again)
     assert cli.main(["compare", str(run)]) == 0
     assert "soil at rest" in " ".join(capsys.readouterr().out.split())
     again = json.loads((run / "comparison" / "comparison.json").read_text())

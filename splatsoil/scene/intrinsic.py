@@ -1,0 +1,79 @@
+"""What photographs say of light and albedo, on file: it takes seconds to estimate and hangs on no parameter."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from splatsoil.errors import ParameterError, RunError
+from splatsoil.files import write_bytes
+from splatsoil.scene.light import Light
+from splatsoil.scene.render import Scene
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Intrinsic:
+    """A scene's light and albedo, parted (an intrinsic decomposition).
+
+    Attributes:
+        light: sun and sky.
+        soil: (s, 3) float32, sRGB-encoded albedo of the reconstruction's soil Gaussians.
+        grains: (p, 3) float32, of the particles.
+        tool: (3,) linear.
+    """
+
+    light: Light
+    soil: npt.NDArray[np.float32]
+    grains: npt.NDArray[np.float32]
+    tool: FloatArray
+
+    @classmethod
+    def of(cls, scene: Scene) -> Intrinsic:
+        """A scene's."""
+        soil, grains = (t.detach().cpu().numpy() for t in (scene.soil_albedo, scene.grain_albedo))
+        return cls(scene.light, soil, grains, scene.tool_albedo)
+
+    @classmethod
+    def load(cls, path: Path) -> Intrinsic:
+        """From a file that `save` wrote.
+
+        Raises:
+            RunError: it can't be read.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as kept:
+                light = Light(kept["direction"], kept["ambient"], kept["level"], float(kept["softness"]))
+                return cls(light, kept["soil"], kept["grains"], kept["tool"])
+        except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+            raise RunError(f"{path}: cannot be read ({error}); delete it, it will be made anew") from error
+
+    def save(self, path: Path) -> None:
+        """Write a NumPy archive, whole or not at all.
+
+        Raises:
+            RunError: the folder can't be written to.
+        """
+        stream = io.BytesIO()
+        light = {name: getattr(self.light, name) for name in ("direction", "ambient", "level", "softness")}
+        np.savez(stream, soil=self.soil, grains=self.grains, tool=self.tool, **light)
+        write_bytes(path, stream.getvalue())
+
+    def applied(self, scene: Scene) -> Scene:
+        """A scene of as many Gaussians and particles in this light and of these colours.
+
+        Raises:
+            ParameterError: it has others.
+        """
+        for name, mine, its in (("soil", self.soil, scene.soil_albedo), ("grains", self.grains, scene.grain_albedo)):
+            if mine.shape != tuple(its.shape):
+                raise ParameterError(f"albedo of {name} has shape {mine.shape}, the scene {tuple(its.shape)}")
+        soil, grains = (torch.from_numpy(a).to(scene.device) for a in (self.soil, self.grains))
+        return scene.replace(light=self.light, soil_albedo=soil, grain_albedo=grains, tool_albedo=self.tool)
