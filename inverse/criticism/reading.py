@@ -173,11 +173,7 @@ def read(
     points = surface.points
     low, high = np.maximum(points.min(axis=0) - beyond, -1.0), np.minimum(points.max(axis=0) + beyond, 1.0)
     draws = _sample(belief.log_density, low, high, seed)
-    likely = np.concatenate([draws, points])
-    start = likely[np.argmin(belief.expected_chi2(likely))]
-    bounds = list(zip(low, high, strict=True))
-    best = minimize(lambda x: float(belief.expected_chi2(x[None])[0]), start, bounds=bounds).x
-    values = space.from_unit(np.clip(best, low, high))
+    values = space.from_unit(belief.best(np.concatenate([draws, points]), low, high))
     # A root mean square would be ruled by the few draws in a gap between simulations.
     spread = np.quantile(np.abs(space.from_unit(draws) - values), ONE_STD, axis=0)
     unknown = np.any(surface.predict(draws)[1] > belief.wide, axis=1)
@@ -192,7 +188,8 @@ class _Belief:
         space: of the parameters.
         surface: through the simulations.
         scores: (p,) the observation along the surface's directions.
-        wide: variance of an independent feature, 1 unless more than noise lies where no parameter reaches.
+        wide: variance of an independent feature, 1 unless more than noise lies where no parameter reaches, or is left
+            by the best of the simulations.
         known: what other measurements say.
         home: (n,) the defaults.
     """
@@ -218,7 +215,19 @@ class _Belief:
         outside, scores = surface.remainder(target), surface.project(target)
         wide = max(1.0, float(outside @ outside) / max(len(target) - len(scores), 1))
         home = space.to_unit(space.to_vector({p.name: p.default for p in parameters}))
-        return cls(space, surface, scores, wide, known, home)
+        belief = cls(space, surface, scores, wide, known, home)
+        # What parameters don't mend where they are best would else lie, for all that is known, where nothing is.
+        points = surface.points
+        best = belief.best(points, points.min(axis=0), points.max(axis=0))
+        left = scores - surface.predict(best[None])[0][0]
+        return replace(belief, wide=max(wide, float(left @ left) / len(left)))
+
+    def best(self, starts: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+        """(n,) within bounds where χ² is expected to be least, downhill from the best of some points."""
+        start = starts[np.argmin(self.expected_chi2(starts))]
+        bounds = list(zip(low, high, strict=True))
+        found = minimize(lambda x: float(self.expected_chi2(x[None])[0]), start, bounds=bounds)
+        return np.clip(found.x, low, high)
 
     def log_density(self, where: FloatArray) -> FloatArray:
         """(q,) up to a constant."""
