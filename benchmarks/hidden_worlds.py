@@ -299,10 +299,8 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
         size = "–" if r["hidden"] == NOTHING else f"{r['size']:.3g}"
         found = ", ".join(f"{k} {v:.3g} ± {std:.2g}" for k, (v, std) in r["sizes"].items()) or "–"
         errors = " → ".join(f"{e / r['floor']:.2f}" for e in r["held_out"]) if r["floor"] else "–"
-        angles = f"{r['angle']:.1f}°; {r['fit'][0]:.1f}, {r['before'][0]:.1f}"
-        if r["sizes"]:
-            angles += f" → {r['after'][0]:.1f}"
-        angles += f" ± {r['after'][1]:.1f}°"
+        refit = f"{r['before'][0]:.1f} → " if r["sizes"] else ""
+        angles = f"{r['angle']:.1f}°; {r['fit'][0]:.1f}, {refit}{r['after'][0]:.1f} ± {r['after'][1]:.1f}°"
         members = ", ".join(r["class"]) or "–"
         cells = (r["hidden"], size, r["verdict"], members, f"{100 * r['explained']:.0f} %", found, errors, angles)
         lines.append("| " + " | ".join(cells) + " |")

@@ -81,6 +81,9 @@ def test_what_is_stated_is_held_against_the_truth() -> None:
         judged(NOTHING, "adequate", []),
         judged("tilt", "missing", ["tilt"]),
     ]
+    refitted_in_vain = judged(NOTHING, "adequate", []) | {"before": [30.0, 0.5]}
+    assert "32.0°; 35.0, 31.0 ± 1.2°" in table([refitted_in_vain])
+    assert "32.0°; 35.0, 34.0 → 34.0 ± 0.5°" in table(rows)
     assert "within 1 × their ±: 1 of 3" in table(rows) and "within 2 × their ±: 2 of 3" in table(rows)
 
 
