@@ -222,10 +222,11 @@ def curves(diagnosis: Mapping[str, Any]) -> str:
             place.set_title(curve["channel"], fontsize=9)
             place.set_ylabel(curve["unit"], fontsize=8)
             place.tick_params(labelsize=7)
-        panels[0].legend(fontsize=8)
+        legend = panels[0].get_legend_handles_labels()
+        figure.legend(*legend, fontsize=8, loc="outside upper center", ncols=2, columnspacing=1.0)
         panels[-1].set_xlabel(diagnosis["time_name"])
 
-    return _draw(draw, (SIZE[0], 0.6 + 1.4 * len(diagnosis["curves"])))
+    return _draw(draw, (SIZE[0], 1.0 + 1.4 * len(diagnosis["curves"])))
 
 
 def plan_maps(diagnosis: Mapping[str, Any], which: Sequence[str]) -> list[str]:
