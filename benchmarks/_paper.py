@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -20,7 +19,7 @@ from splatsoil.inverse.posterior import Data, sample_posterior
 
 from splatsoil.comparison import Block, Comparator
 from splatsoil.errors import SimulationError
-from splatsoil.files import write_bytes, write_json
+from splatsoil.files import write_json, write_npz
 from splatsoil.measurement import Measurement
 from splatsoil.model import Model
 from splatsoil.mpm import PRESETS, Preset, Resolution, simulate_together
@@ -286,12 +285,10 @@ def search(sight: Sight, angle: float, numbers: Sequence[int], out: Path, where:
 
 def save_look(file: Path, angle: float, found: Look | None) -> None:
     """Keep an evaluation; a failed one, too."""
-    stream = io.BytesIO()
     told = {} if found is None else {"published": found.published, "blocks": found.blocks}
     if found is not None and found.ours is not None:
         told["ours"] = found.ours
-    np.savez(stream, angle=angle, **told)  # type: ignore[arg-type]  # numbers are arrays to NumPy
-    write_bytes(file, stream.getvalue())
+    write_npz(file, angle=angle, **told)
 
 
 def load_look(file: Path, angle: float) -> tuple[Look | None] | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import math
 import os
@@ -69,6 +70,13 @@ def write_text(path: str | Path, text: str) -> Path:
 def write_json(path: str | Path, data: Any) -> Path:
     """Write ``data`` as indented, strictly valid JSON; NumPy numbers and arrays are taken, NaN becomes null."""
     return write_text(path, json.dumps(plain(data), indent=1, allow_nan=False) + "\n")
+
+
+def write_npz(path: str | Path, **arrays: Any) -> Path:
+    """Write arrays (numbers are arrays to NumPy) as one of its archives, whole or not at all."""
+    stream = io.BytesIO()
+    np.savez(stream, **arrays)
+    return write_bytes(path, stream.getvalue())
 
 
 def read_json(path: str | Path) -> Any:

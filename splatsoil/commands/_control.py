@@ -94,12 +94,10 @@ def calibrated(
 ) -> Calibration | None:
     """What pictures say of cameras, light, clock and tool where soil plays no part, made once and kept in
     ``features/``."""
-    import io
-
     import numpy as np
 
     from splatsoil.experiment.base import Calibration
-    from splatsoil.files import code_digest, write_bytes
+    from splatsoil.files import code_digest, write_npz
     from splatsoil.inverse.evaluations import digest
 
     names = [p.name for c in experiment.candidates if c.kind == "observation" for p in c.parameters]
@@ -110,8 +108,6 @@ def calibrated(
         found = experiment.calibrate(values)
         if found is None:
             return None
-        stream = io.BytesIO()
-        np.savez(stream, names=np.array(found.names), estimate=found.estimate, covariance=found.covariance)
-        write_bytes(path, stream.getvalue())
+        write_npz(path, names=np.array(found.names), estimate=found.estimate, covariance=found.covariance)
     with np.load(path, allow_pickle=False) as kept:
         return Calibration(tuple(str(name) for name in kept["names"]), kept["estimate"], kept["covariance"])

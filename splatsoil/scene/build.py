@@ -90,7 +90,7 @@ def build_scene(
         background=np.asarray(reconstruction.background if background is None else background, dtype=np.float64),
     )
     if intrinsic is not None:
-        return intrinsic.applied(scene)
+        return intrinsic.coloured(scene)
     frames = still_frames(measurement)
     with torch.no_grad():
         posed = scene.pose(x, None, start)

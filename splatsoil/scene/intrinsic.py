@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass
 from pathlib import Path
 from zipfile import BadZipFile
@@ -12,7 +11,7 @@ import numpy.typing as npt
 import torch
 
 from splatsoil.errors import ParameterError, RunError
-from splatsoil.files import write_bytes
+from splatsoil.files import write_npz
 from splatsoil.scene.light import Light
 from splatsoil.scene.render import Scene
 
@@ -61,13 +60,11 @@ class Intrinsic:
         Raises:
             RunError: the folder can't be written to.
         """
-        stream = io.BytesIO()
         light = {name: getattr(self.light, name) for name in ("direction", "ambient", "level", "softness")}
-        np.savez(stream, soil=self.soil, grains=self.grains, tool=self.tool, **light)
-        write_bytes(path, stream.getvalue())
+        write_npz(path, soil=self.soil, grains=self.grains, tool=self.tool, **light)
 
-    def applied(self, scene: Scene) -> Scene:
-        """A scene of as many Gaussians and particles in this light and of these colours.
+    def coloured(self, scene: Scene) -> Scene:
+        """A scene of as many Gaussians and particles with this albedo.
 
         Raises:
             ParameterError: it has others.
@@ -76,4 +73,4 @@ class Intrinsic:
             if mine.shape != tuple(its.shape):
                 raise ParameterError(f"albedo of {name} has shape {mine.shape}, the scene {tuple(its.shape)}")
         soil, grains = (torch.from_numpy(a).to(scene.device) for a in (self.soil, self.grains))
-        return scene.replace(light=self.light, soil_albedo=soil, grain_albedo=grains, tool_albedo=self.tool)
+        return scene.replace(soil_albedo=soil, grain_albedo=grains, tool_albedo=self.tool)

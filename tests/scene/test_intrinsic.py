@@ -1,12 +1,15 @@
 """Light and albedo on file: what is read back is what was estimated, to the bit."""
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from splatsoil.commands._stages import model_on
 from splatsoil.errors import ParameterError, RunError
 from splatsoil.measurement import Measurement
 from splatsoil.model import Model
@@ -32,7 +35,7 @@ def experiment(small_set: Path):
         torch.full((count,), 0.9),
         torch.tensor([0.6, 0.5, 0.4]).repeat(count, 1),
     )
-    whole = np.ones(count, dtype=bool)
+    whole = torch.ones(count, dtype=torch.bool)
     surface = HeightField.over(bed.lower, bed.upper, 0.02, LEVEL)
     made = SimpleNamespace(gaussians=gaussians, soil=whole, tool=~whole, background=(0.0, 0.0, 0.0), surface=surface)
     return measurement, made
@@ -68,6 +71,20 @@ def test_a_model_estimates_light_and_albedo_once(experiment, tmp_path: Path, mon
     second = Model(*experiment, preset="tiny", frames=[0], intrinsic=file).variant(effects=["cohesion"])
     assert pictures(second) == expected
     assert asked == [first.resolution.spacing] * 2
+
+
+def test_a_runs_file_is_of_one_reconstruction(experiment, tmp_path: Path) -> None:
+    """Soil of other colours, as many Gaussians as before, isn't drawn with the albedo of what was there."""
+    measurement, made = experiment
+    darker = SimpleNamespace(
+        **{**vars(made), "gaussians": replace(made.gaussians, colours=0.5 * made.gaussians.colours)}
+    )
+    run: Any = SimpleNamespace(path=tmp_path)
+    first, other, again = (
+        Intrinsic.of(model_on(measurement, run, each, (), "tiny", "cpu").scene()) for each in (made, darker, made)
+    )
+    assert len(list((tmp_path / "features").glob("intrinsic-*.npz"))) == 2
+    assert np.array_equal(first.soil, again.soil) and not np.array_equal(first.soil, other.soil)
 
 
 def test_a_file_of_another_scene_or_no_file_of_ours_is_refused(experiment, tmp_path: Path) -> None:
