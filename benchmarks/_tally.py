@@ -29,7 +29,7 @@ class Tally:
         members: mean size of the class where there was one.
         verdicts: how often each verdict was given.
         bias: mean error of the model's parameter in prior standard deviations, before and after adding.
-        error: held-out error over the floor, before and after.
+        error: held-out error over each model's floor, before and after.
         inside: how many intervals of 50 % and of 90 % held the truth, angle and size, where the right effect was added.
         intervals: how many there were.
     """
@@ -58,7 +58,7 @@ class Found:
         fitted: the model's own parameter as it was fitted.
         values: parameters refitted with the best effect, empty where there is none.
         stds: theirs.
-        error: held-out error over the floor, before and after that.
+        error: held-out error over each model's floor, before and after that.
         scored: effects that the analysis knew.
     """
 
@@ -80,7 +80,7 @@ class Found:
         if members:
             best = refits[members[0]]
             values, stds = best.values, best.stds
-            error = (refits[""].held_out / best.floor, best.held_out / best.floor)
+            error = (refits[""].held_out / refits[""].floor, best.held_out / best.floor)
         return cls(
             diagnosis.verdict,
             members,

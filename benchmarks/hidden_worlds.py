@@ -281,8 +281,8 @@ def score(hidden: Hidden, fit: Mapping[str, Any], told: Mapping[str, Any]) -> di
         "after": [last["values"]["friction_angle"], last["stds"]["friction_angle"]],
         "sizes": {k: [v, last["stds"][k]] for k, v in last["values"].items() if k != "friction_angle"},
         "off": off,
-        "held_out": [base.get("held_out"), last.get("held_out")],
-        "floor": last.get("floor"),
+        # Each over what noise leaves in such soil.
+        "errors": [refit["held_out"] / refit["floor"] for refit in (base, last) if "floor" in refit],
         "z": {e["name"]: e["z"] for e in told["effects"]},
         "seconds": [fit["seconds"], told["seconds"]],
     }
@@ -298,7 +298,7 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
     for r in rows:
         size = "–" if r["hidden"] == NOTHING else f"{r['size']:.3g}"
         found = ", ".join(f"{k} {v:.3g} ± {std:.2g}" for k, (v, std) in r["sizes"].items()) or "–"
-        errors = " → ".join(f"{e / r['floor']:.2f}" for e in r["held_out"]) if r["floor"] else "–"
+        errors = " → ".join(f"{e:.2f}" for e in r["errors"]) or "–"
         refit = f"{r['before'][0]:.1f} → " if r["sizes"] else ""
         angles = f"{r['angle']:.1f}°; {r['fit'][0]:.1f}, {refit}{r['after'][0]:.1f} ± {r['after'][1]:.1f}°"
         members = ", ".join(r["class"]) or "–"
@@ -322,7 +322,7 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
     share("another effect named", library, lambda r: r["verdict"] == "missing" and not r["right"])
     share("something named that is outside the library", outside, lambda r: not r["right"])
     share("the right effect of soil or tool first: angle within 2.5° after", right, _near)
-    share("the same: error ends within 1.2 × the floor", right, lambda r: r["held_out"][-1] <= 1.2 * r["floor"])
+    share("the same: error ends within 1.2 × the floor", right, lambda r: r["errors"][-1] <= 1.2)
     share("nothing hidden: angle within 2.5°", plain_sand, _near)
     if rows:
         stated = [r["off"] for r in rows if r["class"][:1] == [r["hidden"]] or (r["hidden"] == NOTHING and r["right"])]

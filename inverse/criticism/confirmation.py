@@ -51,7 +51,7 @@ class Confirmation:
             :class:`~splatsoil.experiment.base.Calibration`.
         agrees: likewise, if they were as refitted.
         held_out: root mean square of the residual on times the refit hasn't seen, of features in the layout's unit.
-        floor: what noise alone leaves there.
+        floor: what noise alone leaves there; of soil that has the effect, where that was simulated.
         remainder: what stands on slow waves.
         visits: simulations that the parameters were read off; none where the last derivatives told them.
     """
@@ -314,13 +314,11 @@ class OwnFloor:
     Attributes:
         before: misfit of the model as it is on that floor.
         after: of the model with the effect.
-        noise: root mean square of what it leaves on times hidden from refits.
-        refit: with its parameters read off on that floor.
+        refit: with its parameters read off on that floor, and what that leaves on times hidden from refits.
     """
 
     before: Omnibus
     after: Omnibus
-    noise: float
     refit: Confirmation
 
 
@@ -380,7 +378,7 @@ def on_its_own_floor(
     left = (experiment.observed - there.mean)[seen]
     without = np.concatenate([floor.nuisance, _tangent(floor.noise, slopes[..., : len(experiment.parameters)])], axis=1)
     after = omnibus(floor.noise, free, left, basis)
-    refit = best
+    refit = replace(best, floor=_noise_on(floor.single, _judged(experiment, _split(experiment)[1])))
     if visits:
         sight = Sight.of(experiment, replace(floor, parameters=along), basis)
         known = _known(evidence, parameters)
@@ -390,10 +388,5 @@ def on_its_own_floor(
         least = _stds(parameters, sight(slopes), precision, after)
         stds = {name: max(std, least[name]) for name, std in reading.stds.items()}
         stds, numerics = _with_untried(stds, floor, slopes, precision)
-        refit = replace(best, values=dict(reading.values), stds=stds, numerics=numerics)
-    return OwnFloor(
-        before=omnibus(floor.noise, without, residual, basis),
-        after=after,
-        noise=_noise_on(floor.single, _judged(experiment, _split(experiment)[1])),
-        refit=refit,
-    )
+        refit = replace(refit, values=dict(reading.values), stds=stds, numerics=numerics)
+    return OwnFloor(before=omnibus(floor.noise, without, residual, basis), after=after, refit=refit)

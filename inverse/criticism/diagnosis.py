@@ -236,7 +236,7 @@ def judge(
                 own = on_its_own_floor(experiment, evidence, tried[best], candidates[best], simulate, residual)
                 confirmations[best] = own.refit
                 if more or error > WITHIN:
-                    error = tried[best].held_out / own.noise
+                    error = own.refit.held_out / own.refit.floor
                 if more:
                     before, remainder = own.before, own.after
             gone = explained(before, remainder)

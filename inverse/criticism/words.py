@@ -9,6 +9,7 @@ from splatsoil.experiment.base import Candidate
 from splatsoil.experiment.strokes import MEASURED
 from splatsoil.report.words import symbol, undetermined, with_std
 
+from .confirmation import Confirmation
 from .diagnosis import Diagnosis
 from .estimates import Estimate
 from .outside import CLEAR, FEW, StrengthReading
@@ -46,14 +47,14 @@ def sentences(diagnosis: Diagnosis, candidates: Mapping[str, Candidate], base: M
 
 def _missing(diagnosis: Diagnosis, candidates: Mapping[str, Candidate], base: Mapping[str, float]) -> list[str]:
     best = diagnosis.members[0]
-    confirmed = diagnosis.confirmations[best]
+    confirmed, before = diagnosis.confirmations[best], diagnosis.confirmations[""]
     candidate = candidates[best]
     size = confirmed.values[candidate.size]
     std = confirmed.stds[candidate.size]
     out = [
         f"{title(best)} is missing: about {amount(size, std, candidate.measure.unit)}. Adding it lowers the error on "
-        f"frames that the refit has not seen from {diagnosis.confirmations[''].held_out:.2g} to "
-        f"{confirmed.held_out:.2g} {diagnosis.unit}; noise alone leaves {confirmed.floor:.2g}."
+        f"frames that the refit has not seen from {before.held_out:.2g} to "
+        f"{confirmed.held_out:.2g} {diagnosis.unit}; noise alone leaves {_noise(before, confirmed)}."
     ]
     if diagnosis.where:
         (stage, region, channel), share = max(diagnosis.where.items(), key=lambda item: item[1])
@@ -120,8 +121,8 @@ def _outside(diagnosis: Diagnosis, candidates: Mapping[str, Candidate]) -> list[
         out.append(
             f"The nearest is {best.replace('_', ' ')} ({size}): with it the error on frames that the refit has not "
             f"seen goes from {before.held_out:.2g} to {confirmed.held_out:.2g} {diagnosis.unit} (noise alone leaves "
-            f"{confirmed.floor:.2g}), which is {100.0 * diagnosis.explained:.0f} % of the misfit beyond chance. What "
-            f"remains is more than noise, so it is not all that is missing; {MAKES_UP}."
+            f"{_noise(before, confirmed)}), which is {100.0 * diagnosis.explained:.0f} % of the misfit beyond chance. "
+            f"What remains is more than noise, so it is not all that is missing; {MAKES_UP}."
         )
     return out if diagnosis.strength is None else [*out, *of_strength(diagnosis.strength)]
 
@@ -180,3 +181,9 @@ def listed(words: list[str]) -> str:
 def amount(value: float, std: float, unit: str) -> str:
     """A value with its spread, if it has one, and unit."""
     return (" ± ".join(with_std(value, std)) if 0.0 < std < math.inf else f"{value:.3g}") + symbol(unit)
+
+
+def _noise(before: Confirmation, confirmed: Confirmation) -> str:
+    """What noise leaves on hidden times: soil that has an effect falls otherwise by chance."""
+    there, here = f"{confirmed.floor:.2g}", f"{before.floor:.2g}"
+    return there if there == here else f"{here} without it, and {there} in soil that has it"

@@ -52,7 +52,7 @@ def judged(kind: str, verdict: str, members: list[str]) -> dict[str, object]:
     """A world of 32°; a tilt of 4°, if that is hidden."""
     refit: dict[str, object] = {"values": {"friction_angle": 34.0, "tilt_x": 1.0}}
     refit |= {"stds": {"friction_angle": 0.5, "tilt_x": 2.0}, "held_out": 2.0, "floor": 2.5}
-    refits = dict.fromkeys(["as it is", *members], refit) if members else {}
+    refits = {"as it is": refit | {"held_out": 6.0, "floor": 2.0}, **dict.fromkeys(members, refit)} if members else {}
     told = {"refits": refits, "verdict": verdict, "class": members, "explained": 0.5}
     told |= {"effects": [{"name": "tilt", "parameter": "tilt_x", "z": 3.0}], "seconds": 1.0}
     told["estimates"] = {"friction_angle": {"value": 31.0, "std": 1.2}}
@@ -84,6 +84,7 @@ def test_what_is_stated_is_held_against_the_truth() -> None:
     refitted_in_vain = judged(NOTHING, "adequate", []) | {"before": [30.0, 0.5]}
     assert "32.0°; 35.0, 31.0 ± 1.2°" in table([refitted_in_vain])
     assert "32.0°; 35.0, 34.0 → 34.0 ± 0.5°" in table(rows)
+    assert "| 3.00 → 0.80 |" in table(rows), "each model is held against its own floor"
     assert "within 1 × their ±: 1 of 3" in table(rows) and "within 2 × their ±: 2 of 3" in table(rows)
 
 

@@ -11,10 +11,11 @@ import pytest
 from splatsoil.benchmarks.hidden_effects import detectable, emulated, fitted
 from splatsoil.inverse.criticism.diagnosis import Options, diagnose
 from splatsoil.inverse.criticism.simulations import Simulations
+from splatsoil.inverse.criticism.words import sentences
 
 from splatsoil.experiment.emulated import EmulatedExperiment, FloatArray
 
-NAME, SHIFT = "effect 2", 5.0
+NAME, SHIFT, LOUD = "effect 2", 5.0, 2.0
 
 
 @dataclass(frozen=True)
@@ -78,3 +79,28 @@ def test_the_floor_is_measured_where_all_times_put_the_parameters() -> None:
         )
         nearer.append(near < far)
     assert sum(nearer) >= 3
+
+
+@dataclass(frozen=True)
+class Restless(EmulatedExperiment):
+    """Once there is much of the effect, what is chance is twice as large: clods stand or fall."""
+
+    much: float = 0.0
+
+    def predict(self, values: Mapping[str, float], *, numerics: str = "", **others: Any) -> FloatArray:
+        """(t, s) features."""
+        table, mean = super().predict(values, numerics=numerics, **others), self.expected(values, numerics)
+        return mean + (LOUD if values.get(NAME, 0.0) > self.much else 1.0) * (table - mean)
+
+
+def test_an_error_is_held_against_what_soil_with_the_effect_leaves_by_chance() -> None:
+    """Such soil leaves more than soil without it, on whose floor the model as it is goes on to be judged."""
+    truth = {"angle": 0.0, NAME: 6.0 * detectable(0, Options())[NAME]}
+    made = Restless(**emulated(0).__dict__, much=0.7 * truth[NAME])
+    experiment = replace(made, observed=made.measured(truth, [0, 99]))
+    found = diagnose(experiment, {"angle": fitted(experiment)})
+    assert found.members[0] == NAME
+    best, before = found.confirmations[NAME], found.confirmations[""]
+    assert best.floor > 1.2 * before.floor
+    told = sentences(found, {c.name: c for c in experiment.candidates}, found.evidence.values)
+    assert any(f"{before.floor:.2g} without it, and {best.floor:.2g} in soil that has it" in line for line in told)
