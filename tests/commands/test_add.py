@@ -140,7 +140,11 @@ def test_a_diagnosis_from_before_shapes_were_free_is_none(bench: Bench, kept: tu
     if kept is not None:
         bench.refits["dilatancy"] = refit(dict.fromkeys(kept, 9.0), 40.0)
     found = {"friction_angle": 33.0, "dilatancy_angle": 10.0, "dilatancy_strain": 2.0}
-    bench.confirmed = {"as it is": refit({"friction_angle": 31.0}, 60.0), "dilatancy": refit(found, 20.0)}
+    bench.confirmed = {
+        "as it is": refit({"friction_angle": 31.0}, 60.0),
+        "dilatancy": refit(found, 20.0) | {"floor": 1.5},
+    }
     entry = bench.add("dilatancy")
     assert {name: value for name, (value, _) in bench.refitted.items()} == found
     assert (entry["fall"], bench.history[0]["held_out"]) == (40.0, pytest.approx(6.0))
+    assert [each["floor"] for each in bench.history] == [1.0, 1.5], "each model has what its own soil leaves"
