@@ -5,25 +5,23 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Candidate, Experiment
 from splatsoil.parameters import Parameter
 
 from .dilution import undiluted
 from .estimates import prior, untried
-from .evidence import Evidence, Numerics, Vantage, Visit, other_numerics, pair_of
-from .floor import Floor, floor_of
+from .evidence import Evidence, Vantage, Visit
+from .floor import Floor
 from .joint import precision_of
-from .misfit import Omnibus, omnibus, smooth_basis
+from .misfit import Omnibus, omnibus
 from .noise import Noise
-from .reading import MOST, explored, read, tangent
+from .reading import MOST, explored, read
 from .refit import ROUNDS, Known, Refit, Start, settle
 from .score import Scorer
 from .sight import Sight
@@ -43,7 +41,7 @@ class Confirmation:
         fit: the refit, by which the effect is judged.
         values: the parameters by all times.
         stds: standard deviations of these.
-        numerics: what of these comes of numerics that weren't tried; see :mod:`.estimates`.
+        systematic: what of these is the model's own fault; see :mod:`.estimates`.
         chi2: of all times, as far as these tell of anything; see :class:`~splatsoil.inverse.criticism.sight.Sight`.
         fall: by how much that is less than the model's as it is.
         unseen: likewise, on times the refit hasn't seen alone.
@@ -60,7 +58,7 @@ class Confirmation:
     fit: Refit
     values: Mapping[str, float]
     stds: Mapping[str, float]
-    numerics: Mapping[str, float]
+    systematic: Mapping[str, float]
     chi2: float
     fall: float
     unseen: float
@@ -92,7 +90,7 @@ def confirm(
 
     ``steps`` is the number of simulations from each point where a refit starts; ``vantage`` is another such point.
     """
-    shown, hidden = _split(experiment)
+    shown, hidden = split_times(experiment)
     whiten = Sight.of(experiment, floor, basis, vantage, shown)
     jobs: list[Candidate | None] = [None, *chosen]
     starting = undiluted(evidence, floor.single.plus(floor.nuisance))
@@ -110,8 +108,8 @@ def confirm(
             return table
 
         visits = [v for p in (evidence, vantage) if p is not None for v in p.visits if v.effects in ((), on)]
-        free = _free(experiment, candidate)
-        known, emulated = _known(evidence, free), _emulated(experiment, candidate)
+        free = free_in(experiment, candidate)
+        known, emulated = known_of(evidence, free), _emulated(experiment, candidate)
         fit = settle(
             predict,
             whiten,
@@ -136,56 +134,56 @@ def confirm(
     before = experiment.observed - refits[0][0].prediction
     out: dict[str, Confirmation] = {}
     for candidate, (fit, visits) in zip(jobs, refits, strict=True):
-        free = _free(experiment, candidate)
-        known = _known(evidence, free)
+        free = free_in(experiment, candidate)
+        known = known_of(evidence, free)
         at, off = (np.array([values.get(p.name, p.off or 0.0) for p in free]) for values in (fit.values, {}))
-        left, mask = experiment.observed - fit.prediction, _judged(experiment, hidden)
-        apart_from = np.concatenate([floor.nuisance, _tangent(floor.single, fit.slopes)], axis=1)
+        left, mask = experiment.observed - fit.prediction, judged(experiment, hidden)
+        apart_from = np.concatenate([floor.nuisance, reach_of(floor.single, fit.slopes)], axis=1)
         remainder = omnibus(floor.single, apart_from, left[experiment.seen], basis)
         chi2 = _chi2(whole, left) + known.chi2(at)
-        precision = _beforehand(free, fit.values, known)
-        values, stds = dict(fit.values), _stds(free, whiten(fit.slopes), precision, remainder)
+        precision = beforehand(free, fit.values, known)
+        values, stds = dict(fit.values), stds_of(free, whiten(fit.slopes), precision, remainder)
         emulated: tuple[Visit, ...] = ()
         if _emulated(experiment, candidate):
             # A surface that isn't one tells nothing more than the last derivatives do.
             with suppress(ValueError):
                 reading = read(visits, whole, experiment.observed, free, known)
                 values, stds, emulated = dict(reading.values), dict(reading.stds), tuple(visits)
-        stds, numerics = _with_untried(stds, floor, fit.slopes, precision)
+        stds, systematic = widened(stds, untried(floor, fit.slopes, precision))
         out["" if candidate is None else candidate.name] = Confirmation(
             name="" if candidate is None else candidate.name,
             fit=fit,
             values=values,
             stds=stds,
-            numerics=numerics,
+            systematic=systematic,
             chi2=chi2,
             fall=0.0 if candidate is None else _chi2(whole, before) + known.chi2(off) - chi2,
             unseen=_chi2(apart, before) - _chi2(apart, left),
             told=known.chance(off),
             agrees=known.chance(at),
             held_out=float(np.sqrt(np.mean(left[mask] ** 2))),
-            floor=_noise_on(floor.single, mask),
+            floor=noise_on(floor.single, mask),
             remainder=remainder,
             visits=emulated,
         )
     return out
 
 
-def _free(experiment: Experiment, candidate: Candidate | None) -> list[Parameter]:
+def free_in(experiment: Experiment, candidate: Candidate | None) -> list[Parameter]:
     """Parameters of a refit."""
     return [*experiment.parameters, *(() if candidate is None else candidate.refitted)]
 
 
 def _emulated(experiment: Experiment, candidate: Candidate | None) -> bool:
     """Whether a refit reads the parameters off all simulations: where these have chance in them."""
-    return experiment.chance and len(_free(experiment, candidate)) <= MOST
+    return experiment.chance and len(free_in(experiment, candidate)) <= MOST
 
 
 def _chi2(sight: Sight, left: FloatArray) -> float:
     return float(np.sum(sight(left) ** 2))
 
 
-def _split(experiment: Experiment) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+def split_times(experiment: Experiment) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
     """Times that a refit sees, and those hidden from it: every other one, or all where that leaves nothing."""
     shown = np.arange(experiment.layout.shape[0]) % 2 == 0
     if not experiment.seen[~shown].any() or not experiment.seen[shown].any():
@@ -193,12 +191,12 @@ def _split(experiment: Experiment) -> tuple[npt.NDArray[np.bool_], npt.NDArray[n
     return shown, ~shown
 
 
-def _judged(experiment: Experiment, hidden: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+def judged(experiment: Experiment, hidden: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
     """(t, s) hidden features whose errors can be put together: those in one unit."""
     return experiment.seen & hidden[:, None] & experiment.layout.common[None]
 
 
-def _noise_on(noise: Noise, mask: npt.NDArray[np.bool_]) -> float:
+def noise_on(noise: Noise, mask: npt.NDArray[np.bool_]) -> float:
     """Root mean square of a noise over some features."""
     return float(np.sqrt(np.mean(noise.spread(noise.scale)[mask] ** 2)))
 
@@ -214,7 +212,7 @@ def _renewed(experiment: Experiment, candidate: Candidate | None) -> list[str]:
     return [*soil, *(p.name for p in candidate.refitted)]
 
 
-def _known(evidence: Evidence, free: Sequence[Parameter]) -> Known:
+def known_of(evidence: Evidence, free: Sequence[Parameter]) -> Known:
     """What a calibration says of the parameters that a refit has."""
     precision, centre = precision_of(evidence.calibration, [p.name for p in free])
     told = np.flatnonzero(np.diag(precision) > 0.0)
@@ -247,7 +245,7 @@ def _starts(
     return [start(point) for point in points]
 
 
-def _stds(
+def stds_of(
     free: Sequence[Parameter], columns: FloatArray, precision: FloatArray, remainder: Omnibus
 ) -> dict[str, float]:
     """Standard deviations of a refit's estimates by whitened slopes (d, k) and what is known beforehand (k, k).
@@ -259,20 +257,18 @@ def _stds(
     return {p.name: widened * math.sqrt(float(v)) for p, v in zip(free, np.diag(covariance), strict=True)}
 
 
-def _with_untried(
-    stds: Mapping[str, float], floor: Floor, slopes: FloatArray, precision: FloatArray
-) -> tuple[dict[str, float], dict[str, float]]:
-    """Standard deviations by noise, in the slopes' order, widened by numerics that weren't tried, and the latter."""
-    numerics = dict(zip(stds, map(float, untried(floor, slopes, precision)), strict=True))
-    return {name: math.hypot(std, numerics[name]) for name, std in stds.items()}, numerics
+def widened(stds: Mapping[str, float], systematic: FloatArray) -> tuple[dict[str, float], dict[str, float]]:
+    """Standard deviations by noise, by name, widened by what is systematic (k,) in the same order, and the latter."""
+    named = dict(zip(stds, map(float, systematic), strict=True))
+    return {name: math.hypot(std, named[name]) for name, std in stds.items()}, named
 
 
-def _beforehand(free: Sequence[Parameter], values: Mapping[str, float], known: Known) -> FloatArray:
+def beforehand(free: Sequence[Parameter], values: Mapping[str, float], known: Known) -> FloatArray:
     """(k, k) precision of parameters by their bounds and by what other measurements say."""
     return prior(free, values) + known.root.T @ known.root
 
 
-def _tangent(noise: Noise, slopes: FloatArray) -> FloatArray:
+def reach_of(noise: Noise, slopes: FloatArray) -> FloatArray:
     """(n, k) derivatives (t, s, k), each as large as a parameter's error could be: ten times the noise."""
     columns = slopes[noise.seen]
     size = np.linalg.norm(columns / noise.scale[:, None], axis=0)
@@ -292,7 +288,7 @@ def remainder_of(
         return best.remainder
     seen = experiment.seen
     left = (experiment.observed - best.fit.prediction)[seen]
-    free = np.concatenate([floor.nuisance, _tangent(floor.single, best.fit.slopes)], axis=1)
+    free = np.concatenate([floor.nuisance, reach_of(floor.single, best.fit.slopes)], axis=1)
     others = [c for name, c in candidates.items() if name != best.name]
     if not others:
         return best.remainder
@@ -305,88 +301,3 @@ def remainder_of(
     size = columns[second.name]
     scale = 10.0 * math.sqrt(len(size)) / np.linalg.norm(size / floor.single.scale[:, None], axis=0)
     return omnibus(floor.single, np.concatenate([free, size * scale], axis=1), left, basis)
-
-
-@dataclass(frozen=True)
-class OwnFloor:
-    """What soil that has an effect leaves by chance and by other numerics.
-
-    Attributes:
-        before: misfit of the model as it is on that floor.
-        after: of the model with the effect.
-        refit: with its parameters read off on that floor, and what that leaves on times hidden from refits.
-    """
-
-    before: Omnibus
-    after: Omnibus
-    refit: Confirmation
-
-
-def on_its_own_floor(
-    experiment: Experiment,
-    evidence: Evidence,
-    best: Confirmation,
-    candidate: Candidate,
-    simulate: Simulations,
-    residual: FloatArray,
-) -> OwnFloor:
-    """Judge the model as it is and with its best effect by the chance and numerics of soil that has the effect.
-
-    Cohesive soil falls by chance where dry soil flows, and numerics move it farther: what remains after an effect is
-    added has to be judged by what such soil leaves, and parameters are known no better than that lets them be.
-    """
-    told: dict[str, Any] = {"effects": (best.name,), "purpose": f"floor with {best.name}"}
-    # Half of the times may have led a refit far along a valley from where all of them say that the parameters are.
-    at, middle = best.values, best.fit.prediction
-    try:
-        middle = simulate(at, **told)
-    except SimulationError:
-        at = best.fit.values
-    seeds = range(1, 1 + len(evidence.repeats))
-
-    def spread(ask: Callable[..., FloatArray]) -> tuple[FloatArray, Numerics, list[FloatArray]]:
-        guesses = [ask(at, numerics=name, **told) - middle for name in experiment.guesses]
-        numerics = other_numerics(
-            experiment, lambda name, seed: ask(at, numerics=name, seed=seed, **told), pair_of(experiment, len(seeds))
-        )
-        return np.stack([ask(at, seed=seed, **told) for seed in seeds]), numerics, guesses
-
-    simulate.ahead(spread)
-    runs, (patterns, doubts), guesses = spread(simulate)
-    deviations = (runs - runs.mean(axis=0)) * np.sqrt(len(runs) / max(len(runs) - 1, 1))
-    there = replace(
-        evidence,
-        mean=runs.mean(axis=0),
-        repeats=deviations,
-        numerics=patterns,
-        numerics_doubts=doubts,
-        guesses=np.stack(guesses) if guesses else evidence.guesses,
-        slopes={},
-        curves={},
-        widths={},
-    )
-    floor, seen = floor_of(experiment, there), experiment.seen
-    basis = smooth_basis(experiment.layout, floor.noise)
-    parameters, slopes = _free(experiment, candidate), best.fit.slopes
-    # Where simulations were too few for a surface at first, they still are.
-    visits = (*best.visits, Visit(dict(at), (best.name,), middle)) if best.visits else ()
-    if visits:
-        seeing = Sight.of(experiment, replace(floor, parameters=_tangent(floor.noise, slopes)), basis)
-        slopes = tangent(visits, seeing, parameters, at)
-    along = _tangent(floor.noise, slopes)
-    free = np.concatenate([floor.nuisance, along], axis=1)
-    left = (experiment.observed - there.mean)[seen]
-    without = np.concatenate([floor.nuisance, _tangent(floor.noise, slopes[..., : len(experiment.parameters)])], axis=1)
-    after = omnibus(floor.noise, free, left, basis)
-    refit = replace(best, floor=_noise_on(floor.single, _judged(experiment, _split(experiment)[1])))
-    if visits:
-        sight = Sight.of(experiment, replace(floor, parameters=along), basis)
-        known = _known(evidence, parameters)
-        reading = read(visits, sight, experiment.observed, parameters, known)
-        # Draws don't leave the simulations' range, and these were made where another floor let the parameters be.
-        precision = _beforehand(parameters, at, known)
-        least = _stds(parameters, sight(slopes), precision, after)
-        stds = {name: max(std, least[name]) for name, std in reading.stds.items()}
-        stds, numerics = _with_untried(stds, floor, slopes, precision)
-        refit = replace(refit, values=dict(reading.values), stds=stds, numerics=numerics)
-    return OwnFloor(before=omnibus(floor.noise, without, residual, basis), after=after, refit=refit)

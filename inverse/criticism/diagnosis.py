@@ -13,13 +13,14 @@ from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Calibration, Candidate, Experiment
 
 from .afresh import look_afresh, promising
-from .confirmation import Confirmation, confirm, on_its_own_floor, remainder_of
+from .confirmation import Confirmation, confirm, remainder_of
 from .estimates import Estimate, weighed, weighed_there
 from .evidence import Evidence, Vantage, gather
 from .floor import Floor, floor_of
 from .misfit import Block, Omnibus, blocks, left_over, omnibus, shares, smooth_basis
 from .naming import members_of
 from .outside import StrengthReading, read_strength
+from .own_floor import on_its_own_floor
 from .score import Score, Scorer
 from .sight import Sight
 from .simulations import Simulations

@@ -3,7 +3,8 @@
 The numerics that were tried are nuisances: the data settle how much there is of each, and hardly widen an estimate. But
 another solver, and soil itself, differ from ours in other ways as well. What such a way does to an estimate is told by
 those that were tried, each in turn treated as if it hadn't been (a jackknife over numerics: the estimator that knows
-only the others is shown the one left out).
+only the others is shown the one left out). Where soil is wrong in yet another way, parts of the data contradict each
+other.
 """
 
 from __future__ import annotations
@@ -80,6 +81,42 @@ def untried(floor: Floor, slopes: FloatArray, precision: FloatArray, doubts: Flo
         known = informed(along.T @ weights, chance.T @ unsure)
         shifts.append(np.linalg.solve(known + precision, weights.T @ left_out))
     return np.asarray(np.sqrt(np.mean(np.square(shifts), axis=0)))
+
+
+def at_odds(
+    floor: Floor,
+    parts: npt.NDArray[np.int64],
+    slopes: FloatArray,
+    precision: FloatArray,
+    doubts: FloatArray,
+    residual: FloatArray,
+) -> FloatArray:
+    """(k,) standard deviations by which parts of the data contradict each other on parameters, beyond noise.
+
+    Each part pulls the estimate its own way; noise says how far that may be. A wrong model pulls farther, and the same
+    way all over a part (cluster-robust covariance: Liang & Zeger 1986, Biometrika 73:13).
+
+    Args:
+        floor: of the residual.
+        parts: (t, s) number of the part that a feature belongs to.
+        slopes: see :func:`untried`, like the next two.
+        precision: (k, k).
+        doubts: (t, s, k).
+        residual: (t, s) observed minus the mean prediction where the slopes were measured.
+    """
+    seen = floor.noise.seen
+    solver = floor.noise.plus(floor.nuisance).solver()
+    along, chance, left, part = slopes[seen], doubts[seen], residual[seen], parts[seen]
+    weights = solver.solve(along)
+    scores = along.T @ weights
+    inverse = np.linalg.inv(informed(scores, chance.T @ solver.solve(chance)) + precision)
+    rest = left - along @ (inverse @ weights.T @ left)
+    pulls = np.stack([weights[part == k].T @ rest[part == k] for k in np.unique(part)], axis=1)
+    count = pulls.shape[1]
+    if count < 2:
+        return np.zeros(len(inverse))
+    robust = inverse @ (pulls @ pulls.T * (count / (count - 1))) @ inverse
+    return np.asarray(np.sqrt(np.maximum(np.diag(robust - inverse @ (scores + precision) @ inverse), 0.0)))
 
 
 def weighed(experiment: Experiment, evidence: Evidence, floor: Floor, basis: FloatArray) -> dict[str, Estimate]:

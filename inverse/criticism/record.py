@@ -143,7 +143,7 @@ def confirmation(c: Confirmation) -> dict[str, Any]:
     return {
         "values": dict(c.values),
         "stds": dict(c.stds),
-        "numerics": dict(c.numerics),
+        "systematic": dict(c.systematic),
         "chi2": c.chi2,
         "fall": c.fall,
         "told": c.told,

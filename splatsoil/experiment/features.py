@@ -82,6 +82,13 @@ class Layout:
         return np.array([numbers[site.channel] for site in self.sites], dtype=np.int64)
 
     @cached_property
+    def parts(self) -> npt.NDArray[np.int64]:
+        """(t, s) number of each feature's part of the data: what one instrument says in one stage."""
+        numbers = {stage: i for i, stage in enumerate(dict.fromkeys(self.stages))}
+        stages = np.array([numbers[stage] for stage in self.stages], dtype=np.int64)
+        return stages[:, None] * len(self.channels) + self.channel_numbers[None]
+
+    @cached_property
     def steps(self) -> FloatArray:
         """(t,) times in units of their median spacing."""
         times = np.array(self.times)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from splatsoil.benchmarks.hidden_effects import emulated, fitted, outside
 from splatsoil.inverse.criticism.diagnosis import Bench, Options
-from splatsoil.inverse.criticism.estimates import untried, weighed, weighed_there
+from splatsoil.inverse.criticism.estimates import at_odds, untried, weighed, weighed_there
 from splatsoil.inverse.criticism.evidence import gather
 from splatsoil.inverse.criticism.floor import floor_of
 from splatsoil.inverse.criticism.misfit import smooth_basis
@@ -135,3 +135,33 @@ def test_effects_explain_no_more_than_noise_of_a_truth_that_computes_otherwise()
         scores = scorer.score((experiment.observed - evidence.mean)[experiment.seen])
         falls.append(np.mean([score.statistic for score in scores.values()]))
     assert 0.4 < np.mean(falls) < 1.5
+
+
+def test_the_error_is_as_large_as_parts_of_the_data_contradict_each_other() -> None:
+    """Each part has an angle of its own; where all have the same, noise says nearly all of it."""
+    made = emulated(4)
+    experiment = replace(made, observed=made.expected({"angle": 0.0}))
+    evidence = gather(experiment, Simulations(experiment), {"angle": 0.0})
+    floor = replace(floor_of(experiment, evidence), nuisance=np.zeros((made.observed.size, 0)), tried=0)
+    parts, precision = made.layout.parts, np.zeros((1, 1))
+    slopes = made.slopes["angle"][..., None]
+    along, doubts = slopes.reshape(-1, 1), np.zeros_like(slopes)
+    inverse = np.linalg.inv(floor.noise.covariance)
+    noise = (along.T @ inverse @ along).item() ** -0.5
+    weights = noise**2 * (along.T @ inverse)[0]
+    generator, count = np.random.default_rng(8), int(parts.max()) + 1
+    assert count == len(np.unique(parts)) > 3
+    for spread in (0.0, 4.0 * noise):
+        errors, told = [], []
+        for draw in range(200):
+            own = spread * generator.standard_normal(count)[parts]
+            chance = floor.noise.solver().sample(np.random.default_rng([draw, 1]), 1).reshape(parts.shape)
+            residual = own * slopes[..., 0] + chance
+            errors.append(weights @ residual.reshape(-1))
+            told.append(at_odds(floor, parts, slopes, precision, doubts, residual)[0])
+        if spread:
+            assert 0.75 < rms(np.hypot(noise, told)) / rms(np.array(errors)) < 1.25
+        else:
+            assert rms(np.array(told)) < 0.8 * noise
+    alone = np.zeros_like(parts)
+    np.testing.assert_array_equal(at_odds(floor, alone, slopes, precision, doubts, residual), 0.0)

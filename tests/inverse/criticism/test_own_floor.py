@@ -42,12 +42,30 @@ def test_numerics_of_soil_with_the_effect_shift_no_parameter_unseen() -> None:
         best = found.confirmations[NAME]
         errors.append(best.values["angle"])
         # Without what numerics that weren't tried may do: this one was.
-        stds.append(np.sqrt(best.stds["angle"] ** 2 - best.numerics["angle"] ** 2))
+        stds.append(np.sqrt(best.stds["angle"] ** 2 - best.systematic["angle"] ** 2))
         assert best.values[NAME] == pytest.approx(truth[NAME], rel=0.15)
     assert np.sqrt(np.mean(np.square(errors))) < 2.7
     assert np.sqrt(np.mean(np.square(np.divide(errors, stds)))) < 1.7
     # A spread as wide as what is believed before any data would hold any truth.
     assert max(stds) < SHIFT
+
+
+def test_parameters_are_known_no_better_than_parts_of_the_data_agree() -> None:
+    """What each stage says to each camera has an angle of its own, and no numerics were tried that could tell of it."""
+    off, systematic = [], []
+    for world in range(4):
+        made = replace(emulated(world), patterns={})
+        stages = tuple(f"stage {row // 2}" for row in range(made.layout.shape[0]))
+        made = replace(made, layout=replace(made.layout, stages=stages))
+        truth = {"angle": 0.0, NAME: 6.0 * detectable(world, Options())[NAME]}
+        parts = made.layout.parts
+        own = 6.0 * np.random.default_rng([world, 3]).standard_normal(parts.max() + 1)[parts]
+        experiment = replace(made, observed=made.measured(truth, [world, 99], own * made.slopes["angle"]))
+        best = diagnose(experiment, {"angle": fitted(experiment)}).confirmations[NAME]
+        off += [(best.values[name] - truth[name]) / best.stds[name] for name in truth]
+        systematic.append(best.systematic["angle"])
+    assert np.sqrt(np.mean(np.square(off))) < 1.5
+    assert np.median(systematic) > 0.5
 
 
 class Noted(Simulations):
