@@ -84,12 +84,7 @@ def untried(floor: Floor, slopes: FloatArray, precision: FloatArray, doubts: Flo
 
 
 def at_odds(
-    floor: Floor,
-    parts: npt.NDArray[np.int64],
-    slopes: FloatArray,
-    precision: FloatArray,
-    doubts: FloatArray,
-    residual: FloatArray,
+    floor: Floor, parts: npt.NDArray[np.int64], slopes: FloatArray, precision: FloatArray, residual: FloatArray
 ) -> FloatArray:
     """(k,) standard deviations by which parts of the data contradict each other on parameters, beyond noise.
 
@@ -99,24 +94,22 @@ def at_odds(
     Args:
         floor: of the residual.
         parts: (t, s) number of the part that a feature belongs to.
-        slopes: see :func:`untried`, like the next two.
-        precision: (k, k).
-        doubts: (t, s, k).
+        slopes: (t, s, k) derivatives by the parameters.
+        precision: (k, k) what is known of the parameters beforehand.
         residual: (t, s) observed minus the mean prediction where the slopes were measured.
     """
     seen = floor.noise.seen
-    solver = floor.noise.plus(floor.nuisance).solver()
-    along, chance, left, part = slopes[seen], doubts[seen], residual[seen], parts[seen]
-    weights = solver.solve(along)
-    scores = along.T @ weights
-    inverse = np.linalg.inv(informed(scores, chance.T @ solver.solve(chance)) + precision)
+    along, left, part = slopes[seen], residual[seen], parts[seen]
+    weights = floor.noise.plus(floor.nuisance).solver().solve(along)
+    known = along.T @ weights + precision
+    inverse = np.linalg.inv(known)
     rest = left - along @ (inverse @ weights.T @ left)
     pulls = np.stack([weights[part == k].T @ rest[part == k] for k in np.unique(part)], axis=1)
     count = pulls.shape[1]
     if count < 2:
         return np.zeros(len(inverse))
     robust = inverse @ (pulls @ pulls.T * (count / (count - 1))) @ inverse
-    return np.asarray(np.sqrt(np.maximum(np.diag(robust - inverse @ (scores + precision) @ inverse), 0.0)))
+    return np.asarray(np.sqrt(np.maximum(np.diag(robust - inverse), 0.0)))
 
 
 def weighed(experiment: Experiment, evidence: Evidence, floor: Floor, basis: FloatArray) -> dict[str, Estimate]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -275,28 +274,16 @@ def _look(
 
     switch_on(c for c in candidates if c.kind == "observation")
     for parameter in experiment.parameters:
-        name = parameter.name
-        slope, curve, width = slope_at(parameter, base, look.middle, partial(visit, name))
-        look.slopes[name], look.widths[name] = slope, width
+        value = base[parameter.name]
+        ends = around(parameter, value)
+        tables = [visit(parameter.name, {**base, parameter.name: end}) for end in ends]
+        offsets = [distance(parameter, value, end) for end in ends]
+        look.slopes[parameter.name], curve = derivatives(offsets, tables, look.middle)
+        look.widths[parameter.name] = max(abs(offset) for offset in offsets)
         if curve is not None:
-            look.curves[name] = curve
+            look.curves[parameter.name] = curve
     switch_on(c for c in candidates if c.kind == "physics")
     return look
-
-
-def slope_at(
-    parameter: Parameter,
-    base: Mapping[str, float],
-    middle: FloatArray,
-    ask: Callable[[Mapping[str, float]], FloatArray],
-) -> tuple[FloatArray, FloatArray | None, float]:
-    """(t, s) derivative by one parameter at a point with prediction ``middle``, half the second one if it was measured,
-    and the step."""
-    value = base[parameter.name]
-    ends = around(parameter, value)
-    tables = [ask({**base, parameter.name: end}) for end in ends]
-    offsets = [distance(parameter, value, end) for end in ends]
-    return *derivatives(offsets, tables, middle), max(abs(offset) for offset in offsets)
 
 
 def around(parameter: Parameter, value: float) -> list[float]:

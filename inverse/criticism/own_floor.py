@@ -6,9 +6,9 @@ has to be judged by that, and parameters are known no better than it lets them b
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,6 @@ import numpy.typing as npt
 
 from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Candidate, Experiment
-from splatsoil.parameters import Parameter
 
 from .confirmation import (
     Confirmation,
@@ -31,8 +30,8 @@ from .confirmation import (
     widened,
 )
 from .estimates import at_odds, untried
-from .evidence import Evidence, Numerics, Visit, ignorance, other_numerics, pair_of, slope_at
-from .floor import Floor, floor_of
+from .evidence import Evidence, Numerics, Visit, around, ignorance, other_numerics, pair_of
+from .floor import floor_of
 from .misfit import Omnibus, omnibus, smooth_basis
 from .reading import read, tangent
 from .sight import Sight
@@ -76,18 +75,21 @@ def on_its_own_floor(
     # Where simulations were too few for a surface at first, they still are.
     parameters, emulated = free_in(experiment, candidate), bool(best.visits)
 
-    def spread(ask: Callable[..., FloatArray]) -> tuple[FloatArray, Numerics, list[FloatArray], _Slopes | None]:
+    def spread(ask: Callable[..., FloatArray]) -> tuple[FloatArray, Numerics, list[FloatArray], list[Visit]]:
         guesses = [ask(at, numerics=name, **told) - middle for name in experiment.guesses]
         pair = pair_of(experiment, len(seeds))
         numerics = other_numerics(experiment, lambda name, seed: ask(at, numerics=name, seed=seed, **told), pair)
-        measured = None
-        if emulated:
-            near = {**told, "purpose": f"beside the floor with {best.name}"}
-            measured = _Slopes.measured(parameters, at, lambda seed, there: ask(there, seed=seed, **near), pair)
-        return np.stack([ask(at, seed=seed, **told) for seed in seeds]), numerics, guesses, measured
+        # By the surface's own seed: where chance is the same, it cancels.
+        visits = [Visit(dict(at), (best.name,), middle)]
+        for there in [{**at, p.name: end} for p in parameters for end in around(p, at[p.name])] if emulated else []:
+            # Where nothing can be simulated nothing is learned.
+            with suppress(SimulationError):
+                table = ask(there, effects=(best.name,), purpose=f"beside the floor with {best.name}")
+                visits.append(Visit(there, (best.name,), table))
+        return np.stack([ask(at, seed=seed, **told) for seed in seeds]), numerics, guesses, visits
 
     simulate.ahead(spread)
-    runs, (patterns, doubts), guesses, measured = spread(simulate)
+    runs, (patterns, doubts), guesses, near = spread(simulate)
     deviations = (runs - runs.mean(axis=0)) * np.sqrt(len(runs) / max(len(runs) - 1, 1))
     there = replace(
         evidence,
@@ -102,7 +104,7 @@ def on_its_own_floor(
     )
     floor, seen = floor_of(experiment, there), experiment.seen
     basis = smooth_basis(experiment.layout, floor.noise)
-    slopes, visits = best.fit.slopes, (*best.visits, Visit(dict(at), (best.name,), middle))
+    slopes, visits = best.fit.slopes, (*best.visits, *near)
     if emulated:
         seeing = Sight.of(experiment, replace(floor, parameters=reach_of(floor.noise, slopes)), basis)
         slopes = tangent(visits, seeing, parameters, at)
@@ -120,58 +122,10 @@ def on_its_own_floor(
         precision = beforehand(parameters, at, known)
         least = stds_of(parameters, sight(slopes), precision, after)
         stds = {name: max(std, least[name]) for name, std in reading.stds.items()}
-        known_by = measured or _Slopes(slopes, np.zeros_like(slopes))
-        stds, systematic = widened(stds, known_by.systematic(experiment, floor, parameters, at, precision, there.mean))
-        refit = replace(refit, values=dict(reading.values), stds=stds, systematic=systematic)
-    return OwnFloor(before=omnibus(floor.noise, without, residual, basis), after=after, refit=refit)
-
-
-@dataclass(frozen=True)
-class _Slopes:
-    """Derivatives (t, s, k) by parameters at a point, and the chance in them.
-
-    A surface's tangents are as steep as the chance of single simulations lets them be, which looks like information.
-
-    Attributes:
-        mean: of two seeds.
-        doubts: half their difference.
-    """
-
-    mean: FloatArray
-    doubts: FloatArray
-
-    @classmethod
-    def measured(
-        cls,
-        parameters: Sequence[Parameter],
-        at: Mapping[str, float],
-        ask: Callable[[int, Mapping[str, float]], FloatArray],
-        seeds: tuple[int, ...],
-    ) -> _Slopes | None:
-        """By simulations; None where one can't be made."""
-        try:
-            first, second = (
-                np.stack([slope_at(p, at, ask(seed, at), partial(ask, seed))[0] for p in parameters], axis=-1)
-                for seed in seeds
-            )
-        except SimulationError:
-            return None
-        return cls(0.5 * (first + second), 0.5 * (first - second))
-
-    def systematic(
-        self,
-        experiment: Experiment,
-        floor: Floor,
-        parameters: Sequence[Parameter],
-        at: Mapping[str, float],
-        precision: FloatArray,
-        mean: FloatArray,
-    ) -> FloatArray:
-        """(k,) by how much the parameters may be off by the model's own fault: numerics that weren't tried tell it, and
-        contradictions between parts of the data; the larger counts, up to what is believed before any data."""
-        residual = np.where(experiment.seen, experiment.observed - mean, 0.0)
-        told = np.maximum(
-            untried(floor, self.mean, precision, self.doubts),
-            at_odds(floor, experiment.layout.parts, self.mean, precision, self.doubts, residual),
+        systematic = np.hypot(
+            untried(floor, slopes, precision),
+            at_odds(floor, experiment.layout.parts, slopes, precision, experiment.observed - there.mean),
         )
-        return np.minimum(told, [ignorance(p, at[p.name]) for p in parameters])
+        stds, named = widened(stds, np.minimum(systematic, [ignorance(p, at[p.name]) for p in parameters]))
+        refit = replace(refit, values=dict(reading.values), stds=stds, systematic=named)
+    return OwnFloor(before=omnibus(floor.noise, without, residual, basis), after=after, refit=refit)

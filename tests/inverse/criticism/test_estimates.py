@@ -145,7 +145,7 @@ def test_the_error_is_as_large_as_parts_of_the_data_contradict_each_other() -> N
     floor = replace(floor_of(experiment, evidence), nuisance=np.zeros((made.observed.size, 0)), tried=0)
     parts, precision = made.layout.parts, np.zeros((1, 1))
     slopes = made.slopes["angle"][..., None]
-    along, doubts = slopes.reshape(-1, 1), np.zeros_like(slopes)
+    along = slopes.reshape(-1, 1)
     inverse = np.linalg.inv(floor.noise.covariance)
     noise = (along.T @ inverse @ along).item() ** -0.5
     weights = noise**2 * (along.T @ inverse)[0]
@@ -158,10 +158,10 @@ def test_the_error_is_as_large_as_parts_of_the_data_contradict_each_other() -> N
             chance = floor.noise.solver().sample(np.random.default_rng([draw, 1]), 1).reshape(parts.shape)
             residual = own * slopes[..., 0] + chance
             errors.append(weights @ residual.reshape(-1))
-            told.append(at_odds(floor, parts, slopes, precision, doubts, residual)[0])
+            told.append(at_odds(floor, parts, slopes, precision, residual)[0])
         if spread:
             assert 0.75 < rms(np.hypot(noise, told)) / rms(np.array(errors)) < 1.25
         else:
             assert rms(np.array(told)) < 0.8 * noise
     alone = np.zeros_like(parts)
-    np.testing.assert_array_equal(at_odds(floor, alone, slopes, precision, doubts, residual), 0.0)
+    np.testing.assert_array_equal(at_odds(floor, alone, slopes, precision, residual), 0.0)
