@@ -81,11 +81,11 @@ def on_its_own_floor(
         numerics = other_numerics(experiment, lambda name, seed: ask(at, numerics=name, seed=seed, **told), pair)
         # By the surface's own seed: where chance is the same, it cancels.
         visits = [Visit(dict(at), (best.name,), middle)]
-        for there in [{**at, p.name: end} for p in parameters for end in around(p, at[p.name])] if emulated else []:
+        for point in [{**at, p.name: end} for p in parameters for end in around(p, at[p.name])] if emulated else []:
             # Where nothing can be simulated nothing is learned.
             with suppress(SimulationError):
-                table = ask(there, effects=(best.name,), purpose=f"beside the floor with {best.name}")
-                visits.append(Visit(there, (best.name,), table))
+                table = ask(point, effects=(best.name,), purpose=f"beside the floor with {best.name}")
+                visits.append(Visit(point, (best.name,), table))
         return np.stack([ask(at, seed=seed, **told) for seed in seeds]), numerics, guesses, visits
 
     simulate.ahead(spread)
