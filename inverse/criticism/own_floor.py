@@ -7,7 +7,6 @@ has to be judged by that, and parameters are known no better than it lets them b
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -30,7 +29,7 @@ from .confirmation import (
     widened,
 )
 from .estimates import at_odds, untried
-from .evidence import Evidence, Numerics, Visit, around, ignorance, other_numerics, pair_of
+from .evidence import Evidence, Numerics, Visit, ignorance, other_numerics, pair_of
 from .floor import floor_of
 from .misfit import Omnibus, omnibus, smooth_basis
 from .reading import read, tangent
@@ -72,24 +71,16 @@ def on_its_own_floor(
     except SimulationError:
         at = best.fit.values
     seeds = range(1, 1 + len(evidence.repeats))
-    # Where simulations were too few for a surface at first, they still are.
-    parameters, emulated = free_in(experiment, candidate), bool(best.visits)
 
-    def spread(ask: Callable[..., FloatArray]) -> tuple[FloatArray, Numerics, list[FloatArray], list[Visit]]:
+    def spread(ask: Callable[..., FloatArray]) -> tuple[FloatArray, Numerics, list[FloatArray]]:
         guesses = [ask(at, numerics=name, **told) - middle for name in experiment.guesses]
-        pair = pair_of(experiment, len(seeds))
-        numerics = other_numerics(experiment, lambda name, seed: ask(at, numerics=name, seed=seed, **told), pair)
-        # By the surface's own seed: where chance is the same, it cancels.
-        visits = [Visit(dict(at), (best.name,), middle)]
-        for point in [{**at, p.name: end} for p in parameters for end in around(p, at[p.name])] if emulated else []:
-            # Where nothing can be simulated nothing is learned.
-            with suppress(SimulationError):
-                table = ask(point, effects=(best.name,), purpose=f"beside the floor with {best.name}")
-                visits.append(Visit(point, (best.name,), table))
-        return np.stack([ask(at, seed=seed, **told) for seed in seeds]), numerics, guesses, visits
+        numerics = other_numerics(
+            experiment, lambda name, seed: ask(at, numerics=name, seed=seed, **told), pair_of(experiment, len(seeds))
+        )
+        return np.stack([ask(at, seed=seed, **told) for seed in seeds]), numerics, guesses
 
     simulate.ahead(spread)
-    runs, (patterns, doubts), guesses, near = spread(simulate)
+    runs, (patterns, doubts), guesses = spread(simulate)
     deviations = (runs - runs.mean(axis=0)) * np.sqrt(len(runs) / max(len(runs) - 1, 1))
     there = replace(
         evidence,
@@ -104,8 +95,10 @@ def on_its_own_floor(
     )
     floor, seen = floor_of(experiment, there), experiment.seen
     basis = smooth_basis(experiment.layout, floor.noise)
-    slopes, visits = best.fit.slopes, (*best.visits, *near)
-    if emulated:
+    parameters, slopes = free_in(experiment, candidate), best.fit.slopes
+    # Where simulations were too few for a surface at first, they still are.
+    visits = (*best.visits, Visit(dict(at), (best.name,), middle)) if best.visits else ()
+    if visits:
         seeing = Sight.of(experiment, replace(floor, parameters=reach_of(floor.noise, slopes)), basis)
         slopes = tangent(visits, seeing, parameters, at)
     along = reach_of(floor.noise, slopes)
@@ -114,7 +107,7 @@ def on_its_own_floor(
     without = np.concatenate([floor.nuisance, reach_of(floor.noise, slopes[..., : len(experiment.parameters)])], axis=1)
     after = omnibus(floor.noise, free, left, basis)
     refit = replace(best, floor=noise_on(floor.single, judged(experiment, split_times(experiment)[1])))
-    if emulated:
+    if visits:
         sight = Sight.of(experiment, replace(floor, parameters=along), basis)
         known = known_of(evidence, parameters)
         reading = read(visits, sight, experiment.observed, parameters, known)
