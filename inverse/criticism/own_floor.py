@@ -93,7 +93,7 @@ def on_its_own_floor(
         curves={},
         widths={},
     )
-    floor, seen = floor_of(experiment, there), experiment.seen
+    floor = floor_of(experiment, there)
     basis = smooth_basis(experiment.layout, floor.noise)
     parameters, slopes = free_in(experiment, candidate), best.fit.slopes
     # Where simulations were too few for a surface at first, they still are.
@@ -103,9 +103,9 @@ def on_its_own_floor(
         slopes = tangent(visits, seeing, parameters, at)
     along = reach_of(floor.noise, slopes)
     free = np.concatenate([floor.nuisance, along], axis=1)
-    left = (experiment.observed - there.mean)[seen]
+    left = experiment.observed - there.mean
     without = np.concatenate([floor.nuisance, reach_of(floor.noise, slopes[..., : len(experiment.parameters)])], axis=1)
-    after = omnibus(floor.noise, free, left, basis)
+    after = omnibus(floor.noise, free, left[experiment.seen], basis)
     refit = replace(best, floor=noise_on(floor.single, judged(experiment, split_times(experiment)[1])))
     if visits:
         sight = Sight.of(experiment, replace(floor, parameters=along), basis)
@@ -115,10 +115,8 @@ def on_its_own_floor(
         precision = beforehand(parameters, at, known)
         least = stds_of(parameters, sight(slopes), precision, after)
         stds = {name: max(std, least[name]) for name, std in reading.stds.items()}
-        systematic = np.hypot(
-            untried(floor, slopes, precision),
-            at_odds(floor, experiment.layout.parts, slopes, precision, experiment.observed - there.mean),
-        )
+        contradictions = at_odds(floor, experiment.layout.parts, slopes, precision, left)
+        systematic = np.hypot(untried(floor, slopes, precision), contradictions)
         stds, named = widened(stds, np.minimum(systematic, [ignorance(p, at[p.name]) for p in parameters]))
         refit = replace(refit, values=dict(reading.values), stds=stds, systematic=named)
     return OwnFloor(before=omnibus(floor.noise, without, residual, basis), after=after, refit=refit)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from splatsoil.benchmarks.hidden_effects import detectable, emulated, fitted
+from splatsoil.inverse.criticism import own_floor
 from splatsoil.inverse.criticism.diagnosis import Options, diagnose
 from splatsoil.inverse.criticism.simulations import Simulations
 from splatsoil.inverse.criticism.words import sentences
@@ -66,6 +67,17 @@ def test_parameters_are_known_no_better_than_parts_of_the_data_agree() -> None:
         systematic.append(best.systematic["angle"])
     assert np.sqrt(np.mean(np.square(off))) < 1.5
     assert np.median(systematic) > 0.5
+
+
+def test_what_is_systematic_is_no_more_than_bounds_leave_open(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(own_floor, "at_odds", lambda *_: np.full(2, 1e6))
+    made = emulated(0)
+    truth = {"angle": 0.0, NAME: 6.0 * detectable(0, Options())[NAME]}
+    experiment = replace(made, observed=made.measured(truth, [0, 99]))
+    best = diagnose(experiment, {"angle": fitted(experiment)}).confirmations[NAME]
+    (angle,) = experiment.parameters
+    # uniform between the bounds
+    assert best.systematic["angle"] == pytest.approx((angle.upper - angle.lower) / np.sqrt(12.0))
 
 
 class Noted(Simulations):
