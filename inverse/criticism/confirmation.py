@@ -149,9 +149,11 @@ def confirm(
             with suppress(ValueError):
                 reading = read(visits, whole, experiment.observed, free, known)
                 values, stds, emulated = dict(reading.values), dict(reading.stds), tuple(visits)
-        stds, systematic = widened(stds, untried(floor, fit.slopes, precision))
-        out["" if candidate is None else candidate.name] = Confirmation(
-            name="" if candidate is None else candidate.name,
+        name = "" if candidate is None else candidate.name
+        solvers = [experiment.reproducibility(p, values[p.name], name) for p in free]
+        stds, systematic = widened(stds, np.hypot(untried(floor, fit.slopes, precision), solvers))
+        out[name] = Confirmation(
+            name=name,
             fit=fit,
             values=values,
             stds=stds,

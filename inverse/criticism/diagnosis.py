@@ -20,7 +20,7 @@ from .floor import Floor, floor_of
 from .misfit import Block, Omnibus, blocks, left_over, omnibus, shares, smooth_basis
 from .naming import members_of
 from .outside import StrengthReading, read_strength
-from .own_floor import on_its_own_floor
+from .own_floor import as_it_is, on_its_own_floor
 from .score import Score, Scorer
 from .sight import Sight
 from .simulations import Simulations
@@ -256,10 +256,13 @@ def judge(
             )
         except SimulationError as error:
             notes.append(f"the free strength could not be simulated: {error}")
-    if verdict == "adequate":
-        estimates = weighed_there(experiment, evidence, floor, bench.basis, simulate)
-    else:
+    if verdict != "adequate":
         estimates = weighed(experiment, evidence, floor, bench.basis)
+    elif experiment.model:
+        found = confirmations.get("")
+        estimates = as_it_is(experiment, evidence, floor, bench.basis, found, simulate, options.refit_steps, told)
+    else:
+        estimates = weighed_there(experiment, evidence, floor, bench.basis, simulate)
     strokes = _advice(experiment, members, candidates, confirmations, told)
     return Diagnosis(
         verdict=verdict,

@@ -40,21 +40,28 @@ class Estimate:
     Attributes:
         value: of the parameter.
         noise: standard deviation by noise, chance and what the numerics that were tried leave.
-        numerics: standard deviation by one more way of computing, such as those that were tried.
+        systematic: standard deviation by what is the model's own fault: one more way of computing, such as those that
+            were tried; in soil that has an effect also another solver, and contradictions between parts of the data.
         unit: of all three.
         determined: False where it is hardly better known than by the parameter's bounds alone.
     """
 
     value: float
     noise: float
-    numerics: float
+    systematic: float
     unit: str = ""
     determined: bool = True
+
+    @classmethod
+    def of(cls, parameter: Parameter, value: float, noise: float, systematic: float) -> Estimate:
+        """Of a parameter."""
+        told = cls(value, noise, systematic, parameter.unit)
+        return replace(told, determined=told.std < UNINFORMED * ignorance(parameter, value))
 
     @property
     def std(self) -> float:
         """Standard deviation by both."""
-        return math.hypot(self.noise, self.numerics)
+        return math.hypot(self.noise, self.systematic)
 
 
 def untried(floor: Floor, slopes: FloatArray, precision: FloatArray, doubts: FloatArray | None = None) -> FloatArray:
@@ -134,12 +141,11 @@ def weighed(experiment: Experiment, evidence: Evidence, floor: Floor, basis: Flo
     rest = left - along @ step
     wide = max(1.0, float(rest @ rest) / max(len(rest) - len(step), 1))
     noise = np.sqrt(wide * np.diag(inverse @ (scores + beforehand) @ inverse))
-    numerics = untried(floor, slopes, beforehand, doubts)
-    out = {}
+    numerics, out = untried(floor, slopes, beforehand, doubts), {}
     for k, p in enumerate(parameters):
         value = float(np.clip(values[p.name] + step[k], p.lower, p.upper))
-        told = Estimate(value, float(noise[k]), float(numerics[k]), p.unit)
-        out[p.name] = replace(told, determined=told.std < UNINFORMED * ignorance(p, values[p.name]))
+        systematic = math.hypot(numerics[k], experiment.reproducibility(p, value))
+        out[p.name] = Estimate.of(p, value, float(noise[k]), systematic)
     return out
 
 

@@ -6,7 +6,8 @@ has to be judged by that, and parameters are known no better than it lets them b
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,10 +16,13 @@ import numpy.typing as npt
 
 from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Candidate, Experiment
+from splatsoil.parameters import Parameter
 
 from .confirmation import (
     Confirmation,
+    Report,
     beforehand,
+    confirm,
     free_in,
     judged,
     known_of,
@@ -28,9 +32,9 @@ from .confirmation import (
     stds_of,
     widened,
 )
-from .estimates import at_odds, untried
+from .estimates import Estimate, at_odds, untried, weighed_there
 from .evidence import Evidence, Numerics, Visit, ignorance, other_numerics, pair_of
-from .floor import floor_of
+from .floor import Floor, floor_of
 from .misfit import Omnibus, omnibus, smooth_basis
 from .reading import read, tangent
 from .sight import Sight
@@ -99,24 +103,99 @@ def on_its_own_floor(
     # Where simulations were too few for a surface at first, they still are.
     visits = (*best.visits, Visit(dict(at), (best.name,), middle)) if best.visits else ()
     if visits:
-        seeing = Sight.of(experiment, replace(floor, parameters=reach_of(floor.noise, slopes)), basis)
-        slopes = tangent(visits, seeing, parameters, at)
-    along = reach_of(floor.noise, slopes)
-    free = np.concatenate([floor.nuisance, along], axis=1)
-    left = experiment.observed - there.mean
-    without = np.concatenate([floor.nuisance, reach_of(floor.noise, slopes[..., : len(experiment.parameters)])], axis=1)
-    after = omnibus(floor.noise, free, left[experiment.seen], basis)
+        slopes = _tangent(experiment, floor, basis, visits, parameters, at, slopes)
+    left = (experiment.observed - there.mean)[experiment.seen]
+    without = _with(floor, slopes[..., : len(experiment.parameters)])
+    after = omnibus(floor.noise, _with(floor, slopes), left, basis)
     refit = replace(best, floor=noise_on(floor.single, judged(experiment, split_times(experiment)[1])))
     if visits:
-        sight = Sight.of(experiment, replace(floor, parameters=along), basis)
-        known = known_of(evidence, parameters)
-        reading = read(visits, sight, experiment.observed, parameters, known)
-        # Draws don't leave the simulations' range, and these were made where another floor let the parameters be.
-        precision = beforehand(parameters, at, known)
-        least = stds_of(parameters, sight(slopes), precision, after)
-        stds = {name: max(std, least[name]) for name, std in reading.stds.items()}
-        contradictions = at_odds(floor, experiment.layout.parts, slopes, precision, left)
-        systematic = np.hypot(untried(floor, slopes, precision), contradictions)
-        stds, named = widened(stds, np.minimum(systematic, [ignorance(p, at[p.name]) for p in parameters]))
-        refit = replace(refit, values=dict(reading.values), stds=stds, systematic=named)
+        values, stds, systematic = _told(
+            experiment, there, floor, basis, visits, parameters, at, slopes, after, best.name
+        )
+        refit = replace(refit, values=values, stds=stds, systematic=systematic)
     return OwnFloor(before=omnibus(floor.noise, without, residual, basis), after=after, refit=refit)
+
+
+def as_it_is(
+    experiment: Experiment,
+    evidence: Evidence,
+    floor: Floor,
+    basis: FloatArray,
+    found: Confirmation | None,
+    simulate: Simulations,
+    steps: int,
+    told: Report,
+) -> dict[str, Estimate]:
+    """Parameters of an adequate model that has effects, by name.
+
+    Beside an effect's size the angle lies in a valley, where two seeds' derivatives are little but chance: both are
+    read off all simulations of a refit, as they were when the effect was named.
+
+    Args:
+        experiment: whose model has them, so that the floor is that of such soil.
+        evidence: from the fit.
+        floor: of that.
+        basis: slow waves (n, k).
+        found: the model's refit as it is, if there was one.
+        simulate: for a refit.
+        steps: of that; see :func:`~splatsoil.inverse.criticism.confirmation.confirm`.
+        told: called with (what, share done).
+    """
+    if found is None:
+        found = confirm(experiment, evidence, floor, [], simulate, steps, basis, told)[""]
+    if not found.visits:
+        return weighed_there(experiment, evidence, floor, basis, simulate)
+    parameters, at = experiment.parameters, evidence.values
+    slopes = _tangent(experiment, floor, basis, found.visits, parameters, at, found.fit.slopes)
+    left = (experiment.observed - evidence.mean)[experiment.seen]
+    after = omnibus(floor.noise, _with(floor, slopes), left, basis)
+    values, stds, systematic = _told(experiment, evidence, floor, basis, found.visits, parameters, at, slopes, after)
+    noise = {name: math.sqrt(std**2 - systematic[name] ** 2) for name, std in stds.items()}
+    return {p.name: Estimate.of(p, values[p.name], noise[p.name], systematic[p.name]) for p in parameters}
+
+
+def _with(floor: Floor, slopes: FloatArray) -> FloatArray:
+    """(n, q + k) what numerics and parameters, whose derivatives are (t, s, k), can take up."""
+    return np.concatenate([floor.nuisance, reach_of(floor.noise, slopes)], axis=1)
+
+
+def _tangent(
+    experiment: Experiment,
+    floor: Floor,
+    basis: FloatArray,
+    visits: Sequence[Visit],
+    parameters: Sequence[Parameter],
+    at: Mapping[str, float],
+    slopes: FloatArray,
+) -> FloatArray:
+    """(t, s, k) derivatives at some values, of the surface through all simulations as seen on a floor; the refit's
+    (t, s, k) tell where to look."""
+    sight = Sight.of(experiment, replace(floor, parameters=reach_of(floor.noise, slopes)), basis)
+    return tangent(visits, sight, parameters, at)
+
+
+def _told(
+    experiment: Experiment,
+    there: Evidence,
+    floor: Floor,
+    basis: FloatArray,
+    visits: Sequence[Visit],
+    parameters: Sequence[Parameter],
+    at: Mapping[str, float],
+    slopes: FloatArray,
+    after: Omnibus,
+    effect: str = "",
+) -> tuple[dict[str, float], dict[str, float], dict[str, float]]:
+    """Parameters, their standard deviations and what of these is systematic, by name."""
+    sight = Sight.of(experiment, replace(floor, parameters=reach_of(floor.noise, slopes)), basis)
+    known = known_of(there, parameters)
+    reading = read(visits, sight, experiment.observed, parameters, known)
+    # Draws don't leave the simulations' range, and these were made where another floor let the parameters be.
+    precision = beforehand(parameters, at, known)
+    least = stds_of(parameters, sight(slopes), precision, after)
+    stds = {name: max(std, least[name]) for name, std in reading.stds.items()}
+    contradictions = at_odds(floor, experiment.layout.parts, slopes, precision, experiment.observed - there.mean)
+    solvers = [experiment.reproducibility(p, reading.values[p.name], effect) for p in parameters]
+    systematic = np.sqrt(untried(floor, slopes, precision) ** 2 + contradictions**2 + np.square(solvers))
+    stds, named = widened(stds, np.minimum(systematic, [ignorance(p, at[p.name]) for p in parameters]))
+    return dict(reading.values), stds, named

@@ -37,7 +37,7 @@ def record(experiment: Experiment, diagnosis: Diagnosis) -> dict[str, Any]:
                 "value": e.value,
                 "std": e.std,
                 "noise": e.noise,
-                "numerics": e.numerics,
+                "systematic": e.systematic,
                 "determined": bool(e.determined),
             }
             for name, e in diagnosis.estimates.items()

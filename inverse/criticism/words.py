@@ -99,11 +99,12 @@ def of_estimates(estimates: Mapping[str, Estimate]) -> list[str]:
             out.append(undetermined(name))
             continue
         value = amount(estimate.value, estimate.std, estimate.unit)
-        parts = (float(f"{part:.2g}") for part in (estimate.noise, estimate.numerics))
-        noise, numerics = (f"± {part:g}{symbol(estimate.unit)}" for part in parts)
+        parts = (float(f"{part:.2g}") for part in (estimate.noise, estimate.systematic))
+        noise, systematic = (f"± {part:g}{symbol(estimate.unit)}" for part in parts)
         out.append(
             f"With noise, chance and numerics weighed, the {name.replace('_', ' ')} is {value}: {noise} by noise and "
-            f"chance, {numerics} by numerics that weren't tried and may be as far off as those that were."
+            f"chance, {systematic} by what is systematic: numerics that weren't tried and may be as far off as those "
+            "that were; in soil that has an effect, other solvers and contradictions between parts of the data, too."
         )
     return out
 

@@ -125,6 +125,10 @@ class Experiment(Protocol):
     @property
     def chance(self) -> bool: ...
 
+    def reproducibility(self, parameter: Parameter, value: float, effect: str = "") -> float:
+        """Standard deviation of a parameter at a value between the model's solver and others of the same equations, in
+        its unit, with one candidate on or as the model is; 0 where solvers agree, or nothing is known of it."""
+
     def predict(
         self, values: Mapping[str, float], *, effects: Iterable[str | Effect] = (), seed: int = 0, numerics: str = ""
     ) -> FloatArray:

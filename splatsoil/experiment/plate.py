@@ -102,6 +102,11 @@ class PlateExperiment:
         self.experiment = _set_up(diameter, float(depth[-1]), density, friction)
         self.resolution = Resolution.derive(self.experiment, preset)
 
+    def reproducibility(self, parameter: Parameter, value: float, effect: str = "") -> float:
+        """Not known: no other solver has been pressed into."""
+        del parameter, value, effect
+        return 0.0
+
     def predict(
         self, values: Mapping[str, float], *, effects: Iterable[str | Effect] = (), seed: int = 0, numerics: str = ""
     ) -> FloatArray:

@@ -17,6 +17,7 @@ from splatsoil.errors import SplatsoilError
 from splatsoil.experiment.base import Calibration, Candidate, candidates_of
 from splatsoil.experiment.features import Layout, Site
 from splatsoil.experiment.forces import REGION, UNIT, ToolForces
+from splatsoil.experiment.reproducibility import between_solvers
 from splatsoil.experiment.scene_parts import QUIET, bins_of, regions_of, stages_of
 from splatsoil.experiment.states import States, plow_states
 from splatsoil.experiment.strokes import Predict, plow_strokes
@@ -179,6 +180,11 @@ class PlowExperiment:
             return np.zeros((0, *self.layout.shape))
         pictured = np.zeros(self._pictured.shape)
         return np.stack([self._beside(pictured, error) for error in self.forces.errors])
+
+    def reproducibility(self, parameter: Parameter, value: float, effect: str = "") -> float:
+        """See :class:`~splatsoil.experiment.base.Experiment`."""
+        on = self.base.law.effects + ((self._wanted[effect],) if effect else ())
+        return between_solvers(parameter, value, on)
 
     def predict(
         self, values: Mapping[str, float], *, effects: Iterable[str | Effect] = (), seed: int = 0, numerics: str = ""

@@ -164,6 +164,11 @@ class TriaxialExperiment:
         """The first test."""
         return self.curves[0]
 
+    def reproducibility(self, parameter: Parameter, value: float, effect: str = "") -> float:
+        """An element test is exact."""
+        del parameter, value, effect
+        return 0.0
+
     def predict(
         self,
         values: Mapping[str, float],

@@ -33,8 +33,8 @@ def worlds(size: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         evidence = gather(experiment, Simulations(experiment), {"angle": fitted(experiment)})
         floor = floor_of(experiment, evidence)
         told = weighed(experiment, evidence, floor, smooth_basis(experiment.layout, floor.noise))["angle"]
-        assert told.std == pytest.approx(np.hypot(told.noise, told.numerics)) and told.unit == "deg"
-        found.append((told.value, told.noise, told.numerics))
+        assert told.std == pytest.approx(np.hypot(told.noise, told.systematic)) and told.unit == "deg"
+        found.append((told.value, told.noise, told.systematic))
     errors, noise, numerics = np.array(found).T
     return errors, noise, numerics
 

@@ -11,6 +11,7 @@ import pytest
 from splatsoil.benchmarks.hidden_effects import detectable, emulated, fitted
 from splatsoil.inverse.criticism import own_floor
 from splatsoil.inverse.criticism.diagnosis import Options, diagnose
+from splatsoil.inverse.criticism.refit import optimum
 from splatsoil.inverse.criticism.simulations import Simulations
 from splatsoil.inverse.criticism.words import sentences
 
@@ -134,3 +135,52 @@ def test_an_error_is_held_against_what_soil_with_the_effect_leaves_by_chance() -
     assert best.floor > 1.2 * before.floor
     told = sentences(found, {c.name: c for c in experiment.candidates}, found.evidence.values)
     assert any(f"{before.floor:.2g} without it, and {best.floor:.2g} in soil that has it" in line for line in told)
+
+
+def with_the_effect(world: int) -> tuple[EmulatedExperiment, dict[str, float]]:
+    """Soil of which 0.4 of the chance is another one wherever it differs, the effect a part of the model; its truth."""
+    made = emulated(world, chaos=0.4)
+    truth = {"angle": 0.0, NAME: 6.0 * detectable(world, Options())[NAME]}
+    (effect,) = (c for c in made.candidates if c.name == NAME)
+    made = replace(
+        made,
+        model=(NAME,),
+        home={**made.home, NAME: 0.0},
+        parameters=(*made.parameters, effect.measure),
+        candidates=tuple(c for c in made.candidates if c.name != NAME),
+    )
+    return replace(made, observed=made.measured(truth, [world, 99])), truth
+
+
+def test_parameters_of_a_model_that_has_an_effect_are_told_as_well_as_is_said() -> None:
+    """By two seeds' derivatives, as a model without effects is read, five of the first ten angles end at a bound."""
+    off, errors = [], []
+    for world in (0, 3, 4, 6, 8):
+        experiment, truth = with_the_effect(world)
+        fit = optimum(experiment, Simulations(experiment), {"angle": 2.0, NAME: 0.8 * truth[NAME]})
+        found = diagnose(experiment, fit)
+        assert found.verdict == "adequate"
+        told = found.estimates
+        assert all(told[name].determined for name in truth)
+        off += [(told[name].value - truth[name]) / told[name].std for name in truth]
+        errors.append(told["angle"].value)
+    assert 0.4 < np.sqrt(np.mean(np.square(off))) < 1.5
+    assert np.sqrt(np.mean(np.square(errors))) < 2.5
+
+
+def test_solvers_that_are_apart_are_a_part_of_what_is_told() -> None:
+    """Soil of another solver looks like other parameters to ours: by how much is known of many, not of this one."""
+    apart = {"angle": 3.0, NAME: 1.5}
+    off: dict[bool, list[float]] = {True: [], False: []}
+    for world in range(5):
+        made = emulated(world)
+        truth = {"angle": 0.0, NAME: 8.0 * detectable(world, Options())[NAME]}
+        generator = np.random.default_rng([world, 4])
+        looks = {name: truth[name] + apart[name] * generator.standard_normal() for name in truth}
+        for known in off:
+            experiment = replace(made, observed=made.measured(looks, [world, 99]), apart=apart if known else {})
+            best = diagnose(experiment, {"angle": fitted(experiment)}).confirmations[NAME]
+            off[known] += [(best.values[name] - truth[name]) / best.stds[name] for name in truth]
+            assert best.systematic["angle"] >= known * apart["angle"]
+    rms = {known: np.sqrt(np.mean(np.square(values))) for known, values in off.items()}
+    assert rms[False] > 1.5 > rms[True] > 0.5
