@@ -103,7 +103,7 @@ def on_its_own_floor(
     # Where simulations were too few for a surface at first, they still are.
     visits = (*best.visits, Visit(dict(at), (best.name,), middle)) if best.visits else ()
     if visits:
-        slopes = _tangent(experiment, floor, basis, visits, parameters, at, slopes)
+        slopes = tangent(visits, _sight(experiment, floor, basis, slopes), parameters, at)
     left = (experiment.observed - there.mean)[experiment.seen]
     without = _with(floor, slopes[..., : len(experiment.parameters)])
     after = omnibus(floor.noise, _with(floor, slopes), left, basis)
@@ -146,11 +146,11 @@ def as_it_is(
     if not found.visits:
         return weighed_there(experiment, evidence, floor, basis, simulate)
     parameters, at = experiment.parameters, evidence.values
-    slopes = _tangent(experiment, floor, basis, found.visits, parameters, at, found.fit.slopes)
+    slopes = tangent(found.visits, _sight(experiment, floor, basis, found.fit.slopes), parameters, at)
     left = (experiment.observed - evidence.mean)[experiment.seen]
     after = omnibus(floor.noise, _with(floor, slopes), left, basis)
     values, stds, systematic = _told(experiment, evidence, floor, basis, found.visits, parameters, at, slopes, after)
-    noise = {name: math.sqrt(std**2 - systematic[name] ** 2) for name, std in stds.items()}
+    noise = {name: math.sqrt(max(std**2 - systematic[name] ** 2, 0.0)) for name, std in stds.items()}
     return {p.name: Estimate.of(p, values[p.name], noise[p.name], systematic[p.name]) for p in parameters}
 
 
@@ -159,19 +159,9 @@ def _with(floor: Floor, slopes: FloatArray) -> FloatArray:
     return np.concatenate([floor.nuisance, reach_of(floor.noise, slopes)], axis=1)
 
 
-def _tangent(
-    experiment: Experiment,
-    floor: Floor,
-    basis: FloatArray,
-    visits: Sequence[Visit],
-    parameters: Sequence[Parameter],
-    at: Mapping[str, float],
-    slopes: FloatArray,
-) -> FloatArray:
-    """(t, s, k) derivatives at some values, of the surface through all simulations as seen on a floor; the refit's
-    (t, s, k) tell where to look."""
-    sight = Sight.of(experiment, replace(floor, parameters=reach_of(floor.noise, slopes)), basis)
-    return tangent(visits, sight, parameters, at)
+def _sight(experiment: Experiment, floor: Floor, basis: FloatArray, slopes: FloatArray) -> Sight:
+    """Where to look on a floor, for parameters whose derivatives are (t, s, k)."""
+    return Sight.of(experiment, replace(floor, parameters=reach_of(floor.noise, slopes)), basis)
 
 
 def _told(
@@ -187,8 +177,7 @@ def _told(
     effect: str = "",
 ) -> tuple[dict[str, float], dict[str, float], dict[str, float]]:
     """Parameters, their standard deviations and what of these is systematic, by name."""
-    sight = Sight.of(experiment, replace(floor, parameters=reach_of(floor.noise, slopes)), basis)
-    known = known_of(there, parameters)
+    sight, known = _sight(experiment, floor, basis, slopes), known_of(there, parameters)
     reading = read(visits, sight, experiment.observed, parameters, known)
     # Draws don't leave the simulations' range, and these were made where another floor let the parameters be.
     precision = beforehand(parameters, at, known)

@@ -106,8 +106,9 @@ def fitted_sentence(fit: Mapping[str, Any], judged: Mapping[str, Any] | None) ->
         for name, entry in fit["parameters"].items()
     ]
     return (
-        "Noise, chance and numerics weighed: the ± holds these, and what numerics that weren't tried may do, not a "
-        f"bias that the model has everywhere. The fit by itself says: {', '.join(alone)}."
+        "Noise, chance and numerics weighed: the ± holds these, and what numerics that weren't tried may do (in soil "
+        "that has an effect also how far solvers are apart), not a bias that all of them have. The fit by itself "
+        f"says: {', '.join(alone)}."
     )
 
 
