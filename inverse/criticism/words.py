@@ -93,19 +93,24 @@ def _adequate(diagnosis: Diagnosis, candidates: Mapping[str, Candidate]) -> list
 
 def of_estimates(estimates: Mapping[str, Estimate]) -> list[str]:
     """What an adequate model's parameters are once all of the floor is weighed."""
-    out = []
+    known = []
     for name, estimate in estimates.items():
-        if not estimate.determined:
-            out.append(undetermined(name))
-            continue
-        value = amount(estimate.value, estimate.std, estimate.unit)
-        parts = (float(f"{part:.2g}") for part in (estimate.noise, estimate.systematic))
-        noise, systematic = (f"± {part:g}{symbol(estimate.unit)}" for part in parts)
-        out.append(
-            f"With noise, chance and numerics weighed, the {name.replace('_', ' ')} is {value}: {noise} by noise and "
-            f"chance, {systematic} by what is systematic: numerics that weren't tried and may be as far off as those "
-            "that were; in soil that has an effect, other solvers and contradictions between parts of the data, too."
-        )
+        if estimate.determined:
+            value = amount(estimate.value, estimate.std, estimate.unit)
+            noise, systematic = (
+                f"± {float(f'{part:.2g}'):g}{symbol(estimate.unit)}" for part in (estimate.noise, estimate.systematic)
+            )
+            known.append(
+                f"the {name.replace('_', ' ')} is {value} ({noise} by noise and chance, {systematic} systematic)"
+            )
+    out = [undetermined(name) for name, estimate in estimates.items() if not estimate.determined]
+    if known:
+        out = [
+            f"With noise, chance and numerics weighed, {listed(known)}.",
+            "Systematic is what numerics that weren't tried may do, which may be as far off as those that were; in "
+            "soil that has an effect also how far solvers are apart, and parts of the data that contradict each other.",
+            *out,
+        ]
     return out
 
 
