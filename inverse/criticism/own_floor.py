@@ -99,21 +99,15 @@ def on_its_own_floor(
     )
     floor = floor_of(experiment, there)
     basis = smooth_basis(experiment.layout, floor.noise)
-    parameters, slopes = free_in(experiment, candidate), best.fit.slopes
     # Where simulations were too few for a surface at first, they still are.
     visits = (*best.visits, Visit(dict(at), (best.name,), middle)) if best.visits else ()
-    if visits:
-        slopes = tangent(visits, _sight(experiment, floor, basis, slopes), parameters, at)
-    left = (experiment.observed - there.mean)[experiment.seen]
-    without = _with(floor, slopes[..., : len(experiment.parameters)])
-    after = omnibus(floor.noise, _with(floor, slopes), left, basis)
+    parameters = free_in(experiment, candidate)
+    soil = _Soil(experiment, there, floor, basis, parameters, at, visits, best.fit.slopes).smoothed
     refit = replace(best, floor=noise_on(floor.single, judged(experiment, split_times(experiment)[1])))
     if visits:
-        values, stds, systematic = _told(
-            experiment, there, floor, basis, visits, parameters, at, slopes, after, best.name
-        )
+        values, stds, systematic = soil.told(best.name)
         refit = replace(refit, values=values, stds=stds, systematic=systematic)
-    return OwnFloor(before=omnibus(floor.noise, without, residual, basis), after=after, refit=refit)
+    return OwnFloor(before=soil.misfit(residual, len(experiment.parameters)), after=soil.after, refit=refit)
 
 
 def as_it_is(
@@ -145,46 +139,79 @@ def as_it_is(
         found = confirm(experiment, evidence, floor, [], simulate, steps, basis, told)[""]
     if not found.visits:
         return weighed_there(experiment, evidence, floor, basis, simulate)
-    parameters, at = experiment.parameters, evidence.values
-    slopes = tangent(found.visits, _sight(experiment, floor, basis, found.fit.slopes), parameters, at)
-    left = (experiment.observed - evidence.mean)[experiment.seen]
-    after = omnibus(floor.noise, _with(floor, slopes), left, basis)
-    values, stds, systematic = _told(experiment, evidence, floor, basis, found.visits, parameters, at, slopes, after)
+    parameters = experiment.parameters
+    at = evidence.values
+    soil = _Soil(experiment, evidence, floor, basis, parameters, at, found.visits, found.fit.slopes).smoothed
+    values, stds, systematic = soil.told()
     noise = {name: math.sqrt(max(std**2 - systematic[name] ** 2, 0.0)) for name, std in stds.items()}
     return {p.name: Estimate.of(p, values[p.name], noise[p.name], systematic[p.name]) for p in parameters}
 
 
-def _with(floor: Floor, slopes: FloatArray) -> FloatArray:
-    """(n, q + k) what numerics and parameters, whose derivatives are (t, s, k), can take up."""
-    return np.concatenate([floor.nuisance, reach_of(floor.noise, slopes)], axis=1)
+@dataclass(frozen=True)
+class _Soil:
+    """Soil that has effects, as simulations of it show it.
 
+    Attributes:
+        experiment: what was observed.
+        there: repeats and numerics of such soil.
+        floor: of these.
+        basis: slow waves (n, k).
+        parameters: free ones.
+        at: their values where repeats and numerics were simulated.
+        visits: all simulations; none where a surface has no place.
+        slopes: (t, s, k) derivatives there.
+    """
 
-def _sight(experiment: Experiment, floor: Floor, basis: FloatArray, slopes: FloatArray) -> Sight:
-    """Where to look on a floor, for parameters whose derivatives are (t, s, k)."""
-    return Sight.of(experiment, replace(floor, parameters=reach_of(floor.noise, slopes)), basis)
+    experiment: Experiment
+    there: Evidence
+    floor: Floor
+    basis: FloatArray
+    parameters: Sequence[Parameter]
+    at: Mapping[str, float]
+    visits: Sequence[Visit]
+    slopes: FloatArray
 
+    @property
+    def smoothed(self) -> _Soil:
+        """With the derivatives of the surface through all visits, where there are any; those at hand tell where to
+        look."""
+        if not self.visits:
+            return self
+        return replace(self, slopes=tangent(self.visits, self.sight, self.parameters, self.at))
 
-def _told(
-    experiment: Experiment,
-    there: Evidence,
-    floor: Floor,
-    basis: FloatArray,
-    visits: Sequence[Visit],
-    parameters: Sequence[Parameter],
-    at: Mapping[str, float],
-    slopes: FloatArray,
-    after: Omnibus,
-    effect: str = "",
-) -> tuple[dict[str, float], dict[str, float], dict[str, float]]:
-    """Parameters, their standard deviations and what of these is systematic, by name."""
-    sight, known = _sight(experiment, floor, basis, slopes), known_of(there, parameters)
-    reading = read(visits, sight, experiment.observed, parameters, known)
-    # Draws don't leave the simulations' range, and these were made where another floor let the parameters be.
-    precision = beforehand(parameters, at, known)
-    least = stds_of(parameters, sight(slopes), precision, after)
-    stds = {name: max(std, least[name]) for name, std in reading.stds.items()}
-    contradictions = at_odds(floor, experiment.layout.parts, slopes, precision, experiment.observed - there.mean)
-    solvers = [experiment.reproducibility(p, reading.values[p.name], effect) for p in parameters]
-    systematic = np.sqrt(untried(floor, slopes, precision) ** 2 + contradictions**2 + np.square(solvers))
-    stds, named = widened(stds, np.minimum(systematic, [ignorance(p, at[p.name]) for p in parameters]))
-    return dict(reading.values), stds, named
+    @property
+    def sight(self) -> Sight:
+        """Where to look for the parameters."""
+        along = reach_of(self.floor.noise, self.slopes)
+        return Sight.of(self.experiment, replace(self.floor, parameters=along), self.basis)
+
+    @property
+    def left(self) -> FloatArray:
+        """(t, s) what is left of the observation."""
+        return self.experiment.observed - self.there.mean
+
+    @property
+    def after(self) -> Omnibus:
+        """Misfit of such soil."""
+        return self.misfit(self.left[self.experiment.seen], len(self.parameters))
+
+    def misfit(self, residual: FloatArray, count: int) -> Omnibus:
+        """What of a residual (n,) stands on slow waves once numerics and the first parameters have taken their part."""
+        along = reach_of(self.floor.noise, self.slopes[..., :count])
+        return omnibus(self.floor.noise, np.concatenate([self.floor.nuisance, along], axis=1), residual, self.basis)
+
+    def told(self, effect: str = "") -> tuple[dict[str, float], dict[str, float], dict[str, float]]:
+        """Parameters, their standard deviations and what of these is systematic, by name; ``effect`` is one that the
+        experiment's model lacks."""
+        experiment, sight, known = self.experiment, self.sight, known_of(self.there, self.parameters)
+        reading = read(self.visits, sight, experiment.observed, self.parameters, known)
+        # Draws don't leave the simulations' range, and these were made where another floor let the parameters be.
+        precision = beforehand(self.parameters, self.at, known)
+        least = stds_of(self.parameters, sight(self.slopes), precision, self.after)
+        stds = {name: max(std, least[name]) for name, std in reading.stds.items()}
+        contradictions = at_odds(self.floor, experiment.layout.parts, self.slopes, precision, self.left)
+        solvers = [experiment.reproducibility(p, reading.values[p.name], effect) for p in self.parameters]
+        systematic = np.sqrt(untried(self.floor, self.slopes, precision) ** 2 + contradictions**2 + np.square(solvers))
+        most = [ignorance(p, self.at[p.name]) for p in self.parameters]
+        stds, named = widened(stds, np.minimum(systematic, most))
+        return dict(reading.values), stds, named
