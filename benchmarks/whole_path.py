@@ -203,7 +203,8 @@ def angle(task: Task) -> list[Row]:
     true = Truth.load(task.dry).values["friction_angle"]
     # only a run that hasn't begun can be timed
     fresh = not (task.out / "runs" / f"{task.dry.name}-0").exists()
-    runs = [_fitted(task, task.dry, f"{task.dry.name}-{seed}", "run", "--seed", str(seed)) for seed in FIT_SEEDS]
+    options = ("run", "--stop-at-floor", "--seed")
+    runs = [_fitted(task, task.dry, f"{task.dry.name}-{seed}", *options, str(seed)) for seed in FIT_SEEDS]
     seconds, memory = runs[0].seconds, runs[0].memory
     rows = []
     forces = [run.fit["force"] for run in runs]

@@ -27,22 +27,23 @@ class Config(FitOptions):
     """All of it: check the set, reconstruct, fit, compare with the noise floor, write the report. Goes on where it was
     interrupted.
 
-    With --criticise also: diagnose, add the effect that is missing (or the nearest, where it explains half of the
-    misfit), fit again, and so on, until the model is adequate, no effect of the library explains what is left, or the
-    limit is reached. Each round costs about as much as three plain fits, so it isn't done unless asked for.
+    Where the model isn't adequate also: diagnose it, add the effect that is missing (or the nearest, where it explains
+    half of the misfit), fit again, and so on, until the model is adequate, no effect of the library explains what is
+    left, or the limit is reached. Each round takes two cores half an hour or so.
     """
 
     criticise: bool = False
-    """Diagnose the model, add what is missing, and go on until there is nothing more to be told."""
+    """Diagnose a model that the noise floor calls adequate, too: one effect may be seen before all that is left is."""
+    stop_at_floor: bool = False
+    """Only say whether the model is adequate; don't look for what is missing."""
     most_effects: int = 2
-    """Most effects that --criticise may add."""
+    """Most effects that may be added."""
 
     def again(self, command: str) -> str:
         """The command line that means this."""
-        words = super().again(command)
-        if self.criticise:
-            words += " --criticise" + (f" --most-effects {self.most_effects}" if self.most_effects != 2 else "")
-        return words
+        flags = (("--criticise", self.criticise), ("--stop-at-floor", self.stop_at_floor))
+        words = [super().again(command), *(flag for flag, on in flags if on)]
+        return " ".join(words + ([f"--most-effects {self.most_effects}"] if self.most_effects != 2 else []))
 
 
 def run(config: Config) -> int:
@@ -63,6 +64,8 @@ def run(config: Config) -> int:
     hush()
     if config.most_effects < 0:
         raise ParameterError(f"--most-effects: must be 0 or more, not {config.most_effects}")
+    if config.criticise and config.stop_at_floor:
+        raise ParameterError("--criticise and --stop-at-floor: give one of them")
     stopped, diagnosis, misfit, unknown = "", None, None, ""
     with stages(quiet=config.json) as begin:
         begin("check")("reading every image", 0.0)
@@ -72,14 +75,14 @@ def run(config: Config) -> int:
         model = stage.model_on(measurement, folder, reconstruction, config.effects, config.preset, device)
         result = stage.fitted(config, measurement, folder, model, begin("fit"))
         comparison = stage.compared(folder, model, begin("compare"))
-        if config.criticise:
-            diagnosis, stopped = loop(folder, model, config.most_effects, begin)
-            result, comparison = folder.fit(), read_json(folder.comparison / "comparison.json")
-        else:
+        if not config.criticise:
             try:
                 misfit = criticism.misfit(folder, model, Options(), begin("floor"))
             except SplatsoilError as error:  # the fit stands all the same
                 unknown = f"the noise floor isn't known: {error}"
+        if config.criticise or not (config.stop_at_floor or misfit is None or misfit["adequate"]):
+            diagnosis, stopped = loop(folder, model, config.most_effects, begin)
+            result, comparison = folder.fit(), read_json(folder.comparison / "comparison.json")
         begin("report")("drawing figures", 0.0)
         page = write_report(folder.path)
     if unknown:
@@ -97,9 +100,8 @@ def run(config: Config) -> int:
         print_json({"ok": True, "run": str(folder.path), "report": str(page), "comparison": losses, **extra, **result})
         return 0
     fit.show(result, str(folder.path))
-    adequate = called_adequate(result, diagnosis if misfit is None else misfit)
-    compare.show(comparison, str(folder.comparison), adequate)
-    if misfit is not None:
+    compare.show(comparison, str(folder.comparison), called_adequate(result, diagnosis or misfit))
+    if diagnosis is None and misfit is not None:
         compare.show_misfit(misfit, str(folder.path))
     if diagnosis is not None:
         if entries := criticism.history(folder):

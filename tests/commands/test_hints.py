@@ -16,6 +16,8 @@ GIVEN = {
     "posterior": "runs/a --design 7 --repeats 2 --checks 0 --executor processes:2 --device cpu --seed 1",
     "fit": "nowhere --parameters friction_angle --with cohesion --budget 9 --coarse tiny --preset fine --device cpu "
     "--seed 2 --run 'a run'",
+    "run": "nowhere --parameters friction_angle --with cohesion --budget 9 --coarse tiny --preset fine --device cpu "
+    "--seed 2 --run 'a run' --criticise --most-effects 3",
 }
 
 
@@ -29,6 +31,7 @@ def test_the_hint_is_the_command_that_was_given(command: str, how: str) -> None:
         "json",
         "search",
         "scene",
+        "stop_at_floor",
     }
     hint = module.interrupted(config)
     again = shlex.split(hint[hint.index("splatsoil ") :])

@@ -1,14 +1,18 @@
-"""When `run --criticise` goes on and when it stops, by what each diagnosis says."""
+"""When `run` looks for what is missing, when it goes on and when it stops."""
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from splatsoil.commands import _criticism, add
-from splatsoil.commands.run import loop
+from splatsoil.commands import _criticism, _stages, add
+from splatsoil.commands import run as command
+from splatsoil.commands.run import Config, loop
+from splatsoil.errors import ParameterError
 
 
 def said(verdict: str, nearest: str = "", explained: float = 0.0) -> dict[str, Any]:
@@ -41,3 +45,44 @@ def test_the_loop_adds_what_is_missing_or_nearest_and_says_why_it_stops(
     model: Any = SimpleNamespace(variant=lambda effects: model)
     last, why = loop(folder, model, most, lambda _: lambda what, share: None)
     assert done == added and reason in why and last is diagnoses[len(added)]
+
+
+@pytest.mark.parametrize(
+    ("flags", "adequate", "looks"),
+    [
+        ({}, True, False),
+        ({}, False, True),
+        ({"criticise": True}, True, True),
+        ({"criticise": True}, False, True),
+        ({"stop_at_floor": True}, False, False),
+    ],
+)
+def test_run_looks_for_what_is_missing_where_the_floor_says_that_something_is(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    flags: dict[str, bool],
+    adequate: bool,
+    looks: bool,
+) -> None:
+    comparison = {"loss": "robust", "total": {}, "noise": {}}
+    (tmp_path / "comparison.json").write_text(json.dumps(comparison))
+    folder = SimpleNamespace(path=tmp_path, comparison=tmp_path, fit=lambda: {"name": "last"})
+    monkeypatch.setattr(_stages, "prepare", lambda config: (None, folder))
+    for name, found in (("reconstructed", None), ("model_on", None), ("fitted", {}), ("compared", comparison)):
+        monkeypatch.setattr(_stages, name, lambda *_, found=found: found)
+    told = {"adequate": adequate, "misfit": {}, "estimates": {}, "blocks": [], "floor": {}}
+    monkeypatch.setattr(_criticism, "misfit", lambda *_: told)
+    monkeypatch.setattr(_criticism, "history", lambda _: [])
+    parts = ("verdict", "class", "sentences", "effects", "estimates", "simulations")
+    monkeypatch.setattr(command, "loop", lambda *_: (dict.fromkeys(parts, ""), "enough"))
+    monkeypatch.setattr("splatsoil.report.write_report", lambda path: path)
+    assert command.run(Config(set=tmp_path, json=True, **flags)) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert (said.get("stopped") == "enough") is looks and ("diagnosis" in said) is looks
+    assert ("misfit" in said) is not looks
+
+
+def test_run_cannot_both_look_and_not_look(tmp_path: Path) -> None:
+    with pytest.raises(ParameterError, match="give one of them"):
+        command.run(Config(set=tmp_path, criticise=True, stop_at_floor=True))

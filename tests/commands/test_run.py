@@ -71,7 +71,8 @@ def place(plow_dry: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def whole(place: Path) -> dict[str, Any]:
     """``splatsoil run`` from nothing."""
-    done = command("run", "set", "--preset", "tiny", "--budget", str(BUDGET), "--run", "whole", "--json", cwd=place)
+    words = ["--preset", "tiny", "--budget", str(BUDGET), "--run", "whole", "--stop-at-floor", "--json"]
+    done = command("run", "set", *words, cwd=place)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 
