@@ -15,7 +15,7 @@ from splatsoil.experiment.base import Candidate, Experiment
 from splatsoil.parameters import Parameter
 
 from .dilution import undiluted
-from .estimates import prior, untried
+from .estimates import bounded, prior, untried
 from .evidence import Evidence, Vantage, Visit
 from .floor import Floor
 from .joint import precision_of
@@ -109,7 +109,7 @@ def confirm(
 
         visits = [v for p in (evidence, vantage) if p is not None for v in p.visits if v.effects in ((), on)]
         free = free_in(experiment, candidate)
-        known, emulated = known_of(evidence, free), _emulated(experiment, candidate)
+        known, emulated = known_of(evidence, free), has_surface(experiment, candidate)
         fit = settle(
             predict,
             whiten,
@@ -144,14 +144,15 @@ def confirm(
         precision = beforehand(free, fit.values, known)
         values, stds = dict(fit.values), stds_of(free, whiten(fit.slopes), precision, remainder)
         emulated: tuple[Visit, ...] = ()
-        if _emulated(experiment, candidate):
+        if has_surface(experiment, candidate):
             # A surface that isn't one tells nothing more than the last derivatives do.
             with suppress(ValueError):
                 reading = read(visits, whole, experiment.observed, free, known)
                 values, stds, emulated = dict(reading.values), dict(reading.stds), tuple(visits)
         name = "" if candidate is None else candidate.name
         solvers = [experiment.reproducibility(p, values[p.name], name) for p in free]
-        stds, systematic = widened(stds, np.hypot(untried(floor, fit.slopes, precision), solvers))
+        told = np.hypot(untried(floor, fit.slopes, precision), solvers)
+        stds, systematic = widened(stds, [bounded(s, p, fit.values[p.name]) for s, p in zip(told, free, strict=True)])
         out[name] = Confirmation(
             name=name,
             fit=fit,
@@ -176,7 +177,7 @@ def free_in(experiment: Experiment, candidate: Candidate | None) -> list[Paramet
     return [*experiment.parameters, *(() if candidate is None else candidate.refitted)]
 
 
-def _emulated(experiment: Experiment, candidate: Candidate | None) -> bool:
+def has_surface(experiment: Experiment, candidate: Candidate | None) -> bool:
     """Whether a refit reads the parameters off all simulations: where these have chance in them."""
     return experiment.chance and len(free_in(experiment, candidate)) <= MOST
 
@@ -259,7 +260,7 @@ def stds_of(
     return {p.name: widened * math.sqrt(float(v)) for p, v in zip(free, np.diag(covariance), strict=True)}
 
 
-def widened(stds: Mapping[str, float], systematic: FloatArray) -> tuple[dict[str, float], dict[str, float]]:
+def widened(stds: Mapping[str, float], systematic: Sequence[float]) -> tuple[dict[str, float], dict[str, float]]:
     """Standard deviations by noise, by name, widened by what is systematic (k,) in the same order, and the latter."""
     named = dict(zip(stds, map(float, systematic), strict=True))
     return {name: math.hypot(std, named[name]) for name, std in stds.items()}, named

@@ -72,7 +72,7 @@ class Diagnosis:
         scores: of each effect, alone.
         given: of each effect, with the best one taken to be on; empty where none was named.
         confusion: correlation of each pair of effects' scores.
-        estimates: the model's own parameters as it is, all of the floor and untried numerics counted, by name.
+        estimates: the model's own parameters as it is, all of the floor and what is systematic counted, by name.
         misfit: of the model as it is.
         remainder: after the best effect; None where none was named.
         explained: share of the misfit beyond chance that the best effect explains.

@@ -4,7 +4,7 @@ The numerics that were tried are nuisances: the data settle how much there is of
 another solver, and soil itself, differ from ours in other ways as well. What such a way does to an estimate is told by
 those that were tried, each in turn treated as if it hadn't been (a jackknife over numerics: the estimator that knows
 only the others is shown the one left out). Where soil is wrong in yet another way, parts of the data contradict each
-other.
+other. And how far solvers of the same equations are apart is known from others' soil (`Experiment.reproducibility`).
 """
 
 from __future__ import annotations
@@ -53,10 +53,10 @@ class Estimate:
     determined: bool = True
 
     @classmethod
-    def of(cls, parameter: Parameter, value: float, noise: float, systematic: float) -> Estimate:
-        """Of a parameter."""
+    def of(cls, parameter: Parameter, value: float, noise: float, systematic: float, at: float) -> Estimate:
+        """Of a parameter, by standard deviations in its unit as it is at some value."""
         told = cls(value, noise, systematic, parameter.unit)
-        return replace(told, determined=told.std < UNINFORMED * ignorance(parameter, value))
+        return replace(told, determined=told.std < UNINFORMED * ignorance(parameter, at))
 
     @property
     def std(self) -> float:
@@ -88,6 +88,11 @@ def untried(floor: Floor, slopes: FloatArray, precision: FloatArray, doubts: Flo
         known = informed(along.T @ weights, chance.T @ unsure)
         shifts.append(np.linalg.solve(known + precision, weights.T @ left_out))
     return np.asarray(np.sqrt(np.mean(np.square(shifts), axis=0)))
+
+
+def bounded(systematic: float, parameter: Parameter, value: float) -> float:
+    """What is systematic in a parameter at a value, no more than is open before any data."""
+    return min(float(systematic), ignorance(parameter, value))
 
 
 def at_odds(
@@ -144,8 +149,8 @@ def weighed(experiment: Experiment, evidence: Evidence, floor: Floor, basis: Flo
     numerics, out = untried(floor, slopes, beforehand, doubts), {}
     for k, p in enumerate(parameters):
         value = float(np.clip(values[p.name] + step[k], p.lower, p.upper))
-        systematic = math.hypot(numerics[k], experiment.reproducibility(p, value))
-        out[p.name] = Estimate.of(p, value, float(noise[k]), systematic)
+        systematic = bounded(math.hypot(numerics[k], experiment.reproducibility(p, value)), p, values[p.name])
+        out[p.name] = Estimate.of(p, value, float(noise[k]), systematic, values[p.name])
     return out
 
 

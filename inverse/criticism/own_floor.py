@@ -24,16 +24,16 @@ from .confirmation import (
     beforehand,
     confirm,
     free_in,
+    has_surface,
     judged,
     known_of,
     noise_on,
     reach_of,
     split_times,
     stds_of,
-    widened,
 )
-from .estimates import Estimate, at_odds, untried, weighed_there
-from .evidence import Evidence, Numerics, Visit, ignorance, other_numerics, pair_of
+from .estimates import Estimate, at_odds, bounded, untried, weighed_there
+from .evidence import Evidence, Numerics, Visit, other_numerics, pair_of
 from .floor import Floor, floor_of
 from .misfit import Omnibus, omnibus, smooth_basis
 from .reading import read, tangent
@@ -105,7 +105,8 @@ def on_its_own_floor(
     soil = _Soil(experiment, there, floor, basis, parameters, at, visits, best.fit.slopes).smoothed
     refit = replace(best, floor=noise_on(floor.single, judged(experiment, split_times(experiment)[1])))
     if visits:
-        values, stds, systematic = soil.told(best.name)
+        values, noise, systematic = soil.told(best.name)
+        stds = {name: math.hypot(noise[name], systematic[name]) for name in noise}
         refit = replace(refit, values=values, stds=stds, systematic=systematic)
     return OwnFloor(before=soil.misfit(residual, len(experiment.parameters)), after=soil.after, refit=refit)
 
@@ -135,16 +136,17 @@ def as_it_is(
         steps: of that; see :func:`~splatsoil.inverse.criticism.confirmation.confirm`.
         told: called with (what, share done).
     """
+    if not has_surface(experiment, None):
+        return weighed_there(experiment, evidence, floor, basis, simulate)
     if found is None:
         found = confirm(experiment, evidence, floor, [], simulate, steps, basis, told)[""]
-    if not found.visits:
+    parameters, at = experiment.parameters, evidence.values
+    soil = _Soil(experiment, evidence, floor, basis, parameters, at, found.visits, found.fit.slopes)
+    try:
+        values, noise, systematic = soil.smoothed.told()
+    except ValueError:  # simulations that make no surface
         return weighed_there(experiment, evidence, floor, basis, simulate)
-    parameters = experiment.parameters
-    at = evidence.values
-    soil = _Soil(experiment, evidence, floor, basis, parameters, at, found.visits, found.fit.slopes).smoothed
-    values, stds, systematic = soil.told()
-    noise = {name: math.sqrt(max(std**2 - systematic[name] ** 2, 0.0)) for name, std in stds.items()}
-    return {p.name: Estimate.of(p, values[p.name], noise[p.name], systematic[p.name]) for p in parameters}
+    return {p.name: Estimate.of(p, *(of[p.name] for of in (values, noise, systematic, at))) for p in parameters}
 
 
 @dataclass(frozen=True)
@@ -201,17 +203,16 @@ class _Soil:
         return omnibus(self.floor.noise, np.concatenate([self.floor.nuisance, along], axis=1), residual, self.basis)
 
     def told(self, effect: str = "") -> tuple[dict[str, float], dict[str, float], dict[str, float]]:
-        """Parameters, their standard deviations and what of these is systematic, by name; ``effect`` is one that the
-        experiment's model lacks."""
+        """Parameters, and standard deviations of them by noise and by what is systematic, by name; ``effect`` is one
+        that the experiment's model lacks."""
         experiment, sight, known = self.experiment, self.sight, known_of(self.there, self.parameters)
         reading = read(self.visits, sight, experiment.observed, self.parameters, known)
         # Draws don't leave the simulations' range, and these were made where another floor let the parameters be.
         precision = beforehand(self.parameters, self.at, known)
         least = stds_of(self.parameters, sight(self.slopes), precision, self.after)
-        stds = {name: max(std, least[name]) for name, std in reading.stds.items()}
+        noise = {name: max(std, least[name]) for name, std in reading.stds.items()}
         contradictions = at_odds(self.floor, experiment.layout.parts, self.slopes, precision, self.left)
         solvers = [experiment.reproducibility(p, reading.values[p.name], effect) for p in self.parameters]
         systematic = np.sqrt(untried(self.floor, self.slopes, precision) ** 2 + contradictions**2 + np.square(solvers))
-        most = [ignorance(p, self.at[p.name]) for p in self.parameters]
-        stds, named = widened(stds, np.minimum(systematic, most))
-        return dict(reading.values), stds, named
+        named = {p.name: bounded(s, p, self.at[p.name]) for p, s in zip(self.parameters, systematic, strict=True)}
+        return dict(reading.values), noise, named

@@ -7,6 +7,7 @@ nothing in one measurement tells which one soil follows.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 
 from splatsoil.parameters import Parameter
@@ -15,15 +16,16 @@ from splatsoil.soil.effect import Effect
 ANGLE = 2.3
 """Degrees: friction angle of soil that has an effect."""
 SHARE = 0.22
-"""Of what an effect's parameter is away from off."""
+"""Of what an effect's parameter is away from off, along its scale."""
 
 
 def between_solvers(parameter: Parameter, value: float, effects: Iterable[Effect]) -> float:
     """Standard deviation of a parameter at a value between solvers, in its unit, of soil that has effects.
 
     Maximum likelihood over sixteen sealed worlds of an implicit solver with cohesion or viscosity hidden
-    (docs/hidden-worlds.md, seeds 41 to 44), beyond all that a diagnosis finds by itself. Soil without an effect is read
-    as well as a diagnosis says, and what cameras report doesn't hang on a solver.
+    (docs/hidden-worlds.md, seeds 41 to 44), beyond all that a diagnosis finds by itself; other effects of soil are
+    taken to be alike. Soil without an effect is read as well as a diagnosis says, what cameras report doesn't hang on a
+    solver, and of what only shapes an effect nothing is known.
     """
     on = tuple(effects)
     reported = {p.name for effect in on if effect.observes for p in effect.parameters}
@@ -31,4 +33,6 @@ def between_solvers(parameter: Parameter, value: float, effects: Iterable[Effect
         return 0.0
     if parameter.name == "friction_angle":
         return ANGLE
-    return SHARE * abs(value - (parameter.off or 0.0))
+    if parameter.off is None:
+        return 0.0
+    return SHARE * abs(value * math.log(value / parameter.off) if parameter.log else value - parameter.off)

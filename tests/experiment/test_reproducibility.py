@@ -1,5 +1,7 @@
 """What another solver of the same equations makes of a parameter."""
 
+import pytest
+
 from splatsoil.experiment.reproducibility import between_solvers
 from splatsoil.soil.effect import Effect
 from splatsoil.soil.law import Law
@@ -25,10 +27,20 @@ def test_soil_with_an_effect_is_not() -> None:
     assert apart("cohesion", 0.0, "cohesion") == 0.0
 
 
-def test_sizes_count_from_where_an_effect_is_off() -> None:
-    name = find_effects(("gravity",))[0].size
+def test_sizes_count_from_where_an_effect_is_off_along_their_scale() -> None:
+    (gravity,) = find_effects(("gravity",))
+    name = gravity.size
+    assert gravity.parameters[0].log and gravity.parameters[0].off == 1.0
     assert apart(name, 1.0, "gravity") == 0.0
-    assert apart(name, 0.5, "gravity") == apart(name, 1.5, "gravity") > 0.0
+    # as many logarithms up as down: in the parameter's unit in proportion to where that is
+    assert apart(name, 2.0, "gravity") / 2.0 == pytest.approx(apart(name, 0.5, "gravity") / 0.5)
+
+
+def test_of_what_only_shapes_an_effect_nothing_is_known() -> None:
+    (layering,) = find_effects(("layering",))
+    for shape in layering.shapes:
+        assert apart(shape, 0.05, "layering") == 0.0
+    assert layering.shapes
 
 
 def test_what_cameras_report_hangs_on_no_solver() -> None:

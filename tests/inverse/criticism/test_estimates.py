@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from splatsoil.benchmarks.hidden_effects import emulated, fitted, outside
-from splatsoil.inverse.criticism.diagnosis import Bench, Options
+from splatsoil.inverse.criticism.diagnosis import Bench, Options, diagnose
 from splatsoil.inverse.criticism.estimates import at_odds, untried, weighed, weighed_there
 from splatsoil.inverse.criticism.evidence import gather
 from splatsoil.inverse.criticism.floor import floor_of
@@ -165,3 +165,17 @@ def test_the_error_is_as_large_as_parts_of_the_data_contradict_each_other() -> N
             assert rms(np.array(told)) < 0.8 * noise
     alone = np.zeros_like(parts)
     np.testing.assert_array_equal(at_odds(floor, alone, slopes, precision, residual), 0.0)
+
+
+def test_solvers_that_are_apart_count_in_what_is_weighed_and_in_a_refit_without_a_floor_of_its_own() -> None:
+    made = replace(emulated(0), patterns={}, chance=False)
+    truth = {"angle": 0.0, "effect 1": 8.0}
+    made = replace(made, observed=made.measured(truth, [0, 99]))
+    found = diagnose(replace(made, apart={"angle": 2.0}), {"angle": fitted(made)})
+    assert found.estimates["angle"].systematic == pytest.approx(2.0)
+    assert found.confirmations["effect 1"].systematic["angle"] == pytest.approx(2.0)
+    # no more than is open before any data
+    wide = diagnose(replace(made, apart={"angle": 1e3}), {"angle": fitted(made)})
+    told = (wide.estimates["angle"].systematic, wide.confirmations["effect 1"].systematic["angle"])
+    assert told == pytest.approx((20.0 / np.sqrt(12.0),) * 2)
+    assert not wide.estimates["angle"].determined
