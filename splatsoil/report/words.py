@@ -107,8 +107,8 @@ def fitted_sentence(fit: Mapping[str, Any], judged: Mapping[str, Any] | None) ->
     ]
     return (
         "Noise, chance and numerics weighed: the ± holds these, and what numerics that weren't tried may do (in soil "
-        "that has an effect also how far solvers are apart), not a bias that all of them have. The fit by itself "
-        f"says: {', '.join(alone)}."
+        "that has an effect also how far solvers are apart, and parts of the data that contradict each other), not a "
+        f"bias that all of them have. The fit by itself says: {', '.join(alone)}."
     )
 
 

@@ -14,6 +14,7 @@ from splatsoil.experiment.strokes import MEASURED
 from splatsoil.measurement import Measurement
 from splatsoil.model import Model
 from splatsoil.reconstruction import HeightField
+from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
 
 
@@ -162,3 +163,16 @@ def test_other_strokes_know_an_effect_of_ones_own(monkeypatch: pytest.MonkeyPatc
     with pytest.raises(Asked):
         PlowExperiment.strokes(experiment)[MEASURED]({}, ("suction", "tilt"))
     assert asked == [("cohesion", suction, "tilt")]
+
+
+def test_solvers_are_apart_where_the_model_or_the_effect_asked_for_changes_soil() -> None:
+    (angle,) = (p for p in Law().parameters if p.name == "friction_angle")
+    wanted = {effect.name: effect for effect in find_effects(("cohesion", "exposure"))}
+
+    def apart(*on: str, effect: str = "") -> float:
+        base = SimpleNamespace(law=Law(find_effects(on)))
+        experiment: Any = SimpleNamespace(base=base, _wanted=wanted)
+        return PlowExperiment.reproducibility(experiment, angle, 35.0, effect)
+
+    assert apart() == apart(effect="exposure") == apart("exposure") == 0.0
+    assert apart(effect="cohesion") == apart("tilt") == apart("viscosity", effect="exposure") > 0.0
