@@ -151,8 +151,8 @@ def confirm(
                 values, stds, emulated = dict(reading.values), dict(reading.stds), tuple(visits)
         name = "" if candidate is None else candidate.name
         solvers = [experiment.reproducibility(p, values[p.name], name) for p in free]
-        told = np.hypot(untried(floor, fit.slopes, precision), solvers)
-        stds, systematic = widened(stds, [bounded(s, p, fit.values[p.name]) for s, p in zip(told, free, strict=True)])
+        own = np.hypot(untried(floor, fit.slopes, precision), solvers)
+        stds, systematic = widened(stds, [bounded(s, p, fit.values[p.name]) for s, p in zip(own, free, strict=True)])
         out[name] = Confirmation(
             name=name,
             fit=fit,
