@@ -81,7 +81,12 @@ def run(config: Config) -> int:
             except SplatsoilError as error:  # the fit stands all the same
                 unknown = f"the noise floor isn't known: {error}"
         if config.criticise or not (config.stop_at_floor or misfit is None or misfit["adequate"]):
-            diagnosis, stopped = loop(folder, model, config.most_effects, begin)
+            try:
+                diagnosis, stopped = loop(folder, model, config.most_effects, begin)
+            except SplatsoilError as error:
+                if config.criticise:
+                    raise
+                unknown = f"what is missing isn't known: {error}"
             result, comparison = folder.fit(), read_json(folder.comparison / "comparison.json")
         begin("report")("drawing figures", 0.0)
         page = write_report(folder.path)

@@ -103,7 +103,7 @@ class PlateExperiment:
         self.resolution = Resolution.derive(self.experiment, preset)
 
     def reproducibility(self, parameter: Parameter, value: float, effect: str = "") -> float:
-        """Not known: no other solver has been pressed into."""
+        """Not known: plates were pressed into no other solver's soil."""
         del parameter, value, effect
         return 0.0
 

@@ -12,7 +12,7 @@ import pytest
 from splatsoil.commands import _criticism, _stages, add
 from splatsoil.commands import run as command
 from splatsoil.commands.run import Config, loop
-from splatsoil.errors import ParameterError
+from splatsoil.errors import ParameterError, SimulationError
 
 
 def said(verdict: str, nearest: str = "", explained: float = 0.0) -> dict[str, Any]:
@@ -47,6 +47,20 @@ def test_the_loop_adds_what_is_missing_or_nearest_and_says_why_it_stops(
     assert done == added and reason in why and last is diagnoses[len(added)]
 
 
+def stand_in(monkeypatch: pytest.MonkeyPatch, place: Path, adequate: bool) -> None:
+    """All of the stages but the loop."""
+    comparison = {"loss": "robust", "total": {}, "noise": {}}
+    (place / "comparison.json").write_text(json.dumps(comparison))
+    folder = SimpleNamespace(path=place, comparison=place, fit=lambda: {"name": "last"})
+    monkeypatch.setattr(_stages, "prepare", lambda config: (None, folder))
+    for name, found in (("reconstructed", None), ("model_on", None), ("fitted", {}), ("compared", comparison)):
+        monkeypatch.setattr(_stages, name, lambda *_, found=found: found)
+    told = {"adequate": adequate, "misfit": {}, "estimates": {}, "blocks": [], "floor": {}}
+    monkeypatch.setattr(_criticism, "misfit", lambda *_: told)
+    monkeypatch.setattr(_criticism, "history", lambda _: [])
+    monkeypatch.setattr("splatsoil.report.write_report", lambda path: path)
+
+
 @pytest.mark.parametrize(
     ("flags", "adequate", "looks"),
     [
@@ -65,18 +79,9 @@ def test_run_looks_for_what_is_missing_where_the_floor_says_that_something_is(
     adequate: bool,
     looks: bool,
 ) -> None:
-    comparison = {"loss": "robust", "total": {}, "noise": {}}
-    (tmp_path / "comparison.json").write_text(json.dumps(comparison))
-    folder = SimpleNamespace(path=tmp_path, comparison=tmp_path, fit=lambda: {"name": "last"})
-    monkeypatch.setattr(_stages, "prepare", lambda config: (None, folder))
-    for name, found in (("reconstructed", None), ("model_on", None), ("fitted", {}), ("compared", comparison)):
-        monkeypatch.setattr(_stages, name, lambda *_, found=found: found)
-    told = {"adequate": adequate, "misfit": {}, "estimates": {}, "blocks": [], "floor": {}}
-    monkeypatch.setattr(_criticism, "misfit", lambda *_: told)
-    monkeypatch.setattr(_criticism, "history", lambda _: [])
+    stand_in(monkeypatch, tmp_path, adequate)
     parts = ("verdict", "class", "sentences", "effects", "estimates", "simulations")
     monkeypatch.setattr(command, "loop", lambda *_: (dict.fromkeys(parts, ""), "enough"))
-    monkeypatch.setattr("splatsoil.report.write_report", lambda path: path)
     assert command.run(Config(set=tmp_path, json=True, **flags)) == 0
     said = json.loads(capsys.readouterr().out)
     assert (said.get("stopped") == "enough") is looks and ("diagnosis" in said) is looks
@@ -86,3 +91,18 @@ def test_run_looks_for_what_is_missing_where_the_floor_says_that_something_is(
 def test_run_cannot_both_look_and_not_look(tmp_path: Path) -> None:
     with pytest.raises(ParameterError, match="give one of them"):
         command.run(Config(set=tmp_path, criticise=True, stop_at_floor=True))
+
+
+def test_a_diagnosis_that_fails_costs_no_report_unless_it_was_asked_for(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    def fails(*_: object) -> None:
+        raise SimulationError("soil left the bin")
+
+    stand_in(monkeypatch, tmp_path, adequate=False)
+    monkeypatch.setattr(command, "loop", fails)
+    assert command.run(Config(set=tmp_path, json=True)) == 0
+    told = capsys.readouterr()
+    assert "what is missing isn't known: soil left the bin" in told.err and json.loads(told.out)["name"] == "last"
+    with pytest.raises(SimulationError):
+        command.run(Config(set=tmp_path, json=True, criticise=True))
