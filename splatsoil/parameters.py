@@ -73,6 +73,11 @@ class Parameter:
         return min(max(number, lower), upper)
 
 
+def distance(parameter: Parameter, value: float, end: float) -> float:
+    """From a value to another along the parameter's scale, in its unit at the value."""
+    return value * math.log(end / value) if parameter.log else end - value
+
+
 class ParameterSpace:
     """An ordered set of free parameters: dictionaries <-> vectors in physical units <-> vectors in [-1, 1]."""
 

@@ -19,10 +19,10 @@ from splatsoil.inverse.surrogate import UNINFORMED
 
 from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Experiment
-from splatsoil.parameters import Parameter
+from splatsoil.parameters import Parameter, distance
 
 from .dilution import informed
-from .evidence import Evidence, distance, ignorance, look_from, pair_of
+from .evidence import Evidence, ignorance, look_from, pair_of
 from .floor import Floor, taken_up
 from .sight import Sight
 from .simulations import Simulations

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Calibration, Candidate, Experiment
-from splatsoil.parameters import Parameter
+from splatsoil.parameters import Parameter, distance
 
 FloatArray = npt.NDArray[np.float64]
 Run = Callable[..., FloatArray]
@@ -298,11 +298,6 @@ def around(parameter: Parameter, value: float) -> list[float]:
 def rate(parameter: Parameter, value: float) -> float:
     """How fast a parameter grows along its scale: 1, or the value itself on a logarithmic one."""
     return value if parameter.log else 1.0
-
-
-def distance(parameter: Parameter, value: float, end: float) -> float:
-    """From a value to another along the parameter's scale, in its unit at the value."""
-    return value * math.log(end / value) if parameter.log else end - value
 
 
 def moved(parameter: Parameter, value: float, step: float) -> float:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -192,7 +193,7 @@ class _Soil:
         """(t, s) what is left of the observation."""
         return self.experiment.observed - self.there.mean
 
-    @property
+    @cached_property
     def after(self) -> Omnibus:
         """Misfit of such soil."""
         return self.misfit(self.left[self.experiment.seen], len(self.parameters))

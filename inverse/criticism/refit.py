@@ -18,9 +18,9 @@ from scipy.optimize import lsq_linear
 
 from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Experiment
-from splatsoil.parameters import Parameter, ParameterSpace
+from splatsoil.parameters import Parameter, ParameterSpace, distance
 
-from .evidence import around, derivatives, distance, ignorance
+from .evidence import around, derivatives, ignorance
 from .noise import Noise, independent
 from .simulations import Simulations
 

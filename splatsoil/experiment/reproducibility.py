@@ -7,10 +7,9 @@ nothing in one measurement tells which one soil follows.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 
-from splatsoil.parameters import Parameter
+from splatsoil.parameters import Parameter, distance
 from splatsoil.soil.effect import Effect
 
 ANGLE = 2.3
@@ -35,4 +34,4 @@ def between_solvers(parameter: Parameter, value: float, effects: Iterable[Effect
         return ANGLE
     if parameter.off is None:
         return 0.0
-    return SHARE * abs(value * math.log(value / parameter.off) if parameter.log else value - parameter.off)
+    return SHARE * abs(distance(parameter, value, parameter.off))

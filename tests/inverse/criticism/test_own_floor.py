@@ -11,6 +11,7 @@ import pytest
 from splatsoil.benchmarks.hidden_effects import detectable, emulated, fitted
 from splatsoil.inverse.criticism import own_floor
 from splatsoil.inverse.criticism.diagnosis import Options, diagnose
+from splatsoil.inverse.criticism.record import record
 from splatsoil.inverse.criticism.refit import optimum
 from splatsoil.inverse.criticism.simulations import Simulations
 from splatsoil.inverse.criticism.words import sentences
@@ -177,9 +178,10 @@ def test_parameters_of_a_model_that_has_an_effect_are_told_as_well_as_is_said() 
 def test_solvers_that_are_apart_count_in_a_model_that_has_an_effect() -> None:
     experiment, truth = with_the_effect(0)
     fit = nearby(experiment, truth)
-    alone, among = (
-        diagnose(replace(experiment, apart=apart), fit).estimates["angle"] for apart in ({}, {"angle": 2.0})
-    )
+    both = [diagnose(replace(experiment, apart=apart), fit) for apart in ({}, {"angle": 2.0})]
+    alone, among = (found.estimates["angle"] for found in both)
+    kept = record(experiment, both[1])["estimates"]["angle"]
+    assert (kept["systematic"], kept["std"]) == (among.systematic, among.std)
     assert among.systematic == pytest.approx(np.hypot(alone.systematic, 2.0))
     assert (among.value, among.noise) == (alone.value, alone.noise)
 

@@ -6,13 +6,13 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 import pytest
-from splatsoil.inverse.criticism.evidence import Visit, around, distance
+from splatsoil.inverse.criticism.evidence import Visit, around
 from splatsoil.inverse.criticism.reading import explored, read
 from splatsoil.inverse.criticism.refit import Known, Refit, refit
 from splatsoil.inverse.criticism.surface import Surface
 
 from splatsoil.errors import SimulationError
-from splatsoil.parameters import Parameter
+from splatsoil.parameters import Parameter, distance
 
 ANGLE = Parameter("angle", "deg", 20.0, 50.0, 35.0, meaningful=1.0)
 STICK = Parameter("stick", "Pa", 0.0, 1000.0, 0.0, off=0.0, meaningful=50.0, sign=1)
