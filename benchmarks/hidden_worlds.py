@@ -5,6 +5,9 @@ tell, or with nothing, photographed by the path tracer, or by Mitsuba 3 (``--ren
 ``diagnose`` then get the set alone. Truths (what is hidden, how much, the friction angle, the surface, looks) are drawn
 by a stream of random numbers of their own, and opened only to score. What was made is kept in the folder, and a second
 call goes on from there.
+
+The same truths ploughed by this project's own solver (``--solver small``, or another preset) tell what of an error is
+the solvers' difference, and what the photographs' or the estimates' fault.
 """
 
 from __future__ import annotations
@@ -17,7 +20,6 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,11 +28,12 @@ from splatsoil.benchmarks._common import keep_to_one_protocol, sources, stamp
 from splatsoil.benchmarks._mitsuba import MitsubaStage, load_mitsuba
 from splatsoil.benchmarks._newton import Numerics, World, plough
 from splatsoil.benchmarks._tally import wilson
+from splatsoil.benchmarks._truths import FIELD, KINDS, NOTHING, OBSERVATION, Hidden, draw
 from splatsoil.benchmarks.numerics import FloatArray
 
+from splatsoil.errors import ParameterError
 from splatsoil.files import plain, write_json
-from splatsoil.mpm import Resolution, Trajectory, frames_around
-from splatsoil.observation import Observation
+from splatsoil.mpm import PRESETS, Resolution, Trajectory, frames_around, simulate
 from splatsoil.quiet import hush
 from splatsoil.reconstruction import fill
 from splatsoil.soil.law import Law
@@ -40,136 +43,9 @@ from splatsoil.synthetic import Appearance, Renderer, Setup, Stage, photograph_r
 NUMERICS = Numerics(voxel=0.02, substeps=2, iterations=120)
 SPACING = 0.01
 """Of the independent solver's particles, m."""
-ANGLES = (30.0, 40.0)
-"""Range of the true friction angle, degrees."""
-NOTHING, FIELD = "nothing", "friction_field"
-"""Kinds without an effect of the library: nothing is hidden, or something that the library doesn't have."""
-
-
-@dataclass(frozen=True)
-class Hidden:
-    """The truth of one world.
-
-    Attributes:
-        kind: name of the effect that is hidden, or one of the kinds without.
-        number: of the world of its kind.
-        angle: friction angle, degrees.
-        size: of what is hidden, in the effect's unit where it has one.
-        seed: of surface, looks, particles and noise.
-        soil: what differs from plain sand, for the solver.
-        gravity: (3,) m/s^2; None for what the set says.
-        values: parameters of an effect on what cameras report.
-    """
-
-    kind: str
-    number: int
-    angle: float
-    size: float
-    seed: int
-    soil: Mapping[str, Any] = field(default_factory=dict)
-    gravity: tuple[float, float, float] | None = None
-    values: Mapping[str, float] = field(default_factory=dict)
-
-    @property
-    def name(self) -> str:
-        """Of its folders."""
-        return f"{self.kind.replace(' ', '-')}-{self.number}"
-
-    def observation(self) -> Observation:
-        """How the cameras err."""
-        if not self.values:
-            return Observation()
-        law = Law(find_effects([self.kind]))
-        return law.observation(law.require_on(dict(self.values)))
-
-
-def _cohesion(rng: np.random.Generator, hidden: Hidden) -> Hidden:
-    size = rng.uniform(150.0, 500.0)
-    return replace(hidden, size=size, soil={"cohesion": size})
-
-
-def _dilatancy(rng: np.random.Generator, hidden: Hidden) -> Hidden:
-    share = rng.uniform(0.15, 0.35)
-    return replace(hidden, size=share * hidden.angle, soil={"dilatancy": share})
-
-
-def _viscosity(rng: np.random.Generator, hidden: Hidden) -> Hidden:
-    size = rng.uniform(50.0, 200.0)
-    return replace(hidden, size=size, soil={"viscosity": size})
-
-
-def _tool_friction(rng: np.random.Generator, hidden: Hidden) -> Hidden:
-    size = rng.uniform(0.6, 0.9)
-    return replace(hidden, size=size, soil={"tool_friction": size})
-
-
-def _tool_adhesion(rng: np.random.Generator, hidden: Hidden) -> Hidden:
-    size = rng.uniform(200.0, 600.0)
-    return replace(hidden, size=size, soil={"tool_adhesion": size})
-
-
-def _tilt(rng: np.random.Generator, hidden: Hidden) -> Hidden:
-    size = rng.uniform(3.0, 6.0) * rng.choice([-1.0, 1.0])
-    lean = np.radians(size)
-    return replace(hidden, size=size, gravity=(9.81 * np.sin(lean), 0.0, -9.81 * np.cos(lean)))
-
-
-def _gravity(rng: np.random.Generator, hidden: Hidden) -> Hidden:
-    size = rng.uniform(0.3, 0.6)
-    return replace(hidden, size=size, gravity=(0.0, 0.0, -9.81 * size))
-
-
-def _layering(rng: np.random.Generator, hidden: Hidden) -> Hidden:
-    size = rng.uniform(-12.0, -7.0)
-    return replace(hidden, size=size, soil={"layer": (size, rng.uniform(0.03, 0.06))})
-
-
-def _buried_obstacle(rng: np.random.Generator, hidden: Hidden) -> Hidden:
-    size = rng.uniform(0.03, 0.045)
-    # beside the tool's way, which it must not touch
-    y = 0.25 + rng.choice([-1.0, 1.0]) * (0.07 + size)
-    return replace(hidden, size=size, soil={"obstacle": (rng.uniform(0.32, 0.45), y, 0.06, size)})
-
-
-def _exposure(rng: np.random.Generator, hidden: Hidden) -> Hidden:
-    size = rng.uniform(0.85, 0.93)
-    return replace(hidden, size=size, values={"exposure_gain": size})
-
-
-def _time_offset(rng: np.random.Generator, hidden: Hidden) -> Hidden:
-    size = rng.uniform(0.02, 0.035) * rng.choice([-1.0, 1.0])
-    return replace(hidden, size=size, values={"time_offset": size})
-
-
-def _friction_field(rng: np.random.Generator, hidden: Hidden) -> Hidden:
-    size = rng.uniform(6.0, 10.0) * rng.choice([-1.0, 1.0])
-    return replace(hidden, size=size, soil={"across": size})
-
-
-KINDS: dict[str, Callable[[np.random.Generator, Hidden], Hidden]] = {
-    NOTHING: lambda rng, hidden: hidden,
-    "cohesion": _cohesion,
-    "dilatancy": _dilatancy,
-    "viscosity": _viscosity,
-    "tool_friction": _tool_friction,
-    "tool_adhesion": _tool_adhesion,
-    "tilt": _tilt,
-    "gravity": _gravity,
-    "layering": _layering,
-    "buried_obstacle": _buried_obstacle,
-    "exposure": _exposure,
-    "time_offset": _time_offset,
-    FIELD: _friction_field,
-}
-OBSERVATION = ("exposure", "time_offset")
 RENDERERS: dict[str, Callable[..., Renderer]] = {"own": Stage, "mitsuba": MitsubaStage}
-
-
-def draw(kind: str, number: int, seed: int) -> Hidden:
-    """A sealed truth."""
-    rng = np.random.default_rng([seed, list(KINDS).index(kind), number])
-    angle = float(rng.uniform(*ANGLES))
-    return KINDS[kind](rng, Hidden(kind, number, angle, 0.0, int(rng.integers(1000, 2**20))))
+NEWTON = "newton"
+"""The other solver; ours go by their presets."""
 
 
 def soil_of(hidden: Hidden, setup: Setup) -> World:
@@ -189,14 +65,53 @@ def soil_of(hidden: Hidden, setup: Setup) -> World:
     return World(hidden.name, angle, x, SPACING, **told)
 
 
+def ploughed_by_newton(
+    group: Sequence[Hidden], setups: Sequence[Setup], frames: Sequence[int], device: str
+) -> list[Trajectory]:
+    """Worlds under one gravity, side by side."""
+    soils = [soil_of(h, s) for h, s in zip(group, setups, strict=True)]
+    runs = plough(setups[0].experiment(), soils, NUMERICS, frames, device, gravity=group[0].gravity)
+    found = []
+    for setup, soil, run in zip(setups, soils, runs, strict=True):
+        positions = np.stack([soil.particles, *(run.particles[f] for f in frames if f > 0)]).astype(np.float32)
+        found.append(
+            Trajectory(
+                frames=tuple(frames),
+                positions=positions,
+                deformations=np.broadcast_to(np.eye(3, dtype=np.float32), (*positions.shape, 3)),
+                force=run.force[: max(setup.frames)],
+                spacing=SPACING,
+                resolution=Resolution.derive(setup.experiment(), "small"),
+            )
+        )
+    return found
+
+
+def ploughed_by_us(hidden: Hidden, setup: Setup, frames: Sequence[int], preset: str, device: str) -> Trajectory:
+    """A world of our own solver, of particles that no fit starts from."""
+    experiment = setup.experiment()
+    law = Law(effect.for_measurement(experiment) for effect in find_effects([hidden.kind] if hidden.values else []))
+    resolution = Resolution.derive(experiment, preset)
+    return simulate(
+        experiment,
+        fill(setup.surface, setup.bed, resolution.spacing, seed=hidden.seed),
+        law.require_on({**hidden.values, "friction_angle": hidden.angle}),
+        law=law,
+        resolution=resolution,
+        frames=frames,
+        device=device,
+    )[0]
+
+
 def make_worlds(
     truths: Sequence[Hidden],
     out: Path,
     device: str,
     say: Callable[[str], None],
+    solver: str = NEWTON,
     renderer: Callable[..., Renderer] = Stage,
 ) -> None:
-    """Simulate and photograph the worlds that the folder doesn't have, those under one gravity side by side."""
+    """Simulate and photograph the worlds that the folder doesn't have."""
     missing = [h for h in truths if not (out / "sets" / h.name / "truth.json").is_file()]
     for gravity in dict.fromkeys(h.gravity for h in missing):
         group = [h for h in missing if h.gravity == gravity]
@@ -205,20 +120,13 @@ def make_worlds(
         rate = setups[0].frame_rate
         frames = sorted({f for o in seen for f in frames_around(setups[0].frames, o.time_offset * rate)})
         began = time.perf_counter()
-        soils = [soil_of(h, s) for h, s in zip(group, setups, strict=True)]
-        runs = plough(setups[0].experiment(), soils, NUMERICS, frames, device, gravity=gravity)
+        if solver == NEWTON:
+            trajectories = ploughed_by_newton(group, setups, frames, device)
+        else:
+            ours = zip(group, setups, strict=True)
+            trajectories = [ploughed_by_us(h, setup, frames, solver, device) for h, setup in ours]
         say(f"{len(group)} worlds ploughed in {time.perf_counter() - began:.0f} s: {', '.join(h.name for h in group)}")
-        for hidden, setup, soil, run, observation in zip(group, setups, soils, runs, seen, strict=True):
-            positions = np.stack([soil.particles, *(run.particles[f] for f in frames if f > 0)]).astype(np.float32)
-            still = np.broadcast_to(np.eye(3, dtype=np.float32), (*positions.shape, 3))
-            trajectory = Trajectory(
-                frames=tuple(frames),
-                positions=positions,
-                deformations=still,
-                force=run.force[: max(setup.frames)],
-                spacing=SPACING,
-                resolution=Resolution.derive(setup.experiment(), "small"),
-            )
+        for hidden, setup, trajectory, observation in zip(group, setups, trajectories, seen, strict=True):
             photograph_run(
                 out / "sets" / hidden.name,
                 setup,
@@ -352,6 +260,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--renderer", choices=list(RENDERERS), default="own", help="takes the photographs; mitsuba needs the package"
     )
+    parser.add_argument(
+        "--solver",
+        choices=[NEWTON, *PRESETS],
+        default=NEWTON,
+        help="ploughs the worlds: newton needs the package, the others are ours by preset (not friction_field)",
+    )
     parser.add_argument("--worlds-only", action="store_true", help="make the sets and stop")
     parser.add_argument("--out", type=Path, default=Path("runs/hidden-worlds"))
     options = parser.parse_args(arguments)
@@ -361,17 +275,20 @@ def main(arguments: list[str] | None = None) -> int:
     def say(what: str) -> None:
         print(f"{time.perf_counter() - began:6.0f} s  {what}", file=sys.stderr, flush=True)
 
+    if options.solver != NEWTON and FIELD in options.kinds:
+        raise ParameterError(f"{FIELD} is outside of our library: give --kinds without it, or --solver {NEWTON}")
     if options.renderer == "mitsuba":
         load_mitsuba()  # says what is missing before worlds are made
-    own = [Path(__file__).with_name(f"{name}.py") for name in ("_mitsuba", "_newton", "hidden_worlds")]
-    decides = {"seed": options.seed, "preset": options.preset, "renderer": options.renderer, "code": sources(own)}
+    own = [Path(__file__).with_name(f"{name}.py") for name in ("_mitsuba", "_newton", "_truths", "hidden_worlds")]
+    decides = {name: getattr(options, name) for name in ("seed", "preset", "solver", "renderer")}
+    decides["code"] = sources(own)
     keep_to_one_protocol(options.out, decides)
     truths = [
         draw(kind, k, options.seed)
         for kind in options.kinds
         for k in range((3 if kind == NOTHING else 1) * options.count)
     ]
-    make_worlds(truths, options.out, options.device, say, RENDERERS[options.renderer])
+    make_worlds(truths, options.out, options.device, say, options.solver, RENDERERS[options.renderer])
     if options.worlds_only:
         return 0
     threads = max(1, (os.cpu_count() or 1) // options.side_by_side)
@@ -389,7 +306,7 @@ def main(arguments: list[str] | None = None) -> int:
             rows.append(score(hidden, fit, told))
     write_json(
         options.out / "result.json",
-        plain({"made_by": stamp(options.device), "renderer": options.renderer, "rows": rows}),
+        plain({"made_by": stamp(options.device), "solver": options.solver, "renderer": options.renderer, "rows": rows}),
     )
     print(table(rows))
     return 0 if len(rows) == len(truths) else 1

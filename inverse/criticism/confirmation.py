@@ -5,18 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+from itertools import cycle, repeat
 
 import numpy as np
 import numpy.typing as npt
 
+from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Candidate, Experiment
 from splatsoil.parameters import Parameter
 
 from .dilution import undiluted
 from .estimates import bounded, prior, untried
-from .evidence import Evidence, Vantage, Visit
+from .evidence import Evidence, Vantage, Visit, pair_of
 from .floor import Floor
 from .joint import precision_of
 from .misfit import Omnibus, omnibus
@@ -30,6 +32,11 @@ from .verdicts import CERTAIN, CLEAN, LEVEL
 
 FloatArray = npt.NDArray[np.float64]
 Report = Callable[[str, float], None]
+
+SHARED = 0
+"""Seed by which refits are compared: what chance they have in common cancels."""
+MORE_SEEDS = 4
+"""Seeds of refits beside those of the evidence."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +98,11 @@ def confirm(
     ``steps`` is the number of simulations from each point where a refit starts; ``vantage`` is another such point.
     """
     shown, hidden = split_times(experiment)
-    whiten = Sight.of(experiment, floor, basis, vantage, shown)
+    whiten, whole = (Sight.of(experiment, floor, basis, vantage, rows) for rows in (shown, None))
+    # A surface through many simulations has hardly any of one's chance, and its own doubt beside.
+    through, through_whole = (
+        Sight.of(experiment, floor, basis, vantage, rows, averaged=True) for rows in (shown, None)
+    )
     jobs: list[Candidate | None] = [None, *chosen]
     starting = undiluted(evidence, floor.single.plus(floor.nuisance))
     done = 0
@@ -101,15 +112,16 @@ def confirm(
         on = () if candidate is None else (candidate.name,)
         purpose = f"refit {candidate.name if candidate else 'of the model'}"
         told(purpose, 0.75 + 0.2 * done / len(jobs))
-
-        def predict(values: Mapping[str, float]) -> FloatArray:
-            table = simulate(values, effects=on, purpose=purpose)
-            visits.append(Visit(dict(values), on, table))
-            return table
-
-        visits = [v for p in (evidence, vantage) if p is not None for v in p.visits if v.effects in ((), on)]
         free = free_in(experiment, candidate)
         known, emulated = known_of(evidence, free), has_surface(experiment, candidate)
+        seeds = cycle(seeds_of(experiment, len(evidence.repeats))) if emulated else repeat(SHARED)
+
+        def predict(values: Mapping[str, float], seed: int | None = None) -> FloatArray:
+            seed = next(seeds) if seed is None else seed
+            visits.append(Visit(dict(values), on, simulate(values, effects=on, seed=seed, purpose=purpose), seed))
+            return visits[-1].table
+
+        visits = [v for p in (evidence, vantage) if p is not None for v in p.visits if v.effects in ((), on)]
         fit = settle(
             predict,
             whiten,
@@ -124,12 +136,13 @@ def confirm(
         )
         if emulated:
             shapes = () if candidate is None else candidate.shapes
-            fit = explored(predict, visits, whiten, experiment.observed, free, known, fit, shapes)
+            fit = explored(predict, visits, through, experiment.observed, free, known, fit, shapes)
+            with suppress(SimulationError):
+                fit = replace(fit, prediction=predict(fit.values, SHARED))
         done += 1
         return fit, visits
 
     refits = simulate.side_by_side([partial(refitted, candidate) for candidate in jobs])
-    whole = Sight.of(experiment, floor, basis, vantage)
     apart = whole if shown.all() else Sight.of(experiment, floor, basis, vantage, hidden)
     before = experiment.observed - refits[0][0].prediction
     out: dict[str, Confirmation] = {}
@@ -147,7 +160,7 @@ def confirm(
         if has_surface(experiment, candidate):
             # A surface that isn't one tells nothing more than the last derivatives do.
             with suppress(ValueError):
-                reading = read(visits, whole, experiment.observed, free, known)
+                reading = read(visits, through_whole, experiment.observed, free, known)
                 values, stds, emulated = dict(reading.values), dict(reading.stds), tuple(visits)
         name = "" if candidate is None else candidate.name
         solvers = [experiment.reproducibility(p, values[p.name], name) for p in free]
@@ -170,6 +183,11 @@ def confirm(
             visits=emulated,
         )
     return out
+
+
+def seeds_of(experiment: Experiment, repeats: int) -> list[int]:
+    """Those by which refits simulate in turn: one alone would have its chance in all that they say."""
+    return [*(pair := pair_of(experiment, repeats)), *range(1 + pair[-1], 1 + pair[-1] + MORE_SEEDS)]
 
 
 def free_in(experiment: Experiment, candidate: Candidate | None) -> list[Parameter]:

@@ -33,11 +33,13 @@ class Visit:
         values: its parameters, by name.
         effects: names of the candidates that were on.
         table: (t, s) features.
+        seed: of what is chance in it.
     """
 
     values: Mapping[str, float]
     effects: tuple[str, ...]
     table: FloatArray
+    seed: int = 0
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,7 @@ class Vantage:
         directions: (k, t, s) derivatives by each candidate's parameters, at off.
         steps: the step of each of these.
         failed: candidates whose simulation could not go on, with the reason.
-        visits: all simulations that were made, with the same particles.
+        visits: all simulations that were made.
         shapes: by candidate, what shapes it where its directions were measured, if not the defaults.
         doubts: by parameter of the model (t, s) and by candidate (k, t, s), half the difference between the derivatives
             of two seeds, of which those above are the mean: as large as the chance in these. Empty with one seed.
@@ -147,8 +149,9 @@ def gather(
     numerics, doubts = other_numerics(
         experiment, lambda name, seed: run(f"numerics: {name or 'none'}", base, seed=seed, numerics=name), pair
     )
+    at_the_point = tuple(Visit(base, (), table, seed) for table, seed in zip(runs, seeds, strict=True))
     return Evidence(
-        **vars(found),
+        **{**vars(found), "visits": (*found.visits, *at_the_point)},
         mean=runs.mean(axis=0),
         repeats=deviations,
         numerics=numerics,
@@ -199,7 +202,7 @@ def look_from(
         values: of these, at the point.
         candidates: effects that are switched on there, one at a time.
         run: called with (purpose, parameters by name), the name of an effect that is on in a tuple, and a seed.
-        seeds: one, or two whose mean derivatives are; prediction and visits are the first one's.
+        seeds: one, or two whose mean derivatives are; the prediction is the first one's.
 
     Raises:
         SimulationError: the point or a neighbour without an effect can't be simulated.
@@ -229,7 +232,7 @@ def look_from(
         directions,
         first.steps,
         failed,
-        tuple(first.visits),
+        tuple(visit for look in looks for visit in look.visits),
         doubts=doubts,
     )
 
@@ -259,7 +262,7 @@ def _look(
     visits: list[Visit] = []
 
     def visit(purpose: str, at: Mapping[str, float], effects: tuple[str, ...] = ()) -> FloatArray:
-        visits.append(Visit(dict(at), effects, run(purpose, at, effects, seed)))
+        visits.append(Visit(dict(at), effects, run(purpose, at, effects, seed), seed))
         return visits[-1].table
 
     look = _Look(visit("the point", base), visits=visits)

@@ -20,6 +20,7 @@ from splatsoil.experiment.base import Candidate, Experiment
 from splatsoil.parameters import Parameter
 
 from .confirmation import (
+    SHARED,
     Confirmation,
     Report,
     beforehand,
@@ -101,7 +102,9 @@ def on_its_own_floor(
     floor = floor_of(experiment, there)
     basis = smooth_basis(experiment.layout, floor.noise)
     # Where simulations were too few for a surface at first, they still are.
-    visits = (*best.visits, Visit(dict(at), (best.name,), middle)) if best.visits else ()
+    here = [(SHARED, middle), *zip(seeds, runs, strict=True)]
+    there_too = [Visit(dict(at), (best.name,), table, seed) for seed, table in here]
+    visits = (*best.visits, *there_too) if best.visits else ()
     parameters = free_in(experiment, candidate)
     soil = _Soil(experiment, there, floor, basis, parameters, at, visits, best.fit.slopes).smoothed
     refit = replace(best, floor=noise_on(floor.single, judged(experiment, split_times(experiment)[1])))
@@ -186,7 +189,7 @@ class _Soil:
     def sight(self) -> Sight:
         """Where to look for the parameters."""
         along = reach_of(self.floor.noise, self.slopes)
-        return Sight.of(self.experiment, replace(self.floor, parameters=along), self.basis)
+        return Sight.of(self.experiment, replace(self.floor, parameters=along), self.basis, averaged=True)
 
     @property
     def left(self) -> FloatArray:

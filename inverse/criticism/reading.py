@@ -136,8 +136,9 @@ def tangent(
     tables = np.stack([visit.table for visit in visits])
     # The surface has seen its few directions of the whitened features alone. What these are in tables, those that were
     # simulated tell: regressed on their scores, which are orthogonal.
-    scores = surface.modes @ surface.scores
-    patterns = np.tensordot((scores / np.sum(scores**2, axis=0)).T, tables - tables.mean(axis=0), axes=1)
+    patterns = np.tensordot(
+        (surface.scores / np.sum(surface.scores**2, axis=0)).T, tables - tables.mean(axis=0), axes=1
+    )
     slopes = np.tensordot(surface.slopes(space.to_unit(space.to_vector(values))), patterns, axes=1)
     return np.moveaxis(slopes, 0, -1) / half_ranges(parameters, values)
 
@@ -253,7 +254,7 @@ def _surface(
     space = ParameterSpace(parameters)
     rest = {p.name: p.off if p.off is not None else p.default for p in parameters}
     points = np.stack([space.to_unit(space.to_vector({n: {**rest, **v.values}[n] for n in rest})) for v in visits])
-    return Surface.through(points, np.stack([whiten(v.table) for v in visits]))
+    return Surface.through(points, np.stack([whiten(v.table) for v in visits]), [v.seed for v in visits])
 
 
 def _sample(

@@ -5,6 +5,9 @@ Donoho 2014, IEEE Trans. Inf. Theory 60:5040). Each is a parabola in the paramet
 All share length scales, the parabola's share and noise, which some twenty simulations then determine well enough to
 take the most probable ones, in a tenth of a second; :class:`~splatsoil.inverse.emulator.Emulator` gives each component
 its own and averages over them, in seconds.
+
+A part of the chance is the same in all simulations that share a seed (random effects, Laird & Ware 1982, Biometrics
+38:963): within a seed it cancels in differences, over seeds it averages out, and simulations tell how large it is.
 """
 
 from __future__ import annotations
@@ -13,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
 from splatsoil.inverse.hyperparameters import LENGTH_BOUNDS, LENGTH_MEAN, LENGTH_STD
 
@@ -26,6 +30,8 @@ TREND = 2.0
 """Standard deviation of the logarithm of the parabola's share."""
 FREEDOM = 0.5
 """Standard deviation of the logarithms of signal and noise about what the singular values say."""
+SHARED_SPREAD = 1.5
+"""Standard deviation of the logit of the share of chance that a seed's simulations have in common, about a half."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +46,10 @@ class Surface:
         trend: variance of a parabola's coefficients over that of the process.
         signal: (p,) variance of each direction's process.
         noise: variance of one simulation's chance in any direction.
-        modes: (m, m) eigenvectors of the points' correlation.
-        strengths: (m,) its eigenvalues.
-        scores: (m, p) simulations along the directions, in those modes.
+        shared: share of that which all simulations of a seed have in common.
+        scores: (m, p) simulations along the directions.
+        modes: (m, m) in which both the points' correlation and that of chance are diagonal.
+        strengths: (m,) the former there, of the latter as 1.
         doubt: (p,) by which simulations left out are farther off, squared, than what is quoted; 1 at least.
     """
 
@@ -53,18 +60,20 @@ class Surface:
     trend: float
     signal: FloatArray
     noise: float
+    shared: float
+    scores: FloatArray
     modes: FloatArray
     strengths: FloatArray
-    scores: FloatArray
     doubt: FloatArray
 
     @classmethod
-    def through(cls, points: FloatArray, features: FloatArray) -> Surface:
+    def through(cls, points: FloatArray, features: FloatArray, seeds: npt.ArrayLike) -> Surface:
         """Through simulations.
 
         Args:
             points: (m, n) in [-1, 1].
             features: (m, d) of the simulations there, in units of their noise.
+            seeds: (m,) theirs.
 
         Raises:
             ValueError: fewer than three simulations, or all alike.
@@ -81,27 +90,30 @@ class Surface:
         noise = max(float(np.sum(size[count:] ** 2)) / max((m - 1 - count) * (features.shape[1] - count), 1), LEAST)
         signal = np.maximum(np.mean(scores**2, axis=0) - noise, 1e-3 * noise)
 
+        alike = np.equal.outer(np.asarray(seeds), np.asarray(seeds))
+
         def cost(at: FloatArray) -> float:
-            strengths, modes = np.linalg.eigh(_kernel(points, points, np.exp(at[:n]), float(np.exp(at[n]))))
-            variance = np.exp(at[n + 1]) * signal * np.maximum(strengths, 0.0)[:, None] + np.exp(at[n + 2]) * noise
-            fit = np.sum(np.log(variance) + (modes.T @ scores) ** 2 / variance)
+            strengths, modes, root = _modes(points, np.exp(at[:n]), float(np.exp(at[n])), alike, _share(at[n + 3]))
+            variance = np.exp(at[n + 1]) * signal * strengths[:, None] + np.exp(at[n + 2]) * noise
+            fit = np.sum(np.log(variance) + (modes.T @ scores) ** 2 / variance) + 2.0 * count * np.sum(np.log(root))
             return 0.5 * float(fit + np.sum(((at - middle) / spread) ** 2))
 
         # The prior is the unit cube's, whose sides are half as long.
-        middle = np.array([np.log(2.0) + LENGTH_MEAN + 0.5 * np.log(n)] * n + [0.0] * 3)
-        spread = np.array([LENGTH_STD] * n + [TREND, *[FREEDOM] * 2])
-        bounds = [LENGTH_BOUNDS] * n + [(-8.0, 8.0)] * 3
-        starts = [np.array([np.log(length)] * n + [0.0] * 3) for length in (0.5, 2.0)]
+        middle = np.array([np.log(2.0) + LENGTH_MEAN + 0.5 * np.log(n)] * n + [0.0] * 4)
+        spread = np.array([LENGTH_STD] * n + [TREND, *[FREEDOM] * 2, SHARED_SPREAD])
+        bounds = [LENGTH_BOUNDS] * n + [(-8.0, 8.0)] * 4
+        starts = [np.array([np.log(length)] * n + [0.0] * 4) for length in (0.5, 2.0)]
         best = min((minimize(cost, s, bounds=bounds, method="L-BFGS-B") for s in starts), key=lambda found: found.fun).x
-        lengths, trend = np.exp(best[:n]), float(np.exp(best[n]))
-        strengths, modes = np.linalg.eigh(_kernel(points, points, lengths, trend))
+        lengths, trend, shared = np.exp(best[:n]), float(np.exp(best[n])), _share(best[n + 3])
+        strengths, modes, _ = _modes(points, lengths, trend, alike, shared)
         signal, noise = np.exp(best[n + 1]) * signal, float(np.exp(best[n + 2]) * noise)
-        strengths, turned = np.maximum(strengths, 0.0), modes.T @ scores
         # Errors of those left out are K⁻¹y / diag(K⁻¹), their variances 1 / diag(K⁻¹).
         inverse = 1.0 / (strengths[:, None] * signal + noise)
-        z2 = (modes @ (inverse * turned)) ** 2 / (modes**2 @ inverse)
+        z2 = (modes @ (inverse * (modes.T @ scores))) ** 2 / (modes**2 @ inverse)
         doubt = np.maximum(z2.mean(axis=0), 1.0)
-        return cls(centre, right[:count].T, points, lengths, trend, signal, noise, modes, strengths, turned, doubt)
+        return cls(
+            centre, right[:count].T, points, lengths, trend, signal, noise, shared, scores, modes, strengths, doubt
+        )
 
     def project(self, features: FloatArray) -> FloatArray:
         """Features (…, d) along the directions (…, p)."""
@@ -116,11 +128,12 @@ class Surface:
         seen, gain = _kernel(where, self.points, self.lengths, self.trend) @ self.modes, self._gain
         alone = 1.0 + self.trend * (np.sum(where**2, axis=1) + 0.5 * np.sum(where**2, axis=1) ** 2)
         variance = self.doubt * self.signal * (alone[:, None] - seen**2 @ gain)
-        return seen @ (gain * self.scores), np.maximum(variance, 0.0)
+        return seen @ (gain * (self.modes.T @ self.scores)), np.maximum(variance, 0.0)
 
     def slopes(self, where: FloatArray) -> FloatArray:
         """Derivatives (n, p) of the mean features along the directions, at one point (n,)."""
-        return _kernel_slopes(where, self.points, self.lengths, self.trend) @ self.modes @ (self._gain * self.scores)
+        slopes = _kernel_slopes(where, self.points, self.lengths, self.trend)
+        return slopes @ self.modes @ (self._gain * (self.modes.T @ self.scores))
 
     @property
     def _gain(self) -> FloatArray:
@@ -140,6 +153,22 @@ def _kernel_slopes(where: FloatArray, b: FloatArray, lengths: FloatArray, trend:
     apart = where - b
     near = np.exp(-0.5 * np.sum((apart / lengths) ** 2, axis=1))
     return np.asarray((trend * (1.0 + b @ where)[:, None] * b - near[:, None] * apart / lengths**2).T)
+
+
+def _share(logit: float) -> float:
+    """A share by its logit."""
+    return float(1.0 / (1.0 + np.exp(-logit)))
+
+
+def _modes(
+    points: FloatArray, lengths: FloatArray, trend: float, alike: npt.NDArray[np.bool_], shared: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Strengths (m,) of the points' correlation and modes (m, m) with which it is theirs and chance's is 1, and the
+    diagonal (m,) of chance's Cholesky factor."""
+    chance = np.linalg.cholesky(shared * alike + (1.0 - shared) * np.eye(len(points)))
+    half = solve_triangular(chance, _kernel(points, points, lengths, trend), lower=True)
+    strengths, modes = np.linalg.eigh(solve_triangular(chance, half.T, lower=True))
+    return np.maximum(strengths, 0.0), solve_triangular(chance, modes, lower=True, trans=1), np.diag(chance)
 
 
 def _edge(size: FloatArray, shape: tuple[int, int]) -> float:

@@ -9,21 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from splatsoil.benchmarks import hidden_worlds
-from splatsoil.benchmarks.hidden_worlds import (
-    ANGLES,
-    FIELD,
-    KINDS,
-    NOTHING,
-    OBSERVATION,
-    draw,
-    main,
-    score,
-    soil_of,
-    table,
-)
+from splatsoil.benchmarks._truths import ANGLES, FIELD, KINDS, NOTHING, OBSERVATION, draw
+from splatsoil.benchmarks.hidden_worlds import main, ploughed_by_us, score, soil_of, table
 
 from splatsoil.errors import ParameterError, RunError
-from splatsoil.soil.library import library
+from splatsoil.mpm.simulate import base_settings
+from splatsoil.soil.law import Law
+from splatsoil.soil.library import find_effects, library
 from splatsoil.synthetic import plow
 
 
@@ -46,6 +38,45 @@ def test_a_layer_lies_below_its_depth_and_a_stone_holds_no_sand() -> None:
     stone = draw("buried_obstacle", 0, 1)
     x, y, z, radius = stone.soil["obstacle"]
     assert np.linalg.norm(soil_of(stone, setup).particles - [x, y, z], axis=1).min() > radius
+
+
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in (NOTHING, FIELD)])
+def test_both_solvers_are_told_the_same(kind: str) -> None:
+    """Our library's settings against what the other solver is given."""
+    hidden, setup = draw(kind, 0, 1), plow(3)
+    experiment = setup.experiment()
+    law = Law(effect.for_measurement(experiment) for effect in find_effects([kind]))
+    values = law.require_on(hidden.values)
+    settings = law.settings(base_settings(experiment), values)
+    told = soil_of(hidden, setup)
+    expected = experiment.gravity if hidden.gravity is None else hidden.gravity
+    assert settings.gravity == pytest.approx(tuple(expected), abs=1e-9)
+    friction = setup.tool.friction if told.tool_friction is None else told.tool_friction
+    assert settings.tool_friction == pytest.approx(friction)
+    assert {"cohesion": told.cohesion, "viscosity": told.viscosity, "tool_adhesion": told.tool_adhesion}.get(
+        kind, hidden.size
+    ) == pytest.approx(hidden.size)
+    if kind == "buried_obstacle":
+        middle = setup.bed.lower + 0.5 * setup.bed.extents
+        place = [values["obstacle_x"] + middle[0], values["obstacle_y"] + middle[1], values["obstacle_height"]]
+        assert told.obstacle == pytest.approx((*place, values["obstacle_radius"]))
+
+
+def test_our_solver_ploughs_a_truth_of_its_own() -> None:
+    setup = plow(3)
+    dry, damp = (
+        ploughed_by_us(replace(draw(kind, 0, 1), angle=33.0, seed=2000), setup, [0, 2], "tiny", "cpu")
+        for kind in (NOTHING, "cohesion")
+    )
+    assert dry.frames == damp.frames == (0, 2)
+    assert np.array_equal(dry.positions[0], damp.positions[0])
+    assert not np.array_equal(dry.positions[1], damp.positions[1])
+
+
+def test_what_our_library_lacks_our_solver_cannot_plough(tmp_path: Path) -> None:
+    with pytest.raises(ParameterError, match="friction_field"):
+        main(["--solver", "small", "--kinds", FIELD, "--out", str(tmp_path / "worlds")])
+    assert not (tmp_path / "worlds").exists()
 
 
 def judged(kind: str, verdict: str, members: list[str]) -> dict[str, object]:
@@ -101,5 +132,6 @@ def test_a_folder_keeps_one_renderer(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     monkeypatch.setattr(hidden_worlds, "load_mitsuba", lambda: None)
     own = ["--kinds", NOTHING, "--worlds-only", "--out", str(tmp_path)]
     assert main(own) == 0 and main(own) == 0
-    with pytest.raises(ParameterError, match="another --out"):
-        main([*own, "--renderer", "mitsuba"])
+    for other in (["--renderer", "mitsuba"], ["--solver", "small"]):
+        with pytest.raises(ParameterError, match="another --out"):
+            main([*own, *other])

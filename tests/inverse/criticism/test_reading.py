@@ -73,7 +73,7 @@ def test_a_surface_predicts_where_nothing_was_simulated_and_knows_its_error() ->
         x, y = at.T
         return np.stack([30.0 * x - 20.0 * y, 15.0 * np.sin(x) * y, 10.0 * x**2], axis=1)
 
-    surface = Surface.through(points, scores(points) @ basis.T + 0.5 * generator.standard_normal((30, 60)))
+    surface = Surface.through(points, scores(points) @ basis.T + 0.5 * generator.standard_normal((30, 60)), range(30))
     elsewhere = generator.uniform(-0.9, 0.9, (200, 2))
     mean, variance = surface.predict(elsewhere)
     error = surface.centre + mean @ surface.basis.T - scores(elsewhere) @ basis.T
@@ -85,6 +85,27 @@ def test_a_surface_predicts_where_nothing_was_simulated_and_knows_its_error() ->
     for at in elsewhere[:5]:
         ahead, behind = (surface.predict(at + side * 1e-4 * np.eye(2))[0] for side in (1.0, -1.0))
         assert surface.slopes(at) == pytest.approx((ahead - behind) / 2e-4, rel=1e-4, abs=1e-4)
+
+
+def test_what_simulations_of_one_seed_have_in_common_is_told_from_what_soil_does() -> None:
+    """Differences within a seed tell slopes that an offset of every seed would hide; without any it is none."""
+    off, told, alone = [], [], []
+    for world in range(6):
+        generator = np.random.default_rng(world)
+        points, seeds = generator.uniform(-1.0, 1.0, (24, 2)), np.arange(24) % 6
+        direction = np.linalg.qr(generator.standard_normal((60, 1)))[0][:, 0]
+        noise, offsets = 0.5 * generator.standard_normal((24, 60)), 5.0 * generator.standard_normal(6)
+        features = np.outer(points @ [6.0, -4.0], direction) + noise
+        shifted = Surface.through(points, features + np.outer(offsets[seeds], direction), seeds)
+        taken_for_soil = Surface.through(points, features + np.outer(offsets[seeds], direction), range(24))
+        for surface, errors in ((shifted, off), (taken_for_soil, told)):
+            slopes = surface.slopes(np.zeros(2)) @ surface.basis.T @ direction
+            errors.append(np.linalg.norm(slopes - [6.0, -4.0]))
+        alone.append((shifted.shared, Surface.through(points, features, seeds).shared))
+    assert np.median(off) < 0.5 * np.median(told)
+    with_offsets, without = np.median(alone, axis=0)
+    assert with_offsets > 0.8
+    assert without < 0.3
 
 
 def test_estimate_and_spread_are_those_of_least_squares() -> None:
