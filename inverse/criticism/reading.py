@@ -135,10 +135,8 @@ def tangent(
     space, surface = ParameterSpace(parameters), _surface(visits, whiten, parameters)
     tables = np.stack([visit.table for visit in visits])
     # The surface has seen its few directions of the whitened features alone. What these are in tables, those that were
-    # simulated tell: regressed on their scores, which are orthogonal.
-    patterns = np.tensordot(
-        (surface.scores / np.sum(surface.scores**2, axis=0)).T, tables - tables.mean(axis=0), axes=1
-    )
+    # simulated tell.
+    patterns = surface.patterns(tables)
     slopes = np.tensordot(surface.slopes(space.to_unit(space.to_vector(values))), patterns, axes=1)
     return np.moveaxis(slopes, 0, -1) / half_ranges(parameters, values)
 

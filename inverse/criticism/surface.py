@@ -30,8 +30,8 @@ TREND = 2.0
 """Standard deviation of the logarithm of the parabola's share."""
 FREEDOM = 0.5
 """Standard deviation of the logarithms of signal and noise about what the singular values say."""
-SHARED_SPREAD = 1.5
-"""Standard deviation of the logit of the share of chance that a seed's simulations have in common, about a half."""
+COMMON = 1.5
+"""Standard deviation of the logarithm of a seed's chance over that of a simulation alone."""
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,9 @@ class Surface:
         lengths: (n,) of the processes, in halves of the parameters' ranges.
         trend: variance of a parabola's coefficients over that of the process.
         signal: (p,) variance of each direction's process.
-        noise: variance of one simulation's chance in any direction.
-        shared: share of that which all simulations of a seed have in common.
+        noise: variance of a simulation's own chance in any direction.
+        common: variance of what all simulations of a seed have in common over that; 0 where none share one.
+        root: (m, m) Cholesky factor of chance's covariance, over that noise.
         scores: (m, p) simulations along the directions.
         modes: (m, m) in which both the points' correlation and that of chance are diagonal.
         strengths: (m,) the former there, of the latter as 1.
@@ -60,7 +61,8 @@ class Surface:
     trend: float
     signal: FloatArray
     noise: float
-    shared: float
+    common: float
+    root: FloatArray
     scores: FloatArray
     modes: FloatArray
     strengths: FloatArray
@@ -81,39 +83,43 @@ class Surface:
         m, n = points.shape
         if m < 3:
             raise ValueError(f"{m} simulations make no surface")
+        alike = np.equal.outer(np.asarray(seeds), np.asarray(seeds))
         centre = features.mean(axis=0)
-        left, size, right = np.linalg.svd(features - centre, full_matrices=False)
-        count = int(np.clip(np.sum(size > _edge(size, features.shape)), 1, min(MOST, m - 2)))
+        within, free = _within(features, np.asarray(seeds))
+        _, size, right = np.linalg.svd(within, full_matrices=False)
+        size = size[: free + 1]
+        count = int(np.clip(np.sum(size > _edge(size, (free + 1, features.shape[1]))), 1, max(min(MOST, free - 1), 1)))
         if size[0] <= 1e-12 * max(1.0, float(np.abs(centre).max())):
             raise ValueError("the features are the same wherever they were simulated")
-        scores = left[:, :count] * size[:count]
-        noise = max(float(np.sum(size[count:] ** 2)) / max((m - 1 - count) * (features.shape[1] - count), 1), LEAST)
+        scores = (features - centre) @ right[:count].T
+        noise = max(float(np.sum(size[count:] ** 2)) / max((free - count) * (features.shape[1] - count), 1), LEAST)
         signal = np.maximum(np.mean(scores**2, axis=0) - noise, 1e-3 * noise)
-
-        alike = np.equal.outer(np.asarray(seeds), np.asarray(seeds))
+        apart = bool(alike.sum() > m)  # else nothing tells a seed's chance from a simulation's own
 
         def cost(at: FloatArray) -> float:
-            strengths, modes, root = _modes(points, np.exp(at[:n]), float(np.exp(at[n])), alike, _share(at[n + 3]))
+            common = np.exp(at[n + 3]) if apart else 0.0
+            strengths, modes, root = _modes(points, np.exp(at[:n]), float(np.exp(at[n])), alike, common)
             variance = np.exp(at[n + 1]) * signal * strengths[:, None] + np.exp(at[n + 2]) * noise
-            fit = np.sum(np.log(variance) + (modes.T @ scores) ** 2 / variance) + 2.0 * count * np.sum(np.log(root))
+            fit = np.sum(np.log(variance) + (modes.T @ scores) ** 2 / variance) + 2.0 * count * np.sum(
+                np.log(np.diag(root))
+            )
             return 0.5 * float(fit + np.sum(((at - middle) / spread) ** 2))
 
         # The prior is the unit cube's, whose sides are half as long.
         middle = np.array([np.log(2.0) + LENGTH_MEAN + 0.5 * np.log(n)] * n + [0.0] * 4)
-        spread = np.array([LENGTH_STD] * n + [TREND, *[FREEDOM] * 2, SHARED_SPREAD])
+        spread = np.array([LENGTH_STD] * n + [TREND, *[FREEDOM] * 2, COMMON])
         bounds = [LENGTH_BOUNDS] * n + [(-8.0, 8.0)] * 4
         starts = [np.array([np.log(length)] * n + [0.0] * 4) for length in (0.5, 2.0)]
         best = min((minimize(cost, s, bounds=bounds, method="L-BFGS-B") for s in starts), key=lambda found: found.fun).x
-        lengths, trend, shared = np.exp(best[:n]), float(np.exp(best[n])), _share(best[n + 3])
-        strengths, modes, _ = _modes(points, lengths, trend, alike, shared)
+        lengths, trend, common = np.exp(best[:n]), float(np.exp(best[n])), float(np.exp(best[n + 3])) * apart
+        strengths, modes, root = _modes(points, lengths, trend, alike, common)
         signal, noise = np.exp(best[n + 1]) * signal, float(np.exp(best[n + 2]) * noise)
         # Errors of those left out are K⁻¹y / diag(K⁻¹), their variances 1 / diag(K⁻¹).
         inverse = 1.0 / (strengths[:, None] * signal + noise)
         z2 = (modes @ (inverse * (modes.T @ scores))) ** 2 / (modes**2 @ inverse)
         doubt = np.maximum(z2.mean(axis=0), 1.0)
-        return cls(
-            centre, right[:count].T, points, lengths, trend, signal, noise, shared, scores, modes, strengths, doubt
-        )
+        basis = right[:count].T
+        return cls(centre, basis, points, lengths, trend, signal, noise, common, root, scores, modes, strengths, doubt)
 
     def project(self, features: FloatArray) -> FloatArray:
         """Features (…, d) along the directions (…, p)."""
@@ -135,6 +141,13 @@ class Surface:
         slopes = _kernel_slopes(where, self.points, self.lengths, self.trend)
         return slopes @ self.modes @ (self._gain * (self.modes.T @ self.scores))
 
+    def patterns(self, tables: FloatArray) -> FloatArray:
+        """(p, …) what the directions are in tables (m, …) of the simulations: regressed on their scores, by chance's
+        covariance (generalised least squares)."""
+        columns = np.column_stack([np.ones(len(tables)), self.scores])
+        columns, told = (solve_triangular(self.root, a, lower=True) for a in (columns, tables.reshape(len(tables), -1)))
+        return np.asarray(np.linalg.lstsq(columns, told, rcond=None)[0][1:].reshape(-1, *tables.shape[1:]))
+
     @property
     def _gain(self) -> FloatArray:
         """(m, p) what a mode's score counts for in a prediction."""
@@ -155,20 +168,26 @@ def _kernel_slopes(where: FloatArray, b: FloatArray, lengths: FloatArray, trend:
     return np.asarray((trend * (1.0 + b @ where)[:, None] * b - near[:, None] * apart / lengths**2).T)
 
 
-def _share(logit: float) -> float:
-    """A share by its logit."""
-    return float(1.0 / (1.0 + np.exp(-logit)))
+def _within(features: FloatArray, seeds: npt.NDArray[np.int_]) -> tuple[FloatArray, int]:
+    """Features (m, d) less the mean of their seed's (of all, where a seed has but one), and how many are independent.
+
+    What simulations of a seed have in common would else be taken for what soil does.
+    """
+    _, group, size = np.unique(seeds, return_inverse=True, return_counts=True)
+    means = np.stack([features[group == g].mean(axis=0) for g in range(len(size))])
+    means[size == 1] = features.mean(axis=0)
+    return features - means[group], len(features) - int(np.sum(size > 1)) - int(np.any(size == 1))
 
 
 def _modes(
-    points: FloatArray, lengths: FloatArray, trend: float, alike: npt.NDArray[np.bool_], shared: float
+    points: FloatArray, lengths: FloatArray, trend: float, alike: npt.NDArray[np.bool_], common: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Strengths (m,) of the points' correlation and modes (m, m) with which it is theirs and chance's is 1, and the
-    diagonal (m,) of chance's Cholesky factor."""
-    chance = np.linalg.cholesky(shared * alike + (1.0 - shared) * np.eye(len(points)))
+    Cholesky factor (m, m) of the latter."""
+    chance = np.linalg.cholesky(common * alike + np.eye(len(points)))
     half = solve_triangular(chance, _kernel(points, points, lengths, trend), lower=True)
     strengths, modes = np.linalg.eigh(solve_triangular(chance, half.T, lower=True))
-    return np.maximum(strengths, 0.0), solve_triangular(chance, modes, lower=True, trans=1), np.diag(chance)
+    return np.maximum(strengths, 0.0), solve_triangular(chance, modes, lower=True, trans=1), chance
 
 
 def _edge(size: FloatArray, shape: tuple[int, int]) -> float:
