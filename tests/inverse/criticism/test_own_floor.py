@@ -89,9 +89,11 @@ class Noted(Simulations):
         super().__init__(experiment)
         self.where: list[dict[str, float]] = []
         self.purposes: list[str] = []
+        self.seeds: dict[str, list[int]] = {}
 
     def __call__(self, values: Mapping[str, float], *, purpose: str = "", **others: Any) -> FloatArray:
         self.purposes.append(purpose)
+        self.seeds.setdefault(purpose, []).append(others.get("seed", 0))
         if purpose.startswith("floor with"):
             self.where.append(dict(values))
         return super().__call__(values, purpose=purpose, **others)
@@ -113,6 +115,25 @@ def test_the_floor_is_measured_where_all_times_put_the_parameters() -> None:
         )
         nearer.append(near < far)
     assert sum(nearer) >= 3
+
+
+def test_refits_simulate_by_several_seeds_and_are_compared_by_one() -> None:
+    """A seed's own chance is in all that it simulates; where two refits are compared, it cancels."""
+    made = emulated(0)
+    truth = {"angle": 0.0, NAME: 6.0 * detectable(0, Options())[NAME]}
+    experiment = replace(made, observed=made.measured(truth, [0, 99]))
+    simulate = Noted(experiment)
+    found = diagnose(experiment, {"angle": fitted(experiment)}, simulate=simulate)
+    refits = {purpose: seeds for purpose, seeds in simulate.seeds.items() if purpose.startswith("refit ")}
+    assert len(refits) >= 2
+    for seeds in refits.values():
+        counts = np.bincount(seeds[:-1], minlength=1)
+        assert np.count_nonzero(counts) >= min(len(seeds) - 1, 5)
+        assert counts.max() <= 0.4 * len(seeds) + 1.0
+    assert len({seeds[-1] for seeds in refits.values()}) == 1
+    best = found.confirmations[NAME]
+    expected = experiment.predict(best.fit.values, effects=(NAME,), seed=0)
+    assert np.array_equal(best.fit.prediction, expected)
 
 
 @dataclass(frozen=True)
