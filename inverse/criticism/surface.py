@@ -184,7 +184,7 @@ def _modes(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Strengths (m,) of the points' correlation and modes (m, m) with which it is theirs and chance's is 1, and the
     Cholesky factor (m, m) of the latter."""
-    chance = np.linalg.cholesky(common * alike + np.eye(len(points)))
+    chance = np.linalg.cholesky(common * alike + np.eye(len(points))).astype(np.float64)
     half = solve_triangular(chance, _kernel(points, points, lengths, trend), lower=True)
     strengths, modes = np.linalg.eigh(solve_triangular(chance, half.T, lower=True))
     return np.maximum(strengths, 0.0), solve_triangular(chance, modes, lower=True, trans=1), chance
