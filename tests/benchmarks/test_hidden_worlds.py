@@ -53,9 +53,14 @@ def test_both_solvers_are_told_the_same(kind: str) -> None:
     assert settings.gravity == pytest.approx(tuple(expected), abs=1e-9)
     friction = setup.tool.friction if told.tool_friction is None else told.tool_friction
     assert settings.tool_friction == pytest.approx(friction)
-    assert {"cohesion": told.cohesion, "viscosity": told.viscosity, "tool_adhesion": told.tool_adhesion}.get(
-        kind, hidden.size
-    ) == pytest.approx(hidden.size)
+    for name in ("cohesion", "viscosity", "tool_adhesion"):
+        assert values.get(name, 0.0) == pytest.approx(getattr(told, name))
+    assert values.get("dilatancy_angle", 0.0) == pytest.approx(told.dilatancy * hidden.angle)
+    if kind == "layering":
+        weaker = np.asarray(told.angle) < hidden.angle
+        deep = setup.surface.sample(told.particles[:, :2]) - told.particles[:, 2] > values["layer_depth"]
+        assert np.array_equal(weaker, deep)
+        assert np.asarray(told.angle).min() - hidden.angle == pytest.approx(values["layer_friction"])
     if kind == "buried_obstacle":
         middle = setup.bed.lower + 0.5 * setup.bed.extents
         place = [values["obstacle_x"] + middle[0], values["obstacle_y"] + middle[1], values["obstacle_height"]]

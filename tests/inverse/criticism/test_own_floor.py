@@ -117,12 +117,13 @@ def test_the_floor_is_measured_where_all_times_put_the_parameters() -> None:
     assert sum(nearer) >= 3
 
 
-def test_refits_simulate_by_several_seeds_and_are_compared_by_one() -> None:
+def test_refits_simulate_by_several_seeds_and_are_compared_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
     """A seed's own chance is in all that it simulates; where two refits are compared, it cancels."""
     made = emulated(0)
     truth = {"angle": 0.0, NAME: 6.0 * detectable(0, Options())[NAME]}
     experiment = replace(made, observed=made.measured(truth, [0, 99]))
-    simulate = Noted(experiment)
+    read, read_off, simulate = own_floor.read, [], Noted(experiment)
+    monkeypatch.setattr(own_floor, "read", lambda visits, *told: read_off.append(visits) or read(visits, *told))
     found = diagnose(experiment, {"angle": fitted(experiment)}, simulate=simulate)
     refits = {purpose: seeds for purpose, seeds in simulate.seeds.items() if purpose.startswith("refit ")}
     assert len(refits) >= 2
@@ -131,6 +132,11 @@ def test_refits_simulate_by_several_seeds_and_are_compared_by_one() -> None:
         assert np.count_nonzero(counts) >= min(len(seeds) - 1, 5)
         assert counts.max() <= 0.4 * len(seeds) + 1.0
     assert len({seeds[-1] for seeds in refits.values()}) == 1
+    # What was repeated and looked at by another seed is there already, and tells as much.
+    at_the_fit = [v for v in found.evidence.visits if v.values == found.evidence.values]
+    on_the_floor = [v for v in read_off[-1] if v.values == simulate.where[0]]
+    for visits in (at_the_fit, on_the_floor):
+        assert {1, 2, 3, 4} <= {visit.seed for visit in visits}
     best = found.confirmations[NAME]
     expected = experiment.predict(best.fit.values, effects=(NAME,), seed=0)
     assert np.array_equal(best.fit.prediction, expected)
