@@ -89,8 +89,9 @@ def emulated(seed: int, *, duplicate: bool = False, chaos: float = 0.0) -> Emula
         name = f"effect {k + 1}"
         parameter = Parameter(name, "1", 0.0 if k % 2 else -LARGEST, LARGEST, 0.0, off=0.0, meaningful=0.25, sign=k % 2)
         candidates.append(Candidate(name, kind, (parameter,), name))  # type: ignore[arg-type]
-        slopes[name] = slopes["effect 1"] if duplicate and k == 1 else pattern()
-        curves[name] = 0.02 * pattern()
+        twin = duplicate and k == 1
+        slopes[name] = slopes["effect 1"] if twin else pattern()
+        curves[name] = curves["effect 1"] if twin else 0.02 * pattern()
     angle = Parameter("angle", "deg", -10.0, 10.0, 0.0, meaningful=0.5)
     return EmulatedExperiment(
         layout=layout,

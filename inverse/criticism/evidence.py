@@ -87,7 +87,7 @@ class Evidence(Vantage):
         repeats: (r, t, s) deviations of those seeds from their mean, scaled to have the variance of one seed.
         numerics: (t, s) what other numerics change, by name: the mean over two seeds where there is chance in it.
         numerics_doubts: (t, s) half the difference between these two, as large as the chance that is left; by name.
-        guesses: (g, t, s) what other guesses of what no instrument shows change.
+        guesses: (g, t, s) the same of other guesses of what no instrument shows, all drawn of one simulation.
         replays: (k, t, s) residuals of known soils that went through the whole chain of pictures and reconstruction.
         calibration: what pictures say of cameras, light, clock and tool where soil plays no part.
     """
@@ -138,14 +138,12 @@ def gather(
         return table
 
     runs = np.stack([run(f"repeat {seed} of {len(seeds)}", base, seed=seed) for seed in seeds])
-    deviations = (runs - runs.mean(axis=0)) * np.sqrt(len(runs) / max(len(runs) - 1, 1))
     # Before the point itself: they are other drawings of its simulation.
     guesses = [run(f"guess: {name}", base, numerics=name) for name in experiment.guesses]
     for name in experiment.redrawn:
         run(f"numerics: {name}", base, numerics=name)
     pair = pair_of(experiment, len(seeds))
     found = look_from(experiment, base, experiment.candidates, run, pair)
-    changes = np.stack(guesses) - found.prediction if guesses else np.zeros((0, *experiment.layout.shape))
     numerics, doubts = other_numerics(
         experiment, lambda name, seed: run(f"numerics: {name or 'none'}", base, seed=seed, numerics=name), pair
     )
@@ -153,11 +151,17 @@ def gather(
     return Evidence(
         **{**vars(found), "visits": (*found.visits, *at_the_point)},
         mean=runs.mean(axis=0),
-        repeats=deviations,
+        repeats=deviations(runs),
         numerics=numerics,
-        guesses=changes,
+        guesses=deviations(guesses) if guesses else np.zeros((0, *experiment.layout.shape)),
         numerics_doubts=doubts,
     )
+
+
+def deviations(tables: Sequence[FloatArray] | FloatArray) -> FloatArray:
+    """(k, t, s) of k tables from their mean, scaled to have the variance of one."""
+    samples = np.asarray(tables)
+    return np.asarray((samples - samples.mean(axis=0)) * np.sqrt(len(samples) / max(len(samples) - 1, 1)))
 
 
 def pair_of(experiment: Experiment, repeats: int) -> tuple[int, ...]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import helmert
 from scipy.optimize import nnls
 
 from splatsoil.experiment.base import Experiment
@@ -14,7 +15,8 @@ from splatsoil.experiment.features import Layout
 
 from .dilution import reliable
 from .evidence import Evidence, Vantage, ignorance
-from .noise import Noise, Part, correlated, estimate, extra_noise, independent
+from .noise import Noise, Part, extra_noise, independent
+from .sampled_noise import correlated, estimate
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -82,9 +84,9 @@ def floor_of(experiment: Experiment, evidence: Evidence) -> Floor:
     # What is chance in a direction is told from what is chance in its doubt: the noise must be the same along both.
     doubted = _columns([table for both in acting for tables in both for table in tables], seen)
     if experiment.chance and runs > 1:
-        parts["chance"] = estimate(layout, evidence.repeats, seen, directions, parameters)
-    if len(evidence.guesses):
-        parts["guesses"] = estimate(layout, evidence.guesses, seen, directions, parameters)
+        parts["chance"] = estimate(layout, _contrasts(evidence.repeats), seen, directions, parameters)
+    if len(evidence.guesses) > 1:
+        parts["guesses"] = estimate(layout, _contrasts(evidence.guesses), seen, directions, parameters)
     if np.count_nonzero(experiment.quiet) >= FEWEST_QUIET:
         known = _total(layout, parts, seen, runs)[0]
         parts["reconstruction"] = _instruments(experiment, evidence, known)
@@ -145,7 +147,15 @@ def _instruments(experiment: Experiment, evidence: Evidence, known: Noise) -> Pa
     whole = np.sqrt(variance)
     table = np.zeros(signal.shape)
     table[quiet] = np.sign(rest) * np.sqrt(squares)
-    return replace(correlated(experiment.layout, table[None], np.hypot(whole, known.spread(known.scale))), scale=whole)
+    found = correlated(experiment.layout, table[None], quiet, np.hypot(whole, known.spread(known.scale)))
+    return replace(found, scale=whole)
+
+
+def _contrasts(deviations: FloatArray) -> FloatArray:
+    """(r - 1, t, s) independent samples from r deviations from a mean, which are none."""
+    count = len(deviations)
+    # Helmert's: orthonormal, and orthogonal to the mean.
+    return np.tensordot(helmert(count), deviations, axes=1) * np.sqrt((count - 1) / count)
 
 
 def _replayed(experiment: Experiment, replays: FloatArray, parts: Mapping[str, Part]) -> Part:

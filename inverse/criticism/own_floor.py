@@ -35,7 +35,7 @@ from .confirmation import (
     stds_of,
 )
 from .estimates import Estimate, at_odds, bounded, untried, weighed_there
-from .evidence import Evidence, Numerics, Visit, other_numerics, pair_of
+from .evidence import Evidence, Numerics, Visit, deviations, other_numerics, pair_of
 from .floor import Floor, floor_of
 from .misfit import Omnibus, omnibus, smooth_basis
 from .reading import read, tangent
@@ -79,7 +79,7 @@ def on_its_own_floor(
     seeds = range(1, 1 + len(evidence.repeats))
 
     def spread(ask: Callable[..., FloatArray]) -> tuple[FloatArray, Numerics, list[FloatArray]]:
-        guesses = [ask(at, numerics=name, **told) - middle for name in experiment.guesses]
+        guesses = [ask(at, numerics=name, **told) for name in experiment.guesses]
         numerics = other_numerics(
             experiment, lambda name, seed: ask(at, numerics=name, seed=seed, **told), pair_of(experiment, len(seeds))
         )
@@ -87,14 +87,13 @@ def on_its_own_floor(
 
     simulate.ahead(spread)
     runs, (patterns, doubts), guesses = spread(simulate)
-    deviations = (runs - runs.mean(axis=0)) * np.sqrt(len(runs) / max(len(runs) - 1, 1))
     there = replace(
         evidence,
         mean=runs.mean(axis=0),
-        repeats=deviations,
+        repeats=deviations(runs),
         numerics=patterns,
         numerics_doubts=doubts,
-        guesses=np.stack(guesses) if guesses else evidence.guesses,
+        guesses=deviations(guesses) if guesses else evidence.guesses,
         slopes={},
         curves={},
         widths={},

@@ -146,13 +146,16 @@ class Simulations:
         shares: list[dict[str, dict[str, Any]]] = []
         latest: dict[object, dict[str, dict[str, Any]]] = {}
         seen = {*self._tables, *self._planned}
+        drawings = {*self.experiment.guesses, *self.experiment.redrawn}
         for what in asked:
             key = self._key(what)
             if key in seen or self._kept(key) is not None:
                 continue
             seen.add(key)
-            kind = (*_names(what["effects"]), what["numerics"])
-            if kind not in latest or len(latest[kind]) == self._helpers.together:
+            # What only draws a simulation otherwise is left to one process: on a GPU no second one is quite the same.
+            drawn = what["numerics"] in drawings
+            kind = self._key({**what, "numerics": ""}) if drawn else (*_names(what["effects"]), what["numerics"])
+            if kind not in latest or (len(latest[kind]) == self._helpers.together and not drawn):
                 latest[kind] = {}
                 shares.append(latest[kind])
             latest[kind][key] = what

@@ -164,14 +164,12 @@ def relief_of_particles(
     for axis in range(3):
         density = _blur(density, axis, float(missing[axis]))
     density *= spacing**3 / float(np.prod(cell))
-    height = _crossing(density, 0.5) * float(cell[2]) + float(low[2])
-    fine = functional.interpolate(height.T[None, None], scale_factor=2, mode="bicubic", align_corners=False)[0, 0]
-    # Bicubic overshoots at cliffs: hold it within the heights around.
-    near = functional.pad(height.T[None, None], (1, 1, 1, 1), mode="replicate")
-    highest, lowest = functional.max_pool2d(near, 3, 1), -functional.max_pool2d(-near, 3, 1)
-    fine = fine.clamp(*(functional.interpolate(m, scale_factor=2)[0, 0] for m in (lowest, highest)))
+    # The density is smooth, heights aren't: a wall stands where the former says, not somewhere in a coarse cell.
+    layers = density.permute(2, 1, 0)[None]
+    fine = functional.interpolate(layers, scale_factor=2, mode="bicubic", align_corners=False)[0]
+    height = _crossing(fine, 0.5) * float(cell[2]) + float(low[2])
     half = (float(cell[0]) / 2, float(cell[1]) / 2)
-    return Relief.of_heights(fine, (float(low[0]) + half[0] / 2, float(low[1]) + half[1] / 2), half)
+    return Relief.of_heights(height, (float(low[0]) + half[0] / 2, float(low[1]) + half[1] / 2), half)
 
 
 def _spread(positions: Tensor, low: FloatArray, cell: FloatArray, count: npt.NDArray[np.int64]) -> Tensor:
@@ -234,12 +232,12 @@ def _blur(grid: Tensor, axis: int, variance: float) -> Tensor:
 
 
 def _crossing(density: Tensor, level: float) -> Tensor:
-    """Height in cells (nx, ny) above the floor where the density falls through the level, seen from above."""
-    nz = density.shape[2]
-    index = torch.arange(nz, device=density.device)
-    last = torch.where(density > level, index, -1).amax(dim=2)
-    inside = last.clamp(0, nz - 2)[..., None]
-    below = density.gather(2, inside)[..., 0]
-    above = density.gather(2, inside + 1)[..., 0]
+    """Height in cells (ny, nx) above the floor where the density (nz, ny, nx) falls through the level, from above."""
+    nz = len(density)
+    index = torch.arange(nz, device=density.device)[:, None, None]
+    last = torch.where(density > level, index, -1).amax(dim=0)
+    inside = last.clamp(0, nz - 2)[None]
+    below = density.gather(0, inside)[0]
+    above = density.gather(0, inside + 1)[0]
     part = ((below - level) / (below - above).clamp_min(1e-9)).clamp(0.0, 1.0)
-    return torch.where(last >= 0, inside[..., 0] + 0.5 + part, torch.zeros_like(part))
+    return torch.where(last >= 0, inside[0] + 0.5 + part, torch.zeros_like(part))

@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 from splatsoil.measurement import Bed
 from splatsoil.reconstruction import HeightField, fill
 from splatsoil.scene import Relief, relief_of_particles
+from splatsoil.synthetic.soil_surface import soil_surface
 
 LOWER, UPPER = np.zeros(3), np.array([0.4, 0.3, 0.2])
 
@@ -67,6 +68,25 @@ def test_twice_the_rounding_takes_as_much_again(length):
     lost = 1.0 - np.exp(-2.0 * (np.pi * 0.01 / length) ** 2)
     assert 2.0 * once - twice == pytest.approx(1.0, abs=0.05 + lost**2)
     assert once - twice > 0.5 * lost
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.3, 0.8])
+def test_a_step_stands_where_marching_cubes_says(turn):
+    """Rim and foot of a wall against scikit-image's surface of the same particles, on a grid of its own."""
+    level = filled(lambda x, y: 0.12 + 0.0 * x).numpy()
+    side = (level[:, 0] - 0.204) * np.cos(turn) + (level[:, 1] - 0.15) * np.sin(turn)
+    particles = level[(side > 0.0) | (level[:, 2] < 0.06)]
+    relief = relief_of_particles(torch.tensor(particles), 0.01, LOWER, UPPER)
+    mesh = soil_surface(particles, np.ones((len(particles), 3)), 0.01, Bed(LOWER, UPPER, density=1600.0))
+    x, y, _ = mesh.points.T
+    near = np.abs((x - 0.204) * np.cos(turn) + (y - 0.15) * np.sin(turn)) < 0.03
+    chosen = near & (mesh.normals[:, 2] > 0.7) & (y > 0.05) & (y < 0.25)
+    points = torch.tensor(mesh.points[chosen], dtype=torch.float32)
+    off = relief.sample(relief.height, points).numpy() - mesh.points[chosen][:, 2]
+    assert np.sqrt(np.mean(off**2)) < 0.0005
+    normals = torch.nn.functional.normalize(relief.sample(relief.normal, points), dim=1).numpy()
+    turned = np.degrees(np.arccos(np.clip(np.sum(normals * mesh.normals[chosen], axis=1), -1.0, 1.0)))
+    assert np.sqrt(np.mean(turned**2)) < 8.0
 
 
 def test_walls_do_not_pull_the_surface_down():

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from splatsoil.inverse.criticism.misfit import omnibus, smooth_basis
-from splatsoil.inverse.criticism.noise import Noise, Part, estimate, extra_noise, independent
+from splatsoil.inverse.criticism.noise import Noise, Part, extra_noise, independent
+from splatsoil.inverse.criticism.sampled_noise import estimate
 
 from splatsoil.experiment.features import Layout, Site
 
@@ -62,6 +63,20 @@ def test_scales_that_vary_are_told_from_scales_that_do_not() -> None:
     level = estimate(LAYOUT, draw(TRUE, 6, 2), SEEN)
     assert np.log(varied.scale[:, place > 0.25].mean() / varied.scale[:, place < 0.05].mean()) > 1.5
     assert np.std(np.log(level.scale)) < 0.15
+
+
+def test_the_law_is_found_where_soil_moves_in_one_place_and_lies_still_beside_it() -> None:
+    """Scales over three decades with a sharp edge: what is too large a scale where nothing moves is no correlation."""
+    place = np.array([[s.x, s.y] for s in LAYOUT.sites])
+    moving = (place[:, 0] < 0.15) & (place[:, 1] < 0.25)
+    steep = np.broadcast_to(np.where(moving, 3.0, 0.003), LAYOUT.shape).copy()
+    for seed in range(3):
+        found = estimate(LAYOUT, draw(replace(TRUE, scale=steep), 6, seed), SEEN)
+        assert found.memory == pytest.approx(0.6, abs=0.15)
+        assert 0.06 < found.length < 0.16
+        assert found.nugget < 0.4
+        assert np.sqrt(np.mean(found.scale[:, moving] ** 2)) == pytest.approx(3.0, rel=0.25)
+        assert np.median(found.scale[:, ~moving]) < 0.3
 
 
 def test_rows_and_unseen_features_are_the_matching_parts_of_the_whole() -> None:

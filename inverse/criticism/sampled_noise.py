@@ -1,0 +1,218 @@
+"""Noise as samples of it suggest: other seeds, other guesses, other numerics.
+
+Such samples hold nothing but noise, and are few. So the law is plain and has few parameters: an empirical covariance
+from as many raises false alarms by the dozen. What the law leaves out is noted where it matters, on slow waves and
+along directions of interest.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import solve_triangular
+from scipy.optimize import minimize
+
+from splatsoil.experiment.features import Layout
+
+from .noise import Noise, Part, alive, in_space, in_time
+from .scales import scales_of, spacing_of, varied
+from .waves import smooth_waves
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+
+MOST_MEMORY = 0.98
+"""Largest correlation of neighbouring times."""
+ROUNDS = 2
+"""Of estimating scales and correlation in turn."""
+FEWEST_TO_JUDGE = 3
+"""Samples from which each can be judged by the others."""
+FEWEST_FREEDOM = 8.0
+"""Least degrees of freedom of a part's variance: few samples scatter too little or too much by chance."""
+
+
+def estimate(
+    layout: Layout,
+    samples: FloatArray,
+    seen: BoolArray,
+    directions: FloatArray | None = None,
+    free: FloatArray | None = None,
+) -> Part:
+    """The part that samples (k, t, s) of it, with mean zero, suggest.
+
+    See :mod:`.scales` for how large it is. The correlation's parameters maximise the Gaussian likelihood of the scaled
+    samples, two neighbouring times at once (composite likelihood: Varin et al. 2011, Stat. Sinica 21:5).
+
+    Such a part is too plain: soil that falls otherwise by chance does so where effects act, and other numerics change
+    what is smooth. So how much more scores along slow waves and along directions (n, k) of interest scatter is noted,
+    for `extra_noise`, once what ``free`` (n, q; times prior spreads) can take up is gone: a seed that acts like another
+    friction angle is no noise where the angle is fitted.
+    """
+    samples = np.where(seen, samples, 0.0)
+    if not np.any(samples):
+        return Part(scale=np.zeros(layout.shape))
+    # How far the variance's own scatter is chance depends on the correlation, which depends on the variance. Too much
+    # memory at first: a scale that follows its few samples would hide what they have.
+    part = Part(np.zeros(layout.shape), MOST_MEMORY, spacing_of(layout))
+    for _ in range(ROUNDS):
+        known = part.across(layout), in_time(layout.steps, part.memory)
+        part = _correlated(layout, samples, seen, scales_of(layout, samples, seen, *known))
+    return _calibrated(layout, part, samples, seen, directions, free)
+
+
+def correlated(layout: Layout, samples: FloatArray, seen: BoolArray, scale: FloatArray) -> Part:
+    """The part of given scale (t, s) whose correlation samples (k, t, s) suggest where they were seen (t, s)."""
+    return _correlated(layout, np.where(seen, samples, 0.0), seen, scale)
+
+
+def _calibrated(
+    layout: Layout,
+    part: Part,
+    samples: FloatArray,
+    seen: BoolArray,
+    directions: FloatArray | None,
+    free: FloatArray | None,
+) -> Part:
+    """The part, with what samples come to on slow waves and along directions.
+
+    With three samples or more, each is judged by scales that the others give: a scale that is too small by chance
+    weighs more than one that is too large, and a sample cannot show that of scales it has made itself.
+    """
+    across, times, count = part.across(layout), in_time(layout.steps, part.memory), len(samples)
+    changed = alive(part, seen)
+    directions, free = (None if columns is None else columns[changed[seen]] for columns in (directions, free))
+    seen = changed
+    waves = smooth_waves(layout, seen)
+    on_waves, along = [], []
+    for k in range(count):
+        scale = part.scale
+        if count >= FEWEST_TO_JUDGE:
+            others = np.delete(samples, k, axis=0)
+            scale = scales_of(layout, others, seen, across, times)
+        noise = Noise.of(layout, [(1.0, replace(part, scale=scale))], seen)
+        solver = (noise if free is None else noise.plus(free)).solver()
+        left, _ = np.linalg.qr(solver.whiten(waves * noise.scale[:, None]))
+        sample = solver.whiten(samples[k][seen])
+        on_waves.append(np.mean((left.T @ sample) ** 2))
+        if directions is not None and directions.size:
+            columns = solver.whiten(directions)
+            along.append(np.mean((columns.T @ sample) ** 2 / np.maximum(np.sum(columns**2, axis=0), 1e-300)))
+    # One sample that is far larger than the others there says that it is another kind of thing.
+    factor = float(np.median(on_waves))
+    # A mean of χ² over its ν degrees of freedom has the relative variance 2 / ν.
+    doubt = float(np.var(on_waves, ddof=1)) / count / factor**2 if count > 1 and factor > 0.0 else 2.0
+    return replace(
+        part,
+        on_waves=max(factor, 1.0),
+        on_directions=max(float(np.mean(along)), 1.0) if along else 1.0,
+        freedom=max(2.0 / max(doubt, 1e-12), FEWEST_FREEDOM),
+    )
+
+
+def _correlated(layout: Layout, samples: FloatArray, seen: BoolArray, scale: FloatArray) -> Part:
+    """The part of given scale, with the correlation of samples that are 0 where nothing was seen."""
+    # Where nothing is told apart scales are bounds, and samples over them far too small.
+    telling = varied(layout, samples, seen, scale)
+    scaled = np.divide(samples, scale, out=np.zeros_like(samples), where=telling)
+    memory, length, nugget, between = _correlation(layout, scaled, telling)
+    return Part(scale, memory, length, nugget, between)
+
+
+def _correlation(layout: Layout, scaled: FloatArray, seen: BoolArray) -> tuple[float, float, float, FloatArray]:
+    """Memory, length, nugget and correlation between instruments that maximise the likelihood of scaled samples
+    (k, t, s), whatever their size: scales are known too badly for that to tell a correlation."""
+    spacing, places = spacing_of(layout), bool(layout.placed.any())
+    channels, number = len(layout.channels), layout.channel_numbers
+    # Instruments with a place and those without are never correlated.
+    placed = [bool(layout.placed[number == c].any()) for c in range(channels)]
+    told = [bool(seen[:, number == c].any()) for c in range(channels)]
+    pairs = [(a, b) for a in range(channels) for b in range(a) if placed[a] == placed[b] and told[a] and told[b]]
+    blocks = _blocks(layout, scaled, seen)
+    if not blocks:
+        return 0.0, 0.0, 1.0, np.eye(channels)
+    count = sum(block.before.size + block.after.size for block in blocks)
+
+    def unpack(p: FloatArray) -> tuple[float, float, float, FloatArray]:
+        memory = MOST_MEMORY / (1.0 + math.exp(-p[0]))
+        length = spacing * math.exp(float(np.clip(p[1], -3.0, 4.0))) if places else 0.0
+        nugget = 0.01 + 0.98 / (1.0 + math.exp(-p[2])) if places else 0.01
+        between = np.eye(channels)
+        for (a, b), value in zip(pairs, p[3:], strict=True):
+            between[a, b] = between[b, a] = math.tanh(value)
+        return memory, length, nugget, _valid(between)
+
+    def loss(p: FloatArray) -> float:
+        memory, *law = unpack(p)
+        whole = in_space(layout, *law)
+        squares, logs = np.sum([block.fit(whole, memory) for block in blocks], axis=0)
+        return count * math.log(max(squares, 1e-300)) + float(logs)
+
+    first = np.zeros(3 + len(pairs))
+    options = {
+        "maxfev": 120 + 40 * len(pairs),
+        "xatol": 0.05,
+        "fatol": 0.5,
+        "initial_simplex": np.vstack([first, first + np.eye(len(first))]),
+    }
+    return unpack(minimize(loss, first, method="Nelder-Mead", options=options).x)
+
+
+@dataclass(frozen=True)
+class _Block:
+    """Neighbouring times at which the same sites were seen.
+
+    Attributes:
+        sites: (s,) which.
+        gap: from one to the other, in steps.
+        before: (m, k) samples of the m sites at the first times.
+        after: (m, k) at the second ones; (m, 0) where there is but one time.
+    """
+
+    sites: BoolArray
+    gap: float
+    before: FloatArray
+    after: FloatArray
+
+    def fit(self, whole: FloatArray, memory: float) -> tuple[float, float]:
+        """χ² and logarithm of the determinant by a correlation (s, s) between sites."""
+        lower = np.linalg.cholesky(whole[np.ix_(self.sites, self.sites)])
+        logs = 2.0 * float(np.log(np.diag(lower)).sum())
+        before = solve_triangular(lower, self.before, lower=True)
+        if not self.after.size:
+            return float(np.sum(before**2)), logs * before.shape[1]
+        after, link = solve_triangular(lower, self.after, lower=True), memory**self.gap
+        # Sum and difference of two that are so correlated are independent.
+        squares = 0.5 * (np.sum((before + after) ** 2) / (1.0 + link) + np.sum((before - after) ** 2) / (1.0 - link))
+        return float(squares), 2.0 * logs * before.shape[1] + before.size * math.log(1.0 - link**2)
+
+
+def _blocks(layout: Layout, scaled: FloatArray, seen: BoolArray) -> list[_Block]:
+    """Pairs of neighbouring times, those of the same sites together; or single times, where no two have any."""
+    gaps, found = np.diff(layout.steps), dict[tuple[float, bytes], list[int]]()
+    both = seen[:-1] & seen[1:]
+    alone = not both.any()
+    for t, sites in enumerate(seen if alone else both):
+        if sites.any():
+            found.setdefault((0.0 if alone else round(float(gaps[t]), 6), sites.tobytes()), []).append(t)
+    out = []
+    for (gap, mask), times in found.items():
+        sites = np.frombuffer(mask, dtype=bool)
+        size = int(sites.sum())
+        first, second = (
+            scaled[:, np.array(times) + on][:, :, sites].reshape(-1, size).T for on in (0, 0 if alone else 1)
+        )
+        out.append(_Block(sites, gap, first, second[:, :0] if alone else second))
+    return out
+
+
+def _valid(correlation: FloatArray) -> FloatArray:
+    """The nearest-looking correlation matrix whose eigenvalues are positive."""
+    values, vectors = np.linalg.eigh(correlation)
+    if values[0] > 1e-3:
+        return correlation
+    fixed = (vectors * np.maximum(values, 1e-3)) @ vectors.T
+    root = np.sqrt(np.diag(fixed))
+    return fixed / np.outer(root, root)
