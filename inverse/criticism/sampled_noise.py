@@ -145,8 +145,8 @@ def _correlation(layout: Layout, scaled: FloatArray, seen: BoolArray) -> tuple[f
         return memory, length, nugget, _valid(between)
 
     def loss(p: FloatArray) -> float:
-        memory, *law = unpack(p)
-        whole = in_space(layout, *law)
+        memory, length, nugget, between = unpack(p)
+        whole = in_space(layout, length, nugget, between)
         squares, logs = np.sum([block.fit(whole, memory) for block in blocks], axis=0)
         return count * math.log(max(squares, 1e-300)) + float(logs)
 
