@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from splatsoil.inverse.criticism.evidence import gather
 from splatsoil.inverse.criticism.simulations import Helpers, Simulations
 
 from splatsoil.errors import RunError, SimulationError
+from splatsoil.experiment.emulated import EmulatedExperiment
 
 AT = {"angle": 0.5}
 
@@ -105,6 +107,36 @@ def test_a_share_is_made_whole_by_who_takes_it_and_one_failure_in_it_is_no_other
             simulate({"angle": 2.0})
         assert np.array_equal(simulate({"angle": 3.0}), emulated(3).predict({"angle": 3.0}))
     assert [call["angle"] for call in mine.calls] == [1.0, 2.0, 3.0, 2.0]
+
+
+def drawn_otherwise(offset: float) -> EmulatedExperiment:
+    """Three guesses and one numerics that only draw a simulation otherwise."""
+    base = emulated(3)
+    names = [name for name in base.slopes if name.startswith("effect")][:3]
+    guessed = {f"guess {k}": base.slopes[name] + offset for k, name in enumerate(names)}
+    return replace(base, guessed=guessed, redrawn=("grid",))
+
+
+def test_all_drawings_of_a_simulation_are_one_share_whatever_is_best_made_at_a_time() -> None:
+    experiment = drawn_otherwise(0.0)
+    shares: list[list[str]] = []
+
+    def never(jobs: Sequence[Mapping[str, Any]]) -> Future[None]:
+        shares.append([job["numerics"] for job in jobs])
+        return Future()
+
+    simulate = Simulations(experiment)
+    with simulate.helped(Helpers(1, never, 2)):
+        simulate.ahead(lambda ask: [ask(AT, numerics=name) for name in (*experiment.guesses, "step", "grid", "")])
+    assert sorted(sorted(share) for share in shares) == [[""], ["grid", "guess 0", "guess 1", "guess 2"], ["step"]]
+
+
+def test_guesses_are_told_from_their_own_mean() -> None:
+    """What all of them differ by from another simulation, which is never quite the same on a GPU, is no colour."""
+    one, other = (gather(drawn_otherwise(offset), Simulations(drawn_otherwise(offset)), AT) for offset in (0.0, 7.0))
+    assert np.allclose(one.guesses, other.guesses)
+    patterns = np.stack(list(drawn_otherwise(0.0).guessed.values()))
+    assert np.allclose(one.guesses[0] - one.guesses[1], np.sqrt(1.5) * (patterns[0] - patterns[1]))
 
 
 def test_nobody_waits_for_a_share_that_was_given_up(tmp_path: Path) -> None:
