@@ -1,7 +1,7 @@
 """Noise of features: what differs between observation and prediction although nothing is wrong with the model.
 
 The covariance is a sum of parts, each separable: a scale for each feature, AR(1) in time, a correlation between
-instruments and a Matérn-3/2 correlation in space with a nugget. See :mod:`.sampled` for where they come from.
+instruments and a Matérn-3/2 correlation in space with a nugget. See :mod:`.sampled_noise` for where they come from.
 """
 
 from __future__ import annotations

@@ -42,7 +42,7 @@ def scales_of(
     squares = np.mean(samples**2, axis=0)
     pooled = _of_instruments(layout, squares, seen)
     least, changed = LEAST * pooled, _changed(pooled, seen)
-    near_in_time, near_in_space = neighbours(layout)
+    near_in_time, near_in_space = _neighbours(layout)
     variance = pooled
     for near in (near_in_space, np.eye(layout.shape[1])):
         share = near_in_time @ seen.astype(float) @ near.T
@@ -78,7 +78,7 @@ def _changed(pooled: FloatArray, seen: BoolArray) -> BoolArray:
     return seen & (pooled > 1e-9 * float(pooled.max()))
 
 
-def neighbours(layout: Layout) -> tuple[FloatArray, FloatArray]:
+def _neighbours(layout: Layout) -> tuple[FloatArray, FloatArray]:
     """Weights (t, t) and (s, s) of local means, Gaussian in time and space, each instrument's for itself."""
     steps = layout.steps
     in_time = np.exp(-0.5 * (np.subtract.outer(steps, steps) / IN_TIME) ** 2)

@@ -121,8 +121,11 @@ def test_refits_simulate_by_several_seeds_and_are_compared_by_one(monkeypatch: p
     """A seed's own chance is in all that it simulates; where two refits are compared, it cancels."""
     made = emulated(0)
     truth = {"angle": 0.0, NAME: 6.0 * detectable(0, Options())[NAME]}
-    experiment = replace(made, observed=made.measured(truth, [0, 99]))
+    guessed = {f"guess {k}": 0.01 * k * made.slopes["effect 3"] for k in range(1, 4)}
+    experiment = replace(made, observed=made.measured(truth, [0, 99]), guessed=guessed)
     read, read_off, simulate = own_floor.read, [], Noted(experiment)
+    floor_of, there = own_floor.floor_of, []
+    monkeypatch.setattr(own_floor, "floor_of", lambda *told: there.append(told[1]) or floor_of(*told))
     monkeypatch.setattr(own_floor, "read", lambda visits, *told: read_off.append(visits) or read(visits, *told))
     found = diagnose(experiment, {"angle": fitted(experiment)}, simulate=simulate)
     refits = {purpose: seeds for purpose, seeds in simulate.seeds.items() if purpose.startswith("refit ")}
@@ -137,6 +140,9 @@ def test_refits_simulate_by_several_seeds_and_are_compared_by_one(monkeypatch: p
     on_the_floor = [v for v in read_off[-1] if v.values == simulate.where[0]]
     for visits in (at_the_fit, on_the_floor):
         assert {1, 2, 3, 4} <= {visit.seed for visit in visits}
+    # The point itself may be of another simulation than the guesses are drawn of: they are told from their own mean.
+    assert len(there[-1].guesses) == 3
+    assert np.abs(there[-1].guesses.mean(axis=0)).max() < 1e-9 < np.abs(there[-1].guesses).max()
     best = found.confirmations[NAME]
     expected = experiment.predict(best.fit.values, effects=(NAME,), seed=0)
     assert np.array_equal(best.fit.prediction, expected)
