@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from splatsoil.inverse.posterior import Data
 
 #: Everything that a benchmark's numbers may hang on: parts of the package, and packages beside it.
-PARTS = ("measurement", "splats", "reconstruction", "soil", "mpm", "scene", "synthetic")
+PARTS = ("measurement", "splats", "reconstruction", "soil", "mpm", "scene", "experiment", "synthetic")
 FILES = ("parameters.py", "model.py", "comparison.py", "robust_loss.py")
 BESIDE = ("splatsoil.envs", "splatsoil.inverse")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -32,6 +33,8 @@ class Tally:
         error: held-out error over each model's floor, before and after.
         inside: how many intervals of 50 % and of 90 % held the truth, angle and size, where the right effect was added.
         intervals: how many there were.
+        simulations: of a diagnosis, on average.
+        blind: in how many the smallest error of all refits would name some effect, and the truth; None if not asked.
     """
 
     name: str
@@ -46,6 +49,8 @@ class Tally:
     error: tuple[float, float]
     inside: tuple[int, int]
     intervals: int
+    simulations: float
+    blind: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True)
@@ -60,6 +65,8 @@ class Found:
         stds: theirs.
         error: held-out error over each model's floor, before and after that.
         scored: effects that the analysis knew.
+        simulations: how many it took.
+        blind: the effect with the smallest error of all refits, "" where that is the model as it is; None if not asked.
     """
 
     verdict: Verdict
@@ -69,6 +76,8 @@ class Found:
     stds: Mapping[str, float]
     error: tuple[float, float]
     scored: tuple[str, ...]
+    simulations: int
+    blind: str | None = None
 
     @classmethod
     def of(cls, diagnosis: Diagnosis, parameter: str) -> Found:
@@ -89,6 +98,7 @@ class Found:
             stds,
             error,
             tuple(diagnosis.scores),
+            diagnosis.simulations,
         )
 
     @classmethod
@@ -139,6 +149,7 @@ def tally(
             misses += [abs(told.values[key] - value) / told.stds[key] for key, value in known.items()]
         errors.append(told.error)
     error = tuple(np.mean(errors, axis=0)) if errors else (math.nan, math.nan)
+    blind = [(f.blind, f.blind in truth) for truth, f in zip(truths, found, strict=True) if f.blind is not None]
     return Tally(
         name,
         len(found),
@@ -152,6 +163,8 @@ def tally(
         (float(error[0]), float(error[1])),
         (sum(miss < HALF for miss in misses), sum(miss < MOST for miss in misses)),
         len(misses),
+        float(np.mean([told.simulations for told in found])) if found else 0.0,
+        (sum(bool(name) for name, _ in blind), sum(right for _, right in blind)) if blind else None,
     )
 
 
@@ -166,8 +179,8 @@ def table(result: dict[str, Any]) -> str:
     lines = [
         "| hidden | experiments | some effect named | a physical one | truth first | class holds it | mean class "
         "| adequate / missing / outside | error over floor, before → after | angle's error, before → after "
-        "| truth inside 50 % / 90 % |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
+        "| truth inside 50 % / 90 % | simulations | the smallest error names: some effect, the truth |",
+        "|" + "---|" * 13,
     ]
     for row in result["rows"]:
         low, high = row["named_interval"]
@@ -178,13 +191,29 @@ def table(result: dict[str, Any]) -> str:
             f"| {row['name']} | {n} | {100 * row['named'] / n:.0f} % ({100 * low:.0f}–{100 * high:.0f}) "
             f"| {100 * row['physics'] / n:.0f} % | {100 * row['first'] / n:.0f} % "
             f"| {100 * row['held'] / n:.0f} % ({100 * first:.0f}–{100 * last:.0f}) | {row['members']:.1f} | {verdicts} "
-            f"| {_pair(row['error'])} | {_pair(row['bias'])} | {_inside(row['inside'], row['intervals'])} |"
+            f"| {_pair(row['error'])} | {_pair(row['bias'])} | {_inside(row['inside'], row['intervals'])} "
+            f"| {row['simulations']:.0f} | {_blind(row['blind'], n)} |"
         )
+    return "\n".join(lines)
+
+
+def confusion(pairs: Sequence[tuple[str, str]], nothing: str = "nothing") -> str:
+    """What was hidden against what was named first, as Markdown; ``nothing`` comes first."""
+    named = sorted({name for _, name in pairs}, key=lambda name: (name != nothing, name))
+    counts = Counter(pairs)
+    lines = ["| hidden \\ named | " + " | ".join(named) + " |", "|" + "---|" * (1 + len(named))]
+    for hidden in sorted({hidden for hidden, _ in pairs}, key=lambda name: (name != nothing, name)):
+        cells = [str(counts[hidden, name] or "–") for name in named]
+        lines.append(f"| {hidden} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
 def _pair(values: Sequence[float | None]) -> str:
     return " → ".join("–" if v is None or not math.isfinite(v) else f"{v:.2f}" for v in values)
+
+
+def _blind(hits: Sequence[int] | None, count: int) -> str:
+    return "–" if hits is None else ", ".join(f"{100 * h / count:.0f} %" for h in hits)
 
 
 def _inside(hits: Sequence[int], count: int) -> str:

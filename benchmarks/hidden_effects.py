@@ -2,37 +2,55 @@
 
 ``python -m splatsoil.benchmarks.hidden_effects`` judges emulated plow experiments: patterns of parameters and effects
 over time and space, chance drawn for every seed, a diagnosis from nothing but its own repeated "simulations". The truth
-is drawn by a stream of random numbers of its own and opened only to score.
+is drawn by a stream of random numbers of its own and opened only to score. What was judged is kept in the folder, and a
+second call goes on from there.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import time
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from splatsoil.benchmarks._tally import Found, Tally, entry, table, tally
+from splatsoil.benchmarks._common import keep_to_one_protocol, sources, stamp
+from splatsoil.benchmarks._hidden import NOTHING, Kind, Truth, count_up, draw, judge_all, kept
+from splatsoil.benchmarks._tally import Found, entry, table
+from splatsoil.inverse.criticism.confirmation import confirm
 from splatsoil.inverse.criticism.diagnosis import Bench, Diagnosis, Options, judge
 from splatsoil.inverse.criticism.evidence import gather
 from splatsoil.inverse.criticism.noise import Noise, Part
 from splatsoil.inverse.criticism.simulations import Simulations
+from splatsoil.inverse.executors import executor
 
+from splatsoil.errors import ParameterError
 from splatsoil.experiment.base import Candidate
 from splatsoil.experiment.emulated import EmulatedExperiment
 from splatsoil.experiment.features import Layout, Site
+from splatsoil.files import plain, write_json
 from splatsoil.parameters import Parameter
 
 FloatArray = npt.NDArray[np.float64]
 
 EFFECTS = 8
 OBSERVATIONS = 2
-STRENGTHS = (0.5, 1.0, 2.0, 4.0)
-"""Sizes of single effects, in smallest detectable ones."""
+ANGLES = (-2.0, 2.0)
+"""Range of the true angle, whose home is 0."""
+KINDS = (
+    NOTHING,
+    *(Kind(f"one effect, {times:g} × smallest detectable", times, 1) for times in (0.5, 1.0, 2.0, 4.0)),
+    Kind("observation only, 3 ×", 3.0, 1, "observation"),
+    Kind("two effects, 3 × each", 3.0, 2),
+    Kind("outside the library, 1 × noise", beyond=1.0),
+    Kind("outside the library, 2 × noise", beyond=2.0),
+    Kind("control: the truth taken out of the library, 4 ×", 4.0, 1, dropped=True),
+    Kind("control: the truth taken out of the library, 2 ×", 2.0, 1, dropped=True),
+    Kind("control: the library's traces shuffled, 4 ×", 4.0, 1, shuffled=True),
+    Kind("control: effect 1 there twice, 4 ×", 4.0, 1, "effect 1", twin=True),
+)
 LARGEST = 50.0
 """Size of an effect."""
 MEMORY, LENGTH, NUGGET = 0.7, 0.12, 0.1
@@ -131,12 +149,14 @@ def one(
 ) -> Diagnosis:
     """Diagnose one experiment with a hidden truth; the analysis sees the observation and its own simulations only."""
     experiment = base or emulated(world)
-    experiment = replace(experiment, observed=experiment.measured(truth, [world, 99], extra))
-    # A fit of the base model: least squares over its one parameter.
-    values = {"angle": fitted(experiment)}
+    return diagnosed(replace(experiment, observed=experiment.measured(truth, [world, 99], extra)), options)
+
+
+def diagnosed(experiment: EmulatedExperiment, options: Options) -> Diagnosis:
+    """A diagnosis from where least squares over the one parameter would end."""
     simulate = Simulations(experiment)
-    evidence = gather(experiment, simulate, values, repeats=options.repeats)
-    return judge(experiment, evidence, simulate, options=options, bench=Bench.of(experiment, evidence, options))
+    evidence = gather(experiment, simulate, {"angle": fitted(experiment)}, repeats=options.repeats)
+    return judge(experiment, evidence, simulate, options=options)
 
 
 def fitted(experiment: EmulatedExperiment) -> float:
@@ -153,67 +173,60 @@ def detectable(world: int, options: Options, chaos: float = 0.0) -> dict[str, fl
     return {name: score.detectable for name, score in found.scores.items()}
 
 
-def run(count: int = 40, *, seed: int = 1, repeats: int = 4, only: str = "") -> dict[str, Any]:
-    """All kinds of truth (or those with ``only`` in their name), ``count`` experiments each; a JSON-able result."""
-    began = time.perf_counter()
-    options = Options(repeats=repeats)
-    kinds: dict[str, str] = {c.name: c.kind for c in emulated(0).candidates}
-    physics = [name for name, kind in kinds.items() if kind == "physics"]
-    reported = [name for name, kind in kinds.items() if kind == "observation"]
-    rows: list[Tally] = []
-    kind = 0
+def shuffled(experiment: EmulatedExperiment, generator: np.random.Generator) -> EmulatedExperiment:
+    """The same world in which effects leave their traces at each camera's places in another order."""
+    channel = experiment.layout.channel_numbers
+    order = np.arange(len(channel))
+    for number in np.unique(channel):
+        order[channel == number] = generator.permutation(order[channel == number])
 
-    def series(name: str, hide: Any, beyond: float = 0.0, *, drop: bool = False, twin: bool = False) -> None:
-        nonlocal kind
-        truths, found, angles = [], [], []
-        kind += 1
-        if only not in name:
-            return
-        for k in range(count):
-            world = seed * 100_000 + (kind - 1) * 1_000 + k
-            sealed = np.random.default_rng([world, 2])
-            angle = float(sealed.uniform(-2.0, 2.0))
-            hidden = hide(sealed, detectable(world, options, CHAOS)) if hide is not None else {}
-            base = emulated(world, duplicate=twin, chaos=CHAOS)
-            extra = outside(base, sealed, beyond) if beyond else None
-            truth = {"angle": angle, **hidden}
-            if drop:
-                observed = base.measured(truth, [world, 99])
-                base = replace(base, candidates=tuple(c for c in base.candidates if c.name not in hidden))
-                extra = observed - base.measured({"angle": angle}, [world, 99])
-                truth = {"angle": angle}
-            found.append(Found.of(one(world, truth, extra, options, base), "angle"))
-            truths.append(hidden)
-            angles.append(angle)
-        rows.append(tally(name, truths, found, angles, kinds))
+    def moved(tables: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+        effects = {c.name for c in experiment.candidates}
+        return {name: table[:, order] if name in effects else table for name, table in tables.items()}
 
-    def single(names: Sequence[str], times: float) -> Any:
-        def hide(sealed: np.random.Generator, sizes: dict[str, float]) -> dict[str, float]:
-            name = str(sealed.choice(list(names)))
-            return {name: min(times * sizes[name], LARGEST)}
+    return replace(experiment, slopes=moved(experiment.slopes), curves=moved(experiment.curves))
 
-        return hide
 
-    def pair(sealed: np.random.Generator, sizes: dict[str, float]) -> dict[str, float]:
-        return {str(n): min(3.0 * sizes[str(n)], LARGEST) for n in sealed.choice(physics, 2, replace=False)}
+def smallest_error(experiment: EmulatedExperiment, options: Options) -> str:
+    """What one would say without criticism: the effect whose refit ends with the smallest error on hidden frames, or ""
+    where the model as it is does."""
+    simulate = Simulations(experiment)
+    evidence = gather(experiment, simulate, {"angle": fitted(experiment)}, repeats=options.repeats)
+    bench = Bench.of(experiment, evidence, options)
+    refits = confirm(
+        experiment,
+        evidence,
+        bench.floor,
+        bench.candidates,
+        simulate,
+        options.refit_steps,
+        bench.basis,
+        lambda what, share: None,
+    )
+    return min(refits, key=lambda name: refits[name].held_out)
 
-    series("nothing", None)
-    for times in STRENGTHS:
-        series(f"one effect, {times:g} × smallest detectable", single(physics, times))
-    series("observation only, 3 ×", single(reported, 3.0))
-    series("two effects, 3 × each", pair)
-    series("outside the library, 1 × noise", None, 1.0)
-    series("outside the library, 2 × noise", None, 2.0)
-    series("control: the truth taken out of the library, 4 ×", single(physics, 4.0), drop=True)
-    series("control: effect 1 there twice, 4 ×", single(["effect 1"], 4.0), twin=True)
-    series("control: the truth taken out of the library, 2 ×", single(physics, 2.0), drop=True)
-    return {
-        "count": count,
-        "seed": seed,
-        "repeats": repeats,
-        "seconds": time.perf_counter() - began,
-        "rows": [entry(row) for row in rows],
-    }
+
+def judge_one(keep: Path, kind: Kind, number: int, seed: int, repeats: int, blindly: bool) -> tuple[Truth, Found]:
+    """Hide a truth in a world of its own, and diagnose it from nothing but the observation; ``blindly`` also says what
+    the smallest error would name."""
+
+    def make() -> tuple[Truth, Found]:
+        options = Options(repeats=repeats)
+        world = int(np.random.SeedSequence([seed, kind.number, number]).generate_state(1)[0])
+        base = emulated(world, duplicate=kind.twin, chaos=CHAOS)
+        least = {n: s for n, s in detectable(world, options, CHAOS).items() if np.isfinite(s)} if kind.effects else {}
+        truth = draw(kind, number, seed, base.candidates, least, ANGLES)
+        sealed = np.random.default_rng([world, 2])
+        extra = outside(base, sealed, kind.beyond) if kind.beyond else None
+        observed = base.measured({"angle": truth.angle, **truth.sizes}, [world, truth.seed], extra)
+        known = shuffled(base, sealed) if kind.shuffled else base
+        if kind.dropped:
+            known = replace(known, candidates=tuple(c for c in known.candidates if c.name not in truth.sizes))
+        known = replace(known, observed=observed)
+        blind = smallest_error(known, options) if blindly else None
+        return truth, replace(Found.of(diagnosed(known, options), "angle"), blind=blind)
+
+    return kept(keep, kind, number, make)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -223,16 +236,30 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--only", default="", help="only the kinds whose name has this in it")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--repeats", type=int, default=4)
+    parser.add_argument("--blindly", action="store_true", help="count what the smallest error of all refits names, too")
+    parser.add_argument("--executor", default="serial", help="serial, or processes:N")
+    parser.add_argument("--out", type=Path, default=Path("runs/hidden-effects"), help="folder for what is finished")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args(arguments)
-    result = run(options.count, seed=options.seed, repeats=options.repeats, only=options.only)
-    if options.json:
-        from splatsoil.files import plain
-
-        print(json.dumps(plain(result), indent=1))
-    else:
-        print(table(result))
-        print(f"\n{options.count} of each kind, {result['repeats']} repeats, {result['seconds']:.0f} s")
+    kinds = [kind for kind in KINDS if options.only in kind.name]
+    if not kinds:
+        raise ParameterError(f"--only {options.only}: no kind has this in its name")
+    own = [Path(__file__).with_name(f"{name}.py") for name in ("hidden_effects", "_hidden", "_tally")]
+    decides = {"seed": options.seed, "repeats": options.repeats, "blindly": options.blindly, "code": sources(own)}
+    keep = options.out.resolve()
+    keep_to_one_protocol(keep, decides)
+    candidates = emulated(0).candidates
+    with executor(options.executor) as pool:
+        rows = judge_all(
+            pool,
+            judge_one,
+            [(kind, number) for kind in kinds for number in range(options.count)],
+            lambda kind, number: (keep, kind, number, options.seed, options.repeats, options.blindly),
+        )
+    result = {"rows": [entry(count_up(kind, judged, candidates, "angle")) for kind, judged in rows.items()]}
+    told = plain({"made_by": stamp("cpu"), **decides, "count": options.count, **result})
+    write_json(keep / "result.json", told)
+    print(json.dumps(told, indent=1) if options.json else table(result))
     return 0
 
 

@@ -11,24 +11,31 @@ kept in the folder, and a second call goes on from there.
 from __future__ import annotations
 
 import argparse
-import sys
-import time
-import zlib
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from splatsoil.benchmarks._common import keep_to_one_protocol, sources, stamp
-from splatsoil.benchmarks._tally import Found, Tally, entry, table, tally
+from splatsoil.benchmarks._hidden import (
+    FIRST_SEED,
+    NOTHING,
+    Kind,
+    Truth,
+    count_up,
+    draw,
+    hidden_and_named,
+    judge_all,
+    kept,
+)
+from splatsoil.benchmarks._tally import Found, confusion, entry, table
 from splatsoil.inverse.criticism.diagnosis import Diagnosis, diagnose
 from splatsoil.inverse.criticism.simulations import Simulations
-from splatsoil.inverse.executors import executor, in_order
+from splatsoil.inverse.executors import executor
 
-from splatsoil.experiment.base import Candidate
 from splatsoil.experiment.plow import PlowExperiment
 from splatsoil.experiment.states import States
 from splatsoil.experiment.strokes import Predict
@@ -45,8 +52,6 @@ ANGLES = (30.0, 40.0)
 """Range of the true friction angle, degrees."""
 FITTED = np.linspace(25.0, 50.0, 8)
 """Angles that fits simulate, degrees."""
-FIRST_SEED = 1000
-"""Of the truths' particles; the analysis uses seeds below."""
 FRICTION = "friction_angle"
 
 
@@ -68,28 +73,6 @@ class Hidden:
         return self._experiment.strokes()
 
 
-@dataclass(frozen=True)
-class Kind:
-    """What is hidden.
-
-    Attributes:
-        name: of the row.
-        times: size of each effect, in smallest detectable ones.
-        effects: how many at once.
-        among: from which they are drawn.
-        dropped: whether they are taken out of the analysis's library.
-    """
-
-    name: str
-    times: float = 0.0
-    effects: int = 0
-    among: Literal["physics", "observation"] = "physics"
-    dropped: bool = False
-
-
-NOTHING = Kind("nothing")
-
-
 def kinds_of(strengths: Sequence[float]) -> list[Kind]:
     """All rows: nothing, single effects in several strengths, reported ones, pairs, and truths out of the library."""
     single = [Kind(f"one effect, {times:g} × smallest detectable", times, 1) for times in strengths]
@@ -100,38 +83,6 @@ def kinds_of(strengths: Sequence[float]) -> list[Kind]:
         Kind("two effects, 3 × each", 3.0, 2),
         Kind("control: the truth taken out of the library, 4 ×", 4.0, 1, dropped=True),
     ]
-
-
-@dataclass(frozen=True)
-class Truth:
-    """One experiment's: the friction angle in degrees, the effects' sizes in their units, and a seed of its particles
-    and noise."""
-
-    angle: float
-    sizes: Mapping[str, float]
-    seed: int
-
-
-def draw(kind: Kind, number: int, seed: int, candidates: Sequence[Candidate], least: Mapping[str, float]) -> Truth:
-    """A sealed truth; ``least`` are the effects' smallest detectable sizes. An effect whose bounds don't reach the size
-    asked for isn't drawn."""
-    rng = np.random.default_rng([seed, zlib.crc32(kind.name.encode()), number])
-    angle = float(rng.uniform(*ANGLES))
-    possible: dict[str, list[float]] = {}
-    for candidate in candidates:
-        measure = candidate.measure
-        if candidate.kind == kind.among and candidate.name in least:
-            far = [
-                float(measure.off or 0.0) + side * kind.times * least[candidate.name]
-                for side in ([measure.sign] if measure.sign else [-1, 1])
-            ]
-            if inside := [value for value in far if measure.lower <= value <= measure.upper]:
-                possible[candidate.name] = inside
-    chosen: Iterable[str] = (
-        rng.choice(sorted(possible), min(kind.effects, len(possible)), replace=False) if possible else []
-    )
-    sizes = {str(name): float(rng.choice(possible[str(name)])) for name in chosen}
-    return Truth(angle, sizes, int(rng.integers(FIRST_SEED, 2**20)))
 
 
 @dataclass(frozen=True)
@@ -215,28 +166,14 @@ def detectable(place: Place) -> dict[str, float]:
 
 def judge(place: Place, kind: Kind, number: int, seed: int, least: Mapping[str, float]) -> tuple[Truth, Found]:
     """Hide a truth, diagnose what is seen of it, and keep what was found."""
-    file = place.keep / "judged" / f"{zlib.crc32(kind.name.encode()):08x}-{number}.json"
-    if file.is_file():
-        kept = read_json(file)
-        return Truth(**kept["truth"]), Found.from_json(kept["found"])
-    bed = _bed(place)
-    truth = draw(kind, number, seed, bed.whole.candidates, least)
-    found = Found.of(bed.diagnosed(bed.observed(truth), tuple(truth.sizes) if kind.dropped else ()), FRICTION)
-    write_json(file, plain({"kind": kind.name, "truth": asdict(truth), "found": asdict(found)}))
-    return truth, found
 
+    def make() -> tuple[Truth, Found]:
+        bed = _bed(place)
+        truth = draw(kind, number, seed, bed.whole.candidates, least, ANGLES)
+        without = tuple(truth.sizes) if kind.dropped else ()
+        return truth, Found.of(bed.diagnosed(bed.observed(truth), without), FRICTION)
 
-def count_up(kind: Kind, judged: Sequence[tuple[Truth, Found]], candidates: Sequence[Candidate]) -> Tally:
-    """A row. Truths of which the analysis knows nothing count as none."""
-    return tally(
-        kind.name,
-        [{} if kind.dropped else truth.sizes for truth, _ in judged],
-        [found for _, found in judged],
-        [truth.angle for truth, _ in judged],
-        {c.name: c.kind for c in candidates},
-        FRICTION,
-        {c.name: c.measure.name for c in candidates},
-    )
+    return kept(place.keep, kind, number, make)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -254,8 +191,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--executor", default="serial", help="serial, or processes:N")
     parser.add_argument("--out", type=Path, default=Path("runs/hidden-soil"), help="folder for what is finished")
     options = parser.parse_args(arguments)
-    began = time.perf_counter()
-    own = [Path(__file__), Path(__file__).with_name("hidden_effects.py")]
+    own = [Path(__file__).with_name(f"{name}.py") for name in ("hidden_soil", "_hidden", "_tally")]
     decides = {"seed": options.seed, "preset": options.preset, "effects": options.effects, "code": sources(own)}
     place = Place(options.set.resolve(), options.preset, options.device, tuple(options.effects), options.out.resolve())
     keep_to_one_protocol(place.keep, {**decides, "set": Measurement.load(place.folder).hash})
@@ -267,23 +203,13 @@ def main(arguments: list[str] | None = None) -> int:
             for kind in kinds_of(options.strengths)
             for number in range((3 if kind == NOTHING else 1) * options.count)
         ]
-        rows: dict[Kind, list[tuple[Truth, Found]]] = {}
-        told = in_order(pool, judge, [(place, kind, number, options.seed, least) for kind, number in jobs])
-        for (kind, number), (truth, found) in zip(jobs, told, strict=True):
-            rows.setdefault(kind, []).append((truth, found))
-            hidden = ", ".join(f"{n} {v:.3g}" for n, v in truth.sizes.items()) or "nothing"
-            print(
-                f"{time.perf_counter() - began:6.0f} s  {kind.name}, {number + 1}: {hidden}; "
-                f"{found.verdict} {', '.join(found.members)}",
-                file=sys.stderr,
-                flush=True,
-            )
+        rows = judge_all(pool, judge, jobs, lambda kind, number: (place, kind, number, options.seed, least))
     result = {
-        "rows": [entry(count_up(kind, judged, candidates)) for kind, judged in rows.items()],
+        "rows": [entry(count_up(kind, judged, candidates, FRICTION)) for kind, judged in rows.items()],
         "smallest detectable": least,
     }
     write_json(place.keep / "result.json", plain({"made_by": stamp(options.device), **decides, **result}))
-    print(table(result))
+    print(table(result), confusion(hidden_and_named(rows)), sep="\n\n")
     return 0
 
 

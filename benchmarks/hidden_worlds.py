@@ -27,7 +27,7 @@ import numpy as np
 from splatsoil.benchmarks._common import keep_to_one_protocol, sources, stamp
 from splatsoil.benchmarks._mitsuba import MitsubaStage, load_mitsuba
 from splatsoil.benchmarks._newton import Numerics, World, plough
-from splatsoil.benchmarks._tally import wilson
+from splatsoil.benchmarks._tally import confusion, wilson
 from splatsoil.benchmarks._truths import FIELD, KINDS, NOTHING, OBSERVATION, Hidden, draw
 from splatsoil.benchmarks.numerics import FloatArray
 
@@ -219,7 +219,8 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
             low, high = wilson(hits, len(among))
             lines.append(f"- {what}: {hits} of {len(among)} ({100 * low:.0f}–{100 * high:.0f} %)")
 
-    lines.append("")
+    firsts = [(r["hidden"], r["class"][0] if r["verdict"] == "missing" else NOTHING) for r in rows]
+    lines += ["", confusion(firsts), ""]
     library = [r for r in rows if r["hidden"] not in (NOTHING, FIELD)]
     right = [r for r in library if r["class"][:1] == [r["hidden"]] and r["hidden"] not in OBSERVATION]
     plain_sand = [r for r in rows if r["hidden"] == NOTHING]

@@ -10,20 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from splatsoil.benchmarks._hidden import FIRST_SEED, NOTHING, Truth, count_up, draw
 from splatsoil.benchmarks._tally import Found, entry, table, tally
 from splatsoil.benchmarks.hidden_effects import emulated
-from splatsoil.benchmarks.hidden_soil import (
-    FIRST_SEED,
-    NOTHING,
-    Hidden,
-    Place,
-    Truth,
-    count_up,
-    draw,
-    judge,
-    kinds_of,
-    main,
-)
+from splatsoil.benchmarks.hidden_soil import ANGLES, Hidden, Place, judge, kinds_of, main
 from splatsoil.inverse.criticism.diagnosis import diagnose
 
 from splatsoil.files import plain, write_json
@@ -52,24 +42,24 @@ def test_the_analysis_sees_the_hidden_observation_and_nothing_else_of_it() -> No
 def test_truths_are_sealed_by_their_seed_and_of_the_size_that_their_row_says() -> None:
     world = emulated(77)
     nothing, single, reported, pair, dropped = kinds_of([2.0])
-    assert draw(nothing, 0, 5, world.candidates, LEAST).sizes == {}
-    drawn = [draw(single, k, 5, world.candidates, LEAST) for k in range(40)]
-    assert drawn == [draw(single, k, 5, world.candidates, LEAST) for k in range(40)]
-    assert drawn != [draw(single, k, 6, world.candidates, LEAST) for k in range(40)]
+    assert draw(nothing, 0, 5, world.candidates, LEAST, ANGLES).sizes == {}
+    drawn = [draw(single, k, 5, world.candidates, LEAST, ANGLES) for k in range(40)]
+    assert drawn == [draw(single, k, 5, world.candidates, LEAST, ANGLES) for k in range(40)]
+    assert drawn != [draw(single, k, 6, world.candidates, LEAST, ANGLES) for k in range(40)]
     assert len({truth.seed for truth in drawn}) == 40 and min(truth.seed for truth in drawn) >= FIRST_SEED
     assert all(30.0 <= truth.angle <= 40.0 for truth in drawn)
     # Twice 30 lies beyond the bounds of ±50; an effect without a detectable size is never drawn.
     assert {name for truth in drawn for name in truth.sizes} == {"effect 1"}
     assert {value for truth in drawn for value in truth.sizes.values()} == {-4.0, 4.0}
-    assert {n for k in range(9) for n in draw(reported, k, 5, world.candidates, LEAST).sizes} == {"effect 7"}
+    assert {n for k in range(9) for n in draw(reported, k, 5, world.candidates, LEAST, ANGLES).sizes} == {"effect 7"}
     both = {**LEAST, "effect 2": 3.0}
-    assert draw(pair, 0, 5, world.candidates, both).sizes.keys() == {"effect 1", "effect 2"}
+    assert draw(pair, 0, 5, world.candidates, both, ANGLES).sizes.keys() == {"effect 1", "effect 2"}
     assert dropped.dropped and not single.dropped
 
 
 def test_what_was_judged_is_read_and_not_judged_again(tmp_path: Path) -> None:
     truth = Truth(33.0, {}, 2000)
-    found = Found("adequate", (), 34.5, {}, {}, (math.nan, math.nan), ("cohesion",))
+    found = Found("adequate", (), 34.5, {}, {}, (math.nan, math.nan), ("cohesion",), 40)
     place = Place(tmp_path / "no such set", "tiny", "cpu", ("cohesion",), tmp_path)
     with pytest.raises(Exception, match="no such set"):
         judge(place, NOTHING, 0, 1, {})
@@ -88,9 +78,9 @@ def test_what_was_judged_is_read_and_not_judged_again(tmp_path: Path) -> None:
 def test_a_truth_that_was_taken_out_of_the_library_is_not_to_be_found() -> None:
     candidates = emulated(77).candidates
     single, dropped = (kind for kind in kinds_of([4.0]) if kind.effects == 1 and kind.among == "physics")
-    found = Found("missing", ("effect 1",), 36.0, {"friction_angle": 33.5, "effect 1": 4.2}, {}, (2.0, 1.0), ())
+    found = Found("missing", ("effect 1",), 36.0, {"friction_angle": 33.5, "effect 1": 4.2}, {}, (2.0, 1.0), (), 40)
     judged = [(Truth(33.0, {"effect 1": 4.0}, 2000), found)]
-    rows = [count_up(kind, judged, candidates) for kind in (single, dropped)]
+    rows = [count_up(kind, judged, candidates, "friction_angle") for kind in (single, dropped)]
     assert [(row.named, row.held, row.first) for row in rows] == [(1, 1, 1), (1, 0, 0)]
     assert rows[0].bias == pytest.approx((3.0, 0.5)) and rows[0].error == (2.0, 1.0)
 
