@@ -32,6 +32,9 @@ FEWEST_TO_JUDGE = 3
 """Samples from which each can be judged by the others."""
 FEWEST_FREEDOM = 8.0
 """Least degrees of freedom of a part's variance: few samples scatter too little or too much by chance."""
+OUTLYING = 9.0
+"""Variance over that of the middle sample beyond which a sample counts as no farther out: it is another kind of thing,
+and not noise that all of them have."""
 
 
 def estimate(
@@ -86,30 +89,37 @@ def _calibrated(
     directions, free = (None if columns is None else columns[changed[seen]] for columns in (directions, free))
     seen = changed
     waves = smooth_waves(layout, seen)
-    on_waves, along = [], []
+    waved, directed = list[float](), list[float]()
     for k in range(count):
         scale = part.scale
         if count >= FEWEST_TO_JUDGE:
             others = np.delete(samples, k, axis=0)
-            scale = scales_of(layout, others, seen, across, times)
+            # What but one sample changes has no scale by the others; all of them say that of a mean square.
+            least = part.scale / math.sqrt(count)
+            scale = np.maximum(scales_of(layout, others, seen, across, times), least)
         noise = Noise.of(layout, [(1.0, replace(part, scale=scale))], seen)
         solver = (noise if free is None else noise.plus(free)).solver()
         left, _ = np.linalg.qr(solver.whiten(waves * noise.scale[:, None]))
         sample = solver.whiten(samples[k][seen])
-        on_waves.append(np.mean((left.T @ sample) ** 2))
+        waved.append(np.mean((left.T @ sample) ** 2))
         if directions is not None and directions.size:
             columns = solver.whiten(directions)
-            along.append(np.mean((columns.T @ sample) ** 2 / np.maximum(np.sum(columns**2, axis=0), 1e-300)))
-    # One sample that is far larger than the others there says that it is another kind of thing.
+            directed.append(np.mean((columns.T @ sample) ** 2 / np.maximum(np.sum(columns**2, axis=0), 1e-300)))
+    on_waves, along = _within(waved), _within(directed)
     factor = float(np.median(on_waves))
     # A mean of χ² over its ν degrees of freedom has the relative variance 2 / ν.
     doubt = float(np.var(on_waves, ddof=1)) / count / factor**2 if count > 1 and factor > 0.0 else 2.0
     return replace(
         part,
         on_waves=max(factor, 1.0),
-        on_directions=max(float(np.mean(along)), 1.0) if along else 1.0,
+        on_directions=max(float(np.mean(along)), 1.0) if along.size else 1.0,
         freedom=max(2.0 / max(doubt, 1e-12), FEWEST_FREEDOM),
     )
+
+
+def _within(squares: list[float]) -> FloatArray:
+    """(k,) mean squares of samples, none of which counts as farther out than `OUTLYING`."""
+    return np.minimum(squares, OUTLYING * np.median(squares)) if squares else np.zeros(0)
 
 
 def _correlated(layout: Layout, samples: FloatArray, seen: BoolArray, scale: FloatArray) -> Part:
