@@ -17,6 +17,7 @@ from splatsoil.envs.together import attempt, evaluate_together
 
 from splatsoil.errors import RunError
 from splatsoil.parameters import Parameter, ParameterSpace
+from splatsoil.run_files import FIT_FORMAT
 from splatsoil.threads import one_thread
 
 from .bayesopt import PAPER, START, Episode, optimise
@@ -28,7 +29,6 @@ from .posterior import Data
 from .run_folder import RunFolder
 from .surrogate import FloatArray, Minimum, Surrogate
 
-FORMAT = "splatsoil-fit/1"
 #: Points of the GP's curve kept for the figure.
 CURVE = 201
 
@@ -280,7 +280,7 @@ def summarise(
     done = [record for record in good if is_full(record.parameters)]
     best = min(done, key=lambda record: record.loss if record.loss is not None else math.inf)
     return {
-        "format": FORMAT,
+        "format": FIT_FORMAT,
         "name": setup.name,
         "parameters": {p.name: _estimate(p, i, minimum, space) for i, p in enumerate(space)},
         "estimated_from": source,

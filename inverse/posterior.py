@@ -14,6 +14,7 @@ from splatsoil.envs.problem import Problem
 
 from splatsoil.errors import RunError
 from splatsoil.parameters import Parameter, ParameterSpace
+from splatsoil.run_files import POSTERIOR_FORMAT
 
 from .beside import Beside
 from .campaign import Job
@@ -26,7 +27,6 @@ from .surrogate import sobol
 
 FloatArray = npt.NDArray[np.float64]
 
-FORMAT = "splatsoil-posterior/1"
 #: Posterior over prior standard deviation: below the first a parameter is determined, above the second it is not.
 DETERMINED, UNDETERMINED = 0.5, 0.8
 #: A bound is reached where this share of the axis beside it holds more than twice its share of the posterior.
@@ -243,7 +243,7 @@ def summarise(posterior: Posterior) -> dict[str, Any]:
     chains, emulator, misfit = posterior.chains, posterior.emulator, posterior.misfit
     correlation = np.atleast_2d(np.corrcoef(unit.T)) if len(space) > 1 else np.ones((1, 1))
     return {
-        "format": FORMAT,
+        "format": POSTERIOR_FORMAT,
         "parameters": parameters,
         "correlation": correlation.tolist(),
         "evidence": None if posterior.evidence is None else dict(zip(("log", "std"), posterior.evidence, strict=True)),

@@ -13,6 +13,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -21,11 +22,10 @@ from pathlib import Path
 from typing import Any
 
 from splatsoil.errors import RunError
-from splatsoil.files import read_json, write_json
+from splatsoil.files import check_folder, write_json
+from splatsoil.run_files import RUN_FORMAT, read_description, read_fit
 
 from .evaluations import EvaluationStore, writer_lock
-
-FORMAT = "splatsoil-run/1"
 
 
 @dataclass(frozen=True)
@@ -49,13 +49,9 @@ class RunFolder:
         """
         folder = Path(path)
         if not folder.is_dir():
-            raise RunError(f"{folder}: there is no such run folder; `splatsoil fit SET --run {folder}` makes one")
-        if not (folder / "run.json").is_file():
-            raise RunError(f"{folder}: has no run.json, so it isn't a run folder; name one made by `splatsoil fit`")
-        description = read_json(folder / "run.json")
-        if not isinstance(description, dict) or description.get("format") != FORMAT:
-            raise RunError(f"{folder / 'run.json'}: isn't a run of format {FORMAT}; choose another run folder")
-        return cls(folder, description)
+            make = f"splatsoil fit SET --run {shlex.quote(str(folder))}"
+            raise RunError(f"{folder}: there is no such run folder; `{make}` makes one")
+        return cls(folder, read_description(folder))
 
     @classmethod
     def prepare(
@@ -81,7 +77,7 @@ class RunFolder:
         if folder.exists() and (not folder.is_dir() or any(p.name != "writer.lock" for p in folder.iterdir())):
             raise RunError(f"{folder}: exists and isn't a run folder; choose another --run")
         description = {
-            "format": FORMAT,
+            "format": RUN_FORMAT,
             "measurement": dict(measurement),
             "preset": preset,
             "seed": seed,
@@ -126,6 +122,17 @@ class RunFolder:
         """Be the only process that writes into the run; a context manager."""
         return writer_lock(self.path)
 
+    def check_writable(self) -> None:
+        """See that results can go into the run, before hours are spent on them.
+
+        Raises:
+            RunError: another process is writing there, or it can't be written to.
+        """
+        for folder in (self.path, self.comparison, self.path / "features"):
+            check_folder(folder)
+        with self.lock():
+            pass
+
     def evaluations(self, *, writable: bool = False) -> EvaluationStore:
         """The run database; a context manager."""
         return EvaluationStore(self.path / "evaluations.db", writable=writable)
@@ -139,9 +146,6 @@ class RunFolder:
         """The latest finished fit.
 
         Raises:
-            RunError: no fit has been finished.
+            RunError: no fit has been finished, or what is kept of it is damaged.
         """
-        path = self.path / "fit.json"
-        if not path.is_file():
-            raise RunError(f"{self.path}: no fit has been finished here; `splatsoil fit` goes on where it stopped")
-        return read_json(path)
+        return read_fit(self.path)

@@ -8,13 +8,18 @@ import json
 import math
 import os
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
 from splatsoil.errors import RunError
+
+#: What helps where a file is damaged that is made anew when it isn't there.
+ANEW = "delete it and run the command again"
 
 
 def write_bytes(path: str | Path, data: bytes) -> Path:
@@ -93,7 +98,39 @@ def read_json(path: str | Path) -> Any:
     except OSError as error:
         raise RunError(f"{source}: cannot be read ({error.strerror})") from error
     except ValueError as error:
-        raise RunError(f"{source}: is not JSON ({error}); delete it and run the command again") from error
+        raise RunError(f"{source}: is not JSON ({error}); {ANEW}") from error
+
+
+def read_npy(path: str | Path) -> np.ndarray:
+    """Read a NumPy array of a run folder.
+
+    Raises:
+        RunError: it can't be read.
+    """
+    with _readable(path):
+        array = np.load(path, allow_pickle=False)
+        if not isinstance(array, np.ndarray):
+            raise ValueError("is no single array")
+        return array
+
+
+def read_npz(path: str | Path, names: Iterable[str], *, remedy: str = ANEW) -> dict[str, np.ndarray]:
+    """Read arrays of a run folder that `write_npz` wrote, by their names; the remedy is for where that can't be done.
+
+    Raises:
+        RunError: it can't be read, or lacks one.
+    """
+    with _readable(path, remedy), np.load(path, allow_pickle=False) as kept:
+        return {name: kept[name] for name in names}
+
+
+@contextmanager
+def _readable(path: str | Path, remedy: str = ANEW) -> Iterator[None]:
+    """Say in one sentence what NumPy thinks of a file that was cut short, or is no array."""
+    try:
+        yield
+    except (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile) as error:
+        raise RunError(f"{path}: cannot be read ({error}); {remedy}") from error
 
 
 def plain(data: Any) -> Any:
@@ -117,8 +154,9 @@ def plain(data: Any) -> Any:
 RECONSTRUCTING = ("measurement", "splats", "reconstruction")
 FORWARD = (
     *RECONSTRUCTING,
-    *("soil", "mpm", "scene", "parameters.py", "model.py", "comparison.py", "robust_loss.py"),
-    *("experiment/forces.py", "experiment/scene_parts.py"),
+    *("soil", "mpm", "scene", "parameters.py", "model.py", "observation.py", "colour.py"),
+    *("comparison.py", "robust_loss.py", "envs/measured.py"),
+    *("experiment/features.py", "experiment/forces.py", "experiment/scene_parts.py"),
 )
 
 
@@ -126,16 +164,16 @@ def code_digest(parts: Iterable[str] = FORWARD, others: Iterable[str | Path] = (
     """SHA-256 (16 hex digits) of the package's sources: what they made before they changed isn't what they make now.
 
     Args:
-        parts: folders and files of the package.
+        parts: folders and files of the package, by their place in it.
         others: further files, such as a user's effects.
 
     Raises:
         RunError: one of the others can't be read.
     """
     root = Path(__file__).parent
-    files = sorted(
-        f for part in parts for f in ([root / part] if part.endswith(".py") else (root / part).rglob("*.py"))
-    )
+    # In the source tree some of the package's folders lie beside this one.
+    places = ((root if (root / part).exists() else root.parent) / part for part in parts)
+    files = sorted(f for place in places for f in ([place] if place.suffix == ".py" else place.rglob("*.py")))
     digest = hashlib.sha256()
     try:
         for file in (*files, *map(Path, others)):

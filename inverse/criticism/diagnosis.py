@@ -224,7 +224,8 @@ def judge(
         tried = {name: c for name, c in confirmations.items() if name}
         # Not by what is left of χ²: an effect that stays off leaves what other pictures say of it unexplained.
         costs = {name: scorer.price(candidates[name], refitted=True) - c.fall for name, c in tried.items()}
-        members = members_of(confirmations, costs, misfit, scores)
+        measures = {name: c.measure for name, c in candidates.items()}
+        members = members_of(confirmations, costs, misfit, scores, measures)
         before = confirmations[""].remainder
         if members:
             best = members[0]
@@ -235,9 +236,7 @@ def judge(
             if experiment.chance and (more or error > WITHIN or tried[best].visits):
                 told("the floor with the effect on", 0.97)
                 own = on_its_own_floor(experiment, evidence, tried[best], candidates[best], simulate, residual)
-                confirmations[best] = own.refit
-                if more or error > WITHIN:
-                    error = own.refit.held_out / own.refit.floor
+                confirmations[best], error = own.refit, own.refit.held_out / own.refit.floor
                 if more:
                     before, remainder = own.before, own.after
             gone = explained(before, remainder)

@@ -97,7 +97,7 @@ def floor_of(experiment: Experiment, evidence: Evidence) -> Floor:
         known = _total(layout, parts, seen, runs)[0]
         doubts = [evidence.numerics_doubts.get(name, np.zeros(layout.shape)) for name in evidence.numerics]
         left = _unexplained(known, parameters, patterns, doubts, seen & layout.common[None])
-        parts["numerics"] = estimate(layout, left, seen, directions, parameters)
+        parts["numerics"] = estimate(layout, left, seen, directions, parameters, alike=False)
     noise, single = _total(layout, parts, seen, runs)
     for name, part in parts.items():
         columns = extra_noise(layout, part, seen, doubted if name in ACTING else None)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from splatsoil.parameters import Parameter
+
 from .confirmation import Confirmation
 from .misfit import Omnibus
 from .score import Score
-from .verdicts import CERTAIN, EQUIVALENT, GATE, LEVEL, RELEVANT
+from .verdicts import CERTAIN, DENIES, EQUIVALENT, GATE, LEVEL, RELEVANT
 
 
 def members_of(
@@ -15,6 +17,7 @@ def members_of(
     costs: Mapping[str, float],
     misfit: Omnibus,
     scores: Mapping[str, Score],
+    measures: Mapping[str, Parameter],
 ) -> tuple[str, ...]:
     """The equivalence class, the best effect first; empty where the best one doesn't stand.
 
@@ -27,11 +30,12 @@ def members_of(
         costs: χ² by effect, up to a constant.
         misfit: of the model as it is.
         scores: of each effect.
+        measures: the parameter that measures each effect.
     """
     costs = {name: cost for name, cost in costs.items() if not confirmations[name].ruled_out}
     if not costs:
         return ()
-    standing = [name for name in costs if stands(confirmations, name, misfit, scores[name])]
+    standing = [name for name in costs if stands(confirmations, name, misfit, scores[name], measures[name])]
     certain = {name: costs[name] for name in standing if confirmations[name].told < CERTAIN}
     among = certain or costs
     best = min(among, key=lambda name: among[name])
@@ -42,12 +46,15 @@ def members_of(
     return _equals(explaining, best, max(confirmations[best].remainder.dispersion, scores[best].dispersion))
 
 
-def stands(confirmations: Mapping[str, Confirmation], name: str, misfit: Omnibus, score: Score) -> bool:
+def stands(
+    confirmations: Mapping[str, Confirmation], name: str, misfit: Omnibus, score: Score, measure: Parameter
+) -> bool:
     """Something is to be explained, and the refit does: χ² falls, on times that it hasn't seen too.
 
     Where slow waves show no more than chance, either the effect is significant among all of the library, or the model
-    is off by more than noise on those times; and it must take away a relevant share of the squared error there. What
-    other pictures say of an effect beyond doubt needs no more of the features than that they don't speak against it.
+    is off by more than noise on those times; it must take away a relevant share of the squared error there; and its
+    refit, all that is systematic counted, must tell its size from none. What other pictures say of an effect beyond
+    doubt needs no more of the features than that they don't speak against it.
     """
     before, after = confirmations[""], confirmations[name]
     least = EQUIVALENT * score.dispersion
@@ -57,7 +64,8 @@ def stands(confirmations: Mapping[str, Confirmation], name: str, misfit: Omnibus
         return after.unseen > -least
     wanting = score.adjusted < LEVEL or before.held_out > before.floor
     relevant = after.held_out**2 < (1.0 - RELEVANT) * before.held_out**2
-    return (misfit.p < GATE or (wanting and relevant)) and after.unseen > 0.0
+    told = abs(after.values[measure.name] - float(measure.off or 0.0)) > DENIES * after.stds[measure.name]
+    return (misfit.p < GATE or (wanting and relevant and told)) and after.unseen > 0.0
 
 
 def _equals(costs: Mapping[str, float], best: str, dispersion: float) -> tuple[str, ...]:

@@ -7,14 +7,13 @@ from typing import Any
 import numpy as np
 
 from splatsoil.experiment.base import Calibration, Candidate, Experiment
+from splatsoil.run_files import DIAGNOSIS_FORMAT, MISFIT_FORMAT
 
 from .confirmation import Confirmation
 from .diagnosis import Diagnosis
 from .misfit import Omnibus
 from .outside import StrengthReading
 from .words import of_estimates, sentences
-
-FORMAT = "splatsoil-diagnosis/1"
 
 
 def record(experiment: Experiment, diagnosis: Diagnosis) -> dict[str, Any]:
@@ -23,7 +22,7 @@ def record(experiment: Experiment, diagnosis: Diagnosis) -> dict[str, Any]:
     layout = experiment.layout
     scale = diagnosis.floor.noise.spread(diagnosis.floor.noise.scale)
     return {
-        "format": FORMAT,
+        "format": DIAGNOSIS_FORMAT,
         "experiment": experiment.name,
         "model": list(experiment.model),
         "verdict": diagnosis.verdict,
@@ -88,7 +87,7 @@ def misfit_record(experiment: Experiment, diagnosis: Diagnosis) -> dict[str, Any
     kept = ("misfit", "blocks", "floor", "unit", "time_name", "times", "stages", "sites", "curves", "maps", "values")
     adequate = diagnosis.verdict == "adequate"
     return {
-        "format": "splatsoil-misfit/1",
+        "format": MISFIT_FORMAT,
         "adequate": adequate,
         "estimates": whole["estimates"] if adequate else {},
         "sentences": of_estimates(diagnosis.estimates) if adequate else [],

@@ -33,8 +33,9 @@ FEWEST_TO_JUDGE = 3
 FEWEST_FREEDOM = 8.0
 """Least degrees of freedom of a part's variance: few samples scatter too little or too much by chance."""
 OUTLYING = 9.0
-"""Variance over that of the middle sample beyond which a sample counts as no farther out: it is another kind of thing,
-and not noise that all of them have."""
+"""Variance over that of the middle one beyond which a sample of a law that all follow counts as no farther out."""
+LEAST_BY_OTHERS = 1e-3
+"""Share of a scale that is least believed of what the other samples give, where each may be of another kind."""
 
 
 def estimate(
@@ -43,6 +44,8 @@ def estimate(
     seen: BoolArray,
     directions: FloatArray | None = None,
     free: FloatArray | None = None,
+    *,
+    alike: bool = True,
 ) -> Part:
     """The part that samples (k, t, s) of it, with mean zero, suggest.
 
@@ -52,7 +55,8 @@ def estimate(
     Such a part is too plain: soil that falls otherwise by chance does so where effects act, and other numerics change
     what is smooth. So how much more scores along slow waves and along directions (n, k) of interest scatter is noted,
     for `extra_noise`, once what ``free`` (n, q; times prior spreads) can take up is gone: a seed that acts like another
-    friction angle is no noise where the angle is fitted.
+    friction angle is no noise where the angle is fitted. Where samples are ``alike``, draws of one law, one that is far
+    out says something else than noise; where each is of its own kind, as other numerics are, it counts in full.
     """
     samples = np.where(seen, samples, 0.0)
     if not np.any(samples):
@@ -63,7 +67,7 @@ def estimate(
     for _ in range(ROUNDS):
         known = part.across(layout), in_time(layout.steps, part.memory)
         part = _correlated(layout, samples, seen, scales_of(layout, samples, seen, *known))
-    return _calibrated(layout, part, samples, seen, directions, free)
+    return _calibrated(layout, part, samples, seen, directions, free, alike)
 
 
 def correlated(layout: Layout, samples: FloatArray, seen: BoolArray, scale: FloatArray) -> Part:
@@ -78,6 +82,7 @@ def _calibrated(
     seen: BoolArray,
     directions: FloatArray | None,
     free: FloatArray | None,
+    alike: bool,
 ) -> Part:
     """The part, with what samples come to on slow waves and along directions.
 
@@ -94,18 +99,21 @@ def _calibrated(
         scale = part.scale
         if count >= FEWEST_TO_JUDGE:
             others = np.delete(samples, k, axis=0)
-            # What but one sample changes has no scale by the others; all of them say that of a mean square.
-            least = part.scale / math.sqrt(count)
+            # What but one sample changes has no scale by the others.
+            least = part.scale * (1.0 / math.sqrt(count) if alike else LEAST_BY_OTHERS)
             scale = np.maximum(scales_of(layout, others, seen, across, times), least)
         noise = Noise.of(layout, [(1.0, replace(part, scale=scale))], seen)
         solver = (noise if free is None else noise.plus(free)).solver()
         left, _ = np.linalg.qr(solver.whiten(waves * noise.scale[:, None]))
         sample = solver.whiten(samples[k][seen])
-        waved.append(np.mean((left.T @ sample) ** 2))
+        waved.append(float(np.mean((left.T @ sample) ** 2)))
         if directions is not None and directions.size:
             columns = solver.whiten(directions)
-            directed.append(np.mean((columns.T @ sample) ** 2 / np.maximum(np.sum(columns**2, axis=0), 1e-300)))
-    on_waves, along = _within(waved), _within(directed)
+            shares = (columns.T @ sample) ** 2 / np.maximum(np.sum(columns**2, axis=0), 1e-300)
+            directed.append(float(np.mean(shares)))
+    on_waves, along = np.array(waved), np.array(directed)
+    if alike:
+        on_waves, along = (np.minimum(of, OUTLYING * np.median(of)) if of.size else of for of in (on_waves, along))
     factor = float(np.median(on_waves))
     # A mean of χ² over its ν degrees of freedom has the relative variance 2 / ν.
     doubt = float(np.var(on_waves, ddof=1)) / count / factor**2 if count > 1 and factor > 0.0 else 2.0
@@ -115,11 +123,6 @@ def _calibrated(
         on_directions=max(float(np.mean(along)), 1.0) if along.size else 1.0,
         freedom=max(2.0 / max(doubt, 1e-12), FEWEST_FREEDOM),
     )
-
-
-def _within(squares: list[float]) -> FloatArray:
-    """(k,) mean squares of samples, none of which counts as farther out than `OUTLYING`."""
-    return np.minimum(squares, OUTLYING * np.median(squares)) if squares else np.zeros(0)
 
 
 def _correlated(layout: Layout, samples: FloatArray, seen: BoolArray, scale: FloatArray) -> Part:

@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 from splatsoil.inverse.evaluations import digest
 
-from splatsoil.errors import RunError, SimulationError
+from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Experiment
-from splatsoil.files import write_bytes
+from splatsoil.files import read_npy, write_bytes
 
 from .free_strength import FreeStrength
 
@@ -186,10 +186,7 @@ class Simulations:
         path = self._path(key)
         if path is None or not path.is_file():
             return None
-        try:
-            table: FloatArray = np.load(path, allow_pickle=False)
-        except (OSError, ValueError) as error:
-            raise RunError(f"{path}: cannot be read ({error}); delete it and run the command again") from error
+        table: FloatArray = read_npy(path)
         return table if table.shape == self.experiment.layout.shape else None
 
     def _find(self, key: str, what: Mapping[str, Any], purpose: str) -> FloatArray:

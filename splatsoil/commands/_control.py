@@ -20,12 +20,23 @@ if TYPE_CHECKING:
     FloatArray = npt.NDArray[np.float64]
 
 
+#: Parts of the package that decide features, what criticism makes of simulations, besides those that simulate; the
+#: replay control; the calibration.
+FEATURES = ("experiment/plow.py", "experiment/base.py")
+REPLAY = ("synthetic", "experiment/replay.py")
+CALIBRATION = ("experiment/bands.py", "experiment/calibration.py", "experiment/calibration_bench.py")
+
+
 def code_of(effects: Iterable[str]) -> str:
     """Digest of the code that decides features, users' own effects in it."""
     from splatsoil.files import FORWARD, code_digest
 
-    own = [name for name in effects if name.endswith(".py")]
-    return code_digest((*FORWARD, "observation.py", "experiment/plow.py"), own)
+    return code_digest((*FORWARD, *FEATURES), own_files(effects))
+
+
+def own_files(effects: Iterable[str]) -> list[str]:
+    """Of effects' names those that are a user's own files."""
+    return [name for name in effects if name.endswith(".py")]
 
 
 def replay_path(folder: RunFolder, simulate: Simulations) -> Path:
@@ -36,7 +47,7 @@ def replay_path(folder: RunFolder, simulate: Simulations) -> Path:
 
     # Candidates, a user's own among them, are no part of it.
     own = {"code": code_of(folder.fit()["setup"]["effects"])}
-    what = {**simulate.identity, **own, "replay code": code_digest(("synthetic", "experiment/replay.py"))}
+    what = {**simulate.identity, **own, "replay code": code_digest(REPLAY)}
     return folder.path / "features" / f"replay-{digest(what)[:24]}.npy"
 
 
@@ -53,7 +64,7 @@ def replayed(
     import numpy as np
 
     from splatsoil.experiment.replay import replay
-    from splatsoil.files import write_bytes
+    from splatsoil.files import read_npy, write_bytes
 
     path = replay_path(folder, simulate)
     if not path.is_file():
@@ -61,7 +72,7 @@ def replayed(
         made = replay(experiment, values, folder.path / "replay", progress=lambda what, _: say(what))
         np.save(stream, made, allow_pickle=False)
         write_bytes(path, stream.getvalue())
-    return np.load(path, allow_pickle=False)[None]
+    return read_npy(path)[None]
 
 
 def control(
@@ -73,16 +84,15 @@ def control(
     say: Callable[[str], None],
 ) -> Callable[[], FloatArray]:
     """Have the replay control made: by a helper, or here and now where there is none. What it returns waits for it."""
-    making = None
-    if not replay_path(folder, simulate).is_file():
-        making = helper(values)
-        if making is None:
-            replayed(folder, experiment, simulate, values, say)
+    making = None if replay_path(folder, simulate).is_file() else helper(values)
+    if making is None:
+        # One that is kept is read here and now, too: if it is damaged, nothing has been simulated in vain.
+        known = replayed(folder, experiment, simulate, values, say)
+        return lambda: known
 
     def result() -> FloatArray:
-        if making is not None:
-            say("a made-up bed through the whole chain")
-            wait([making])
+        say("a made-up bed through the whole chain")
+        wait([making])
         # made here where no helper could
         return replayed(folder, experiment, simulate, values, say)
 
@@ -97,17 +107,21 @@ def calibrated(
     import numpy as np
 
     from splatsoil.experiment.base import Calibration
-    from splatsoil.files import code_digest, write_npz
+    from splatsoil.files import code_digest, read_npz, write_npz
     from splatsoil.inverse.evaluations import digest
 
     names = [p.name for c in experiment.candidates if c.kind == "observation" for p in c.parameters]
-    code = code_digest(("experiment/bands.py", "experiment/calibration.py", "experiment/calibration_bench.py"))
-    what = {**simulate.identity, "values": dict(values), "calibrated": names, "calibration code": code}
+    what = {
+        **simulate.identity,
+        "values": dict(values),
+        "calibrated": names,
+        "calibration code": code_digest(CALIBRATION),
+    }
     path = folder.path / "features" / f"calibration-{digest(what)[:24]}.npz"
     if not path.is_file():
         found = experiment.calibrate(values)
         if found is None:
             return None
         write_npz(path, names=np.array(found.names), estimate=found.estimate, covariance=found.covariance)
-    with np.load(path, allow_pickle=False) as kept:
-        return Calibration(tuple(str(name) for name in kept["names"]), kept["estimate"], kept["covariance"])
+    kept = read_npz(path, ("names", "estimate", "covariance"))
+    return Calibration(tuple(str(name) for name in kept["names"]), kept["estimate"], kept["covariance"])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from splatsoil.errors import ParameterError, RunError
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from splatsoil.inverse.criticism.simulations import Simulations
     from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.model import Model
+    from splatsoil.soil.effect import Effect
 
 
 def model_of(folder: RunFolder, device: str, report: Report) -> Model:
@@ -42,13 +43,9 @@ def experiment_of(
     from splatsoil.commands._stages import digest_of
     from splatsoil.experiment.plow import PlowExperiment
     from splatsoil.inverse.criticism.simulations import Simulations
-    from splatsoil.soil.library import find_effects
 
     named = None if effects is None else tuple(effects)
-    wanted = None if named is None else find_effects(named)
-    for effect in wanted or ():
-        if effect.name in {e.name for e in model.law.effects}:
-            raise ParameterError(f"effect {effect.name} is on already; name one that is off")
+    wanted = None if named is None else off_effects(named, model.law.effects)
     fit = folder.fit()
     experiment = PlowExperiment(model, tuple(fit["parameters"]), candidates=wanted)
     identity = {
@@ -62,6 +59,21 @@ def experiment_of(
         "layout": list(experiment.layout.shape),
     }
     return experiment, Simulations(experiment, folder.path / "features", identity)
+
+
+def off_effects(names: Iterable[str], on: Iterable[Effect]) -> tuple[Effect, ...]:
+    """Effects by name, or from files, that are none of those that are on.
+
+    Raises:
+        ParameterError: one is unknown, or on already.
+    """
+    from splatsoil.soil.library import find_effects
+
+    wanted, taken = find_effects(names), {effect.name for effect in on}
+    for effect in wanted:
+        if effect.name in taken:
+            raise ParameterError(f"effect {effect.name} is on already; name one that is off")
+    return wanted
 
 
 def diagnosed(
@@ -241,13 +253,13 @@ def entry(fit: dict[str, Any], refit: dict[str, Any]) -> dict[str, Any]:
 
 def pictured(folder: RunFolder) -> bool:
     """Whether there are pictures at the latest fit's estimate."""
-    from splatsoil.files import read_json
     from splatsoil.report.data import estimates
+    from splatsoil.run_files import COMPARISON_FORMAT, read_kept
 
     path, fit = folder.comparison / "comparison.json", folder.fit()
     if not path.is_file():
         return False
-    data = read_json(path)
+    data = read_kept(path, COMPARISON_FORMAT)
     return bool(data["fit"] == fit["name"] and data["parameters"] == estimates(fit))
 
 
@@ -266,31 +278,42 @@ def keep_pictures(folder: RunFolder) -> None:
 def latest_diagnosis(folder: RunFolder, effect: str) -> dict[str, Any] | None:
     """The diagnosis of the latest fit by the code as it is, an effect or its file among it, if there is one."""
     from splatsoil.commands._control import code_of
-    from splatsoil.files import read_json
     from splatsoil.report.data import estimates
+    from splatsoil.run_files import DIAGNOSIS_FORMAT, read_kept
 
     fit = folder.fit()
     path = folder.path / "diagnoses" / f"{fit['name']}.json"
     if not path.is_file():
         return None
-    data = read_json(path)
+    data = read_kept(path, DIAGNOSIS_FORMAT)
     code = code_of((*fit["setup"]["effects"], effect))
     return data if data["values"] == estimates(fit) and data.get("code") == code else None
 
 
 def history(folder: RunFolder) -> list[dict[str, Any]]:
     """The models tried so far, the first one first."""
-    from splatsoil.files import read_json
+    return list(_history(folder).get("models", ()))
+
+
+def adding(folder: RunFolder) -> dict[str, Any]:
+    """What `remember` was last told of an addition that is under way; nothing where none is."""
+    return dict(_history(folder).get("adding", {}))
+
+
+def _history(folder: RunFolder) -> dict[str, Any]:
+    from splatsoil.run_files import HISTORY_FORMAT, read_kept
 
     path = folder.path / "history.json"
-    return list(read_json(path)["models"]) if path.is_file() else []
+    return read_kept(path, HISTORY_FORMAT) if path.is_file() else {}
 
 
-def remember(folder: RunFolder, entries: list[dict[str, Any]]) -> Path:
-    """Keep the models tried."""
+def remember(folder: RunFolder, entries: list[dict[str, Any]], under_way: Mapping[str, Any] | None = None) -> Path:
+    """Keep the models tried, and what is needed to go on with an addition that is under way."""
     from splatsoil.files import write_json
+    from splatsoil.run_files import HISTORY_FORMAT
 
-    return write_json(folder.path / "history.json", {"format": "splatsoil-history/1", "models": entries})
+    more = {"adding": dict(under_way)} if under_way else {}
+    return write_json(folder.path / "history.json", {"format": HISTORY_FORMAT, "models": entries, **more})
 
 
 def check_budget(options: Options) -> None:

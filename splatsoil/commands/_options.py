@@ -11,6 +11,11 @@ from typing import Annotated, Literal
 import tyro
 from tyro.conf import Positional
 
+from splatsoil.errors import ParameterError
+
+Option = tuple[str, object, object]
+"""Name, value and usual value of an option."""
+
 #: Evaluations for each free parameter, unless the user says how many.
 EVALUATIONS = 10
 
@@ -48,8 +53,8 @@ class FitOptions:
             return self.run
         return Path("runs") / (f"{name}-{self.preset}" + (f"-seed{self.seed}" if self.seed else ""))
 
-    def again(self, command: str) -> str:
-        """The command line that means this."""
+    def again(self, command: str, *others: Option) -> str:
+        """The command line that means this, and other options besides."""
         return command_line(
             command,
             (self.set,),
@@ -63,14 +68,31 @@ class FitOptions:
                 ("--device", self.device, "auto"),
                 ("--seed", self.seed, 0),
                 ("--run", self.run, None),
+                *others,
+                ("--json", self.json, False),
             ),
         )
 
 
-def command_line(command: str, positional: Iterable[object], options: Iterable[tuple[str, object, object]]) -> str:
-    """A command as a shell takes it; options are (name, value, usual value), and usual ones are left out."""
+def command_line(command: str, positional: Iterable[object], options: Iterable[Option] = ()) -> str:
+    """A command as a shell takes it; options are (name, value, usual value), and usual ones are left out.
+
+    What is True is a flag.
+    """
     words = ["splatsoil", command, *(str(word) for word in positional)]
     for name, value, usual in options:
-        if value != usual:
+        if value is True and usual is False:
+            words.append(name)
+        elif value != usual:
             words += [name, *map(str, value)] if isinstance(value, tuple) else [name, str(value)]
     return shlex.join(words)
+
+
+def check_evaluations(budget: int | None) -> None:
+    """ParameterError for a fit of too few evaluations.
+
+    Raises:
+        ParameterError: see above.
+    """
+    if budget is not None and budget < 2:
+        raise ParameterError(f"--budget: a fit needs at least 2 evaluations, not {budget}")

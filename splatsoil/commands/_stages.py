@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import hashlib
+import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from splatsoil.commands._options import EVALUATIONS, FitOptions
+from splatsoil.commands._control import own_files
+from splatsoil.commands._options import EVALUATIONS, FitOptions, check_evaluations
 from splatsoil.errors import MeasurementError, ParameterError, RunError
 
 if TYPE_CHECKING:
@@ -39,8 +41,7 @@ def prepare(options: FitOptions) -> tuple[Measurement, RunFolder]:
     from splatsoil.soil.law import Law
     from splatsoil.soil.library import find_effects
 
-    if options.budget is not None and options.budget < 2:
-        raise ParameterError(f"--budget: a fit needs at least 2 evaluations, not {options.budget}")
+    check_evaluations(options.budget)
     if options.coarse is not None and options.search == "paper":
         raise ParameterError("--search paper knows one resolution; leave --coarse out")
     if not 0 <= options.seed < 2**63:
@@ -65,6 +66,7 @@ def prepare(options: FitOptions) -> tuple[Measurement, RunFolder]:
         seed=options.seed,
         version=__version__,
     )
+    run.check_writable()
     return measurement, run
 
 
@@ -84,7 +86,10 @@ def reconstructed(measurement: Measurement, run: RunFolder, device: str, report:
     }
     if (run.reconstruction / "reconstruction.json").is_file():
         report("reading", 0.0)
-        kept = Reconstruction.load(run.reconstruction)
+        try:
+            kept = Reconstruction.load(run.reconstruction)
+        except RunError as error:
+            raise RunError(f"{error}: delete the folder {run.reconstruction} and run the command again") from error
         if all(kept.metadata.get(key) == value for key, value in wanted.items()):
             return kept
     made = reconstruct(measurement, seed=seed, device=device, preset=preset, progress=report)
@@ -159,14 +164,13 @@ def fitted(
 
     ``refitted`` is the estimate and its std of a diagnosis' refit, where there is one: it is kept as the fit's.
     """
-    from splatsoil import __version__
     from splatsoil.envs.levels import is_full
     from splatsoil.envs.measured import LOSS, MeasuredProblem
-    from splatsoil.files import code_digest
     from splatsoil.inverse.fitting import FitSetup, fit
 
     space = model.space(options.parameters or None)
     budget = options.budget or EVALUATIONS * len(space)
+    version, code = sources(options.effects)
     setup = FitSetup(
         measurement=measurement.hash,
         reconstruction=digest_of(model.reconstruction),
@@ -175,8 +179,8 @@ def fitted(
         preset=options.preset,
         device=model.device,
         seed=options.seed,
-        version=__version__,
-        code=code_digest(others=[name for name in options.effects if name.endswith(".py")]),
+        version=version,
+        code=code,
         loss=LOSS,
         search=options.search,
         coarse=options.coarse,
@@ -204,12 +208,46 @@ def fitted(
     return fit(problem, run, setup, budget=budget, facts=facts(model), refitted=refitted, after_evaluation=told)
 
 
+def sources(effects: Iterable[str]) -> tuple[str, str]:
+    """Version and digest of the code that a fit with some effects would be made by now."""
+    from splatsoil import __version__
+    from splatsoil.files import code_digest
+
+    return __version__, code_digest(others=own_files(effects))
+
+
+def note_other_sources(run: RunFolder) -> None:
+    """Say on stderr, in one line, if the latest fit was made by other sources than these."""
+    from splatsoil.commands._anew import anew
+
+    fit = run.fit()
+    setup = fit["setup"]
+    then = (setup.get("version"), setup.get("code"))
+    try:
+        now = sources(setup["effects"])
+    except RunError as error:
+        print(f"splatsoil: {run.path}: effects that it was fitted with are gone ({error})", file=sys.stderr)
+        return
+    if then != now:
+        print(
+            f"splatsoil: {run.path} was fitted by splatsoil {then[0]}, code {then[1]}, and this is {now[0]}, code "
+            f"{now[1]}; this makes it anew: {anew(run, fit)}",
+            file=sys.stderr,
+        )
+
+
 def compared(run: RunFolder, model: Model, report: Report) -> dict[str, Any]:
     """Simulate at the latest fit's estimate, and keep pictures and losses of every frame in ``comparison/``."""
+    with run.lock():
+        return _compared(run, model, report)
+
+
+def _compared(run: RunFolder, model: Model, report: Report) -> dict[str, Any]:
     from splatsoil import __version__
     from splatsoil.envs.measured import LOSS, MeasuredProblem
     from splatsoil.files import write_json
-    from splatsoil.report.data import COMPARISON_FORMAT, estimates
+    from splatsoil.report.data import estimates
+    from splatsoil.run_files import COMPARISON_FORMAT
 
     result = run.fit()
     values = estimates(result)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
-from splatsoil.commands._options import FitOptions
+from splatsoil.commands._options import FitOptions, check_evaluations, command_line
 from splatsoil.commands._output import print_json
 
 if TYPE_CHECKING:
@@ -45,6 +45,7 @@ class Config:
 def run(config: Config) -> int:
     """Refit with each effect, keep the history, draw the report."""
     from splatsoil.commands import _criticism as criticism
+    from splatsoil.commands import _stages as stage
     from splatsoil.commands._progress import stages
     from splatsoil.envs.devices import resolve_device
     from splatsoil.errors import ParameterError
@@ -52,27 +53,40 @@ def run(config: Config) -> int:
     from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.quiet import hush
     from splatsoil.report import write_report
+    from splatsoil.report.data import load
     from splatsoil.soil.law import Law
     from splatsoil.soil.library import find_effects
 
     hush()
     options = Options(repeats=config.repeats)
     criticism.check_budget(options)
+    check_evaluations(config.budget)
     folder = RunFolder.open(config.run)
-    on = criticism.need_fit(folder)["setup"]["effects"]
+    fit = criticism.need_fit(folder)
+    on = fit["setup"]["effects"]
     if not config.effects:
         raise ParameterError("name an effect to add, for example: splatsoil add RUN cohesion")
     for name in config.effects:
         if len(find_effects([name])) != 1:
             raise ParameterError(f"{name} defines several effects; put each that is to be added into a file of its own")
-    Law(find_effects((*on, *config.effects)))
+    # All that the report will show: what is damaged is better known now than after hours.
+    load(folder.path)
+    before = criticism.adding(folder)
+    half_done = before.get("effects") == on
+    left = remaining(config.effects, on, before, half_done=half_done)
+    Law(find_effects((*on, *left)))
+    folder.check_writable()
     device = resolve_device(config.device)
+    stage.note_other_sources(folder)
     with stages(quiet=config.json) as begin:
-        for name in config.effects:
+        if half_done:
+            finished(folder, criticism.model_of(folder, device, begin("reconstruct")), fit, before, begin)
+        for name in left:
             model = criticism.model_of(folder, device, begin("reconstruct"))
-            added(folder, model, name, options, begin, budget=config.budget)
+            added(folder, model, name, options, begin, budget=config.budget, command=config.effects)
         begin("report")("drawing figures", 0.0)
         page = write_report(folder.path)
+    criticism.remember(folder, criticism.history(folder))
     entries = criticism.history(folder)
     if config.json:
         print_json({"ok": True, "run": str(folder.path), "report": str(page), "models": entries})
@@ -84,8 +98,39 @@ def run(config: Config) -> int:
 
 def interrupted(config: Config) -> str:
     """Simulations and evaluations are kept one by one."""
-    words = " ".join(config.effects)
-    return f"finished simulations are kept; go on with: splatsoil add {config.run} {words}"
+    again = command_line(
+        "add",
+        (config.run, *config.effects),
+        (
+            ("--budget", config.budget, None),
+            ("--repeats", config.repeats, 4),
+            ("--device", config.device, "auto"),
+            ("--json", config.json, False),
+        ),
+    )
+    return f"finished simulations are kept; go on with: {again}"
+
+
+def remaining(effects: Sequence[str], on: Sequence[str], before: Mapping[str, Any], *, half_done: bool) -> list[str]:
+    """Effects that are still to be added: a command that was interrupted, and is given again, goes on.
+
+    Args:
+        effects: of the command.
+        on: of the latest fit.
+        before: the addition that was under way, see `splatsoil.commands._criticism.adding`.
+        half_done: whether its fit is the latest.
+
+    Raises:
+        ParameterError: one is on that this command didn't put in.
+    """
+    from splatsoil.commands._criticism import off_effects
+    from splatsoil.soil.library import find_effects
+
+    mine = set(before["done"] if before.get("command") == list(effects) else ())
+    mine |= {before["effect"]} if half_done else set()
+    left = [name for name in effects if not (name in on and name in mine)]
+    off_effects(left, find_effects(on))
+    return left
 
 
 def added(
@@ -96,8 +141,12 @@ def added(
     begin: Callable[[str], Report],
     *,
     budget: int | None = None,
+    command: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """One effect more: confirmation on hidden frames, full fit, comparison; returns the new entry of the history."""
+    """One effect more: confirmation on hidden frames, full fit, comparison; returns the new entry of the history.
+
+    ``command`` is all the effects that are being added, where one command adds several.
+    """
     from splatsoil.commands import _criticism as criticism
     from splatsoil.commands import _stages as stage
     from splatsoil.soil.library import find_effects
@@ -131,15 +180,40 @@ def added(
     if not criticism.pictured(folder):
         stage.compared(folder, model, begin("compare"))
     refitted = {name: (with_it["values"][name], with_it["stds"][name]) for name in fitting.parameters}
+    under_way = {
+        "command": list(command),
+        "done": list(command[: command.index(name)]) if command else [],
+        "effect": name,
+        "effects": sorted(effects),
+        "refit": {key: with_it[key] for key in ("values", "held_out", "floor")},
+        "line": {"added": effect.name, "fall": base["chi2"] - with_it["chi2"]},
+    }
+    # Before the fit is the latest one: from then on nothing else knows what it was made from.
+    criticism.remember(folder, entries, under_way)
     begun = begin(f"fit with {effect.name}")
     result = stage.fitted(fitting, model.measurement, folder, larger, begun, refitted=refitted)
-    criticism.keep_pictures(folder)
-    stage.compared(folder, larger, begin("compare"))
-    fresh = criticism.entry(result, with_it)
-    fresh["added"] = effect.name
-    fresh["fall"] = base["chi2"] - with_it["chi2"]
-    entries = [*entries, fresh]
-    criticism.remember(folder, entries)
+    return finished(folder, larger, result, under_way, begin)
+
+
+def finished(
+    folder: RunFolder,
+    model: Model,
+    fit: dict[str, Any],
+    under_way: Mapping[str, Any],
+    begin: Callable[[str], Report],
+) -> dict[str, Any]:
+    """What is left to do once the fit with the new effect is the latest one; returns the new entry of the history."""
+    from splatsoil.commands import _criticism as criticism
+    from splatsoil.commands import _stages as stage
+
+    if not criticism.pictured(folder):
+        criticism.keep_pictures(folder)
+        stage.compared(folder, model, begin("compare"))
+    fresh = {**criticism.entry(fit, under_way["refit"]), **under_way["line"]}
+    # Until all of the command is done, what it has put in is known to be its own.
+    command, done = under_way["command"], [*under_way["done"], under_way["effect"]]
+    rest = {"command": command, "done": done} if command else None
+    criticism.remember(folder, [*criticism.history(folder), fresh], rest)
     return fresh
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from tyro.conf import Positional
 
+from splatsoil.commands._options import command_line
 from splatsoil.commands._output import print_json
 
 #: Chance below which a block is called off: of any block, with nothing wrong.
@@ -56,7 +57,9 @@ def run(config: Config) -> int:
     criticism.check_budget(options)
     folder = RunFolder.open(config.run)
     folder.fit()
+    folder.check_writable()
     device = resolve_device(config.device)
+    stage.note_other_sources(folder)
     misfit = None
     with stages(quiet=config.json) as begin:
         model = criticism.model_of(folder, device, begin("reconstruct"))
@@ -75,7 +78,18 @@ def run(config: Config) -> int:
 
 def interrupted(config: Config) -> str:
     """Simulations for the floor are kept one by one."""
-    return f"the comparison was not finished; start again with: splatsoil compare {config.run}"
+    again = command_line(
+        "compare",
+        (config.run,),
+        (
+            ("--repeats", config.repeats, 4),
+            ("--quick", config.quick, False),
+            ("--no-replay", not config.replay, False),
+            ("--device", config.device, "auto"),
+            ("--json", config.json, False),
+        ),
+    )
+    return f"the comparison was not finished; start again with: {again}"
 
 
 def show(result: Mapping[str, Any], folder: str, adequate: bool | None = None) -> None:
@@ -136,4 +150,5 @@ def show_misfit(misfit: Mapping[str, Any], run: str) -> None:
     for sentence in misfit["sentences"]:
         console.print(sentence)
     ask = "Could these data show a missing effect?" if misfit["adequate"] else "Which effect is missing?"
-    console.print(f"{ask} splatsoil diagnose {escape(run)}")
+    # Wrapped, it couldn't be pasted.
+    console.print(f"{ask} {escape(command_line('diagnose', (run,)))}", soft_wrap=True)

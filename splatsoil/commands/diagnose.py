@@ -7,6 +7,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
+from splatsoil.commands._options import command_line
 from splatsoil.commands._output import print_json
 
 
@@ -26,7 +27,8 @@ class Config:
     repeats: int = 4
     """Simulations with other seeds, to know what chance does."""
     refits: int = 3
-    """Effects, the best ones, to refit."""
+    """Effects, the best ones, to refit; one more where slow waves show a misfit or the fit lies on a bound: those that
+    would explain most by themselves are tried there, too."""
     refit_steps: int = 5
     """Simulations from each point where a refit starts; some ten to twenty more follow."""
     replay: bool = True
@@ -41,19 +43,24 @@ class Config:
 def run(config: Config) -> int:
     """Diagnose; the result goes into the run folder."""
     from splatsoil.commands import _criticism as criticism
+    from splatsoil.commands import _stages as stage
     from splatsoil.commands._diagnosis_table import show
     from splatsoil.commands._progress import stages
     from splatsoil.envs.devices import resolve_device
     from splatsoil.inverse.criticism.diagnosis import Options
     from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.quiet import hush
+    from splatsoil.soil.library import find_effects
 
     hush()
     options = Options(repeats=config.repeats, refits=config.refits, refit_steps=config.refit_steps)
     criticism.check_budget(options)
     folder = RunFolder.open(config.run)
-    criticism.need_fit(folder)
+    on = criticism.need_fit(folder)["setup"]["effects"]
+    criticism.off_effects(config.effects, find_effects(on))
+    folder.check_writable()
     device = resolve_device(config.device)
+    stage.note_other_sources(folder)
     with stages(quiet=config.json) as begin:
         model = criticism.model_of(folder, device, begin("reconstruct"))
         result = criticism.diagnosed(folder, model, options, begin, config.effects, with_replay=config.replay)
@@ -67,7 +74,20 @@ def run(config: Config) -> int:
 
 def interrupted(config: Config) -> str:
     """Simulations are kept one by one."""
-    return f"finished simulations are kept; go on with: splatsoil diagnose {config.run}"
+    again = command_line(
+        "diagnose",
+        (config.run,),
+        (
+            ("--effects", config.effects, ()),
+            ("--repeats", config.repeats, 4),
+            ("--refits", config.refits, 3),
+            ("--refit-steps", config.refit_steps, 5),
+            ("--no-replay", not config.replay, False),
+            ("--device", config.device, "auto"),
+            ("--json", config.json, False),
+        ),
+    )
+    return f"finished simulations are kept; go on with: {again}"
 
 
 def _finite(result: dict) -> dict:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from splatsoil.commands._options import command_line
 from splatsoil.commands._output import print_json
 from splatsoil.errors import ParameterError
 
@@ -31,11 +32,11 @@ class Config:
     values: Annotated[tuple[str, ...], tyro.conf.arg(name="set", metavar="NAME=VALUE …")] = ()
     """Parameters of the effects."""
     strain: float = 0.2
-    """Largest logarithmic strain: of the axis, or of shear."""
+    """Largest logarithmic strain: of the axis, or of shear; at most 10."""
     pressure: float | None = None
     """Largest pressure of the isotropic test in Pa; ten times the confining stress unless given."""
     records: int = 100
-    """Points of the curve."""
+    """Points of the curve, 2 to 100000."""
     void_ratio: float = 0.8
     """At the start."""
     young: float = 5.0e7
@@ -54,6 +55,8 @@ class Config:
     """Print one JSON object with all records instead of a table."""
 
 
+#: A specimen strained by more is none any more; a curve of more points says no more.
+LARGEST_STRAIN, MOST_RECORDS = 10.0, 100_000
 #: Lines of the table.
 ROWS = 12
 #: Least height of a plot: of stresses, in parts of the largest; of volume strain and void ratio.
@@ -73,6 +76,8 @@ def run(config: Config) -> int:
         raise ParameterError("the friction angle is given by --friction-angle, not by --set")
     if config.records < 2:
         raise ParameterError(f"--records: a curve needs at least 2 points, not {config.records}")
+    if config.records > MOST_RECORDS:
+        raise ParameterError(f"--records: a curve may have {MOST_RECORDS} points at most, not {config.records}")
     if config.plot.suffix not in (".png", ".svg", ".pdf"):
         raise ParameterError(f"--plot {config.plot}: give a file that ends in .png, .svg or .pdf")
     law = Law(find_effects(config.effects))
@@ -119,8 +124,8 @@ def perform(law: Law, values: dict[str, float], config: Config) -> ElementTest:
     from splatsoil.soil.element import Options, isotropic_compression, simple_shear, triaxial
     from splatsoil.soil.matching import Matching
 
-    if not config.strain > 0.0:
-        raise ParameterError(f"--strain: {config.strain} is not a positive strain")
+    if not 0.0 < config.strain <= LARGEST_STRAIN:
+        raise ParameterError(f"--strain: {config.strain:g} is not a strain above 0 and up to {LARGEST_STRAIN:g}")
     options = Options(
         void_ratio=config.void_ratio,
         young=config.young,
@@ -206,4 +211,26 @@ def show(columns: dict[str, Any], config: Config) -> None:
 
 def interrupted(config: Config) -> str:
     """A plot is written whole or not at all."""
-    return f"the plot was not written; start again with: splatsoil element --test {config.test}"
+    again = command_line(
+        "element",
+        (),
+        (
+            ("--test", config.test, "triaxial"),
+            ("--confining", config.confining, 100e3),
+            ("--friction-angle", config.friction_angle, 35.0),
+            ("--with", config.effects, ()),
+            ("--set", config.values, ()),
+            ("--strain", config.strain, 0.2),
+            ("--pressure", config.pressure, None),
+            ("--records", config.records, 100),
+            ("--void-ratio", config.void_ratio, 0.8),
+            ("--young", config.young, 5.0e7),
+            ("--poisson", config.poisson, 0.2),
+            ("--strain-rate", config.strain_rate, 1.0e-5),
+            ("--depth", config.depth, 0.0),
+            ("--matching", config.matching, "compression"),
+            ("--plot", config.plot, Path("element.png")),
+            ("--json", config.json, False),
+        ),
+    )
+    return f"the plot was not written; start again with: {again}"

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from splatsoil.commands._options import FitOptions
+from splatsoil.commands._options import FitOptions, command_line
 from splatsoil.commands._output import print_json
 
 
@@ -34,7 +34,7 @@ def run(config: Config) -> int:
     else:
         show(result, str(folder.path))
         print("The ± leaves out what other numerics would say. Where the model is adequate, they are weighed, too, by:")
-        print(f"splatsoil compare {folder.path}")
+        print(command_line("compare", (folder.path,)))
     return 0
 
 

@@ -37,13 +37,11 @@ class Config:
 
 def run(config: Config) -> int:
     """Simulate what is missing, emulate, sample; ``posterior.json`` and the folder ``posterior`` are kept."""
-    from splatsoil import __version__
     from splatsoil.commands import _stages as stage
     from splatsoil.commands._progress import stages
     from splatsoil.envs.devices import resolve_device
     from splatsoil.envs.measured import MeasuredProblem
     from splatsoil.errors import ParameterError
-    from splatsoil.files import code_digest
     from splatsoil.inverse.executors import executor
     from splatsoil.inverse.posterior_run import Effort, run_posterior, setup_of
     from splatsoil.inverse.run_folder import RunFolder
@@ -62,8 +60,7 @@ def run(config: Config) -> int:
         raise ParameterError(
             f"--device {config.device}: the fit in {folder.path} was made on {setup.device}; give the same or fit again"
         )
-    own = [name for name in setup.effects if name.endswith(".py")]
-    if setup.version != __version__ or setup.code != code_digest(others=own):
+    if (setup.version, setup.code) != stage.sources(setup.effects):
         raise ParameterError(
             f"{folder.path}: the fit was made by other sources of splatsoil; fit again before the posterior"
         )
@@ -101,6 +98,7 @@ def interrupted(config: Config) -> str:
             ("--executor", config.executor, "serial"),
             ("--device", config.device, "auto"),
             ("--seed", config.seed, 0),
+            ("--json", config.json, False),
         ),
     )
     return f"what was simulated and sampled is kept; go on with: {again}"

@@ -75,6 +75,7 @@ def interrupted(config: Config) -> str:
             ("--seed", config.seed, 0),
             ("--device", config.device, "auto"),
             ("--holdout", config.holdout, 8),
+            ("--json", config.json, False),
         ),
     )
     return f"nothing was written; start again with: {again}"

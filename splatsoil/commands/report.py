@@ -7,6 +7,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
+from splatsoil.commands._options import command_line
 from splatsoil.commands._output import print_json
 
 
@@ -22,8 +23,11 @@ class Config:
 
 def run(config: Config) -> int:
     """Write the page; RunError when the folder has no finished fit."""
+    from splatsoil.commands import _stages as stage
+    from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.report import write_report
 
+    stage.note_other_sources(RunFolder.open(config.run))
     path = write_report(config.run)
     if config.json:
         print_json({"ok": True, "report": str(path)})
@@ -34,4 +38,5 @@ def run(config: Config) -> int:
 
 def interrupted(config: Config) -> str:
     """The page is written whole or not at all."""
-    return f"the page was not written; start again with: splatsoil report {config.run}"
+    again = command_line("report", (config.run,), (("--json", config.json, False),))
+    return f"the page was not written; start again with: {again}"

@@ -6,7 +6,7 @@ import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from splatsoil.commands._options import FitOptions
+from splatsoil.commands._options import FitOptions, Option, command_line
 from splatsoil.commands._output import print_json
 
 if TYPE_CHECKING:
@@ -39,11 +39,15 @@ class Config(FitOptions):
     most_effects: int = 2
     """Most effects that may be added."""
 
-    def again(self, command: str) -> str:
-        """The command line that means this."""
-        flags = (("--criticise", self.criticise), ("--stop-at-floor", self.stop_at_floor))
-        words = [super().again(command), *(flag for flag, on in flags if on)]
-        return " ".join(words + ([f"--most-effects {self.most_effects}"] if self.most_effects != 2 else []))
+    def again(self, command: str, *others: Option) -> str:
+        """The command line that means this, and other options besides."""
+        return super().again(
+            command,
+            ("--criticise", self.criticise, False),
+            ("--stop-at-floor", self.stop_at_floor, False),
+            ("--most-effects", self.most_effects, 2),
+            *others,
+        )
 
 
 def run(config: Config) -> int:
@@ -130,7 +134,8 @@ def loop(folder: RunFolder, model: Model, most: int, begin: Callable[[str], Repo
             return diagnosis, "nothing stands above what noise, chance and numerics leave"
         if diagnosis["verdict"] != "missing" and diagnosis["explained"] < WORTH_TRYING:
             nearest = diagnosis["class"][0] if diagnosis["class"] else ""
-            hint = f"; the nearest is {nearest}: splatsoil add {folder.path} {nearest} tries it" if nearest else ""
+            tries = command_line("add", (folder.path, nearest))
+            hint = f"; the nearest is {nearest}: {tries} tries it" if nearest else ""
             return diagnosis, f"no effect of the library explains all that is left{hint}"
         if count == most:
             return diagnosis, f"{most} effects have been added, which is the limit (--most-effects)"

@@ -104,6 +104,7 @@ def interrupted(config: Config) -> str:
             ("--device", config.device, "cpu"),
             ("--views", config.views, None),
             ("--picture-scale", config.picture_scale, 1.0),
+            ("--json", config.json, False),
         ),
     )
     return f"nothing was written; start again with: {again}"

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from splatsoil.errors import RunError
 from splatsoil.files import read_json, write_bytes, write_json
 from splatsoil.reconstruction.height_field import HeightField
+from splatsoil.run_files import RECONSTRUCTION_FORMAT
 from splatsoil.splats import Gaussians, save_ply
 
-FORMAT = "splatsoil-reconstruction/1"
 FILES = ("reconstruction.json", "gaussians.npz", "gaussians.ply", "surface.npz", "soil.ply")
 
 
@@ -82,7 +82,7 @@ class Reconstruction:
     def summary(self) -> dict[str, Any]:
         """The numbers, in JSON's types."""
         return {
-            "format": FORMAT,
+            "format": RECONSTRUCTION_FORMAT,
             **self.metadata,
             "seconds": self.seconds,
             "gaussians": len(self.gaussians),
@@ -134,8 +134,10 @@ class Reconstruction:
         """
         source = Path(folder)
         facts = read_json(source / "reconstruction.json")
-        if not isinstance(facts, dict) or facts.get("format") != FORMAT:
-            raise RunError(f"{source / 'reconstruction.json'}: is not of the format {FORMAT}; reconstruct again")
+        if not isinstance(facts, dict) or facts.get("format") != RECONSTRUCTION_FORMAT:
+            raise RunError(
+                f"{source / 'reconstruction.json'}: is not of the format {RECONSTRUCTION_FORMAT}; reconstruct again"
+            )
         try:
             arrays = _load_npz(source / "gaussians.npz")
             heights = _load_npz(source / "surface.npz")

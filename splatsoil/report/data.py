@@ -9,15 +9,19 @@ from typing import Any
 
 import numpy as np
 
-from splatsoil.errors import RunError
-from splatsoil.files import read_json
-
-FIT_FORMAT = "splatsoil-fit/1"
-COMPARISON_FORMAT = "splatsoil-comparison/1"
-DIAGNOSIS_FORMAT = "splatsoil-diagnosis/1"
-MISFIT_FORMAT = "splatsoil-misfit/1"
-POSTERIOR_FORMAT = "splatsoil-posterior/1"
-HISTORY_FORMAT = "splatsoil-history/1"
+from splatsoil.files import read_npz
+from splatsoil.run_files import (
+    COMPARISON_FORMAT,
+    DIAGNOSIS_FORMAT,
+    FIT_FORMAT,
+    HISTORY_FORMAT,
+    MISFIT_FORMAT,
+    POSTERIOR_FORMAT,
+    RECONSTRUCTION_FORMAT,
+    read_description,
+    read_fit,
+    read_kept,
+)
 
 
 @dataclass(frozen=True)
@@ -75,17 +79,8 @@ def load(folder: str | Path) -> RunData:
         RunError: it isn't one, has no finished fit, or a file in it is damaged.
     """
     path = Path(folder)
-    if not (path / "run.json").is_file():
-        raise RunError(f"{path}: isn't a run folder (it has no run.json); name one made by `splatsoil fit`")
-    run = read_json(path / "run.json")
-    if not isinstance(run, dict) or "measurement" not in run:
-        raise RunError(
-            f"{path / 'run.json'}: doesn't say what the run is for; it is damaged, choose another run folder"
-        )
-    if not (path / "fit.json").is_file():
-        raise RunError(f"{path}: no fit has been finished here; `splatsoil fit` goes on where it stopped")
-    fit = _checked(path / "fit.json", FIT_FORMAT)
-    fits = {file.stem: _checked(file, FIT_FORMAT) for file in sorted((path / "fits").glob("*.json"))}
+    run, fit = read_description(path), read_fit(path)
+    fits = {file.stem: read_kept(file, FIT_FORMAT) for file in sorted((path / "fits").glob("*.json"))}
     return RunData(
         folder=path,
         run=run,
@@ -102,13 +97,6 @@ def load(folder: str | Path) -> RunData:
     )
 
 
-def _checked(path: Path, format_tag: str) -> dict[str, Any]:
-    data = read_json(path)
-    if not isinstance(data, dict) or data.get("format") != format_tag:
-        raise RunError(f"{path}: isn't of format {format_tag}; run the command that made it again")
-    return data
-
-
 def estimates(fit: Mapping[str, Any]) -> dict[str, float]:
     """The fitted values by name."""
     return {name: float(entry["estimate"]) for name, entry in fit["parameters"].items()}
@@ -118,7 +106,7 @@ def _comparison(folder: Path, fit: Mapping[str, Any]) -> dict[str, Any] | None:
     """The comparison, unless it was made at another estimate."""
     if not (folder / "comparison.json").is_file():
         return None
-    data = _checked(folder / "comparison.json", COMPARISON_FORMAT)
+    data = read_kept(folder / "comparison.json", COMPARISON_FORMAT)
     same = data["fit"] == fit["name"] and data["parameters"] == estimates(fit)
     return data if same else None
 
@@ -127,13 +115,13 @@ def _misfit(path: Path, fit: Mapping[str, Any]) -> dict[str, Any] | None:
     """The latest fit against the noise floor, unless that was another estimate."""
     if not path.is_file():
         return None
-    data = _checked(path, MISFIT_FORMAT)
+    data = read_kept(path, MISFIT_FORMAT)
     return data if data["fit"] == fit["name"] and data["values"] == estimates(fit) else None
 
 
 def _before(folder: Path) -> dict[str, Any] | None:
     path = folder / "comparison.json"
-    return _checked(path, COMPARISON_FORMAT) if path.is_file() else None
+    return read_kept(path, COMPARISON_FORMAT) if path.is_file() else None
 
 
 def _diagnosis(folder: Path, fits: Mapping[str, Any], fit: Mapping[str, Any]) -> dict[str, Any] | None:
@@ -142,7 +130,7 @@ def _diagnosis(folder: Path, fits: Mapping[str, Any], fit: Mapping[str, Any]) ->
     for name, other in fits.items():
         path = folder / f"{name}.json"
         if path.is_file():
-            data = _checked(path, DIAGNOSIS_FORMAT)
+            data = read_kept(path, DIAGNOSIS_FORMAT)
             if data["values"] == estimates(other):
                 found[name] = data
     if fit["name"] in found:
@@ -156,24 +144,21 @@ def _posterior(path: Path, fit: Mapping[str, Any]) -> dict[str, Any] | None:
     """The posterior, unless it was sampled for another fit."""
     if not path.is_file():
         return None
-    data = _checked(path, POSTERIOR_FORMAT)
+    data = read_kept(path, POSTERIOR_FORMAT)
     return data if data["setup"] == fit.get("setup") else None
 
 
 def _history(path: Path) -> list[dict[str, Any]]:
-    return list(_checked(path, HISTORY_FORMAT)["models"]) if path.is_file() else []
+    return list(read_kept(path, HISTORY_FORMAT)["models"]) if path.is_file() else []
 
 
 def _reconstruction(folder: Path) -> dict[str, Any] | None:
     path = folder / "reconstruction.json"
-    return read_json(path) if path.is_file() else None
+    return read_kept(path, RECONSTRUCTION_FORMAT) if path.is_file() else None
 
 
 def _surface(path: Path) -> Surface | None:
     if not path.is_file():
         return None
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            return Surface(arrays["x"], arrays["y"], arrays["height"])
-    except (OSError, ValueError, KeyError) as error:
-        raise RunError(f"{path}: cannot be read ({error}); reconstruct again") from error
+    remedy = f"delete the folder {path.parent}; `splatsoil fit` makes it anew"
+    return Surface(**read_npz(path, ("x", "y", "height"), remedy=remedy))

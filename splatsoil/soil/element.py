@@ -26,6 +26,8 @@ Values = Mapping[str, float] | Sequence[Mapping[str, float]]
 
 TOLERANCE = 1.0e-5
 """Largest miss of a wanted stress, relative to the test's stress."""
+MOST_STEPS = 10_000_000
+"""Steps of the law that a test may take, over all of its records; a strain of 1 takes 5000 of the usual ones."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,8 @@ class Options(TypedDict, total=False):
         poisson: Poisson's ratio; 0.2 by default.
         strain_rate: of the controlled strain, 1/s; only effects of rate feel it. 1e-5 by default.
         depth: below the undisturbed surface in m, 0 by default; only effects of depth feel it.
-        largest_step: most strain in one step of the law, so that records may lie far apart; 2e-4 by default.
+        largest_step: most strain in one step of the law, so that records may lie far apart; 2e-4 by default. A test
+            that would take more than 10 million steps is refused.
         matching: of the friction cone; triaxial compression by default.
     """
 
@@ -205,7 +208,13 @@ def drive(
     start = np.array([confining if s else 0.0 for s in by_stress] + [0.0])
     moves = np.diff(np.vstack([start, targets]), axis=0)
     way = np.abs(np.where([*by_stress, False], moves / (3.0 * bulk), moves)).max(axis=1)
-    steps = np.maximum(np.ceil(way / largest_step - 1e-9), 1).astype(np.int32)
+    needed = np.maximum(np.ceil(way / largest_step - 1e-9), 1)
+    if not needed.sum() <= MOST_STEPS:
+        raise ParameterError(
+            f"element test: the path would take {needed.sum():.3g} steps of a strain of {largest_step:g}, and "
+            f"{MOST_STEPS} are the most; give a shorter path or a longer step"
+        )
+    steps = needed.astype(np.int32)
     seconds = np.maximum(way, 1.0e-12) / steps / strain_rate
 
     sets, records = len(batch), len(targets)

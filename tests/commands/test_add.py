@@ -85,7 +85,7 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
     monkeypatch.setattr(_criticism, "latest_diagnosis", lambda folder, effect: {"refits": made.refits})
     monkeypatch.setattr(_criticism, "confirmed", lambda *others: {"refits": made.confirmed})
     monkeypatch.setattr(_criticism, "history", lambda folder: made.history)
-    monkeypatch.setattr(_criticism, "remember", lambda folder, entries: setattr(made, "history", entries))
+    monkeypatch.setattr(_criticism, "remember", lambda folder, entries, *_: setattr(made, "history", entries))
     monkeypatch.setattr(_criticism, "pictured", lambda folder: True)
     monkeypatch.setattr(_criticism, "keep_pictures", lambda folder: None)
     monkeypatch.setattr(_stages, "compared", lambda *others: {})
@@ -127,7 +127,8 @@ def test_a_diagnosis_by_other_code_is_none(tmp_path: Path) -> None:
     fit = {"name": "base", "setup": {"effects": []}, "parameters": {"friction_angle": {"estimate": 30.0}}}
     folder = cast(Any, SimpleNamespace(fit=lambda: fit, path=tmp_path))
     assert _criticism.latest_diagnosis(folder, "cohesion") is None
-    data = {"values": {"friction_angle": 30.0}, "code": _control.code_of(())}
+    data = {"format": "splatsoil-diagnosis/1", "model": [], "refits": {}, "values": {"friction_angle": 30.0}}
+    data["code"] = _control.code_of(())
     for change, known in ({}, True), ({"code": "of yesterday"}, False), ({"values": {"friction_angle": 31.0}}, False):
         write_json(tmp_path / "diagnoses" / "base.json", {**data, **change})
         assert (_criticism.latest_diagnosis(folder, "cohesion") is not None) is known

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from splatsoil import cli
+from splatsoil.commands.element import LARGEST_STRAIN, MOST_RECORDS
 
 
 def test_the_triaxial_test_as_json_with_a_plot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -57,11 +58,23 @@ def test_the_other_tests(
         (["--with", "exposure", "--set", "exposure_gain=1.1"], "effect exposure does not act on a specimen"),
         (["--plot", "curve.txt"], "ends in .png, .svg or .pdf"),
         (["--records", "1"], "--records: a curve needs at least 2 points"),
+        (["--records", "1000000000000"], "--records: a curve may have 100000 points at most"),
+        (["--strain", "1e9"], "--strain: 1e+09 is not a strain above 0 and up to 10"),
+        (["--strain", "0"], "--strain: 0 is not a strain above 0"),
+        (["--strain", "nan"], "--strain: nan is not a strain above 0"),
+        (["--test", "isotropic", "--pressure", "1e30"], "6e+25 steps"),
     ],
 )
 def test_mistakes_are_said_in_a_sentence(words: list[str], says: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["element", *words]) == 2
     assert says in capsys.readouterr().err
+
+
+def test_the_limits_are_in_the_help(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["element", "--help"])
+    told = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert f"at most {LARGEST_STRAIN:g}." in told and f"2 to {MOST_RECORDS}." in told
 
 
 def test_commands_and_python_of_the_documents_run(

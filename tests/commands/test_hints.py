@@ -5,20 +5,35 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import shlex
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 import tyro
 
+from splatsoil import cli
+from splatsoil.commands import _criticism, _stages, compare, fit, run
+
 GIVEN = {
-    "reconstruct": "'my set' --out a/b --preset tiny --seed 3 --device cpu --holdout 0",
+    "reconstruct": "'my set' --out a/b --preset tiny --seed 3 --device cpu --holdout 0 --json",
     "simulate": "out --friction-angle 31.5 --with cohesion tilt --set cohesion=300 tilt_x=-2 --scene plow --depth 0.09 "
-    "--preset tiny --seed 4 --particle-seed 5 --views 12 --picture-scale 0.5 --device cuda:0 --like 'a set'",
-    "posterior": "runs/a --design 7 --repeats 2 --checks 0 --executor processes:2 --device cpu --seed 1",
+    "--preset tiny --seed 4 --particle-seed 5 --views 12 --picture-scale 0.5 --device cuda:0 --like 'a set' --json",
+    "posterior": "runs/a --design 7 --repeats 2 --checks 0 --executor processes:2 --device cpu --seed 1 --json",
     "fit": "nowhere --parameters friction_angle --with cohesion --budget 9 --coarse tiny --preset fine --device cpu "
-    "--seed 2 --run 'a run'",
+    "--seed 2 --run 'a run' --json",
     "run": "nowhere --parameters friction_angle --with cohesion --budget 9 --coarse tiny --preset fine --device cpu "
-    "--seed 2 --run 'a run' --criticise --most-effects 3",
+    "--seed 2 --run 'a run' --criticise --most-effects 3 --json",
+    "compare": "'a run' --repeats 2 --quick --no-replay --device cpu --json",
+    "diagnose": "'a run' --effects cohesion 'my effects/crust.py' --repeats 2 --refits 1 --refit-steps 2 --no-replay "
+    "--device cpu --json",
+    "add": "'a run' --budget 9 --repeats 2 --device cpu --json",
+    "report": "'a run' --json",
+    "element": "--test isotropic --confining 5e4 --friction-angle 30 --with dilatancy 'my effects/crust.py' --set "
+    "dilatancy_angle=9 --strain 0.1 --pressure 1e6 --records 20 --void-ratio 0.7 --young 1e7 --poisson 0.3 "
+    "--strain-rate 1e-3 --depth 0.1 --matching extension --plot 'a plot.svg' --json",
 }
+POSITIONAL = {"element": 0}
 
 
 @pytest.mark.parametrize("command", GIVEN)
@@ -26,9 +41,8 @@ GIVEN = {
 def test_the_hint_is_the_command_that_was_given(command: str, how: str) -> None:
     module = importlib.import_module(f"splatsoil.commands.{command}")
     words = shlex.split(GIVEN[command])
-    config = tyro.cli(module.Config, args=words if how == "everything" else words[:1])
+    config = parsed(module.Config, words if how == "everything" else words[: POSITIONAL.get(command, 1)])
     assert how == "nothing" or {f.name for f in dataclasses.fields(config) if _usual(config, f)} <= {
-        "json",
         "search",
         "scene",
         "stop_at_floor",
@@ -36,7 +50,50 @@ def test_the_hint_is_the_command_that_was_given(command: str, how: str) -> None:
     hint = module.interrupted(config)
     again = shlex.split(hint[hint.index("splatsoil ") :])
     assert again[:2] == ["splatsoil", command]
-    assert tyro.cli(module.Config, args=again[2:]) == config
+    assert parsed(module.Config, again[2:]) == config
+
+
+def test_effects_that_are_added_are_told_again() -> None:
+    module = importlib.import_module("splatsoil.commands.add")
+    config = parsed(module.Config, ["a run", "cohesion", "my effects/crust.py"])
+    assert module.interrupted(config).endswith(": splatsoil add 'a run' cohesion 'my effects/crust.py'")
+
+
+def test_the_hints_after_a_fit_and_a_comparison_can_be_pasted(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """From a terminal that is too narrow for them, too."""
+    monkeypatch.setenv("COLUMNS", "40")
+    folder = "runs/of the year/with a long name"
+    test = {"dispersion": 1.2, "p": 0.2}
+    compare.show_misfit({"blocks": [], "misfit": test, "adequate": False, "sentences": []}, folder)
+    assert f"Which effect is missing? splatsoil diagnose '{folder}'\n" in capsys.readouterr().out
+
+    monkeypatch.setattr(_stages, "prepare", lambda config: (None, SimpleNamespace(path=folder)))
+    for stage in ("reconstructed", "model_on", "fitted"):
+        monkeypatch.setattr(_stages, stage, lambda *_: {})
+    monkeypatch.setattr(fit, "show", lambda *_: None)
+    assert fit.run(fit.Config(Path("set"))) == 0
+    assert f"\nsplatsoil compare '{folder}'\n" in capsys.readouterr().out
+
+    diagnosis = {"verdict": "outside the library", "class": ["tilt"], "explained": 0.2}
+    monkeypatch.setattr(_criticism, "diagnosed", lambda *_: diagnosis)
+    _, why = run.loop(cast(Any, SimpleNamespace(path=folder)), cast(Any, None), 2, lambda _: lambda what, share: None)
+    assert f": splatsoil add '{folder}' tilt tries it" in why
+
+
+def test_the_help_says_when_one_effect_more_is_refitted(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["diagnose", "--help"])
+    told = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert (
+        "Effects, the best ones, to refit; one more where slow waves show a misfit or the fit lies on a bound" in told
+    )
+
+
+def parsed(config: Any, words: list[str]) -> Any:
+    """As the command line parses them."""
+    return tyro.cli(config, args=words, config=(tyro.conf.FlagCreatePairsOff,))
 
 
 def _usual(config: object, field: dataclasses.Field) -> bool:

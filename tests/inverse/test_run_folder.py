@@ -52,7 +52,7 @@ def test_an_empty_folder_is_taken(tmp_path: Path) -> None:
     assert prepare(tmp_path).path == tmp_path
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", '{"format": "other/1"}'])
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"format": "other/1"}', '{"format": "splatsoil-run/1"}'])
 def test_a_broken_description_gets_one_sentence(tmp_path: Path, text: str) -> None:
     (tmp_path / "run.json").write_text(text)
     with pytest.raises(RunError, match=r"run\.json"):
@@ -62,6 +62,8 @@ def test_a_broken_description_gets_one_sentence(tmp_path: Path, text: str) -> No
 def test_opening_what_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(RunError, match="no such run folder"):
         RunFolder.open(tmp_path / "nothing")
+    with pytest.raises(RunError, match=r"`splatsoil fit SET --run '.*/not here'`"):
+        RunFolder.open(tmp_path / "not here")
     with pytest.raises(RunError, match=r"no run\.json"):
         RunFolder.open(tmp_path)
 
@@ -70,10 +72,24 @@ def test_the_latest_fit_and_the_earlier_ones(tmp_path: Path) -> None:
     run = prepare(tmp_path)
     with pytest.raises(RunError, match="no fit"):
         run.fit()
-    run.write_fit("base", {"loss": 2.0})
-    run.write_fit("cohesion", {"loss": 1.0})
-    assert run.fit() == {"loss": 1.0}
-    assert read_json(tmp_path / "fits" / "base.json") == {"loss": 2.0}
+    first, second = (
+        {"format": "splatsoil-fit/1", "name": name, "parameters": {}, "setup": {"effects": [], "preset": "tiny"}}
+        for name in ("base", "cohesion")
+    )
+    run.write_fit("base", first)
+    run.write_fit("cohesion", second)
+    assert run.fit() == second
+    assert read_json(tmp_path / "fits" / "base.json") == first
+
+
+def test_a_run_that_another_process_writes_into_is_not_writable(tmp_path: Path) -> None:
+    run = prepare(tmp_path)
+    run.check_writable()
+    with run.lock(), pytest.raises(RunError, match="another process is writing"):
+        run.check_writable()
+    (tmp_path / "comparison").write_text("in the way")
+    with pytest.raises(RunError, match="comparison"):
+        run.check_writable()
 
 
 def test_a_write_that_fails_leaves_the_old_file_and_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -64,7 +64,7 @@ def fit(name: str, angle: float, effects: list[str], extra: dict[str, float]) ->
         "device": "cpu",
         "preset": "tiny",
         "version": "0",
-        "setup": {"effects": effects},
+        "setup": {"effects": effects, "preset": "tiny"},
         "notes": [],
         "facts": {},
         "curves": {k: {"x": list(x), "mean": list(x**2), "std": [1.0] * 11} for k in parameters},
@@ -103,7 +103,12 @@ def run(tmp_path: Path, diagnosis: dict[str, Any]) -> Path:
     after = fit("effect 2", 1.0, ["effect 2"], {"effect 2": 7.0})
     write_json(
         tmp_path / "run.json",
-        {"format": "splatsoil-run/1", "measurement": {"name": "emulated", "folder": "sets/e", "hash": "ab" * 32}},
+        {
+            "format": "splatsoil-run/1",
+            "measurement": {"name": "emulated", "folder": "sets/e", "hash": "ab" * 32},
+            "preset": "tiny",
+            "seed": 0,
+        },
     )
     for each in (base, after):
         write_json(tmp_path / "fits" / f"{each['name']}.json", each)
@@ -114,7 +119,8 @@ def run(tmp_path: Path, diagnosis: dict[str, Any]) -> Path:
         kept = {
             k: {"estimate": p["estimate"], "std": p["std"], "unit": p["unit"]} for k, p in each["parameters"].items()
         }
-        models.append({"model": each["name"], "parameters": kept, "loss": 0.2, "held_out": error, "floor": 1.24})
+        line = {"model": each["name"], "effects": each["setup"]["effects"], "parameters": kept}
+        models.append({**line, "loss": 0.2, "held_out": error, "floor": 1.24})
     models[1]["added"] = "effect 2"
     write_json(tmp_path / "history.json", {"format": "splatsoil-history/1", "models": models})
     comparison(tmp_path / "before", base, 40)

@@ -52,6 +52,7 @@ def fit(name: str = "base", **changes: Any) -> dict[str, Any]:
         "device": "cpu",
         "preset": "small",
         "version": "0.1.0",
+        "setup": {"effects": [], "preset": "small"},
         "notes": [],
         "facts": {"cell": "20 mm", "time step": "0.25 ms"},
         "curves": {"friction_angle": {"x": list(x), "mean": list((x - 35.6) ** 2), "std": [0.1] * 31}},
@@ -87,12 +88,24 @@ def fit(name: str = "base", **changes: Any) -> dict[str, Any]:
 def make_run(folder: Path, name: str = "plow", *, compare: bool = True, **changes: Any) -> Path:
     write_json(
         folder / "run.json",
-        {"format": "splatsoil-run/1", "measurement": {"name": name, "folder": "sets/plow", "hash": "ab" * 32}},
+        {
+            "format": "splatsoil-run/1",
+            "measurement": {"name": name, "folder": "sets/plow", "hash": "ab" * 32},
+            "preset": "small",
+            "seed": 5,
+        },
     )
     latest = fit(**changes)
     write_json(folder / "fit.json", latest)
     write_json(folder / "fits" / f"{latest['name']}.json", latest)
-    reconstruction = {"held_out": [{}, {}], "psnr": 31.24, "ssim": 0.931, "gaussians": 24011, "seconds": 131.0}
+    reconstruction = {
+        "format": "splatsoil-reconstruction/1",
+        "held_out": [{}, {}],
+        "psnr": 31.24,
+        "ssim": 0.931,
+        "gaussians": 24011,
+        "seconds": 131.0,
+    }
     write_json(folder / "reconstruction" / "reconstruction.json", reconstruction)
     x, y = np.linspace(0.0025, 0.0975, 20), np.linspace(0.0025, 0.0475, 10)
     np.savez(folder / "reconstruction" / "surface.npz", x=x, y=y, height=0.1 + 0.1 * y[:, None] * x)
@@ -268,6 +281,10 @@ def test_same_files_same_page(tmp_path: Path) -> None:
     assert write_report(tmp_path).read_bytes() == write_report(tmp_path).read_bytes()
 
 
+def cut_short(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-100])
+
+
 @pytest.mark.parametrize(
     ("damage", "says"),
     [
@@ -279,6 +296,15 @@ def test_same_files_same_page(tmp_path: Path) -> None:
         (lambda f: (f / "comparison" / "left_0_observed.jpg").unlink(), "left_0_observed.jpg"),
         (lambda f: (f / "comparison" / "left_0_observed.jpg").write_text("<svg>"), "neither PNG nor JPEG"),
         (lambda f: (f / "reconstruction" / "surface.npz").write_text("x"), r"surface\.npz"),
+        (
+            lambda f: cut_short(f / "reconstruction" / "surface.npz"),
+            r"surface\.npz.*; delete the folder .*reconstruction;",
+        ),
+        (
+            lambda f: (f / "reconstruction" / "reconstruction.json").write_text("[]"),
+            "reconstruction.json: isn't of format",
+        ),
+        (lambda f: (f / "history.json").write_text('{"format": "splatsoil-history/1"}'), "history.json.*lacks models"),
     ],
 )
 def test_what_is_missing_or_damaged_is_named(tmp_path: Path, damage: Any, says: str) -> None:
@@ -371,10 +397,10 @@ def posterior(folder: Path, setup: dict[str, Any]) -> None:
 
 
 def test_a_posterior_is_told_and_what_it_leaves_open_has_no_number(tmp_path: Path) -> None:
-    folder = make_run(tmp_path, setup={"agent": "bayesopt", "effects": []})
+    folder = make_run(tmp_path, setup={"agent": "bayesopt", "effects": [], "preset": "small"})
     before = write_report(folder).read_text()
     assert "What the pictures leave possible" not in before
-    posterior(folder, {"agent": "bayesopt", "effects": []})
+    posterior(folder, {"agent": "bayesopt", "effects": [], "preset": "small"})
     text = write_report(folder).read_text()
     page = Page(text)
     told = " ".join(" ".join(page.words).split())
@@ -390,12 +416,21 @@ def test_a_posterior_is_told_and_what_it_leaves_open_has_no_number(tmp_path: Pat
 
 
 def test_a_posterior_of_another_fit_is_not_shown(tmp_path: Path) -> None:
-    folder = make_run(tmp_path, setup={"agent": "bayesopt", "effects": ["cohesion"]})
+    folder = make_run(tmp_path, setup={"agent": "bayesopt", "effects": ["cohesion"], "preset": "small"})
     posterior(folder, {"agent": "bayesopt", "effects": []})
     assert "What the pictures leave possible" not in write_report(folder).read_text()
 
 
-@pytest.mark.parametrize("text", ['{"format": "splatsoil-run/1", "meas', "[]", "{}"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        '{"format": "splatsoil-run/1", "meas',
+        "[]",
+        "{}",
+        '{"format": "splatsoil-run/1"}',
+        '{"format": "splatsoil-run/9", "measurement": {"name": "", "folder": "", "hash": ""}, "preset": "", "seed": 0}',
+    ],
+)
 def test_a_damaged_run_json_is_named_before_anything_else(tmp_path: Path, text: str) -> None:
     (tmp_path / "run.json").write_text(text)
     with pytest.raises(RunError, match=r"run\.json"):

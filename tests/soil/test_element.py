@@ -74,6 +74,15 @@ def test_records_do_not_hang_on_the_size_of_steps() -> None:
     np.testing.assert_allclose(coarse.volume_strain, fine.volume_strain, atol=2e-4)
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_path_that_would_never_end_is_refused() -> None:
+    """Its steps are more than a 32-bit number holds, too."""
+    with pytest.raises(ParameterError, match=r"5e\+12 steps .* 10000000 are the most"):
+        triaxial(Law(), {}, confining=1e5, strains=[1e9])
+    with pytest.raises(ParameterError, match="steps"):
+        simple_shear(Law(), {}, confining=1e5, strains=[0.1], largest_step=1e-12)
+
+
 def test_a_stress_that_the_soil_cannot_bear_is_an_error() -> None:
     """At 35 deg and 10 kPa the strength is 36.90 kPa: under stress control, 36 kPa are reached and 38 kPa are not."""
 

@@ -28,6 +28,7 @@ from splatsoil.files import plain
 FloatArray = npt.NDArray[np.float64]
 OPTIONS = Options()
 WORLD = 77
+MEASURE = next(c.measure for c in emulated(WORLD).candidates if c.name == "effect 2")
 
 
 @pytest.fixture(scope="module")
@@ -208,31 +209,41 @@ def test_an_effect_that_leaves_more_than_noise_is_not_all_that_is_missing(error:
 
 
 @pytest.mark.parametrize(
-    ("error", "misfit", "p", "left", "unseen", "named"),
+    ("error", "misfit", "p", "left", "unseen", "ratio", "named"),
     [
-        (0.7, CLEAN, 0.3, 0.97, 9.0, False),
-        (0.7, CLEAN, 0.3, 0.8, 9.0, False),
-        (0.7, CLEAN, 0.001, 0.8, 9.0, True),
-        (0.7, CLEAN, 0.001, 0.97, 9.0, False),
-        (0.7, OFF, 0.3, 0.97, 9.0, True),
-        (1.5, CLEAN, 0.3, 0.97, 9.0, False),
-        (1.5, CLEAN, 0.3, 0.8, 9.0, True),
-        (1.5, OFF, 0.3, 0.97, 9.0, True),
-        (1.5, OFF, 0.3, 0.97, -1.0, False),
+        (0.7, CLEAN, 0.3, 0.97, 9.0, 5.0, False),
+        (0.7, CLEAN, 0.3, 0.8, 9.0, 5.0, False),
+        (0.7, CLEAN, 0.001, 0.8, 9.0, 5.0, True),
+        (0.7, CLEAN, 0.001, 0.97, 9.0, 5.0, False),
+        (0.7, OFF, 0.3, 0.97, 9.0, 5.0, True),
+        (1.5, CLEAN, 0.3, 0.97, 9.0, 5.0, False),
+        (1.5, CLEAN, 0.3, 0.8, 9.0, 5.0, True),
+        (1.5, CLEAN, 0.001, 0.8, 9.0, 1.2, False),
+        (1.5, OFF, 0.3, 0.97, 9.0, 1.2, True),
+        (1.5, OFF, 0.3, 0.97, -1.0, 5.0, False),
     ],
 )
 def test_nothing_is_missing_where_nothing_is_to_be_explained(
-    sizes: dict[str, float], error: float, misfit: Omnibus, p: float, left: float, unseen: float, named: bool
+    sizes: dict[str, float],
+    error: float,
+    misfit: Omnibus,
+    p: float,
+    left: float,
+    unseen: float,
+    ratio: float,
+    named: bool,
 ) -> None:
-    """A refit that explains much; error on hidden times, slow waves and the effect's score may be chance before it, and
-    so much is left."""
+    """A refit that explains much; error on hidden times, slow waves and the effect's score may be chance before it, so
+    much is left, and its size is so many of its standard deviations."""
     diagnosed = one(WORLD, {"angle": 1.0, "effect 2": 5.0 * sizes["effect 2"]}, None, OPTIONS)
     found, score = diagnosed.confirmations, replace(diagnosed.scores["effect 2"], adjusted=p, dispersion=1.0)
     before, after = found[""], found["effect 2"]
     floor = before.held_out / error
     held_out = left * before.held_out
-    told = {"": replace(before, floor=floor), "effect 2": replace(after, floor=floor, held_out=held_out, unseen=unseen)}
-    assert stands(told, "effect 2", misfit, score) is named
+    stds = {"effect 2": abs(after.values["effect 2"]) / ratio}
+    after = replace(after, floor=floor, held_out=held_out, unseen=unseen, stds=stds)
+    told = {"": replace(before, floor=floor), "effect 2": after}
+    assert stands(told, "effect 2", misfit, score, MEASURE) is named
 
 
 @pytest.mark.parametrize(("told", "unseen", "named"), [(1e-5, -1.0, True), (1e-5, -9.0, False), (1e-3, -1.0, False)])
@@ -244,20 +255,20 @@ def test_what_other_pictures_say_beyond_doubt_the_soil_need_only_not_deny(
     floor = found[""].held_out / 0.7
     after = replace(found["effect 2"], floor=floor, held_out=found[""].held_out, unseen=unseen, told=told)
     told_of = {"": replace(found[""], floor=floor), "effect 2": after}
-    assert stands(told_of, "effect 2", Omnibus(60.0, 72, 0.5), score) is named
+    assert stands(told_of, "effect 2", Omnibus(60.0, 72, 0.5), score, MEASURE) is named
 
 
 def test_what_other_pictures_say_beyond_doubt_is_named_before_what_soil_shows(sizes: dict[str, float]) -> None:
     found = one(WORLD, {"angle": 1.0, "effect 2": 5.0 * sizes["effect 2"]}, None, OPTIONS)
     big = found.confirmations["effect 2"]
     told = {"": found.confirmations[""], "effect 2": big, "clock": replace(big, fall=0.5 * big.fall, told=1e-9)}
-    scores = {**found.scores, "clock": found.scores["effect 2"]}
+    scores, measures = {**found.scores, "clock": found.scores["effect 2"]}, dict.fromkeys(told, MEASURE)
     costs = {name: -c.fall for name, c in told.items() if name}
-    assert members_of(told, costs, found.misfit, scores) == ("clock",)
+    assert members_of(told, costs, found.misfit, scores, measures) == ("clock",)
     doubtful = {**told, "clock": replace(told["clock"], told=0.01)}
-    assert members_of(doubtful, costs, found.misfit, scores)[0] == "effect 2"
+    assert members_of(doubtful, costs, found.misfit, scores, measures)[0] == "effect 2"
     denied = {**told, "clock": replace(told["clock"], unseen=-50.0)}
-    assert members_of(denied, costs, found.misfit, scores)[0] == "effect 2"
+    assert members_of(denied, costs, found.misfit, scores, measures)[0] == "effect 2"
 
 
 def test_what_explains_nothing_is_no_equal_however_wide_the_doubt(sizes: dict[str, float]) -> None:
@@ -265,9 +276,9 @@ def test_what_explains_nothing_is_no_equal_however_wide_the_doubt(sizes: dict[st
     best, asis = found.confirmations["effect 2"], found.confirmations[""]
     doubt = replace(best, remainder=Omnibus(72.0 * best.fall, 72, 0.5))
     told = {"": asis, "effect 2": doubt, "little": replace(best, fall=0.1), "nothing": replace(best, fall=0.0)}
-    scores = dict.fromkeys(told, found.scores["effect 2"])
+    scores, measures = dict.fromkeys(told, found.scores["effect 2"]), dict.fromkeys(told, MEASURE)
     costs = {name: -c.fall for name, c in told.items() if name}
-    assert members_of(told, costs, found.misfit, scores) == ("effect 2", "little")
+    assert members_of(told, costs, found.misfit, scores, measures) == ("effect 2", "little")
 
 
 def test_what_other_pictures_rule_out_is_not_named_however_well_it_explains_soil(sizes: dict[str, float]) -> None:

@@ -1,0 +1,207 @@
+"""Files of a run folder that are damaged or of other sources, as commands meet them: before any work."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from splatsoil.inverse.run_folder import RunFolder
+
+from splatsoil import cli
+from splatsoil.commands import _control, _criticism, _stages
+from splatsoil.commands._options import FitOptions
+from splatsoil.errors import RunError
+from splatsoil.files import write_json, write_npz
+
+ALL = ("compare", "diagnose", "add", "report", "posterior")
+
+
+def words(command: str, run: RunFolder) -> list[str]:
+    return [command, str(run.path), *(["cohesion"] if command == "add" else [])]
+
+
+@pytest.mark.usefixtures("no_work")
+@pytest.mark.parametrize(
+    ("file", "text", "says", "commands"),
+    [
+        ("fit.json", "{}", "isn't of format splatsoil-fit/1", ALL),
+        ("fit.json", "[]", "isn't of format splatsoil-fit/1", ALL),
+        ("fit.json", '{"format": "splatsoil-fit/1", "name": "base"}', "lacks parameters", ALL),
+        (
+            "fit.json",
+            '{"format": "splatsoil-fit/1", "name": "base", "parameters": {"friction_angle": {}}}',
+            "lacks parameters.friction_angle.estimate",
+            ALL,
+        ),
+        (
+            "fit.json",
+            '{"format": "splatsoil-fit/1", "name": "base", "parameters": {}, "setup": {"effects": [3]}}',
+            "lacks setup.effects.0",
+            ALL,
+        ),
+        ("run.json", '{"format": "splatsoil-run/1"}', "lacks measurement", ALL),
+        ("run.json", '{"format": "splatsoil-run/1", "measurement": {}}', "lacks measurement.name", ALL),
+        ("run.json", '{"format": "splatsoil-run/2"}', "isn't of format splatsoil-run/1", ALL),
+        ("history.json", "{}", "isn't of format splatsoil-history/1", ("add", "report")),
+        (
+            "history.json",
+            '{"format": "splatsoil-history/1", "models": [{}]}',
+            "lacks models.0.model",
+            ("add", "report"),
+        ),
+        ("diagnoses/base.json", "{}", "isn't of format splatsoil-diagnosis/1", ("add", "report")),
+        ("comparison/comparison.json", "{}", "isn't of format splatsoil-comparison/1", ("add", "report")),
+    ],
+)
+def test_json_of_another_shape_is_named_before_any_work(
+    run: RunFolder, capsys: pytest.CaptureFixture[str], file: str, text: str, says: str, commands: tuple[str, ...]
+) -> None:
+    (run.path / file).parent.mkdir(exist_ok=True)
+    (run.path / file).write_text(text)
+    for command in commands:
+        assert cli.main(words(command, run)) == 2, command
+        out, err = capsys.readouterr()
+        assert out == "" and err.count("\n") == 1 and file in err and says in err, err
+        assert cli.main([*words(command, run), "--json"]) == 2
+        out, err = capsys.readouterr()
+        assert json.loads(out) == {"ok": False, "error": err.removeprefix("splatsoil: ").strip()}
+
+
+def test_a_fit_into_a_run_that_does_not_say_what_it_is_for_is_refused(
+    plow_dry: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "run.json").write_text('{"format": "splatsoil-run/1"}')
+    assert cli.main(["fit", str(plow_dry), "--run", str(tmp_path)]) == 2
+    assert "run.json: is damaged, it lacks measurement" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("no_work")
+@pytest.mark.parametrize("command", ["compare", "diagnose", "add"])
+def test_what_cannot_be_written_to_is_met_before_any_work(
+    run: RunFolder, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    with run.lock():
+        assert cli.main(words(command, run)) == 2
+    assert "another process is writing into this run folder" in capsys.readouterr().err
+    # root may write anywhere
+    monkeypatch.setattr(os, "access", lambda place, mode: Path(place) != run.path)
+    assert cli.main(words(command, run)) == 2
+    assert "cannot be written (Permission denied)" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("no_work")
+@pytest.mark.parametrize("command", ["fit", "run"])
+def test_a_fit_meets_another_process_before_any_work(
+    plow_dry: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    _, run = _stages.prepare(FitOptions(plow_dry, run=tmp_path))
+    with run.lock():
+        assert cli.main([command, str(plow_dry), "--run", str(tmp_path)]) == 2
+    assert "another process is writing into this run folder" in capsys.readouterr().err
+
+
+def test_pictures_are_written_by_one_process_at_a_time(run: RunFolder) -> None:
+    with run.lock(), pytest.raises(RunError, match="another process is writing"):
+        _stages.compared(run, cast(Any, None), lambda what, share: pytest.fail("work has begun"))
+
+
+class Kept:
+    """What criticism keeps in ``features/`` of a run: where, and how to ask for it."""
+
+    def __init__(self, run: RunFolder) -> None:
+        self.run = run
+        self.experiment = cast(Any, SimpleNamespace(candidates=()))
+        self.simulate = cast(Any, SimpleNamespace(identity={"preset": "tiny"}))
+
+    def control(self) -> np.ndarray:
+        """As a diagnosis asks for it, before it simulates."""
+        return _control.control(self.run, self.experiment, self.simulate, {}, lambda _: pytest.fail("made"), print)()
+
+    def calibration(self) -> Any:
+        return _control.calibrated(self.run, self.experiment, self.simulate, {})
+
+
+@pytest.mark.parametrize("length", [0, 40, -60])
+def test_a_control_that_was_cut_short_is_named_at_once(run: RunFolder, length: int) -> None:
+    kept = Kept(run)
+    path = _control.replay_path(run, kept.simulate)
+    path.parent.mkdir()
+    np.save(path, np.ones((3, 4)))
+    assert kept.control().shape == (1, 3, 4)
+    path.write_bytes(path.read_bytes()[:length])
+    with pytest.raises(RunError, match=rf"{path.name}: cannot be read .*; delete it and run the command again"):
+        _control.control(run, kept.experiment, kept.simulate, {}, lambda _: pytest.fail("made"), print)
+
+
+@pytest.mark.parametrize("length", [0, 40, -60])
+def test_a_calibration_that_was_cut_short_is_named(run: RunFolder, length: int) -> None:
+    kept = Kept(run)
+    kept.experiment.calibrate = lambda values: SimpleNamespace(
+        names=("pan",), estimate=np.zeros(1), covariance=np.eye(1)
+    )
+    assert kept.calibration().names == ("pan",)
+    (path,) = run.path.glob("features/calibration-*.npz")
+    path.write_bytes(path.read_bytes()[:length])
+    with pytest.raises(RunError, match=rf"{path.name}: cannot be read .*; delete it and run the command again"):
+        kept.calibration()
+    write_npz(path, names=np.array(["pan"]))
+    with pytest.raises(RunError, match="estimate"):
+        kept.calibration()
+
+
+def test_a_damaged_reconstruction_is_to_be_deleted(run: RunFolder) -> None:
+    write_json(run.reconstruction / "reconstruction.json", {"format": "splatsoil-reconstruction/1"})
+    measurement = cast(Any, SimpleNamespace(hash="a" * 64))
+    with pytest.raises(RunError, match=r"delete the folder .*my run/reconstruction and run the command again"):
+        _stages.reconstructed(measurement, run, "cpu", lambda what, share: None)
+
+
+@pytest.mark.parametrize("command", ["compare", "diagnose", "add", "report"])
+@pytest.mark.parametrize(
+    "change", [{}, {"version": "0.0.1"}, {"code": "of yesterday"}], ids=["same", "version", "code"]
+)
+def test_a_fit_by_other_sources_is_said_to_be_one(
+    run: RunFolder,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    command: str,
+    change: dict[str, str],
+    fit_of: Callable[..., dict[str, Any]],
+) -> None:
+    fit = fit_of()
+    fit["setup"] |= change
+    run.write_fit("base", fit)
+
+    def goes_on(*_: object, **__: object) -> None:
+        raise RunError("has gone on")
+
+    monkeypatch.setattr(_criticism, "model_of", goes_on)
+    monkeypatch.setattr("splatsoil.report.write_report", goes_on)
+    assert cli.main([*words(command, run), "--json"]) == 2
+    out, err = capsys.readouterr()
+    said, *last = err.splitlines() if change else ["", *err.splitlines()]
+    assert last == ["splatsoil: has gone on"] and json.loads(out)["error"] == "has gone on"
+    if change:
+        was = f"was fitted by splatsoil {fit['setup']['version']}, code {fit['setup']['code']}, and this is "
+        assert was in said and f"splatsoil fit '{run.path.parent}/my set' --parameters friction_angle" in said
+        assert said.endswith(f"--preset tiny --run '{run.path}'")
+
+
+def test_a_model_with_added_effects_is_made_anew_by_adding_them(
+    run: RunFolder, capsys: pytest.CaptureFixture[str], fit_of: Callable[..., dict[str, Any]]
+) -> None:
+    fits = [fit_of(), fit_of(["tilt"], tilt_x=1.0), fit_of(["cohesion", "tilt"], tilt_x=1.0, cohesion=100.0)]
+    entries = [_criticism.entry(fit, {"held_out": 1.0, "floor": 1.0, "values": {}}) for fit in fits]
+    _criticism.remember(run, entries)
+    fits[-1]["setup"]["code"] = "of yesterday"
+    run.write_fit("cohesion+tilt", fits[-1])
+    _stages.note_other_sources(run)
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "--with" not in said
+    assert said.strip().endswith(f"--run '{run.path}' && splatsoil add '{run.path}' tilt cohesion")

@@ -1,0 +1,141 @@
+"""What decides results is in the digest of the code, and damaged files get one sentence."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatsoil.commands._control import CALIBRATION, FEATURES, REPLAY
+from splatsoil.errors import RunError
+from splatsoil.files import FORWARD, RECONSTRUCTING, code_digest, read_npy, read_npz, write_npz
+
+#: Modules that results are made with, and why they don't decide one.
+NEUTRAL = {
+    "__init__.py": "the version, which each key has by itself",
+    "_version.py": "the version, which each key has by itself",
+    "deterministic.py": "the same numbers, always in the same order",
+    "errors.py": "words",
+    "files.py": "files, and the digest itself",
+    "run_files.py": "what kept files are called, and must hold",
+    "threads.py": "how many work at once",
+    "envs/__init__.py": "the names of environments",
+    "envs/devices.py": "the device, which each key has by itself",
+    "envs/levels.py": "which resolution is asked for, which each key has by itself",
+    "envs/problem.py": "what an evaluation is",
+}
+#: Of features: what is computed anew each time, or has a digest of its own.
+BESIDES = {
+    "experiment/bands.py": "of the calibration",
+    "experiment/calibration.py": "of the calibration",
+    "experiment/calibration_bench.py": "of the calibration",
+    "experiment/reproducibility.py": "what an estimate's std holds",
+    "experiment/states.py": "what a free strength is read over",
+    "experiment/strokes.py": "advice on other experiments",
+}
+
+
+def source(repository: Path, module: str) -> Path | None:
+    """The file of ``splatsoil.…``, where there is one."""
+    parts = module.split(".")[1:]
+    for root in (repository / "splatsoil", repository):
+        place = root.joinpath(*parts)
+        for file in (place / "__init__.py", place.with_suffix(".py")):
+            if file.is_file():
+                return file
+    return None
+
+
+def part(repository: Path, file: Path) -> str:
+    """A file's place in the package as installed."""
+    return file.relative_to(repository).as_posix().removeprefix("splatsoil/")
+
+
+def imported(repository: Path, file: Path) -> Iterator[Path]:
+    """Files of the package whose modules, or whose members, a file imports somewhere."""
+    package = ["splatsoil", *part(repository, file).split("/")[:-1]]
+    for node in ast.walk(ast.parse(file.read_text())):
+        names: list[str] = []
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = [] if node.level == 0 else package[: len(package) + 1 - node.level]
+            module = ".".join([*base, *([node.module] if node.module else [])])
+            names = [module, *(f"{module}.{alias.name}" for alias in node.names)]
+        for name in names:
+            found = source(repository, name) if name.split(".")[0] == "splatsoil" else None
+            if found is not None:
+                yield found
+
+
+def reached(repository: Path, start: str) -> set[str]:
+    """All that a module of the package imports, directly or not, and itself."""
+    left, seen = [source(repository, f"splatsoil.{start}")], set()
+    while left:
+        file = left.pop()
+        assert file is not None
+        if file not in seen:
+            seen.add(file)
+            left += imported(repository, file)
+    return {part(repository, file) for file in seen}
+
+
+@pytest.mark.parametrize(
+    ("start", "parts", "besides"),
+    [
+        ("reconstruction.pipeline", RECONSTRUCTING, {}),
+        ("model", FORWARD, {}),
+        ("envs.measured", FORWARD, {}),
+        ("experiment.plow", (*FORWARD, *FEATURES), BESIDES),
+        ("experiment.replay", (*FORWARD, *FEATURES, *REPLAY), BESIDES),
+        ("experiment.calibration", (*FORWARD, *FEATURES, *CALIBRATION), {}),
+    ],
+)
+def test_the_code_that_decides_a_result_is_in_its_digest(
+    repository: Path, start: str, parts: tuple[str, ...], besides: dict[str, str]
+) -> None:
+    found = reached(repository, start)
+    assert len(found) > 10
+    covered = {name for name in found for p in parts if name == p or name.startswith(f"{p}/")}
+    assert found - covered - {*NEUTRAL} - {*besides} == set()
+
+
+def test_every_part_of_a_digest_is_there(tmp_path: Path) -> None:
+    """One that were not would change nothing, unnoticed."""
+    nothing = code_digest(())
+    for name in (*FORWARD, *FEATURES, *REPLAY, *CALIBRATION):
+        assert code_digest((name,)) != nothing, name
+
+
+DAMAGE = {"empty": 0, "cut": -100}
+
+
+@pytest.mark.parametrize("length", DAMAGE.values(), ids=DAMAGE)
+def test_arrays_that_were_cut_short_get_one_sentence(tmp_path: Path, length: int) -> None:
+    one, several = tmp_path / "one.npy", tmp_path / "several.npz"
+    np.save(one, np.arange(30.0))
+    write_npz(several, a=np.arange(30.0), b=1.5)
+    np.testing.assert_array_equal(read_npy(one), np.arange(30.0))
+    assert read_npz(several, ("b",)) == {"b": 1.5}
+    for path in (one, several):
+        path.write_bytes(path.read_bytes()[:length])
+    with pytest.raises(RunError, match=r"one\.npy: cannot be read .*; delete it and run the command again"):
+        read_npy(one)
+    with pytest.raises(RunError, match=r"several\.npz: cannot be read .*; delete it and run the command again"):
+        read_npz(several, ("a",))
+
+
+def test_what_is_no_array_or_lacks_one_gets_one_sentence(tmp_path: Path) -> None:
+    path = write_npz(tmp_path / "several.npz", a=1.0)
+    with pytest.raises(RunError, match=r"several\.npz: cannot be read .*b.*; make another"):
+        read_npz(path, ("a", "b"), remedy="make another")
+    for read in (read_npy, lambda path: read_npz(path, ("a",))):
+        text = tmp_path / "text"
+        text.write_text("no array")
+        with pytest.raises(RunError, match="text: cannot be read"):
+            read(text)
+    with pytest.raises(RunError, match="no single array"):
+        read_npy(path)
