@@ -6,15 +6,18 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 from splatsoil.benchmarks._tally import wilson
 from splatsoil.benchmarks.hidden_effects import detectable, emulated, fitted, one, outside
+from splatsoil.inverse.criticism import diagnosis
 from splatsoil.inverse.criticism.diagnosis import Options, diagnose
 from splatsoil.inverse.criticism.misfit import Omnibus
 from splatsoil.inverse.criticism.naming import members_of, stands
+from splatsoil.inverse.criticism.own_floor import OwnFloor
 from splatsoil.inverse.criticism.record import record
 from splatsoil.inverse.criticism.simulations import Simulations
 from splatsoil.inverse.criticism.verdicts import of_effect, overall
@@ -49,6 +52,22 @@ def test_a_large_hidden_effect_is_named_its_size_found_and_the_error_falls(sizes
     # What was promised is about what came.
     fall = before.chi2 - best.chi2
     assert 0.4 < found.scores["effect 2"].statistic / fall < 2.5
+
+
+@pytest.mark.parametrize(("ratio", "verdict"), [(1.1, "missing"), (1.3, "outside the library")])
+def test_the_error_is_held_against_soil_that_has_the_effect(
+    sizes: dict[str, float], monkeypatch: pytest.MonkeyPatch, ratio: float, verdict: str
+) -> None:
+    """However loud soil without it is."""
+    own_floor = diagnosis.on_its_own_floor
+
+    def quieter(*arguments: Any) -> OwnFloor:
+        own = own_floor(*arguments)
+        return replace(own, refit=replace(own.refit, floor=own.refit.held_out / ratio))
+
+    monkeypatch.setattr(diagnosis, "on_its_own_floor", quieter)
+    found = one(WORLD, {"angle": 1.0, "effect 2": 5.0 * sizes["effect 2"]}, None, OPTIONS)
+    assert found.verdict == verdict and found.members[0] == "effect 2"
 
 
 def test_a_move_within_its_own_spread_is_not_called_bias(sizes: dict[str, float]) -> None:
