@@ -20,8 +20,9 @@ from splatsoil.benchmarks._common import keep_to_one_protocol, sources, stamp
 from splatsoil.benchmarks._hidden import NOTHING, Kind, Truth, count_up, draw, judge_all, kept
 from splatsoil.benchmarks._tally import Found, entry, table
 from splatsoil.inverse.criticism.confirmation import confirm
-from splatsoil.inverse.criticism.diagnosis import Bench, Diagnosis, Options, judge
+from splatsoil.inverse.criticism.diagnosis import Diagnosis, Options, judge
 from splatsoil.inverse.criticism.evidence import gather
+from splatsoil.inverse.criticism.misfit import smooth_basis
 from splatsoil.inverse.criticism.noise import Noise, Part
 from splatsoil.inverse.criticism.simulations import Simulations
 from splatsoil.inverse.executors import executor
@@ -187,20 +188,17 @@ def shuffled(experiment: EmulatedExperiment, generator: np.random.Generator) -> 
     return replace(experiment, slopes=moved(experiment.slopes), curves=moved(experiment.curves))
 
 
-def smallest_error(experiment: EmulatedExperiment, options: Options) -> str:
-    """What one would say without criticism: the effect whose refit ends with the smallest error on hidden frames, or ""
-    where the model as it is does."""
-    simulate = Simulations(experiment)
-    evidence = gather(experiment, simulate, {"angle": fitted(experiment)}, repeats=options.repeats)
-    bench = Bench.of(experiment, evidence, options)
+def smallest_error(experiment: EmulatedExperiment, diagnosis: Diagnosis, options: Options) -> str:
+    """What one would say without criticism, from a diagnosis' evidence: the effect whose refit ends with the smallest
+    error on hidden frames, or "" where the model as it is does."""
     refits = confirm(
         experiment,
-        evidence,
-        bench.floor,
-        bench.candidates,
-        simulate,
+        diagnosis.evidence,
+        diagnosis.floor,
+        experiment.candidates,
+        Simulations(experiment),
         options.refit_steps,
-        bench.basis,
+        smooth_basis(experiment.layout, diagnosis.floor.noise),
         lambda what, share: None,
     )
     return min(refits, key=lambda name: refits[name].held_out)
@@ -223,8 +221,9 @@ def judge_one(keep: Path, kind: Kind, number: int, seed: int, repeats: int, blin
         if kind.dropped:
             known = replace(known, candidates=tuple(c for c in known.candidates if c.name not in truth.sizes))
         known = replace(known, observed=observed)
-        blind = smallest_error(known, options) if blindly else None
-        return truth, replace(Found.of(diagnosed(known, options), "angle"), blind=blind)
+        diagnosis = diagnosed(known, options)
+        blind = smallest_error(known, diagnosis, options) if blindly else None
+        return truth, replace(Found.of(diagnosis, "angle"), blind=blind)
 
     return kept(keep, kind, number, make)
 

@@ -86,8 +86,8 @@ def run(config: Config) -> int:
             added(folder, model, name, options, begin, budget=config.budget, command=config.effects)
         begin("report")("drawing figures", 0.0)
         page = write_report(folder.path)
-    criticism.remember(folder, criticism.history(folder))
     entries = criticism.history(folder)
+    criticism.remember(folder, entries)
     if config.json:
         print_json({"ok": True, "run": str(folder.path), "report": str(page), "models": entries})
     else:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from splatsoil.benchmarks._hidden import NOTHING, Kind, Truth, hidden_and_named
 from splatsoil.benchmarks._tally import Found, confusion, tally
-from splatsoil.benchmarks.hidden_effects import KINDS, emulated, main, shuffled, smallest_error
+from splatsoil.benchmarks.hidden_effects import KINDS, diagnosed, emulated, main, shuffled, smallest_error
 from splatsoil.inverse.criticism.diagnosis import Options
 from splatsoil.inverse.criticism.verdicts import Verdict
 
@@ -40,10 +40,11 @@ def test_a_shuffled_library_keeps_each_cameras_values_and_the_models_own_trace()
 def test_the_smallest_error_of_all_refits_names_something_where_nothing_is_hidden() -> None:
     world = emulated(78)
     large = replace(world, observed=world.measured({"angle": 0.5, "effect 2": 9.0}, [78, 99]))
-    assert smallest_error(large, Options(repeats=4)) == "effect 2"
+    options = Options(repeats=4)
+    assert smallest_error(large, diagnosed(large, options), options) == "effect 2"
     # Eight refits with a parameter more than the model as it is: one of them is luckier.
     nothing = [replace(w, observed=w.measured({"angle": 0.5}, [78, k])) for k, w in enumerate(map(emulated, (78, 79)))]
-    assert any(smallest_error(w, Options(repeats=4)) for w in nothing)
+    assert any(smallest_error(w, diagnosed(w, options), options) for w in nothing)
 
 
 def test_names_are_counted_against_what_is_hidden() -> None:

@@ -86,6 +86,17 @@ def test_a_wild_numerics_pattern_does_not_stand_for_those_not_tried() -> None:
     assert floor_with(wild=30.0)[1] > 0.5
 
 
+def test_other_numerics_that_alone_act_as_an_effect_does_count_in_full_along_it() -> None:
+    """Each is of its own kind; of six guesses that are alike one such would be another kind of thing."""
+    generator = np.random.default_rng(6)
+    trace = generator.standard_normal(LAYOUT.shape)
+    patterns = {name: generator.standard_normal(LAYOUT.shape) for name in ("stiffness", "step", "grid", "rounding")}
+    told = replace(evidence(generator, {**patterns, "contact": trace}), directions={"effect": trace[None]})
+    experiment = looked(generator.standard_normal(LAYOUT.shape), np.zeros(LAYOUT.shape, dtype=bool))
+    # Along the trace it has the variance of all its features, and the four others hardly more than one's.
+    assert floor_of(experiment, told).parts["numerics"].on_directions > 0.1 * trace.size
+
+
 def test_numerics_and_parameters_that_change_nothing_are_no_trouble() -> None:
     generator = np.random.default_rng(4)
     nothing = np.zeros(LAYOUT.shape)
