@@ -19,10 +19,8 @@ from splatsoil.experiment.base import Candidate, Experiment
 
 from .evidence import STRIDE, Evidence, Run, Vantage, Visit, around, directions_of, look_from
 from .floor import Floor
-from .misfit import Omnibus
 from .sight import Sight
 from .simulations import Simulations
-from .verdicts import GATE
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -35,7 +33,7 @@ magnitude is known beforehand."""
 def look_afresh(
     experiment: Experiment,
     evidence: Evidence,
-    misfit: Omnibus,
+    off: bool,
     simulate: Simulations,
     floor: Floor,
     basis: FloatArray,
@@ -45,13 +43,13 @@ def look_afresh(
     Each of these in the shape in which it would explain most: as by default, or a decade off. Soil that dilates without
     end leaves other traces than soil that soon is loose.
 
-    None where nothing says that the fit was led astray (no misfit on slow waves, and no bound reached), where the fit
-    lies near the defaults, or where these can't be simulated.
+    None where nothing says that the fit was led astray (the model isn't ``off`` by more than noise, and no bound is
+    reached), where the fit lies near the defaults, or where these can't be simulated.
     """
     bound = any(len(around(p, evidence.values[p.name])) == 1 for p in experiment.parameters)
     own = {p.name: p.default for p in experiment.parameters if p.off is None}
     far = any(abs(evidence.values[name] - value) > evidence.widths[name] for name, value in own.items())
-    if not far or not (bound or misfit.p < GATE):
+    if not far or not (bound or off):
         return None
     there = {**evidence.values, **own}
     candidates = [c for c in experiment.candidates if c.kind == "physics" and c.name in evidence.directions]

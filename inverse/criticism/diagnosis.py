@@ -13,11 +13,12 @@ from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Calibration, Candidate, Experiment
 
 from .afresh import look_afresh, promising
+from .bench import Bench
 from .confirmation import Confirmation, confirm, remainder_of
 from .estimates import Estimate, weighed, weighed_there
 from .evidence import Evidence, Vantage, gather
-from .floor import Floor, floor_of
-from .misfit import Block, Omnibus, blocks, left_over, omnibus, shares, smooth_basis
+from .floor import Floor
+from .misfit import Block, Omnibus, left_over, shares
 from .naming import members_of
 from .outside import StrengthReading, read_strength
 from .own_floor import as_it_is, on_its_own_floor
@@ -33,7 +34,9 @@ from .verdicts import (
     WITHIN,
     EffectVerdict,
     Verdict,
+    amiss,
     explained,
+    explained_of_all,
     of_effect,
     overall,
 )
@@ -73,9 +76,10 @@ class Diagnosis:
         given: of each effect, with the best one taken to be on; empty where none was named.
         confusion: correlation of each pair of effects' scores.
         estimates: the model's own parameters as it is, all of the floor and what is systematic counted, by name.
-        misfit: of the model as it is.
+        misfit: of the model as it is, on slow waves.
+        whole: how far it is off in all.
         remainder: after the best effect; None where none was named.
-        explained: share of the misfit beyond chance that the best effect explains.
+        explained: share of the misfit beyond chance that the best effect explains, on slow waves where these show one.
         confirmations: refits by effect, the model as it is under the empty name.
         blocks: where the model fails.
         where: share of the best effect's evidence in each (stage, region, channel).
@@ -97,6 +101,7 @@ class Diagnosis:
     confusion: Mapping[tuple[str, str], float]
     estimates: Mapping[str, Estimate]
     misfit: Omnibus
+    whole: Block
     remainder: Omnibus | None
     explained: float
     confirmations: Mapping[str, Confirmation]
@@ -150,49 +155,6 @@ def diagnose(
     )
 
 
-@dataclass(frozen=True)
-class Bench:
-    """What doesn't depend on the observation, prepared once: many observations may be judged by it.
-
-    Attributes:
-        floor: noise and nuisances.
-        candidates: effects that could be simulated.
-        scorer: of them; None where there are none.
-        basis: (n, k) slow waves.
-    """
-
-    floor: Floor
-    candidates: tuple[Candidate, ...]
-    scorer: Scorer | None
-    basis: FloatArray
-
-    @classmethod
-    def of(cls, experiment: Experiment, evidence: Evidence, options: Options) -> Bench:
-        """Prepare."""
-        floor = floor_of(experiment, evidence)
-        seen = experiment.seen
-        candidates = tuple(c for c in experiment.candidates if c.name in evidence.directions)
-        columns = {c.name: evidence.directions[c.name][:, seen].T for c in candidates}
-        doubts = {c.name: evidence.doubts[c.name][:, seen].T for c in candidates if c.name in evidence.doubts}
-        scorer = None
-        if candidates:
-            scorer = Scorer.of(
-                floor.noise,
-                floor.free,
-                columns,
-                candidates,
-                doubts=doubts,
-                calibration=evidence.calibration,
-                level=options.level,
-                seed=options.seed,
-            )
-        return cls(floor, candidates, scorer, smooth_basis(experiment.layout, floor.noise))
-
-    def misfit(self, residual: FloatArray) -> Omnibus:
-        """What of a residual (n,) stands on slow waves."""
-        return omnibus(self.floor.noise, self.floor.free, residual, self.basis)
-
-
 def judge(
     experiment: Experiment,
     evidence: Evidence,
@@ -204,14 +166,15 @@ def judge(
 ) -> Diagnosis:
     """From evidence to a verdict; simulates only to refit the best effects."""
     told = progress or (lambda what, share: None)
-    bench = bench or Bench.of(experiment, evidence, options)
+    bench = bench or Bench.of(experiment, evidence, level=options.level, seed=options.seed)
     floor, scorer, seen = bench.floor, bench.scorer, experiment.seen
     residual = (experiment.observed - evidence.mean)[seen]
-    misfit = bench.misfit(residual)
+    misfit, (whole, parts) = bench.misfit(residual), bench.blocks(residual)
+    off = amiss(misfit, whole)
     scores = {} if scorer is None else scorer.score(residual)
     candidates = {c.name: c for c in bench.candidates}
-    vantage = None if scorer is None else look_afresh(experiment, evidence, misfit, simulate, floor, bench.basis)
-    chosen = _chosen(experiment, bench, scores, residual, misfit, vantage, options)
+    vantage = None if scorer is None else look_afresh(experiment, evidence, off, simulate, floor, bench.basis)
+    chosen = _chosen(experiment, bench, scores, residual, off, vantage, options)
     confirmations: dict[str, Confirmation] = {}
     members: tuple[str, ...] = ()
     given: Mapping[str, Score] = {}
@@ -225,7 +188,7 @@ def judge(
         # Not by what is left of χ²: an effect that stays off leaves what other pictures say of it unexplained.
         costs = {name: scorer.price(candidates[name], refitted=True) - c.fall for name, c in tried.items()}
         measures = {name: c.measure for name, c in candidates.items()}
-        members = members_of(confirmations, costs, misfit, scores, measures)
+        members = members_of(confirmations, costs, off, scores, measures)
         before = confirmations[""].remainder
         if members:
             best = members[0]
@@ -239,13 +202,14 @@ def judge(
                 confirmations[best], error = own.refit, own.refit.held_out / own.refit.floor
                 if more:
                     before, remainder = own.before, own.after
-            gone = explained(before, remainder)
+            asis = confirmations[""].held_out / confirmations[""].floor
+            gone = explained(before, remainder) if misfit.p < GATE else explained_of_all(asis, error)
     effects = _effects(candidates, scores, given, members, confirmations, options.level)
     # Where the best explanation is too small to matter, so is what is missing.
     named = bool(members) and effects[members[0]] == "missing"
     if chosen and not named:
         effects = {n: "cannot tell" if v == "missing" else v for n, v in effects.items()}
-    verdict = overall(named, before if named else misfit, remainder, error=error)
+    verdict = overall(named, off, before, remainder, error=error)
     notes = [f"{name} could not be simulated: {why}" for name, why in evidence.failed.items()]
     strength = None
     if verdict == "outside the library":
@@ -272,10 +236,11 @@ def judge(
         confusion=_pairs(scorer),
         estimates=estimates,
         misfit=misfit,
+        whole=whole,
         remainder=remainder,
         explained=gone,
         confirmations=confirmations,
-        blocks=blocks(experiment.layout, floor.noise, floor.free, residual, seed=options.seed),
+        blocks=parts,
         where=_where(experiment, floor, evidence, scores, members, residual),
         residual=floor.noise.spread(left_over(floor.noise, floor.free, residual)),
         floor=floor,
@@ -310,13 +275,13 @@ def _chosen(
     bench: Bench,
     scores: Mapping[str, Score],
     residual: FloatArray,
-    misfit: Omnibus,
+    off: bool,
     vantage: Vantage | None,
     options: Options,
 ) -> list[str]:
     """Effects to refit: significant ones, those first that explain most for their parameters.
 
-    Where there is a misfit, those too that would explain most if they were alone, as seen from soil as one would guess
+    Where the model is off, those too that would explain most if they were alone, as seen from soil as one would guess
     it where the fit is far from that: at a fit that a missing effect has led astray, it needn't stand out.
     """
     scorer = bench.scorer
@@ -329,7 +294,7 @@ def _chosen(
     if vantage is not None:
         sight = Sight.of(experiment, bench.floor, bench.basis, vantage)
         alone = promising(experiment, vantage, sight, bench.candidates, scorer.price)
-    elif misfit.p < GATE:
+    elif off:
         alone = scorer.ranked(residual)
     if not alone:
         return strong[: options.refits]

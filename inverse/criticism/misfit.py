@@ -74,7 +74,7 @@ class Block:
     Attributes:
         stage, region, channel: which part; an empty word means all of them.
         ratio: root mean square of the residual over that of noise alone: 1 where nothing is wrong.
-        p: chance that any block is as far off, with nothing wrong.
+        p: chance that it is as far off, of a part that any of them is, with nothing wrong.
         features: how many it holds.
     """
 
@@ -88,10 +88,10 @@ class Block:
 
 def blocks(
     layout: Layout, noise: Noise, nuisance: FloatArray, residual: FloatArray, *, seed: int = 0
-) -> tuple[Block, ...]:
-    """Blocks of the data, the worst first, calibrated together on draws of the noise (max-T).
+) -> tuple[Block, tuple[Block, ...]]:
+    """The whole of the data, and parts of it, the worst first, these calibrated together on draws of the noise (max-T).
 
-    The residual (n,) is what parameters and nuisances (n, q) cannot take up.
+    Of the residual (n,) counts what parameters and nuisances (n, q) cannot take up.
     """
     bare = noise.solver()
     gain = _gain(bare, nuisance)
@@ -112,11 +112,17 @@ def blocks(
         value = squares[mine].mean()
         worst = np.maximum(worst, (np.log(null) - middle) / spread)
         found.append((key, float(np.log(max(value, 1e-300)) - middle) / spread, value / null.mean(), int(mine.sum())))
-    out = [
-        Block(*key, ratio=float(np.sqrt(ratio)), p=float((1 + np.sum(worst >= t)) / (1 + DRAWS)), features=count)
-        for key, t, ratio, count in found
+    parts = [
+        Block(*key, ratio=float(np.sqrt(ratio)), p=_chance(worst, t), features=count) for key, t, ratio, count in found
     ]
-    return tuple(sorted(out, key=lambda b: (b.p, -b.ratio)))
+    value, null = float(squares.mean()), of_noise.mean(axis=0)
+    whole = Block("", "", "", float(np.sqrt(value / null.mean())), _chance(null, value), len(squares))
+    return whole, tuple(sorted(parts, key=lambda b: (b.p, -b.ratio)))
+
+
+def _chance(null: FloatArray, value: float) -> float:
+    """Of being as large as a value, by draws with nothing wrong."""
+    return float((1 + np.sum(null >= value)) / (1 + len(null)))
 
 
 def shares(layout: Layout, noise: Noise, contributions: FloatArray) -> dict[tuple[str, str, str], float]:

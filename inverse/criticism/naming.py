@@ -7,15 +7,14 @@ from collections.abc import Mapping
 from splatsoil.parameters import Parameter
 
 from .confirmation import Confirmation
-from .misfit import Omnibus
 from .score import Score
-from .verdicts import CERTAIN, DENIES, EQUIVALENT, GATE, LEVEL, RELEVANT
+from .verdicts import CERTAIN, DENIES, EQUIVALENT, LEVEL, RELEVANT
 
 
 def members_of(
     confirmations: Mapping[str, Confirmation],
     costs: Mapping[str, float],
-    misfit: Omnibus,
+    off: bool,
     scores: Mapping[str, Score],
     measures: Mapping[str, Parameter],
 ) -> tuple[str, ...]:
@@ -28,14 +27,14 @@ def members_of(
     Args:
         confirmations: of the model as it is, under the empty name, and with each effect.
         costs: χ² by effect, up to a constant.
-        misfit: of the model as it is.
+        off: the model as it is leaves more than noise; see :func:`~splatsoil.inverse.criticism.verdicts.amiss`.
         scores: of each effect.
         measures: the parameter that measures each effect.
     """
     costs = {name: cost for name, cost in costs.items() if not confirmations[name].ruled_out}
     if not costs:
         return ()
-    standing = [name for name in costs if stands(confirmations, name, misfit, scores[name], measures[name])]
+    standing = [name for name in costs if stands(confirmations, name, off, scores[name], measures[name])]
     certain = {name: costs[name] for name in standing if confirmations[name].told < CERTAIN}
     among = certain or costs
     best = min(among, key=lambda name: among[name])
@@ -46,12 +45,10 @@ def members_of(
     return _equals(explaining, best, max(confirmations[best].remainder.dispersion, scores[best].dispersion))
 
 
-def stands(
-    confirmations: Mapping[str, Confirmation], name: str, misfit: Omnibus, score: Score, measure: Parameter
-) -> bool:
+def stands(confirmations: Mapping[str, Confirmation], name: str, off: bool, score: Score, measure: Parameter) -> bool:
     """Something is to be explained, and the refit does: χ² falls, on times that it hasn't seen too.
 
-    Where slow waves show no more than chance, either the effect is significant among all of the library, or the model
+    Where the model leaves no more than noise, either the effect is significant among all of the library, or the model
     is off by more than noise on those times; it must take away a relevant share of the squared error there; and its
     refit, all that is systematic counted, must tell its size from none. What other pictures say of an effect beyond
     doubt needs no more of the features than that they don't speak against it.
@@ -65,7 +62,7 @@ def stands(
     wanting = score.adjusted < LEVEL or before.held_out > before.floor
     relevant = after.held_out**2 < (1.0 - RELEVANT) * before.held_out**2
     told = abs(after.values[measure.name] - float(measure.off or 0.0)) > DENIES * after.stds[measure.name]
-    return (misfit.p < GATE or (wanting and relevant and told)) and after.unseen > 0.0
+    return (off or (wanting and relevant and told)) and after.unseen > 0.0
 
 
 def _equals(costs: Mapping[str, float], best: str, dispersion: float) -> tuple[str, ...]:

@@ -42,6 +42,7 @@ def record(experiment: Experiment, diagnosis: Diagnosis) -> dict[str, Any]:
             for name, e in diagnosis.estimates.items()
         },
         "misfit": _omnibus(diagnosis.misfit),
+        "whole": {"ratio": diagnosis.whole.ratio, "p": diagnosis.whole.p, "n": diagnosis.whole.features},
         "remainder": None if diagnosis.remainder is None else _omnibus(diagnosis.remainder),
         "explained": diagnosis.explained,
         "refits": {name or "as it is": confirmation(c) for name, c in diagnosis.confirmations.items()},
@@ -84,7 +85,8 @@ def record(experiment: Experiment, diagnosis: Diagnosis) -> dict[str, Any]:
 def misfit_record(experiment: Experiment, diagnosis: Diagnosis) -> dict[str, Any]:
     """Only how far the model is from the data, where and when."""
     whole = record(experiment, diagnosis)
-    kept = ("misfit", "blocks", "floor", "unit", "time_name", "times", "stages", "sites", "curves", "maps", "values")
+    kept = ("misfit", "whole", "blocks", "floor", "values")
+    drawn = ("unit", "time_name", "times", "stages", "sites", "curves", "maps")
     adequate = diagnosis.verdict == "adequate"
     return {
         "format": MISFIT_FORMAT,
@@ -92,7 +94,7 @@ def misfit_record(experiment: Experiment, diagnosis: Diagnosis) -> dict[str, Any
         "estimates": whole["estimates"] if adequate else {},
         "sentences": of_estimates(diagnosis.estimates) if adequate else [],
         "simulations": diagnosis.simulations,
-        **{key: whole[key] for key in kept},
+        **{key: whole[key] for key in kept + drawn},
     }
 
 

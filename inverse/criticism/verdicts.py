@@ -6,7 +6,7 @@ from typing import Literal
 
 from splatsoil.experiment.base import Candidate
 
-from .misfit import Omnibus
+from .misfit import Block, Omnibus
 from .score import Score
 
 EffectVerdict = Literal["missing", "trivial", "absent", "cannot tell"]
@@ -15,7 +15,7 @@ Verdict = Literal["adequate", "missing", "outside the library"]
 LEVEL = 0.05
 """Family-wise chance of naming an effect when none is missing."""
 GATE = 0.01
-"""Chance below which what is left is called a remainder."""
+"""Chance below which what is left, on slow waves or in all, is called a remainder."""
 CERTAIN = 1e-4
 """Chance below which what pictures say of an effect where soil plays no part needs no confirmation by soil."""
 CLEAN = 0.05
@@ -23,8 +23,7 @@ CLEAN = 0.05
 EQUIVALENT = 6.0
 """Fall of χ² within which effects count as equally good."""
 RELEVANT = 0.1
-"""Share of the squared error on times that a refit hasn't seen which an effect must take away where slow waves show
-no misfit."""
+"""Share of the squared error on times that a refit hasn't seen which an effect must take away where no misfit shows."""
 DENIES, SEEN = 1.645, 1.960
 """Standard deviations within which an effect's size lies with 95 % to one side, and to both."""
 LEAST_SURVIVAL = 0.05
@@ -53,13 +52,22 @@ def of_effect(candidate: Candidate, score: Score, *, level: float = LEVEL) -> Ef
     return "cannot tell"
 
 
+def amiss(misfit: Omnibus, whole: Block) -> bool:
+    """Whether more is left than noise leaves: on slow waves, or in all by more than an adequate model may leave.
+
+    What one part of the trench shows in one camera isn't slow: cohesive soil that passes for dry soil of a larger angle
+    leaves twice the noise, and hardly anything on slow waves.
+    """
+    return misfit.p < GATE or (whole.ratio > WITHIN and whole.p < GATE)
+
+
 def overall(
     named: bool,
+    off: bool,
     misfit: Omnibus,
     remainder: Omnibus | None,
     *,
     error: float = 1.0,
-    gate: float = GATE,
     clean: float = CLEAN,
     enough: float = ENOUGH,
 ) -> Verdict:
@@ -67,20 +75,29 @@ def overall(
 
     Args:
         named: some effect is significant and large enough to matter.
-        misfit: of the model as it is.
+        off: the model as it is leaves more than noise; see :func:`amiss`.
+        misfit: of that.
         remainder: after the best the library can do; None where nothing was named.
         error: with that best, on times its refit hasn't seen, over what noise leaves there.
-        gate: see :data:`GATE`.
         clean: see :data:`CLEAN`.
         enough: see :data:`ENOUGH`.
     """
     if not named or remainder is None:
-        return "adequate" if misfit.p >= gate else "outside the library"
+        return "outside the library" if off else "adequate"
     if error <= WITHIN and (remainder.p >= clean or explained(misfit, remainder) >= enough):
         return "missing"
     return "outside the library"
 
 
 def explained(before: Omnibus, after: Omnibus) -> float:
-    """Share of the misfit beyond chance that is gone."""
-    return 1.0 if before.excess <= 0.0 else max(0.0, 1.0 - after.excess / before.excess)
+    """Share of the misfit beyond chance that is gone from slow waves."""
+    return _gone(before.excess, after.excess)
+
+
+def explained_of_all(before: float, after: float) -> float:
+    """Share of the squared error beyond noise that is gone, by errors over noise."""
+    return _gone(*(max(error**2 - 1.0, 0.0) for error in (before, after)))
+
+
+def _gone(before: float, after: float) -> float:
+    return 1.0 if before <= 0.0 else max(0.0, 1.0 - after / before)

@@ -115,19 +115,22 @@ def of_estimates(estimates: Mapping[str, Estimate]) -> list[str]:
 
 
 def _outside(diagnosis: Diagnosis, candidates: Mapping[str, Candidate]) -> list[str]:
+    slow = diagnosis.misfit.p < GATE
+    where, times = ("on slow waves", diagnosis.misfit.dispersion) if slow else ("as a whole", diagnosis.whole.ratio)
     out = [
-        f"The model is not adequate, and no effect of the library explains all of it: the misfit on slow waves is "
-        f"{diagnosis.misfit.dispersion:.3g} times what noise leaves."
+        f"The model is not adequate, and no effect of the library explains all of it: the misfit {where} is "
+        f"{times:.3g} times what noise leaves."
     ]
     if diagnosis.members:
         best = diagnosis.members[0]
         confirmed, before = diagnosis.confirmations[best], diagnosis.confirmations[""]
         candidate = candidates[best]
         size = amount(confirmed.values[candidate.size], confirmed.stds[candidate.size], candidate.measure.unit)
+        share = f"{100.0 * diagnosis.explained:.0f} % of the misfit beyond chance{' on slow waves' if slow else ''}"
         out.append(
             f"The nearest is {best.replace('_', ' ')} ({size}): with it the error on frames that the refit has not "
             f"seen goes from {before.held_out:.2g} to {confirmed.held_out:.2g} {diagnosis.unit} (noise alone leaves "
-            f"{_noise(before, confirmed)}), which is {100.0 * diagnosis.explained:.0f} % of the misfit beyond chance. "
+            f"{_noise(before, confirmed)}), which is {share}. "
             f"What remains is more than noise, so it is not all that is missing; {MAKES_UP}."
         )
     return out if diagnosis.strength is None else [*out, *of_strength(diagnosis.strength)]

@@ -154,7 +154,7 @@ def misfit(
     from splatsoil.commands._control import control
     from splatsoil.commands._crew import crew
     from splatsoil.files import plain, write_json
-    from splatsoil.inverse.criticism.diagnosis import Bench, judge
+    from splatsoil.inverse.criticism.diagnosis import judge
     from splatsoil.inverse.criticism.evidence import gather
     from splatsoil.inverse.criticism.record import misfit_record
     from splatsoil.report.data import estimates
@@ -178,8 +178,7 @@ def misfit(
         )
         if replays is not None:
             evidence = replace(evidence, replays=replays())
-        bench = Bench.of(experiment, evidence, options)
-        found = judge(experiment, evidence, simulate, options=options, bench=bench)
+        found = judge(experiment, evidence, simulate, options=options)
         result = {**misfit_record(experiment, found), "fit": fit["name"]}
         write_json(folder.comparison / "misfit.json", result)
     return dict(plain(result))
@@ -193,8 +192,8 @@ def confirmed(folder: RunFolder, model: Model, name: str, options: Options, repo
     from splatsoil.commands._crew import crew
     from splatsoil.files import plain
     from splatsoil.inverse.criticism.afresh import look_afresh
+    from splatsoil.inverse.criticism.bench import Bench
     from splatsoil.inverse.criticism.confirmation import confirm
-    from splatsoil.inverse.criticism.diagnosis import Bench
     from splatsoil.inverse.criticism.evidence import gather
     from splatsoil.inverse.criticism.own_floor import on_its_own_floor
     from splatsoil.inverse.criticism.record import confirmation
@@ -217,7 +216,7 @@ def confirmed(folder: RunFolder, model: Model, name: str, options: Options, repo
             raise RunError(f"{effect} cannot be added: {evidence.failed[effect]}")
         calibration = calibrated(folder, experiment, simulate, values)
         evidence = replace(evidence, replays=replays(), calibration=calibration)
-        bench = Bench.of(experiment, evidence, options)
+        bench = Bench.of(experiment, evidence, level=options.level, seed=options.seed)
         left = (experiment.observed - evidence.mean)[experiment.seen]
         found = confirm(
             experiment,
@@ -228,7 +227,7 @@ def confirmed(folder: RunFolder, model: Model, name: str, options: Options, repo
             options.refit_steps,
             bench.basis,
             report,
-            look_afresh(experiment, evidence, bench.misfit(left), simulate, bench.floor, bench.basis),
+            look_afresh(experiment, evidence, bench.off(left), simulate, bench.floor, bench.basis),
         )
         if found[effect].visits:
             (candidate,) = bench.candidates

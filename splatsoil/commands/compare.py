@@ -17,7 +17,7 @@ SURE = 0.05
 #: Blocks shown on the screen.
 SHOWN = 12
 #: What --json prints of the misfit.
-TOLD = ("adequate", "misfit", "estimates", "blocks", "floor")
+TOLD = ("adequate", "misfit", "whole", "estimates", "blocks", "floor")
 
 
 @dataclass(frozen=True)
@@ -139,9 +139,10 @@ def show_misfit(misfit: Mapping[str, Any], run: str) -> None:
     test = misfit["misfit"]
     off = sum(block["p"] < SURE for block in misfit["blocks"])
     word = "[bold]adequate[/bold]" if misfit["adequate"] else "[bold]not adequate[/bold]"
+    whole = misfit["whole"]
     console.print(
-        f"{word}: slow waves of the residual are {test['dispersion']:.3g} times what noise leaves (p {test['p']:.2g}); "
-        f"{off} of {len(misfit['blocks'])} blocks stand out"
+        f"{word}: the residual is {whole['ratio']:.3g} times what noise leaves (p {whole['p']:.2g}), slow waves of it "
+        f"{test['dispersion']:.3g} times (p {test['p']:.2g}); {off} of {len(misfit['blocks'])} blocks stand out"
     )
     if misfit["adequate"] and off:
         console.print(

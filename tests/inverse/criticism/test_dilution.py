@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from splatsoil.benchmarks.hidden_effects import emulated
-from splatsoil.inverse.criticism.diagnosis import Bench, Options
+from splatsoil.inverse.criticism.bench import Bench
 from splatsoil.inverse.criticism.dilution import informed, reliable, undiluted
 from splatsoil.inverse.criticism.evidence import gather
 from splatsoil.inverse.criticism.noise import Noise
@@ -52,7 +52,7 @@ def test_sizes_come_out_right_where_soil_falls_otherwise_each_time() -> None:
         evidence = gather(experiment, Simulations(experiment), {"angle": 0.0})
         residual = (experiment.observed - evidence.mean)[experiment.seen]
         for known, out in ((evidence, right), (replace(evidence, doubts={}), drawn)):
-            scorer = Bench.of(experiment, known, Options()).scorer
+            scorer = Bench.of(experiment, known).scorer
             assert scorer is not None
             score = scorer.score(residual)["effect 1"]
             out.append(score.estimate)

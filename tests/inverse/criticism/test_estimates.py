@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from splatsoil.benchmarks.hidden_effects import emulated, fitted, outside
-from splatsoil.inverse.criticism.diagnosis import Bench, Options, diagnose
+from splatsoil.inverse.criticism.bench import Bench
+from splatsoil.inverse.criticism.diagnosis import diagnose
 from splatsoil.inverse.criticism.estimates import at_odds, untried, weighed, weighed_there
 from splatsoil.inverse.criticism.evidence import gather
 from splatsoil.inverse.criticism.floor import floor_of
@@ -130,7 +131,7 @@ def test_effects_explain_no_more_than_noise_of_a_truth_that_computes_otherwise()
         observed = made.measured({"angle": 0.0}, [world, 99], outside(made, generator, 6.0))
         experiment = replace(made, observed=observed)
         evidence = gather(experiment, Simulations(experiment), {"angle": 0.0})
-        scorer = Bench.of(experiment, evidence, Options()).scorer
+        scorer = Bench.of(experiment, evidence).scorer
         assert scorer is not None
         scores = scorer.score((experiment.observed - evidence.mean)[experiment.seen])
         falls.append(np.mean([score.statistic for score in scores.values()]))

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from splatsoil.benchmarks.hidden_effects import emulated, fitted
 from splatsoil.inverse.criticism.afresh import look_afresh
+from splatsoil.inverse.criticism.bench import Bench
 from splatsoil.inverse.criticism.confirmation import _starts
-from splatsoil.inverse.criticism.diagnosis import Bench, Diagnosis, Options, diagnose
+from splatsoil.inverse.criticism.diagnosis import Diagnosis, diagnose
 from splatsoil.inverse.criticism.evidence import gather
-from splatsoil.inverse.criticism.misfit import Omnibus
 from splatsoil.inverse.criticism.simulations import Simulations
 
 from splatsoil.errors import ParameterError
@@ -122,8 +122,8 @@ def test_from_the_defaults_an_effect_is_seen_in_the_shape_that_it_has(hidden: fl
     experiment = replace(made, observed=made.measured(truth, [WORLD, 99]))
     simulate = Simulations(experiment)
     evidence = gather(experiment, simulate, {"angle": 8.0})
-    bench = Bench.of(experiment, evidence, Options())
-    found = look_afresh(experiment, evidence, Omnibus(900.0, 72, 0.0), simulate, bench.floor, bench.basis)
+    bench = Bench.of(experiment, evidence)
+    found = look_afresh(experiment, evidence, True, simulate, bench.floor, bench.basis)
     assert found is not None
     assert found.shapes == ({} if hidden == SHAPE.default else {"effect 2": {SHAPE.name: pytest.approx(hidden)}})
     exact = made.expected({"angle": 0.0, "effect 2": 1.0, SHAPE.name: hidden}) - made.expected({"angle": 0.0})
