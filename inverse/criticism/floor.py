@@ -87,11 +87,11 @@ def floor_of(experiment: Experiment, evidence: Evidence) -> Floor:
         parts["chance"] = estimate(layout, _contrasts(evidence.repeats), seen, directions, parameters)
     if len(evidence.guesses) > 1:
         parts["guesses"] = estimate(layout, _contrasts(evidence.guesses), seen, directions, parameters)
-    if np.count_nonzero(experiment.quiet) >= FEWEST_QUIET:
+    if evidence.replays is not None:
+        parts["reconstruction"] = _replayed(experiment, evidence, parts)
+    elif np.count_nonzero(experiment.quiet) >= FEWEST_QUIET:
         known = _total(layout, parts, seen, runs)[0]
         parts["reconstruction"] = _instruments(experiment, evidence, known)
-    if evidence.replays is not None:
-        parts["reconstruction"] = _replayed(experiment, evidence.replays, parts)
     patterns = list(evidence.numerics.values())
     if patterns:
         known = _total(layout, parts, seen, runs)[0]
@@ -123,15 +123,8 @@ def _instruments(experiment: Experiment, evidence: Evidence, known: Noise) -> Pa
     elsewhere too.
     """
     quiet, signal = experiment.quiet, np.abs(evidence.mean)
-    rest = (experiment.observed - evidence.mean)[quiet]
     scale = known.spread(known.scale)[quiet]
-    reported = [c.name for c in experiment.candidates if c.kind == "observation" and c.name in evidence.directions]
-    if reported:
-        columns = np.concatenate([evidence.directions[name][:, quiet] for name in reported]).T / scale[:, None]
-        size = np.linalg.norm(columns, axis=0)
-        columns = columns[:, size > 1e-9] / size[size > 1e-9]
-        amplitude, *_ = np.linalg.lstsq(columns, rest / scale, rcond=1e-3)
-        rest = rest - scale * (columns @ amplitude)
+    rest = _unreported(experiment, evidence, experiment.observed - evidence.mean, scale)
     terms = np.stack([np.ones(rest.size), signal[quiet] ** 2], axis=1)
     size = np.maximum(np.linalg.norm(terms, axis=0), 1e-300)
     squares = rest**2
@@ -151,6 +144,21 @@ def _instruments(experiment: Experiment, evidence: Evidence, known: Noise) -> Pa
     return replace(found, scale=whole)
 
 
+def _unreported(experiment: Experiment, evidence: Evidence, table: FloatArray, scale: FloatArray) -> FloatArray:
+    """(q,) what is left of a table (t, s) in quiet features, of noise ``scale`` (q,), once exposure, camera poses and
+    the like are taken out."""
+    quiet = experiment.quiet
+    rest = table[quiet]
+    reported = [c.name for c in experiment.candidates if c.kind == "observation" and c.name in evidence.directions]
+    if not reported:
+        return rest
+    columns = np.concatenate([evidence.directions[name][:, quiet] for name in reported]).T / scale[:, None]
+    size = np.linalg.norm(columns, axis=0)
+    columns = columns[:, size > 1e-9] / size[size > 1e-9]
+    amplitude, *_ = np.linalg.lstsq(columns, rest / scale, rcond=1e-3)
+    return np.asarray(rest - scale * (columns @ amplitude), dtype=np.float64)
+
+
 def _contrasts(deviations: FloatArray) -> FloatArray:
     """(r - 1, t, s) independent samples from r deviations from a mean, which are none."""
     count = len(deviations)
@@ -158,21 +166,40 @@ def _contrasts(deviations: FloatArray) -> FloatArray:
     return np.tensordot(helmert(count), deviations, axes=1) * np.sqrt((count - 1) / count)
 
 
-def _replayed(experiment: Experiment, replays: FloatArray, parts: Mapping[str, Part]) -> Part:
+def _replayed(experiment: Experiment, evidence: Evidence, parts: Mapping[str, Part]) -> Part:
     """What known soils leave that went through the whole chain, beyond chance, guesses and the cameras' noise.
 
-    Where the undisturbed part of the real pictures is worse than the replay's, the real one counts.
+    What the undisturbed bed of the real pictures leaves beyond that of the replays comes on top everywhere. By the
+    middle square of the bed: soil that moves where none was expected to does so beside the tool's way, and is no fault
+    of the pictures; theirs are all over it.
     """
-    whole = estimate(experiment.layout, replays, experiment.seen)
+    assert evidence.replays is not None
+    whole = estimate(experiment.layout, evidence.replays, experiment.seen)
     known = parts["instruments"].scale ** 2
     if "chance" in parts:
         known = known + 2.0 * parts["chance"].scale ** 2
     if "guesses" in parts:
         known = known + parts["guesses"].scale ** 2
     variance = np.maximum(whole.scale**2 - known, 0.0)
-    if "reconstruction" in parts:
-        variance = np.maximum(variance, parts["reconstruction"].scale ** 2)
+    if np.count_nonzero(experiment.quiet) >= FEWEST_QUIET:
+        real = _middle_square(experiment, evidence, [experiment.observed - evidence.mean], whole)
+        more = max(0.0, real - _middle_square(experiment, evidence, evidence.replays, whole))
+        # Where nothing moves pictures tell of pictures alone.
+        variance[:, experiment.layout.common] += more
     return replace(whole, scale=np.sqrt(variance))
+
+
+def _middle_square(
+    experiment: Experiment, evidence: Evidence, tables: Sequence[FloatArray] | FloatArray, noise: Part
+) -> float:
+    """Median over quiet sites of the mean square of tables (t, s) there, beyond what cameras report."""
+    quiet = experiment.quiet
+    scale = np.maximum(noise.scale[quiet], 1e-300)
+    squares = np.zeros(experiment.layout.shape)
+    for table in tables:
+        squares[quiet] += _unreported(experiment, evidence, table, scale) ** 2 / len(tables)
+    counts = quiet.sum(axis=0)
+    return float(np.median(squares.sum(axis=0)[counts > 0] / counts[counts > 0]))
 
 
 def _factors(name: str, runs: int) -> tuple[float, float]:

@@ -81,6 +81,30 @@ def test_soil_that_moved_where_none_was_expected_is_no_fault_of_the_pictures() -
     assert floor_with(moved=40.0)[0] < 1.8 * floor_with()[0]
 
 
+@pytest.mark.parametrize(
+    ("error", "moved", "told"),
+    [(ERROR, 0.0, ERROR), (0.5 * ERROR, 0.0, ERROR), (3.0 * ERROR, 0.0, 3.0 * ERROR), (ERROR, 20.0, ERROR)],
+)
+def test_a_control_tells_errors_of_pictures_and_the_bed_only_what_is_worse_all_over_it(
+    error: float, moved: float, told: float
+) -> None:
+    """Beside the tool's way, in two squares of five, soil may move that a model without the right effect lets lie."""
+    generator = np.random.default_rng(2)
+    base = evidence(generator, {})
+
+    def pictures(size: float, count: int) -> np.ndarray:
+        chance = 0.3 * generator.standard_normal((count, 2, *LAYOUT.shape))
+        left = size * generator.standard_normal((count, *LAYOUT.shape))
+        return left + chance[:, 0] - chance[:, 1] + SENSOR * generator.standard_normal(left.shape)
+
+    quiet = np.ones(LAYOUT.shape, dtype=bool)
+    quiet[:, :6] = False
+    (observed,) = pictures(error, 1)
+    observed[:, [6, 7, 8, 9, 10, 22, 23, 24, 25, 26]] += moved
+    found = floor_of(looked(observed, quiet), replace(base, replays=pictures(ERROR, 3)))
+    assert np.sqrt(np.mean(found.parts["reconstruction"].scale ** 2)) == pytest.approx(told, rel=0.12)
+
+
 def test_a_wild_numerics_pattern_does_not_stand_for_those_not_tried() -> None:
     assert floor_with(wild=30.0)[1] < 1.3 * floor_with()[1]
     assert floor_with(wild=30.0)[1] > 0.5
