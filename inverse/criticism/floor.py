@@ -71,9 +71,9 @@ def floor_of(experiment: Experiment, evidence: Evidence) -> Floor:
     """Assemble the floor.
 
     Chance comes from repeated seeds, what no instrument shows from other guesses of it, the pictures' own errors from
-    where physics can't act. What other numerics change
-    is projected out, pattern by pattern; what each of these patterns holds beyond parameters, the other patterns and
-    its own chance is a sample of what numerics that weren't tried would leave, and goes into the noise.
+    a control, or else from where physics can't act. What other numerics change is projected out, pattern by pattern;
+    what each of these patterns holds beyond parameters, the other patterns and its own chance is a sample of what
+    numerics that weren't tried would leave, and goes into the noise.
     """
     layout, seen = experiment.layout, experiment.seen
     parameters = taken_up(experiment, evidence)

@@ -189,7 +189,8 @@ def listed(words: list[str]) -> str:
 
 def amount(value: float, std: float, unit: str) -> str:
     """A value with its spread, if it has one, and unit."""
-    return (" ± ".join(with_std(value, std)) if 0.0 < std < math.inf else f"{value:.3g}") + symbol(unit)
+    bare = f"{float(f'{value:.3g}'):g}"
+    return (" ± ".join(with_std(value, std)) if 0.0 < std < math.inf else bare) + symbol(unit)
 
 
 def _noise(before: Confirmation, confirmed: Confirmation) -> str:
