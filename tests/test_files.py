@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatsoil.commands._control import CALIBRATION, FEATURES, REPLAY
+from splatsoil.commands._control import CALIBRATION, FEATURES, JUDGING, REPLAY
 from splatsoil.errors import RunError
 from splatsoil.files import FORWARD, RECONSTRUCTING, code_digest, read_npy, read_npz, write_npz
 
@@ -106,7 +106,7 @@ def test_the_code_that_decides_a_result_is_in_its_digest(
 def test_every_part_of_a_digest_is_there(tmp_path: Path) -> None:
     """One that were not would change nothing, unnoticed."""
     nothing = code_digest(())
-    for name in (*FORWARD, *FEATURES, *REPLAY, *CALIBRATION):
+    for name in (*FORWARD, *FEATURES, *REPLAY, *CALIBRATION, *JUDGING):
         assert code_digest((name,)) != nothing, name
 
 

@@ -161,12 +161,11 @@ def judge(
     simulate: Simulations,
     *,
     options: Options,
-    bench: Bench | None = None,
     progress: Report | None = None,
 ) -> Diagnosis:
     """From evidence to a verdict; simulates only to refit the best effects."""
     told = progress or (lambda what, share: None)
-    bench = bench or Bench.of(experiment, evidence, level=options.level, seed=options.seed)
+    bench = Bench.of(experiment, evidence, level=options.level, seed=options.seed)
     floor, scorer, seen = bench.floor, bench.scorer, experiment.seen
     residual = (experiment.observed - evidence.mean)[seen]
     misfit, (whole, parts) = bench.misfit(residual), bench.blocks(residual)
@@ -212,7 +211,8 @@ def judge(
     verdict = overall(named, off, before, remainder, error=error)
     notes = [f"{name} could not be simulated: {why}" for name, why in evidence.failed.items()]
     strength = None
-    if verdict == "outside the library":
+    # Strength is told along slow waves: of what they don't show it explains nothing.
+    if verdict == "outside the library" and misfit.p < GATE:
         try:
             strength = read_strength(
                 experiment, evidence, floor, simulate, bench.basis, misfit, progress=lambda s: told("free strength", s)

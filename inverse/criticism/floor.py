@@ -24,12 +24,12 @@ NUMERICS_PRIOR = 1.0
 """Standard deviation of a numerical difference pattern's amplitude, in units of the change that was tried."""
 ACTING = ("chance", "guesses", "numerics")
 """Parts of soil's making, which lie where effects act more than a separable noise says."""
-FEWEST_QUIET = 30
-"""Features without physics from which the instruments' errors can be told."""
+FEWEST_QUIET, FEWEST_SQUARES = 30, 12
+"""Features without physics, and places of them, from which the instruments' errors can be told."""
 OUTLYING = 3.0
 """Standard deviations beyond which a quiet feature counts as no farther out."""
-ROBUST_ROUNDS = 30
-"""Of reweighting quiet features."""
+ROBUST_ROUNDS, REPORTED_ROUNDS = 30, 10
+"""Of reweighting quiet features: for the size of errors, and for what cameras report."""
 
 
 @dataclass(frozen=True)
@@ -146,17 +146,24 @@ def _instruments(experiment: Experiment, evidence: Evidence, known: Noise) -> Pa
 
 def _unreported(experiment: Experiment, evidence: Evidence, table: FloatArray, scale: FloatArray) -> FloatArray:
     """(q,) what is left of a table (t, s) in quiet features, of noise ``scale`` (q,), once exposure, camera poses and
-    the like are taken out."""
-    quiet = experiment.quiet
-    rest = table[quiet]
+    the like are taken out; where these effects aren't at hand, what changes all of a camera's frame alike."""
+    quiet, layout = experiment.quiet, experiment.layout
     reported = [c.name for c in experiment.candidates if c.kind == "observation" and c.name in evidence.directions]
-    if not reported:
-        return rest
-    columns = np.concatenate([evidence.directions[name][:, quiet] for name in reported]).T / scale[:, None]
+    if reported:
+        tables = np.concatenate([evidence.directions[name] for name in reported])
+    else:
+        alike = layout.channel_numbers == np.unique(layout.channel_numbers)[:, None]
+        tables = np.einsum("ij,cs->icjs", np.eye(layout.shape[0]), alike).reshape(-1, *layout.shape)
+    columns = tables[:, quiet].T / scale[:, None]
     size = np.linalg.norm(columns, axis=0)
     columns = columns[:, size > 1e-9] / size[size > 1e-9]
-    amplitude, *_ = np.linalg.lstsq(columns, rest / scale, rcond=1e-3)
-    return np.asarray(rest - scale * (columns @ amplitude), dtype=np.float64)
+    white, weight = table[quiet] / scale, np.ones(len(scale))
+    for _ in range(REPORTED_ROUNDS):
+        # Soil that moved is none of the cameras' doing (Huber's weights; 1.48 medians are a standard deviation).
+        amplitude, *_ = np.linalg.lstsq(weight[:, None] * columns, weight * white, rcond=1e-3)
+        far = np.abs(white - columns @ amplitude)
+        weight = np.sqrt(np.minimum(1.0, 1.4826 * np.median(far) / np.maximum(far, 1e-300)))
+    return np.asarray(scale * (white - columns @ amplitude), dtype=np.float64)
 
 
 def _contrasts(deviations: FloatArray) -> FloatArray:
@@ -181,25 +188,23 @@ def _replayed(experiment: Experiment, evidence: Evidence, parts: Mapping[str, Pa
     if "guesses" in parts:
         known = known + parts["guesses"].scale ** 2
     variance = np.maximum(whole.scale**2 - known, 0.0)
-    if np.count_nonzero(experiment.quiet) >= FEWEST_QUIET:
-        real = _middle_square(experiment, evidence, [experiment.observed - evidence.mean], whole)
-        more = max(0.0, real - _middle_square(experiment, evidence, evidence.replays, whole))
+    if np.count_nonzero(experiment.quiet.any(axis=0)) >= FEWEST_SQUARES:
+        scale = np.maximum(np.hypot(whole.scale, experiment.sensor), 1e-9)
+        real = _middle_square(experiment, evidence, (experiment.observed - evidence.mean)[None], scale)
+        more = max(0.0, real - _middle_square(experiment, evidence, evidence.replays, scale))
         # Where nothing moves pictures tell of pictures alone.
         variance[:, experiment.layout.common] += more
     return replace(whole, scale=np.sqrt(variance))
 
 
-def _middle_square(
-    experiment: Experiment, evidence: Evidence, tables: Sequence[FloatArray] | FloatArray, noise: Part
-) -> float:
-    """Median over quiet sites of the mean square of tables (t, s) there, beyond what cameras report."""
+def _middle_square(experiment: Experiment, evidence: Evidence, tables: FloatArray, scale: FloatArray) -> float:
+    """Median over quiet sites, and over tables (r, t, s), of the mean square there, beyond what cameras report."""
     quiet = experiment.quiet
-    scale = np.maximum(noise.scale[quiet], 1e-300)
-    squares = np.zeros(experiment.layout.shape)
-    for table in tables:
-        squares[quiet] += _unreported(experiment, evidence, table, scale) ** 2 / len(tables)
+    squares = np.zeros(tables.shape)
+    for square, table in zip(squares, tables, strict=True):
+        square[quiet] = _unreported(experiment, evidence, table, scale[quiet]) ** 2
     counts = quiet.sum(axis=0)
-    return float(np.median(squares.sum(axis=0)[counts > 0] / counts[counts > 0]))
+    return float(np.median(squares.sum(axis=1)[:, counts > 0] / counts[counts > 0]))
 
 
 def _factors(name: str, runs: int) -> tuple[float, float]:

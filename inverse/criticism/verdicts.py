@@ -76,7 +76,7 @@ def overall(
     Args:
         named: some effect is significant and large enough to matter.
         off: the model as it is leaves more than noise; see :func:`amiss`.
-        misfit: of that.
+        misfit: slow waves before the best the library can do, on the floor by which the remainder is judged.
         remainder: after the best the library can do; None where nothing was named.
         error: with that best, on times its refit hasn't seen, over what noise leaves there.
         clean: see :data:`CLEAN`.
@@ -100,4 +100,6 @@ def explained_of_all(before: float, after: float) -> float:
 
 
 def _gone(before: float, after: float) -> float:
-    return 1.0 if before <= 0.0 else max(0.0, 1.0 - after / before)
+    if before <= 0.0:
+        return 0.0 if after > 0.0 else 1.0
+    return max(0.0, 1.0 - after / before)

@@ -13,7 +13,7 @@ from .confirmation import Confirmation
 from .diagnosis import Diagnosis
 from .estimates import Estimate
 from .outside import CLEAR, FEW, StrengthReading
-from .verdicts import CLEAN, GATE
+from .verdicts import CLEAN, GATE, amiss
 
 #: Correlation of two effects' scores from which they are called alike.
 ALIKE = 0.8
@@ -70,10 +70,10 @@ def _missing(diagnosis: Diagnosis, candidates: Mapping[str, Candidate], base: Ma
         out.append(f"With it the refit moves {listed(told)}{': that much was bias' if sure else ''}.")
     if len(diagnosis.members) > 1:
         out.append(f"{listed([title(m) for m in diagnosis.members[1:]])} would explain it nearly as well.")
-    if diagnosis.remainder is not None and diagnosis.remainder.p < CLEAN:
+    if diagnosis.remainder is not None and diagnosis.remainder.p < CLEAN and diagnosis.misfit.p < GATE:
         out.append(
-            f"It explains {100.0 * diagnosis.explained:.0f} % of the misfit beyond chance; what remains is more than "
-            f"noise, and {MAKES_UP}."
+            f"It explains {100.0 * diagnosis.explained:.0f} % of the misfit beyond chance on slow waves; what remains "
+            f"is more than noise, and {MAKES_UP}."
         )
     return out
 
@@ -115,22 +115,23 @@ def of_estimates(estimates: Mapping[str, Estimate]) -> list[str]:
 
 
 def _outside(diagnosis: Diagnosis, candidates: Mapping[str, Candidate]) -> list[str]:
+    out = ["The model is not adequate, and no effect of the library explains all of it."]
     slow = diagnosis.misfit.p < GATE
-    where, times = ("on slow waves", diagnosis.misfit.dispersion) if slow else ("as a whole", diagnosis.whole.ratio)
-    out = [
-        f"The model is not adequate, and no effect of the library explains all of it: the misfit {where} is "
-        f"{times:.3g} times what noise leaves."
-    ]
+    if amiss(diagnosis.misfit, diagnosis.whole):
+        where, times = (
+            ("on slow waves", math.sqrt(diagnosis.misfit.dispersion)) if slow else ("as a whole", diagnosis.whole.ratio)
+        )
+        out = [f"{out[0][:-1]}: the misfit {where} is {times:.3g} times what noise leaves."]
     if diagnosis.members:
         best = diagnosis.members[0]
         confirmed, before = diagnosis.confirmations[best], diagnosis.confirmations[""]
         candidate = candidates[best]
         size = amount(confirmed.values[candidate.size], confirmed.stds[candidate.size], candidate.measure.unit)
-        share = f"{100.0 * diagnosis.explained:.0f} % of the misfit beyond chance{' on slow waves' if slow else ''}"
+        share = f"{100.0 * diagnosis.explained:.0f} % of the {'misfit on slow waves' if slow else 'squared error'}"
         out.append(
             f"The nearest is {best.replace('_', ' ')} ({size}): with it the error on frames that the refit has not "
             f"seen goes from {before.held_out:.2g} to {confirmed.held_out:.2g} {diagnosis.unit} (noise alone leaves "
-            f"{_noise(before, confirmed)}), which is {share}. "
+            f"{_noise(before, confirmed)}). It explains {share} beyond noise. "
             f"What remains is more than noise, so it is not all that is missing; {MAKES_UP}."
         )
     return out if diagnosis.strength is None else [*out, *of_strength(diagnosis.strength)]

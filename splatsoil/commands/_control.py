@@ -21,10 +21,11 @@ if TYPE_CHECKING:
 
 
 #: Parts of the package that decide features, what criticism makes of simulations, besides those that simulate; the
-#: replay control; the calibration.
+#: replay control; the calibration; verdicts.
 FEATURES = ("experiment/plow.py", "experiment/base.py")
 REPLAY = ("synthetic", "experiment/replay.py")
 CALIBRATION = ("experiment/bands.py", "experiment/calibration.py", "experiment/calibration_bench.py")
+JUDGING = ("inverse/criticism",)
 
 
 def code_of(effects: Iterable[str]) -> str:
@@ -32,6 +33,13 @@ def code_of(effects: Iterable[str]) -> str:
     from splatsoil.files import FORWARD, code_digest
 
     return code_digest((*FORWARD, *FEATURES), own_files(effects))
+
+
+def judged_by() -> str:
+    """Digest of the code that draws verdicts from features."""
+    from splatsoil.files import code_digest
+
+    return code_digest(JUDGING)
 
 
 def own_files(effects: Iterable[str]) -> list[str]:

@@ -87,7 +87,7 @@ def diagnosed(
 ) -> dict[str, Any]:
     """Diagnose the latest fit; the result is ``diagnosis.json`` and, by model, ``diagnoses/NAME.json``."""
     from splatsoil import __version__
-    from splatsoil.commands._control import calibrated, control
+    from splatsoil.commands._control import calibrated, control, judged_by
     from splatsoil.commands._crew import crew
     from splatsoil.files import write_json
     from splatsoil.inverse.criticism.diagnosis import diagnose
@@ -136,6 +136,7 @@ def diagnosed(
             "device": model.device,
             "version": __version__,
             "code": simulate.identity["code"],
+            "judged_by": judged_by(),
             "seed": options.seed,
             "seconds": round(time.perf_counter() - began, 1),
             "simulated_now": simulate.made,
@@ -276,7 +277,7 @@ def keep_pictures(folder: RunFolder) -> None:
 
 def latest_diagnosis(folder: RunFolder, effect: str) -> dict[str, Any] | None:
     """The diagnosis of the latest fit by the code as it is, an effect or its file among it, if there is one."""
-    from splatsoil.commands._control import code_of
+    from splatsoil.commands._control import code_of, judged_by
     from splatsoil.report.data import estimates
     from splatsoil.run_files import DIAGNOSIS_FORMAT, read_kept
 
@@ -286,7 +287,8 @@ def latest_diagnosis(folder: RunFolder, effect: str) -> dict[str, Any] | None:
         return None
     data = read_kept(path, DIAGNOSIS_FORMAT)
     code = code_of((*fit["setup"]["effects"], effect))
-    return data if data["values"] == estimates(fit) and data.get("code") == code else None
+    same = data.get("code") == code and data.get("judged_by") == judged_by()
+    return data if same and data["values"] == estimates(fit) else None
 
 
 def history(folder: RunFolder) -> list[dict[str, Any]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +25,7 @@ TOLD = ("adequate", "misfit", "whole", "estimates", "blocks", "floor")
 class Config:
     """Compare the prediction at a run's latest estimate with every frame of the video: how far off, where and when.
 
-    What counts as far is learnt from simulations with other seeds and other numerics (about twenty), which are kept.
+    What counts as far is learnt from simulations with other seeds and other numerics (about forty), which are kept.
     """
 
     run: Positional[Path]
@@ -140,14 +141,13 @@ def show_misfit(misfit: Mapping[str, Any], run: str) -> None:
     off = sum(block["p"] < SURE for block in misfit["blocks"])
     word = "[bold]adequate[/bold]" if misfit["adequate"] else "[bold]not adequate[/bold]"
     whole = misfit["whole"]
+    waves = math.sqrt(test["dispersion"])
     console.print(
         f"{word}: the residual is {whole['ratio']:.3g} times what noise leaves (p {whole['p']:.2g}), slow waves of it "
-        f"{test['dispersion']:.3g} times (p {test['p']:.2g}); {off} of {len(misfit['blocks'])} blocks stand out"
+        f"{waves:.3g} times (p {test['p']:.2g}); {off} of {len(misfit['blocks'])} blocks stand out"
     )
     if misfit["adequate"] and off:
-        console.print(
-            "Blocks are judged at the fitted parameters, slow waves after what other parameters would change."
-        )
+        console.print("A part may stand out by itself; the verdict goes by all of it, and by its slow waves.")
     for sentence in misfit["sentences"]:
         console.print(sentence)
     ask = "Could these data show a missing effect?" if misfit["adequate"] else "Which effect is missing?"

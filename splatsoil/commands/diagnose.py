@@ -27,8 +27,8 @@ class Config:
     repeats: int = 4
     """Simulations with other seeds, to know what chance does."""
     refits: int = 3
-    """Effects, the best ones, to refit; one more where slow waves show a misfit or the fit lies on a bound: those that
-    would explain most by themselves are tried there, too."""
+    """Effects, the best ones, to refit; one more where the model leaves more than noise or the fit lies on a bound:
+    those that would explain most by themselves are tried there, too."""
     refit_steps: int = 5
     """Simulations from each point where a refit starts; some ten to twenty more follow."""
     replay: bool = True

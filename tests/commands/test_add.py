@@ -128,8 +128,9 @@ def test_a_diagnosis_by_other_code_is_none(tmp_path: Path) -> None:
     folder = cast(Any, SimpleNamespace(fit=lambda: fit, path=tmp_path))
     assert _criticism.latest_diagnosis(folder, "cohesion") is None
     data = {"format": "splatsoil-diagnosis/1", "model": [], "refits": {}, "values": {"friction_angle": 30.0}}
-    data["code"] = _control.code_of(())
-    for change, known in ({}, True), ({"code": "of yesterday"}, False), ({"values": {"friction_angle": 31.0}}, False):
+    data |= {"code": _control.code_of(()), "judged_by": _control.judged_by()}
+    other = [{key: "of yesterday"} for key in ("code", "judged_by")] + [{"values": {"friction_angle": 31.0}}]
+    for change, known in ({}, True), *((change, False) for change in other):
         write_json(tmp_path / "diagnoses" / "base.json", {**data, **change})
         assert (_criticism.latest_diagnosis(folder, "cohesion") is not None) is known
     (tmp_path / "own.py").write_text(OWN)

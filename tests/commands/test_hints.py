@@ -66,7 +66,9 @@ def test_the_hints_after_a_fit_and_a_comparison_can_be_pasted(
     monkeypatch.setenv("COLUMNS", "40")
     folder = "runs/of the year/with a long name"
     test = {"dispersion": 1.2, "p": 0.2}
-    compare.show_misfit({"blocks": [], "misfit": test, "adequate": False, "sentences": []}, folder)
+    whole = {"ratio": 1.3, "p": 0.001, "n": 9}
+    told = {"blocks": [], "misfit": test, "whole": whole, "adequate": False, "sentences": []}
+    compare.show_misfit(told, folder)
     assert f"Which effect is missing? splatsoil diagnose '{folder}'\n" in capsys.readouterr().out
 
     monkeypatch.setattr(_stages, "prepare", lambda config: (None, SimpleNamespace(path=folder)))
@@ -87,7 +89,8 @@ def test_the_help_says_when_one_effect_more_is_refitted(capsys: pytest.CaptureFi
         cli.main(["diagnose", "--help"])
     told = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert (
-        "Effects, the best ones, to refit; one more where slow waves show a misfit or the fit lies on a bound" in told
+        "Effects, the best ones, to refit; one more where the model leaves more than noise or the fit lies on a bound"
+        in told
     )
 
 

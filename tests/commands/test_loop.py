@@ -55,7 +55,7 @@ def stand_in(monkeypatch: pytest.MonkeyPatch, place: Path, adequate: bool) -> No
     monkeypatch.setattr(_stages, "prepare", lambda config: (None, folder))
     for name, found in (("reconstructed", None), ("model_on", None), ("fitted", {}), ("compared", comparison)):
         monkeypatch.setattr(_stages, name, lambda *_, found=found: found)
-    told = {"adequate": adequate, "misfit": {}, "estimates": {}, "blocks": [], "floor": {}}
+    told = {"adequate": adequate, "misfit": {}, "whole": {}, "estimates": {}, "blocks": [], "floor": {}}
     monkeypatch.setattr(_criticism, "misfit", lambda *_: told)
     monkeypatch.setattr(_criticism, "history", lambda _: [])
     monkeypatch.setattr("splatsoil.report.write_report", lambda path: path)
@@ -80,7 +80,7 @@ def test_run_looks_for_what_is_missing_where_the_floor_says_that_something_is(
     looks: bool,
 ) -> None:
     stand_in(monkeypatch, tmp_path, adequate)
-    parts = ("verdict", "class", "sentences", "effects", "estimates", "simulations")
+    parts = ("verdict", "class", "sentences", "misfit", "whole", "effects", "estimates", "simulations")
     monkeypatch.setattr(command, "loop", lambda *_: (dict.fromkeys(parts, ""), "enough"))
     assert command.run(Config(set=tmp_path, json=True, **flags)) == 0
     said = json.loads(capsys.readouterr().out)

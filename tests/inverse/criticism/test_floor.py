@@ -82,13 +82,21 @@ def test_soil_that_moved_where_none_was_expected_is_no_fault_of_the_pictures() -
 
 
 @pytest.mark.parametrize(
-    ("error", "moved", "told"),
-    [(ERROR, 0.0, ERROR), (0.5 * ERROR, 0.0, ERROR), (3.0 * ERROR, 0.0, 3.0 * ERROR), (ERROR, 20.0, ERROR)],
+    ("error", "moved", "turned", "cameras", "told"),
+    [
+        (ERROR, 0.0, 0.0, True, ERROR),
+        (0.5 * ERROR, 0.0, 0.0, True, ERROR),
+        (3.0 * ERROR, 0.0, 0.0, True, 3.0 * ERROR),
+        (ERROR, 20.0, 0.0, True, 1.1 * ERROR),
+        (ERROR, 0.0, 5.0, True, ERROR),
+        (ERROR, 0.0, 5.0, False, ERROR),
+    ],
 )
 def test_a_control_tells_errors_of_pictures_and_the_bed_only_what_is_worse_all_over_it(
-    error: float, moved: float, told: float
+    error: float, moved: float, turned: float, cameras: bool, told: float
 ) -> None:
-    """Beside the tool's way, in two squares of five, soil may move that a model without the right effect lets lie."""
+    """Beside the tool's way, in two squares of five, soil may move that a model without the right effect lets lie. What
+    a turned camera does is an effect's, and where that isn't at hand a frame may be brighter as a whole."""
     generator = np.random.default_rng(2)
     base = evidence(generator, {})
 
@@ -101,7 +109,12 @@ def test_a_control_tells_errors_of_pictures_and_the_bed_only_what_is_worse_all_o
     quiet[:, :6] = False
     (observed,) = pictures(error, 1)
     observed[:, [6, 7, 8, 9, 10, 22, 23, 24, 25, 26]] += moved
-    found = floor_of(looked(observed, quiet), replace(base, replays=pictures(ERROR, 3)))
+    shift = generator.standard_normal(LAYOUT.shape) if cameras else np.ones(LAYOUT.shape)
+    experiment = looked(observed + turned * shift, quiet)
+    if cameras:
+        experiment.candidates = (SimpleNamespace(name="pose", kind="observation"),)
+        base = replace(base, directions={"pose": shift[None]})
+    found = floor_of(experiment, replace(base, replays=pictures(ERROR, 3)))
     assert np.sqrt(np.mean(found.parts["reconstruction"].scale ** 2)) == pytest.approx(told, rel=0.12)
 
 
