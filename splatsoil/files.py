@@ -172,8 +172,10 @@ def code_digest(parts: Iterable[str] = FORWARD, others: Iterable[str | Path] = (
     """
     root = Path(__file__).parent
     # In the source tree some of the package's folders lie beside this one.
-    places = ((root if (root / part).exists() else root.parent) / part for part in parts)
-    files = sorted(f for place in places for f in ([place] if place.suffix == ".py" else place.rglob("*.py")))
+    places = [(base := root if (root / part).exists() else root.parent, base / part) for part in parts]
+    found = [(base, f) for base, place in places for f in ([place] if place.suffix == ".py" else place.rglob("*.py"))]
+    # By their place in the package, so that a source tree and what is installed of it have the same.
+    files = [file for _, file in sorted((file.relative_to(base).as_posix(), file) for base, file in found)]
     digest = hashlib.sha256()
     try:
         for file in (*files, *map(Path, others)):

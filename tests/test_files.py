@@ -110,6 +110,20 @@ def test_every_part_of_a_digest_is_there(tmp_path: Path) -> None:
         assert code_digest((name,)) != nothing, name
 
 
+def test_a_source_tree_and_what_is_installed_of_it_have_the_same_digest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = []
+    for tree, envs in ("source", "envs"), ("installed", "splatsoil/envs"):
+        for place, contents in ("splatsoil/soil", "1"), ("splatsoil/comparison", "2"), (f"{envs}/measured", "3"):
+            file = tmp_path / tree / f"{place}.py"
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text(contents)
+        monkeypatch.setattr("splatsoil.files.__file__", str(tmp_path / tree / "splatsoil" / "files.py"))
+        found.append(code_digest(("soil.py", "envs/measured.py", "comparison.py")))
+    assert found[0] == found[1] != code_digest(("soil.py", "envs/measured.py"))
+
+
 DAMAGE = {"empty": 0, "cut": -100}
 
 
