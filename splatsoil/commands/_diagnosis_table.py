@@ -42,7 +42,7 @@ def show(result: dict[str, Any]) -> None:
         table.add_row(*(cells[column] for column in columns))
     console.print(table)
     if columns != COLUMNS:
-        console.print(f"diagnosis.json, the page and wider terminals have {', '.join(WIDE_ONLY)}, too.")
+        console.print(f"Wider terminals, the page and diagnosis.json also have: {', '.join(WIDE_ONLY)}.")
     console.print(f"[bold]{result['verdict']}[/bold]")
     for sentence in result["sentences"]:
         console.print(escape(sentence))
