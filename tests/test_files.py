@@ -92,6 +92,11 @@ def reached(repository: Path, start: str) -> set[str]:
         ("experiment.plow", (*FORWARD, *FEATURES), BESIDES),
         ("experiment.replay", (*FORWARD, *FEATURES, *REPLAY), BESIDES),
         ("experiment.calibration", (*FORWARD, *FEATURES, *CALIBRATION), {}),
+        (
+            "inverse.criticism.diagnosis",
+            (*FORWARD, *FEATURES, *JUDGING),
+            {"inverse/evaluations.py": "names what is kept"},
+        ),
     ],
 )
 def test_the_code_that_decides_a_result_is_in_its_digest(

@@ -1,4 +1,4 @@
-"""What a diagnosis needs that doesn't depend on the observation."""
+"""What a residual is judged by."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FloatArray = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Bench:
-    """What doesn't depend on the observation, prepared once: many observations may be judged by it.
+    """What a residual is judged by, made of the evidence.
 
     Attributes:
         floor: noise and nuisances.

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from splatsoil.experiment.base import Candidate
 from splatsoil.experiment.strokes import MEASURED
-from splatsoil.report.words import symbol, undetermined, with_std
+from splatsoil.report.words import rounded, symbol, undetermined, with_std
 
 from .confirmation import Confirmation
 from .diagnosis import Diagnosis
@@ -190,8 +190,7 @@ def listed(words: list[str]) -> str:
 
 def amount(value: float, std: float, unit: str) -> str:
     """A value with its spread, if it has one, and unit."""
-    bare = f"{float(f'{value:.3g}'):g}"
-    return (" ± ".join(with_std(value, std)) if 0.0 < std < math.inf else bare) + symbol(unit)
+    return (" ± ".join(with_std(value, std)) if 0.0 < std < math.inf else rounded(value)) + symbol(unit)
 
 
 def _noise(before: Confirmation, confirmed: Confirmation) -> str:

@@ -25,7 +25,10 @@ if TYPE_CHECKING:
 FEATURES = ("experiment/plow.py", "experiment/base.py")
 REPLAY = ("synthetic", "experiment/replay.py")
 CALIBRATION = ("experiment/bands.py", "experiment/calibration.py", "experiment/calibration_bench.py")
-JUDGING = ("inverse/criticism",)
+JUDGING = (
+    *("inverse/criticism", "inverse/hyperparameters.py", "inverse/surrogate.py"),
+    *("experiment/states.py", "experiment/strokes.py"),
+)
 
 
 def code_of(effects: Iterable[str]) -> str:

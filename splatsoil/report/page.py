@@ -45,6 +45,7 @@ def render(data: RunData) -> str:
     )
     environment.filters["duration"] = words.duration
     environment.filters["symbol"] = words.symbol
+    environment.filters["rounded"] = words.rounded
     environment.filters["model"] = words.model_name
     environment.filters["estimate"] = words.estimate
     comparison, diagnosis = data.comparison, data.diagnosis

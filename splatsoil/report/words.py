@@ -244,6 +244,11 @@ def estimate(value: Any, std: Any, unit: str) -> str:
     return f"{number} ± {spread}{symbol(unit)}"
 
 
+def rounded(value: float) -> str:
+    """A number of three digits without an exponent: "25400", "0.0034"."""
+    return f"{float(f'{value:.3g}'):g}"
+
+
 def percent(share: float) -> str:
     """A share for readers: "7.3 %", "0.26 %", "81 %"."""
     value = 100.0 * share
