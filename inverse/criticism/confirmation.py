@@ -34,7 +34,7 @@ FloatArray = npt.NDArray[np.float64]
 Report = Callable[[str, float], None]
 
 SHARED = 0
-"""Seed by which refits are compared: what chance they have in common cancels."""
+"""Seed of the simulation where a refit ends."""
 MORE_SEEDS = 4
 """Seeds of refits beside those of the evidence."""
 
@@ -49,7 +49,8 @@ class Confirmation:
         values: the parameters by all times.
         stds: standard deviations of these.
         systematic: what of these is the model's own fault; see :mod:`.estimates`.
-        chi2: of all times, as far as these tell of anything; see :class:`~splatsoil.inverse.criticism.sight.Sight`.
+        chi2: of all times, against the mean of several seeds, as far as these tell of anything; see
+            :class:`~splatsoil.inverse.criticism.sight.Sight`.
         fall: by how much that is less than the model's as it is.
         unseen: likewise, on times the refit hasn't seen alone.
         told: chance of what other pictures say of its parameters if they were off; see
@@ -98,11 +99,10 @@ def confirm(
     ``steps`` is the number of simulations from each point where a refit starts; ``vantage`` is another such point.
     """
     shown, hidden = split_times(experiment)
-    whiten, whole = (Sight.of(experiment, floor, basis, vantage, rows) for rows in (shown, None))
+    whiten = Sight.of(experiment, floor, basis, vantage, shown)
     # A surface through many simulations has hardly any of one's chance, and its own doubt beside.
-    through, through_whole = (
-        Sight.of(experiment, floor, basis, vantage, rows, averaged=True) for rows in (shown, None)
-    )
+    through, whole = (Sight.of(experiment, floor, basis, vantage, rows, averaged=True) for rows in (shown, None))
+    apart = whole if shown.all() else Sight.of(experiment, floor, basis, vantage, hidden, averaged=True)
     jobs: list[Candidate | None] = [None, *chosen]
     starting = undiluted(evidence, floor.single.plus(floor.nuisance))
     done = 0
@@ -143,24 +143,26 @@ def confirm(
         return fit, visits
 
     refits = simulate.side_by_side([partial(refitted, candidate) for candidate in jobs])
-    apart = whole if shown.all() else Sight.of(experiment, floor, basis, vantage, hidden)
-    before = experiment.observed - refits[0][0].prediction
+    ends = repeated(simulate, jobs, [fit for fit, _ in refits], len(evidence.repeats))
+    before = experiment.observed - mean_of(ends[0])
     out: dict[str, Confirmation] = {}
-    for candidate, (fit, visits) in zip(jobs, refits, strict=True):
+    for candidate, (fit, visits), end in zip(jobs, refits, ends, strict=True):
         free = free_in(experiment, candidate)
         known = known_of(evidence, free)
         at, off = (np.array([values.get(p.name, p.off or 0.0) for p in free]) for values in (fit.values, {}))
         left, mask = experiment.observed - fit.prediction, judged(experiment, hidden)
+        after = experiment.observed - mean_of(end)
         apart_from = np.concatenate([floor.nuisance, reach_of(floor.single, fit.slopes)], axis=1)
         remainder = omnibus(floor.single, apart_from, left[experiment.seen], basis)
-        chi2 = _chi2(whole, left) + known.chi2(at)
+        chi2 = _chi2(whole, after) + known.chi2(at)
         precision = beforehand(free, fit.values, known)
         values, stds = dict(fit.values), stds_of(free, whiten(fit.slopes), precision, remainder)
         emulated: tuple[Visit, ...] = ()
         if has_surface(experiment, candidate):
             # A surface that isn't one tells nothing more than the last derivatives do.
             with suppress(ValueError):
-                reading = read(visits, through_whole, experiment.observed, free, known)
+                visits = [*visits, *end[1:]]
+                reading = read(visits, whole, experiment.observed, free, known)
                 values, stds, emulated = dict(reading.values), dict(reading.stds), tuple(visits)
         name = "" if candidate is None else candidate.name
         solvers = [experiment.reproducibility(p, values[p.name], name) for p in free]
@@ -174,7 +176,7 @@ def confirm(
             systematic=systematic,
             chi2=chi2,
             fall=0.0 if candidate is None else _chi2(whole, before) + known.chi2(off) - chi2,
-            unseen=_chi2(apart, before) - _chi2(apart, left),
+            unseen=_chi2(apart, before) - _chi2(apart, after),
             told=known.chance(off),
             agrees=known.chance(at),
             held_out=float(np.sqrt(np.mean(left[mask] ** 2))),
@@ -183,6 +185,33 @@ def confirm(
             visits=emulated,
         )
     return out
+
+
+def repeated(
+    simulate: Simulations, jobs: Sequence[Candidate | None], fits: Sequence[Refit], count: int
+) -> list[list[Visit]]:
+    """Simulations by ``count`` seeds where each refit ended, its own the first: two single ones differ in χ² by chance
+    as much as an effect of twice the smallest detectable size takes away."""
+    seeds = range(SHARED + 1, SHARED + count)
+
+    def again(ask: Callable[..., FloatArray]) -> list[list[Visit]]:
+        out = []
+        for candidate, fit in zip(jobs, fits, strict=True):
+            on, purpose = ((), "of the model") if candidate is None else ((candidate.name,), candidate.name)
+            out.append([Visit(dict(fit.values), on, fit.prediction, SHARED)])
+            for seed in seeds:
+                with suppress(SimulationError):
+                    table = ask(fit.values, effects=on, seed=seed, purpose=f"refit {purpose} once more")
+                    out[-1].append(Visit(dict(fit.values), on, table, seed))
+        return out
+
+    simulate.ahead(again)
+    return again(simulate)
+
+
+def mean_of(visits: Sequence[Visit]) -> FloatArray:
+    """(t, s) mean features of simulations."""
+    return np.asarray(np.mean([visit.table for visit in visits], axis=0))
 
 
 def seeds_of(experiment: Experiment, repeats: int) -> list[int]:

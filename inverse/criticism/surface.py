@@ -2,9 +2,10 @@
 
 Few directions of the features vary by more than the chance of a simulation; singular values tell which (Gavish &
 Donoho 2014, IEEE Trans. Inf. Theory 60:5040). Each is a parabola in the parameters, and a Gaussian process about that.
-All share length scales, the parabola's share and noise, which some twenty simulations then determine well enough to
-take the most probable ones, in a tenth of a second; :class:`~splatsoil.inverse.emulator.Emulator` gives each component
-its own and averages over them, in seconds.
+All share length scales and the parabola's share, which some twenty simulations then determine well enough to take the
+most probable ones, in tenths of a second; :class:`~splatsoil.inverse.emulator.Emulator` gives each component its own
+and averages over them, in seconds. Signal and noise are each direction's own: chance isn't the same in all, and where
+it is large a direction looks as if it varied.
 
 A part of the chance is the same in all simulations that share a seed (random effects, Laird & Ware 1982, Biometrics
 38:963): within a seed it cancels in differences, over seeds it averages out, and simulations tell how large it is.
@@ -28,8 +29,10 @@ LEAST = 1e-4
 """Variance of a simulation's chance at least, of features whose own noise has a variance of 1."""
 TREND = 2.0
 """Standard deviation of the logarithm of the parabola's share."""
-FREEDOM = 0.5
-"""Standard deviation of the logarithms of signal and noise about what the singular values say."""
+SIGNAL, NOISE = 0.5, 1.0
+"""Standard deviations of the logarithms of a direction's signal and noise about what the singular values say."""
+STEP = 1e-6
+"""Of differences that make a slope of the likelihood."""
 COMMON = 1.5
 """Standard deviation of the logarithm of a seed's chance over that of a simulation alone."""
 
@@ -45,7 +48,7 @@ class Surface:
         lengths: (n,) of the processes, in halves of the parameters' ranges.
         trend: variance of a parabola's coefficients over that of the process.
         signal: (p,) variance of each direction's process.
-        noise: variance of a simulation's own chance in any direction.
+        noise: (p,) variance of a simulation's own chance in each direction.
         common: variance of what all simulations of a seed have in common over that; 0 where none share one.
         root: (m, m) Cholesky factor of chance's covariance, over that noise.
         scores: (m, p) simulations along the directions.
@@ -60,7 +63,7 @@ class Surface:
     lengths: FloatArray
     trend: float
     signal: FloatArray
-    noise: float
+    noise: FloatArray
     common: float
     root: FloatArray
     scores: FloatArray
@@ -96,24 +99,39 @@ class Surface:
         signal = np.maximum(np.mean(scores**2, axis=0) - noise, 1e-3 * noise)
         apart = bool(alike.sum() > m)  # else nothing tells a seed's chance from a simulation's own
 
-        def cost(at: FloatArray) -> float:
-            common = np.exp(at[n + 3]) if apart else 0.0
-            strengths, modes, root = _modes(points, np.exp(at[:n]), float(np.exp(at[n])), alike, common)
-            variance = np.exp(at[n + 1]) * signal * strengths[:, None] + np.exp(at[n + 2]) * noise
-            fit = np.sum(np.log(variance) + (modes.T @ scores) ** 2 / variance) + 2.0 * count * np.sum(
-                np.log(np.diag(root))
-            )
-            return 0.5 * float(fit + np.sum(((at - middle) / spread) ** 2))
+        shared = n + 2  # lengths, the parabola's share, what a seed's simulations have in common
+
+        def parts(at: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+            return _modes(points, np.exp(at[:n]), float(np.exp(at[n])), alike, float(np.exp(at[n + 1])) * apart)
+
+        def likelihood(at: FloatArray) -> tuple[float, FloatArray]:
+            strengths, modes, root = parts(at)
+            of_signal = np.exp(at[shared : shared + count]) * signal * strengths[:, None]
+            of_noise = np.exp(at[shared + count :]) * noise
+            variance, squares = of_signal + of_noise, (modes.T @ scores) ** 2
+            value = np.sum(np.log(variance) + squares / variance) + 2.0 * count * np.sum(np.log(np.diag(root)))
+            pull = 1.0 / variance - squares / variance**2
+            own = [np.sum(pull * part, axis=0) for part in (of_signal, of_noise)]
+            return 0.5 * float(value), 0.5 * np.concatenate(own)
+
+        def cost(at: FloatArray) -> tuple[float, FloatArray]:
+            value, own = likelihood(at)
+            steps = STEP * np.eye(shared, len(at))
+            slopes = [(likelihood(at + step)[0] - value) / STEP for step in steps]
+            z = (at - middle) / spread
+            return value + 0.5 * float(z @ z), np.concatenate([slopes, own]) + z / spread
 
         # The prior is the unit cube's, whose sides are half as long.
-        middle = np.array([np.log(2.0) + LENGTH_MEAN + 0.5 * np.log(n)] * n + [0.0] * 4)
-        spread = np.array([LENGTH_STD] * n + [TREND, *[FREEDOM] * 2, COMMON])
-        bounds = [LENGTH_BOUNDS] * n + [(-8.0, 8.0)] * 4
-        starts = [np.array([np.log(length)] * n + [0.0] * 4) for length in (0.5, 2.0)]
-        best = min((minimize(cost, s, bounds=bounds, method="L-BFGS-B") for s in starts), key=lambda found: found.fun).x
-        lengths, trend, common = np.exp(best[:n]), float(np.exp(best[n])), float(np.exp(best[n + 3])) * apart
-        strengths, modes, root = _modes(points, lengths, trend, alike, common)
-        signal, noise = np.exp(best[n + 1]) * signal, float(np.exp(best[n + 2]) * noise)
+        middle = np.array([np.log(2.0) + LENGTH_MEAN + 0.5 * np.log(n)] * n + [0.0] * (2 + 2 * count))
+        spread = np.array([LENGTH_STD] * n + [TREND, COMMON] + [SIGNAL] * count + [NOISE] * count)
+        bounds = [LENGTH_BOUNDS] * n + [(-8.0, 8.0)] * (2 + 2 * count)
+        starts = [np.where(np.arange(len(middle)) < n, np.log(length), 0.0) for length in (0.5, 2.0)]
+        found = (minimize(cost, s, jac=True, bounds=bounds, method="L-BFGS-B") for s in starts)
+        best = min(found, key=lambda found: found.fun).x
+        strengths, modes, root = parts(best)
+        lengths, trend, common = np.exp(best[:n]), float(np.exp(best[n])), float(np.exp(best[n + 1])) * apart
+        signal = np.exp(best[shared : shared + count]) * signal
+        noise = np.exp(best[shared + count :]) * noise
         # Errors of those left out are K⁻¹y / diag(K⁻¹), their variances 1 / diag(K⁻¹).
         inverse = 1.0 / (strengths[:, None] * signal + noise)
         z2 = (modes @ (inverse * (modes.T @ scores))) ** 2 / (modes**2 @ inverse)
