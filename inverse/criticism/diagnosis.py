@@ -35,6 +35,7 @@ from .verdicts import (
     EffectVerdict,
     Verdict,
     amiss,
+    beyond,
     explained,
     explained_of_all,
     of_effect,
@@ -79,6 +80,7 @@ class Diagnosis:
         misfit: of the model as it is, on slow waves.
         whole: how far it is off in all.
         remainder: after the best effect; None where none was named.
+        whole_after: how far the model with it is off in all; None where that wasn't simulated by several seeds.
         explained: share of the misfit beyond chance that the best effect explains, on slow waves where these show one.
         confirmations: refits by effect, the model as it is under the empty name.
         blocks: where the model fails.
@@ -110,6 +112,7 @@ class Diagnosis:
     residual: FloatArray
     floor: Floor
     evidence: Evidence
+    whole_after: Block | None = None
     strength: StrengthReading | None = None
     strokes: tuple[StrokeAdvice, ...] = ()
     simulations: int = 0
@@ -177,7 +180,7 @@ def judge(
     confirmations: dict[str, Confirmation] = {}
     members: tuple[str, ...] = ()
     given: Mapping[str, Score] = {}
-    remainder, gone, before, error = None, 0.0, misfit, 1.0
+    remainder, gone, before, left, whole_after = None, 0.0, misfit, False, None
     if chosen and scorer is not None:
         trials = [candidates[name] for name in chosen]
         confirmations = confirm(
@@ -194,11 +197,12 @@ def judge(
             given = scorer.score(residual, given=best)
             remainder = remainder_of(experiment, floor, tried[best], candidates, evidence, bench.basis)
             error = tried[best].held_out / tried[best].floor
-            more = remainder.p < CLEAN and explained(before, remainder) < ENOUGH
-            if experiment.chance and (more or error > WITHIN or tried[best].visits):
+            left, more = error > WITHIN, remainder.p < CLEAN and explained(before, remainder) < ENOUGH
+            if experiment.chance and (more or left or tried[best].visits):
                 told("the floor with the effect on", 0.97)
                 own = on_its_own_floor(experiment, evidence, tried[best], candidates[best], simulate, residual)
                 confirmations[best], error = own.refit, own.refit.held_out / own.refit.floor
+                whole_after, left = own.whole, beyond(own.whole)
                 if more:
                     before, remainder = own.before, own.after
             asis = confirmations[""].held_out / confirmations[""].floor
@@ -208,7 +212,7 @@ def judge(
     named = bool(members) and effects[members[0]] == "missing"
     if chosen and not named:
         effects = {n: "cannot tell" if v == "missing" else v for n, v in effects.items()}
-    verdict = overall(named, off, before, remainder, error=error)
+    verdict = overall(named, off, before, remainder, left=left)
     notes = [f"{name} could not be simulated: {why}" for name, why in evidence.failed.items()]
     strength = None
     # Strength is told along slow waves: of what they don't show it explains nothing.
@@ -238,6 +242,7 @@ def judge(
         misfit=misfit,
         whole=whole,
         remainder=remainder,
+        whole_after=whole_after,
         explained=gone,
         confirmations=confirmations,
         blocks=parts,

@@ -37,7 +37,7 @@ from .confirmation import (
 from .estimates import Estimate, at_odds, bounded, untried, weighed_there
 from .evidence import Evidence, Numerics, Visit, deviations, other_numerics, pair_of
 from .floor import Floor, floor_of
-from .misfit import Omnibus, omnibus, smooth_basis
+from .misfit import Block, Omnibus, blocks, omnibus, smooth_basis
 from .reading import read, tangent
 from .sight import Sight
 from .simulations import Simulations
@@ -53,11 +53,13 @@ class OwnFloor:
         before: misfit of the model as it is on that floor.
         after: of the model with the effect.
         refit: with its parameters read off on that floor, and what that leaves on times hidden from refits.
+        whole: how far the model with the effect is off in all.
     """
 
     before: Omnibus
     after: Omnibus
     refit: Confirmation
+    whole: Block
 
 
 def on_its_own_floor(
@@ -111,7 +113,8 @@ def on_its_own_floor(
         values, noise, systematic = soil.told(best.name)
         stds = {name: math.hypot(noise[name], systematic[name]) for name in noise}
         refit = replace(refit, values=values, stds=stds, systematic=systematic)
-    return OwnFloor(before=soil.misfit(residual, len(experiment.parameters)), after=soil.after, refit=refit)
+    before = soil.misfit(residual, len(experiment.parameters))
+    return OwnFloor(before=before, after=soil.after, refit=refit, whole=soil.whole)
 
 
 def as_it_is(
@@ -200,10 +203,19 @@ class _Soil:
         """Misfit of such soil."""
         return self.misfit(self.left[self.experiment.seen], len(self.parameters))
 
+    @property
+    def whole(self) -> Block:
+        """How far such soil is off in all."""
+        left, free = self.left[self.experiment.seen], self._free(len(self.parameters))
+        return blocks(self.experiment.layout, self.floor.noise, free, left)[0]
+
     def misfit(self, residual: FloatArray, count: int) -> Omnibus:
         """What of a residual (n,) stands on slow waves once numerics and the first parameters have taken their part."""
-        along = reach_of(self.floor.noise, self.slopes[..., :count])
-        return omnibus(self.floor.noise, np.concatenate([self.floor.nuisance, along], axis=1), residual, self.basis)
+        return omnibus(self.floor.noise, self._free(count), residual, self.basis)
+
+    def _free(self, count: int) -> FloatArray:
+        """(n, q) what numerics and the first parameters can take up."""
+        return np.concatenate([self.floor.nuisance, reach_of(self.floor.noise, self.slopes[..., :count])], axis=1)
 
     def told(self, effect: str = "") -> tuple[dict[str, float], dict[str, float], dict[str, float]]:
         """Parameters, and standard deviations of them by noise and by what is systematic, by name; ``effect`` is one

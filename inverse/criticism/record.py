@@ -11,7 +11,7 @@ from splatsoil.run_files import DIAGNOSIS_FORMAT, MISFIT_FORMAT
 
 from .confirmation import Confirmation
 from .diagnosis import Diagnosis
-from .misfit import Omnibus
+from .misfit import Block, Omnibus
 from .outside import StrengthReading
 from .words import of_estimates, sentences
 
@@ -42,7 +42,8 @@ def record(experiment: Experiment, diagnosis: Diagnosis) -> dict[str, Any]:
             for name, e in diagnosis.estimates.items()
         },
         "misfit": _omnibus(diagnosis.misfit),
-        "whole": {"ratio": diagnosis.whole.ratio, "p": diagnosis.whole.p, "n": diagnosis.whole.features},
+        "whole": _block(diagnosis.whole),
+        "whole_after": None if diagnosis.whole_after is None else _block(diagnosis.whole_after),
         "remainder": None if diagnosis.remainder is None else _omnibus(diagnosis.remainder),
         "explained": diagnosis.explained,
         "refits": {name or "as it is": confirmation(c) for name, c in diagnosis.confirmations.items()},
@@ -193,6 +194,10 @@ def _strength(found: StrengthReading) -> dict[str, Any]:
             for s in found.shapes
         ],
     }
+
+
+def _block(whole: Block) -> dict[str, float]:
+    return {"ratio": whole.ratio, "p": whole.p, "n": whole.features}
 
 
 def _omnibus(test: Omnibus) -> dict[str, float]:

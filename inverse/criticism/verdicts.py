@@ -32,10 +32,11 @@ ENOUGH = 0.6
 """Share of the misfit beyond chance that effects must explain where a remainder stands: another solver's soil, or a
 real one, leaves one of its own. What imitates an effect is told by :data:`WITHIN`, hardly ever by this."""
 WITHIN = 1.2
-"""Error on times that a refit hasn't seen, over what noise leaves there in soil that has the effect, up to which an
-effect can be all there is. Chosen on emulated worlds of one effect of two and four times the smallest detectable size
-(seed 61, a hundred each): 1.2 gives away 1 and 3 of the right ones, 1.1 gives away 5 and 12; of those that imitate a
-truth out of the library 1.2 lets 18 and 4 pass, 1.25 22 and 4."""
+"""Residual over what noise leaves, up to which a model can be adequate, and an effect all there is: in all, or on times
+that a refit hasn't seen where soil that has the effect wasn't simulated by several seeds. Chosen on emulated worlds of
+one effect of two and four times the smallest detectable size, by the latter (seed 61, a hundred each): 1.2 gives away 1
+and 3 of the right ones, 1.1 gives away 5 and 12; of those that imitate a truth out of the library 1.2 lets 18 and 4
+pass, 1.25 22 and 4."""
 
 
 def of_effect(candidate: Candidate, score: Score, *, level: float = LEVEL) -> EffectVerdict:
@@ -52,13 +53,18 @@ def of_effect(candidate: Candidate, score: Score, *, level: float = LEVEL) -> Ef
     return "cannot tell"
 
 
+def beyond(whole: Block) -> bool:
+    """Whether more is left in all than an adequate model may leave."""
+    return whole.ratio > WITHIN and whole.p < GATE
+
+
 def amiss(misfit: Omnibus, whole: Block) -> bool:
     """Whether more is left than noise leaves: on slow waves, or in all by more than an adequate model may leave.
 
     What one part of the trench shows in one camera isn't slow: cohesive soil that passes for dry soil of a larger angle
     leaves twice the noise, and hardly anything on slow waves.
     """
-    return misfit.p < GATE or (whole.ratio > WITHIN and whole.p < GATE)
+    return misfit.p < GATE or beyond(whole)
 
 
 def overall(
@@ -67,7 +73,7 @@ def overall(
     misfit: Omnibus,
     remainder: Omnibus | None,
     *,
-    error: float = 1.0,
+    left: bool = False,
     clean: float = CLEAN,
     enough: float = ENOUGH,
 ) -> Verdict:
@@ -78,13 +84,13 @@ def overall(
         off: the model as it is leaves more than noise; see :func:`amiss`.
         misfit: slow waves before the best the library can do, on the floor by which the remainder is judged.
         remainder: after the best the library can do; None where nothing was named.
-        error: with that best, on times its refit hasn't seen, over what noise leaves there.
+        left: with that best more is left in all than an adequate model may leave.
         clean: see :data:`CLEAN`.
         enough: see :data:`ENOUGH`.
     """
     if not named or remainder is None:
         return "outside the library" if off else "adequate"
-    if error <= WITHIN and (remainder.p >= clean or explained(misfit, remainder) >= enough):
+    if not left and (remainder.p >= clean or explained(misfit, remainder) >= enough):
         return "missing"
     return "outside the library"
 

@@ -13,7 +13,7 @@ from .confirmation import Confirmation
 from .diagnosis import Diagnosis
 from .estimates import Estimate
 from .outside import CLEAR, FEW, StrengthReading
-from .verdicts import CLEAN, GATE, amiss
+from .verdicts import CLEAN, GATE, WITHIN, amiss
 
 #: Correlation of two effects' scores from which they are called alike.
 ALIKE = 0.8
@@ -56,6 +56,12 @@ def _missing(diagnosis: Diagnosis, candidates: Mapping[str, Candidate], base: Ma
         f"frames that the refit has not seen from {before.held_out:.2g} to "
         f"{confirmed.held_out:.2g} {diagnosis.unit}; noise alone leaves {_noise(before, confirmed)}."
     ]
+    after = diagnosis.whole_after
+    if after is not None and confirmed.held_out > WITHIN * confirmed.floor:
+        out.append(
+            "Without what numerics and the refitted parameters can make up for, what is left in all is "
+            f"{after.ratio:.2f} times what noise leaves: nothing more need be missing."
+        )
     if diagnosis.where:
         (stage, region, channel), share = max(diagnosis.where.items(), key=lambda item: item[1])
         out.append(
