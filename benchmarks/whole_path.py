@@ -1,6 +1,6 @@
 """From photographs to a friction angle: each stage against its aim, and the table in the README.
 
-``splatsoil benchmark whole-path --page README.md`` takes about half an hour on two cores: the example sets are
+``splatsoil benchmark whole-path --page README.md`` takes the best part of an hour on two cores: the example sets are
 reconstructed, drawn from their true particles, simulated from them with one piece of the numerics changed at a time,
 and fitted as a user does. Parts are kept in the folder as they end, fits with all their evaluations, and a second call
 goes on from there; a part that is asked for by name is measured again.
@@ -347,7 +347,7 @@ def _run(options: argparse.Namespace, task: Task) -> int:
     check_folder(task.out)
     here = machine.describe(task.device)
     if options.page:
-        written(_page(options.page), (), here)  # a page without a place for the table fails now, not in half an hour
+        written(_page(options.page), (), here)  # a page without a place for the table fails now, not at the end
     todo = parts(task)
     kept = _kept(task, here, todo)
     for name in options.only or [name for name in todo if name not in kept]:
