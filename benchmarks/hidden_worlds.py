@@ -191,6 +191,8 @@ def score(hidden: Hidden, fit: Mapping[str, Any], told: Mapping[str, Any]) -> di
         "off": off,
         # Each over what noise leaves in such soil.
         "errors": [refit["held_out"] / refit["floor"] for refit in (base, last) if "floor" in refit],
+        # In all, without what numerics and parameters can make up for.
+        "whole": [told[key]["ratio"] for key in ("whole", "whole_after") if told.get(key)],
         "z": {e["name"]: e["z"] for e in told["effects"]},
         "seconds": [fit["seconds"], told["seconds"]],
     }
@@ -232,6 +234,8 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
     share("something named that is outside the library", outside, lambda r: not r["right"])
     share("the right effect of soil or tool first: angle within 2.5° after", right, _near)
     share("the same: error ends within 1.2 × the floor", right, lambda r: r["errors"][-1] <= 1.2)
+    judged = [r for r in right if len(r["whole"]) > 1]
+    share("the same: the whole ends within 1.2 × noise", judged, lambda r: r["whole"][-1] <= 1.2)
     share("nothing hidden: angle within 2.5°", plain_sand, _near)
     if rows:
         stated = [r["off"] for r in rows if r["class"][:1] == [r["hidden"]] or (r["hidden"] == NOTHING and r["right"])]

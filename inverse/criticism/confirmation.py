@@ -56,9 +56,10 @@ class Confirmation:
         told: chance of what other pictures say of its parameters if they were off; see
             :class:`~splatsoil.experiment.base.Calibration`.
         agrees: likewise, if they were as refitted.
-        held_out: root mean square of the residual on times the refit hasn't seen, of features in the layout's unit.
+        held_out: root mean square of one simulation's residual on times the refit hasn't seen, of features in the
+            layout's unit.
         floor: what noise alone leaves there; of soil that has the effect, where that was simulated.
-        remainder: what stands on slow waves.
+        remainder: what of it stands on slow waves.
         visits: simulations that the parameters were read off; none where the last derivatives told them.
     """
 
@@ -97,6 +98,10 @@ def confirm(
     """Refit the model as it is, and with each chosen effect, on every other time; judge on the rest.
 
     ``steps`` is the number of simulations from each point where a refit starts; ``vantage`` is another such point.
+    Effects that no seed of the model's own simulates where their refit ended are left out.
+
+    Raises:
+        SimulationError: the model can't be simulated where its own ended.
     """
     shown, hidden = split_times(experiment)
     whiten = Sight.of(experiment, floor, basis, vantage, shown)
@@ -144,14 +149,17 @@ def confirm(
 
     refits = simulate.side_by_side([partial(refitted, candidate) for candidate in jobs])
     ends = repeated(simulate, jobs, [fit for fit, _ in refits], len(evidence.repeats))
-    before = experiment.observed - mean_of(ends[0])
+    if not ends[0]:
+        raise SimulationError("the model can't be simulated where its refit ended")
     out: dict[str, Confirmation] = {}
     for candidate, (fit, visits), end in zip(jobs, refits, ends, strict=True):
+        if candidate is not None and not ends[0].keys() & end.keys():
+            continue  # nothing to compare them by
         free = free_in(experiment, candidate)
         known = known_of(evidence, free)
         at, off = (np.array([values.get(p.name, p.off or 0.0) for p in free]) for values in (fit.values, {}))
         left, mask = experiment.observed - fit.prediction, judged(experiment, hidden)
-        after = experiment.observed - mean_of(end)
+        before, after = (experiment.observed - table for table in means(ends[0], end))
         apart_from = np.concatenate([floor.nuisance, reach_of(floor.single, fit.slopes)], axis=1)
         remainder = omnibus(floor.single, apart_from, left[experiment.seen], basis)
         chi2 = _chi2(whole, after) + known.chi2(at)
@@ -161,7 +169,8 @@ def confirm(
         if has_surface(experiment, candidate):
             # A surface that isn't one tells nothing more than the last derivatives do.
             with suppress(ValueError):
-                visits = [*visits, *end[1:]]
+                known_tables = [visit.table for visit in visits]
+                visits += [v for v in end.values() if not any(np.array_equal(v.table, t) for t in known_tables)]
                 reading = read(visits, whole, experiment.observed, free, known)
                 values, stds, emulated = dict(reading.values), dict(reading.stds), tuple(visits)
         name = "" if candidate is None else candidate.name
@@ -189,29 +198,30 @@ def confirm(
 
 def repeated(
     simulate: Simulations, jobs: Sequence[Candidate | None], fits: Sequence[Refit], count: int
-) -> list[list[Visit]]:
-    """Simulations by ``count`` seeds where each refit ended, its own the first: two single ones differ in χ² by chance
-    as much as an effect of twice the smallest detectable size takes away."""
-    seeds = range(SHARED + 1, SHARED + count)
+) -> list[dict[int, Visit]]:
+    """Simulations by ``count`` seeds where each refit ended, by seed: two single ones differ in χ² by chance as much as
+    an effect of twice the smallest detectable size takes away. Seeds that can't be simulated there are left out."""
 
-    def again(ask: Callable[..., FloatArray]) -> list[list[Visit]]:
-        out = []
+    def again(ask: Callable[..., FloatArray]) -> list[dict[int, Visit]]:
+        out = list[dict[int, Visit]]()
         for candidate, fit in zip(jobs, fits, strict=True):
             on, purpose = ((), "of the model") if candidate is None else ((candidate.name,), candidate.name)
-            out.append([Visit(dict(fit.values), on, fit.prediction, SHARED)])
-            for seed in seeds:
+            out.append({})
+            for seed in range(SHARED, SHARED + count):
                 with suppress(SimulationError):
                     table = ask(fit.values, effects=on, seed=seed, purpose=f"refit {purpose} once more")
-                    out[-1].append(Visit(dict(fit.values), on, table, seed))
+                    out[-1][seed] = Visit(dict(fit.values), on, table, seed)
         return out
 
     simulate.ahead(again)
     return again(simulate)
 
 
-def mean_of(visits: Sequence[Visit]) -> FloatArray:
-    """(t, s) mean features of simulations."""
-    return np.asarray(np.mean([visit.table for visit in visits], axis=0))
+def means(one: Mapping[int, Visit], other: Mapping[int, Visit]) -> tuple[FloatArray, FloatArray]:
+    """(t, s) mean features of both over the seeds that both have: of as many, chance adds as much to either χ²."""
+    shared = sorted(one.keys() & other.keys())
+    both = [np.mean([visits[seed].table for seed in shared], axis=0) for visits in (one, other)]
+    return both[0], both[1]
 
 
 def seeds_of(experiment: Experiment, repeats: int) -> list[int]:

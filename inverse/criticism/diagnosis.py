@@ -27,8 +27,6 @@ from .sight import Sight
 from .simulations import Simulations
 from .strokes import StrokeAdvice, advise
 from .verdicts import (
-    CLEAN,
-    ENOUGH,
     GATE,
     LEVEL,
     WITHIN,
@@ -80,7 +78,8 @@ class Diagnosis:
         misfit: of the model as it is, on slow waves.
         whole: how far it is off in all.
         remainder: after the best effect; None where none was named.
-        whole_after: how far the model with it is off in all; None where that wasn't simulated by several seeds.
+        whole_after: how far the model with it is off in all; None where none was named, where there is no chance, or
+            none could be simulated.
         explained: share of the misfit beyond chance that the best effect explains, on slow waves where these show one.
         confirmations: refits by effect, the model as it is under the empty name.
         blocks: where the model fails.
@@ -176,6 +175,7 @@ def judge(
     scores = {} if scorer is None else scorer.score(residual)
     candidates = {c.name: c for c in bench.candidates}
     vantage = None if scorer is None else look_afresh(experiment, evidence, off, simulate, floor, bench.basis)
+    notes = [f"{name} could not be simulated: {why}" for name, why in evidence.failed.items()]
     chosen = _chosen(experiment, bench, scores, residual, off, vantage, options)
     confirmations: dict[str, Confirmation] = {}
     members: tuple[str, ...] = ()
@@ -195,25 +195,28 @@ def judge(
         if members:
             best = members[0]
             given = scorer.score(residual, given=best)
-            remainder = remainder_of(experiment, floor, tried[best], candidates, evidence, bench.basis)
-            error = tried[best].held_out / tried[best].floor
-            left, more = error > WITHIN, remainder.p < CLEAN and explained(before, remainder) < ENOUGH
-            if experiment.chance and (more or left or tried[best].visits):
+            own = None
+            if experiment.chance:
                 told("the floor with the effect on", 0.97)
-                own = on_its_own_floor(experiment, evidence, tried[best], candidates[best], simulate, residual)
-                confirmations[best], error = own.refit, own.refit.held_out / own.refit.floor
+                try:
+                    own = on_its_own_floor(experiment, evidence, tried[best], candidates[best], simulate, residual)
+                except SimulationError as error:
+                    notes.append(f"with {best} on, its noise could not be simulated: {error}")
+            if own is not None:
+                confirmations[best], before, remainder = own.refit, own.before, own.after
                 whole_after, left = own.whole, beyond(own.whole)
-                if more:
-                    before, remainder = own.before, own.after
-            asis = confirmations[""].held_out / confirmations[""].floor
-            gone = explained(before, remainder) if misfit.p < GATE else explained_of_all(asis, error)
+                errors = whole.ratio, own.whole.ratio
+            else:
+                remainder = remainder_of(experiment, floor, tried[best], candidates, evidence, bench.basis)
+                asis, after = (c.held_out / c.floor for c in (confirmations[""], tried[best]))
+                errors, left = (asis, after), after > WITHIN
+            gone = explained(before, remainder) if misfit.p < GATE else explained_of_all(*errors)
     effects = _effects(candidates, scores, given, members, confirmations, options.level)
     # Where the best explanation is too small to matter, so is what is missing.
     named = bool(members) and effects[members[0]] == "missing"
     if chosen and not named:
         effects = {n: "cannot tell" if v == "missing" else v for n, v in effects.items()}
     verdict = overall(named, off, before, remainder, left=left)
-    notes = [f"{name} could not be simulated: {why}" for name, why in evidence.failed.items()]
     strength = None
     # Strength is told along slow waves: of what they don't show it explains nothing.
     if verdict == "outside the library" and misfit.p < GATE:

@@ -95,43 +95,17 @@ class Surface:
         if size[0] <= 1e-12 * max(1.0, float(np.abs(centre).max())):
             raise ValueError("the features are the same wherever they were simulated")
         scores = (features - centre) @ right[:count].T
-        noise = max(float(np.sum(size[count:] ** 2)) / max((free - count) * (features.shape[1] - count), 1), LEAST)
-        signal = np.maximum(np.mean(scores**2, axis=0) - noise, 1e-3 * noise)
+        level = max(float(np.sum(size[count:] ** 2)) / max((free - count) * (features.shape[1] - count), 1), LEAST)
+        signal = np.maximum(np.mean(scores**2, axis=0) - level, 1e-3 * level)
         apart = bool(alike.sum() > m)  # else nothing tells a seed's chance from a simulation's own
 
-        shared = n + 2  # lengths, the parabola's share, what a seed's simulations have in common
-
-        def parts(at: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-            return _modes(points, np.exp(at[:n]), float(np.exp(at[n])), alike, float(np.exp(at[n + 1])) * apart)
-
-        def likelihood(at: FloatArray) -> tuple[float, FloatArray]:
-            strengths, modes, root = parts(at)
-            of_signal = np.exp(at[shared : shared + count]) * signal * strengths[:, None]
-            of_noise = np.exp(at[shared + count :]) * noise
-            variance, squares = of_signal + of_noise, (modes.T @ scores) ** 2
-            value = np.sum(np.log(variance) + squares / variance) + 2.0 * count * np.sum(np.log(np.diag(root)))
-            pull = 1.0 / variance - squares / variance**2
-            own = [np.sum(pull * part, axis=0) for part in (of_signal, of_noise)]
-            return 0.5 * float(value), 0.5 * np.concatenate(own)
-
-        def cost(at: FloatArray) -> tuple[float, FloatArray]:
-            value, own = likelihood(at)
-            steps = STEP * np.eye(shared, len(at))
-            slopes = [(likelihood(at + step)[0] - value) / STEP for step in steps]
-            z = (at - middle) / spread
-            return value + 0.5 * float(z @ z), np.concatenate([slopes, own]) + z / spread
-
-        # The prior is the unit cube's, whose sides are half as long.
-        middle = np.array([np.log(2.0) + LENGTH_MEAN + 0.5 * np.log(n)] * n + [0.0] * (2 + 2 * count))
-        spread = np.array([LENGTH_STD] * n + [TREND, COMMON] + [SIGNAL] * count + [NOISE] * count)
-        bounds = [LENGTH_BOUNDS] * n + [(-8.0, 8.0)] * (2 + 2 * count)
-        starts = [np.where(np.arange(len(middle)) < n, np.log(length), 0.0) for length in (0.5, 2.0)]
-        found = (minimize(cost, s, jac=True, bounds=bounds, method="L-BFGS-B") for s in starts)
+        density = _Density(points, scores, alike, signal, level, apart)
+        starts = [np.where(np.arange(density.size) < n, np.log(length), 0.0) for length in (0.5, 2.0)]
+        found = (minimize(density, s, jac=True, bounds=density.bounds, method="L-BFGS-B") for s in starts)
         best = min(found, key=lambda found: found.fun).x
-        strengths, modes, root = parts(best)
-        lengths, trend, common = np.exp(best[:n]), float(np.exp(best[n])), float(np.exp(best[n + 1])) * apart
-        signal = np.exp(best[shared : shared + count]) * signal
-        noise = np.exp(best[shared + count :]) * noise
+        lengths, trend, common = density.shared(best)
+        strengths, modes, root = _modes(points, lengths, trend, alike, common)
+        signal, noise = density.own(best)
         # Errors of those left out are K⁻¹y / diag(K⁻¹), their variances 1 / diag(K⁻¹).
         inverse = 1.0 / (strengths[:, None] * signal + noise)
         z2 = (modes @ (inverse * (modes.T @ scores))) ** 2 / (modes**2 @ inverse)
@@ -170,6 +144,72 @@ class Surface:
     def _gain(self) -> FloatArray:
         """(m, p) what a mode's score counts for in a prediction."""
         return np.asarray(self.signal / (self.strengths[:, None] * self.signal + self.noise))
+
+
+@dataclass(frozen=True)
+class _Density:
+    """Minus the log posterior density of the logarithms of lengths (n,), the parabola's share, what a seed's
+    simulations have in common, and signals and noises (p,) over those that singular values say.
+
+    Attributes:
+        points: (m, n) of the simulations.
+        scores: (m, p) of these.
+        alike: (m, m) whether two share a seed.
+        signal: (p,) by singular values.
+        level: noise by these, in any direction.
+        apart: whether some share a seed, so that anything tells what they have in common.
+    """
+
+    points: FloatArray
+    scores: FloatArray
+    alike: npt.NDArray[np.bool_]
+    signal: FloatArray
+    level: float
+    apart: bool
+
+    @property
+    def size(self) -> int:
+        """Of its argument."""
+        return self.points.shape[1] + 2 + 2 * self.scores.shape[1]
+
+    @property
+    def bounds(self) -> list[tuple[float, float]]:
+        """Of its argument."""
+        n = self.points.shape[1]
+        return [LENGTH_BOUNDS] * n + [(-8.0, 8.0)] * (self.size - n)
+
+    def shared(self, at: FloatArray) -> tuple[FloatArray, float, float]:
+        """Lengths (n,), the parabola's share, and what a seed's simulations have in common."""
+        n = self.points.shape[1]
+        return np.exp(at[:n]), float(np.exp(at[n])), float(np.exp(at[n + 1])) * self.apart
+
+    def own(self, at: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Each direction's signal and noise (p,)."""
+        signal, noise = np.exp(at[self.points.shape[1] + 2 :].reshape(2, -1))
+        return signal * self.signal, noise * self.level
+
+    def __call__(self, at: FloatArray) -> tuple[float, FloatArray]:
+        """Value and gradient."""
+        n, count = self.points.shape[1], self.scores.shape[1]
+        # The prior of lengths is the unit cube's, whose sides are half as long.
+        middle = np.array([np.log(2.0) + LENGTH_MEAN + 0.5 * np.log(n)] * n + [0.0] * (self.size - n))
+        spread = np.array([LENGTH_STD] * n + [TREND, COMMON] + [SIGNAL] * count + [NOISE] * count)
+        value, own = self._likelihood(at)
+        slopes = [(self._likelihood(at + step)[0] - value) / STEP for step in STEP * np.eye(n + 2, self.size)]
+        z = (at - middle) / spread
+        return value + 0.5 * float(z @ z), np.concatenate([slopes, own]) + z / spread
+
+    def _likelihood(self, at: FloatArray) -> tuple[float, FloatArray]:
+        """Minus its logarithm, and the derivatives by signals and noises."""
+        lengths, trend, common = self.shared(at)
+        strengths, modes, root = _modes(self.points, lengths, trend, self.alike, common)
+        signal, noise = self.own(at)
+        of_signal = signal * strengths[:, None]
+        variance, squares = of_signal + noise, (modes.T @ self.scores) ** 2
+        value = np.sum(np.log(variance) + squares / variance) + 2.0 * len(signal) * np.sum(np.log(np.diag(root)))
+        pull = 1.0 / variance - squares / variance**2
+        own = [np.sum(pull * part, axis=0) for part in (of_signal, noise)]
+        return 0.5 * float(value), 0.5 * np.concatenate(own)
 
 
 def _kernel(a: FloatArray, b: FloatArray, lengths: FloatArray, trend: float) -> FloatArray:

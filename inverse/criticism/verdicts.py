@@ -32,8 +32,8 @@ ENOUGH = 0.6
 """Share of the misfit beyond chance that effects must explain where a remainder stands: another solver's soil, or a
 real one, leaves one of its own. What imitates an effect is told by :data:`WITHIN`, hardly ever by this."""
 WITHIN = 1.2
-"""Residual over what noise leaves, up to which a model can be adequate, and an effect all there is: in all, or on times
-that a refit hasn't seen where soil that has the effect wasn't simulated by several seeds. Chosen on emulated worlds of
+"""Residual over what noise leaves, up to which a model can be adequate, and an effect all there is, whatever the chance
+of it: in all, or, where there is no chance, on times that a refit hasn't seen. Chosen on emulated worlds of
 one effect of two and four times the smallest detectable size, by the latter (seed 61, a hundred each): 1.2 gives away 1
 and 3 of the right ones, 1.1 gives away 5 and 12; of those that imitate a truth out of the library 1.2 lets 18 and 4
 pass, 1.25 22 and 4."""

@@ -13,7 +13,7 @@ from .confirmation import Confirmation
 from .diagnosis import Diagnosis
 from .estimates import Estimate
 from .outside import CLEAR, FEW, StrengthReading
-from .verdicts import CLEAN, GATE, WITHIN, amiss
+from .verdicts import CLEAN, GATE, WITHIN, amiss, beyond
 
 #: Correlation of two effects' scores from which they are called alike.
 ALIKE = 0.8
@@ -56,11 +56,13 @@ def _missing(diagnosis: Diagnosis, candidates: Mapping[str, Candidate], base: Ma
         f"frames that the refit has not seen from {before.held_out:.2g} to "
         f"{confirmed.held_out:.2g} {diagnosis.unit}; noise alone leaves {_noise(before, confirmed)}."
     ]
-    after = diagnosis.whole_after
-    if after is not None and confirmed.held_out > WITHIN * confirmed.floor:
+    after, remainder = diagnosis.whole_after, diagnosis.remainder
+    clean = remainder is not None and remainder.p >= CLEAN
+    if after is not None and clean and confirmed.held_out > WITHIN * confirmed.floor:
         out.append(
             "Without what numerics and the refitted parameters can make up for, what is left in all is "
-            f"{after.ratio:.2f} times what noise leaves: nothing more need be missing."
+            f"{after.ratio:.2f} times what noise leaves{', which chance may do' if after.ratio > WITHIN else ''}: "
+            "nothing more need be missing."
         )
     if diagnosis.where:
         (stage, region, channel), share = max(diagnosis.where.items(), key=lambda item: item[1])
@@ -138,9 +140,17 @@ def _outside(diagnosis: Diagnosis, candidates: Mapping[str, Candidate]) -> list[
             f"The nearest is {best.replace('_', ' ')} ({size}): with it the error on frames that the refit has not "
             f"seen goes from {before.held_out:.2g} to {confirmed.held_out:.2g} {diagnosis.unit} (noise alone leaves "
             f"{_noise(before, confirmed)}). It explains {share} beyond noise. "
-            f"What remains is more than noise, so it is not all that is missing; {MAKES_UP}."
+            f"What remains is more than noise{_in_all(diagnosis)}, so it is not all that is missing; {MAKES_UP}."
         )
     return out if diagnosis.strength is None else [*out, *of_strength(diagnosis.strength)]
+
+
+def _in_all(diagnosis: Diagnosis) -> str:
+    """By how much, where that is the reason."""
+    after = diagnosis.whole_after
+    if after is None or not beyond(after):
+        return ""
+    return f" ({after.ratio:.2g} times what it leaves, without what numerics and what is refitted can make up for)"
 
 
 def of_strokes(diagnosis: Diagnosis) -> list[str]:

@@ -100,7 +100,8 @@ def run(config: Config) -> int:
         losses = {key: comparison[key] for key in ("loss", "total", "noise")}
         extra: dict[str, Any] = {} if misfit is None else {"misfit": {key: misfit[key] for key in compare.TOLD}}
         if diagnosis is not None:
-            kept = ("verdict", "class", "sentences", "misfit", "whole", "effects", "estimates", "simulations")
+            judged = ("verdict", "class", "sentences", "misfit", "whole", "whole_after")
+            kept = (*judged, "effects", "estimates", "simulations")
             extra = {
                 "diagnosis": plain({key: diagnosis[key] for key in kept}),
                 "models": criticism.history(folder),

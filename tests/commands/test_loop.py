@@ -80,7 +80,7 @@ def test_run_looks_for_what_is_missing_where_the_floor_says_that_something_is(
     looks: bool,
 ) -> None:
     stand_in(monkeypatch, tmp_path, adequate)
-    parts = ("verdict", "class", "sentences", "misfit", "whole", "effects", "estimates", "simulations")
+    parts = ("verdict", "class", "sentences", "misfit", "whole", "whole_after", "effects", "estimates", "simulations")
     monkeypatch.setattr(command, "loop", lambda *_: (dict.fromkeys(parts, ""), "enough"))
     assert command.run(Config(set=tmp_path, json=True, **flags)) == 0
     said = json.loads(capsys.readouterr().out)

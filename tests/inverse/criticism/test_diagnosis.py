@@ -13,7 +13,7 @@ import numpy.typing as npt
 import pytest
 from splatsoil.benchmarks._tally import wilson
 from splatsoil.benchmarks.hidden_effects import detectable, emulated, fitted, one, outside
-from splatsoil.inverse.criticism import diagnosis
+from splatsoil.inverse.criticism import confirmation, diagnosis
 from splatsoil.inverse.criticism.diagnosis import Options, diagnose
 from splatsoil.inverse.criticism.misfit import Block, Omnibus
 from splatsoil.inverse.criticism.naming import members_of, stands
@@ -58,25 +58,45 @@ def test_a_large_hidden_effect_is_named_its_size_found_and_the_error_falls(sizes
 
 
 @pytest.mark.parametrize(
-    ("ratio", "p", "verdict"),
-    [(1.1, 0.001, "missing"), (1.3, 0.001, "outside the library"), (1.3, 0.2, "missing")],
+    ("error", "ratio", "p", "verdict"),
+    [
+        (1.5, 1.1, 0.001, "missing"),
+        (1.5, 1.3, 0.001, "outside the library"),
+        (1.5, 1.3, 0.2, "missing"),
+        (1.0, 1.3, 0.001, "outside the library"),
+    ],
 )
+@pytest.mark.parametrize("most", [4, 1])
 def test_what_is_left_is_held_against_soil_that_has_the_effect(
-    sizes: dict[str, float], monkeypatch: pytest.MonkeyPatch, ratio: float, p: float, verdict: str
+    sizes: dict[str, float],
+    monkeypatch: pytest.MonkeyPatch,
+    error: float,
+    ratio: float,
+    p: float,
+    verdict: str,
+    most: int,
 ) -> None:
-    """However loud soil without it is, and however far off on hidden times, where numerics count as error."""
+    """However loud soil without it is, and however far off on hidden times, where numerics count as error; and however
+    many parameters its refit has."""
+    monkeypatch.setattr(confirmation, "MOST", most)
     own_floor = diagnosis.on_its_own_floor
 
     def other(*arguments: Any) -> OwnFloor:
         own = own_floor(*arguments)
-        off = replace(own.refit, floor=own.refit.held_out / 1.5)
+        off = replace(own.refit, floor=own.refit.held_out / error)
         return replace(own, refit=off, whole=replace(own.whole, ratio=ratio, p=p))
 
     monkeypatch.setattr(diagnosis, "on_its_own_floor", other)
     found = one(WORLD, {"angle": 1.0, "effect 2": 5.0 * sizes["effect 2"]}, None, OPTIONS)
     assert found.verdict == verdict and found.members[0] == "effect 2"
-    told = " ".join(sentences(found, {c.name: c for c in emulated(WORLD).candidates}, {"angle": 4.0}))
+    candidates = emulated(WORLD).candidates
+    told = " ".join(sentences(found, {c.name: c for c in candidates}, {"angle": 4.0}))
     assert ("nothing more need be missing" in told) is (verdict == "missing")
+    assert ("which chance may do" in told) is (verdict == "missing" and ratio > 1.2)
+    assert ("(1.3 times what it leaves" in told) is (verdict == "outside the library")
+    # Where slow waves tell that more is left, too, nothing to the contrary is said.
+    slow = sentences(replace(found, remainder=LITTLE), {c.name: c for c in candidates}, {"angle": 4.0})
+    assert "nothing more need be missing" not in " ".join(slow)
 
 
 def test_a_move_within_its_own_spread_is_not_called_bias(sizes: dict[str, float]) -> None:

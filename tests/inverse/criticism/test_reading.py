@@ -9,7 +9,7 @@ import pytest
 from splatsoil.inverse.criticism.evidence import Visit, around
 from splatsoil.inverse.criticism.reading import explored, read
 from splatsoil.inverse.criticism.refit import Known, Refit, refit
-from splatsoil.inverse.criticism.surface import Surface
+from splatsoil.inverse.criticism.surface import Surface, _Density
 
 from splatsoil.errors import SimulationError
 from splatsoil.parameters import Parameter, distance
@@ -85,6 +85,30 @@ def test_a_surface_predicts_where_nothing_was_simulated_and_knows_its_error() ->
     for at in elsewhere[:5]:
         ahead, behind = (surface.predict(at + side * 1e-4 * np.eye(2))[0] for side in (1.0, -1.0))
         assert surface.slopes(at) == pytest.approx((ahead - behind) / 2e-4, rel=1e-4, abs=1e-4)
+
+
+def test_each_direction_has_its_own_chance() -> None:
+    """The one with the smaller trend has six times the other's standard deviation of it."""
+    generator = np.random.default_rng(3)
+    points = generator.uniform(-1.0, 1.0, (40, 2))
+    basis = np.linalg.qr(generator.standard_normal((60, 2)))[0]
+    scores = points * [60.0, 25.0] + generator.standard_normal((40, 2)) * [0.5, 3.0]
+    surface = Surface.through(points, scores @ basis.T + 0.5 * generator.standard_normal((40, 60)), range(40))
+    assert np.abs(surface.basis.T @ basis) == pytest.approx(np.eye(2), abs=0.1)
+    assert np.sqrt(surface.noise) == pytest.approx([0.5 * 2**0.5, 3.0], rel=0.35)
+
+
+def test_the_density_of_what_a_surface_hangs_on_has_its_gradient() -> None:
+    generator = np.random.default_rng(4)
+    points, seeds = generator.uniform(-1.0, 1.0, (15, 2)), np.arange(15) % 5
+    scores = points @ generator.standard_normal((2, 3)) + generator.standard_normal((15, 3))
+    density = _Density(points, scores, np.equal.outer(seeds, seeds), np.array([2.0, 1.0, 0.3]), 0.2, True)
+    for _ in range(3):
+        at = 0.5 * generator.standard_normal(density.size)
+        ahead, behind = (
+            np.array([density(at + side * step)[0] for step in 1e-4 * np.eye(density.size)]) for side in (1.0, -1.0)
+        )
+        assert density(at)[1] == pytest.approx((ahead - behind) / 2e-4, rel=1e-3, abs=1e-3)
 
 
 def test_what_simulations_of_one_seed_have_in_common_is_told_from_what_soil_does() -> None:
