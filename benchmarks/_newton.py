@@ -249,12 +249,13 @@ def _tension(world: World) -> float:
 
 
 def _walls(lower: FloatArray, upper: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
-    """Centre and half extents (3,) of four walls, as high again as the box."""
+    """Centre and half extents (3,) of four walls, as high again as the box; each as long as the box outside: where they
+    end with the soil, weak soil leaks between two."""
     middle, half = (upper + lower) / 2.0, (upper - lower) / 2.0 * np.array([1.0, 1.0, 3.0])
     found = []
     for axis in (0, 1):
         for side in (-1.0, 1.0):
-            centre, extent = middle.copy(), half.copy()
+            centre, extent = middle.copy(), half + np.array([2.0 * WALL, 2.0 * WALL, 0.0])
             centre[axis] += side * (half[axis] + WALL)
             extent[axis] = WALL
             found.append((centre, extent))

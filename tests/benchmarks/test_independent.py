@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from splatsoil.benchmarks._newton import Numerics, Run, World, _model, plough
+from splatsoil.benchmarks._newton import Numerics, Run, World, _model, _walls, plough
 from splatsoil.benchmarks.independent import judge
 from splatsoil.benchmarks.numerics import Scan, Truth, volume_range
 
@@ -74,6 +74,25 @@ def test_cohesion_is_the_whole_strength_without_pressure_and_counted_once() -> N
     exact = 6.0 * 300.0 * np.cos(np.radians(33.0)) / (np.sqrt(3.0) * (3.0 - sine))
     assert strength[: len(x)] == pytest.approx(exact, rel=1e-3)
     assert not strength[len(x) :].any()
+
+
+def test_no_gap_is_left_between_two_walls() -> None:
+    lower, upper = np.array([0.0, -0.2, 0.1]), np.array([0.8, 0.3, 0.4])
+    margin = np.array([0.1, 0.1, 0.0])
+    around = np.random.default_rng(0).uniform(lower - margin, upper + margin, (2000, 3))
+    outside = np.any((around < lower) | (around > upper), axis=1)
+    held = [np.all(np.abs(around - centre) <= half, axis=1) for centre, half in _walls(lower, upper)]
+    assert np.array_equal(np.any(held, axis=0), outside)
+
+
+@pytest.mark.slow
+def test_soil_too_weak_to_stand_stays_in_the_box(plow_dry: Path) -> None:
+    pytest.importorskip("newton")
+    truth = Truth.load(plow_dry)
+    bed, weak = truth.measurement.bed, World("weak", 12.0, truth.start(SPACING, 0), SPACING)
+    x = plough(truth.measurement, [weak], COARSE, (20,))[0].particles[20]
+    # through corners that were open it came out by 57 mm
+    assert np.maximum(bed.lower - x, x - bed.upper).max() < 1e-3
 
 
 @pytest.fixture(scope="module")
