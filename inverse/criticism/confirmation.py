@@ -51,6 +51,7 @@ class Confirmation:
         systematic: what of these is the model's own fault; see :mod:`.estimates`.
         chi2: of all times, against the mean of several seeds, as far as these tell of anything; see
             :class:`~splatsoil.inverse.criticism.sight.Sight`.
+        freedom: numbers that this sums, but for one a parameter.
         fall: by how much that is less than the model's as it is.
         unseen: likewise, on times the refit hasn't seen alone.
         told: chance of what other pictures say of its parameters if they were off; see
@@ -69,6 +70,7 @@ class Confirmation:
     stds: Mapping[str, float]
     systematic: Mapping[str, float]
     chi2: float
+    freedom: int
     fall: float
     unseen: float
     told: float
@@ -77,6 +79,12 @@ class Confirmation:
     floor: float
     remainder: Omnibus
     visits: tuple[Visit, ...] = ()
+
+    @property
+    def dispersion(self) -> float:
+        """What is left over what noise leaves, 1 at least: where no model explains the data, what is no part of any of
+        them changes χ² by as much more (McCullagh and Nelder 1989, Generalized Linear Models, section 4.5)."""
+        return max(1.0, self.chi2 / self.freedom)
 
     @property
     def ruled_out(self) -> bool:
@@ -162,7 +170,8 @@ def confirm(
         before, after = (experiment.observed - table for table in means(ends[0], end))
         apart_from = np.concatenate([floor.nuisance, reach_of(floor.single, fit.slopes)], axis=1)
         remainder = omnibus(floor.single, apart_from, left[experiment.seen], basis)
-        chi2 = _chi2(whole, after) + known.chi2(at)
+        seen = whole(after)
+        chi2 = float(np.sum(seen**2)) + known.chi2(at)
         precision = beforehand(free, fit.values, known)
         values, stds = dict(fit.values), stds_of(free, whiten(fit.slopes), precision, remainder)
         emulated: tuple[Visit, ...] = ()
@@ -184,6 +193,7 @@ def confirm(
             stds=stds,
             systematic=systematic,
             chi2=chi2,
+            freedom=max(seen.size - len(free), 1),
             fall=0.0 if candidate is None else _chi2(whole, before) + known.chi2(off) - chi2,
             unseen=_chi2(apart, before) - _chi2(apart, after),
             told=known.chance(off),

@@ -42,11 +42,12 @@ def members_of(
         return ()
     # What explains nothing equals nothing, however wide the doubt.
     explaining = {name: cost for name, cost in among.items() if confirmations[name].fall > 0.0}
-    return _equals(explaining, best, max(confirmations[best].remainder.dispersion, scores[best].dispersion))
+    return _equals(explaining, best, max(confirmations[best].dispersion, scores[best].dispersion))
 
 
 def stands(confirmations: Mapping[str, Confirmation], name: str, off: bool, score: Score, measure: Parameter) -> bool:
-    """Something is to be explained, and the refit does: χ² falls, on times that it hasn't seen too.
+    """Something is to be explained, and the refit does: χ² falls, on times that it hasn't seen too, by more than chance
+    does in what is left.
 
     Where the model leaves no more than noise, either the effect is significant among all of the library, or the model
     is off by more than noise on those times; it must take away a relevant share of the squared error there; and its
@@ -54,7 +55,7 @@ def stands(confirmations: Mapping[str, Confirmation], name: str, off: bool, scor
     doubt needs no more of the features than that they don't speak against it.
     """
     before, after = confirmations[""], confirmations[name]
-    least = EQUIVALENT * score.dispersion
+    least = EQUIVALENT * max(after.dispersion, score.dispersion)
     if after.fall <= least:
         return False
     if after.told < CERTAIN:
@@ -67,6 +68,6 @@ def stands(confirmations: Mapping[str, Confirmation], name: str, off: bool, scor
 
 def _equals(costs: Mapping[str, float], best: str, dispersion: float) -> tuple[str, ...]:
     """Effects whose χ² after refitting lies as near to the best as equals do; wider where a misfit remains."""
-    wide = EQUIVALENT * max(1.0, dispersion)
+    wide = EQUIVALENT * dispersion
     close = [name for name, cost in costs.items() if cost - costs[best] < wide]
     return tuple(sorted(close, key=lambda name: costs[name]))

@@ -147,6 +147,7 @@ def confirmation(c: Confirmation) -> dict[str, Any]:
         "stds": dict(c.stds),
         "systematic": dict(c.systematic),
         "chi2": c.chi2,
+        "dispersion": c.dispersion,
         "fall": c.fall,
         "told": c.told,
         "agrees": c.agrees,
