@@ -27,7 +27,7 @@ def record(experiment: Experiment, diagnosis: Diagnosis) -> dict[str, Any]:
         "model": list(experiment.model),
         "verdict": diagnosis.verdict,
         "class": list(diagnosis.members),
-        "sentences": sentences(diagnosis, candidates, diagnosis.evidence.values),
+        "sentences": sentences(diagnosis, candidates, diagnosis.evidence.values, _still(experiment)),
         "effects": [_effect(diagnosis, candidates[name]) for name in _order(diagnosis)],
         "simulations": diagnosis.simulations,
         "values": dict(diagnosis.evidence.values),
@@ -107,6 +107,12 @@ def _order(diagnosis: Diagnosis) -> list[str]:
         reverse=True,
     )
     return [*diagnosis.members, *rest]
+
+
+def _still(experiment: Experiment) -> frozenset[str]:
+    """Regions in which none of the model's physics acts."""
+    regions, seen = experiment.layout.regions, experiment.seen
+    return frozenset(str(r) for r in np.unique(regions[seen]) if experiment.quiet[seen & (regions == r)].all())
 
 
 def _effect(diagnosis: Diagnosis, candidate: Candidate) -> dict[str, Any]:

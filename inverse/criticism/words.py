@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 from splatsoil.experiment.base import Candidate
 from splatsoil.experiment.strokes import MEASURED
@@ -21,8 +21,20 @@ ALIKE = 0.8
 MAKES_UP = "what is refitted makes up for the rest as far as it can, so that it may be off by more than its ± says"
 
 
-def sentences(diagnosis: Diagnosis, candidates: Mapping[str, Candidate], base: Mapping[str, float]) -> list[str]:
-    """What was found, the most important first."""
+def sentences(
+    diagnosis: Diagnosis,
+    candidates: Mapping[str, Candidate],
+    base: Mapping[str, float],
+    still: Collection[str] = (),
+) -> list[str]:
+    """What was found, the most important first.
+
+    Args:
+        diagnosis: what to tell.
+        candidates: effects by name.
+        base: the model's parameters.
+        still: regions in which none of the model's physics acts.
+    """
     if diagnosis.verdict == "missing":
         out = _missing(diagnosis, candidates, base)
     elif diagnosis.verdict == "adequate":
@@ -39,6 +51,8 @@ def sentences(diagnosis: Diagnosis, candidates: Mapping[str, Candidate], base: M
             f"Before anything is added, the model is farthest off here: {worst.region}, {worst.stage}, "
             f"{worst.channel}, with {worst.ratio:.1f} times what noise leaves."
         )
+        if worst.region in still and diagnosis.verdict == "outside the library":
+            out.append("Nothing that is modelled acts there: look at cameras, light and what holds the soil, too.")
     blind = [name.replace("_", " ") for name, verdict in diagnosis.effects.items() if verdict == "cannot tell"]
     if blind:
         out.append(f"What these data cannot tell: {listed(blind)}.")

@@ -126,6 +126,23 @@ def test_where_more_than_noise_remains_spreads_are_said_to_be_too_small(sizes: d
         assert ("off by more than its ±" in told) is doubted
 
 
+def test_a_misfit_where_nothing_acts_sends_one_beyond_the_soil() -> None:
+    """Soil that leaked out of its box was off in corners that no tool had reached."""
+    base = emulated(WORLD)
+    where = str(base.layout.regions[0, 0])
+    quiet = np.isin(base.layout.regions, where) & base.seen
+    assert quiet.any()
+    found = one(WORLD, {"angle": 1.0}, None, OPTIONS)
+    for verdict, calm, told in (
+        ("outside the library", quiet, True),
+        ("outside the library", np.zeros_like(quiet), False),
+        ("adequate", quiet, False),
+    ):
+        off = replace(found, verdict=verdict, blocks=(Block("pushing", where, "left", 5.0, 0.001, 20),))
+        sentence = " ".join(record(replace(base, quiet=calm), off)["sentences"])
+        assert ("Nothing that is modelled acts there" in sentence) is told
+
+
 def test_an_observation_effect_is_named_and_not_a_physical_one(sizes: dict[str, float]) -> None:
     found = one(WORLD, {"angle": 0.0, "effect 8": 5.0 * sizes["effect 8"]}, None, OPTIONS)
     assert found.members[0] == "effect 8"
