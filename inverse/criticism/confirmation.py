@@ -170,16 +170,16 @@ def confirm(
         before, after = (experiment.observed - table for table in means(ends[0], end))
         apart_from = np.concatenate([floor.nuisance, reach_of(floor.single, fit.slopes)], axis=1)
         remainder = omnibus(floor.single, apart_from, left[experiment.seen], basis)
-        seen = whole(after)
-        chi2 = float(np.sum(seen**2)) + known.chi2(at)
+        white = whole(after)
+        chi2 = float(np.sum(white**2)) + known.chi2(at)
         precision = beforehand(free, fit.values, known)
         values, stds = dict(fit.values), stds_of(free, whiten(fit.slopes), precision, remainder)
         emulated: tuple[Visit, ...] = ()
         if has_surface(experiment, candidate):
             # A surface that isn't one tells nothing more than the last derivatives do.
             with suppress(ValueError):
-                known_tables = [visit.table for visit in visits]
-                visits += [v for v in end.values() if not any(np.array_equal(v.table, t) for t in known_tables)]
+                there = [visit.table for visit in visits]
+                visits += [v for v in end.values() if not any(np.array_equal(v.table, table) for table in there)]
                 reading = read(visits, whole, experiment.observed, free, known)
                 values, stds, emulated = dict(reading.values), dict(reading.stds), tuple(visits)
         name = "" if candidate is None else candidate.name
@@ -193,7 +193,7 @@ def confirm(
             stds=stds,
             systematic=systematic,
             chi2=chi2,
-            freedom=max(seen.size - len(free), 1),
+            freedom=max(white.size - len(free), 1),
             fall=0.0 if candidate is None else _chi2(whole, before) + known.chi2(off) - chi2,
             unseen=_chi2(apart, before) - _chi2(apart, after),
             told=known.chance(off),

@@ -91,6 +91,7 @@ def judged(kind: str, verdict: str, members: list[str]) -> dict[str, object]:
     refits = {"as it is": refit | {"held_out": 6.0, "floor": 2.0}, **dict.fromkeys(members, refit)} if members else {}
     told = {"refits": refits, "verdict": verdict, "class": members, "explained": 0.5}
     told |= {"effects": [{"name": "tilt", "parameter": "tilt_x", "z": 3.0}], "seconds": 1.0}
+    told |= {"whole": {"ratio": 2.5}, "whole_after": {"ratio": 1.1 if "tilt" in members[:1] else 1.3}}
     told["estimates"] = {"friction_angle": {"value": 31.0, "std": 1.2}}
     fit = {"parameters": {"friction_angle": {"estimate": 35.0, "std": 0.5}}, "seconds": 1.0}
     return score(replace(draw(kind, 0, 1), angle=32.0, size=4.0), fit, told)
@@ -121,6 +122,9 @@ def test_what_is_stated_is_held_against_the_truth() -> None:
     assert "32.0°; 35.0, 31.0 ± 1.2°" in table([refitted_in_vain])
     assert "32.0°; 35.0, 34.0 → 34.0 ± 0.5°" in table(rows)
     assert "| 3.00 → 0.80 |" in table(rows), "each model is held against its own floor"
+    assert "the whole ends within 1.2 × noise: 1 of 1" in table(rows)
+    not_all = judged("tilt", "outside the library", ["tilt"]) | {"whole": [2.5, 1.3]}
+    assert "the whole ends within 1.2 × noise: 1 of 2" in table([*rows, not_all])
     assert "within 1 × their ±: 1 of 3" in table(rows) and "within 2 × their ±: 2 of 3" in table(rows)
 
 

@@ -32,8 +32,9 @@ class Failing(Simulations):
         return super().__call__(values, purpose=purpose, seed=seed, **others)
 
 
-def judged(world: int) -> tuple[float, float, float, float]:
-    """Fall of χ² of a refit: as told (all times, hidden ones), of one simulation against another, without chance."""
+def judged(world: int) -> tuple[float, float, float, float, float]:
+    """Fall of χ² of a refit: as told (all times, hidden ones), of one simulation against another, without chance; and
+    χ² over its freedom."""
     found, experiment, bench = confirmed(world)
     asis, fit = found[""].fit, found["effect 2"].fit
     sight = Sight.of(experiment, bench.floor, bench.basis, averaged=True)
@@ -43,7 +44,8 @@ def judged(world: int) -> tuple[float, float, float, float]:
         return float(np.subtract(*[np.sum(sight(table) ** 2) for table in left]))
 
     exact = fall(experiment.expected(asis.values), experiment.expected(fit.values))
-    return found["effect 2"].fall, found["effect 2"].unseen, fall(asis.prediction, fit.prediction), exact
+    best = found["effect 2"]
+    return best.fall, best.unseen, fall(asis.prediction, fit.prediction), exact, best.chi2 / best.freedom
 
 
 def confirmed(world: int, lost: tuple[int, ...] = ()) -> tuple[dict[str, Confirmation], EmulatedExperiment, Bench]:
@@ -61,11 +63,13 @@ def confirmed(world: int, lost: tuple[int, ...] = ()) -> tuple[dict[str, Confirm
 
 
 def test_refits_are_compared_by_their_mean_features_and_not_by_one_simulation() -> None:
-    told, unseen, single, exact = np.array([judged(world) for world in WORLDS]).T
+    told, unseen, single, exact, spread = np.array([judged(world) for world in WORLDS]).T
     off, hidden, lucky = (np.sqrt(np.mean((falls - exact) ** 2)) for falls in (told, unseen, single))
     # Of four seeds the mean has half of the chance; every other time tells nearly as much as all.
     assert off < 0.75 * lucky
     assert hidden < 0.75 * lucky
+    # With the effect in, noise is all that is left.
+    assert 0.7 < spread.mean() < 1.4
 
 
 def test_seeds_that_one_refit_lacks_are_left_out_of_both() -> None:

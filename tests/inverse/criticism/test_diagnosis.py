@@ -16,7 +16,6 @@ from splatsoil.benchmarks.hidden_effects import detectable, emulated, fitted, on
 from splatsoil.inverse.criticism import confirmation, diagnosis
 from splatsoil.inverse.criticism.diagnosis import Options, diagnose
 from splatsoil.inverse.criticism.misfit import Block, Omnibus
-from splatsoil.inverse.criticism.naming import members_of, stands
 from splatsoil.inverse.criticism.own_floor import OwnFloor
 from splatsoil.inverse.criticism.record import record
 from splatsoil.inverse.criticism.simulations import Simulations
@@ -32,7 +31,6 @@ FloatArray = npt.NDArray[np.float64]
 OPTIONS = Options()
 WORLD = 77
 CLEAN, OFF, LITTLE = Omnibus(70.0, 72, 0.5), Omnibus(900.0, 72, 0.0), Omnibus(120.0, 72, 0.0005)
-MEASURE = next(c.measure for c in emulated(WORLD).candidates if c.name == "effect 2")
 
 
 @pytest.fixture(scope="module")
@@ -305,92 +303,6 @@ def test_the_share_that_is_explained_is_of_squares_beyond_noise(before: float, a
 @pytest.mark.parametrize(("left", "verdict"), [(False, "missing"), (True, "outside the library")])
 def test_an_effect_that_leaves_more_than_noise_is_not_all_that_is_missing(left: bool, verdict: str) -> None:
     assert overall(True, True, OFF, CLEAN, left=left) == verdict
-
-
-@pytest.mark.parametrize(
-    ("error", "off", "p", "left", "unseen", "ratio", "named"),
-    [
-        (0.7, False, 0.3, 0.97, 9.0, 5.0, False),
-        (0.7, False, 0.3, 0.8, 9.0, 5.0, False),
-        (0.7, False, 0.001, 0.8, 9.0, 5.0, True),
-        (0.7, False, 0.001, 0.97, 9.0, 5.0, False),
-        (0.7, True, 0.3, 0.97, 9.0, 5.0, True),
-        (1.5, False, 0.3, 0.97, 9.0, 5.0, False),
-        (1.5, False, 0.3, 0.8, 9.0, 5.0, True),
-        (1.5, False, 0.001, 0.8, 9.0, 1.2, False),
-        (1.5, True, 0.3, 0.97, 9.0, 1.2, True),
-        (1.5, True, 0.3, 0.97, -1.0, 5.0, False),
-    ],
-)
-def test_nothing_is_missing_where_nothing_is_to_be_explained(
-    sizes: dict[str, float],
-    error: float,
-    off: bool,
-    p: float,
-    left: float,
-    unseen: float,
-    ratio: float,
-    named: bool,
-) -> None:
-    """A refit that explains much; error on hidden times, the whole misfit and the effect's score may be chance before
-    it, so much is left, and its size is so many of its standard deviations."""
-    diagnosed = one(WORLD, {"angle": 1.0, "effect 2": 5.0 * sizes["effect 2"]}, None, OPTIONS)
-    found, score = diagnosed.confirmations, replace(diagnosed.scores["effect 2"], adjusted=p, dispersion=1.0)
-    before, after = found[""], found["effect 2"]
-    floor = before.held_out / error
-    held_out = left * before.held_out
-    stds = {"effect 2": abs(after.values["effect 2"]) / ratio}
-    after = replace(after, floor=floor, held_out=held_out, unseen=unseen, stds=stds)
-    told = {"": replace(before, floor=floor), "effect 2": after}
-    assert stands(told, "effect 2", off, score, MEASURE) is named
-
-
-@pytest.mark.parametrize(("told", "unseen", "named"), [(1e-5, -1.0, True), (1e-5, -9.0, False), (1e-3, -1.0, False)])
-def test_what_other_pictures_say_beyond_doubt_the_soil_need_only_not_deny(
-    sizes: dict[str, float], told: float, unseen: float, named: bool
-) -> None:
-    diagnosed = one(WORLD, {"angle": 1.0, "effect 2": 5.0 * sizes["effect 2"]}, None, OPTIONS)
-    found, score = diagnosed.confirmations, replace(diagnosed.scores["effect 2"], adjusted=1.0, dispersion=1.0)
-    floor = found[""].held_out / 0.7
-    after = replace(found["effect 2"], floor=floor, held_out=found[""].held_out, unseen=unseen, told=told)
-    told_of = {"": replace(found[""], floor=floor), "effect 2": after}
-    assert stands(told_of, "effect 2", False, score, MEASURE) is named
-
-
-def test_what_other_pictures_say_beyond_doubt_is_named_before_what_soil_shows(sizes: dict[str, float]) -> None:
-    found = one(WORLD, {"angle": 1.0, "effect 2": 5.0 * sizes["effect 2"]}, None, OPTIONS)
-    big = found.confirmations["effect 2"]
-    told = {"": found.confirmations[""], "effect 2": big, "clock": replace(big, fall=0.5 * big.fall, told=1e-9)}
-    scores, measures = {**found.scores, "clock": found.scores["effect 2"]}, dict.fromkeys(told, MEASURE)
-    costs = {name: -c.fall for name, c in told.items() if name}
-    assert members_of(told, costs, True, scores, measures) == ("clock",)
-    doubtful = {**told, "clock": replace(told["clock"], told=0.01)}
-    assert members_of(doubtful, costs, True, scores, measures)[0] == "effect 2"
-    denied = {**told, "clock": replace(told["clock"], unseen=-50.0)}
-    assert members_of(denied, costs, True, scores, measures)[0] == "effect 2"
-
-
-def test_what_explains_nothing_is_no_equal_however_wide_the_doubt(sizes: dict[str, float]) -> None:
-    found = one(WORLD, {"angle": 1.0, "effect 2": 5.0 * sizes["effect 2"]}, None, OPTIONS)
-    best = replace(found.confirmations["effect 2"], fall=20.0, chi2=300.0, freedom=100)
-    told = {"": found.confirmations[""], "effect 2": best, "little": replace(best, fall=3.0)}
-    told["nothing"] = replace(best, fall=0.0)
-    scores = dict.fromkeys(told, replace(found.scores["effect 2"], dispersion=1.0))
-    # What has fewer parameters costs less.
-    costs = {"effect 2": -20.0, "little": -3.0, "nothing": -4.0}
-    assert members_of(told, costs, True, scores, dict.fromkeys(told, MEASURE)) == ("effect 2", "little")
-
-
-@pytest.mark.parametrize(("left", "named"), [(0.5, True), (3.0, True), (3.5, False), (30.0, False)])
-def test_of_data_that_nothing_explains_an_effect_must_explain_more(
-    sizes: dict[str, float], left: float, named: bool
-) -> None:
-    """Soil once leaked out of a made-up box: χ² was 2000 over 120 numbers, and tilt took 49 away."""
-    found = one(WORLD, {"angle": 1.0, "effect 2": 5.0 * sizes["effect 2"]}, None, OPTIONS)
-    best = replace(found.confirmations["effect 2"], fall=20.0, chi2=100.0 * left, freedom=100)
-    told = {"": found.confirmations[""], "effect 2": best}
-    scores = dict.fromkeys(told, replace(found.scores["effect 2"], dispersion=1.0))
-    assert bool(members_of(told, {"effect 2": -20.0}, True, scores, dict.fromkeys(told, MEASURE))) is named
 
 
 def test_what_other_pictures_rule_out_is_not_named_however_well_it_explains_soil(sizes: dict[str, float]) -> None:
