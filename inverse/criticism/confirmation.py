@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from functools import partial
-from itertools import cycle, repeat
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -16,27 +14,20 @@ from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Candidate, Experiment
 from splatsoil.parameters import Parameter
 
-from .dilution import undiluted
 from .estimates import bounded, prior, untried
-from .evidence import Evidence, Vantage, Visit, pair_of
+from .evidence import Evidence, Vantage, Visit
 from .floor import Floor
-from .joint import precision_of
 from .misfit import Omnibus, omnibus
 from .noise import Noise
-from .reading import MOST, explored, read
-from .refit import ROUNDS, Known, Refit, Start, settle
+from .reading import read
+from .refit import Known, Refit
+from .refits import Report, refitted, repeated
 from .score import Scorer
 from .sight import Sight
 from .simulations import Simulations
 from .verdicts import CERTAIN, CLEAN, LEVEL
 
 FloatArray = npt.NDArray[np.float64]
-Report = Callable[[str, float], None]
-
-SHARED = 0
-"""Seed of the simulation where a refit ends."""
-MORE_SEEDS = 4
-"""Seeds of refits beside those of the evidence."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +53,7 @@ class Confirmation:
         floor: what noise alone leaves there; of soil that has the effect, where that was simulated.
         remainder: what of it stands on slow waves.
         visits: simulations that the parameters were read off; none where the last derivatives told them.
+        stopped: whether the refit's first steps said that another effect explains much more, and it took no others.
     """
 
     name: str
@@ -79,6 +71,7 @@ class Confirmation:
     floor: float
     remainder: Omnibus
     visits: tuple[Visit, ...] = ()
+    stopped: bool = False
 
     @property
     def dispersion(self) -> float:
@@ -116,73 +109,31 @@ def confirm(
     # A surface through many simulations has hardly any of one's chance, and its own doubt beside.
     through, whole = (Sight.of(experiment, floor, basis, vantage, rows, averaged=True) for rows in (shown, None))
     apart = whole if shown.all() else Sight.of(experiment, floor, basis, vantage, hidden, averaged=True)
-    jobs: list[Candidate | None] = [None, *chosen]
-    starting = undiluted(evidence, floor.single.plus(floor.nuisance))
-    done = 0
-
-    def refitted(candidate: Candidate | None) -> tuple[Refit, list[Visit]]:
-        nonlocal done
-        on = () if candidate is None else (candidate.name,)
-        purpose = f"refit {candidate.name if candidate else 'of the model'}"
-        told(purpose, 0.75 + 0.2 * done / len(jobs))
-        free = free_in(experiment, candidate)
-        known, emulated = known_of(evidence, free), has_surface(experiment, candidate)
-        seeds = cycle(seeds_of(experiment, len(evidence.repeats))) if emulated else repeat(SHARED)
-
-        def predict(values: Mapping[str, float], seed: int | None = None) -> FloatArray:
-            seed = next(seeds) if seed is None else seed
-            visits.append(Visit(dict(values), on, simulate(values, effects=on, seed=seed, purpose=purpose), seed))
-            return visits[-1].table
-
-        visits = [v for p in (evidence, vantage) if p is not None for v in p.visits if v.effects in ((), on)]
-        fit = settle(
-            predict,
-            whiten,
-            experiment.observed,
-            free,
-            _starts(experiment, starting, candidate, vantage),
-            chance=experiment.chance,
-            known=known,
-            renewed=_renewed(experiment, candidate),
-            most=steps if candidate is not None else max(steps - 2, 1),
-            rounds=0 if candidate is None or emulated else ROUNDS,
-        )
-        if emulated:
-            shapes = () if candidate is None else candidate.shapes
-            fit = explored(predict, visits, through, experiment.observed, free, known, fit, shapes)
-            with suppress(SimulationError):
-                fit = replace(fit, prediction=predict(fit.values, SHARED))
-        done += 1
-        return fit, visits
-
-    refits = simulate.side_by_side([partial(refitted, candidate) for candidate in jobs])
-    ends = repeated(simulate, jobs, [fit for fit, _ in refits], len(evidence.repeats))
+    trials = refitted(experiment, evidence, floor, chosen, simulate, steps, told, vantage, whiten, through)
+    ends = repeated(simulate, trials, len(evidence.repeats))
     if not ends[0]:
         raise SimulationError("the model can't be simulated where its refit ended")
     out: dict[str, Confirmation] = {}
-    for candidate, (fit, visits), end in zip(jobs, refits, ends, strict=True):
-        if candidate is not None and not ends[0].keys() & end.keys():
+    for trial, end in zip(trials, ends, strict=True):
+        name, fit, visits, known, free = trial.name, trial.fit, trial.visits, trial.known, trial.free
+        if name and not ends[0].keys() & end.keys():
             continue  # nothing to compare them by
-        free = free_in(experiment, candidate)
-        known = known_of(evidence, free)
-        at, off = (np.array([values.get(p.name, p.off or 0.0) for p in free]) for values in (fit.values, {}))
         left, mask = experiment.observed - fit.prediction, judged(experiment, hidden)
         before, after = (experiment.observed - table for table in means(ends[0], end))
         apart_from = np.concatenate([floor.nuisance, reach_of(floor.single, fit.slopes)], axis=1)
         remainder = omnibus(floor.single, apart_from, left[experiment.seen], basis)
         white = whole(after)
-        chi2 = float(np.sum(white**2)) + known.chi2(at)
+        chi2 = float(np.sum(white**2)) + known.chi2(trial.at)
         precision = beforehand(free, fit.values, known)
         values, stds = dict(fit.values), stds_of(free, whiten(fit.slopes), precision, remainder)
         emulated: tuple[Visit, ...] = ()
-        if has_surface(experiment, candidate):
+        if trial.emulated:
             # A surface that isn't one tells nothing more than the last derivatives do.
             with suppress(ValueError):
                 there = [visit.table for visit in visits]
                 visits += [v for v in end.values() if not any(np.array_equal(v.table, table) for table in there)]
                 reading = read(visits, whole, experiment.observed, free, known)
                 values, stds, emulated = dict(reading.values), dict(reading.stds), tuple(visits)
-        name = "" if candidate is None else candidate.name
         solvers = [experiment.reproducibility(p, values[p.name], name) for p in free]
         own = np.hypot(untried(floor, fit.slopes, precision), solvers)
         stds, systematic = widened(stds, [bounded(s, p, fit.values[p.name]) for s, p in zip(own, free, strict=True)])
@@ -194,37 +145,17 @@ def confirm(
             systematic=systematic,
             chi2=chi2,
             freedom=max(white.size - len(free), 1),
-            fall=0.0 if candidate is None else _chi2(whole, before) + known.chi2(off) - chi2,
+            fall=_chi2(whole, before) + known.chi2(trial.off) - chi2 if name else 0.0,
             unseen=_chi2(apart, before) - _chi2(apart, after),
-            told=known.chance(off),
-            agrees=known.chance(at),
+            told=known.chance(trial.off),
+            agrees=known.chance(trial.at),
             held_out=float(np.sqrt(np.mean(left[mask] ** 2))),
             floor=noise_on(floor.single, mask),
             remainder=remainder,
             visits=emulated,
+            stopped=trial.stopped,
         )
     return out
-
-
-def repeated(
-    simulate: Simulations, jobs: Sequence[Candidate | None], fits: Sequence[Refit], count: int
-) -> list[dict[int, Visit]]:
-    """Simulations by ``count`` seeds where each refit ended, by seed: two single ones differ in χ² by chance as much as
-    an effect of twice the smallest detectable size takes away. Seeds that can't be simulated there are left out."""
-
-    def again(ask: Callable[..., FloatArray]) -> list[dict[int, Visit]]:
-        out = list[dict[int, Visit]]()
-        for candidate, fit in zip(jobs, fits, strict=True):
-            on, purpose = ((), "of the model") if candidate is None else ((candidate.name,), candidate.name)
-            out.append({})
-            for seed in range(SHARED, SHARED + count):
-                with suppress(SimulationError):
-                    table = ask(fit.values, effects=on, seed=seed, purpose=f"refit {purpose} once more")
-                    out[-1][seed] = Visit(dict(fit.values), on, table, seed)
-        return out
-
-    simulate.ahead(again)
-    return again(simulate)
 
 
 def means(one: Mapping[int, Visit], other: Mapping[int, Visit]) -> tuple[FloatArray, FloatArray]:
@@ -232,21 +163,6 @@ def means(one: Mapping[int, Visit], other: Mapping[int, Visit]) -> tuple[FloatAr
     shared = sorted(one.keys() & other.keys())
     both = [np.mean([visits[seed].table for seed in shared], axis=0) for visits in (one, other)]
     return both[0], both[1]
-
-
-def seeds_of(experiment: Experiment, repeats: int) -> list[int]:
-    """Those by which refits simulate in turn: one alone would have its chance in all that they say."""
-    return [*(pair := pair_of(experiment, repeats)), *range(1 + pair[-1], 1 + pair[-1] + MORE_SEEDS)]
-
-
-def free_in(experiment: Experiment, candidate: Candidate | None) -> list[Parameter]:
-    """Parameters of a refit."""
-    return [*experiment.parameters, *(() if candidate is None else candidate.refitted)]
-
-
-def has_surface(experiment: Experiment, candidate: Candidate | None) -> bool:
-    """Whether a refit reads the parameters off all simulations: where these have chance in them."""
-    return experiment.chance and len(free_in(experiment, candidate)) <= MOST
 
 
 def _chi2(sight: Sight, left: FloatArray) -> float:
@@ -269,50 +185,6 @@ def judged(experiment: Experiment, hidden: npt.NDArray[np.bool_]) -> npt.NDArray
 def noise_on(noise: Noise, mask: npt.NDArray[np.bool_]) -> float:
     """Root mean square of a noise over some features."""
     return float(np.sqrt(np.mean(noise.spread(noise.scale)[mask] ** 2)))
-
-
-def _renewed(experiment: Experiment, candidate: Candidate | None) -> list[str]:
-    """Parameters whose derivatives change on the way; what cameras report is nearly linear, and beside it those of soil
-    are better known by two seeds than anew by one."""
-    soil = [p.name for p in experiment.parameters]
-    if candidate is None:
-        return soil
-    if candidate.kind == "observation":
-        return [*([] if experiment.chance else soil), candidate.size]
-    return [*soil, *(p.name for p in candidate.refitted)]
-
-
-def known_of(evidence: Evidence, free: Sequence[Parameter]) -> Known:
-    """What a calibration says of the parameters that a refit has."""
-    precision, centre = precision_of(evidence.calibration, [p.name for p in free])
-    told = np.flatnonzero(np.diag(precision) > 0.0)
-    root = np.zeros((len(told), len(free)))
-    if told.size:
-        root[:, told] = np.linalg.cholesky(precision[np.ix_(told, told)]).T
-    return Known(root, centre + np.array([p.off or 0.0 for p in free]))
-
-
-def _starts(
-    experiment: Experiment, evidence: Vantage, candidate: Candidate | None, vantage: Vantage | None
-) -> list[Start]:
-    """Where a refit begins: at the fit, and at the second look's point for an effect that was switched on there."""
-    extra = () if candidate is None else candidate.refitted
-    off = {p.name: p.off if p.off is not None else p.default for p in extra}
-
-    def start(point: Vantage) -> Start:
-        model = np.stack([point.slopes[p.name] for p in experiment.parameters], axis=-1)
-        added = [] if candidate is None else [np.moveaxis(point.directions[candidate.name], 0, -1)]
-        # While the effect is off, its shape changes nothing.
-        shapes = np.zeros((*model.shape[:2], 0 if candidate is None else len(candidate.shapes)))
-        shaped = {} if candidate is None else point.shapes.get(candidate.name, {})
-        return Start(
-            {**point.values, **off, **shaped}, point.prediction, np.concatenate([model, *added, shapes], axis=-1)
-        )
-
-    points: list[Vantage] = [evidence]
-    if candidate is not None and vantage is not None and candidate.name in vantage.directions:
-        points.append(vantage)
-    return [start(point) for point in points]
 
 
 def stds_of(

@@ -20,15 +20,10 @@ from splatsoil.experiment.base import Candidate, Experiment
 from splatsoil.parameters import Parameter
 
 from .confirmation import (
-    SHARED,
     Confirmation,
-    Report,
     beforehand,
     confirm,
-    free_in,
-    has_surface,
     judged,
-    known_of,
     noise_on,
     reach_of,
     split_times,
@@ -39,6 +34,7 @@ from .evidence import Evidence, Numerics, Visit, deviations, other_numerics, pai
 from .floor import Floor, floor_of
 from .misfit import Block, Omnibus, blocks, omnibus, smooth_basis
 from .reading import read, tangent
+from .refits import SHARED, Report, free_in, has_surface, known_of
 from .sight import Sight
 from .simulations import Simulations
 

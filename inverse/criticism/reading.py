@@ -73,6 +73,8 @@ def explored(
     known: Known,
     start: Refit,
     shapes: Sequence[Parameter] = (),
+    *,
+    ahead: Callable[[Sequence[Mapping[str, float]]], object] = lambda points: None,
 ) -> Refit:
     """Simulate where the parameters may lie by what is known so far, then at the most probable ones, and go there if
     that is better by all simulations. Slopes are those of the surface where the refit then stands.
@@ -86,25 +88,26 @@ def explored(
         known: what other measurements say of them.
         start: a refit of them, and what is returned where nothing changes the features.
         shapes: those that no simulation has varied yet.
+        ahead: told of several points before they are predicted one by one.
     """
     space, first, better = ParameterSpace(parameters), len(visits), start
 
-    def visit(values: Mapping[str, float]) -> None:
-        # Where nothing can be simulated nothing is learned.
-        with suppress(SimulationError):
-            predict(values)
+    def visit(points: Sequence[Mapping[str, float]]) -> None:
+        ahead(points)
+        for values in points:
+            # Where nothing can be simulated nothing is learned.
+            with suppress(SimulationError):
+                predict(values)
 
-    for shape in shapes:
-        for end in around(shape, float(start.values[shape.name])):
-            visit({**start.values, shape.name: end})
+    visit([{**start.values, p.name: end} for p in shapes for end in around(p, float(start.values[p.name]))])
     try:
         for batch in range(BATCHES):
             found = read(visits, whiten, observed, parameters, known, seed=batch, bold=True)
             if batch >= FEWEST and np.mean(found.unknown) < UNKNOWN:
                 break
             # What isn't known first.
-            for draw in found.draws[np.argsort(~found.unknown, kind="stable")][:TOGETHER]:
-                visit(space.to_dict(space.from_unit(draw)))
+            draws = found.draws[np.argsort(~found.unknown, kind="stable")][:TOGETHER]
+            visit([space.to_dict(space.from_unit(draw)) for draw in draws])
         values = read(visits, whiten, observed, parameters, known, seed=BATCHES).values
         with suppress(SimulationError):
             table = predict(values)

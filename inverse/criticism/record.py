@@ -161,6 +161,7 @@ def confirmation(c: Confirmation) -> dict[str, Any]:
         "floor": c.floor,
         "remainder": _omnibus(c.remainder),
         "simulations": c.fit.simulations,
+        "stopped": c.stopped,
     }
 
 

@@ -128,11 +128,12 @@ class Simulations:
         finally:
             self._helpers, self._planned = None, {}
 
-    def ahead(self, work: Callable[[Simulate], object]) -> None:
+    def ahead(self, work: Callable[[Simulate], object], *, apart: bool = False) -> None:
         """Have the helpers make what some work will ask for, from the last on; the first ones are made here.
 
         Args:
             work: asks its argument for simulations, as it would ask this, and gets zeros.
+            apart: share out what is best made together, too: for a few that somebody waits for.
         """
         if self._helpers is None:
             return
@@ -143,25 +144,25 @@ class Simulations:
             return np.zeros(self.experiment.layout.shape)
 
         work(noted)
+        drawings = {*self.experiment.guesses, *self.experiment.redrawn}
+        with self._guard:
+            known = {*self._tables, *self._planned}
+        new = {key: what for what in asked if (key := self._key(what)) not in known and self._kept(key) is None}
+        together = 1 if apart else self._helpers.together
         shares: list[dict[str, dict[str, Any]]] = []
         latest: dict[object, dict[str, dict[str, Any]]] = {}
-        seen = {*self._tables, *self._planned}
-        drawings = {*self.experiment.guesses, *self.experiment.redrawn}
-        for what in asked:
-            key = self._key(what)
-            if key in seen or self._kept(key) is not None:
-                continue
-            seen.add(key)
+        for key, what in new.items():
             # What only draws a simulation otherwise is left to one process: on a GPU no second one is quite the same.
             drawn = what["numerics"] in drawings
             kind = self._key({**what, "numerics": ""}) if drawn else (*_names(what["effects"]), what["numerics"])
-            if kind not in latest or (len(latest[kind]) == self._helpers.together and not drawn):
+            if kind not in latest or (len(latest[kind]) == together and not drawn):
                 latest[kind] = {}
                 shares.append(latest[kind])
             latest[kind][key] = what
         for jobs in reversed(shares):
             plan = _Plan(jobs, self._helpers.submit(list(jobs.values())))
-            self._planned |= dict.fromkeys(jobs, plan)
+            with self._guard:
+                self._planned |= dict.fromkeys(jobs, plan)
 
     def side_by_side(self, jobs: Iterable[Callable[[], T]]) -> list[T]:
         """Results of jobs that wait for simulations, in order, as many at a time as there are processes."""

@@ -159,8 +159,9 @@ def added(
     mine = [p.name for p in own.parameters if p.off is not None or p.name in own.shapes]
     free = (*before["parameters"], *mine)
     known = criticism.latest_diagnosis(folder, name) or {"refits": {}}
-    # One that was kept may be of a time when other parameters of the effect were free.
-    if {*known["refits"].get(effect.name, {"values": ()})["values"]} != {*free}:
+    kept = known["refits"].get(effect.name, {"values": ()})
+    # It may be of a time when other parameters of the effect were free, or have stopped at its first steps.
+    if {*kept["values"]} != {*free} or kept.get("stopped", False):
         known = criticism.confirmed(folder, model, name, options, begin(f"try {effect.name}"))
     entries = criticism.history(folder)
     base, with_it = known["refits"]["as it is"], known["refits"][effect.name]

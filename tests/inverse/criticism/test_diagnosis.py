@@ -13,7 +13,7 @@ import numpy.typing as npt
 import pytest
 from splatsoil.benchmarks._tally import wilson
 from splatsoil.benchmarks.hidden_effects import detectable, emulated, fitted, one, outside
-from splatsoil.inverse.criticism import confirmation, diagnosis
+from splatsoil.inverse.criticism import diagnosis, refits
 from splatsoil.inverse.criticism.diagnosis import Options, diagnose
 from splatsoil.inverse.criticism.misfit import Block, Omnibus
 from splatsoil.inverse.criticism.own_floor import OwnFloor
@@ -76,7 +76,7 @@ def test_what_is_left_is_held_against_soil_that_has_the_effect(
 ) -> None:
     """However loud soil without it is, and however far off on hidden times, where numerics count as error; and however
     many parameters its refit has."""
-    monkeypatch.setattr(confirmation, "MOST", most)
+    monkeypatch.setattr(refits, "MOST", most)
     own_floor = diagnosis.on_its_own_floor
 
     def other(*arguments: Any) -> OwnFloor:

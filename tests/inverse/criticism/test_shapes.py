@@ -13,9 +13,9 @@ import pytest
 from splatsoil.benchmarks.hidden_effects import emulated, fitted
 from splatsoil.inverse.criticism.afresh import look_afresh
 from splatsoil.inverse.criticism.bench import Bench
-from splatsoil.inverse.criticism.confirmation import _starts
 from splatsoil.inverse.criticism.diagnosis import Diagnosis, diagnose
 from splatsoil.inverse.criticism.evidence import gather
+from splatsoil.inverse.criticism.refits import starts_of
 from splatsoil.inverse.criticism.simulations import Simulations
 
 from splatsoil.errors import ParameterError
@@ -128,7 +128,7 @@ def test_from_the_defaults_an_effect_is_seen_in_the_shape_that_it_has(hidden: fl
     assert found.shapes == ({} if hidden == SHAPE.default else {"effect 2": {SHAPE.name: pytest.approx(hidden)}})
     exact = made.expected({"angle": 0.0, "effect 2": 1.0, SHAPE.name: hidden}) - made.expected({"angle": 0.0})
     (candidate,) = (c for c in experiment.candidates if c.name == "effect 2")
-    first, second = (start.values[SHAPE.name] for start in _starts(experiment, evidence, candidate, found))
+    first, second = (start.values[SHAPE.name] for start in starts_of(experiment, evidence, candidate, found))
     assert first == SHAPE.default and second == pytest.approx(hidden)
     (seen,) = found.directions["effect 2"]
     assert np.linalg.norm(seen - exact) < 0.2 * np.linalg.norm(exact)

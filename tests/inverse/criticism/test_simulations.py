@@ -156,6 +156,18 @@ def test_nobody_waits_for_a_share_that_was_given_up(tmp_path: Path) -> None:
     assert len(done) == 1 and np.array_equal(done[0], emulated(3).predict({"angle": 2.0}))
 
 
+def test_a_few_that_somebody_waits_for_are_shared_out(tmp_path: Path) -> None:
+    simulate, shares = Simulations(Watched(), tmp_path), list[int]()
+
+    def counted(jobs: Sequence[Mapping[str, Any]]) -> Future[None]:
+        shares.append(len(jobs))
+        return Future()
+
+    with simulate.helped(Helpers(1, counted, 4)):
+        simulate.ahead(lambda ask: [ask({"angle": angle}) for angle in (1.0, 2.0, 3.0)], apart=True)
+    assert shares == [1, 1, 1]
+
+
 def test_threads_that_share_a_share_make_it_once(tmp_path: Path) -> None:
     mine = Watched()
     simulate = Simulations(mine, tmp_path)
