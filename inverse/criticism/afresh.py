@@ -41,24 +41,26 @@ def look_afresh(
     """The soil's own parameters at their defaults, those of effects as fitted; effects of physics switched on there.
 
     Each of these in the shape in which it would explain most: as by default, or a decade off. Soil that dilates without
-    end leaves other traces than soil that soon is loose.
+    end leaves other traces than soil that soon is loose. Where the fit lies near the defaults, effects are tried in
+    other shapes there.
 
     None where nothing says that the fit was led astray (the model isn't ``off`` by more than noise, and no bound is
-    reached), where the fit lies near the defaults, or where these can't be simulated.
+    reached), where the defaults can't be simulated, or where the fit lies near them and nothing has a shape.
     """
     bound = any(len(around(p, evidence.values[p.name])) == 1 for p in experiment.parameters)
     own = {p.name: p.default for p in experiment.parameters if p.off is None}
     far = any(abs(evidence.values[name] - value) > evidence.widths[name] for name, value in own.items())
-    if not far or not (bound or off):
+    if not (bound or off):
         return None
     there = {**evidence.values, **own}
     candidates = [c for c in experiment.candidates if c.kind == "physics" and c.name in evidence.directions]
 
     def look(ask: Callable[..., FloatArray]) -> tuple[Vantage, list[_Variant]]:
         def run(purpose: str, at: Mapping[str, float], effects: tuple[str, ...] = (), seed: int = 0) -> FloatArray:
-            return ask(at, effects=effects, seed=seed, purpose=f"from the defaults: {purpose}")
+            where = "from the defaults" if far else "in another shape"
+            return ask(at, effects=effects, seed=seed, purpose=f"{where}: {purpose}")
 
-        found = look_from(experiment, there, candidates, run)
+        found = look_from(experiment, there, candidates, run) if far else _at_the_fit(evidence, candidates)
         on = [c for c in candidates if c.name in found.directions]
         return found, [v for c in on for v in _variants(c, found, run, STRIDE if experiment.chance else 1.0)]
 
@@ -67,7 +69,15 @@ def look_afresh(
         found, variants = look(simulate)
     except SimulationError:
         return None
-    return _in_best_shapes(experiment, found, variants, floor, basis) if variants else found
+    if variants:
+        return _in_best_shapes(experiment, found, variants, floor, basis)
+    return found if far else None
+
+
+def _at_the_fit(evidence: Evidence, candidates: Sequence[Candidate]) -> Vantage:
+    """The fit as a point to look from, whose own simulations count already."""
+    directions = {c.name: evidence.directions[c.name] for c in candidates}
+    return replace(evidence, directions=directions, visits=())
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -43,24 +44,31 @@ class Bench:
     def of(cls, experiment: Experiment, evidence: Evidence, *, level: float = LEVEL, seed: int = 0) -> Bench:
         """Prepare, with ``level`` the family-wise chance of naming an effect when none is missing."""
         floor = floor_of(experiment, evidence)
-        seen = experiment.seen
         candidates = tuple(c for c in experiment.candidates if c.name in evidence.directions)
-        columns = {c.name: evidence.directions[c.name][:, seen].T for c in candidates}
-        doubts = {c.name: evidence.doubts[c.name][:, seen].T for c in candidates if c.name in evidence.doubts}
-        scorer = None
-        if candidates:
-            scorer = Scorer.of(
-                floor.noise,
-                floor.free,
-                columns,
-                candidates,
-                doubts=doubts,
-                calibration=evidence.calibration,
-                level=level,
-                seed=seed,
-            )
-        layout = experiment.layout
-        return cls(floor, candidates, scorer, smooth_basis(layout, floor.noise), layout, seed)
+        made = cls(floor, candidates, None, smooth_basis(experiment.layout, floor.noise), experiment.layout, seed)
+        return (
+            replace(made, scorer=made.scored(experiment, evidence, evidence.directions, level)) if candidates else made
+        )
+
+    def scored(
+        self,
+        experiment: Experiment,
+        evidence: Evidence,
+        directions: Mapping[str, FloatArray],
+        level: float = LEVEL,
+    ) -> Scorer:
+        """A scorer of the candidates by their directions, each (k, t, s)."""
+        seen, names = experiment.seen, [c.name for c in self.candidates]
+        return Scorer.of(
+            self.floor.noise,
+            self.floor.free,
+            {name: directions[name][:, seen].T for name in names},
+            self.candidates,
+            doubts={name: evidence.doubts[name][:, seen].T for name in names if name in evidence.doubts},
+            calibration=evidence.calibration,
+            level=level,
+            seed=self.seed,
+        )
 
     def misfit(self, residual: FloatArray) -> Omnibus:
         """What of a residual (n,) stands on slow waves."""

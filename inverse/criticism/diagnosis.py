@@ -176,7 +176,7 @@ def judge(
     candidates = {c.name: c for c in bench.candidates}
     vantage = None if scorer is None else look_afresh(experiment, evidence, off, simulate, floor, bench.basis)
     notes = [f"{name} could not be simulated: {why}" for name, why in evidence.failed.items()]
-    chosen = _chosen(experiment, bench, scores, residual, off, vantage, options)
+    chosen = _chosen(experiment, evidence, bench, scores, residual, off, vantage, options)
     confirmations: dict[str, Confirmation] = {}
     members: tuple[str, ...] = ()
     given: Mapping[str, Score] = {}
@@ -280,6 +280,7 @@ def _advice(
 
 def _chosen(
     experiment: Experiment,
+    evidence: Evidence,
     bench: Bench,
     scores: Mapping[str, Score],
     residual: FloatArray,
@@ -289,8 +290,9 @@ def _chosen(
 ) -> list[str]:
     """Effects to refit: significant ones, those first that explain most for their parameters.
 
-    Where the model is off, those too that would explain most if they were alone, as seen from soil as one would guess
-    it where the fit is far from that: at a fit that a missing effect has led astray, it needn't stand out.
+    Where the model is off, those too that would explain most if they were alone, in their best shapes, as seen from
+    soil as one would guess it where the fit is far from that: at a fit that a missing effect has led astray, it needn't
+    stand out.
     """
     scorer = bench.scorer
     if scorer is None:
@@ -299,11 +301,12 @@ def _chosen(
     found = [s for s in scores.values() if s.adjusted < options.level]
     strong = [s.name for s in sorted(found, key=lambda s: s.statistic - prices[s.name], reverse=True)]
     alone: list[str] = []
-    if vantage is not None:
+    if vantage is not None and vantage.values != evidence.values:
         sight = Sight.of(experiment, bench.floor, bench.basis, vantage)
         alone = promising(experiment, vantage, sight, bench.candidates, scorer.price)
     elif off:
-        alone = scorer.ranked(residual)
+        shaped = {} if vantage is None else {name: vantage.directions[name] for name in vantage.shapes}
+        alone = bench.scored(experiment, evidence, {**evidence.directions, **shaped}).ranked(residual)
     if not alone:
         return strong[: options.refits]
     # The two orders take turns, and one more is tried than either would have.

@@ -272,7 +272,8 @@ def known_of(evidence: Evidence, free: Sequence[Parameter]) -> Known:
 def starts_of(
     experiment: Experiment, evidence: Vantage, candidate: Candidate | None, vantage: Vantage | None
 ) -> list[Start]:
-    """Where a refit begins: at the fit, and at the second look's point for an effect that was switched on there."""
+    """Where a refit begins: at the fit, and at the second look's point for an effect that was switched on there; where
+    that is the fit, in another shape than by default."""
     extra = () if candidate is None else candidate.refitted
     off = {p.name: p.off if p.off is not None else p.default for p in extra}
 
@@ -287,8 +288,9 @@ def starts_of(
         )
 
     points: list[Vantage] = [evidence]
-    if candidate is not None and vantage is not None and candidate.name in vantage.directions:
-        points.append(vantage)
+    if candidate is not None and vantage is not None:
+        other = vantage.values != evidence.values or candidate.name in vantage.shapes
+        points += [vantage] if other and candidate.name in vantage.directions else []
     return [start(point) for point in points]
 
 

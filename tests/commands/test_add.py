@@ -123,6 +123,17 @@ def test_what_shapes_an_effect_is_fitted_with_it(
     assert {name: p["estimate"] for name, p in entry["parameters"].items()} == found
 
 
+def test_a_refit_that_stopped_at_its_first_steps_is_made_anew(bench: Bench) -> None:
+    first, whole = ({"friction_angle": 33.0, "cohesion": size} for size in (200.0, 300.0))
+    bench.confirmed = {"as it is": refit({"friction_angle": 30.0}, 50.0), "cohesion": refit(whole, 20.0)}
+    bench.refits["cohesion"] = {**refit(first, 40.0), "stopped": False}
+    bench.add("cohesion")
+    assert bench.refitted["cohesion"] == (200.0, pytest.approx(20.0))
+    bench.refits["cohesion"]["stopped"] = True
+    bench.add("cohesion")
+    assert bench.refitted["cohesion"] == (300.0, pytest.approx(30.0))
+
+
 def test_a_diagnosis_by_other_code_is_none(tmp_path: Path) -> None:
     fit = {"name": "base", "setup": {"effects": []}, "parameters": {"friction_angle": {"estimate": 30.0}}}
     folder = cast(Any, SimpleNamespace(fit=lambda: fit, path=tmp_path))

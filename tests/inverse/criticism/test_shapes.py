@@ -13,7 +13,7 @@ import pytest
 from splatsoil.benchmarks.hidden_effects import emulated, fitted
 from splatsoil.inverse.criticism.afresh import look_afresh
 from splatsoil.inverse.criticism.bench import Bench
-from splatsoil.inverse.criticism.diagnosis import Diagnosis, diagnose
+from splatsoil.inverse.criticism.diagnosis import Diagnosis, Options, diagnose
 from splatsoil.inverse.criticism.evidence import gather
 from splatsoil.inverse.criticism.refits import starts_of
 from splatsoil.inverse.criticism.simulations import Simulations
@@ -135,6 +135,43 @@ def test_from_the_defaults_an_effect_is_seen_in_the_shape_that_it_has(hidden: fl
     # All simulations with the effect are there to be read, those in other shapes, too.
     shapes = {visit.values.get(SHAPE.name, SHAPE.default) for visit in found.visits if visit.effects == ("effect 2",)}
     assert sorted(shapes) == pytest.approx([0.03, 0.3, 3.0])
+
+
+@pytest.mark.parametrize("hidden", [3.0, 0.03, 0.3])
+def test_at_a_fit_near_the_defaults_an_effect_is_seen_in_the_shape_that_it_has(hidden: float) -> None:
+    made = turning(WORLD, (SHAPE,))
+    truth = {"angle": ANGLE, "effect 2": SIZE, SHAPE.name: hidden}
+    experiment = replace(made, observed=made.measured(truth, [WORLD, 99]))
+    simulate = Simulations(experiment)
+    evidence = gather(experiment, simulate, {"angle": ANGLE})
+    before, bench = simulate.asked, Bench.of(experiment, evidence)
+    found = look_afresh(experiment, evidence, True, simulate, bench.floor, bench.basis)
+    assert look_afresh(experiment, evidence, False, simulate, bench.floor, bench.basis) is None
+    # The effect, up and down, in two other shapes; the fit itself counts already.
+    assert found is not None and simulate.asked - before == len(found.visits) <= 4
+    assert found.values == evidence.values
+    assert found.shapes == ({} if hidden == SHAPE.default else {"effect 2": {SHAPE.name: pytest.approx(hidden)}})
+    starts = {c.name: starts_of(experiment, evidence, c, found) for c in experiment.candidates}
+    assert {len(several) for name, several in starts.items() if name != "effect 2"} == {1}
+    assert starts["effect 2"][-1].values[SHAPE.name] == pytest.approx(hidden)
+    exact = made.expected({"angle": ANGLE, "effect 2": 1.0, SHAPE.name: hidden}) - made.expected({"angle": ANGLE})
+    (seen,) = found.directions["effect 2"]
+    assert np.linalg.norm(seen - exact) < 0.2 * np.linalg.norm(exact)
+
+
+def test_an_effect_that_explains_little_in_its_default_shape_is_tried_in_another() -> None:
+    """Three traces that are nearer to it than its own by default promise more by then."""
+    made = turning(WORLD, (SHAPE,))
+    own, far = made.slopes["effect 2"], made.slopes[SHAPE.name]
+    near = {f"effect {k}": 0.4 * made.slopes[f"effect {k}"] + 0.6 * far for k in (1, 3, 4)}
+    made = replace(made, slopes={**made.slopes, **near, "effect 2": own})
+    truth = {"angle": ANGLE, "effect 2": SIZE, SHAPE.name: 3.0}
+    experiment = replace(made, observed=made.measured(truth, [WORLD, 99]))
+    found = diagnose(experiment, {"angle": ANGLE}, options=Options(refits=1))
+    assert "effect 2" in found.confirmations
+    assert found.members == ("effect 2",)
+    bare = replace(experiment, candidates=tuple(replace(c, shapes=()) for c in experiment.candidates))
+    assert "effect 2" not in diagnose(bare, {"angle": ANGLE}, options=Options(refits=1)).confirmations
 
 
 def test_what_cameras_report_has_no_shapes(tmp_path: Path) -> None:
