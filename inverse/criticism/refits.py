@@ -65,7 +65,7 @@ class Trial:
     visits: list[Visit]
     fit: Refit = field(init=False)
     stopped: bool = False
-    _asked: int = 0
+    _asked: int = field(default=0, init=False)
 
     @property
     def name(self) -> str:
