@@ -45,10 +45,10 @@ class Bench:
         """Prepare, with ``level`` the family-wise chance of naming an effect when none is missing."""
         floor = floor_of(experiment, evidence)
         candidates = tuple(c for c in experiment.candidates if c.name in evidence.directions)
-        made = cls(floor, candidates, None, smooth_basis(experiment.layout, floor.noise), experiment.layout, seed)
-        return (
-            replace(made, scorer=made.scored(experiment, evidence, evidence.directions, level)) if candidates else made
-        )
+        bench = cls(floor, candidates, None, smooth_basis(experiment.layout, floor.noise), experiment.layout, seed)
+        if not candidates:
+            return bench
+        return replace(bench, scorer=bench.scored(experiment, evidence, evidence.directions, level))
 
     def scored(
         self,

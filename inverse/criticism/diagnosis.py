@@ -306,7 +306,8 @@ def _chosen(
         alone = promising(experiment, vantage, sight, bench.candidates, scorer.price)
     elif off:
         shaped = {} if vantage is None else {name: vantage.directions[name] for name in vantage.shapes}
-        alone = bench.scored(experiment, evidence, {**evidence.directions, **shaped}).ranked(residual)
+        best = bench.scored(experiment, evidence, {**evidence.directions, **shaped}) if shaped else scorer
+        alone = best.ranked(residual)
     if not alone:
         return strong[: options.refits]
     # The two orders take turns, and one more is tried than either would have.
