@@ -25,7 +25,7 @@ from .refits import Report, refitted, repeated
 from .score import Scorer
 from .sight import Sight
 from .simulations import Simulations
-from .verdicts import CERTAIN, CLEAN, LEVEL
+from .verdicts import CLEAN, LEVEL, ruled_out
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -82,7 +82,7 @@ class Confirmation:
     @property
     def ruled_out(self) -> bool:
         """Other pictures deny the size that soil asks for, and don't ask for the effect themselves."""
-        return self.agrees < CERTAIN <= self.told
+        return ruled_out(self.told, self.agrees)
 
 
 def confirm(
@@ -147,8 +147,8 @@ def confirm(
             freedom=max(white.size - len(free), 1),
             fall=_chi2(whole, before) + known.chi2(trial.off) - chi2 if name else 0.0,
             unseen=_chi2(apart, before) - _chi2(apart, after),
-            told=known.chance(trial.off),
-            agrees=known.chance(trial.at),
+            told=trial.told,
+            agrees=trial.agrees,
             held_out=float(np.sqrt(np.mean(left[mask] ** 2))),
             floor=noise_on(floor.single, mask),
             remainder=remainder,

@@ -26,7 +26,7 @@ from .reading import MOST, explored
 from .refit import ROUNDS, Known, Refit, Start, settle
 from .sight import Sight
 from .simulations import Simulations
-from .verdicts import CERTAIN, EQUIVALENT
+from .verdicts import CERTAIN, EQUIVALENT, ruled_out
 
 FloatArray = npt.NDArray[np.float64]
 Report = Callable[[str, float], None]
@@ -98,14 +98,14 @@ class Trial:
         return np.array([self.fit.values.get(p.name, p.off or 0.0) for p in self.free])
 
     @property
-    def certain(self) -> bool:
-        """Other pictures ask for the effect."""
-        return self.known.chance(self.off) < CERTAIN
+    def told(self) -> float:
+        """Chance of what other pictures say of the parameters if they were off."""
+        return self.known.chance(self.off)
 
     @property
-    def ruled_out(self) -> bool:
-        """Other pictures deny the size that soil asks for, and don't ask for the effect themselves."""
-        return self.known.chance(self.at) < CERTAIN and not self.certain
+    def agrees(self) -> float:
+        """The same, if they were as refitted."""
+        return self.known.chance(self.at)
 
     def predict(self, values: Mapping[str, float], seed: int | None = None) -> FloatArray:
         """(t, s) features by parameters, of the next seed unless told which; adds a visit."""
@@ -198,14 +198,14 @@ def stop(trials: Sequence[Trial], count: int) -> None:
     """Stop those whose first steps say that they can't be the best effect's equals, of ``count`` numbers in χ²."""
     asis, *others = trials
     falls = {t.name: asis.fit.chi2 + t.known.chi2(t.off) - t.fit.chi2 for t in others}
-    possible = [t for t in others if not t.ruled_out]
+    possible = [t for t in others if not ruled_out(t.told, t.agrees)]
     if not possible:
         return
     best = max(possible, key=lambda t: falls[t.name])
     dispersion = max(1.0, best.fit.chi2 / max(count - len(best.free), 1))
     least = min(LEAST_SHARE * falls[best.name], falls[best.name] - CLEARLY * dispersion)
     for trial in others:
-        trial.stopped = trial.emulated and not trial.certain and falls[trial.name] < least
+        trial.stopped = trial.emulated and trial.told >= CERTAIN and falls[trial.name] < least
 
 
 def _trial(

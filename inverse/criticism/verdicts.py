@@ -53,6 +53,12 @@ def of_effect(candidate: Candidate, score: Score, *, level: float = LEVEL) -> Ef
     return "cannot tell"
 
 
+def ruled_out(told: float, agrees: float) -> bool:
+    """Whether other pictures deny the size that soil asks for (their chance if it were so: ``agrees``), and don't ask
+    for the effect themselves (their chance if it were off: ``told``)."""
+    return agrees < CERTAIN <= told
+
+
 def beyond(whole: Block) -> bool:
     """Whether more is left in all than an adequate model may leave."""
     return whole.ratio > WITHIN and whole.p < GATE

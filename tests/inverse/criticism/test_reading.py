@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import pytest
@@ -251,6 +251,18 @@ def test_a_shape_is_found_though_no_slope_tells_of_it() -> None:
     assert fit.values["shape"] == pytest.approx(2.0, rel=0.5)
     assert fit.values["stick"] == pytest.approx(400.0, rel=0.2)
     assert fit.simulations == len(world.visits) - known
+
+
+def test_several_points_are_told_of_before_they_are_simulated() -> None:
+    world, told = Shaped(), list[Sequence[Mapping[str, float]]]()
+    known, nothing = len(world.visits), Known.nothing(3)
+    explored(
+        *(world.predict, world.visits, whiten, world.observed, world.free, nothing, world.begun, (SHAPE,)),
+        ahead=told.append,
+    )
+    # All but the last one, the most probable by all the others.
+    assert [point for some in told for point in some] == [visit.values for visit in world.visits[known:-1]]
+    assert all(len(some) > 1 for some in told)
 
 
 def off(found: np.ndarray, exact: np.ndarray) -> np.ndarray:

@@ -61,12 +61,16 @@ def turning(world: int, shapes: tuple[Parameter, ...] = ()) -> Turning:
     return Turning(**{**plain.__dict__, "candidates": candidates, "slopes": slopes})
 
 
+def hiding(made: Turning, shape: float, world: int = WORLD) -> Turning:
+    """The second effect hidden in a shape."""
+    truth = {"angle": ANGLE, "effect 2": SIZE, SHAPE.name: shape}
+    return replace(made, observed=made.measured(truth, [world, 99]))
+
+
 @cache
 def judged(world: int, hidden: float, shapes: tuple[Parameter, ...]) -> Diagnosis:
     """A diagnosis of soil with the second effect in a hidden shape."""
-    made = turning(world, shapes)
-    truth = {"angle": ANGLE, "effect 2": SIZE, SHAPE.name: hidden}
-    experiment = replace(made, observed=made.measured(truth, [world, 99]))
+    experiment = hiding(turning(world, shapes), hidden, world)
     assert experiment.chance
     return diagnose(experiment, {"angle": fitted(experiment)})
 
@@ -117,16 +121,16 @@ def test_slopes_are_those_of_the_effect_in_the_shape_that_was_found(world: int, 
 
 @pytest.mark.parametrize("hidden", [3.0, 0.03, 0.3])
 def test_from_the_defaults_an_effect_is_seen_in_the_shape_that_it_has(hidden: float) -> None:
-    made = turning(WORLD, (SHAPE,))
-    truth = {"angle": ANGLE, "effect 2": SIZE, SHAPE.name: hidden}
-    experiment = replace(made, observed=made.measured(truth, [WORLD, 99]))
+    experiment = hiding(turning(WORLD, (SHAPE,)), hidden)
     simulate = Simulations(experiment)
     evidence = gather(experiment, simulate, {"angle": 8.0})
     bench = Bench.of(experiment, evidence)
     found = look_afresh(experiment, evidence, True, simulate, bench.floor, bench.basis)
     assert found is not None
     assert found.shapes == ({} if hidden == SHAPE.default else {"effect 2": {SHAPE.name: pytest.approx(hidden)}})
-    exact = made.expected({"angle": 0.0, "effect 2": 1.0, SHAPE.name: hidden}) - made.expected({"angle": 0.0})
+    exact = experiment.expected({"angle": 0.0, "effect 2": 1.0, SHAPE.name: hidden}) - experiment.expected(
+        {"angle": 0.0}
+    )
     (candidate,) = (c for c in experiment.candidates if c.name == "effect 2")
     first, second = (start.values[SHAPE.name] for start in starts_of(experiment, evidence, candidate, found))
     assert first == SHAPE.default and second == pytest.approx(hidden)
@@ -139,9 +143,7 @@ def test_from_the_defaults_an_effect_is_seen_in_the_shape_that_it_has(hidden: fl
 
 @pytest.mark.parametrize("hidden", [3.0, 0.03, 0.3])
 def test_at_a_fit_near_the_defaults_an_effect_is_seen_in_the_shape_that_it_has(hidden: float) -> None:
-    made = turning(WORLD, (SHAPE,))
-    truth = {"angle": ANGLE, "effect 2": SIZE, SHAPE.name: hidden}
-    experiment = replace(made, observed=made.measured(truth, [WORLD, 99]))
+    experiment = hiding(turning(WORLD, (SHAPE,)), hidden)
     simulate = Simulations(experiment)
     evidence = gather(experiment, simulate, {"angle": ANGLE})
     before, bench = simulate.asked, Bench.of(experiment, evidence)
@@ -154,7 +156,9 @@ def test_at_a_fit_near_the_defaults_an_effect_is_seen_in_the_shape_that_it_has(h
     starts = {c.name: starts_of(experiment, evidence, c, found) for c in experiment.candidates}
     assert {len(several) for name, several in starts.items() if name != "effect 2"} == {1}
     assert starts["effect 2"][-1].values[SHAPE.name] == pytest.approx(hidden)
-    exact = made.expected({"angle": ANGLE, "effect 2": 1.0, SHAPE.name: hidden}) - made.expected({"angle": ANGLE})
+    exact = experiment.expected({"angle": ANGLE, "effect 2": 1.0, SHAPE.name: hidden}) - experiment.expected(
+        {"angle": ANGLE}
+    )
     (seen,) = found.directions["effect 2"]
     assert np.linalg.norm(seen - exact) < 0.2 * np.linalg.norm(exact)
 
@@ -162,11 +166,10 @@ def test_at_a_fit_near_the_defaults_an_effect_is_seen_in_the_shape_that_it_has(h
 def test_an_effect_that_explains_little_in_its_default_shape_is_tried_in_another() -> None:
     """Three traces that are nearer to it than its own by default promise more by then."""
     made = turning(WORLD, (SHAPE,))
-    own, far = made.slopes["effect 2"], made.slopes[SHAPE.name]
-    near = {f"effect {k}": 0.4 * made.slopes[f"effect {k}"] + 0.6 * far for k in (1, 3, 4)}
-    made = replace(made, slopes={**made.slopes, **near, "effect 2": own})
-    truth = {"angle": ANGLE, "effect 2": SIZE, SHAPE.name: 3.0}
-    experiment = replace(made, observed=made.measured(truth, [WORLD, 99]))
+    names = ("effect 1", "effect 3", "effect 4")
+    near = {name: 0.4 * made.slopes[name] + 0.6 * made.slopes[SHAPE.name] for name in names}
+    made = replace(made, slopes={**made.slopes, **near})
+    experiment = hiding(made, 3.0)
     found = diagnose(experiment, {"angle": ANGLE}, options=Options(refits=1))
     assert "effect 2" in found.confirmations
     assert found.members == ("effect 2",)
