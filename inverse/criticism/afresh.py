@@ -1,4 +1,4 @@
-"""A second look, from soil as one would guess it: the fit may have been led astray.
+"""Where effects are switched on: at the fit, or at soil as one would guess it where the fit may have been led astray.
 
 Soil that is viscous, or sticks together, drives the friction angle of a model without that effect far off, up to its
 bound. There the derivatives are those of another regime, and the effect that is missing looks like nothing in
@@ -17,10 +17,13 @@ from scipy.optimize import lsq_linear
 from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Candidate, Experiment
 
-from .evidence import STRIDE, Evidence, Run, Vantage, Visit, around, directions_of, look_from
+from .bench import Bench
+from .derivatives import Run, around, directions_of
+from .evidence import STRIDE, Evidence, Vantage, Visit, look_from, switched_on
 from .floor import Floor
 from .sight import Sight
 from .simulations import Simulations
+from .verdicts import LEVEL
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -30,54 +33,113 @@ DECADE = 10.0
 magnitude is known beforehand."""
 
 
-def look_afresh(
-    experiment: Experiment,
-    evidence: Evidence,
-    off: bool,
-    simulate: Simulations,
-    floor: Floor,
-    basis: FloatArray,
-) -> Vantage | None:
-    """The soil's own parameters at their defaults, those of effects as fitted; effects of physics switched on there.
+@dataclass(frozen=True)
+class Looks:
+    """What was seen of effects.
 
-    Each of these in the shape in which it would explain most: as by default, or a decade off. Soil that dilates without
-    end leaves other traces than soil that soon is loose. Where the fit lies near the defaults, effects are tried in
-    other shapes there.
-
-    None where nothing says that the fit was led astray (the model isn't ``off`` by more than noise, and no bound is
-    reached), where the defaults can't be simulated, or where the fit lies near them and nothing has a shape.
+    Attributes:
+        evidence: with all effects' derivatives: at the fit, or those of physics at the defaults.
+        bench: what a residual is judged by.
+        off: whether the model as it is leaves more than noise.
+        vantage: the law's defaults where the fit was led astray; else the fit where effects were tried in other shapes
+            there; None where neither was.
     """
+
+    evidence: Evidence
+    bench: Bench
+    off: bool
+    vantage: Vantage | None
+
+    @property
+    def astray(self) -> bool:
+        """Whether effects were switched on at the defaults."""
+        return self.vantage is not None and self.vantage.values != self.evidence.values
+
+
+def look(
+    experiment: Experiment, evidence: Evidence, simulate: Simulations, *, level: float = LEVEL, seed: int = 0
+) -> Looks:
+    """Switch the effects of physics on, one at a time.
+
+    At the fit, by two seeds, and where the model is off by more than noise in other shapes, too: soil that dilates
+    without end leaves other traces than soil that soon is loose. Where the fit was led astray (the model is off, or a
+    bound is reached, and the fit lies far from the law's defaults) at these instead: the soil's own parameters at their
+    defaults, those of effects as fitted. Shapes are as by default, or a decade off.
+
+    Args:
+        experiment: whose effects are tried.
+        evidence: of :func:`~splatsoil.inverse.criticism.evidence.gather`.
+        simulate: for what that hasn't.
+        level: family-wise chance of naming an effect when none is missing.
+        seed: of draws.
+    """
+    left = (experiment.observed - evidence.mean)[experiment.seen]
+    first = Bench.of(experiment, evidence, seed=seed, scored=False)
+    off = first.off(left)
+    vantage = _from_defaults(experiment, evidence, off, simulate)
+    if vantage is None:
+        simulate.ahead(lambda ask: switched_on(experiment, ask, evidence))
+        whole = switched_on(experiment, simulate, evidence)
+    else:
+        point, _ = vantage
+        whole = evidence.with_effects(experiment.candidates, point.directions, steps=point.steps, failed=point.failed)
+    bench = Bench.of(experiment, whole, level=level, seed=seed, before=first.floor)
+    off = bench.off(left)
+    if vantage is None and off:
+        vantage = _at_the_fit(experiment, whole, simulate)
+    if vantage is None:
+        return Looks(whole, bench, off, None)
+    point, variants = vantage
+    best = _in_best_shapes(experiment, point, variants, bench.floor, bench.basis) if variants else point
+    return Looks(whole, bench, off, best)
+
+
+def _from_defaults(
+    experiment: Experiment, evidence: Evidence, off: bool, simulate: Simulations
+) -> tuple[Vantage, list[_Variant]] | None:
+    """From the defaults; None where nothing says that the fit was led astray, or these can't be simulated."""
     bound = any(len(around(p, evidence.values[p.name])) == 1 for p in experiment.parameters)
     own = {p.name: p.default for p in experiment.parameters if p.off is None}
     far = any(abs(evidence.values[name] - value) > evidence.widths[name] for name, value in own.items())
-    if not (bound or off):
+    if not (experiment.candidates and far and (bound or off)):
         return None
-    there = {**evidence.values, **own}
-    candidates = [c for c in experiment.candidates if c.kind == "physics" and c.name in evidence.directions]
+    physics = [c for c in experiment.candidates if c.kind == "physics"]
 
-    def look(ask: Callable[..., FloatArray]) -> tuple[Vantage, list[_Variant]]:
-        def run(purpose: str, at: Mapping[str, float], effects: tuple[str, ...] = (), seed: int = 0) -> FloatArray:
-            where = "from the defaults" if far else "in another shape"
-            return ask(at, effects=effects, seed=seed, purpose=f"{where}: {purpose}")
+    def seen(ask: Callable[..., FloatArray]) -> tuple[Vantage, list[_Variant]]:
+        run = _called("from the defaults", ask)
+        found = look_from(experiment, {**evidence.values, **own}, physics, run)
+        return found, _variants(experiment, found, run)
 
-        found = look_from(experiment, there, candidates, run) if far else _at_the_fit(evidence, candidates)
-        on = [c for c in candidates if c.name in found.directions]
-        return found, [v for c in on for v in _variants(c, found, run, STRIDE if experiment.chance else 1.0)]
-
-    simulate.ahead(look)
+    simulate.ahead(seen)
     try:
-        found, variants = look(simulate)
+        return seen(simulate)
     except SimulationError:
         return None
-    if variants:
-        return _in_best_shapes(experiment, found, variants, floor, basis)
-    return found if far else None
 
 
-def _at_the_fit(evidence: Evidence, candidates: Sequence[Candidate]) -> Vantage:
-    """The fit as a point to look from, whose own simulations count already."""
-    directions = {c.name: evidence.directions[c.name] for c in candidates}
-    return replace(evidence, directions=directions, visits=())
+def _at_the_fit(
+    experiment: Experiment, evidence: Evidence, simulate: Simulations
+) -> tuple[Vantage, list[_Variant]] | None:
+    """The fit as a point to look from in other shapes, whose own simulations count already; None where there are none
+    to try."""
+    names = [c.name for c in experiment.candidates if c.kind == "physics" and c.name in evidence.directions]
+    point = replace(evidence, directions={name: evidence.directions[name] for name in names}, visits=())
+
+    def seen(ask: Callable[..., FloatArray]) -> list[_Variant]:
+        return _variants(experiment, point, _called("in another shape", ask))
+
+    simulate.ahead(seen)
+    variants = seen(simulate)
+    return (point, variants) if variants else None
+
+
+def _called(where: str, ask: Callable[..., FloatArray]) -> Run:
+    """Asks for simulations, and says what for."""
+
+    def run(purpose: str, at: Mapping[str, float], effects: tuple[str, ...] = (), seed: int = 0) -> FloatArray:
+        return ask(at, effects=effects, seed=seed, purpose=f"{where}: {purpose}")
+
+    return run
 
 
 @dataclass(frozen=True)
@@ -90,10 +152,11 @@ class _Variant:
     visits: tuple[Visit, ...]
 
 
-def _variants(candidate: Candidate, point: Vantage, run: Run, times: float) -> list[_Variant]:
-    """A candidate in other shapes."""
-    out = []
-    for parameter in (p for p in candidate.shapes if p.log):
+def _variants(experiment: Experiment, point: Vantage, run: Run) -> list[_Variant]:
+    """The point's effects in other shapes; one that can't be simulated is left out."""
+    out, times = [], STRIDE if experiment.chance else 1.0
+    on = [c for c in experiment.candidates if c.kind == "physics" and c.name in point.directions]
+    for candidate, parameter in ((c, p) for c in on for p in c.shapes if p.log):
         for factor in (1.0 / DECADE, DECADE):
             shape = {parameter.name: float(np.clip(factor * parameter.default, parameter.lower, parameter.upper))}
             visits: list[Visit] = []

@@ -41,12 +41,23 @@ class Bench:
     seed: int
 
     @classmethod
-    def of(cls, experiment: Experiment, evidence: Evidence, *, level: float = LEVEL, seed: int = 0) -> Bench:
-        """Prepare, with ``level`` the family-wise chance of naming an effect when none is missing."""
-        floor = floor_of(experiment, evidence)
+    def of(
+        cls,
+        experiment: Experiment,
+        evidence: Evidence,
+        *,
+        level: float = LEVEL,
+        seed: int = 0,
+        scored: bool = True,
+        before: Floor | None = None,
+    ) -> Bench:
+        """Prepare, with ``level`` the family-wise chance of naming an effect when none is missing; for effects, too,
+        unless they needn't be ``scored``. ``before`` is the floor of the same evidence with other effects' derivatives.
+        """
+        floor = floor_of(experiment, evidence, before)
         candidates = tuple(c for c in experiment.candidates if c.name in evidence.directions)
         bench = cls(floor, candidates, None, smooth_basis(experiment.layout, floor.noise), experiment.layout, seed)
-        if not candidates:
+        if not (candidates and scored):
             return bench
         return replace(bench, scorer=bench.scored(experiment, evidence, evidence.directions, level))
 

@@ -12,11 +12,10 @@ import numpy.typing as npt
 from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Calibration, Candidate, Experiment
 
-from .afresh import look_afresh, promising
-from .bench import Bench
+from .afresh import Looks, look, promising
 from .confirmation import Confirmation, confirm, remainder_of
 from .estimates import Estimate, weighed, weighed_there
-from .evidence import Evidence, Vantage, gather
+from .evidence import Evidence, gather
 from .floor import Floor
 from .misfit import Block, Omnibus, left_over, shares
 from .naming import members_of
@@ -32,7 +31,6 @@ from .verdicts import (
     WITHIN,
     EffectVerdict,
     Verdict,
-    amiss,
     beyond,
     explained,
     explained_of_all,
@@ -42,6 +40,10 @@ from .verdicts import (
 
 FloatArray = npt.NDArray[np.float64]
 Report = Callable[[str, float], None]
+
+
+MORE = 3
+"""Effects that are refitted beyond those asked for where the model is off: a refit's first steps cost little."""
 
 
 @dataclass(frozen=True)
@@ -146,7 +148,7 @@ def diagnose(
     options, simulate = options or Options(), simulate or Simulations(experiment)
     told = progress or (lambda what, share: None)
     evidence = gather(
-        experiment, simulate, values, repeats=options.repeats, progress=lambda share: told("simulations", 0.75 * share)
+        experiment, simulate, values, repeats=options.repeats, progress=lambda share: told("simulations", 0.4 * share)
     )
     return judge(
         experiment,
@@ -165,18 +167,17 @@ def judge(
     options: Options,
     progress: Report | None = None,
 ) -> Diagnosis:
-    """From evidence to a verdict; simulates only to refit the best effects."""
+    """From evidence to a verdict; simulates only to switch effects on and to refit the best of them."""
     told = progress or (lambda what, share: None)
-    bench = Bench.of(experiment, evidence, level=options.level, seed=options.seed)
+    looks = look(experiment, evidence, simulate, level=options.level, seed=options.seed)
+    evidence, bench, off, vantage = looks.evidence, looks.bench, looks.off, looks.vantage
     floor, scorer, seen = bench.floor, bench.scorer, experiment.seen
     residual = (experiment.observed - evidence.mean)[seen]
     misfit, (whole, parts) = bench.misfit(residual), bench.blocks(residual)
-    off = amiss(misfit, whole)
     scores = {} if scorer is None else scorer.score(residual)
     candidates = {c.name: c for c in bench.candidates}
-    vantage = None if scorer is None else look_afresh(experiment, evidence, off, simulate, floor, bench.basis)
     notes = [f"{name} could not be simulated: {why}" for name, why in evidence.failed.items()]
-    chosen = _chosen(experiment, evidence, bench, scores, residual, off, vantage, options)
+    chosen = _chosen(experiment, looks, scores, residual, options)
     confirmations: dict[str, Confirmation] = {}
     members: tuple[str, ...] = ()
     given: Mapping[str, Score] = {}
@@ -280,12 +281,9 @@ def _advice(
 
 def _chosen(
     experiment: Experiment,
-    evidence: Evidence,
-    bench: Bench,
+    looks: Looks,
     scores: Mapping[str, Score],
     residual: FloatArray,
-    off: bool,
-    vantage: Vantage | None,
     options: Options,
 ) -> list[str]:
     """Effects to refit: significant ones, those first that explain most for their parameters.
@@ -294,25 +292,25 @@ def _chosen(
     soil as one would guess it where the fit is far from that: at a fit that a missing effect has led astray, it needn't
     stand out.
     """
-    scorer = bench.scorer
+    evidence, bench, vantage, scorer = looks.evidence, looks.bench, looks.vantage, looks.bench.scorer
     if scorer is None:
         return []
     prices = {c.name: scorer.price(c) for c in scorer.candidates}
     found = [s for s in scores.values() if s.adjusted < options.level]
     strong = [s.name for s in sorted(found, key=lambda s: s.statistic - prices[s.name], reverse=True)]
     alone: list[str] = []
-    if vantage is not None and vantage.values != evidence.values:
+    if looks.astray and vantage is not None:
         sight = Sight.of(experiment, bench.floor, bench.basis, vantage)
         alone = promising(experiment, vantage, sight, bench.candidates, scorer.price)
-    elif off:
+    elif looks.off:
         shaped = {} if vantage is None else {name: vantage.directions[name] for name in vantage.shapes}
         best = bench.scored(experiment, evidence, {**evidence.directions, **shaped}) if shaped else scorer
         alone = best.ranked(residual)
     if not alone:
         return strong[: options.refits]
-    # The two orders take turns, and one more is tried than either would have.
+    # The two orders take turns, and more are tried than either would have: chance is in both.
     turns = [name for pair in zip_longest(strong, alone) for name in pair if name is not None]
-    return list(dict.fromkeys(turns))[: options.refits + 1]
+    return list(dict.fromkeys(turns))[: options.refits + MORE]
 
 
 def _effects(

@@ -21,8 +21,9 @@ from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Experiment
 from splatsoil.parameters import Parameter, distance
 
+from .derivatives import ignorance
 from .dilution import informed
-from .evidence import Evidence, ignorance, look_from, pair_of
+from .evidence import Evidence, look_from, pair_of
 from .floor import Floor, taken_up
 from .sight import Sight
 from .simulations import Simulations

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -13,16 +12,13 @@ from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Calibration, Candidate, Experiment
 from splatsoil.parameters import Parameter, distance
 
+from .derivatives import Run, around, derivatives, directions_of
+
 FloatArray = npt.NDArray[np.float64]
-Run = Callable[..., FloatArray]
 Numerics = tuple[dict[str, FloatArray], dict[str, FloatArray]]
 
-STEP = 4.0
-"""Steps of derivatives in smallest meaningful sizes."""
 STRIDE = 2.0
 """By how much longer steps of an effect are whose simulations have chance, to stand above it."""
-REACH = 0.5
-"""Most of the way to a bound that such a step may go."""
 
 
 @dataclass(frozen=True)
@@ -100,6 +96,27 @@ class Evidence(Vantage):
     calibration: Calibration | None = None
     numerics_doubts: Mapping[str, FloatArray] = field(default_factory=dict, kw_only=True)
 
+    def with_effects(
+        self,
+        candidates: Sequence[Candidate],
+        directions: Mapping[str, FloatArray],
+        *,
+        steps: Mapping[str, float],
+        failed: Mapping[str, str],
+        visits: tuple[Visit, ...] = (),
+        doubts: Mapping[str, FloatArray] | None = None,
+    ) -> Evidence:
+        """The same with more effects' derivatives, all in the order of ``candidates``; see :class:`Vantage`."""
+        both = {**self.directions, **directions}
+        return replace(
+            self,
+            directions={c.name: both[c.name] for c in candidates if c.name in both},
+            steps={**self.steps, **steps},
+            failed={**self.failed, **failed},
+            visits=(*self.visits, *visits),
+            doubts={**self.doubts, **(doubts or {})},
+        )
+
 
 def gather(
     experiment: Experiment,
@@ -109,7 +126,7 @@ def gather(
     repeats: int = 4,
     progress: Callable[[float], None] | None = None,
 ) -> Evidence:
-    """Simulate what a diagnosis needs.
+    """Simulate what a misfit is told by, and what cameras may report; :func:`switched_on` adds effects of physics.
 
     The residual's prediction is the mean over seeds 1, 2, …; derivatives are differences at seed 0 and one more, the
     same for both ends, so that a part of chance cancels in them. What is left of it looks like information: the two
@@ -122,8 +139,7 @@ def gather(
     jobs = (
         len(seeds)
         + len(experiment.guesses)
-        + (2 if experiment.chance else 1)
-        * (2 + 2 * len(experiment.parameters) + len(experiment.candidates) + len(experiment.numerics))
+        + (2 if experiment.chance else 1) * (1 + 2 * len(experiment.parameters) + len(experiment.numerics))
     )
     done = 0
 
@@ -143,7 +159,8 @@ def gather(
     for name in experiment.redrawn:
         run(f"numerics: {name}", base, numerics=name)
     pair = pair_of(experiment, len(seeds))
-    found = look_from(experiment, base, experiment.candidates, run, pair)
+    reported = [c for c in experiment.candidates if c.kind == "observation"]
+    found = look_from(experiment, base, reported, run, pair)
     numerics, doubts = other_numerics(
         experiment, lambda name, seed: run(f"numerics: {name or 'none'}", base, seed=seed, numerics=name), pair
     )
@@ -204,7 +221,7 @@ def look_from(
     Args:
         experiment: whose parameters are varied.
         values: of these, at the point.
-        candidates: effects that are switched on there, one at a time.
+        candidates: effects that are switched on there, one at a time, by the first seed.
         run: called with (purpose, parameters by name), the name of an effect that is on in a tuple, and a seed.
         seeds: one, or two whose mean derivatives are; the prediction is the first one's.
 
@@ -212,28 +229,24 @@ def look_from(
         SimulationError: the point or a neighbour without an effect can't be simulated.
     """
     base, failed = dict(values), dict[str, str]()
-    # Other reports of the point's simulation come first, while it is at hand.
-    ordered = sorted(candidates, key=lambda c: c.kind == "physics")
-    looks = [_look(experiment, base, ordered, run, seeds[0], failed)]
-    for seed in seeds[1:]:
-        rest = [c for c in ordered if c.kind == "physics" and c.name not in failed]
-        looks.append(_look(experiment, base, rest, run, seed, failed))
-    first, doubts = looks[0], dict[str, FloatArray]()
-    slopes, directions = dict(first.slopes), dict(first.directions)
-    for other in looks[1:]:
-        for mine, theirs in ((slopes, other.slopes), (directions, other.directions)):
-            for name in theirs:
-                doubts[name] = 0.5 * (mine[name] - theirs[name])
-                mine[name] = 0.5 * (mine[name] + theirs[name])
-    curves = {name: np.mean([look.curves[name] for look in looks], axis=0) for name in first.curves}
-    directions = {c.name: directions[c.name] for c in candidates if c.name not in failed}
+    looks = [_Look(seed, run) for seed in seeds]
+    for look in looks:
+        look.see(base)
+        if look is looks[0]:
+            # Other reports of the point's simulation come first, while it is at hand.
+            look.switch_on([c for c in candidates if c.kind == "observation"], base, 1.0, failed)
+        look.vary(experiment.parameters, base)
+    times = STRIDE if experiment.chance else 1.0
+    looks[0].switch_on([c for c in candidates if c.kind == "physics"], base, times, failed)
+    slopes, doubts = _mean_of([look.slopes for look in looks])
+    first = looks[0]
     return Vantage(
         base,
         first.middle,
         slopes,
-        curves,
+        {name: np.mean([look.curves[name] for look in looks], axis=0) for name in first.curves},
         first.widths,
-        directions,
+        {c.name: first.directions[c.name] for c in candidates if c.name not in failed},
         first.steps,
         failed,
         tuple(visit for look in looks for visit in look.visits),
@@ -241,139 +254,84 @@ def look_from(
     )
 
 
-@dataclass(frozen=True)
-class _Look:
-    """A point and its neighbours by one seed; see :class:`Vantage`."""
+def switched_on(experiment: Experiment, simulate: Callable[..., FloatArray], evidence: Evidence) -> Evidence:
+    """The evidence with the derivatives by effects of physics, switched on at the fit one at a time, by two seeds."""
+    base, failed = dict(evidence.values), dict[str, str]()
 
-    middle: FloatArray
+    def run(purpose: str, at: Mapping[str, float], effects: tuple[str, ...] = (), seed: int = 0) -> FloatArray:
+        return simulate(at, effects=effects, seed=seed, purpose=purpose)
+
+    looks, times = [], STRIDE if experiment.chance else 1.0
+    for seed in pair_of(experiment, len(evidence.repeats)):
+        look = _Look(seed, run)
+        look.see(base)
+        look.visits.clear()  # these the evidence has
+        physics = [c for c in experiment.candidates if c.kind == "physics" and c.name not in failed]
+        look.switch_on(physics, base, times, failed)
+        looks.append(look)
+    directions, doubts = _mean_of([look.directions for look in looks])
+    return evidence.with_effects(
+        experiment.candidates,
+        directions,
+        steps=looks[0].steps,
+        failed=failed,
+        visits=tuple(visit for look in looks for visit in look.visits),
+        doubts=doubts,
+    )
+
+
+def _mean_of(looks: Sequence[Mapping[str, FloatArray]]) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
+    """Mean derivatives of one or two looks, of what all of them tell, and half the difference where there are two."""
+    names = [name for name in looks[0] if all(name in look for look in looks)]
+    means = {name: np.mean([look[name] for look in looks], axis=0) for name in names}
+    doubts = {name: 0.5 * (looks[0][name] - looks[1][name]) for name in names} if len(looks) > 1 else {}
+    return means, doubts
+
+
+@dataclass
+class _Look:
+    """A point and its neighbours by one seed, run by run; see :class:`Vantage`."""
+
+    seed: int
+    run: Run
     slopes: dict[str, FloatArray] = field(default_factory=dict)
     curves: dict[str, FloatArray] = field(default_factory=dict)
     widths: dict[str, float] = field(default_factory=dict)
     directions: dict[str, FloatArray] = field(default_factory=dict)
     steps: dict[str, float] = field(default_factory=dict)
     visits: list[Visit] = field(default_factory=list)
+    middle: FloatArray = field(init=False)
 
+    def visit(self, purpose: str, at: Mapping[str, float], effects: tuple[str, ...] = ()) -> FloatArray:
+        """(t, s) features by parameters."""
+        self.visits.append(Visit(dict(at), effects, self.run(purpose, at, effects, self.seed), self.seed))
+        return self.visits[-1].table
 
-def _look(
-    experiment: Experiment,
-    base: Mapping[str, float],
-    candidates: Sequence[Candidate],
-    run: Run,
-    seed: int,
-    failed: dict[str, str],
-) -> _Look:
-    """By one seed; candidates that can't be simulated are noted."""
-    visits: list[Visit] = []
+    def see(self, base: Mapping[str, float]) -> None:
+        """The point itself, which comes first."""
+        self.middle = self.visit("the point", base)
 
-    def visit(purpose: str, at: Mapping[str, float], effects: tuple[str, ...] = ()) -> FloatArray:
-        visits.append(Visit(dict(at), effects, run(purpose, at, effects, seed), seed))
-        return visits[-1].table
+    def vary(self, parameters: Sequence[Parameter], base: Mapping[str, float]) -> None:
+        """The model's own parameters, one at a time."""
+        for parameter in parameters:
+            value = base[parameter.name]
+            ends = around(parameter, value)
+            tables = [self.visit(parameter.name, {**base, parameter.name: end}) for end in ends]
+            offsets = [distance(parameter, value, end) for end in ends]
+            self.slopes[parameter.name], curve = derivatives(offsets, tables, self.middle)
+            self.widths[parameter.name] = max(abs(offset) for offset in offsets)
+            if curve is not None:
+                self.curves[parameter.name] = curve
 
-    look = _Look(visit("the point", base), visits=visits)
-
-    def switch_on(chosen: Iterable[Candidate]) -> None:
-        for candidate in chosen:
-            times = STRIDE if experiment.chance and candidate.kind == "physics" else 1.0
+    def switch_on(
+        self, candidates: Sequence[Candidate], base: Mapping[str, float], times: float, failed: dict[str, str]
+    ) -> None:
+        """Effects, one at a time, by steps ``times`` as long as where nothing is left to chance; ``failed`` gets those
+        that can't be simulated."""
+        for candidate in candidates:
             try:
-                look.directions[candidate.name] = directions_of(candidate, base, look.middle, visit, look.steps, times)
+                self.directions[candidate.name] = directions_of(
+                    candidate, base, self.middle, self.visit, self.steps, times
+                )
             except SimulationError as error:
                 failed[candidate.name] = str(error)
-
-    switch_on(c for c in candidates if c.kind == "observation")
-    for parameter in experiment.parameters:
-        value = base[parameter.name]
-        ends = around(parameter, value)
-        tables = [visit(parameter.name, {**base, parameter.name: end}) for end in ends]
-        offsets = [distance(parameter, value, end) for end in ends]
-        look.slopes[parameter.name], curve = derivatives(offsets, tables, look.middle)
-        look.widths[parameter.name] = max(abs(offset) for offset in offsets)
-        if curve is not None:
-            look.curves[parameter.name] = curve
-    switch_on(c for c in candidates if c.kind == "physics")
-    return look
-
-
-def around(parameter: Parameter, value: float) -> list[float]:
-    """Where a model's parameter is varied to: both sides of its value, or one where a bound is near."""
-    whole = distance(parameter, parameter.lower, parameter.upper) / rate(parameter, parameter.lower)
-    step = STEP * parameter.meaningful / rate(parameter, value) if parameter.meaningful > 0.0 else 0.05 * whole
-    step = min(step, 0.25 * whole)
-    ends = [moved(parameter, value, side * step) for side in (-1.0, 1.0)]
-    return [end for end in ends if abs(distance(parameter, value, end)) > 0.3 * step * rate(parameter, value)]
-
-
-def rate(parameter: Parameter, value: float) -> float:
-    """How fast a parameter grows along its scale: 1, or the value itself on a logarithmic one."""
-    return value if parameter.log else 1.0
-
-
-def moved(parameter: Parameter, value: float, step: float) -> float:
-    """A value moved along its scale (by a logarithm, where that is logarithmic), within the bounds."""
-    end = value * math.exp(step) if parameter.log else value + step
-    return min(max(end, parameter.lower), parameter.upper)
-
-
-def ignorance(parameter: Parameter, value: float) -> float:
-    """Standard deviation of a parameter of which only the bounds are known, in its unit at a value."""
-    whole = distance(parameter, parameter.lower, parameter.upper) / rate(parameter, parameter.lower)
-    return whole * rate(parameter, value) / math.sqrt(12.0)
-
-
-def derivatives(
-    offsets: Sequence[float], tables: Sequence[FloatArray], middle: FloatArray
-) -> tuple[FloatArray, FloatArray | None]:
-    """First derivative and half the second from one or two neighbours."""
-    if len(offsets) == 1:
-        return (tables[0] - middle) / offsets[0], None
-    matrix = np.array([[offset, offset**2] for offset in offsets])
-    first, second = np.linalg.solve(matrix, np.stack([(t - middle).reshape(-1) for t in tables]))
-    return first.reshape(middle.shape), second.reshape(middle.shape)
-
-
-def step_of(parameter: Parameter, times: float = 1.0) -> float:
-    """How far an effect's parameter is moved from off, in the direction in which there is room; ``times`` as far as
-    where nothing is left to chance."""
-    off = parameter.off if parameter.off is not None else parameter.default
-    room = {1: parameter.upper - off, -1: off - parameter.lower}
-    side = parameter.sign or (1 if room[1] >= room[-1] else -1)
-    wanted = times * (STEP * parameter.meaningful if parameter.meaningful > 0.0 else 0.1 * room[side])
-    return side * min(wanted, REACH * room[side])
-
-
-def directions_of(
-    candidate: Candidate,
-    base: Mapping[str, float],
-    middle: FloatArray,
-    run: Run,
-    steps: dict[str, float],
-    times: float = 1.0,
-) -> FloatArray:
-    """(k, t, s) derivatives by a candidate's parameters at off, of predictions whose ``middle`` is that without it, by
-    steps ``times`` as long as where nothing is left to chance; ``steps`` gets them."""
-    return np.stack([_slope(candidate, p, base, middle, run, steps, times) for p in candidate.parameters])
-
-
-def _slope(
-    candidate: Candidate,
-    parameter: Parameter,
-    base: Mapping[str, float],
-    middle: FloatArray,
-    run: Run,
-    steps: dict[str, float],
-    times: float,
-) -> FloatArray:
-    """Derivative by one parameter of an effect, its others at off; from both sides where it has no sign."""
-    off = {p.name: float(p.off or 0.0) for p in candidate.parameters}
-    step = step_of(parameter, times)
-    steps[parameter.name] = abs(step)
-    tables = []
-    # Drawing the same simulation otherwise has no chance in it: one side will do.
-    both = (
-        candidate.kind == "physics"
-        and parameter.sign == 0
-        and parameter.lower <= off[parameter.name] - step <= parameter.upper
-    )
-    for offset in (step, -step) if both else (step,):
-        at = {**base, **off, parameter.name: off[parameter.name] + offset}
-        tables.append(run(f"{candidate.name}: {parameter.name}", at, (candidate.name,)))
-    return (tables[0] - tables[1]) / (2.0 * step) if both else (tables[0] - middle) / step

@@ -13,8 +13,9 @@ from scipy.optimize import nnls
 from splatsoil.experiment.base import Experiment
 from splatsoil.experiment.features import Layout
 
+from .derivatives import ignorance
 from .dilution import reliable
-from .evidence import Evidence, Vantage, ignorance
+from .evidence import Evidence, Vantage
 from .noise import Noise, Part, extra_noise, independent
 from .sampled_noise import correlated, estimate
 
@@ -67,8 +68,8 @@ class Floor:
         return totals[name] / max(sum(totals.values()), 1e-300)
 
 
-def floor_of(experiment: Experiment, evidence: Evidence) -> Floor:
-    """Assemble the floor.
+def floor_of(experiment: Experiment, evidence: Evidence, before: Floor | None = None) -> Floor:
+    """Assemble the floor; ``before`` is that of the same evidence with other effects' derivatives.
 
     Chance comes from repeated seeds, what no instrument shows from other guesses of it, the pictures' own errors from
     a control, or else from where physics can't act. What other numerics change is projected out, pattern by pattern;
@@ -83,11 +84,18 @@ def floor_of(experiment: Experiment, evidence: Evidence) -> Floor:
     directions = _columns([table for direction, _ in acting for table in direction], seen)
     # What is chance in a direction is told from what is chance in its doubt: the noise must be the same along both.
     doubted = _columns([table for both in acting for tables in both for table in tables], seen)
+    known_parts = {} if before is None else before.parts
     if experiment.chance and runs > 1:
-        parts["chance"] = estimate(layout, _contrasts(evidence.repeats), seen, directions, parameters)
+        parts["chance"] = estimate(
+            layout, _contrasts(evidence.repeats), seen, directions, parameters, known=known_parts.get("chance")
+        )
     if len(evidence.guesses) > 1:
-        parts["guesses"] = estimate(layout, _contrasts(evidence.guesses), seen, directions, parameters)
-    if evidence.replays is not None:
+        parts["guesses"] = estimate(
+            layout, _contrasts(evidence.guesses), seen, directions, parameters, known=known_parts.get("guesses")
+        )
+    if "reconstruction" in known_parts:
+        parts["reconstruction"] = known_parts["reconstruction"]
+    elif evidence.replays is not None:
         parts["reconstruction"] = _replayed(experiment, evidence, parts)
     elif np.count_nonzero(experiment.quiet) >= FEWEST_QUIET:
         known = _total(layout, parts, seen, runs)[0]
@@ -97,7 +105,9 @@ def floor_of(experiment: Experiment, evidence: Evidence) -> Floor:
         known = _total(layout, parts, seen, runs)[0]
         doubts = [evidence.numerics_doubts.get(name, np.zeros(layout.shape)) for name in evidence.numerics]
         left = _unexplained(known, parameters, patterns, doubts, seen & layout.common[None])
-        parts["numerics"] = estimate(layout, left, seen, directions, parameters, alike=False)
+        parts["numerics"] = estimate(
+            layout, left, seen, directions, parameters, alike=False, known=known_parts.get("numerics")
+        )
     noise, single = _total(layout, parts, seen, runs)
     for name, part in parts.items():
         columns = extra_noise(layout, part, seen, doubted if name in ACTING else None)

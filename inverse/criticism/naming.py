@@ -22,7 +22,7 @@ def members_of(
 
     What other pictures say of an effect beyond doubt comes first, even if another one would explain more of what soil
     shows: the next diagnosis, with the first one on, tells of that. What they rule out isn't it, however well it
-    explains soil.
+    explains soil, nor is what another effect left behind in its first steps.
 
     Args:
         confirmations: of the model as it is, under the empty name, and with each effect.
@@ -31,7 +31,7 @@ def members_of(
         scores: of each effect.
         measures: the parameter that measures each effect.
     """
-    costs = {name: cost for name, cost in costs.items() if not confirmations[name].ruled_out}
+    costs = {n: cost for n, cost in costs.items() if not (confirmations[n].ruled_out or confirmations[n].stopped)}
     if not costs:
         return ()
     standing = [name for name in costs if stands(confirmations, name, off, scores[name], measures[name])]

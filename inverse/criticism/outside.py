@@ -22,7 +22,8 @@ from splatsoil.experiment.base import Experiment
 from splatsoil.experiment.states import States, Strained
 from splatsoil.parameters import Parameter
 
-from .evidence import Evidence, around, ignorance
+from .derivatives import around, ignorance
+from .evidence import Evidence
 from .floor import Floor
 from .free_strength import NODES, FreeStrength, Range, coordinates, hats, ranges
 from .misfit import Omnibus, omnibus

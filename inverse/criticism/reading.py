@@ -20,7 +20,8 @@ from scipy.stats import qmc
 from splatsoil.errors import SimulationError
 from splatsoil.parameters import Parameter, ParameterSpace
 
-from .evidence import Visit, around
+from .derivatives import around
+from .evidence import Visit
 from .refit import Known, Refit, half_ranges
 from .surface import Surface
 

@@ -20,7 +20,7 @@ from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Experiment
 from splatsoil.parameters import Parameter, ParameterSpace, distance
 
-from .evidence import around, derivatives, ignorance
+from .derivatives import around, derivatives, ignorance
 from .noise import Noise, independent
 from .simulations import Simulations
 
@@ -31,6 +31,8 @@ TRUST = 0.5
 LEAST_FALL, LEAST_SHARE = 0.1, 2e-4
 """Falls of χ² below this, or below this share of it, are not worth a simulation: an estimate that is one standard
 deviation off costs one unit."""
+IDLE = 2
+"""Steps in a row that bring too little, after which a refit ends."""
 ROUNDS = 3
 """Most times that derivatives are measured anew where a refit stands."""
 
@@ -98,6 +100,7 @@ def refit(
     chance: bool,
     known: Known | None = None,
     most: int = 5,
+    least: float = -math.inf,
 ) -> Refit:
     """Minimise χ².
 
@@ -112,6 +115,8 @@ def refit(
         chance: whether predictions hold some.
         known: what other measurements say of the parameters.
         most: simulations.
+        least: fall of χ², over what each number still holds, below which a step counts as idle; after two such in a row
+            (the first may have gone too far) there are no more.
     """
     space = ParameterSpace(parameters)
     at = space.to_unit(space.to_vector(start))
@@ -120,7 +125,7 @@ def refit(
     slopes, here = slopes * scale, prediction
     other = (known or Known.nothing(len(at))).scaled(space, start)
     chi2 = float(np.sum(whiten(observed - here) ** 2) + other.chi2(at))
-    trust, tried = 2.0 * TRUST, 0
+    trust, tried, idle = 2.0 * TRUST, 0, 0
     while tried < most:
         matrix = np.concatenate([whiten(slopes), other.root])
         target = np.concatenate([whiten(observed - here), other.root @ (other.centre - at)])
@@ -143,9 +148,13 @@ def refit(
             break
         slopes = mended(slopes, table - here, moved, widths, chance=chance)
         fresh = float(np.sum(whiten(observed - table) ** 2) + other.chi2(there))
-        gain = (chi2 - fresh) / predicted
+        fall = chi2 - fresh
+        gain = fall / predicted
         if fresh < chi2:
             at, here, chi2 = there, table, fresh
+        idle = idle + 1 if fall < least * max(1.0, chi2 / max(len(target) - len(at), 1)) else 0
+        if idle == IDLE:
+            break
         trust = min(2.0 * trust, 2.0) if gain > 0.75 else trust if gain > 0.25 else 0.4 * float(np.max(np.abs(step)))
     values = space.to_dict(space.from_unit(at))
     return Refit(values, chi2, here, tried, slopes / half_ranges(parameters, values))
@@ -183,6 +192,7 @@ def settle(
     renewed: Sequence[str],
     most: int = 5,
     rounds: int = ROUNDS,
+    least: float = -math.inf,
 ) -> Refit:
     """Minimise χ² from several points, and go on from the best of them until it falls no more than noise does.
 
@@ -199,8 +209,9 @@ def settle(
         renewed: names of the parameters whose derivatives are measured anew in each round.
         most: simulations from each start, and two less (but two at least) in each round.
         rounds: most of them.
+        least: see :func:`refit`.
     """
-    told: dict[str, Any] = {"chance": chance, "known": known}
+    told: dict[str, Any] = {"chance": chance, "known": known, "least": least}
     runs = [
         refit(predict, whiten, observed, parameters, s.values, s.prediction, s.slopes, most=most, **told)
         for s in starts

@@ -5,6 +5,7 @@ All take their first steps. Those that might still be the best, or its equal, th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -167,10 +168,14 @@ def refitted(
             renewed=_renewed(experiment, candidate),
             most=steps if candidate is not None else max(steps - 2, 1),
             rounds=0 if candidate is None or trial.emulated else ROUNDS,
+            # In steps that bring less chance leads, not derivatives, and a surface goes on from there.
+            least=CLEARLY if trial.emulated else -math.inf,
         )
 
     def go_on(trial: Trial) -> None:
         said(trial)
+        if trial.stopped and trial.name:
+            return
         shapes = () if trial.candidate is None else trial.candidate.shapes
         if not trial.stopped:
             trial.fit = explored(
@@ -195,7 +200,8 @@ def refitted(
 
 
 def stop(trials: Sequence[Trial], count: int) -> None:
-    """Stop those whose first steps say that they can't be the best effect's equals, of ``count`` numbers in χ²."""
+    """Stop those whose first steps say that they can't be the best effect's equals, of ``count`` numbers in χ²; the
+    model as it is, too, which takes nothing off."""
     asis, *others = trials
     falls = {t.name: asis.fit.chi2 + t.known.chi2(t.off) - t.fit.chi2 for t in others}
     possible = [t for t in others if not ruled_out(t.told, t.agrees)]
@@ -204,6 +210,7 @@ def stop(trials: Sequence[Trial], count: int) -> None:
     best = max(possible, key=lambda t: falls[t.name])
     dispersion = max(1.0, best.fit.chi2 / max(count - len(best.free), 1))
     least = min(LEAST_SHARE * falls[best.name], falls[best.name] - CLEARLY * dispersion)
+    asis.stopped = asis.emulated and least > 0.0
     for trial in others:
         trial.stopped = trial.emulated and trial.told >= CERTAIN and falls[trial.name] < least
 
@@ -226,15 +233,18 @@ def _trial(
 
 def repeated(simulate: Simulations, trials: Sequence[Trial], count: int) -> list[dict[int, Visit]]:
     """Simulations by ``count`` seeds where each refit ended, by seed: two single ones differ in χ² by chance as much as
-    an effect of twice the smallest detectable size takes away. Seeds that can't be simulated there are left out, and
-    of one that stopped early all but one."""
+    an effect of twice the smallest detectable size takes away. Seeds that can't be simulated there are left out; of an
+    effect's that stopped early there is its last simulation, in place of the shared seed's."""
 
     def again(ask: Callable[..., FloatArray]) -> list[dict[int, Visit]]:
         out = list[dict[int, Visit]]()
         for trial in trials:
             at, purpose = trial.fit.values, f"refit {trial.name or 'of the model'} once more"
             out.append({})
-            for seed in range(SHARED, SHARED + (1 if trial.stopped else count)):
+            if trial.stopped and trial.name:
+                out[-1][SHARED] = Visit(dict(at), trial.on, trial.fit.prediction, SHARED)
+                continue
+            for seed in range(SHARED, SHARED + count):
                 with suppress(SimulationError):
                     table = ask(at, effects=trial.on, seed=seed, purpose=purpose)
                     out[-1][seed] = Visit(dict(at), trial.on, table, seed)
@@ -272,8 +282,7 @@ def known_of(evidence: Evidence, free: Sequence[Parameter]) -> Known:
 def starts_of(
     experiment: Experiment, evidence: Vantage, candidate: Candidate | None, vantage: Vantage | None
 ) -> list[Start]:
-    """Where a refit begins: at the fit, and at the second look's point for an effect that was switched on there; where
-    that is the fit, in another shape than by default."""
+    """Where a refit begins: where the effect was switched on, and where that is the fit, in another shape, too."""
     extra = () if candidate is None else candidate.refitted
     off = {p.name: p.off if p.off is not None else p.default for p in extra}
 
@@ -287,11 +296,11 @@ def starts_of(
             {**point.values, **off, **shaped}, point.prediction, np.concatenate([model, *added, shapes], axis=-1)
         )
 
-    points: list[Vantage] = [evidence]
-    if candidate is not None and vantage is not None:
-        other = vantage.values != evidence.values or candidate.name in vantage.shapes
-        points += [vantage] if other and candidate.name in vantage.directions else []
-    return [start(point) for point in points]
+    if vantage is None or candidate is None or candidate.name not in vantage.directions:
+        return [start(evidence)]
+    if vantage.values != evidence.values:
+        return [start(vantage)]
+    return [start(point) for point in (evidence, vantage) if point is evidence or candidate.name in vantage.shapes]
 
 
 def _renewed(experiment: Experiment, candidate: Candidate | None) -> list[str]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import solve_triangular
+from scipy.linalg.lapack import dpotrf, dtrtrs
 from scipy.optimize import minimize
 
 from splatsoil.experiment.features import Layout
@@ -46,6 +46,7 @@ def estimate(
     free: FloatArray | None = None,
     *,
     alike: bool = True,
+    known: Part | None = None,
 ) -> Part:
     """The part that samples (k, t, s) of it, with mean zero, suggest.
 
@@ -57,16 +58,20 @@ def estimate(
     for `extra_noise`, once what ``free`` (n, q; times prior spreads) can take up is gone: a seed that acts like another
     friction angle is no noise where the angle is fitted. Where samples are ``alike``, draws of one law, one that is far
     out says something else than noise; where each is of its own kind, as other numerics are, it counts in full.
+
+    ``known`` is what the same samples suggested along other directions.
     """
     samples = np.where(seen, samples, 0.0)
     if not np.any(samples):
         return Part(scale=np.zeros(layout.shape))
+    if known is not None:
+        return _calibrated(layout, known, samples, seen, directions, free, alike)
     # How far the variance's own scatter is chance depends on the correlation, which depends on the variance. Too much
     # memory at first: a scale that follows its few samples would hide what they have.
     part = Part(np.zeros(layout.shape), MOST_MEMORY, spacing_of(layout))
     for _ in range(ROUNDS):
-        known = part.across(layout), in_time(layout.steps, part.memory)
-        part = _correlated(layout, samples, seen, scales_of(layout, samples, seen, *known))
+        before = part.across(layout), in_time(layout.steps, part.memory)
+        part = _correlated(layout, samples, seen, scales_of(layout, samples, seen, *before))
     return _calibrated(layout, part, samples, seen, directions, free, alike)
 
 
@@ -146,7 +151,7 @@ def _correlation(layout: Layout, scaled: FloatArray, seen: BoolArray) -> tuple[f
     blocks = _blocks(layout, scaled, seen)
     if not blocks:
         return 0.0, 0.0, 1.0, np.eye(channels)
-    count = sum(block.before.size + block.after.size for block in blocks)
+    count = sum(block.pairs.size for block in blocks)
 
     def unpack(p: FloatArray) -> tuple[float, float, float, FloatArray]:
         memory = MOST_MEMORY / (1.0 + math.exp(-p[0]))
@@ -178,28 +183,36 @@ class _Block:
     """Neighbouring times at which the same sites were seen.
 
     Attributes:
-        sites: (s,) which.
+        sites: (n,) their numbers.
         gap: from one to the other, in steps.
-        before: (m, k) samples of the m sites at the first times.
-        after: (m, k) at the second ones; (m, 0) where there is but one time.
+        pairs: (n, 2 m) the sums of m samples at the first times and at the second ones, then the differences; (n, m)
+            the samples where there is but one time.
     """
 
-    sites: BoolArray
+    sites: npt.NDArray[np.intp]
     gap: float
-    before: FloatArray
-    after: FloatArray
+    pairs: FloatArray
+
+    @classmethod
+    def of(cls, sites: BoolArray, gap: float, before: FloatArray, after: FloatArray | None) -> _Block:
+        """Of samples (n, m) at the first and at the second times, if there are any."""
+        pairs = before if after is None else np.concatenate([before + after, before - after], axis=1)
+        return cls(np.flatnonzero(sites), gap, np.asfortranarray(pairs))
 
     def fit(self, whole: FloatArray, memory: float) -> tuple[float, float]:
         """χ² and logarithm of the determinant by a correlation (s, s) between sites."""
-        lower = np.linalg.cholesky(whole[np.ix_(self.sites, self.sites)])
+        lower, info = dpotrf(whole[self.sites[:, None], self.sites], lower=1, clean=0)
+        if info:
+            raise np.linalg.LinAlgError(f"a correlation between sites is not positive definite ({info})")
         logs = 2.0 * float(np.log(np.diag(lower)).sum())
-        before = solve_triangular(lower, self.before, lower=True)
-        if not self.after.size:
-            return float(np.sum(before**2)), logs * before.shape[1]
-        after, link = solve_triangular(lower, self.after, lower=True), memory**self.gap
+        white, _ = dtrtrs(lower, self.pairs, lower=1)
+        squares, count = np.einsum("nm,nm->m", white, white), self.pairs.shape[1]
+        if self.gap == 0.0:
+            return float(squares.sum()), logs * count
         # Sum and difference of two that are so correlated are independent.
-        squares = 0.5 * (np.sum((before + after) ** 2) / (1.0 + link) + np.sum((before - after) ** 2) / (1.0 - link))
-        return float(squares), 2.0 * logs * before.shape[1] + before.size * math.log(1.0 - link**2)
+        link, half = memory**self.gap, count // 2
+        whole_square = 0.5 * (squares[:half].sum() / (1.0 + link) + squares[half:].sum() / (1.0 - link))
+        return float(whole_square), logs * count + 0.5 * self.pairs.size * math.log(1.0 - link**2)
 
 
 def _blocks(layout: Layout, scaled: FloatArray, seen: BoolArray) -> list[_Block]:
@@ -217,7 +230,7 @@ def _blocks(layout: Layout, scaled: FloatArray, seen: BoolArray) -> list[_Block]
         first, second = (
             scaled[:, np.array(times) + on][:, :, sites].reshape(-1, size).T for on in (0, 0 if alone else 1)
         )
-        out.append(_Block(sites, gap, first, second[:, :0] if alone else second))
+        out.append(_Block.of(sites, gap, first, None if alone else second))
     return out
 
 

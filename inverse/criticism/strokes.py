@@ -13,7 +13,7 @@ from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Candidate, Experiment
 from splatsoil.experiment.strokes import MEASURED, Predict, Stroked
 
-from .evidence import around, step_of
+from .derivatives import around, step_of
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -192,8 +192,7 @@ def confirmed(folder: RunFolder, model: Model, name: str, options: Options, repo
     from splatsoil.commands._control import calibrated, control
     from splatsoil.commands._crew import crew
     from splatsoil.files import plain
-    from splatsoil.inverse.criticism.afresh import look_afresh
-    from splatsoil.inverse.criticism.bench import Bench
+    from splatsoil.inverse.criticism.afresh import look
     from splatsoil.inverse.criticism.confirmation import confirm
     from splatsoil.inverse.criticism.evidence import gather
     from splatsoil.inverse.criticism.own_floor import on_its_own_floor
@@ -213,11 +212,12 @@ def confirmed(folder: RunFolder, model: Model, name: str, options: Options, repo
             repeats=options.repeats,
             progress=lambda share: report("simulations", 0.7 * share),
         )
-        if effect in evidence.failed:
-            raise RunError(f"{effect} cannot be added: {evidence.failed[effect]}")
         calibration = calibrated(folder, experiment, simulate, values)
         evidence = replace(evidence, replays=replays(), calibration=calibration)
-        bench = Bench.of(experiment, evidence, level=options.level, seed=options.seed)
+        looks = look(experiment, evidence, simulate, level=options.level, seed=options.seed)
+        evidence, bench = looks.evidence, looks.bench
+        if effect in evidence.failed:
+            raise RunError(f"{effect} cannot be added: {evidence.failed[effect]}")
         left = (experiment.observed - evidence.mean)[experiment.seen]
         found = confirm(
             experiment,
@@ -228,7 +228,7 @@ def confirmed(folder: RunFolder, model: Model, name: str, options: Options, repo
             options.refit_steps,
             bench.basis,
             report,
-            look_afresh(experiment, evidence, bench.off(left), simulate, bench.floor, bench.basis),
+            looks.vantage,
         )
         if found[effect].visits:
             (candidate,) = bench.candidates

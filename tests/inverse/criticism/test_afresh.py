@@ -1,4 +1,4 @@
-"""The second look: taken where the fit may have been led astray, and right about what is missing from there."""
+"""Where effects are switched on: at the defaults where the fit may have been led astray, and right from there."""
 
 from __future__ import annotations
 
@@ -7,15 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from splatsoil.benchmarks.hidden_effects import detectable, emulated
-from splatsoil.inverse.criticism.afresh import look_afresh, promising
-from splatsoil.inverse.criticism.bench import Bench
+from splatsoil.inverse.criticism.afresh import Looks, look, promising
 from splatsoil.inverse.criticism.diagnosis import Options
-from splatsoil.inverse.criticism.evidence import Evidence, Vantage, gather
+from splatsoil.inverse.criticism.evidence import gather
 from splatsoil.inverse.criticism.sight import Sight
 from splatsoil.inverse.criticism.simulations import Simulations
 
 from splatsoil.errors import SimulationError
-from splatsoil.experiment.base import Experiment
 from splatsoil.experiment.emulated import EmulatedExperiment
 
 WORLD = 77
@@ -27,29 +25,48 @@ def hiding(effect: str, size: float, angle: float = 1.0) -> EmulatedExperiment:
     return replace(plain, observed=plain.measured({"angle": angle, effect: size}, (WORLD, 5)))
 
 
-def look(experiment: Experiment, evidence: Evidence, off: bool, simulate: Simulations) -> Vantage | None:
-    bench = Bench.of(experiment, evidence)
-    return look_afresh(experiment, evidence, off, simulate, bench.floor, bench.basis)
+def looked(experiment: EmulatedExperiment, at: float, simulate: Simulations | None = None) -> Looks:
+    simulate = simulate or Simulations(experiment)
+    return look(experiment, gather(experiment, simulate, {"angle": at}, repeats=4), simulate)
 
 
-@pytest.mark.parametrize(("at", "off", "looks"), [(8.0, True, True), (8.0, False, False), (0.2, True, False)])
-def test_it_is_taken_where_a_misfit_stands_far_from_the_defaults(at: float, off: bool, looks: bool) -> None:
-    experiment = hiding("effect 2", 1.0)
+@pytest.mark.parametrize(
+    ("at", "hidden", "astray", "off"), [(8.0, 30.0, True, True), (0.2, 30.0, False, True), (0.9, 0.0, False, False)]
+)
+def test_a_misfit_far_from_the_defaults_is_looked_at_from_there(
+    at: float, hidden: float, astray: bool, off: bool
+) -> None:
+    experiment = hiding("effect 2", hidden)
     simulate = Simulations(experiment)
-    evidence = gather(experiment, simulate, {"angle": at}, repeats=3)
-    found = look(experiment, evidence, off, simulate)
-    assert (found is not None) is looks
-    if found is not None:
-        assert found.values == {"angle": experiment.parameters[0].default}
-        physics = {c.name for c in experiment.candidates if c.kind == "physics"}
-        assert found.directions.keys() == physics, "what cameras report is drawn of the same soil everywhere"
+    found = looked(experiment, at, simulate)
+    assert (found.astray, found.off) == (astray, off)
+    names = [c.name for c in experiment.candidates]
+    physics = {c.name for c in experiment.candidates if c.kind == "physics"}
+    assert list(found.evidence.directions) == names, "what cameras report is drawn at the fit, and all are there"
+    on = {
+        tuple(visit.values.items()) for visit in found.evidence.visits if visit.effects and visit.effects[0] in physics
+    }
+    if astray:
+        assert found.vantage is not None and found.vantage.directions.keys() == physics
+        assert found.vantage.values == {"angle": experiment.parameters[0].default}
+        assert not on, "nothing is switched on at the fit"
+        assert not found.evidence.doubts.keys() & physics
+    else:
+        assert found.vantage is None and on
+        assert found.evidence.doubts.keys() == {"angle", *physics}
+
+
+def test_without_a_misfit_a_fit_far_from_the_defaults_is_as_good_as_any() -> None:
+    experiment = hiding("effect 2", 0.0, angle=8.0)
+    found = looked(experiment, 8.0)
+    assert not (found.off or found.astray)
 
 
 def test_a_bound_is_reason_enough_and_defaults_that_fail_are_none() -> None:
-    experiment = hiding("effect 2", 1.0)
-    upper = experiment.parameters[0].upper
-    evidence = gather(experiment, Simulations(experiment), {"angle": upper}, repeats=3)
-    assert look(experiment, evidence, False, Simulations(experiment)) is not None
+    upper = emulated(WORLD).parameters[0].upper
+    experiment = hiding("effect 2", 0.0, angle=upper)
+    found = looked(experiment, upper)
+    assert found.astray and not found.off
 
     class Brittle(Simulations):
         def __call__(self, values, **others):  # type: ignore[no-untyped-def]
@@ -57,17 +74,17 @@ def test_a_bound_is_reason_enough_and_defaults_that_fail_are_none() -> None:
                 raise SimulationError("blew up")
             return super().__call__(values, **others)
 
-    assert look(experiment, evidence, False, Brittle(experiment)) is None
+    found = looked(experiment, upper, Brittle(experiment))
+    assert found.vantage is None
+    assert found.evidence.directions.keys() == {c.name for c in experiment.candidates}
 
 
 def test_the_missing_effect_promises_most_from_there_and_what_promises_nothing_is_left_out() -> None:
     sizes = detectable(WORLD, Options())
     for effect in ("effect 2", "effect 5"):
         experiment = hiding(effect, 4.0 * sizes[effect])
-        simulate = Simulations(experiment)
-        evidence = gather(experiment, simulate, {"angle": 8.0}, repeats=4)
-        bench = Bench.of(experiment, evidence)
-        found = look(experiment, evidence, True, simulate)
+        looks = looked(experiment, 8.0)
+        found, bench = looks.vantage, looks.bench
         assert found is not None and bench.scorer is not None
         sight = Sight.of(experiment, bench.floor, bench.basis, found)
         names = promising(experiment, found, sight, bench.candidates, bench.scorer.price)
@@ -76,11 +93,9 @@ def test_the_missing_effect_promises_most_from_there_and_what_promises_nothing_i
 
 
 def test_sight_sees_what_was_switched_on_there() -> None:
-    experiment = hiding("effect 2", 1.0)
-    simulate = Simulations(experiment)
-    evidence = gather(experiment, simulate, {"angle": 8.0}, repeats=4)
-    bench = Bench.of(experiment, evidence)
-    found = look(experiment, evidence, True, simulate)
+    experiment = hiding("effect 2", 30.0)
+    looks = looked(experiment, 8.0)
+    found, bench = looks.vantage, looks.bench
     assert found is not None
     bare = replace(bench.floor, directions=bench.floor.directions[:, :0])
     table = next(iter(found.directions.values()))[0]

@@ -11,7 +11,7 @@ import pytest
 from splatsoil.benchmarks.hidden_effects import emulated
 from splatsoil.inverse.criticism.bench import Bench
 from splatsoil.inverse.criticism.confirmation import Confirmation, confirm
-from splatsoil.inverse.criticism.evidence import gather
+from splatsoil.inverse.criticism.evidence import gather, switched_on
 from splatsoil.inverse.criticism.sight import Sight
 from splatsoil.inverse.criticism.simulations import Simulations
 
@@ -56,7 +56,7 @@ def confirmed(world: int, lost: tuple[int, ...] = ()) -> tuple[dict[str, Confirm
     experiment = replace(base, observed=base.measured(truth, [world, 99]))
     simulate = Failing(experiment)
     simulate.lost = lost
-    evidence = gather(experiment, simulate, {"angle": 0.0})
+    evidence = switched_on(experiment, simulate, gather(experiment, simulate, {"angle": 0.0}))
     bench = Bench.of(experiment, evidence, level=0.05, seed=0)
     found = confirm(experiment, evidence, bench.floor, [candidate], simulate, 5, bench.basis, lambda what, share: None)
     return found, experiment, bench

@@ -98,3 +98,15 @@ def test_of_data_that_nothing_explains_an_effect_must_explain_more(found: Diagno
     told = {"": found.confirmations[""], "effect 2": best}
     scores = dict.fromkeys(told, replace(found.scores["effect 2"], dispersion=1.0))
     assert bool(members_of(told, {"effect 2": -20.0}, True, scores, dict.fromkeys(told, MEASURE))) is named
+
+
+def test_what_another_effect_left_behind_in_its_first_steps_is_not_named(found: Diagnosis) -> None:
+    """Its last simulation may have been a lucky one."""
+    lucky = replace(found.confirmations["effect 2"], stopped=True)
+    other = replace(lucky, name="effect 1", stopped=False)
+    told = {"": found.confirmations[""], "effect 1": other, "effect 2": lucky}
+    measures = {"effect 1": MEASURE, "effect 2": MEASURE}
+    scores = {name: replace(found.scores["effect 2"], name=name) for name in measures}
+    assert members_of(told, {"effect 1": 0.0, "effect 2": -50.0}, True, scores, measures) == ("effect 1",)
+    alone = {"": found.confirmations[""], "effect 2": lucky}
+    assert members_of(alone, {"effect 2": -50.0}, True, scores, measures) == ()

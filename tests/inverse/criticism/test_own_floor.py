@@ -131,10 +131,10 @@ def test_refits_simulate_by_several_seeds_and_are_compared_by_the_same_ones(monk
     asked = {purpose: seeds for purpose, seeds in simulate.seeds.items() if purpose.startswith("refit ")}
     compared = {purpose: seeds for purpose, seeds in asked.items() if purpose.endswith("once more")}
     refits = {purpose: seeds for purpose, seeds in asked.items() if purpose not in compared}
-    assert len(refits) == len(compared) >= 2
-    stopped = [name for name, c in found.confirmations.items() if c.stopped]
-    for purpose, seeds in compared.items():
-        assert seeds == ([0] if any(name in purpose for name in stopped) else [0, 1, 2, 3])
+    assert len(refits) == len(found.confirmations)
+    stopped = {f"refit {name} once more" for name, c in found.confirmations.items() if name and c.stopped}
+    assert len(compared) >= 2 and not compared.keys() & stopped
+    assert all(seeds == [0, 1, 2, 3] for seeds in compared.values())
     for seeds in refits.values():
         counts = np.bincount(seeds[:-1], minlength=1)
         assert np.count_nonzero(counts) >= min(len(seeds) - 1, 5)

@@ -6,7 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import pytest
-from splatsoil.inverse.criticism.evidence import Visit, around
+from splatsoil.inverse.criticism.derivatives import around
+from splatsoil.inverse.criticism.evidence import Visit
 from splatsoil.inverse.criticism.reading import explored, read
 from splatsoil.inverse.criticism.refit import Known, Refit, refit
 from splatsoil.inverse.criticism.surface import Surface, _Density

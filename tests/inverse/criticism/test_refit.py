@@ -48,6 +48,43 @@ def test_it_ends_where_least_squares_does() -> None:
     assert np.array_equal(found.prediction, model(found.values))
 
 
+@pytest.mark.parametrize(("least", "ended"), [(1e9, True), (3.0, True), (-np.inf, False)])
+def test_steps_end_once_two_in_a_row_bring_too_little(least: float, ended: bool) -> None:
+    """Each simulation has a chance of its own, half as large as what is weighed by."""
+    generator = np.random.default_rng(0)
+    observed = model({"a": 7.0, "b": 1.0})
+    start = {"a": 2.0, "b": 0.0}
+    middle, slopes = start_of(start)
+    left = [float(np.sum(((observed - middle) / 0.05) ** 2))]
+
+    def chancy(values: Mapping[str, float]) -> np.ndarray:
+        table = model(values) + 0.025 * generator.normal(size=PLACES.shape)
+        left.append(float(np.sum(((observed - table) / 0.05) ** 2)))
+        return table
+
+    found = refit(
+        chancy,
+        lambda t: t.reshape(PLACES.size, -1).squeeze() / 0.05,
+        observed,
+        PARAMETERS,
+        start,
+        middle,
+        slopes,
+        chance=True,
+        most=8,
+        least=least,
+    )
+    best = np.minimum.accumulate(left)
+    assert found.chi2 == best[-1]
+    brought = (best[:-1] - np.array(left[1:])) / np.maximum(1.0, best[1:] / (PLACES.size - 2))
+    idle = brought < least
+    twice = np.flatnonzero(idle[1:] & idle[:-1]).tolist()
+    assert twice == ([len(brought) - 2] if ended else [])
+    if least == 3.0:
+        assert 2 < found.simulations < 8
+        assert found.chi2 < 0.01 * left[0], "what goes well goes on"
+
+
 def test_bounds_hold_and_failed_simulations_only_cost() -> None:
     observed = model({"a": 14.0, "b": 0.0})
 

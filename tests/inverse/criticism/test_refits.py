@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from splatsoil.benchmarks.hidden_effects import emulated
 from splatsoil.inverse.criticism import refits
+from splatsoil.inverse.criticism.afresh import look
 from splatsoil.inverse.criticism.bench import Bench
-from splatsoil.inverse.criticism.confirmation import Confirmation, confirm
-from splatsoil.inverse.criticism.evidence import gather
+from splatsoil.inverse.criticism.confirmation import Confirmation, confirm, judged, split_times
+from splatsoil.inverse.criticism.evidence import gather, switched_on
 from splatsoil.inverse.criticism.refit import Known, Refit
 from splatsoil.inverse.criticism.refits import Trial, stop
 from splatsoil.inverse.criticism.simulations import Simulations
@@ -30,7 +31,7 @@ def confirmed(world: int) -> tuple[dict[str, Confirmation], int]:
     base = emulated(world, chaos=0.9)
     experiment = replace(base, observed=base.measured({"angle": 0.3, HIDDEN: SIZE}, [world, 99]))
     simulate = Simulations(experiment)
-    evidence = gather(experiment, simulate, {"angle": 0.0})
+    evidence = switched_on(experiment, simulate, gather(experiment, simulate, {"angle": 0.0}))
     bench = Bench.of(experiment, evidence, level=0.05, seed=0)
     few = bench.candidates[:3]
     found = confirm(experiment, evidence, bench.floor, few, simulate, 5, bench.basis, lambda what, share: None)
@@ -41,8 +42,8 @@ def test_what_explains_much_less_stops_early_and_changes_nothing(monkeypatch: py
     stopped = [confirmed(world) for world in WORLDS]
     monkeypatch.setattr(refits, "LEAST_SHARE", -np.inf)
     for (some, fewer), (every, more) in zip(stopped, map(confirmed, WORLDS), strict=True):
-        assert not any(c.stopped for c in every.values())
-        assert any(c.stopped for c in some.values())
+        assert not any(c.stopped for name, c in every.items() if name)
+        assert any(c.stopped for name, c in some.items() if name)
         assert fewer < more
         best = max(every, key=lambda name: every[name].fall)
         assert best == HIDDEN
@@ -50,7 +51,7 @@ def test_what_explains_much_less_stops_early_and_changes_nothing(monkeypatch: py
         # What goes on is what it would have been: no seed hangs on who else does.
         for name in (name for name, c in some.items() if not c.stopped):
             assert some[name].values == every[name].values
-            assert some[name].fall == every[name].fall
+            assert some[name].chi2 == every[name].chi2
         # And what stopped would have been far behind.
         assert all(every[n].fall < 0.6 * every[best].fall for n, c in some.items() if c.stopped)
 
@@ -66,33 +67,60 @@ def trial(fall: float, known: Known | None = None, size: float = 0.0) -> Trial:
 
 
 def goes_on(*others: Trial, count: int = 1000) -> list[bool]:
-    """Whether each goes on, as an effect of its own, of as many numbers in χ²."""
+    """Whether each goes on, as an effect of its own, and the model as it is, of as many numbers in χ²."""
     for number, other in enumerate(others):
         other.candidate = EXPERIMENT.candidates[number]
     asis = Trial(EXPERIMENT, None, Known.nothing(1), Simulations(EXPERIMENT), [0], [])
     asis.fit = Refit({"angle": 0.0}, 1000.0, EXPERIMENT.middle, 3, np.zeros((*EXPERIMENT.layout.shape, 1)))
     stop([asis, *others], count)
-    assert not asis.stopped
-    return [not other.stopped for other in others]
+    return [not trial.stopped for trial in (*others, asis)]
 
 
 def test_what_first_steps_cannot_tell_apart_goes_on() -> None:
-    assert goes_on(trial(100.0), trial(60.0), trial(45.0), trial(-20.0)) == [True, True, False, False]
-    assert goes_on(trial(26.0), trial(4.0), trial(1.0)) == [True, True, False]
-    # Where each number still holds ten times its noise, a fall of 45 less than another is chance.
-    assert goes_on(trial(100.0), trial(45.0), count=90) == [True, True]
+    assert goes_on(trial(100.0), trial(60.0), trial(45.0), trial(-20.0)) == [True, True, False, False, False]
+    assert goes_on(trial(26.0), trial(4.0), trial(1.0)) == [True, True, False, False]
+    assert goes_on(trial(20.0), trial(-2.0), trial(-5.0)) == [True, True, False, True]
+    # Where each number still holds ten times its noise, a fall of 45 less than another is chance, and so are both.
+    assert goes_on(trial(100.0), trial(45.0), count=90) == [True, True, True]
 
 
 def test_what_other_pictures_ask_for_goes_on_and_what_they_deny_stops_nothing() -> None:
     """They say that the size is 5 ± 0.5."""
     told = Known(np.array([[0.0, 2.0]]), np.array([0.0, 5.0]))
-    assert goes_on(trial(400.0), trial(0.0, told, size=5.0)) == [True, True]
+    assert goes_on(trial(400.0), trial(0.0, told, size=5.0)) == [True, True, False]
     nothing = Known(np.array([[0.0, 2.0]]), np.array([0.0, 0.0]))
-    assert goes_on(trial(400.0, nothing, size=5.0), trial(100.0), trial(45.0)) == [True, True, False]
+    assert goes_on(trial(400.0, nothing, size=5.0), trial(100.0), trial(45.0)) == [True, True, False, False]
 
 
 def test_the_model_as_it_is_alone_stops_nothing() -> None:
-    assert goes_on() == []
+    assert goes_on() == [True]
+
+
+def test_what_stopped_costs_no_more_and_is_told_by_its_last_simulation() -> None:
+    base = emulated(0, chaos=0.9)
+    experiment = replace(base, observed=base.measured({"angle": 0.3, HIDDEN: SIZE}, [0, 99]))
+    asked: list[str] = []
+
+    class Counted(Simulations):
+        def __call__(self, values: Mapping[str, float], **what: Any) -> np.ndarray:
+            asked.append(what.get("purpose", ""))
+            return super().__call__(values, **what)
+
+    simulate = Counted(experiment)
+    looks = look(experiment, gather(experiment, simulate, {"angle": 0.0}), simulate)
+    asked.clear()
+    found = confirm(
+        *(experiment, looks.evidence, looks.bench.floor, experiment.candidates[:3], simulate, 5),
+        *(looks.bench.basis, lambda what, share: None),
+    )
+    for name in (name for name, c in found.items() if name and c.stopped):
+        spent = [purpose for purpose in asked if purpose.startswith(f"refit {name}")]
+        assert len(spent) == found[name].fit.simulations <= 5
+        left = experiment.observed - found[name].fit.prediction
+        hidden = judged(experiment, split_times(experiment)[1])
+        assert found[name].held_out == pytest.approx(np.sqrt(np.mean(left[hidden] ** 2)))
+    assert found[""].stopped
+    assert sum("of the model once more" in purpose for purpose in asked) == 4
 
 
 class Noted(Simulations):

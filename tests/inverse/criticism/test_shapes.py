@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from splatsoil.benchmarks.hidden_effects import emulated, fitted
-from splatsoil.inverse.criticism.afresh import look_afresh
-from splatsoil.inverse.criticism.bench import Bench
+from splatsoil.inverse.criticism import diagnosis
+from splatsoil.inverse.criticism.afresh import look
 from splatsoil.inverse.criticism.diagnosis import Diagnosis, Options, diagnose
-from splatsoil.inverse.criticism.evidence import gather
+from splatsoil.inverse.criticism.evidence import gather, switched_on
 from splatsoil.inverse.criticism.refits import starts_of
 from splatsoil.inverse.criticism.simulations import Simulations
 
@@ -123,17 +123,16 @@ def test_slopes_are_those_of_the_effect_in_the_shape_that_was_found(world: int, 
 def test_from_the_defaults_an_effect_is_seen_in_the_shape_that_it_has(hidden: float) -> None:
     experiment = hiding(turning(WORLD, (SHAPE,)), hidden)
     simulate = Simulations(experiment)
-    evidence = gather(experiment, simulate, {"angle": 8.0})
-    bench = Bench.of(experiment, evidence)
-    found = look_afresh(experiment, evidence, True, simulate, bench.floor, bench.basis)
-    assert found is not None
+    looks = look(experiment, gather(experiment, simulate, {"angle": 8.0}), simulate)
+    evidence, found = looks.evidence, looks.vantage
+    assert found is not None and looks.astray
     assert found.shapes == ({} if hidden == SHAPE.default else {"effect 2": {SHAPE.name: pytest.approx(hidden)}})
     exact = experiment.expected({"angle": 0.0, "effect 2": 1.0, SHAPE.name: hidden}) - experiment.expected(
         {"angle": 0.0}
     )
     (candidate,) = (c for c in experiment.candidates if c.name == "effect 2")
-    first, second = (start.values[SHAPE.name] for start in starts_of(experiment, evidence, candidate, found))
-    assert first == SHAPE.default and second == pytest.approx(hidden)
+    (start,) = starts_of(experiment, evidence, candidate, found)
+    assert start.values == pytest.approx({"angle": 0.0, "effect 2": 0.0, SHAPE.name: hidden})
     (seen,) = found.directions["effect 2"]
     assert np.linalg.norm(seen - exact) < 0.2 * np.linalg.norm(exact)
     # All simulations with the effect are there to be read, those in other shapes, too.
@@ -145,10 +144,10 @@ def test_from_the_defaults_an_effect_is_seen_in_the_shape_that_it_has(hidden: fl
 def test_at_a_fit_near_the_defaults_an_effect_is_seen_in_the_shape_that_it_has(hidden: float) -> None:
     experiment = hiding(turning(WORLD, (SHAPE,)), hidden)
     simulate = Simulations(experiment)
-    evidence = gather(experiment, simulate, {"angle": ANGLE})
-    before, bench = simulate.asked, Bench.of(experiment, evidence)
-    found = look_afresh(experiment, evidence, True, simulate, bench.floor, bench.basis)
-    assert look_afresh(experiment, evidence, False, simulate, bench.floor, bench.basis) is None
+    at_the_fit = gather(experiment, simulate, {"angle": ANGLE})
+    switched_on(experiment, simulate, at_the_fit)
+    before, looks = simulate.asked, look(experiment, at_the_fit, simulate)
+    evidence, found = looks.evidence, looks.vantage
     # The effect, up and down, in two other shapes; the fit itself counts already.
     assert found is not None and simulate.asked - before == len(found.visits) <= 4
     assert found.values == evidence.values
@@ -163,8 +162,11 @@ def test_at_a_fit_near_the_defaults_an_effect_is_seen_in_the_shape_that_it_has(h
     assert np.linalg.norm(seen - exact) < 0.2 * np.linalg.norm(exact)
 
 
-def test_an_effect_that_explains_little_in_its_default_shape_is_tried_in_another() -> None:
+def test_an_effect_that_explains_little_in_its_default_shape_is_tried_in_another(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Three traces that are nearer to it than its own by default promise more by then."""
+    monkeypatch.setattr(diagnosis, "MORE", 1)
     made = turning(WORLD, (SHAPE,))
     names = ("effect 1", "effect 3", "effect 4")
     near = {name: 0.4 * made.slopes[name] + 0.6 * made.slopes[SHAPE.name] for name in names}
