@@ -153,7 +153,7 @@ class _Variant:
 
 
 def _variants(experiment: Experiment, point: Vantage, run: Run) -> list[_Variant]:
-    """The point's effects in other shapes; one that can't be simulated is left out."""
+    """The point's effects in other shapes, each from one side; one that can't be simulated is left out."""
     out, times = [], STRIDE if experiment.chance else 1.0
     on = [c for c in experiment.candidates if c.kind == "physics" and c.name in point.directions]
     for candidate, parameter in ((c, p) for c in on for p in c.shapes if p.log):
@@ -168,7 +168,9 @@ def _variants(experiment: Experiment, point: Vantage, run: Run) -> list[_Variant
                 return visits[-1].table
 
             try:
-                directions = directions_of(candidate, {**point.values, **shape}, point.prediction, visit, {}, times)
+                directions = directions_of(
+                    candidate, {**point.values, **shape}, point.prediction, visit, {}, times, sides=1
+                )
             except SimulationError:
                 continue
             out.append(_Variant(candidate, shape, directions, tuple(visits)))

@@ -74,10 +74,13 @@ def directions_of(
     run: Run,
     steps: dict[str, float],
     times: float = 1.0,
+    *,
+    sides: int = 2,
 ) -> FloatArray:
     """(k, t, s) derivatives by a candidate's parameters at off, of predictions whose ``middle`` is that without it, by
-    steps ``times`` as long as where nothing is left to chance; ``steps`` gets them."""
-    return np.stack([_slope(candidate, p, base, middle, run, steps, times) for p in candidate.parameters])
+    steps ``times`` as long as where nothing is left to chance; ``steps`` gets them. Where a parameter has no sign, from
+    one or two ``sides``."""
+    return np.stack([_slope(candidate, p, base, middle, run, steps, times, sides) for p in candidate.parameters])
 
 
 def _slope(
@@ -88,15 +91,17 @@ def _slope(
     run: Run,
     steps: dict[str, float],
     times: float,
+    sides: int,
 ) -> FloatArray:
-    """Derivative by one parameter of an effect, its others at off; from both sides where it has no sign."""
+    """Derivative by one parameter of an effect, its others at off."""
     off = {p.name: float(p.off or 0.0) for p in candidate.parameters}
     step = step_of(parameter, times)
     steps[parameter.name] = abs(step)
     tables = []
     # Drawing the same simulation otherwise has no chance in it: one side will do.
     both = (
-        candidate.kind == "physics"
+        sides > 1
+        and candidate.kind == "physics"
         and parameter.sign == 0
         and parameter.lower <= off[parameter.name] - step <= parameter.upper
     )

@@ -53,8 +53,8 @@ class Options:
     Attributes:
         level: family-wise chance of naming an effect when none is missing.
         repeats: simulations at the fit with other seeds.
-        refits: effects, the best ones, that are refitted.
-        refit_steps: simulations from each point where a refit starts; some ten to twenty more follow.
+        refits: effects, the best ones, that are refitted; :data:`MORE` where the model is off.
+        refit_steps: a refit's first simulations at most; some ten to twenty more follow for what explains most.
         seed: of draws.
     """
 

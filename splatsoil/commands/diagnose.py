@@ -27,10 +27,10 @@ class Config:
     repeats: int = 4
     """Simulations with other seeds, to know what chance does."""
     refits: int = 3
-    """Effects, the best ones, to refit; one more where the model leaves more than noise or the fit lies on a bound:
+    """Effects, the best ones, to refit; three more where the model leaves more than noise or the fit lies on a bound:
     those that would explain most by themselves are tried there, too."""
     refit_steps: int = 5
-    """Simulations from each point where a refit starts; some ten to twenty more follow."""
+    """First simulations of a refit at most; some ten to twenty more follow for what explains most."""
     replay: bool = True
     """Leave out the control: a made-up bed of the same soil, photographed and taken through the whole chain, that
     tells what pictures and reconstruction get wrong by themselves. Without it, their errors can pass for soil."""
