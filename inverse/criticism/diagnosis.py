@@ -12,11 +12,11 @@ import numpy.typing as npt
 from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Calibration, Candidate, Experiment
 
-from .afresh import Looks, look, promising
 from .confirmation import Confirmation, confirm, remainder_of
 from .estimates import Estimate, weighed, weighed_there
 from .evidence import Evidence, gather
 from .floor import Floor
+from .looks import Looks, look, promising
 from .misfit import Block, Omnibus, left_over, shares
 from .naming import members_of
 from .outside import StrengthReading, read_strength

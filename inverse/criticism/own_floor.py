@@ -133,14 +133,14 @@ def as_it_is(
         evidence: from the fit.
         floor: of that.
         basis: slow waves (n, k).
-        found: the model's refit as it is, if there was one.
+        found: the model's refit as it is, if there was one; one that stopped early is made anew.
         simulate: for a refit.
         steps: of that; see :func:`~splatsoil.inverse.criticism.confirmation.confirm`.
         told: called with (what, share done).
     """
     if not has_surface(experiment, None):
         return weighed_there(experiment, evidence, floor, basis, simulate)
-    if found is None:
+    if found is None or found.stopped:
         found = confirm(experiment, evidence, floor, [], simulate, steps, basis, told)[""]
     parameters, at = experiment.parameters, evidence.values
     soil = _Soil(experiment, evidence, floor, basis, parameters, at, found.visits, found.fit.slopes)

@@ -192,9 +192,9 @@ def confirmed(folder: RunFolder, model: Model, name: str, options: Options, repo
     from splatsoil.commands._control import calibrated, control
     from splatsoil.commands._crew import crew
     from splatsoil.files import plain
-    from splatsoil.inverse.criticism.afresh import look
     from splatsoil.inverse.criticism.confirmation import confirm
     from splatsoil.inverse.criticism.evidence import gather
+    from splatsoil.inverse.criticism.looks import look
     from splatsoil.inverse.criticism.own_floor import on_its_own_floor
     from splatsoil.inverse.criticism.record import confirmation
     from splatsoil.report.data import estimates

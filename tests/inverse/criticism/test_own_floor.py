@@ -10,7 +10,10 @@ import numpy as np
 import pytest
 from splatsoil.benchmarks.hidden_effects import detectable, emulated, fitted
 from splatsoil.inverse.criticism import own_floor
+from splatsoil.inverse.criticism.confirmation import confirm
 from splatsoil.inverse.criticism.diagnosis import Options, diagnose
+from splatsoil.inverse.criticism.misfit import smooth_basis
+from splatsoil.inverse.criticism.own_floor import as_it_is
 from splatsoil.inverse.criticism.record import record
 from splatsoil.inverse.criticism.refit import optimum
 from splatsoil.inverse.criticism.simulations import Simulations
@@ -221,6 +224,20 @@ def test_solvers_that_are_apart_count_in_a_model_that_has_an_effect() -> None:
     assert (kept["systematic"], kept["std"]) == (among.systematic, among.std)
     assert among.systematic == pytest.approx(np.hypot(alone.systematic, 2.0))
     assert (among.value, among.noise) == (alone.value, alone.noise)
+
+
+def test_a_refit_that_stopped_early_is_made_anew_before_it_tells_parameters() -> None:
+    experiment, truth = with_the_effect(0)
+    simulate = Noted(experiment)
+    found = diagnose(experiment, nearby(experiment, truth), simulate=simulate)
+    basis = smooth_basis(experiment.layout, found.floor.noise)
+    told = {"simulate": simulate, "steps": 5, "told": lambda what, share: None}
+    kept = confirm(experiment, found.evidence, found.floor, [], simulate, 5, basis, told["told"])[""]
+    anew, ended, stopped = (
+        as_it_is(experiment, found.evidence, found.floor, basis, refit, **told)
+        for refit in (None, kept, replace(kept, stopped=True, visits=kept.visits[:3]))
+    )
+    assert anew == ended == stopped
 
 
 def test_what_has_no_chance_is_read_by_derivatives() -> None:

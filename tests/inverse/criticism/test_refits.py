@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from splatsoil.benchmarks.hidden_effects import emulated
 from splatsoil.inverse.criticism import refits
-from splatsoil.inverse.criticism.afresh import look
 from splatsoil.inverse.criticism.bench import Bench
 from splatsoil.inverse.criticism.confirmation import Confirmation, confirm, judged, split_times
 from splatsoil.inverse.criticism.evidence import gather, switched_on
+from splatsoil.inverse.criticism.looks import look
 from splatsoil.inverse.criticism.refit import Known, Refit
 from splatsoil.inverse.criticism.refits import Trial, stop
 from splatsoil.inverse.criticism.simulations import Simulations

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from splatsoil.benchmarks.hidden_effects import emulated, fitted
 from splatsoil.inverse.criticism import diagnosis
-from splatsoil.inverse.criticism.afresh import look
 from splatsoil.inverse.criticism.diagnosis import Diagnosis, Options, diagnose
 from splatsoil.inverse.criticism.evidence import gather, switched_on
+from splatsoil.inverse.criticism.looks import look
 from splatsoil.inverse.criticism.refits import starts_of
 from splatsoil.inverse.criticism.simulations import Simulations
 

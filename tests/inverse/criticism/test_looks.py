@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from splatsoil.benchmarks.hidden_effects import detectable, emulated
-from splatsoil.inverse.criticism.afresh import Looks, look, promising
 from splatsoil.inverse.criticism.diagnosis import Options
-from splatsoil.inverse.criticism.evidence import gather
+from splatsoil.inverse.criticism.evidence import gather, switched_on
+from splatsoil.inverse.criticism.floor import floor_of
+from splatsoil.inverse.criticism.looks import Looks, look, promising
 from splatsoil.inverse.criticism.sight import Sight
 from splatsoil.inverse.criticism.simulations import Simulations
 
@@ -103,3 +104,23 @@ def test_sight_sees_what_was_switched_on_there() -> None:
     whole = np.linalg.norm(more.solver.whiten(table[experiment.seen]))
     assert np.linalg.norm(more(table)) == pytest.approx(whole, rel=1e-6)
     assert np.linalg.norm(alone(table)) < 0.9 * whole
+
+
+@pytest.mark.parametrize("replayed", [False, True])
+def test_a_floor_that_knows_of_one_along_other_directions_is_what_it_would_be_alone(replayed: bool) -> None:
+    made = emulated(WORLD)
+    guessed = {f"guess {k}": 0.3 * made.slopes[f"effect {k}"] for k in range(1, 4)}
+    experiment = replace(made, observed=made.measured({"angle": 1.0, "effect 2": 5.0}, (WORLD, 5)), guessed=guessed)
+    simulate = Simulations(experiment)
+    bare = gather(experiment, simulate, {"angle": 1.0})
+    if replayed:
+        bare = replace(bare, replays=2.0 * bare.repeats[:1])
+    whole = switched_on(experiment, simulate, bare)
+    first, alone = floor_of(experiment, bare), floor_of(experiment, whole)
+    known = floor_of(experiment, whole, first)
+    for part in alone.parts:
+        assert known.parts[part].on_directions == alone.parts[part].on_directions
+    assert any(alone.parts[part].on_directions != first.parts[part].on_directions for part in alone.parts)
+    for one, other in ((known.noise, alone.noise), (known.single, alone.single)):
+        assert np.array_equal(one.covariance, other.covariance)
+    assert np.array_equal(known.free, alone.free)
