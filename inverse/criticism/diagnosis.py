@@ -212,7 +212,7 @@ def judge(
                 asis, after = (c.held_out / c.floor for c in (confirmations[""], tried[best]))
                 errors, left = (asis, after), after > WITHIN
             gone = explained(before, remainder) if misfit.p < GATE else explained_of_all(*errors)
-    effects = _effects(candidates, scores, given, members, confirmations, options.level)
+    effects = _effects(candidates, scores, given, members, confirmations, looks.astray, options.level)
     # Where the best explanation is too small to matter, so is what is missing.
     named = bool(members) and effects[members[0]] == "missing"
     if chosen and not named:
@@ -319,16 +319,20 @@ def _effects(
     given: Mapping[str, Score],
     members: Sequence[str],
     confirmations: Mapping[str, Confirmation],
+    astray: bool,
     level: float,
 ) -> dict[str, EffectVerdict]:
-    """A verdict for each effect: members by their refits, the others by what the best one leaves for them."""
+    """A verdict for each effect: members by their refits, the others by what the best one leaves for them.
+
+    Where the fit was ``astray``, by one seed and of other soil than that which was fitted: that denies nothing.
+    """
     out: dict[str, EffectVerdict] = {}
     for name, candidate in candidates.items():
         if name in members:
             out[name] = "missing" if _matters(candidate, confirmations[name].values) else "trivial"
         else:
             out[name] = of_effect(candidate, given.get(name, scores[name]), level=level)
-            if out[name] == "missing":
+            if out[name] == "missing" or (astray and candidate.kind == "physics"):
                 # Significant beside the best one too, or because the best one's size is off: the next round tells.
                 out[name] = "cannot tell"
     return out

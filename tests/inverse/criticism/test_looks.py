@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from splatsoil.benchmarks.hidden_effects import detectable, emulated
-from splatsoil.inverse.criticism.diagnosis import Options
+from splatsoil.inverse.criticism.diagnosis import Options, diagnose
 from splatsoil.inverse.criticism.evidence import gather, switched_on
 from splatsoil.inverse.criticism.floor import floor_of
 from splatsoil.inverse.criticism.looks import Looks, look, promising
@@ -61,6 +61,21 @@ def test_without_a_misfit_a_fit_far_from_the_defaults_is_as_good_as_any() -> Non
     experiment = hiding("effect 2", 0.0, angle=8.0)
     found = looked(experiment, 8.0)
     assert not (found.off or found.astray)
+
+
+def test_from_the_defaults_nothing_is_denied() -> None:
+    """By one seed, and of other soil than that which was fitted."""
+    sizes = detectable(WORLD, Options())
+    experiment = hiding("effect 2", 4.0 * sizes["effect 2"])
+    large = 3.0 * sizes["effect 5"]
+    (coarse,) = (c for c in experiment.candidates if c.name == "effect 5")
+    coarse = replace(coarse, parameters=(replace(coarse.parameters[0], meaningful=large),))
+    among = tuple(coarse if c.name == coarse.name else c for c in experiment.candidates)
+    experiment = replace(experiment, candidates=among)
+    near, far = (diagnose(experiment, {"angle": at}).effects for at in (0.9, 8.0))
+    assert near["effect 2"] == far["effect 2"] == "missing"
+    assert near["effect 5"] == "absent"
+    assert {far[c.name] for c in among if c.kind == "physics" and c.name != "effect 2"} == {"cannot tell"}
 
 
 def test_a_bound_is_reason_enough_and_defaults_that_fail_are_none() -> None:
