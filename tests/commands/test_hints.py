@@ -84,12 +84,12 @@ def test_the_hints_after_a_fit_and_a_comparison_can_be_pasted(
     assert f": splatsoil add '{folder}' tilt tries it" in why
 
 
-def test_the_help_says_when_one_effect_more_is_refitted(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_help_says_when_more_effects_are_refitted(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         cli.main(["diagnose", "--help"])
     told = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert (
-        "Effects, the best ones, to refit; one more where the model leaves more than noise or the fit lies on a bound"
+        "Effects, the best ones, to refit; three more where the model leaves more than noise or the fit lies on a bound"
         in told
     )
 

@@ -205,8 +205,8 @@ class Shaped:
     free = (ANGLE, STICK, SHAPE)
     start: Mapping[str, float] = {"angle": 35.0, "stick": 300.0, "shape": 0.3}
 
-    def __init__(self) -> None:
-        generator = np.random.default_rng(0)
+    def __init__(self, seed: int = 0) -> None:
+        generator = np.random.default_rng(seed)
         self.one, self.other = np.linalg.qr(generator.standard_normal((FEATURES, 2)))[0].T
         self.observed = self({"angle": 33.0, "stick": 400.0, "shape": 2.0}) + generator.standard_normal((1, FEATURES))
         places = [(35.0, 0.0), (31.0, 0.0), (39.0, 0.0), (35.0, 200.0), (35.0, 300.0), (32.0, 400.0)]
@@ -272,13 +272,17 @@ def off(found: np.ndarray, exact: np.ndarray) -> np.ndarray:
 
 
 def test_slopes_are_those_where_the_refit_ends_in_features_too_that_it_does_not_see() -> None:
-    world = Shaped()
-    fit = world.explored(world.predict, hidden=FEATURES // 2)
-    exact, hidden = world.tangent(fit.values), slice(FEATURES // 2, None)
-    assert off(fit.slopes, exact) == pytest.approx(np.zeros(3), abs=0.15)
-    assert off(fit.slopes[:, hidden], exact[:, hidden]) == pytest.approx(np.zeros(3), abs=0.15)
-    # What the effect does has turned on the way, and so have its slopes.
-    assert off(world.tangent(world.start), exact)[1] > 0.5
+    hidden, wrong = slice(FEATURES // 2, None), []
+    for seed in range(8):
+        world = Shaped(seed)
+        fit = world.explored(world.predict, hidden=FEATURES // 2)
+        exact = world.tangent(fit.values)
+        wrong.append([off(fit.slopes, exact), off(fit.slopes[:, hidden], exact[:, hidden])])
+        # What the effect does has turned on the way, and so have its slopes.
+        assert off(world.tangent(world.start), exact)[1] > 0.5
+    # Points are drawn: of one world in ten they tell less of a slope.
+    assert np.median(wrong, axis=0) == pytest.approx(np.zeros((2, 3)), abs=0.03)
+    assert np.sort(wrong, axis=0)[-2] == pytest.approx(np.zeros((2, 3)), abs=0.15)
 
 
 def test_slopes_are_right_where_a_refit_stays() -> None:
