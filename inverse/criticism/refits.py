@@ -74,6 +74,11 @@ class Trial:
         return "" if self.candidate is None else self.candidate.name
 
     @property
+    def left_behind(self) -> bool:
+        """Whether it is an effect's that stopped."""
+        return self.stopped and self.candidate is not None
+
+    @property
     def on(self) -> tuple[str, ...]:
         """Effects that are."""
         return () if self.candidate is None else (self.candidate.name,)
@@ -175,7 +180,7 @@ def refitted(
 
     def go_on(trial: Trial) -> None:
         said(trial)
-        if trial.stopped and trial.name:
+        if trial.left_behind:
             return
         shapes = () if trial.candidate is None else trial.candidate.shapes
         if not trial.stopped:
@@ -242,7 +247,7 @@ def repeated(simulate: Simulations, trials: Sequence[Trial], count: int) -> list
         for trial in trials:
             at, purpose = trial.fit.values, f"refit {trial.name or 'of the model'} once more"
             out.append({})
-            if trial.stopped and trial.name:
+            if trial.left_behind:
                 out[-1][SHARED] = Visit(dict(at), trial.on, trial.fit.prediction, SHARED)
                 continue
             for seed in range(SHARED, SHARED + count):

@@ -211,8 +211,8 @@ class _Block:
             return float(squares.sum()), logs * count
         # Sum and difference of two that are so correlated are independent.
         link, half = memory**self.gap, count // 2
-        whole_square = 0.5 * (squares[:half].sum() / (1.0 + link) + squares[half:].sum() / (1.0 - link))
-        return float(whole_square), logs * count + 0.5 * self.pairs.size * math.log(1.0 - link**2)
+        both = 0.5 * (squares[:half].sum() / (1.0 + link) + squares[half:].sum() / (1.0 - link))
+        return float(both), logs * count + 0.5 * self.pairs.size * math.log(1.0 - link**2)
 
 
 def _blocks(layout: Layout, scaled: FloatArray, seen: BoolArray) -> list[_Block]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -11,12 +11,19 @@ import pytest
 from splatsoil.benchmarks.hidden_effects import emulated
 from splatsoil.inverse.criticism.bench import Bench
 from splatsoil.inverse.criticism.dilution import informed, reliable, undiluted
-from splatsoil.inverse.criticism.evidence import gather, switched_on
+from splatsoil.inverse.criticism.evidence import Evidence, gather, switched_on
 from splatsoil.inverse.criticism.noise import Noise
 from splatsoil.inverse.criticism.simulations import Simulations
 
+from splatsoil.experiment.emulated import EmulatedExperiment
+
 WORLDS = range(40, 52)
 CHAOS = 0.5
+
+
+def looked(experiment: EmulatedExperiment, simulate: Callable[..., Any], at: dict[str, float], **how: int) -> Evidence:
+    """Evidence with every effect switched on at a fit."""
+    return switched_on(experiment, simulate, gather(experiment, simulate, at, **how))
 
 
 def test_the_share_that_is_no_chance_is_the_one_that_was_put_in() -> None:
@@ -49,9 +56,7 @@ def test_sizes_come_out_right_where_soil_falls_otherwise_each_time() -> None:
     for world in WORLDS:
         base = emulated(world, chaos=CHAOS)
         experiment = replace(base, observed=base.measured({"angle": 0.0, "effect 1": 6.0}, [world, 99]))
-        evidence = switched_on(
-            experiment, Simulations(experiment), gather(experiment, Simulations(experiment), {"angle": 0.0})
-        )
+        evidence = looked(experiment, Simulations(experiment), {"angle": 0.0})
         residual = (experiment.observed - evidence.mean)[experiment.seen]
         for known, out in ((evidence, right), (replace(evidence, doubts={}), drawn)):
             scorer = Bench.of(experiment, known).scorer
@@ -75,7 +80,7 @@ def test_what_is_reported_has_no_chance_and_is_asked_for_while_the_points_simula
         told = {"effects": how["effects"], "seed": how["seed"], "numerics": numerics}
         return experiment.predict(values, **told)
 
-    evidence = switched_on(experiment, simulate, gather(experiment, simulate, {"angle": 0.0}, repeats=3))
+    evidence = looked(experiment, simulate, {"angle": 0.0}, repeats=3)
     reported = {c.name for c in experiment.candidates if c.kind == "observation"}
     assert reported and not reported & evidence.doubts.keys()
     assert evidence.doubts.keys() == {"angle", *(c.name for c in experiment.candidates)} - reported
@@ -83,17 +88,13 @@ def test_what_is_reported_has_no_chance_and_is_asked_for_while_the_points_simula
     assert {seed for effects, seed, _ in asked if effects} == {0, 4}
     point = asked.index(((), 0, ""))
     assert {effects[0] for effects, _, _ in asked[point + 1 : point + 1 + len(reported)]} == reported
-    quiet = switched_on(
-        replace(experiment, chance=False, chaos=0.0),
-        simulate,
-        gather(replace(experiment, chance=False, chaos=0.0), simulate, {"angle": 0.0}),
-    )
+    quiet = looked(replace(experiment, chance=False, chaos=0.0), simulate, {"angle": 0.0})
     assert not quiet.doubts
 
 
 def test_starts_of_refits_have_the_size_that_is_expected_of_them() -> None:
     base = emulated(11, chaos=CHAOS)
-    evidence = switched_on(base, Simulations(base), gather(base, Simulations(base), {"angle": 0.0}))
+    evidence = looked(base, Simulations(base), {"angle": 0.0})
     noise = Noise(np.eye(base.seen.size), base.seen)
     told = undiluted(evidence, noise)
     for name, tables in (("angle", told.slopes), ("effect 1", told.directions), ("effect 8", told.directions)):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,12 +12,19 @@ from splatsoil.benchmarks.hidden_effects import emulated, fitted, outside
 from splatsoil.inverse.criticism.bench import Bench
 from splatsoil.inverse.criticism.diagnosis import diagnose
 from splatsoil.inverse.criticism.estimates import at_odds, untried, weighed, weighed_there
-from splatsoil.inverse.criticism.evidence import gather, switched_on
+from splatsoil.inverse.criticism.evidence import Evidence, gather, switched_on
 from splatsoil.inverse.criticism.floor import floor_of
 from splatsoil.inverse.criticism.misfit import smooth_basis
 from splatsoil.inverse.criticism.simulations import Simulations
 
+from splatsoil.experiment.emulated import EmulatedExperiment
+
 TRIED, WORLDS = 5, 40
+
+
+def looked(experiment: EmulatedExperiment, simulate: Callable[..., Any], at: dict[str, float], **how: int) -> Evidence:
+    """Evidence with every effect switched on at a fit."""
+    return switched_on(experiment, simulate, gather(experiment, simulate, at, **how))
 
 
 def worlds(size: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -31,11 +40,7 @@ def worlds(size: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         made = replace(made, patterns=tried)
         observed = made.measured({"angle": 0.0}, [world, 99], outside(made, generator, size))
         experiment = replace(made, observed=observed)
-        evidence = switched_on(
-            experiment,
-            Simulations(experiment),
-            gather(experiment, Simulations(experiment), {"angle": fitted(experiment)}),
-        )
+        evidence = looked(experiment, Simulations(experiment), {"angle": fitted(experiment)})
         floor = floor_of(experiment, evidence)
         told = weighed(experiment, evidence, floor, smooth_basis(experiment.layout, floor.noise))["angle"]
         assert told.std == pytest.approx(np.hypot(told.noise, told.systematic)) and told.unit == "deg"
@@ -63,9 +68,7 @@ def test_noise_is_that_of_least_squares_that_knows_the_covariance() -> None:
     for world in range(12):
         made = replace(emulated(world), patterns={})
         experiment = replace(made, observed=made.measured({"angle": 0.0}, [world, 99]))
-        evidence = switched_on(
-            experiment, Simulations(experiment), gather(experiment, Simulations(experiment), {"angle": 0.0}, repeats=4)
-        )
+        evidence = looked(experiment, Simulations(experiment), {"angle": 0.0}, repeats=4)
         floor = floor_of(experiment, evidence)
         told = weighed(experiment, evidence, floor, smooth_basis(experiment.layout, floor.noise))["angle"]
         assert told.determined
@@ -88,14 +91,14 @@ def test_steps_go_on_where_one_would_leave_what_derivatives_were_measured_over()
         made = replace(made, curves={**made.curves, "angle": -0.08 * made.slopes["angle"]})
         experiment = replace(made, observed=made.measured({"angle": 0.0}, [world, 99]))
         simulate = Simulations(experiment)
-        evidence = switched_on(experiment, simulate, gather(experiment, simulate, {"angle": 8.0}))
+        evidence = looked(experiment, simulate, {"angle": 8.0})
         floor = floor_of(experiment, evidence)
         basis = smooth_basis(experiment.layout, floor.noise)
         once.append(weighed(experiment, evidence, floor, basis)["angle"])
         asked = simulate.asked
         there.append(weighed_there(experiment, evidence, floor, basis, simulate)["angle"])
         assert simulate.asked > asked
-        near = switched_on(experiment, simulate, gather(experiment, simulate, {"angle": 0.0}))
+        near = looked(experiment, simulate, {"angle": 0.0})
         asked, own = simulate.asked, floor_of(experiment, near)
         assert weighed_there(experiment, near, own, basis, simulate) == weighed(experiment, near, own, basis)
         assert simulate.asked == asked
@@ -109,9 +112,7 @@ def test_each_way_left_out_is_what_the_estimator_of_the_others_makes_of_it() -> 
     made = emulated(3)
     tried = {f"way {k}": outside(made, np.random.default_rng(k), 2.0) for k in range(3)}
     experiment = replace(made, patterns=tried, observed=made.measured({"angle": 0.0}, [3, 99]))
-    evidence = switched_on(
-        experiment, Simulations(experiment), gather(experiment, Simulations(experiment), {"angle": 0.0})
-    )
+    evidence = looked(experiment, Simulations(experiment), {"angle": 0.0})
     floor = floor_of(experiment, evidence)
     slopes = np.stack([experiment.slopes[name] for name in ("angle", "effect 1")], axis=-1)
     precision = np.diag([0.1, 2.0])
@@ -138,9 +139,7 @@ def test_effects_explain_no_more_than_noise_of_a_truth_that_computes_otherwise()
         made = replace(made, patterns={f"way {k}": outside(made, generator, 6.0) for k in range(TRIED)})
         observed = made.measured({"angle": 0.0}, [world, 99], outside(made, generator, 6.0))
         experiment = replace(made, observed=observed)
-        evidence = switched_on(
-            experiment, Simulations(experiment), gather(experiment, Simulations(experiment), {"angle": 0.0})
-        )
+        evidence = looked(experiment, Simulations(experiment), {"angle": 0.0})
         scorer = Bench.of(experiment, evidence).scorer
         assert scorer is not None
         scores = scorer.score((experiment.observed - evidence.mean)[experiment.seen])
@@ -152,9 +151,7 @@ def test_the_error_is_as_large_as_parts_of_the_data_contradict_each_other() -> N
     """Each part has an angle of its own; where all have the same, noise says nearly all of it."""
     made = emulated(4)
     experiment = replace(made, observed=made.expected({"angle": 0.0}))
-    evidence = switched_on(
-        experiment, Simulations(experiment), gather(experiment, Simulations(experiment), {"angle": 0.0})
-    )
+    evidence = looked(experiment, Simulations(experiment), {"angle": 0.0})
     floor = replace(floor_of(experiment, evidence), nuisance=np.zeros((made.observed.size, 0)), tried=0)
     parts, precision = made.layout.parts, np.zeros((1, 1))
     slopes = made.slopes["angle"][..., None]

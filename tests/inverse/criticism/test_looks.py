@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -61,6 +62,29 @@ def test_without_a_misfit_a_fit_far_from_the_defaults_is_as_good_as_any() -> Non
     experiment = hiding("effect 2", 0.0, angle=8.0)
     found = looked(experiment, 8.0)
     assert not (found.off or found.astray)
+
+
+@pytest.mark.parametrize("at", [0.9, 8.0])
+def test_what_looks_need_is_told_of_before_it_is_simulated(at: float) -> None:
+    """Helpers make it side by side."""
+    experiment = hiding("effect 2", 30.0)
+    early: set[str] = set()
+    late: set[str] = set()
+
+    class Noted(Simulations):
+        def ahead(self, work: Callable[..., object], *, apart: bool = False) -> None:
+            nothing = np.zeros(experiment.layout.shape)
+            work(lambda values, **what: (early.add(repr((values, what))), nothing)[1])
+
+        def __call__(self, values, **what):  # type: ignore[no-untyped-def]
+            late.add(repr((values, what)))
+            return super().__call__(values, **what)
+
+    simulate = Noted(experiment)
+    evidence = gather(experiment, simulate, {"angle": at}, repeats=4)
+    late.clear()
+    look(experiment, evidence, simulate)
+    assert late and late == early
 
 
 def test_from_the_defaults_nothing_is_denied() -> None:

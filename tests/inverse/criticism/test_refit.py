@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
-from splatsoil.inverse.criticism.refit import mended, refit
+from splatsoil.inverse.criticism.refit import Refit, mended, refit
 
 from splatsoil.errors import SimulationError
 from splatsoil.parameters import Parameter
@@ -26,21 +27,23 @@ def start_of(values: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray]:
     return middle, np.stack(slopes, axis=-1)
 
 
+def white(table: np.ndarray) -> np.ndarray:
+    """By an error of 0.05."""
+    return table.reshape(PLACES.size, -1).squeeze() / 0.05
+
+
+def refitted(
+    predict: Callable[[Mapping[str, float]], np.ndarray], observed: np.ndarray, start: Mapping[str, float], **how: Any
+) -> Refit:
+    """From a start whose derivatives are known."""
+    middle, slopes = start_of(start)
+    return refit(predict, white, observed, PARAMETERS, start, middle, slopes, **{"chance": False, **how})
+
+
 def test_it_ends_where_least_squares_does() -> None:
     observed = model({"a": 7.0, "b": 1.0}) + 0.05 * np.random.default_rng(0).normal(size=PLACES.shape)
     start = {"a": 2.0, "b": 0.0}
-    middle, slopes = start_of(start)
-    found = refit(
-        model,
-        lambda t: t.reshape(PLACES.size, -1).squeeze() / 0.05,
-        observed,
-        PARAMETERS,
-        start,
-        middle,
-        slopes,
-        chance=False,
-        most=12,
-    )
+    found = refitted(model, observed, start, most=12)
     oracle = least_squares(lambda p: ((model({"a": p[0], "b": p[1]}) - observed) / 0.05).ravel(), [2.0, 0.0])
     assert found.chi2 == pytest.approx(2.0 * oracle.cost, rel=0.05)
     assert found.values["a"] == pytest.approx(oracle.x[0], abs=0.1)
@@ -54,26 +57,14 @@ def test_steps_end_once_two_in_a_row_bring_too_little(least: float, ended: bool)
     generator = np.random.default_rng(0)
     observed = model({"a": 7.0, "b": 1.0})
     start = {"a": 2.0, "b": 0.0}
-    middle, slopes = start_of(start)
-    left = [float(np.sum(((observed - middle) / 0.05) ** 2))]
+    left = [np.sum(white(observed - model(start)) ** 2)]
 
     def chancy(values: Mapping[str, float]) -> np.ndarray:
         table = model(values) + 0.025 * generator.normal(size=PLACES.shape)
-        left.append(float(np.sum(((observed - table) / 0.05) ** 2)))
+        left.append(np.sum(white(observed - table) ** 2))
         return table
 
-    found = refit(
-        chancy,
-        lambda t: t.reshape(PLACES.size, -1).squeeze() / 0.05,
-        observed,
-        PARAMETERS,
-        start,
-        middle,
-        slopes,
-        chance=True,
-        most=8,
-        least=least,
-    )
+    found = refitted(chancy, observed, start, chance=True, most=8, least=least)
     best = np.minimum.accumulate(left)
     assert found.chi2 == best[-1]
     brought = (best[:-1] - np.array(left[1:])) / np.maximum(1.0, best[1:] / (PLACES.size - 2))
@@ -94,20 +85,9 @@ def test_bounds_hold_and_failed_simulations_only_cost() -> None:
         return model(values)
 
     start = {"a": 6.0, "b": 0.0}
-    middle, slopes = start_of(start)
-    found = refit(
-        brittle,
-        lambda t: t.reshape(PLACES.size, -1).squeeze() / 0.05,
-        observed,
-        PARAMETERS,
-        start,
-        middle,
-        slopes,
-        chance=False,
-        most=6,
-    )
+    found = refitted(brittle, observed, start, most=6)
     assert 6.0 < found.values["a"] < 9.99
-    assert found.chi2 < np.sum(((middle - observed) / 0.05) ** 2)
+    assert found.chi2 < np.sum(white(observed - model(start)) ** 2)
 
 
 def test_a_long_step_tells_the_slope_and_a_short_one_hardly_anything() -> None:

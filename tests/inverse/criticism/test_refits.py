@@ -113,7 +113,9 @@ def test_what_stopped_costs_no_more_and_is_told_by_its_last_simulation() -> None
         *(experiment, looks.evidence, looks.bench.floor, experiment.candidates[:3], simulate, 5),
         *(looks.bench.basis, lambda what, share: None),
     )
-    for name in (name for name, c in found.items() if name and c.stopped):
+    stopped = [name for name, c in found.items() if name and c.stopped]
+    assert stopped
+    for name in stopped:
         spent = [purpose for purpose in asked if purpose.startswith(f"refit {name}")]
         assert len(spent) == found[name].fit.simulations <= 5
         left = experiment.observed - found[name].fit.prediction
