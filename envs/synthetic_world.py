@@ -134,11 +134,11 @@ class World:
         """Pictures (k, h, w, 3), camera by camera, of particles that have moved and deformed."""
         scene = self.scene(particles)
         motion = self.measurement.tool.motion
-        posed = [
-            scene.pose(x, f, motion.pose(frame / FRAME_RATE))
+        posed = scene.poses(
+            (x, f, motion.pose(frame / FRAME_RATE))
             for frame, x, f in zip(COMPARED, positions, deformations, strict=True)
-        ]
-        return np.stack([scene.picture(moment, camera) for camera in self.cameras.values() for moment in posed])
+        )
+        return np.stack(scene.pictures((moment, camera) for camera in self.cameras.values() for moment in posed))
 
     def scene(self, particles: FloatArray) -> Scene:
         """Gaussians of the undisturbed surface, bound to these particles."""

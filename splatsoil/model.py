@@ -249,16 +249,17 @@ class Model:
             name: observation.camera(camera.undistorted(), k)
             for k, (name, camera) in enumerate(self.measurement.cameras.items())
         }
-        images: dict[tuple[str, int], Image] = {}
         posed = self._poses.of(trajectory, (seed, albedo, rounding, observation.of_scene))
-        for frame in self.frames:
-            if frame not in posed:
-                moment = frame + observation.time_offset * rate
-                tool = observation.tool(motion.pose(moment / rate))
-                posed[frame] = scene.pose(*trajectory.at(moment), tool)
-            for name, camera in cameras.items():
-                images[name, frame] = observation.image(scene.picture(posed[frame], camera), frame / rate)
-        return images
+        moments = {f: f + observation.time_offset * rate for f in self.frames if f not in posed}
+        tools = [observation.tool(motion.pose(moment / rate)) for moment in moments.values()]
+        states = [(*trajectory.at(moment), tool) for moment, tool in zip(moments.values(), tools, strict=True)]
+        posed |= zip(moments, scene.poses(states), strict=True)
+        keys = [(name, frame) for frame in self.frames for name in cameras]
+        pictures = scene.pictures([(posed[frame], cameras[name]) for name, frame in keys])
+        return {
+            (name, frame): observation.image(picture, frame / rate)
+            for (name, frame), picture in zip(keys, pictures, strict=True)
+        }
 
     def predict(
         self,

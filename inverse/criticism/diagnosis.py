@@ -16,7 +16,7 @@ from .confirmation import Confirmation, confirm, remainder_of
 from .estimates import Estimate, weighed, weighed_there
 from .evidence import Evidence, gather
 from .floor import Floor
-from .looks import Looks, look, promising
+from .looks import Looks, foreseen, look, promising
 from .misfit import Block, Omnibus, left_over, shares
 from .naming import members_of
 from .outside import StrengthReading, read_strength
@@ -150,6 +150,7 @@ def diagnose(
     evidence = gather(
         experiment, simulate, values, repeats=options.repeats, progress=lambda share: told("simulations", 0.4 * share)
     )
+    foreseen(experiment, evidence, simulate)
     return judge(
         experiment,
         replace(evidence, replays=None if replays is None else replays(), calibration=calibration),

@@ -8,6 +8,7 @@ particular. From the law's defaults it stands out.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -56,6 +57,12 @@ class Looks:
         return self.vantage is not None and self.vantage.values != self.evidence.values
 
 
+def foreseen(experiment: Experiment, evidence: Evidence, simulate: Simulations) -> None:
+    """Have helpers begin with what :func:`look` will most likely ask for, before it is known what is noise."""
+    astray = _astray(experiment, evidence, True)
+    simulate.ahead(lambda ask: (_defaults if astray else switched_on)(experiment, ask, evidence))
+
+
 def look(
     experiment: Experiment, evidence: Evidence, simulate: Simulations, *, level: float = LEVEL, seed: int = 0
 ) -> Looks:
@@ -76,7 +83,13 @@ def look(
     left = (experiment.observed - evidence.mean)[experiment.seen]
     first = Bench.of(experiment, evidence, seed=seed, scored=False)
     off = first.off(left)
-    vantage = _from_defaults(experiment, evidence, off, simulate)
+    vantage = None
+    if _astray(experiment, evidence, off):
+        simulate.ahead(lambda ask: _defaults(experiment, ask, evidence))
+        with suppress(SimulationError):  # then the fit will have to do
+            vantage = _defaults(experiment, simulate, evidence)
+    else:
+        simulate.forget()  # what was foreseen, if it was something else
     if vantage is None:
         simulate.ahead(lambda ask: switched_on(experiment, ask, evidence))
         whole = switched_on(experiment, simulate, evidence)
@@ -94,27 +107,30 @@ def look(
     return Looks(whole, bench, off, best)
 
 
-def _from_defaults(
-    experiment: Experiment, evidence: Evidence, off: bool, simulate: Simulations
-) -> tuple[Vantage, list[_Variant]] | None:
-    """From the defaults; None where nothing says that the fit was led astray, or these can't be simulated."""
+def _astray(experiment: Experiment, evidence: Evidence, off: bool) -> bool:
+    """Whether a missing effect may have led the fit astray, the model being ``off`` by more than noise or not."""
     bound = any(len(around(p, evidence.values[p.name])) == 1 for p in experiment.parameters)
-    own = {p.name: p.default for p in experiment.parameters if p.off is None}
-    far = any(abs(evidence.values[name] - value) > evidence.widths[name] for name, value in own.items())
-    if not (experiment.candidates and far and (bound or off)):
-        return None
+    far = any(abs(evidence.values[name] - value) > evidence.widths[name] for name, value in _own(experiment).items())
+    return bool(experiment.candidates) and far and (bound or off)
+
+
+def _own(experiment: Experiment) -> dict[str, float]:
+    """The soil's own parameters at the law's defaults."""
+    return {p.name: p.default for p in experiment.parameters if p.off is None}
+
+
+def _defaults(
+    experiment: Experiment, ask: Callable[..., FloatArray], evidence: Evidence
+) -> tuple[Vantage, list[_Variant]]:
+    """From the defaults.
+
+    Raises:
+        SimulationError: these can't be simulated.
+    """
     physics = [c for c in experiment.candidates if c.kind == "physics"]
-
-    def seen(ask: Callable[..., FloatArray]) -> tuple[Vantage, list[_Variant]]:
-        run = _called("from the defaults", ask)
-        found = look_from(experiment, {**evidence.values, **own}, physics, run)
-        return found, _variants(experiment, found, run)
-
-    simulate.ahead(seen)
-    try:
-        return seen(simulate)
-    except SimulationError:
-        return None
+    run = _called("from the defaults", ask)
+    found = look_from(experiment, {**evidence.values, **_own(experiment)}, physics, run)
+    return found, _variants(experiment, found, run)
 
 
 def _at_the_fit(

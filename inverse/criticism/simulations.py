@@ -164,6 +164,13 @@ class Simulations:
             with self._guard:
                 self._planned |= dict.fromkeys(jobs, plan)
 
+    def forget(self) -> None:
+        """Helpers don't make what they were told `ahead` and haven't begun with."""
+        with self._guard:
+            for plan in self._planned.values():
+                plan.future.cancel()
+            self._planned = {key: plan for key, plan in self._planned.items() if not plan.future.cancelled()}
+
     def side_by_side(self, jobs: Iterable[Callable[[], T]]) -> list[T]:
         """Results of jobs that wait for simulations, in order, as many at a time as there are processes."""
         if self._helpers is None:

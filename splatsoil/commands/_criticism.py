@@ -194,7 +194,7 @@ def confirmed(folder: RunFolder, model: Model, name: str, options: Options, repo
     from splatsoil.files import plain
     from splatsoil.inverse.criticism.confirmation import confirm
     from splatsoil.inverse.criticism.evidence import gather
-    from splatsoil.inverse.criticism.looks import look
+    from splatsoil.inverse.criticism.looks import foreseen, look
     from splatsoil.inverse.criticism.own_floor import on_its_own_floor
     from splatsoil.inverse.criticism.record import confirmation
     from splatsoil.report.data import estimates
@@ -212,6 +212,7 @@ def confirmed(folder: RunFolder, model: Model, name: str, options: Options, repo
             repeats=options.repeats,
             progress=lambda share: report("simulations", 0.7 * share),
         )
+        foreseen(experiment, evidence, simulate)
         calibration = calibrated(folder, experiment, simulate, values)
         evidence = replace(evidence, replays=replays(), calibration=calibration)
         looks = look(experiment, evidence, simulate, level=options.level, seed=options.seed)

@@ -74,34 +74,59 @@ def corner_weight(f: wp.vec3, corner: int) -> float:
     return wx * wy * wz
 
 
-@wp.func
-def corner_gradient(f: wp.vec3, corner: int, inverse: wp.vec3) -> wp.vec3:
-    """Gradient of :func:`corner_weight` in 1/m."""
-    wx = wp.where((corner & 4) == 0, 1.0 - f[0], f[0])
-    wy = wp.where((corner & 2) == 0, 1.0 - f[1], f[1])
-    wz = wp.where((corner & 1) == 0, 1.0 - f[2], f[2])
-    sx = wp.where((corner & 4) == 0, -inverse[0], inverse[0])
-    sy = wp.where((corner & 2) == 0, -inverse[1], inverse[1])
-    sz = wp.where((corner & 1) == 0, -inverse[2], inverse[2])
-    return wp.vec3(sx * wy * wz, wx * sy * wz, wx * wy * sz)
+@wp.struct
+class Field:
+    """A trilinear field about a point of a cell, in powers of local coordinates: per cell, cell and cell, and so on."""
+
+    value: wp.vec3
+    x: wp.vec3
+    y: wp.vec3
+    z: wp.vec3
+    yz: wp.vec3
+    xz: wp.vec3
+    xy: wp.vec3
+    xyz: wp.vec3
 
 
 @wp.func
-def corner_twist(f: wp.vec3, corner: int) -> wp.vec3:
-    """Mixed second derivatives (yz, xz, xy) of :func:`corner_weight`, per cell and cell."""
-    wx = wp.where((corner & 4) == 0, 1.0 - f[0], f[0])
-    wy = wp.where((corner & 2) == 0, 1.0 - f[1], f[1])
-    wz = wp.where((corner & 1) == 0, 1.0 - f[2], f[2])
-    sx = wp.where((corner & 4) == 0, -1.0, 1.0)
-    sy = wp.where((corner & 2) == 0, -1.0, 1.0)
-    sz = wp.where((corner & 1) == 0, -1.0, 1.0)
-    return wp.vec3(wx * sy * sz, sx * wy * sz, sx * sy * wz)
+def field_at(nodes: wp.array(dtype=wp.vec3), grid: Grid, base: int, f: wp.vec3) -> Field:
+    """Field of the nodes of the cell with lowest node ``base`` about local coordinates ``f``, axis by axis."""
+    along_y = grid.shape[2]
+    along_x = grid.shape[1] * grid.shape[2]
+    # along four edges, which are named by their y and z; then along two; then between these
+    x00 = nodes[base + along_x] - nodes[base]
+    x01 = nodes[base + along_x + 1] - nodes[base + 1]
+    x10 = nodes[base + along_x + along_y] - nodes[base + along_y]
+    x11 = nodes[base + along_x + along_y + 1] - nodes[base + along_y + 1]
+    v00 = nodes[base] + f[0] * x00
+    v01 = nodes[base + 1] + f[0] * x01
+    v10 = nodes[base + along_y] + f[0] * x10
+    v11 = nodes[base + along_y + 1] + f[0] * x11
+    xy0 = x10 - x00
+    xy1 = x11 - x01
+    y0 = v10 - v00
+    y1 = v11 - v01
+    x0 = x00 + f[1] * xy0
+    x1 = x01 + f[1] * xy1
+    v0 = v00 + f[1] * y0
+    v1 = v01 + f[1] * y1
+    out = Field()
+    out.xyz = xy1 - xy0
+    out.xz = x1 - x0
+    out.yz = y1 - y0
+    out.z = v1 - v0
+    out.xy = xy0 + f[2] * out.xyz
+    out.x = x0 + f[2] * out.xz
+    out.y = y0 + f[2] * out.yz
+    out.value = v0 + f[2] * out.z
+    return out
 
 
 @wp.func
-def corner_sign(corner: int) -> float:
-    """Third mixed derivative (xyz) of :func:`corner_weight`, per cell, cell and cell."""
-    return wp.where((((corner >> 2) + (corner >> 1) + corner) & 1) == 0, -1.0, 1.0)
+def field_beside(field: Field, d: wp.vec3) -> wp.vec3:
+    """Value of a field ``d`` away from the point that it is about, in cells."""
+    plane = field.value + d[0] * field.x + d[1] * (field.y + d[0] * field.xy)
+    return plane + d[2] * (field.z + d[0] * field.xz + d[1] * (field.yz + d[0] * field.xyz))
 
 
 @wp.func

@@ -17,6 +17,7 @@ import numpy.typing as npt
 import trimesh
 import warp as wp
 
+from splatsoil.deterministic import wanted
 from splatsoil.errors import SimulationError
 from splatsoil.mpm.grid import GridShape
 from splatsoil.mpm.presets import Resolution
@@ -142,6 +143,9 @@ class Solver:
         )
         self._start(x, base)
         self._met = False
+        # what sorts its sums counts them on the host in between
+        self._replays = device != "cpu" and not wanted()
+        self._graphs: dict[tuple[bool, float, int, float], wp.Graph | None] = {}
         self.frame = 0
 
     def _refuse_unseen(self, obstacles: npt.NDArray[np.float64]) -> None:
@@ -191,7 +195,8 @@ class Solver:
         c = Cells()
         c.slot, c.node, c.count = ints(count), ints(most), ints(1)
         c.volume, c.elastic, c.opening = floats(most), floats(most), floats(most)
-        c.normal, c.shear, c.gradient = vectors(most), vectors(most), vectors(8 * most)
+        c.normal, c.shear, c.middle, c.spread = (vectors(most) for _ in range(4))
+        c.gradient = vectors(8 * most)
         kept = most if self.law.history else 0
         c.history, c.depth = wp.zeros(kept, dtype=wp.vec2, device=device), floats(kept)
         self._cells = c
@@ -269,6 +274,28 @@ class Solver:
         return self._force.numpy().astype(np.float64)
 
     def _step(self, pose: Pose | None, step_time: float, substeps: int, share: float) -> None:
+        """One exchange between particles and grid, and the substeps that follow.
+
+        A GPU waits for launches longer than it works on them: what the second such step launches is kept as a graph,
+        and the ones after it are launched whole.
+        """
+        if pose is not None:
+            self._pose.assign(pose.row().astype(np.float32))
+        step = (pose is not None, step_time, substeps, share)
+        if not self._replays:
+            self._launch_step(*step)
+            return
+        if step not in self._graphs:
+            self._graphs[step] = None
+            self._launch_step(*step)
+            return
+        if self._graphs[step] is None:
+            with wp.ScopedCapture(device=self.device) as captured:
+                self._launch_step(*step)
+            self._graphs[step] = captured.graph
+        wp.capture_launch(self._graphs[step])
+
+    def _launch_step(self, with_tool: bool, step_time: float, substeps: int, share: float) -> None:
         p, c, g, grid, device = self._particles, self._cells, self._nodes, self.grid, self.device
         r = self.resolution
         dt = step_time / substeps
@@ -293,7 +320,7 @@ class Solver:
             device=device,
             record_cmd=True,
         )
-        contact = None if pose is None else self._contact(pose, dt, share)
+        contact = self._contact(dt, share) if with_tool else None
         exchanges = step_time * (r.relaxation or 1.0 / step_time)
         keep, release = hourglass_share(exchanges), 1.0 - math.exp(-CONTACT_RELEASE * exchanges)
         move = wp.launch(move_nodes, dim=nodes, inputs=[g, grid, dt, self._table], device=device, record_cmd=True)
@@ -312,11 +339,10 @@ class Solver:
             device=device,
         )
 
-    def _contact(self, pose: Pose, dt: float, share: float) -> wp.Launch:
+    def _contact(self, dt: float, share: float) -> wp.Launch:
         """Find the particles near the tool, and make ready the launch of what runs in every substep."""
         p, device, reach = self._particles, self.device, self.resolution.cell
         n = p.position.shape[0]
-        self._pose.assign(pose.row().astype(np.float32))
         near = [self.tool, self._pose, reach, self._near, self._near_count]
         wp.launch(find_gaps, dim=n, inputs=[p, *near], device=device)
         if not self._met:

@@ -90,6 +90,8 @@ class Cells:
         node: lowest node of each active cell.
         count: how many are active.
         volume: soil in the cell, m^3.
+        middle: of its soil, in local coordinates; times ``volume`` until all of it is counted, like ``spread``.
+        spread: mean products yz, xz and xy of these.
         gradient: mean gradient of the eight corners' weights over the cell's soil, 1/m; entry 8 * cell + corner.
         normal: deviatoric stress, diagonal, Pa.
         shear: deviatoric stress, off-diagonal, Pa.
@@ -103,6 +105,8 @@ class Cells:
     node: wp.array(dtype=int)
     count: wp.array(dtype=int)
     volume: wp.array(dtype=float)
+    middle: wp.array(dtype=wp.vec3)
+    spread: wp.array(dtype=wp.vec3)
     gradient: wp.array(dtype=wp.vec3)
     normal: wp.array(dtype=wp.vec3)
     shear: wp.array(dtype=wp.vec3)

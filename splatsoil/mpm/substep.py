@@ -7,6 +7,7 @@ from typing import Any
 
 import warp as wp
 
+from splatsoil.mpm.compiler import OPTIONS
 from splatsoil.mpm.grid import Grid, base_node, cell_of, corner_offset, corner_weight, local_coordinates
 from splatsoil.mpm.state import Cells, Nodes, Particles
 from splatsoil.mpm.tool import Tool, signed_distance, tool_position, tool_rotation, tool_velocity
@@ -20,6 +21,8 @@ from splatsoil.soil.law import (
     WALL_FRICTION,
     Stress,
 )
+
+wp.set_module_options(OPTIONS)
 
 # Of a particle's spacing: soil that slides along the tool chatters on the contact spring, and clings all the while.
 ADHESION_REACH = wp.constant(0.05)
@@ -35,7 +38,7 @@ def make_stress_kernel(update: Any, history: bool) -> Any:
     cell that each held their volume would lock and make the soil too strong, the more so the stiffer it is.
     """
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", module_options=OPTIONS, enable_backward=False)
     def stress_forces(
         cells: Cells,
         nodes: Nodes,

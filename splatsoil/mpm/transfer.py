@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import warp as wp
 
+from splatsoil.mpm.compiler import OPTIONS
 from splatsoil.mpm.grid import (
+    Field,
     Grid,
     base_node,
     cell_of,
-    corner_gradient,
     corner_offset,
-    corner_sign,
-    corner_twist,
     corner_weight,
+    field_at,
+    field_beside,
     local_coordinates,
 )
 from splatsoil.mpm.state import Cells, Nodes, Particles
 from splatsoil.mpm.tool import FAR, Tool, distance_normal, signed_distance, tool_position, tool_rotation
+
+wp.set_module_options(OPTIONS)
 
 RUNAWAY = wp.constant(1.0e3)
 """Most that the visual deformation's norm comes to between two frames."""
@@ -54,8 +57,8 @@ def number_cells(cells: Cells) -> None:
         if entry < cells.history.shape[0]:
             cells.history[entry] = wp.vec2(0.0)
             cells.depth[entry] = 0.0
-        for corner in range(8):
-            cells.gradient[8 * entry + corner] = wp.vec3(0.0)
+        cells.middle[entry] = wp.vec3(0.0)
+        cells.spread[entry] = wp.vec3(0.0)
 
 
 @wp.kernel(enable_backward=False)
@@ -81,20 +84,49 @@ def particles_to_grid(particles: Particles, cells: Cells, nodes: Nodes, grid: Gr
     if p < particles.history.shape[0]:
         wp.atomic_add(cells.history, entry, volume * particles.history[p])
         wp.atomic_add(cells.depth, entry, volume * particles.depth[p])
-    v = particles.velocity[p]
+    wp.atomic_add(cells.middle, entry, volume * f)
+    wp.atomic_add(cells.spread, entry, volume * wp.vec3(f[1] * f[2], f[0] * f[2], f[0] * f[1]))
     affine = particles.affine[p]
     bilinear = particles.bilinear[p]
-    trilinear = particles.trilinear[p]
+    field = Field()
+    field.value = particles.velocity[p]
+    field.x = grid.cell[0] * wp.vec3(affine[0, 0], affine[1, 0], affine[2, 0])
+    field.y = grid.cell[1] * wp.vec3(affine[0, 1], affine[1, 1], affine[2, 1])
+    field.z = grid.cell[2] * wp.vec3(affine[0, 2], affine[1, 2], affine[2, 2])
+    field.yz = wp.vec3(bilinear[0, 0], bilinear[1, 0], bilinear[2, 0])
+    field.xz = wp.vec3(bilinear[0, 1], bilinear[1, 1], bilinear[2, 1])
+    field.xy = wp.vec3(bilinear[0, 2], bilinear[1, 2], bilinear[2, 2])
+    field.xyz = particles.trilinear[p]
     mass = particles.mass * particles.density[p]
     for corner in range(8):
         node = base + corner_offset(grid, corner)
         weight = mass * corner_weight(f, corner)
         offset = wp.vec3(float(corner >> 2), float((corner >> 1) & 1), float(corner & 1)) - f
         wp.atomic_add(nodes.mass, node, weight)
-        mixed = wp.vec3(offset[1] * offset[2], offset[0] * offset[2], offset[0] * offset[1])
-        there = v + affine * wp.cw_mul(offset, grid.cell) + bilinear * mixed + (offset[0] * mixed[0]) * trilinear
-        wp.atomic_add(nodes.velocity, node, weight * there)
-        wp.atomic_add(cells.gradient, 8 * entry + corner, volume * corner_gradient(f, corner, grid.inverse))
+        wp.atomic_add(nodes.velocity, node, weight * field_beside(field, offset))
+
+
+@wp.func
+def mean_gradient(middle: wp.vec3, spread: wp.vec3, corner: int, inverse: wp.vec3) -> wp.vec3:
+    """Mean gradient in 1/m of a corner's trilinear weight over soil whose local coordinates have the means ``middle``
+    and whose products yz, xz and xy have the means ``spread``."""
+    x, y, z = corner >> 2, (corner >> 1) & 1, corner & 1
+    gradient = wp.vec3(
+        mean_weight(middle[1], middle[2], spread[0], y, z),
+        mean_weight(middle[0], middle[2], spread[1], x, z),
+        mean_weight(middle[0], middle[1], spread[2], x, y),
+    )
+    side = wp.vec3(2.0 * float(x) - 1.0, 2.0 * float(y) - 1.0, 2.0 * float(z) - 1.0)
+    return wp.cw_mul(wp.cw_mul(side, inverse), gradient)
+
+
+@wp.func
+def mean_weight(a: float, b: float, both: float, upper_a: int, upper_b: int) -> float:
+    """Mean of a face's bilinear weight at one of its corners."""
+    # of b alone, given the side along a: a b or (1 - a) b, and what is left of a or 1 - a
+    whole = wp.where(upper_a == 1, a, 1.0 - a)
+    above = wp.where(upper_a == 1, both, b - both)
+    return wp.where(upper_b == 1, above, whole - above)
 
 
 @wp.kernel(enable_backward=False)
@@ -115,8 +147,10 @@ def average_cells(cells: Cells, nodes: Nodes, grid: Grid, stiffness: float) -> N
         if entry < cells.history.shape[0]:
             cells.history[entry] = share * cells.history[entry]
             cells.depth[entry] = share * cells.depth[entry]
+        middle = share * cells.middle[entry]
+        spread = share * cells.spread[entry]
         for corner in range(8):
-            gradient = share * cells.gradient[8 * entry + corner]
+            gradient = mean_gradient(middle, spread, corner, grid.inverse)
             cells.gradient[8 * entry + corner] = gradient
             node = cells.node[entry] + corner_offset(grid, corner)
             wp.atomic_add(nodes.inertia, node, stiffness * volume * wp.length_sq(gradient))
@@ -192,26 +226,14 @@ def grid_to_particles(
     f = local_coordinates(grid, x, cell_of(grid, x))
     entry = particles.cell[p]
     base = cells.node[entry]
-    velocity = wp.vec3(0.0)
-    displacement = wp.vec3(0.0)
-    affine = wp.mat33(0.0)
-    stretch = wp.mat33(0.0)
-    bilinear = wp.mat33(0.0)
-    trilinear = wp.vec3(0.0)
-    for corner in range(8):
-        node = base + corner_offset(grid, corner)
-        weight = corner_weight(f, corner)
-        gradient = corner_gradient(f, corner, grid.inverse)
-        bilinear += wp.outer(nodes.velocity[node], corner_twist(f, corner))
-        trilinear += corner_sign(corner) * nodes.velocity[node]
-        velocity += weight * nodes.velocity[node]
-        displacement += weight * nodes.displacement[node]
-        affine += wp.outer(nodes.velocity[node], gradient)
-        stretch += wp.outer(nodes.displacement[node], gradient)
-    particles.velocity[p] = velocity
-    particles.affine[p] = affine
-    particles.bilinear[p] = keep * bilinear
-    particles.trilinear[p] = keep * trilinear
+    velocity = field_at(nodes.velocity, grid, base, f)
+    moved = field_at(nodes.displacement, grid, base, f)
+    inverse = grid.inverse
+    particles.velocity[p] = velocity.value
+    particles.affine[p] = wp.matrix_from_cols(inverse[0] * velocity.x, inverse[1] * velocity.y, inverse[2] * velocity.z)
+    particles.bilinear[p] = keep * wp.matrix_from_cols(velocity.yz, velocity.xz, velocity.xy)
+    particles.trilinear[p] = keep * velocity.xyz
+    stretch = wp.matrix_from_cols(inverse[0] * moved.x, inverse[1] * moved.y, inverse[2] * moved.z)
     # bounded when a frame is recorded; what tumbles freely until then must not outgrow single precision
     grown = particles.deformation[p] + stretch * particles.deformation[p]
     particles.deformation[p] = grown * wp.min(1.0, RUNAWAY / wp.sqrt(wp.ddot(grown, grown)))
@@ -224,12 +246,9 @@ def grid_to_particles(
 
     # the midpoint rule: with the displacement where it starts, turning soil would swell and shearing soil shrink
     # (within the particle's cell, beyond which its field is another)
-    half = f + 0.5 * wp.cw_mul(displacement, grid.inverse)
+    half = f + 0.5 * wp.cw_mul(moved.value, inverse)
     half = wp.vec3(wp.clamp(half[0], 0.0, 1.0), wp.clamp(half[1], 0.0, 1.0), wp.clamp(half[2], 0.0, 1.0))
-    displacement = wp.vec3(0.0)
-    for corner in range(8):
-        displacement += corner_weight(half, corner) * nodes.displacement[base + corner_offset(grid, corner)]
-    x += displacement
+    x += field_beside(moved, half - f)
     gap = particles.gap[p]
     if gap < 0.0 and gap > -FAR:
         out = -wp.min(release * gap, gap + deepest)
@@ -246,7 +265,7 @@ def grid_to_particles(
     )
     margin = 1.0e-3 * grid.cell
     # comparisons with NaN are false: "not slower" catches a broken state as well as a runaway
-    if not wp.length(velocity) < limit:
+    if not wp.length(velocity.value) < limit:
         wp.atomic_add(broken, 0, 1)
         x = particles.position[p]
     elif x[2] > ceiling:
@@ -267,9 +286,15 @@ def grid_to_particles(
 def bound_stretch(particles: Particles, least: float, most: float) -> None:
     """Clamp the singular values of the visual deformation, so that flowing sand does not become needles."""
     p = wp.tid()
-    u = wp.mat33()
-    sigma = wp.vec3()
-    v = wp.mat33()
-    wp.svd3(particles.deformation[p], u, sigma, v)
-    sigma = wp.vec3(wp.clamp(sigma[0], least, most), wp.clamp(sigma[1], least, most), wp.clamp(sigma[2], least, most))
-    particles.deformation[p] = u * wp.diag(sigma) * wp.transpose(v)
+    grown = particles.deformation[p]
+    # With the squares' sum q, none is above sqrt(q), nor below det / (q / 2): most soil needs no decomposition.
+    square = wp.ddot(grown, grown)
+    if square > most * most or wp.determinant(grown) < 0.5 * least * square:
+        u = wp.mat33()
+        sigma = wp.vec3()
+        v = wp.mat33()
+        wp.svd3(grown, u, sigma, v)
+        sigma = wp.vec3(
+            wp.clamp(sigma[0], least, most), wp.clamp(sigma[1], least, most), wp.clamp(sigma[2], least, most)
+        )
+        particles.deformation[p] = u * wp.diag(sigma) * wp.transpose(v)

@@ -16,6 +16,7 @@ from splatsoil.scene import kernels
 from splatsoil.scene.light import SUN_SOFTNESS, Light
 from splatsoil.scene.relief import Relief, grid_of
 from splatsoil.scene.sky import light_from_slopes, sky_openness
+from splatsoil.splats.steps import Steps, stepwise
 from splatsoil.splats.warp_torch import as_warp, launch, upload
 
 FloatArray = npt.NDArray[np.float64]
@@ -57,7 +58,10 @@ class LitRelief:
         return ambient * sky + (1.0 - ambient) * direct + self.relief.sample(self.bounced, points)
 
 
-def light_relief(relief: Relief, light: Light, tool: Any, tool_colour: npt.ArrayLike = (0.0, 0.0, 0.0)) -> LitRelief:
+@stepwise
+def light_relief(
+    relief: Relief, light: Light, tool: Any, tool_colour: npt.ArrayLike = (0.0, 0.0, 0.0)
+) -> Steps[LitRelief]:
     """Work out what of sky and sun reaches each cell of a surface.
 
     Args:
@@ -66,19 +70,22 @@ def light_relief(relief: Relief, light: Light, tool: Any, tool_colour: npt.Array
         tool: a pose from `ToolBody.at` or `ToolBody.absent`.
         tool_colour: (3,) linear colour of the tool in level ground's light.
     """
+    if "range" not in vars(relief):
+        yield from relief.ranged()
     visible = torch.empty_like(relief.height)
     inputs = [as_warp(relief.height, wp.float32), grid_of(relief), light.kernel_form()]
     inputs += [march_step(relief), ceiling(relief), as_warp(visible, wp.float32)]
     launch(kernels.sun_visibility, tuple(visible.shape), inputs, visible)
-    openness, hidden = sky_openness(relief, tool)
+    openness, hidden = yield from sky_openness.steps(relief, tool)
     dark = LitRelief(relief, light, tool, openness, visible, relief.height.new_zeros((*relief.height.shape, 3)))
-    return LitRelief(relief, light, tool, openness, visible, _bounced(dark, hidden, light.reflectance(tool_colour)))
+    bounced = yield from _bounced(dark, hidden, light.reflectance(tool_colour))
+    return LitRelief(relief, light, tool, openness, visible, bounced)
 
 
-def _bounced(lit: LitRelief, hidden: Tensor, tool_reflectance: FloatArray) -> Tensor:
+def _bounced(lit: LitRelief, hidden: Tensor, tool_reflectance: FloatArray) -> Steps[Tensor]:
     """Light (ny, nx, 3) that comes from the soil around each cell and from the tool, instead of sky."""
     relief = lit.relief
-    rough = _coarser(relief)
+    rough = yield from _coarser(relief).ranged()
     points = rough.points.reshape(-1, 3)
     first = lit.irradiance(points, 0.5 * rough.cell[0]).T.reshape(3, *rough.height.shape)
     ground = _row(lit.light.reflectance(lit.light.level), relief)[:, None, None]

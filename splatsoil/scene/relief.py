@@ -20,6 +20,7 @@ import warp as wp
 from torch import Tensor
 
 from splatsoil.scene import kernels
+from splatsoil.splats.steps import Steps, finished, stepwise
 from splatsoil.splats.warp_torch import as_warp, launch
 
 FloatArray = npt.NDArray[np.float64]
@@ -66,9 +67,17 @@ class Relief:
 
     @cached_property
     def range(self) -> tuple[float, float]:
-        """Lowest and highest height, m; asked for once, because a GPU that tells a number makes the host wait."""
-        low, high = torch.stack(torch.aminmax(self.height)).tolist()
+        """Lowest and highest height, m."""
+        return finished(self._range())
+
+    def _range(self) -> Steps[tuple[float, float]]:
+        low, high = yield torch.stack(torch.aminmax(self.height))
         return low, high
+
+    def ranged(self) -> Steps[Relief]:
+        """This, with its range known."""
+        self.__dict__["range"] = yield from self._range()
+        return self
 
     @property
     def points(self) -> Tensor:
@@ -132,6 +141,7 @@ def grid_of(relief: Relief) -> Any:
     return grid
 
 
+@stepwise
 def relief_of_particles(
     positions: Tensor,
     spacing: float,
@@ -139,7 +149,7 @@ def relief_of_particles(
     upper: npt.ArrayLike,
     *,
     smoothing: float = SMOOTHING,
-) -> Relief:
+) -> Steps[Relief]:
     """The surface of a bed of particles.
 
     Args:
@@ -154,7 +164,8 @@ def relief_of_particles(
         particle is.
     """
     low, high = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
-    top = max(float(high[2]), float(positions[:, 2].max()) if len(positions) else 0.0) + 3.0 * spacing
+    (highest,) = (yield positions[:, 2].max()) if len(positions) else (0.0,)
+    top = max(float(high[2]), highest) + 3.0 * spacing
     extent = np.array([high[0] - low[0], high[1] - low[1], top - low[2]])
     count = np.maximum(np.round(extent / (_COARSE * spacing)).astype(int), 4)
     cell = extent / count
@@ -169,7 +180,8 @@ def relief_of_particles(
     fine = functional.interpolate(layers, scale_factor=2, mode="bicubic", align_corners=False)[0]
     height = _crossing(fine, 0.5) * float(cell[2]) + float(low[2])
     half = (float(cell[0]) / 2, float(cell[1]) / 2)
-    return Relief.of_heights(height, (float(low[0]) + half[0] / 2, float(low[1]) + half[1] / 2), half)
+    relief = Relief.of_heights(height, (float(low[0]) + half[0] / 2, float(low[1]) + half[1] / 2), half)
+    return (yield from relief.ranged())
 
 
 def _spread(positions: Tensor, low: FloatArray, cell: FloatArray, count: npt.NDArray[np.int64]) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -23,6 +24,7 @@ from splatsoil.scene.lit import LitRelief, ceiling, light_relief, march_step
 from splatsoil.scene.relief import SMOOTHING, Relief, grid_of, relief_of_particles
 from splatsoil.scene.tool import ToolBody, eye_of
 from splatsoil.splats import Gaussians, rasterise_features
+from splatsoil.splats.steps import Steps, finished, together
 from splatsoil.splats.warp_torch import as_warp, launch, launch_parts, thread_count, upload
 
 FloatArray = npt.NDArray[np.float64]
@@ -205,14 +207,24 @@ class Scene:
             deformations: (p, 3, 3) visual deformation since rest, or None.
             tool: rotation (3, 3) and position (3,) of the tool's frame, or None for no tool.
         """
+        return finished(self._posing(positions, deformations, tool))
+
+    def poses(self, moments: Iterable[tuple[Any, Any, Pose | None]]) -> list[Posed]:
+        """Everything moved, hidden and lit for several moments, by arguments of `pose`."""
+        return together([self._posing(*moment) for moment in moments])
+
+    def _posing(self, positions: Any, deformations: Any, tool: Pose | None) -> Steps[Posed]:
+        """Steps of `pose`."""
         x = upload(positions, self.device).contiguous()
         f = None if deformations is None else upload(deformations, self.device)
-        relief = relief_of_particles(x, self.spacing, self.bed.lower, self.bed.upper, smoothing=self.smoothing)
+        relief = yield from relief_of_particles.steps(
+            x, self.spacing, self.bed.lower, self.bed.upper, smoothing=self.smoothing
+        )
         placed = self.tool.absent() if tool is None else self.tool.at(*tool)
-        lit = light_relief(relief, self.light, placed, self.tool_albedo)
+        lit = yield from light_relief.steps(relief, self.light, placed, self.tool_albedo)
         centres, covariances = self.soil.carry(x, None if f is None else f.contiguous())
         # Numbers of what is drawn, not masks: a GPU makes the host wait for each mask that selects something.
-        shown, near = (mask.nonzero()[:, 0] for mask in self.shown(relief, centres, x))
+        shown, near = yield from _numbers_of(self.shown(relief, centres, x))
         grains = x[near]
         count = len(grains)
         around = self.surroundings
@@ -236,11 +248,15 @@ class Scene:
 
     def layers(self, posed: Posed, camera: Camera) -> Layers:
         """What a camera without distortion sees of a posed scene."""
+        return finished(self._layering(posed, camera))
+
+    def _layering(self, posed: Posed, camera: Camera) -> Steps[Layers]:
+        """Steps of `layers`."""
         view = upload(camera.world_to_camera, self.device)
         along = posed.centres @ view[2, :3] + view[2, 3]
         features = torch.cat([posed.features, along[:, None]], dim=1)
         behind = upload([*self.background, 0.0, 0.0], self.device)
-        drawn = rasterise_features(
+        drawn = yield from rasterise_features.steps(
             posed.centres, posed.covariances, posed.opacities, features, camera, background=behind, antialias=True
         )
         covered = drawn.alpha.clamp_min(1e-3)
@@ -250,7 +266,7 @@ class Scene:
         filled = drawn.image[..., :4] - (1.0 - drawn.alpha[..., None]) * behind[:4]
         seen = torch.where(ground[..., None], filled / covered[..., None], drawn.image[..., :4])
         colour, soil = seen[..., :3], seen[..., 3].contiguous()
-        unhidden = _tool_among_splats(posed, camera)
+        unhidden = yield from _tool_among_splats(posed, camera)
         light, tool = _illuminated(posed.lit, camera, depth, soil, unhidden, self.tool_albedo, _REACH * self.spacing)
         return Layers(colour, soil, depth, light, tool)
 
@@ -260,8 +276,17 @@ class Scene:
 
     def picture(self, posed: Posed, camera: Camera) -> FloatImage:
         """The picture (h, w, 3) float32 sRGB in [0, 1] of a posed scene; several cameras may share the posing."""
+        return self.pictures([(posed, camera)])[0]
+
+    def pictures(self, views: Iterable[tuple[Posed, Camera]]) -> list[FloatImage]:
+        """The `picture` of each posed scene by its camera."""
+
+        def seen(posed: Posed, camera: Camera) -> Steps[Tensor]:
+            return (yield from self._layering(posed, camera)).image
+
         with torch.no_grad():
-            return self.layers(posed, camera).image.cpu().numpy().astype(np.float32)
+            images = together([seen(*view) for view in views])
+            return [image.cpu().numpy().astype(np.float32) for image in images]
 
 
 def _settled(relief: Relief, centres: Tensor, shapes: Tensor, thickness: Tensor) -> tuple[Tensor, Tensor]:
@@ -294,7 +319,16 @@ def _grain_shapes(relief: Relief, grains: Tensor, spacing: float) -> Tensor:
     return torch.where(buried[:, None, None], round_, flat).contiguous()
 
 
-def _tool_among_splats(posed: Posed, camera: Camera) -> Tensor:
+def _numbers_of(masks: Sequence[Tensor]) -> Steps[list[Tensor]]:
+    """Where each mask (n,) holds."""
+    if not masks[0].is_cuda:
+        return [mask.nonzero()[:, 0] for mask in masks]
+    counts = yield torch.stack([mask.sum() for mask in masks])
+    # where they hold first, in order: to select by a mask is to ask how often it holds once more
+    return [(~m).to(torch.uint8).argsort(stable=True)[: int(c)] for m, c in zip(masks, counts, strict=True)]
+
+
+def _tool_among_splats(posed: Posed, camera: Camera) -> Steps[Tensor]:
     """(h, w) how much of the tool the particles before it leave to be seen, where it is; drawn only around it.
 
     Only particles count, which no tool lets through; what they carry may poke through a thin blade.
@@ -319,7 +353,7 @@ def _tool_among_splats(posed: Posed, camera: Camera) -> Tensor:
     )
     mark = torch.zeros((len(parts[0]), 1), device=out.device)
     mark[-len(centres) :] = 1.0
-    drawn = rasterise_features(*parts, mark, camera.cropped(x0, y0, width, height), antialias=True)
+    drawn = yield from rasterise_features.steps(*parts, mark, camera.cropped(x0, y0, width, height), antialias=True)
     out[y0 : y0 + height, x0 : x0 + width] = (drawn.image[..., 0] / TOOL_OPACITY).clamp_max(1.0)
     return out
 

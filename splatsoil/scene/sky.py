@@ -15,6 +15,7 @@ from torch import Tensor
 from splatsoil.scene import kernels
 from splatsoil.scene.kernels_sky import WIDTH, light_of_slopes, sky_kernel
 from splatsoil.scene.relief import Relief, grid_of
+from splatsoil.splats.steps import Steps, stepwise
 from splatsoil.splats.warp_torch import as_warp, launch, upload
 
 FloatArray = npt.NDArray[np.float64]
@@ -29,7 +30,8 @@ _NOTHING = 1e6
 """A height beyond all others, m."""
 
 
-def sky_openness(relief: Relief, tool: Any) -> tuple[Tensor, Tensor]:
+@stepwise
+def sky_openness(relief: Relief, tool: Any) -> Steps[tuple[Tensor, Tensor]]:
     """What of a uniform sky reaches each cell, by the horizon in a dozen directions.
 
     Args:
@@ -44,7 +46,8 @@ def sky_openness(relief: Relief, tool: Any) -> tuple[Tensor, Tensor]:
     looks = _Looks.over(relief)
     scale = 2.0 / _AZIMUTHS
     total = _sum(relief, looks, None, 1)
-    if not bool((top > bottom).any()):
+    (covered,) = yield (top > bottom).any()
+    if not covered:
         return (scale * total).clamp(0.0, 1.0), torch.zeros_like(total)
     taken = _sum(relief, looks, (bottom, top), _STRIDE)
     hidden = _between(taken, _STRIDE, (total.shape[0], total.shape[1]))

@@ -104,10 +104,16 @@ def _stress_update(strength_of: Any, history: bool) -> Any:
         row: int,
     ) -> Stress:
         """Advance ``stress`` by ``dt`` under the velocity gradient; bulk and shear modulus in Pa."""
-        rate = 0.5 * (gradient + wp.transpose(gradient))
-        spin = 0.5 * (gradient - wp.transpose(gradient))
-        dilation = wp.trace(rate)
-        deviator = rate - (dilation / 3.0) * wp.identity(n=3, dtype=float)
+        dilation = wp.trace(gradient)
+        third = dilation / 3.0
+        # the deviator's rate, and the spin, by their six and three numbers: a cell's stress is most of what substeps do
+        rate = wp.vec3(gradient[0, 0] - third, gradient[1, 1] - third, gradient[2, 2] - third)
+        sheared = 0.5 * wp.vec3(
+            gradient[0, 1] + gradient[1, 0], gradient[0, 2] + gradient[2, 0], gradient[1, 2] + gradient[2, 1]
+        )
+        spin = 0.5 * wp.vec3(
+            gradient[0, 1] - gradient[1, 0], gradient[0, 2] - gradient[2, 0], gradient[1, 2] - gradient[2, 1]
+        )
 
         elastic = stress.elastic + dt * dilation
         opening = stress.opening
@@ -119,13 +125,20 @@ def _stress_update(strength_of: Any, history: bool) -> Any:
 
         d = stress.normal
         o = stress.shear
-        s = wp.mat33(d[0], o[0], o[1], o[0], d[1], o[2], o[1], o[2], d[2])
-        turned = spin * s
-        s = s + dt * (2.0 * shear * deviator + turned + wp.transpose(turned))
+        # spin * s and its transpose
+        xy, xz, yz = spin[0] * o[0], spin[1] * o[1], spin[2] * o[2]
+        turned = 2.0 * wp.vec3(xy + xz, yz - xy, -xz - yz)
+        twisted = wp.vec3(
+            spin[0] * (d[1] - d[0]) + spin[1] * o[2] + spin[2] * o[1],
+            spin[1] * (d[2] - d[0]) + spin[0] * o[2] - spin[2] * o[0],
+            spin[2] * (d[2] - d[1]) - spin[0] * o[1] - spin[1] * o[0],
+        )
+        normal = d + dt * (2.0 * shear * rate + turned)
+        tangent = o + dt * (2.0 * shear * sheared + twisted)
 
         state = SoilState()
         state.pressure = pressure
-        state.shear_rate = wp.sqrt(2.0 * wp.ddot(deviator, deviator))
+        state.shear_rate = wp.sqrt(2.0 * wp.dot(rate, rate) + 4.0 * wp.dot(sheared, sheared))
         state.opening = opening
         if wp.static(history):
             state.plastic_strain = stress.plastic_strain
@@ -139,7 +152,8 @@ def _stress_update(strength_of: Any, history: bool) -> Any:
             pressure = apex
         result = Stress()
         limit = wp.max(strength.intercept + strength.slope * pressure, 0.0)
-        measure = wp.sqrt(0.5 * wp.ddot(s, s))
+        measure = wp.sqrt(0.5 * wp.dot(normal, normal) + wp.dot(tangent, tangent))
+        kept = 1.0
         if wp.static(history):
             dilated = stress.dilated
             crush = strength.crush_pressure
@@ -164,15 +178,15 @@ def _stress_update(strength_of: Any, history: bool) -> Any:
                     opening = opening + elastic + apex / bulk
                     elastic = -apex / bulk
                 limit = wp.max(limit + (strength.viscosity / dt + strength.slope * gain * bulk) * slip, 0.0)
-                s = s * (limit / wp.max(measure, 1.0e-12))
+                kept = limit / wp.max(measure, 1.0e-12)
             result.plastic_strain = stress.plastic_strain + slip
             result.dilated = dilated
             result.depth = stress.depth
         else:
             if measure > limit:
-                s = s * (limit / wp.max(measure, 1.0e-12))
-        result.normal = wp.vec3(s[0, 0], s[1, 1], s[2, 2])
-        result.shear = wp.vec3(s[0, 1], s[0, 2], s[1, 2])
+                kept = limit / wp.max(measure, 1.0e-12)
+        result.normal = kept * normal
+        result.shear = kept * tangent
         result.elastic = elastic
         result.opening = opening
         return result

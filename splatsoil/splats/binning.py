@@ -18,6 +18,7 @@ from splatsoil.splats import constants, kernels_cpu
 from splatsoil.splats import kernels_binning as kernels
 from splatsoil.splats.camera import View
 from splatsoil.splats.projection import Projection
+from splatsoil.splats.steps import Steps, stepwise
 from splatsoil.splats.warp_torch import as_warp, launch
 
 
@@ -46,7 +47,8 @@ class Bins:
     entries: Tensor
 
 
-def bin_by_tile(projection: Projection, features: Tensor, view: View) -> Bins:
+@stepwise
+def bin_by_tile(projection: Projection, features: Tensor, view: View) -> Steps[Bins]:
     """Sort by depth, pack, list tiles, sort by tile; ``features`` is (n, k). Nothing here carries gradients."""
     tiles_x, tiles_y = -(-view.width // constants.TILE), -(-view.height // constants.TILE)
     order = _depth_order(projection)
@@ -64,8 +66,8 @@ def bin_by_tile(projection: Projection, features: Tensor, view: View) -> Bins:
     packed = as_warp(rows, wp.float32)
     launch(kernels.pack, count, [*inputs, tiles_x, tiles_y, packed, as_warp(ends, wp.int32)], features)
     ends = ends.cumsum(0, dtype=torch.int32)
-    total = int(ends[-1]) if count else 0
-    tiles = torch.empty(total, dtype=torch.int32, device=features.device)
+    (total,) = (yield ends[-1]) if count else (0,)
+    tiles = torch.empty(int(total), dtype=torch.int32, device=features.device)
     owners = torch.empty_like(tiles)
     lists = [as_warp(tiles, wp.int32), as_warp(owners, wp.int32)]
     launch(kernels.list_tiles, count, [packed, as_warp(ends, wp.int32), tiles_x, tiles_y, *lists], features)

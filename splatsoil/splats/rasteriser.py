@@ -17,6 +17,7 @@ from splatsoil.splats.binning import Bins, bin_by_tile
 from splatsoil.splats.camera import AnyCamera, View, view_of
 from splatsoil.splats.gaussians import Gaussians
 from splatsoil.splats.projection import Projection, covariances_of, project
+from splatsoil.splats.steps import Steps, finished, stepwise
 from splatsoil.splats.warp_torch import as_warp, launch, launch_parts, thread_count
 
 _ENTRIES_PER_MILLISECOND = 8000
@@ -113,6 +114,7 @@ def rasterise_covariances(
     return _draw(means, covariances, opacities, colours, normals, view_of(camera), background, antialias)
 
 
+@stepwise
 def rasterise_features(
     means: Tensor,
     covariances: Tensor,
@@ -122,11 +124,23 @@ def rasterise_features(
     *,
     background: Tensor | Sequence[float] | None = None,
     antialias: bool = False,
-) -> Features:
+) -> Steps[Features]:
     """Blend any features (n, k), 1 ≤ k ≤ 8, with the weights that colours would get; differentiable in every tensor."""
-    if background is None:
-        background = features.new_zeros(features.shape[1])
-    return _blend(means, covariances, opacities, features, view_of(camera), background, antialias)
+    if features.ndim != 2 or not 1 <= features.shape[1] <= constants.MAX_CHANNELS:
+        raise ParameterError(
+            f"features have shape {tuple(features.shape)}, expected (n, 1 to {constants.MAX_CHANNELS})"
+        )
+    view = view_of(camera)
+    projection = _projected(means, covariances, opacities, view, antialias)
+    behind = torch.as_tensor(
+        features.new_zeros(features.shape[1]) if background is None else background,
+        dtype=torch.float32,
+        device=means.device,
+    )
+    if behind.shape != features.shape[1:]:
+        raise ParameterError(f"background has shape {tuple(behind.shape)}, expected ({features.shape[1]},)")
+    image, alpha = yield from _composite(projection, features, view, behind)
+    return Features(image, alpha, projection)
 
 
 def _draw(
@@ -146,31 +160,10 @@ def _draw(
     if behind.shape != (3,):
         raise ParameterError(f"background has shape {tuple(behind.shape)}, expected (3,)")
     behind = torch.cat([behind, behind.new_zeros(1 if normals is None else 4)])
-    image, alpha = _composite(projection, torch.cat(parts, dim=1), view, behind)
+    image, alpha = finished(_composite(projection, torch.cat(parts, dim=1), view, behind))
     colour, weighted_depth, *rest = image.split([3, 1] if normals is None else [3, 1, 3], dim=2)
     depth = weighted_depth[:, :, 0] / alpha.clamp_min(1e-8)
     return Rendering(colour, alpha, depth, rest[0] if rest else None, projection)
-
-
-def _blend(
-    means: Tensor,
-    covariances: Tensor,
-    opacities: Tensor,
-    features: Tensor,
-    view: View,
-    background: Tensor | Sequence[float],
-    antialias: bool,
-) -> Features:
-    if features.ndim != 2 or not 1 <= features.shape[1] <= constants.MAX_CHANNELS:
-        raise ParameterError(
-            f"features have shape {tuple(features.shape)}, expected (n, 1 to {constants.MAX_CHANNELS})"
-        )
-    projection = _projected(means, covariances, opacities, view, antialias)
-    behind = torch.as_tensor(background, dtype=torch.float32, device=means.device)
-    if behind.shape != features.shape[1:]:
-        raise ParameterError(f"background has shape {tuple(behind.shape)}, expected ({features.shape[1]},)")
-    image, alpha = _composite(projection, features, view, behind)
-    return Features(image, alpha, projection)
 
 
 def _projected(means: Tensor, covariances: Tensor, opacities: Tensor, view: View, antialias: bool) -> Projection:
@@ -185,9 +178,12 @@ def _projected(means: Tensor, covariances: Tensor, opacities: Tensor, view: View
     return project(means, covariances, opacities, view, antialias)
 
 
-def _composite(projection: Projection, features: Tensor, view: View, background: Tensor) -> tuple[Tensor, Tensor]:
+def _composite(
+    projection: Projection, features: Tensor, view: View, background: Tensor
+) -> Steps[tuple[Tensor, Tensor]]:
     p = projection
-    image, transmittance = _Composite.apply(p.centres, p.conics, p.strengths, features, background, p, view)
+    bins = yield from bin_by_tile.steps(p, features, view)
+    image, transmittance = _Composite.apply(p.centres, p.conics, p.strengths, features, background, bins, view)
     return image, 1.0 - transmittance
 
 
@@ -202,10 +198,9 @@ class _Composite(torch.autograd.Function):
         strengths: Tensor,
         features: Tensor,
         background: Tensor,
-        projection: Projection,
+        bins: Bins,
         view: View,
     ) -> tuple[Tensor, Tensor]:
-        bins = bin_by_tile(projection, features, view)
         channels = features.shape[1]
         image = features.new_empty((view.height, view.width, channels))
         transmittance = features.new_empty((view.height, view.width))
