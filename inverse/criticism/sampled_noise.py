@@ -34,6 +34,8 @@ FEWEST_FREEDOM = 8.0
 """Least degrees of freedom of a part's variance: few samples scatter too little or too much by chance."""
 OUTLYING = 9.0
 """Variance over that of the middle one beyond which a sample of a law that all follow counts as no farther out."""
+SPARED = 0.1
+"""Share of sites that a correlation may do without, where they weren't seen at neighbouring times."""
 LEAST_BY_OTHERS = 1e-3
 """Share of a scale that is least believed of what the other samples give, where each may be of another kind."""
 
@@ -180,24 +182,18 @@ def _correlation(layout: Layout, scaled: FloatArray, seen: BoolArray) -> tuple[f
 
 @dataclass(frozen=True)
 class _Block:
-    """Neighbouring times at which the same sites were seen.
+    """Pairs of neighbouring times, at all of which the same sites were seen; or single times.
 
     Attributes:
         sites: (n,) their numbers.
-        gap: from one to the other, in steps.
-        pairs: (n, 2 m) the sums of m samples at the first times and at the second ones, then the differences; (n, m)
-            the samples where there is but one time.
+        gaps: (p,) from one to the other of each pair, in steps; empty where there is but one time.
+        pairs: (n, 2 p m) the sums of m samples at the first times and at the second ones, pair by pair, then the
+            differences; (n, m) the samples where there is but one time.
     """
 
     sites: npt.NDArray[np.intp]
-    gap: float
+    gaps: FloatArray
     pairs: FloatArray
-
-    @classmethod
-    def of(cls, sites: BoolArray, gap: float, before: FloatArray, after: FloatArray | None) -> _Block:
-        """Of samples (n, m) at the first and at the second times, if there are any."""
-        pairs = before if after is None else np.concatenate([before + after, before - after], axis=1)
-        return cls(np.flatnonzero(sites), gap, np.asfortranarray(pairs))
 
     def fit(self, whole: FloatArray, memory: float) -> tuple[float, float]:
         """χ² and logarithm of the determinant by a correlation (s, s) between sites."""
@@ -207,30 +203,43 @@ class _Block:
         logs = 2.0 * float(np.log(np.diag(lower)).sum())
         white, _ = dtrtrs(lower, self.pairs, lower=1)
         squares, count = np.einsum("nm,nm->m", white, white), self.pairs.shape[1]
-        if self.gap == 0.0:
+        if not len(self.gaps):
             return float(squares.sum()), logs * count
         # Sum and difference of two that are so correlated are independent.
-        link, half = memory**self.gap, count // 2
-        both = 0.5 * (squares[:half].sum() / (1.0 + link) + squares[half:].sum() / (1.0 - link))
-        return float(both), logs * count + 0.5 * self.pairs.size * math.log(1.0 - link**2)
+        links = memory**self.gaps
+        sums, differences = squares.reshape(2, len(links), -1).sum(axis=2)
+        both = 0.5 * float((sums / (1.0 + links) + differences / (1.0 - links)).sum())
+        share = self.pairs.size / (2.0 * len(links))
+        return both, logs * count + share * float(np.log(1.0 - links**2).sum())
 
 
 def _blocks(layout: Layout, scaled: FloatArray, seen: BoolArray) -> list[_Block]:
-    """Pairs of neighbouring times, those of the same sites together; or single times, where no two have any."""
-    gaps, found = np.diff(layout.steps), dict[tuple[float, bytes], list[int]]()
-    both = seen[:-1] & seen[1:]
+    """Pairs of neighbouring times, as far as the same sites were seen; or single times, where no two have any.
+
+    Pairs that follow each other go together where they have all but `SPARED` of their sites in common: each block
+    costs a decomposition, and the others of these sites say little more.
+    """
+    gaps, both = np.diff(layout.steps), seen[:-1] & seen[1:]
     alone = not both.any()
+    groups: list[tuple[BoolArray, list[int], int]] = []
     for t, sites in enumerate(seen if alone else both):
-        if sites.any():
-            found.setdefault((0.0 if alone else round(float(gaps[t]), 6), sites.tobytes()), []).append(t)
+        if not sites.any():
+            continue
+        shared, times, most = groups[-1] if groups else (sites, [], 0)
+        most = max(most, int(sites.sum()))
+        if times and np.count_nonzero(shared & sites) >= (1.0 - SPARED) * most:
+            groups[-1] = (shared & sites, [*times, t], most)
+        else:
+            groups.append((sites, [t], int(sites.sum())))
     out = []
-    for (gap, mask), times in found.items():
-        sites = np.frombuffer(mask, dtype=bool)
-        size = int(sites.sum())
+    for sites, times, _ in groups:
         first, second = (
-            scaled[:, np.array(times) + on][:, :, sites].reshape(-1, size).T for on in (0, 0 if alone else 1)
+            scaled[:, np.array(times) + on][:, :, sites].transpose(2, 1, 0).reshape(int(sites.sum()), -1)
+            for on in (0, 0 if alone else 1)
         )
-        out.append(_Block.of(sites, gap, first, None if alone else second))
+        pairs = first if alone else np.concatenate([first + second, first - second], axis=1)
+        apart = gaps[:0] if alone else gaps[times]
+        out.append(_Block(np.flatnonzero(sites), apart, np.asfortranarray(pairs)))
     return out
 
 

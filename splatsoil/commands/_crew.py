@@ -24,56 +24,77 @@ Replay = Callable[[Mapping[str, float]], "Future[None] | None"]
 """Has a helper make the replay control at these values; None where there is no helper."""
 
 
-@contextmanager
-def crew(
-    folder: RunFolder, experiment: PlowExperiment, effects: Iterable[str], simulate: Simulations
-) -> Iterator[Replay]:
-    """While the block runs, other processes simulate, too: one for every other core, as far as there is use for them.
+class Crew:
+    """Other processes that simulate, too: one for every other core, as far as there is use for them.
 
     All keep what they make in ``features/`` and find it there, and one that dies costs nothing but its help. On a CPU
-    each process keeps to one thread, this one too: the results are those of one process, bit for bit, and with more
-    they would wait for each other. A GPU is shared: each process makes simulations that are alike as one batch, as one
-    leaves most of it idle, and cores are shared out.
+    each process keeps to one thread, the first one too: the results are those of one process, bit for bit, and with
+    more they would wait for each other. A GPU is shared: each process makes simulations that are alike as one batch, as
+    one leaves most of it idle, and cores are shared out.
 
     Args:
-        folder: the run folder, locked by this process.
-        experiment: of the latest fit.
+        folder: the run folder.
+        device: where it is computed.
         effects: the candidates, as `experiment_of` takes them; none for all.
-        simulate: what is helped.
-
-    Yields:
-        What has a helper make the replay control, before what it is asked for later.
     """
-    from splatsoil.inverse.criticism.simulations import Helpers
-    from splatsoil.inverse.executors import Processes
-    from splatsoil.threads import at_most, cores
 
-    device = experiment.base.device
-    room = _memory(device) / SHARE[device.split(":")[0]]
-    count, named = int(min(cores(), 1 + MOST_HELPERS, room)) - 1, tuple(effects)
-    threads = 1 if device == "cpu" or count < 1 else max(1, cores() // (1 + count))
-    with at_most(threads):
-        if count < 1:
-            yield lambda values: None
-            return
-        workers = Processes(count)
+    def __init__(self, folder: RunFolder, device: str, effects: Iterable[str]) -> None:
+        from splatsoil.inverse.executors import Processes
+        from splatsoil.threads import cores
 
-        def submit(jobs: Sequence[Mapping[str, Any]]) -> Any:
-            return workers.submit(_simulate, folder.path, device, named, threads, [dict(job) for job in jobs])
+        room = _memory(device) / SHARE[device.split(":")[0]]
+        self.count = int(min(cores(), 1 + MOST_HELPERS, room)) - 1
+        self._threads = 1 if device == "cpu" or self.count < 1 else max(1, cores() // (1 + self.count))
+        self._place = (folder.path, device, tuple(effects), self._threads)
+        self._workers = Processes(self.count) if self.count > 0 else None
+        if self._workers is not None:
+            for _ in range(self.count):
+                self._workers.submit(_ready, *self._place)
 
-        def replay(values: Mapping[str, float]) -> Future[None]:
-            return workers.submit(_replay, folder.path, device, named, threads, dict(values))
+    def __enter__(self) -> Crew:
+        return self
 
-        try:
-            with simulate.helped(Helpers(count, submit, experiment.together, experiment.prepare)):
-                yield replay
-            workers.shutdown(cancel_futures=True)
-        except BaseException:
-            workers.kill()
-            raise
-        finally:
-            # a helper that was ended at the replay couldn't tidy up
-            rmtree(folder.path / "replay", ignore_errors=True)
+    def __exit__(self, *_: object) -> None:
+        """End those that never came to help."""
+        if self._workers is not None:
+            self._workers.kill()
+
+    @contextmanager
+    def helping(self, experiment: PlowExperiment, simulate: Simulations) -> Iterator[Replay]:
+        """While the block runs, where this process holds the folder's lock, they simulate.
+
+        Args:
+            experiment: of the latest fit.
+            simulate: what is helped.
+
+        Yields:
+            What has a helper make the replay control, before what it is asked for later.
+        """
+        from splatsoil.inverse.criticism.simulations import Helpers
+        from splatsoil.threads import at_most
+
+        workers, self._workers = self._workers, None
+        with at_most(self._threads):
+            if workers is None:
+                yield lambda values: None
+                return
+
+            def submit(job: Callable[..., None], *more: object) -> Future[None]:
+                return workers.submit(job, *self._place, *more)
+
+            def together(jobs: Sequence[Mapping[str, Any]]) -> Future[None]:
+                return submit(_simulate, [dict(job) for job in jobs])
+
+            try:
+                with simulate.helped(Helpers(self.count, together, experiment.together, experiment.prepare)):
+                    yield lambda values: submit(_replay, dict(values))
+                workers.shutdown(cancel_futures=True)
+            except BaseException:
+                workers.kill()
+                raise
+            finally:
+                # a helper that was ended at the replay couldn't tidy up
+                rmtree(self._place[0] / "replay", ignore_errors=True)
 
 
 def _memory(device: str) -> float:
@@ -91,6 +112,20 @@ def _memory(device: str) -> float:
 
 
 _known: dict[tuple[Path, str, tuple[str, ...]], tuple[RunFolder, PlowExperiment, Simulations]] = {}
+
+
+def _ready(path: Path, device: str, effects: tuple[str, ...], threads: int) -> None:
+    """A helper's work: to load what takes seconds, before it is needed."""
+    import signal
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process ends this one
+    with _quietly(threads):
+        import torch
+
+        from splatsoil.commands import _control, _criticism  # noqa: F401
+        from splatsoil.experiment import plow  # noqa: F401
+
+        torch.zeros(1, device=device)
 
 
 def _simulate(

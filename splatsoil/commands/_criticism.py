@@ -11,6 +11,7 @@ from splatsoil.errors import ParameterError, RunError
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from splatsoil.commands._crew import Crew
     from splatsoil.commands._progress import Report
     from splatsoil.experiment.plow import PlowExperiment
     from splatsoil.inverse.criticism.diagnosis import Options
@@ -84,11 +85,17 @@ def diagnosed(
     effects: Iterable[str] = (),
     *,
     with_replay: bool = True,
+    crew: Crew | None = None,
 ) -> dict[str, Any]:
-    """Diagnose the latest fit; the result is ``diagnosis.json`` and, by model, ``diagnoses/NAME.json``."""
+    """Diagnose the latest fit; the result is ``diagnosis.json`` and, by model, ``diagnoses/NAME.json``.
+
+    ``crew`` are processes for these effects that are there already.
+    """
+    from contextlib import nullcontext
+
     from splatsoil import __version__
     from splatsoil.commands._control import calibrated, control, judged_by
-    from splatsoil.commands._crew import crew
+    from splatsoil.commands._crew import Crew
     from splatsoil.files import write_json
     from splatsoil.inverse.criticism.diagnosis import diagnose
     from splatsoil.inverse.criticism.evidence import gather
@@ -115,7 +122,8 @@ def diagnosed(
 
     simulate.told = starting
     values = estimates(fit)
-    with folder.lock(), crew(folder, experiment, effects, simulate) as helper:
+    team = Crew(folder, model.device, effects) if crew is None else nullcontext(crew)
+    with folder.lock(), team as mine, mine.helping(experiment, simulate) as helper:
         replays = control(folder, experiment, simulate, values, helper, say) if with_replay else None
         simulate.ahead(lambda ask: gather(experiment, ask, values, repeats=options.repeats))
         say("where soil plays no part")
@@ -153,7 +161,7 @@ def misfit(
     from dataclasses import replace
 
     from splatsoil.commands._control import control
-    from splatsoil.commands._crew import crew
+    from splatsoil.commands._crew import Crew
     from splatsoil.files import plain, write_json
     from splatsoil.inverse.criticism.diagnosis import judge
     from splatsoil.inverse.criticism.evidence import gather
@@ -163,7 +171,7 @@ def misfit(
     fit = folder.fit()
     experiment, simulate = experiment_of(folder, model, ())
     values = estimates(fit)
-    with folder.lock(), crew(folder, experiment, (), simulate) as helper:
+    with folder.lock(), Crew(folder, model.device, ()) as crew, crew.helping(experiment, simulate) as helper:
         replays = (
             control(folder, experiment, simulate, values, helper, lambda what: report(what, 0.0))
             if with_replay
@@ -190,7 +198,7 @@ def confirmed(folder: RunFolder, model: Model, name: str, options: Options, repo
     from dataclasses import replace
 
     from splatsoil.commands._control import calibrated, control
-    from splatsoil.commands._crew import crew
+    from splatsoil.commands._crew import Crew
     from splatsoil.files import plain
     from splatsoil.inverse.criticism.confirmation import confirm
     from splatsoil.inverse.criticism.evidence import gather
@@ -202,7 +210,7 @@ def confirmed(folder: RunFolder, model: Model, name: str, options: Options, repo
     experiment, simulate = experiment_of(folder, model, (name,))
     (effect,) = (candidate.name for candidate in experiment.candidates)
     values = estimates(folder.fit())
-    with folder.lock(), crew(folder, experiment, (name,), simulate) as helper:
+    with folder.lock(), Crew(folder, model.device, (name,)) as crew, crew.helping(experiment, simulate) as helper:
         replays = control(folder, experiment, simulate, values, helper, lambda what: report(what, 0.0))
         simulate.ahead(lambda ask: gather(experiment, ask, values, repeats=options.repeats))
         evidence = gather(

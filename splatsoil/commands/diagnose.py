@@ -44,6 +44,7 @@ def run(config: Config) -> int:
     """Diagnose; the result goes into the run folder."""
     from splatsoil.commands import _criticism as criticism
     from splatsoil.commands import _stages as stage
+    from splatsoil.commands._crew import Crew
     from splatsoil.commands._diagnosis_table import show
     from splatsoil.commands._progress import stages
     from splatsoil.envs.devices import resolve_device
@@ -61,9 +62,11 @@ def run(config: Config) -> int:
     folder.check_writable()
     device = resolve_device(config.device)
     stage.note_other_sources(folder)
-    with stages(quiet=config.json) as begin:
+    with Crew(folder, device, config.effects) as crew, stages(quiet=config.json) as begin:
         model = criticism.model_of(folder, device, begin("reconstruct"))
-        result = criticism.diagnosed(folder, model, options, begin, config.effects, with_replay=config.replay)
+        result = criticism.diagnosed(
+            folder, model, options, begin, config.effects, with_replay=config.replay, crew=crew
+        )
     if config.json:
         print_json({"ok": True, "run": str(folder.path), **_finite(result)})
     else:

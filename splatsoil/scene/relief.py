@@ -19,9 +19,9 @@ import torch.nn.functional as functional
 import warp as wp
 from torch import Tensor
 
-from splatsoil.scene import kernels
+from splatsoil.scene import kernels, kernels_relief
 from splatsoil.splats.steps import Steps, finished, stepwise
-from splatsoil.splats.warp_torch import as_warp, launch
+from splatsoil.splats.warp_torch import as_warp, launch, upload
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -56,9 +56,10 @@ class Relief:
     def of_heights(cls, height: Tensor, origin: tuple[float, float], cell: tuple[float, float]) -> Relief:
         """A relief with the normals of its heights (central differences)."""
         height = height.to(torch.float32).contiguous()
-        along_y, along_x = torch.gradient(height, spacing=[float(cell[1]), float(cell[0])])
-        normal = functional.normalize(torch.stack([-along_x, -along_y, torch.ones_like(height)], dim=-1), dim=-1)
-        return cls(height, normal.contiguous(), origin, cell)
+        normal = height.new_empty((*height.shape, 3))
+        inputs = [as_warp(height, wp.float32), float(cell[0]), float(cell[1]), as_warp(normal, wp.vec3)]
+        launch(kernels_relief.normals, tuple(height.shape), inputs, height)
+        return cls(height, normal, origin, cell)
 
     @property
     def device(self) -> torch.device:
@@ -98,16 +99,11 @@ class Relief:
         Returns:
             (n,) or (n, k).
         """
-        ny, nx = self.height.shape
-        column = ((xy[:, 0] - self.origin[0]) / self.cell[0]).clamp(0.0, nx - 1.0)
-        row = ((xy[:, 1] - self.origin[1]) / self.cell[1]).clamp(0.0, ny - 1.0)
-        i, j = row.floor().long().clamp_max(ny - 2), column.floor().long().clamp_max(nx - 2)
-        u, v = row - i, column - j
-        if values.ndim == 3:
-            u, v = u[:, None], v[:, None]
-        low = values[i, j] * (1 - v) + values[i, j + 1] * v
-        high = values[i + 1, j] * (1 - v) + values[i + 1, j + 1] * v
-        return low * (1 - u) + high * u
+        out = values.new_empty((len(xy), *values.shape[2:]))
+        inputs = [as_warp(m, wp.float32) for m in (values.reshape(*values.shape[:2], -1), xy)]
+        inputs += [wp.vec2(*self.origin), wp.vec2(*self.cell), as_warp(out.reshape(len(xy), -1), wp.float32)]
+        launch(kernels_relief.sample, len(xy), inputs, values)
+        return out
 
     def depth_below(self, points: Tensor) -> Tensor:
         """How far points (n, 3) lie below the surface, measured along its normal, m; negative above it."""
@@ -120,16 +116,18 @@ class Relief:
         What lies behind a steep wall is near to it, however far below the rim. The surface is eroded by a ball of that
         radius; the bed's own walls are no surface.
         """
-        reach = [int(depth / self.cell[k]) for k in (0, 1)]
-        wide = functional.pad(self.height[None, None], (reach[0], reach[0], reach[1], reach[1]), value=math.inf)[0, 0]
-        ny, nx = self.height.shape
-        eroded = torch.full_like(self.height, math.inf)
-        for row in range(-reach[1], reach[1] + 1):
-            for column in range(-reach[0], reach[0] + 1):
-                left = depth**2 - (row * self.cell[1]) ** 2 - (column * self.cell[0]) ** 2
-                if left >= 0.0:
-                    shifted = wide[reach[1] + row : reach[1] + row + ny, reach[0] + column : reach[0] + column + nx]
-                    eroded = torch.minimum(eroded, shifted - math.sqrt(left))
+        across, along = (int(depth / self.cell[k]) for k in (0, 1))
+        wider = (across, across + kernels_relief.WIDTH, along, along)
+        wide = functional.pad(self.height[None, None], wider, value=math.inf)[0, 0]
+        rows, columns = np.mgrid[-along : along + 1, -across : across + 1]
+        left = depth**2 - (rows * self.cell[1]) ** 2 - (columns * self.cell[0]) ** 2
+        offsets = upload((rows * wide.shape[1] + columns)[left >= 0.0], self.device, torch.int32)
+        drops = upload(np.sqrt(left[left >= 0.0]), self.device)
+        eroded = torch.empty_like(self.height)
+        inputs = [depth, as_warp(wide, wp.float32), across, along, as_warp(offsets, wp.int32)]
+        inputs += [as_warp(m, wp.float32) for m in (drops, eroded)]
+        groups = -(-eroded.shape[1] // kernels_relief.WIDTH)
+        launch(kernels_relief.erode, (eroded.shape[0], groups), inputs, eroded)
         return points[:, 2] > self.sample(eroded, points)
 
 
@@ -190,7 +188,7 @@ def _spread(positions: Tensor, low: FloatArray, cell: FloatArray, count: npt.NDA
     grid = torch.zeros(shape, dtype=torch.float32, device=positions.device)
     inverse = wp.vec3(*(1.0 / cell))
     inputs = [as_warp(positions.float(), wp.vec3), wp.vec3(*low), inverse, as_warp(grid, wp.float32)]
-    launch(_spread_kernel, len(positions), inputs, positions)
+    launch(kernels_relief.spread, len(positions), inputs, positions)
     for axis in range(3):
         inner = grid.narrow(axis, _PAD, int(count[axis])).clone()
         before = grid.narrow(axis, 0, _PAD).flip(axis)
@@ -201,45 +199,16 @@ def _spread(positions: Tensor, low: FloatArray, cell: FloatArray, count: npt.NDA
     return grid
 
 
-@wp.kernel(enable_backward=False)
-def _spread_kernel(
-    positions: wp.array(dtype=wp.vec3), low: wp.vec3, inverse: wp.vec3, grid: wp.array3d(dtype=wp.float32)
-) -> None:
-    p = wp.tid()
-    q = wp.cw_mul(positions[p] - low, inverse)
-    edge_x = float(grid.shape[0]) - 7.0
-    edge_y = float(grid.shape[1]) - 7.0
-    edge_z = float(grid.shape[2]) - 7.0
-    x = wp.clamp(q[0], 0.0, edge_x + 0.999) - 0.5
-    y = wp.clamp(q[1], 0.0, edge_y + 0.999) - 0.5
-    z = wp.clamp(q[2], 0.0, edge_z + 0.999) - 0.5
-    i = int(wp.floor(x + 0.5))
-    j = int(wp.floor(y + 0.5))
-    k = int(wp.floor(z + 0.5))
-    fx = x - float(i)
-    fy = y - float(j)
-    fz = z - float(k)
-    wx = wp.vec3(0.5 * (0.5 - fx) * (0.5 - fx), 0.75 - fx * fx, 0.5 * (0.5 + fx) * (0.5 + fx))
-    wy = wp.vec3(0.5 * (0.5 - fy) * (0.5 - fy), 0.75 - fy * fy, 0.5 * (0.5 + fy) * (0.5 + fy))
-    wz = wp.vec3(0.5 * (0.5 - fz) * (0.5 - fz), 0.75 - fz * fz, 0.5 * (0.5 + fz) * (0.5 + fz))
-    for a in range(3):
-        for b in range(3):
-            w = wx[a] * wy[b]
-            for c in range(3):
-                wp.atomic_add(grid, i + a + 2, j + b + 2, k + c + 2, w * wz[c])
-
-
 def _blur(grid: Tensor, axis: int, variance: float) -> Tensor:
     """Add a variance (cells²) along an axis by repeated (w, 1 − 2w, w), the ends mirrored."""
     if variance <= 0.0:
         return grid
     passes = max(1, math.ceil(variance / 0.5))
     w = variance / (2.0 * passes)
-    n = grid.shape[axis]
     for _ in range(passes):
-        before = torch.cat([grid.narrow(axis, 0, 1), grid.narrow(axis, 0, n - 1)], dim=axis)
-        after = torch.cat([grid.narrow(axis, 1, n - 1), grid.narrow(axis, n - 1, 1)], dim=axis)
-        grid = (1.0 - 2.0 * w) * grid + w * (before + after)
+        before, grid = grid.contiguous(), torch.empty(grid.shape, device=grid.device)
+        inputs = [axis, w, *(as_warp(g, wp.float32) for g in (before, grid))]
+        launch(kernels_relief.blur, tuple(grid.shape[:2]), inputs, grid)
     return grid
 
 

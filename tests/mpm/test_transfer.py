@@ -10,6 +10,7 @@ import pytest
 import trimesh
 
 from splatsoil.mpm import Resolution, Solver
+from splatsoil.mpm.solver import STRETCH
 from splatsoil.mpm.tool import Pose
 from splatsoil.soil.law import Law
 from splatsoil.soil.settings import Settings
@@ -52,6 +53,65 @@ def amplitude_after_a_frame(steps: int, relaxation: float) -> float:
 @pytest.mark.parametrize("steps", [1, 4, 16])
 def test_an_exchange_loses_nothing_by_itself(steps: int) -> None:
     assert amplitude_after_a_frame(steps, relaxation=1e-6) == pytest.approx(1.0, abs=2e-3)
+
+
+def lump(seed: int) -> tuple[Solver, np.ndarray]:
+    """Soil at (n, 3) random places with random velocities, and a frame in which it neither moves nor is stressed."""
+    rng = np.random.default_rng(seed)
+    x = rng.uniform(0.045, 0.115, (400, 3))
+    instant = replace(RESOLUTION, steps=1, frame_time=1e-9, relaxation=1e-6)
+    still = Settings(friction_angle=35.0, gravity=(0.0, 0.0, 0.0))
+    run = Solver(x[None], np.zeros(3), np.full(3, 0.16), None, instant, Law(), still, [{"friction_angle": 35.0}])
+    run._particles.velocity.assign(rng.uniform(-1.0, 1.0, x.shape).astype(np.float32))
+    return run, x
+
+
+def test_what_particles_take_from_nodes_they_give_back() -> None:
+    """All of a cell's eight coefficients, of any field: a second exchange changes none of them."""
+    run, _ = lump(0)
+    names = ("velocity", "affine", "bilinear", "trilinear")
+    run.advance(1)
+    first = {name: getattr(run._particles, name).numpy().copy() for name in names}
+    run.advance(1)
+    for name, values in first.items():
+        assert np.abs(values).max() > 0.1
+        np.testing.assert_allclose(getattr(run._particles, name).numpy(), values, atol=1e-4 * np.abs(values).max())
+
+
+def test_a_cells_gradient_is_the_mean_over_its_soil() -> None:
+    """Against the derivatives of the eight weights at each particle, worked out one by one."""
+    run, x = lump(1)
+    run.advance(1)
+    cell = np.floor(x / CELL).astype(int)
+    nodes = run.shape.nodes
+    found = run._cells.gradient.numpy().reshape(-1, 8, 3)
+    count = int(run._cells.count.numpy()[0])
+    assert count > 30
+    for entry, node in enumerate(run._cells.node.numpy()[:count]):
+        mine = (cell == np.unravel_index(node, nodes)).all(axis=1)
+        f = x[mine] / CELL - cell[mine]
+        for corner in range(8):
+            bits = np.array([corner >> 2, (corner >> 1) & 1, corner & 1])
+            weight = np.where(bits, f, 1.0 - f)
+            others = np.stack([weight[:, 1] * weight[:, 2], weight[:, 0] * weight[:, 2], weight[:, 0] * weight[:, 1]])
+            expected = (2.0 * bits - 1.0) / CELL * others.mean(axis=1)
+            np.testing.assert_allclose(found[entry, corner], expected, atol=2e-4 / CELL)
+
+
+def test_soil_shows_no_more_stretch_than_allowed() -> None:
+    """Against singular values by numpy, of deformations of which some need no bounds and some do."""
+    run, x = lump(2)
+    rng = np.random.default_rng(3)
+    shapes = (np.eye(3) + rng.normal(0.0, rng.uniform(0.0, 0.8, (len(x), 1, 1)), (len(x), 3, 3))).astype(np.float32)
+    shapes = shapes[np.linalg.det(shapes) > 0.02]
+    given = np.concatenate([shapes, np.broadcast_to(np.eye(3, dtype=np.float32), (len(x) - len(shapes), 3, 3))])
+    run._particles.deformation.assign(given)
+    u, sizes, v = np.linalg.svd(given.astype(np.float64))
+    low, high = STRETCH
+    bound = (sizes < low) | (sizes > high)
+    assert 0.1 < bound.any(axis=1).mean() < 0.9
+    expected = (u * np.clip(sizes, low, high)[:, None, :]) @ v
+    np.testing.assert_allclose(run.deformations()[0], expected, atol=5e-3)
 
 
 @pytest.mark.parametrize("steps", [4, 8, 16])

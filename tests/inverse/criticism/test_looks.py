@@ -11,7 +11,7 @@ from splatsoil.benchmarks.hidden_effects import detectable, emulated
 from splatsoil.inverse.criticism.diagnosis import Options, diagnose
 from splatsoil.inverse.criticism.evidence import gather, switched_on
 from splatsoil.inverse.criticism.floor import floor_of
-from splatsoil.inverse.criticism.looks import Looks, look, promising
+from splatsoil.inverse.criticism.looks import Looks, foreseen, look, promising
 from splatsoil.inverse.criticism.sight import Sight
 from splatsoil.inverse.criticism.simulations import Simulations
 
@@ -64,27 +64,51 @@ def test_without_a_misfit_a_fit_far_from_the_defaults_is_as_good_as_any() -> Non
     assert not (found.off or found.astray)
 
 
+class Noted(Simulations):
+    """Notes what is told of ahead, and forgotten, and what is asked for."""
+
+    def __init__(self, experiment: EmulatedExperiment) -> None:
+        super().__init__(experiment)
+        self.early, self.late, self.forgot = set[str](), set[str](), False
+
+    def ahead(self, work: Callable[..., object], *, apart: bool = False) -> None:
+        nothing = np.zeros(self.experiment.layout.shape)
+        work(lambda values, **what: (self.early.add(repr((values, what))), nothing)[1])
+
+    def forget(self) -> None:
+        self.early.clear()
+        self.forgot = True
+
+    def __call__(self, values, **what):  # type: ignore[no-untyped-def]
+        self.late.add(repr((values, what)))
+        return super().__call__(values, **what)
+
+
 @pytest.mark.parametrize("at", [0.9, 8.0])
 def test_what_looks_need_is_told_of_before_it_is_simulated(at: float) -> None:
     """Helpers make it side by side."""
     experiment = hiding("effect 2", 30.0)
-    early: set[str] = set()
-    late: set[str] = set()
-
-    class Noted(Simulations):
-        def ahead(self, work: Callable[..., object], *, apart: bool = False) -> None:
-            nothing = np.zeros(experiment.layout.shape)
-            work(lambda values, **what: (early.add(repr((values, what))), nothing)[1])
-
-        def __call__(self, values, **what):  # type: ignore[no-untyped-def]
-            late.add(repr((values, what)))
-            return super().__call__(values, **what)
-
     simulate = Noted(experiment)
     evidence = gather(experiment, simulate, {"angle": at}, repeats=4)
-    late.clear()
+    simulate.late.clear()
     look(experiment, evidence, simulate)
-    assert late and late == early
+    assert simulate.late and simulate.late == simulate.early
+
+
+@pytest.mark.parametrize(("at", "hidden", "in_vain"), [(0.9, 30.0, False), (8.0, 30.0, False), (8.0, 0.0, True)])
+def test_what_a_look_will_ask_for_is_foreseen_but_where_a_fit_far_off_is_right(
+    at: float, hidden: float, in_vain: bool
+) -> None:
+    experiment = hiding("effect 2", hidden, angle=8.0 if in_vain else 1.0)
+    simulate = Noted(experiment)
+    evidence = gather(experiment, simulate, {"angle": at}, repeats=4)
+    foreseen(experiment, evidence, simulate)
+    early = set(simulate.early)
+    simulate.late.clear()
+    look(experiment, evidence, simulate)
+    assert early and early.isdisjoint(simulate.late) is in_vain
+    assert in_vain or early <= simulate.late
+    assert simulate.forgot or not in_vain
 
 
 def test_from_the_defaults_nothing_is_denied() -> None:

@@ -168,6 +168,28 @@ def test_a_few_that_somebody_waits_for_are_shared_out(tmp_path: Path) -> None:
     assert shares == [1, 1, 1]
 
 
+def test_what_was_foreseen_in_vain_is_not_made(tmp_path: Path) -> None:
+    """But for what a helper is at; and it can still be asked for."""
+    mine, theirs = Watched(), Watched()
+    simulate, begun, go_on = Simulations(mine, tmp_path), threading.Event(), threading.Event()
+
+    def slow(values: Mapping[str, float]) -> bool:
+        begun.set()
+        return not go_on.wait(20.0)
+
+    theirs.fails = slow
+    with helper(theirs, tmp_path) as helpers, simulate.helped(helpers):
+        simulate.ahead(lambda ask: [ask({"angle": angle}) for angle in (1.0, 2.0, 3.0)])
+        assert begun.wait(20.0)
+        simulate.forget()
+        go_on.set()
+        found = [simulate({"angle": angle}) for angle in (1.0, 3.0)]
+    assert theirs.calls == [{"angle": 3.0}], "a helper begins at the far end"
+    assert mine.calls == [{"angle": 1.0}]
+    for angle, table in zip((1.0, 3.0), found, strict=True):
+        assert np.array_equal(table, emulated(3).predict({"angle": angle}))
+
+
 def test_threads_that_share_a_share_make_it_once(tmp_path: Path) -> None:
     mine = Watched()
     simulate = Simulations(mine, tmp_path)

@@ -1,0 +1,142 @@
+# mypy: ignore-errors
+# (Warp reads the annotations of kernels as types of its own)
+"""Warp kernels that make a relief of particles and look things up in it: one launch where torch takes dozens, which a
+GPU waits for and several processes that share one wait for all the more."""
+
+import warp as wp
+
+from splatsoil.scene.kernels_sky import WIDTH
+
+
+@wp.kernel(enable_backward=False)
+def spread(
+    positions: wp.array(dtype=wp.vec3), low: wp.vec3, inverse: wp.vec3, grid: wp.array3d(dtype=wp.float32)
+) -> None:
+    """Add each particle to a grid by a quadratic B-spline; three cells around the box are for what reaches beyond."""
+    p = wp.tid()
+    q = wp.cw_mul(positions[p] - low, inverse)
+    edge_x = float(grid.shape[0]) - 7.0
+    edge_y = float(grid.shape[1]) - 7.0
+    edge_z = float(grid.shape[2]) - 7.0
+    x = wp.clamp(q[0], 0.0, edge_x + 0.999) - 0.5
+    y = wp.clamp(q[1], 0.0, edge_y + 0.999) - 0.5
+    z = wp.clamp(q[2], 0.0, edge_z + 0.999) - 0.5
+    i = int(wp.floor(x + 0.5))
+    j = int(wp.floor(y + 0.5))
+    k = int(wp.floor(z + 0.5))
+    fx = x - float(i)
+    fy = y - float(j)
+    fz = z - float(k)
+    wx = wp.vec3(0.5 * (0.5 - fx) * (0.5 - fx), 0.75 - fx * fx, 0.5 * (0.5 + fx) * (0.5 + fx))
+    wy = wp.vec3(0.5 * (0.5 - fy) * (0.5 - fy), 0.75 - fy * fy, 0.5 * (0.5 + fy) * (0.5 + fy))
+    wz = wp.vec3(0.5 * (0.5 - fz) * (0.5 - fz), 0.75 - fz * fz, 0.5 * (0.5 + fz) * (0.5 + fz))
+    for a in range(3):
+        for b in range(3):
+            w = wx[a] * wy[b]
+            for c in range(3):
+                wp.atomic_add(grid, i + a + 2, j + b + 2, k + c + 2, w * wz[c])
+
+
+@wp.func_native("""
+    const int ny = grid.shape[1], nz = grid.shape[2], line = (i * ny + j) * nz;
+    const float* g = grid.data + line;
+    float* o = out.data + line;
+    const float v = 1.0f - 2.0f * w;
+    if (axis == 2) {
+        for (int k = 1; k < nz - 1; ++k) o[k] = v * g[k] + w * (g[k - 1] + g[k + 1]);
+        o[0] = v * g[0] + w * (g[0] + g[1]);
+        o[nz - 1] = v * g[nz - 1] + w * (g[nz - 2] + g[nz - 1]);
+    } else {
+        const int m = axis == 0 ? i : j, n = axis == 0 ? grid.shape[0] : ny, step = axis == 0 ? ny * nz : nz;
+        const float* b = m > 0 ? g - step : g;
+        const float* a = m < n - 1 ? g + step : g;
+        for (int k = 0; k < nz; ++k) o[k] = v * g[k] + w * (b[k] + a[k]);
+    }
+""")
+def _blurred_line(
+    i: int, j: int, axis: int, w: float, grid: wp.array3d(dtype=wp.float32), out: wp.array3d(dtype=wp.float32)
+): ...
+
+
+@wp.kernel(enable_backward=False)
+def blur(axis: int, w: float, grid: wp.array3d(dtype=wp.float32), out: wp.array3d(dtype=wp.float32)) -> None:
+    """Over lines along z, which fill vector registers on the CPU: one pass of (w, 1 - 2w, w) along an axis, the ends
+    mirrored; two cells or more along each."""
+    i, j = wp.tid()
+    _blurred_line(i, j, axis, w, grid, out)
+
+
+@wp.kernel(enable_backward=False)
+def normals(height: wp.array2d(dtype=wp.float32), cell_x: float, cell_y: float, out: wp.array2d(dtype=wp.vec3)) -> None:
+    """Unit normals, upward, by central differences; by the neighbour inside at the edges."""
+    i, j = wp.tid()
+    left = wp.max(j - 1, 0)
+    right = wp.min(j + 1, height.shape[1] - 1)
+    down = wp.max(i - 1, 0)
+    up = wp.min(i + 1, height.shape[0] - 1)
+    along_x = (height[i, right] - height[i, left]) / (float(right - left) * cell_x)
+    along_y = (height[up, j] - height[down, j]) / (float(up - down) * cell_y)
+    out[i, j] = wp.normalize(wp.vec3(-along_x, -along_y, 1.0))
+
+
+@wp.kernel(enable_backward=False)
+def sample(
+    values: wp.array3d(dtype=wp.float32),
+    points: wp.array2d(dtype=wp.float32),
+    origin: wp.vec2,
+    cell: wp.vec2,
+    out: wp.array2d(dtype=wp.float32),
+) -> None:
+    """Bilinear values of a map (ny, nx, k) at points (n, 2 or 3), constant beyond the outermost cells' centres."""
+    p = wp.tid()
+    column = wp.clamp((points[p, 0] - origin[0]) / cell[0], 0.0, float(values.shape[1] - 1))
+    row = wp.clamp((points[p, 1] - origin[1]) / cell[1], 0.0, float(values.shape[0] - 1))
+    i = wp.min(int(row), values.shape[0] - 2)
+    j = wp.min(int(column), values.shape[1] - 2)
+    u = row - float(i)
+    v = column - float(j)
+    for c in range(values.shape[2]):
+        low = values[i, j, c] * (1.0 - v) + values[i, j + 1, c] * v
+        high = values[i + 1, j, c] * (1.0 - v) + values[i + 1, j + 1, c] * v
+        out[p, c] = low * (1.0 - u) + high * u
+
+
+@wp.func_native(f"""
+    constexpr int W = {WIDTH};
+    const int across = wide.shape[1];
+    const float* here = wide.data + (row + margin_y) * across + margin_x + first;
+    float lowest[W];
+    for (int l = 0; l < W; ++l) lowest[l] = here[l] - radius;
+    for (int k = 0; k < offsets.shape[0]; ++k) {{
+        const float* there = here + offsets.data[k];
+        const float drop = drops.data[k];
+        for (int l = 0; l < W; ++l) lowest[l] = there[l] - drop < lowest[l] ? there[l] - drop : lowest[l];
+    }}
+    for (int l = 0; l < W && first + l < out.shape[1]; ++l) out.data[row * out.shape[1] + first + l] = lowest[l];
+""")
+def _eroded_cells(
+    row: int,
+    first: int,
+    radius: float,
+    wide: wp.array2d(dtype=wp.float32),
+    margin_x: int,
+    margin_y: int,
+    offsets: wp.array(dtype=wp.int32),
+    drops: wp.array(dtype=wp.float32),
+    out: wp.array2d(dtype=wp.float32),
+): ...
+
+
+@wp.kernel(enable_backward=False)
+def erode(
+    radius: float,
+    wide: wp.array2d(dtype=wp.float32),
+    margin_x: int,
+    margin_y: int,
+    offsets: wp.array(dtype=wp.int32),
+    drops: wp.array(dtype=wp.float32),
+    out: wp.array2d(dtype=wp.float32),
+) -> None:
+    """Over (rows, groups of `WIDTH` cells): a map with margins eroded by a ball, given by what it drops where."""
+    row, group = wp.tid()
+    _eroded_cells(row, group * wp.static(WIDTH), radius, wide, margin_x, margin_y, offsets, drops, out)
