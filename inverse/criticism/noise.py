@@ -53,18 +53,23 @@ class Part:
     on_directions: float = 1.0
     freedom: float = math.inf
 
-    def correlation(self, layout: Layout) -> FloatArray:
-        """(t s, t s) correlation of the features."""
-        return np.asarray(np.kron(in_time(layout.steps, self.memory), self.across(layout)), dtype=np.float64)
-
     def across(self, layout: Layout) -> FloatArray:
         """(s, s) correlation between sites at one time."""
         return in_space(layout, self.length, self.nugget, self.between)
 
-    def covariance(self, layout: Layout) -> FloatArray:
-        """(t s, t s) covariance."""
-        scale = self.scale.reshape(-1)
-        return scale[:, None] * self.correlation(layout) * scale[None]
+    def covariance(self, layout: Layout, seen: BoolArray) -> FloatArray:
+        """(n, n) covariance of the features that were seen (t, s), in blocks of two times each."""
+        across, times = self.across(layout), in_time(layout.steps, self.memory)
+        sites = [np.flatnonzero(row) for row in seen]
+        ends = np.cumsum([0, *(len(here) for here in sites)])
+        out = np.empty((ends[-1], ends[-1]))
+        for t, here in enumerate(sites):
+            rows = self.scale[t, here][:, None] * across[here]
+            for u, there in enumerate(sites[: t + 1]):
+                block = rows[:, there] * (times[t, u] * self.scale[u, there])
+                mine, other = slice(ends[t], ends[t + 1]), slice(ends[u], ends[u + 1])
+                out[mine, other], out[other, mine] = block, block.T
+        return out
 
 
 def independent(scale: FloatArray, memory: float = 0.0) -> Part:
@@ -145,10 +150,9 @@ class Noise:
     @classmethod
     def of(cls, layout: Layout, parts: Sequence[tuple[float, Part]], seen: BoolArray) -> Noise:
         """The sum of parts, each with the factor on its variance."""
-        index = np.flatnonzero(seen.reshape(-1))
-        total = np.zeros((index.size, index.size))
+        total = np.zeros((np.count_nonzero(seen), np.count_nonzero(seen)))
         for factor, part in parts:
-            total += factor * part.covariance(layout)[np.ix_(index, index)]
+            total += factor * part.covariance(layout, seen)
         ridge = RIDGE * float(np.mean(np.diag(total)))
         total[np.diag_indices_from(total)] += ridge
         # Welch (1947) and Satterthwaite: a sum of variances, each known with its own degrees of freedom.

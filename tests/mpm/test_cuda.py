@@ -78,13 +78,13 @@ def test_with_run_to_run_equality_kernels_compile_for_cuda() -> None:
 import tempfile
 import warp as wp
 from splatsoil.mpm import substep, transfer
-from splatsoil.scene import relief
+from splatsoil.scene import kernels_relief
 from splatsoil.soil.law import Law
 
 assert wp.config.deterministic == wp.DeterministicMode.RUN_TO_RUN
 wp.init()
 stress = substep.make_stress_kernel(Law().update, True)
-for module in (transfer, substep, stress.module, relief):
+for module in (transfer, substep, stress.module, kernels_relief):
     (artifact,) = wp.compile_aot_module(module, arch=90, module_dir=tempfile.mkdtemp(), use_ptx=True)
     # additions take a place in a list, which is then sorted, by compare and swap; ours have none of their own
     assert "atom.global.cas" in open(artifact).read(), "nothing is put in order"

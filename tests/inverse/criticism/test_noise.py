@@ -34,7 +34,7 @@ def draw(part: Part, count: int, seed: int) -> np.ndarray:
 
 
 def test_covariance_is_the_product_of_its_separate_laws() -> None:
-    covariance = TRUE.covariance(LAYOUT).reshape(*LAYOUT.shape, *LAYOUT.shape)
+    covariance = TRUE.covariance(LAYOUT, SEEN).reshape(*LAYOUT.shape, *LAYOUT.shape)
     far = np.sqrt(3.0) * 0.1 / 0.1
     matern = (1.0 + far) * np.exp(-far)
     # Same camera, neighbouring patch, three frames later.
@@ -44,18 +44,32 @@ def test_covariance_is_the_product_of_its_separate_laws() -> None:
     assert covariance[5, 0, 5, 0] == pytest.approx(4.0, rel=1e-5)
 
 
+def test_of_what_was_seen_it_is_the_same() -> None:
+    """Against the whole of it, as a Kronecker product."""
+    rng = np.random.default_rng(4)
+    seen, scale = rng.random(LAYOUT.shape) < 0.7, rng.uniform(0.5, 3.0, LAYOUT.shape)
+    part = replace(TRUE, scale=scale)
+    ones = replace(TRUE, scale=np.ones(LAYOUT.shape)).covariance(LAYOUT, SEEN).reshape(*LAYOUT.shape, *LAYOUT.shape)
+    times, across = ones[:, 0, :, 0] / ones[0, 0, 0, 0], ones[0, :, 0, :]
+    whole = np.outer(scale, scale) * np.kron(times, across)
+    np.testing.assert_allclose(part.covariance(LAYOUT, seen), whole[np.ix_(seen.ravel(), seen.ravel())], rtol=1e-9)
+
+
 def test_independent_noise_is_independent() -> None:
-    covariance = independent(np.full(LAYOUT.shape, 3.0)).covariance(LAYOUT)
+    covariance = independent(np.full(LAYOUT.shape, 3.0)).covariance(LAYOUT, SEEN)
     assert np.allclose(covariance, 9.0 * np.eye(len(covariance)), atol=1e-3)
 
 
-def test_the_law_that_samples_were_drawn_with_is_found_again() -> None:
-    found = estimate(LAYOUT, draw(TRUE, 40, 1), SEEN)
+@pytest.mark.parametrize("hidden", [0.0, 0.04, 0.3])
+def test_the_law_that_samples_were_drawn_with_is_found_again(hidden: float) -> None:
+    """Also where each time hides sites of its own: few, so that several times are taken together, or many."""
+    seen = np.random.default_rng(5).random(LAYOUT.shape) >= hidden
+    found = estimate(LAYOUT, draw(TRUE, 40, 1), seen)
     assert found.memory == pytest.approx(0.6, abs=0.05)
     assert found.length == pytest.approx(0.1, rel=0.2)
     assert found.nugget == pytest.approx(0.1, abs=0.06)
     assert found.between is not None and found.between[0, 1] == pytest.approx(0.5, abs=0.1)
-    assert np.mean(found.scale) == pytest.approx(2.0, rel=0.1)
+    assert np.mean(found.scale[seen]) == pytest.approx(2.0, rel=0.1)
 
 
 def test_scales_that_vary_are_told_from_scales_that_do_not() -> None:
@@ -174,7 +188,7 @@ def mixed(count: int, seed: int) -> np.ndarray:
 def test_instruments_without_a_place_are_noisy_for_themselves() -> None:
     seen = np.ones(MIXED.shape, dtype=bool)
     part = estimate(MIXED, mixed(30, 1), seen)
-    covariance = part.covariance(MIXED).reshape(*MIXED.shape, *MIXED.shape)
+    covariance = part.covariance(MIXED, seen).reshape(*MIXED.shape, *MIXED.shape)
     assert np.all(covariance[:, :32, :, 32:] == 0.0)
     assert np.mean(part.scale[:, 32:]) == pytest.approx(20.0, rel=0.1)
     together = covariance[5, 32, 5, 33] / np.sqrt(covariance[5, 32, 5, 32] * covariance[5, 33, 5, 33])
