@@ -15,7 +15,7 @@ from splatsoil.experiment.base import Candidate, Experiment
 from splatsoil.parameters import Parameter
 
 from .estimates import bounded, prior, untried
-from .evidence import Evidence, Vantage, Visit
+from .evidence import Evidence, Vantage, Visit, joined
 from .floor import Floor
 from .misfit import Omnibus, omnibus
 from .noise import Noise
@@ -130,10 +130,9 @@ def confirm(
         if trial.emulated:
             # A surface that isn't one tells nothing more than the last derivatives do.
             with suppress(ValueError):
-                there = [visit.table for visit in visits]
-                visits += [v for v in end.values() if not any(np.array_equal(v.table, table) for table in there)]
-                reading = read(visits, whole, experiment.observed, free, known)
-                values, stds, emulated = dict(reading.values), dict(reading.stds), tuple(visits)
+                together = joined(visits, end.values())
+                reading = read(together, whole, experiment.observed, free, known)
+                values, stds, emulated = dict(reading.values), dict(reading.stds), together
         solvers = [experiment.reproducibility(p, values[p.name], name) for p in free]
         own = np.hypot(untried(floor, fit.slopes, precision), solvers)
         stds, systematic = widened(stds, [bounded(s, p, fit.values[p.name]) for s, p in zip(own, free, strict=True)])

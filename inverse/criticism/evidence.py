@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -36,6 +36,12 @@ class Visit:
     effects: tuple[str, ...]
     table: FloatArray
     seed: int = 0
+
+
+def joined(visits: Iterable[Visit], more: Iterable[Visit]) -> tuple[Visit, ...]:
+    """Visits, and those of some more that aren't among them: to count a simulation twice is to believe its chance."""
+    there = tuple(visits)
+    return (*there, *(v for v in more if not any(np.array_equal(v.table, known.table) for known in there)))
 
 
 @dataclass(frozen=True)

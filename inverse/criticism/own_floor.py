@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -30,7 +31,7 @@ from .confirmation import (
     stds_of,
 )
 from .estimates import Estimate, at_odds, bounded, untried, weighed_there
-from .evidence import Evidence, Numerics, Visit, deviations, other_numerics, pair_of
+from .evidence import Evidence, Numerics, Visit, deviations, joined, other_numerics, pair_of
 from .floor import Floor, floor_of
 from .misfit import Block, Omnibus, blocks, omnibus, smooth_basis
 from .reading import read, tangent
@@ -39,6 +40,9 @@ from .sight import Sight
 from .simulations import Simulations
 
 FloatArray = npt.NDArray[np.float64]
+
+NEAR = 0.5
+"""Of a parameter's standard deviation: soil so near is the same to noise and numerics."""
 
 
 @dataclass(frozen=True)
@@ -69,11 +73,12 @@ def on_its_own_floor(
     """Judge the model as it is and with its best effect by the chance and numerics of soil that has the effect."""
     told: dict[str, Any] = {"effects": (best.name,), "purpose": f"floor with {best.name}"}
     # Half of the times may have led a refit far along a valley from where all of them say that the parameters are.
-    at, middle = best.values, best.fit.prediction
-    try:
-        middle = simulate(at, **told)
-    except SimulationError:
-        at = best.fit.values
+    # Where they haven't, simulations by other seeds are there already.
+    at, middle = best.fit.values, best.fit.prediction
+    if any(abs(best.values[name] - at[name]) > NEAR * std for name, std in best.stds.items()):
+        with suppress(SimulationError):
+            middle = simulate(best.values, **told)
+            at = best.values
     seeds = range(1, 1 + len(evidence.repeats))
 
     def spread(ask: Callable[..., FloatArray]) -> tuple[FloatArray, Numerics, list[FloatArray]]:
@@ -101,7 +106,7 @@ def on_its_own_floor(
     # Where simulations were too few for a surface at first, they still are.
     here = [(SHARED, middle), *zip(seeds, runs, strict=True)]
     there_too = [Visit(dict(at), (best.name,), table, seed) for seed, table in here]
-    visits = (*best.visits, *there_too) if best.visits else ()
+    visits = joined(best.visits, there_too) if best.visits else ()
     parameters = free_in(experiment, candidate)
     soil = _Soil(experiment, there, floor, basis, parameters, at, visits, best.fit.slopes).smoothed
     refit = replace(best, floor=noise_on(floor.single, judged(experiment, split_times(experiment)[1])))

@@ -42,7 +42,7 @@ ONE_STD = 0.683
 """Share of a normal distribution within a standard deviation."""
 DRAWS = 500
 """Kept of the points."""
-BATCHES, FEWEST, TOGETHER = 3, 2, 4
+BATCHES, FEWEST, TOGETHER = 4, 3, 4
 """Simulations where the parameters may lie: so many times at most and at least, so many."""
 UNKNOWN = 0.1
 """Share of what is possible that may lie where too little was simulated."""

@@ -102,22 +102,28 @@ class Noted(Simulations):
         return super().__call__(values, purpose=purpose, **others)
 
 
-def test_the_floor_is_measured_where_all_times_put_the_parameters() -> None:
-    """Refits see every other time only, which by chance may lead them off; what is told is by all times."""
-    nearer = []
-    for world in range(4):
-        made = emulated(world)
-        truth = {"angle": 0.0, NAME: 4.0 * detectable(world, Options())[NAME]}
-        experiment = replace(made, observed=made.measured(truth, [world, 99]))
-        simulate = Noted(experiment)
-        best = diagnose(experiment, {"angle": fitted(experiment)}, simulate=simulate).confirmations[NAME]
-        assert all(point == simulate.where[0] for point in simulate.where)
-        far, near = (
-            np.hypot(*((point[n] - best.values[n]) / best.stds[n] for n in ("angle", NAME)))
-            for point in (best.fit.values, simulate.where[0])
-        )
-        nearer.append(near < far)
-    assert sum(nearer) >= 3
+@pytest.mark.parametrize(("stds", "moved"), [(0.3, False), (-0.3, False), (2.0, True)])
+def test_the_floor_is_measured_where_all_times_put_the_parameters(stds: float, moved: bool) -> None:
+    """Refits see every other time only, which may lead them off; what is told is by all times. Where that is no other
+    place, what was simulated there counts, once."""
+    made = emulated(0)
+    truth = {"angle": 0.0, NAME: 4.0 * detectable(0, Options())[NAME]}
+    experiment = replace(made, observed=made.measured(truth, [0, 99]))
+    simulate = Noted(experiment)
+    found = diagnose(experiment, {"angle": fitted(experiment)}, simulate=simulate)
+    best, residual = found.confirmations[NAME], (experiment.observed - found.evidence.mean)[experiment.seen]
+    told = {name: best.fit.values[name] + stds * std for name, std in best.stds.items()}
+    (candidate,) = (c for c in experiment.candidates if c.name == NAME)
+    simulate.where.clear()
+    before = simulate.made
+    own = own_floor.on_its_own_floor(
+        experiment, found.evidence, replace(best, values=told), candidate, simulate, residual
+    )
+    there = told if moved else {name: best.fit.values[name] for name in told}
+    assert simulate.where and all(point == there for point in simulate.where)
+    assert simulate.made > before or not moved
+    tables = [visit.table.tobytes() for visit in own.refit.visits]
+    assert len(tables) == len(set(tables))
 
 
 def test_refits_simulate_by_several_seeds_and_are_compared_by_the_same_ones(monkeypatch: pytest.MonkeyPatch) -> None:
