@@ -123,7 +123,7 @@ def mean_gradient(middle: wp.vec3, spread: wp.vec3, corner: int, inverse: wp.vec
 @wp.func
 def mean_weight(a: float, b: float, both: float, upper_a: int, upper_b: int) -> float:
     """Mean of a face's bilinear weight at one of its corners."""
-    # of b alone, given the side along a: a b or (1 - a) b, and what is left of a or 1 - a
+    # on the side along a, and of that on the upper side along b
     whole = wp.where(upper_a == 1, a, 1.0 - a)
     above = wp.where(upper_a == 1, both, b - both)
     return wp.where(upper_b == 1, above, whole - above)

@@ -77,7 +77,7 @@ class Relief:
 
     def ranged(self) -> Steps[Relief]:
         """This, with its range known."""
-        self.__dict__["range"] = yield from self._range()
+        self.__dict__["range"] = yield from self._range()  # where a cached property is looked for
         return self
 
     @property

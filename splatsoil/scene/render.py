@@ -53,6 +53,9 @@ _HIDDEN = 2.5
 _REACH = 10.0
 """How far behind the splats the surface that a pixel shows is looked for, in particle spacings."""
 
+_AT_ONCE = 16
+"""Pictures that are drawn beside each other on a GPU, whose memory holds the Gaussians of each tile until they are."""
+
 _PIXELS_PER_MILLISECOND = 5000
 """About how many pixels one CPU core lights in a millisecond."""
 
@@ -284,9 +287,11 @@ class Scene:
         def seen(posed: Posed, camera: Camera) -> Steps[Tensor]:
             return (yield from self._layering(posed, camera)).image
 
+        works, out = [seen(*view) for view in views], list[FloatImage]()
         with torch.no_grad():
-            images = together([seen(*view) for view in views])
-            return [image.cpu().numpy().astype(np.float32) for image in images]
+            for k in range(0, len(works), _AT_ONCE):
+                out += [image.cpu().numpy().astype(np.float32) for image in together(works[k : k + _AT_ONCE])]
+        return out
 
 
 def _settled(relief: Relief, centres: Tensor, shapes: Tensor, thickness: Tensor) -> tuple[Tensor, Tensor]:
