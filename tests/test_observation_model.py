@@ -98,8 +98,8 @@ def test_a_pan_shifts_the_picture_of_that_camera_alone(measurement, scene, still
 
 def test_what_cameras_alone_report_looks_at_scenes_that_are_posed_already(measurement, scene, still, monkeypatch):
     posed = []
-    pose = Scene.pose
-    monkeypatch.setattr(Scene, "pose", lambda self, *words: posed.append(1) or pose(self, *words))
+    poses = Scene.poses
+    monkeypatch.setattr(Scene, "poses", lambda self, moments: posed.extend(moments) or poses(self, moments))
     model = model_of(measurement, scene, "camera_pose", "exposure", "blur", "tool_pose", "light")
     trajectory, frames = trajectory_of(model, still), len(model.frames)
     model.draw(trajectory)
