@@ -150,7 +150,8 @@ class Noise:
     @classmethod
     def of(cls, layout: Layout, parts: Sequence[tuple[float, Part]], seen: BoolArray) -> Noise:
         """The sum of parts, each with the factor on its variance."""
-        total = np.zeros((np.count_nonzero(seen), np.count_nonzero(seen)))
+        count = np.count_nonzero(seen)
+        total = np.zeros((count, count))
         for factor, part in parts:
             total += factor * part.covariance(layout, seen)
         ridge = RIDGE * float(np.mean(np.diag(total)))

@@ -30,6 +30,7 @@ from splatsoil.mpm.transfer import (
     bound_stretch,
     find_gaps,
     grid_to_particles,
+    hourglass_share,
     list_cells,
     mark_cells,
     momentum_to_velocity,
@@ -53,21 +54,8 @@ DEEPEST = 0.25
 """Of a particle's spacing: soil deeper in the tool, as where a tool starts in the soil, comes out at once."""
 MOST_STRAYS = 1.0e-3
 """Fraction of a batch's particles that may have risen above the bed's space before the run is given up."""
-AFFINE_SHARE = 7.0 / 16.0
-"""Of a bilinear mode, what affine fields of eight particles in a cell carry over an exchange."""
-HOURGLASS_DAMPING = (1.0 - AFFINE_SHARE) / (1.0 + AFFINE_SHARE)
 STRETCH = (0.4, 2.5)
 """Bounds of the visual deformation's singular values."""
-
-
-def hourglass_share(exchanges: float) -> float:
-    """What particles must keep of the hourglass modes for them to be damped as by this many plain APIC exchanges.
-
-    With eight particles to a cell, affine fields alone carry 7/16 of a bilinear mode over an exchange. Under a steady
-    force the mode's mean velocity is what the trapezoidal rule makes of that: (1 - q) / (1 + q) = 7/16, q = 9/23.
-    """
-    carried = (1.0 - HOURGLASS_DAMPING * exchanges) / (1.0 + HOURGLASS_DAMPING * exchanges)
-    return max(0.0, (carried - AFFINE_SHARE) / (1.0 - AFFINE_SHARE))
 
 
 class Solver:

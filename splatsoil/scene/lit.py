@@ -70,8 +70,7 @@ def light_relief(
         tool: a pose from `ToolBody.at` or `ToolBody.absent`.
         tool_colour: (3,) linear colour of the tool in level ground's light.
     """
-    if "range" not in vars(relief):
-        yield from relief.ranged()
+    yield from relief.ranged()
     visible = torch.empty_like(relief.height)
     inputs = [as_warp(relief.height, wp.float32), grid_of(relief), light.kernel_form()]
     inputs += [march_step(relief), ceiling(relief), as_warp(visible, wp.float32)]

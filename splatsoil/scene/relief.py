@@ -77,7 +77,8 @@ class Relief:
 
     def ranged(self) -> Steps[Relief]:
         """This, with its range known."""
-        self.__dict__["range"] = yield from self._range()  # where a cached property is looked for
+        if "range" not in self.__dict__:  # where a cached property is looked for
+            self.__dict__["range"] = yield from self._range()
         return self
 
     @property
@@ -117,8 +118,7 @@ class Relief:
         radius; the bed's own walls are no surface.
         """
         across, along = (int(depth / self.cell[k]) for k in (0, 1))
-        wider = (across, across + kernels_relief.WIDTH, along, along)
-        wide = functional.pad(self.height[None, None], wider, value=math.inf)[0, 0]
+        wide = padded(self.height, (across, along), kernels_relief.WIDTH, "constant", math.inf)
         rows, columns = np.mgrid[-along : along + 1, -across : across + 1]
         left = depth**2 - (rows * self.cell[1]) ** 2 - (columns * self.cell[0]) ** 2
         offsets = upload((rows * wide.shape[1] + columns)[left >= 0.0], self.device, torch.int32)
@@ -129,6 +129,13 @@ class Relief:
         groups = -(-eroded.shape[1] // kernels_relief.WIDTH)
         launch(kernels_relief.erode, (eroded.shape[0], groups), inputs, eroded)
         return points[:, 2] > self.sample(eroded, points)
+
+
+def padded(values: Tensor, margin: tuple[int, int], beyond: int, mode: str, value: float = 0.0) -> Tensor:
+    """A map with ``margin`` columns and rows more on every side, and ``beyond`` more columns on the right."""
+    wider = (margin[0], margin[0] + beyond, margin[1], margin[1])
+    wide = functional.pad(values[None, None], wider, mode=mode, value=value if mode == "constant" else None)
+    return wide[0, 0].contiguous()
 
 
 def grid_of(relief: Relief) -> Any:

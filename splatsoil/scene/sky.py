@@ -8,13 +8,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
-import torch.nn.functional as functional
 import warp as wp
 from torch import Tensor
 
 from splatsoil.scene import kernels
 from splatsoil.scene.kernels_sky import WIDTH, light_of_slopes, sky_kernel
-from splatsoil.scene.relief import Relief, grid_of
+from splatsoil.scene.relief import Relief, grid_of, padded
 from splatsoil.splats.steps import Steps, stepwise
 from splatsoil.splats.warp_torch import as_warp, launch, upload
 
@@ -70,7 +69,7 @@ def light_from_slopes(relief: Relief, sent: Tensor) -> Tensor:
     z = relief.height
     ny, nx = z.shape
     looks = _Looks.over(relief)
-    wide, *planes = (_padded(m, looks.margin, WIDTH, "replicate") for m in (z, *sent))
+    wide, *planes = (padded(m, looks.margin, WIDTH, "replicate") for m in (z, *sent))
     result = sent.new_empty(sent.shape)
     inputs = [as_warp(z, wp.float32), as_warp(relief.normal, wp.vec3), as_warp(wide, wp.float32)]
     inputs += [as_warp(torch.stack(planes), wp.float32), *looks.tables(wide), *looks.rows.shape]
@@ -127,10 +126,10 @@ def _sum(relief: Relief, looks: _Looks, tool: tuple[Tensor, Tensor] | None, stri
     z = relief.height
     ny, nx = z.shape
     beyond = stride * WIDTH
-    wide = below = above = _padded(z, looks.margin, beyond, "replicate")
+    wide = below = above = padded(z, looks.margin, beyond, "replicate")
     if tool is not None:
         below, above = (
-            _padded(part, looks.margin, beyond, "constant", value)
+            padded(part, looks.margin, beyond, "constant", value)
             for part, value in zip(tool, (_NOTHING, -_NOTHING), strict=True)
         )
     result = z.new_empty((-(-ny // stride), -(-nx // stride)))
@@ -161,13 +160,6 @@ def _distances(relief: Relief) -> list[float]:
     while out[-1] < reach:
         out.append(out[-1] + max(cell, 0.2 * out[-1]))
     return out
-
-
-def _padded(values: Tensor, margin: tuple[int, int], beyond: int, mode: str, value: float = 0.0) -> Tensor:
-    """A map with ``margin`` columns and rows more on every side, and ``beyond`` more columns on the right."""
-    wider = (margin[0], margin[0] + beyond, margin[1], margin[1])
-    padded = functional.pad(values[None, None], wider, mode=mode, value=value if mode == "constant" else None)
-    return padded[0, 0].contiguous()
 
 
 def _tool_columns(relief: Relief, tool: Any) -> tuple[Tensor, Tensor]:

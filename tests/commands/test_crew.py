@@ -1,11 +1,13 @@
 """What other processes do for criticism."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from splatsoil.inverse.criticism.simulations import Simulations
 
 from splatsoil.commands import _crew
 from splatsoil.errors import SimulationError
@@ -29,3 +31,51 @@ def test_a_helper_prepares_what_goes_together_and_makes_what_can_be_made(
     _crew._simulate(tmp_path, "cpu", (), 1, jobs)
     assert made == [number for number in range(count) if number != 1]
     assert prepared == ([] if count == 1 else [jobs])
+
+
+class Workers:
+    """Processes that are none, and what becomes of them."""
+
+    def __init__(self, count: int) -> None:
+        self.jobs, self.ended = list[Any](), list[str]()
+        made.append(self)
+
+    def submit(self, job: Any, *words: Any) -> None:
+        self.jobs.append(job)
+
+    def kill(self) -> None:
+        self.ended.append("killed")
+
+    def shutdown(self, *, cancel_futures: bool) -> None:
+        assert cancel_futures
+        self.ended.append("let go")
+
+
+made: list[Workers] = []
+
+
+@pytest.mark.parametrize(("helps", "fails"), [(False, False), (False, True), (True, False), (True, True)])
+def test_helpers_begin_with_the_command_and_none_outlives_it(
+    helps: bool, fails: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And only who holds the folder's lock, so that they help, tidies up there: the replay may be another one's."""
+    made.clear()
+    monkeypatch.setattr("splatsoil.inverse.executors.Processes", Workers)
+    monkeypatch.setattr("splatsoil.threads.cores", lambda: 3)
+    replay = tmp_path / "replay"
+    replay.mkdir()
+    folder: Any = SimpleNamespace(path=tmp_path)
+    experiment: Any = SimpleNamespace(together=1, prepare=len)
+    with suppress(SimulationError), _crew.Crew(folder, "cpu", ()) as crew:
+        (workers,) = made
+        assert workers.jobs == [_crew._ready] * crew.count == [_crew._ready] * 2
+        if helps:
+            with crew.helping(experiment, Simulations(experiment)) as ask:
+                ask({})
+                assert workers.jobs[-1] is _crew._replay
+                if fails:
+                    raise SimulationError("blew up")
+        elif fails:
+            raise SimulationError("blew up")
+    assert workers.ended == ["let go" if helps and not fails else "killed"]
+    assert replay.exists() is not helps
