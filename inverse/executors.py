@@ -81,6 +81,11 @@ class Processes(Executor):
         for thread in self._threads if wait else ():
             thread.join()
 
+    def dismiss(self, count: int) -> None:
+        """End as many workers as come first to the end of what has been queued."""
+        for _ in range(count):
+            self._jobs.put(None)
+
     def kill(self) -> None:
         """End the workers, and with them all other child processes, without waiting for what they are at."""
         self._closed = True

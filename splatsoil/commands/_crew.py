@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
     from splatsoil.experiment.plow import PlowExperiment
     from splatsoil.inverse.criticism.simulations import Simulations
+    from splatsoil.inverse.executors import Processes
     from splatsoil.inverse.run_folder import RunFolder
 
 MOST_HELPERS = 3
@@ -27,14 +28,14 @@ Replay = Callable[[Mapping[str, float]], "Future[None] | None"]
 class Crew:
     """Other processes that simulate, too: one for every other core, as far as there is use for them.
 
-    All keep what they make in ``features/`` and find it there, and one that dies costs nothing but its help. On a CPU
+    They begin at once, so that they have loaded what takes seconds when the first process has. All keep what they make in ``features/`` and find it there, and one that dies costs nothing but its help. On a CPU
     each process keeps to one thread, the first one too: the results are those of one process, bit for bit, and with
     more they would wait for each other. A GPU is shared: each process makes simulations that are alike as one batch, as
     one leaves most of it idle, and cores are shared out.
 
     Args:
         folder: the run folder.
-        device: where it is computed.
+        device: where it is computed, in the user's word.
         effects: the candidates, as `experiment_of` takes them; none for all.
     """
 
@@ -42,14 +43,12 @@ class Crew:
         from splatsoil.inverse.executors import Processes
         from splatsoil.threads import cores
 
-        room = _memory(device) / SHARE[device.split(":")[0]]
-        self.count = int(min(cores(), 1 + MOST_HELPERS, room)) - 1
-        self._threads = 1 if device == "cpu" or self.count < 1 else max(1, cores() // (1 + self.count))
-        self._place = (folder.path, device, tuple(effects), self._threads)
+        self.count = max(0, int(min(cores(), 1 + MOST_HELPERS, _memory("cpu") / SHARE["cpu"])) - 1)
+        self._path, self._effects = folder.path, tuple(effects)
         self._workers = Processes(self.count) if self.count > 0 else None
         if self._workers is not None:
             for _ in range(self.count):
-                self._workers.submit(_ready, *self._place)
+                self._workers.submit(_ready, device)
 
     def __enter__(self) -> Crew:
         return self
@@ -71,16 +70,18 @@ class Crew:
             What has a helper make the replay control, before what it is asked for later.
         """
         from splatsoil.inverse.criticism.simulations import Helpers
-        from splatsoil.threads import at_most
+        from splatsoil.threads import at_most, cores
 
-        workers, self._workers = self._workers, None
-        with at_most(self._threads):
+        device = experiment.base.device
+        workers, self._workers = self._fitting(device), None
+        threads = 1 if device == "cpu" or workers is None else max(1, cores() // (1 + self.count))
+        with at_most(threads):
             if workers is None:
                 yield lambda values: None
                 return
 
             def submit(job: Callable[..., None], *more: object) -> Future[None]:
-                return workers.submit(job, *self._place, *more)
+                return workers.submit(job, self._path, device, self._effects, threads, *more)
 
             def together(jobs: Sequence[Mapping[str, Any]]) -> Future[None]:
                 return submit(_simulate, [dict(job) for job in jobs])
@@ -94,7 +95,16 @@ class Crew:
                 raise
             finally:
                 # a helper that was ended at the replay couldn't tidy up
-                rmtree(self._place[0] / "replay", ignore_errors=True)
+                rmtree(self._path / "replay", ignore_errors=True)
+
+    def _fitting(self, device: str) -> Processes | None:
+        """The helpers that a device has memory for, if any; the others end."""
+        workers = self._workers
+        if workers is not None and device != "cpu":
+            count = max(0, min(self.count, int(_memory(device) / SHARE["cuda"]) - 1))
+            workers.dismiss(self.count - count)
+            self.count = count
+        return workers if self.count > 0 else None
 
 
 def _memory(device: str) -> float:
@@ -114,18 +124,19 @@ def _memory(device: str) -> float:
 _known: dict[tuple[Path, str, tuple[str, ...]], tuple[RunFolder, PlowExperiment, Simulations]] = {}
 
 
-def _ready(path: Path, device: str, effects: tuple[str, ...], threads: int) -> None:
+def _ready(device: str) -> None:
     """A helper's work: to load what takes seconds, before it is needed."""
     import signal
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process ends this one
-    with _quietly(threads):
+    with _quietly(1):
         import torch
 
         from splatsoil.commands import _control, _criticism  # noqa: F401
+        from splatsoil.envs.devices import resolve_device
         from splatsoil.experiment import plow  # noqa: F401
 
-        torch.zeros(1, device=device)
+        torch.zeros(1, device=resolve_device(device))
 
 
 def _simulate(

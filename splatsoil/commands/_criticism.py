@@ -326,15 +326,15 @@ def remember(folder: RunFolder, entries: list[dict[str, Any]], under_way: Mappin
     return write_json(folder.path / "history.json", {"format": HISTORY_FORMAT, "models": entries, **more})
 
 
-def check_budget(options: Options) -> None:
+def check_budget(repeats: int, refits: int = 1, refit_steps: int = 1) -> None:
     """ParameterError for numbers that make no sense.
 
     Raises:
         ParameterError: see above.
     """
-    if options.repeats < 2:
-        raise ParameterError(f"--repeats: chance needs at least 2 repeats, not {options.repeats}")
-    if options.refits < 1 or options.refit_steps < 1:
+    if repeats < 2:
+        raise ParameterError(f"--repeats: chance needs at least 2 repeats, not {repeats}")
+    if refits < 1 or refit_steps < 1:
         raise ParameterError("--refits and --refit-steps: give 1 or more")
 
 

@@ -59,7 +59,7 @@ def run(config: Config) -> int:
 
     hush()
     options = Options(repeats=config.repeats)
-    criticism.check_budget(options)
+    criticism.check_budget(config.repeats)
     check_evaluations(config.budget)
     folder = RunFolder.open(config.run)
     fit = criticism.need_fit(folder)

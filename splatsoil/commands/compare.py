@@ -55,7 +55,7 @@ def run(config: Config) -> int:
 
     hush()
     options = Options(repeats=config.repeats)
-    criticism.check_budget(options)
+    criticism.check_budget(config.repeats)
     folder = RunFolder.open(config.run)
     folder.fit()
     folder.check_writable()

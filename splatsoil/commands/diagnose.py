@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
 from splatsoil.commands._options import command_line
 from splatsoil.commands._output import print_json
+
+if TYPE_CHECKING:
+    from splatsoil.commands._crew import Crew
+    from splatsoil.inverse.run_folder import RunFolder
 
 
 @dataclass(frozen=True)
@@ -43,36 +48,42 @@ class Config:
 def run(config: Config) -> int:
     """Diagnose; the result goes into the run folder."""
     from splatsoil.commands import _criticism as criticism
-    from splatsoil.commands import _stages as stage
     from splatsoil.commands._crew import Crew
     from splatsoil.commands._diagnosis_table import show
-    from splatsoil.commands._progress import stages
-    from splatsoil.envs.devices import resolve_device
-    from splatsoil.inverse.criticism.diagnosis import Options
     from splatsoil.inverse.run_folder import RunFolder
-    from splatsoil.quiet import hush
     from splatsoil.soil.library import find_effects
 
-    hush()
-    options = Options(repeats=config.repeats, refits=config.refits, refit_steps=config.refit_steps)
-    criticism.check_budget(options)
+    criticism.check_budget(config.repeats, config.refits, config.refit_steps)
     folder = RunFolder.open(config.run)
     on = criticism.need_fit(folder)["setup"]["effects"]
     criticism.off_effects(config.effects, find_effects(on))
     folder.check_writable()
-    device = resolve_device(config.device)
-    stage.note_other_sources(folder)
-    with Crew(folder, device, config.effects) as crew, stages(quiet=config.json) as begin:
-        model = criticism.model_of(folder, device, begin("reconstruct"))
-        result = criticism.diagnosed(
-            folder, model, options, begin, config.effects, with_replay=config.replay, crew=crew
-        )
+    with Crew(folder, config.device, config.effects) as crew:
+        result = _diagnosed(config, folder, crew)
     if config.json:
         print_json({"ok": True, "run": str(folder.path), **_finite(result)})
     else:
         show(result)
         print(f"kept in {folder.path / 'diagnosis.json'}")
     return 0
+
+
+def _diagnosed(config: Config, folder: RunFolder, crew: Crew) -> dict[str, Any]:
+    """What takes seconds to load is loaded here: helpers have begun by then."""
+    from splatsoil.commands import _criticism as criticism
+    from splatsoil.commands import _stages as stage
+    from splatsoil.commands._progress import stages
+    from splatsoil.envs.devices import resolve_device
+    from splatsoil.inverse.criticism.diagnosis import Options
+    from splatsoil.quiet import hush
+
+    hush()
+    options = Options(repeats=config.repeats, refits=config.refits, refit_steps=config.refit_steps)
+    device = resolve_device(config.device)
+    stage.note_other_sources(folder)
+    with stages(quiet=config.json) as begin:
+        model = criticism.model_of(folder, device, begin("reconstruct"))
+        return criticism.diagnosed(folder, model, options, begin, config.effects, with_replay=config.replay, crew=crew)
 
 
 def interrupted(config: Config) -> str:

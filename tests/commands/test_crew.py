@@ -43,6 +43,9 @@ class Workers:
     def submit(self, job: Any, *words: Any) -> None:
         self.jobs.append(job)
 
+    def dismiss(self, count: int) -> None:
+        self.ended += ["dismissed"] * count
+
     def kill(self) -> None:
         self.ended.append("killed")
 
@@ -65,7 +68,7 @@ def test_helpers_begin_with_the_command_and_none_outlives_it(
     replay = tmp_path / "replay"
     replay.mkdir()
     folder: Any = SimpleNamespace(path=tmp_path)
-    experiment: Any = SimpleNamespace(together=1, prepare=len)
+    experiment: Any = SimpleNamespace(together=1, prepare=len, base=SimpleNamespace(device="cpu"))
     with suppress(SimulationError), _crew.Crew(folder, "cpu", ()) as crew:
         (workers,) = made
         assert workers.jobs == [_crew._ready] * crew.count == [_crew._ready] * 2
@@ -79,3 +82,22 @@ def test_helpers_begin_with_the_command_and_none_outlives_it(
             raise SimulationError("blew up")
     assert workers.ended == ["let go" if helps and not fails else "killed"]
     assert replay.exists() is not helps
+
+
+@pytest.mark.parametrize(("free", "left"), [(20.0, 2), (9.0, 1), (5.0, 0)])
+def test_a_gpu_with_little_memory_keeps_few_helpers(
+    free: float, left: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They began before it was known how much is free there."""
+    made.clear()
+    monkeypatch.setattr("splatsoil.inverse.executors.Processes", Workers)
+    monkeypatch.setattr("splatsoil.threads.cores", lambda: 3)
+    monkeypatch.setattr(_crew, "_memory", {"cpu": 64.0, "cuda:0": free}.__getitem__)
+    folder: Any = SimpleNamespace(path=tmp_path)
+    experiment: Any = SimpleNamespace(together=1, prepare=len, base=SimpleNamespace(device="cuda:0"))
+    with _crew.Crew(folder, "auto", ()) as crew, crew.helping(experiment, Simulations(experiment)) as ask:
+        ask({})
+        (workers,) = made
+        assert crew.count == left
+        assert workers.jobs == [_crew._ready] * 2 + [_crew._replay] * (left > 0)
+    assert workers.ended == ["dismissed"] * (2 - left) + ["let go"] * (left > 0)
