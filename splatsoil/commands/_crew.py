@@ -28,10 +28,11 @@ Replay = Callable[[Mapping[str, float]], "Future[None] | None"]
 class Crew:
     """Other processes that simulate, too: one for every other core, as far as there is use for them.
 
-    They begin at once, so that they have loaded what takes seconds when the first process has. All keep what they make in ``features/`` and find it there, and one that dies costs nothing but its help. On a CPU
-    each process keeps to one thread, the first one too: the results are those of one process, bit for bit, and with
-    more they would wait for each other. A GPU is shared: each process makes simulations that are alike as one batch, as
-    one leaves most of it idle, and cores are shared out.
+    They begin at once, so that they have loaded what takes seconds when the first process has. All keep what they make
+    in ``features/`` and find it there, and one that dies costs nothing but its help. On a CPU each process keeps to one
+    thread, the first one too: the results are those of one process, bit for bit, and with more they would wait for each
+    other. A GPU is shared: each process makes simulations that are alike as one batch, as one leaves most of it idle,
+    and cores are shared out.
 
     Args:
         folder: the run folder.

@@ -4,11 +4,12 @@ from splatsoil.scene.binding import Binding, bind
 from splatsoil.scene.estimate import estimate_light, seen_colours, still_frames
 from splatsoil.scene.ground import ground_of_pixels
 from splatsoil.scene.intrinsic import Intrinsic
+from splatsoil.scene.layers import Layers, Posed
 from splatsoil.scene.light import Light, encoded, linear
 from splatsoil.scene.light_fit import LightEstimate
 from splatsoil.scene.lit import LitRelief, light_relief
 from splatsoil.scene.relief import Relief, relief_of_particles
-from splatsoil.scene.render import Layers, Posed, Scene
+from splatsoil.scene.render import Scene
 from splatsoil.scene.tool import ToolBody, silhouette
 
 __all__ = [

@@ -14,10 +14,11 @@ from splatsoil.scene import albedo as albedos
 from splatsoil.scene.binding import bind
 from splatsoil.scene.estimate import estimate_light, still_frames
 from splatsoil.scene.intrinsic import Intrinsic
+from splatsoil.scene.layers import Posed
 from splatsoil.scene.light import Light, encoded, linear
 from splatsoil.scene.lit import LitRelief, light_relief
 from splatsoil.scene.relief import relief_of_particles
-from splatsoil.scene.render import Posed, Scene
+from splatsoil.scene.render import Scene
 from splatsoil.scene.tool import ToolBody
 from splatsoil.splats import Gaussians
 

@@ -8,19 +8,25 @@ import warp as wp
 from splatsoil.scene.kernels_sky import WIDTH
 
 
+@wp.func
+def _mirrored(i: int, count: int) -> int:
+    """A cell beyond the box, at most by the width of the box, to its mirror image in it."""
+    return wp.where(i < 0, -1 - i, wp.where(i >= count, 2 * count - 1 - i, i))
+
+
 @wp.kernel(enable_backward=False)
 def spread(
     positions: wp.array(dtype=wp.vec3), low: wp.vec3, inverse: wp.vec3, grid: wp.array3d(dtype=wp.float32)
 ) -> None:
-    """Add each particle to a grid by a quadratic B-spline; three cells around the box are for what reaches beyond."""
+    """Add each particle to a grid by a quadratic B-spline; walls, floor and top mirror what would leave."""
     p = wp.tid()
     q = wp.cw_mul(positions[p] - low, inverse)
-    edge_x = float(grid.shape[0]) - 7.0
-    edge_y = float(grid.shape[1]) - 7.0
-    edge_z = float(grid.shape[2]) - 7.0
-    x = wp.clamp(q[0], 0.0, edge_x + 0.999) - 0.5
-    y = wp.clamp(q[1], 0.0, edge_y + 0.999) - 0.5
-    z = wp.clamp(q[2], 0.0, edge_z + 0.999) - 0.5
+    nx = grid.shape[0]
+    ny = grid.shape[1]
+    nz = grid.shape[2]
+    x = wp.clamp(q[0], 0.0, float(nx - 1) + 0.999) - 0.5
+    y = wp.clamp(q[1], 0.0, float(ny - 1) + 0.999) - 0.5
+    z = wp.clamp(q[2], 0.0, float(nz - 1) + 0.999) - 0.5
     i = int(wp.floor(x + 0.5))
     j = int(wp.floor(y + 0.5))
     k = int(wp.floor(z + 0.5))
@@ -34,7 +40,9 @@ def spread(
         for b in range(3):
             w = wx[a] * wy[b]
             for c in range(3):
-                wp.atomic_add(grid, i + a + 2, j + b + 2, k + c + 2, w * wz[c])
+                wp.atomic_add(
+                    grid, _mirrored(i + a - 1, nx), _mirrored(j + b - 1, ny), _mirrored(k + c - 1, nz), w * wz[c]
+                )
 
 
 @wp.func_native("""
@@ -64,6 +72,41 @@ def blur(axis: int, w: float, grid: wp.array3d(dtype=wp.float32), out: wp.array3
     mirrored; two cells or more along each."""
     i, j = wp.tid()
     _blurred_line(i, j, axis, w, grid, out)
+
+
+@wp.kernel(enable_backward=False)
+def crossing(
+    density: wp.array3d(dtype=wp.float32), level: float, floor: float, cell: float, out: wp.array2d(dtype=wp.float32)
+) -> None:
+    """Height at which a density (nz, ny, nx) falls through a level, from above; the floor where it never reaches it."""
+    i, j = wp.tid()
+    last = density.shape[0] - 1
+    while last >= 0 and density[last, i, j] <= level:
+        last -= 1
+    height = 0.0
+    if last >= 0:
+        k = wp.min(last, density.shape[0] - 2)
+        below = density[k, i, j]
+        part = (below - level) / wp.max(below - density[k + 1, i, j], 1.0e-9)
+        height = float(k) + 0.5 + wp.clamp(part, 0.0, 1.0)
+    out[i, j] = height * cell + floor
+
+
+@wp.kernel(enable_backward=False)
+def between(values: wp.array2d(dtype=wp.float32), stride: int, out: wp.array2d(dtype=wp.float32)) -> None:
+    """A map known at every so many rows and columns, the first among them, linearly in between, constant beyond."""
+    i, j = wp.tid()
+    row = float(i) / float(stride)
+    column = float(j) / float(stride)
+    k = wp.min(int(row), wp.max(values.shape[0] - 2, 0))
+    m = wp.min(int(column), wp.max(values.shape[1] - 2, 0))
+    k_next = wp.min(k + 1, values.shape[0] - 1)
+    m_next = wp.min(m + 1, values.shape[1] - 1)
+    u = wp.min(row - float(k), 1.0)
+    v = wp.min(column - float(m), 1.0)
+    low = values[k, m] * (1.0 - u) + values[k_next, m] * u
+    high = values[k, m_next] * (1.0 - u) + values[k_next, m_next] * u
+    out[i, j] = low * (1.0 - v) + high * v
 
 
 @wp.kernel(enable_backward=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -50,6 +51,12 @@ class LitRelief:
     openness: Tensor
     visible: Tensor
     bounced: Tensor
+
+    @cached_property
+    def shades(self) -> Tensor:
+        """(ny, nx, 8) normals, openness, visibility and bounced light, as a picture is lit by."""
+        scalars = self.openness[..., None], self.visible[..., None]
+        return torch.cat([self.relief.normal, *scalars, self.bounced], dim=2)
 
     def irradiance(self, points: Tensor, spread: float = 0.0) -> Tensor:
         """Light (n, 3) on points (n, 3) of the surface; a point stands for a patch of half width ``spread`` metres."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -31,9 +31,6 @@ so that soil looks weaker than it is and a fit takes it to be stronger (docs/pho
 
 _COARSE = 0.8
 """Cell of the density grid in particle spacings; the kernel is wide enough for it."""
-
-_PAD = 3
-"""Cells around the bed, folded back at the walls."""
 
 
 @dataclass(frozen=True)
@@ -119,10 +116,7 @@ class Relief:
         """
         across, along = (int(depth / self.cell[k]) for k in (0, 1))
         wide = padded(self.height, (across, along), kernels_relief.WIDTH, "constant", math.inf)
-        rows, columns = np.mgrid[-along : along + 1, -across : across + 1]
-        left = depth**2 - (rows * self.cell[1]) ** 2 - (columns * self.cell[0]) ** 2
-        offsets = upload((rows * wide.shape[1] + columns)[left >= 0.0], self.device, torch.int32)
-        drops = upload(np.sqrt(left[left >= 0.0]), self.device)
+        offsets, drops = _ball(depth, self.cell, wide.shape[1], self.device)
         eroded = torch.empty_like(self.height)
         inputs = [depth, as_warp(wide, wp.float32), across, along, as_warp(offsets, wp.int32)]
         inputs += [as_warp(m, wp.float32) for m in (drops, eroded)]
@@ -131,11 +125,24 @@ class Relief:
         return points[:, 2] > self.sample(eroded, points)
 
 
+@lru_cache(maxsize=16)
+def _ball(radius: float, cell: tuple[float, float], width: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """A ball's lower half on a map of so many columns: offsets (n,) int32 from its middle's cell, and how far it
+    reaches down there (n,), m."""
+    across, along = (int(radius / cell[k]) for k in (0, 1))
+    rows, columns = np.mgrid[-along : along + 1, -across : across + 1]
+    left = radius**2 - (rows * cell[1]) ** 2 - (columns * cell[0]) ** 2
+    offsets = (rows * width + columns)[left >= 0.0]
+    return upload(offsets, device, torch.int32), upload(np.sqrt(left[left >= 0.0]), device)
+
+
 def padded(values: Tensor, margin: tuple[int, int], beyond: int, mode: str, value: float = 0.0) -> Tensor:
-    """A map with ``margin`` columns and rows more on every side, and ``beyond`` more columns on the right."""
+    """Maps (..., ny, nx) with ``margin`` columns and rows more on every side, and ``beyond`` more columns on the
+    right."""
     wider = (margin[0], margin[0] + beyond, margin[1], margin[1])
-    wide = functional.pad(values[None, None], wider, mode=mode, value=value if mode == "constant" else None)
-    return wide[0, 0].contiguous()
+    maps = values.reshape(1, -1, *values.shape[-2:])
+    wide = functional.pad(maps, wider, mode=mode, value=value if mode == "constant" else None)
+    return wide.reshape(*values.shape[:-2], *wide.shape[-2:])
 
 
 def grid_of(relief: Relief) -> Any:
@@ -144,6 +151,12 @@ def grid_of(relief: Relief) -> Any:
     grid.x0, grid.y0 = relief.origin
     grid.inverse_x, grid.inverse_y = 1.0 / relief.cell[0], 1.0 / relief.cell[1]
     return grid
+
+
+def surface_of(relief: Relief) -> list[Any]:
+    """Its heights, normals, first cell and cell size, for kernels that look them up at points."""
+    maps = as_warp(relief.height, wp.float32), as_warp(relief.normal, wp.vec3)
+    return [*maps, wp.vec2(*relief.origin), wp.vec2(*relief.cell)]
 
 
 @stepwise
@@ -183,7 +196,9 @@ def relief_of_particles(
     # The density is smooth, heights aren't: a wall stands where the former says, not somewhere in a coarse cell.
     layers = density.permute(2, 1, 0)[None]
     fine = functional.interpolate(layers, scale_factor=2, mode="bicubic", align_corners=False)[0]
-    height = _crossing(fine, 0.5) * float(cell[2]) + float(low[2])
+    height = fine.new_empty(fine.shape[1:])
+    inputs = [as_warp(fine, wp.float32), 0.5, float(low[2]), float(cell[2]), as_warp(height, wp.float32)]
+    launch(kernels_relief.crossing, tuple(height.shape), inputs, fine)
     half = (float(cell[0]) / 2, float(cell[1]) / 2)
     relief = Relief.of_heights(height, (float(low[0]) + half[0] / 2, float(low[1]) + half[1] / 2), half)
     return (yield from relief.ranged())
@@ -191,18 +206,9 @@ def relief_of_particles(
 
 def _spread(positions: Tensor, low: FloatArray, cell: FloatArray, count: npt.NDArray[np.int64]) -> Tensor:
     """Particles per cell (nx, ny, nz) of centres (i + ½)·cell, walls and floor mirroring what would leave."""
-    shape = tuple(int(c) + 2 * _PAD for c in count)
-    grid = torch.zeros(shape, dtype=torch.float32, device=positions.device)
-    inverse = wp.vec3(*(1.0 / cell))
-    inputs = [as_warp(positions.float(), wp.vec3), wp.vec3(*low), inverse, as_warp(grid, wp.float32)]
+    grid = torch.zeros(tuple(int(c) for c in count), dtype=torch.float32, device=positions.device)
+    inputs = [as_warp(positions.float(), wp.vec3), wp.vec3(*low), wp.vec3(*(1.0 / cell)), as_warp(grid, wp.float32)]
     launch(kernels_relief.spread, len(positions), inputs, positions)
-    for axis in range(3):
-        inner = grid.narrow(axis, _PAD, int(count[axis])).clone()
-        before = grid.narrow(axis, 0, _PAD).flip(axis)
-        after = grid.narrow(axis, _PAD + int(count[axis]), _PAD).flip(axis)
-        inner.narrow(axis, 0, _PAD).add_(before)
-        inner.narrow(axis, int(count[axis]) - _PAD, _PAD).add_(after)
-        grid = inner
     return grid
 
 
@@ -217,15 +223,3 @@ def _blur(grid: Tensor, axis: int, variance: float) -> Tensor:
         inputs = [axis, w, *(as_warp(g, wp.float32) for g in (before, grid))]
         launch(kernels_relief.blur, tuple(grid.shape[:2]), inputs, grid)
     return grid
-
-
-def _crossing(density: Tensor, level: float) -> Tensor:
-    """Height in cells (ny, nx) above the floor where the density (nz, ny, nx) falls through the level, from above."""
-    nz = len(density)
-    index = torch.arange(nz, device=density.device)[:, None, None]
-    last = torch.where(density > level, index, -1).amax(dim=0)
-    inside = last.clamp(0, nz - 2)[None]
-    below = density.gather(0, inside)[0]
-    above = density.gather(0, inside + 1)[0]
-    part = ((below - level) / (below - above).clamp_min(1e-9)).clamp(0.0, 1.0)
-    return torch.where(last >= 0, inside[0] + 0.5 + part, torch.zeros_like(part))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from splatsoil.scene import kernels
+from splatsoil.scene import kernels, kernels_relief
 from splatsoil.scene.kernels_sky import WIDTH, light_of_slopes, sky_kernel
 from splatsoil.scene.relief import Relief, grid_of, padded
 from splatsoil.splats.steps import Steps, stepwise
@@ -49,7 +50,9 @@ def sky_openness(relief: Relief, tool: Any) -> Steps[tuple[Tensor, Tensor]]:
     if not covered:
         return (scale * total).clamp(0.0, 1.0), torch.zeros_like(total)
     taken = _sum(relief, looks, (bottom, top), _STRIDE)
-    hidden = _between(taken, _STRIDE, (total.shape[0], total.shape[1]))
+    hidden = torch.empty_like(total)
+    between = [as_warp(taken, wp.float32), _STRIDE, as_warp(hidden, wp.float32)]
+    launch(kernels_relief.between, tuple(hidden.shape), between, hidden)
     return (scale * (total - hidden)).clamp(0.0, 1.0), (scale * hidden).clamp(0.0, 1.0)
 
 
@@ -69,10 +72,10 @@ def light_from_slopes(relief: Relief, sent: Tensor) -> Tensor:
     z = relief.height
     ny, nx = z.shape
     looks = _Looks.over(relief)
-    wide, *planes = (padded(m, looks.margin, WIDTH, "replicate") for m in (z, *sent))
+    wide, planes = (padded(m, looks.margin, WIDTH, "replicate") for m in (z, sent))
     result = sent.new_empty(sent.shape)
     inputs = [as_warp(z, wp.float32), as_warp(relief.normal, wp.vec3), as_warp(wide, wp.float32)]
-    inputs += [as_warp(torch.stack(planes), wp.float32), *looks.tables(wide), *looks.rows.shape]
+    inputs += [as_warp(planes, wp.float32), *looks.tables(wide), *looks.rows.shape]
     launch(light_of_slopes, (ny, -(-nx // WIDTH)), [*inputs, as_warp(result, wp.float32)], z)
     return result
 
@@ -85,33 +88,34 @@ class _Looks:
         directions: (azimuths, 2) cosine and sine.
         rows, columns: (azimuths, looks) cells on.
         inverses: (azimuths, looks) one over the distance, 1/m.
+        uploaded: what `tables` has put on devices, by the maps' width.
     """
 
     directions: FloatArray
     rows: IntArray
     columns: IntArray
     inverses: FloatArray
+    uploaded: dict[tuple[int, torch.device], list[Tensor]] = field(default_factory=dict)
 
     @classmethod
     def over(cls, relief: Relief) -> _Looks:
-        angle = 2.0 * np.pi * (np.arange(_AZIMUTHS) + 0.5) / _AZIMUTHS
-        directions = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        away = directions[:, :, None] * np.array(_distances(relief))
-        columns, rows = (np.round(away[:, k] / relief.cell[k]).astype(np.int64) for k in (0, 1))
-        return cls(directions, rows, columns, 1.0 / np.hypot(columns * relief.cell[0], rows * relief.cell[1]))
+        return _looks(_distances(relief), relief.cell)
 
-    @property
+    @cached_property
     def margin(self) -> tuple[int, int]:
         """Most columns and rows that a cell looks on."""
         return int(np.abs(self.columns).max()), int(np.abs(self.rows).max())
 
     def tables(self, wide: Tensor) -> list[Any]:
         """Margins, directions, offsets in a map with these margins, and inverses, as the kernels take them."""
-        offsets = (self.rows * wide.shape[1] + self.columns).astype(np.int32)
-        parts: tuple[npt.NDArray[Any], ...] = (self.directions, offsets, self.inverses)
-        types, kinds = (torch.float32, torch.int32, torch.float32), (wp.float32, wp.int32, wp.float32)
-        on = [upload(part.reshape(-1), wide.device, dtype) for part, dtype in zip(parts, types, strict=True)]
-        return [*self.margin, *(as_warp(table, kind) for table, kind in zip(on, kinds, strict=True))]
+        key, kinds = (wide.shape[1], wide.device), (wp.float32, wp.int32, wp.float32)
+        if key not in self.uploaded:
+            offsets = (self.rows * wide.shape[1] + self.columns).astype(np.int32)
+            parts: tuple[npt.NDArray[Any], ...] = (self.directions, offsets, self.inverses)
+            types = (torch.float32, torch.int32, torch.float32)
+            on = [upload(part.reshape(-1), wide.device, dtype) for part, dtype in zip(parts, types, strict=True)]
+            self.uploaded[key] = on
+        return [*self.margin, *(as_warp(table, kind) for table, kind in zip(self.uploaded[key], kinds, strict=True))]
 
 
 def _sum(relief: Relief, looks: _Looks, tool: tuple[Tensor, Tensor] | None, stride: int) -> Tensor:
@@ -140,18 +144,17 @@ def _sum(relief: Relief, looks: _Looks, tool: tuple[Tensor, Tensor] | None, stri
     return result
 
 
-def _between(values: Tensor, stride: int, size: tuple[int, int]) -> Tensor:
-    """A map known at every so many rows and columns, the first among them, linearly in between."""
-    for axis in (0, 1):
-        place = torch.arange(size[axis], device=values.device) / stride
-        before = place.floor().long().clamp_max(max(values.shape[axis] - 2, 0))
-        after = (before + 1).clamp_max(values.shape[axis] - 1)
-        part = (place - before).clamp(0.0, 1.0).reshape((-1, 1) if axis == 0 else (1, -1))
-        values = values.index_select(axis, before) * (1.0 - part) + values.index_select(axis, after) * part
-    return values
+@lru_cache(maxsize=64)
+def _looks(distances: tuple[float, ...], cell: tuple[float, float]) -> _Looks:
+    """Made once: frames differ in how far off there is something to look at, by a few steps."""
+    angle = 2.0 * np.pi * (np.arange(_AZIMUTHS) + 0.5) / _AZIMUTHS
+    directions = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    away = directions[:, :, None] * np.array(distances)
+    columns, rows = (np.round(away[:, k] / cell[k]).astype(np.int64) for k in (0, 1))
+    return _Looks(directions, rows, columns, 1.0 / np.hypot(columns * cell[0], rows * cell[1]))
 
 
-def _distances(relief: Relief) -> list[float]:
+def _distances(relief: Relief) -> tuple[float, ...]:
     """How far off a cell looks: each step a fifth farther, a cell at least, for blockers far away hide little sky."""
     cell = max(relief.cell)
     low, high = relief.range
@@ -159,7 +162,7 @@ def _distances(relief: Relief) -> list[float]:
     out = [cell]
     while out[-1] < reach:
         out.append(out[-1] + max(cell, 0.2 * out[-1]))
-    return out
+    return tuple(out)
 
 
 def _tool_columns(relief: Relief, tool: Any) -> tuple[Tensor, Tensor]:

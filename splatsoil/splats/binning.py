@@ -8,6 +8,7 @@ rows of one Gaussian are neighbours, so that their sum has a fixed order however
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -19,7 +20,7 @@ from splatsoil.splats import kernels_binning as kernels
 from splatsoil.splats.camera import View
 from splatsoil.splats.projection import Projection
 from splatsoil.splats.steps import Steps, stepwise
-from splatsoil.splats.warp_torch import as_warp, launch
+from splatsoil.splats.warp_torch import as_warp, launch, upload
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ class Bins:
         order: (v,) int32, index of the Gaussian of each rank; v are visible, or all, the others last and in no tile.
         rows: (v, HEADER + k) float32, a Gaussian's numbers packed by rank.
         ends: (v,) int32, one past the last entry of each rank.
-        starts: (tiles + 1,) int32, where each tile's list begins in ``ranks`` and ``entries``.
+        starts: (tiles + 1,) int32, of all views, where each tile's list begins in ``ranks`` and ``entries``.
         ranks: (m,) int32, by tile and then by depth.
         entries: (m,) int32, number of the same entry in rank order.
     """
@@ -48,8 +49,15 @@ class Bins:
 
 
 @stepwise
-def bin_by_tile(projection: Projection, features: Tensor, view: View) -> Steps[Bins]:
-    """Sort by depth, pack, list tiles, sort by tile; ``features`` is (n, k). Nothing here carries gradients."""
+def bin_by_tile(projection: Projection, features: Tensor, view: View, counts: Sequence[int] = ()) -> Steps[Bins]:
+    """Sort by depth, pack, list tiles, sort by tile. Nothing here carries gradients.
+
+    Args:
+        projection: of n Gaussians.
+        features: (n, k).
+        view: tells the picture's size.
+        counts: Gaussians of each of several views of this size, whose Gaussians, and then tiles, follow each other.
+    """
     tiles_x, tiles_y = -(-view.width // constants.TILE), -(-view.height // constants.TILE)
     order = _depth_order(projection)
     count = order.shape[0]
@@ -71,8 +79,16 @@ def bin_by_tile(projection: Projection, features: Tensor, view: View) -> Steps[B
     owners = torch.empty_like(tiles)
     lists = [as_warp(tiles, wp.int32), as_warp(owners, wp.int32)]
     launch(kernels.list_tiles, count, [packed, as_warp(ends, wp.int32), tiles_x, tiles_y, *lists], features)
-    starts, ranks, entries = _sort_by_tile(tiles, owners, tiles_x * tiles_y)
+    if counts:
+        tiles += tiles_x * tiles_y * _numbers(counts, features.device)[order[owners]]
+    starts, ranks, entries = _sort_by_tile(tiles, owners, tiles_x * tiles_y * max(len(counts), 1))
     return Bins(tiles_x, tiles_y, order, rows, ends, starts, ranks, entries)
+
+
+def _numbers(counts: Sequence[int], device: torch.device) -> Tensor:
+    """(n,) int32: of the view that each Gaussian belongs to."""
+    each = torch.arange(len(counts), dtype=torch.int32, device=device)
+    return torch.repeat_interleave(each, upload(counts, device, torch.int64), output_size=sum(counts))
 
 
 def _depth_order(projection: Projection) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -53,6 +54,21 @@ def project(means: Tensor, covariances: Tensor, opacities: Tensor, view: View, a
     return Projection(*_Project.apply(means, covariances, opacities, view, antialias))
 
 
+def project_each(
+    gaussians: Sequence[tuple[Tensor, Tensor, Tensor]], views: Sequence[View], antialias: bool = False
+) -> Projection:
+    """Means, covariances and opacities of several scenes, each projected by its own view, one after the other in one
+    projection; without gradients."""
+    counts = [len(means) for means, _, _ in gaussians]
+    outputs = _outputs(sum(counts), gaussians[0][0])
+    for inputs, view, parts in zip(
+        gaussians, views, zip(*(o.split(counts) for o in outputs), strict=True), strict=True
+    ):
+        arguments = [*_arrays(inputs, _INPUTS), _lens(view, antialias), *_arrays(parts, _OUTPUTS)]
+        launch(kernels.project_forward, len(inputs[0]), arguments, inputs[0])
+    return Projection(*outputs)
+
+
 def covariances_of(scales: Tensor, quaternions: Tensor) -> Tensor:
     """R diag(s²) Rᵀ (n, 3, 3), as `Gaussians.covariances` but in one kernel each way."""
     return _Covariances.apply(scales, quaternions)
@@ -75,6 +91,11 @@ def _arrays(tensors: tuple[Tensor, ...], types: tuple[Any, ...]) -> list[Any]:
     return [as_warp(t, d) for t, d in zip(tensors, types, strict=True)]
 
 
+def _outputs(n: int, like: Tensor) -> tuple[Tensor, ...]:
+    """What a projection of n Gaussians is written to."""
+    return tuple(like.new_zeros(shape) for shape in ((n, 2), (n, 3), (n,), (n,), (n, 2)))
+
+
 _INPUTS = (wp.vec3, wp.mat33, wp.float32)
 _OUTPUTS = (wp.vec2, wp.vec3, wp.float32, wp.float32, wp.vec2)
 
@@ -86,7 +107,7 @@ class _Project(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         n = means.shape[0]
         inputs = (means, covariances, opacities)
-        outputs = tuple(means.new_zeros(shape) for shape in ((n, 2), (n, 3), (n,), (n,), (n, 2)))
+        outputs = _outputs(n, means)
         ctx.lens = _lens(view, antialias)
         ctx.save_for_backward(*inputs)
         arguments = [*_arrays(inputs, _INPUTS), ctx.lens, *_arrays(outputs, _OUTPUTS)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any
 
@@ -167,6 +167,16 @@ def _draw(
 
 
 def _projected(means: Tensor, covariances: Tensor, opacities: Tensor, view: View, antialias: bool) -> Projection:
+    checked(means, covariances, opacities)
+    return project(means, covariances, opacities, view, antialias)
+
+
+def checked(means: Tensor, covariances: Tensor, opacities: Tensor) -> None:
+    """Refuse what isn't Gaussians.
+
+    Raises:
+        ParameterError: shapes or types that don't fit.
+    """
     n = means.shape[0]
     for name, tensor, shape in (
         ("means", means, (n, 3)), ("covariances", covariances, (n, 3, 3)), ("opacities", opacities, (n,)),
@@ -175,7 +185,6 @@ def _projected(means: Tensor, covariances: Tensor, opacities: Tensor, view: View
             raise ParameterError(f"{name} have shape {tuple(tensor.shape)}, expected {shape}")
         if tensor.dtype != torch.float32:
             raise ParameterError(f"{name} are {tensor.dtype}; the rasteriser takes torch.float32")
-    return project(means, covariances, opacities, view, antialias)
 
 
 def _composite(
@@ -201,12 +210,7 @@ class _Composite(torch.autograd.Function):
         bins: Bins,
         view: View,
     ) -> tuple[Tensor, Tensor]:
-        channels = features.shape[1]
-        image = features.new_empty((view.height, view.width, channels))
-        transmittance = features.new_empty((view.height, view.width))
-        tensors = (background, image, transmittance)
-        inputs = [*_tile_arguments(bins, view), *(as_warp(t.reshape(-1), wp.float32) for t in tensors)]
-        _launch_tiles(_kernels(features).forward_kernel(channels), bins, inputs, features)
+        (image,), (transmittance,) = blend_each(bins, background, view, 1)
         ctx.bins, ctx.view = bins, view
         ctx.save_for_backward(conics, strengths, image, transmittance)
         return image, transmittance
@@ -236,6 +240,21 @@ class _Composite(torch.autograd.Function):
         return (*outputs, v_background, None, None)
 
 
+def blend_each(bins: Bins, background: Tensor, view: View, count: int) -> tuple[Tensor, Tensor]:
+    """Features (v, h, w, k) and transmittance (v, h, w) of ``count`` views of one size, whose tiles follow each
+    other."""
+    channels, tiles = len(background), bins.tiles_x * bins.tiles_y
+    images = background.new_empty((count, view.height, view.width, channels))
+    transmittances = background.new_empty((count, view.height, view.width))
+    kernel = _kernels(background).forward_kernel(channels)
+    for k in range(count):
+        mine = replace(bins, starts=bins.starts[k * tiles : (k + 1) * tiles + 1])
+        tensors = (background, images[k], transmittances[k])
+        inputs = [*_tile_arguments(mine, view), *(as_warp(t.reshape(-1), wp.float32) for t in tensors)]
+        _launch_tiles(kernel, mine, inputs, background)
+    return images, transmittances
+
+
 def _kernels(like: Tensor) -> ModuleType:
     """The tile kernels for the device of ``like``."""
     return kernels_cuda if like.is_cuda else kernels_cpu
@@ -247,9 +266,9 @@ def _launch_tiles(kernel: Any, bins: Bins, inputs: list[Any], like: Tensor) -> N
     if like.is_cuda:
         launch(kernel, tiles * kernels_cuda.THREADS, [0, *inputs], like, block=kernels_cuda.THREADS)
         return
-    total = bins.ranks.shape[0]
-    threads = thread_count(total / _ENTRIES_PER_MILLISECOND)
-    shares = torch.arange(1, threads) * total // threads
+    first, end = int(bins.starts[0]), int(bins.starts[-1])
+    threads = thread_count((end - first) / _ENTRIES_PER_MILLISECOND)
+    shares = first + torch.arange(1, threads) * (end - first) // threads
     inner = torch.searchsorted(bins.starts, shares.to(torch.int32)).tolist()
     launch_parts(kernel, [0, *inner, tiles], inputs)
 

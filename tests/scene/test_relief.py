@@ -3,11 +3,14 @@
 import numpy as np
 import pytest
 import torch
+import warp as wp
+from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial import cKDTree
 
 from splatsoil.measurement import Bed
 from splatsoil.reconstruction import HeightField, fill
-from splatsoil.scene import Relief, relief_of_particles
+from splatsoil.scene import Relief, kernels_relief, relief, relief_of_particles
+from splatsoil.splats.warp_torch import as_warp, launch
 from splatsoil.synthetic.soil_surface import soil_surface
 
 LOWER, UPPER = np.zeros(3), np.array([0.4, 0.3, 0.2])
@@ -124,6 +127,54 @@ def test_what_lies_behind_a_steep_wall_is_near_the_surface():
     assert np.array_equal(shown[sure], distance[sure] < 0.025)
     behind = (points[:, 0] < 0.12) & (relief.depth_below(torch.tensor(points).float()).numpy() > 0.03) & sure
     assert shown[behind].any(), "some are near a wall though far below the rim"
+
+
+def test_what_particles_spread_over_the_walls_comes_back():
+    """Against the same particles with their mirror images behind all six walls, on a grid that goes on there."""
+    generator = np.random.default_rng(4)
+    particles = generator.uniform(0.0, 1.0, (300, 3)) * [0.4, 0.3, 0.2]
+    particles[:100] *= 0.05
+    cell, count = np.array([0.05, 0.05, 0.05]), np.array([8, 6, 4])
+    grid = relief._spread(torch.tensor(particles, dtype=torch.float32), LOWER, cell, count).double().numpy()
+    assert grid.sum() == pytest.approx(300.0, rel=1e-5)
+    images = particles
+    for axis, wall in enumerate(UPPER):
+        mirrored = [images, images * np.where(np.arange(3) == axis, -1.0, 1.0)]
+        beyond = images.copy()
+        beyond[:, axis] = 2.0 * wall - beyond[:, axis]
+        images = np.concatenate([*mirrored, beyond])
+    middles = [cell[k] * (np.arange(count[k]) + 0.5) for k in range(3)]
+    away = [np.abs(images[:, k, None] - middles[k]) / cell[k] for k in range(3)]
+    b = [np.where(u < 0.5, 0.75 - u**2, 0.5 * np.clip(1.5 - u, 0.0, None) ** 2) for u in away]
+    assert np.allclose(grid, np.einsum("ni,nj,nk->ijk", *b), atol=1e-4)
+
+
+@pytest.mark.parametrize("stride", [1, 3])
+def test_what_is_known_at_every_third_cell_is_linear_in_between(stride):
+    """Against SciPy's, and constant beyond the last."""
+    generator = np.random.default_rng(5)
+    values = generator.random((5, 7)).astype(np.float32)
+    size = (5 * stride - 1, 7 * stride)
+    out = torch.zeros(size)
+    inputs = [torch.from_numpy(values), stride, out]
+    launch(
+        kernels_relief.between,
+        size,
+        [as_warp(i, wp.float32) if isinstance(i, torch.Tensor) else i for i in inputs],
+        out,
+    )
+    known = RegularGridInterpolator((stride * np.arange(5), stride * np.arange(7)), values)
+    rows, columns = np.minimum(np.indices(size), stride * np.array([4, 6])[:, None, None])
+    assert np.allclose(out.numpy(), known(np.stack([rows, columns], axis=-1)), atol=1e-6)
+
+
+def test_the_surface_is_the_uppermost_crossing():
+    """A cavity, nothing at all, a column full to the top, and one that ends between two cells."""
+    density = torch.tensor([[1.0, 0.0, 1.0, 0.9], [0.1, 0.0, 1.0, 0.7], [0.8, 0.0, 1.0, 0.2], [0.2, 0.0, 1.0, 0.0]])
+    height = torch.zeros(1, 4)
+    inputs = [as_warp(density[:, None].contiguous(), wp.float32), 0.5, 1.0, 0.1, as_warp(height, wp.float32)]
+    launch(kernels_relief.crossing, (1, 4), inputs, height)
+    assert height[0].tolist() == pytest.approx([1.0 + 0.1 * 3.0, 1.0, 1.0 + 0.1 * 3.5, 1.0 + 0.1 * 1.9])
 
 
 def test_the_same_particles_give_the_same_bits():

@@ -16,19 +16,24 @@ from splatsoil.measurement import Bed, Camera, Measurement
 from splatsoil.scene import (
     Layers,
     Light,
+    Relief,
     Scene,
     ToolBody,
     bind,
     encoded,
     kernels,
     kernels_colour,
+    kernels_relief,
+    kernels_visible,
     linear,
     relief_of_particles,
+    render,
     seen_colours,
     still_frames,
 )
 from splatsoil.scene.kernels_sky import sky_kernel
 from splatsoil.splats import Gaussians
+from splatsoil.splats.steps import finished
 
 SPACING = 0.02
 BED = Bed(np.zeros(3), np.array([0.4, 0.4, 0.2]), 1600.0)
@@ -160,9 +165,72 @@ def test_a_picture_is_its_layers_put_together():
 
 def test_kernels_compile_for_cuda(tmp_path):
     """NVRTC comes with Warp, so a compiler error shows without a GPU; sm_90 is an H100 or H200."""
-    for kernel in (kernels.illuminate, kernels_colour.develop, sky_kernel(1, False), sky_kernel(3, True)):
+    ours = kernels.illuminate, kernels_colour.develop, kernels_relief.crossing, kernels_visible.settle
+    for kernel in (*ours, sky_kernel(1, False), sky_kernel(3, True)):
         (artifact,) = wp.compile_aot_module(kernel.module, arch=90, module_dir=tmp_path, use_ptx=True)
         assert ".entry" in Path(artifact).read_text()
+
+
+def test_views_that_are_drawn_together_are_those_drawn_alone():
+    """With the tool elsewhere in each, so that other windows are drawn around it, and not at all in one."""
+    bed, view = level_bed(), camera()
+    scene = scene_of(bed, mesh=trimesh.creation.box((0.08, 0.08, 0.02)))
+    tools = [(np.eye(3), np.array(place)) for place in ([0.12, 0.2, 0.105], [0.22, 0.2, 0.13])]
+    moments = scene.poses([(bed, None, tool) for tool in (*tools, None)])
+    views = [(moments[0], view), (moments[1], view), (moments[2], view), (moments[1], camera((0.2, -0.35, 0.6)))]
+    together = finished(scene._layering(views)).image
+    alone = scene.pictures([*views, (moments[0], view.scaled(0.5))])
+    assert torch.equal(together, torch.from_numpy(np.stack(alone[:4])))
+    assert alone[4].shape == (view.height // 2, view.width // 2, 3)
+    assert np.array_equal(alone[4], scene.picture(moments[0], view.scaled(0.5)))
+    assert len({picture.tobytes() for picture in alone[:4]}) == 4
+
+
+def test_no_gaussian_reaches_out_of_the_soil():
+    """On a slope: those that did lie flat within it, as thin as at rest and as wide along it as before; the others stay
+    as they are. Particles' own are flat beneath the surface and round far below."""
+    slope = np.array([-0.3, 0.0, 1.0]) / np.hypot(0.3, 1.0)
+    x = torch.arange(0.005, 0.4, 0.01).expand(40, 40)
+    relief = Relief.of_heights(0.1 + 0.3 * x, (0.005, 0.005), (0.01, 0.01))
+    generator = np.random.default_rng(1)
+    count, thin = 200, 0.001
+    place = generator.uniform(0.05, 0.35, (count, 3))
+    depth = generator.uniform(-0.005, 0.03, count)
+    place[:, 2] = 0.1 + 0.3 * place[:, 0]
+    place -= depth[:, None] * slope
+    turned = Rotation.random(count, random_state=2).as_matrix()
+    shapes = turned @ np.diag([0.006, 0.004, thin]) ** 2 @ turned.transpose(0, 2, 1)
+    tensors = [
+        torch.tensor(t, dtype=torch.float32) for t in (place, shapes, np.full(count, thin), generator.random(count))
+    ]
+    albedo = torch.tensor(generator.random((count, 3)), dtype=torch.float32)
+    out = [torch.zeros(count - 20, *shape) for shape in ((3,), (3, 3), (), (4,))]
+    chosen = torch.arange(20, count, dtype=torch.int32)
+    render._settle(relief, chosen, (*tensors, albedo), out)
+    centres, covariances, opacities, features = (t.double().numpy() for t in out)
+    before, left = shapes[20:], depth[20:]
+    across = np.sqrt(np.einsum("i,nij,j->n", slope, before, slope))
+    reached = left < 2.0 * across
+    assert 20 < reached.sum() < 160
+    assert np.allclose(centres[~reached], place[20:][~reached], atol=1e-6)
+    assert np.allclose(covariances[~reached], before[~reached], atol=1e-10)
+    flat = covariances[reached]
+    assert np.allclose(flat @ slope, thin**2 * slope, atol=1e-9)
+    along = np.eye(3) - np.outer(slope, slope)
+    assert np.allclose(along @ flat @ along, along @ before[reached] @ along, atol=1e-9)
+    ends = (0.1 + 0.3 * centres[:, 0] - centres[:, 2]) * slope[2]
+    assert np.allclose(ends[reached], np.maximum(left[reached], 2.0 * thin), atol=1e-6)
+    assert np.array_equal(opacities, tensors[3].double().numpy()[20:]) and np.all(features[:, 3] == 1.0)
+    assert np.array_equal(features[:, :3], albedo.double().numpy()[20:])
+
+    render._draw_grains(relief, chosen, (tensors[0], albedo), SPACING, out)
+    centres, covariances, opacities, _ = (t.double().numpy() for t in out)
+    deep = left > 2.0 * render.BURIED_SIZE * SPACING
+    assert 5 < deep.sum() < 175 and np.allclose(centres, place[20:], atol=1e-6) and np.allclose(opacities, 0.95)
+    sizes = np.sqrt(np.linalg.eigvalsh(covariances)) / SPACING
+    assert np.allclose(sizes[deep], render.BURIED_SIZE, atol=1e-4)
+    assert np.allclose(sizes[~deep], [render.PARTICLE_THICKNESS, render.PARTICLE_SIZE, render.PARTICLE_SIZE], atol=1e-4)
+    assert np.allclose(covariances[~deep] @ slope, (render.PARTICLE_THICKNESS * SPACING) ** 2 * slope, atol=1e-9)
 
 
 @pytest.mark.cuda

@@ -1,0 +1,62 @@
+"""Several views at once against each of them by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from splatsoil.errors import ParameterError
+from splatsoil.measurement import Camera
+from splatsoil.splats import Gaussians, rasterise_features
+from splatsoil.splats.steps import finished
+from splatsoil.splats.views import Seen, at_once, rasterise_views
+
+BACKGROUND = torch.tensor([0.1, 0.2, 0.3])
+
+
+@pytest.fixture(scope="module")
+def views(camera_at: Callable[..., Camera], cloud: Callable[..., Gaussians]) -> list[Seen]:
+    """Of four cameras of one size, 5 by 4 tiles: of one cloud, of another one turned, of nothing, of one behind it."""
+    out = []
+    for k, (count, turn) in enumerate([(400, 0.0), (250, 20.0), (0, 0.0), (100, 180.0)]):
+        g = cloud(count, seed=k)
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_euler("y", turn, degrees=True).as_matrix() @ np.diag([1.0, -1.0, -1.0])
+        camera = camera_at(70, 50, f=90.0 + 5.0 * k, camera_to_world=pose)
+        out.append(Seen(g.means, g.covariances(), g.opacities, g.colours, camera))
+    return out
+
+
+def test_views_together_are_the_same_as_each_alone(views: list[Seen]) -> None:
+    image, alpha = finished(at_once(views, BACKGROUND, True))
+    assert image.shape == (4, 50, 70, 3) and alpha.shape == (4, 50, 70)
+    for k, v in enumerate(views):
+        alone = rasterise_features(
+            v.means, v.covariances, v.opacities, v.features, v.camera, background=BACKGROUND, antialias=True
+        )
+        assert torch.equal(image[k], alone.image) and torch.equal(alpha[k], alone.alpha)
+    assert alpha[:2].amax(dim=(1, 2)).min() > 0.5 and alpha[2:].max() == 0.0
+    one_by_one, alphas = rasterise_views(views, background=BACKGROUND, antialias=True)
+    assert torch.equal(one_by_one, image) and torch.equal(alphas, alpha)
+
+
+def test_one_that_is_no_gaussian_is_refused(views: list[Seen]) -> None:
+    odd = Seen(
+        views[0].means[:, :2], *(getattr(views[0], n) for n in ("covariances", "opacities", "features", "camera"))
+    )
+    with pytest.raises(ParameterError, match="means have shape"):
+        finished(at_once([views[1], odd], BACKGROUND, False))
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_a_gpu_draws_them_as_a_cpu_does(views: list[Seen]) -> None:
+    there = [Seen(*(t.cuda() for t in (v.means, v.covariances, v.opacities, v.features)), v.camera) for v in views]
+    ours = rasterise_views(views, background=BACKGROUND, antialias=True)
+    theirs = rasterise_views(there, background=BACKGROUND.cuda(), antialias=True)
+    for here, on_gpu in zip(ours, theirs, strict=True):
+        assert torch.allclose(here, on_gpu.cpu(), atol=2e-4)
