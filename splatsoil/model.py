@@ -238,7 +238,7 @@ class Model:
             ParameterError: values out of bounds, or a trajectory without the frames that a time offset needs.
         """
         observation = self.observation(values)
-        scene = self.scene(seed) if albedo is None else self.scene(seed).with_other_albedo(albedo)
+        scene = self.scene(seed)
         if rounding != 1.0:
             scene = scene.replace(smoothing=math.sqrt(rounding) * scene.smoothing)
         if observation.changes_light:
@@ -249,13 +249,17 @@ class Model:
             name: observation.camera(camera.undistorted(), k)
             for k, (name, camera) in enumerate(self.measurement.cameras.items())
         }
-        posed = self._poses.of(trajectory, (seed, albedo, rounding, observation.of_scene))
+        posed = self._poses.of(trajectory, (seed, rounding, observation.of_scene))
         moments = {f: f + observation.time_offset * rate for f in self.frames if f not in posed}
         tools = [observation.tool(motion.pose(moment / rate)) for moment in moments.values()]
         states = [(*trajectory.at(moment), tool) for moment, tool in zip(moments.values(), tools, strict=True)]
         posed |= zip(moments, scene.poses(states), strict=True)
+        seen = dict(posed)
+        if albedo is not None:
+            other = scene.with_other_albedo(albedo)
+            seen = {frame: other.recoloured(moment) for frame, moment in posed.items()}
         keys = [(name, frame) for frame in self.frames for name in cameras]
-        pictures = scene.pictures([(posed[frame], cameras[name]) for name, frame in keys])
+        pictures = scene.pictures([(seen[frame], cameras[name]) for name, frame in keys])
         return {
             (name, frame): observation.image(picture, frame / rate)
             for (name, frame), picture in zip(keys, pictures, strict=True)

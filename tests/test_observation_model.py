@@ -114,6 +114,12 @@ def test_what_cameras_alone_report_looks_at_scenes_that_are_posed_already(measur
     for count, values in enumerate(others, start=2):
         model.draw(trajectory, 0, values)
         assert len(posed) == count * frames
+    for albedo in (1, 2, None):  # colours, too, are another matter than where things are
+        guessed = model.draw(trajectory, albedo=albedo)
+        assert len(posed) == (1 + len(others)) * frames
+        fresh = model_of(measurement, scene if albedo is None else scene.with_other_albedo(albedo)).draw(trajectory)
+        assert all(np.array_equal(guessed[key], fresh[key]) for key in fresh)
+        del posed[(1 + len(others)) * frames :]
     model.draw(trajectory, rounding=2.0)
     model.draw(trajectory_of(model, still))
     assert len(posed) == (3 + len(others)) * frames

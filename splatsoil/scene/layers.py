@@ -42,7 +42,9 @@ class Posed:
         opacities: (n,).
         features: (n, 4): albedo (soil) or colour (surroundings) in sRGB, and 1 for soil.
         grains: the particles' own Gaussians among them.
+        grain_numbers: (g,) int32: the particles whose own these are.
         discs: centres (k, 3) and covariances (k, 3, 3) of the discs that stand for the tool.
+        tool_box: (8, 3) corners of a box around the tool, m; none where there is no tool.
         lit: the soil's surface under the light, with the tool's pose.
     """
 
@@ -51,7 +53,9 @@ class Posed:
     opacities: Tensor
     features: Tensor
     grains: slice
+    grain_numbers: Tensor
     discs: tuple[Tensor, Tensor]
+    tool_box: FloatArray
     lit: LitRelief
 
     @cached_property
@@ -66,11 +70,6 @@ class Posed:
             torch.cat([self.opacities[self.grains], discs.new_full((few,), TOOL_OPACITY)]),
             functional.pad(discs.new_ones((few, 1)), (0, 0, count, 0)),
         )
-
-    @cached_property
-    def tool_points(self) -> FloatArray:
-        """(k, 3) the discs' centres, m."""
-        return self.discs[0].cpu().numpy().astype(np.float64)
 
 
 @dataclass(frozen=True)
@@ -165,14 +164,14 @@ def _tools_among_splats(views: Sequence[tuple[Posed, Camera]]) -> Steps[Tensor]:
 
 def _box_of_tool(posed: Posed, camera: Camera) -> tuple[list[int], list[int]] | None:
     """First and one-past-last column and row around the tool in a picture, if it is in it."""
-    if len(posed.tool_points) == 0:
+    if len(posed.tool_box) == 0:
         return None
-    pixels, _ = camera.project(posed.tool_points)
-    pixels = pixels[np.isfinite(pixels).all(axis=1)]
-    if len(pixels) == 0:
-        return None
+    size = [camera.width, camera.height]
+    pixels, _ = camera.project(posed.tool_box)
+    if not np.isfinite(pixels).all():  # it reaches behind the camera
+        return [0, 0], size
     low = np.maximum(np.floor(pixels.min(axis=0)).astype(int) - 2, 0)
-    high = np.minimum(np.ceil(pixels.max(axis=0)).astype(int) + 2, [camera.width, camera.height])
+    high = np.minimum(np.ceil(pixels.max(axis=0)).astype(int) + 2, size)
     return None if np.any(high <= low) else (low.tolist(), high.tolist())
 
 

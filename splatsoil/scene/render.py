@@ -176,10 +176,18 @@ class Scene:
         still = (around.means, self.surrounding_shapes, around.opacities, functional.pad(around.colours, (0, 1)))
         for part, of_rest in zip(rest, still, strict=True):
             part.copy_(of_rest)
-        discs = (x.new_zeros((0, 3)), x.new_zeros((0, 3, 3))) if tool is None else self.tool.discs(*tool)
+        discs, box = (x.new_zeros((0, 3)), x.new_zeros((0, 3, 3))), np.zeros((0, 3))
+        if tool is not None:
+            discs, box = self.tool.discs(*tool), self.tool.corners @ np.asarray(tool[0]).T + np.asarray(tool[1])
         centres, covariances, opacities, features = visible
         drawn_grains = slice(counts[0], counts[0] + counts[1])
-        return Posed(centres, covariances, opacities, features, drawn_grains, discs, lit)
+        return Posed(centres, covariances, opacities, features, drawn_grains, chosen[1], discs, box, lit)
+
+    def recoloured(self, posed: Posed) -> Posed:
+        """What was posed of the same soil with other colours beneath its surface, in this scene's."""
+        features = posed.features.clone()
+        features[posed.grains, :3] = self.grain_albedo[posed.grain_numbers]
+        return replace(posed, features=features)
 
     def layers(self, posed: Posed, camera: Camera) -> Layers:
         """What a camera without distortion sees of a posed scene."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from itertools import pairwise
 from threading import Thread
 from typing import Any
@@ -36,11 +37,18 @@ def upload(values: npt.ArrayLike | Tensor, device: torch.device, dtype: torch.dt
     return values.to(dtype).to(device, non_blocking=device.type == "cuda")
 
 
+@cache
+def _stream(device: torch.device, handle: int) -> Any:
+    """Torch's current stream on a device, of that handle, as Warp's; to ask for it each time takes as long as to
+    describe two arrays."""
+    wp.init()  # a stream can't be asked for before; making descriptors doesn't do it
+    return wp.stream_from_torch(torch.cuda.current_stream(device))
+
+
 def launch(kernel: Any, count: int | tuple[int, ...], inputs: list[Any], like: Tensor, block: int = 256) -> None:
     """Run ``count`` threads (along one or more axes) of a kernel where ``like`` lives, on torch's current stream."""
     if like.is_cuda:
-        wp.init()  # a stream can't be asked for before; making descriptors doesn't do it
-        stream = wp.stream_from_torch(like.device)
+        stream = _stream(like.device, torch.cuda.current_stream(like.device.index).cuda_stream)
         wp.launch(kernel, dim=count, inputs=inputs, device=stream.device, stream=stream, block_dim=block)
     else:
         wp.launch(kernel, dim=count, inputs=inputs, device="cpu")
