@@ -365,7 +365,7 @@ def _where(
         return {}
     seen = experiment.seen
     direction = evidence.directions[members[0]][:, seen].T @ np.array(list(scores[members[0]].steps.values()))
-    solver = floor.noise.plus(floor.free).solver()
+    solver = floor.noise.solver.beside(floor.free)
     parts = shares(experiment.layout, floor.noise, direction * solver.solve(residual))
     whole = sum(parts.values())
     return {key: value / whole for key, value in parts.items()} if whole > 0.0 else {}

@@ -35,9 +35,10 @@ def informed(whole: FloatArray, chance: FloatArray) -> FloatArray:
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 
-def undiluted(vantage: Vantage, noise: Noise) -> Vantage:
-    """The same predictions, every derivative of which doubts are known times its reliability under a noise."""
-    solver = noise.solver()
+def undiluted(vantage: Vantage, noise: Noise, nuisance: FloatArray) -> Vantage:
+    """The same predictions, every derivative of which doubts are known times its reliability under a noise with
+    nuisances (n, q)."""
+    solver = noise.solver.beside(nuisance)
 
     def scaled(tables: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
         out = dict(tables)

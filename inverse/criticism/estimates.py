@@ -77,7 +77,7 @@ def untried(floor: Floor, slopes: FloatArray, precision: FloatArray, doubts: Flo
     count = floor.tried
     if not count:
         return np.zeros(slopes.shape[-1])
-    solver = floor.noise.solver()
+    solver = floor.noise.solver
     along, nuisance = solver.whiten(slopes[floor.noise.seen]), solver.whiten(floor.nuisance)
     chance = np.zeros_like(along) if doubts is None else solver.whiten(doubts[floor.noise.seen])
     shifts = []
@@ -113,7 +113,7 @@ def at_odds(
     """
     seen = floor.noise.seen
     along, left, part = slopes[seen], residual[seen], parts[seen]
-    weights = floor.noise.plus(floor.nuisance).solver().solve(along)
+    weights = floor.noise.solver.beside(floor.nuisance).solve(along)
     known = along.T @ weights + precision
     inverse = np.linalg.inv(known)
     rest = left - along @ (inverse @ weights.T @ left)

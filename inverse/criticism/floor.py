@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -109,10 +110,12 @@ def floor_of(experiment: Experiment, evidence: Evidence, before: Floor | None = 
             layout, left, seen, directions, parameters, alike=False, known=known_parts.get("numerics")
         )
     noise, single = _total(layout, parts, seen, runs)
-    for name, part in parts.items():
-        columns = extra_noise(layout, part, seen, doubted if name in ACTING else None)
-        averaged, alone = (np.sqrt(factor) for factor in _factors(name, runs))
-        noise, single = noise.plus(averaged * columns), single.plus(alone * columns)
+    columns = {name: extra_noise(layout, p, seen, doubted if name in ACTING else None) for name, p in parts.items()}
+    averaged, alone = (
+        np.concatenate([math.sqrt(_factors(name, runs)[i]) * extra for name, extra in columns.items()], axis=1)
+        for i in (0, 1)
+    )
+    noise, single = noise.plus(averaged), single.plus(alone)
     nuisance = [NUMERICS_PRIOR * _columns(patterns, seen), _columns(experiment.systematic, seen)]
     return Floor(noise, single, np.concatenate(nuisance, axis=1), len(patterns), parameters, directions, parts)
 

@@ -56,7 +56,7 @@ def omnibus(noise: Noise, nuisance: FloatArray, residual: FloatArray, basis: Flo
 
     The noise's size is itself known from a few samples only, so the statistic over its degrees of freedom is F.
     """
-    solver = (noise.plus(nuisance) if nuisance.size else noise).solver()
+    solver = noise.solver.beside(nuisance)
     white = solver.whiten(basis)
     left, singular, _ = np.linalg.svd(white, full_matrices=False)
     left = left[:, singular > 1e-6 * singular[0]]
@@ -93,7 +93,7 @@ def blocks(
 
     Of the residual (n,) counts what parameters and nuisances (n, q) cannot take up.
     """
-    bare = noise.solver()
+    bare = noise.solver
     gain = _gain(bare, nuisance)
     generator = np.random.default_rng(seed)
     draws = _project(nuisance, gain, bare.sample(generator, DRAWS) + _drawn(nuisance, generator))
@@ -135,7 +135,7 @@ def shares(layout: Layout, noise: Noise, contributions: FloatArray) -> dict[tupl
 
 def left_over(noise: Noise, nuisance: FloatArray, residual: FloatArray) -> FloatArray:
     """(n,) what parameters and nuisances cannot take up of a residual."""
-    bare = noise.solver()
+    bare = noise.solver
     return _project(nuisance, _gain(bare, nuisance), residual[:, None])[:, 0]
 
 

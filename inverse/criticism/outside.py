@@ -199,7 +199,7 @@ def _fit(
     precision = np.zeros((len(home), len(home)))
     precision[: len(wide), : len(wide)] = np.diag(np.array(wide) ** -2.0)
     precision[len(wide) :, len(wide) :] = np.linalg.inv(root @ root.T)
-    solver = floor.single.plus(floor.nuisance).solver()
+    solver = floor.single.solver.beside(floor.nuisance)
     done, rounds = 0, 1 if experiment.chance else 3
     jobs = rounds * (len(home) + TRIES) + 1
 

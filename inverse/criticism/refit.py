@@ -293,7 +293,7 @@ def optimum(
     values = dict(start)
     noise = Noise.of(
         experiment.layout, [(1.0, independent(experiment.sensor, experiment.sensor_memory))], experiment.seen
-    ).solver()
+    ).solver
 
     def whiten(table: FloatArray) -> FloatArray:
         return noise.whiten(table[experiment.seen])

@@ -149,7 +149,7 @@ def refitted(
     ``whiten`` is what one simulation's χ² is over, ``through`` that of a surface through many; the rest is as in
     :func:`~splatsoil.inverse.criticism.confirmation.confirm`.
     """
-    starting = undiluted(evidence, floor.single.plus(floor.nuisance))
+    starting = undiluted(evidence, floor.single, floor.nuisance)
     jobs: list[Candidate | None] = [None, *chosen]
     trials = [_trial(experiment, evidence, vantage, simulate, candidate) for candidate in jobs]
     done = 0

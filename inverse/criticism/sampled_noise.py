@@ -17,7 +17,7 @@ from scipy.optimize import minimize
 
 from splatsoil.experiment.features import Layout
 
-from .noise import Noise, Part, alive, in_space, in_time
+from .noise import Part, alive, in_space, in_time
 from .scales import scales_of, spacing_of, varied
 from .waves import smooth_waves
 
@@ -28,6 +28,8 @@ MOST_MEMORY = 0.98
 """Largest correlation of neighbouring times."""
 ROUNDS = 2
 """Of estimating scales and correlation in turn."""
+NEARER = 0.3
+"""First steps of looking for a correlation near that of the round before, in those of the first round."""
 FEWEST_TO_JUDGE = 3
 """Samples from which each can be judged by the others."""
 FEWEST_FREEDOM = 8.0
@@ -70,16 +72,16 @@ def estimate(
         return _calibrated(layout, known, samples, seen, directions, free, alike)
     # How far the variance's own scatter is chance depends on the correlation, which depends on the variance. Too much
     # memory at first: a scale that follows its few samples would hide what they have.
-    part = Part(np.zeros(layout.shape), MOST_MEMORY, spacing_of(layout))
+    part, best = Part(np.zeros(layout.shape), MOST_MEMORY, spacing_of(layout)), None
     for _ in range(ROUNDS):
         before = part.across(layout), in_time(layout.steps, part.memory)
-        part = _correlated(layout, samples, seen, scales_of(layout, samples, seen, *before))
+        part, best = _correlated(layout, samples, seen, scales_of(layout, samples, seen, *before), best)
     return _calibrated(layout, part, samples, seen, directions, free, alike)
 
 
 def correlated(layout: Layout, samples: FloatArray, seen: BoolArray, scale: FloatArray) -> Part:
     """The part of given scale (t, s) whose correlation samples (k, t, s) suggest where they were seen (t, s)."""
-    return _correlated(layout, np.where(seen, samples, 0.0), seen, scale)
+    return _correlated(layout, np.where(seen, samples, 0.0), seen, scale, None)[0]
 
 
 def _calibrated(
@@ -109,9 +111,10 @@ def _calibrated(
             # What but one sample changes has no scale by the others.
             least = part.scale * (1.0 / math.sqrt(count) if alike else LEAST_BY_OTHERS)
             scale = np.maximum(scales_of(layout, others, seen, across, times), least)
-        noise = Noise.of(layout, [(1.0, replace(part, scale=scale))], seen)
-        solver = (noise if free is None else noise.plus(free)).solver()
-        white, sample = solver.whiten(waves * noise.scale[:, None]), solver.whiten(samples[k][seen])
+        solver = replace(part, scale=scale).solver(layout, seen)
+        if free is not None:
+            solver = solver.beside(free)
+        white, sample = solver.whiten(waves * scale[seen][:, None]), solver.whiten(samples[k][seen])
         moments = white.T @ sample
         # What of the sample lies in the span of the waves, by normal equations: a tenth of the time of a QR.
         waved.append(float(moments @ np.linalg.solve(white.T @ white, moments)) / len(moments))
@@ -133,18 +136,23 @@ def _calibrated(
     )
 
 
-def _correlated(layout: Layout, samples: FloatArray, seen: BoolArray, scale: FloatArray) -> Part:
-    """The part of given scale, with the correlation of samples that are 0 where nothing was seen."""
+def _correlated(
+    layout: Layout, samples: FloatArray, seen: BoolArray, scale: FloatArray, start: FloatArray | None
+) -> tuple[Part, FloatArray]:
+    """The part of given scale, with the correlation of samples that are 0 where nothing was seen, and where it was
+    found; it is looked for from where another one was, if there is a ``start``."""
     # Where nothing is told apart scales are bounds, and samples over them far too small.
     telling = varied(layout, samples, seen, scale)
     scaled = np.divide(samples, scale, out=np.zeros_like(samples), where=telling)
-    memory, length, nugget, between = _correlation(layout, scaled, telling)
-    return Part(scale, memory, length, nugget, between)
+    (memory, length, nugget, between), best = _correlation(layout, scaled, telling, start)
+    return Part(scale, memory, length, nugget, between), best
 
 
-def _correlation(layout: Layout, scaled: FloatArray, seen: BoolArray) -> tuple[float, float, float, FloatArray]:
+def _correlation(
+    layout: Layout, scaled: FloatArray, seen: BoolArray, start: FloatArray | None
+) -> tuple[tuple[float, float, float, FloatArray], FloatArray]:
     """Memory, length, nugget and correlation between instruments that maximise the likelihood of scaled samples
-    (k, t, s), whatever their size: scales are known too badly for that to tell a correlation."""
+    (k, t, s), whatever their size: scales are known too badly for that to tell a correlation. And where that is."""
     spacing, places = spacing_of(layout), bool(layout.placed.any())
     channels, number = len(layout.channels), layout.channel_numbers
     # Instruments with a place and those without are never correlated.
@@ -153,7 +161,7 @@ def _correlation(layout: Layout, scaled: FloatArray, seen: BoolArray) -> tuple[f
     pairs = [(a, b) for a in range(channels) for b in range(a) if placed[a] == placed[b] and told[a] and told[b]]
     blocks = _blocks(layout, scaled, seen)
     if not blocks:
-        return 0.0, 0.0, 1.0, np.eye(channels)
+        return (0.0, 0.0, 1.0, np.eye(channels)), np.zeros(3 + len(pairs))
     count = sum(block.pairs.size for block in blocks)
 
     def unpack(p: FloatArray) -> tuple[float, float, float, FloatArray]:
@@ -171,14 +179,17 @@ def _correlation(layout: Layout, scaled: FloatArray, seen: BoolArray) -> tuple[f
         squares, logs = np.sum([block.fit(whole, memory) for block in blocks], axis=0)
         return count * math.log(max(squares, 1e-300)) + float(logs)
 
-    first = np.zeros(3 + len(pairs))
+    first, step = np.zeros(3 + len(pairs)), 1.0
+    if start is not None and len(start) == len(first):
+        first, step = start, NEARER
     options = {
         "maxfev": 120 + 40 * len(pairs),
         "xatol": 0.05,
         "fatol": 0.5,
-        "initial_simplex": np.vstack([first, first + np.eye(len(first))]),
+        "initial_simplex": np.vstack([first, first + step * np.eye(len(first))]),
     }
-    return unpack(minimize(loss, first, method="Nelder-Mead", options=options).x)
+    best = minimize(loss, first, method="Nelder-Mead", options=options).x
+    return unpack(best), best
 
 
 @dataclass(frozen=True)
@@ -198,12 +209,13 @@ class _Block:
 
     def fit(self, whole: FloatArray, memory: float) -> tuple[float, float]:
         """χ² and logarithm of the determinant by a correlation (s, s) between sites."""
-        lower, info = dpotrf(whole[self.sites[:, None], self.sites], lower=1, clean=0)
+        lower, info = dpotrf(whole.take(self.sites, axis=0).take(self.sites, axis=1), lower=1, clean=0)
         if info:
             raise np.linalg.LinAlgError(f"a correlation between sites is not positive definite ({info})")
         logs = 2.0 * float(np.log(np.diag(lower)).sum())
         white, _ = dtrtrs(lower, self.pairs, lower=1)
-        squares, count = np.einsum("nm,nm->m", white, white), self.pairs.shape[1]
+        # columns are what lies in a row of memory
+        squares, count = np.einsum("mn,mn->m", white.T, white.T), self.pairs.shape[1]
         if not len(self.gaps):
             return float(squares.sum()), logs * count
         # Sum and difference of two that are so correlated are independent.

@@ -49,8 +49,8 @@ def scales_of(
         local = (near_in_time @ squares @ near.T) / np.maximum(share, 1e-9)
         local = np.maximum(np.where(share > 1e-6, local, variance), least)
         # Degrees of freedom of a mean of squares whose terms are correlated; of their logarithm, bias and variance.
-        held = np.einsum("ij,ik,jk->i", near_in_time, near_in_time, in_time**2).mean()
-        held *= np.einsum("ij,ik,jk->i", near, near, across**2).mean()
+        held = np.sum(near_in_time @ in_time**2 * near_in_time, axis=1).mean()
+        held *= np.sum(near @ across**2 * near, axis=1).mean()
         half = 0.5 * len(samples) / float(held)
         chance = float(polygamma(1, half))
         relative = np.log(local / variance) - (digamma(half) - np.log(half))

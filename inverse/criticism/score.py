@@ -134,8 +134,8 @@ class Scorer:
             ],
             axis=1,
         )
-        whole = np.sum(noise.solver().whiten(joined) ** 2, axis=0)
-        solver = noise.plus(nuisance).solver()
+        whole = np.sum(noise.solver.whiten(joined) ** 2, axis=0)
+        solver = noise.solver.beside(nuisance)
         weights, chance = solver.solve(joined), solver.solve(unsure)
         reliability = reliable(np.sum(joined * weights, axis=0), np.sum(unsure * chance, axis=0))
         joined, weights, whole = reliability * joined, reliability * weights, reliability**2 * whole

@@ -48,11 +48,13 @@ class Sight:
         """For slow waves (n, k), a second look where one was taken, and some times (t,) or all; against one prediction,
         or the mean of the repeats."""
         rows = np.ones(len(experiment.observed), dtype=bool) if rows is None else rows
-        noise = (floor.noise if averaged else floor.single).plus(floor.nuisance).rows(rows)
-        solver = noise.solver()
+        noise = floor.noise if averaged else floor.single
+        inside = (experiment.seen & rows[:, None])[experiment.seen]
+        if not rows.all():
+            noise = noise.rows(rows)
+        solver = noise.solver.beside(floor.nuisance[inside])
         if not experiment.chance:
             return cls(noise, solver, None)
-        inside = (experiment.seen & rows[:, None])[experiment.seen]
         columns = [floor.parameters, floor.directions, basis]
         if vantage is not None:
             tables = [*vantage.slopes.values(), *(table for tables in vantage.directions.values() for table in tables)]

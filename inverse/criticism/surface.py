@@ -17,9 +17,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
 from splatsoil.inverse.hyperparameters import LENGTH_BOUNDS, LENGTH_MEAN, LENGTH_STD
+
+from .noise import triangular
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -137,7 +138,7 @@ class Surface:
         """(p, …) what the directions are in tables (m, …) of the simulations: regressed on their scores, by chance's
         covariance (generalised least squares)."""
         columns = np.column_stack([np.ones(len(tables)), self.scores])
-        columns, told = (solve_triangular(self.root, a, lower=True) for a in (columns, tables.reshape(len(tables), -1)))
+        columns, told = (triangular(self.root, a) for a in (columns, tables.reshape(len(tables), -1)))
         return np.asarray(np.linalg.lstsq(columns, told, rcond=None)[0][1:].reshape(-1, *tables.shape[1:]))
 
     @property
@@ -243,9 +244,9 @@ def _modes(
     """Strengths (m,) of the points' correlation and modes (m, m) with which it is theirs and chance's is 1, and the
     Cholesky factor (m, m) of the latter."""
     chance = np.linalg.cholesky(common * alike + np.eye(len(points))).astype(np.float64)
-    half = solve_triangular(chance, _kernel(points, points, lengths, trend), lower=True)
-    strengths, modes = np.linalg.eigh(solve_triangular(chance, half.T, lower=True))
-    return np.maximum(strengths, 0.0), solve_triangular(chance, modes, lower=True, trans=1), chance
+    half = triangular(chance, _kernel(points, points, lengths, trend))
+    strengths, modes = np.linalg.eigh(triangular(chance, half.T))
+    return np.maximum(strengths, 0.0), triangular(chance, modes, transposed=True), chance
 
 
 def _edge(size: FloatArray, shape: tuple[int, int]) -> float:

@@ -29,9 +29,9 @@ class Site:
     unit: str = ""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Layout:
-    """Labels of a feature table.
+    """Labels of a feature table; the same only as itself.
 
     Attributes:
         times: (t,) what orders the rows (frame numbers, strains, depths), increasing.

@@ -96,7 +96,7 @@ def test_starts_of_refits_have_the_size_that_is_expected_of_them() -> None:
     base = emulated(11, chaos=CHAOS)
     evidence = looked(base, Simulations(base), {"angle": 0.0})
     noise = Noise(np.eye(base.seen.size), base.seen)
-    told = undiluted(evidence, noise)
+    told = undiluted(evidence, noise, np.zeros((base.seen.size, 0)))
     for name, tables in (("angle", told.slopes), ("effect 1", told.directions), ("effect 8", told.directions)):
         raw = evidence.slopes[name] if name == "angle" else evidence.directions[name]
         doubt = evidence.doubt(name, raw)

@@ -165,7 +165,7 @@ def test_the_error_is_as_large_as_parts_of_the_data_contradict_each_other() -> N
         errors, told = [], []
         for draw in range(200):
             own = spread * generator.standard_normal(count)[parts]
-            chance = floor.noise.solver().sample(np.random.default_rng([draw, 1]), 1).reshape(parts.shape)
+            chance = floor.noise.solver.sample(np.random.default_rng([draw, 1]), 1).reshape(parts.shape)
             residual = own * slopes[..., 0] + chance
             errors.append(weights @ residual.reshape(-1))
             told.append(at_odds(floor, parts, slopes, precision, residual)[0])

@@ -9,7 +9,7 @@ import pytest
 from splatsoil.inverse.criticism import floor
 from splatsoil.inverse.criticism.evidence import deviations
 from splatsoil.inverse.criticism.misfit import omnibus, smooth_basis
-from splatsoil.inverse.criticism.noise import Noise, Part, extra_noise, independent
+from splatsoil.inverse.criticism.noise import Noise, Part, extra_noise, independent, orthonormal
 from splatsoil.inverse.criticism.sampled_noise import estimate
 
 from splatsoil.experiment.features import Layout, Site
@@ -132,9 +132,56 @@ def test_correlated_noise_raises_few_false_alarms_and_independent_pixels_nearly_
     assert rates(ours, 25) <= 0.2
 
 
+def test_what_a_solver_says_of_low_rank_noise_is_what_the_whole_matrix_says() -> None:
+    """Against NumPy's inverse, with nuisances from next to nothing to far above the noise, two of them the same, added
+    in two goes; of a part by its scale and correlation, and of a covariance."""
+    rng = np.random.default_rng(5)
+    seen, scale = rng.random(LAYOUT.shape) < 0.2, rng.uniform(0.5, 3.0, LAYOUT.shape)
+    part = replace(TRUE, scale=scale)
+    noise = Noise.of(LAYOUT, [(1.0, part)], seen)
+    count = len(noise.covariance)
+    nuisance = rng.standard_normal((count, 6)) * [1e-9, 1e-2, 1.0, 30.0, 3000.0, 0.0]
+    nuisance[:, 5] = nuisance[:, 4]
+    whole = noise.covariance + nuisance @ nuisance.T
+    columns, bare = rng.standard_normal((count, 3)), np.zeros((count, 0))
+    # The ridge that a part's solver has isn't quite the covariance's.
+    for solver, near in ((noise.solver, 1e-7), (part.solver(LAYOUT, seen), 1e-4)):
+        assert solver.beside(bare).whiten(columns) == pytest.approx(solver.whiten(columns))
+        solver = solver.beside(nuisance[:, :2]).beside(nuisance[:, 2:])
+        expected = columns.T @ np.linalg.inv(whole) @ columns
+        assert columns.T @ solver.solve(columns) == pytest.approx(expected, rel=near, abs=near)
+        white = solver.whiten(columns)
+        assert white.T @ white == pytest.approx(expected, rel=near, abs=near)
+        assert solver.whiten(columns[:, 0]) == pytest.approx(white[:, 0])
+        root = solver.coloured(np.eye(count))
+        assert np.abs(root @ root.T - whole).max() < near * np.abs(whole).max()
+        with pytest.raises(ValueError, match="infs or NaNs"):
+            solver.whiten(np.full(count, np.nan))
+    with pytest.raises(np.linalg.LinAlgError):
+        _ = Noise(np.diag([1.0, -1.0]), SEEN[:1, :2]).solver
+    with pytest.raises(np.linalg.LinAlgError):
+        _ = Noise(np.full((2, 2), np.nan), SEEN[:1, :2]).solver
+
+
+@pytest.mark.parametrize("few", [3, 200])
+def test_orthonormal_columns_span_what_they_are_made_of(few: int) -> None:
+    """Against a singular value decomposition: some hardly differ, some are the same, one is tiny and one nothing."""
+    rng = np.random.default_rng(6)
+    columns = rng.standard_normal((few, 8))
+    columns[:, 1] = columns[:, 0] + 1e-4 * columns[:, 1]
+    columns[:, 2], columns[:, 3], columns[:, 4] = columns[:, 0], 1e-5 * columns[:, 3], 0.0
+    found = orthonormal(columns)
+    left, size, _ = np.linalg.svd(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), full_matrices=False)
+    left = left[:, size > 1e-6 * size[0]]
+    assert found.shape == left.shape == (few, min(few, 6))
+    assert np.abs(found.T @ found - np.eye(found.shape[1])).max() < 1e-10
+    assert np.abs(found @ found.T - left @ left.T).max() < 1e-7
+    assert orthonormal(np.zeros((few, 2))).shape == orthonormal(np.zeros((few, 0))).shape == (few, 0)
+
+
 def scores(noise: Noise, direction: np.ndarray, samples: np.ndarray) -> float:
     """Mean square of standardised scores along a direction (n,): 1 where the noise is right."""
-    solver = noise.solver()
+    solver = noise.solver
     column = solver.whiten(direction)
     white = solver.whiten(samples.reshape(len(samples), -1).T)
     return float(np.mean((column @ white) ** 2) / (column @ column))
