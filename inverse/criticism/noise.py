@@ -105,8 +105,8 @@ def _factor(covariance: FloatArray) -> FloatArray:
         LinAlgError: not positive definite, or not finite.
     """
     lower, info = dpotrf(covariance.T, lower=1, clean=1)  # transposed: as LAPACK lays matrices out
-    if info:
-        raise LinAlgError(f"a covariance isn't positive definite ({info})")
+    if info or not np.isfinite(lower.diagonal()).all():
+        raise LinAlgError("a covariance isn't positive definite, or isn't finite")
     return np.asarray(lower)
 
 
