@@ -256,7 +256,7 @@ def repeated(simulate: Simulations, trials: Sequence[Trial], count: int) -> list
                     out[-1][seed] = Visit(dict(at), trial.on, table, seed)
         return out
 
-    simulate.ahead(again)
+    simulate.ahead(again, apart=True)
     return again(simulate)
 
 
