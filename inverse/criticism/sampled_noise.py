@@ -17,7 +17,7 @@ from scipy.optimize import minimize
 
 from splatsoil.experiment.features import Layout
 
-from .noise import Part, alive, in_space, in_time
+from .noise import Part, alive, in_space, in_time, orthonormal
 from .scales import scales_of, spacing_of, varied
 from .waves import smooth_waves
 
@@ -114,10 +114,8 @@ def _calibrated(
         solver = replace(part, scale=scale).solver(layout, seen)
         if free is not None:
             solver = solver.beside(free)
-        white, sample = solver.whiten(waves * scale[seen][:, None]), solver.whiten(samples[k][seen])
-        moments = white.T @ sample
-        # What of the sample lies in the span of the waves, by normal equations: a tenth of the time of a QR.
-        waved.append(float(moments @ np.linalg.solve(white.T @ white, moments)) / len(moments))
+        left, sample = orthonormal(solver.whiten(waves * scale[seen][:, None])), solver.whiten(samples[k][seen])
+        waved.append(float(np.mean((left.T @ sample) ** 2)))
         if directions is not None and directions.size:
             columns = solver.whiten(directions)
             shares = (columns.T @ sample) ** 2 / np.maximum(np.sum(columns**2, axis=0), 1e-300)
