@@ -182,14 +182,16 @@ def test_a_launch_on_a_gpu_is_the_first_that_warp_hears_of() -> None:
     code = """
 import sys
 from types import SimpleNamespace
+import torch
 import warp as wp
 from splatsoil.splats import warp_torch
 
 def stream(device):
     sys.exit(0 if wp.get_devices.__globals__["runtime"] is not None else 1)
 
+torch.cuda.current_stream = lambda device: SimpleNamespace(cuda_stream=7)
 wp.stream_from_torch = stream
-warp_torch.launch(None, 1, [], SimpleNamespace(is_cuda=True, device="cuda:0"))
+warp_torch.launch(None, 1, [], SimpleNamespace(is_cuda=True, device=torch.device("cuda:0")))
 """
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
