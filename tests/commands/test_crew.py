@@ -1,5 +1,7 @@
 """What other processes do for criticism."""
 
+import subprocess
+import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -101,3 +103,25 @@ def test_a_gpu_with_little_memory_keeps_few_helpers(
         assert crew.count == left
         assert workers.jobs == [_crew._ready] * 2 + [_crew._replay] * (left > 0)
     assert workers.ended == ["dismissed"] * (2 - left) + ["let go"] * (left > 0)
+
+
+EARLY = """
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from splatsoil.commands import _crew, _criticism, diagnose
+from splatsoil.inverse.run_folder import RunFolder
+
+def helpers(*words):
+    sys.exit(1 if {"torch", "kornia"} & sys.modules.keys() else 0)
+
+RunFolder.open = lambda path: SimpleNamespace(check_writable=lambda: None)
+_criticism.need_fit = lambda folder: {"setup": {"effects": []}}
+_crew.Crew = helpers
+diagnose.run(diagnose.Config(Path("run"), effects=("cohesion",)))
+"""
+
+
+def test_a_diagnosis_has_helpers_before_it_loads_what_takes_seconds() -> None:
+    """They load the same, beside it."""
+    assert subprocess.run([sys.executable, "-c", EARLY], check=False).returncode == 0
