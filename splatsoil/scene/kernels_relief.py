@@ -122,6 +122,17 @@ def normals(height: wp.array2d(dtype=wp.float32), cell_x: float, cell_y: float, 
     out[i, j] = wp.normalize(wp.vec3(-along_x, -along_y, 1.0))
 
 
+@wp.func
+def place_of(x: float, y: float, origin: wp.vec2, cell: wp.vec2, rows: int, columns: int) -> wp.vec4:
+    """Row and column of the cell's centre before a place on a map, and how far on the place is along each, in cells;
+    held at the outermost centres."""
+    column = wp.clamp((x - origin[0]) / cell[0], 0.0, float(columns - 1))
+    row = wp.clamp((y - origin[1]) / cell[1], 0.0, float(rows - 1))
+    i = wp.min(int(row), rows - 2)
+    j = wp.min(int(column), columns - 2)
+    return wp.vec4(float(i), float(j), row - float(i), column - float(j))
+
+
 @wp.kernel(enable_backward=False)
 def sample(
     values: wp.array3d(dtype=wp.float32),
@@ -132,12 +143,11 @@ def sample(
 ) -> None:
     """Bilinear values of a map (ny, nx, k) at points (n, 2 or 3), constant beyond the outermost cells' centres."""
     p = wp.tid()
-    column = wp.clamp((points[p, 0] - origin[0]) / cell[0], 0.0, float(values.shape[1] - 1))
-    row = wp.clamp((points[p, 1] - origin[1]) / cell[1], 0.0, float(values.shape[0] - 1))
-    i = wp.min(int(row), values.shape[0] - 2)
-    j = wp.min(int(column), values.shape[1] - 2)
-    u = row - float(i)
-    v = column - float(j)
+    place = place_of(points[p, 0], points[p, 1], origin, cell, values.shape[0], values.shape[1])
+    i = int(place[0])
+    j = int(place[1])
+    u = place[2]
+    v = place[3]
     for c in range(values.shape[2]):
         low = values[i, j, c] * (1.0 - v) + values[i, j + 1, c] * v
         high = values[i + 1, j, c] * (1.0 - v) + values[i + 1, j + 1, c] * v

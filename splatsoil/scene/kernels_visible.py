@@ -4,6 +4,8 @@
 
 import warp as wp
 
+from splatsoil.scene.kernels_relief import place_of
+
 
 @wp.func
 def _blended(
@@ -14,12 +16,11 @@ def _blended(
     point: wp.vec3,
 ) -> wp.vec4:
     """Normal, not of unit length, and height over or under a point; constant beyond the outermost cells' centres."""
-    column = wp.clamp((point[0] - origin[0]) / cell[0], 0.0, float(height.shape[1] - 1))
-    row = wp.clamp((point[1] - origin[1]) / cell[1], 0.0, float(height.shape[0] - 1))
-    i = wp.min(int(row), height.shape[0] - 2)
-    j = wp.min(int(column), height.shape[1] - 2)
-    u = row - float(i)
-    v = column - float(j)
+    place = place_of(point[0], point[1], origin, cell, height.shape[0], height.shape[1])
+    i = int(place[0])
+    j = int(place[1])
+    u = place[2]
+    v = place[3]
     low = normals[i, j] * (1.0 - v) + normals[i, j + 1] * v
     high = normals[i + 1, j] * (1.0 - v) + normals[i + 1, j + 1] * v
     normal = low * (1.0 - u) + high * u

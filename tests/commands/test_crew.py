@@ -59,14 +59,18 @@ class Workers:
 made: list[Workers] = []
 
 
-@pytest.mark.parametrize(("helps", "fails"), [(False, False), (False, True), (True, False), (True, True)])
-def test_helpers_begin_with_the_command_and_none_outlives_it(
-    helps: bool, fails: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """And only who holds the folder's lock, so that they help, tidies up there: the replay may be another one's."""
+@pytest.fixture
+def three_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine with as many, whose processes are none."""
     made.clear()
     monkeypatch.setattr("splatsoil.inverse.executors.Processes", Workers)
     monkeypatch.setattr("splatsoil.threads.cores", lambda: 3)
+
+
+@pytest.mark.usefixtures("three_cores")
+@pytest.mark.parametrize(("helps", "fails"), [(False, False), (False, True), (True, False), (True, True)])
+def test_helpers_begin_with_the_command_and_none_outlives_it(helps: bool, fails: bool, tmp_path: Path) -> None:
+    """And only who holds the folder's lock, so that they help, tidies up there: the replay may be another one's."""
     replay = tmp_path / "replay"
     replay.mkdir()
     folder: Any = SimpleNamespace(path=tmp_path)
@@ -86,14 +90,12 @@ def test_helpers_begin_with_the_command_and_none_outlives_it(
     assert replay.exists() is not helps
 
 
+@pytest.mark.usefixtures("three_cores")
 @pytest.mark.parametrize(("free", "left"), [(20.0, 2), (9.0, 1), (5.0, 0)])
 def test_a_gpu_with_little_memory_keeps_few_helpers(
     free: float, left: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """They began before it was known how much is free there."""
-    made.clear()
-    monkeypatch.setattr("splatsoil.inverse.executors.Processes", Workers)
-    monkeypatch.setattr("splatsoil.threads.cores", lambda: 3)
     monkeypatch.setattr(_crew, "_memory", {"cpu": 64.0, "cuda:0": free}.__getitem__)
     folder: Any = SimpleNamespace(path=tmp_path)
     experiment: Any = SimpleNamespace(together=1, prepare=len, base=SimpleNamespace(device="cuda:0"))

@@ -70,6 +70,16 @@ def test_a_killed_worker_costs_one_evaluation(tmp_path: Path) -> None:
         pool.submit(abs, 1)
 
 
+def test_who_is_dismissed_works_no_more() -> None:
+    pool = Processes(2)
+    try:
+        pool.dismiss(1)
+        at_work = {future.result(timeout=60) for future in [pool.submit(os.getpid) for _ in range(4)]}
+        assert len(at_work) == 1
+    finally:
+        pool.shutdown()
+
+
 WORKS_ON = """
 import os, sys, time
 from splatsoil.inverse.executors import Processes
