@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import wait
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -66,21 +67,26 @@ def replayed(
     folder: RunFolder,
     experiment: PlowExperiment,
     simulate: Simulations,
-    values: Mapping[str, float],
+    place: Path,
     say: Callable[[str], None],
 ) -> FloatArray:
-    """The replay control (1, t, s), made once for a model and its values and kept in ``features/``."""
+    """The replay control (1, t, s), made once for a model, at the latest fit's values, and kept in ``features/``.
+
+    ``place`` is an empty folder for what lies about meanwhile.
+    """
     import io
 
     import numpy as np
 
     from splatsoil.experiment.replay import replay
     from splatsoil.files import read_npy, write_bytes
+    from splatsoil.report.data import estimates
 
     path = replay_path(folder, simulate)
     if not path.is_file():
         stream = io.BytesIO()
-        made = replay(experiment, values, folder.path / "replay", progress=lambda what, _: say(what))
+        values = estimates(folder.fit())
+        made = replay(experiment, values, place / "replay", progress=lambda what, _: say(what))
         np.save(stream, made, allow_pickle=False)
         write_bytes(path, stream.getvalue())
     return read_npy(path)[None]
@@ -90,22 +96,25 @@ def control(
     folder: RunFolder,
     experiment: PlowExperiment,
     simulate: Simulations,
-    values: Mapping[str, float],
     helper: Replay,
     say: Callable[[str], None],
 ) -> Callable[[], FloatArray]:
     """Have the replay control made: by a helper, or here and now where there is none. What it returns waits for it."""
-    making = None if replay_path(folder, simulate).is_file() else helper(values)
+
+    def known() -> FloatArray:
+        with TemporaryDirectory(prefix="splatsoil-") as place:
+            return replayed(folder, experiment, simulate, Path(place), say)
+
+    making = None if replay_path(folder, simulate).is_file() else helper()
     if making is None:
         # One that is kept is read here and now, too: if it is damaged, nothing has been simulated in vain.
-        known = replayed(folder, experiment, simulate, values, say)
-        return lambda: known
+        found = known()
+        return lambda: found
 
     def result() -> FloatArray:
         say("a made-up bed through the whole chain")
         wait([making])
-        # made here where no helper could
-        return replayed(folder, experiment, simulate, values, say)
+        return known()  # made here where no helper could
 
     return result
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from shutil import rmtree
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
-    from pathlib import Path
 
     from splatsoil.experiment.plow import PlowExperiment
     from splatsoil.inverse.criticism.simulations import Simulations
@@ -21,8 +21,8 @@ SHARE = {"cpu": 2.0, "cuda": 4.0}
 """Memory that each process is to have, GiB: it holds a reconstruction, a scene and soil."""
 
 
-Replay = Callable[[Mapping[str, float]], "Future[None] | None"]
-"""Has a helper make the replay control at these values; None where there is no helper."""
+Replay = Callable[[], "Future[None] | None"]
+"""Has a helper make the replay control, if none is at it; None where there is no helper."""
 
 
 class Crew:
@@ -38,18 +38,24 @@ class Crew:
         folder: the run folder.
         device: where it is computed, in the user's word.
         effects: the candidates, as `experiment_of` takes them; none for all.
+        control: whether one is to begin with the replay control, which others wait for in the end, unless that is kept.
     """
 
-    def __init__(self, folder: RunFolder, device: str, effects: Iterable[str]) -> None:
+    def __init__(self, folder: RunFolder, device: str, effects: Iterable[str], *, control: bool) -> None:
         from splatsoil.inverse.executors import Processes
         from splatsoil.threads import cores
 
-        self.count = max(0, int(min(cores(), 1 + MOST_HELPERS, _memory("cpu") / SHARE["cpu"])) - 1)
+        self.count = max(0, int(min(cores(), 1 + MOST_HELPERS, _memory() / SHARE["cpu"])) - 1)
         self._path, self._effects = folder.path, tuple(effects)
+        # One that is ended at the replay can't tidy up.
+        self._place = TemporaryDirectory(prefix="splatsoil-", ignore_cleanup_errors=True)
         self._workers = Processes(self.count) if self.count > 0 else None
+        self._control: Future[None] | None = None
         if self._workers is not None:
             for _ in range(self.count):
                 self._workers.submit(_ready, device)
+            if control:
+                self._control = self._replayed_by(self._workers, device)
 
     def __enter__(self) -> Crew:
         return self
@@ -58,6 +64,7 @@ class Crew:
         """End those that never came to help."""
         if self._workers is not None:
             self._workers.kill()
+        self._place.cleanup()
 
     @contextmanager
     def helping(self, experiment: PlowExperiment, simulate: Simulations) -> Iterator[Replay]:
@@ -71,55 +78,72 @@ class Crew:
             What has a helper make the replay control, before what it is asked for later.
         """
         from splatsoil.inverse.criticism.simulations import Helpers
-        from splatsoil.threads import at_most, cores
+        from splatsoil.threads import at_most
 
         device = experiment.base.device
         workers, self._workers = self._fitting(device), None
-        threads = 1 if device == "cpu" or workers is None else max(1, cores() // (1 + self.count))
-        with at_most(threads):
+        with at_most(_threads(device, self.count)):
             if workers is None:
-                yield lambda values: None
+                yield lambda: None
                 return
 
-            def submit(job: Callable[..., None], *more: object) -> Future[None]:
-                return workers.submit(job, self._path, device, self._effects, threads, *more)
-
             def together(jobs: Sequence[Mapping[str, Any]]) -> Future[None]:
-                return submit(_simulate, [dict(job) for job in jobs])
+                made = [dict(job) for job in jobs]
+                return workers.submit(_simulate, self._path, device, self._effects, self.count, made)
+
+            def replay() -> Future[None]:
+                if self._control is None or self._control.done():
+                    self._control = self._replayed_by(workers, device)
+                return self._control
 
             try:
                 with simulate.helped(Helpers(self.count, together, experiment.together, experiment.prepare)):
-                    yield lambda values: submit(_replay, dict(values))
+                    yield replay
                 workers.shutdown(cancel_futures=True)
             except BaseException:
                 workers.kill()
                 raise
-            finally:
-                # a helper that was ended at the replay couldn't tidy up
-                rmtree(self._path / "replay", ignore_errors=True)
+
+    def _replayed_by(self, workers: Processes, device: str) -> Future[None]:
+        """What is done when one of the helpers has made the control."""
+        place = Path(self._place.name)
+        return workers.submit(_replay, self._path, device, self._effects, self.count, place)
 
     def _fitting(self, device: str) -> Processes | None:
         """The helpers that a device has memory for, if any; the others end."""
         workers = self._workers
         if workers is not None and device != "cpu":
-            count = max(0, min(self.count, int(_memory(device) / SHARE["cuda"]) - 1))
-            workers.dismiss(self.count - count)
+            count = max(0, min(self.count, int(_free(device) / SHARE["cuda"]) - 1))
+            if count > 0:
+                workers.dismiss(self.count - count)
+            else:
+                workers.kill()
             self.count = count
         return workers if self.count > 0 else None
 
 
-def _memory(device: str) -> float:
-    """GiB: the machine's whole, or what is free on a GPU."""
+def _memory() -> float:
+    """The machine's, GiB."""
     import os
 
-    import torch
-
-    if device != "cpu":
-        return float(torch.cuda.mem_get_info(device)[0]) / 2**30
     try:
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
     except (AttributeError, ValueError, OSError):  # not every system tells
         return float("inf")
+
+
+def _free(device: str) -> float:
+    """What is free of a GPU's memory, GiB."""
+    import torch
+
+    return float(torch.cuda.mem_get_info(device)[0]) / 2**30
+
+
+def _threads(device: str, helpers: int) -> int:
+    """How many each process keeps to."""
+    from splatsoil.threads import cores
+
+    return 1 if device == "cpu" or helpers == 0 else max(1, cores() // (1 + helpers))
 
 
 _known: dict[tuple[Path, str, tuple[str, ...]], tuple[RunFolder, PlowExperiment, Simulations]] = {}
@@ -130,24 +154,26 @@ def _ready(device: str) -> None:
     import signal
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process ends this one
-    with _quietly(1):
+
+    def load(here: str) -> None:
         import torch
 
         from splatsoil.commands import _control, _criticism  # noqa: F401
-        from splatsoil.envs.devices import resolve_device
         from splatsoil.experiment import plow  # noqa: F401
 
-        torch.zeros(1, device=resolve_device(device))
+        torch.zeros(1, device=here)
+
+    _quietly(load, device, 0)
 
 
 def _simulate(
-    path: Path, device: str, effects: tuple[str, ...], threads: int, jobs: Sequence[Mapping[str, Any]]
+    path: Path, device: str, effects: tuple[str, ...], helpers: int, jobs: Sequence[Mapping[str, Any]]
 ) -> None:
     """A helper's work."""
     from splatsoil.errors import SplatsoilError
 
-    with _quietly(threads):
-        _, experiment, simulate = _known_here(path, device, effects)
+    def make(here: str) -> None:
+        _, experiment, simulate = _known_here(path, here, effects)
         if len(jobs) > 1:
             experiment.prepare(jobs)
         for job in jobs:
@@ -155,23 +181,26 @@ def _simulate(
             with suppress(SplatsoilError):
                 simulate(**job)
 
+    _quietly(make, device, helpers)
 
-def _replay(path: Path, device: str, effects: tuple[str, ...], threads: int, values: Mapping[str, float]) -> None:
-    """A helper's work."""
+
+def _replay(path: Path, device: str, effects: tuple[str, ...], helpers: int, place: Path) -> None:
+    """A helper's work, in a place for what lies about meanwhile."""
     from splatsoil.commands._control import replayed
 
-    with _quietly(threads):
-        replayed(*_known_here(path, device, effects), values, lambda what: None)
+    _quietly(lambda here: replayed(*_known_here(path, here, effects), place, lambda what: None), device, helpers)
 
 
-@contextmanager
-def _quietly(threads: int) -> Iterator[None]:
-    """Whatever goes wrong, the first process meets it too, and says so."""
+def _quietly(work: Callable[[str], object], device: str, helpers: int) -> None:
+    """Work on a device. Whatever goes wrong, the first process meets it too, and says so."""
+    from splatsoil.envs.devices import resolve_device
     from splatsoil.errors import SplatsoilError
     from splatsoil.threads import at_most
 
-    with at_most(threads), suppress(SplatsoilError, OSError):
-        yield
+    with suppress(SplatsoilError, OSError):
+        here = resolve_device(device)
+        with at_most(_threads(here, helpers)):
+            work(here)
 
 
 def _known_here(path: Path, device: str, effects: tuple[str, ...]) -> tuple[RunFolder, PlowExperiment, Simulations]:
@@ -187,6 +216,7 @@ def _known_here(path: Path, device: str, effects: tuple[str, ...]) -> tuple[RunF
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process ends this one
         hush()
         folder = RunFolder.open(path)
-        model = criticism.model_of(folder, device, lambda what, share: None)
+        # a reconstruction that isn't kept is the first process's to make
+        model = criticism.model_of(folder, device, lambda what, share: None, anew=False)
         _known[key] = (folder, *criticism.experiment_of(folder, model, effects or None))
     return _known[key]

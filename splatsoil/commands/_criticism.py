@@ -21,13 +21,17 @@ if TYPE_CHECKING:
     from splatsoil.soil.effect import Effect
 
 
-def model_of(folder: RunFolder, device: str, report: Report) -> Model:
-    """The model that a run's latest fit is of, on one device."""
+def model_of(folder: RunFolder, device: str, report: Report, *, anew: bool = True) -> Model:
+    """The model that a run's latest fit is of, on one device; a reconstruction that isn't kept is made ``anew``.
+
+    Raises:
+        RunError: it may not be.
+    """
     from splatsoil.commands import _stages as stage
 
     setup = folder.fit()["setup"]
     measurement = stage.measurement_of(folder)
-    reconstruction = stage.reconstructed(measurement, folder, device, report)
+    reconstruction = stage.reconstructed(measurement, folder, device, report, anew=anew)
     return stage.model_on(measurement, folder, reconstruction, setup["effects"], setup["preset"], device)
 
 
@@ -122,9 +126,9 @@ def diagnosed(
 
     simulate.told = starting
     values = estimates(fit)
-    team = Crew(folder, model.device, effects) if crew is None else nullcontext(crew)
+    team = Crew(folder, model.device, effects, control=with_replay) if crew is None else nullcontext(crew)
     with folder.lock(), team as mine, mine.helping(experiment, simulate) as helper:
-        replays = control(folder, experiment, simulate, values, helper, say) if with_replay else None
+        replays = control(folder, experiment, simulate, helper, say) if with_replay else None
         simulate.ahead(lambda ask: gather(experiment, ask, values, repeats=options.repeats))
         say("where soil plays no part")
         calibration = calibrated(folder, experiment, simulate, values)
@@ -155,9 +159,19 @@ def diagnosed(
 
 
 def misfit(
-    folder: RunFolder, model: Model, options: Options, report: Report, *, with_replay: bool = True
+    folder: RunFolder,
+    model: Model,
+    options: Options,
+    report: Report,
+    *,
+    with_replay: bool = True,
+    crew: Crew | None = None,
 ) -> dict[str, Any]:
-    """How far the model is from the data, where and when, against the floor; kept as ``comparison/misfit.json``."""
+    """How far the model is from the data, where and when, against the floor; kept as ``comparison/misfit.json``.
+
+    ``crew`` are processes for no effects that are there already.
+    """
+    from contextlib import nullcontext
     from dataclasses import replace
 
     from splatsoil.commands._control import control
@@ -171,12 +185,11 @@ def misfit(
     fit = folder.fit()
     experiment, simulate = experiment_of(folder, model, ())
     values = estimates(fit)
-    with folder.lock(), Crew(folder, model.device, ()) as crew, crew.helping(experiment, simulate) as helper:
-        replays = (
-            control(folder, experiment, simulate, values, helper, lambda what: report(what, 0.0))
-            if with_replay
-            else None
-        )
+    team = Crew(folder, model.device, (), control=with_replay) if crew is None else nullcontext(crew)
+    with folder.lock(), team as mine, mine.helping(experiment, simulate) as helper:
+        replays = None
+        if with_replay:
+            replays = control(folder, experiment, simulate, helper, lambda what: report(what, 0.0))
         simulate.ahead(lambda ask: gather(experiment, ask, values, repeats=options.repeats))
         evidence = gather(
             experiment,
@@ -210,8 +223,9 @@ def confirmed(folder: RunFolder, model: Model, name: str, options: Options, repo
     experiment, simulate = experiment_of(folder, model, (name,))
     (effect,) = (candidate.name for candidate in experiment.candidates)
     values = estimates(folder.fit())
-    with folder.lock(), Crew(folder, model.device, (name,)) as crew, crew.helping(experiment, simulate) as helper:
-        replays = control(folder, experiment, simulate, values, helper, lambda what: report(what, 0.0))
+    team = Crew(folder, model.device, (name,), control=True)
+    with folder.lock(), team as crew, crew.helping(experiment, simulate) as helper:
+        replays = control(folder, experiment, simulate, helper, lambda what: report(what, 0.0))
         simulate.ahead(lambda ask: gather(experiment, ask, values, repeats=options.repeats))
         evidence = gather(
             experiment,

@@ -70,8 +70,14 @@ def prepare(options: FitOptions) -> tuple[Measurement, RunFolder]:
     return measurement, run
 
 
-def reconstructed(measurement: Measurement, run: RunFolder, device: str, report: Report) -> Reconstruction:
-    """The run's reconstruction: from the folder, or made and kept there."""
+def reconstructed(
+    measurement: Measurement, run: RunFolder, device: str, report: Report, *, anew: bool = True
+) -> Reconstruction:
+    """The run's reconstruction: from the folder, or made ``anew`` and kept there.
+
+    Raises:
+        RunError: what is kept is damaged, or nothing is and it may not be made.
+    """
     from splatsoil import __version__
     from splatsoil.files import RECONSTRUCTING, code_digest
     from splatsoil.reconstruction import Reconstruction, reconstruct
@@ -92,6 +98,8 @@ def reconstructed(measurement: Measurement, run: RunFolder, device: str, report:
             raise RunError(f"{error}: delete the folder {run.reconstruction} and run the command again") from error
         if all(kept.metadata.get(key) == value for key, value in wanted.items()):
             return kept
+    if not anew:
+        raise RunError(f"{run.path}: its reconstruction isn't there")
     made = reconstruct(measurement, seed=seed, device=device, preset=preset, progress=report)
     with run.lock():
         made.save(run.reconstruction)

@@ -6,12 +6,16 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
 from splatsoil.commands._options import command_line
 from splatsoil.commands._output import print_json
+
+if TYPE_CHECKING:
+    from splatsoil.commands._crew import Crew
+    from splatsoil.inverse.run_folder import RunFolder
 
 #: Chance below which a block is called off: of any block, with nothing wrong.
 SURE = 0.05
@@ -45,28 +49,18 @@ class Config:
 
 def run(config: Config) -> int:
     """Simulate, draw, compare; pictures, losses and the misfit by block go into the run folder."""
-    from splatsoil.commands import _criticism as criticism
-    from splatsoil.commands import _stages as stage
-    from splatsoil.commands._progress import stages
-    from splatsoil.envs.devices import resolve_device
-    from splatsoil.inverse.criticism.diagnosis import Options
-    from splatsoil.inverse.run_folder import RunFolder
-    from splatsoil.quiet import hush
+    from contextlib import nullcontext
 
-    hush()
-    options = Options(repeats=config.repeats)
+    from splatsoil.commands import _criticism as criticism
+    from splatsoil.commands._crew import Crew
+    from splatsoil.inverse.run_folder import RunFolder
+
     criticism.check_budget(config.repeats)
     folder = RunFolder.open(config.run)
     folder.fit()
     folder.check_writable()
-    device = resolve_device(config.device)
-    stage.note_other_sources(folder)
-    misfit = None
-    with stages(quiet=config.json) as begin:
-        model = criticism.model_of(folder, device, begin("reconstruct"))
-        result = stage.compared(folder, model, begin("compare"))
-        if not config.quick:
-            misfit = criticism.misfit(folder, model, options, begin("floor"), with_replay=config.replay)
+    with nullcontext() if config.quick else Crew(folder, config.device, (), control=config.replay) as crew:
+        result, misfit = _compared(config, folder, crew)
     if config.json:
         extra = {} if misfit is None else {"misfit": {k: misfit[k] for k in TOLD}}
         print_json({"ok": True, "run": str(folder.path), **result, **extra})
@@ -75,6 +69,29 @@ def run(config: Config) -> int:
         if misfit is not None:
             show_misfit(misfit, str(folder.path))
     return 0
+
+
+def _compared(config: Config, folder: RunFolder, crew: Crew | None) -> tuple[dict[str, Any], dict[str, Any] | None]:
+    """Pictures and losses, and the misfit where helpers for it have begun; what takes seconds to load is loaded
+    here."""
+    from splatsoil.commands import _criticism as criticism
+    from splatsoil.commands import _stages as stage
+    from splatsoil.commands._progress import stages
+    from splatsoil.envs.devices import resolve_device
+    from splatsoil.inverse.criticism.diagnosis import Options
+    from splatsoil.quiet import hush
+
+    hush()
+    options = Options(repeats=config.repeats)
+    device = resolve_device(config.device)
+    stage.note_other_sources(folder)
+    with stages(quiet=config.json) as begin:
+        model = criticism.model_of(folder, device, begin("reconstruct"))
+        result = stage.compared(folder, model, begin("compare"))
+        if crew is None:
+            return result, None
+        floor = begin("floor")
+        return result, criticism.misfit(folder, model, options, floor, with_replay=config.replay, crew=crew)
 
 
 def interrupted(config: Config) -> str:

@@ -58,7 +58,7 @@ def run(config: Config) -> int:
     on = criticism.need_fit(folder)["setup"]["effects"]
     criticism.off_effects(config.effects, find_effects(on))
     folder.check_writable()
-    with Crew(folder, config.device, config.effects) as crew:
+    with Crew(folder, config.device, config.effects, control=config.replay) as crew:
         result = _diagnosed(config, folder, crew)
     if config.json:
         print_json({"ok": True, "run": str(folder.path), **_finite(result)})

@@ -15,6 +15,7 @@ from splatsoil.reconstruction.hidden import reaching_into_soil
 from splatsoil.reconstruction.initial import SOIL, SURROUNDINGS
 from splatsoil.reconstruction.views import Views
 from splatsoil.splats import Gaussians, rasterise, ssim
+from splatsoil.splats.warp_torch import upload
 
 Report = Callable[[str, float], None]
 
@@ -49,64 +50,70 @@ class Trained:
     losses: list[float]
 
 
+COLUMNS = {
+    "means": slice(0, 3),
+    "scales": slice(3, 6),
+    "quaternions": slice(6, 10),
+    "opacities": slice(10, 11),
+    "colours": slice(11, 14),
+}
+"""Of what is learnt of a Gaussian: logarithms of its scales, its opacity's logit, the rest as it is."""
+
+
 class _Optimiser:
-    """Adam over per-Gaussian tensors that may be picked from and added to between steps."""
+    """Adam over Gaussians that may be picked from and added to between steps.
+
+    All numbers of a Gaussian are a row of one tensor, by `COLUMNS`: a GPU waits for every call.
+    """
 
     def __init__(self, gaussians: Gaussians) -> None:
-        self.values: dict[str, Tensor] = {
-            "means": gaussians.means.clone(),
-            "scales": gaussians.scales.log(),
-            "quaternions": gaussians.quaternions.clone(),
-            "opacities": torch.logit(gaussians.opacities),
-            "colours": gaussians.colours.clone(),
-        }
-        self.size = gaussians.scales.amax(dim=1)
-        self.first = {name: torch.zeros_like(value) for name, value in self.values.items()}
-        self.second = {name: torch.zeros_like(value) for name, value in self.values.items()}
-        self.age = torch.zeros(len(gaussians), device=gaussians.device)
+        g = gaussians
+        parts = (g.means, g.scales.log(), g.quaternions, torch.logit(g.opacities)[:, None], g.colours)
+        self.rows = torch.cat(parts, dim=1)
+        self.size = g.scales.amax(dim=1)
+        self.first, self.second = torch.zeros_like(self.rows), torch.zeros_like(self.rows)
+        self.age = torch.zeros((len(g), 1), device=g.device)
 
     def gaussians(self) -> Gaussians:
-        """The Gaussians, with gradients to `values`."""
-        for value in self.values.values():
-            value.requires_grad_(True)
-            value.grad = None
-        v = self.values
-        return Gaussians(v["means"], v["scales"].exp(), v["quaternions"], torch.sigmoid(v["opacities"]), v["colours"])
+        """The Gaussians, with gradients to `rows`."""
+        self.rows.requires_grad_(True)
+        self.rows.grad = None
+        means, scales, quaternions, opacities, colours = self.rows.split(
+            [c.stop - c.start for c in COLUMNS.values()], 1
+        )
+        return Gaussians(means, scales.exp(), quaternions, torch.sigmoid(opacities[:, 0]), colours)
+
+    def values(self, name: str) -> Tensor:
+        """(n, k) columns, to read and to write, without gradients."""
+        return self.rows.detach()[:, COLUMNS[name]]
 
     @torch.no_grad()
     def step(self, rates: dict[str, float]) -> None:
         """One step of Adam (β 0.9, 0.99) with bias correction by each Gaussian's own age."""
+        gradient, value = self.rows.grad, self.rows.detach()
+        assert gradient is not None
         self.age += 1.0
-        short, long = 1.0 - 0.9**self.age, (1.0 - 0.99**self.age).sqrt()
-        for name, value in self.values.items():
-            gradient = value.grad
-            if gradient is None:
-                continue
-            value.requires_grad_(False)
-            shape = (-1,) + (1,) * (value.ndim - 1)
-            rate = rates[name] * (self.size.view(shape) if name == "means" else 1.0)
-            self.first[name].mul_(0.9).add_(gradient, alpha=0.1)
-            self.second[name].mul_(0.99).addcmul_(gradient, gradient, value=0.01)
-            mean, spread = self.first[name] / short.view(shape), self.second[name].sqrt() / long.view(shape)
-            value -= rate * mean / (spread + 1e-12)
-        self.values["colours"].clamp_(0.0, 1.0)
+        self.first.mul_(0.9).add_(gradient, alpha=0.1)
+        self.second.mul_(0.99).addcmul_(gradient, gradient, value=0.01)
+        mean = self.first / (1.0 - 0.9**self.age)
+        spread = self.second.sqrt() / (1.0 - 0.99**self.age).sqrt()
+        columns = [rates[name] for name, c in COLUMNS.items() for _ in range(c.start, c.stop)]
+        change = mean / (spread + 1e-12) * upload(columns, value.device)
+        change[:, COLUMNS["means"]] *= self.size[:, None]
+        value -= change
+        value[:, COLUMNS["colours"]].clamp_(0.0, 1.0)
 
     @torch.no_grad()
     def rearrange(self, kept: Tensor, copied: Tensor, changes: dict[str, Tensor]) -> None:
         """Keep the Gaussians of index `kept`, then append those of index `copied` with some of their values changed."""
-        order = torch.cat([kept, copied])
-        fresh = len(kept)
-        for name in self.values:
-            value = self.values[name].detach()[order].clone()
-            if name in changes:
-                value[fresh:] = changes[name]
-            self.values[name] = value
-            for moment in (self.first, self.second):
-                moment[name] = moment[name][order].clone()
-                moment[name][fresh:] = 0.0
-        self.size = self.size[order]
-        self.age = self.age[order].clone()
-        self.age[fresh:] = 0.0
+        order, fresh = torch.cat([kept, copied]), len(kept)
+        self.rows, self.first, self.second, self.age, self.size = (
+            values.detach()[order] for values in (self.rows, self.first, self.second, self.age, self.size)
+        )
+        for name, value in changes.items():
+            self.rows[fresh:, COLUMNS[name]] = value
+        for began in (self.first, self.second, self.age):
+            began[fresh:] = 0.0
 
 
 def train(
@@ -151,10 +158,12 @@ def train(
     every = max(iterations // 7, 20)
     pull = torch.zeros(len(gaussians), device=device)
     hits = torch.zeros(len(gaussians), device=device)
-    losses: list[float] = []
+    losses: list[Tensor] = []
+    soil = torch.nonzero(label == SOIL)[:, 0]
     order: list[int] = []
     for step in range(iterations):
         if step % 10 == 0:
+            _check(losses)
             report("training Gaussians", step / iterations)
         if not order:
             order = torch.randperm(len(views), generator=generator).tolist()
@@ -165,10 +174,7 @@ def train(
         difference = (rendering.colour - photographs[k]) * valid[k]
         likeness = ssim(rendering.colour * valid[k], photographs[k] * valid[k])
         loss = (1.0 - SIMILARITY) * difference.abs().mean() + SIMILARITY * (1.0 - likeness)
-        losses.append(float(loss.detach()))
-        if not np.isfinite(losses[-1]):
-            raise SimulationError(f"training fell apart at step {step}: the loss is {losses[-1]}; try another seed")
-        soil = label == SOIL
+        losses.append(loss.detach())
         through = ((1.0 - rendering.alpha[..., None]) * valid[k]).mean()
         total = loss + OPEN * through + ANCHOR * anchor(current.means[soil]) + FLAT * _thickness(current.scales)
         total.backward()
@@ -183,15 +189,29 @@ def train(
             stray = _stray(state.gaussians().detach(), label, surface, floor)
             limit = most if progress < GROWING else 0
             label = _grow_and_prune(state, label, pull / hits.clamp_min(1.0), stray, limit, generator)
+            soil = torch.nonzero(label == SOIL)[:, 0]
             pull = torch.zeros(len(label), device=device)
             hits = torch.zeros(len(label), device=device)
+    _check(losses)
     with torch.no_grad():
         result = state.gaussians().detach()
         kept = result.opacities > FAINTEST
         # Quaternions of length 1 are what every reader of the file expects.
         unit = result.replace(quaternions=torch.nn.functional.normalize(result.quaternions, dim=1))
     report("training Gaussians", 1.0)
-    return Trained(unit[kept].to("cpu"), label[kept].to("cpu"), background, losses)
+    return Trained(unit[kept].to("cpu"), label[kept].to("cpu"), background, torch.stack(losses).tolist())
+
+
+def _check(losses: list[Tensor]) -> None:
+    """Now and then: to ask for a number is to wait for a GPU.
+
+    Raises:
+        SimulationError: one is not finite.
+    """
+    lost = torch.nonzero(~torch.isfinite(torch.stack(losses[-10:]))) if losses else ()
+    if len(lost):
+        step = max(len(losses) - 10, 0) + int(lost[0])
+        raise SimulationError(f"training fell apart at step {step}: the loss is {losses[step]:g}; try another seed")
 
 
 def _thickness(scales: Tensor) -> Tensor:
@@ -237,28 +257,22 @@ def _grow_and_prune(
     state: _Optimiser, label: Tensor, pull: Tensor, stray: Tensor, most: int, generator: torch.Generator
 ) -> Tensor:
     """Split the Gaussians that the pictures pull hardest on, drop the faint and the stray; the new labels."""
-    opacity = torch.sigmoid(state.values["opacities"].detach())
+    opacity = torch.sigmoid(state.values("opacities")[:, 0])
     visible = (opacity > FAINTEST) & ~stray
     room = most - int(visible.sum())
     share = min(max(room, 0), int(0.08 * len(pull)))
     threshold = pull[visible].sort(descending=True).values[share] if share else torch.inf
     split = torch.nonzero(visible & (pull > threshold))[:, 0]
     # Of a split Gaussian's two halves one stays in its place in the list; both move apart along its longest axis.
-    scales = state.values["scales"].detach()
-    longest = scales[split].argmax(dim=1)
-    whole = Gaussians(
-        state.values["means"].detach(),
-        scales.exp(),
-        state.values["quaternions"].detach(),
-        opacity,
-        state.values["colours"].detach(),
-    )[split]
+    whole = state.gaussians().detach()[split]
+    longest = whole.scales.argmax(dim=1)
     axis = whole.rotations().gather(2, longest[:, None, None].expand(-1, 3, 1))[:, :, 0]
     away = 0.7 + 0.2 * torch.rand(len(split), generator=generator).to(axis)
     offset = axis * (away * whole.scales.amax(dim=1))[:, None]
-    narrowed = scales[split].scatter_add(1, longest[:, None], torch.full((len(split), 1), -0.6).to(scales))
-    state.values["means"] = state.values["means"].detach().index_copy(0, split, whole.means - offset)
-    state.values["scales"] = scales.index_copy(0, split, narrowed)
+    scales = state.values("scales")[split]
+    narrowed = scales.scatter_add(1, longest[:, None], torch.full((len(split), 1), -0.6).to(scales))
+    state.values("means").index_copy_(0, split, whole.means - offset)
+    state.values("scales").index_copy_(0, split, narrowed)
     kept = torch.nonzero(visible)[:, 0]
     state.rearrange(kept, split, {"means": whole.means + offset, "scales": narrowed})
     return torch.cat([label[kept], label[split]])

@@ -49,16 +49,14 @@ def correlation_length(points: Tensor, values: Tensor, longest: float) -> float:
     if variance < 1e-12 or len(v) < 10:
         return longest
     chosen = np.random.default_rng(0).permutation(len(v))[:2000]
-    tree = cKDTree(xy)
     edges = np.linspace(0.0, longest, 21)
-    total, count = np.zeros(20), np.zeros(20)
-    for i, others in zip(chosen, tree.query_ball_point(xy[chosen], longest), strict=True):
-        others = np.asarray(others)
-        others = others[others != i]
-        distance = np.linalg.norm(xy[others] - xy[i], axis=1)
-        bins = np.minimum((distance / longest * 20).astype(int), 19)
-        np.add.at(total, bins, v[i] * v[others])
-        np.add.at(count, bins, 1.0)
+    total, count, tree = np.zeros(20), np.zeros(20), cKDTree(xy)
+    for some in np.array_split(chosen, max(len(chosen) // 200, 1)):  # all pairs at once may fill the memory
+        pairs = cKDTree(xy[some]).sparse_distance_matrix(tree, longest, output_type="ndarray")
+        pairs = pairs[some[pairs["i"]] != pairs["j"]]
+        bins = np.minimum((pairs["v"] / longest * 20).astype(int), 19)
+        total += np.bincount(bins, v[some[pairs["i"]]] * v[pairs["j"]], 20)
+        count += np.bincount(bins, minlength=20)
     correlation = total / np.maximum(count, 1.0) / variance
     known = count > 30
     centre = 0.5 * (edges[1:] + edges[:-1])

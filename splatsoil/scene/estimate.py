@@ -165,7 +165,8 @@ def untouched(
                 if (depth > 0.0).any():
                     reach = min(_WEDGE * float(depth.max()), float(max(mesh.extents)))
                     sunk = cKDTree(parts[depth > 0.0, :2].double().cpu().numpy())
-                    moved |= np.isfinite(sunk.query(where, distance_upper_bound=reach)[0])
+                    rest = np.flatnonzero(~moved)
+                    moved[rest] = np.isfinite(sunk.query(where[rest], distance_upper_bound=reach)[0])
             at = time
         out.update({f: torch.from_numpy(~moved).to(points.device) for f, end in ends.items() if end == time})
     return out

@@ -5,7 +5,7 @@ GPU waits for and several processes that share one wait for all the more."""
 
 import warp as wp
 
-from splatsoil.scene.kernels_sky import WIDTH
+from splatsoil.scene.kernels_sky import WIDTH_SOURCE
 
 
 @wp.func
@@ -155,8 +155,7 @@ def sample(
 
 
 @wp.func_native(f"""
-    constexpr int W = {WIDTH};
-    const int across = wide.shape[1];
+{WIDTH_SOURCE}    const int across = wide.shape[1];
     const float* here = wide.data + (row + margin_y) * across + margin_x + first;
     float lowest[W];
     for (int l = 0; l < W; ++l) lowest[l] = here[l] - radius;
@@ -169,7 +168,7 @@ def sample(
 """)
 def _eroded_cells(
     row: int,
-    first: int,
+    group: int,
     radius: float,
     wide: wp.array2d(dtype=wp.float32),
     margin_x: int,
@@ -190,6 +189,6 @@ def erode(
     drops: wp.array(dtype=wp.float32),
     out: wp.array2d(dtype=wp.float32),
 ) -> None:
-    """Over (rows, groups of `WIDTH` cells): a map with margins eroded by a ball, given by what it drops where."""
+    """Over (rows, groups of cells): a map with margins eroded by a ball, given by what it drops where."""
     row, group = wp.tid()
-    _eroded_cells(row, group * wp.static(WIDTH), radius, wide, margin_x, margin_y, offsets, drops, out)
+    _eroded_cells(row, group, radius, wide, margin_x, margin_y, offsets, drops, out)

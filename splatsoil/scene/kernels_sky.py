@@ -2,7 +2,8 @@
 # (Warp reads the annotations of kernels as types of its own)
 """The sky over each cell of a relief, in C++ that both the CPU's clang and CUDA compile.
 
-A task is sixteen cells of a row, so that the loop over them fills vector registers on the CPU.
+A task is sixteen cells of a row on the CPU, so that the loop over them fills vector registers, and one cell on a GPU,
+where a map has too few cells to keep it at work otherwise.
 """
 
 from __future__ import annotations
@@ -11,15 +12,35 @@ from functools import cache
 from typing import Any
 
 import warp as wp
+from torch import Tensor
 
 WIDTH = 16
-"""Cells of a row that one task does."""
+"""Cells of a row that one task does on a CPU."""
+
+WIDTH_SOURCE = f"""
+#if defined(__CUDA_ARCH__)
+    constexpr int W = 1;
+#else
+    constexpr int W = {WIDTH};
+#endif
+    const int first = group * W;
+"""
+"""Of C++ that does a group: its width, and its first cell."""
+
+BLOCK = 64
+"""Threads of a block on a GPU: small ones, so that a map is shared out evenly."""
+
+
+def width_of(like: Tensor) -> int:
+    """Cells of a row that one task does where a tensor lives."""
+    return 1 if like.is_cuda else WIDTH
+
 
 _NOTHING = 1.0e6
 """A height beyond all others, m."""
 
 _SNIPPET = """
-    constexpr int W = WIDTH, S = STRIDE;
+    constexpr int S = STRIDE;
     const int ny = height.shape[0], nx = height.shape[1], across = wide.shape[1];
     const int i = row * S;
     const float* surface = wide.data + (i + margin_y) * across + margin_x + first * S;
@@ -81,7 +102,7 @@ _WEDGE = """[](float slope, float up, float along) {
 
 
 _SLOPES_SNIPPET = """
-    constexpr int W = WIDTH, CHANNELS = 3;
+    constexpr int CHANNELS = 3;
     const int ny = height.shape[0], nx = height.shape[1], across = wide.shape[1];
     const int plane = wide.shape[0] * across, start = (row + margin_y) * across + margin_x + first;
     float here[W], nx_[W], ny_[W], up[W], along[W], slope[W], before[W], sum[W], light[CHANNELS][W];
@@ -125,23 +146,23 @@ _SLOPES_SNIPPET = """
 
 def _source(snippet: str) -> str:
     """A snippet with its width, and what its wedges are."""
-    text = snippet.replace("WEDGE(", "wedge(").replace("WIDTH", str(WIDTH))
-    return f"    const auto wedge = {_WEDGE};\n{text}"
+    text = snippet.replace("WEDGE(", "wedge(")
+    return f"{WIDTH_SOURCE}    const auto wedge = {_WEDGE};\n{text}"
 
 
 @cache
 def sky_kernel(stride: int, tool: bool) -> Any:
-    """Kernel over (rows, groups of `WIDTH`) of every ``stride``-th row and column of a map.
+    """Kernel over (rows, groups) of every ``stride``-th row and column of a map.
 
     It sums, over the azimuths, the sky that soil leaves open to a cell, or what of that a tool takes; maps with margins
-    are wide enough for every look and ``WIDTH · stride`` columns more.
+    are wide enough for every look and a group's width times the stride more.
     """
     text = _source(_SNIPPET).replace("STRIDE", str(stride))
 
     @wp.func_native(text.replace("NOTHING", f"{_NOTHING!r}f").replace("TOOL", "true" if tool else "false"))
     def sky_of_cells(
         row: int,
-        first: int,
+        group: int,
         height: wp.array2d(dtype=wp.float32),
         normal: wp.array2d(dtype=wp.vec3),
         wide: wp.array2d(dtype=wp.float32),
@@ -176,7 +197,7 @@ def sky_kernel(stride: int, tool: bool) -> Any:
         row, group = wp.tid()
         sky_of_cells(
             row,
-            group * wp.static(WIDTH),
+            group,
             height,
             normal,
             wide,
@@ -198,7 +219,7 @@ def sky_kernel(stride: int, tool: bool) -> Any:
 @wp.func_native(_source(_SLOPES_SNIPPET))
 def _slopes_of_cells(
     row: int,
-    first: int,
+    group: int,
     height: wp.array2d(dtype=wp.float32),
     normal: wp.array2d(dtype=wp.vec3),
     wide: wp.array2d(dtype=wp.float32),
@@ -229,15 +250,15 @@ def light_of_slopes(
     looks: int,
     result: wp.array3d(dtype=wp.float32),
 ):
-    """Over (rows, groups of `WIDTH` cells): the mean of three maps over the soil in the sky's way of a cell.
+    """Over (rows, groups of cells): the mean of three maps over the soil in the sky's way of a cell.
 
     What rises above the horizon at a look shows the soil between that look and the one before. Maps with margins are
-    wide enough for every look and ``WIDTH`` columns more; 0 where nothing stands in the way.
+    wide enough for every look and a group's width more; 0 where nothing stands in the way.
     """
     row, group = wp.tid()
     _slopes_of_cells(
         row,
-        group * wp.static(WIDTH),
+        group,
         height,
         normal,
         wide,

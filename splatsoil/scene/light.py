@@ -75,9 +75,7 @@ class Light:
     @classmethod
     def from_angles(cls, azimuth: float, elevation: float, ambient: npt.ArrayLike, **options: Any) -> Light:
         """A light from the sun's azimuth (degrees from +x towards +y) and elevation (degrees above the horizon)."""
-        a, e = math.radians(azimuth), math.radians(elevation)
-        direction = np.array([math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)])
-        return cls(direction, np.asarray(ambient, dtype=np.float64), **options)
+        return cls(np.array(towards(azimuth, elevation)), np.asarray(ambient, dtype=np.float64), **options)
 
     @property
     def azimuth(self) -> float:
@@ -112,6 +110,12 @@ class Light:
         out.ground = wp.vec3(*self.reflectance(self.level))
         out.softness = float(self.softness)
         return out
+
+
+def towards(azimuth: float, elevation: float) -> tuple[float, float, float]:
+    """Unit vector of an azimuth (degrees from +x towards +y) and an elevation (degrees above the horizon)."""
+    a, e = math.radians(azimuth), math.radians(elevation)
+    return math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)
 
 
 def linear(srgb: Tensor) -> Tensor:

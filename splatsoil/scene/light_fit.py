@@ -23,10 +23,11 @@ import torch.nn.functional as functional
 from scipy.optimize import minimize, minimize_scalar
 from torch import Tensor
 
-from splatsoil.scene.light import SOIL_REFLECTANCE, Light
+from splatsoil.scene.light import SOIL_REFLECTANCE, Light, towards
 from splatsoil.scene.lit import facing, normals, suns_on_points
 from splatsoil.scene.relief import Relief
 from splatsoil.scene.sky import sky_openness
+from splatsoil.splats.warp_torch import upload
 
 FloatArray = npt.NDArray[np.float64]
 Directions = Sequence[tuple[float, float]]
@@ -207,8 +208,8 @@ class _Sunlit:
 
     def _towards(self, directions: Directions) -> Tensor:
         """(d, 3) unit vectors."""
-        where = [Light.from_angles(azimuth, elevation, 0.5).direction for azimuth, elevation in directions]
-        return torch.tensor(np.array(where), dtype=torch.float32, device=self.points.device)
+        where = [towards(azimuth, elevation) for azimuth, elevation in directions]
+        return upload(where, self.points.device)
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ import warp as wp
 from torch import Tensor
 
 from splatsoil.scene import kernels, kernels_relief
+from splatsoil.scene.kernels_sky import BLOCK, width_of
 from splatsoil.splats.steps import Steps, finished, stepwise
 from splatsoil.splats.warp_torch import as_warp, launch, upload
 
@@ -115,13 +116,13 @@ class Relief:
         radius; the bed's own walls are no surface.
         """
         across, along = (int(depth / self.cell[k]) for k in (0, 1))
-        wide = padded(self.height, (across, along), kernels_relief.WIDTH, "constant", math.inf)
+        width = width_of(self.height)
+        wide = padded(self.height, (across, along), width, "constant", math.inf)
         offsets, drops = _ball(depth, self.cell, wide.shape[1], self.device)
         eroded = torch.empty_like(self.height)
         inputs = [depth, as_warp(wide, wp.float32), across, along, as_warp(offsets, wp.int32)]
         inputs += [as_warp(m, wp.float32) for m in (drops, eroded)]
-        groups = -(-eroded.shape[1] // kernels_relief.WIDTH)
-        launch(kernels_relief.erode, (eroded.shape[0], groups), inputs, eroded)
+        launch(kernels_relief.erode, (eroded.shape[0], -(-eroded.shape[1] // width)), inputs, eroded, BLOCK)
         return points[:, 2] > self.sample(eroded, points)
 
 

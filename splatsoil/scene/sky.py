@@ -13,7 +13,7 @@ import warp as wp
 from torch import Tensor
 
 from splatsoil.scene import kernels, kernels_relief
-from splatsoil.scene.kernels_sky import WIDTH, light_of_slopes, sky_kernel
+from splatsoil.scene.kernels_sky import BLOCK, light_of_slopes, sky_kernel, width_of
 from splatsoil.scene.relief import Relief, grid_of, padded
 from splatsoil.splats.steps import Steps, stepwise
 from splatsoil.splats.warp_torch import as_warp, launch, upload
@@ -71,12 +71,12 @@ def light_from_slopes(relief: Relief, sent: Tensor) -> Tensor:
     """
     z = relief.height
     ny, nx = z.shape
-    looks = _Looks.over(relief)
-    wide, planes = (padded(m, looks.margin, WIDTH, "replicate") for m in (z, sent))
+    looks, width = _Looks.over(relief), width_of(z)
+    wide, planes = (padded(m, looks.margin, width, "replicate") for m in (z, sent))
     result = sent.new_empty(sent.shape)
     inputs = [as_warp(z, wp.float32), as_warp(relief.normal, wp.vec3), as_warp(wide, wp.float32)]
     inputs += [as_warp(planes, wp.float32), *looks.tables(wide), *looks.rows.shape]
-    launch(light_of_slopes, (ny, -(-nx // WIDTH)), [*inputs, as_warp(result, wp.float32)], z)
+    launch(light_of_slopes, (ny, -(-nx // width)), [*inputs, as_warp(result, wp.float32)], z, BLOCK)
     return result
 
 
@@ -129,7 +129,8 @@ def _sum(relief: Relief, looks: _Looks, tool: tuple[Tensor, Tensor] | None, stri
     """
     z = relief.height
     ny, nx = z.shape
-    beyond = stride * WIDTH
+    width = width_of(z)
+    beyond = stride * width
     wide = below = above = padded(z, looks.margin, beyond, "replicate")
     if tool is not None:
         below, above = (
@@ -140,7 +141,8 @@ def _sum(relief: Relief, looks: _Looks, tool: tuple[Tensor, Tensor] | None, stri
     inputs = [as_warp(z, wp.float32), as_warp(relief.normal, wp.vec3)]
     inputs += [as_warp(m, wp.float32) for m in (wide, below, above)]
     inputs += [*looks.tables(wide), *looks.rows.shape, as_warp(result, wp.float32)]
-    launch(sky_kernel(stride, tool is not None), (result.shape[0], -(-result.shape[1] // WIDTH)), inputs, z)
+    rows, columns = result.shape
+    launch(sky_kernel(stride, tool is not None), (rows, -(-columns // width)), inputs, z, BLOCK)
     return result
 
 

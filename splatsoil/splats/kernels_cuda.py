@@ -86,7 +86,8 @@ def _pixel(first: int, thread: int, tiles_x: int):
 
 @cache
 def forward_kernel(channels: int) -> Any:
-    """Kernel over pixels, tile after tile, that blends ``channels`` features."""
+    """Kernel over pixels, tile after tile, that blends ``channels`` features, of one view or of several of one size,
+    whose tiles and pictures follow each other."""
     Features = wp.types.vector(length=channels, dtype=float)
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -104,9 +105,12 @@ def forward_kernel(channels: int) -> Any:
     ):
         place = _pixel(first, wp.tid(), tiles_x)
         tile = place[0]
-        inside = place[1] < width and place[2] < height
+        tiles_y = (height + _TILE - 1) // _TILE
+        view = tile // (tiles_x * tiles_y)
+        row = place[2] - view * tiles_y * _TILE
+        inside = place[1] < width and row < height
         x = float(place[1]) + 0.5
-        y = float(place[2]) + 0.5
+        y = float(row) + 0.5
         t = wp.float32(-1.0)  # negative: finished
         if inside:
             t = wp.float32(1.0)
@@ -126,7 +130,7 @@ def forward_kernel(channels: int) -> Any:
                         total[k] += w * rows[rank, HEADER + k]
                     t = after
         if inside:
-            pixel = place[2] * width + place[1]
+            pixel = (view * height + row) * width + place[1]
             left = wp.abs(t)
             transmittance[pixel] = left
             for k in range(channels):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -61,22 +62,25 @@ def _check(a: Tensor, b: Tensor) -> None:
 def ssim_map_torch(a: Tensor, b: Tensor) -> Tensor:
     """`ssim_map` by autograd: the path for CUDA and other float types, and the check of the CPU kernels.
 
-    The blur is a sum of shifted pictures: convolutions on CUDA may round to ten bits (TF32), which spoils variances.
+    The blur is two products with banded matrices, few calls for a GPU to wait for: convolutions on CUDA may round to
+    ten bits (TF32), which spoils variances, as products do only if they are told to.
     """
     x, y = (t.reshape(t.shape[0], t.shape[1], -1).permute(2, 0, 1) for t in (a, b))
-    height, width = a.shape[:2]
-    weights = window().tolist()
-    half = WINDOW // 2
-
-    def blurred(t: Tensor) -> Tensor:
-        t = torch.nn.functional.pad(t, (half, half, half, half))
-        t = torch.stack([w * t[:, :, i : i + width] for i, w in enumerate(weights)]).sum(dim=0)
-        return torch.stack([w * t[:, i : i + height] for i, w in enumerate(weights)]).sum(dim=0)
-
-    mx, my, xx, yy, xy = blurred(torch.cat([x, y, x * x, y * y, x * y])).chunk(5)
+    down, along = (_band(n, a.dtype, a.device) for n in a.shape[:2])
+    mx, my, xx, yy, xy = (down @ torch.cat([x, y, x * x, y * y, x * y]) @ along).chunk(5)
     vx, vy, cov = xx - mx * mx, yy - my * my, xy - mx * my
     out = (2 * mx * my + C1) * (2 * cov + C2) / ((mx * mx + my * my + C1) * (vx + vy + C2))
     return out.permute(1, 2, 0).reshape(a.shape)
+
+
+@lru_cache(maxsize=16)
+def _band(n: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """(n, n) symmetric: the window about each pixel of a row, zeros beyond its ends."""
+    half, weights = WINDOW // 2, window()
+    rows = torch.zeros((n, n + 2 * half), dtype=torch.float64)
+    for i in range(WINDOW):
+        rows.diagonal(i).fill_(float(weights[i]))
+    return rows[:, half : half + n].to(device, dtype).contiguous()
 
 
 class _Similarity(torch.autograd.Function):

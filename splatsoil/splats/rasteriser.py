@@ -246,10 +246,13 @@ def blend_each(bins: Bins, background: Tensor, view: View, count: int) -> tuple[
     channels, tiles = len(background), bins.tiles_x * bins.tiles_y
     images = background.new_empty((count, view.height, view.width, channels))
     transmittances = background.new_empty((count, view.height, view.width))
-    kernel = _kernels(background).forward_kernel(channels)
-    for k in range(count):
-        mine = replace(bins, starts=bins.starts[k * tiles : (k + 1) * tiles + 1])
-        tensors = (background, images[k], transmittances[k])
+    kernels = _kernels(background)
+    kernel = kernels.forward_kernel(channels)
+    # A GPU draws all views in one launch: one by itself leaves most of it idle.
+    at_once = count if kernels is kernels_cuda else 1
+    for k in range(0, count, at_once):
+        mine = replace(bins, starts=bins.starts[k * tiles : (k + at_once) * tiles + 1])
+        tensors = (background, images[k : k + at_once], transmittances[k : k + at_once])
         inputs = [*_tile_arguments(mine, view), *(as_warp(t.reshape(-1), wp.float32) for t in tensors)]
         _launch_tiles(kernel, mine, inputs, background)
     return images, transmittances
@@ -262,7 +265,7 @@ def _kernels(like: Tensor) -> ModuleType:
 
 def _launch_tiles(kernel: Any, bins: Bins, inputs: list[Any], like: Tensor) -> None:
     """Run a tile kernel over all tiles; on the CPU by as many threads as pay, with equal numbers of entries."""
-    tiles = bins.tiles_x * bins.tiles_y
+    tiles = len(bins.starts) - 1
     if like.is_cuda:
         launch(kernel, tiles * kernels_cuda.THREADS, [0, *inputs], like, block=kernels_cuda.THREADS)
         return

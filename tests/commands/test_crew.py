@@ -2,7 +2,9 @@
 
 import subprocess
 import sys
+import tempfile
 from collections.abc import Sequence
+from concurrent.futures import Future
 from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
@@ -30,7 +32,7 @@ def test_a_helper_prepares_what_goes_together_and_makes_what_can_be_made(
     experiment = SimpleNamespace(prepare=prepared.append)
     monkeypatch.setitem(_crew._known, (tmp_path, "cpu", ()), (None, experiment, simulate))  # type: ignore[misc]
     jobs = [{"number": number} for number in range(count)]
-    _crew._simulate(tmp_path, "cpu", (), 1, jobs)
+    _crew._simulate(tmp_path, "cpu", (), 2, jobs)
     assert made == [number for number in range(count) if number != 1]
     assert prepared == ([] if count == 1 else [jobs])
 
@@ -39,11 +41,13 @@ class Workers:
     """Processes that are none, and what becomes of them."""
 
     def __init__(self, count: int) -> None:
-        self.jobs, self.ended = list[Any](), list[str]()
+        self.jobs, self.words, self.ended = list[Any](), list[Any](), list[str]()
         made.append(self)
 
-    def submit(self, job: Any, *words: Any) -> None:
+    def submit(self, job: Any, *words: Any) -> Future[None]:
         self.jobs.append(job)
+        self.words.append(words)
+        return Future()
 
     def dismiss(self, count: int) -> None:
         self.ended += ["dismissed"] * count
@@ -69,25 +73,35 @@ def three_cores(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("three_cores")
 @pytest.mark.parametrize(("helps", "fails"), [(False, False), (False, True), (True, False), (True, True)])
-def test_helpers_begin_with_the_command_and_none_outlives_it(helps: bool, fails: bool, tmp_path: Path) -> None:
-    """And only who holds the folder's lock, so that they help, tidies up there: the replay may be another one's."""
-    replay = tmp_path / "replay"
-    replay.mkdir()
-    folder: Any = SimpleNamespace(path=tmp_path)
+@pytest.mark.parametrize("control", [False, True])
+def test_helpers_begin_with_the_command_and_nothing_outlives_it(
+    helps: bool, fails: bool, control: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The control is first, if it is wanted at all, and one of it is enough."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    folder: Any = SimpleNamespace(path=tmp_path / "run")
     experiment: Any = SimpleNamespace(together=1, prepare=len, base=SimpleNamespace(device="cpu"))
-    with suppress(SimulationError), _crew.Crew(folder, "cpu", ()) as crew:
+    first = [_crew._ready] * 2 + [_crew._replay] * control
+    with suppress(SimulationError), _crew.Crew(folder, "cpu", (), control=control) as crew:
         (workers,) = made
-        assert workers.jobs == [_crew._ready] * crew.count == [_crew._ready] * 2
+        assert crew.count == 2 and workers.jobs == first
         if helps:
-            with crew.helping(experiment, Simulations(experiment)) as ask:
-                ask({})
-                assert workers.jobs[-1] is _crew._replay
+            with crew.helping(experiment, Simulations(experiment)) as replay:
+                making = replay()
+                assert replay() is making and workers.jobs == first + [_crew._replay] * (not control)
+                # what a helper has begun with when it is ended
+                place = workers.words[-1][-1]
+                assert place.is_dir() and tmp_path in place.parents
+                (place / "replay").mkdir()
+                assert making is not None
+                making.set_result(None)
+                assert replay() is not making, "it came to nothing: once more"
                 if fails:
                     raise SimulationError("blew up")
         elif fails:
             raise SimulationError("blew up")
     assert workers.ended == ["let go" if helps and not fails else "killed"]
-    assert replay.exists() is not helps
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.usefixtures("three_cores")
@@ -96,34 +110,44 @@ def test_a_gpu_with_little_memory_keeps_few_helpers(
     free: float, left: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """They began before it was known how much is free there."""
-    monkeypatch.setattr(_crew, "_memory", {"cpu": 64.0, "cuda:0": free}.__getitem__)
+    monkeypatch.setattr(_crew, "_free", {"cuda:0": free}.__getitem__)
     folder: Any = SimpleNamespace(path=tmp_path)
     experiment: Any = SimpleNamespace(together=1, prepare=len, base=SimpleNamespace(device="cuda:0"))
-    with _crew.Crew(folder, "auto", ()) as crew, crew.helping(experiment, Simulations(experiment)) as ask:
-        ask({})
+    with _crew.Crew(folder, "auto", (), control=True) as crew, crew.helping(experiment, Simulations(experiment)) as ask:
         (workers,) = made
         assert crew.count == left
-        assert workers.jobs == [_crew._ready] * 2 + [_crew._replay] * (left > 0)
-    assert workers.ended == ["dismissed"] * (2 - left) + ["let go"] * (left > 0)
+        assert (ask() is None) is (left == 0)
+    assert workers.ended == (["dismissed"] * (2 - left) + ["let go"] if left else ["killed"])
 
 
 EARLY = """
 import sys
 from pathlib import Path
 from types import SimpleNamespace
-from splatsoil.commands import _crew, _criticism, diagnose
+from splatsoil.commands import _crew, _criticism, {command}
+from splatsoil.inverse import executors
 from splatsoil.inverse.run_folder import RunFolder
 
-def helpers(*words):
-    sys.exit(1 if {"torch", "kornia"} & sys.modules.keys() else 0)
+class Helpers:
+    def __init__(self, count):
+        pass
 
-RunFolder.open = lambda path: SimpleNamespace(check_writable=lambda: None)
-_criticism.need_fit = lambda folder: {"setup": {"effects": []}}
-_crew.Crew = helpers
-diagnose.run(diagnose.Config(Path("run"), effects=("cohesion",)))
+    def submit(self, job, *words):
+        if job is _crew._replay:
+            sys.exit(1 if {{"torch", "kornia"}} & sys.modules.keys() else 0)
+
+fit = {{"setup": {{"effects": []}}}}
+RunFolder.open = lambda path: SimpleNamespace(path=path, fit=lambda: fit, check_writable=lambda: None)
+executors.Processes = Helpers
+_crew.MOST_HELPERS = 1
+splatsoil.threads.cores = lambda: 2
+{command}.run({command}.Config(Path("run")))
+sys.exit(2)
 """
 
 
-def test_a_diagnosis_has_helpers_before_it_loads_what_takes_seconds() -> None:
-    """They load the same, beside it."""
-    assert subprocess.run([sys.executable, "-c", EARLY], check=False).returncode == 0
+@pytest.mark.parametrize("command", ["diagnose", "compare"])
+def test_helpers_begin_before_what_takes_seconds_is_loaded(command: str) -> None:
+    """They load the same, beside it; and the control, which all wait for in the end, begins as early."""
+    script = "import splatsoil.threads\n" + EARLY.format(command=command)
+    assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
