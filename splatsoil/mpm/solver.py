@@ -133,6 +133,7 @@ class Solver:
         self._met = False
         # what sorts its sums counts them on the host in between
         self._replays = device != "cpu" and not wanted()
+        self._beside = wp.Stream(device) if self._replays else None
         self._graphs: dict[tuple[bool, float, int, float], wp.Graph | None] = {}
         self.frame = 0
 
@@ -312,10 +313,16 @@ class Solver:
         exchanges = step_time * (r.relaxation or 1.0 / step_time)
         keep, release = hourglass_share(exchanges), 1.0 - math.exp(-CONTACT_RELEASE * exchanges)
         move = wp.launch(move_nodes, dim=nodes, inputs=[g, grid, dt, self._table], device=device, record_cmd=True)
+        beside = self._beside if contact is not None else None
         for _ in range(substeps):
+            # Soil's stress and the tool's contact only add to the same forces: a GPU works on both at once.
+            if beside is not None:
+                beside.wait_stream(wp.get_stream(device))
             stress.launch()
             if contact is not None:
-                contact.launch()
+                contact.launch(beside)
+            if beside is not None:
+                wp.get_stream(device).wait_stream(beside)
             move.launch()
         wp.launch(
             grid_to_particles,

@@ -99,10 +99,12 @@ def draw(views: Views, points: torch.Tensor, trust: torch.Tensor) -> tuple[torch
     height, width = views.images.shape[-2:]
     grid = torch.stack([flat[..., 0] * (2.0 / width) - 1.0, flat[..., 1] * (2.0 / height) - 1.0], dim=-1)
     grid = grid.clamp(-4.0, 4.0)
-    channels = torch.cat([views.images, trust[:, None]], dim=1)
-    drawn = functional.grid_sample(channels, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
-    seen = ((drawn[:, 3] > 0.999) & (depth > 0)).to(torch.float32)
-    return drawn[:, :3], seen
+    # one by one: to put them together would take as long as to draw them
+    drawn, sure = (
+        functional.grid_sample(maps, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
+        for maps in (views.images, trust[:, None])
+    )
+    return drawn, ((sure[:, 0] > 0.999) & (depth > 0)).to(torch.float32)
 
 
 def disagreement(
