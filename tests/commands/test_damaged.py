@@ -121,7 +121,7 @@ class Kept:
 
     def control(self) -> np.ndarray:
         """As a diagnosis asks for it, before it simulates."""
-        return _control.control(self.run, self.experiment, self.simulate, {}, lambda _: pytest.fail("made"), print)()
+        return _control.control(self.run, self.experiment, self.simulate, lambda: pytest.fail("made"), print)()
 
     def calibration(self) -> Any:
         return _control.calibrated(self.run, self.experiment, self.simulate, {})
@@ -136,7 +136,7 @@ def test_a_control_that_was_cut_short_is_named_at_once(run: RunFolder, length: i
     assert kept.control().shape == (1, 3, 4)
     path.write_bytes(path.read_bytes()[:length])
     with pytest.raises(RunError, match=rf"{path.name}: cannot be read .*; delete it and run the command again"):
-        _control.control(run, kept.experiment, kept.simulate, {}, lambda _: pytest.fail("made"), print)
+        _control.control(run, kept.experiment, kept.simulate, lambda: pytest.fail("made"), print)
 
 
 @pytest.mark.parametrize("length", [0, 40, -60])
