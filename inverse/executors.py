@@ -22,6 +22,7 @@ from splatsoil.errors import ParameterError, RunError
 ATTEMPTS = 4
 #: What decides how many threads a worker's libraries start.
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+_ENVIRONMENT = threading.Lock()
 
 
 class Serial(Executor):
@@ -52,14 +53,13 @@ class Processes(Executor):
             raise ParameterError(f"processes:{workers}: at least one worker is needed")
         # Each worker's libraries would start a thread for every core, and stand in each other's way. What the user has
         # set stays.
-        if not any(name in os.environ for name in THREADS):
-            os.environ.update(dict.fromkeys(THREADS, str(max(1, (os.cpu_count() or 1) // workers))))
-        # A fresh interpreter each: forking a process that has threads or a CUDA context breaks both.
-        self._context = multiprocessing.get_context("spawn")
+        share = str(max(1, (os.cpu_count() or 1) // workers))
+        self._limits = {} if any(name in os.environ for name in THREADS) else dict.fromkeys(THREADS, share)
         self._jobs: queue.SimpleQueue[tuple[Future[Any], Callable[..., Any], tuple[Any, ...], dict[str, Any]] | None]
         self._jobs = queue.SimpleQueue()
         self._closed = False
-        self._threads = [threading.Thread(target=self._work, daemon=True) for _ in range(workers)]
+        pools = [self._started() for _ in range(workers)]
+        self._threads = [threading.Thread(target=self._work, args=(pool,), daemon=True) for pool in pools]
         for thread in self._threads:
             thread.start()
 
@@ -104,14 +104,29 @@ class Processes(Executor):
             if job is not None:
                 job[0].cancel()
 
-    def _work(self) -> None:
-        pool: ProcessPoolExecutor | None = None
+    def _started(self) -> ProcessPoolExecutor:
+        """A worker, on its way. What limits its libraries is in its environment alone: this process may load them
+        later."""
+        # A fresh interpreter: forking a process that has threads or a CUDA context breaks both.
+        context = multiprocessing.get_context("spawn")
+        pool = ProcessPoolExecutor(1, mp_context=context, initializer=_end_with_parent)
+        with _ENVIRONMENT:
+            os.environ.update(self._limits)
+            try:
+                pool.submit(int)
+            finally:
+                for name in self._limits:
+                    del os.environ[name]
+        return pool
+
+    def _work(self, first: ProcessPoolExecutor) -> None:
+        pool: ProcessPoolExecutor | None = first
         while (job := self._jobs.get()) is not None:
             future, fn, args, kwargs = job
             if not future.set_running_or_notify_cancel():
                 continue
             for attempt in range(1, ATTEMPTS + 1):
-                pool = pool or ProcessPoolExecutor(1, mp_context=self._context, initializer=_end_with_parent)
+                pool = pool or self._started()
                 try:
                     future.set_result(pool.submit(fn, *args, **kwargs).result())
                 except BrokenProcessPool:

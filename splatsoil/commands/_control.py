@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import wait
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -30,6 +30,10 @@ JUDGING = (
     *("inverse/criticism", "inverse/hyperparameters.py", "inverse/surrogate.py"),
     *("experiment/states.py", "experiment/strokes.py"),
 )
+
+
+#: How folders in a run are called in which a control is made, before a process's number.
+PLACES = ".replay-"
 
 
 def code_of(effects: Iterable[str]) -> str:
@@ -72,7 +76,7 @@ def replayed(
 ) -> FloatArray:
     """The replay control (1, t, s), made once for a model, at the latest fit's values, and kept in ``features/``.
 
-    ``place`` is an empty folder for what lies about meanwhile.
+    ``place`` is a folder for what lies about meanwhile, which is gone in the end.
     """
     import io
 
@@ -86,7 +90,7 @@ def replayed(
     if not path.is_file():
         stream = io.BytesIO()
         values = estimates(folder.fit())
-        made = replay(experiment, values, place / "replay", progress=lambda what, _: say(what))
+        made = replay(experiment, values, place, progress=lambda what, _: say(what))
         np.save(stream, made, allow_pickle=False)
         write_bytes(path, stream.getvalue())
     return read_npy(path)[None]
@@ -102,8 +106,7 @@ def control(
     """Have the replay control made: by a helper, or here and now where there is none. What it returns waits for it."""
 
     def known() -> FloatArray:
-        with TemporaryDirectory(prefix="splatsoil-") as place:
-            return replayed(folder, experiment, simulate, Path(place), say)
+        return replayed(folder, experiment, simulate, folder.path / f"{PLACES}{os.getpid()}", say)
 
     making = None if replay_path(folder, simulate).is_file() else helper()
     if making is None:

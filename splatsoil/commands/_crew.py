@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from pathlib import Path
-from tempfile import TemporaryDirectory
+from shutil import rmtree
 from typing import TYPE_CHECKING, Any
+
+from splatsoil.commands._control import PLACES
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
+    from pathlib import Path
 
     from splatsoil.experiment.plow import PlowExperiment
     from splatsoil.inverse.criticism.simulations import Simulations
@@ -29,10 +32,11 @@ class Crew:
     """Other processes that simulate, too: one for every other core, as far as there is use for them.
 
     They begin at once, so that they have loaded what takes seconds when the first process has. All keep what they make
-    in ``features/`` and find it there, and one that dies costs nothing but its help. On a CPU each process keeps to one
-    thread, the first one too: the results are those of one process, bit for bit, and with more they would wait for each
-    other. A GPU is shared: each process makes simulations that are alike as one batch, as one leaves most of it idle,
-    and cores are shared out.
+    in ``features/`` and find it there, and one that dies costs nothing but its help. Simulations wait until the first
+    process holds the folder's lock; the control, which is made in a place of its own and kept whole, doesn't. On a CPU
+    each process keeps to one thread, the first one too: the results are those of one process, bit for bit, and with
+    more they would wait for each other. A GPU is shared: each process makes simulations that are alike as one batch, as
+    one leaves most of it idle, and cores are shared out.
 
     Args:
         folder: the run folder.
@@ -47,8 +51,7 @@ class Crew:
 
         self.count = max(0, int(min(cores(), 1 + MOST_HELPERS, _memory() / SHARE["cpu"])) - 1)
         self._path, self._effects = folder.path, tuple(effects)
-        # One that is ended at the replay can't tidy up.
-        self._place = TemporaryDirectory(prefix="splatsoil-", ignore_cleanup_errors=True)
+        self._place = folder.path / f"{PLACES}{os.getpid()}"
         self._workers = Processes(self.count) if self.count > 0 else None
         self._control: Future[None] | None = None
         if self._workers is not None:
@@ -64,7 +67,7 @@ class Crew:
         """End those that never came to help."""
         if self._workers is not None:
             self._workers.kill()
-        self._place.cleanup()
+        rmtree(self._place, ignore_errors=True)  # a helper that was ended at the replay couldn't tidy up
 
     @contextmanager
     def helping(self, experiment: PlowExperiment, simulate: Simulations) -> Iterator[Replay]:
@@ -81,6 +84,9 @@ class Crew:
         from splatsoil.threads import at_most
 
         device = experiment.base.device
+        for place in self._path.glob(f"{PLACES}*"):  # left by what was killed
+            if place != self._place:
+                rmtree(place, ignore_errors=True)
         workers, self._workers = self._fitting(device), None
         with at_most(_threads(device, self.count)):
             if workers is None:
@@ -106,14 +112,15 @@ class Crew:
 
     def _replayed_by(self, workers: Processes, device: str) -> Future[None]:
         """What is done when one of the helpers has made the control."""
-        place = Path(self._place.name)
-        return workers.submit(_replay, self._path, device, self._effects, self.count, place)
+        return workers.submit(_replay, self._path, device, self._effects, self.count, self._place)
 
     def _fitting(self, device: str) -> Processes | None:
         """The helpers that a device has memory for, if any; the others end."""
         workers = self._workers
         if workers is not None and device != "cpu":
-            count = max(0, min(self.count, int(_free(device) / SHARE["cuda"]) - 1))
+            at_it = self._control is not None and not self._control.done()
+            room = _free(device) + SHARE["cuda"] * at_it  # one has its share already
+            count = max(0, min(self.count, int(room / SHARE["cuda"]) - 1))
             if count > 0:
                 workers.dismiss(self.count - count)
             else:
@@ -124,8 +131,6 @@ class Crew:
 
 def _memory() -> float:
     """The machine's, GiB."""
-    import os
-
     try:
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
     except (AttributeError, ValueError, OSError):  # not every system tells

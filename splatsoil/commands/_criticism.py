@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any
 
 from splatsoil.errors import ParameterError, RunError
@@ -81,6 +82,15 @@ def off_effects(names: Iterable[str], on: Iterable[Effect]) -> tuple[Effect, ...
     return wanted
 
 
+def _team(
+    crew: Crew | None, folder: RunFolder, device: str, effects: Iterable[str], control: bool
+) -> AbstractContextManager[Crew]:
+    """Helpers that are there already, or new ones: asked for by who holds the folder's lock."""
+    from splatsoil.commands._crew import Crew
+
+    return Crew(folder, device, effects, control=control) if crew is None else nullcontext(crew)
+
+
 def diagnosed(
     folder: RunFolder,
     model: Model,
@@ -95,11 +105,8 @@ def diagnosed(
 
     ``crew`` are processes for these effects that are there already.
     """
-    from contextlib import nullcontext
-
     from splatsoil import __version__
     from splatsoil.commands._control import calibrated, control, judged_by
-    from splatsoil.commands._crew import Crew
     from splatsoil.files import write_json
     from splatsoil.inverse.criticism.diagnosis import diagnose
     from splatsoil.inverse.criticism.evidence import gather
@@ -126,8 +133,11 @@ def diagnosed(
 
     simulate.told = starting
     values = estimates(fit)
-    team = Crew(folder, model.device, effects, control=with_replay) if crew is None else nullcontext(crew)
-    with folder.lock(), team as mine, mine.helping(experiment, simulate) as helper:
+    with (
+        folder.lock(),
+        _team(crew, folder, model.device, effects, with_replay) as mine,
+        mine.helping(experiment, simulate) as helper,
+    ):
         replays = control(folder, experiment, simulate, helper, say) if with_replay else None
         simulate.ahead(lambda ask: gather(experiment, ask, values, repeats=options.repeats))
         say("where soil plays no part")
@@ -171,11 +181,9 @@ def misfit(
 
     ``crew`` are processes for no effects that are there already.
     """
-    from contextlib import nullcontext
     from dataclasses import replace
 
     from splatsoil.commands._control import control
-    from splatsoil.commands._crew import Crew
     from splatsoil.files import plain, write_json
     from splatsoil.inverse.criticism.diagnosis import judge
     from splatsoil.inverse.criticism.evidence import gather
@@ -185,8 +193,11 @@ def misfit(
     fit = folder.fit()
     experiment, simulate = experiment_of(folder, model, ())
     values = estimates(fit)
-    team = Crew(folder, model.device, (), control=with_replay) if crew is None else nullcontext(crew)
-    with folder.lock(), team as mine, mine.helping(experiment, simulate) as helper:
+    with (
+        folder.lock(),
+        _team(crew, folder, model.device, (), with_replay) as mine,
+        mine.helping(experiment, simulate) as helper,
+    ):
         replays = None
         if with_replay:
             replays = control(folder, experiment, simulate, helper, lambda what: report(what, 0.0))
@@ -211,7 +222,6 @@ def confirmed(folder: RunFolder, model: Model, name: str, options: Options, repo
     from dataclasses import replace
 
     from splatsoil.commands._control import calibrated, control
-    from splatsoil.commands._crew import Crew
     from splatsoil.files import plain
     from splatsoil.inverse.criticism.confirmation import confirm
     from splatsoil.inverse.criticism.evidence import gather
@@ -223,8 +233,11 @@ def confirmed(folder: RunFolder, model: Model, name: str, options: Options, repo
     experiment, simulate = experiment_of(folder, model, (name,))
     (effect,) = (candidate.name for candidate in experiment.candidates)
     values = estimates(folder.fit())
-    team = Crew(folder, model.device, (name,), control=True)
-    with folder.lock(), team as crew, crew.helping(experiment, simulate) as helper:
+    with (
+        folder.lock(),
+        _team(None, folder, model.device, (name,), True) as mine,
+        mine.helping(experiment, simulate) as helper,
+    ):
         replays = control(folder, experiment, simulate, helper, lambda what: report(what, 0.0))
         simulate.ahead(lambda ask: gather(experiment, ask, values, repeats=options.repeats))
         evidence = gather(

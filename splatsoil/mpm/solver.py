@@ -21,6 +21,7 @@ from splatsoil.deterministic import wanted
 from splatsoil.errors import SimulationError
 from splatsoil.mpm.grid import GridShape
 from splatsoil.mpm.presets import Resolution
+from splatsoil.mpm.start import at_rest
 from splatsoil.mpm.state import Cells, Nodes, Particles
 from splatsoil.mpm.substep import contact_forces, make_stress_kernel, move_nodes
 from splatsoil.mpm.tool import Pose, build_tool
@@ -197,37 +198,17 @@ class Solver:
 
     def _start(self, x: npt.NDArray[np.float32], base: Settings) -> None:
         """Start from the pressure of the soil above, so that the bed does not settle when the run begins."""
-        low, cell = self.shape.lower, self.shape.cell
-        plan = (self.shape.nodes[0] - 1, self.shape.nodes[1] - 1)
-        index = np.clip(((x[..., :2] - low[:2]) / cell[:2]).astype(int), 0, np.array(plan) - 1)
-        column = index[..., 0] * plan[1] + index[..., 1]
-        depth, strain = np.empty(x.shape[:2]), np.empty(x.shape[:2])
-        density = np.ones(x.shape[:2])
         stiffness = self._table.numpy()[:, STIFFNESS] * self.resolution.bulk
-        for row, values in enumerate(self.values):
-            top = np.full(plan[0] * plan[1], -np.inf)
-            np.maximum.at(top, column[row], x[row, :, 2])
-            depth[row] = top[column[row]] + 0.5 * self.resolution.spacing - x[row, :, 2]
-            above = depth[row]
-            found = self.law.density(depth[row], values)
-            if found is not None:
-                density[row] = found
-                above = self._integral(depth[row], values)
-            weight = self.resolution.density * abs(self.law.settings(base, values).gravity[2])
-            strain[row] = -weight * above / stiffness[row]
+        soils = [
+            at_rest(self.law, base, values, places, self.shape, self.resolution, float(bulk))
+            for values, places, bulk in zip(self.values, x, stiffness, strict=True)
+        ]
+        strain, depth, density = (np.concatenate(parts).astype(np.float32) for parts in zip(*soils, strict=True))
         p = self._particles
-        p.elastic.assign(strain.reshape(-1).astype(np.float32))
-        p.density.assign(density.reshape(-1).astype(np.float32))
+        p.elastic.assign(strain)
+        p.density.assign(density)
         if self.law.history:
-            p.depth.assign(depth.reshape(-1).astype(np.float32))
-
-    def _integral(self, depth: npt.NDArray[np.float64], values: Mapping[str, float]) -> npt.NDArray[np.float64]:
-        """Relative density times depth, summed from the surface down to each depth (n,) in m."""
-        levels = np.linspace(0.0, float(depth.max()), 257)
-        density = self.law.density(levels, values)
-        assert density is not None
-        sums = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(levels))])
-        return np.interp(depth, levels, sums)
+            p.depth.assign(depth)
 
     def advance(self, poses: Sequence[Pose] | int) -> npt.NDArray[np.float64]:
         """Advance one frame.
@@ -313,16 +294,8 @@ class Solver:
         exchanges = step_time * (r.relaxation or 1.0 / step_time)
         keep, release = hourglass_share(exchanges), 1.0 - math.exp(-CONTACT_RELEASE * exchanges)
         move = wp.launch(move_nodes, dim=nodes, inputs=[g, grid, dt, self._table], device=device, record_cmd=True)
-        beside = self._beside if contact is not None else None
         for _ in range(substeps):
-            # Soil's stress and the tool's contact only add to the same forces: a GPU works on both at once.
-            if beside is not None:
-                beside.wait_stream(wp.get_stream(device))
-            stress.launch()
-            if contact is not None:
-                contact.launch(beside)
-            if beside is not None:
-                wp.get_stream(device).wait_stream(beside)
+            self._launch_forces(stress, contact)
             move.launch()
         wp.launch(
             grid_to_particles,
@@ -333,6 +306,19 @@ class Solver:
             ],
             device=device,
         )
+
+    def _launch_forces(self, stress: wp.Launch, contact: wp.Launch | None) -> None:
+        """Both only add to the nodes' forces: a GPU works on both at once."""
+        if contact is None or self._beside is None:
+            stress.launch()
+            if contact is not None:
+                contact.launch()
+            return
+        here = wp.get_stream(self.device)
+        self._beside.wait_stream(here)
+        stress.launch()
+        contact.launch(self._beside)
+        here.wait_stream(self._beside)
 
     def _contact(self, dt: float, share: float) -> wp.Launch:
         """Find the particles near the tool, and make ready the launch of what runs in every substep."""

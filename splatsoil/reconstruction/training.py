@@ -186,6 +186,7 @@ def train(
         progress = step / max(iterations - 1, 1)
         state.step({**RATES, "means": RATES["means"] * LAST_RATE**progress})
         if (step + 1) % every == 0 and progress > 0.1:
+            _check(losses)
             stray = _stray(state.gaussians().detach(), label, surface, floor)
             limit = most if progress < GROWING else 0
             label = _grow_and_prune(state, label, pull / hits.clamp_min(1.0), stray, limit, generator)

@@ -179,7 +179,7 @@ def _eroded_cells(
 ): ...
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel(enable_backward=False, module="unique")
 def erode(
     radius: float,
     wide: wp.array2d(dtype=wp.float32),

@@ -78,7 +78,7 @@ def _opacity(rows: wp.array2d(dtype=float), rank: int, dx: float, dy: float):
 
 @wp.func
 def _pixel(first: int, thread: int, tiles_x: int):
-    """Tile, column and row of a thread's pixel."""
+    """Tile, column and row of a thread's pixel; rows go on from view to view, by whole tiles."""
     tile = first + thread // _THREADS
     cell = thread % _THREADS
     return wp.vec3i(tile, (tile % tiles_x) * _TILE + cell % _TILE, (tile // tiles_x) * _TILE + cell // _TILE)

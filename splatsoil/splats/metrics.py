@@ -66,8 +66,9 @@ def ssim_map_torch(a: Tensor, b: Tensor) -> Tensor:
     ten bits (TF32), which spoils variances, as products do only if they are told to.
     """
     x, y = (t.reshape(t.shape[0], t.shape[1], -1).permute(2, 0, 1) for t in (a, b))
-    down, along = (_band(n, a.dtype, a.device) for n in a.shape[:2])
-    mx, my, xx, yy, xy = (down @ torch.cat([x, y, x * x, y * y, x * y]) @ along).chunk(5)
+    moments = torch.cat([x, y, x * x, y * y, x * y])
+    down, along = (_band(n, moments.dtype, a.device) for n in a.shape[:2])
+    mx, my, xx, yy, xy = (down @ moments @ along).chunk(5)
     vx, vy, cov = xx - mx * mx, yy - my * my, xy - mx * my
     out = (2 * mx * my + C1) * (2 * cov + C2) / ((mx * mx + my * my + C1) * (vx + vy + C2))
     return out.permute(1, 2, 0).reshape(a.shape)

@@ -2,19 +2,20 @@
 
 import subprocess
 import sys
-import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from splatsoil.inverse.criticism.diagnosis import Options
 from splatsoil.inverse.criticism.simulations import Simulations
 
-from splatsoil.commands import _crew
-from splatsoil.errors import SimulationError
+from splatsoil.commands import _crew, _criticism
+from splatsoil.commands._control import PLACES
+from splatsoil.errors import RunError, SimulationError
 
 
 @pytest.mark.parametrize("count", [1, 3])
@@ -75,11 +76,13 @@ def three_cores(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(("helps", "fails"), [(False, False), (False, True), (True, False), (True, True)])
 @pytest.mark.parametrize("control", [False, True])
 def test_helpers_begin_with_the_command_and_nothing_outlives_it(
-    helps: bool, fails: bool, control: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    helps: bool, fails: bool, control: bool, tmp_path: Path
 ) -> None:
-    """The control is first, if it is wanted at all, and one of it is enough."""
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    folder: Any = SimpleNamespace(path=tmp_path / "run")
+    """The control is first, if it is wanted at all, and one of it is enough. Only who holds the folder's lock, so that
+    helpers help, tidies up what another process may be at."""
+    folder: Any = SimpleNamespace(path=tmp_path)
+    other = tmp_path / f"{PLACES}1"
+    other.mkdir()
     experiment: Any = SimpleNamespace(together=1, prepare=len, base=SimpleNamespace(device="cpu"))
     first = [_crew._ready] * 2 + [_crew._replay] * control
     with suppress(SimulationError), _crew.Crew(folder, "cpu", (), control=control) as crew:
@@ -89,10 +92,8 @@ def test_helpers_begin_with_the_command_and_nothing_outlives_it(
             with crew.helping(experiment, Simulations(experiment)) as replay:
                 making = replay()
                 assert replay() is making and workers.jobs == first + [_crew._replay] * (not control)
-                # what a helper has begun with when it is ended
                 place = workers.words[-1][-1]
-                assert place.is_dir() and tmp_path in place.parents
-                (place / "replay").mkdir()
+                place.mkdir()  # what a helper has begun with when it is ended
                 assert making is not None
                 making.set_result(None)
                 assert replay() is not making, "it came to nothing: once more"
@@ -101,19 +102,44 @@ def test_helpers_begin_with_the_command_and_nothing_outlives_it(
         elif fails:
             raise SimulationError("blew up")
     assert workers.ended == ["let go" if helps and not fails else "killed"]
-    assert not list(tmp_path.iterdir())
+    assert list(tmp_path.iterdir()) == ([] if helps else [other])
 
 
 @pytest.mark.usefixtures("three_cores")
-@pytest.mark.parametrize(("free", "left"), [(20.0, 2), (9.0, 1), (5.0, 0)])
+@pytest.mark.parametrize("stage", ["diagnosed", "misfit", "confirmed"])
+def test_who_is_not_alone_in_a_folder_has_no_helpers(stage: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    @contextmanager
+    def taken() -> Iterator[None]:
+        raise RunError("another process is writing")
+        yield
+
+    folder: Any = SimpleNamespace(lock=taken, fit=lambda: {"parameters": {}})
+    model: Any = SimpleNamespace(device="cpu")
+    experiment = SimpleNamespace(candidates=[SimpleNamespace(name="cohesion")])
+    monkeypatch.setattr(_criticism, "experiment_of", lambda *words: (experiment, SimpleNamespace()))
+    words = {
+        "diagnosed": (Options(), lambda what: lambda *told: None),
+        "misfit": (Options(), lambda *told: None),
+        "confirmed": ("cohesion", Options(), lambda *told: None),
+    }[stage]
+    with pytest.raises(RunError, match="another process"):
+        getattr(_criticism, stage)(folder, model, *words)
+    assert not made
+
+
+@pytest.mark.usefixtures("three_cores")
+@pytest.mark.parametrize(
+    ("free", "control", "left"), [(20.0, True, 2), (9.0, False, 1), (5.0, False, 0), (5.0, True, 1), (3.0, True, 0)]
+)
 def test_a_gpu_with_little_memory_keeps_few_helpers(
-    free: float, left: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    free: float, control: bool, left: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """They began before it was known how much is free there."""
+    """They began before it was known how much is free there; what the control has taken is its own."""
     monkeypatch.setattr(_crew, "_free", {"cuda:0": free}.__getitem__)
     folder: Any = SimpleNamespace(path=tmp_path)
     experiment: Any = SimpleNamespace(together=1, prepare=len, base=SimpleNamespace(device="cuda:0"))
-    with _crew.Crew(folder, "auto", (), control=True) as crew, crew.helping(experiment, Simulations(experiment)) as ask:
+    helping = _crew.Crew(folder, "auto", (), control=control)
+    with helping as crew, crew.helping(experiment, Simulations(experiment)) as ask:
         (workers,) = made
         assert crew.count == left
         assert (ask() is None) is (left == 0)

@@ -31,7 +31,7 @@ from splatsoil.scene import (
     seen_colours,
     still_frames,
 )
-from splatsoil.scene.kernels_sky import sky_kernel
+from splatsoil.scene.kernels_sky import light_of_slopes, sky_kernel
 from splatsoil.splats import Gaussians
 from splatsoil.splats.steps import finished
 
@@ -166,7 +166,7 @@ def test_a_picture_is_its_layers_put_together():
 def test_kernels_compile_for_cuda(tmp_path):
     """NVRTC comes with Warp, so a compiler error shows without a GPU; sm_90 is an H100 or H200."""
     ours = kernels.illuminate, kernels_colour.develop, kernels_relief.crossing, kernels_visible.settle
-    for kernel in (*ours, sky_kernel(1, False), sky_kernel(3, True)):
+    for kernel in (*ours, kernels_relief.erode, light_of_slopes, sky_kernel(1, False), sky_kernel(3, True)):
         (artifact,) = wp.compile_aot_module(kernel.module, arch=90, module_dir=tmp_path, use_ptx=True)
         assert ".entry" in Path(artifact).read_text()
 

@@ -63,6 +63,12 @@ def test_ssim_of_equal_and_of_flat_pictures() -> None:
     assert inner == pytest.approx((2 * 0.12 + 1e-4) / (0.04 + 0.36 + 1e-4), abs=1e-4)
 
 
+def test_ssim_of_two_float_types() -> None:
+    a, b = torch.rand(2, 20, 30, 3, generator=torch.Generator().manual_seed(3))
+    for one, other in ((a, b.double()), (a.double(), b)):
+        assert ssim(one, other).item() == pytest.approx(ssim(a, b).item(), abs=1e-5)
+
+
 def test_ssim_gradients() -> None:
     """Kernel and autograd agree on both gradients, and both with finite differences in double precision."""
     a, b = pair(height=23, width=19)
