@@ -209,7 +209,9 @@ def _check(losses: list[Tensor]) -> None:
     Raises:
         SimulationError: one is not finite.
     """
-    lost = torch.nonzero(~torch.isfinite(torch.stack(losses[-10:]))) if losses else ()
+    if not losses:
+        return
+    lost = torch.nonzero(~torch.isfinite(torch.stack(losses[-10:])))
     if len(lost):
         step = max(len(losses) - 10, 0) + int(lost[0])
         raise SimulationError(f"training fell apart at step {step}: the loss is {losses[step]:g}; try another seed")

@@ -76,9 +76,12 @@ class Photographer:
         undisturbed = (setup.frames[0], Observation())
         filmed = [(frame, self.observation) for frame in setup.frames]
         moments = [undisturbed, *(moment for moment in filmed if moment != undisturbed)]
+
+        def soil(moment: tuple[int, Observation]) -> Body:
+            return self.soil(*moment, colours)
+
         # While a GPU traces light the CPU is free.
-        made = map if self.device == "cpu" else _one_ahead
-        soils = iter(made(lambda moment: self.soil(*moment, colours), moments))
+        soils = map(soil, moments) if self.device == "cpu" else _one_ahead(soil, moments)
         stage = self.stage(*undisturbed, next(soils))
         for i, camera in enumerate(setup.views):
             views.append(Picture(camera, self._expose(self._light(stage, camera, 0, i), 0, i)))

@@ -133,7 +133,8 @@ def test_correlated_noise_raises_few_false_alarms_and_independent_pixels_nearly_
 
 
 def test_what_a_solver_says_of_low_rank_noise_is_what_the_whole_matrix_says() -> None:
-    """Against NumPy's inverse, with nuisances from next to nothing to far above the noise, two of them the same, added
+    """Against NumPy's solution, refined in longer numbers: with such a condition its own eighth digit is another one on
+    another processor. With nuisances from next to nothing to far above the noise, two of them the same, added
     in two goes; of a part by its scale and correlation, and of a covariance."""
     rng = np.random.default_rng(5)
     seen, scale = rng.random(LAYOUT.shape) < 0.2, rng.uniform(0.5, 3.0, LAYOUT.shape)
@@ -144,11 +145,14 @@ def test_what_a_solver_says_of_low_rank_noise_is_what_the_whole_matrix_says() ->
     nuisance[:, 5] = nuisance[:, 4]
     whole = noise.covariance + nuisance @ nuisance.T
     columns, bare = rng.standard_normal((count, 3)), np.zeros((count, 0))
+    exact = np.linalg.solve(whole, columns).astype(np.longdouble)
+    for _ in range(5):
+        exact += np.linalg.solve(whole, (columns - whole.astype(np.longdouble) @ exact).astype(float))
+    expected = (columns.T @ exact).astype(float)
     # The ridge that a part's solver has isn't quite the covariance's.
     for solver, near in ((noise.solver, 1e-7), (part.solver(LAYOUT, seen), 1e-4)):
         assert solver.beside(bare).whiten(columns) == pytest.approx(solver.whiten(columns))
         solver = solver.beside(nuisance[:, :2]).beside(nuisance[:, 2:])
-        expected = columns.T @ np.linalg.inv(whole) @ columns
         assert columns.T @ solver.solve(columns) == pytest.approx(expected, rel=near, abs=near)
         white = solver.whiten(columns)
         assert white.T @ white == pytest.approx(expected, rel=near, abs=near)
