@@ -52,13 +52,19 @@ class Crew:
         self.count = max(0, int(min(cores(), 1 + MOST_HELPERS, _memory() / SHARE["cpu"])) - 1)
         self._path, self._effects = folder.path, tuple(effects)
         self._place = folder.path / f"{PLACES}{os.getpid()}"
-        self._workers = Processes(self.count) if self.count > 0 else None
+        self._workers: Processes | None = None
         self._control: Future[None] | None = None
-        if self._workers is not None:
-            for _ in range(self.count):
-                self._workers.submit(_ready, device)
-            if control:
-                self._control = self._replayed_by(self._workers, device)
+        try:
+            with _unheard():
+                self._workers = Processes(self.count) if self.count > 0 else None
+            if self._workers is not None:
+                for _ in range(self.count):
+                    self._workers.submit(_ready, device)
+                if control:
+                    self._control = self._replayed_by(self._workers, device)
+        except BaseException:
+            self.__exit__()
+            raise
 
     def __enter__(self) -> Crew:
         return self
@@ -127,6 +133,21 @@ class Crew:
                 workers.kill()
             self.count = count
         return workers if self.count > 0 else None
+
+
+@contextmanager
+def _unheard() -> Iterator[None]:
+    """Processes that begin meanwhile never hear of Ctrl-C, not even while they load: the first process ends them."""
+    import signal
+
+    if not hasattr(signal, "pthread_sigmask"):  # not every system has masks
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _memory() -> float:

@@ -162,6 +162,9 @@ class Helpers:
         if job is _crew._replay:
             sys.exit(1 if {{"torch", "kornia"}} & sys.modules.keys() else 0)
 
+    def kill(self):
+        pass
+
 fit = {{"setup": {{"effects": []}}}}
 RunFolder.open = lambda path: SimpleNamespace(path=path, fit=lambda: fit, check_writable=lambda: None)
 executors.Processes = Helpers
