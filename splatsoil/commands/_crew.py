@@ -139,10 +139,12 @@ class Crew:
 def _unheard() -> Iterator[None]:
     """Processes that begin meanwhile never hear of Ctrl-C, not even while they load: the first process ends them."""
     import signal
+    from multiprocessing import resource_tracker
 
     if not hasattr(signal, "pthread_sigmask"):  # not every system has masks
         yield
         return
+    resource_tracker.ensure_running()  # it has the mask its own way when it begins
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
