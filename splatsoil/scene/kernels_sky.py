@@ -12,7 +12,6 @@ from functools import cache
 from typing import Any
 
 import warp as wp
-from torch import Tensor
 
 WIDTH = 16
 """Cells of a row that one task does on a CPU."""
@@ -26,15 +25,6 @@ WIDTH_SOURCE = f"""
     const int first = group * W;
 """
 """Of C++ that does a group: its width, and its first cell."""
-
-BLOCK = 64
-"""Threads of a block on a GPU: small ones, so that a map is shared out evenly."""
-
-
-def width_of(like: Tensor) -> int:
-    """Cells of a row that one task does where a tensor lives."""
-    return 1 if like.is_cuda else WIDTH
-
 
 _NOTHING = 1.0e6
 """A height beyond all others, m."""

@@ -20,7 +20,7 @@ import warp as wp
 from torch import Tensor
 
 from splatsoil.scene import kernels, kernels_relief
-from splatsoil.scene.kernels_sky import BLOCK, width_of
+from splatsoil.scene.kernels_sky import WIDTH
 from splatsoil.splats.steps import Steps, finished, stepwise
 from splatsoil.splats.warp_torch import as_warp, launch, upload
 
@@ -29,6 +29,9 @@ FloatArray = npt.NDArray[np.float64]
 SMOOTHING = 1.0
 """Standard deviation of the kernel in particle spacings. Less shows single particles, more rounds off trench and heaps,
 so that soil looks weaker than it is and a fit takes it to be stronger (docs/photographs.md)."""
+
+BLOCK = 64
+"""Threads of a GPU's block that work on a map: few, so that it is shared out evenly."""
 
 _COARSE = 0.8
 """Cell of the density grid in particle spacings; the kernel is wide enough for it."""
@@ -135,6 +138,11 @@ def _ball(radius: float, cell: tuple[float, float], width: int, device: torch.de
     left = radius**2 - (rows * cell[1]) ** 2 - (columns * cell[0]) ** 2
     offsets = (rows * width + columns)[left >= 0.0]
     return upload(offsets, device, torch.int32), upload(np.sqrt(left[left >= 0.0]), device)
+
+
+def width_of(like: Tensor) -> int:
+    """Cells of a row that one task of `kernels_sky` does where a tensor lives."""
+    return 1 if like.is_cuda else WIDTH
 
 
 def padded(values: Tensor, margin: tuple[int, int], beyond: int, mode: str, value: float = 0.0) -> Tensor:

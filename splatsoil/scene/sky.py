@@ -13,8 +13,8 @@ import warp as wp
 from torch import Tensor
 
 from splatsoil.scene import kernels, kernels_relief
-from splatsoil.scene.kernels_sky import BLOCK, light_of_slopes, sky_kernel, width_of
-from splatsoil.scene.relief import Relief, grid_of, padded
+from splatsoil.scene.kernels_sky import light_of_slopes, sky_kernel
+from splatsoil.scene.relief import BLOCK, Relief, grid_of, padded, width_of
 from splatsoil.splats.steps import Steps, stepwise
 from splatsoil.splats.warp_torch import as_warp, launch, upload
 

@@ -1,5 +1,6 @@
 """What other processes do for criticism."""
 
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
@@ -12,6 +13,7 @@ from typing import Any
 import pytest
 from splatsoil.inverse.criticism.diagnosis import Options
 from splatsoil.inverse.criticism.simulations import Simulations
+from splatsoil.inverse.executors import Processes
 
 from splatsoil.commands import _crew, _criticism
 from splatsoil.commands._control import PLACES
@@ -144,6 +146,18 @@ def test_a_gpu_with_little_memory_keeps_few_helpers(
         assert crew.count == left
         assert (ask() is None) is (left == 0)
     assert workers.ended == (["dismissed"] * (2 - left) + ["let go"] if left else ["killed"])
+
+
+@pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="this system has no masks")
+def test_helpers_never_hear_of_an_interrupt_and_the_first_process_does() -> None:
+    """Not even while they load: one would print a traceback beside the sentence of the first."""
+    with _crew._unheard():
+        workers = Processes(1)
+    try:
+        assert signal.SIGINT in workers.submit(signal.pthread_sigmask, signal.SIG_BLOCK, []).result()
+        assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+    finally:
+        workers.shutdown()
 
 
 EARLY = """
