@@ -118,6 +118,7 @@ class Comparator:
         interior: (h, w) by camera, pixels that have such a place.
         bed: (h, w) by camera, those of them whose ray meets the surface; the others look past a crest.
         silhouettes: (h, w) by camera and frame, the tool's, a little wider.
+        patch: side of a block, m, about: whole ones fill the bed.
         patches: (h, w) by camera, the block that a pixel is in, or -1.
         noise: the robust loss that the cameras' noise alone leaves; None where it can't be told.
 
@@ -136,7 +137,7 @@ class Comparator:
         patch: float = PATCH,
     ) -> None:
         self.measurement = measurement
-        self._patch = patch
+        self.patch = patch
         self.reference = int(measurement.frames[0])
         self.cameras = tuple(measurement.cameras) if cameras is None else tuple(cameras)
         chosen = measurement.frames if frames is None else tuple(sorted({int(f) for f in frames}))
@@ -300,7 +301,7 @@ class Comparator:
     def _layout(self) -> tuple[tuple[Block, ...], dict[str, npt.NDArray[np.int64]]]:
         """Labels of all blocks, and for each camera the block (in its order) that each pixel belongs to, or -1."""
         low, high = self.measurement.bed.lower[:2], self.measurement.bed.upper[:2]
-        count = np.maximum(np.round((high - low) / self._patch).astype(int), 1)
+        count = np.maximum(np.round((high - low) / self.patch).astype(int), 1)
         size = (high - low) / count
         labels: list[Block] = []
         patches = {}

@@ -18,7 +18,7 @@ from splatsoil.experiment.base import Calibration, Candidate, candidates_of
 from splatsoil.experiment.features import Layout, Site
 from splatsoil.experiment.forces import REGION, UNIT, ToolForces
 from splatsoil.experiment.reproducibility import between_solvers
-from splatsoil.experiment.scene_parts import QUIET, bins_of, regions_of, stages_of
+from splatsoil.experiment.scene_parts import QUIET, bins_of, entered, regions_of, stages_of
 from splatsoil.experiment.states import States, plow_states
 from splatsoil.experiment.strokes import Predict, plow_strokes
 from splatsoil.model import Model, Prediction
@@ -154,9 +154,22 @@ class PlowExperiment:
 
     @cached_property
     def seen(self) -> npt.NDArray[np.bool_]:
-        """(t, s) False where the tool hides most of a patch, or forces don't count."""
+        """(t, s) False where the tool hides most of a patch, within a cell of where it went into the soil, or where
+        forces don't count.
+
+        How far soil is dragged along beside an edge that cuts into it is a matter of a solver's cells, and a wall that
+        stands there keeps it (docs/numerics.md).
+        """
         shares = self._table(self.comparator.open_shares())
+        shares[:, self._entered] = 0.0
         return self._beside(shares, None if self.forces is None else self.forces.seen.astype(float)) > 0.5
+
+    @cached_property
+    def _entered(self) -> npt.NDArray[np.bool_]:
+        """Columns of cameras that show where the tool went into the soil."""
+        sites = [Site(c, label.x, label.y) for c in self.comparator.cameras for label in self._labels(c)]
+        surface, last = self.base.reconstruction.surface, float(self.comparator.frames[-1])
+        return entered(self.base.measurement, surface, last, sites, self.comparator.patch, self.base.resolution.cell)
 
     @cached_property
     def sensor(self) -> FloatArray:

@@ -24,6 +24,8 @@ AHEAD = 0.6
 """Widths of the tool ahead of it that count as its face, and behind it as behind."""
 POINTS = 400
 """Of the tool's surface, to know where it stands in the soil."""
+DEPTHS = 9
+"""At which a camera's rays into soil that the tool has opened are looked at."""
 
 
 def stages_of(measurement: Measurement, frames: Sequence[float]) -> tuple[str, ...]:
@@ -77,6 +79,43 @@ def heading_of(measurement: Measurement) -> FloatArray:
     return np.asarray(level[first] / length[first])
 
 
+def entered(
+    measurement: Measurement, surface: HeightField, last: float, sites: Sequence[Site], side: float, reach: float
+) -> npt.NDArray[np.bool_]:
+    """(s,) squares of the bed, ``side`` (m) wide, through which a site's camera looks at soil within ``reach`` (m) of
+    the tool as it is lowered, up to frame ``last``: from the surface down to the tool's lowest point.
+
+    None if the tool isn't pushed on from there: then there is little else to see.
+    """
+    moments = [float(frame) for frame in range(int(last) + 1)]
+    stages = stages_of(measurement, moments)
+    out = np.zeros(len(sites), dtype=bool)
+    points = np.asarray(measurement.tool.mesh.sample(POINTS, seed=0), dtype=np.float64)
+    lowered = [moment for moment, stage in zip(moments, stages, strict=True) if stage == "lowering"]
+    sunk = [_sunk(measurement, surface, points, moment) for moment in lowered]
+    if "pushing" not in stages or not any(map(len, sunk)):
+        return out
+    place = np.array([[site.x, site.y] for site in sites])
+    eye = np.stack([measurement.cameras[site.channel].position for site in sites])
+    level = surface.smooth(place)
+    floor = min(float(at[:, 2].min()) for at in sunk if len(at))
+    # What lies deeper is seen farther away.
+    slope = (place - eye[:, :2]) / np.maximum(eye[:, 2] - level, 1e-9)[:, None]
+    deep = np.linspace(0.0, 1.0, DEPTHS)[:, None] * np.maximum(level - floor, 0.0)
+    seen = place + deep[..., None] * slope
+    for at in sunk:
+        beyond = np.maximum(np.abs(seen[:, :, None] - at[:, :2]) - 0.5 * side, 0.0)
+        out |= (np.linalg.norm(beyond, axis=-1) <= reach).any(axis=(0, 2))
+    return out
+
+
+def _sunk(measurement: Measurement, surface: HeightField, points: FloatArray, moment: float) -> FloatArray:
+    """(n, 3) where the tool's ``points`` are that lie below the surface at a moment in frames."""
+    rotation, position = measurement.tool.motion.pose(moment / measurement.frame_rate)
+    at = points @ np.asarray(rotation).T + position
+    return np.asarray(at[at[:, 2] < surface.smooth(at[:, :2])])
+
+
 def regions_of(
     measurement: Measurement, surface: HeightField, frames: Sequence[float], sites: Sequence[Site]
 ) -> npt.NDArray[np.str_]:
@@ -90,9 +129,8 @@ def regions_of(
     out = np.full((len(frames), len(sites)), QUIET, dtype="<U16")
     previous = None
     for moment in moments:
-        rotation, position = tool.motion.pose(moment / rate)
-        at = points @ np.asarray(rotation).T + position
-        sunk = at[at[:, 2] < surface.smooth(at[:, :2])][:, :2]
+        position = tool.motion.pose(moment / rate)[1]
+        sunk = _sunk(measurement, surface, points, moment)[:, :2]
         distance = np.full(len(sites), np.inf)
         if len(sunk):
             distance = np.linalg.norm(place[:, None] - sunk[None], axis=-1).min(axis=1)
