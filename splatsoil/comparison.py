@@ -118,7 +118,7 @@ class Comparator:
         interior: (h, w) by camera, pixels that have such a place.
         bed: (h, w) by camera, those of them whose ray meets the surface; the others look past a crest.
         silhouettes: (h, w) by camera and frame, the tool's, a little wider.
-        patch: side of a block, m, about: whole ones fill the bed.
+        block: (2,) sides of a block, m: about ``patch``, whole ones fill the bed.
         patches: (h, w) by camera, the block that a pixel is in, or -1.
         noise: the robust loss that the cameras' noise alone leaves; None where it can't be told.
 
@@ -137,7 +137,6 @@ class Comparator:
         patch: float = PATCH,
     ) -> None:
         self.measurement = measurement
-        self.patch = patch
         self.reference = int(measurement.frames[0])
         self.cameras = tuple(measurement.cameras) if cameras is None else tuple(cameras)
         chosen = measurement.frames if frames is None else tuple(sorted({int(f) for f in frames}))
@@ -165,6 +164,8 @@ class Comparator:
         self.before = {c: np.mean([*self._still[c], self.observed[c, self.reference]], axis=0) for c in self.cameras}
         self.silhouettes = self._tool_silhouettes()
         self._tool_colour = {c: self._tool_rule(c) for c in self.cameras}
+        extent = measurement.bed.upper[:2] - measurement.bed.lower[:2]
+        self.block: FloatArray = extent / np.maximum(np.round(extent / patch), 1.0)
         self.labels, self.patches = self._layout()
         self._unit = self._motionless()
         self.noise = self._noise()
@@ -300,9 +301,8 @@ class Comparator:
 
     def _layout(self) -> tuple[tuple[Block, ...], dict[str, npt.NDArray[np.int64]]]:
         """Labels of all blocks, and for each camera the block (in its order) that each pixel belongs to, or -1."""
-        low, high = self.measurement.bed.lower[:2], self.measurement.bed.upper[:2]
-        count = np.maximum(np.round((high - low) / self.patch).astype(int), 1)
-        size = (high - low) / count
+        low, size = self.measurement.bed.lower[:2], self.block
+        count = np.round((self.measurement.bed.upper[:2] - low) / size).astype(int)
         labels: list[Block] = []
         patches = {}
         for camera in self.cameras:

@@ -68,7 +68,7 @@ def record(experiment: Experiment, diagnosis: Diagnosis) -> dict[str, Any]:
             for s, there in zip(layout.sites, layout.placed, strict=True)
         ],
         "curves": [_curve(experiment, diagnosis, column) for column, there in enumerate(layout.placed) if not there],
-        # In units of each feature's noise; null where the tool hides it.
+        # In units of each feature's noise; null where nothing is seen.
         "maps": {
             "before": _map(diagnosis.residual, scale, experiment),
             **{

@@ -78,8 +78,8 @@ class Experiment(Protocol):
     Attributes:
         name: for people.
         layout: labels of the features.
-        observed: (t, s) features; 0 where ``seen`` is False.
-        seen: (t, s) False where there is no observation (the tool hides it).
+        observed: (t, s) features; anything where ``seen`` is False.
+        seen: (t, s) False where there is no observation (the tool hides it), or none that counts.
         quiet: (t, s) True where no physics of the model can act, so that what is left there is the instruments' doing.
         sensor: (t, s) standard deviation of what the instruments add, known or measured.
         sensor_memory: correlation of that between neighbouring times, in [0, 1).

@@ -120,9 +120,7 @@ class PlowExperiment:
         """Labels of the features."""
         measurement = self.base.measurement
         frames = tuple(float(np.mean([self.comparator.frames[i] for i in group])) for group in self._bins)
-        sites = tuple(
-            Site(camera, label.x, label.y) for camera in self.comparator.cameras for label in self._labels(camera)
-        )
+        sites = self._sites
         regions = regions_of(measurement, self.base.reconstruction.surface, frames, sites)
         if self.forces is not None:
             channels = self.forces.channels
@@ -154,22 +152,31 @@ class PlowExperiment:
 
     @cached_property
     def seen(self) -> npt.NDArray[np.bool_]:
-        """(t, s) False where the tool hides most of a patch, within a cell of where it went into the soil, or where
-        forces don't count.
+        """(t, s) False where the tool hides most of a patch, where a camera looks beside the way by which the tool went
+        into the soil, or where forces don't count.
 
-        How far soil is dragged along beside an edge that cuts into it is a matter of a solver's cells, and a wall that
-        stands there keeps it (docs/numerics.md).
+        How far soil is dragged along beside a blade that is lowered is a matter of a solver's cells, and a wall that
+        stands there keeps it (docs/numerics.md). Where nothing else is seen of what the tool moves, it counts.
         """
         shares = self._table(self.comparator.open_shares())
-        shares[:, self._entered] = 0.0
+        moved = self.layout.regions[:, : shares.shape[1]] != QUIET
+        others = np.where(self._entered, 0.0, shares)
+        if np.any(moved & (others > 0.5)):
+            shares = others
         return self._beside(shares, None if self.forces is None else self.forces.seen.astype(float)) > 0.5
+
+    @cached_property
+    def _sites(self) -> tuple[Site, ...]:
+        """Columns of cameras."""
+        cameras = self.comparator.cameras
+        return tuple(Site(camera, label.x, label.y) for camera in cameras for label in self._labels(camera))
 
     @cached_property
     def _entered(self) -> npt.NDArray[np.bool_]:
         """Columns of cameras that show where the tool went into the soil."""
-        sites = [Site(c, label.x, label.y) for c in self.comparator.cameras for label in self._labels(c)]
-        surface, last = self.base.reconstruction.surface, float(self.comparator.frames[-1])
-        return entered(self.base.measurement, surface, last, sites, self.comparator.patch, self.base.resolution.cell)
+        heights = self.base.reconstruction.surface.height
+        level, last = float(np.mean(heights[np.isfinite(heights)])), int(self.comparator.frames[-1])
+        return entered(self.base.measurement, level, last, self._sites, self.comparator.block)
 
     @cached_property
     def sensor(self) -> FloatArray:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from splatsoil.experiment.features import Site
 from splatsoil.measurement import Measurement
@@ -24,8 +25,10 @@ AHEAD = 0.6
 """Widths of the tool ahead of it that count as its face, and behind it as behind."""
 POINTS = 400
 """Of the tool's surface, to know where it stands in the soil."""
-DEPTHS = 9
-"""At which a camera's rays into soil that the tool has opened are looked at."""
+BESIDE_WAY = 1.0 / 6.0
+"""Widths of the tool beside its way into the soil where solvers differ: a cell as they use them (docs/numerics.md)."""
+DENSE = 2000
+"""Points of the tool's surface, to know beside which places it went."""
 
 
 def stages_of(measurement: Measurement, frames: Sequence[float]) -> tuple[str, ...]:
@@ -80,40 +83,60 @@ def heading_of(measurement: Measurement) -> FloatArray:
 
 
 def entered(
-    measurement: Measurement, surface: HeightField, last: float, sites: Sequence[Site], side: float, reach: float
+    measurement: Measurement, level: float, last: int, sites: Sequence[Site], sides: FloatArray
 ) -> npt.NDArray[np.bool_]:
-    """(s,) squares of the bed, ``side`` (m) wide, through which a site's camera looks at soil within ``reach`` (m) of
-    the tool as it is lowered, up to frame ``last``: from the surface down to the tool's lowest point.
+    """(s,) squares of the bed through which a site's camera looks at soil beside the way by which the tool went in.
 
-    None if the tool isn't pushed on from there: then there is little else to see.
+    At the surface, or down into soil that the tool has opened. The way is where the tool is below the surface in stages
+    of lowering, if it is pushed on through soil from there: else there is little more to see. A way in that is flatter
+    than 45° is pushing.
+
+    Args:
+        measurement: tool, motion, cameras.
+        level: of the surface, m.
+        last: frame up to which it is looked at.
+        sites: places as cameras see them.
+        sides: (2,) of a square, m.
     """
-    moments = [float(frame) for frame in range(int(last) + 1)]
-    stages = stages_of(measurement, moments)
     out = np.zeros(len(sites), dtype=bool)
-    points = np.asarray(measurement.tool.mesh.sample(POINTS, seed=0), dtype=np.float64)
-    lowered = [moment for moment, stage in zip(moments, stages, strict=True) if stage == "lowering"]
-    sunk = [_sunk(measurement, surface, points, moment) for moment in lowered]
-    if "pushing" not in stages or not any(map(len, sunk)):
+    frames = range(last + 1)
+    stages = stages_of(measurement, [float(frame) for frame in frames])
+    mesh = measurement.tool.mesh
+    reach = BESIDE_WAY * float(np.sort(mesh.extents)[1])
+    points = np.asarray(mesh.sample(DENSE, seed=0), dtype=np.float64)
+    places, lowest = [], []
+    for frame in frames:
+        at = _sunk(measurement, level, points, float(frame))
+        places.append(np.unique(np.round(at[:, :2] / (0.25 * reach)), axis=0) * (0.25 * reach))
+        lowest.append(at[:, 2].min(initial=level))
+    lowered = [f for f in frames if stages[f] == "lowering" and len(places[f])]
+    pushed = [f for f in frames if stages[f] == "pushing" and len(places[f])] if heading_of(measurement).any() else []
+    ways = [f for f in lowered if pushed and pushed[-1] > f]
+    if not ways:
         return out
-    place = np.array([[site.x, site.y] for site in sites])
-    eye = np.stack([measurement.cameras[site.channel].position for site in sites])
-    level = surface.smooth(place)
-    floor = min(float(at[:, 2].min()) for at in sunk if len(at))
-    # What lies deeper is seen farther away.
-    slope = (place - eye[:, :2]) / np.maximum(eye[:, 2] - level, 1e-9)[:, None]
-    deep = np.linspace(0.0, 1.0, DEPTHS)[:, None] * np.maximum(level - floor, 0.0)
-    seen = place + deep[..., None] * slope
-    for at in sunk:
-        beyond = np.maximum(np.abs(seen[:, :, None] - at[:, :2]) - 0.5 * side, 0.0)
-        out |= (np.linalg.norm(beyond, axis=-1) <= reach).any(axis=(0, 2))
+    way = cKDTree(np.concatenate([places[f] for f in ways]))
+    opened = cKDTree(np.unique(np.concatenate(places), axis=0))
+    depth = level - min(lowest[f] for f in ways)
+    across = np.linspace(-0.5, 0.5, 1 + 2 * math.ceil(float(sides.max()) / reach))
+    square = np.stack(np.meshgrid(across * sides[0], across * sides[1]), axis=-1).reshape(-1, 2)
+    for index, site in enumerate(sites):
+        eye = measurement.cameras[site.channel].position
+        place = np.array([site.x, site.y]) + square
+        # What lies deeper is seen farther away; along the ground nothing deep is.
+        shift = (place - eye[:2]) * depth / max(float(eye[2]) - level, depth)
+        steps = 1 + math.ceil(2.0 * float(np.linalg.norm(shift, axis=1).max()) / reach)
+        rays = place + np.linspace(0.0, 1.0, steps)[:, None, None] * shift
+        visible = np.logical_and.accumulate(opened.query(rays)[0] <= reach, axis=0)
+        visible[0] = True
+        out[index] = bool((visible & (way.query(rays)[0] <= reach)).any())
     return out
 
 
-def _sunk(measurement: Measurement, surface: HeightField, points: FloatArray, moment: float) -> FloatArray:
+def _sunk(measurement: Measurement, level: float | HeightField, points: FloatArray, moment: float) -> FloatArray:
     """(n, 3) where the tool's ``points`` are that lie below the surface at a moment in frames."""
     rotation, position = measurement.tool.motion.pose(moment / measurement.frame_rate)
     at = points @ np.asarray(rotation).T + position
-    return np.asarray(at[at[:, 2] < surface.smooth(at[:, :2])])
+    return np.asarray(at[at[:, 2] < (level if isinstance(level, float) else level.smooth(at[:, :2]))])
 
 
 def regions_of(
