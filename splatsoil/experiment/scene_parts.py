@@ -106,13 +106,16 @@ def entered(
     points = np.asarray(mesh.sample(DENSE, seed=0), dtype=np.float64)
     places, lowest = [], []
     for frame in frames:
-        at = _sunk(measurement, level, points, float(frame))
+        at = _placed(measurement, points, float(frame))
+        at = at[at[:, 2] < level]
         places.append(np.unique(np.round(at[:, :2] / (0.25 * reach)), axis=0) * (0.25 * reach))
         lowest.append(at[:, 2].min(initial=level))
-    lowered = [f for f in frames if stages[f] == "lowering" and len(places[f])]
-    pushed = [f for f in frames if stages[f] == "pushing" and len(places[f])] if heading_of(measurement).any() else []
-    ways = [f for f in lowered if pushed and pushed[-1] > f]
-    if not ways:
+    ways, on = [], False
+    for frame in reversed(frames):
+        on = len(places[frame]) > 0 and (on or stages[frame] == "pushing")
+        if on and stages[frame] == "lowering":
+            ways.append(frame)
+    if not ways or not heading_of(measurement).any():
         return out
     way = cKDTree(np.concatenate([places[f] for f in ways]))
     opened = cKDTree(np.unique(np.concatenate(places), axis=0))
@@ -132,11 +135,10 @@ def entered(
     return out
 
 
-def _sunk(measurement: Measurement, level: float | HeightField, points: FloatArray, moment: float) -> FloatArray:
-    """(n, 3) where the tool's ``points`` are that lie below the surface at a moment in frames."""
+def _placed(measurement: Measurement, points: FloatArray, moment: float) -> FloatArray:
+    """(n, 3) where the tool's ``points`` are at a moment in frames."""
     rotation, position = measurement.tool.motion.pose(moment / measurement.frame_rate)
-    at = points @ np.asarray(rotation).T + position
-    return np.asarray(at[at[:, 2] < (level if isinstance(level, float) else level.smooth(at[:, :2]))])
+    return np.asarray(points @ np.asarray(rotation).T + position)
 
 
 def regions_of(
@@ -153,7 +155,8 @@ def regions_of(
     previous = None
     for moment in moments:
         position = tool.motion.pose(moment / rate)[1]
-        sunk = _sunk(measurement, surface, points, moment)[:, :2]
+        at = _placed(measurement, points, moment)
+        sunk = at[at[:, 2] < surface.smooth(at[:, :2])][:, :2]
         distance = np.full(len(sites), np.inf)
         if len(sunk):
             distance = np.linalg.norm(place[:, None] - sunk[None], axis=-1).min(axis=1)

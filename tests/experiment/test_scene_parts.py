@@ -26,8 +26,8 @@ REACH = 0.02
 
 
 @pytest.fixture(scope="module")
-def dry() -> Measurement:
-    return Measurement.load(Path("examples/plow-dry"))
+def dry(plow_dry: Path) -> Measurement:
+    return Measurement.load(plow_dry)
 
 
 def moved(measurement: Measurement, *ways: tuple[float, float, float]) -> Measurement:
@@ -110,7 +110,8 @@ def test_each_way_into_the_soil_from_which_it_is_pushed_on_is_left_out(dry: Meas
     camera = next(iter(dry.cameras))
     sites = [Site(camera, 0.2, 0.25), Site(camera, 0.5, 0.25)]
     away = (0.3, 0.0, 0.0)
-    assert entered(moved(dry, DOWN, UP, away, DOWN, ON), LEVEL, 125, sites, SIDES).tolist() == [True, True]
+    assert entered(moved(dry, DOWN, UP, away, DOWN, ON), LEVEL, 125, sites, SIDES).tolist() == [False, True]
+    assert entered(moved(dry, DOWN, ON, UP, (0.2, 0.0, 0.0), DOWN, ON), LEVEL, 150, sites, SIDES).all()
     assert entered(moved(dry, DOWN, ON, UP, away, DOWN), LEVEL, 125, sites, SIDES).tolist() == [True, False]
 
 
