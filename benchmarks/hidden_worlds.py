@@ -40,18 +40,19 @@ from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
 from splatsoil.synthetic import Appearance, Renderer, Setup, Stage, photograph_run, plow
 
-NUMERICS = Numerics(voxel=0.02, substeps=2, iterations=120)
-SPACING = 0.01
-"""Of the independent solver's particles, m."""
+VOXEL, ITERATIONS, SUBSTEPS = 0.02, 120, 2
+"""Of the independent solver: m, in a substep, in a frame."""
+SPACING = 0.5
+"""Of the independent solver's particles, of a voxel."""
 RENDERERS: dict[str, Callable[..., Renderer]] = {"own": Stage, "mitsuba": MitsubaStage}
 NEWTON = "newton"
 """The other solver; ours go by their presets."""
 
 
-def soil_of(hidden: Hidden, setup: Setup) -> World:
-    """What the solver ploughs."""
+def soil_of(hidden: Hidden, setup: Setup, spacing: float) -> World:
+    """What the solver ploughs, of particles so far apart."""
     told = dict(hidden.soil)
-    x = fill(setup.surface, setup.bed, SPACING, seed=hidden.seed)
+    x = fill(setup.surface, setup.bed, spacing, seed=hidden.seed)
     angle: float | FloatArray = hidden.angle
     if "layer" in told:
         excess, below = told.pop("layer")
@@ -62,15 +63,16 @@ def soil_of(hidden: Hidden, setup: Setup) -> World:
     if "obstacle" in told:
         keep = np.linalg.norm(x - np.array(told["obstacle"][:3]), axis=1) > told["obstacle"][3]
         x = x[keep]
-    return World(hidden.name, angle, x, SPACING, **told)
+    return World(hidden.name, angle, x, spacing, **told)
 
 
 def ploughed_by_newton(
-    group: Sequence[Hidden], setups: Sequence[Setup], frames: Sequence[int], device: str
+    group: Sequence[Hidden], setups: Sequence[Setup], frames: Sequence[int], device: str, numerics: Numerics
 ) -> list[Trajectory]:
     """Worlds under one gravity, side by side."""
-    soils = [soil_of(h, s) for h, s in zip(group, setups, strict=True)]
-    runs = plough(setups[0].experiment(), soils, NUMERICS, frames, device, gravity=group[0].gravity)
+    spacing = SPACING * numerics.voxel
+    soils = [soil_of(h, s, spacing) for h, s in zip(group, setups, strict=True)]
+    runs = plough(setups[0].experiment(), soils, numerics, frames, device, gravity=group[0].gravity)
     found = []
     for setup, soil, run in zip(setups, soils, runs, strict=True):
         positions = np.stack([soil.particles, *(run.particles[f] for f in frames if f > 0)]).astype(np.float32)
@@ -80,7 +82,7 @@ def ploughed_by_newton(
                 positions=positions,
                 deformations=np.broadcast_to(np.eye(3, dtype=np.float32), (*positions.shape, 3)),
                 force=run.force[: max(setup.frames)],
-                spacing=SPACING,
+                spacing=spacing,
                 resolution=Resolution.derive(setup.experiment(), "small"),
             )
         )
@@ -108,7 +110,7 @@ def make_worlds(
     out: Path,
     device: str,
     say: Callable[[str], None],
-    solver: str = NEWTON,
+    solver: str | Numerics,
     renderer: Callable[..., Renderer] = Stage,
 ) -> None:
     """Simulate and photograph the worlds that the folder doesn't have."""
@@ -120,8 +122,8 @@ def make_worlds(
         rate = setups[0].frame_rate
         frames = sorted({f for o in seen for f in frames_around(setups[0].frames, o.time_offset * rate)})
         began = time.perf_counter()
-        if solver == NEWTON:
-            trajectories = ploughed_by_newton(group, setups, frames, device)
+        if isinstance(solver, Numerics):
+            trajectories = ploughed_by_newton(group, setups, frames, device, solver)
         else:
             ours = zip(group, setups, strict=True)
             trajectories = [ploughed_by_us(h, setup, frames, solver, device) for h, setup in ours]
@@ -271,6 +273,8 @@ def main(arguments: list[str] | None = None) -> int:
         default=NEWTON,
         help="ploughs the worlds: newton needs the package, the others are ours by preset (not friction_field)",
     )
+    parser.add_argument("--voxel", type=float, default=VOXEL, help="edge of the other solver's cells, m")
+    parser.add_argument("--iterations", type=int, default=ITERATIONS, help="most of the other solver's in a substep")
     parser.add_argument("--worlds-only", action="store_true", help="make the sets and stop")
     parser.add_argument("--out", type=Path, default=Path("runs/hidden-worlds"))
     options = parser.parse_args(arguments)
@@ -282,10 +286,12 @@ def main(arguments: list[str] | None = None) -> int:
 
     if options.solver != NEWTON and FIELD in options.kinds:
         raise ParameterError(f"{FIELD} is outside of our library: give --kinds without it, or --solver {NEWTON}")
+    if not 0.0 < options.voxel or options.iterations < 1:
+        raise ParameterError("--voxel must be positive, and --iterations one at least")
     if options.renderer == "mitsuba":
         load_mitsuba()  # says what is missing before worlds are made
     own = [Path(__file__).with_name(f"{name}.py") for name in ("_mitsuba", "_newton", "_truths", "hidden_worlds")]
-    decides = {name: getattr(options, name) for name in ("seed", "preset", "solver", "renderer")}
+    decides = {name: getattr(options, name) for name in ("seed", "preset", "solver", "renderer", "voxel", "iterations")}
     decides["code"] = sources(own)
     keep_to_one_protocol(options.out, decides)
     truths = [
@@ -293,7 +299,9 @@ def main(arguments: list[str] | None = None) -> int:
         for kind in options.kinds
         for k in range((3 if kind == NOTHING else 1) * options.count)
     ]
-    make_worlds(truths, options.out, options.device, say, options.solver, RENDERERS[options.renderer])
+    other = Numerics(options.voxel, SUBSTEPS, options.iterations)
+    solver = other if options.solver == NEWTON else options.solver
+    make_worlds(truths, options.out, options.device, say, solver, RENDERERS[options.renderer])
     if options.worlds_only:
         return 0
     threads = max(1, (os.cpu_count() or 1) // options.side_by_side)
@@ -311,7 +319,7 @@ def main(arguments: list[str] | None = None) -> int:
             rows.append(score(hidden, fit, told))
     write_json(
         options.out / "result.json",
-        plain({"made_by": stamp(options.device), "solver": options.solver, "renderer": options.renderer, "rows": rows}),
+        plain({"made_by": stamp(options.device), **decides, "rows": rows}),
     )
     print(table(rows))
     return 0 if len(rows) == len(truths) else 1

@@ -30,14 +30,14 @@ def test_a_truth_is_drawn_by_seed_and_is_an_effect_of_the_library(kind: str) -> 
 
 def test_a_layer_lies_below_its_depth_and_a_stone_holds_no_sand() -> None:
     setup = plow(3)
-    layered = soil_of(replace(draw("layering", 0, 1), soil={"layer": (-8.0, 0.05)}), setup)
+    layered = soil_of(replace(draw("layering", 0, 1), soil={"layer": (-8.0, 0.05)}), setup, 0.01)
     weak = np.asarray(layered.angle) < draw("layering", 0, 1).angle - 7.9
     top = float(setup.surface.height.max())
     assert weak[layered.particles[:, 2] < 0.02].all(), "the soil is 8 cm deep and more"
     assert not weak[layered.particles[:, 2] > top - 0.05].any()
     stone = draw("buried_obstacle", 0, 1)
     x, y, z, radius = stone.soil["obstacle"]
-    assert np.linalg.norm(soil_of(stone, setup).particles - [x, y, z], axis=1).min() > radius
+    assert np.linalg.norm(soil_of(stone, setup, 0.01).particles - [x, y, z], axis=1).min() > radius
 
 
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in (NOTHING, FIELD)])
@@ -48,7 +48,7 @@ def test_both_solvers_are_told_the_same(kind: str) -> None:
     law = Law(effect.for_measurement(experiment) for effect in find_effects([kind]))
     values = law.require_on(hidden.values)
     settings = law.settings(base_settings(experiment), values)
-    told = soil_of(hidden, setup)
+    told = soil_of(hidden, setup, 0.01)
     expected = experiment.gravity if hidden.gravity is None else hidden.gravity
     assert settings.gravity == pytest.approx(tuple(expected), abs=1e-9)
     friction = setup.tool.friction if told.tool_friction is None else told.tool_friction
@@ -81,6 +81,13 @@ def test_our_solver_ploughs_a_truth_of_its_own() -> None:
 def test_what_our_library_lacks_our_solver_cannot_plough(tmp_path: Path) -> None:
     with pytest.raises(ParameterError, match="friction_field"):
         main(["--solver", "small", "--kinds", FIELD, "--out", str(tmp_path / "worlds")])
+    assert not (tmp_path / "worlds").exists()
+
+
+@pytest.mark.parametrize("wrong", [["--voxel", "0"], ["--voxel", "-0.02"], ["--iterations", "0"]])
+def test_numerics_that_are_none_are_refused(tmp_path: Path, wrong: list[str]) -> None:
+    with pytest.raises(ParameterError, match="--voxel"):
+        main(["--kinds", NOTHING, "--out", str(tmp_path / "worlds"), *wrong])
     assert not (tmp_path / "worlds").exists()
 
 
@@ -135,12 +142,12 @@ def test_a_missing_renderer_is_said_before_anything_is_made(monkeypatch: pytest.
     assert not (tmp_path / "worlds").exists()
 
 
-def test_a_folder_keeps_one_renderer(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_folder_keeps_one_renderer_and_one_solver(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Worlds that the path tracer photographed aren't told as Mitsuba's."""
     monkeypatch.setattr(hidden_worlds, "make_worlds", lambda *_: None)
     monkeypatch.setattr(hidden_worlds, "load_mitsuba", lambda: None)
     own = ["--kinds", NOTHING, "--worlds-only", "--out", str(tmp_path)]
     assert main(own) == 0 and main(own) == 0
-    for other in (["--renderer", "mitsuba"], ["--solver", "small"]):
+    for other in (["--renderer", "mitsuba"], ["--solver", "small"], ["--voxel", "0.015"], ["--iterations", "240"]):
         with pytest.raises(ParameterError, match="another --out"):
             main([*own, *other])
