@@ -131,7 +131,7 @@ def confirm(
             # A surface that isn't one tells nothing more than the last derivatives do.
             with suppress(ValueError):
                 together = joined(visits, end.values())
-                reading = read(together, whole.everywhere, experiment.observed, free, known)
+                reading = read(together, whole, experiment.observed, free, known)
                 values, stds, emulated = dict(reading.values), dict(reading.stds), together
         solvers = [experiment.reproducibility(p, values[p.name], name) for p in free]
         own = np.hypot(untried(floor, fit.slopes, precision), solvers)

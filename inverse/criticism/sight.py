@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -60,12 +60,6 @@ class Sight:
             tables = [*vantage.slopes.values(), *(table for tables in vantage.directions.values() for table in tables)]
             columns.append(np.stack([table[experiment.seen] for table in tables], axis=-1))
         return cls(noise, solver, orthonormal(solver.whiten(np.concatenate(columns, axis=1)[inside])))
-
-    @property
-    def everywhere(self) -> Sight:
-        """The same features in all directions, for a surface through simulations, in which their chance averages out:
-        in the few directions in which anything acts to first order a part of what they tell of sizes is lost."""
-        return replace(self, directions=None)
 
     def __call__(self, table: FloatArray) -> FloatArray:
         """Of a table (t, s, …): (d, …), of noise alone independent with variance 1."""
