@@ -48,7 +48,7 @@ def sentences(
     worst = next((b for b in diagnosis.blocks if b.p < GATE), None)
     if worst is not None:
         out.append(
-            f"Before anything is added, the model is farthest off here: {worst.region}, {worst.stage}, "
+            f"Before anything is added, the model fails most clearly here: {worst.region}, {worst.stage}, "
             f"{worst.channel}, with {worst.ratio:.1f} times what noise leaves."
         )
         if worst.region in still and diagnosis.verdict == "outside the library":
