@@ -286,7 +286,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     if options.solver != NEWTON and FIELD in options.kinds:
         raise ParameterError(f"{FIELD} is outside of our library: give --kinds without it, or --solver {NEWTON}")
-    if not 0.0 < options.voxel or options.iterations < 1:
+    if not options.voxel > 0.0 or options.iterations < 1:
         raise ParameterError("--voxel must be positive, and --iterations one at least")
     if options.renderer == "mitsuba":
         load_mitsuba()  # says what is missing before worlds are made
