@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from splatsoil.benchmarks import hidden_worlds
+from splatsoil.benchmarks._newton import Numerics, World
 from splatsoil.benchmarks._truths import ANGLES, FIELD, KINDS, NOTHING, OBSERVATION, draw
 from splatsoil.benchmarks.hidden_worlds import main, ploughed_by_us, score, soil_of, table
 
@@ -89,6 +92,23 @@ def test_numerics_that_are_none_are_refused(tmp_path: Path, wrong: list[str]) ->
     with pytest.raises(ParameterError, match="--voxel"):
         main(["--kinds", NOTHING, "--out", str(tmp_path / "worlds"), *wrong])
     assert not (tmp_path / "worlds").exists()
+
+
+def test_the_other_solver_gets_the_numerics_that_are_asked_for(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    asked: list[tuple[Any, ...]] = []
+
+    class Ploughed(Exception):
+        """Far enough."""
+
+    def plough(_: object, worlds: Sequence[World], numerics: Numerics, *__: object, **___: object) -> None:
+        asked.append((numerics.voxel, numerics.iterations, {world.spacing for world in worlds}))
+        raise Ploughed
+
+    monkeypatch.setattr(hidden_worlds, "plough", plough)
+    for name, words in (("usual", []), ("coarse", ["--voxel", "0.04", "--iterations", "60"])):
+        with pytest.raises(Ploughed):
+            main(["--kinds", "cohesion", "--out", str(tmp_path / name), *words])
+    assert asked == [(0.02, 120, {0.01}), (0.04, 60, {0.02})]
 
 
 def judged(kind: str, verdict: str, members: list[str]) -> dict[str, object]:
