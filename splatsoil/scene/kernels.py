@@ -309,6 +309,19 @@ def surface_depth(
     return -1.0
 
 
+@wp.func
+def way_out(grid: Grid, rows: int, columns: int, origin: wp.vec3, ray: wp.vec3) -> float:
+    """Depth at which a ray leaves the rectangle that a map of so many cells covers."""
+    out = float(1.0e6)
+    if wp.abs(ray[0]) > 1.0e-9:
+        end = wp.where(ray[0] > 0.0, float(columns) - 0.5, -0.5)
+        out = wp.min(out, (grid.x0 + end / grid.inverse_x - origin[0]) / ray[0])
+    if wp.abs(ray[1]) > 1.0e-9:
+        end = wp.where(ray[1] > 0.0, float(rows) - 0.5, -0.5)
+        out = wp.min(out, (grid.y0 + end / grid.inverse_y - origin[1]) / ray[1])
+    return out
+
+
 @wp.kernel(enable_backward=False)
 def illuminate(
     first: int,
@@ -324,15 +337,14 @@ def illuminate(
     albedo: wp.vec3,
     step: float,
     top: float,
-    reach: float,
     light_out: wp.array2d(dtype=wp.vec3),
     tool_out: wp.array2d(dtype=wp.vec4),
 ) -> None:
     """For each pixel: the light on the soil it shows; the tool's radiance times its share of the pixel, and that share.
 
-    The splats say that a pixel shows soil; light is looked up where the pixel's ray meets the surface (at most
-    ``reach`` behind their depth), because blobs end a little before or behind it, and at a rim their mean depth lies in
-    the air. Soil hides the tool where both say so: the smooth surface runs on behind a blade that holds soil back, and
+    The splats say that a pixel shows soil; light is looked up where the pixel's ray meets the surface, however far
+    behind their depth, because blobs end a little before or behind it, and at a rim their mean depth lies in the air,
+    over a trench's floor where what is seen is its far wall. Soil hides the tool where both say so: the smooth surface runs on behind a blade that holds soil back, and
     single blobs stand out from the soil that a blade touches.
     """
     pixel = first + wp.tid()
@@ -343,7 +355,8 @@ def illuminate(
     light_out[i, j] = wp.vec3(1.0, 1.0, 1.0)
     tool_out[i, j] = wp.vec4(0.0, 0.0, 0.0, 0.0)
     if soil[i, j] > 0.01 and z > 0.0:
-        found = surface_depth(height, grid, eye.position, ray, top, step, z + reach)
+        out = way_out(grid, height.shape[0], height.shape[1], eye.position, ray)
+        found = surface_depth(height, grid, eye.position, ray, top, step, out)
         if found > 0.0:
             z = found
         x = eye.position + ray * z

@@ -104,7 +104,7 @@ class Layers:
 
 @stepwise
 def layers_of(
-    views: Sequence[tuple[Posed, Camera]], background: npt.ArrayLike, tool_albedo: FloatArray, reach: float
+    views: Sequence[tuple[Posed, Camera]], background: npt.ArrayLike, tool_albedo: FloatArray
 ) -> Steps[Layers]:
     """What cameras without distortion, all of one size, see of posed scenes.
 
@@ -112,7 +112,6 @@ def layers_of(
         views: of each, with an axis in front in what is returned.
         background: (3,) sRGB where nothing is.
         tool_albedo: (3,) linear.
-        reach: how far behind the splats the surface that a pixel shows is looked for, m.
     """
     device = views[0][0].centres.device
     behind = upload([*np.asarray(background, dtype=np.float64), 0.0, 0.0], device)
@@ -134,7 +133,7 @@ def layers_of(
     light, tool = (torch.empty((*depth.shape, k), dtype=torch.float32, device=device) for k in (3, 4))
     for k, (posed, camera) in enumerate(views):
         maps = depth[k], soil[k], unhidden[k], light[k], tool[k]
-        _illuminate(posed.lit, camera, *maps, tool_albedo, reach)
+        _illuminate(posed.lit, camera, *maps, tool_albedo)
     return Layers(colour, soil, depth, light, tool)
 
 
@@ -184,7 +183,6 @@ def _illuminate(
     light: Tensor,
     tool: Tensor,
     tool_albedo: FloatArray,
-    reach: float,
 ) -> None:
     """Write light on the soil (h, w, 3) and the tool's share (h, w, 4) of each pixel."""
     relief = lit.relief
@@ -192,7 +190,7 @@ def _illuminate(
     numbers = [grid_of(relief), lit.light.kernel_form(), lit.tool, wp.vec3(*tool_albedo), march_step(relief)]
     outputs = [as_warp(light, wp.vec3), as_warp(tool, wp.vec4)]
     shades = as_warp(lit.shades, kernels.Shade)
-    inputs = [eye_of(camera), *maps, shades, *numbers, ceiling(relief), reach, *outputs]
+    inputs = [eye_of(camera), *maps, shades, *numbers, ceiling(relief), *outputs]
     pixels = camera.height * camera.width
     if depth.is_cuda:
         launch(kernels.illuminate, pixels, [0, *inputs], depth)

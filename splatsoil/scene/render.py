@@ -47,9 +47,6 @@ PARTICLE_OPACITY = 0.95
 _HIDDEN = 2.5
 """Particles this many spacings from the surface are not drawn."""
 
-_REACH = 10.0
-"""How far behind the splats the surface that a pixel shows is looked for, in particle spacings."""
-
 _AT_ONCE = 16
 """Pictures that are drawn beside each other on a GPU, whose memory holds the Gaussians of each tile until they are."""
 
@@ -196,7 +193,7 @@ class Scene:
 
     def _layering(self, views: Sequence[tuple[Posed, Camera]]) -> Steps[Layers]:
         """Steps of the layers of views of one size."""
-        return layers_of.steps(views, self.background, self.tool_albedo, _REACH * self.spacing)
+        return layers_of.steps(views, self.background, self.tool_albedo)
 
     def render(self, positions: Any, deformations: Any, tool: Pose | None, camera: Camera) -> FloatImage:
         """The picture (h, w, 3) float32 sRGB in [0, 1] that an undistorted camera takes of particles and tool."""
