@@ -9,6 +9,9 @@ from __future__ import annotations
 
 import warp as wp
 
+STEEP, STEEPEST = wp.constant(0.7), wp.constant(0.5)
+"""Upward parts of normals (45°, 60°) between which a surface's slope is less and less that of its heights."""
+
 
 @wp.struct
 class Grid:
@@ -62,6 +65,46 @@ _PLACE = """
 )
 def sample(values: wp.array2d(dtype=wp.float32), grid: Grid, x: float, y: float) -> float:  # type: ignore[empty-body]
     """Bilinear value of a contiguous map (ny, nx), held constant beyond its border."""
+
+
+@wp.func_native(
+    """
+    const int nz = values.shape[0], ny = values.shape[1], nx = values.shape[2];
+    const float right = (float)nx - 1.001f, upper = (float)ny - 1.001f, top = (float)nz - 1.001f;
+    float u = (x - grid.x0) * grid.inverse_x, v = (y - grid.y0) * grid.inverse_y, w = (z - layers[0]) * layers[1];
+    u = u > 0.0f ? u : 0.0f; u = u < right ? u : right;
+    v = v > 0.0f ? v : 0.0f; v = v < upper ? v : upper;
+    w = w > 0.0f ? w : 0.0f; w = w < top ? w : top;
+    const int j = (int)u, i = (int)v, k = (int)w;
+    const float fu = u - (float)j, fv = v - (float)i, fw = w - (float)k;
+    const float* p = values.data + ((long long)k * ny + i) * nx + j;
+    const float* q = p + (long long)ny * nx;
+    const float p0 = p[0] + fu * (p[1] - p[0]), p1 = p[nx] + fu * (p[nx + 1] - p[nx]);
+    const float q0 = q[0] + fu * (q[1] - q[0]), q1 = q[nx] + fu * (q[nx + 1] - q[nx]);
+    const float low = p0 + fv * (p1 - p0), high = q0 + fv * (q1 - q0);
+    return low + fw * (high - low);
+"""
+)
+def sample_layers(  # type: ignore[empty-body]
+    values: wp.array3d(dtype=wp.float32), grid: Grid, layers: wp.vec2, x: float, y: float, z: float
+) -> float:
+    """Trilinear value of contiguous layers of maps (nz, ny, nx), held constant beyond their border; ``layers`` are the
+    lowest one's height and one over the distance from one to the next."""
+
+
+@wp.func
+def slope_of_layers(values: wp.array3d(dtype=wp.float32), grid: Grid, layers: wp.vec2, x: wp.vec3) -> wp.vec3:
+    """Gradient of the same, by differences over a cell each way, and half a layer."""
+    dx = 1.0 / grid.inverse_x
+    dy = 1.0 / grid.inverse_y
+    dz = 0.5 / layers[1]
+    along_x = sample_layers(values, grid, layers, x[0] + dx, x[1], x[2])
+    along_x -= sample_layers(values, grid, layers, x[0] - dx, x[1], x[2])
+    along_y = sample_layers(values, grid, layers, x[0], x[1] + dy, x[2])
+    along_y -= sample_layers(values, grid, layers, x[0], x[1] - dy, x[2])
+    along_z = sample_layers(values, grid, layers, x[0], x[1], x[2] + dz)
+    along_z -= sample_layers(values, grid, layers, x[0], x[1], x[2] - dz)
+    return 0.5 * wp.vec3(along_x / dx, along_y / dy, along_z / dz)
 
 
 Shade = wp.types.vector(length=8, dtype=wp.float32)
@@ -331,6 +374,8 @@ def illuminate(
     unhidden: wp.array2d(dtype=wp.float32),
     height: wp.array2d(dtype=wp.float32),
     shades: wp.array2d(dtype=Shade),
+    filling: wp.array3d(dtype=wp.float32),
+    layers: wp.vec2,
     grid: Grid,
     light: Illumination,
     tool: ToolPose,
@@ -344,8 +389,10 @@ def illuminate(
 
     The splats say that a pixel shows soil; light is looked up where the pixel's ray meets the surface, however far
     behind their depth, because blobs end a little before or behind it, and at a rim their mean depth lies in the air,
-    over a trench's floor where what is seen is its far wall. Soil hides the tool where both say so: the smooth surface runs on behind a blade that holds soil back, and
-    single blobs stand out from the soil that a blade touches.
+    over a trench's floor where what is seen is its far wall. Where heights say that it is steep, and there is any
+    density ``filling``, it slopes as that says: a wall falls from one cell to the next, so that heights don't tell how
+    it stands. Soil hides the tool where both say so: the smooth surface runs on behind a blade that holds soil back,
+    and single blobs stand out from the soil that a blade touches.
     """
     pixel = first + wp.tid()
     i = pixel // depth.shape[1]
@@ -362,6 +409,10 @@ def illuminate(
         x = eye.position + ray * z
         shade = sample_shade(shades, grid, x[0], x[1])
         n = wp.normalize(wp.vec3(shade[0], shade[1], shade[2]))
+        steep = wp.clamp((STEEP - n[2]) / (STEEP - STEEPEST), 0.0, 1.0)
+        if steep > 0.0 and found > 0.0 and filling.shape[0] > 0:
+            outward = -wp.normalize(slope_of_layers(filling, grid, layers, x))
+            n = wp.normalize(n + steep * (outward - n))
         direct = wp.max(wp.dot(n, light.sun), 0.0) / light.sun[2]
         if direct > 0.0:
             sunny = shade[4]

@@ -190,7 +190,9 @@ def _illuminate(
     numbers = [grid_of(relief), lit.light.kernel_form(), lit.tool, wp.vec3(*tool_albedo), march_step(relief)]
     outputs = [as_warp(light, wp.vec3), as_warp(tool, wp.vec4)]
     shades = as_warp(lit.shades, kernels.Shade)
-    inputs = [eye_of(camera), *maps, shades, *numbers, ceiling(relief), *outputs]
+    low, thick = relief.layers
+    filling = [as_warp(relief.filling, wp.float32), wp.vec2(low, 1.0 / thick)]
+    inputs = [eye_of(camera), *maps, shades, *filling, *numbers, ceiling(relief), *outputs]
     pixels = camera.height * camera.width
     if depth.is_cuda:
         launch(kernels.illuminate, pixels, [0, *inputs], depth)

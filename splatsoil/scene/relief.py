@@ -8,7 +8,7 @@ so that a plane stays the plane that bounds the particles' volume.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -46,12 +46,17 @@ class Relief:
         normal: (ny, nx, 3) float32, unit length, upward.
         origin: x and y of the first cell's centre, m.
         cell: cell size along x and y, m.
+        filling: (nz, ny, nx) float32 density over that of the bulk in layers over the same cells, by which the surface
+            slopes; no layers where heights are all that is known.
+        layers: height of the lowest layer, and from one to the next, m.
     """
 
     height: Tensor
     normal: Tensor
     origin: tuple[float, float]
     cell: tuple[float, float]
+    filling: Tensor
+    layers: tuple[float, float]
 
     @classmethod
     def of_heights(cls, height: Tensor, origin: tuple[float, float], cell: tuple[float, float]) -> Relief:
@@ -60,7 +65,7 @@ class Relief:
         normal = height.new_empty((*height.shape, 3))
         inputs = [as_warp(height, wp.float32), float(cell[0]), float(cell[1]), as_warp(normal, wp.vec3)]
         launch(kernels_relief.normals, tuple(height.shape), inputs, height)
-        return cls(height, normal, origin, cell)
+        return cls(height, normal, origin, cell, height.new_zeros((0, 0, 0)), (0.0, 1.0))
 
     @property
     def device(self) -> torch.device:
@@ -210,6 +215,8 @@ def relief_of_particles(
     launch(kernels_relief.crossing, tuple(height.shape), inputs, fine)
     half = (float(cell[0]) / 2, float(cell[1]) / 2)
     relief = Relief.of_heights(height, (float(low[0]) + half[0] / 2, float(low[1]) + half[1] / 2), half)
+    thick = float(cell[2])
+    relief = replace(relief, filling=fine.contiguous(), layers=(float(low[2]) + 0.5 * thick, thick))
     return (yield from relief.ranged())
 
 
