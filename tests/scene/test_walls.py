@@ -1,0 +1,108 @@
+"""Pits with upright walls, drawn from particles, against a path tracer that gets the same soil as triangles."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from splatsoil.measurement import Bed, Camera
+from splatsoil.scene import Light, Scene, ToolBody, bind, encoded, linear, relief_of_particles
+from splatsoil.splats import Gaussians
+from splatsoil.synthetic import stage as synthetic
+from splatsoil.synthetic.soil_surface import soil_surface
+
+SPACING = 0.01
+BED = Bed(np.zeros(3), np.array([0.4, 0.4, 0.2]), 1600.0)
+TOP, FLOOR = 0.12, 0.02
+ALBEDO = 0.4
+AMBIENT, ELEVATION = 0.4, 40.0
+
+
+def pit(near, far, lean=0.0):
+    """Particles (n, 3) of a bed with a hole from one side of it nearly to the other, between ``near`` and ``far`` along
+    y at the top; the far wall leans back by ``lean`` degrees."""
+    axis = np.arange(SPACING / 2, 0.4, SPACING)
+    x = np.stack(np.meshgrid(axis, axis, np.arange(SPACING / 2, TOP, SPACING), indexing="ij"), axis=-1).reshape(-1, 3)
+    x = x + 0.2 * SPACING * np.random.default_rng(1).uniform(-1.0, 1.0, x.shape)
+    back = far - (TOP - x[:, 2]) * math.tan(math.radians(lean))
+    hole = (x[:, 2] > FLOOR) & (x[:, 1] > near) & (x[:, 1] < back) & (np.abs(x[:, 0] - 0.2) < 0.15)
+    return torch.tensor(x[~hole], dtype=torch.float32)
+
+
+def scene_of(particles, light):
+    axis = torch.arange(0.0025, 0.4, 0.005)
+    y, x = torch.meshgrid(axis, axis, indexing="ij")
+    flat = torch.stack([x.reshape(-1), y.reshape(-1)], dim=1)
+    relief = relief_of_particles(particles, SPACING, BED.lower, BED.upper)
+    centres = torch.cat([flat, relief.sample(relief.height, flat)[:, None]], dim=1)
+    shape = torch.diag(torch.tensor([0.003, 0.003, 0.0006]) ** 2).expand(len(centres), 3, 3).contiguous()
+    albedo = encoded(torch.full((3,), ALBEDO))
+    none = Gaussians(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, 4), torch.zeros(0), torch.zeros(0, 3))
+    return Scene(
+        soil=bind(centres, shape, particles, SPACING),
+        soil_opacity=torch.full((len(centres),), 0.9),
+        soil_albedo=albedo.expand(len(centres), 3).contiguous(),
+        grain_albedo=albedo.expand(len(particles), 3).contiguous(),
+        surroundings=none,
+        surrounding_shapes=torch.zeros(0, 3, 3),
+        light=light,
+        tool=ToolBody(None),
+        tool_albedo=np.zeros(3),
+        bed=BED,
+        spacing=SPACING,
+        background=np.zeros(3),
+    )
+
+
+def camera(eye, target, size=(160, 120), focal=260.0):
+    back = np.subtract(eye, target) / np.linalg.norm(np.subtract(eye, target))
+    right = np.cross([0.0, 0.0, 1.0], back)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(back, right), back], axis=1)
+    pose[:3, 3] = eye
+    return Camera(size[0], size[1], focal, focal, size[0] / 2, size[1] / 2, pose, model="PINHOLE")
+
+
+def both(particles, view, azimuth):
+    """Light on what each pixel shows, (h, w), over that of level ground: drawn by splats, and path traced."""
+    light = Light.from_angles(azimuth, ELEVATION, AMBIENT, level=np.full(3, ALBEDO))
+    drawn = linear(torch.tensor(scene_of(particles, light).render(particles, None, None, view)))[..., 1].numpy()
+    body = soil_surface(particles.numpy(), np.full((len(particles), 3), ALBEDO), SPACING, BED)
+    sun = (1.0 - AMBIENT) / math.sin(math.radians(ELEVATION))
+    stage = synthetic.Stage([body], synthetic.Light.from_angles(azimuth, ELEVATION, sun, AMBIENT), ground=-0.1)
+    return drawn / ALBEDO, stage.radiance(view, seed=1, side=8)[..., 1] / ALBEDO
+
+
+def rows_between(view, *points):
+    """Rows of pixels that show points (3,)."""
+    return [int(row) for row in view.project(np.array(points))[0][:, 1]]
+
+
+@pytest.mark.parametrize("azimuth", [-90.0, 90.0])
+def test_over_a_near_rim_the_far_wall_shows(azimuth):
+    """A camera looks over the rim of a pit at its far wall, two dozen particles away, once in the sun and once in
+    shade. The floor before that wall, which the camera doesn't see, is in the other one's light."""
+    view = camera((0.2, -0.35, 0.28), (0.2, 0.2, 0.1))
+    drawn, traced = both(pit(0.08, 0.32), view, azimuth)
+    (rim,) = rows_between(view, (0.2, 0.08, TOP))
+    middle = np.s_[rim - 5 : rim + 4, 65:95]
+    # The other one's light is 0.8 away.
+    assert np.sqrt(np.mean((drawn[middle] - traced[middle]) ** 2)) < 0.12
+    assert drawn[middle].mean() == pytest.approx(traced[middle].mean(), abs=0.05)
+
+
+@pytest.mark.parametrize(("lean", "azimuth"), [(0.0, -90.0), (15.0, -90.0), (0.0, -30.0), (15.0, 30.0)])
+def test_a_wall_is_lit_as_it_stands(lean, azimuth):
+    """Straight ahead and from the side, an upright one and one that leans back."""
+    view = camera((0.2, -0.35, 0.4), (0.2, 0.25, 0.08))
+    drawn, traced = both(pit(0.1, 0.32, lean), view, azimuth)
+    heights = TOP - 2.0 * SPACING, FLOOR + 4.0 * SPACING
+    top, foot = ((0.2, 0.32 - (TOP - z) * math.tan(math.radians(lean)), z) for z in heights)
+    first, last = rows_between(view, top, foot)
+    wall = np.s_[first:last, 60:100]
+    assert last - first >= 12
+    # By the slope of heights, an upright one is off by 0.13.
+    assert np.sqrt(np.mean((drawn[wall] - traced[wall]) ** 2)) < 0.08
+    assert drawn[wall].mean() == pytest.approx(traced[wall].mean(), rel=0.08)
