@@ -13,6 +13,7 @@ import warp as wp
 
 from splatsoil.measurement import Camera
 from splatsoil.scene import kernels
+from splatsoil.scene.kernels_maps import Grid, sample
 from splatsoil.scene.lit import march_step
 from splatsoil.scene.relief import Relief, grid_of
 from splatsoil.scene.tool import eye_of
@@ -61,10 +62,8 @@ def ground_of_pixels(
 
 
 @wp.func
-def _height_over(
-    height: wp.array2d(dtype=wp.float32), grid: kernels.Grid, origin: wp.vec3, ray: wp.vec3, t: float
-) -> float:
-    return origin[2] + t * ray[2] - kernels.sample(height, grid, origin[0] + t * ray[0], origin[1] + t * ray[1])
+def _height_over(height: wp.array2d(dtype=wp.float32), grid: Grid, origin: wp.vec3, ray: wp.vec3, t: float) -> float:
+    return origin[2] + t * ray[2] - sample(height, grid, origin[0] + t * ray[0], origin[1] + t * ray[1])
 
 
 @wp.func
@@ -78,7 +77,7 @@ def _inside(bounds: wp.vec4, origin: wp.vec3, ray: wp.vec3, t: float) -> bool:
 def _ground(
     eye: kernels.Eye,
     height: wp.array2d(dtype=wp.float32),
-    grid: kernels.Grid,
+    grid: Grid,
     ends: wp.vec4,
     bounds: wp.vec4,
     floor: float,

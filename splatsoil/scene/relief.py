@@ -19,7 +19,8 @@ import torch.nn.functional as functional
 import warp as wp
 from torch import Tensor
 
-from splatsoil.scene import kernels, kernels_relief
+from splatsoil.scene import kernels_relief
+from splatsoil.scene.kernels_maps import Grid
 from splatsoil.scene.kernels_sky import WIDTH
 from splatsoil.splats.steps import Steps, finished, stepwise
 from splatsoil.splats.warp_torch import as_warp, launch, upload
@@ -32,6 +33,9 @@ so that soil looks weaker than it is and a fit takes it to be stronger (docs/pho
 
 BLOCK = 64
 """Threads of a GPU's block that work on a map: few, so that it is shared out evenly."""
+
+_LAYERS_BEYOND = 3
+"""Layers of the density that are kept beneath and above the surface."""
 
 _COARSE = 0.8
 """Cell of the density grid in particle spacings; the kernel is wide enough for it."""
@@ -86,6 +90,12 @@ class Relief:
         if "range" not in self.__dict__:  # where a cached property is looked for
             self.__dict__["range"] = yield from self._range()
         return self
+
+    def with_filling(self, filling: Tensor, layers: tuple[float, float]) -> Relief:
+        """The same surface with the density that it is of; its range, which a GPU is asked for, stays known."""
+        out = replace(self, filling=filling, layers=layers)
+        out.__dict__["range"] = self.range
+        return out
 
     @property
     def points(self) -> Tensor:
@@ -161,7 +171,7 @@ def padded(values: Tensor, margin: tuple[int, int], beyond: int, mode: str, valu
 
 def grid_of(relief: Relief) -> Any:
     """Where the relief's maps lie, in the kernels' form."""
-    grid = kernels.Grid()
+    grid = Grid()
     grid.x0, grid.y0 = relief.origin
     grid.inverse_x, grid.inverse_y = 1.0 / relief.cell[0], 1.0 / relief.cell[1]
     return grid
@@ -215,9 +225,13 @@ def relief_of_particles(
     launch(kernels_relief.crossing, tuple(height.shape), inputs, fine)
     half = (float(cell[0]) / 2, float(cell[1]) / 2)
     relief = Relief.of_heights(height, (float(low[0]) + half[0] / 2, float(low[1]) + half[1] / 2), half)
+    relief = yield from relief.ranged()
+    # Layers within reach of the surface, as a copy: a view would keep them all.
     thick = float(cell[2])
-    relief = replace(relief, filling=fine.contiguous(), layers=(float(low[2]) + 0.5 * thick, thick))
-    return (yield from relief.ranged())
+    first, last = (int((end - float(low[2])) / thick) for end in relief.range)
+    first = max(first - _LAYERS_BEYOND, 0)
+    filling = fine[first : last + 1 + _LAYERS_BEYOND].clone()
+    return relief.with_filling(filling, (float(low[2]) + (first + 0.5) * thick, thick))
 
 
 def _spread(positions: Tensor, low: FloatArray, cell: FloatArray, count: npt.NDArray[np.int64]) -> Tensor:
