@@ -15,8 +15,10 @@ class Grid:
     inverse_y: float
 
 
-_PLACE = """
+_ROWS = """
     const int ny = values.shape[0], nx = values.shape[1];
+"""
+_PLACE = """
     const float right = (float)nx - 1.001f, upper = (float)ny - 1.001f;
     float u = (x - grid.x0) * grid.inverse_x, v = (y - grid.y0) * grid.inverse_y;
     u = u > 0.0f ? u : 0.0f; u = u < right ? u : right;
@@ -27,7 +29,8 @@ _PLACE = """
 
 
 @wp.func_native(
-    _PLACE
+    _ROWS
+    + _PLACE
     + """
     const float* p = values.data + i * nx + j;
     const float low = p[0] + fu * (p[1] - p[0]), high = p[nx] + fu * (p[nx + 1] - p[nx]);
@@ -38,16 +41,39 @@ def sample(values: wp.array2d(dtype=wp.float32), grid: Grid, x: float, y: float)
     """Bilinear value of a contiguous map (ny, nx), held constant beyond its border."""
 
 
+Shade = wp.types.vector(length=8, dtype=wp.float32)
+"""What decides the light on a place: normal, share of sky, share of sun, light bounced (red, green, blue)."""
+
+
+@wp.func_native(
+    _ROWS
+    + _PLACE
+    + """
+    const float* p = (const float*)values.data + 8 * (i * nx + j);
+    const float* q = p + 8 * nx;
+    wp::vec_t<8, float> out;
+    for (int k = 0; k < 8; ++k) {
+        const float low = p[k] + fu * (p[k + 8] - p[k]), high = q[k] + fu * (q[k + 8] - q[k]);
+        out[k] = low + fv * (high - low);
+    }
+    return out;
+"""
+)
+def sample_shade(values: wp.array2d(dtype=Shade), grid: Grid, x: float, y: float) -> Shade:
+    """The same for all that decides the light at once."""
+
+
 @wp.func_native(
     """
     const int nz = values.shape[0], ny = values.shape[1], nx = values.shape[2];
-    const float right = (float)nx - 1.001f, upper = (float)ny - 1.001f, top = (float)nz - 1.001f;
-    float u = (x - grid.x0) * grid.inverse_x, v = (y - grid.y0) * grid.inverse_y, w = (z - layers[0]) * layers[1];
-    u = u > 0.0f ? u : 0.0f; u = u < right ? u : right;
-    v = v > 0.0f ? v : 0.0f; v = v < upper ? v : upper;
+"""
+    + _PLACE
+    + """
+    const float top = (float)nz - 1.001f;
+    float w = (z - layers[0]) * layers[1];
     w = w > 0.0f ? w : 0.0f; w = w < top ? w : top;
-    const int j = (int)u, i = (int)v, k = (int)w;
-    const float fu = u - (float)j, fv = v - (float)i, fw = w - (float)k;
+    const int k = (int)w;
+    const float fw = w - (float)k;
     const float* p = values.data + ((long long)k * ny + i) * nx + j;
     const float* q = p + (long long)ny * nx;
     const float p0 = p[0] + fu * (p[1] - p[0]), p1 = p[nx] + fu * (p[nx + 1] - p[nx]);
@@ -76,24 +102,3 @@ def slope_of_layers(values: wp.array3d(dtype=wp.float32), grid: Grid, layers: wp
     along_z = sample_layers(values, grid, layers, x[0], x[1], x[2] + dz)
     along_z -= sample_layers(values, grid, layers, x[0], x[1], x[2] - dz)
     return 0.5 * wp.vec3(along_x / dx, along_y / dy, along_z / dz)
-
-
-Shade = wp.types.vector(length=8, dtype=wp.float32)
-"""What decides the light on a place: normal, share of sky, share of sun, light bounced (red, green, blue)."""
-
-
-@wp.func_native(
-    _PLACE
-    + """
-    const float* p = (const float*)values.data + 8 * (i * nx + j);
-    const float* q = p + 8 * nx;
-    wp::vec_t<8, float> out;
-    for (int k = 0; k < 8; ++k) {
-        const float low = p[k] + fu * (p[k + 8] - p[k]), high = q[k] + fu * (q[k + 8] - q[k]);
-        out[k] = low + fv * (high - low);
-    }
-    return out;
-"""
-)
-def sample_shade(values: wp.array2d(dtype=Shade), grid: Grid, x: float, y: float) -> Shade:
-    """The same for all that decides the light at once."""

@@ -16,6 +16,7 @@ from torch import Tensor
 from splatsoil.measurement import Camera
 from splatsoil.scene import kernels
 from splatsoil.scene.kernels_colour import WIDTH, develop
+from splatsoil.scene.kernels_maps import Shade
 from splatsoil.scene.lit import LitRelief, ceiling, march_step
 from splatsoil.scene.relief import grid_of
 from splatsoil.scene.tool import eye_of
@@ -189,7 +190,7 @@ def _illuminate(
     maps = [*(as_warp(m, wp.float32) for m in (depth, soil, unhidden, relief.height))]
     numbers = [grid_of(relief), lit.light.kernel_form(), lit.tool, wp.vec3(*tool_albedo), march_step(relief)]
     outputs = [as_warp(light, wp.vec3), as_warp(tool, wp.vec4)]
-    shades = as_warp(lit.shades, kernels.Shade)
+    shades = as_warp(lit.shades, Shade)
     low, thick = relief.layers
     filling = [as_warp(relief.filling, wp.float32), wp.vec2(low, 1.0 / thick)]
     inputs = [eye_of(camera), *maps, shades, *filling, *numbers, ceiling(relief), *outputs]

@@ -34,6 +34,7 @@ from splatsoil.scene import (
 from splatsoil.scene.kernels_sky import light_of_slopes, sky_kernel
 from splatsoil.splats import Gaussians
 from splatsoil.splats.steps import finished
+from splatsoil.synthetic.setups import look_at
 
 SPACING = 0.02
 BED = Bed(np.zeros(3), np.array([0.4, 0.4, 0.2]), 1600.0)
@@ -77,13 +78,7 @@ def scene_of(particles, light=SUN, mesh=None):
 
 
 def camera(eye=(0.2, -0.35, 0.6), target=(0.2, 0.2, 0.1), size=(120, 90)):
-    back = np.subtract(eye, target) / np.linalg.norm(np.subtract(eye, target))
-    right = np.cross([0.0, 0.0, 1.0], back)
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(back, right), back], axis=1)
-    pose[:3, 3] = eye
-    return Camera(size[0], size[1], 150.0, 150.0, size[0] / 2, size[1] / 2, pose, model="PINHOLE")
+    return Camera(size[0], size[1], 150.0, 150.0, size[0] / 2, size[1] / 2, look_at(eye, target), model="PINHOLE")
 
 
 def pixel(view, point):

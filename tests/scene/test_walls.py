@@ -10,6 +10,7 @@ from splatsoil.measurement import Bed, Camera
 from splatsoil.scene import Light, Scene, ToolBody, bind, encoded, linear, relief_of_particles
 from splatsoil.splats import Gaussians
 from splatsoil.synthetic import stage as synthetic
+from splatsoil.synthetic.setups import look_at
 from splatsoil.synthetic.soil_surface import soil_surface
 
 SPACING = 0.01
@@ -55,14 +56,8 @@ def scene_of(particles, light):
     )
 
 
-def camera(eye, target, size=(160, 120), focal=260.0):
-    back = np.subtract(eye, target) / np.linalg.norm(np.subtract(eye, target))
-    right = np.cross([0.0, 0.0, 1.0], back)
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(back, right), back], axis=1)
-    pose[:3, 3] = eye
-    return Camera(size[0], size[1], focal, focal, size[0] / 2, size[1] / 2, pose, model="PINHOLE")
+def camera(eye, target):
+    return Camera(160, 120, 260.0, 260.0, 80.0, 60.0, look_at(eye, target), model="PINHOLE")
 
 
 def both(particles, view, azimuth):
