@@ -10,6 +10,7 @@ from __future__ import annotations
 import warp as wp
 
 from splatsoil.scene.kernels_maps import Grid, Shade, sample, sample_shade, slope_of_layers
+from splatsoil.scene.kernels_sky import light_around
 
 STEEP, STEEPEST = wp.constant(0.7), wp.constant(0.5)
 """Upward parts of normals (45°, 60°) between which a surface's slope is less and less that of its heights."""
@@ -284,6 +285,10 @@ def illuminate(
     shades: wp.array2d(dtype=Shade),
     filling: wp.array3d(dtype=wp.float32),
     layers: wp.vec2,
+    sent: wp.array2d(dtype=wp.vec3),
+    hidden: wp.array2d(dtype=wp.float32),
+    tool_light: wp.vec3,
+    reach: float,
     grid: Grid,
     light: Illumination,
     tool: ToolPose,
@@ -298,8 +303,8 @@ def illuminate(
     The splats say that a pixel shows soil; light is looked up where the pixel's ray meets the surface, however far
     behind their depth, because blobs end a little before or behind it, and at a rim their mean depth lies in the air,
     over a trench's floor where what is seen is its far wall. Where heights say that it is steep, and there is any
-    density ``filling``, it slopes as that says: a wall falls from one cell to the next, so that heights don't tell how
-    it stands. Soil hides the tool where both say so: the smooth surface runs on behind a blade that holds soil back,
+    density ``filling``, it slopes as that says, and what it sees around it is looked for from there: a wall falls from
+    one cell to the next, so that maps don't tell how it stands, nor what it sees. Soil hides the tool where both say so: the smooth surface runs on behind a blade that holds soil back,
     and single blobs stand out from the soil that a blade touches.
     """
     pixel = first + wp.tid()
@@ -317,10 +322,16 @@ def illuminate(
         x = eye.position + ray * z
         shade = sample_shade(shades, grid, x[0], x[1])
         n = wp.normalize(wp.vec3(shade[0], shade[1], shade[2]))
+        sky = shade[3]
+        back = wp.vec3(shade[5], shade[6], shade[7])
         steep = wp.clamp((STEEP - n[2]) / (STEEP - STEEPEST), 0.0, 1.0)
         if steep > 0.0 and found > 0.0 and filling.shape[0] > 0:
             outward = -wp.normalize(slope_of_layers(filling, grid, layers, x))
             n = wp.normalize(n + steep * (outward - n))
+            seen = light_around(height, sent, grid, x, n, step, reach)
+            by_tool = wp.min(sample(hidden, grid, x[0], x[1]), seen[3])
+            sky += steep * (seen[3] - by_tool - sky)
+            back += steep * (wp.vec3(seen[0], seen[1], seen[2]) + by_tool * tool_light - back)
         direct = wp.max(wp.dot(n, light.sun), 0.0) / light.sun[2]
         if direct > 0.0:
             sunny = shade[4]
@@ -330,8 +341,7 @@ def illuminate(
             direct *= sunny
         if direct > 0.0:
             direct *= tool_shadow(tool, light, x, 0.5 * z / eye.fx)
-        back = wp.vec3(shade[5], shade[6], shade[7])
-        light_out[i, j] = light.ambient * shade[3] + (wp.vec3(1.0, 1.0, 1.0) - light.ambient) * direct + back
+        light_out[i, j] = light.ambient * sky + (wp.vec3(1.0, 1.0, 1.0) - light.ambient) * direct + back
     axis = wp.normalize(ray)
     # A pixel's corner lies less than 1.5 of its width off its axis.
     if not near_tool(tool, eye.position, axis, 1.5 * (wp.length(tool.centre - eye.position) + tool.radius) / eye.fx):

@@ -18,7 +18,7 @@ class Grid:
 _ROWS = """
     const int ny = values.shape[0], nx = values.shape[1];
 """
-_PLACE = """
+PLACE = """
     const float right = (float)nx - 1.001f, upper = (float)ny - 1.001f;
     float u = (x - grid.x0) * grid.inverse_x, v = (y - grid.y0) * grid.inverse_y;
     u = u > 0.0f ? u : 0.0f; u = u < right ? u : right;
@@ -26,11 +26,12 @@ _PLACE = """
     const int j = (int)u, i = (int)v;
     const float fu = u - (float)j, fv = v - (float)i;
 """
+"""Of C++: the cell (i, j) of a map of nx columns and ny rows before a place (x, y), and how far on to the next."""
 
 
 @wp.func_native(
     _ROWS
-    + _PLACE
+    + PLACE
     + """
     const float* p = values.data + i * nx + j;
     const float low = p[0] + fu * (p[1] - p[0]), high = p[nx] + fu * (p[nx + 1] - p[nx]);
@@ -47,7 +48,7 @@ Shade = wp.types.vector(length=8, dtype=wp.float32)
 
 @wp.func_native(
     _ROWS
-    + _PLACE
+    + PLACE
     + """
     const float* p = (const float*)values.data + 8 * (i * nx + j);
     const float* q = p + 8 * nx;
@@ -67,7 +68,7 @@ def sample_shade(values: wp.array2d(dtype=Shade), grid: Grid, x: float, y: float
     """
     const int nz = values.shape[0], ny = values.shape[1], nx = values.shape[2];
 """
-    + _PLACE
+    + PLACE
     + """
     const float top = (float)nz - 1.001f;
     float w = (z - layers[0]) * layers[1];

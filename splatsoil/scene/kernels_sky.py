@@ -13,6 +13,8 @@ from typing import Any
 
 import warp as wp
 
+from splatsoil.scene.kernels_maps import PLACE, Grid
+
 WIDTH = 16
 """Cells of a row that one task does on a CPU."""
 
@@ -113,6 +115,7 @@ _SLOPES_SNIPPET = """
         for (int k = a * looks; k < (a + 1) * looks; ++k) {
             const int place = start + offsets.data[k], last = k > a * looks ? start + offsets.data[k - 1] : start;
             const float inverse = inverses.data[k];
+            const float run = 1.0f / inverse - (k > a * looks ? 1.0f / inverses.data[k - 1] : 0.0f);
             for (int l = 0; l < W; ++l) {
                 const float rise = (wide.data[place + l] - here[l]) * inverse;
                 slope[l] = rise > slope[l] ? rise : slope[l];
@@ -120,9 +123,10 @@ _SLOPES_SNIPPET = """
                 const float part = upto - before[l];
                 before[l] = upto;
                 sum[l] += part;
+                const float upper = UPPER(wide.data[place + l] - wide.data[last + l], run);
                 for (int c = 0; c < CHANNELS; ++c) {
                     const float* p = sent.data + c * plane + l;
-                    light[c][l] += 0.5f * part * (p[place] + p[last]);
+                    light[c][l] += part * (p[last] + upper * (p[place] - p[last]));
                 }
             }
         }
@@ -133,11 +137,68 @@ _SLOPES_SNIPPET = """
     }
 """
 
+# What soil between two looks sends is the mean of both ends, but for a wall: none of the light on its top is on it.
+_UPPER = """[](float climb, float run) {
+        return climb <= run ? 0.5f : climb < 2.0f * run ? 1.0f - 0.5f * climb / run : 0.0f;
+    }"""
+
+_AROUND_SNIPPET = """
+    constexpr int AZIMUTHS = 12;
+    const int ny = height.shape[0], nx = height.shape[1];
+    const auto look = [&](float x, float y, float* light) {
+        PLACE
+        const float* p = height.data + i * nx + j;
+        const float* s = (const float*)sent.data + 3 * (i * nx + j);
+        for (int c = 0; c < 3; ++c) {
+            const float low = s[c] + fu * (s[c + 3] - s[c]);
+            const float high = s[c + 3 * nx] + fu * (s[c + 3 * nx + 3] - s[c + 3 * nx]);
+            light[c] = low + fv * (high - low);
+        }
+        const float low = p[0] + fu * (p[1] - p[0]), high = p[nx] + fu * (p[nx + 1] - p[nx]);
+        return low + fv * (high - low);
+    };
+    const float up = normal[2] > LEAST ? normal[2] : LEAST;
+    float sky = 0.0f, around[3] = {0.0f, 0.0f, 0.0f}, here[3], last[3], there[3];
+    look(place[0], place[1], here);
+    for (int a = 0; a < AZIMUTHS; ++a) {
+        const float angle = 6.2831853f * ((float)a + 0.5f) / (float)AZIMUTHS;
+        const float c = cosf(angle), s = sinf(angle), along = c * normal[0] + s * normal[1];
+        const float all = 0.5f * up + 0.78539816f * along;
+        float slope = -along / up, before = WEDGE(slope, up, along), below = place[2], run = step;
+        if (all - before < 0.01f) continue;  // into the wall
+        for (int k = 0; k < 3; ++k) last[k] = here[k];
+        for (float r = step; r < reach; r += run) {
+            const float top = look(place[0] + r * c, place[1] + r * s, there);
+            const float rise = (top - place[2]) / r;
+            if (rise > slope) {
+                slope = rise;
+                const float upto = WEDGE(slope, up, along), part = upto - before;
+                const float upper = UPPER(top - below, run);
+                for (int k = 0; k < 3; ++k) around[k] += part * (last[k] + upper * (there[k] - last[k]));
+                before = upto;
+            }
+            for (int k = 0; k < 3; ++k) last[k] = there[k];
+            below = top;
+            run = 0.2f * r > step ? 0.2f * r : step;
+        }
+        sky += all - before;
+    }
+    const float share = 2.0f / (float)AZIMUTHS;
+    sky *= share;
+    sky = sky < 0.0f ? 0.0f : sky > 1.0f ? 1.0f : sky;
+    return wp::vec_t<4, float>(share * around[0], share * around[1], share * around[2], sky);
+"""
+
 
 def _source(snippet: str) -> str:
     """A snippet with its width, and what its wedges are."""
-    text = snippet.replace("WEDGE(", "wedge(")
-    return f"{WIDTH_SOURCE}    const auto wedge = {_WEDGE};\n{text}"
+    return WIDTH_SOURCE + _with_wedges(snippet)
+
+
+def _with_wedges(snippet: str) -> str:
+    """A snippet with what its wedges are, and the light of what it sees between two looks."""
+    text = snippet.replace("WEDGE(", "wedge(").replace("UPPER(", "upper_share(")
+    return f"    const auto wedge = {_WEDGE};\n    const auto upper_share = {_UPPER};\n{text}"
 
 
 @cache
@@ -204,6 +265,20 @@ def sky_kernel(stride: int, tool: bool) -> Any:
         )
 
     return sky
+
+
+@wp.func_native(_with_wedges(_AROUND_SNIPPET.replace("PLACE", PLACE).replace("LEAST", "0.05f")))
+def light_around(
+    height: wp.array2d(dtype=wp.float32),
+    sent: wp.array2d(dtype=wp.vec3),
+    grid: Grid,
+    place: wp.vec3,
+    normal: wp.vec3,
+    step: float,
+    reach: float,
+) -> wp.vec4:
+    """Light ``sent`` by the soil within ``reach`` to a place that slopes in any way, and the share of the sky that this
+    leaves open to it; both as for the cells of a map."""
 
 
 @wp.func_native(_source(_SLOPES_SNIPPET))

@@ -19,6 +19,7 @@ from splatsoil.scene.kernels_colour import WIDTH, develop
 from splatsoil.scene.kernels_maps import Shade
 from splatsoil.scene.lit import LitRelief, ceiling, march_step
 from splatsoil.scene.relief import grid_of
+from splatsoil.scene.sky import reach
 from splatsoil.scene.tool import eye_of
 from splatsoil.splats.steps import Steps, stepwise
 from splatsoil.splats.views import Seen, rasterise_views
@@ -193,7 +194,8 @@ def _illuminate(
     shades = as_warp(lit.shades, Shade)
     low, thick = relief.layers
     filling = [as_warp(relief.filling, wp.float32), wp.vec2(low, 1.0 / thick)]
-    inputs = [eye_of(camera), *maps, shades, *filling, *numbers, ceiling(relief), *outputs]
+    around = [as_warp(lit.sent, wp.vec3), as_warp(lit.hidden, wp.float32), wp.vec3(*lit.tool_light), reach(relief)]
+    inputs = [eye_of(camera), *maps, shades, *filling, *around, *numbers, ceiling(relief), *outputs]
     pixels = camera.height * camera.width
     if depth.is_cuda:
         launch(kernels.illuminate, pixels, [0, *inputs], depth)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -43,6 +43,9 @@ class LitRelief:
         openness: (ny, nx) share of the sky that each cell sees.
         visible: (ny, nx) share of the sun that the soil lets through to each cell (the tool's shadow is not in it).
         bounced: (ny, nx, 3) light from soil and tool that stand in the sky's way.
+        sent: (ny, nx, 3) light that each cell sends back.
+        hidden: (ny, nx) share of the sky that the tool takes from each cell.
+        tool_light: (3,) light on the side of the tool that a shaded cell sees.
     """
 
     relief: Relief
@@ -51,6 +54,9 @@ class LitRelief:
     openness: Tensor
     visible: Tensor
     bounced: Tensor
+    sent: Tensor
+    hidden: Tensor
+    tool_light: FloatArray
 
     @cached_property
     def shades(self) -> Tensor:
@@ -83,26 +89,31 @@ def light_relief(
     inputs += [march_step(relief), ceiling(relief), as_warp(visible, wp.float32)]
     launch(kernels.sun_visibility, tuple(visible.shape), inputs, visible)
     openness, hidden = yield from sky_openness.steps(relief, tool)
-    dark = LitRelief(relief, light, tool, openness, visible, relief.height.new_zeros((*relief.height.shape, 3)))
-    bounced = yield from _bounced(dark, hidden, light.reflectance(tool_colour))
-    return LitRelief(relief, light, tool, openness, visible, bounced)
+    none = relief.height.new_zeros((*relief.height.shape, 3))
+    side = _TOOL_LIGHT * light.reflectance(tool_colour)
+    dark = LitRelief(relief, light, tool, openness, visible, none, none, hidden, side)
+    bounced, sent = yield from _bounced(dark)
+    return replace(dark, bounced=bounced, sent=sent)
 
 
-def _bounced(lit: LitRelief, hidden: Tensor, tool_reflectance: FloatArray) -> Steps[Tensor]:
-    """Light (ny, nx, 3) that comes from the soil around each cell and from the tool, instead of sky."""
-    relief = lit.relief
+def _bounced(lit: LitRelief) -> Steps[tuple[Tensor, Tensor]]:
+    """Light (ny, nx, 3) that comes from the soil around each cell and from the tool, instead of sky; and what each cell
+    sends back."""
+    relief, hidden = lit.relief, lit.hidden
     rough = yield from _coarser(relief).ranged()
     points = rough.points.reshape(-1, 3)
     first = lit.irradiance(points, 0.5 * rough.cell[0]).T.reshape(3, *rough.height.shape)
     ground = _row(lit.light.reflectance(lit.light.level), relief)[:, None, None]
-    tool = _TOOL_LIGHT * _row(tool_reflectance, relief)[:, None, None]
+    tool = _row(lit.tool_light, relief)[:, None, None]
     by_soil = (1.0 - lit.openness - hidden).clamp_min(0.0)
     share, by_tool = (_resized(m, (rough.height.shape[0], rough.height.shape[1])) for m in (by_soil, hidden))
-    around = light_from_slopes(rough, ground * first)
+    sent = ground * first
     for _ in range(_BOUNCES - 1):
-        around = light_from_slopes(rough, ground * (first + share * around + by_tool * tool))
-    around = functional.interpolate(around[None], relief.height.shape, mode="bilinear", align_corners=False)[0]
-    return (by_soil * around + hidden * tool).permute(1, 2, 0).contiguous()
+        sent = ground * (first + share * light_from_slopes(rough, sent) + by_tool * tool)
+    maps = torch.cat([light_from_slopes(rough, sent), sent])
+    fine = functional.interpolate(maps[None], relief.height.shape, mode="bilinear", align_corners=False)[0]
+    bounced = by_soil * fine[:3] + hidden * tool
+    return bounced.permute(1, 2, 0).contiguous(), fine[3:].permute(1, 2, 0).contiguous()
 
 
 def _row(values: npt.ArrayLike, relief: Relief) -> Tensor:

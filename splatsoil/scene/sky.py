@@ -159,12 +159,16 @@ def _looks(distances: tuple[float, ...], cell: tuple[float, float]) -> _Looks:
 def _distances(relief: Relief) -> tuple[float, ...]:
     """How far off a cell looks: each step a fifth farther, a cell at least, for blockers far away hide little sky."""
     cell = max(relief.cell)
-    low, high = relief.range
-    reach = max(4.0 * (high - low), 0.15)
-    out = [cell]
-    while out[-1] < reach:
+    out, farthest = [cell], reach(relief)
+    while out[-1] < farthest:
         out.append(out[-1] + max(cell, 0.2 * out[-1]))
     return tuple(out)
+
+
+def reach(relief: Relief) -> float:
+    """How far off there is something to look at, m."""
+    low, high = relief.range
+    return max(4.0 * (high - low), 0.15)
 
 
 def _tool_columns(relief: Relief, tool: Any) -> tuple[Tensor, Tensor]:

@@ -85,7 +85,7 @@ def test_over_a_near_rim_the_far_wall_shows(azimuth):
     middle = np.s_[rim - 5 : rim + 4, 65:95]
     # The other one's light is 0.8 away.
     assert np.sqrt(np.mean((drawn[middle] - traced[middle]) ** 2)) < 0.12
-    assert drawn[middle].mean() == pytest.approx(traced[middle].mean(), abs=0.05)
+    assert drawn[middle].mean() == pytest.approx(traced[middle].mean(), abs=0.04)
 
 
 @pytest.mark.parametrize(("lean", "azimuth"), [(0.0, -90.0), (15.0, -90.0), (0.0, -30.0), (15.0, 30.0)])
@@ -99,5 +99,16 @@ def test_a_wall_is_lit_as_it_stands(lean, azimuth):
     wall = np.s_[first:last, 60:100]
     assert last - first >= 12
     # By the slope of heights, an upright one is off by 0.13.
-    assert np.sqrt(np.mean((drawn[wall] - traced[wall]) ** 2)) < 0.08
-    assert drawn[wall].mean() == pytest.approx(traced[wall].mean(), rel=0.08)
+    assert np.sqrt(np.mean((drawn[wall] - traced[wall]) ** 2)) < 0.05
+    assert drawn[wall].mean() == pytest.approx(traced[wall].mean(), rel=0.04)
+
+
+@pytest.mark.parametrize("azimuth", [90.0, -90.0])
+def test_a_pit_sends_itself_the_light_that_it_has(azimuth):
+    """An upright wall in the shade and the floor before it in the sun, or the other way round. With what maps say
+    between a wall's foot and its rim, and the rim's light for the wall's, they are too bright by up to 13 and 7 %."""
+    view = camera((0.2, -0.35, 0.4), (0.2, 0.25, 0.08))
+    drawn, traced = both(pit(0.1, 0.32), view, azimuth)
+    wall, floor = np.s_[42:54, 60:100], np.s_[70:76, 60:100]
+    assert drawn[wall].mean() == pytest.approx(traced[wall].mean(), rel=0.045)
+    assert drawn[floor].mean() == pytest.approx(traced[floor].mean(), rel=0.035)
