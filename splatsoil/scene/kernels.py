@@ -304,8 +304,10 @@ def illuminate(
     behind their depth, because blobs end a little before or behind it, and at a rim their mean depth lies in the air,
     over a trench's floor where what is seen is its far wall. Where heights say that it is steep, and there is any
     density ``filling``, it slopes as that says, and what it sees around it is looked for from there: a wall falls from
-    one cell to the next, so that maps don't tell how it stands, nor what it sees. Soil hides the tool where both say so: the smooth surface runs on behind a blade that holds soil back,
-    and single blobs stand out from the soil that a blade touches.
+    one cell to the next, so that maps don't tell how it stands, nor what it sees.
+
+    Soil hides the tool where both say so: the smooth surface runs on behind a blade that holds soil back, and single
+    blobs stand out from the soil that a blade touches.
     """
     pixel = first + wp.tid()
     i = pixel // depth.shape[1]
