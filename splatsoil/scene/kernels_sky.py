@@ -157,7 +157,7 @@ _AROUND_SNIPPET = """
         const float low = p[0] + fu * (p[1] - p[0]), high = p[nx] + fu * (p[nx + 1] - p[nx]);
         return low + fv * (high - low);
     };
-    const float up = normal[2] > LEAST ? normal[2] : LEAST;
+    const float up = normal[2] > 0.05f ? normal[2] : 0.05f;  // slopes are finite
     float sky = 0.0f, around[3] = {0.0f, 0.0f, 0.0f}, here[3], last[3], there[3];
     look(place[0], place[1], here);
     for (int a = 0; a < AZIMUTHS; ++a) {
@@ -267,7 +267,7 @@ def sky_kernel(stride: int, tool: bool) -> Any:
     return sky
 
 
-@wp.func_native(_with_wedges(_AROUND_SNIPPET.replace("PLACE", PLACE).replace("LEAST", "0.05f")))
+@wp.func_native(_with_wedges(_AROUND_SNIPPET.replace("PLACE", PLACE)))
 def light_around(
     height: wp.array2d(dtype=wp.float32),
     sent: wp.array2d(dtype=wp.vec3),
