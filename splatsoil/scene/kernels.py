@@ -331,7 +331,9 @@ def illuminate(
             outward = -wp.normalize(slope_of_layers(filling, grid, layers, x))
             n = wp.normalize(n + steep * (outward - n))
             seen = light_around(height, sent, grid, x, n, step, reach)
-            by_tool = wp.min(sample(hidden, grid, x[0], x[1]), seen[3])
+            # The tool takes the share of its sky that it takes of the cell's.
+            taken = sample(hidden, grid, x[0], x[1])
+            by_tool = seen[3] * taken / wp.max(taken + shade[3], 1.0e-3)
             sky += steep * (seen[3] - by_tool - sky)
             back += steep * (wp.vec3(seen[0], seen[1], seen[2]) + by_tool * tool_light - back)
         direct = wp.max(wp.dot(n, light.sun), 0.0) / light.sun[2]

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from splatsoil.measurement import Bed, Camera
 from splatsoil.scene import Light, Scene, ToolBody, bind, encoded, linear, relief_of_particles
@@ -31,7 +32,7 @@ def pit(near, far, lean=0.0):
     return torch.tensor(x[~hole], dtype=torch.float32)
 
 
-def scene_of(particles, light):
+def scene_of(particles, light, mesh=None):
     axis = torch.arange(0.0025, 0.4, 0.005)
     y, x = torch.meshgrid(axis, axis, indexing="ij")
     flat = torch.stack([x.reshape(-1), y.reshape(-1)], dim=1)
@@ -48,7 +49,7 @@ def scene_of(particles, light):
         surroundings=none,
         surrounding_shapes=torch.zeros(0, 3, 3),
         light=light,
-        tool=ToolBody(None),
+        tool=ToolBody(mesh),
         tool_albedo=np.zeros(3),
         bed=BED,
         spacing=SPACING,
@@ -60,13 +61,16 @@ def camera(eye, target):
     return Camera(160, 120, 260.0, 260.0, 80.0, 60.0, look_at(eye, target), model="PINHOLE")
 
 
-def both(particles, view, azimuth):
-    """Light on what each pixel shows, (h, w), over that of level ground: drawn by splats, and path traced."""
-    light = Light.from_angles(azimuth, ELEVATION, AMBIENT, level=np.full(3, ALBEDO))
-    drawn = linear(torch.tensor(scene_of(particles, light).render(particles, None, None, view)))[..., 1].numpy()
-    body = soil_surface(particles.numpy(), np.full((len(particles), 3), ALBEDO), SPACING, BED)
-    sun = (1.0 - AMBIENT) / math.sin(math.radians(ELEVATION))
-    stage = synthetic.Stage([body], synthetic.Light.from_angles(azimuth, ELEVATION, sun, AMBIENT), ground=-0.1)
+def both(particles, view, azimuth, mesh=None, sky=AMBIENT):
+    """Light on what each pixel shows, (h, w), over that of level ground: drawn by splats, and path traced; with a black
+    tool where its mesh lies, and a share of ``sky`` in the light."""
+    light = Light.from_angles(azimuth, ELEVATION, sky, level=np.full(3, ALBEDO))
+    pose = None if mesh is None else (np.eye(3), np.zeros(3))
+    drawn = linear(torch.tensor(scene_of(particles, light, mesh).render(particles, None, pose, view)))[..., 1].numpy()
+    bodies = [soil_surface(particles.numpy(), np.full((len(particles), 3), ALBEDO), SPACING, BED)]
+    bodies += [] if mesh is None else [synthetic.Body.flat(mesh, (0.0, 0.0, 0.0))]
+    sun = (1.0 - sky) / math.sin(math.radians(ELEVATION))
+    stage = synthetic.Stage(bodies, synthetic.Light.from_angles(azimuth, ELEVATION, sun, sky), ground=-0.1)
     return drawn / ALBEDO, stage.radiance(view, seed=1, side=8)[..., 1] / ALBEDO
 
 
@@ -112,3 +116,15 @@ def test_a_pit_sends_itself_the_light_that_it_has(azimuth):
     wall, floor = np.s_[42:54, 60:100], np.s_[70:76, 60:100]
     assert drawn[wall].mean() == pytest.approx(traced[wall].mean(), rel=0.045)
     assert drawn[floor].mean() == pytest.approx(traced[floor].mean(), rel=0.035)
+
+
+def test_a_tool_takes_sky_from_a_wall():
+    """A black plate over half of the pit, under a sky alone; the camera looks beneath it. Without it the wall would be
+    33 % too bright, and taking from it what the plate takes of level ground's sky makes it 27 % too dark."""
+    view = camera((0.2, -0.35, 0.4), (0.2, 0.25, 0.08))
+    plate = trimesh.creation.box((0.3, 0.12, 0.01), trimesh.transformations.translation_matrix((0.2, 0.24, 0.22)))
+    wall = np.s_[42:54, 60:100]
+    drawn, traced = (image[wall].mean() for image in both(pit(0.1, 0.32), view, 0.0, plate, sky=0.999))
+    open_sky = both(pit(0.1, 0.32), view, 0.0, sky=0.999)[0][wall].mean()
+    assert traced < 0.8 * open_sky
+    assert drawn == pytest.approx(traced, rel=0.15)
