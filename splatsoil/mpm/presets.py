@@ -27,7 +27,8 @@ class Preset:
         poisson: Poisson's ratio.
         courant: sound-wave Courant number of a substep.
         transport: most cells the tool may travel in one step of the particles; and the way, in cells, over which
-            hourglass modes are damped and contact gives way, see :attr:`Resolution.relaxation`.
+            hourglass modes are damped, see :attr:`Resolution.relaxation`.
+        give: of the tool's way, by how much soil gives way to it for each Pa of its pressure.
     """
 
     name: str
@@ -37,6 +38,7 @@ class Preset:
     poisson: float = 0.3
     courant: float = 0.5
     transport: float = 0.1
+    give: float = 1.55e-5
 
 
 PRESETS: dict[str, Preset] = {
@@ -66,7 +68,8 @@ class Resolution:
         relaxation: exchanges between particles and grid a second of which hourglass modes and the tool's contact shall
             know, whatever the number of ``steps``: the former are damped as that many plain APIC exchanges would, soil
             sunk into the tool comes out at twice the rate. 0 for as many as there are.
-        memory: share of its load, 0 to 1, that the tool's contact keeps when soil comes out of it.
+        give: how fast soil gives way to the tool that presses on it, in m/s for each Pa. Real soil doesn't. Other
+            solvers' soil does where iterations end early, and is lost to the heap: see docs/numerics.md.
         skin: of the spacing, how far from the faces of a plate thinner than a cell particles stop, because they stand
             for soil half a spacing around them. Its edges need none: contact acts through the grid, which widens them.
             Thick bodies have none, because nothing was measured on them.
@@ -81,7 +84,7 @@ class Resolution:
     shear: float
     density: float
     relaxation: float = 0.0
-    memory: float = 0.0
+    give: float = 0.0
     skin: float = 0.5
 
     def __post_init__(self) -> None:
@@ -89,11 +92,12 @@ class Resolution:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
                 raise SimulationError(f"resolution: {name} = {value} must be a positive number")
-        if not (math.isfinite(self.relaxation) and self.relaxation >= 0.0):
-            raise SimulationError(f"resolution: relaxation = {self.relaxation} must be 0 or a positive number")
-        for name in ("memory", "skin"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise SimulationError(f"resolution: {name} = {getattr(self, name)} must be between 0 and 1")
+        for name in ("relaxation", "give"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0.0):
+                raise SimulationError(f"resolution: {name} = {value} must be 0 or a positive number")
+        if not 0.0 <= self.skin <= 1.0:
+            raise SimulationError(f"resolution: skin = {self.skin} must be between 0 and 1")
         if self.courant > COURANT_LIMIT:
             raise SimulationError(
                 f"resolution: a Courant number of {self.courant} breaks the wave-speed limit of {COURANT_LIMIT}"
@@ -124,7 +128,8 @@ class Resolution:
         motion = measurement.tool.motion
         travel = np.linalg.norm(np.diff(motion.positions, axis=0), axis=1) / np.diff(motion.times)
         frame_time = 1.0 / measurement.frame_rate
-        relaxation = float(travel.max()) / (preset.transport * cell)
+        fastest = float(travel.max())
+        relaxation = fastest / (preset.transport * cell)
         steps = max(1, math.ceil(relaxation * frame_time - 1e-6))
         return cls(
             cell=cell,
@@ -136,4 +141,5 @@ class Resolution:
             shear=preset.young / (2.0 * (1.0 + preset.poisson)),
             density=measurement.bed.density,
             relaxation=relaxation,
+            give=preset.give * fastest,
         )

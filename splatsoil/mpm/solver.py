@@ -302,7 +302,7 @@ class Solver:
             dim=n,
             inputs=[
                 *(p, c, g, grid, self.ceiling, r.wave_speed),
-                *(keep, release, DEEPEST * r.spacing, r.memory, self._broken, self._strays),
+                *(keep, release, DEEPEST * r.spacing, self._broken, self._strays),
             ],
             device=device,
         )
@@ -342,6 +342,7 @@ class Solver:
                 self._near_count,
                 self.resolution.spacing**2,
                 DEEPEST * self.resolution.spacing,
+                self.resolution.give,
                 dt,
                 share,
                 self._table,

@@ -101,6 +101,7 @@ def contact_forces(
     count: wp.array(dtype=int),
     area: float,
     deepest: float,
+    give: float,
     dt: float,
     share: float,
     values: wp.array2d(dtype=float),
@@ -108,8 +109,9 @@ def contact_forces(
 ) -> None:
     """Penalty contact with Coulomb friction between particles and tool; ``force`` (simulations) gains share * force.
 
-    ``area`` (m^2) is what one particle covers of the tool, for adhesion; a spring is loaded no further than ``deepest``
-    (m), so that soil in which a tool starts is not shot out of it.
+    ``area`` (m^2) is what one particle covers of the tool; a spring is loaded no further than ``deepest`` (m), so that
+    soil in which a tool starts is not shot out of it, and loses its load as fast as soil gives way, by ``give`` (m/s)
+    for a pressure of 1 Pa.
 
     A particle keeps the side of the tool it is on, so a plate thinner than a cell holds soil on both its faces, and
     what the soil feels is exactly what the tool feels.
@@ -141,7 +143,8 @@ def contact_forces(
         depth = preload - gap
         adhesion = values[row, TOOL_ADHESION] * area
         if depth > 0.0 or (adhesion > 0.0 and gap < ADHESION_REACH * wp.sqrt(area)):
-            spring = tool.stiffness * wp.min(depth, deepest)
+            spring = tool.stiffness * wp.clamp(depth, 0.0, deepest)
+            particles.preload[p] = preload - dt * give * spring / area
             push = wp.where(depth > 0.0, wp.max(spring - tool.damping * closing, 0.0), 0.0)
             slip -= closing * normal
             speed = wp.length(slip)

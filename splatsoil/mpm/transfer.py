@@ -220,7 +220,6 @@ def grid_to_particles(
     keep: float,
     release: float,
     deepest: float,
-    memory: float,
     broken: wp.array(dtype=int),
     strays: wp.array(dtype=int),
 ) -> None:
@@ -228,8 +227,8 @@ def grid_to_particles(
 
     The mean gradient of a cell doesn't see the bilinear and trilinear parts of its velocity, so stress can't resist
     them (hourglass modes); a particle keeps the fraction ``keep`` of them. A particle that has sunk into the tool is
-    moved out by the fraction ``release`` of its depth, and to ``deepest`` (m) at once; its spring keeps the fraction
-    ``memory`` of the load that this takes off, until soil and tool part.
+    moved out by the fraction ``release`` of its depth, and to ``deepest`` (m) at once; its spring keeps the load, until
+    soil and tool part.
 
     A particle faster than ``limit`` (m/s) or without a finite state counts as ``broken``; one that rises above
     ``ceiling`` (m) counts as a stray, loses its velocity and falls back.
@@ -266,10 +265,7 @@ def grid_to_particles(
     if gap < 0.0 and gap > -FAR:
         out = -wp.min(release * gap, gap + deepest)
         x += out * particles.gap_normal[p]
-        preload = particles.preload[p]
-        if preload < 0.0:
-            preload = wp.max((1.0 - release) * preload, -deepest)
-        particles.preload[p] = wp.min(preload + memory * out, deepest)
+        particles.preload[p] = wp.min(particles.preload[p] + out, deepest)
     elif gap > particles.preload[p]:
         particles.preload[p] = 0.0
     low = grid.origin
