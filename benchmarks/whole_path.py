@@ -1,8 +1,8 @@
-"""From photographs to a friction angle: each stage against its aim, and the table in the README.
+"""From photographs to a friction angle: each stage against its aim, and the table in docs/measurements.md.
 
-``splatsoil benchmark whole-path --page README.md`` takes the best part of an hour on two cores: the example sets are
-reconstructed, drawn from their true particles, simulated from them with one piece of the numerics changed at a time,
-and fitted as a user does. Parts are kept in the folder as they end, fits with all their evaluations, and a second call
+``splatsoil benchmark whole-path --page docs/measurements.md`` takes the best part of an hour on two cores: the example
+sets are reconstructed, drawn from their true particles, simulated from them with one piece of the numerics changed at a
+time, and fitted as a user does. Parts are kept in the folder as they end, fits with all their evaluations, and a second call
 goes on from there; a part that is asked for by name is measured again.
 """
 

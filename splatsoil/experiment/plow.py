@@ -43,8 +43,8 @@ NUMERICS: Mapping[str, Callable[[Resolution], Resolution]] = {
     "grid": lambda r: replace(r, cell=0.8 * r.cell, spacing=0.8 * r.spacing),
     "contact": lambda r: replace(r, give=0.0),
 }
-"""Other ways to compute the same physics: three times as stiff, twice as many steps, a finer grid, soil that doesn't give
-way to the tool."""
+"""Other ways to compute the same physics: three times as stiff, twice as many steps, a finer grid, soil that doesn't
+give way to the tool."""
 ROUNDING = "rounding"
 """Another drawing of the same simulation, its surface rounded off twice as much. To first order that changes features
 by as much as the drawing has done already, so that one such change is what it gets wrong."""

@@ -26,8 +26,8 @@ class Preset:
             skeleton allows long steps.
         poisson: Poisson's ratio.
         courant: sound-wave Courant number of a substep.
-        transport: most cells the tool may travel in one step of the particles; and the way, in cells, over which
-            hourglass modes are damped, see :attr:`Resolution.relaxation`.
+        transport: most cells the tool may travel in one step of the particles.
+        way: of the tool, in cells, over which hourglass modes are damped once, see :attr:`Resolution.relaxation`.
         give: of the tool's way, by how much soil gives way to it for each Pa of its pressure.
     """
 
@@ -38,15 +38,16 @@ class Preset:
     poisson: float = 0.3
     courant: float = 0.5
     transport: float = 0.1
+    way: float = 0.1
     give: float = 1.55e-5
 
 
 PRESETS: dict[str, Preset] = {
     preset.name: preset
     for preset in (
-        Preset("tiny", cells_across_tool=3.0, young=2.0e5, transport=0.2),
-        Preset("small", cells_across_tool=6.0, transport=1.0 / 15.0),
-        Preset("fine", cells_across_tool=8.0, transport=0.05),
+        Preset("tiny", cells_across_tool=3.0, young=2.0e5, transport=0.2, way=0.2),
+        Preset("small", cells_across_tool=6.0, way=1.0 / 15.0),
+        Preset("fine", cells_across_tool=8.0, transport=0.05, way=0.05),
         Preset("paper", cells_across_tool=3.2, young=1.0e6, poisson=0.2),
     )
 }
@@ -129,8 +130,7 @@ class Resolution:
         travel = np.linalg.norm(np.diff(motion.positions, axis=0), axis=1) / np.diff(motion.times)
         frame_time = 1.0 / measurement.frame_rate
         fastest = float(travel.max())
-        relaxation = fastest / (preset.transport * cell)
-        steps = max(1, math.ceil(relaxation * frame_time - 1e-6))
+        steps = max(1, math.ceil(fastest * frame_time / (preset.transport * cell) - 1e-6))
         return cls(
             cell=cell,
             spacing=cell / preset.particles_per_edge,
@@ -140,6 +140,6 @@ class Resolution:
             bulk=preset.young / (3.0 * (1.0 - 2.0 * preset.poisson)),
             shear=preset.young / (2.0 * (1.0 + preset.poisson)),
             density=measurement.bed.density,
-            relaxation=relaxation,
+            relaxation=fastest / (preset.way * cell),
             give=preset.give * fastest,
         )

@@ -38,8 +38,8 @@ def test_only_what_stands_between_the_lines_is_written() -> None:
         written("some other page", [], MADE)
 
 
-def test_the_readme_has_a_place_for_the_table() -> None:
-    page = Path(__file__).parents[2] / "README.md"
+def test_the_measurements_have_a_place_for_the_table() -> None:
+    page = Path(__file__).parents[2] / "docs" / "measurements.md"
     assert "| a | 1 |" in written(page.read_text(encoding="utf-8"), [Row("a", "1")], MADE)
 
 

@@ -46,8 +46,8 @@ def test_soil_falls_under_the_gravity_of_its_world() -> None:
 
 
 def test_a_plate_feels_the_changed_friction() -> None:
-    """A plate pressed on coherent soil and dragged: drag over normal force grows by the change of the coefficient. Pressed
-    lightly: a substep's friction takes no more than a particle's momentum, 1 kPa here."""
+    """A plate pressed on coherent soil and dragged: drag over normal force grows by the change of the coefficient.
+    Pressed lightly: a substep's friction takes no more than a particle's momentum, 1 kPa here."""
     plate = trimesh.creation.box(extents=[0.08, 0.08, 0.02])
     x = lattice([0.0, 0.0, 0.0], [0.24, 0.12, 0.08], 0.5 * CELL, jitter=0.0)
     s = scene(x, plate, tool_friction=0.2)
