@@ -2,8 +2,8 @@
 
 ``splatsoil benchmark whole-path --page docs/measurements.md`` takes the best part of an hour on two cores: the example
 sets are reconstructed, drawn from their true particles, simulated from them with one piece of the numerics changed at a
-time, and fitted as a user does. Parts are kept in the folder as they end, fits with all their evaluations, and a second call
-goes on from there; a part that is asked for by name is measured again.
+time, and fitted as a user does. Parts are kept in the folder as they end, fits with all their evaluations, and a second
+call goes on from there; a part that is asked for by name is measured again.
 """
 
 from __future__ import annotations
