@@ -51,7 +51,7 @@ def ploughed(cell: float = 0.015) -> Scene:
     return Scene(
         x,
         (size[0], size[1], 0.2),
-        resolution(cell, float(SPEED[0]), density=1600.0, young=5e5, transport=1.0 / 15.0),
+        resolution(cell, float(SPEED[0]), density=1600.0, young=5e5, transport=0.1, way=1.0 / 15.0),
         settings,
         mesh=plate,
     )
