@@ -190,7 +190,7 @@ def test_a_bed_on_a_tool_gives_way_as_fast_as_it_is_told_to(steps: int, stiffer:
         run = Solver(x[None], np.zeros(3), upper, plate, resolution, Law(), smooth, [{"friction_angle": 35.0}])
         force = [run.advance([held] * steps)[0, 2] for _ in range(frames)]
         weight = len(x) * spacing**3 * RESOLUTION.density * 9.81
-        assert np.mean(force[-5:]) == pytest.approx(-weight, rel=5e-3)
+        assert np.mean(force[-5:]) == pytest.approx(-weight, rel=1e-3)
         return float(np.mean((x - run.positions()[0])[x[:, 2] > 0.13, 2]))
 
     pressure = RESOLUTION.density * 9.81 * height
