@@ -41,10 +41,10 @@ NUMERICS: Mapping[str, Callable[[Resolution], Resolution]] = {
     "stiffness": lambda r: replace(r, bulk=3.0 * r.bulk, shear=3.0 * r.shear),
     "step": lambda r: replace(r, steps=2 * r.steps),
     "grid": lambda r: replace(r, cell=0.8 * r.cell, spacing=0.8 * r.spacing),
-    "contact": lambda r: replace(r, give=0.0),
+    "contact": lambda r: replace(r, give=0.5 * r.give),
 }
-"""Other ways to compute the same physics: three times as stiff, twice as many steps, a finer grid, soil that doesn't
-give way to the tool."""
+"""Other ways to compute the same physics: three times as stiff, twice as many steps, a finer grid, soil that
+gives way to the tool half as much."""
 ROUNDING = "rounding"
 """Another drawing of the same simulation, its surface rounded off twice as much. To first order that changes features
 by as much as the drawing has done already, so that one such change is what it gets wrong."""

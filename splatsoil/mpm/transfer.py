@@ -26,6 +26,11 @@ RUNAWAY = wp.constant(1.0e3)
 AFFINE_SHARE = 7.0 / 16.0
 """Of a bilinear mode, what affine fields of eight particles in a cell carry over an exchange."""
 HOURGLASS_DAMPING = (1.0 - AFFINE_SHARE) / (1.0 + AFFINE_SHARE)
+HOLLOW = wp.constant(0.7)
+"""Of a cell's volume: with so little soil and less it counts as it is. One in twenty of the cells within soil that a
+blade has sheared holds less."""
+FULL = wp.constant(0.9)
+"""Of a cell's volume: with so much soil and more it counts as full."""
 
 
 def hourglass_share(exchanges: float) -> float:
@@ -146,6 +151,10 @@ def mean_weight(a: float, b: float, both: float, upper_a: int, upper_b: int) -> 
 def average_cells(cells: Cells, nodes: Nodes, grid: Grid, stiffness: float) -> None:
     """Sums to means; ``stiffness`` = c (K + 4G/3) dt^2 turns a node's share of stiffness into the least stable inertia.
 
+    Counted by its particles, a cell holds an eighth more or less soil whenever one of eight crosses its face: stresses
+    around it no longer balance, and soil that shears is shaken and yields too early. So cells within the soil count as
+    full, by one point in their middle (Beuth, Wieckowski & Vermeer 2011), the emptier ones by their particles.
+
     Trilinear weights vanish at a cell's faces but their gradients do not, so a node reached only by the edge of a
     particle would be flung away by stress. The inertia bound is the central-difference limit node by node.
     """
@@ -160,8 +169,12 @@ def average_cells(cells: Cells, nodes: Nodes, grid: Grid, stiffness: float) -> N
         if entry < cells.history.shape[0]:
             cells.history[entry] = share * cells.history[entry]
             cells.depth[entry] = share * cells.depth[entry]
-        middle = share * cells.middle[entry]
-        spread = share * cells.spread[entry]
+        capacity = grid.cell[0] * grid.cell[1] * grid.cell[2]
+        full = wp.clamp((volume / capacity - HOLLOW) / (FULL - HOLLOW), 0.0, 1.0)
+        volume = wp.lerp(volume, capacity, full)
+        cells.volume[entry] = volume
+        middle = wp.lerp(share * cells.middle[entry], wp.vec3(0.5), full)
+        spread = wp.lerp(share * cells.spread[entry], wp.vec3(0.25), full)
         for corner in range(8):
             gradient = mean_gradient(middle, spread, corner, grid.inverse)
             cells.gradient[8 * entry + corner] = gradient

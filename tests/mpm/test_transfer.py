@@ -55,10 +55,10 @@ def test_an_exchange_loses_nothing_by_itself(steps: int) -> None:
     assert amplitude_after_a_frame(steps, relaxation=1e-6) == pytest.approx(1.0, abs=2e-3)
 
 
-def lump(seed: int) -> tuple[Solver, np.ndarray]:
+def lump(seed: int, count: int = 400) -> tuple[Solver, np.ndarray]:
     """Soil at (n, 3) random places with random velocities, and a frame in which it neither moves nor is stressed."""
     rng = np.random.default_rng(seed)
-    x = rng.uniform(0.045, 0.115, (400, 3))
+    x = rng.uniform(0.045, 0.115, (count, 3))
     instant = replace(RESOLUTION, steps=1, frame_time=1e-9, relaxation=1e-6)
     still = Settings(friction_angle=35.0, gravity=(0.0, 0.0, 0.0))
     run = Solver(x[None], np.zeros(3), np.full(3, 0.16), None, instant, Law(), still, [{"friction_angle": 35.0}])
@@ -78,24 +78,61 @@ def test_what_particles_take_from_nodes_they_give_back() -> None:
         np.testing.assert_allclose(getattr(run._particles, name).numpy(), values, atol=1e-4 * np.abs(values).max())
 
 
+def gradients(run: Solver, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+    """Of each cell with soil: its indices (n, 3), mean gradients (n, 8, 3), and its particles' local coordinates."""
+    cell = np.floor(x / CELL).astype(int)
+    count = int(run._cells.count.numpy()[0])
+    places = np.stack(np.unravel_index(run._cells.node.numpy()[:count], run.shape.nodes), axis=1)
+    inside = [x[mine] / CELL - place for place in places if (mine := (cell == place).all(axis=1)).any()]
+    assert len(inside) == count
+    return places, run._cells.gradient.numpy().reshape(-1, 8, 3)[:count], inside
+
+
 def test_a_cells_gradient_is_the_mean_over_its_soil() -> None:
-    """Against the derivatives of the eight weights at each particle, worked out one by one."""
+    """Against the derivatives of the eight weights: at each particle, worked out one by one, where a cell is hollow;
+    over the cell where it is full; between the two where it is neither."""
     run, x = lump(1)
     run.advance(1)
-    cell = np.floor(x / CELL).astype(int)
-    nodes = run.shape.nodes
-    found = run._cells.gradient.numpy().reshape(-1, 8, 3)
-    count = int(run._cells.count.numpy()[0])
-    assert count > 30
-    for entry, node in enumerate(run._cells.node.numpy()[:count]):
-        mine = (cell == np.unravel_index(node, nodes)).all(axis=1)
-        f = x[mine] / CELL - cell[mine]
+    _, found, inside = gradients(run, x)
+    seen = {"hollow": 0, "between": 0, "full": 0}
+    for own, f in zip(found, inside, strict=True):
+        filled = len(f) * RESOLUTION.spacing**3 / CELL**3
+        kind = "hollow" if filled <= 0.7 else "full" if filled >= 0.9 else "between"
+        seen[kind] += 1
         for corner in range(8):
             bits = np.array([corner >> 2, (corner >> 1) & 1, corner & 1])
             weight = np.where(bits, f, 1.0 - f)
             others = np.stack([weight[:, 1] * weight[:, 2], weight[:, 0] * weight[:, 2], weight[:, 0] * weight[:, 1]])
-            expected = (2.0 * bits - 1.0) / CELL * others.mean(axis=1)
-            np.testing.assert_allclose(found[entry, corner], expected, atol=2e-4 / CELL)
+            hollow, full = ((2.0 * bits - 1.0) / CELL * mean for mean in (others.mean(axis=1), np.full(3, 0.25)))
+            low, high = {
+                "hollow": (hollow, hollow),
+                "full": (full, full),
+                "between": (np.minimum(hollow, full), np.maximum(hollow, full)),
+            }[kind]
+            slack = 2e-4 / CELL
+            assert np.all(own[corner] >= low - slack), (kind, corner)
+            assert np.all(own[corner] <= high + slack), (kind, corner)
+    assert min(seen.values()) > 5
+
+
+def test_an_even_stress_leaves_soil_alone_wherever_its_particles_are() -> None:
+    """Within a body the forces of one stress everywhere cancel, as the divergence theorem says: at nodes amid full
+    cells, whose particles are strewn at random."""
+    run, x = lump(4, 1200)
+    run.advance(1)
+    places, found, inside = gradients(run, x)
+    force, full = np.zeros((*run.shape.nodes, 3)), np.zeros(run.shape.nodes, dtype=int)
+    volume = run._cells.volume.numpy()
+    held = [len(f) for f in inside]
+    for place, own, soil, number in zip(places, found, volume, held, strict=False):
+        for corner in range(8):
+            node = tuple(place + np.array([corner >> 2, (corner >> 1) & 1, corner & 1]))
+            force[node] += soil * own[corner]
+            full[node] += number >= 8
+    amid = full == 8
+    assert amid.sum() > 3
+    assert max(held) - min(n for n in held if n >= 8) > 5
+    np.testing.assert_allclose(force[amid], 0.0, atol=1e-4 * CELL**2)
 
 
 def test_soil_shows_no_more_stretch_than_allowed() -> None:
