@@ -110,8 +110,8 @@ def contact_forces(
     """Penalty contact with Coulomb friction between particles and tool; ``force`` (simulations) gains share * force.
 
     ``area`` (m^2) is what one particle covers of the tool; a spring is loaded no further than ``deepest`` (m), so that
-    soil in which a tool starts is not shot out of it, and loses its load as fast as soil gives way, by ``give`` (m/s)
-    for a pressure of 1 Pa.
+    soil in which a tool starts is not shot out of it, and loses its load as soil gives way to a tool that comes on, by
+    ``give`` (1/Pa) of the way times the pressure.
 
     A particle keeps the side of the tool it is on, so a plate thinner than a cell holds soil on both its faces, and
     what the soil feels is exactly what the tool feels.
@@ -128,7 +128,8 @@ def contact_forces(
         for corner in range(8):
             velocity += corner_weight(f, corner) * nodes.velocity[base + corner_offset(grid, corner)]
         normal = particles.gap_normal[p]
-        slip = velocity - tool_velocity(pose, x)
+        coming = tool_velocity(pose, x)
+        slip = velocity - coming
         closing = wp.dot(slip, normal)
         # not "+=", which Warp takes for an atomic addition; each place is one thread's
         drift = particles.drift[p] + dt * slip
@@ -144,7 +145,8 @@ def contact_forces(
         adhesion = values[row, TOOL_ADHESION] * area
         if depth > 0.0 or (adhesion > 0.0 and gap < ADHESION_REACH * wp.sqrt(area)):
             spring = tool.stiffness * wp.clamp(depth, 0.0, deepest)
-            particles.preload[p] = preload - dt * give * spring / area
+            way = dt * wp.max(wp.dot(coming, normal), 0.0)
+            particles.preload[p] = preload - way * give * spring / area
             push = wp.where(depth > 0.0, wp.max(spring - tool.damping * closing, 0.0), 0.0)
             slip -= closing * normal
             speed = wp.length(slip)

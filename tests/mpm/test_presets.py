@@ -22,7 +22,7 @@ def test_a_faster_tool_loses_as_much_soil_on_its_way(name: str, plow_dry: Path) 
     sets = (slow, replace(slow, tool=replace(slow.tool, motion=quick)))
     before, after = (Resolution.derive(measurement, name) for measurement in sets)
     assert before.give > 0.0
-    assert after.give == pytest.approx(3.0 * before.give)
+    assert after.give == before.give
     assert after.relaxation == pytest.approx(3.0 * before.relaxation)
     for measurement, resolution in zip(sets, (before, after), strict=True):
         speed = np.linalg.norm(np.diff(measurement.tool.motion.positions, axis=0), axis=1) * slow.frame_rate
