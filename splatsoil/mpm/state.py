@@ -89,7 +89,7 @@ class Cells:
         slot: entry among the active cells for every cell of the batch, -1 where empty (indexed by lowest node).
         node: lowest node of each active cell.
         count: how many are active.
-        volume: soil in the cell, m^3.
+        volume: soil in the cell, m^3; of a cell that counts as full its own.
         middle: of its soil, in local coordinates; times ``volume`` until all of it is counted, like ``spread``.
         spread: mean products yz, xz and xy of these.
         gradient: mean gradient of the eight corners' weights over the cell's soil, 1/m; entry 8 * cell + corner.
