@@ -14,7 +14,8 @@ from splatsoil.mpm import PRESETS, Resolution
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_a_faster_tool_loses_as_much_soil_on_its_way(name: str, plow_dry: Path) -> None:
-    """Dry sand that is pushed slowly doesn't know how fast: rates follow the tool, and steps go no farther."""
+    """Dry sand that is pushed slowly doesn't know how fast: rates follow the tool, soil gives way to it by its way, and
+    steps go no farther."""
     slow = Measurement.load(plow_dry)
     motion = slow.tool.motion
     start = motion.positions[0]
