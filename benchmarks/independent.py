@@ -4,7 +4,8 @@ The independent solver is Newton's implicit MPM (``newton`` on PyPI; extra ``ind
 first particles it ploughs at several friction angles, and at the true one with a piece of its numerics changed. The
 angle of every such world is then estimated from its heights, and from their slopes, as in
 :mod:`splatsoil.benchmarks.numerics`, with our presets; and with the independent solver's own runs, which says what its
-numerics are worth in degrees.
+numerics are worth in degrees. Where a run began with the set's own particles, it is also told how far from the set's
+they end, which says whether the set was made that way.
 """
 
 from __future__ import annotations
@@ -20,24 +21,40 @@ from typing import Any
 import numpy as np
 import warp as wp
 from splatsoil.benchmarks._common import stamp
-from splatsoil.benchmarks._newton import Numerics, World, load_newton, plough
+from splatsoil.benchmarks._newton import Numerics, Run, World, load_newton, plough
 from splatsoil.benchmarks.numerics import FloatArray, Scan, Truth, scan, volume_range
 
 from splatsoil.errors import RunError, SimulationError
 from splatsoil.files import write_json
 from splatsoil.mpm import Resolution
+from splatsoil.soil.matching import cone_intercept
 
 OFFSETS = (-9.0, -6.0, -3.0, 0.0, 3.0, 6.0)
 """Angles of the independent worlds, degrees from the true one."""
 BEYOND = 3.0
 """Our scan ends this far, in degrees, outside the range of the worlds."""
 OTHER_SEED = 5
+TWICE = "cohesion as tension and as yield stress"
+MOVED = 0.003
+"""Particles of a set that were carried further than this, in m, tell whether a run repeats it."""
 
 
 def base_worlds(truth: Truth, angles: Sequence[float]) -> list[World]:
     """The set's own first particles at these angles."""
     spacing, cohesion = truth.volume ** (1.0 / 3.0), truth.values.get("cohesion", 0.0)
     return [World(f"{a:g}°", float(a), truth.particles[0], spacing, cohesion=cohesion) for a in angles]
+
+
+def twice_cohesive(truth: Truth) -> list[World]:
+    """The set's soil as it comes out where its cohesion is given both as a tension that it bears and as a yield stress.
+
+    Newton's strength is the yield stress + friction (p + tension), so that each of them is the whole cohesion.
+    """
+    angle, cohesion = truth.values["friction_angle"], truth.values.get("cohesion", 0.0)
+    if not cohesion:
+        return []
+    stress, spacing = cone_intercept(angle, cohesion), truth.volume ** (1.0 / 3.0)
+    return [World(TWICE, angle, truth.particles[0], spacing, cohesion=cohesion, yield_stress=stress)]
 
 
 def changed(truth: Truth, numerics: Numerics) -> list[tuple[Numerics, list[World]]]:
@@ -58,6 +75,7 @@ def changed(truth: Truth, numerics: Numerics) -> list[tuple[Numerics, list[World
     return [
         (numerics, side_by_side),
         (replace(numerics, late=False), [world("projection at the substep's end")]),
+        (replace(numerics, grid="sparse"), [world("cells laid anew")]),
         (replace(numerics, substeps=2 * numerics.substeps), [world("substeps x 2")]),
         (replace(numerics, iterations=4 * numerics.iterations), [world("iterations x 4")]),
         (finer[0], [world("voxel x 2/3", 2 / 3)]),
@@ -69,6 +87,16 @@ def changed(truth: Truth, numerics: Numerics) -> list[tuple[Numerics, list[World
 def heights(truth: Truth, particles: Mapping[int, FloatArray], volume: float) -> FloatArray:
     """(frames, ny, nx) in m of the frames after the first."""
     return np.array([truth.heights(particles[f], volume) for f in sorted(particles) if f > 0])
+
+
+def apart(truth: Truth, particles: Mapping[int, FloatArray]) -> dict[int, float]:
+    """How far, in mm, particles that began as the set's are from where it has them: by frame, median of what moved."""
+    start = truth.particles[0]
+    found = {}
+    for f in sorted(f for f in particles if f > 0):
+        moved = np.linalg.norm(truth.particles[f] - start, axis=1) > MOVED
+        found[f] = 1e3 * float(np.median(np.linalg.norm(particles[f] - truth.particles[f], axis=1)[moved]))
+    return found
 
 
 def judge(other: FloatArray, ours: Mapping[str, Scan], own: Scan | None) -> dict[str, Any]:
@@ -117,8 +145,9 @@ class Campaign:
         """The independent solver's scan, ours with every preset, and what they say of each other and of the set."""
         truth, start = self.truth, time.perf_counter()
         worlds = base_worlds(truth, self.angles)
-        runs = plough(truth.measurement, worlds, self.numerics, truth.particles, self.device)
-        scanned = np.array([heights(truth, run.particles, truth.volume) for run in runs])
+        more = twice_cohesive(truth)
+        runs = plough(truth.measurement, [*worlds, *more], self.numerics, truth.particles, self.device)
+        scanned = np.array([heights(truth, run.particles, truth.volume) for run in runs[: len(worlds)]])
         nearest = int(np.argmin(np.abs(np.array(self.angles) - self.entry["true_angle"])))
         volume = volume_range(truth.heights(truth.particles[0], truth.volume), scanned[nearest])
         self.own = Scan(np.array(self.angles), scanned, 0.0, volume)
@@ -131,9 +160,11 @@ class Campaign:
             self.ours[preset] = found
             self.entry["presets"][preset] = {"chance_mm": 1e3 * found.chance, "volume": found.volume}
             self.entry["seconds"][preset] = time.perf_counter() - start
-        for world, surface in zip(worlds, scanned, strict=True):
-            self._enter(world.label, float(world.angle), surface, None)
-        self._enter("the set itself", self.entry["true_angle"], heights(truth, truth.particles, truth.volume), self.own)
+        for world, run in zip([*worlds, *more], runs, strict=True):
+            self._enter(world, run, None)
+        itself = heights(truth, truth.particles, truth.volume)
+        told = {"angle": self.entry["true_angle"], "apart_mm": None, **judge(itself, self.ours, self.own)}
+        self.entry["worlds"]["the set itself"] = told
 
     def change(self, numerics: Numerics, worlds: Sequence[World]) -> None:
         """Worlds with numerics of their own, after the base; one that can't be computed is entered as failed."""
@@ -145,11 +176,17 @@ class Campaign:
                 self.entry["worlds"][world.label] = {"angle": float(world.angle), "failed": str(error)}
             return
         for world, run in zip(worlds, runs, strict=True):
-            self._enter(world.label, float(world.angle), heights(self.truth, run.particles, world.spacing**3), self.own)
+            self._enter(world, run, self.own)
         self.entry["seconds"][", ".join(w.label for w in worlds)] = time.perf_counter() - start
 
-    def _enter(self, label: str, angle: float, surface: FloatArray, own: Scan | None) -> None:
-        self.entry["worlds"][label] = {"angle": angle, **judge(surface, self.ours, own)}
+    def _enter(self, world: World, run: Run, own: Scan | None) -> None:
+        surface = heights(self.truth, run.particles, world.spacing**3)
+        began_as_the_set = world.particles is self.truth.particles[0]
+        self.entry["worlds"][world.label] = {
+            "angle": float(world.angle),
+            "apart_mm": apart(self.truth, run.particles) if began_as_the_set else None,
+            **judge(surface, self.ours, own),
+        }
 
 
 def table(result: Mapping[str, Any]) -> str:
@@ -161,16 +198,18 @@ def table(result: Mapping[str, Any]) -> str:
         lines += [
             f"{name}: {result['seeds']} particle seeds, newton {result['newton']}, {result['made_by']['device']}.",
             "",
-            "| world | φ | " + " | ".join(heads) + " | newton's own: heights / slopes |",
-            "|---" * (len(heads) + 3) + "|",
+            "| world | φ | " + " | ".join(heads) + " | newton's own: heights / slopes | particles off the set's, mm |",
+            "|---" * (len(heads) + 4) + "|",
         ]
         for label, world in entry["worlds"].items():
             if "failed" in world:
-                lines.append(f"| {label} | {world['angle']:g}° | " + " | ".join("failed" for _ in (*heads, 0)) + " |")
+                failed = " | ".join("failed" for _ in (*heads, 0, 0))
+                lines.append(f"| {label} | {world['angle']:g}° | {failed} |")
                 continue
             cells = [_cell(world["presets"][p], entry["scan"], left_over=True) for p in presets]
             own = "" if world["own"] is None else _cell(world["own"], (entry["angles"][0], entry["angles"][-1]))
-            lines.append(f"| {label} | {world['angle']:g}° | " + " | ".join([*cells, own]) + " |")
+            off = ", ".join(f"{mm:.2f}" for mm in (world["apart_mm"] or {}).values())
+            lines.append(f"| {label} | {world['angle']:g}° | " + " | ".join([*cells, own, off]) + " |")
         for solver, (low, high) in (
             ("newton", entry["independent_volume"]),
             *((f"`{p}`", entry["presets"][p]["volume"]) for p in presets),

@@ -6,11 +6,13 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 from splatsoil.benchmarks._newton import Numerics, Run, World, _model, _walls, plough
-from splatsoil.benchmarks.independent import judge
+from splatsoil.benchmarks.independent import apart, judge, twice_cohesive
 from splatsoil.benchmarks.numerics import Scan, Truth, volume_range
 
 SPACING, COARSE = 0.02, Numerics(voxel=0.04, substeps=2, iterations=60)
@@ -74,6 +76,27 @@ def test_cohesion_is_the_whole_strength_without_pressure_and_counted_once() -> N
     exact = 6.0 * 300.0 * np.cos(np.radians(33.0)) / (np.sqrt(3.0) * (3.0 - sine))
     assert strength[: len(x)] == pytest.approx(exact, rel=1e-3)
     assert not strength[len(x) :].any()
+
+
+def test_a_yield_stress_beside_the_tension_makes_the_cohesion_twice() -> None:
+    newton = pytest.importorskip("newton")
+    truth = Truth.load(Path(__file__).parents[2] / "examples" / "plow-damp")
+    worlds = twice_cohesive(truth)
+    soil = _model(newton, truth.measurement, worlds, np.zeros((1, 3)), "cpu").mpm
+    tension = soil.yield_pressure.numpy() * soil.tensile_yield_ratio.numpy()
+    strength = soil.yield_stress.numpy() + soil.friction.numpy() * tension
+    sine = np.sin(np.radians(33.0))
+    assert strength == pytest.approx(6.0 * 600.0 * np.cos(np.radians(33.0)) / (np.sqrt(3.0) * (3.0 - sine)), rel=1e-3)
+    dry = Truth.load(Path(__file__).parents[2] / "examples" / "plow-dry")
+    assert not twice_cohesive(dry)
+
+
+def test_how_far_particles_are_off_is_told_of_those_that_moved() -> None:
+    start = np.zeros((5, 3))
+    there = start + np.array([0.05, 0.04, 0.06, 0.0, 0.0])[:, None] * np.array([1.0, 0.0, 0.0])
+    truth = SimpleNamespace(particles={0: start, 50: there})
+    ours = there + np.array([0.001, 0.002, 0.004, 9.0, 9.0])[:, None] * np.array([0.0, 1.0, 0.0])
+    assert apart(cast("Truth", truth), {50: ours}) == {50: pytest.approx(2.0)}
 
 
 def test_no_gap_is_left_between_two_walls() -> None:
