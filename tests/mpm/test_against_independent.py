@@ -16,6 +16,8 @@ from splatsoil.soil.library import find_effects
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 FRAMES = (50, 100, 150, 199)
+DRY, DAMP = {"friction_angle": 36.0}, {"friction_angle": 33.0, "cohesion": 600.0}
+"""The damp set's file says 300 Pa, which its simulator was given twice: docs/numerics.md."""
 CELL, FINE = 0.01, 0.005
 
 
@@ -44,14 +46,15 @@ def heights(x: npt.NDArray[np.floating], measurement: Measurement, volume: float
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "values", "limit"),
+    ("name", "values", "limits"),
     [
-        ("plow-dry", {"friction_angle": 36.0}, 4.0e-3),
-        # damp sand stands in clods whose fine shape is chance (1.7 mm between particle seeds); 4.6 mm was measured
-        ("plow-damp", {"friction_angle": 33.0, "cohesion": 300.0}, 5.0e-3),
+        ("plow-dry", DRY, (1.5, 2.5, 3.0, 3.0)),
+        # damp sand stands in clods whose fine shape is chance: the other solver repeats itself to 0.8, 2.5, 1.7, 2.7 mm
+        ("plow-damp", DAMP, (2.0, 3.0, 4.5, 5.5)),
     ],
 )
-def test_heights_agree_with_the_implicit_solver(name: str, values: dict[str, float], limit: float) -> None:
+def test_heights_agree_with_the_implicit_solver(name: str, values: dict[str, float], limits: tuple[float, ...]) -> None:
+    """Root mean square over the bed, mm, by frame."""
     measurement = Measurement.load(EXAMPLES / name)
     particles, spacing = truth(name)
     law = Law(find_effects([effect for effect in ("cohesion",) if effect in values]))
@@ -61,20 +64,22 @@ def test_heights_agree_with_the_implicit_solver(name: str, values: dict[str, flo
     for k, frame in enumerate(FRAMES):
         predicted = heights(run.positions[k], measurement, volume)
         observed = heights(particles[frame], measurement, volume)
-        assert np.sqrt(np.mean((predicted - observed) ** 2)) < limit
+        assert 1e3 * np.sqrt(np.mean((predicted - observed) ** 2)) < limits[k]
         assert predicted.mean() < 1.005 * start.mean()  # no volume gain
-    # a bed that nothing had happened to would be further off by far: the check can fail
-    untouched = np.sqrt(np.mean((start - heights(particles[199], measurement, volume)) ** 2))
-    assert untouched > 2.0 * limit
+        # a bed that nothing had happened to would be further off by far: the check can fail
+        assert 1e3 * np.sqrt(np.mean((start - observed) ** 2)) > 3.0 * limits[k]
 
 
 @pytest.mark.slow
-def test_pushing_force_agrees_with_the_implicit_solver() -> None:
-    """The mean horizontal force while pushing: within 15 % of the other solver's."""
-    measurement = Measurement.load(EXAMPLES / "plow-dry")
-    particles, _ = truth("plow-dry")
-    run = simulate(measurement, particles[0], {"friction_angle": 36.0}, preset="small", frames=[98])[0]
+@pytest.mark.parametrize(("name", "values"), [("plow-dry", DRY), ("plow-damp", DAMP)])
+def test_force_agrees_with_the_implicit_solver(name: str, values: dict[str, float]) -> None:
+    """The mean force along the way is within 15 % of the other solver's while pushing, within 30 % while standing."""
+    measurement = Measurement.load(EXAMPLES / name)
+    particles, _ = truth(name)
+    law = Law(find_effects([effect for effect in ("cohesion",) if effect in values]))
+    run = simulate(measurement, particles[0], values, law=law, preset="small", frames=[121])[0]
     recorded = measurement.tool.force
     assert recorded is not None
-    pushing = (recorded[:, 0] >= 60) & (recorded[:, 0] < 98)
-    assert run.force[59:97, 0].mean() == pytest.approx(recorded[pushing, 2].mean(), rel=0.15)
+    for first, last, near in ((60, 98, 0.15), (110, 121, 0.3)):
+        there = (recorded[:, 0] >= first) & (recorded[:, 0] < last)
+        assert run.force[first - 1 : last - 1, 0].mean() == pytest.approx(recorded[there, 2].mean(), rel=near)
