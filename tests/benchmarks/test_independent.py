@@ -118,6 +118,16 @@ def test_soil_too_weak_to_stand_stays_in_the_box(plow_dry: Path) -> None:
     assert np.maximum(bed.lower - x, x - bed.upper).max() < 1e-3
 
 
+@pytest.mark.slow
+def test_a_set_is_repeated_by_what_made_it(plow_dry: Path) -> None:
+    """Particles end ten times closer to the set's than with cells laid anew (2.6 mm), or another tool or soil."""
+    pytest.importorskip("newton")
+    truth = Truth.load(plow_dry)
+    world = World("the set's", 36.0, truth.particles[0], truth.volume ** (1.0 / 3.0))
+    run = plough(truth.measurement, [world], Numerics.of(plow_dry), (50,))[0]
+    assert apart(truth, run.particles)[50] < 0.5
+
+
 @pytest.fixture(scope="module")
 def ploughed() -> tuple[Truth, list[Run]]:
     """Two coarse worlds, ten frames into the push."""
