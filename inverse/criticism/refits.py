@@ -178,30 +178,41 @@ def refitted(
             least=CLEARLY if trial.emulated else -math.inf,
         )
 
+    def explore(trial: Trial, shapes: Sequence[Parameter] = ()) -> None:
+        trial.fit = explored(
+            trial.predict,
+            trial.visits,
+            through,
+            experiment.observed,
+            trial.free,
+            trial.known,
+            trial.fit,
+            shapes,
+            ahead=trial.ahead,
+        )
+
+    def end(trial: Trial) -> None:
+        with suppress(SimulationError):
+            trial.fit = replace(trial.fit, prediction=trial.predict(trial.fit.values, SHARED))
+
     def go_on(trial: Trial) -> None:
         said(trial)
         if trial.left_behind:
             return
-        shapes = () if trial.candidate is None else trial.candidate.shapes
         if not trial.stopped:
-            trial.fit = explored(
-                trial.predict,
-                trial.visits,
-                through,
-                experiment.observed,
-                trial.free,
-                trial.known,
-                trial.fit,
-                shapes,
-                ahead=trial.ahead,
-            )
-        with suppress(SimulationError):
-            trial.fit = replace(trial.fit, prediction=trial.predict(trial.fit.values, SHARED))
+            explore(trial, () if trial.candidate is None else trial.candidate.shapes)
+        end(trial)
 
     simulate.side_by_side([partial(begin, trial) for trial in trials])
     emulated = [trial for trial in trials if trial.emulated]
     stop(trials, whiten(experiment.observed).size)
     simulate.side_by_side([partial(go_on, trial) for trial in emulated])
+    far = [trial for trial in emulated if trial.candidate is not None and not trial.stopped]
+    if far:
+        # Chance of few simulations is most of what the estimates of the best one are off by.
+        best = min(far, key=lambda trial: trial.fit.chi2)
+        explore(best)
+        end(best)
     return trials
 
 
