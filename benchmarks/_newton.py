@@ -40,7 +40,7 @@ class Numerics:
             sets soil stands one substep's way deep in the moving tool, so they were made so.
         grid: "dense", whose cells stay, or "sparse", whose cells are laid anew around the soil in every substep: soil
             then loses up to half as much volume again. The example sets were made with the first: their particles come
-            out ten times closer by it (`splatsoil.benchmarks.independent`).
+            out eight times closer by it (`splatsoil.benchmarks.independent`).
     """
 
     voxel: float

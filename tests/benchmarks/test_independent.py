@@ -120,7 +120,7 @@ def test_soil_too_weak_to_stand_stays_in_the_box(plow_dry: Path) -> None:
 
 @pytest.mark.slow
 def test_a_set_is_repeated_by_what_made_it(plow_dry: Path) -> None:
-    """Particles end ten times closer to the set's than with cells laid anew (2.6 mm), or another tool or soil."""
+    """With cells laid anew particles are 2.6 mm from the set's."""
     pytest.importorskip("newton")
     truth = Truth.load(plow_dry)
     world = World("the set's", 36.0, truth.particles[0], truth.volume ** (1.0 / 3.0))

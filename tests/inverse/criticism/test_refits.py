@@ -56,6 +56,19 @@ def test_what_explains_much_less_stops_early_and_changes_nothing(monkeypatch: py
         assert all(every[n].fall < 0.6 * every[best].fall for n, c in some.items() if c.stopped)
 
 
+def test_what_leaves_least_is_explored_once_more_and_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen, explored = [], refits.explored
+
+    def spy(*args: Any, **more: Any) -> Refit:
+        seen.extend(p.name for p in args[4] if p.name != "angle")
+        return explored(*args, **more)
+
+    monkeypatch.setattr(refits, "explored", spy)
+    monkeypatch.setattr(refits, "LEAST_SHARE", -np.inf)
+    found, _ = confirmed(0)
+    assert {name: seen.count(name) for name in found if name} == {n: 1 + (n == HIDDEN) for n in found if n}
+
+
 def trial(fall: float, known: Known | None = None, size: float = 0.0) -> Trial:
     """An effect that has taken as much off χ² = 1000 in its first steps, at some size of it."""
     candidate: Candidate = EXPERIMENT.candidates[0]
