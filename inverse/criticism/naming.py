@@ -4,11 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from scipy.stats import chi2
+
 from splatsoil.parameters import Parameter
 
 from .confirmation import Confirmation
 from .score import Score
 from .verdicts import CERTAIN, DENIES, EQUIVALENT, LEVEL, RELEVANT
+
+CONTRARY = float(chi2.isf(CERTAIN, 1))
+"""Rise of χ² on times that a refit hasn't seen, over what each number still holds, by which features deny beyond doubt
+what other pictures say beyond doubt."""
 
 
 def members_of(
@@ -52,14 +58,15 @@ def stands(confirmations: Mapping[str, Confirmation], name: str, off: bool, scor
     Where the model leaves no more than noise, either the effect is significant among all of the library, or the model
     is off by more than noise on those times; it must take away a relevant share of the squared error there; and its
     refit, all that is systematic counted, must tell its size from none. What other pictures say of an effect beyond
-    doubt needs no more of the features than that they don't speak against it.
+    doubt needs no more of the features than that they don't speak against it beyond doubt: χ² of two models on times
+    that neither has seen differs by tens by chance.
     """
     before, after = confirmations[""], confirmations[name]
-    least = EQUIVALENT * max(after.dispersion, score.dispersion)
-    if after.fall <= least:
+    dispersion = max(after.dispersion, score.dispersion)
+    if after.fall <= EQUIVALENT * dispersion:
         return False
     if after.told < CERTAIN:
-        return after.unseen > -least
+        return after.unseen > -CONTRARY * dispersion
     wanting = score.adjusted < LEVEL or before.held_out > before.floor
     relevant = after.held_out**2 < (1.0 - RELEVANT) * before.held_out**2
     told = abs(after.values[measure.name] - float(measure.off or 0.0)) > DENIES * after.stds[measure.name]

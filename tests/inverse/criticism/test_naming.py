@@ -58,7 +58,7 @@ def test_nothing_is_missing_where_nothing_is_to_be_explained(
     assert stands(told, "effect 2", off, score, MEASURE) is named
 
 
-@pytest.mark.parametrize(("told", "unseen", "named"), [(1e-5, -1.0, True), (1e-5, -9.0, False), (1e-3, -1.0, False)])
+@pytest.mark.parametrize(("told", "unseen", "named"), [(1e-5, -12.0, True), (1e-5, -20.0, False), (1e-3, -1.0, False)])
 def test_what_other_pictures_say_beyond_doubt_the_soil_need_only_not_deny(
     found: Diagnosis, told: float, unseen: float, named: bool
 ) -> None:
