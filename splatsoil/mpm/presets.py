@@ -39,7 +39,7 @@ class Preset:
     courant: float = 0.5
     transport: float = 0.1
     way: float = 0.1
-    give: float = 2.0e-5
+    give: float = 2.6e-5
 
 
 PRESETS: dict[str, Preset] = {

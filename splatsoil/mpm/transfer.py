@@ -37,10 +37,11 @@ def hourglass_share(exchanges: float) -> float:
     """What particles must keep of the hourglass modes for them to be damped as by this many plain APIC exchanges.
 
     With eight particles to a cell, affine fields alone carry 7/16 of a bilinear mode over an exchange. Under a steady
-    force the mode's mean velocity is what the trapezoidal rule makes of that: (1 - q) / (1 + q) = 7/16, q = 9/23.
+    force the mode's mean velocity is what the trapezoidal rule makes of that: (1 - q) / (1 + q) = 7/16, q = 9/23. Where
+    it makes less, particles keep the reverse of the mode, against what affine fields carry.
     """
     carried = (1.0 - HOURGLASS_DAMPING * exchanges) / (1.0 + HOURGLASS_DAMPING * exchanges)
-    return max(0.0, (carried - AFFINE_SHARE) / (1.0 - AFFINE_SHARE))
+    return (carried - AFFINE_SHARE) / (1.0 - AFFINE_SHARE)
 
 
 @wp.kernel(enable_backward=False)

@@ -160,6 +160,13 @@ def test_hourglass_modes_are_damped_by_the_second_and_not_by_the_step(steps: int
     )
 
 
+@pytest.mark.parametrize("exchanges", [1.5, 2.5])
+def test_a_step_damps_them_as_several_exchanges_where_it_is_as_long(exchanges: float) -> None:
+    """By the trapezoidal rule with 9/23 an exchange, which is below the 7/16 of affine particles."""
+    left = amplitude_after_a_frame(2, relaxation=exchanges / 0.01)
+    assert left == pytest.approx((23.0 - 9.0 * exchanges) / (23.0 + 9.0 * exchanges), abs=0.005)
+
+
 @pytest.mark.parametrize("steps", [2, 3])
 def test_without_a_rate_they_are_damped_as_by_affine_particles(steps: int) -> None:
     """Affine particles at 1/4 and 3/4 of a cell leave 7/16 of a bilinear mode, but for the last step's own velocity."""
