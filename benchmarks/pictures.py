@@ -114,7 +114,14 @@ class Bench:
         """Features (t, s) of the other solver's soils, and the force along the tool's way while it pushes, N."""
         start, spacing = self.truth.particles[0], self.truth.volume ** (1.0 / 3.0)
         worlds = [
-            World(str(k), soil[ANGLE], start, spacing, **{name: v for name, v in soil.items() if name != ANGLE})
+            World(
+                str(k),
+                soil[ANGLE],
+                start,
+                spacing,
+                cohesion=soil.get("cohesion", 0.0),
+                viscosity=soil.get("viscosity", 0.0),
+            )
             for k, soil in enumerate(soils)
         ]
         runs = plough(self.truth.measurement, worlds, numerics, self.model.frames, self.device)

@@ -140,8 +140,16 @@ def test_ctrl_c_says_what_is_kept(monkeypatch: pytest.MonkeyPatch, capsys: pytes
 
 
 def test_ctrl_c_while_the_program_loads_leaves_no_traceback(tmp_path: Path) -> None:
-    """As a signal would come: in the middle of a module that the command line needs."""
-    (tmp_path / "tyro.py").write_text("import os, signal, time\nos.kill(os.getpid(), signal.SIGINT)\ntime.sleep(9)\n")
+    """As a signal would come: in the middle of a module that the command line needs.
+
+    A shell's background jobs, tests in one among them, ignore the signal unless they are told to heed it.
+    """
+    (tmp_path / "tyro.py").write_text(
+        "import os, signal, time\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "os.kill(os.getpid(), signal.SIGINT)\n"
+        "time.sleep(9)\n"
+    )
     environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
     command = [sys.executable, "-m", "splatsoil", "check", "nothing"]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
