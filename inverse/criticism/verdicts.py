@@ -43,12 +43,14 @@ def of_effect(candidate: Candidate, score: Score, *, level: float = LEVEL) -> Ef
     """Verdict on one effect that is off.
 
     Absent or trivial, unseen or seen, is one whose estimate denies that it matters (Schuirmann 1987, J. Pharmacokinet.
-    Biopharm. 15:657).
+    Biopharm. 15:657). What has a shape of its own was looked for in one shape, and isn't denied: an obstacle may lie
+    elsewhere.
     """
     meaningful = candidate.measure.meaningful
     if score.adjusted < level:
         return "missing" if abs(score.estimate) >= meaningful else "trivial"
-    if abs(score.estimate) + DENIES * score.std <= meaningful and score.survival >= LEAST_SURVIVAL:
+    denied = abs(score.estimate) + DENIES * score.std <= meaningful and score.survival >= LEAST_SURVIVAL
+    if denied and not candidate.shapes:
         return "trivial" if abs(score.z) > SEEN else "absent"
     return "cannot tell"
 
