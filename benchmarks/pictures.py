@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +23,7 @@ from splatsoil.benchmarks.numerics import Truth, variants
 
 from splatsoil.commands._output import print_json
 from splatsoil.errors import ParameterError, RunError
+from splatsoil.experiment.forces import STAGE
 from splatsoil.experiment.plow import PlowExperiment
 from splatsoil.experiment.scene_parts import stages_of
 from splatsoil.files import plain
@@ -32,6 +32,7 @@ from splatsoil.mpm import Resolution, Trajectory, simulate_together
 from splatsoil.quiet import hush
 from splatsoil.reconstruction import Reconstruction, reconstruct
 from splatsoil.reconstruction.progress import progress_bar
+from splatsoil.soil.settings import FRICTION_ANGLE
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -45,11 +46,10 @@ SOILS: tuple[Mapping[str, float], ...] = (
     {"friction_angle": 33.0, "viscosity": 140.0},
 )
 """What is ploughed in each set's bed; degrees, Pa, Pa s."""
-ANGLE = "friction_angle"
+ANGLE = FRICTION_ANGLE.name
 TURN, SHARE = 2.0, 0.3
 """Either way of the truth, in degrees and of a size, between which a reading takes features for linear."""
 AS_IT_IS = "as it is"
-PUSHING = "pushing"
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def ways(base: Resolution) -> dict[str, Resolution]:
         AS_IT_IS: base,
         **variants(base),
         "soil gives way half as much": replace(base, give=0.5 * base.give),
-        "half as much again": replace(base, give=1.5 * base.give),
+        "soil gives way half as much again": replace(base, give=1.5 * base.give),
     }
 
 
@@ -108,7 +108,7 @@ class Bench:
         self.seen = self.experiment.seen & self.experiment.layout.common
         self._computed = {self.model.resolution: self.model}
         every = [float(frame) for frame in range(1, frames[-1] + 1)]
-        self._pushing = np.array([stage == PUSHING for stage in stages_of(truth.measurement, every)])
+        self._pushing = np.array([stage == STAGE for stage in stages_of(truth.measurement, every)])
 
     def others(self, soils: Sequence[Mapping[str, float]], numerics: Numerics) -> list[tuple[FloatArray, float]]:
         """Features (t, s) of the other solver's soils, and the force along the tool's way while it pushes, N."""
@@ -153,14 +153,15 @@ class Bench:
 
     def read(self, soil: Mapping[str, float], other: tuple[FloatArray, float], changed: bool = True) -> list[Reading]:
         """What the other's soil is read as, by all numerics or by ours as they are."""
-        base, features = self.model.resolution, partial(self._moved, soil)
-        slopes = {name: features(name) for name in soil}
+        base = self.model.resolution
         resolutions = ways(base) if changed else {AS_IT_IS: base}
+        pairs = [self._either_way(soil, name) for name in soil]
         runs = {name: self.ours(soil, resolution) for name, resolution in resolutions.items()}
-        spread = [runs[AS_IT_IS][0], *(table for pair, _ in slopes.values() for table in pair)]
+        spread = [runs[AS_IT_IS][0], *(table for pair in pairs for table in pair)]
         chance = np.mean([table.var(axis=0, ddof=1) for table in spread], axis=0)
         weight = np.sqrt(self.seen / (1.0 + chance))
-        columns = np.stack([(high - low).mean(axis=0) / step for (low, high), step in slopes.values()])
+        steps = [2.0 * (TURN if name == ANGLE else SHARE) for name in soil]
+        columns = np.stack([(high - low).mean(axis=0) / step for (low, high), step in zip(pairs, steps, strict=True)])
         out = []
         for name, (tables, force) in runs.items():
             each = np.array([amplitudes(other[0] - table, columns, weight) for table in tables])
@@ -178,11 +179,11 @@ class Bench:
             )
         return out
 
-    def _moved(self, soil: Mapping[str, float], name: str) -> tuple[tuple[FloatArray, FloatArray], float]:
-        """Features either way of a parameter, and what lies between: degrees, or a share of the size."""
+    def _either_way(self, soil: Mapping[str, float], name: str) -> tuple[FloatArray, FloatArray]:
+        """(seeds, t, s) features below and above a parameter's true value."""
         way = TURN if name == ANGLE else SHARE * soil[name]
         low, high = (self.ours({**soil, name: soil[name] + d}, self.model.resolution)[0] for d in (-way, way))
-        return (low, high), 2.0 * (TURN if name == ANGLE else SHARE)
+        return low, high
 
     def _features(self, model: Model, trajectory: Trajectory, seed: int) -> FloatArray:
         return self.experiment.features(Prediction({}, seed, model.draw(trajectory, seed), trajectory, {}))
