@@ -1,7 +1,7 @@
 """The force on the tool, where it was measured: instruments beside the cameras.
 
 Pictures leave a valley in which friction and cohesion make up for each other. The force that moves the tool differs
-along it by a factor of four (docs/numerics.md), so even a force that is believed to 15 % shortens it.
+along it by a factor of four (docs/numerics-evidence.md), so even a force that is believed to 15 % shortens it.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ SENSOR = 1.0
 """Standard deviation of what is measured, in the features' unit."""
 ERROR = 0.1
 """Standard deviation of all simulated forces over their size, together: at the true parameters ours are within 5 % of
-another solver's in four beds and 12 % off in a fifth (docs/numerics.md), and 2 to 28 % off Reece's equation
+another solver's in four beds and 12 % off in a fifth (docs/numerics-evidence.md), and 2 to 28 % off Reece's equation
 (docs/validation.md)."""
 OWN = 0.1
 """Likewise of one instrument's, beside that: ours upwards are 8 to 17 % too small."""

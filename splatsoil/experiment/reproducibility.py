@@ -22,9 +22,9 @@ def between_solvers(parameter: Parameter, value: float, effects: Iterable[Effect
     """Standard deviation of a parameter at a value between solvers, in its unit, of soil that has effects.
 
     Maximum likelihood over sixteen sealed worlds of an implicit solver with cohesion or viscosity hidden
-    (docs/hidden-worlds.md, seeds 41 to 44), beyond all that a diagnosis finds by itself; other effects of soil are
-    taken to be alike. Soil without an effect is read as well as a diagnosis says, what cameras report doesn't hang on a
-    solver, and of what only shapes an effect nothing is known.
+    (docs/hidden-worlds-before.md, seeds 41 to 44), beyond all that a diagnosis finds by itself; other effects of soil
+    are taken to be alike. Soil without an effect is read as well as a diagnosis says, what cameras report doesn't hang
+    on a solver, and of what only shapes an effect nothing is known.
     """
     on = tuple(effects)
     reported = {p.name for effect in on if effect.observes for p in effect.parameters}
