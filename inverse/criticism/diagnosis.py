@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import zip_longest
@@ -13,6 +14,7 @@ from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Calibration, Candidate, Experiment
 
 from .confirmation import Confirmation, confirm, remainder_of
+from .derivatives import moved, rate
 from .estimates import Estimate, weighed, weighed_there
 from .evidence import Evidence, gather
 from .floor import Floor
@@ -213,7 +215,7 @@ def judge(
                 asis, after = (c.held_out / c.floor for c in (confirmations[""], tried[best]))
                 errors, left = (asis, after), after > WITHIN
             gone = explained(before, remainder) if misfit.p < GATE else explained_of_all(*errors)
-    effects = _effects(candidates, scores, given, members, confirmations, looks.astray, options.level)
+    effects = _effects(experiment, candidates, scores, given, members, confirmations, looks.astray, options.level)
     # Where the best explanation is too small to matter, so is what is missing.
     named = bool(members) and effects[members[0]] == "missing"
     if chosen and not named:
@@ -315,6 +317,7 @@ def _chosen(
 
 
 def _effects(
+    experiment: Experiment,
     candidates: Mapping[str, Candidate],
     scores: Mapping[str, Score],
     given: Mapping[str, Score],
@@ -332,11 +335,20 @@ def _effects(
         if name in members:
             out[name] = "missing" if _matters(candidate, confirmations[name].values) else "trivial"
         else:
-            out[name] = of_effect(candidate, given.get(name, scores[name]), level=level)
+            score = given.get(name, scores[name])
+            out[name] = of_effect(candidate, score, level=level, apart=_apart(experiment, candidate, score))
             if out[name] == "missing" or (astray and candidate.kind == "physics"):
                 # Significant beside the best one too, or because the best one's size is off: the next round tells.
                 out[name] = "cannot tell"
     return out
+
+
+def _apart(experiment: Experiment, candidate: Candidate, score: Score) -> float:
+    """Standard deviation between solvers of the size from which an effect matters, on the side where it is scored."""
+    size = candidate.measure
+    off = float(size.off or 0.0)
+    matters = moved(size, off, math.copysign(size.meaningful, score.estimate) / rate(size, off))
+    return experiment.reproducibility(size, matters, candidate.name)
 
 
 def _matters(candidate: Candidate, values: Mapping[str, float]) -> bool:

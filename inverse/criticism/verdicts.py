@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 from splatsoil.experiment.base import Candidate
@@ -39,17 +40,19 @@ and 3 of the right ones, 1.1 gives away 5 and 12; of those that imitate a truth 
 pass, 1.25 22 and 4."""
 
 
-def of_effect(candidate: Candidate, score: Score, *, level: float = LEVEL) -> EffectVerdict:
+def of_effect(candidate: Candidate, score: Score, *, level: float = LEVEL, apart: float = 0.0) -> EffectVerdict:
     """Verdict on one effect that is off.
 
     Absent or trivial, unseen or seen, is one whose estimate denies that it matters (Schuirmann 1987, J. Pharmacokinet.
-    Biopharm. 15:657). What has a shape of its own was looked for in one shape, and isn't denied: an obstacle may lie
+    Biopharm. 15:657), also where another solver is right (``apart``: standard deviation between solvers of the size
+    from which it would). What has a shape of its own was looked for in one shape, and isn't denied: an obstacle may lie
     elsewhere.
     """
     meaningful = candidate.measure.meaningful
     if score.adjusted < level:
         return "missing" if abs(score.estimate) >= meaningful else "trivial"
-    denied = abs(score.estimate) + DENIES * score.std <= meaningful and score.survival >= LEAST_SURVIVAL
+    unsure = DENIES * math.hypot(score.std, apart)
+    denied = abs(score.estimate) + unsure <= meaningful and score.survival >= LEAST_SURVIVAL
     if denied and not candidate.shapes:
         return "trivial" if abs(score.z) > SEEN else "absent"
     return "cannot tell"

@@ -333,6 +333,9 @@ def test_verdicts_on_an_effect(sizes: dict[str, float]) -> None:
     assert of_effect(candidate, replace(denied, std=0.1 * meaningful, z=3.0)) == "trivial"
     assert of_effect(candidate, replace(denied, std=0.5 * meaningful, z=0.6)) == "cannot tell"
     assert of_effect(candidate, replace(denied, survival=0.01)) == "cannot tell"
+    # nor is it denied where other solvers' soil of a size that matters may look like less
+    assert of_effect(candidate, denied, apart=0.1 * meaningful) == "absent"
+    assert of_effect(candidate, denied, apart=0.22 * meaningful) == "cannot tell"
     # where an obstacle lies, say: it was looked for in one place
     shaped = replace(candidate, shapes=(candidate.measure,))
     assert of_effect(shaped, denied) == "cannot tell"
