@@ -48,8 +48,8 @@ class Confirmation:
         told: chance of what other pictures say of its parameters if they were off; see
             :class:`~splatsoil.experiment.base.Calibration`.
         agrees: likewise, if they were as refitted.
-        held_out: root mean square of one simulation's residual on times the refit hasn't seen, of features in the
-            layout's unit.
+        held_out: root mean square of single simulations' residuals on times the refit hasn't seen, over the seeds that
+            were simulated, of features in the layout's unit.
         floor: what noise alone leaves there; of soil that has the effect, where that was simulated.
         remainder: what of it stands on slow waves.
         visits: simulations that the parameters were read off; none where the last derivatives told them.
@@ -148,7 +148,7 @@ def confirm(
             unseen=_chi2(apart, before) - _chi2(apart, after),
             told=trial.told,
             agrees=trial.agrees,
-            held_out=float(np.sqrt(np.mean(left[mask] ** 2))),
+            held_out=math.sqrt(np.mean([(experiment.observed - v.table)[mask] ** 2 for v in end.values()])),
             floor=noise_on(floor.single, mask),
             remainder=remainder,
             visits=emulated,

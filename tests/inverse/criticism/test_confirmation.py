@@ -85,3 +85,15 @@ def test_seeds_that_one_refit_lacks_are_left_out_of_both() -> None:
     assert part["effect 2"].fall == pytest.approx(left[0] - left[1])
     assert part["effect 2"].fall != pytest.approx(whole["effect 2"].fall)
     assert set(confirmed(0, lost=(0, 1, 2, 3))[0]) == {""}
+
+
+def test_the_error_on_hidden_times_is_that_of_a_simulation_whichever_its_seed() -> None:
+    """Without luck: as the experiment's own simulations by all seeds at hand leave, and no less where one is lost."""
+    for lost in ((), (0, 3)):
+        found, experiment, _ = confirmed(1, lost)
+        fit, seeds = found["effect 2"].fit, [s for s in range(4) if s not in lost]
+        hidden = experiment.seen & (np.arange(experiment.layout.shape[0]) % 2 == 1)[:, None]
+        left = [
+            (experiment.observed - experiment.predict(fit.values, effects=("effect 2",), seed=s))[hidden] for s in seeds
+        ]
+        assert found["effect 2"].held_out == pytest.approx(np.sqrt(np.mean(np.square(left))))
