@@ -28,7 +28,8 @@ class Preset:
         courant: sound-wave Courant number of a substep.
         transport: most cells the tool may travel in one step of the particles.
         way: of the tool, in cells, over which hourglass modes are damped once, see :attr:`Resolution.relaxation`.
-        give: see :attr:`Resolution.give`.
+        give: of the tool's way, how much soil gives way where the pressure is the weight of soil as high as that edge
+            is long; see :attr:`Resolution.give`.
     """
 
     name: str
@@ -39,7 +40,7 @@ class Preset:
     courant: float = 0.5
     transport: float = 0.1
     way: float = 0.1
-    give: float = 2.6e-5
+    give: float = 0.049
 
 
 PRESETS: dict[str, Preset] = {
@@ -69,9 +70,10 @@ class Resolution:
         relaxation: exchanges between particles and grid a second of which hourglass modes and the tool's contact shall
             know, whatever the number of ``steps``: the former are damped as that many plain APIC exchanges would, soil
             sunk into the tool comes out at twice the rate. 0 for as many as there are.
-        give: of the tool's way towards the soil, how much soil gives way to it for each Pa of pressure, in 1/Pa; a tool
-            that stands is borne for good. Real soil doesn't give way. Other solvers' soil does where iterations end
-            early, and is lost to the heap: see docs/numerics.md.
+        give: of the tool's way towards the soil, how much soil gives way to it for each metre of soil whose weight
+            makes the pressure, in 1/m: so dry soil is the same under any gravity, as it should be (Froude). A tool that
+            stands is borne for good. Real soil doesn't give way. Other solvers' soil does where iterations end early,
+            and is lost to the heap: see docs/numerics.md.
         skin: of the spacing, how far from the faces of a plate thinner than a cell particles stop, because they stand
             for soil half a spacing around them. Its edges need none: contact acts through the grid, which widens them.
             Thick bodies have none, because nothing was measured on them.
@@ -142,5 +144,5 @@ class Resolution:
             shear=preset.young / (2.0 * (1.0 + preset.poisson)),
             density=measurement.bed.density,
             relaxation=fastest / (preset.way * cell),
-            give=preset.give,
+            give=preset.give / float(extents[1]),
         )

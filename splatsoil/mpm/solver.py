@@ -342,7 +342,7 @@ class Solver:
                 self._near_count,
                 self.resolution.spacing**2,
                 DEEPEST * self.resolution.spacing,
-                self.resolution.give,
+                self.resolution.give / self.resolution.density,
                 dt,
                 share,
                 self._table,
