@@ -169,7 +169,7 @@ def test_an_effect_that_explains_little_in_its_default_shape_is_tried_in_another
     monkeypatch.setattr(diagnosis, "MORE", 1)
     made = turning(WORLD, (SHAPE,))
     names = ("effect 1", "effect 3", "effect 4")
-    near = {name: 0.4 * made.slopes[name] + 0.6 * made.slopes[SHAPE.name] for name in names}
+    near = {name: 0.3 * made.slopes[name] + 0.7 * made.slopes[SHAPE.name] for name in names}
     made = replace(made, slopes={**made.slopes, **near})
     experiment = hiding(made, 3.0)
     found = diagnose(experiment, {"angle": ANGLE}, options=Options(refits=1))
