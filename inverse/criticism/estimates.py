@@ -42,7 +42,7 @@ class Estimate:
         value: of the parameter.
         noise: standard deviation by noise, chance and what the numerics that were tried leave.
         systematic: standard deviation by what is the model's own fault: one more way of computing, such as those that
-            were tried; in soil that has an effect also another solver, and contradictions between parts of the data.
+            were tried, and another solver; in soil that has an effect also contradictions between parts of the data.
         unit: of all three.
         determined: False where it is hardly better known than by the parameter's bounds alone.
     """

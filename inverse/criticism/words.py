@@ -129,8 +129,8 @@ def of_estimates(estimates: Mapping[str, Estimate]) -> list[str]:
     if known:
         out = [
             f"With noise, chance and numerics weighed, {listed(known)}.",
-            "Systematic is what numerics that weren't tried may do, which may be as far off as those that were; in "
-            "soil that has an effect also how far solvers are apart, and parts of the data that contradict each other.",
+            "Systematic is what numerics that weren't tried may do, which may be as far off as those that were, and "
+            "how far solvers are apart; in soil that has an effect also parts of the data that contradict each other.",
             *out,
         ]
     return out

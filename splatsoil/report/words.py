@@ -106,9 +106,9 @@ def fitted_sentence(fit: Mapping[str, Any], judged: Mapping[str, Any] | None) ->
         for name, entry in fit["parameters"].items()
     ]
     return (
-        "Noise, chance and numerics weighed: the ± holds these, and what numerics that weren't tried may do (in soil "
-        "that has an effect also how far solvers are apart, and parts of the data that contradict each other), not a "
-        f"bias that all of them have. The fit by itself says: {', '.join(alone)}."
+        "Noise, chance and numerics weighed: the ± holds these, what numerics that weren't tried may do, and how far "
+        "solvers are apart (in soil that has an effect also parts of the data that contradict each other), not a bias "
+        f"that all of them have. The fit by itself says: {', '.join(alone)}."
     )
 
 
