@@ -28,6 +28,27 @@ FILES = ("parameters.py", "model.py", "comparison.py", "robust_loss.py")
 BESIDE = ("splatsoil.envs", "splatsoil.inverse")
 
 
+def here(name: str) -> str:
+    """A device that is here, for an argument parser."""
+    from splatsoil.envs.devices import resolve_device
+
+    try:
+        return resolve_device(name)
+    except ParameterError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def at_least(least: int) -> Callable[[str], int]:
+    """Whole numbers from one on, for an argument parser."""
+
+    def number(text: str) -> int:
+        if not text.strip().lstrip("+-").isdigit() or int(text) < least:
+            raise argparse.ArgumentTypeError(f"{text}: give {least} or more")
+        return int(text)
+
+    return number
+
+
 def world_options(parser: argparse.ArgumentParser) -> None:
     """Options that choose a world to simulate."""
     parser.add_argument("set", type=Path, nargs="?", help="measurement set; none: the made-up world of PlowSand-v0")
@@ -35,7 +56,7 @@ def world_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--parameters", nargs="+", default=["friction_angle"])
     parser.add_argument("--with", dest="effects", nargs="*", default=[], metavar="EFFECT")
     parser.add_argument("--preset", default="tiny")
-    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--device", type=here, default="cpu")
     parser.add_argument("--executor", default="serial", help="serial, processes:N or dask:ADDRESS")
 
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
+from splatsoil.benchmarks._common import here
 from splatsoil.benchmarks.numerics import Truth
 
 from splatsoil.files import write_bytes
@@ -162,7 +163,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--preset", default="tiny")
     parser.add_argument("--angle", type=float, default=35.0, help="friction angle of the pictures, degrees")
     parser.add_argument("--seeds", type=int, default=3, help="particle seeds that the pictures average over")
-    parser.add_argument("--device", default="cpu", help="of the pictures")
+    parser.add_argument("--device", type=here, default="cpu", help="of the pictures")
     options = parser.parse_args(arguments)
     wp.config.log_level = wp.LOG_ERROR
     if options.table:

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from splatsoil.benchmarks._common import keep_to_one_protocol, sources, stamp
+from splatsoil.benchmarks._common import at_least, keep_to_one_protocol, sources, stamp
 from splatsoil.benchmarks._hidden import NOTHING, Kind, Truth, count_up, draw, judge_all, kept
 from splatsoil.benchmarks._tally import Found, entry, table
 from splatsoil.inverse.criticism.confirmation import confirm
@@ -231,7 +231,7 @@ def judge_one(keep: Path, kind: Kind, number: int, seed: int, repeats: int, blin
 def main(arguments: list[str] | None = None) -> int:
     """Command line; exit code 0."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--count", type=int, default=40, help="experiments of each kind")
+    parser.add_argument("--count", type=at_least(1), default=40, help="experiments of each kind")
     parser.add_argument("--only", default="", help="only the kinds whose name has this in it")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--repeats", type=int, default=4)

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from splatsoil.benchmarks._common import keep_to_one_protocol, sources, stamp
+from splatsoil.benchmarks._common import at_least, here, keep_to_one_protocol, sources, stamp
 from splatsoil.benchmarks._hidden import (
     FIRST_SEED,
     NOTHING,
@@ -182,12 +182,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("set", type=Path)
     parser.add_argument("--preset", default="tiny")
     parser.add_argument(
-        "--count", type=int, default=4, help="experiments of each kind; three times as many without anything"
+        "--count", type=at_least(1), default=4, help="experiments of each kind; three times as many without anything"
     )
     parser.add_argument("--strengths", type=float, nargs="*", default=[1.0, 2.0, 4.0], help="in smallest detectable")
     parser.add_argument("--effects", nargs="+", default=list(EFFECTS), help="the library that the analysis has")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--device", type=here, default="cpu")
     parser.add_argument("--executor", default="serial", help="serial, or processes:N")
     parser.add_argument("--out", type=Path, default=Path("runs/hidden-soil"), help="folder for what is finished")
     options = parser.parse_args(arguments)

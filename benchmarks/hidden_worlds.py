@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from splatsoil.benchmarks._common import keep_to_one_protocol, sources, stamp
+from splatsoil.benchmarks._common import at_least, here, keep_to_one_protocol, sources, stamp
 from splatsoil.benchmarks._mitsuba import MitsubaStage, load_mitsuba
 from splatsoil.benchmarks._newton import Numerics, World, plough
 from splatsoil.benchmarks._tally import confusion, wilson
@@ -258,11 +258,11 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=list(KINDS), metavar="KIND")
     parser.add_argument(
-        "--count", type=int, default=1, help="worlds of each kind; three times as many without anything"
+        "--count", type=at_least(1), default=1, help="worlds of each kind; three times as many without anything"
     )
     parser.add_argument("--seed", type=int, default=1, help="of the truths")
     parser.add_argument("--preset", default="small")
-    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--device", type=here, default="cpu")
     parser.add_argument("--side-by-side", type=int, default=1, help="chains at a time")
     parser.add_argument(
         "--renderer", choices=list(RENDERERS), default="own", help="takes the photographs; mitsuba needs the package"

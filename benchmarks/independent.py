@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from splatsoil.benchmarks._common import stamp
+from splatsoil.benchmarks._common import at_least, here, stamp
 from splatsoil.benchmarks._newton import Numerics, Run, World, load_newton, plough
 from splatsoil.benchmarks.numerics import FloatArray, Scan, Truth, scan, volume_range
 
@@ -235,10 +235,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sets", nargs="+", type=Path)
     parser.add_argument("--presets", nargs="+", default=["small", "fine"])
-    parser.add_argument("--seeds", type=int, default=3, help="particle seeds that our heights are averaged over")
+    parser.add_argument(
+        "--seeds", type=at_least(1), default=3, help="particle seeds that our heights are averaged over"
+    )
     parser.add_argument("--angles", nargs="+", type=float, help="of the independent worlds; none: 9° below to 6° above")
     parser.add_argument("--base", action="store_true", help="leave out the worlds with changed numerics")
-    parser.add_argument("--device", default="cpu", help="cuda:0; on a CPU every world takes a quarter of an hour or so")
+    parser.add_argument("--device", type=here, default="cpu", help="cuda:0; a CPU takes a quarter of an hour a world")
     parser.add_argument("--json", type=Path, metavar="FILE", help="result, written after every piece of work")
     options = parser.parse_args(arguments)
     if options.angles and len(set(options.angles)) < 3:

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 from scipy.interpolate import CubicSpline
+from splatsoil.benchmarks._common import at_least, here
 from splatsoil.benchmarks.numerics import Truth
 
 from splatsoil.comparison import Comparator, Comparison
@@ -107,9 +108,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("set", type=Path)
     parser.add_argument("--angles", type=float, nargs="+", default=[26.0, 31.0, 34.0, 36.0, 38.0, 41.0, 46.0])
-    parser.add_argument("--seeds", type=int, default=2)
+    parser.add_argument("--seeds", type=at_least(1), default=2)
     parser.add_argument("--preset", default="small")
-    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--device", type=here, default="cpu")
     parser.add_argument("--cohesion", type=float, help="switches the effect on, at this value in Pa")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args(arguments)

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 from rich.console import Console
-from splatsoil.benchmarks._common import output_options, stamp, write_result
+from splatsoil.benchmarks._common import at_least, here, output_options, stamp, write_result
 
 from splatsoil.commands._output import print_json
 from splatsoil.errors import MeasurementError, ParameterError
@@ -94,10 +94,10 @@ def main(arguments: list[str] | None = None) -> int:
     """Command line; exit code 0."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sets", type=Path, nargs="*", metavar="SET")
-    parser.add_argument("--count", type=int, default=3, help="worlds to make where no sets are given")
+    parser.add_argument("--count", type=at_least(1), default=3, help="worlds to make where no sets are given")
     parser.add_argument("--seed", type=int, default=0, help="of the first one")
     parser.add_argument("--preset", default="small", help="of worlds and models")
-    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--device", type=here, default="cpu")
     output_options(parser)
     options = parser.parse_args(arguments)
     hush()
@@ -105,8 +105,8 @@ def main(arguments: list[str] | None = None) -> int:
     for folder in folders:
         true_light(folder)  # says what is missing before anything is computed
     if not folders:
-        if options.out is None or options.count < 1:
-            raise ParameterError("worlds to make need a folder, --out DIR, and a --count of 1 or more")
+        if options.out is None:
+            raise ParameterError("worlds to make need a folder, --out DIR")
         folders = [options.out / f"world-{options.seed + k}" for k in range(options.count)]
         for k, folder in enumerate(folders):
             if not (folder / "truth.json").is_file():

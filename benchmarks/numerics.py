@@ -20,6 +20,7 @@ import numpy.typing as npt
 import torch
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter
+from splatsoil.benchmarks._common import at_least, here
 
 from splatsoil.errors import MeasurementError
 from splatsoil.measurement import Measurement
@@ -244,8 +245,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("sets", nargs="+", type=Path)
     parser.add_argument("--preset", default="small")
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--device", default="cpu", help="cuda:0 runs a scan as one batch")
+    parser.add_argument("--seeds", type=at_least(1), default=3)
+    parser.add_argument("--device", type=here, default="cpu", help="cuda:0 runs a scan as one batch")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args(arguments)
     result = run(options.sets, options.preset, options.seeds, options.device)

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from splatsoil.benchmarks._common import output_options, stamp, write_result
+from splatsoil.benchmarks._common import here, output_options, stamp, write_result
 from splatsoil.benchmarks._newton import Numerics, World, load_newton, plough
 from splatsoil.benchmarks.numerics import Truth, variants
 
@@ -221,7 +221,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seeds", type=int, default=4, help="particle seeds that ours are averaged over")
     parser.add_argument("--preset", default="small", help="of our solver")
     parser.add_argument("--as-it-is", action="store_true", help="leave out changed numerics")
-    parser.add_argument("--device", default="cpu", help="cuda:0; on a CPU each world takes ten minutes and more")
+    parser.add_argument(
+        "--device", type=here, default="cpu", help="cuda:0; on a CPU each world takes ten minutes and more"
+    )
     output_options(parser)
     options = parser.parse_args(arguments)
     if options.seeds < 2:

@@ -18,6 +18,7 @@ import torch
 from kornia.losses import ssim_loss
 from rich.console import Console
 from rich.table import Table
+from splatsoil.benchmarks._common import here
 
 from splatsoil.measurement import Camera
 from splatsoil.splats import Gaussians, rasterise, reference, ssim
@@ -142,7 +143,7 @@ def _median(task: Callable[[], object], repeats: int, device: str) -> float:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--device", type=here, default="cpu")
     parser.add_argument("--threads", type=int, default=1)
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)

@@ -23,6 +23,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 from scipy.ndimage import gaussian_filter, map_coordinates
+from splatsoil.benchmarks._common import here
 
 from splatsoil.commands._output import only_json, print_json
 from splatsoil.measurement import Measurement
@@ -117,7 +118,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("sets", nargs="+", type=Path, help="folders of measurement sets")
     parser.add_argument("--preset", default="small")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--device", type=here, default="cpu")
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
     options = parser.parse_args(arguments)
     with only_json() if options.json else nullcontext():

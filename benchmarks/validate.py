@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import warp as wp
+from splatsoil.benchmarks._common import here
 from splatsoil.benchmarks._validation import (
     basics,
     blades,
@@ -71,7 +72,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--out", type=Path, default=Path("runs/validation"), help="results of the parts, to resume from"
     )
     parser.add_argument("--page", type=Path, help="write the page (.md) here and its pictures beside it")
-    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--device", type=here, default="cpu")
     parser.add_argument("--again", action="store_true", help="run parts that are done already")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of tables")
     options = parser.parse_args(arguments)

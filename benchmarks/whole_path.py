@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from splatsoil.benchmarks import numerics
+from splatsoil.benchmarks._common import at_least, here
 from splatsoil.benchmarks._speed import machine
 from splatsoil.benchmarks._speed.clock import repeated
 from splatsoil.benchmarks._speed.page import between
@@ -323,8 +324,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--dry", type=Path, default=Path("examples/plow-dry"), help="set that the base model explains")
     parser.add_argument("--damp", type=Path, default=Path("examples/plow-damp"), help="set with cohesive soil")
     parser.add_argument("--preset", default="small", choices=sorted(PRESETS))
-    parser.add_argument("--seeds", type=int, default=2, help="of the particles, for heights and shifts")
-    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--seeds", type=at_least(1), default=2, help="of the particles, for heights and shifts")
+    parser.add_argument("--device", type=here, default="cpu")
     parser.add_argument("--only", nargs="+", metavar="PART", help="parts to measure, again if need be; all by default")
     parser.add_argument("--out", type=Path, default=Path("runs/whole-path"))
     parser.add_argument("--page", type=Path, help="write the table into this page")

@@ -49,7 +49,7 @@ class Confirmation:
             :class:`~splatsoil.experiment.base.Calibration`.
         agrees: likewise, if they were as refitted.
         held_out: root mean square of single simulations' residuals on times the refit hasn't seen, over the seeds that
-            were simulated, of features in the layout's unit.
+            were simulated (one, where it stopped), of features in the layout's unit.
         floor: what noise alone leaves there; of soil that has the effect, where that was simulated.
         remainder: what of it stands on slow waves.
         visits: simulations that the parameters were read off; none where the last derivatives told them.

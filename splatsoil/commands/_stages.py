@@ -36,8 +36,10 @@ def prepare(options: FitOptions) -> tuple[Measurement, RunFolder]:
     """
     from splatsoil import __version__
     from splatsoil.envs.devices import resolve_device
+    from splatsoil.envs.levels import relative_cost
     from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.measurement import Measurement
+    from splatsoil.mpm import Resolution
     from splatsoil.soil.law import Law
     from splatsoil.soil.library import find_effects
 
@@ -53,6 +55,8 @@ def prepare(options: FitOptions) -> tuple[Measurement, RunFolder]:
     unknown = [name for name in options.parameters if name not in known]
     if unknown:
         raise ParameterError(f"--parameters: unknown {', '.join(unknown)}; this model has {', '.join(known)}")
+    if options.coarse is not None:
+        relative_cost(*(Resolution.derive(measurement, preset) for preset in (options.preset, options.coarse)))
     if not measurement.frames:
         raise MeasurementError("has no video frames from 0 on: there is nothing to compare with", file=options.set)
     run = RunFolder.prepare(

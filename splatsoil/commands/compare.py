@@ -38,7 +38,7 @@ class Config:
     """Simulations with other seeds, to know what chance does."""
     quick: bool = False
     """Only pictures and losses: one simulation, and nothing said about where the model is wrong."""
-    replay: bool = True
+    no_replay: bool = False
     """Leave out the control: a made-up bed of the same soil, photographed and taken through the whole chain, that
     tells what pictures and reconstruction get wrong by themselves. Without it the floor is too low."""
     device: str = "auto"
@@ -59,7 +59,7 @@ def run(config: Config) -> int:
     folder = RunFolder.open(config.run)
     folder.fit()
     folder.check_writable()
-    with nullcontext() if config.quick else Crew(folder, config.device, (), control=config.replay) as crew:
+    with nullcontext() if config.quick else Crew(folder, config.device, (), control=not config.no_replay) as crew:
         result, misfit = _compared(config, folder, crew)
     if config.json:
         extra = {} if misfit is None else {"misfit": {k: misfit[k] for k in TOLD}}
@@ -91,7 +91,7 @@ def _compared(config: Config, folder: RunFolder, crew: Crew | None) -> tuple[dic
         if crew is None:
             return result, None
         floor = begin("floor")
-        return result, criticism.misfit(folder, model, options, floor, with_replay=config.replay, crew=crew)
+        return result, criticism.misfit(folder, model, options, floor, with_replay=not config.no_replay, crew=crew)
 
 
 def interrupted(config: Config) -> str:
@@ -102,7 +102,7 @@ def interrupted(config: Config) -> str:
         (
             ("--repeats", config.repeats, 4),
             ("--quick", config.quick, False),
-            ("--no-replay", not config.replay, False),
+            ("--no-replay", config.no_replay, False),
             ("--device", config.device, "auto"),
             ("--json", config.json, False),
         ),

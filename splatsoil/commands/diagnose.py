@@ -36,7 +36,7 @@ class Config:
     those that would explain most by themselves are tried there, too."""
     refit_steps: int = 5
     """First simulations of a refit at most; some ten to twenty more follow for what explains most."""
-    replay: bool = True
+    no_replay: bool = False
     """Leave out the control: a made-up bed of the same soil, photographed and taken through the whole chain, that
     tells what pictures and reconstruction get wrong by themselves. Without it, their errors can pass for soil."""
     device: str = "auto"
@@ -58,7 +58,7 @@ def run(config: Config) -> int:
     on = criticism.need_fit(folder)["setup"]["effects"]
     criticism.off_effects(config.effects, find_effects(on))
     folder.check_writable()
-    with Crew(folder, config.device, config.effects, control=config.replay) as crew:
+    with Crew(folder, config.device, config.effects, control=not config.no_replay) as crew:
         result = _diagnosed(config, folder, crew)
     if config.json:
         print_json({"ok": True, "run": str(folder.path), **_finite(result)})
@@ -83,7 +83,9 @@ def _diagnosed(config: Config, folder: RunFolder, crew: Crew) -> dict[str, Any]:
     stage.note_other_sources(folder)
     with stages(quiet=config.json) as begin:
         model = criticism.model_of(folder, device, begin("reconstruct"))
-        return criticism.diagnosed(folder, model, options, begin, config.effects, with_replay=config.replay, crew=crew)
+        return criticism.diagnosed(
+            folder, model, options, begin, config.effects, with_replay=not config.no_replay, crew=crew
+        )
 
 
 def interrupted(config: Config) -> str:
@@ -96,7 +98,7 @@ def interrupted(config: Config) -> str:
             ("--repeats", config.repeats, 4),
             ("--refits", config.refits, 3),
             ("--refit-steps", config.refit_steps, 5),
-            ("--no-replay", not config.replay, False),
+            ("--no-replay", config.no_replay, False),
             ("--device", config.device, "auto"),
             ("--json", config.json, False),
         ),

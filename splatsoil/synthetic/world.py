@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -212,8 +211,12 @@ def check_place(target: Path) -> None:
     parent = target.absolute().parent
     while not parent.exists():
         parent = parent.parent
-    if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
-        raise ParameterError(f"{target}: {parent} is no folder you may write to; choose another place")
+    # By trying: permissions tell nothing to root, nor of folders that no one may write to.
+    try:
+        with tempfile.TemporaryDirectory(dir=parent):
+            pass
+    except OSError:
+        raise ParameterError(f"{target}: {parent} is no folder you may write to; choose another place") from None
 
 
 def check_device(device: str) -> str:

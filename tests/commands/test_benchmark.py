@@ -28,3 +28,20 @@ def test_options_behind_the_name_are_the_benchmarks_own(name: str, capsys: pytes
 def test_an_unknown_name_is_told_the_known_ones(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["benchmark", "nix"]) == 2
     assert "bo-vs-mcmc" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ("numerics examples/plow-dry --seeds 0", "--seeds: 0: give 1 or more"),
+        ("hidden-effects --count -2", "--count: -2: give 1 or more"),
+        ("hidden-worlds --count few", "--count: few: give 1 or more"),
+        ("validate --device cuda:99", "there is no device 'cuda:99' here"),
+        ("rasteriser --device gpu", "there is no device 'gpu' here"),
+    ],
+)
+def test_options_that_make_no_sense_are_refused_before_the_work(
+    words: str, says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["benchmark", *words.split()]) == 2
+    assert says in capsys.readouterr().err

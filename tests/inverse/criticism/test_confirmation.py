@@ -88,7 +88,7 @@ def test_seeds_that_one_refit_lacks_are_left_out_of_both() -> None:
 
 
 def test_the_error_on_hidden_times_is_that_of_a_simulation_whichever_its_seed() -> None:
-    """Without luck: as the experiment's own simulations by all seeds at hand leave, and no less where one is lost."""
+    """Without luck: as the experiment's own simulations by all seeds at hand leave, or by those that weren't lost."""
     for lost in ((), (0, 3)):
         found, experiment, _ = confirmed(1, lost)
         fit, seeds = found["effect 2"].fit, [s for s in range(4) if s not in lost]

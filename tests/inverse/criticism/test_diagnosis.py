@@ -321,6 +321,22 @@ def test_what_other_pictures_rule_out_is_not_named_however_well_it_explains_soil
     assert diagnose(experiment, {"angle": fitted(experiment)}, calibration=surely_on).members == ("effect 8",)
 
 
+def test_an_effect_is_absent_only_where_another_solver_would_deny_it_as_well() -> None:
+    made = emulated(WORLD)
+    coarse = tuple(
+        replace(c, parameters=tuple(replace(p, meaningful=10.0 * p.meaningful) for p in c.parameters))
+        for c in made.candidates
+    )
+    experiment = replace(made, candidates=coarse, observed=made.measured({"angle": 0.0}, [WORLD, 99]))
+    fit = {"angle": fitted(experiment)}
+    found = diagnose(experiment, fit, options=OPTIONS)
+    absent = [c for c in experiment.candidates if found.effects[c.name] == "absent"]
+    assert absent
+    apart = {absent[0].size: 0.7 * absent[0].measure.meaningful}
+    again = diagnose(replace(experiment, apart=apart), fit, options=OPTIONS)
+    assert again.effects == {**found.effects, absent[0].name: "cannot tell"}
+
+
 def test_verdicts_on_an_effect(sizes: dict[str, float]) -> None:
     found = one(WORLD, {"angle": 0.0}, None, OPTIONS)
     candidate = emulated(WORLD).candidates[1]
