@@ -60,7 +60,7 @@ def diagnosis(
         invert(folder, run, preset, device)
     began = time.perf_counter()
     with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
-        diagnose.run(diagnose.Config(run=run, effects=chosen, device=device, replay=replay))
+        diagnose.run(diagnose.Config(run=run, effects=chosen, device=device, no_replay=not replay))
     synchronise(device)
     seconds = Sample((time.perf_counter() - began,))
     row = Row(
