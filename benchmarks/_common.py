@@ -42,9 +42,10 @@ def at_least(least: int) -> Callable[[str], int]:
     """Whole numbers from one on, for an argument parser."""
 
     def number(text: str) -> int:
-        if not text.strip().lstrip("+-").isdigit() or int(text) < least:
+        value = int(text)
+        if value < least:
             raise argparse.ArgumentTypeError(f"{text}: give {least} or more")
-        return int(text)
+        return value
 
     return number
 

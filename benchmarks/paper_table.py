@@ -36,6 +36,7 @@ from typing import Any
 
 import numpy as np
 from splatsoil.benchmarks._common import (
+    here,
     keep_to_one_protocol,
     output_options,
     sources,
@@ -222,7 +223,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--executor", default="serial", help="where worlds are made and searched: serial, processes:N or dask:ADDRESS"
     )
-    parser.add_argument("--device", nargs="+", default=[usual.device], help="or several, which jobs take in turn")
+    parser.add_argument("--device", nargs="+", type=here, default=[usual.device], help="or several, taken in turn")
     output_options(parser)
     options = parser.parse_args(arguments)
     hush()

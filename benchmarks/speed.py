@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from splatsoil.benchmarks._common import at_least, here
 from splatsoil.benchmarks._speed import (
     against_newton,
     against_taichi,
@@ -26,7 +27,6 @@ from splatsoil.benchmarks._speed import (
 )
 from splatsoil.benchmarks._speed.rows import Group, missing, text
 from splatsoil.benchmarks._speed.scenes import paper_scene, plough
-from splatsoil.envs.devices import resolve_device
 
 from splatsoil.commands._output import only_json, print_json
 from splatsoil.errors import RunError, SplatsoilError
@@ -100,22 +100,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--set", type=Path, default=Path("examples/plow-dry"), help="measurement set with true particles"
     )
-    parser.add_argument("--device", default="cpu", help="cpu or cuda:0; they have parts of their own")
+    parser.add_argument("--device", type=here, default="cpu", help="cpu or cuda:0; they have parts of their own")
     parser.add_argument("--only", nargs="+", metavar="PART", help="parts to measure; all of the device by default")
     parser.add_argument("--preset", default="small", choices=sorted(PRESETS), help="of solver and reconstruction")
-    parser.add_argument("--repeats", type=int, default=3, help="of what takes seconds")
+    parser.add_argument("--repeats", type=at_least(1), default=3, help="of what takes seconds")
     parser.add_argument("--out", type=Path, default=Path("runs/speed"), help="results, one file a part")
     parser.add_argument("--page", type=Path, help="write the device's section of this page (.md)")
     parser.add_argument("--render", action="store_true", help="measure nothing: write the page from --out")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of tables")
     options = parser.parse_args(arguments)
     hush()
-    if options.repeats < 1:
-        parser.error(f"--repeats must be 1 or more, not {options.repeats}")
     try:
-        device = resolve_device(options.device)
         with tempfile.TemporaryDirectory() as work, only_json() if options.json else nullcontext():
-            task = Task(options.set, options.preset, device, options.repeats, Path(work))
+            task = Task(options.set, options.preset, options.device, options.repeats, Path(work))
             return _run(parser, options, task)
     except SplatsoilError as error:
         parser.error(" ".join(str(error).split()))

@@ -54,7 +54,7 @@ def write_bytes(path: str | Path, data: bytes) -> Path:
 
 
 def check_folder(path: str | Path) -> None:
-    """See that results can go into a folder, which need not exist yet, before hours are spent on them; writes nothing.
+    """See that results can go into a folder, which need not exist yet, before hours are spent on them; leaves nothing.
 
     Raises:
         RunError: a file is in the way, or the folder can't be written to.
@@ -63,8 +63,12 @@ def check_folder(path: str | Path) -> None:
     there = next(place for place in (folder, *folder.parents) if place.exists())
     if not there.is_dir():
         raise RunError(f"{path}: {there} is a file and no folder; choose another folder for the result")
-    if not os.access(there, os.W_OK | os.X_OK):
-        raise RunError(f"{path}: cannot be written (Permission denied); choose a folder you may write to")
+    # By trying: permissions tell nothing to root, nor of folders that no one may write to.
+    try:
+        with tempfile.TemporaryDirectory(dir=there):
+            pass
+    except OSError as error:
+        raise RunError(f"{path}: cannot be written ({error.strerror}); choose a folder you may write to") from None
 
 
 def write_text(path: str | Path, text: str) -> Path:

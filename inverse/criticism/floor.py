@@ -24,7 +24,8 @@ FloatArray = npt.NDArray[np.float64]
 
 NUMERICS_PRIOR = 0.5
 """Standard deviation of a numerical difference pattern's amplitude, in units of the change that was tried: thirteen of
-another solver's soils hold 0.2 (contact) to 0.6 of them (steps), root mean square."""
+another solver's soils hold 0.2 (contact) to 0.6 of them (steps), root mean square. In the noise that stands for
+numerics which weren't tried these patterns count in full."""
 ACTING = ("chance", "guesses", "numerics")
 """Parts of soil's making, which lie where effects act more than a separable noise says."""
 FEWEST_QUIET, FEWEST_SQUARES = 30, 12

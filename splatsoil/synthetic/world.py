@@ -17,6 +17,7 @@ import warp as wp
 
 from splatsoil import __version__
 from splatsoil.errors import ParameterError
+from splatsoil.files import check_folder
 from splatsoil.measurement import Measurement, write_measurement
 from splatsoil.mpm import Preset, Resolution, Trajectory, frames_around, simulate
 from splatsoil.mpm.simulate import base_settings
@@ -205,18 +206,10 @@ def photograph_run(
 
 
 def check_place(target: Path) -> None:
-    """Raise ParameterError unless a new folder can be made at ``target``."""
+    """Raise ParameterError where something stands at ``target``, RunError unless a new folder can be made there."""
     if (target.is_dir() and any(target.iterdir())) or (target.exists() and not target.is_dir()):
         raise ParameterError(f"{target}: already there and not an empty folder; nothing is overwritten")
-    parent = target.absolute().parent
-    while not parent.exists():
-        parent = parent.parent
-    # By trying: permissions tell nothing to root, nor of folders that no one may write to.
-    try:
-        with tempfile.TemporaryDirectory(dir=parent):
-            pass
-    except OSError:
-        raise ParameterError(f"{target}: {parent} is no folder you may write to; choose another place") from None
+    check_folder(target)
 
 
 def check_device(device: str) -> str:

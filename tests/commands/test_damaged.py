@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -89,8 +91,13 @@ def test_what_cannot_be_written_to_is_met_before_any_work(
     with run.lock():
         assert cli.main(words(command, run)) == 2
     assert "another process is writing into this run folder" in capsys.readouterr().err
+
+    def refused(suffix: str | None = None, prefix: str | None = None, dir: Path | None = None) -> str:
+        assert dir == run.path
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
     # root may write anywhere
-    monkeypatch.setattr(os, "access", lambda place, mode: Path(place) != run.path)
+    monkeypatch.setattr(tempfile, "mkdtemp", refused)
     assert cli.main(words(command, run)) == 2
     assert "cannot be written (Permission denied)" in capsys.readouterr().err
 

@@ -22,7 +22,11 @@ def test_soil_without_an_effect_is_read_almost_as_well_as_is_said() -> None:
     give them by themselves, and what is unforeseen as `scipy` finds it where the likelihood is largest."""
     off = np.array([-0.3, -0.8, 0.4, 0.3, 1.1, 1.7, -1.2, 2.3, 1.1, -0.2, -1.3, 0.7, 0.0])
     told = np.array([0.9, 0.9, 0.9, 0.7, 1.0, 0.6, 1.1, 1.5, 0.8, 0.6, 0.7, 1.1, 0.6])
-    found = minimize_scalar(lambda t: -norm.logpdf(off, scale=np.hypot(told, t)).sum(), bounds=(0.0, 5.0))
+
+    def surprise(unforeseen: float) -> float:
+        return -float(norm.logpdf(off, scale=np.hypot(told, unforeseen)).sum())
+
+    found = minimize_scalar(surprise, bounds=(0.0, 5.0), method="bounded")
     assert apart("friction_angle", 35.0) == pytest.approx(found.x, abs=0.1)
     assert apart("friction_angle", 35.0, "exposure") == apart("friction_angle", 35.0)
 
