@@ -9,6 +9,7 @@ import numpy as np
 
 from splatsoil.errors import ParameterError, SimulationError
 from splatsoil.measurement import Measurement
+from splatsoil.soil.settings import Settings
 
 COURANT_LIMIT = 0.8
 """Of the substeps: a full cell becomes unstable at 1."""
@@ -28,8 +29,7 @@ class Preset:
         courant: sound-wave Courant number of a substep.
         transport: most cells the tool may travel in one step of the particles.
         way: of the tool, in cells, over which hourglass modes are damped once, see :attr:`Resolution.relaxation`.
-        give: of the tool's way, how much soil gives way where the pressure is the weight of soil as high as that edge
-            is long; see :attr:`Resolution.give`.
+        give: of the tool's way, how much soil gives way to it under its usual pressure; see :meth:`Resolution.ease`.
     """
 
     name: str
@@ -40,7 +40,7 @@ class Preset:
     courant: float = 0.5
     transport: float = 0.1
     way: float = 0.1
-    give: float = 0.049
+    give: float = 0.0414
 
 
 PRESETS: dict[str, Preset] = {
@@ -70,10 +70,11 @@ class Resolution:
         relaxation: exchanges between particles and grid a second of which hourglass modes and the tool's contact shall
             know, whatever the number of ``steps``: the former are damped as that many plain APIC exchanges would, soil
             sunk into the tool comes out at twice the rate. 0 for as many as there are.
-        give: of the tool's way towards the soil, how much soil gives way to it for each metre of soil whose weight
-            makes the pressure, in 1/m: so dry soil is the same under any gravity, as it should be (Froude). A tool that
-            stands is borne for good. Real soil doesn't give way. Other solvers' soil does where iterations end early,
-            and is lost to the heap: see docs/numerics.md.
+        give: of the tool's way towards the soil, how much soil gives way to it where the contact's pressure is the
+            soil's usual one, see :meth:`ease`. A tool that stands is borne for good. Real soil doesn't give way. Other
+            solvers' soil does where iterations end early, and is lost to the heap: see docs/numerics.md.
+        depth: where the weight of soil makes its usual pressure, in m: half the tool's second longest edge. Soil that
+            gives way needs it.
         skin: of the spacing, how far from the faces of a plate thinner than a cell particles stop, because they stand
             for soil half a spacing around them. Its edges need none: contact acts through the grid, which widens them.
             Thick bodies have none, because nothing was measured on them.
@@ -89,6 +90,7 @@ class Resolution:
     density: float
     relaxation: float = 0.0
     give: float = 0.0
+    depth: float = 0.0
     skin: float = 0.5
 
     def __post_init__(self) -> None:
@@ -96,10 +98,12 @@ class Resolution:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
                 raise SimulationError(f"resolution: {name} = {value} must be a positive number")
-        for name in ("relaxation", "give"):
+        for name in ("relaxation", "give", "depth"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):
                 raise SimulationError(f"resolution: {name} = {value} must be 0 or a positive number")
+        if self.give > 0.0 and self.depth == 0.0:
+            raise SimulationError("resolution: soil that gives way needs the depth of its usual pressure")
         if not 0.0 <= self.skin <= 1.0:
             raise SimulationError(f"resolution: skin = {self.skin} must be between 0 and 1")
         if self.courant > COURANT_LIMIT:
@@ -115,6 +119,18 @@ class Resolution:
     def substeps(self, steps: int) -> int:
         """Substeps in each of ``steps`` steps of a frame that keep the Courant limit."""
         return max(1, math.ceil(self.frame_time / steps * self.wave_speed / (self.courant * self.cell) - 1e-9))
+
+    def ease(self, settings: Settings) -> float:
+        """Of the tool's way, how much this soil gives way for each Pa of the contact's pressure, in 1/Pa.
+
+        In proportion to the pressure over a usual one, so that what a soil gives hangs on no unit: dry soil is the same
+        under any gravity (Froude), and soil with cohesion c is as dry soil in which all pressures are larger by
+        c cot(friction angle) (Caquot's theorem of corresponding states; Caquot & Kérisel 1949). 0 where there is
+        neither weight nor cohesion.
+        """
+        weight = self.density * float(np.linalg.norm(settings.gravity)) * self.depth
+        usual = weight + settings.cohesion / math.tan(math.radians(settings.friction_angle))
+        return self.give / usual if usual > 0.0 else 0.0
 
     @classmethod
     def derive(cls, measurement: Measurement, preset: Preset | str = "small") -> Resolution:
@@ -144,5 +160,6 @@ class Resolution:
             shear=preset.young / (2.0 * (1.0 + preset.poisson)),
             density=measurement.bed.density,
             relaxation=fastest / (preset.way * cell),
-            give=preset.give / float(extents[1]),
+            give=preset.give,
+            depth=0.5 * float(extents[1]),
         )

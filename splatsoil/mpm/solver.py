@@ -114,6 +114,8 @@ class Solver:
         self.grid = self.shape.to_warp()
         self.ceiling = float(high[2] + 2.0 * resolution.cell)
         self._table = wp.array(table.astype(np.float32), dtype=float, device=device)
+        ease = [resolution.ease(law.settings(base, v)) for v in self.values]
+        self._ease = wp.array(np.array(ease, dtype=np.float32), dtype=float, device=device)
         self._stress_kernel = make_stress_kernel(law.update, law.history)
         self._allocate(x)
         spring = resolution.bulk * resolution.spacing
@@ -342,7 +344,7 @@ class Solver:
                 self._near_count,
                 self.resolution.spacing**2,
                 DEEPEST * self.resolution.spacing,
-                self.resolution.give / self.resolution.density,
+                self._ease,
                 dt,
                 share,
                 self._table,

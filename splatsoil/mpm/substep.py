@@ -101,7 +101,7 @@ def contact_forces(
     count: wp.array(dtype=int),
     area: float,
     deepest: float,
-    give: float,
+    ease: wp.array(dtype=float),
     dt: float,
     share: float,
     values: wp.array2d(dtype=float),
@@ -111,7 +111,7 @@ def contact_forces(
 
     ``area`` (m^2) is what one particle covers of the tool; a spring is loaded no further than ``deepest`` (m), so that
     soil in which a tool starts is not shot out of it, and loses its load as soil gives way to a tool that comes on, by
-    ``give`` (m/s^2/Pa) of the way times the pressure over gravity; without gravity it doesn't give way.
+    ``ease`` (simulations, 1/Pa) of the way times the pressure.
 
     A particle keeps the side of the tool it is on, so a plate thinner than a cell holds soil on both its faces, and
     what the soil feels is exactly what the tool feels.
@@ -146,9 +146,7 @@ def contact_forces(
         if depth > 0.0 or (adhesion > 0.0 and gap < ADHESION_REACH * wp.sqrt(area)):
             spring = tool.stiffness * wp.clamp(depth, 0.0, deepest)
             way = dt * wp.max(wp.dot(coming, normal), 0.0)
-            gravity = wp.length(wp.vec3(values[row, GRAVITY], values[row, GRAVITY + 1], values[row, GRAVITY + 2]))
-            yielding = wp.where(gravity > 0.0, give / wp.max(gravity, 1.0e-9), 0.0)
-            particles.preload[p] = preload - way * yielding * spring / area
+            particles.preload[p] = preload - way * ease[row] * spring / area
             push = wp.where(depth > 0.0, wp.max(spring - tool.damping * closing, 0.0), 0.0)
             slip -= closing * normal
             speed = wp.length(slip)

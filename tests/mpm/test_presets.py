@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 from splatsoil.benchmarks.numerics import Truth
 
+from splatsoil.errors import SimulationError
 from splatsoil.measurement import Measurement
 from splatsoil.mpm import PRESETS, Resolution, Trajectory, simulate
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
+from splatsoil.soil.settings import Settings
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -34,14 +36,30 @@ def test_a_faster_tool_loses_as_much_soil_on_its_way(name: str, plow_dry: Path) 
 
 
 def test_a_larger_tool_moves_as_much_larger_soil(plow_dry: Path) -> None:
-    """Similar soil before a similar tool gives way by the same share of its way: of half as much for each pascal before
-    one of twice the size; 2.6e-5 for each before the examples' blade."""
+    """Similar soil before a similar tool gives way by the same share of its way: dry of half as much for each pascal
+    before one of twice the size, and with a cohesion that follows its weight likewise."""
     small = Measurement.load(plow_dry)
     mesh = small.tool.mesh.copy()
     mesh.apply_scale(2.0)
     large = replace(small, tool=replace(small.tool, mesh=mesh))
-    a_pascal = [Resolution.derive(m, "small").give / (1600.0 * 9.81) for m in (small, large)]
-    assert a_pascal == pytest.approx([2.6e-5, 1.3e-5], rel=0.01)
+    one, two = (Resolution.derive(m, "small") for m in (small, large))
+    for cohesion in (0.0, 300.0):
+        soil = Settings(friction_angle=36.0, cohesion=cohesion)
+        assert two.ease(replace(soil, cohesion=2.0 * cohesion)) == pytest.approx(0.5 * one.ease(soil))
+
+
+def test_soil_with_cohesion_gives_way_as_heavier_soil_does(plow_dry: Path) -> None:
+    """By corresponding states: 600 Pa at 45 degrees are pressures larger by 600 Pa everywhere, whatever carries them.
+    Nothing to compare with is no giving way."""
+    resolution = Resolution.derive(Measurement.load(plow_dry), "small")
+    soil = Settings(friction_angle=45.0)
+    heavier = (1600.0 * 9.81 * 0.06 + 600.0) / (1600.0 * 0.06)
+    cohesive, heavy = replace(soil, cohesion=600.0), replace(soil, gravity=(0.0, 0.0, -heavier))
+    assert resolution.ease(cohesive) == pytest.approx(resolution.ease(heavy))
+    assert resolution.ease(cohesive) < resolution.ease(soil)
+    assert resolution.ease(replace(soil, gravity=(0.0, 0.0, 0.0))) == 0.0
+    with pytest.raises(SimulationError, match="depth"):
+        replace(resolution, depth=0.0)
 
 
 def test_dry_soil_is_the_same_under_any_gravity(plow_dry: Path) -> None:
