@@ -51,12 +51,10 @@ def run(config: Config) -> int:
     from splatsoil.commands._crew import Crew
     from splatsoil.commands._diagnosis_table import show
     from splatsoil.inverse.run_folder import RunFolder
-    from splatsoil.soil.library import find_effects
 
     criticism.check_budget(config.repeats, config.refits, config.refit_steps)
     folder = RunFolder.open(config.run)
-    on = criticism.need_fit(folder)["setup"]["effects"]
-    criticism.off_effects(config.effects, find_effects(on))
+    criticism.need_fit(folder)
     folder.check_writable()
     with Crew(folder, config.device, config.effects, control=not config.no_replay) as crew:
         result = _diagnosed(config, folder, crew)
@@ -74,8 +72,13 @@ def _diagnosed(config: Config, folder: RunFolder, crew: Crew) -> dict[str, Any]:
     from splatsoil.commands import _stages as stage
     from splatsoil.commands._progress import stages
     from splatsoil.envs.devices import resolve_device
-    from splatsoil.inverse.criticism.diagnosis import Options
     from splatsoil.quiet import hush
+    from splatsoil.soil.library import find_effects
+
+    # a name that is wrong is refused before the rest is loaded
+    criticism.off_effects(config.effects, find_effects(folder.fit()["setup"]["effects"]))
+
+    from splatsoil.inverse.criticism.diagnosis import Options
 
     hush()
     options = Options(repeats=config.repeats, refits=config.refits, refit_steps=config.refit_steps)

@@ -203,7 +203,10 @@ def refined(
             covered = drawn.alpha.detach().clamp_min(1e-3)[..., None]
             residual = (target - image[..., :3].detach() / covered) * mask[..., None]
             pull = torch.cat([residual, mask[..., None]], dim=2)
-            (gradient,) = torch.autograd.grad(image, features, pull)
+            # of a number: for the gradient of a picture torch would load half a thousand modules
+            with torch.enable_grad():
+                pulled = (image * pull).sum()
+            (gradient,) = torch.autograd.grad(pulled, features)
             push += gradient[:, :3]
             weight += gradient[:, 3:]
         current = (current + push / (weight + 0.5)).clamp(0.0, ceiling)
