@@ -24,6 +24,7 @@ from .naming import members_of
 from .outside import StrengthReading, read_strength
 from .own_floor import as_it_is, on_its_own_floor
 from .score import Score, Scorer
+from .sides import lopsided
 from .sight import Sight
 from .simulations import Simulations
 from .strokes import StrokeAdvice, advise
@@ -177,8 +178,14 @@ def judge(
     floor, scorer, seen = bench.floor, bench.scorer, experiment.seen
     residual = (experiment.observed - evidence.mean)[seen]
     misfit, (whole, parts) = bench.misfit(residual), bench.blocks(residual)
-    scores = {} if scorer is None else scorer.score(residual)
+    sides = lopsided(experiment, evidence, floor)
+
+    def scored(given: str | None = None) -> dict[str, Score]:
+        found = {} if scorer is None else scorer.score(residual, given=given)
+        return {n: s.on_the_weaker_side(sides.get(n, 1.0), candidates[n].measure.meaningful) for n, s in found.items()}
+
     candidates = {c.name: c for c in bench.candidates}
+    scores = scored()
     notes = [f"{name} could not be simulated: {why}" for name, why in evidence.failed.items()]
     chosen = _chosen(experiment, looks, scores, residual, options)
     confirmations: dict[str, Confirmation] = {}
@@ -198,7 +205,7 @@ def judge(
         before = confirmations[""].remainder
         if members:
             best = members[0]
-            given = scorer.score(residual, given=best)
+            given = scored(best)
             own = None
             if experiment.chance:
                 told("the floor with the effect on", 0.97)

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -51,11 +51,13 @@ class Score:
         adjusted: chance that any effect of the library reaches so small a p.
         estimate: of the size, as its distance from off, in the parameter's unit.
         std: of that.
-        detectable: smallest size that is found with 80 % power at the level used.
+        detectable: smallest size that is found with 80 % power at the level used; on the side that shows less, where
+            sides differ.
         survival: share of the effect's information that parameters and nuisances leave.
         reliability: share of that which isn't chance in the derivatives.
         steps: estimates of all its parameters, as distances from off.
         dispersion: by which the remainder along the other effects exceeds noise; z, p and std allow for it.
+        lopsided: how many times as far the size is known, by ``std``, as on the side that shows less.
     """
 
     name: str
@@ -70,6 +72,12 @@ class Score:
     steps: Mapping[str, float]
     dispersion: float = 1.0
     reliability: float = 1.0
+    lopsided: float = 1.0
+
+    def on_the_weaker_side(self, lopsided: float, meaningful: float) -> Score:
+        """The same, what is detectable told of the side that shows less."""
+        detectable = meaningful + lopsided * (self.detectable - meaningful)
+        return replace(self, detectable=detectable, lopsided=lopsided)
 
 
 @dataclass(frozen=True)

@@ -44,14 +44,14 @@ def of_effect(candidate: Candidate, score: Score, *, level: float = LEVEL, apart
     """Verdict on one effect that is off.
 
     Absent or trivial, unseen or seen, is one whose estimate denies that it matters (Schuirmann 1987, J. Pharmacokinet.
-    Biopharm. 15:657), also where another solver is right (``apart``: standard deviation between solvers of the size
-    from which it would). What has a shape of its own was looked for in one shape, and isn't denied: an obstacle may lie
-    elsewhere.
+    Biopharm. 15:657), also on the side that shows less, and where another solver is right (``apart``: standard
+    deviation between solvers of the size from which it would). What has a shape of its own was looked for in one shape,
+    and isn't denied: an obstacle may lie elsewhere.
     """
     meaningful = candidate.measure.meaningful
     if score.adjusted < level:
         return "missing" if abs(score.estimate) >= meaningful else "trivial"
-    unsure = DENIES * math.hypot(score.std, apart)
+    unsure = DENIES * math.hypot(score.lopsided * score.std, apart)
     denied = abs(score.estimate) + unsure <= meaningful and score.survival >= LEAST_SURVIVAL
     if denied and not candidate.shapes:
         return "trivial" if abs(score.z) > SEEN else "absent"

@@ -1,0 +1,53 @@
+"""Effects that show less on one side, against features whose two sides are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from splatsoil.benchmarks.hidden_effects import emulated
+from splatsoil.inverse.criticism.bench import Bench
+from splatsoil.inverse.criticism.derivatives import step_of
+from splatsoil.inverse.criticism.diagnosis import Options, diagnose
+from splatsoil.inverse.criticism.evidence import STRIDE, gather, switched_on
+from splatsoil.inverse.criticism.sides import lopsided
+from splatsoil.inverse.criticism.simulations import Simulations
+
+from splatsoil.experiment.emulated import EmulatedExperiment
+
+BOTH, ONE = "effect 1", "effect 2"
+"""Effects without a sign, and with one."""
+
+
+def bent(world: int, less: float) -> EmulatedExperiment:
+    """A world in which the first effect shows ``less`` times its mean on one side, and as much more on the other."""
+    made = emulated(world)
+    step = abs(step_of(made.candidates[0].measure, STRIDE))
+    curve = 2.0 * (less - 1.0) / step * made.slopes[BOTH]
+    return replace(made, curves={**made.curves, BOTH: curve}, observed=made.measured({"angle": 0.0}, [world, 5]))
+
+
+@pytest.mark.parametrize("less", [1.0, 0.5, 0.25])
+def test_a_side_that_shows_less_is_measured(less: float) -> None:
+    """A derivative to one side that is so many times the mean of both knows a size so many times less well; chance in
+    it isn't taken for something that is seen."""
+    found = []
+    for world in range(6):
+        experiment = bent(world, less)
+        simulate = Simulations(experiment)
+        evidence = switched_on(experiment, simulate, gather(experiment, simulate, {"angle": 0.0}))
+        told = lopsided(experiment, evidence, Bench.of(experiment, evidence).floor)
+        assert ONE not in told
+        found.append(told[BOTH])
+    assert np.median(found) == pytest.approx(1.0 / less, rel=0.15)
+
+
+def test_what_is_detectable_is_told_of_the_weaker_side() -> None:
+    """Of features of four times as little on one side four times as much is needed there, beyond what is trivial."""
+    even, odd = (diagnose(bent(3, less), {"angle": 0.0}, options=Options(refits=0)) for less in (1.0, 0.25))
+    trivial = 0.25
+    ratio = (odd.scores[BOTH].detectable - trivial) / (even.scores[BOTH].detectable - trivial)
+    assert ratio == pytest.approx(4.0, rel=0.25)
+    assert odd.scores[ONE].detectable == pytest.approx(even.scores[ONE].detectable, rel=0.1)
+    assert odd.scores[BOTH].std == pytest.approx(even.scores[BOTH].std, rel=0.1)
