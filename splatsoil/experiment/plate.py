@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -56,7 +57,7 @@ class PlateExperiment:
 
     chance = True
     sensor_memory = 0.8
-    numerics = tuple(NUMERICS)
+    numerics = tuple(name for name in NUMERICS if name != "contact")
     redrawn: tuple[str, ...] = ()
     guesses: tuple[str, ...] = ()
 
@@ -100,7 +101,8 @@ class PlateExperiment:
         self.systematic = np.zeros((0, *self.layout.shape))
         self.sensor = np.broadcast_to(np.asarray(spread, dtype=np.float64).reshape(-1), depth.shape)[:, None].copy()
         self.experiment = _set_up(diameter, float(depth[-1]), density, friction)
-        self.resolution = Resolution.derive(self.experiment, preset)
+        # real soil doesn't give way to a plate, which bears more than soil that does ever could
+        self.resolution = replace(Resolution.derive(self.experiment, preset), give=0.0)
 
     def reproducibility(self, parameter: Parameter, value: float, effect: str = "") -> float:
         """Not known: plates were pressed into no other solver's soil."""
