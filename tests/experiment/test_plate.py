@@ -21,8 +21,8 @@ def test_force_grows_with_depth_and_with_friction_and_repeats_itself() -> None:
     experiment = plate(np.ones(6))
     weak, strong = (experiment.predict({"friction_angle": angle})[:, 0] for angle in (28.0, 42.0))
     assert weak[-1] > weak[0] > 0.0
-    # a footing's bearing capacity grows ninefold from 28 to 42 degrees (Vesic 1973); soil that gives way bears 1.45 times
-    # as much here, which no depth would change
+    # a footing's bearing capacity grows ninefold from 28 to 42 degrees (Vesic 1973); soil that gives way bears 1.45
+    # times as much here, which no depth would change
     assert strong[-1] > 1.8 * weak[-1]
     assert np.array_equal(strong, experiment.predict({"friction_angle": 42.0})[:, 0])
     assert not np.array_equal(strong, experiment.predict({"friction_angle": 42.0}, seed=1)[:, 0])
