@@ -8,59 +8,56 @@ of it isn't where there is more.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
 
 from splatsoil.experiment.base import Candidate, Experiment
 
-from .dilution import reliable
-from .evidence import Evidence, Visit
+from .evidence import Evidence
 from .floor import Floor
-from .noise import Solver
 
 FloatArray = npt.NDArray[np.float64]
 
-LEAST = 0.01
-"""Share of what is seen of both sides that counts as seen of either: a side of nothing but chance shows no less."""
+LEAST = 0.1
+"""Of what both sides show on the average, what counts as shown by either."""
+CHANCE = 1.5
+"""Variance of half the second difference of three simulations, in that of one: 1/4 + 1/4 + 1."""
 
 
 def lopsided(experiment: Experiment, evidence: Evidence, floor: Floor) -> dict[str, float]:
-    """How many times as far an effect's size is known by both sides together as by the side that shows less, by name:
-    1 where both are alike, and at most ten. Effects that were switched on to one side have none."""
+    """How many times as much an effect shows on both sides' average as on the side that shows less, by name.
+
+    1 where both are alike, or differ by no more than a standard deviation of chance. Where features go by a second
+    difference e from the straight line that both sides make (slope g), one side shows g + e of it and the other g - e,
+    and along g, which is what a score looks along, 1 ± gᵀΣ⁻¹e/(gᵀΣ⁻¹g). Effects that were switched on to one side have
+    none.
+    """
     solver, out = floor.noise.solver.beside(floor.free), dict[str, float]()
+    part = floor.parts.get("chance")
+    chance = None if part is None else part.covariance(experiment.layout, experiment.seen)
+    middles = {v.seed: v.table for v in evidence.visits if not v.effects and v.values == evidence.values}
     for candidate in experiment.candidates:
-        ends = [v for v in evidence.visits if v.effects == (candidate.name,) and _alone(candidate, v)]
-        sizes = sorted({v.values[candidate.size] for v in ends})
-        if len(sizes) != 2:
+        ends = _ends(candidate, evidence)
+        if not ends:
             continue
-        off = float(candidate.measure.off or 0.0)
-        sides = [
-            [_slope(evidence, v, v.values[candidate.size] - off) for v in ends if v.values[candidate.size] == size]
-            for size in sizes
-        ]
-        both = [0.5 * (low + high) for low, high in zip(*sides, strict=True)]
-        whole, *parts = (_information(side, experiment, solver) for side in (both, *sides))
+        sides = [((sides[max(sides)], sides[min(sides)]), middles[seed]) for seed, sides in ends.items()]
+        slope = np.mean([0.5 * (high - low) for (high, low), _ in sides], axis=0)[experiment.seen]
+        bend = np.mean([0.5 * (high + low) - middle for (high, low), middle in sides], axis=0)[experiment.seen]
+        weights = solver.solve(slope)
+        whole = float(slope @ weights)
         if whole > 0.0:
-            out[candidate.name] = math.sqrt(max(1.0, 1.0 / max(min(parts) / whole, LEAST)))
+            doubt = 0.0 if chance is None else math.sqrt(CHANCE / len(sides) * float(weights @ chance @ weights))
+            share = max(abs(float(bend @ weights)) - doubt, 0.0) / whole
+            out[candidate.name] = 1.0 / max(1.0 - share, LEAST)
     return out
 
 
-def _alone(candidate: Candidate, visit: Visit) -> bool:
-    """Whether nothing but the size of an effect is on."""
-    others = (p for p in candidate.parameters if p.name != candidate.size)
-    return all(visit.values.get(p.name, p.off) == p.off for p in others)
-
-
-def _slope(evidence: Evidence, end: Visit, offset: float) -> FloatArray:
-    """(t, s) derivative to one side, by one seed."""
-    middle = next(v for v in evidence.visits if not v.effects and v.seed == end.seed and v.values == evidence.values)
-    return np.asarray((end.table - middle.table) / offset)
-
-
-def _information(seeds: Sequence[FloatArray], experiment: Experiment, solver: Solver) -> float:
-    """Of a derivative (t, s) by one seed or two, without what of it is chance."""
-    mean, doubt = np.mean(seeds, axis=0), 0.5 * (seeds[0] - seeds[-1])
-    size, chance = (np.atleast_1d(np.sum(solver.whiten(table[experiment.seen]) ** 2)) for table in (mean, doubt))
-    return float((reliable(size, chance) * size)[0])
+def _ends(candidate: Candidate, evidence: Evidence) -> dict[int, dict[float, FloatArray]]:
+    """What was simulated with nothing but an effect's size on, by seed and size, where that is on both sides."""
+    others = [p for p in candidate.parameters if p.name != candidate.size]
+    out: dict[int, dict[float, FloatArray]] = {}
+    for v in evidence.visits:
+        if v.effects == (candidate.name,) and all(v.values.get(p.name, p.off) == p.off for p in others):
+            out.setdefault(v.seed, {})[v.values[candidate.size]] = v.table
+    return {seed: sides for seed, sides in out.items() if len(sides) == 2}

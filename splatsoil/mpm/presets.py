@@ -75,6 +75,7 @@ class Resolution:
             solvers' soil does where iterations end early, and is lost to the heap: see docs/numerics.md.
         depth: where the weight of soil makes its usual pressure, in m: half the tool's second longest edge. Soil that
             gives way needs it.
+        rate: usual shear rate of soil before the tool, in 1/s: its largest speed over that depth.
         skin: of the spacing, how far from the faces of a plate thinner than a cell particles stop, because they stand
             for soil half a spacing around them. Its edges need none: contact acts through the grid, which widens them.
             Thick bodies have none, because nothing was measured on them.
@@ -91,6 +92,7 @@ class Resolution:
     relaxation: float = 0.0
     give: float = 0.0
     depth: float = 0.0
+    rate: float = 0.0
     skin: float = 0.5
 
     def __post_init__(self) -> None:
@@ -98,7 +100,7 @@ class Resolution:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
                 raise SimulationError(f"resolution: {name} = {value} must be a positive number")
-        for name in ("relaxation", "give", "depth"):
+        for name in ("relaxation", "give", "depth", "rate"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):
                 raise SimulationError(f"resolution: {name} = {value} must be 0 or a positive number")
@@ -124,12 +126,13 @@ class Resolution:
         """Of the tool's way, how much this soil gives way for each Pa of the contact's pressure, in 1/Pa.
 
         In proportion to the pressure over a usual one, so that what a soil gives hangs on no unit: dry soil is the same
-        under any gravity (Froude), and soil with cohesion c is as dry soil in which all pressures are larger by
-        c cot(friction angle) (Caquot's theorem of corresponding states; Caquot & Kérisel 1949). 0 where there is
-        neither weight nor cohesion.
+        under any gravity (Froude), and soil with a strength c that needs no pressure is as dry soil in which all
+        pressures are larger by c cot(friction angle) (Caquot's theorem of corresponding states; Caquot & Kérisel 1949).
+        That is its cohesion, and its viscosity times the shear rate. 0 where there is neither weight nor such strength.
         """
         weight = self.density * float(np.linalg.norm(settings.gravity)) * self.depth
-        usual = weight + settings.cohesion / math.tan(math.radians(settings.friction_angle))
+        strength = settings.cohesion + settings.viscosity * self.rate
+        usual = weight + strength / math.tan(math.radians(settings.friction_angle))
         return self.give / usual if usual > 0.0 else 0.0
 
     @classmethod
@@ -162,4 +165,5 @@ class Resolution:
             relaxation=fastest / (preset.way * cell),
             give=preset.give,
             depth=0.5 * float(extents[1]),
+            rate=fastest / (0.5 * float(extents[1])),
         )

@@ -36,4 +36,5 @@ class Cohesion(Effect):
     strength = cohesive_strength
 
     def settings(self, settings: Settings, values: Mapping[str, float]) -> Settings:
+        """Add the cohesion."""
         return replace(settings, cohesion=settings.cohesion + values["cohesion"])

@@ -20,27 +20,33 @@ BOTH, ONE = "effect 1", "effect 2"
 """Effects without a sign, and with one."""
 
 
-def bent(world: int, less: float) -> EmulatedExperiment:
+def bent(world: int, less: float, chance: float = 0.1, chaos: float = 0.0) -> EmulatedExperiment:
     """A world in which the first effect shows ``less`` times its mean on one side, and as much more on the other."""
-    made = emulated(world)
+    made = emulated(world, chaos=chaos)
     step = abs(step_of(made.candidates[0].measure, STRIDE))
     curve = 2.0 * (less - 1.0) / step * made.slopes[BOTH]
-    return replace(made, curves={**made.curves, BOTH: curve}, observed=made.measured({"angle": 0.0}, [world, 5]))
+    made = replace(made, curves={**made.curves, BOTH: curve}, chance_root=chance * made.chance_root)
+    return replace(made, observed=made.measured({"angle": 0.0}, [world, 5]))
+
+
+def told(experiment: EmulatedExperiment) -> dict[str, float]:
+    simulate = Simulations(experiment)
+    evidence = switched_on(experiment, simulate, gather(experiment, simulate, {"angle": 0.0}))
+    return lopsided(experiment, evidence, Bench.of(experiment, evidence).floor)
 
 
 @pytest.mark.parametrize("less", [1.0, 0.5, 0.25])
 def test_a_side_that_shows_less_is_measured(less: float) -> None:
-    """A derivative to one side that is so many times the mean of both knows a size so many times less well; chance in
-    it isn't taken for something that is seen."""
-    found = []
-    for world in range(6):
-        experiment = bent(world, less)
-        simulate = Simulations(experiment)
-        evidence = switched_on(experiment, simulate, gather(experiment, simulate, {"angle": 0.0}))
-        told = lopsided(experiment, evidence, Bench.of(experiment, evidence).floor)
-        assert ONE not in told
-        found.append(told[BOTH])
-    assert np.median(found) == pytest.approx(1.0 / less, rel=0.15)
+    found = [told(bent(world, less)) for world in range(6)]
+    assert not any(ONE in of_one for of_one in found)
+    assert np.median([of_one[BOTH] for of_one in found]) == pytest.approx(1.0 / less, rel=0.15)
+
+
+def test_chance_is_not_taken_for_sides_that_differ() -> None:
+    """Where soil is another one whenever it differs at all, second differences are mostly chance."""
+    found = np.array([list(told(bent(world, 1.0, 1.0, chaos=1.0)).values()) for world in range(6)])
+    assert np.median(found) < 1.1
+    assert np.quantile(found, 0.9) < 1.5
 
 
 def test_what_is_detectable_is_told_of_the_weaker_side() -> None:
