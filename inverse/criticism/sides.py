@@ -28,10 +28,9 @@ CHANCE = 1.5
 def lopsided(experiment: Experiment, evidence: Evidence, floor: Floor) -> dict[str, float]:
     """How many times as much an effect shows on both sides' average as on the side that shows less, by name.
 
-    1 where both are alike, or differ by no more than a standard deviation of chance. Where features go by a second
-    difference e from the straight line that both sides make (slope g), one side shows g + e of it and the other g - e,
-    and along g, which is what a score looks along, 1 ± gᵀΣ⁻¹e/(gᵀΣ⁻¹g). Effects that were switched on to one side have
-    none.
+    1 where both are alike, or differ by no more than a standard deviation of chance. Where a step to one side changes
+    features by e + g and one to the other by e - g, a score, which looks along g, sees 1 ± gᵀΣ⁻¹e/(gᵀΣ⁻¹g) of it.
+    Effects that were switched on to one side have none.
     """
     solver, out = floor.noise.solver.beside(floor.free), dict[str, float]()
     part = floor.parts.get("chance")
@@ -41,13 +40,13 @@ def lopsided(experiment: Experiment, evidence: Evidence, floor: Floor) -> dict[s
         ends = _ends(candidate, evidence)
         if not ends:
             continue
-        sides = [((sides[max(sides)], sides[min(sides)]), middles[seed]) for seed, sides in ends.items()]
-        slope = np.mean([0.5 * (high - low) for (high, low), _ in sides], axis=0)[experiment.seen]
-        bend = np.mean([0.5 * (high + low) - middle for (high, low), middle in sides], axis=0)[experiment.seen]
-        weights = solver.solve(slope)
-        whole = float(slope @ weights)
+        found = [(tables[max(tables)], tables[min(tables)], middles[seed]) for seed, tables in ends.items()]
+        line = np.mean([0.5 * (high - low) for high, low, _ in found], axis=0)[experiment.seen]
+        bend = np.mean([0.5 * (high + low) - middle for high, low, middle in found], axis=0)[experiment.seen]
+        weights = solver.solve(line)
+        whole = float(line @ weights)
         if whole > 0.0:
-            doubt = 0.0 if chance is None else math.sqrt(CHANCE / len(sides) * float(weights @ chance @ weights))
+            doubt = 0.0 if chance is None else math.sqrt(CHANCE / len(found) * float(weights @ chance @ weights))
             share = max(abs(float(bend @ weights)) - doubt, 0.0) / whole
             out[candidate.name] = 1.0 / max(1.0 - share, LEAST)
     return out
