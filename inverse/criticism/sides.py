@@ -53,10 +53,11 @@ def lopsided(experiment: Experiment, evidence: Evidence, floor: Floor) -> dict[s
 
 
 def _ends(candidate: Candidate, evidence: Evidence) -> dict[int, dict[float, FloatArray]]:
-    """What was simulated with nothing but an effect's size on, by seed and size, where that is on both sides."""
-    others = [p for p in candidate.parameters if p.name != candidate.size]
+    """What was simulated at the fit with nothing but an effect's size on, by seed and size, where that is on both
+    sides."""
+    rest = {**evidence.values, **{p.name: p.off for p in candidate.parameters if p.name != candidate.size}}
     out: dict[int, dict[float, FloatArray]] = {}
     for v in evidence.visits:
-        if v.effects == (candidate.name,) and all(v.values.get(p.name, p.off) == p.off for p in others):
+        if v.effects == (candidate.name,) and all(v.values.get(name, value) == value for name, value in rest.items()):
             out.setdefault(v.seed, {})[v.values[candidate.size]] = v.table
     return {seed: sides for seed, sides in out.items() if len(sides) == 2}

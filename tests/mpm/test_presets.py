@@ -60,6 +60,10 @@ def test_soil_with_cohesion_gives_way_as_heavier_soil_does(plow_dry: Path) -> No
     # the examples' blade goes its depth of 60 mm in 0.3 s: what shears as fast carries 600 Pa by 180 Pa s
     assert resolution.ease(replace(soil, viscosity=180.0)) == pytest.approx(resolution.ease(heavy))
     assert resolution.ease(replace(soil, gravity=(0.0, 0.0, 0.0))) == 0.0
+    # the effects say so, too
+    for size in ({"cohesion": 600.0}, {"viscosity": 180.0}):
+        told = Law(find_effects(size)).settings(soil, {"friction_angle": 45.0, **size})
+        assert resolution.ease(told) == pytest.approx(resolution.ease(heavy))
     with pytest.raises(SimulationError, match="depth"):
         replace(resolution, depth=0.0)
 

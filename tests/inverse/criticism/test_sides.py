@@ -35,6 +35,17 @@ def told(experiment: EmulatedExperiment) -> dict[str, float]:
     return lopsided(experiment, evidence, Bench.of(experiment, evidence).floor)
 
 
+def test_sides_seen_from_elsewhere_are_none_of_the_fit() -> None:
+    """Where the fit was led astray effects are switched on at the defaults; its own point has no sides then."""
+    experiment = bent(0, 0.5)
+    simulate = Simulations(experiment)
+    evidence = switched_on(experiment, simulate, gather(experiment, simulate, {"angle": 0.0}))
+    moved = tuple(replace(v, values={**v.values, "angle": 1.0}) if v.effects == (BOTH,) else v for v in evidence.visits)
+    floor = Bench.of(experiment, evidence).floor
+    assert BOTH in lopsided(experiment, evidence, floor)
+    assert BOTH not in lopsided(experiment, replace(evidence, visits=moved), floor)
+
+
 @pytest.mark.parametrize("less", [1.0, 0.5, 0.25])
 def test_a_side_that_shows_less_is_measured(less: float) -> None:
     found = [told(bent(world, less)) for world in range(6)]
