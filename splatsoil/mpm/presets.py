@@ -29,7 +29,8 @@ class Preset:
         courant: sound-wave Courant number of a substep.
         transport: most cells the tool may travel in one step of the particles.
         way: of the tool, in cells, over which hourglass modes are damped once, see :attr:`Resolution.relaxation`.
-        give: of the tool's way, how much soil gives way to it under its usual pressure; see :meth:`Resolution.ease`.
+        give: of the tool's way, how much soil gives way to it under its usual pressure, once it was pushed over the
+            usual depth; see :meth:`Resolution.ease`.
     """
 
     name: str
@@ -40,7 +41,7 @@ class Preset:
     courant: float = 0.5
     transport: float = 0.1
     way: float = 0.1
-    give: float = 0.0414
+    give: float = 0.062
 
 
 PRESETS: dict[str, Preset] = {
@@ -71,10 +72,11 @@ class Resolution:
             know, whatever the number of ``steps``: the former are damped as that many plain APIC exchanges would, soil
             sunk into the tool comes out at twice the rate. 0 for as many as there are.
         give: of the tool's way towards the soil, how much soil gives way to it where the contact's pressure is the
-            soil's usual one, see :meth:`ease`. A tool that stands is borne for good. Real soil doesn't give way. Other
-            solvers' soil does where iterations end early, and is lost to the heap: see docs/numerics.md.
-        depth: where the weight of soil makes its usual pressure, in m: half the tool's second longest edge. Soil that
-            gives way needs it.
+            soil's usual one and the tool has pushed it over the usual depth, see :meth:`ease`. A tool that stands is
+            borne for good. Real soil doesn't give way. Other solvers' soil does where iterations end early, and is lost
+            to the heap: see docs/numerics.md.
+        depth: the usual one, where the weight of soil makes its usual pressure, in m: half the tool's second longest
+            edge. Soil that gives way needs it.
         rate: usual shear rate of soil before the tool, in 1/s: its largest speed over that depth.
         skin: of the spacing, how far from the faces of a plate thinner than a cell particles stop, because they stand
             for soil half a spacing around them. Its edges need none: contact acts through the grid, which widens them.
@@ -123,17 +125,22 @@ class Resolution:
         return max(1, math.ceil(self.frame_time / steps * self.wave_speed / (self.courant * self.cell) - 1e-9))
 
     def ease(self, settings: Settings) -> float:
-        """Of the tool's way, how much this soil gives way for each Pa of the contact's pressure, in 1/Pa.
+        """Of the tool's way, how much this soil gives way for each Pa of the contact's pressure and each metre over
+        which it has been pushed since they touched, in 1/(Pa m).
 
         In proportion to the pressure over a usual one, so that what a soil gives hangs on no unit: dry soil is the same
         under any gravity (Froude), and soil with a strength c that needs no pressure is as dry soil in which all
         pressures are larger by c cot(friction angle) (Caquot's theorem of corresponding states; Caquot & Kérisel 1949).
-        That is its cohesion, and its viscosity times the shear rate. 0 where there is neither weight nor such strength.
+        That is its cohesion, and its viscosity times the shear rate. And in proportion to the way over the usual depth:
+        what a tool is lowered into or begins to push gives way less than what it has piled up before it. 0 where there
+        is neither weight nor such strength.
         """
+        if self.give == 0.0:
+            return 0.0
         weight = self.density * float(np.linalg.norm(settings.gravity)) * self.depth
         strength = settings.cohesion + settings.viscosity * self.rate
         usual = weight + strength / math.tan(math.radians(settings.friction_angle))
-        return self.give / usual if usual > 0.0 else 0.0
+        return self.give / (usual * self.depth) if usual > 0.0 else 0.0
 
     @classmethod
     def derive(cls, measurement: Measurement, preset: Preset | str = "small") -> Resolution:

@@ -169,7 +169,8 @@ class Solver:
         p.velocity, p.trilinear, p.normal, p.shear, p.gap_normal, p.drift = (vectors(n) for _ in range(6))
         p.affine, p.bilinear = (wp.zeros(n, dtype=wp.mat33, device=device) for _ in range(2))
         p.deformation = wp.array(np.tile(np.eye(3, dtype=np.float32), (n, 1, 1)), dtype=wp.mat33, device=device)
-        p.elastic, p.opening, p.gap, p.preload, p.cell = floats(n), floats(n), floats(n), floats(n), ints(n)
+        p.elastic, p.opening, p.gap, p.preload, p.pushed = (floats(n) for _ in range(5))
+        p.cell = ints(n)
         kept = n if self.law.history else 0
         p.history, p.depth = wp.zeros(kept, dtype=wp.vec2, device=device), floats(kept)
         p.density = wp.ones(n, dtype=float, device=device)

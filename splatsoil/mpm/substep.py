@@ -111,7 +111,7 @@ def contact_forces(
 
     ``area`` (m^2) is what one particle covers of the tool; a spring is loaded no further than ``deepest`` (m), so that
     soil in which a tool starts is not shot out of it, and loses its load as soil gives way to a tool that comes on, by
-    ``ease`` (simulations, 1/Pa) of the way times the pressure.
+    ``ease`` (simulations, 1/(Pa m)) of the way times the pressure and the way since they touched.
 
     A particle keeps the side of the tool it is on, so a plate thinner than a cell holds soil on both its faces, and
     what the soil feels is exactly what the tool feels.
@@ -146,7 +146,9 @@ def contact_forces(
         if depth > 0.0 or (adhesion > 0.0 and gap < ADHESION_REACH * wp.sqrt(area)):
             spring = tool.stiffness * wp.clamp(depth, 0.0, deepest)
             way = dt * wp.max(wp.dot(coming, normal), 0.0)
-            particles.preload[p] = preload - way * ease[row] * spring / area
+            pushed = particles.pushed[p] + way
+            particles.pushed[p] = pushed
+            particles.preload[p] = preload - way * pushed * ease[row] * spring / area
             push = wp.where(depth > 0.0, wp.max(spring - tool.damping * closing, 0.0), 0.0)
             slip -= closing * normal
             speed = wp.length(slip)

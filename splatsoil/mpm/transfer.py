@@ -282,6 +282,7 @@ def grid_to_particles(
         particles.preload[p] = wp.min(particles.preload[p] + out, deepest)
     elif gap > particles.preload[p]:
         particles.preload[p] = 0.0
+        particles.pushed[p] = 0.0
     low = grid.origin
     high = low + wp.cw_mul(
         grid.cell, wp.vec3(float(grid.shape[0] - 1), float(grid.shape[1] - 1), float(grid.shape[2] - 1))
