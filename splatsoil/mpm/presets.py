@@ -41,7 +41,7 @@ class Preset:
     courant: float = 0.5
     transport: float = 0.1
     way: float = 0.1
-    give: float = 0.062
+    give: float = 0.234
 
 
 PRESETS: dict[str, Preset] = {
@@ -128,18 +128,19 @@ class Resolution:
         """Of the tool's way, how much this soil gives way for each Pa of the contact's pressure and each metre over
         which it has been pushed since they touched, in 1/(Pa m).
 
-        In proportion to the pressure over a usual one, so that what a soil gives hangs on no unit: dry soil is the same
-        under any gravity (Froude), and soil with a strength c that needs no pressure is as dry soil in which all
-        pressures are larger by c cot(friction angle) (Caquot's theorem of corresponding states; Caquot & Kérisel 1949).
-        That is its cohesion, and its viscosity times the shear rate. And in proportion to the way over the usual depth:
-        what a tool is lowered into or begins to push gives way less than what it has piled up before it. 0 where there
-        is neither weight nor such strength.
+        In proportion to the pressure over the soil's usual one, so that what a soil gives hangs on no unit: dry soil is
+        the same under any gravity (Froude). That is Rankine's (1857) passive pressure at the usual depth. Soil with a
+        strength c that needs no pressure counts as dry soil in which all pressures are larger by c cot(friction angle)
+        (Caquot's theorem of corresponding states; Caquot & Kérisel 1949); that is its cohesion, and its viscosity times
+        the shear rate. And in proportion to the way over the usual depth: what a tool is lowered into or begins to push
+        gives way less than what it has piled up before it. 0 where there is neither weight nor such strength.
         """
         if self.give == 0.0:
             return 0.0
         weight = self.density * float(np.linalg.norm(settings.gravity)) * self.depth
         strength = settings.cohesion + settings.viscosity * self.rate
-        usual = weight + strength / math.tan(math.radians(settings.friction_angle))
+        angle = math.radians(settings.friction_angle)
+        usual = math.tan(0.25 * math.pi + 0.5 * angle) ** 2 * (weight + strength / math.tan(angle))
         return self.give / (usual * self.depth) if usual > 0.0 else 0.0
 
     @classmethod

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -64,6 +65,9 @@ def test_soil_with_cohesion_gives_way_as_heavier_soil_does(plow_dry: Path) -> No
     for size in ({"cohesion": 600.0}, {"viscosity": 180.0}):
         told = Law(find_effects(size)).settings(soil, {"friction_angle": 45.0, **size})
         assert resolution.ease(told) == pytest.approx(resolution.ease(heavy))
+    # Rankine's passive pressure, by another formula: 3 at 30 degrees, 3 + 2 sqrt(2) at 45
+    weak = resolution.ease(replace(soil, friction_angle=30.0))
+    assert weak / resolution.ease(soil) == pytest.approx((3.0 + 2.0 * math.sqrt(2.0)) / 3.0)
     with pytest.raises(SimulationError, match="depth"):
         replace(resolution, depth=0.0)
 
