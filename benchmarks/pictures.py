@@ -20,6 +20,7 @@ import numpy.typing as npt
 from splatsoil.benchmarks._common import here, output_options, stamp, write_result
 from splatsoil.benchmarks._newton import Numerics, World, load_newton, plough
 from splatsoil.benchmarks.numerics import Truth, variants
+from splatsoil.inverse.criticism.dilution import informed
 
 from splatsoil.commands._output import print_json
 from splatsoil.errors import ParameterError, RunError
@@ -73,9 +74,21 @@ class Reading:
     force: float
 
 
-def amplitudes(difference: FloatArray, columns: FloatArray, weight: FloatArray) -> FloatArray:
-    """(k,) least squares of a difference (t, s) by columns (k, t, s), both times a weight (t, s)."""
-    found, *_ = np.linalg.lstsq((columns * weight).reshape(len(columns), -1).T, (difference * weight).ravel())
+def amplitudes(
+    difference: FloatArray, columns: FloatArray, weight: FloatArray, doubts: FloatArray | None = None
+) -> FloatArray:
+    """(k,) least squares of a difference (t, s) by columns (k, t, s), all times a weight (t, s).
+
+    Columns that hold chance look as if they told more than they do, and read everything too small (regression
+    dilution): ``doubts`` (n, k, t, s), whose squares' sum is that of the chance in them, are taken out of what they
+    tell (Fuller 1987, Measurement Error Models, section 1.2).
+    """
+    flat = (columns * weight).reshape(len(columns), -1)
+    chance = np.zeros((len(flat), len(flat)))
+    for doubt in () if doubts is None else doubts:
+        wrong = (doubt * weight).reshape(len(flat), -1)
+        chance += wrong @ wrong.T
+    found = np.linalg.pinv(informed(flat @ flat.T, chance), hermitian=True) @ flat @ (difference * weight).ravel()
     return np.asarray(found, dtype=np.float64)
 
 
@@ -161,10 +174,12 @@ class Bench:
         chance = np.mean([table.var(axis=0, ddof=1) for table in spread], axis=0)
         weight = np.sqrt(self.seen / (1.0 + chance))
         steps = [2.0 * (TURN if name == ANGLE else SHARE) for name in soil]
-        columns = np.stack([(high - low).mean(axis=0) / step for (low, high), step in zip(pairs, steps, strict=True)])
+        slopes = np.stack([(high - low) / step for (low, high), step in zip(pairs, steps, strict=True)], axis=1)
+        columns = slopes.mean(axis=0)
+        doubts = (slopes - columns) / np.sqrt(len(slopes) * (len(slopes) - 1.0))
         out = []
         for name, (tables, force) in runs.items():
-            each = np.array([amplitudes(other[0] - table, columns, weight) for table in tables])
+            each = np.array([amplitudes(other[0] - table, columns, weight, doubts) for table in tables])
             left = float(np.sum(((other[0] - tables.mean(axis=0)) * weight) ** 2) / np.count_nonzero(self.seen))
             off, scatter = each.mean(axis=0), each.std(axis=0, ddof=1)
             out.append(
