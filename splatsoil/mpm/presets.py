@@ -29,7 +29,7 @@ class Preset:
         courant: sound-wave Courant number of a substep.
         transport: most cells the tool may travel in one step of the particles.
         way: of the tool, in cells, over which hourglass modes are damped once, see :attr:`Resolution.relaxation`.
-        give: of the tool's way, how much soil gives way to it under its usual pressure, once it was pushed over the
+        give: of the tool's way, how much soil gives way to it under its passive pressure, once it was pushed over the
             usual depth; see :meth:`Resolution.ease`.
     """
 
@@ -72,11 +72,11 @@ class Resolution:
             know, whatever the number of ``steps``: the former are damped as that many plain APIC exchanges would, soil
             sunk into the tool comes out at twice the rate. 0 for as many as there are.
         give: of the tool's way towards the soil, how much soil gives way to it where the contact's pressure is the
-            soil's usual one and the tool has pushed it over the usual depth, see :meth:`ease`. A tool that stands is
+            soil's passive one and the tool has pushed it over the usual depth, see :meth:`ease`. A tool that stands is
             borne for good. Real soil doesn't give way. Other solvers' soil does where iterations end early, and is lost
             to the heap: see docs/numerics.md.
-        depth: the usual one, where the weight of soil makes its usual pressure, in m: half the tool's second longest
-            edge. Soil that gives way needs it.
+        depth: the usual one, of which soil's passive pressure is told, in m: half the tool's second longest edge. Soil
+            that gives way needs it.
         rate: usual shear rate of soil before the tool, in 1/s: its largest speed over that depth.
         skin: of the spacing, how far from the faces of a plate thinner than a cell particles stop, because they stand
             for soil half a spacing around them. Its edges need none: contact acts through the grid, which widens them.
@@ -128,20 +128,20 @@ class Resolution:
         """Of the tool's way, how much this soil gives way for each Pa of the contact's pressure and each metre over
         which it has been pushed since they touched, in 1/(Pa m).
 
-        In proportion to the pressure over the soil's usual one, so that what a soil gives hangs on no unit: dry soil is
-        the same under any gravity (Froude). That is Rankine's (1857) passive pressure at the usual depth. Soil with a
-        strength c that needs no pressure counts as dry soil in which all pressures are larger by c cot(friction angle)
-        (Caquot's theorem of corresponding states; Caquot & Kérisel 1949); that is its cohesion, and its viscosity times
-        the shear rate. And in proportion to the way over the usual depth: what a tool is lowered into or begins to push
-        gives way less than what it has piled up before it. 0 where there is neither weight nor such strength.
+        In proportion to the pressure over the soil's passive one (Rankine 1857) at the usual depth, so that what a soil
+        gives hangs on no unit: dry soil is the same under any gravity (Froude). Soil with a strength c that needs no
+        pressure counts as dry soil in which all pressures are larger by c cot(friction angle) (Caquot's theorem of
+        corresponding states; Caquot & Kérisel 1949); that is its cohesion, and its viscosity times the shear rate. And
+        in proportion to the way over the usual depth: what a tool is lowered into or begins to push gives way less than
+        what it has piled up before it. 0 where there is neither weight nor such strength.
         """
         if self.give == 0.0:
             return 0.0
         weight = self.density * float(np.linalg.norm(settings.gravity)) * self.depth
         strength = settings.cohesion + settings.viscosity * self.rate
         angle = math.radians(settings.friction_angle)
-        usual = math.tan(0.25 * math.pi + 0.5 * angle) ** 2 * (weight + strength / math.tan(angle))
-        return self.give / (usual * self.depth) if usual > 0.0 else 0.0
+        passive = math.tan(0.25 * math.pi + 0.5 * angle) ** 2 * (weight + strength / math.tan(angle))
+        return self.give / (passive * self.depth) if passive > 0.0 else 0.0
 
     @classmethod
     def derive(cls, measurement: Measurement, preset: Preset | str = "small") -> Resolution:

@@ -213,6 +213,36 @@ def test_soil_sunk_into_a_tool_comes_out_by_the_second(steps: int) -> None:
     assert left[2] < 2.5e-3
 
 
+def test_what_has_parted_from_a_tool_is_pushed_anew() -> None:
+    """A bed on a plate that is lifted by 4 mm, drops away at once, and is there again when the bed has fallen on it."""
+    upper, spacing = np.array([0.12, 0.12, 0.2]), 0.01
+    plane = np.arange(0.5 * spacing, 0.12, spacing)
+    levels = np.arange(0.06 + 0.5 * spacing, 0.10, spacing)
+    x = np.stack(np.meshgrid(plane, plane, levels, indexing="ij"), axis=-1).reshape(-1, 3)
+    smooth = Settings(friction_angle=35.0, wall_friction=0.0, tool_friction=0.0)
+    resolution = replace(RESOLUTION, relaxation=100.0, give=0.1, depth=0.05, skin=0.0)
+    plate = trimesh.creation.box([0.2, 0.2, 0.04])
+    run = Solver(x[None], np.zeros(3), upper, plate, resolution, Law(), smooth, [{"friction_angle": 35.0}])
+    lowest, height = x[:, 2] < 0.07, 0.045
+
+    def pushed(way: float, frames: int) -> float:
+        """Median of what the lowest particles were pushed over, after the plate has moved on by some metres."""
+        nonlocal height
+        speed = way / (frames * resolution.frame_time)
+        for _ in range(frames):
+            moments = np.arange(2) / 2.0 * resolution.frame_time
+            places = [np.array([0.06, 0.06, height + t * speed]) for t in moments]
+            still, along = np.zeros(3), np.array([0.0, 0.0, speed])
+            run.advance([Pose(place, np.array([0.0, 0.0, 0.0, 1.0]), along, still) for place in places])
+            height += speed * resolution.frame_time
+        return float(np.median(run._particles.pushed.numpy()[lowest]))
+
+    assert pushed(0.004, 20) == pytest.approx(0.004, rel=0.1)
+    assert pushed(-0.01, 1) == 0.0
+    pushed(0.0, 20)  # the bed comes to rest on it
+    assert pushed(0.002, 20) == pytest.approx(0.002, rel=0.1)
+
+
 @pytest.mark.parametrize("stiffer", [1.0, 3.0])
 @pytest.mark.parametrize("steps", [1, 8])
 def test_a_bed_on_a_tool_gives_way_to_it_as_told(steps: int, stiffer: float) -> None:
