@@ -77,8 +77,8 @@ def test_ours_are_read_as_what_they_are(plow_dry: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(pictures, "plough", ploughed)
     ((features, force),) = bench.others([soil], SimpleNamespace())  # type: ignore[arg-type]
     (found,) = bench.read(soil, (features, force), changed=False)
-    # chance of four seeds' derivatives and of one world: 0.3°
-    assert found.off["friction_angle"] == pytest.approx(1.5, abs=0.6)
+    # one seed scatters by 0.3°
+    assert found.off["friction_angle"] == pytest.approx(1.5, abs=0.5)
     # steeper soil bears more, by about 6 % a degree (docs/numerics-evidence.md, what the tool's force tells)
     assert found.force == pytest.approx(0.92, abs=0.05)
 
