@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -101,8 +100,7 @@ class PlateExperiment:
         self.systematic = np.zeros((0, *self.layout.shape))
         self.sensor = np.broadcast_to(np.asarray(spread, dtype=np.float64).reshape(-1), depth.shape)[:, None].copy()
         self.experiment = _set_up(diameter, float(depth[-1]), density, friction)
-        # real soil doesn't give way to a plate, which bears more than soil that does ever could
-        self.resolution = replace(Resolution.derive(self.experiment, preset), give=0.0)
+        self.resolution = Resolution.derive(self.experiment, preset)
 
     def reproducibility(self, parameter: Parameter, value: float, effect: str = "") -> float:
         """Not known: plates were pressed into no other solver's soil."""
@@ -162,7 +160,8 @@ def _set_up(diameter: float, deepest: float, density: float, friction: float) ->
         gravity=np.array([0.0, 0.0, -9.81]),
         frame_rate=FRAME_RATE,
         bed=bed,
-        tool=Tool(plate, motion, friction=friction),
+        # Real soil bears a plate better than soil that gives way ever could.
+        tool=Tool(plate, motion, friction=friction, give=0.0),
         views=(),
         video=(),
     )

@@ -91,7 +91,8 @@ class PlowExperiment:
         self.name = model.measurement.name
         self.model = tuple(effect.name for effect in model.law.effects)
         self.parameters: tuple[Parameter, ...] = tuple(model.space(parameters))
-        self.numerics = tuple(numerics)
+        # Where soil doesn't give way half of that is no other way to compute.
+        self.numerics = tuple(n for n in numerics if n == ROUNDING or NUMERICS[n](model.resolution) != model.resolution)
         self.redrawn = tuple(name for name in self.numerics if name == ROUNDING)
         self.progress = progress
         wanted = tuple(library().values()) if candidates is None else find_effects(candidates)

@@ -30,7 +30,7 @@ class Preset:
         transport: most cells the tool may travel in one step of the particles.
         way: of the tool, in cells, over which hourglass modes are damped once, see :attr:`Resolution.relaxation`.
         give: of the tool's way, how much soil gives way to it under its passive pressure, once it was pushed over the
-            usual depth; see :meth:`Resolution.ease`.
+            usual depth, unless the measurement tells; see :meth:`Resolution.ease`.
     """
 
     name: str
@@ -145,7 +145,8 @@ class Resolution:
 
     @classmethod
     def derive(cls, measurement: Measurement, preset: Preset | str = "small") -> Resolution:
-        """Resolution for a measurement set: the cell from the tool's width, the steps from its speed.
+        """Resolution for a measurement set: the cell from the tool's width, the steps from its speed, and how much soil
+        gives way to the tool from the set, if it tells.
 
         Raises:
             ParameterError: an unknown preset.
@@ -171,7 +172,7 @@ class Resolution:
             shear=preset.young / (2.0 * (1.0 + preset.poisson)),
             density=measurement.bed.density,
             relaxation=fastest / (preset.way * cell),
-            give=preset.give,
+            give=preset.give if measurement.tool.give is None else measurement.tool.give,
             depth=0.5 * float(extents[1]),
             rate=fastest / (0.5 * float(extents[1])),
         )

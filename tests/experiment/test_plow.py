@@ -1,5 +1,6 @@
 """What a plow experiment draws without simulating anew."""
 
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 from types import SimpleNamespace
@@ -69,6 +70,18 @@ def test_an_unknown_way_is_not_taken_for_the_usual_one() -> None:
     assert PlowExperiment._variant(experiment, ("cohesion",), "") is base
     with pytest.raises(KeyError, match="gird"):
         PlowExperiment._variant(experiment, ("cohesion",), "gird")
+
+
+def test_half_of_no_giving_way_is_no_other_numerics(small_set: Path) -> None:
+    measurement = Measurement.load(small_set)
+    surface = HeightField.over(measurement.bed.lower, measurement.bed.upper, 0.02, 0.12)
+
+    def numerics(measurement: Measurement) -> tuple[str, ...]:
+        model = Model(measurement, cast(Any, SimpleNamespace(surface=surface)), preset="tiny")
+        return PlowExperiment(model, candidates=("cohesion",)).numerics
+
+    real = replace(measurement, tool=replace(measurement.tool, give=0.0))
+    assert set(numerics(measurement)) - set(numerics(real)) == {"contact"}
 
 
 def test_soil_prepared_together_is_that_of_single_simulations(small_set: Path, monkeypatch: pytest.MonkeyPatch) -> None:

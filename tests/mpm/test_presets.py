@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,7 @@ import pytest
 from splatsoil.benchmarks.numerics import Truth
 
 from splatsoil.errors import SimulationError
-from splatsoil.measurement import Measurement
+from splatsoil.measurement import Measurement, write_measurement
 from splatsoil.mpm import PRESETS, Resolution, Trajectory, simulate
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
@@ -47,6 +48,30 @@ def test_a_larger_tool_moves_as_much_larger_soil(plow_dry: Path) -> None:
     for cohesion in (0.0, 300.0):
         soil = Settings(friction_angle=36.0, cohesion=cohesion)
         assert two.ease(replace(soil, cohesion=2.0 * cohesion)) == pytest.approx(0.25 * one.ease(soil))
+
+
+def test_a_set_can_say_how_much_its_soil_gives_way(small_set: Path) -> None:
+    """Photographs of real soil do: it doesn't. A copy of the set says the same."""
+    unsaid = Measurement.load(small_set)
+    assert Resolution.derive(unsaid, "small").give == PRESETS["small"].give
+    file = small_set / "experiment.json"
+    for told in (0, 0.1):
+        said = json.loads(file.read_text())
+        said["tool"]["give"] = told
+        file.write_text(json.dumps(said))
+        real = Measurement.load(small_set)
+        copy = write_measurement(
+            small_set.parent / f"copy-{told}",
+            name="copy",
+            bed=real.bed,
+            tool=real.tool,
+            frame_rate=real.frame_rate,
+            gravity=real.gravity,
+            views=real.views,
+            video=real.video,
+        )
+        for measurement in (real, copy):
+            assert all(Resolution.derive(measurement, name).give == told for name in PRESETS)
 
 
 def test_soil_with_cohesion_gives_way_as_heavier_soil_does(plow_dry: Path) -> None:
