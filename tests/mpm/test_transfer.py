@@ -284,3 +284,32 @@ def test_a_bed_on_a_tool_gives_way_to_it_as_told(steps: int, stiffer: float) -> 
     sine = math.sin(math.radians(35.0))
     often = height / 0.05 * (1.0 - sine) / (1.0 + sine) * (way / 2.0) / 0.05
     assert sunk(give, way) - sunk(0.0, way) == pytest.approx(give * often * way, rel=0.05)
+
+
+@pytest.mark.parametrize("steps", [2, 8])
+@pytest.mark.parametrize("speed", [0.003, 0.1])
+def test_friction_on_a_tool_is_coulombs_unless_a_film_bears_less(steps: int, speed: float) -> None:
+    """A plate slides beneath a bed that walls hold. In a substep no more than a particle's momentum is taken, a film of
+    density * spacing / substep: slow slip under high pressure meets that, quick slip friction times the weight."""
+    upper, height, spacing, friction = np.array([0.12, 0.12, 0.2]), 0.08, 0.01, 0.3
+    plane = np.arange(0.5 * spacing, 0.12, spacing)
+    levels = np.arange(0.06 + 0.5 * spacing, 0.06 + height, spacing)
+    x = np.stack(np.meshgrid(plane, plane, levels, indexing="ij"), axis=-1).reshape(-1, 3)
+    plate = trimesh.creation.box([0.6, 0.6, 0.04])
+    held = Settings(friction_angle=45.0, wall_friction=0.0, tool_friction=friction)
+    resolution = replace(RESOLUTION, steps=steps, relaxation=100.0, skin=0.0)
+    run = Solver(x[None], np.zeros(3), upper, plate, resolution, Law(), held, [{"friction_angle": 45.0}])
+    force = []
+    for frame in range(40):
+        times = (frame + np.arange(steps) / steps) * resolution.frame_time
+        places = [np.array([0.06 + t * speed, 0.06, 0.045]) for t in times]
+        moving = np.array([speed, 0.0, 0.0])
+        force.append(
+            run.advance([Pose(place, np.array([0.0, 0.0, 0.0, 1.0]), moving, np.zeros(3)) for place in places])
+        )
+    sideways = -float(np.mean([f[0, 0] for f in force[-20:]]))
+    weight = len(x) * spacing**3 * resolution.density * 9.81
+    substep = resolution.frame_time / steps / resolution.substeps(steps)
+    film = resolution.density * spacing / substep * speed * 0.12**2
+    assert (film < 0.5 * friction * weight) == (speed < 0.01)
+    assert sideways == pytest.approx(min(film, friction * weight), rel=0.05)
