@@ -24,7 +24,7 @@ from splatsoil.errors import MeasurementError
 from splatsoil.measurement import Measurement
 from splatsoil.model import Model
 from splatsoil.reconstruction import Reconstruction, reconstruct
-from splatsoil.scene import Scene
+from splatsoil.scene import build_scene
 
 
 def floor(truth: Truth, reconstruction: Reconstruction, device: str) -> tuple[tuple[int, ...], Comparison]:
@@ -32,7 +32,7 @@ def floor(truth: Truth, reconstruction: Reconstruction, device: str) -> tuple[tu
     measurement = truth.measurement
     frames = tuple(sorted(truth.particles))
     spacing = truth.volume ** (1.0 / 3.0)
-    scene = Scene.from_reconstruction(reconstruction, measurement, truth.particles[0], spacing, device=device)
+    scene = build_scene(reconstruction, measurement, truth.particles[0], spacing, device=device)
     images = {}
     for frame in frames:
         posed = scene.pose(truth.particles[frame], None, measurement.tool.motion.pose(frame / measurement.frame_rate))

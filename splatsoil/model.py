@@ -19,7 +19,7 @@ from splatsoil.mpm import Resolution, Trajectory, frames_around, simulate
 from splatsoil.observation import Observation
 from splatsoil.parameters import Parameter, ParameterSpace
 from splatsoil.reconstruction import Reconstruction, fill
-from splatsoil.scene import Intrinsic, Posed, Scene
+from splatsoil.scene import Intrinsic, Posed, Scene, build_scene
 from splatsoil.soil.effect import Effect
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
@@ -184,7 +184,7 @@ class Model:
             return self.scene(0).with_particles(self.particles(seed))
         file = None if self._intrinsic is None else self._intrinsic(self.resolution.spacing)
         known = None if file is None or not file.is_file() else Intrinsic.load(file)
-        scene = Scene.from_reconstruction(
+        scene = build_scene(
             self.reconstruction,
             self.measurement,
             self.particles(0),

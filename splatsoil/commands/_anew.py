@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 def anew(run: RunFolder, fit: Mapping[str, Any]) -> str:
     """A command line: the fit, and the effects that were added to it."""
-    from splatsoil.commands._criticism import history
+    from splatsoil.commands._history import history
 
     setup, entries = fit["setup"], history(run)
     parameters, effects, budget = tuple(fit["parameters"]), tuple(setup["effects"]), fit.get("evaluations")

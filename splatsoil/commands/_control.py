@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from concurrent.futures import Future
+
     import numpy as np
     import numpy.typing as npt
 
-    from splatsoil.commands._crew import Replay
     from splatsoil.experiment.base import Calibration
     from splatsoil.experiment.plow import PlowExperiment
     from splatsoil.inverse.criticism.simulations import Simulations
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 
     FloatArray = npt.NDArray[np.float64]
 
+Replay = Callable[[], "Future[None] | None"]
+"""Has a helper make the replay control, if none is at it; None where there is no helper."""
 
 #: Parts of the package that decide features, what criticism makes of simulations, besides those that simulate; the
 #: replay control; the calibration; verdicts.

@@ -8,7 +8,7 @@ from contextlib import contextmanager, suppress
 from shutil import rmtree
 from typing import TYPE_CHECKING, Any
 
-from splatsoil.commands._control import PLACES
+from splatsoil.commands._control import PLACES, Replay
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
@@ -22,10 +22,6 @@ if TYPE_CHECKING:
 MOST_HELPERS = 3
 SHARE = {"cpu": 2.0, "cuda": 4.0}
 """Memory that each process is to have, GiB: it holds a reconstruction, a scene and soil."""
-
-
-Replay = Callable[[], "Future[None] | None"]
-"""Has a helper make the replay control, if none is at it; None where there is no helper."""
 
 
 class Crew:
@@ -186,7 +182,7 @@ def _ready(device: str) -> None:
     def load(here: str) -> None:
         import torch
 
-        from splatsoil.commands import _control, _criticism  # noqa: F401
+        from splatsoil.commands import _control, _experiments  # noqa: F401
         from splatsoil.experiment import plow  # noqa: F401
 
         torch.zeros(1, device=here)
@@ -235,7 +231,7 @@ def _known_here(path: Path, device: str, effects: tuple[str, ...]) -> tuple[RunF
     """What a helper works with, made once."""
     import signal
 
-    from splatsoil.commands import _criticism as criticism
+    from splatsoil.commands._experiments import experiment_of, model_of
     from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.quiet import hush
 
@@ -245,6 +241,6 @@ def _known_here(path: Path, device: str, effects: tuple[str, ...]) -> tuple[RunF
         hush()
         folder = RunFolder.open(path)
         # a reconstruction that isn't kept is the first process's to make
-        model = criticism.model_of(folder, device, lambda what, share: None, anew=False)
-        _known[key] = (folder, *criticism.experiment_of(folder, model, effects or None))
+        model = model_of(folder, device, lambda what, share: None, anew=False)
+        _known[key] = (folder, *experiment_of(folder, model, effects or None))
     return _known[key]

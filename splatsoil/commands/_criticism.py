@@ -1,85 +1,21 @@
-"""Stages of criticism: a run folder as an experiment, its diagnosis, and the history of what was added."""
+"""Stages of criticism: misfit, diagnosis, an effect tried, and what of these is kept."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any
 
+from splatsoil.commands._experiments import experiment_of
 from splatsoil.errors import ParameterError, RunError
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from splatsoil.commands._crew import Crew
     from splatsoil.commands._progress import Report
-    from splatsoil.experiment.plow import PlowExperiment
     from splatsoil.inverse.criticism.diagnosis import Options
-    from splatsoil.inverse.criticism.simulations import Simulations
     from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.model import Model
-    from splatsoil.soil.effect import Effect
-
-
-def model_of(folder: RunFolder, device: str, report: Report, *, anew: bool = True) -> Model:
-    """The model that a run's latest fit is of, on one device; a reconstruction that isn't kept is made ``anew``.
-
-    Raises:
-        RunError: it may not be.
-    """
-    from splatsoil.commands import _stages as stage
-
-    setup = folder.fit()["setup"]
-    measurement = stage.measurement_of(folder)
-    reconstruction = stage.reconstructed(measurement, folder, device, report, anew=anew)
-    return stage.model_on(measurement, folder, reconstruction, setup["effects"], setup["preset"], device)
-
-
-def experiment_of(
-    folder: RunFolder, model: Model, effects: Iterable[str] | None = None
-) -> tuple[PlowExperiment, Simulations]:
-    """The run as criticism sees it, with some effects as candidates or all, and its simulations, kept in ``features/``.
-
-    Raises:
-        ParameterError: an effect that is unknown or on already.
-    """
-    from splatsoil import __version__
-    from splatsoil.commands._control import code_of
-    from splatsoil.commands._stages import digest_of
-    from splatsoil.experiment.plow import PlowExperiment
-    from splatsoil.inverse.criticism.simulations import Simulations
-
-    named = None if effects is None else tuple(effects)
-    wanted = None if named is None else off_effects(named, model.law.effects)
-    fit = folder.fit()
-    experiment = PlowExperiment(model, tuple(fit["parameters"]), candidates=wanted)
-    identity = {
-        "measurement": folder.description["measurement"]["hash"],
-        "reconstruction": digest_of(model.reconstruction),
-        "model": sorted(experiment.model),
-        "preset": model.preset,
-        "device": model.device.split(":")[0],
-        "version": __version__,
-        "code": code_of((*fit["setup"]["effects"], *(named or ()))),
-        "layout": list(experiment.layout.shape),
-    }
-    return experiment, Simulations(experiment, folder.path / "features", identity)
-
-
-def off_effects(names: Iterable[str], on: Iterable[Effect]) -> tuple[Effect, ...]:
-    """Effects by name, or from files, that are none of those that are on.
-
-    Raises:
-        ParameterError: one is unknown, or on already.
-    """
-    from splatsoil.soil.library import find_effects
-
-    wanted, taken = find_effects(names), {effect.name for effect in on}
-    for effect in wanted:
-        if effect.name in taken:
-            raise ParameterError(f"effect {effect.name} is on already; name one that is off")
-    return wanted
 
 
 def _team(
@@ -325,32 +261,6 @@ def latest_diagnosis(folder: RunFolder, effect: str) -> dict[str, Any] | None:
     code = code_of((*fit["setup"]["effects"], effect))
     same = data.get("code") == code and data.get("judged_by") == judged_by()
     return data if same and data["values"] == estimates(fit) else None
-
-
-def history(folder: RunFolder) -> list[dict[str, Any]]:
-    """The models tried so far, the first one first."""
-    return list(_history(folder).get("models", ()))
-
-
-def adding(folder: RunFolder) -> dict[str, Any]:
-    """What `remember` was last told of an addition that is under way; nothing where none is."""
-    return dict(_history(folder).get("adding", {}))
-
-
-def _history(folder: RunFolder) -> dict[str, Any]:
-    from splatsoil.run_files import HISTORY_FORMAT, read_kept
-
-    path = folder.path / "history.json"
-    return read_kept(path, HISTORY_FORMAT) if path.is_file() else {}
-
-
-def remember(folder: RunFolder, entries: list[dict[str, Any]], under_way: Mapping[str, Any] | None = None) -> Path:
-    """Keep the models tried, and what is needed to go on with an addition that is under way."""
-    from splatsoil.files import write_json
-    from splatsoil.run_files import HISTORY_FORMAT
-
-    more = {"adding": dict(under_way)} if under_way else {}
-    return write_json(folder.path / "history.json", {"format": HISTORY_FORMAT, "models": entries, **more})
 
 
 def check_budget(repeats: int, refits: int = 1, refit_steps: int = 1) -> None:

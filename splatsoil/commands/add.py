@@ -45,6 +45,8 @@ class Config:
 def run(config: Config) -> int:
     """Refit with each effect, keep the history, draw the report."""
     from splatsoil.commands import _criticism as criticism
+    from splatsoil.commands import _experiments as experiments
+    from splatsoil.commands import _history as histories
     from splatsoil.commands import _stages as stage
     from splatsoil.commands._progress import stages
     from splatsoil.envs.devices import resolve_device
@@ -71,7 +73,7 @@ def run(config: Config) -> int:
             raise ParameterError(f"{name} defines several effects; put each that is to be added into a file of its own")
     # All that the report will show: what is damaged is better known now than after hours.
     load(folder.path)
-    before = criticism.adding(folder)
+    before = histories.adding(folder)
     half_done = before.get("effects") == on
     left = remaining(config.effects, on, before, half_done=half_done)
     Law(find_effects((*on, *left)))
@@ -80,14 +82,14 @@ def run(config: Config) -> int:
     stage.note_other_sources(folder)
     with stages(quiet=config.json) as begin:
         if half_done:
-            finished(folder, criticism.model_of(folder, device, begin("reconstruct")), fit, before, begin)
+            finished(folder, experiments.model_of(folder, device, begin("reconstruct")), fit, before, begin)
         for name in left:
-            model = criticism.model_of(folder, device, begin("reconstruct"))
+            model = experiments.model_of(folder, device, begin("reconstruct"))
             added(folder, model, name, options, begin, budget=config.budget, command=config.effects)
         begin("report")("drawing figures", 0.0)
         page = write_report(folder.path)
-    entries = criticism.history(folder)
-    criticism.remember(folder, entries)
+    entries = histories.history(folder)
+    histories.remember(folder, entries)
     if config.json:
         print_json({"ok": True, "run": str(folder.path), "report": str(page), "models": entries})
     else:
@@ -117,13 +119,13 @@ def remaining(effects: Sequence[str], on: Sequence[str], before: Mapping[str, An
     Args:
         effects: of the command.
         on: of the latest fit.
-        before: the addition that was under way, see `splatsoil.commands._criticism.adding`.
+        before: the addition that was under way, see `splatsoil.commands._history.adding`.
         half_done: whether its fit is the latest.
 
     Raises:
         ParameterError: one is on that this command didn't put in.
     """
-    from splatsoil.commands._criticism import off_effects
+    from splatsoil.commands._experiments import off_effects
     from splatsoil.soil.library import find_effects
 
     mine = set(before["done"] if before.get("command") == list(effects) else ())
@@ -148,6 +150,7 @@ def added(
     ``command`` is all the effects that are being added, where one command adds several.
     """
     from splatsoil.commands import _criticism as criticism
+    from splatsoil.commands import _history as histories
     from splatsoil.commands import _stages as stage
     from splatsoil.soil.library import find_effects
 
@@ -163,7 +166,7 @@ def added(
     # It may be of a time when other parameters of the effect were free, or have stopped at its first steps.
     if {*kept["values"]} != {*free} or kept.get("stopped", False):
         known = criticism.confirmed(folder, model, name, options, begin(f"try {effect.name}"))
-    entries = criticism.history(folder)
+    entries = histories.history(folder)
     base, with_it = known["refits"]["as it is"], known["refits"][effect.name]
     if not entries or entries[-1]["model"] != before["name"]:
         entries = [criticism.entry(before, base)]
@@ -190,7 +193,7 @@ def added(
         "line": {"added": effect.name, "fall": base["chi2"] - with_it["chi2"]},
     }
     # Before the fit is the latest one: from then on nothing else knows what it was made from.
-    criticism.remember(folder, entries, under_way)
+    histories.remember(folder, entries, under_way)
     begun = begin(f"fit with {effect.name}")
     result = stage.fitted(fitting, model.measurement, folder, larger, begun, refitted=refitted)
     return finished(folder, larger, result, under_way, begin)
@@ -205,6 +208,7 @@ def finished(
 ) -> dict[str, Any]:
     """What is left to do once the fit with the new effect is the latest one; returns the new entry of the history."""
     from splatsoil.commands import _criticism as criticism
+    from splatsoil.commands import _history as histories
     from splatsoil.commands import _stages as stage
 
     if not criticism.pictured(folder):
@@ -214,7 +218,7 @@ def finished(
     # Until all of the command is done, what it has put in is known to be its own.
     command, done = under_way["command"], [*under_way["done"], under_way["effect"]]
     rest = {"command": command, "done": done} if command else None
-    criticism.remember(folder, [*criticism.history(folder), fresh], rest)
+    histories.remember(folder, [*histories.history(folder), fresh], rest)
     return fresh
 
 

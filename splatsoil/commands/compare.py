@@ -75,6 +75,7 @@ def _compared(config: Config, folder: RunFolder, crew: Crew | None) -> tuple[dic
     """Pictures and losses, and the misfit where helpers for it have begun; what takes seconds to load is loaded
     here."""
     from splatsoil.commands import _criticism as criticism
+    from splatsoil.commands import _experiments as experiments
     from splatsoil.commands import _stages as stage
     from splatsoil.commands._progress import stages
     from splatsoil.envs.devices import resolve_device
@@ -86,7 +87,7 @@ def _compared(config: Config, folder: RunFolder, crew: Crew | None) -> tuple[dic
     device = resolve_device(config.device)
     stage.note_other_sources(folder)
     with stages(quiet=config.json) as begin:
-        model = criticism.model_of(folder, device, begin("reconstruct"))
+        model = experiments.model_of(folder, device, begin("reconstruct"))
         result = stage.compared(folder, model, begin("compare"))
         if crew is None:
             return result, None

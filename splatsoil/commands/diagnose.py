@@ -69,6 +69,7 @@ def run(config: Config) -> int:
 def _diagnosed(config: Config, folder: RunFolder, crew: Crew) -> dict[str, Any]:
     """What takes seconds to load is loaded here: helpers have begun by then."""
     from splatsoil.commands import _criticism as criticism
+    from splatsoil.commands import _experiments as experiments
     from splatsoil.commands import _stages as stage
     from splatsoil.commands._progress import stages
     from splatsoil.envs.devices import resolve_device
@@ -76,7 +77,7 @@ def _diagnosed(config: Config, folder: RunFolder, crew: Crew) -> dict[str, Any]:
     from splatsoil.soil.library import find_effects
 
     # a name that is wrong is refused before the rest is loaded
-    criticism.off_effects(config.effects, find_effects(folder.fit()["setup"]["effects"]))
+    experiments.off_effects(config.effects, find_effects(folder.fit()["setup"]["effects"]))
 
     from splatsoil.inverse.criticism.diagnosis import Options
 
@@ -85,7 +86,7 @@ def _diagnosed(config: Config, folder: RunFolder, crew: Crew) -> dict[str, Any]:
     device = resolve_device(config.device)
     stage.note_other_sources(folder)
     with stages(quiet=config.json) as begin:
-        model = criticism.model_of(folder, device, begin("reconstruct"))
+        model = experiments.model_of(folder, device, begin("reconstruct"))
         return criticism.diagnosed(
             folder, model, options, begin, config.effects, with_replay=not config.no_replay, crew=crew
         )

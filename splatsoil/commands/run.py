@@ -53,6 +53,7 @@ class Config(FitOptions):
 def run(config: Config) -> int:
     """Each stage in turn; what the run folder has already isn't done again."""
     from splatsoil.commands import _criticism as criticism
+    from splatsoil.commands import _history as histories
     from splatsoil.commands import _stages as stage
     from splatsoil.commands import add, compare, fit
     from splatsoil.commands._diagnosis_table import show
@@ -104,7 +105,7 @@ def run(config: Config) -> int:
             kept = (*judged, "effects", "estimates", "simulations")
             extra = {
                 "diagnosis": plain({key: diagnosis[key] for key in kept}),
-                "models": criticism.history(folder),
+                "models": histories.history(folder),
                 "stopped": stopped,
             }
         print_json({"ok": True, "run": str(folder.path), "report": str(page), "comparison": losses, **extra, **result})
@@ -114,7 +115,7 @@ def run(config: Config) -> int:
     if diagnosis is None and misfit is not None:
         compare.show_misfit(misfit, str(folder.path))
     if diagnosis is not None:
-        if entries := criticism.history(folder):
+        if entries := histories.history(folder):
             add.show(entries)
         show(diagnosis)
         print(f"Stopped because {stopped}.")

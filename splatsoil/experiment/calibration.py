@@ -30,7 +30,7 @@ from splatsoil.measurement import Frame, Measurement
 from splatsoil.model import Model
 from splatsoil.mpm import Trajectory
 from splatsoil.parameters import Parameter
-from splatsoil.scene import Scene
+from splatsoil.scene import Scene, build_scene
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -134,7 +134,7 @@ def _scene_of_photographs(model: Model, seed: int) -> Scene:
     seen, aside = model.measurement, _aside(model.measurement)
     views = tuple(v for v in seen.views if v not in aside)
     later = tuple(f for f in seen.video if f.frame is not None and f.frame > 0)
-    return Scene.from_reconstruction(
+    return build_scene(
         model.reconstruction,
         replace(seen, views=views, video=later),
         model.particles(seed),

@@ -1,6 +1,7 @@
 """From moved particles to pictures: Gaussians that ride on particles, lit by sun and sky, with the tool among them."""
 
 from splatsoil.scene.binding import Binding, bind
+from splatsoil.scene.build import build_scene
 from splatsoil.scene.estimate import estimate_light, seen_colours, still_frames
 from splatsoil.scene.ground import ground_of_pixels
 from splatsoil.scene.intrinsic import Intrinsic
@@ -24,6 +25,7 @@ __all__ = [
     "Scene",
     "ToolBody",
     "bind",
+    "build_scene",
     "encoded",
     "estimate_light",
     "ground_of_pixels",

@@ -57,7 +57,22 @@ def build_scene(
     rounds: int = ROUNDS,
     background: tuple[float, float, float] | None = None,
 ) -> Scene:
-    """See `Scene.from_reconstruction`."""
+    """A scene from photographs of the undisturbed bed: light estimated, albedo taken from colours, Gaussians bound.
+
+    Args:
+        reconstruction: has ``gaussians`` (sRGB colours) and masks ``soil`` and ``tool`` (n,).
+        measurement: the set it was made from.
+        particles: (p, 3) at rest, m: those that will move.
+        spacing: side of the cube of soil a particle stands for, m.
+        light: estimated if left out.
+        intrinsic: light and albedo that were found before; nothing is estimated then.
+        device: where the scene is drawn.
+        rounds: of refining the albedo.
+        background: (3,) sRGB; the reconstruction's if left out.
+
+    Raises:
+        ParameterError: particles of another shape, or a reconstruction without soil.
+    """
     x = torch.as_tensor(np.asarray(particles), dtype=torch.float32).to(device).contiguous()
     if x.ndim != 2 or x.shape[1] != 3 or len(x) == 0:
         raise ParameterError(f"particles have shape {tuple(x.shape)}, expected (n, 3) with n > 0")
@@ -99,29 +114,6 @@ def build_scene(
         lit = light_relief(relief, light, body.at(*start), scene.tool_albedo)
         scene = scene.replace(**_albedo(soil, lit, x, spacing, measurement.bed))
         return _refined(scene, scene.pose(x, None, start), frames, rounds) if rounds > 0 else scene
-
-
-def rebound(scene: Scene, particles: Any) -> Scene:
-    """See `Scene.with_particles`."""
-    x = torch.as_tensor(np.asarray(particles), dtype=torch.float32).to(scene.device).contiguous()
-    relief = relief_of_particles(x, scene.spacing, scene.bed.lower, scene.bed.upper)
-    grains = encoded(scene.surface_albedo.beneath(x, relief.depth_below(x)))
-    return scene.replace(soil=scene.soil.to_particles(x, scene.spacing), grain_albedo=grains)
-
-
-def reguessed(scene: Scene, seed: int) -> Scene:
-    """See `Scene.with_other_albedo`."""
-    x, surface = scene.soil.particles, scene.surface_albedo
-    relief = relief_of_particles(x, scene.spacing, scene.bed.lower, scene.bed.upper)
-    others = albedos.other_grain_albedo(
-        x,
-        relief.depth_below(x) - scene.spacing,  # photographs show the uppermost layer
-        linear(scene.grain_albedo),
-        surface.above(x),
-        surface.length,
-        np.random.default_rng(seed),
-    )
-    return scene.replace(grain_albedo=encoded(others.clamp(0.0, albedos.BRIGHTEST)))
 
 
 def _albedo(soil: Gaussians, lit: LitRelief, grains: Tensor, spacing: float, bed: Bed) -> dict[str, Tensor]:

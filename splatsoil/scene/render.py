@@ -14,12 +14,12 @@ import torch.nn.functional as functional
 import warp as wp
 from torch import Tensor
 
-from splatsoil.measurement import Bed, Camera, Measurement
+from splatsoil.measurement import Bed, Camera
 from splatsoil.scene import kernels_visible
-from splatsoil.scene.albedo import SurfaceAlbedo
+from splatsoil.scene.albedo import BRIGHTEST, SurfaceAlbedo, other_grain_albedo
 from splatsoil.scene.binding import Binding
 from splatsoil.scene.layers import Layers, Posed, layers_of
-from splatsoil.scene.light import Light, linear
+from splatsoil.scene.light import Light, encoded, linear
 from splatsoil.scene.lit import light_relief
 from splatsoil.scene.relief import SMOOTHING, Relief, relief_of_particles, surface_of
 from splatsoil.scene.tool import ToolBody
@@ -96,37 +96,27 @@ class Scene:
         rest, albedo = self.soil.rest, linear(self.soil_albedo)
         return SurfaceAlbedo(rest, albedo, self.spacing, self.bed.lower, self.bed.upper)
 
-    @classmethod
-    def from_reconstruction(
-        cls, reconstruction: Any, measurement: Measurement, particles: Any, spacing: float, **options: Any
-    ) -> Scene:
-        """A scene from photographs of the undisturbed bed: light estimated, albedo taken from colours, Gaussians bound.
-
-        Args:
-            reconstruction: has ``gaussians`` (sRGB colours) and masks ``soil`` and ``tool`` (n,).
-            measurement: the set it was made from.
-            particles: (p, 3) at rest, m: those that will move.
-            spacing: side of the cube of soil a particle stands for, m.
-            options: ``light`` (a `Light`; estimated if left out), ``intrinsic`` (light and albedo that were found
-                before, an `Intrinsic`; nothing is estimated then), ``device``, ``rounds`` (of refining the albedo),
-                ``background`` (3,) sRGB (the reconstruction's if left out).
-        """
-        from splatsoil.scene.build import build_scene
-
-        return build_scene(reconstruction, measurement, particles, spacing, **options)
-
     def with_particles(self, particles: Any) -> Scene:
         """The same soil on other particles (p, 3) at rest, m, of the same spacing (another jitter, say): light and
         surface albedo are kept, only the binding and the grains' albedo are made anew."""
-        from splatsoil.scene.build import rebound
-
-        return rebound(self, particles)
+        x = torch.as_tensor(np.asarray(particles), dtype=torch.float32).to(self.device).contiguous()
+        relief = relief_of_particles(x, self.spacing, self.bed.lower, self.bed.upper)
+        grains = encoded(self.surface_albedo.beneath(x, relief.depth_below(x)))
+        return self.replace(soil=self.soil.to_particles(x, self.spacing), grain_albedo=grains)
 
     def with_other_albedo(self, seed: int) -> Scene:
         """The same soil, coloured otherwise beneath its surface, where photographs leave the colour open."""
-        from splatsoil.scene.build import reguessed
-
-        return reguessed(self, seed)
+        x, surface = self.soil.particles, self.surface_albedo
+        relief = relief_of_particles(x, self.spacing, self.bed.lower, self.bed.upper)
+        others = other_grain_albedo(
+            x,
+            relief.depth_below(x) - self.spacing,  # photographs show the uppermost layer
+            linear(self.grain_albedo),
+            surface.above(x),
+            surface.length,
+            np.random.default_rng(seed),
+        )
+        return self.replace(grain_albedo=encoded(others.clamp(0.0, BRIGHTEST)))
 
     def replace(self, **changes: Any) -> Scene:
         """A copy with some parts replaced."""

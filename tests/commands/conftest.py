@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from splatsoil.inverse.run_folder import RunFolder
 
-from splatsoil.commands import _criticism, _stages
+from splatsoil.commands import _experiments, _stages
 
 
 @pytest.fixture
@@ -46,5 +46,5 @@ def run(tmp_path: Path, fit_of: Callable[..., dict[str, Any]]) -> RunFolder:
 @pytest.fixture
 def no_work(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whoever begins to work, fails."""
-    for place, name in ((_criticism, "model_of"), (_stages, "reconstructed"), (_stages, "fitted")):
+    for place, name in ((_experiments, "model_of"), (_stages, "reconstructed"), (_stages, "fitted")):
         monkeypatch.setattr(place, name, lambda *_, **__: pytest.fail("work has begun"))

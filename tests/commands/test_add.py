@@ -11,7 +11,7 @@ from typing import Any, cast
 import pytest
 from splatsoil.inverse.criticism.diagnosis import Options
 
-from splatsoil.commands import _control, _criticism, _stages
+from splatsoil.commands import _control, _criticism, _history, _stages
 from splatsoil.commands._options import FitOptions
 from splatsoil.commands.add import added
 from splatsoil.files import write_json
@@ -84,8 +84,8 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
     made = Bench({"as it is": refit({"friction_angle": 30.0}, 50.0)})
     monkeypatch.setattr(_criticism, "latest_diagnosis", lambda folder, effect: {"refits": made.refits})
     monkeypatch.setattr(_criticism, "confirmed", lambda *others: {"refits": made.confirmed})
-    monkeypatch.setattr(_criticism, "history", lambda folder: made.history)
-    monkeypatch.setattr(_criticism, "remember", lambda folder, entries, *_: setattr(made, "history", entries))
+    monkeypatch.setattr(_history, "history", lambda folder: made.history)
+    monkeypatch.setattr(_history, "remember", lambda folder, entries, *_: setattr(made, "history", entries))
     monkeypatch.setattr(_criticism, "pictured", lambda folder: True)
     monkeypatch.setattr(_criticism, "keep_pictures", lambda folder: None)
     monkeypatch.setattr(_stages, "compared", lambda *others: {})

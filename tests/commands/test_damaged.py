@@ -16,7 +16,7 @@ import pytest
 from splatsoil.inverse.run_folder import RunFolder
 
 from splatsoil import cli
-from splatsoil.commands import _control, _criticism, _stages
+from splatsoil.commands import _control, _criticism, _experiments, _history, _stages
 from splatsoil.commands._options import FitOptions
 from splatsoil.errors import RunError
 from splatsoil.files import write_json, write_npz
@@ -188,7 +188,7 @@ def test_a_fit_by_other_sources_is_said_to_be_one(
     def goes_on(*_: object, **__: object) -> None:
         raise RunError("has gone on")
 
-    monkeypatch.setattr(_criticism, "model_of", goes_on)
+    monkeypatch.setattr(_experiments, "model_of", goes_on)
     monkeypatch.setattr("splatsoil.report.write_report", goes_on)
     assert cli.main([*words(command, run), "--json"]) == 2
     out, err = capsys.readouterr()
@@ -205,7 +205,7 @@ def test_a_model_with_added_effects_is_made_anew_by_adding_them(
 ) -> None:
     fits = [fit_of(), fit_of(["tilt"], tilt_x=1.0), fit_of(["cohesion", "tilt"], tilt_x=1.0, cohesion=100.0)]
     entries = [_criticism.entry(fit, {"held_out": 1.0, "floor": 1.0, "values": {}}) for fit in fits]
-    _criticism.remember(run, entries)
+    _history.remember(run, entries)
     fits[-1]["setup"]["code"] = "of yesterday"
     run.write_fit("cohesion+tilt", fits[-1])
     _stages.note_other_sources(run)

@@ -11,7 +11,7 @@ import pytest
 from splatsoil.inverse.run_folder import RunFolder
 
 from splatsoil import cli
-from splatsoil.commands import _criticism, _stages
+from splatsoil.commands import _criticism, _experiments, _stages
 from splatsoil.commands._options import FitOptions
 from splatsoil.files import read_json, write_json
 from splatsoil.report.data import estimates
@@ -29,7 +29,7 @@ class Stages:
         self.run, self.fit_of, self.done = run, fit_of, list[str]()
         self.stops_at: tuple[str, int] | None = None
         for place, name in (
-            (_criticism, "model_of"),
+            (_experiments, "model_of"),
             (_criticism, "confirmed"),
             (_stages, "fitted"),
             (_stages, "compared"),

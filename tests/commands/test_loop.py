@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from splatsoil.commands import _criticism, _stages, add
+from splatsoil.commands import _criticism, _history, _stages, add
 from splatsoil.commands import run as command
 from splatsoil.commands.run import Config, loop
 from splatsoil.errors import ParameterError, SimulationError
@@ -57,7 +57,7 @@ def stand_in(monkeypatch: pytest.MonkeyPatch, place: Path, adequate: bool) -> No
         monkeypatch.setattr(_stages, name, lambda *_, found=found: found)
     told = {"adequate": adequate, "misfit": {}, "whole": {}, "estimates": {}, "blocks": [], "floor": {}}
     monkeypatch.setattr(_criticism, "misfit", lambda *_: told)
-    monkeypatch.setattr(_criticism, "history", lambda _: [])
+    monkeypatch.setattr(_history, "history", lambda _: [])
     monkeypatch.setattr("splatsoil.report.write_report", lambda path: path)
 
 

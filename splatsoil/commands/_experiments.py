@@ -1,0 +1,76 @@
+"""A run folder as an experiment: its model, and its simulations."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+from splatsoil.errors import ParameterError
+
+if TYPE_CHECKING:
+    from splatsoil.commands._progress import Report
+    from splatsoil.experiment.plow import PlowExperiment
+    from splatsoil.inverse.criticism.simulations import Simulations
+    from splatsoil.inverse.run_folder import RunFolder
+    from splatsoil.model import Model
+    from splatsoil.soil.effect import Effect
+
+
+def model_of(folder: RunFolder, device: str, report: Report, *, anew: bool = True) -> Model:
+    """The model that a run's latest fit is of, on one device; a reconstruction that isn't kept is made ``anew``.
+
+    Raises:
+        RunError: it may not be.
+    """
+    from splatsoil.commands import _stages as stage
+
+    setup = folder.fit()["setup"]
+    measurement = stage.measurement_of(folder)
+    reconstruction = stage.reconstructed(measurement, folder, device, report, anew=anew)
+    return stage.model_on(measurement, folder, reconstruction, setup["effects"], setup["preset"], device)
+
+
+def experiment_of(
+    folder: RunFolder, model: Model, effects: Iterable[str] | None = None
+) -> tuple[PlowExperiment, Simulations]:
+    """The run as criticism sees it, with some effects as candidates or all, and its simulations, kept in ``features/``.
+
+    Raises:
+        ParameterError: an effect that is unknown or on already.
+    """
+    from splatsoil import __version__
+    from splatsoil.commands._control import code_of
+    from splatsoil.commands._stages import digest_of
+    from splatsoil.experiment.plow import PlowExperiment
+    from splatsoil.inverse.criticism.simulations import Simulations
+
+    named = None if effects is None else tuple(effects)
+    wanted = None if named is None else off_effects(named, model.law.effects)
+    fit = folder.fit()
+    experiment = PlowExperiment(model, tuple(fit["parameters"]), candidates=wanted)
+    identity = {
+        "measurement": folder.description["measurement"]["hash"],
+        "reconstruction": digest_of(model.reconstruction),
+        "model": sorted(experiment.model),
+        "preset": model.preset,
+        "device": model.device.split(":")[0],
+        "version": __version__,
+        "code": code_of((*fit["setup"]["effects"], *(named or ()))),
+        "layout": list(experiment.layout.shape),
+    }
+    return experiment, Simulations(experiment, folder.path / "features", identity)
+
+
+def off_effects(names: Iterable[str], on: Iterable[Effect]) -> tuple[Effect, ...]:
+    """Effects by name, or from files, that are none of those that are on.
+
+    Raises:
+        ParameterError: one is unknown, or on already.
+    """
+    from splatsoil.soil.library import find_effects
+
+    wanted, taken = find_effects(names), {effect.name for effect in on}
+    for effect in wanted:
+        if effect.name in taken:
+            raise ParameterError(f"effect {effect.name} is on already; name one that is off")
+    return wanted
