@@ -11,7 +11,6 @@ Exit codes: what ``run`` returns; 2 for a mistake of the user's (one line on std
 from __future__ import annotations
 
 import importlib
-import os
 import pkgutil
 import sys
 from collections.abc import Callable, Sequence
@@ -91,6 +90,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if wants_json:
                 print_json({"ok": False, "error": message})
             return 130
-        except BrokenPipeError:  # the reader of our output (head, less) has gone
-            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-            return 0

@@ -50,6 +50,18 @@ def test_check_writes_nothing_even_where_it_cannot(plow_dry: Path, tmp_path: Pat
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("command", ["--help", "check"])
+def test_a_reader_that_has_gone_is_told_nothing(plow_dry: Path, command: str) -> None:
+    words = [command, *([str(plow_dry)] if command == "check" else [])]
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "wb") as gone:
+        done = subprocess.run(
+            [sys.executable, "-m", "splatsoil", *words], stdout=gone, stderr=subprocess.PIPE, timeout=120, check=False
+        )
+    assert done.stderr == b""
+
+
 def test_a_mistake_is_one_line_without_traceback(small_set: Path) -> None:
     (small_set / "views" / "images" / "001.jpg").unlink()
     done = run("check", str(small_set))
