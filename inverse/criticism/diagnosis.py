@@ -216,12 +216,14 @@ def judge(
             if own is not None:
                 confirmations[best], before, remainder = own.refit, own.before, own.after
                 whole_after, left = own.whole, beyond(own.whole)
-                errors = whole.ratio, own.whole.ratio
+                errors = own.whole_before.ratio, own.whole.ratio
             else:
                 remainder = remainder_of(experiment, floor, tried[best], candidates, evidence, bench.basis)
                 asis, after = (c.held_out / c.floor for c in (confirmations[""], tried[best]))
                 errors, left = (asis, after), after > WITHIN
-            gone = explained(before, remainder) if misfit.p < GATE else explained_of_all(*errors)
+            # Of slow waves there is no share where they show nothing, on either floor.
+            shown = misfit.p < GATE and before.excess > 0.0
+            gone = explained(before, remainder) if shown else explained_of_all(*errors)
     effects = _effects(experiment, candidates, scores, given, members, confirmations, looks.astray, options.level)
     # Where the best explanation is too small to matter, so is what is missing.
     named = bool(members) and effects[members[0]] == "missing"

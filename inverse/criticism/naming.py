@@ -46,8 +46,9 @@ def members_of(
     best = min(among, key=lambda name: among[name])
     if best not in standing:
         return ()
-    # What explains nothing equals nothing, however wide the doubt.
-    explaining = {name: cost for name, cost in among.items() if confirmations[name].fall > 0.0}
+    # What explains nothing, or nothing that its refit hasn't seen, equals nothing, however wide the doubt.
+    told = {name: confirmations[name] for name in among}
+    explaining = {n: among[n] for n, c in told.items() if n in certain or (c.fall > 0.0 and c.unseen > 0.0)}
     return _equals(explaining, best, max(confirmations[best].dispersion, scores[best].dispersion))
 
 

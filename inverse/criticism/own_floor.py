@@ -54,12 +54,14 @@ class OwnFloor:
         after: of the model with the effect.
         refit: with its parameters read off on that floor, and what that leaves on times hidden from refits.
         whole: how far the model with the effect is off in all.
+        whole_before: the same of the model as it is, on that floor.
     """
 
     before: Omnibus
     after: Omnibus
     refit: Confirmation
     whole: Block
+    whole_before: Block
 
 
 def on_its_own_floor(
@@ -114,8 +116,14 @@ def on_its_own_floor(
         values, noise, systematic = soil.told(best.name)
         stds = {name: math.hypot(noise[name], systematic[name]) for name in noise}
         refit = replace(refit, values=values, stds=stds, systematic=systematic)
-    before = soil.misfit(residual, len(experiment.parameters))
-    return OwnFloor(before=before, after=soil.after, refit=refit, whole=soil.whole)
+    own = len(experiment.parameters)
+    return OwnFloor(
+        before=soil.misfit(residual, own),
+        after=soil.after,
+        refit=refit,
+        whole=soil.whole,
+        whole_before=soil.in_all(residual, own),
+    )
 
 
 def as_it_is(
@@ -207,8 +215,11 @@ class _Soil:
     @property
     def whole(self) -> Block:
         """How far such soil is off in all."""
-        left, free = self.left[self.experiment.seen], self._free(len(self.parameters))
-        return blocks(self.experiment.layout, self.floor.noise, free, left)[0]
+        return self.in_all(self.left[self.experiment.seen], len(self.parameters))
+
+    def in_all(self, residual: FloatArray, count: int) -> Block:
+        """How much of a residual (n,) there is once numerics and the first parameters have taken their part."""
+        return blocks(self.experiment.layout, self.floor.noise, self._free(count), residual)[0]
 
     def misfit(self, residual: FloatArray, count: int) -> Omnibus:
         """What of a residual (n,) stands on slow waves once numerics and the first parameters have taken their part."""

@@ -171,8 +171,8 @@ def refitted(
             chance=experiment.chance,
             known=trial.known,
             renewed=_renewed(experiment, candidate),
-            # The model as it is has been fitted, and a surface would go on from there.
-            most=steps if candidate is not None else 0 if trial.emulated else max(steps - 2, 1),
+            # The model as it is has been fitted, if by other weights: what these alone change is no effect's doing.
+            most=steps if candidate is not None else max(steps - 2, 1),
             rounds=0 if candidate is None or trial.emulated else ROUNDS,
             # In steps that bring less chance leads, not derivatives, and a surface goes on from there.
             least=CLEARLY if trial.emulated else -math.inf,

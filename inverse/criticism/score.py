@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -58,6 +58,7 @@ class Score:
         steps: estimates of all its parameters, as distances from off.
         dispersion: by which the remainder along the other effects exceeds noise; z, p and std allow for it.
         lopsided: how many times as far the size is known, by ``std``, as on the side that shows less.
+        stds: standard deviations of ``steps``.
     """
 
     name: str
@@ -73,6 +74,7 @@ class Score:
     dispersion: float = 1.0
     reliability: float = 1.0
     lopsided: float = 1.0
+    stds: Mapping[str, float] = field(default_factory=dict)
 
     def on_the_weaker_side(self, lopsided: float, meaningful: float) -> Score:
         """The same, what is detectable told of the side that shows less."""
@@ -213,15 +215,17 @@ class Scorer:
             np.diag(information) <= SEEN_AT_ALL * np.maximum(whole, 1e-300)
         ):
             # Nothing of it is seen: an estimate of nothing, known to nothing.
-            return _Raw(0.0, 0.0, 0.0, np.zeros(len(own)), math.inf, 0.0)
+            return _Raw(0.0, 0.0, 0.0, np.zeros(len(own)), np.full(len(own), math.inf), 0.0)
         scores = own @ gradient
         statistic, estimate = constrained(scores, information, place, candidate.measure.sign)
         most = self.joint.trivial[self.joint.parts[index]]
         trivial = fall_within(scores, information, most, place, candidate.measure.sign)
-        std = math.sqrt(max(float(np.linalg.pinv(information, hermitian=True)[place, place]), 0.0)) or math.inf
+        variances = np.diag(np.linalg.pinv(information, hermitian=True))
+        stds = np.where(variances > 0.0, np.sqrt(np.maximum(variances, 0.0)), math.inf)
+        std = float(stds[place])
         ratio = float(scores[0]) / math.sqrt(float(information[0, 0])) if len(scores) == 1 else math.nan
         survival = float(1.0 / (std**2 * whole[place])) if whole[place] > 0.0 and math.isfinite(std) else 0.0
-        return _Raw(statistic, max(statistic - trivial, 0.0), ratio, estimate, std, min(survival, 1.0))
+        return _Raw(statistic, max(statistic - trivial, 0.0), ratio, estimate, stds, min(survival, 1.0))
 
     def _score(self, index: int, raw: _Raw, scale: float, freedom: float) -> Score:
         candidate, place = self.candidates[index], self.places[index]
@@ -234,7 +238,8 @@ class Scorer:
         z = raw.ratio / math.sqrt(scale)
         if math.isnan(z):
             z = math.copysign(float(norm.isf(max(0.5 * seen, 1e-300))), float(raw.estimate[place]) or 1.0)
-        std = raw.std * math.sqrt(scale)
+        stds = raw.stds * math.sqrt(scale)
+        std = float(stds[place])
         return Score(
             name=candidate.name,
             statistic=raw.statistic,
@@ -248,19 +253,20 @@ class Scorer:
             steps={q.name: float(v) for q, v in zip(candidate.parameters, raw.estimate, strict=True)},
             dispersion=scale,
             reliability=float(self.reliability[self.joint.parts[index]][place]),
+            stds={q.name: float(v) for q, v in zip(candidate.parameters, stds, strict=True)},
         )
 
 
 @dataclass(frozen=True)
 class _Raw:
     """One candidate's LM, what of it is beyond trivial sizes, a single parameter's score over its spread (NaN for
-    several), estimate, std and survival."""
+    several), estimate, stds and survival."""
 
     statistic: float
     beyond: float
     ratio: float
     estimate: FloatArray
-    std: float
+    stds: FloatArray
     survival: float
 
 

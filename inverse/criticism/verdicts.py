@@ -45,14 +45,19 @@ def of_effect(candidate: Candidate, score: Score, *, level: float = LEVEL, apart
 
     Absent or trivial, unseen or seen, is one whose estimate denies that it matters (Schuirmann 1987, J. Pharmacokinet.
     Biopharm. 15:657), also on the side that shows less, and where another solver is right (``apart``: standard
-    deviation between solvers of the size from which it would). What has a shape of its own was looked for in one shape,
+    deviation between solvers of the size from which it would). Of one with several parameters each counts: a bed may
+    lean one way or the other. What has a shape of its own was looked for in one shape,
     and isn't denied: an obstacle may lie elsewhere.
     """
     meaningful = candidate.measure.meaningful
+    others = [p for p in candidate.parameters if p.name != candidate.size and p.meaningful > 0.0]
+    sizes = {p.name: abs(score.steps[p.name]) for p in others}
     if score.adjusted < level:
-        return "missing" if abs(score.estimate) >= meaningful else "trivial"
+        matters = abs(score.estimate) >= meaningful or any(sizes[p.name] >= p.meaningful for p in others)
+        return "missing" if matters else "trivial"
     unsure = DENIES * math.hypot(score.lopsided * score.std, apart)
     denied = abs(score.estimate) + unsure <= meaningful and score.survival >= LEAST_SURVIVAL
+    denied &= all(sizes[p.name] + DENIES * score.stds[p.name] <= p.meaningful for p in others)
     if denied and not candidate.shapes:
         return "trivial" if abs(score.z) > SEEN else "absent"
     return "cannot tell"

@@ -65,7 +65,7 @@ def off_effects(names: Iterable[str], on: Iterable[Effect]) -> tuple[Effect, ...
     """Effects by name, or from files, that are none of those that are on.
 
     Raises:
-        ParameterError: one is unknown, or on already.
+        ParameterError: one is unknown, on already, or no more than other numerics to a diagnosis.
     """
     from splatsoil.soil.library import find_effects
 
@@ -73,4 +73,9 @@ def off_effects(names: Iterable[str], on: Iterable[Effect]) -> tuple[Effect, ...
     for effect in wanted:
         if effect.name in taken:
             raise ParameterError(f"effect {effect.name} is on already; name one that is off")
+        if effect.numerical:
+            raise ParameterError(
+                f"effect {effect.name} can't be told from other numerics, which a diagnosis allows for; "
+                f"fit it: splatsoil fit SET --with {effect.name}"
+            )
     return wanted

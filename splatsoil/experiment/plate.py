@@ -83,7 +83,7 @@ class PlateExperiment:
         self.parameters: tuple[Parameter, ...] = tuple(
             p for p in law.parameters if p.off is not None or p.name == "friction_angle"
         )
-        acting = (e for n, e in library().items() if n not in NUMERICS and type(e).observe is Effect.observe)
+        acting = (e for e in library().values() if not (e.numerical or e.observes))
         self.candidates = candidates_of(acting, law.effects)
         half = 0.5 * float(depth[-1])
         self.layout = Layout(

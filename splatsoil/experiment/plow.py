@@ -96,9 +96,7 @@ class PlowExperiment:
         self.redrawn = tuple(name for name in self.numerics if name == ROUNDING)
         self.progress = progress
         wanted = tuple(library().values()) if candidates is None else find_effects(candidates)
-        self._wanted: dict[str | Effect, Effect] = {
-            effect.name: effect for effect in wanted if effect.name not in NUMERICS
-        }
+        self._wanted: dict[str | Effect, Effect] = {effect.name: effect for effect in wanted if not effect.numerical}
         self.candidates: tuple[Candidate, ...] = candidates_of(
             (e.for_measurement(model.measurement) for e in self._wanted.values()), model.law.effects
         )

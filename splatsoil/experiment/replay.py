@@ -51,7 +51,7 @@ def replay(
             folder / "set",
             like(base.measurement, SEED, depth=depth),
             friction_angle=values.get("friction_angle", 35.0),
-            effects=experiment.model,
+            effects=base.effects,
             values={name: value for name, value in values.items() if name != "friction_angle"},
             preset=base.preset,
             seed=SEED,
@@ -66,7 +66,7 @@ def replay(
             progress=lambda what, share: told(f"replay: {what}", 0.5 + 0.3 * share),
         )
         model = Model(
-            measurement, scene, effects=experiment.model, preset=base.preset, device=base.device, frames=base.frames
+            measurement, scene, effects=base.effects, preset=base.preset, device=base.device, frames=base.frames
         )
         made = PlowExperiment(model, [p.name for p in experiment.parameters], candidates=(), numerics=())
         told("replay: prediction", 0.85)

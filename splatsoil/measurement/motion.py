@@ -55,6 +55,8 @@ class ToolMotion:
         table = read_table(file, MOTION_COLUMNS)
         frames, times = table[:, 0], table[:, 1]
         check_clock(frames, times, file)
+        if len(table) < 2:
+            raise MeasurementError("a motion has two rows at least: where the tool is at two moments", file=file)
         norms = np.linalg.norm(table[:, 5:], axis=1)
         off = np.flatnonzero(np.abs(norms - 1.0) > _QUATERNION_SLACK)
         if off.size:

@@ -25,9 +25,11 @@ def write_report(folder: str | Path) -> Path:
     Raises:
         RunError: not a run folder, no finished fit, a damaged file, or the folder can't be written.
     """
+    from jinja2 import UndefinedError
+
     try:
         page = render(load(folder))
-    except (KeyError, TypeError, IndexError) as error:
+    except (KeyError, TypeError, IndexError, UndefinedError) as error:
         raise RunError(
             f"{folder}: a file in it lacks what the page needs ({error!r}); it is damaged or made by another "
             "version: fit and compare again"

@@ -87,6 +87,8 @@ def answers(fit: Mapping[str, Any], judged: Mapping[str, Any] | None = None) -> 
                 f"The {plain} lies on the {entry['at_bound']} bound of its range: "
                 "the best value may lie beyond it, or the model may lack an effect."
             )
+        elif called_adequate(fit, judged) is False:
+            remark = f"The model lacks something, which the {plain} makes up for: the ± doesn't hold that."
         out.append(Answer(plain, value, std, symbol(entry["unit"]), state, remark))
     return out
 

@@ -37,6 +37,7 @@ class Effect:
         note: what it is, in one or two sentences.
         source: paper or textbook with equation.
         conflicts: effects that cannot be on at the same time, with the reason.
+        numerical: whether it changes what other numerics change: diagnoses allow for these, and can't tell it.
     """
 
     name: ClassVar[str]
@@ -46,6 +47,7 @@ class Effect:
     source: ClassVar[str] = ""
     strength: ClassVar[Any | None] = None
     conflicts: ClassVar[Mapping[str, str]] = {}
+    numerical: ClassVar[bool] = False
 
     @property
     def observes(self) -> bool:

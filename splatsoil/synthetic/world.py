@@ -23,6 +23,7 @@ from splatsoil.mpm import Preset, Resolution, Trajectory, frames_around, simulat
 from splatsoil.mpm.simulate import base_settings
 from splatsoil.observation import Observation
 from splatsoil.reconstruction.filling import fill
+from splatsoil.soil.effect import Effect
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
 from splatsoil.synthetic.appearance import Appearance
@@ -59,7 +60,7 @@ def make_set(
     setup: Setup,
     *,
     friction_angle: float = 35.0,
-    effects: Iterable[str] = (),
+    effects: Iterable[str | Effect] = (),
     values: Mapping[str, float] | None = None,
     preset: Preset | str = "small",
     seed: int = 0,
@@ -76,7 +77,7 @@ def make_set(
         out: the set's folder; must not exist, or be empty.
         setup: bed, surface, tool, motion and cameras.
         friction_angle: degrees.
-        effects: names of effects (or files that define some) that act.
+        effects: those that act, by name or from files that define some.
         values: their parameters by name; each effect needs one that differs from its off value.
         preset: resolution of the solver.
         seed: of looks, noise and, unless given, particles.

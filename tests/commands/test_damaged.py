@@ -75,6 +75,13 @@ def test_json_of_another_shape_is_named_before_any_work(
         assert json.loads(out) == {"ok": False, "error": err.removeprefix("splatsoil: ").strip()}
 
 
+def test_a_page_that_lacks_something_says_so(run: RunFolder, capsys: pytest.CaptureFixture[str]) -> None:
+    """A fit without its number of evaluations, say: what makes it one is there."""
+    assert cli.main(["report", str(run.path)]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.count("\n") == 1 and "lacks what the page needs" in err
+
+
 def test_a_fit_into_a_run_that_does_not_say_what_it_is_for_is_refused(
     plow_dry: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -9,14 +9,15 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from splatsoil.errors import SimulationError
+from splatsoil.commands._experiments import off_effects
+from splatsoil.errors import ParameterError, SimulationError
 from splatsoil.experiment.plow import MOST_TOGETHER, PlowExperiment
 from splatsoil.experiment.strokes import MEASURED
 from splatsoil.measurement import Measurement
 from splatsoil.model import Model
 from splatsoil.reconstruction import HeightField
 from splatsoil.soil.law import Law
-from splatsoil.soil.library import find_effects
+from splatsoil.soil.library import find_effects, library
 
 
 def asked(numerics: str) -> tuple[list[Any], list[Any]]:
@@ -70,6 +71,15 @@ def test_an_unknown_way_is_not_taken_for_the_usual_one() -> None:
     assert PlowExperiment._variant(experiment, ("cohesion",), "") is base
     with pytest.raises(KeyError, match="gird"):
         PlowExperiment._variant(experiment, ("cohesion",), "gird")
+
+
+def test_what_is_numerics_is_no_candidate(small_set: Path) -> None:
+    measurement = Measurement.load(small_set)
+    surface = HeightField.over(measurement.bed.lower, measurement.bed.upper, 0.02, 0.12)
+    model = Model(measurement, cast(Any, SimpleNamespace(surface=surface)), preset="tiny")
+    assert {c.name for c in PlowExperiment(model).candidates} == {n for n in library() if n != "stiffness"}
+    with pytest.raises(ParameterError, match="other numerics"):
+        off_effects(["stiffness"], ())
 
 
 def test_half_of_no_giving_way_is_no_other_numerics(small_set: Path) -> None:

@@ -296,6 +296,8 @@ CASES = [
     Case("motion-empty", replace("tool_motion.csv", ""), "tool_motion.csv", "line 1", "expected the header"),
     Case("motion-without-rows", replace("tool_motion.csv", "frame,time,x,y,z,qw,qx,qy,qz\n"), "tool_motion.csv", None,
          "no rows"),
+    Case("motion-of-one-row", replace("tool_motion.csv", "frame,time,x,y,z,qw,qx,qy,qz\n0,0,0.2,0.25,0.21,1,0,0,0\n"),
+         "tool_motion.csv", None, "two rows at least"),
     Case("motion-time-backwards", cell(10, 1, "0.1"), "tool_motion.csv", "time, row 10", "runs backwards"),
     Case("motion-time-stands-still", cell(10, 1, "0.16"), "tool_motion.csv", "time, row 10", "stands still"),
     Case("motion-frame-twice", cell(10, 0, "8"), "tool_motion.csv", "frame, row 10", "stands still"),

@@ -101,7 +101,8 @@ def test_an_adequate_fit_is_quoted_as_its_own_diagnosis_weighs_it(of: str, quote
     (answer,) = words.answers(fit, diagnosis)
     assert answer.value == quoted
     assert ("36.0 ± 0.5°" in words.fitted_sentence(fit, diagnosis)) is (quoted == "37")
-    assert words.answers(fit, {**diagnosis, "verdict": "missing"})[0].value == "36.0"
+    (short,) = words.answers(fit, {**diagnosis, "verdict": "missing"})
+    assert short.value == "36.0" and ("lacks something" in short.remark) is (quoted == "37")
     told = {"friction_angle": {"value": 37.1, "std": 8.2, "determined": False}}
     (wide,) = words.answers(fit, {**diagnosis, "estimates": told})
     assert (wide.state == "open") is (quoted == "37") and ("its bounds" in wide.remark) is (quoted == "37")

@@ -22,6 +22,7 @@ class Stiffness(Effect):
         "Elastic strain of the soil's skeleton. Dry sand is far stiffer than the presets, whose softness buys long "
         "time steps; what changes with this factor is numerics before it is soil."
     )
+    numerical = True
     source = "isotropic elasticity; stiffness of sand: Hardin & Black (1966), J. Soil Mech. Found. Div. 92(2)"
 
     def settings(self, settings: Settings, values: Mapping[str, float]) -> Settings:

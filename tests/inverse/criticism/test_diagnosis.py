@@ -18,6 +18,7 @@ from splatsoil.inverse.criticism.diagnosis import Options, diagnose
 from splatsoil.inverse.criticism.misfit import Block, Omnibus
 from splatsoil.inverse.criticism.own_floor import OwnFloor
 from splatsoil.inverse.criticism.record import record
+from splatsoil.inverse.criticism.score import Score
 from splatsoil.inverse.criticism.simulations import Simulations
 from splatsoil.inverse.criticism.verdicts import amiss, explained_of_all, of_effect, overall
 from splatsoil.inverse.criticism.words import sentences
@@ -357,6 +358,18 @@ def test_verdicts_on_an_effect(sizes: dict[str, float]) -> None:
     shaped = replace(candidate, shapes=(candidate.measure,))
     assert of_effect(shaped, denied) == "cannot tell"
     assert of_effect(shaped, replace(score, adjusted=0.001, estimate=2.0 * meaningful)) == "missing"
+    # a slope has two: it is denied, or too small to matter, if both are
+    other = replace(candidate.measure, name="other", sign=0)
+    both = replace(candidate, parameters=(candidate.measure, other))
+
+    def with_other(size: float, std: float, of: Score = denied) -> str:
+        steps, stds = {**of.steps, "other": size * meaningful}, {**of.stds, "other": std * meaningful}
+        return of_effect(both, replace(of, steps=steps, stds=stds))
+
+    assert with_other(0.1, 0.3) == "absent"
+    assert with_other(0.1, 3.0) == with_other(-0.9, 0.3) == "cannot tell"
+    small = replace(score, adjusted=0.001, estimate=0.5 * meaningful)
+    assert (with_other(0.5, 0.1, small), with_other(-1.5, 0.1, small)) == ("trivial", "missing")
     assert math.isfinite(sizes["effect 1"])
 
 

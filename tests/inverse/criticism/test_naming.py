@@ -91,6 +91,16 @@ def test_what_explains_nothing_is_no_equal_however_wide_the_doubt(found: Diagnos
     assert members_of(told, costs, True, scores, dict.fromkeys(told, MEASURE)) == ("effect 2", "little")
 
 
+def test_what_explains_nothing_that_its_refit_has_not_seen_is_no_equal(found: Diagnosis) -> None:
+    best = replace(found.confirmations["effect 2"], fall=100.0, chi2=100.0, freedom=100)
+    told = {"": found.confirmations[""], "effect 2": best, "other": replace(best, fall=97.0)}
+    scores = dict.fromkeys(told, replace(found.scores["effect 2"], dispersion=1.0))
+    costs, measures = {"effect 2": -100.0, "other": -97.0}, dict.fromkeys(told, MEASURE)
+    assert members_of(told, costs, True, scores, measures) == ("effect 2", "other")
+    told["other"] = replace(told["other"], unseen=-80.0)
+    assert members_of(told, costs, True, scores, measures) == ("effect 2",)
+
+
 @pytest.mark.parametrize(("left", "named"), [(0.5, True), (3.0, True), (3.5, False), (30.0, False)])
 def test_of_data_that_nothing_explains_an_effect_must_explain_more(found: Diagnosis, left: float, named: bool) -> None:
     """Soil once leaked out of a made-up box: χ² was 2000 over 120 numbers, and tilt took 49 away."""
