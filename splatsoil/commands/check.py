@@ -124,8 +124,8 @@ def _lengths(values: Any) -> str:
 
 def _contact(give: float | None) -> str:
     if give is None:
-        return "soil gives way to the tool as simulators' soil does; real soil doesn't: say tool.give 0"
-    return f"soil gives way to the tool by {give:g} of its way" if give else "soil doesn't give way to the tool"
+        return "soil gives way to the tool as simulators' does; of photographs of real soil say tool.give 0"
+    return f"soil gives way to the tool: {give:g}" if give else "soil doesn't give way to the tool"
 
 
 def _sizes(sizes: set[tuple[int, int]]) -> str:

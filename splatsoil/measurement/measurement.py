@@ -229,7 +229,7 @@ def _read_tool(fields: Fields, root: Path, assumed: dict[str, float]) -> Tool:
         mesh=read_mesh(mesh_path),
         motion=ToolMotion.read(motion_path),
         friction=_read_friction(fields, "friction", DEFAULT_FRICTION, assumed),
-        give=fields.number("give", 0.0, 1.0, hint="it is a share of the tool's way") if fields.has("give") else None,
+        give=fields.number("give", 0.0, 1.0, hint="it is a share") if fields.has("give") else None,
         force=None if force_path is None else read_force(force_path),
         mesh_path=mesh_path,
         force_path=force_path,

@@ -64,7 +64,7 @@ class Resolution:
         spacing: edge of the cube of soil that a particle stands for, in m.
         frame_time: time between frames in s.
         steps: steps of the particles in a frame.
-        substeps: substeps of the grid in a step.
+        courant: sound-wave Courant number of a substep of the grid.
         bulk: bulk modulus in Pa.
         shear: shear modulus in Pa.
         density: bulk density in kg/m^3.

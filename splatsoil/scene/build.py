@@ -55,7 +55,6 @@ def build_scene(
     intrinsic: Intrinsic | None = None,
     device: torch.device | str = "cpu",
     rounds: int = ROUNDS,
-    background: tuple[float, float, float] | None = None,
 ) -> Scene:
     """A scene from photographs of the undisturbed bed: light estimated, albedo taken from colours, Gaussians bound.
 
@@ -68,7 +67,6 @@ def build_scene(
         intrinsic: light and albedo that were found before; nothing is estimated then.
         device: where the scene is drawn.
         rounds: of refining the albedo.
-        background: (3,) sRGB; the reconstruction's if left out.
 
     Raises:
         ParameterError: particles of another shape, or a reconstruction without soil.
@@ -103,7 +101,7 @@ def build_scene(
         tool_albedo=np.ones(3),
         bed=measurement.bed,
         spacing=spacing,
-        background=np.asarray(reconstruction.background if background is None else background, dtype=np.float64),
+        background=np.asarray(reconstruction.background, dtype=np.float64),
     )
     if intrinsic is not None:
         return intrinsic.coloured(scene)

@@ -1,5 +1,6 @@
 """What our pictures read another solver's particles as."""
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -88,3 +89,4 @@ def test_each_way_of_computing_changes_one_thing() -> None:
     for name, resolution in ways(base).items():
         changed = {k for k, v in vars(resolution).items() if v != getattr(base, k)}
         assert len(changed) == (0 if name == AS_IT_IS else 2 if name in ("stiffness x 3", "cell x 3/4") else 1), name
+    assert len(ways(base)) - len(ways(replace(base, give=0.0))) == 2, "half of no giving way is none"
