@@ -94,6 +94,15 @@ class Trial:
         return has_surface(self.experiment, self.candidate)
 
     @property
+    def explored_alone(self) -> bool:
+        """Whether it is the model as it is, with parameters that make up for each other: steps by derivatives would be
+        led by chance there, so it is only, and always, explored.
+
+        A fit weighs otherwise than a refit does, and what that alone changes is no effect's doing: a model without such
+        parameters takes steps like any other."""
+        return self.candidate is None and self.emulated and len(self.free) > 1
+
+    @property
     def off(self) -> FloatArray:
         """(k,) the free parameters' off values."""
         return np.array([p.off or 0.0 for p in self.free])
@@ -171,8 +180,7 @@ def refitted(
             chance=experiment.chance,
             known=trial.known,
             renewed=_renewed(experiment, candidate),
-            # The model as it is has been fitted, if by other weights: what these alone change is no effect's doing.
-            most=steps if candidate is not None else max(steps - 2, 1),
+            most=steps if candidate is not None else 0 if trial.explored_alone else max(steps - 2, 1),
             rounds=0 if candidate is None or trial.emulated else ROUNDS,
             # In steps that bring less chance leads, not derivatives, and a surface goes on from there.
             least=CLEARLY if trial.emulated else -math.inf,
@@ -233,7 +241,7 @@ def stop(trials: Sequence[Trial], count: int) -> None:
     best = max(possible, key=lambda t: falls[t.name])
     dispersion = max(1.0, best.fit.chi2 / max(count - len(best.free), 1))
     least = min(LEAST_SHARE * falls[best.name], falls[best.name] - CLEARLY * dispersion)
-    asis.stopped = asis.emulated and least > 0.0
+    asis.stopped = asis.emulated and least > 0.0 and not asis.explored_alone
     for trial in others:
         trial.stopped = trial.emulated and trial.told >= CERTAIN and falls[trial.name] < least
 

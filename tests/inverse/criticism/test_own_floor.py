@@ -207,15 +207,12 @@ def nearby(experiment: EmulatedExperiment, truth: dict[str, float]) -> dict[str,
 
 
 def test_parameters_of_a_model_that_has_an_effect_are_told_as_well_as_is_said() -> None:
-    """By two seeds' derivatives, as a model without effects is read, three of the first six angles end at a bound."""
+    """By two seeds' derivatives, as a model without effects is read, three of the six angles end at a bound."""
     off, errors = [], []
-    for world in range(8):
+    for world in range(6):
         experiment, truth = with_the_effect(world)
         found = diagnose(experiment, nearby(experiment, truth))
-        # In the fourth another effect is significant (p of 0.013), which happens to one in twenty.
-        assert found.verdict == "adequate" or world == 3
-        if found.verdict != "adequate":
-            continue
+        assert found.verdict == "adequate"
         told = found.estimates
         off += [(told[name].value - truth[name]) / told[name].std for name in truth]
         errors.append(told["angle"].value - truth["angle"])
