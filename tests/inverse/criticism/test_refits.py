@@ -21,6 +21,7 @@ from splatsoil.inverse.criticism.simulations import Simulations
 
 from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Candidate
+from splatsoil.experiment.emulated import EmulatedExperiment
 
 WORLDS, HIDDEN, SIZE = range(2), "effect 2", 8.0
 EXPERIMENT = emulated(0, chaos=0.9)
@@ -79,11 +80,11 @@ def trial(fall: float, known: Known | None = None, size: float = 0.0) -> Trial:
     return made
 
 
-def goes_on(*others: Trial, count: int = 1000) -> list[bool]:
+def goes_on(*others: Trial, count: int = 1000, experiment: EmulatedExperiment = EXPERIMENT) -> list[bool]:
     """Whether each goes on, as an effect of its own, and the model as it is, of as many numbers in χ²."""
     for number, other in enumerate(others):
         other.candidate = EXPERIMENT.candidates[number]
-    asis = Trial(EXPERIMENT, None, Known.nothing(1), Simulations(EXPERIMENT), [0], [])
+    asis = Trial(experiment, None, Known.nothing(1), Simulations(experiment), [0], [])
     asis.fit = Refit({"angle": 0.0}, 1000.0, EXPERIMENT.middle, 3, np.zeros((*EXPERIMENT.layout.shape, 1)))
     stop([asis, *others], count)
     return [not trial.stopped for trial in (*others, asis)]
@@ -103,6 +104,14 @@ def test_what_other_pictures_ask_for_goes_on_and_what_they_deny_stops_nothing() 
     assert goes_on(trial(400.0), trial(0.0, told, size=5.0)) == [True, True, False]
     nothing = Known(np.array([[0.0, 2.0]]), np.array([0.0, 0.0]))
     assert goes_on(trial(400.0, nothing, size=5.0), trial(100.0), trial(45.0)) == [True, True, False, False]
+
+
+def test_a_model_whose_parameters_make_up_for_each_other_goes_on() -> None:
+    """It took no steps, so that nothing is known of how much these parameters would take off χ²."""
+    second = replace(EXPERIMENT.parameters[0], name="second")
+    two = replace(EXPERIMENT, parameters=(*EXPERIMENT.parameters, second))
+    assert goes_on(trial(100.0), trial(45.0)) == [True, False, False]
+    assert goes_on(trial(100.0), trial(45.0), experiment=two) == [True, False, True]
 
 
 def test_the_model_as_it_is_alone_stops_nothing() -> None:
