@@ -99,7 +99,8 @@ class Trial:
         led by chance there, so it is only, and always, explored.
 
         A fit weighs otherwise than a refit does, and what that alone changes is no effect's doing: a model without such
-        parameters takes steps like any other."""
+        parameters takes steps like any other.
+        """
         return self.candidate is None and self.emulated and len(self.free) > 1
 
     @property

@@ -46,8 +46,8 @@ def of_effect(candidate: Candidate, score: Score, *, level: float = LEVEL, apart
     Absent or trivial, unseen or seen, is one whose estimate denies that it matters (Schuirmann 1987, J. Pharmacokinet.
     Biopharm. 15:657), also on the side that shows less, and where another solver is right (``apart``: standard
     deviation between solvers of the size from which it would). Of one with several parameters each counts: a bed may
-    lean one way or the other. What has a shape of its own was looked for in one shape,
-    and isn't denied: an obstacle may lie elsewhere.
+    lean one way or the other. What has a shape of its own was looked for in one shape, and isn't denied: an obstacle
+    may lie elsewhere.
     """
     meaningful = candidate.measure.meaningful
     others = [p for p in candidate.parameters if p.name != candidate.size and p.meaningful > 0.0]

@@ -213,12 +213,18 @@ def test_soil_sunk_into_a_tool_comes_out_by_the_second(steps: int) -> None:
     assert left[2] < 2.5e-3
 
 
+def bed_on_a_plate(height: float) -> tuple[np.ndarray, np.ndarray]:
+    """Particles (n, 3) between 6 cm and so much more, from wall to wall, and the box's upper corner."""
+    spacing = RESOLUTION.spacing
+    plane = np.arange(0.5 * spacing, 0.12, spacing)
+    levels = np.arange(0.06 + 0.5 * spacing, 0.06 + height - 0.1 * spacing, spacing)
+    grid = np.meshgrid(plane, plane, levels, indexing="ij")
+    return np.stack(grid, axis=-1).reshape(-1, 3), np.array([0.12, 0.12, 0.2])
+
+
 def test_what_has_parted_from_a_tool_is_pushed_anew() -> None:
     """A bed on a plate that is lifted by 4 mm, drops away at once, and is there again when the bed has fallen on it."""
-    upper, spacing = np.array([0.12, 0.12, 0.2]), 0.01
-    plane = np.arange(0.5 * spacing, 0.12, spacing)
-    levels = np.arange(0.06 + 0.5 * spacing, 0.10, spacing)
-    x = np.stack(np.meshgrid(plane, plane, levels, indexing="ij"), axis=-1).reshape(-1, 3)
+    x, upper = bed_on_a_plate(0.04)
     smooth = Settings(friction_angle=35.0, wall_friction=0.0, tool_friction=0.0)
     resolution = replace(RESOLUTION, relaxation=100.0, give=0.1, depth=0.05, skin=0.0)
     plate = trimesh.creation.box([0.2, 0.2, 0.04])
@@ -250,10 +256,8 @@ def test_a_bed_on_a_tool_gives_way_to_it_as_told(steps: int, stiffer: float) -> 
     that gives way sinks on while the tool is lifted, by give of the way as often as that pressure is the passive one at
     the usual depth and the mean way until then as long, by any steps and stiffness; a tool that stands, sinks, or
     slides along bears it for good."""
-    upper, height, spacing = np.array([0.12, 0.12, 0.2]), 0.08, 0.01
-    plane = np.arange(0.5 * spacing, 0.12, spacing)
-    levels = np.arange(0.06 + 0.5 * spacing, 0.06 + height, spacing)
-    x = np.stack(np.meshgrid(plane, plane, levels, indexing="ij"), axis=-1).reshape(-1, 3)
+    height, spacing = 0.08, RESOLUTION.spacing
+    x, upper = bed_on_a_plate(height)
     plate = trimesh.creation.box([0.2, 0.2, 0.04])
     smooth = Settings(friction_angle=35.0, wall_friction=0.0, tool_friction=0.0)
     bulk, frames = stiffer * RESOLUTION.bulk, 25
@@ -291,10 +295,8 @@ def test_a_bed_on_a_tool_gives_way_to_it_as_told(steps: int, stiffer: float) -> 
 def test_friction_on_a_tool_is_coulombs_unless_a_film_bears_less(steps: int, speed: float) -> None:
     """A plate slides beneath a bed that walls hold. In a substep no more than a particle's momentum is taken, a film of
     density * spacing / substep: slow slip under high pressure meets that, quick slip friction times the weight."""
-    upper, height, spacing, friction = np.array([0.12, 0.12, 0.2]), 0.08, 0.01, 0.3
-    plane = np.arange(0.5 * spacing, 0.12, spacing)
-    levels = np.arange(0.06 + 0.5 * spacing, 0.06 + height, spacing)
-    x = np.stack(np.meshgrid(plane, plane, levels, indexing="ij"), axis=-1).reshape(-1, 3)
+    spacing, friction = RESOLUTION.spacing, 0.3
+    x, upper = bed_on_a_plate(0.08)
     plate = trimesh.creation.box([0.6, 0.6, 0.04])
     held = Settings(friction_angle=45.0, wall_friction=0.0, tool_friction=friction)
     resolution = replace(RESOLUTION, steps=steps, relaxation=100.0, skin=0.0)

@@ -20,7 +20,7 @@ def ways_out(
     out: wp.array(dtype=wp.float32),
 ) -> None:
     i = wp.tid()
-    out[i] = way_out(grid, 30, 40, origins[i], rays[i])
+    out[i] = way_out(grid, wp.static(ROWS), wp.static(COLUMNS), origins[i], rays[i])
 
 
 def test_rays_end_where_the_map_does() -> None:

@@ -98,6 +98,23 @@ def test_what_is_left_is_held_against_soil_that_has_the_effect(
     assert "nothing more need be missing" not in " ".join(slow)
 
 
+def test_what_is_explained_compares_errors_on_one_floor(
+    sizes: dict[str, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where slow waves show nothing on the floor of soil that has the effect, which is the wider one."""
+    own_floor = diagnosis.on_its_own_floor
+
+    def other(*arguments: Any) -> OwnFloor:
+        own = own_floor(*arguments)
+        before, after = (replace(own.whole, ratio=ratio) for ratio in (1.5, 1.1))
+        return replace(own, before=replace(own.before, statistic=0.0), whole_before=before, whole=after)
+
+    monkeypatch.setattr(diagnosis, "on_its_own_floor", other)
+    found = one(WORLD, {"angle": 1.0, "effect 2": 5.0 * sizes["effect 2"]}, None, OPTIONS)
+    assert found.whole.ratio != pytest.approx(1.5, abs=0.01)
+    assert found.explained == pytest.approx(explained_of_all(1.5, 1.1))
+
+
 def test_a_move_within_its_own_spread_is_not_called_bias(sizes: dict[str, float]) -> None:
     found = one(WORLD, {"angle": 1.0, "effect 2": 5.0 * sizes["effect 2"]}, None, OPTIONS)
     candidates = {c.name: c for c in emulated(WORLD).candidates}
