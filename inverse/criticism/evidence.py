@@ -90,7 +90,8 @@ class Evidence(Vantage):
         numerics: (t, s) what other numerics change, by name: the mean over two seeds where there is chance in it.
         numerics_doubts: (t, s) half the difference between these two, as large as the chance that is left; by name.
         guesses: (g, t, s) the same of other guesses of what no instrument shows, all drawn of one simulation.
-        replays: (k, t, s) residuals of known soils that went through the whole chain of pictures and reconstruction.
+        replays: (k, t, s) residuals of known soils that went through the whole chain of pictures and reconstruction;
+            NaN where these don't tell.
         calibration: what pictures say of cameras, light, clock and tool where soil plays no part.
     """
 

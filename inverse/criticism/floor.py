@@ -21,6 +21,7 @@ from .noise import Noise, Part, extra_noise, independent
 from .sampled_noise import correlated, estimate
 
 FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
 
 NUMERICS_PRIOR = 0.5
 """Standard deviation of a numerical difference pattern's amplitude, in units of the change that was tried: thirteen of
@@ -64,7 +65,7 @@ class Floor:
         """(n, q + k) all that is projected out."""
         return np.concatenate([self.nuisance, self.parameters], axis=1)
 
-    def share(self, name: str, sites: npt.NDArray[np.bool_]) -> float:
+    def share(self, name: str, sites: BoolArray) -> float:
         """A part's share of the whole variance at some sites (s,), whose features are in one unit."""
         mine = self.noise.seen & sites[None]
         totals = {key: float(np.sum(part.scale[mine] ** 2)) for key, part in self.parts.items()}
@@ -139,7 +140,7 @@ def _instruments(experiment: Experiment, evidence: Evidence, known: Noise) -> Pa
     """
     quiet, signal = experiment.quiet, np.abs(evidence.mean)
     scale = known.spread(known.scale)[quiet]
-    rest = _unreported(experiment, evidence, experiment.observed - evidence.mean, scale)
+    rest = _unreported(experiment, evidence, experiment.observed - evidence.mean, quiet, scale)
     terms = np.stack([np.ones(rest.size), signal[quiet] ** 2], axis=1)
     size = np.maximum(np.linalg.norm(terms, axis=0), 1e-300)
     squares = rest**2
@@ -159,10 +160,12 @@ def _instruments(experiment: Experiment, evidence: Evidence, known: Noise) -> Pa
     return replace(found, scale=whole)
 
 
-def _unreported(experiment: Experiment, evidence: Evidence, table: FloatArray, scale: FloatArray) -> FloatArray:
-    """(q,) what is left of a table (t, s) in quiet features, of noise ``scale`` (q,), once exposure, camera poses and
-    the like are taken out; where these effects aren't at hand, what changes all of a camera's frame alike."""
-    quiet, layout = experiment.quiet, experiment.layout
+def _unreported(
+    experiment: Experiment, evidence: Evidence, table: FloatArray, quiet: BoolArray, scale: FloatArray
+) -> FloatArray:
+    """(q,) what is left of a table (t, s) in quiet features (t, s), of noise ``scale`` (q,), once exposure, camera
+    poses and the like are taken out; where these effects aren't at hand, what changes all of a camera's frame alike."""
+    layout = experiment.layout
     reported = [c.name for c in experiment.candidates if c.kind == "observation" and c.name in evidence.directions]
     if reported:
         tables = np.concatenate([evidence.directions[name] for name in reported])
@@ -196,28 +199,33 @@ def _replayed(experiment: Experiment, evidence: Evidence, parts: Mapping[str, Pa
     of the pictures; theirs are all over it.
     """
     assert evidence.replays is not None
-    whole = estimate(experiment.layout, evidence.replays, experiment.seen)
+    told = np.isfinite(evidence.replays).all(axis=0)
+    replays = np.where(told, evidence.replays, 0.0)
+    whole = estimate(experiment.layout, replays, experiment.seen & told)
     known = parts["instruments"].scale ** 2
     if "chance" in parts:
         known = known + 2.0 * parts["chance"].scale ** 2
     if "guesses" in parts:
         known = known + parts["guesses"].scale ** 2
     variance = np.maximum(whole.scale**2 - known, 0.0)
-    if np.count_nonzero(experiment.quiet.any(axis=0)) >= FEWEST_SQUARES:
+    quiet = experiment.quiet & told
+    if np.count_nonzero(quiet.any(axis=0)) >= FEWEST_SQUARES:
         scale = np.maximum(np.hypot(whole.scale, experiment.sensor), 1e-9)
-        real = _middle_square(experiment, evidence, (experiment.observed - evidence.mean)[None], scale)
-        more = max(0.0, real - _middle_square(experiment, evidence, evidence.replays, scale))
+        real = _middle_square(experiment, evidence, (experiment.observed - evidence.mean)[None], quiet, scale)
+        more = max(0.0, real - _middle_square(experiment, evidence, replays, quiet, scale))
         # Where nothing moves pictures tell of pictures alone.
         variance[:, experiment.layout.common] += more
     return replace(whole, scale=np.sqrt(variance))
 
 
-def _middle_square(experiment: Experiment, evidence: Evidence, tables: FloatArray, scale: FloatArray) -> float:
-    """Median over quiet sites, and over tables (r, t, s), of the mean square there, beyond what cameras report."""
-    quiet = experiment.quiet
+def _middle_square(
+    experiment: Experiment, evidence: Evidence, tables: FloatArray, quiet: BoolArray, scale: FloatArray
+) -> float:
+    """Median over sites with quiet features (t, s), and over tables (r, t, s), of the mean square there, beyond what
+    cameras report."""
     squares = np.zeros(tables.shape)
     for square, table in zip(squares, tables, strict=True):
-        square[quiet] = _unreported(experiment, evidence, table, scale[quiet]) ** 2
+        square[quiet] = _unreported(experiment, evidence, table, quiet, scale[quiet]) ** 2
     counts = quiet.sum(axis=0)
     return float(np.median(squares.sum(axis=1)[:, counts > 0] / counts[counts > 0]))
 
@@ -227,7 +235,7 @@ def _factors(name: str, runs: int) -> tuple[float, float]:
     return (1.0 + 1.0 / runs, 2.0) if name == "chance" else (1.0, 1.0)
 
 
-def _total(layout: Layout, parts: Mapping[str, Part], seen: npt.NDArray[np.bool_], runs: int) -> tuple[Noise, Noise]:
+def _total(layout: Layout, parts: Mapping[str, Part], seen: BoolArray, runs: int) -> tuple[Noise, Noise]:
     """Noise against the mean of ``runs`` predictions, and against one."""
     averaged, alone = (
         Noise.of(layout, [(_factors(name, runs)[i], part) for name, part in parts.items()], seen) for i in (0, 1)
@@ -240,7 +248,7 @@ def _unexplained(
     parameters: FloatArray,
     patterns: Sequence[FloatArray],
     doubts: Sequence[FloatArray],
-    common: npt.NDArray[np.bool_],
+    common: BoolArray,
 ) -> FloatArray:
     """(p, t, s) what each pattern holds beyond the parameters and the other patterns, as large as it is without the
     chance that its doubts (p tables) tell: that is a part of the noise already.
@@ -266,7 +274,7 @@ def _unexplained(
     return left * np.minimum(1.0, np.median(size) / np.maximum(size, 1e-300))[:, None, None]
 
 
-def _columns(tables: Sequence[FloatArray] | FloatArray, seen: npt.NDArray[np.bool_]) -> FloatArray:
+def _columns(tables: Sequence[FloatArray] | FloatArray, seen: BoolArray) -> FloatArray:
     """(n, k) of k tables."""
     if not len(tables):
         return np.zeros((int(seen.sum()), 0))

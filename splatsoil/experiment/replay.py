@@ -34,7 +34,8 @@ def replay(
     *,
     progress: Callable[[str, float], None] | None = None,
 ) -> FloatArray:
-    """(t, s) observed minus predicted features of a made-up bed with the same tool, cameras and parameters.
+    """(t, s) observed minus predicted features of a made-up bed with the same tool, cameras and parameters; NaN where
+    that hides what the experiment's own bed shows.
 
     Args:
         experiment: whose bed, tool, motion, cameras, model and preset are used.
@@ -70,12 +71,11 @@ def replay(
         )
         made = PlowExperiment(model, [p.name for p in experiment.parameters], candidates=(), numerics=())
         told("replay: prediction", 0.85)
-        left = np.where(made.seen, made.observed - made.predict(values), 0.0)
+        left = np.where(made.seen, made.observed - made.predict(values), np.nan)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-    # Squares that one of the two beds hides or cuts stay 0.
     place = {_key(site): i for i, site in enumerate(made.layout.sites)}
-    out = np.zeros(experiment.layout.shape)
+    out = np.full(experiment.layout.shape, np.nan)
     for column, site in enumerate(experiment.layout.sites):
         found = place.get(_key(site))
         if found is not None:

@@ -118,6 +118,25 @@ def test_a_control_tells_errors_of_pictures_and_the_bed_only_what_is_worse_all_o
     assert np.sqrt(np.mean(found.parts["reconstruction"].scale ** 2)) == pytest.approx(told, rel=0.12)
 
 
+def test_what_a_control_does_not_show_is_as_uncertain_as_what_lies_around() -> None:
+    """Its own heaps hide other squares: that these come out right there is nothing that anybody has seen."""
+    generator = np.random.default_rng(3)
+    base = evidence(generator, {})
+    quiet = np.ones(LAYOUT.shape, dtype=bool)
+    quiet[:, :6] = False
+    experiment = looked(ERROR * generator.standard_normal(LAYOUT.shape), quiet)
+    control = 2.0 * ERROR * generator.standard_normal((1, *LAYOUT.shape))
+    hidden = np.zeros(LAYOUT.shape, dtype=bool)
+    hidden[:, [2, 3, 12, 27]] = True
+
+    def scale(replays: np.ndarray) -> np.ndarray:
+        return floor_of(experiment, replace(base, replays=replays)).parts["reconstruction"].scale
+
+    whole, partial = scale(control), scale(np.where(hidden, np.nan, control))
+    assert np.mean(partial[hidden] ** 2) == pytest.approx(np.mean(whole**2), rel=0.4)
+    np.testing.assert_allclose(partial[~hidden], whole[~hidden], rtol=0.3)
+
+
 def test_a_wild_numerics_pattern_does_not_stand_for_those_not_tried() -> None:
     assert floor_with(wild=30.0)[1] < 1.3 * floor_with()[1]
     assert floor_with(wild=30.0)[1] > 0.5
