@@ -29,7 +29,7 @@ class Config(FitOptions):
 
     Where the model isn't adequate also: diagnose it, add the effect that is missing (or the nearest, where it explains
     half of the misfit), fit again, and so on, until the model is adequate, no effect of the library explains what is
-    left, or the limit is reached. Each round takes two cores half an hour or so.
+    left, or the limit is reached. Each round takes two cores a quarter of an hour, or half an hour of a slow processor.
     """
 
     criticise: bool = False
