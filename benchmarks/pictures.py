@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -93,13 +93,8 @@ def amplitudes(
 
 
 def ways(base: Resolution) -> dict[str, Resolution]:
-    """Our solver as it is, and with a piece of its numerics changed (soil that doesn't give way does so by no half)."""
-    changed = {
-        **variants(base),
-        "soil gives way half as much": replace(base, give=0.5 * base.give),
-        "soil gives way half as much again": replace(base, give=1.5 * base.give),
-    }
-    return {AS_IT_IS: base, **{name: resolution for name, resolution in changed.items() if resolution != base}}
+    """Our solver as it is, and with a piece of its numerics changed."""
+    return {AS_IT_IS: base, **variants(base)}
 
 
 class Bench:

@@ -64,7 +64,6 @@ def _as_json(measurement: Measurement, said: tuple[Remark, ...]) -> dict[str, An
             "extents": tool.mesh.extents.tolist(),
             "volume": float(tool.mesh.volume),
             "friction": tool.friction,
-            "give": tool.give,
             "rows": len(tool.motion.times),
             "seconds": float(tool.motion.times[-1] - tool.motion.times[0]),
             "force_rows": 0 if tool.force is None else len(tool.force),
@@ -112,7 +111,6 @@ def _rows(measurement: Measurement) -> list[tuple[str, str]]:
         ("pre-roll", f"{len(pre_roll)} frames" if pre_roll else "none"),
         ("tool", f"{_lengths(tool.mesh.extents)} m, {len(tool.mesh.faces)} triangles, friction {tool.friction:g}"),
         ("motion", f"{len(motion.times)} rows, {motion.times[-1] - motion.times[0]:g} s, {way:.3g} m of way"),
-        ("contact", _contact(tool.give)),
         ("force", "not measured" if tool.force is None else f"{len(tool.force)} rows"),
         ("hash", measurement.hash[:16]),
     ]
@@ -120,12 +118,6 @@ def _rows(measurement: Measurement) -> list[tuple[str, str]]:
 
 def _lengths(values: Any) -> str:
     return " x ".join(f"{v:g}" for v in values.round(4))
-
-
-def _contact(give: float | None) -> str:
-    if give is None:
-        return "soil gives way to the tool as simulators' does; of photographs of real soil say tool.give 0"
-    return f"soil gives way to the tool: {give:g}" if give else "soil doesn't give way to the tool"
 
 
 def _sizes(sizes: set[tuple[int, int]]) -> str:

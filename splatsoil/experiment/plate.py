@@ -161,7 +161,7 @@ def _set_up(diameter: float, deepest: float, density: float, friction: float) ->
         frame_rate=FRAME_RATE,
         bed=bed,
         # Real soil bears a plate better than soil that gives way ever could.
-        tool=Tool(plate, motion, friction=friction, give=0.0),
+        tool=Tool(plate, motion, friction=friction),
         views=(),
         video=(),
     )

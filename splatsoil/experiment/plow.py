@@ -41,10 +41,8 @@ NUMERICS: Mapping[str, Callable[[Resolution], Resolution]] = {
     "stiffness": lambda r: replace(r, bulk=3.0 * r.bulk, shear=3.0 * r.shear),
     "step": lambda r: replace(r, steps=2 * r.steps),
     "grid": lambda r: replace(r, cell=0.8 * r.cell, spacing=0.8 * r.spacing),
-    "contact": lambda r: replace(r, give=0.5 * r.give),
 }
-"""Other ways to compute the same physics: three times as stiff, twice as many steps, a finer grid, soil that
-gives way to the tool half as much."""
+"""Other ways to compute the same physics: three times as stiff, twice as many steps, a finer grid."""
 ROUNDING = "rounding"
 """Another drawing of the same simulation, its surface rounded off twice as much. To first order that changes features
 by as much as the drawing has done already, so that one such change is what it gets wrong."""
@@ -91,8 +89,7 @@ class PlowExperiment:
         self.name = model.measurement.name
         self.model = tuple(effect.name for effect in model.law.effects)
         self.parameters: tuple[Parameter, ...] = tuple(model.space(parameters))
-        # Where soil doesn't give way half of that is no other way to compute.
-        self.numerics = tuple(n for n in numerics if n == ROUNDING or NUMERICS[n](model.resolution) != model.resolution)
+        self.numerics = tuple(numerics)
         self.redrawn = tuple(name for name in self.numerics if name == ROUNDING)
         self.progress = progress
         wanted = tuple(library().values()) if candidates is None else find_effects(candidates)

@@ -222,6 +222,8 @@ def _read_gravity(fields: Fields) -> FloatArray:
 
 
 def _read_tool(fields: Fields, root: Path, assumed: dict[str, float]) -> Tool:
+    if fields.has("give"):
+        fields.fail("give", "soil does not give way to the tool; remove this field")
     mesh_path = fields.path("mesh", root, root)
     motion_path = fields.path("motion", root, root)
     force_path = fields.path("force", root, root) if fields.has("force") else None
@@ -229,7 +231,6 @@ def _read_tool(fields: Fields, root: Path, assumed: dict[str, float]) -> Tool:
         mesh=read_mesh(mesh_path),
         motion=ToolMotion.read(motion_path),
         friction=_read_friction(fields, "friction", DEFAULT_FRICTION, assumed),
-        give=fields.number("give", 0.0, 1.0, hint="it is a share") if fields.has("give") else None,
         force=None if force_path is None else read_force(force_path),
         mesh_path=mesh_path,
         force_path=force_path,

@@ -27,8 +27,6 @@ class Tool:
         mesh: closed surface in the tool's frame, metres.
         motion: where that frame is over time.
         friction: Coulomb coefficient between tool and soil.
-        give: of the tool's way, how much soil gives way to it, as :attr:`splatsoil.mpm.Resolution.give`: 0 for real
-            soil. None where it isn't known: presets then take what simulators' soil does.
         force: (n, 5) columns frame, time, fx, fy, fz: the soil's force on the tool in newtons, world axes; or None.
         mesh_path: the file the mesh came from, if any.
         force_path: the file the force came from, if any.
@@ -37,7 +35,6 @@ class Tool:
     mesh: trimesh.Trimesh
     motion: ToolMotion
     friction: float = DEFAULT_FRICTION
-    give: float | None = None
     force: FloatArray | None = None
     mesh_path: Path | None = None
     force_path: Path | None = None

@@ -102,7 +102,6 @@ def write_measurement(
                 "mesh": "tool.stl",
                 "motion": "tool_motion.csv",
                 "friction": tool.friction,
-                **({} if tool.give is None else {"give": tool.give}),
                 **({} if tool.force is None else {"force": "tool_force.csv"}),
             },
             "views": "views/transforms.json",

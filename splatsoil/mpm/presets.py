@@ -9,7 +9,6 @@ import numpy as np
 
 from splatsoil.errors import ParameterError, SimulationError
 from splatsoil.measurement import Measurement
-from splatsoil.soil.settings import Settings
 
 COURANT_LIMIT = 0.8
 """Of the substeps: a full cell becomes unstable at 1."""
@@ -29,25 +28,22 @@ class Preset:
         courant: sound-wave Courant number of a substep.
         transport: most cells the tool may travel in one step of the particles.
         way: of the tool, in cells, over which hourglass modes are damped once, see :attr:`Resolution.relaxation`.
-        give: of the tool's way, how much soil gives way to it under its passive pressure, once it was pushed over the
-            usual depth, unless the measurement tells; see :meth:`Resolution.ease`.
     """
 
     name: str
     cells_across_tool: float
     particles_per_edge: int = 2
-    young: float = 5.0e5
+    young: float = 5.0e6
     poisson: float = 0.3
     courant: float = 0.5
     transport: float = 0.1
     way: float = 0.1
-    give: float = 0.234
 
 
 PRESETS: dict[str, Preset] = {
     preset.name: preset
     for preset in (
-        Preset("tiny", cells_across_tool=3.0, young=2.0e5, transport=0.2, way=0.2),
+        Preset("tiny", cells_across_tool=3.0, transport=0.2, way=0.2),
         Preset("small", cells_across_tool=6.0, way=1.0 / 15.0),
         Preset("fine", cells_across_tool=8.0, transport=0.05, way=0.05),
         Preset("paper", cells_across_tool=3.2, young=1.0e6, poisson=0.2),
@@ -71,13 +67,6 @@ class Resolution:
         relaxation: exchanges between particles and grid a second of which hourglass modes and the tool's contact shall
             know, whatever the number of ``steps``: the former are damped as that many plain APIC exchanges would, soil
             sunk into the tool comes out at twice the rate. 0 for as many as there are.
-        give: of the tool's way towards the soil, how much soil gives way to it where the contact's pressure is the
-            soil's passive one and the tool has pushed it over the usual depth, see :meth:`ease`. A tool that stands is
-            borne for good. Real soil doesn't give way. Other solvers' soil does where iterations end early, and is lost
-            to the heap: see docs/numerics.md.
-        depth: the usual one, of which soil's passive pressure is told, in m: half the tool's second longest edge. Soil
-            that gives way needs it.
-        rate: usual shear rate of soil before the tool, in 1/s: its largest speed over that depth.
         skin: of the spacing, how far from the faces of a plate thinner than a cell particles stop, because they stand
             for soil half a spacing around them. Its edges need none: contact acts through the grid, which widens them.
             Thick bodies have none, because nothing was measured on them.
@@ -92,9 +81,6 @@ class Resolution:
     shear: float
     density: float
     relaxation: float = 0.0
-    give: float = 0.0
-    depth: float = 0.0
-    rate: float = 0.0
     skin: float = 0.5
 
     def __post_init__(self) -> None:
@@ -102,12 +88,8 @@ class Resolution:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
                 raise SimulationError(f"resolution: {name} = {value} must be a positive number")
-        for name in ("relaxation", "give", "depth", "rate"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0.0):
-                raise SimulationError(f"resolution: {name} = {value} must be 0 or a positive number")
-        if self.give > 0.0 and self.depth == 0.0:
-            raise SimulationError("resolution: soil that gives way needs the depth of its usual pressure")
+        if not (math.isfinite(self.relaxation) and self.relaxation >= 0.0):
+            raise SimulationError(f"resolution: relaxation = {self.relaxation} must be 0 or a positive number")
         if not 0.0 <= self.skin <= 1.0:
             raise SimulationError(f"resolution: skin = {self.skin} must be between 0 and 1")
         if self.courant > COURANT_LIMIT:
@@ -124,29 +106,9 @@ class Resolution:
         """Substeps in each of ``steps`` steps of a frame that keep the Courant limit."""
         return max(1, math.ceil(self.frame_time / steps * self.wave_speed / (self.courant * self.cell) - 1e-9))
 
-    def ease(self, settings: Settings) -> float:
-        """Of the tool's way, how much this soil gives way for each Pa of the contact's pressure and each metre over
-        which it has been pushed since they touched, in 1/(Pa m).
-
-        In proportion to the pressure over the soil's passive one (Rankine 1857) at the usual depth, so that what a soil
-        gives hangs on no unit: dry soil is the same under any gravity (Froude). Soil with a strength c that needs no
-        pressure counts as dry soil in which all pressures are larger by c cot(friction angle) (Caquot's theorem of
-        corresponding states; Caquot & Kérisel 1949); that is its cohesion, and its viscosity times the shear rate. And
-        in proportion to the way over the usual depth: what a tool is lowered into or begins to push gives way less than
-        what it has piled up before it. 0 where there is neither weight nor such strength.
-        """
-        if self.give == 0.0:
-            return 0.0
-        weight = self.density * float(np.linalg.norm(settings.gravity)) * self.depth
-        strength = settings.cohesion + settings.viscosity * self.rate
-        angle = math.radians(settings.friction_angle)
-        passive = math.tan(0.25 * math.pi + 0.5 * angle) ** 2 * (weight + strength / math.tan(angle))
-        return self.give / (passive * self.depth) if passive > 0.0 else 0.0
-
     @classmethod
     def derive(cls, measurement: Measurement, preset: Preset | str = "small") -> Resolution:
-        """Resolution for a measurement set: the cell from the tool's width, the steps from its speed, and how much soil
-        gives way to the tool from the set, if it tells.
+        """Resolution for a measurement set: the cell from the tool's width, the steps from its speed.
 
         Raises:
             ParameterError: an unknown preset.
@@ -172,7 +134,4 @@ class Resolution:
             shear=preset.young / (2.0 * (1.0 + preset.poisson)),
             density=measurement.bed.density,
             relaxation=fastest / (preset.way * cell),
-            give=preset.give if measurement.tool.give is None else measurement.tool.give,
-            depth=0.5 * float(extents[1]),
-            rate=fastest / (0.5 * float(extents[1])),
         )

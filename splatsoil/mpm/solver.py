@@ -114,8 +114,6 @@ class Solver:
         self.grid = self.shape.to_warp()
         self.ceiling = float(high[2] + 2.0 * resolution.cell)
         self._table = wp.array(table.astype(np.float32), dtype=float, device=device)
-        ease = [resolution.ease(law.settings(base, v)) for v in self.values]
-        self._ease = wp.array(np.array(ease, dtype=np.float32), dtype=float, device=device)
         self._stress_kernel = make_stress_kernel(law.update, law.history)
         self._allocate(x)
         spring = resolution.bulk * resolution.spacing
@@ -124,7 +122,7 @@ class Solver:
             if mesh is None
             else build_tool(
                 mesh,
-                margin=1.5 * resolution.cell,
+                margin=3.0 * resolution.cell,
                 stiffness=spring,
                 damping=2.0 * CONTACT_DAMPING * math.sqrt(spring * self._particles.mass),
                 device=device,
@@ -166,10 +164,10 @@ class Solver:
 
         p = Particles()
         p.position = wp.array(x.reshape(-1, 3), dtype=wp.vec3, device=device)
-        p.velocity, p.trilinear, p.normal, p.shear, p.gap_normal, p.drift = (vectors(n) for _ in range(6))
+        p.velocity, p.trilinear, p.normal, p.shear, p.gap_normal, p.drift, p.grip = (vectors(n) for _ in range(7))
         p.affine, p.bilinear = (wp.zeros(n, dtype=wp.mat33, device=device) for _ in range(2))
         p.deformation = wp.array(np.tile(np.eye(3, dtype=np.float32), (n, 1, 1)), dtype=wp.mat33, device=device)
-        p.elastic, p.opening, p.gap, p.preload, p.pushed = (floats(n) for _ in range(5))
+        p.elastic, p.opening, p.gap, p.preload = (floats(n) for _ in range(4))
         p.cell = ints(n)
         kept = n if self.law.history else 0
         p.history, p.depth = wp.zeros(kept, dtype=wp.vec2, device=device), floats(kept)
@@ -194,7 +192,7 @@ class Solver:
         c.history, c.depth = wp.zeros(kept, dtype=wp.vec2, device=device), floats(kept)
         self._cells = c
 
-        self._near, self._near_count = ints(n), ints(1)
+        self._near, self._near_weight, self._near_count = ints(n), floats(8 * n), ints(1)
         self._broken, self._strays = ints(1), ints(1)
         self._pose = floats(13)
         self._force = vectors(self.simulations)
@@ -327,8 +325,8 @@ class Solver:
         """Find the particles near the tool, and make ready the launch of what runs in every substep."""
         p, device, reach = self._particles, self.device, self.resolution.cell
         n = p.position.shape[0]
-        near = [self.tool, self._pose, reach, self._near, self._near_count]
-        wp.launch(find_gaps, dim=n, inputs=[p, *near], device=device)
+        near = [self.tool, self._pose, reach, self._near, self._near_weight, self._near_count]
+        wp.launch(find_gaps, dim=n, inputs=[p, self.grid, *near], device=device)
         if not self._met:
             wp.launch(allow_start, dim=n, inputs=[p], device=device)
             self._met = True
@@ -342,10 +340,10 @@ class Solver:
                 self.tool,
                 self._pose,
                 self._near,
+                self._near_weight,
                 self._near_count,
                 self.resolution.spacing**2,
                 DEEPEST * self.resolution.spacing,
-                self._ease,
                 dt,
                 share,
                 self._table,

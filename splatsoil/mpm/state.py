@@ -30,7 +30,7 @@ class Particles:
         gap_normal: outward normal of the tool there, in the world.
         preload: what the contact spring is loaded by beyond its depth in the tool, m; negative: the depth up to which
             it isn't loaded, where the tool started in the soil.
-        pushed: way over which the tool has come on since it and the particle touched, m.
+        grip: tangential displacement that the contact's friction holds, m.
         per_simulation: particles of one simulation.
         volume: initial volume of a particle, m^3.
         mass: kg, of a particle of nominal density.
@@ -54,7 +54,7 @@ class Particles:
     drift: wp.array(dtype=wp.vec3)
     gap_normal: wp.array(dtype=wp.vec3)
     preload: wp.array(dtype=float)
-    pushed: wp.array(dtype=float)
+    grip: wp.array(dtype=wp.vec3)
     per_simulation: int
     volume: float
     mass: float

@@ -8,7 +8,7 @@ from typing import Any
 import warp as wp
 
 from splatsoil.mpm.compiler import OPTIONS
-from splatsoil.mpm.grid import Grid, base_node, cell_of, corner_offset, corner_weight, local_coordinates
+from splatsoil.mpm.grid import Grid, base_node, cell_of, corner_offset
 from splatsoil.mpm.state import Cells, Nodes, Particles
 from splatsoil.mpm.tool import Tool, signed_distance, tool_position, tool_rotation, tool_velocity
 from splatsoil.soil.law import (
@@ -98,10 +98,10 @@ def contact_forces(
     tool: Tool,
     pose: wp.array(dtype=float),
     near: wp.array(dtype=int),
+    weight: wp.array(dtype=float),
     count: wp.array(dtype=int),
     area: float,
     deepest: float,
-    ease: wp.array(dtype=float),
     dt: float,
     share: float,
     values: wp.array2d(dtype=float),
@@ -110,8 +110,9 @@ def contact_forces(
     """Penalty contact with Coulomb friction between particles and tool; ``force`` (simulations) gains share * force.
 
     ``area`` (m^2) is what one particle covers of the tool; a spring is loaded no further than ``deepest`` (m), so that
-    soil in which a tool starts is not shot out of it, and loses its load as soil gives way to a tool that comes on, by
-    ``ease`` (simulations, 1/(Pa m)) of the way times the pressure and the way since they touched.
+    soil in which a tool starts is not shot out of it. Friction is a tangential spring whose force returns to Coulomb's
+    limit where it exceeds it, so that soil sticks or slips, and does neither by the step's length (Wriggers 2006,
+    Computational Contact Mechanics, sec. 5.2 and 10.5; Cundall & Strack 1979).
 
     A particle keeps the side of the tool it is on, so a plate thinner than a cell holds soil on both its faces, and
     what the soil feels is exactly what the tool feels.
@@ -121,15 +122,12 @@ def contact_forces(
         p = near[i]
         row = p / particles.per_simulation
         x = particles.position[p]
-        cell = cell_of(grid, x)
-        f = local_coordinates(grid, x, cell)
-        base = row * grid.nodes + base_node(grid, cell)
+        base = row * grid.nodes + base_node(grid, cell_of(grid, x))
         velocity = wp.vec3(0.0)
         for corner in range(8):
-            velocity += corner_weight(f, corner) * nodes.velocity[base + corner_offset(grid, corner)]
+            velocity += weight[8 * i + corner] * nodes.velocity[base + corner_offset(grid, corner)]
         normal = particles.gap_normal[p]
-        coming = tool_velocity(pose, x)
-        slip = velocity - coming
+        slip = velocity - tool_velocity(pose, x)
         closing = wp.dot(slip, normal)
         # not "+=", which Warp takes for an atomic addition; each place is one thread's
         drift = particles.drift[p] + dt * slip
@@ -145,19 +143,22 @@ def contact_forces(
         adhesion = values[row, TOOL_ADHESION] * area
         if depth > 0.0 or (adhesion > 0.0 and gap < ADHESION_REACH * wp.sqrt(area)):
             spring = tool.stiffness * wp.clamp(depth, 0.0, deepest)
-            way = dt * wp.max(wp.dot(coming, normal), 0.0)
-            pushed = particles.pushed[p] + way
-            particles.pushed[p] = pushed
-            particles.preload[p] = preload - way * pushed * ease[row] * spring / area
             push = wp.where(depth > 0.0, wp.max(spring - tool.damping * closing, 0.0), 0.0)
             slip -= closing * normal
-            speed = wp.length(slip)
+            grip = particles.grip[p]
+            grip = grip - wp.dot(grip, normal) * normal + dt * slip
             hold = values[row, TOOL_FRICTION] * push + adhesion
-            drag = wp.min(hold, particles.mass * speed / dt)
-            pull = push * normal - slip * (drag / wp.max(speed, 1.0e-9))
+            drag = tool.stiffness * grip + tool.damping * slip
+            strength = wp.length(drag)
+            if strength > hold:
+                kept = hold / strength
+                drag = kept * drag
+                grip = kept * grip
+            particles.grip[p] = grip
+            pull = push * normal - drag
             wp.atomic_add(force, row, -share * pull)
             for corner in range(8):
-                wp.atomic_add(nodes.force, base + corner_offset(grid, corner), corner_weight(f, corner) * pull)
+                wp.atomic_add(nodes.force, base + corner_offset(grid, corner), weight[8 * i + corner] * pull)
 
 
 @wp.func

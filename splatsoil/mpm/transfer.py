@@ -197,22 +197,48 @@ def momentum_to_velocity(nodes: Nodes) -> None:
 @wp.kernel(enable_backward=False)
 def find_gaps(
     particles: Particles,
+    grid: Grid,
     tool: Tool,
     pose: wp.array(dtype=float),
     reach: float,
     near: wp.array(dtype=int),
+    weight: wp.array(dtype=float),
     count: wp.array(dtype=int),
 ) -> None:
-    """Distance and normal of each particle to the tool; those within ``reach`` (m) are listed in ``near``."""
+    """Distance and normal of each particle to the tool; those within ``reach`` (m) are listed in ``near``, with the
+    ``weight`` of the eight corners of the cell by which contact acts on them (entry 8 * listed + corner).
+
+    Trilinear weights carry contact up to a cell beyond the tool's edges, as if it were wider and deeper. So a corner
+    counts by the share of the way to it, along the tangent plane from the point of contact, that lies on the tool.
+    """
     p = wp.tid()
     rotation = tool_rotation(pose)
     local = wp.quat_rotate_inv(rotation, particles.position[p] - tool_position(pose))
     gap = signed_distance(tool, local)
     particles.gap[p] = gap
     if gap < reach:
-        particles.gap_normal[p] = wp.quat_rotate(rotation, distance_normal(tool, local))
+        outward = distance_normal(tool, local)
+        particles.gap_normal[p] = wp.quat_rotate(rotation, outward)
         particles.drift[p] = wp.vec3(0.0)
-        near[wp.atomic_add(count, 0, 1)] = p
+        listed = wp.atomic_add(count, 0, 1)
+        near[listed] = p
+        foot = local - gap * outward
+        cell = cell_of(grid, particles.position[p])
+        f = local_coordinates(grid, particles.position[p], cell)
+        total = 0.0
+        for corner in range(8):
+            offset = wp.vec3(float(corner >> 2), float((corner >> 1) & 1), float(corner & 1)) - f
+            aside = wp.quat_rotate_inv(rotation, wp.cw_mul(grid.cell, offset))
+            aside -= wp.dot(aside, outward) * outward
+            beyond = signed_distance(tool, foot + aside) / wp.max(wp.length(aside), 1.0e-9)
+            share = corner_weight(f, corner) * wp.clamp(1.0 - beyond, 0.0, 1.0)
+            weight[8 * listed + corner] = share
+            total += share
+        for corner in range(8):
+            if total > 0.0:
+                weight[8 * listed + corner] = weight[8 * listed + corner] / total
+            else:
+                weight[8 * listed + corner] = corner_weight(f, corner)
 
 
 @wp.kernel(enable_backward=False)
@@ -282,7 +308,7 @@ def grid_to_particles(
         particles.preload[p] = wp.min(particles.preload[p] + out, deepest)
     elif gap > particles.preload[p]:
         particles.preload[p] = 0.0
-        particles.pushed[p] = 0.0
+        particles.grip[p] = wp.vec3(0.0)
     low = grid.origin
     high = low + wp.cw_mul(
         grid.cell, wp.vec3(float(grid.shape[0] - 1), float(grid.shape[1] - 1), float(grid.shape[2] - 1))

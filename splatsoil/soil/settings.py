@@ -33,8 +33,6 @@ class Settings:
         wall_friction: Coulomb coefficient at the bed's side walls.
         floor_friction: Coulomb coefficient at the bed's floor.
         stiffness: factor on the elastic moduli.
-        cohesion: of the whole soil, Pa; strength is a matter of the law, this is for what scales with it.
-        viscosity: of the whole soil, Pa s; likewise.
         tool_adhesion: shear stress between soil and tool that needs no pressure, Pa.
         obstacle: a fixed sphere: x and y of its centre from the middle of the bed, height above the floor, radius, m.
     """
@@ -46,8 +44,6 @@ class Settings:
     floor_friction: float = 0.6
     matching: Matching = Matching.COMPRESSION
     stiffness: float = 1.0
-    cohesion: float = 0.0
-    viscosity: float = 0.0
     tool_adhesion: float = 0.0
     obstacle: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
 

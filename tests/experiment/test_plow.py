@@ -1,6 +1,5 @@
 """What a plow experiment draws without simulating anew."""
 
-from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 from types import SimpleNamespace
@@ -80,18 +79,6 @@ def test_what_is_numerics_is_no_candidate(small_set: Path) -> None:
     assert {c.name for c in PlowExperiment(model).candidates} == {n for n in library() if n != "stiffness"}
     with pytest.raises(ParameterError, match="other numerics"):
         off_effects(["stiffness"], ())
-
-
-def test_half_of_no_giving_way_is_no_other_numerics(small_set: Path) -> None:
-    measurement = Measurement.load(small_set)
-    surface = HeightField.over(measurement.bed.lower, measurement.bed.upper, 0.02, 0.12)
-
-    def numerics(measurement: Measurement) -> tuple[str, ...]:
-        model = Model(measurement, cast(Any, SimpleNamespace(surface=surface)), preset="tiny")
-        return PlowExperiment(model, candidates=("cohesion",)).numerics
-
-    real = replace(measurement, tool=replace(measurement.tool, give=0.0))
-    assert set(numerics(measurement)) - set(numerics(real)) == {"contact"}
 
 
 def test_soil_prepared_together_is_that_of_single_simulations(small_set: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -275,7 +275,7 @@ CASES = [
     Case("frame-rate-zero", edit(SET, "frame_rate", to=0), SET, "frame_rate", "outside"),
     Case("friction-is-an-angle", edit(SET, "tool", "friction", to=17.0), SET, "tool.friction", "not an angle"),
     Case("friction-negative", edit(SET, "bed", "floor_friction", to=-0.1), SET, "bed.floor_friction", "outside"),
-    Case("give-in-percent", edit(SET, "tool", "give", to=23.0), SET, "tool.give", "it is a share"),
+    Case("give", edit(SET, "tool", "give", to=0.0), SET, "tool.give", "remove this field"),
     Case("views-missing", edit(SET, "views", drop=True), SET, "views", "missing"),
     Case("video-file-missing", lambda f: (f / VIDEO).unlink(), VIDEO, "video", "no such file"),
     Case("tool-not-an-object", edit(SET, "tool", to="tool.stl"), SET, "tool", "expected an object"),

@@ -222,79 +222,36 @@ def bed_on_a_plate(height: float) -> tuple[np.ndarray, np.ndarray]:
     return np.stack(grid, axis=-1).reshape(-1, 3), np.array([0.12, 0.12, 0.2])
 
 
-def test_what_has_parted_from_a_tool_is_pushed_anew() -> None:
-    """A bed on a plate that is lifted by 4 mm, drops away at once, and is there again when the bed has fallen on it."""
-    x, upper = bed_on_a_plate(0.04)
-    smooth = Settings(friction_angle=35.0, wall_friction=0.0, tool_friction=0.0)
-    resolution = replace(RESOLUTION, relaxation=100.0, give=0.1, depth=0.05, skin=0.0)
-    plate = trimesh.creation.box([0.2, 0.2, 0.04])
-    run = Solver(x[None], np.zeros(3), upper, plate, resolution, Law(), smooth, [{"friction_angle": 35.0}])
-    lowest, height = x[:, 2] < 0.07, 0.045
-
-    def pushed(way: float, frames: int) -> float:
-        """Median of what the lowest particles were pushed over, after the plate has moved on by some metres."""
-        nonlocal height
-        speed = way / (frames * resolution.frame_time)
-        for _ in range(frames):
-            moments = np.arange(2) / 2.0 * resolution.frame_time
-            places = [np.array([0.06, 0.06, height + t * speed]) for t in moments]
-            still, along = np.zeros(3), np.array([0.0, 0.0, speed])
-            run.advance([Pose(place, np.array([0.0, 0.0, 0.0, 1.0]), along, still) for place in places])
-            height += speed * resolution.frame_time
-        return float(np.median(run._particles.pushed.numpy()[lowest]))
-
-    assert pushed(0.004, 20) == pytest.approx(0.004, rel=0.1)
-    assert pushed(-0.01, 1) == 0.0
-    pushed(0.0, 20)  # the bed comes to rest on it
-    assert pushed(0.002, 20) == pytest.approx(0.002, rel=0.1)
-
-
 @pytest.mark.parametrize("stiffer", [1.0, 3.0])
 @pytest.mark.parametrize("steps", [1, 8])
-def test_a_bed_on_a_tool_gives_way_to_it_as_told(steps: int, stiffer: float) -> None:
-    """The contact bears the bed's weight, whose pressure p its springs balance at a depth of p * spacing / bulk. Soil
-    that gives way sinks on while the tool is lifted, by give of the way as often as that pressure is the passive one at
-    the usual depth and the mean way until then as long, by any steps and stiffness; a tool that stands, sinks, or
-    slides along bears it for good."""
-    height, spacing = 0.08, RESOLUTION.spacing
+@pytest.mark.parametrize("slid", [0.0, 0.004])
+def test_a_tool_bears_a_bed_for_good(steps: int, stiffer: float, slid: float) -> None:
+    """The contact bears the bed's weight, whose pressure p its springs balance at a depth of p * spacing / bulk, and
+    the bed sinks no further, by any steps and stiffness, whether the tool stands or slides along."""
+    height, spacing, frames = 0.08, RESOLUTION.spacing, 25
     x, upper = bed_on_a_plate(height)
     plate = trimesh.creation.box([0.2, 0.2, 0.04])
     smooth = Settings(friction_angle=35.0, wall_friction=0.0, tool_friction=0.0)
-    bulk, frames = stiffer * RESOLUTION.bulk, 25
-
-    def sunk(give: float, lifted: float = 0.0, slid: float = 0.0) -> float:
-        """Of the bed's middle relative to the tool, m; after the tool was lifted and slid by so much, in m."""
-        shear = stiffer * RESOLUTION.shear
-        resolution = replace(
-            RESOLUTION, steps=steps, relaxation=100.0, bulk=bulk, shear=shear, give=give, depth=0.05, skin=0.0
-        )
-        run = Solver(x[None], np.zeros(3), upper, plate, resolution, Law(), smooth, [{"friction_angle": 35.0}])
-        # its upper face touches the lowest particles
-        start, speed = np.array([0.06, 0.06, 0.045]), np.array([slid, 0.0, lifted]) / (frames * RESOLUTION.frame_time)
-        force = []
-        for frame in range(frames):
-            times = (frame + np.arange(steps) / steps) * RESOLUTION.frame_time
-            poses = [Pose(start + t * speed, np.array([0.0, 0.0, 0.0, 1.0]), speed, np.zeros(3)) for t in times]
-            force.append(run.advance(poses)[0, 2])
-        weight = len(x) * spacing**3 * RESOLUTION.density * 9.81
-        assert np.mean(force[-5:]) == pytest.approx(-weight, rel=0.02 if lifted else 1e-3)
-        return lifted + float(np.mean((x - run.positions()[0])[x[:, 2] > 0.13, 2]))
-
-    borne, give, way = sunk(0.0), 14.0, 0.004
-    assert borne == pytest.approx(RESOLUTION.density * 9.81 * height * spacing / bulk, rel=0.5)
-    assert sunk(give) == pytest.approx(borne, abs=2e-6)
-    assert sunk(give, slid=way) == pytest.approx(borne, abs=2e-6)
-    assert sunk(give, -way) == pytest.approx(sunk(0.0, -way), abs=2e-6)
-    sine = math.sin(math.radians(35.0))
-    often = height / 0.05 * (1.0 - sine) / (1.0 + sine) * (way / 2.0) / 0.05
-    assert sunk(give, way) - sunk(0.0, way) == pytest.approx(give * often * way, rel=0.05)
+    bulk, shear = stiffer * RESOLUTION.bulk, stiffer * RESOLUTION.shear
+    resolution = replace(RESOLUTION, steps=steps, relaxation=100.0, bulk=bulk, shear=shear, skin=0.0)
+    run = Solver(x[None], np.zeros(3), upper, plate, resolution, Law(), smooth, [{"friction_angle": 35.0}])
+    # its upper face touches the lowest particles
+    start, speed = np.array([0.06, 0.06, 0.045]), np.array([slid, 0.0, 0.0]) / (frames * RESOLUTION.frame_time)
+    force = []
+    for frame in range(frames):
+        times = (frame + np.arange(steps) / steps) * RESOLUTION.frame_time
+        poses = [Pose(start + t * speed, np.array([0.0, 0.0, 0.0, 1.0]), speed, np.zeros(3)) for t in times]
+        force.append(run.advance(poses)[0, 2])
+    weight = len(x) * spacing**3 * RESOLUTION.density * 9.81
+    assert np.mean(force[-5:]) == pytest.approx(-weight, rel=1e-3)
+    sunk = float(np.mean((x - run.positions()[0])[x[:, 2] > 0.13, 2]))
+    assert sunk == pytest.approx(RESOLUTION.density * 9.81 * height * spacing / bulk, rel=0.5)
 
 
 @pytest.mark.parametrize("steps", [2, 8])
 @pytest.mark.parametrize("speed", [0.003, 0.1])
-def test_friction_on_a_tool_is_coulombs_unless_a_film_bears_less(steps: int, speed: float) -> None:
-    """A plate slides beneath a bed that walls hold. In a substep no more than a particle's momentum is taken, a film of
-    density * spacing / substep: slow slip under high pressure meets that, quick slip friction times the weight."""
+def test_friction_on_a_tool_is_coulombs(steps: int, speed: float) -> None:
+    """A plate slides beneath a bed that walls hold: quick or slow, by any steps, it feels friction times the weight."""
     spacing, friction = RESOLUTION.spacing, 0.3
     x, upper = bed_on_a_plate(0.08)
     plate = trimesh.creation.box([0.6, 0.6, 0.04])
@@ -311,7 +268,4 @@ def test_friction_on_a_tool_is_coulombs_unless_a_film_bears_less(steps: int, spe
         )
     sideways = -float(np.mean([f[0, 0] for f in force[-20:]]))
     weight = len(x) * spacing**3 * resolution.density * 9.81
-    substep = resolution.frame_time / steps / resolution.substeps(steps)
-    film = resolution.density * spacing / substep * speed * 0.12**2
-    assert (film < 0.5 * friction * weight) == (speed < 0.01)
-    assert sideways == pytest.approx(min(film, friction * weight), rel=0.05)
+    assert sideways == pytest.approx(friction * weight, rel=0.02)

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
 from typing import ClassVar
 
 import warp as wp
 
 from splatsoil.parameters import Parameter
 from splatsoil.soil.effect import Effect
-from splatsoil.soil.settings import Settings
 from splatsoil.soil.strength import SoilState, Strength
 
 
@@ -34,7 +31,3 @@ class Cohesion(Effect):
     note = "Strength that remains at zero pressure: damp or cemented soil stands in steep walls and tears in clods."
     source = "Chen & Mizuno (1990), Nonlinear Analysis in Soil Mechanics, eq. 5.27"
     strength = cohesive_strength
-
-    def settings(self, settings: Settings, values: Mapping[str, float]) -> Settings:
-        """Add the cohesion."""
-        return replace(settings, cohesion=settings.cohesion + values["cohesion"])

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
 from typing import ClassVar
 
 import warp as wp
 
 from splatsoil.parameters import Parameter
 from splatsoil.soil.effect import Effect
-from splatsoil.soil.settings import Settings
 from splatsoil.soil.strength import SoilState, Strength
 
 
@@ -32,7 +29,3 @@ class Viscosity(Effect):
     note = "Wet soil or mud resists shear the more, the faster it is sheared, whatever the pressure."
     source = "Bingham (1922), Fluidity and Plasticity; overstress: Perzyna (1966), Adv. Appl. Mech. 9"
     strength = viscous
-
-    def settings(self, settings: Settings, values: Mapping[str, float]) -> Settings:
-        """Add the viscosity."""
-        return replace(settings, viscosity=settings.viscosity + values["viscosity"])
