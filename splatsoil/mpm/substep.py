@@ -8,7 +8,7 @@ from typing import Any
 import warp as wp
 
 from splatsoil.mpm.compiler import OPTIONS
-from splatsoil.mpm.grid import Grid, base_node, cell_of, corner_offset
+from splatsoil.mpm.grid import Grid, base_node, cell_of, corner_offset, corner_weight, local_coordinates
 from splatsoil.mpm.state import Cells, Nodes, Particles
 from splatsoil.mpm.tool import Tool, signed_distance, tool_position, tool_rotation, tool_velocity
 from splatsoil.soil.law import (
@@ -115,17 +115,20 @@ def contact_forces(
     Computational Contact Mechanics, sec. 5.2 and 10.5; Cundall & Strack 1979).
 
     A particle keeps the side of the tool it is on, so a plate thinner than a cell holds soil on both its faces, and
-    what the soil feels is exactly what the tool feels.
+    what the soil feels is exactly what the tool feels. It moves with the whole field of its cell, and is held by the
+    ``weight`` of the corners that the tool covers (:func:`~splatsoil.mpm.transfer.find_gaps`).
     """
     i = wp.tid()
     if i < count[0]:
         p = near[i]
         row = p / particles.per_simulation
         x = particles.position[p]
-        base = row * grid.nodes + base_node(grid, cell_of(grid, x))
+        cell = cell_of(grid, x)
+        f = local_coordinates(grid, x, cell)
+        base = row * grid.nodes + base_node(grid, cell)
         velocity = wp.vec3(0.0)
         for corner in range(8):
-            velocity += weight[8 * i + corner] * nodes.velocity[base + corner_offset(grid, corner)]
+            velocity += corner_weight(f, corner) * nodes.velocity[base + corner_offset(grid, corner)]
         normal = particles.gap_normal[p]
         slip = velocity - tool_velocity(pose, x)
         closing = wp.dot(slip, normal)
