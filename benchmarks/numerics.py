@@ -3,7 +3,9 @@
 For each measurement set that carries its true particles: the friction angle is scanned from the true particles at frame
 0 with all other parameters true, and heights are compared with the truth at the frames it has. Then one piece of the
 numerics at a time is changed; the shift is how far the friction angle of the unchanged solver must move to look like
-the changed one. Heights are averaged over particle seeds, whose scatter is stated.
+the changed one. Heights are averaged over particle seeds, whose scatter is stated. Beside them stands the mean force on
+the tool while it is pushed, over the measured one. ``--cells`` refines the grid: which angle do coarser cells read off
+the finest ones' heights?
 """
 
 from __future__ import annotations
@@ -23,8 +25,9 @@ from scipy.ndimage import gaussian_filter
 from splatsoil.benchmarks._common import at_least, here
 
 from splatsoil.errors import MeasurementError
+from splatsoil.experiment.scene_parts import stages_of
 from splatsoil.measurement import Measurement
-from splatsoil.mpm import Resolution, simulate
+from splatsoil.mpm import PRESETS, Resolution, simulate
 from splatsoil.reconstruction import HeightField, fill
 from splatsoil.scene import relief_of_particles
 from splatsoil.soil.law import Law
@@ -116,12 +119,14 @@ class Scan:
         heights: (n, frames, ny, nx) in m, averaged over seeds.
         chance: scatter of the heights between seeds, m.
         volume: lowest and highest mean height over the frames, relative to frame 0: most of a loss, most of a gain.
+        force: (n,) mean horizontal force of the soil on the tool while it is pushed, N, averaged over seeds.
     """
 
     angles: FloatArray
     heights: FloatArray
     chance: float
     volume: tuple[float, float]
+    force: FloatArray
 
     def best(self, other: FloatArray, slopes: bool = False) -> float:
         """Angle whose heights, or their slopes, lie nearest to ``other`` (frames, ny, nx) in patches."""
@@ -140,13 +145,20 @@ class Scan:
         return fine, CubicSpline(self.angles, np.mean(square, axis=(1, 2, 3)))(fine)
 
 
+def pushing(measurement: Measurement, force: npt.NDArray[np.floating], first: int = 1) -> float:
+    """Mean horizontal force in N of rows (f, 3), one a frame from ``first`` on, while the tool is pushed."""
+    stages = stages_of(measurement, [float(first + k) for k in range(len(force))])
+    pushed = np.array([stage == "pushing" for stage in stages])
+    return float(np.linalg.norm(np.asarray(force)[pushed, :2].mean(axis=0))) if pushed.any() else 0.0
+
+
 def scan(truth: Truth, resolution: Resolution, angles: Sequence[float], seeds: Sequence[int], device: str) -> Scan:
     """Simulate all angles for all seeds; on a GPU as one batch."""
     frames = sorted(f for f in truth.particles if f > 0)
     batch = [{**truth.values, "friction_angle": float(a)} for a in angles]
     law = Law(find_effects(truth.effects))
     volume = resolution.spacing**3
-    everything, volumes = [], []
+    everything, volumes, forces = [], [], []
     for seed in seeds:
         x = truth.start(resolution.spacing, seed)
         groups = [batch] if device != "cpu" else [[values] for values in batch]
@@ -158,11 +170,13 @@ def scan(truth: Truth, resolution: Resolution, angles: Sequence[float], seeds: S
             )
         ]
         everything.append([[truth.heights(p, volume) for p in run.positions] for run in runs])
+        forces.append([pushing(truth.measurement, run.force) for run in runs])
         volumes.append(volume_range(truth.heights(x, volume), np.array(everything[-1][len(angles) // 2])))
     heights = np.array(everything)
     scatter = float(np.sqrt(heights.var(axis=0, ddof=1).mean())) if len(seeds) > 1 else 0.0
     low, high = np.mean(volumes, axis=0)
-    return Scan(np.asarray(angles, dtype=np.float64), heights.mean(axis=0), scatter, (float(low), float(high)))
+    found = np.asarray(angles, dtype=np.float64)
+    return Scan(found, heights.mean(axis=0), scatter, (float(low), float(high)), np.mean(forces, axis=0))
 
 
 def volume_range(start: FloatArray, heights: FloatArray) -> tuple[float, float]:
@@ -179,12 +193,49 @@ def variants(base: Resolution) -> dict[str, Resolution]:
         "half the grid's substep": replace(base, courant=base.courant / 2.0),
         "stiffness x 3": replace(base, bulk=3.0 * base.bulk, shear=3.0 * base.shear),
         "cell x 3/4": replace(base, cell=fine * base.cell, spacing=fine * base.spacing),
-        "particles x 2": replace(base, spacing=base.spacing / 2.0 ** (1.0 / 3.0)),
+        "particles x 27/8": replace(base, spacing=base.spacing / 1.5),
+        "hourglass modes damped twice as fast": replace(base, relaxation=2.0 * base.relaxation),
+        "hourglass modes damped half as fast": replace(base, relaxation=0.5 * base.relaxation),
+        "no skin": replace(base, skin=0.0),
     }
 
 
+def refine(
+    truth: Truth, preset: str, cells: Sequence[float], seeds: Sequence[int], device: str
+) -> list[dict[str, float]]:
+    """One row for each number of cells across the tool, the coarsest first, held against the finest one's heights."""
+    true_angle = truth.values["friction_angle"]
+    resolutions = [
+        Resolution.derive(truth.measurement, replace(PRESETS[preset], cells_across_tool=c)) for c in sorted(cells)
+    ]
+    finest = scan(truth, resolutions[-1], [true_angle], seeds, device)
+    rows = []
+    for resolution in resolutions[:-1]:
+        found = scan(truth, resolution, [true_angle + offset for offset in OFFSETS], seeds, device)
+        centre = len(OFFSETS) // 2
+        rows.append(_row(resolution, found.volume, float(found.force[centre])))
+        rows[-1] |= {
+            "angle_off": found.best(finest.heights[0]) - true_angle,
+            "rmse_mm": 1e3 * float(np.sqrt(np.mean(_patches(found.heights[centre] - finest.heights[0]) ** 2))),
+        }
+    return [*rows, _row(resolutions[-1], finest.volume, float(finest.force[0]))]
+
+
+def _row(resolution: Resolution, volume: tuple[float, float], force: float) -> dict[str, float]:
+    return {"cell_mm": 1e3 * resolution.cell, "force": force, "lost": volume[0], "gained": volume[1]}
+
+
+def _patches(difference: FloatArray) -> FloatArray:
+    return np.asarray(gaussian_filter(difference, (0, PATCH, PATCH)), dtype=np.float64)
+
+
 def run(
-    sets: Sequence[Path], preset: str = "small", seeds: int = 3, device: str = "cpu", shifts: bool = True
+    sets: Sequence[Path],
+    preset: str = "small",
+    seeds: int = 3,
+    device: str = "cpu",
+    shifts: bool = True,
+    cells: Sequence[float] = (),
 ) -> dict[str, Any]:
     """Measure all sets; a JSON-able result with one entry for each."""
     result: dict[str, Any] = {"preset": preset, "seeds": seeds, "device": device.split(":")[0], "sets": {}}
@@ -204,13 +255,24 @@ def run(
             "rmse_mm": {str(f): round(1e3 * float(e), 2) for f, e in zip(frames, rmse, strict=True)},
             "chance_mm": round(1e3 * found.chance, 2),
             "volume": found.volume,
+            "force": float(found.force[centre]),
+            "measured_force": _measured(truth.measurement),
             "shifts": {},
+            "forces": {},
+            "cells": refine(truth, preset, cells, range(seeds), device) if len(cells) > 1 else [],
         }
         for name, resolution in variants(base).items() if shifts else ():
             changed = scan(truth, resolution, [true_angle], range(seeds), device)
             entry["shifts"][name] = found.best(changed.heights[0]) - found.best(found.heights[centre])
+            entry["forces"][name] = float(changed.force[0]) / entry["force"] - 1.0
         result["sets"][truth.measurement.name] = entry
     return result
+
+
+def _measured(measurement: Measurement) -> float | None:
+    """Pushing force that the set's file tells, N."""
+    rows = measurement.tool.force
+    return None if rows is None else pushing(measurement, rows[:, 2:], int(rows[0, 0]))
 
 
 def table(result: dict[str, Any]) -> str:
@@ -218,26 +280,42 @@ def table(result: dict[str, Any]) -> str:
     lines = [
         f"Preset `{result['preset']}`, {result['seeds']} particle seeds, {result['device']}.",
         "",
-        "| set | true φ | best φ of the scan | height RMSE at the truth, mm (frames) | chance, mm | volume |",
-        "|---|---|---|---|---|---|",
+        "| set | true φ | best φ | height RMSE at the truth, mm (frames) | seed scatter, mm | volume | force, N |",
+        "|---|---|---|---|---|---|---|",
     ]
     for name, entry in result["sets"].items():
         errors = ", ".join(f"{e:.1f} ({f})" for f, e in entry["rmse_mm"].items())
         lines.append(
             f"| {name} | {entry['true_angle']:.1f}° | {entry['best_angle']:.1f}° | {errors} "
-            f"| {entry['chance_mm']:.1f} | {100 * entry['volume'][0]:+.2f} to {100 * entry['volume'][1]:+.2f} % |"
+            f"| {entry['chance_mm']:.1f} | {100 * entry['volume'][0]:+.2f} to {100 * entry['volume'][1]:+.2f} % "
+            f"| {_over(entry['force'], entry['measured_force'])} |"
         )
     if any(entry["shifts"] for entry in result["sets"].values()):
         names = list(result["sets"])
         lines += [
             "",
-            "| change | " + " | ".join(f"shift of φ, {n}" for n in names) + " |",
+            "| change | " + " | ".join(f"shift of φ, of the force, {n}" for n in names) + " |",
             "|---" * (len(names) + 1) + "|",
         ]
         for change in next(iter(result["sets"].values()))["shifts"]:
-            cells = " | ".join(f"{result['sets'][n]['shifts'][change]:+.1f}°" for n in names)
-            lines.append(f"| {change} | {cells} |")
+            entries = [result["sets"][n] for n in names]
+            told = " | ".join(f"{e['shifts'][change]:+.1f}°, {100 * e['forces'][change]:+.0f} %" for e in entries)
+            lines.append(f"| {change} | {told} |")
+    for name, entry in result["sets"].items():
+        if entry["cells"]:
+            lines += ["", f"| {name}: cell, mm | φ read off the finest, error | heights off, mm | force, N | volume |"]
+            lines.append("|---|---|---|---|---|")
+        for row in entry["cells"]:
+            read = f"{row['angle_off']:+.1f}° | {row['rmse_mm']:.1f}" if "angle_off" in row else "– | –"
+            volume = f"{100 * row['lost']:+.2f} to {100 * row['gained']:+.2f} %"
+            lines.append(f"| {row['cell_mm']:.1f} | {read} | {row['force']:.0f} | {volume} |")
     return "\n".join(lines)
+
+
+def _over(force: float, measured: float | None) -> str:
+    return (
+        f"{force:.0f}" if not measured else f"{force:.0f} of {measured:.0f} ({100 * (force / measured - 1.0):+.0f} %)"
+    )
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -246,10 +324,11 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("sets", nargs="+", type=Path)
     parser.add_argument("--preset", default="small")
     parser.add_argument("--seeds", type=at_least(1), default=3)
+    parser.add_argument("--cells", nargs="+", type=float, default=[], help="across the tool: refine the grid by these")
     parser.add_argument("--device", type=here, default="cpu", help="cuda:0 runs a scan as one batch")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args(arguments)
-    result = run(options.sets, options.preset, options.seeds, options.device)
+    result = run(options.sets, options.preset, options.seeds, options.device, cells=options.cells)
     print(json.dumps(result, indent=1) if options.json else table(result))
     return 0
 
