@@ -124,6 +124,7 @@ class Bench:
         worlds = [
             World(
                 str(k),
+                self.truth.measurement,
                 soil[ANGLE],
                 start,
                 spacing,
@@ -132,7 +133,7 @@ class Bench:
             )
             for k, soil in enumerate(soils)
         ]
-        runs = plough(self.truth.measurement, worlds, numerics, self.model.frames, self.device)
+        runs = plough(worlds, numerics, self.model.frames, self.device)
         return [(self.drawn({0: start, **run.particles}), self._force(run.force)) for run in runs]
 
     def drawn(self, particles: Mapping[int, FloatArray]) -> FloatArray:
