@@ -123,10 +123,9 @@ class Case:
         """As our benchmarks take it."""
         return Truth(self.measurement, kept.particles, kept.spacing**3, dict(self.values), self.effects)
 
-    def heights(self, kept: Kept, frames: Sequence[int] = FRAMES) -> FloatArray:
-        """(frames, ny, nx) m."""
-        truth = self.truth(kept)
-        return np.array([truth.heights(kept.particles[f], truth.volume) for f in frames])
+    def heights(self, kept: Kept) -> FloatArray:
+        """(frames, ny, nx) m, at the frames that are compared."""
+        return surfaces(self.measurement, kept.particles, kept.spacing)
 
 
 @dataclass(frozen=True)
@@ -164,10 +163,21 @@ class Kept:
     def load(cls, file: Path, about: Mapping[str, Any]) -> Kept:
         """What `save` wrote; ParameterError where the file holds another world."""
         check_about(file, about)
-        with np.load(file) as stored:
-            scale, origin = float(stored["scale"]), stored["origin"]
-            particles = {int(k[1:]): stored[k] * scale + origin for k in stored.files if k[0] == "f" and k != "force"}
-            return cls(particles, float(stored["spacing"]), stored["force"].astype(np.float64))
+        return cls(*read_particles(file), read_npz(file, ["force"])["force"].astype(np.float64))
+
+
+def read_particles(file: Path) -> tuple[dict[int, FloatArray], float]:
+    """Positions (n, 3) in m by frame and the particles' spacing in m, as `Kept.save` and sets store them."""
+    with np.load(file) as stored:
+        scale, origin = float(stored["scale"]), stored["origin"]
+        particles = {int(k[1:]): stored[k] * scale + origin for k in stored.files if k[1:].isdigit()}
+        return particles, float(stored["spacing"])
+
+
+def surfaces(measurement: Measurement, particles: dict[int, FloatArray], spacing: float) -> FloatArray:
+    """Heights (frames, ny, nx) in m at the frames that are compared, of particles (n, 3) by frame."""
+    truth = Truth(measurement, particles, spacing**3, {}, ())
+    return np.array([truth.heights(particles[f], truth.volume) for f in FRAMES])
 
 
 def _archive(file: Path, **arrays: Any) -> None:
@@ -350,15 +360,33 @@ def refinement(case: Case, kept: Kept, out: Path, numerics: Numerics) -> dict[st
         return None
     check_about(file, told(case, numerics.refined()))
     fine = read_npz(file, ["heights", "force"])
-    height = in_patches(case.heights(kept) - fine["heights"])
-    stages = compare_forces(case.measurement, kept.force, fine["force"].astype(np.float64))
-    pushed = stages["pushing"]["off"]
+    return moved(
+        case.measurement, (case.heights(kept), kept.force), (fine["heights"], fine["force"].astype(np.float64))
+    )
+
+
+def moved(
+    measurement: Measurement, coarse: tuple[FloatArray, FloatArray], fine: tuple[FloatArray, FloatArray]
+) -> dict[str, Any]:
+    """How far apart two runs' heights (frames, ny, nx) and forces (f, 3) are, and whether the first has converged."""
+    height = in_patches(coarse[0] - fine[0])
+    stages = compare_forces(measurement, coarse[1], fine[1])
     return {
-        "voxel": numerics.refined().voxel,
         "heights_mm": 1e3 * height,
         "stages": {name: {"coarse": s["ours"], "fine": s["newton"], "off": s["off"]} for name, s in stages.items()},
-        "converged": bool(height <= HEIGHTS_CLOSE and pushed <= FORCE_CLOSE),
+        "converged": bool(height <= HEIGHTS_CLOSE and stages["pushing"]["off"] <= FORCE_CLOSE),
     }
+
+
+def refinement_table(checked: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """What `moved` said of worlds by name, as lines of Markdown."""
+    lines = ["| world | voxels of 3/4: heights, mm | force while pushed | converged |", "|---|---|---|---|"]
+    for name, found in checked.items():
+        pushed = 100.0 * found["stages"]["pushing"]["off"]
+        lines.append(
+            f"| {name} | {found['heights_mm']:.2f} | {pushed:.1f} % | {'yes' if found['converged'] else 'no'} |"
+        )
+    return lines
 
 
 def table(result: Mapping[str, Any]) -> str:
@@ -391,12 +419,7 @@ def table(result: Mapping[str, Any]) -> str:
         lines += ["", *_summary(rows, stages), ""]
     checked = {n: result["worlds"][n]["refinement"] for n in names if result["worlds"][n].get("refinement")}
     if checked:
-        lines += ["| world | voxels of 3/4: heights, mm | force while pushed | converged |", "|---|---|---|---|"]
-        for name, found in checked.items():
-            lines.append(
-                f"| {name} | {found['heights_mm']:.2f} | {100 * found['stages']['pushing']['off']:.1f} % "
-                f"| {'yes' if found['converged'] else 'no'} |"
-            )
+        lines += refinement_table(checked)
     absent = [n for n in names if not result["worlds"][n]["presets"]]
     if absent:
         lines += ["", f"Not judged: {', '.join(absent)}."]
@@ -502,7 +525,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--worlds-only", action="store_true", help="make the worlds and stop")
     parser.add_argument("--refine", nargs="*", metavar="NAME", help="plough these once more, finer; all without a name")
     parser.add_argument("--presets", nargs="+", default=["small"], help="of our solver")
-    parser.add_argument("--offsets", nargs="+", type=float, default=list(OFFSETS), help="of our angles, degrees")
+    parser.add_argument(
+        "--offsets", nargs="*", type=float, default=list(OFFSETS), help="of our angles, degrees; none: the truth alone"
+    )
     parser.add_argument("--seeds", type=at_least(1), default=2, help="particle seeds that ours are averaged over")
     parser.add_argument("--voxel", type=float, default=Numerics.voxel, help="edge of Newton's cells, m")
     parser.add_argument("--substeps", type=at_least(1), default=Numerics.substeps, help="of Newton in a frame")
