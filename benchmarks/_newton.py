@@ -5,8 +5,8 @@ from __future__ import annotations
 import importlib
 import json
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,22 +32,34 @@ WALL = 0.1
 class Numerics:
     """Of a run.
 
+    The defaults are converged for a blade 120 mm wide: three quarters of their voxel move heights by less than 1 mm and
+    the push force by less than 6 % (docs/numerics.md).
+
     Attributes:
         voxel: edge of the cells, m.
         substeps: in a frame.
         iterations: most of the Gauss-Seidel solver in a substep.
-        late: soil is pushed out of where the tool stood when the substep began, not of where it ends. In the example
-            sets soil stands one substep's way deep in the moving tool, so they were made so.
-        grid: "dense", whose cells stay, or "sparse", whose cells are laid anew around the soil in every substep: soil
-            then loses up to half as much volume again. The example sets were made with the first: their particles come
-            out eight times closer by it (`splatsoil.benchmarks.independent`).
+        tolerance: residual at which it ends earlier.
     """
 
-    voxel: float
-    substeps: int
-    iterations: int
-    late: bool = True
-    grid: str = "dense"
+    voxel: float = 0.04 / 3.0
+    substeps: int = 3
+    iterations: int = 1500
+    tolerance: float = 1.0e-6
+
+    @property
+    def spacing(self) -> float:
+        """Edge of the cube of soil that a particle stands for, m: two along a voxel."""
+        return 0.5 * self.voxel
+
+    def refined(self) -> Numerics:
+        """Voxels of three quarters, with steps and iterations in proportion."""
+        return replace(
+            self,
+            voxel=0.75 * self.voxel,
+            substeps=math.ceil(self.substeps / 0.75),
+            iterations=math.ceil(self.iterations / 0.75),
+        )
 
     @classmethod
     def of(cls, folder: Path) -> Numerics:
@@ -68,31 +80,39 @@ class World:
 
     Attributes:
         label: what it is called in the table.
+        measurement: its bed, tool and motion.
         angle: friction angle, degrees; one, or (n,) one a particle.
         particles: (n, 3) at frame 0, m.
         spacing: edge of the cube of soil that a particle stands for, m.
         young: Young's modulus, Pa.
         cohesion: Pa; of the whole soil, with one friction angle.
-        yield_stress: strength beside what friction and cohesion make, as the root of J2, Pa.
         dilatancy: slope of the plastic potential over that of the yield surface: 1 is associated flow.
         viscosity: Pa s.
         tool_friction: None for the measurement's.
         tool_adhesion: Pa.
         obstacle: centre (x, y, z) and radius in m of a fixed sphere in the bed; None for none.
+        gravity: (3,) m/s^2; None for the measurement's.
     """
 
     label: str
+    measurement: Measurement = field(repr=False)
     angle: float | FloatArray
     particles: FloatArray = field(repr=False)
     spacing: float
     young: float = 1.0e7
     cohesion: float = 0.0
-    yield_stress: float = 0.0
     dilatancy: float = 0.0
     viscosity: float = 0.0
     tool_friction: float | None = None
     tool_adhesion: float = 0.0
     obstacle: tuple[float, float, float, float] | None = None
+    gravity: tuple[float, float, float] | None = None
+
+    @property
+    def weight(self) -> npt.NDArray[np.float32]:
+        """(3,) N, of one particle."""
+        gravity = np.asarray(self.measurement.gravity if self.gravity is None else self.gravity, dtype=np.float64)
+        return (self.measurement.bed.density * self.spacing**3 * gravity).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -117,59 +137,66 @@ def load_newton() -> Any:
 
 
 def plough(
-    measurement: Measurement,
     worlds: Sequence[World],
     numerics: Numerics,
     frames: Iterable[int],
     device: str = "cpu",
     *,
-    gravity: Sequence[float] | None = None,
+    progress: Callable[[int, int], None] = lambda frame, last: None,
 ) -> list[Run]:
-    """Run the worlds side by side, in boxes of their own, to the last frame.
+    """Run the worlds side by side, each in a box of its own, to the last frame.
 
     Args:
-        measurement: bed, tool and motion.
-        worlds: their soil.
+        worlds: soils, beds, tools and motions.
         numerics: of the solver.
         frames: to keep, of those from 1 on.
         device: Warp device name.
-        gravity: (3,) m/s^2; the measurement's by default.
+        progress: called with (frame, last frame) after each.
 
     Returns:
         What became of each world.
 
     Raises:
-        RunError: the ``newton`` package is missing.
+        RunError: the ``newton`` package is missing, or the worlds' floors or frame rates differ.
         SimulationError: particles left the numbers.
     """
     newton = load_newton()
-    # whole voxels, so that every box lies on the grid as the first one does
-    pitch = math.ceil((measurement.bed.upper - measurement.bed.lower)[1] / numerics.voxel + 4.0 * WALL / numerics.voxel)
-    shifts = np.array([[0.0, k * pitch * numerics.voxel, 0.0] for k in range(len(worlds))])
-    model = _model(newton, measurement, worlds, shifts, device, gravity)
+    measurements = [world.measurement for world in worlds]
+    rates, beds = {m.frame_rate for m in measurements}, [m.bed for m in measurements]
+    if len(rates) > 1 or len({(float(bed.lower[2]), bed.floor_friction) for bed in beds}) > 1:
+        raise RunError("worlds side by side stand on one floor and share their frames: plough these one by one")
+    shifts = _shifts(worlds, numerics.voxel)
+    model = _model(newton, worlds, shifts, device)
     config = newton.solvers.SolverImplicitMPM.Config()
-    config.voxel_size, config.max_iterations, config.tolerance = numerics.voxel, numerics.iterations, 1.0e-4
-    config.grid_type = numerics.grid
+    config.voxel_size, config.max_iterations, config.tolerance = numerics.voxel, numerics.iterations, numerics.tolerance
+    # The other kind of cells is laid anew around the soil in every substep: soil then loses half as much volume again.
+    config.grid_type = "dense"
     solver = newton.solvers.SolverImplicitMPM(model, config=config)
-    now, following = model.state(), model.state()
-    frame_time = 1.0 / measurement.frame_rate
+    states = model.state(), model.state()
+    for state in states:
+        state.particle_f.assign(np.concatenate([np.tile(w.weight, (len(w.particles), 1)) for w in worlds]))
+    now, following = states
+    frame_time = 1.0 / rates.pop()
     step = frame_time / numerics.substeps
     wanted = sorted(f for f in frames if f > 0)
     ends = np.cumsum([len(w.particles) for w in worlds])[:-1]
     found: list[dict[int, FloatArray]] = [{} for _ in worlds]
     force = np.zeros((len(worlds), wanted[-1], 3))
     for frame in range(1, wanted[-1] + 1):
-        for pose in step_poses(measurement.tool.motion, (frame - 1) * frame_time, frame_time, numerics.substeps):
+        start = (frame - 1) * frame_time
+        ways = [step_poses(m.tool.motion, start, frame_time, numerics.substeps) for m in measurements]
+        for poses in zip(*ways, strict=True):
             # Both calls carry the tool on by its velocity from its pose at the step's start.
-            places = np.array([[*(pose.position + shift), *pose.quaternion] for shift in shifts], dtype=np.float32)
-            twists = np.array([[*pose.velocity, *pose.spin]] * len(worlds), dtype=np.float32)
-            for state in (now, following):
-                state.body_q.assign(places)
-                state.body_qd.assign(twists)
+            places = [[*(pose.position + shift), *pose.quaternion] for pose, shift in zip(poses, shifts, strict=True)]
+            twists = [[*pose.velocity, *pose.spin] for pose in poses]
+            for state in states:
+                state.body_q.assign(np.array(places, dtype=np.float32))
+                state.body_qd.assign(np.array(twists, dtype=np.float32))
             solver.step(now, following, None, None, step)
             force[:, frame - 1] += _impulses(solver, following, len(worlds)) / frame_time
-            if numerics.late:
-                following.body_qd.zero_()
+            # Soil is pushed out of where the tool stood when the substep began, as in the example sets: it stands up
+            # to one substep's way deep in the moving tool, a tenth of a voxel.
+            following.body_qd.zero_()
             solver.project_outside(following, following, step)
             now, following = following, now
         if frame in wanted:
@@ -178,7 +205,20 @@ def plough(
                 raise SimulationError(f"newton: particles are no numbers at frame {frame} with {numerics}")
             for k, part in enumerate(np.split(x, ends)):
                 found[k][frame] = part - shifts[k]
+        progress(frame, wanted[-1])
     return [Run(particles, of_world) for particles, of_world in zip(found, force, strict=True)]
+
+
+def _shifts(worlds: Sequence[World], voxel: float) -> FloatArray:
+    """(w, 3) m by which each world is moved along y so that no walls meet; whole voxels, so that every box lies on the
+    grid as it would alone."""
+    shifts, free = np.zeros((len(worlds), 3)), -math.inf
+    for shift, world in zip(shifts, worlds, strict=True):
+        bed = world.measurement.bed
+        begin, end = float(bed.lower[1]) - 2.0 * WALL, float(bed.upper[1]) + 2.0 * WALL
+        shift[1] = voxel * max(0, math.ceil((free - begin) / voxel)) if math.isfinite(free) else 0.0
+        free = end + shift[1]
+    return shifts
 
 
 def _impulses(solver: Any, state: Any, bodies: int) -> FloatArray:
@@ -192,22 +232,15 @@ def _impulses(solver: Any, state: Any, bodies: int) -> FloatArray:
     return given
 
 
-def _model(
-    newton: Any,
-    measurement: Measurement,
-    worlds: Sequence[World],
-    shifts: FloatArray,
-    device: str,
-    gravity: Sequence[float] | None = None,
-) -> Any:
-    """Newton's model: one floor; walls, a tool and soil for every world."""
-    bed, tool = measurement.bed, measurement.tool
+def _model(newton: Any, worlds: Sequence[World], shifts: FloatArray, device: str) -> Any:
+    """Newton's model: one floor; walls, a tool and soil for every world. Their weight is not in it."""
     builder = newton.ModelBuilder()
     newton.solvers.SolverImplicitMPM.register_custom_attributes(builder)
     surface = newton.ModelBuilder.ShapeConfig
-    builder.add_ground_plane(height=float(bed.lower[2]), cfg=surface(mu=bed.floor_friction, density=0.0))
-    mesh = newton.Mesh(np.asarray(tool.mesh.vertices), np.asarray(tool.mesh.faces).ravel(), compute_inertia=False)
+    ground = worlds[0].measurement.bed
+    builder.add_ground_plane(height=float(ground.lower[2]), cfg=surface(mu=ground.floor_friction, density=0.0))
     for world, shift in zip(worlds, shifts, strict=True):
+        bed, tool = world.measurement.bed, world.measurement.tool
         for centre, half in _walls(bed.lower + shift, bed.upper + shift):
             place = wp.transform(wp.vec3(*centre), wp.quat_identity())
             smooth = surface(mu=bed.wall_friction, density=0.0)
@@ -218,6 +251,7 @@ def _model(
         friction = tool.friction if world.tool_friction is None else world.tool_friction
         sticky = {"mpm:collider_adhesion": world.tool_adhesion}
         body = builder.add_body()
+        mesh = newton.Mesh(np.asarray(tool.mesh.vertices), np.asarray(tool.mesh.faces).ravel(), compute_inertia=False)
         builder.add_shape_mesh(body=body, mesh=mesh, cfg=surface(mu=friction, density=0.0), custom_attributes=sticky)
         n = len(world.particles)
         builder.add_particles(
@@ -227,7 +261,7 @@ def _model(
             radius=[world.spacing / 2.0] * n,
         )
     model = builder.finalize(device=device)
-    model.set_gravity(tuple(float(g) for g in (measurement.gravity if gravity is None else gravity)))
+    model.set_gravity((0.0, 0.0, 0.0))
 
     def each(values: Sequence[float | FloatArray]) -> npt.NDArray[np.float32]:
         parts = [np.broadcast_to(value, len(w.particles)) for value, w in zip(values, worlds, strict=True)]
@@ -239,7 +273,6 @@ def _model(
     material.friction.assign(each([np.vectorize(cone_slope)(w.angle) for w in worlds]))
     material.dilatancy.assign(each([w.dilatancy for w in worlds]))
     material.viscosity.assign(each([w.viscosity for w in worlds]))
-    material.yield_stress.assign(each([w.yield_stress for w in worlds]))
     if any(w.cohesion for w in worlds):
         # Newton's strength is yield_stress + friction (p + tension): the cone's apex alone makes the whole cohesion,
         # and a yield stress beside it would double that.

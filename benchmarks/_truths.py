@@ -7,17 +7,19 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from splatsoil.benchmarks import _scenes
+from splatsoil.benchmarks._scenes import ANGLES, BEDS, TOOLS, Scene
 
 from splatsoil.observation import Observation
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
 
-ANGLES = (30.0, 40.0)
-"""Range of the true friction angle, degrees."""
 NOTHING, FIELD = "nothing", "friction_field"
 """Kinds without an effect of the library: nothing is hidden, or something that the library doesn't have."""
 MIDDLE, NOTED = (0.4, 0.25), 0.3
-"""Of the bed, m, and the friction that is noted for the tool; see `splatsoil.synthetic.plow`."""
+"""Of the bed, m, and the friction that is noted for the tool; see `splatsoil.benchmarks._scenes`."""
+BESIDE = 0.01
+"""Between an obstacle and the tool that passes it, m."""
 
 
 @dataclass(frozen=True)
@@ -27,9 +29,8 @@ class Hidden:
     Attributes:
         kind: name of the effect that is hidden, or one of the kinds without.
         number: of the world of its kind.
-        angle: friction angle, degrees.
+        scene: what is ploughed, but for what is hidden.
         size: of what is hidden, in the effect's unit where it has one.
-        seed: of surface, looks, particles and noise.
         values: the effect's parameters; none of the kinds without.
         soil: what differs from plain sand, as Newton takes it.
         gravity: (3,) m/s^2, likewise; None for what the set says.
@@ -37,9 +38,8 @@ class Hidden:
 
     kind: str
     number: int
-    angle: float
-    size: float
-    seed: int
+    scene: Scene
+    size: float = 0.0
     values: Mapping[str, float] = field(default_factory=dict)
     soil: Mapping[str, Any] = field(default_factory=dict)
     gravity: tuple[float, float, float] | None = None
@@ -48,6 +48,21 @@ class Hidden:
     def name(self) -> str:
         """Of its folders."""
         return f"{self.kind.replace(' ', '-')}-{self.number}"
+
+    @property
+    def angle(self) -> float:
+        """Friction angle, degrees."""
+        return self.scene.angle
+
+    @property
+    def seed(self) -> int:
+        """Of surface, looks, particles and noise."""
+        return self.scene.seed
+
+    def within(self, rng: np.random.Generator, least: float, most: float) -> Hidden:
+        """The same with an angle between these, and within the range of all, so that no soil leaves it."""
+        angle = float(rng.uniform(max(least, ANGLES[0]), min(most, ANGLES[1])))
+        return replace(self, scene=replace(self.scene, angle=angle))
 
     def observation(self) -> Observation:
         """How the cameras err."""
@@ -99,14 +114,17 @@ def _layering(rng: np.random.Generator, hidden: Hidden) -> Hidden:
     size = rng.uniform(-12.0, -7.0)
     depth = rng.uniform(0.03, 0.06)
     return replace(
-        hidden, size=size, values={"layer_friction": size, "layer_depth": depth}, soil={"layer": (size, depth)}
+        hidden.within(rng, ANGLES[0] - size, ANGLES[1]),
+        size=size,
+        values={"layer_friction": size, "layer_depth": depth},
+        soil={"layer": (size, depth)},
     )
 
 
 def _buried_obstacle(rng: np.random.Generator, hidden: Hidden) -> Hidden:
     size = rng.uniform(0.03, 0.045)
     # beside the tool's way, which it must not touch
-    y = rng.choice([-1.0, 1.0]) * (0.07 + size)
+    y = rng.choice([-1.0, 1.0]) * (0.5 * hidden.scene.width + BESIDE + size)
     x, z = rng.uniform(0.32, 0.45), 0.06
     values = {"obstacle_radius": size, "obstacle_x": x - MIDDLE[0], "obstacle_y": y, "obstacle_height": z}
     return replace(hidden, size=size, values=values, soil={"obstacle": (x, MIDDLE[1] + y, z, size)})
@@ -124,6 +142,7 @@ def _time_offset(rng: np.random.Generator, hidden: Hidden) -> Hidden:
 
 def _friction_field(rng: np.random.Generator, hidden: Hidden) -> Hidden:
     size = rng.uniform(6.0, 10.0) * rng.choice([-1.0, 1.0])
+    hidden = hidden.within(rng, ANGLES[0] + abs(size), ANGLES[1] - abs(size))
     return replace(hidden, size=size, soil={"across": size})
 
 
@@ -148,5 +167,5 @@ OBSERVATION = ("exposure", "time_offset")
 def draw(kind: str, number: int, seed: int) -> Hidden:
     """A sealed truth."""
     rng = np.random.default_rng([seed, list(KINDS).index(kind), number])
-    angle = float(rng.uniform(*ANGLES))
-    return KINDS[kind](rng, Hidden(kind, number, angle, 0.0, int(rng.integers(1000, 2**20))))
+    bed, tool = BEDS[int(rng.integers(len(BEDS)))], TOOLS[int(rng.integers(len(TOOLS)))]
+    return KINDS[kind](rng, Hidden(kind, number, _scenes.draw(rng, bed, tool)))

@@ -2,9 +2,10 @@
 
 Each world is one run of Newton's implicit MPM (extra ``independent``) with one thing that its measurement set doesn't
 tell, or with nothing, photographed by the path tracer, or by Mitsuba 3 (``--renderer mitsuba``). ``splatsoil fit`` and
-``diagnose`` then get the set alone. Truths (what is hidden, how much, the friction angle, the surface, looks) are drawn
+``diagnose`` then get the set alone. Truths (what is hidden, how much, the friction angle, bed, tool, looks) are drawn
 by a stream of random numbers of their own, and opened only to score. What was made is kept in the folder, and a second
-call goes on from there.
+call goes on from there. With ``--refine`` the first world of each kind is ploughed once more with finer voxels, which
+says whether the other solver has converged on such soil; the result stays beside the worlds.
 
 The same truths ploughed by this project's own solver (``--solver small``, or another preset) tell what of an error is
 the solvers' difference, and what the photographs' or the estimates' fault.
@@ -20,6 +21,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -30,20 +32,22 @@ from splatsoil.benchmarks._newton import Numerics, World, plough
 from splatsoil.benchmarks._tally import confusion, wilson
 from splatsoil.benchmarks._truths import FIELD, KINDS, NOTHING, OBSERVATION, Hidden, draw
 from splatsoil.benchmarks.numerics import FloatArray
+from splatsoil.benchmarks.solvers import FRAMES, moved, read_particles, refinement_table, surfaces
 
 from splatsoil.errors import ParameterError
-from splatsoil.files import plain, write_json
+from splatsoil.files import plain, read_json, write_json
+from splatsoil.measurement import Measurement
 from splatsoil.mpm import PRESETS, Resolution, Trajectory, frames_around, simulate
 from splatsoil.quiet import hush
 from splatsoil.reconstruction import fill
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
-from splatsoil.synthetic import Appearance, Renderer, Setup, Stage, photograph_run, plow
+from splatsoil.synthetic import Appearance, Renderer, Setup, Stage, photograph_run
 
-VOXEL, ITERATIONS, SUBSTEPS = 0.02, 120, 2
-"""Of the independent solver: m, in a substep, in a frame."""
-SPACING = 0.5
-"""Of the independent solver's particles, of a voxel."""
+OWN = ("_mitsuba", "_newton", "_scenes", "_truths", "hidden_worlds")
+"""Modules beside the package by which worlds are made."""
+AT_A_TIME = 4
+"""Worlds that the independent solver ploughs side by side."""
 RENDERERS: dict[str, Callable[..., Renderer]] = {"own": Stage, "mitsuba": MitsubaStage}
 NEWTON = "newton"
 """The other solver; ours go by their presets."""
@@ -63,16 +67,15 @@ def soil_of(hidden: Hidden, setup: Setup, spacing: float) -> World:
     if "obstacle" in told:
         keep = np.linalg.norm(x - np.array(told["obstacle"][:3]), axis=1) > told["obstacle"][3]
         x = x[keep]
-    return World(hidden.name, angle, x, spacing, **told)
+    return World(hidden.name, setup.experiment(), angle, x, spacing, gravity=hidden.gravity, **told)
 
 
 def ploughed_by_newton(
     group: Sequence[Hidden], setups: Sequence[Setup], frames: Sequence[int], device: str, numerics: Numerics
 ) -> list[Trajectory]:
-    """Worlds under one gravity, side by side."""
-    spacing = SPACING * numerics.voxel
-    soils = [soil_of(h, s, spacing) for h, s in zip(group, setups, strict=True)]
-    runs = plough(setups[0].experiment(), soils, numerics, frames, device, gravity=group[0].gravity)
+    """Worlds side by side."""
+    soils = [soil_of(h, s, numerics.spacing) for h, s in zip(group, setups, strict=True)]
+    runs = plough(soils, numerics, frames, device)
     found = []
     for setup, soil, run in zip(setups, soils, runs, strict=True):
         positions = np.stack([soil.particles, *(run.particles[f] for f in frames if f > 0)]).astype(np.float32)
@@ -82,7 +85,7 @@ def ploughed_by_newton(
                 positions=positions,
                 deformations=np.broadcast_to(np.eye(3, dtype=np.float32), (*positions.shape, 3)),
                 force=run.force[: max(setup.frames)],
-                spacing=spacing,
+                spacing=soil.spacing,
                 resolution=Resolution.derive(setup.experiment(), "small"),
             )
         )
@@ -112,12 +115,13 @@ def make_worlds(
     say: Callable[[str], None],
     solver: str | Numerics,
     renderer: Callable[..., Renderer] = Stage,
+    at_a_time: int = AT_A_TIME,
 ) -> None:
-    """Simulate and photograph the worlds that the folder doesn't have."""
+    """Simulate and photograph the worlds that the folder doesn't have, so many at a time."""
     missing = [h for h in truths if not (out / "sets" / h.name / "truth.json").is_file()]
-    for gravity in dict.fromkeys(h.gravity for h in missing):
-        group = [h for h in missing if h.gravity == gravity]
-        setups = [plow(h.seed) for h in group]
+    for first in range(0, len(missing), at_a_time):
+        group = missing[first : first + at_a_time]
+        setups = [h.scene.setup() for h in group]
         seen = [h.observation() for h in group]
         rate = setups[0].frame_rate
         frames = sorted({f for o in seen for f in frames_around(setups[0].frames, o.time_offset * rate)})
@@ -134,7 +138,13 @@ def make_worlds(
                 setup,
                 trajectory,
                 plain(
-                    {"hidden": hidden.kind, "size": hidden.size, "friction_angle": hidden.angle, "seed": hidden.seed}
+                    {
+                        "hidden": hidden.kind,
+                        "size": hidden.size,
+                        "values": hidden.values,
+                        "scene": asdict(hidden.scene),
+                        "solver": asdict(solver) if isinstance(solver, Numerics) else solver,
+                    }
                 ),
                 appearance=Appearance.drawn(hidden.seed),
                 observation=observation,
@@ -143,6 +153,34 @@ def make_worlds(
                 renderer=renderer,
             )
             say(f"{hidden.name} photographed, {time.perf_counter() - began:.0f} s")
+
+
+def refine(
+    truths: Sequence[Hidden], out: Path, device: str, say: Callable[[str], None], numerics: Numerics, at_a_time: int
+) -> None:
+    """Plough the first world of each kind of soil once more with finer voxels, unless that is done; what they change is
+    kept in ``refinement.json``, by world."""
+    file = out / "refinement.json"
+    done: dict[str, Any] = read_json(file) if file.is_file() else {}
+    missing = [h for h in truths if h.number == 0 and h.kind not in OBSERVATION and h.name not in done]
+    finer = numerics.refined()
+    for begin in range(0, len(missing), at_a_time):
+        group = missing[begin : begin + at_a_time]
+        began = time.perf_counter()
+        soils = [soil_of(h, h.scene.setup(), finer.spacing) for h in group]
+        for hidden, soil, run in zip(group, soils, plough(soils, finer, FRAMES, device), strict=True):
+            measurement = Measurement.load(out / "sets" / hidden.name)
+            made, spacing = read_particles(measurement.folder / "truth_particles.npz")
+            force = measurement.tool.force
+            assert force is not None  # of every world that the other solver made
+            heights = [
+                surfaces(measurement, particles, size)
+                for particles, size in ((made, spacing), (run.particles, soil.spacing))
+            ]
+            done[hidden.name] = moved(measurement, (heights[0], force[:, 2:]), (heights[1], run.force))
+        write_json(file, plain(done))
+        names = ", ".join(h.name for h in group)
+        say(f"{names} ploughed with voxels of {1e3 * finer.voxel:.1f} mm in {time.perf_counter() - began:.0f} s")
 
 
 def criticise(name: str, out: Path, preset: str, device: str, say: Callable[[str], None]) -> None:
@@ -273,8 +311,12 @@ def main(arguments: list[str] | None = None) -> int:
         default=NEWTON,
         help="ploughs the worlds: newton needs the package, the others are ours by preset (not friction_field)",
     )
-    parser.add_argument("--voxel", type=float, default=VOXEL, help="edge of the other solver's cells, m")
-    parser.add_argument("--iterations", type=int, default=ITERATIONS, help="most of the other solver's in a substep")
+    parser.add_argument("--voxel", type=float, default=Numerics.voxel, help="edge of the other solver's cells, m")
+    parser.add_argument(
+        "--iterations", type=int, default=Numerics.iterations, help="most of the other solver's in a substep"
+    )
+    parser.add_argument("--worlds-side-by-side", type=at_least(1), default=AT_A_TIME, help="ploughed at a time")
+    parser.add_argument("--refine", action="store_true", help="check the first world of each kind with finer voxels")
     parser.add_argument("--worlds-only", action="store_true", help="make the sets and stop")
     parser.add_argument("--out", type=Path, default=Path("runs/hidden-worlds"))
     options = parser.parse_args(arguments)
@@ -288,9 +330,11 @@ def main(arguments: list[str] | None = None) -> int:
         raise ParameterError(f"{FIELD} is outside of our library: give --kinds without it, or --solver {NEWTON}")
     if not options.voxel > 0.0 or options.iterations < 1:
         raise ParameterError("--voxel must be positive, and --iterations one at least")
+    if options.refine and options.solver != NEWTON:
+        raise ParameterError(f"--refine is of the other solver: leave it out, or give --solver {NEWTON}")
     if options.renderer == "mitsuba":
         load_mitsuba()  # says what is missing before worlds are made
-    own = [Path(__file__).with_name(f"{name}.py") for name in ("_mitsuba", "_newton", "_truths", "hidden_worlds")]
+    own = [Path(__file__).with_name(f"{name}.py") for name in OWN]
     decides = {name: getattr(options, name) for name in ("seed", "preset", "solver", "renderer", "voxel", "iterations")}
     decides["code"] = sources(own)
     keep_to_one_protocol(options.out, decides)
@@ -299,9 +343,12 @@ def main(arguments: list[str] | None = None) -> int:
         for kind in options.kinds
         for k in range((3 if kind == NOTHING else 1) * options.count)
     ]
-    other = Numerics(options.voxel, SUBSTEPS, options.iterations)
+    other = Numerics(voxel=options.voxel, iterations=options.iterations)
     solver = other if options.solver == NEWTON else options.solver
-    make_worlds(truths, options.out, options.device, say, solver, RENDERERS[options.renderer])
+    at_a_time = options.worlds_side_by_side
+    make_worlds(truths, options.out, options.device, say, solver, RENDERERS[options.renderer], at_a_time)
+    if options.refine:
+        refine(truths, options.out, options.device, say, other, at_a_time)
     if options.worlds_only:
         return 0
     threads = max(1, (os.cpu_count() or 1) // options.side_by_side)
@@ -317,11 +364,11 @@ def main(arguments: list[str] | None = None) -> int:
         if (run / "diagnosis.json").is_file():
             fit, told = (json.loads((run / file).read_text()) for file in ("fit.json", "diagnosis.json"))
             rows.append(score(hidden, fit, told))
-    write_json(
-        options.out / "result.json",
-        plain({"made_by": stamp(options.device), **decides, "rows": rows}),
-    )
-    print(table(rows))
+    file = options.out / "refinement.json"
+    checked = read_json(file) if file.is_file() else {}
+    result = {"made_by": stamp(options.device), **decides, "rows": rows, "refinement": checked}
+    write_json(options.out / "result.json", plain(result))
+    print(table(rows), *(["", *refinement_table(checked)] if checked else ()), sep="\n")
     return 0 if len(rows) == len(truths) else 1
 
 

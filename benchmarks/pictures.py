@@ -4,7 +4,7 @@ On a set's own bed, from its first particles, Newton's implicit MPM (extra ``ind
 solvers know. Its particles and ours at the same parameters are drawn by one renderer, with the set's reconstruction, so
 that neither photographs nor light have a part in what they differ by. That difference is read as one of the
 parameters, for our solver as it is and with a piece of its numerics changed: 0 is what a solver should come to. A
-fit's heights and slopes can say otherwise (:mod:`splatsoil.benchmarks.independent`), as cameras look at rims and walls.
+fit's heights and slopes can say otherwise (:mod:`splatsoil.benchmarks.solvers`), as cameras look at rims and walls.
 """
 
 from __future__ import annotations
@@ -124,6 +124,7 @@ class Bench:
         worlds = [
             World(
                 str(k),
+                self.truth.measurement,
                 soil[ANGLE],
                 start,
                 spacing,
@@ -132,7 +133,7 @@ class Bench:
             )
             for k, soil in enumerate(soils)
         ]
-        runs = plough(self.truth.measurement, worlds, numerics, self.model.frames, self.device)
+        runs = plough(worlds, numerics, self.model.frames, self.device)
         return [(self.drawn({0: start, **run.particles}), self._force(run.force)) for run in runs]
 
     def drawn(self, particles: Mapping[int, FloatArray]) -> FloatArray:

@@ -62,12 +62,15 @@ def _window(scene: Plough, newton: object, start: int) -> list[float]:
     numerics = Numerics.of(measurement.folder)
     angle = scene.values["friction_angle"]
     cohesion = scene.values.get("cohesion", 0.0)
-    world = World("speed", angle, truth.particles[start], truth.volume ** (1.0 / 3.0), cohesion=cohesion)
-    model = _model(newton, measurement, [world], np.zeros((1, 3)), "cpu")
+    spacing = truth.volume ** (1.0 / 3.0)
+    world = World("speed", measurement, angle, truth.particles[start], spacing, cohesion=cohesion)
+    model = _model(newton, [world], np.zeros((1, 3)), "cpu")
     config = newton.solvers.SolverImplicitMPM.Config()  # type: ignore[attr-defined]
     config.voxel_size, config.max_iterations, config.tolerance = numerics.voxel, numerics.iterations, 1.0e-4
     solver = newton.solvers.SolverImplicitMPM(model, config=config)  # type: ignore[attr-defined]
     states = [model.state(), model.state()]
+    for state in states:
+        state.particle_f.assign(np.tile(world.weight, (len(world.particles), 1)))
     frame_time = 1.0 / measurement.frame_rate
     step = frame_time / numerics.substeps
 

@@ -22,6 +22,8 @@ VIDEO_EVERY = 10
 VIEWS = 40
 FRAME_RATE = 50.0
 GRAVITY = (0.0, 0.0, -9.81)
+STAGES = (25, 75, 25, 75)
+"""Frames of a tool's way down, forward, at rest and back."""
 
 SURFACE_CELL = 0.005
 """Of surfaces, m."""
@@ -101,8 +103,8 @@ class Setup:
 def plow(seed: int = 0, *, views: int = VIEWS, depth: float | None = None) -> Setup:
     """A plate of 12 x 12 cm, tilted by 20°, lowered into a bed of 0.8 x 0.5 m, pushed, paused and drawn back."""
     bed = Bed(np.zeros(3), np.array([0.8, 0.5, 0.27]), density=1600.0, wall_friction=0.0, floor_friction=0.6)
-    motion = staged_motion((0.2, 0.25, 0.21), tilt=20.0, down=0.2, push=0.2, stages=(25, 75, 25, 75))
-    tool = Tool(trimesh.creation.box((0.012, 0.12, 0.12)), motion, friction=0.3)
+    motion = staged_motion((0.2, 0.25, 0.21), tilt=20.0, down=0.2, push=0.2, stages=STAGES)
+    tool = Tool(plate(), motion, friction=0.3)
     target = (0.4, 0.25, 0.08)
     focal = 343.12
 
@@ -134,7 +136,7 @@ def paper(*, views: int = VIEWS) -> Setup:
     field = HeightField.over(bed.lower, bed.upper, SURFACE_CELL)
     x, z = field.points[..., 0], 1.0 - field.points[..., 1]
     waves = np.sin(math.pi * x) + 0.5 * np.sin(1.5 * math.pi * z) + 0.05 * np.sin(4.0 * math.pi * x)
-    motion = staged_motion((0.1, 0.5, 0.4), tilt=30.0, down=0.1, push=0.3, stages=(25, 75, 25, 75))
+    motion = staged_motion((0.1, 0.5, 0.4), tilt=30.0, down=0.1, push=0.3, stages=STAGES)
     target = (0.5, 0.5, 0.25)
     focal = 640.0 / math.tan(math.radians(0.5 * 61.93))
 
@@ -192,8 +194,27 @@ def like(measurement: Measurement, seed: int = 0, *, views: int | None = None, d
     )
 
 
+def plate(width: float = 0.12) -> trimesh.Trimesh:
+    """12 mm thick along x, ``width`` m wide along y, 12 cm high."""
+    return trimesh.creation.box((0.012, width, 0.12))
+
+
+def drum(width: float = 0.12, radius: float = 0.06) -> trimesh.Trimesh:
+    """A wheel-like cylinder about y, lengths in m."""
+    return trimesh.creation.cylinder(radius, width, sections=48).apply_transform(
+        trimesh.transformations.rotation_matrix(0.5 * math.pi, (1.0, 0.0, 0.0))
+    )
+
+
 def staged_motion(
-    start: Sequence[float], *, tilt: float, down: float, push: float, stages: Sequence[int], rate: float = FRAME_RATE
+    start: Sequence[float],
+    *,
+    tilt: float,
+    down: float,
+    push: float,
+    stages: Sequence[int],
+    rate: float = FRAME_RATE,
+    roll: float = 0.0,
 ) -> ToolMotion:
     """Down, along +x, a pause, back.
 
@@ -203,21 +224,38 @@ def staged_motion(
         down, push: speeds in m/s.
         stages: frames of each.
         rate: frames a second.
+        roll: turn about y in radians a metre along +x: 1 / radius for a wheel that doesn't slip.
     """
     velocities = np.array([[0.0, 0.0, -down], [push, 0.0, 0.0], [0.0, 0.0, 0.0], [-push, 0.0, 0.0]])
     steps = np.repeat(velocities, stages, axis=0) / rate
     positions = np.concatenate([[start], np.asarray(start) + np.cumsum(steps, axis=0)])
-    half = 0.5 * math.radians(tilt)
-    frames = np.arange(len(positions))
-    turn = np.array([math.cos(half), 0.0, math.sin(half), 0.0])
-    return ToolMotion(frames, frames / rate, positions, np.tile(turn, (len(positions), 1)))
+    half = 0.5 * (math.radians(tilt) + roll * (positions[:, 0] - positions[0, 0]))
+    frames, none = np.arange(len(positions)), np.zeros(len(positions))
+    return ToolMotion(frames, frames / rate, positions, np.stack([np.cos(half), none, np.sin(half), none], axis=1))
 
 
 def wavy_surface(bed: Bed, depth: float, seed: int, tool: Tool) -> HeightField:
-    """Waves drawn by seed around a mean ``depth`` in m over the bed's floor, clear of the tool where it starts.
+    """`waves` that are clear of the tool where it starts.
 
     Raises:
         ParameterError: a depth that does not fit the bed, or soil that would reach the tool before it moves.
+    """
+    field = waves(bed, depth, seed)
+    low, high = tool.bounds(0.0)
+    reach = highest(field, low, high)
+    if reach + CLEARANCE > low[2]:
+        raise ParameterError(
+            f"the soil would reach {reach:.3f} m where the tool starts at {low[2]:.3f} m; "
+            f"give --depth less than {depth:.3f} m"
+        )
+    return field
+
+
+def waves(bed: Bed, depth: float, seed: int) -> HeightField:
+    """Waves drawn by seed around a mean ``depth`` in m over the bed's floor.
+
+    Raises:
+        ParameterError: a depth that does not fit the bed.
     """
     if not 0.0 < depth < bed.extents[2]:
         raise ParameterError(
@@ -236,17 +274,29 @@ def wavy_surface(bed: Bed, depth: float, seed: int, tool: Tool) -> HeightField:
     relief -= relief.mean()
     slope = np.hypot(*np.gradient(relief, *field.cell[::-1])).max()
     scale = min(RELIEF * depth / relief.std(), math.tan(math.radians(STEEPEST)) / slope)
-    height = np.minimum(bed.lower[2] + depth + scale * relief, bed.upper[2])
-    field = replace(field, height=height)
-    low, high = tool.bounds(0.0)
-    x, y = place[..., 0], place[..., 1]
+    return replace(field, height=np.minimum(bed.lower[2] + depth + scale * relief, bed.upper[2]))
+
+
+def plane(bed: Bed, depth: float, slope: float = 0.0, towards: float = 0.0) -> HeightField:
+    """A level or sloping surface.
+
+    Args:
+        bed: its box.
+        depth: of the soil in the bed's middle, m.
+        slope: degrees.
+        towards: where it rises, degrees from +x to +y.
+    """
+    field = HeightField.over(bed.lower, bed.upper, SURFACE_CELL)
+    turn, middle = math.radians(towards), bed.lower[:2] + 0.5 * bed.extents[:2]
+    along = (field.points[..., :2] - middle) @ np.array([math.cos(turn), math.sin(turn)])
+    return replace(field, height=bed.lower[2] + depth + math.tan(math.radians(slope)) * along)
+
+
+def highest(surface: HeightField, low: FloatArray, high: FloatArray) -> float:
+    """Height in m of the surface's highest cell whose centre lies between two corners in plan; -inf where none does."""
+    x, y = surface.points[..., 0], surface.points[..., 1]
     under = (x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1])
-    if under.any() and float(height[under].max()) + CLEARANCE > low[2]:
-        raise ParameterError(
-            f"the soil would reach {height[under].max():.3f} m where the tool starts at {low[2]:.3f} m; "
-            f"give --depth less than {depth:.3f} m"
-        )
-    return field
+    return float(surface.height[under].max(initial=-np.inf))
 
 
 def spiral(target: Sequence[float], distance: float, count: int) -> list[FloatArray]:

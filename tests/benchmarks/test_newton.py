@@ -1,0 +1,201 @@
+"""The independent solver's scene: what its solver is handed, held against what the tool and the bed must do."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from splatsoil.benchmarks._newton import WALL, Numerics, Run, World, _model, _shifts, _walls, plough
+from splatsoil.benchmarks._scenes import Scene
+from splatsoil.benchmarks.numerics import Truth
+
+from splatsoil.errors import MeasurementError, RunError
+from splatsoil.measurement import Bed, Measurement
+from splatsoil.reconstruction import fill
+
+SPACING, COARSE = 0.02, Numerics(voxel=0.04, substeps=2, iterations=60)
+
+
+def soil(scene: Scene, label: str = "soil", spacing: float = SPACING) -> World:
+    """A world of a drawn scene."""
+    setup = scene.setup()
+    return World(label, setup.experiment(), scene.angle, fill(setup.surface, setup.bed, spacing, seed=1), spacing)
+
+
+def test_the_examples_were_made_with_converged_numerics(plow_dry: Path, plow_damp: Path) -> None:
+    assert Numerics.of(plow_dry) == Numerics.of(plow_damp) == Numerics()
+
+
+def test_a_set_that_does_not_tell_its_numerics_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "truth.json").write_text("{}")
+    with pytest.raises(MeasurementError, match="numerics"):
+        Numerics.of(tmp_path)
+
+
+def test_finer_voxels_get_more_steps_and_iterations() -> None:
+    finer = Numerics().refined()
+    assert finer.voxel == pytest.approx(0.01)
+    assert (finer.substeps, finer.iterations) == (4, 2000)
+    assert finer.spacing == pytest.approx(0.005)
+
+
+def test_a_bed_weighs_what_its_soil_does() -> None:
+    """Whatever the spacing: volume x density x gravity."""
+    scene = Scene(seed=1, angle=35.0, bed="flat", density=1430.0)
+    for spacing in (0.02, 0.013):
+        world = soil(scene, spacing=spacing)
+        weight = len(world.particles) * world.weight.astype(np.float64)
+        assert weight == pytest.approx([0.0, 0.0, -0.8 * 0.5 * 0.12 * 1430.0 * 9.81], rel=1e-4)
+    tilted = replace(world, gravity=(1.0, 0.0, -2.0))
+    assert tilted.weight == pytest.approx(1430.0 * 0.013**3 * np.array([1.0, 0.0, -2.0]))
+
+
+def test_beds_beside_each_other_keep_their_walls_and_their_place_on_the_grid() -> None:
+    sizes = ((0.0, 0.5), (-0.31, 0.4), (0.2, 1.0))
+    base = Scene(seed=1, angle=35.0).setup().experiment()
+    worlds = []
+    for low, high in sizes:
+        bed = Bed(np.array([0.0, low, 0.0]), np.array([0.8, high, 0.27]), density=1600.0)
+        worlds.append(World("bed", replace(base, bed=bed), 35.0, np.zeros((1, 3)), SPACING))
+    shifts = _shifts(worlds, 0.04)
+    assert not shifts[0].any() and not shifts[:, [0, 2]].any()
+    assert shifts[:, 1] / 0.04 == pytest.approx(np.round(shifts[:, 1] / 0.04))
+    outsides = [(low - 2 * WALL + s, high + 2 * WALL + s) for (low, high), s in zip(sizes, shifts[:, 1], strict=True)]
+    for (_, end), (begin, _) in pairwise(outsides):
+        assert -1e-9 <= begin - end < 0.04 + 1e-9, "walls meet, or room is wasted"
+
+
+def test_worlds_on_different_floors_are_not_ploughed_together() -> None:
+    pytest.importorskip("newton")
+    world = soil(Scene(seed=1, angle=35.0))
+    bed = replace(world.measurement.bed, floor_friction=0.2)
+    with pytest.raises(RunError, match="one by one"):
+        plough([world, replace(world, measurement=replace(world.measurement, bed=bed))], COARSE, (1,))
+
+
+def test_cohesion_is_the_whole_strength_without_pressure_and_counted_once(plow_damp: Path) -> None:
+    newton = pytest.importorskip("newton")
+    truth = Truth.load(plow_damp)
+    x = truth.start(SPACING, 0)
+    damp = World("damp", truth.measurement, 33.0, x, SPACING, cohesion=300.0)
+    material = _model(newton, [damp, replace(damp, angle=30.0, cohesion=0.0)], np.zeros((2, 3)), "cpu").mpm
+    # Newton's shear strength is yield_stress + friction (p + tension)
+    tension = material.yield_pressure.numpy() * material.tensile_yield_ratio.numpy()
+    strength = material.yield_stress.numpy() + material.friction.numpy() * tension
+    sine = np.sin(np.radians(33.0))
+    # Drucker-Prager matched to triaxial compression, in sqrt(J2): 6 c cos / (sqrt(3) (3 - sin))
+    exact = 6.0 * 300.0 * np.cos(np.radians(33.0)) / (np.sqrt(3.0) * (3.0 - sine))
+    assert strength[: len(x)] == pytest.approx(exact, rel=1e-3)
+    assert not strength[len(x) :].any()
+    # the cone's apex, at c cot(friction angle)
+    assert tension[: len(x)] == pytest.approx(300.0 / np.tan(np.radians(33.0)), rel=1e-3)
+
+
+def test_no_gap_is_left_between_two_walls() -> None:
+    lower, upper = np.array([0.0, -0.2, 0.1]), np.array([0.8, 0.3, 0.4])
+    margin = np.array([0.1, 0.1, 0.0])
+    around = np.random.default_rng(0).uniform(lower - margin, upper + margin, (2000, 3))
+    outside = np.any((around < lower) | (around > upper), axis=1)
+    held = [np.all(np.abs(around - centre) <= half, axis=1) for centre, half in _walls(lower, upper)]
+    assert np.array_equal(np.any(held, axis=0), outside)
+
+
+@pytest.mark.slow
+def test_soil_falls_as_its_own_world_pulls() -> None:
+    """A lump in the air, under 9.81 and under 4 m/s², and one without weight."""
+    pytest.importorskip("newton")
+    world = soil(Scene(seed=1, angle=35.0))
+    along = np.arange(4) * SPACING
+    lump = np.stack(np.meshgrid(0.55 + along, 0.21 + along, 0.12 + along), axis=-1).reshape(-1, 3)
+    pulls = (9.81, 4.0, 0.0)
+    worlds = [replace(world, particles=lump, gravity=(0.0, 0.0, -g)) for g in pulls]
+    runs = plough(worlds, COARSE, (5,))
+    substeps = 5 * COARSE.substeps
+    for pull, run in zip(pulls, runs, strict=True):
+        fall = pull * 0.01**2 * substeps * (substeps + 1) / 2  # each step by the velocity at its end
+        assert (lump - run.particles[5])[:, 2].mean() == pytest.approx(fall, rel=0.02, abs=1e-6)
+
+
+@pytest.mark.slow
+def test_soil_too_weak_to_stand_stays_in_the_box(plow_dry: Path) -> None:
+    pytest.importorskip("newton")
+    truth = Truth.load(plow_dry)
+    bed, weak = truth.measurement.bed, World("weak", truth.measurement, 12.0, truth.start(SPACING, 0), SPACING)
+    x = plough([weak], COARSE, (20,))[0].particles[20]
+    # through corners that were open it came out by 57 mm
+    assert np.maximum(bed.lower - x, x - bed.upper).max() < 1e-3
+
+
+@pytest.fixture(scope="module")
+def ploughed() -> tuple[Truth, list[Run]]:
+    """Two coarse worlds, ten frames into the push."""
+    pytest.importorskip("newton")
+    truth = Truth.load(Path(__file__).parents[2] / "examples" / "plow-damp")
+    x = truth.start(SPACING, 0)
+    short = replace(truth, particles={0: x, 5: x, 35: x}, volume=SPACING**3)
+    true = World("true", short.measurement, 33.0, x, SPACING, cohesion=300.0)
+    return short, plough([true, replace(true, angle=20.0)], COARSE, (5, 35))
+
+
+@pytest.mark.slow
+def test_before_the_tool_arrives_the_bed_rests(
+    ploughed: tuple[Truth, list[Run]],
+) -> None:
+    truth, runs = ploughed
+    for run in runs:
+        moved = np.linalg.norm(run.particles[5] - truth.particles[0], axis=1)
+        assert np.percentile(moved, 90) < 0.3e-3  # loose grains on top settle by more; free fall would be 49 mm
+
+
+@pytest.mark.slow
+def test_soil_reaches_where_the_plate_was_a_substep_ago_and_no_further(
+    ploughed: tuple[Truth, list[Run]],
+) -> None:
+    truth, runs = ploughed
+    for run in runs:
+        # the solver lets particles a hundredth of a voxel in; the tool's way in a substep is 2 mm
+        assert abs(gap_before(truth.measurement, run.particles[35])) < 0.6e-3
+
+
+def gap_before(measurement: Measurement, x: np.ndarray) -> float:
+    """Between the plate's front, where it was a substep before frame 35, and the soil nearest to it, m."""
+    tool = measurement.tool
+    lower, upper = tool.mesh.bounds
+    rotation, position = tool.motion.pose((35 - 1 / COARSE.substeps) / measurement.frame_rate)
+    local = (x - position) @ rotation
+    before = local[(np.abs(local[:, 1]) < upper[1] - 0.01) & (local[:, 2] > lower[2] + 0.01) & (local[:, 0] > 0.0)]
+    return float(before[:, 0].min() - upper[0])
+
+
+@pytest.mark.slow
+def test_a_world_hangs_on_no_other_beside_it() -> None:
+    """Of another bed, tool, motion and density."""
+    pytest.importorskip("newton")
+    level = soil(Scene(seed=1, angle=35.0, bed="flat", tool="drum", rolling=1.2, depth=0.05))
+    slope = soil(Scene(seed=2, angle=26.0, bed="sloping", slope=6.0, density=1450.0, width=0.16, tilt=0.0))
+    beside, alone = plough([level, slope], COARSE, (30,)), plough([slope], COARSE, (30,))[0]
+    moved = np.linalg.norm(alone.particles[30] - slope.particles, axis=1)
+    apart = np.linalg.norm(beside[1].particles[30] - alone.particles[30], axis=1)
+    assert np.percentile(moved, 99) > 10e-3
+    assert np.percentile(apart, 99) < 0.2e-3
+    assert beside[1].force[20:].mean(axis=0) == pytest.approx(alone.force[20:].mean(axis=0), rel=0.02, abs=0.5)
+
+
+@pytest.mark.slow
+def test_the_force_is_the_soils_on_the_tool(ploughed: tuple[Truth, list[Run]]) -> None:
+    """Next to nothing before it arrives; then against its way and up, more of it in stronger soil, and of the set's
+    size: coarse voxels and few iterations bear less."""
+    truth, (strong, weak) = ploughed
+    force = truth.measurement.tool.force
+    assert force is not None
+    pushing = slice(29, 35)
+    ours, less = (run.force[pushing].mean(axis=0) for run in (strong, weak))
+    measured = force[pushing, 2:].mean(axis=0)
+    assert np.abs(strong.force[:5, 0]).max() < 0.05 * abs(ours[0])
+    assert np.all(np.sign(ours[[0, 2]]) == np.sign(measured[[0, 2]]))
+    assert abs(ours[1]) < 0.1 * abs(ours[0])
+    assert np.linalg.norm(less) < 0.8 * np.linalg.norm(ours)
+    assert 0.5 * np.linalg.norm(measured) < np.linalg.norm(ours) < 1.1 * np.linalg.norm(measured)
