@@ -79,6 +79,17 @@ class Fields:
                 self.fail(name, f"expected an object, found {_kind(item)}")
             yield Fields(item, self.file, self.path_of(name), parent=self)
 
+    def names(self) -> list[str]:
+        """All fields' names, those of the enclosing object that values fall back to included."""
+        return [*self.data, *(self.parent.names() if self.parent is not None else ())]
+
+    def flag(self, key: str) -> bool:
+        """True or false."""
+        value = self.raw(key)
+        if not isinstance(value, bool):
+            self.fail(key, f"expected true or false, found {_kind(value)}")
+        return value
+
     def text(self, key: str) -> str:
         """A non-empty string."""
         value = self.raw(key)

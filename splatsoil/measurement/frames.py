@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
@@ -11,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatsoil.errors import MeasurementError
-from splatsoil.measurement.camera import CAMERA_MODELS, Camera
+from splatsoil.measurement.camera import FISHEYE, LENSES, Camera
 from splatsoil.measurement.fields import Fields
 from splatsoil.measurement.images import check_image, read_alpha, read_image
 from splatsoil.measurement.rotations import nearest_rigid, why_not_rigid
@@ -20,6 +22,8 @@ FloatImage = npt.NDArray[np.float32]
 BoolImage = npt.NDArray[np.bool_]
 
 _COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
+_LENS_KEY = re.compile(r"[kps]\d|skew|distortion_params")  # what bends an image in any of the formats alike
+_FOCAL_SLACK = 0.01  # further apart than digits that were cut off explain
 _DEPTH_UNIT = 1e-3  # nerfstudio's depth images are 16-bit millimetres
 
 
@@ -121,24 +125,52 @@ def read_transforms(file: Path, root: Path, *, video: bool) -> tuple[Frame, ...]
     return frames
 
 
-def read_camera(fields: Fields, name: str) -> Camera:
-    """A camera from one frame's fields (those the frame lacks come from the top of the file)."""
-    model = fields.text("camera_model") if fields.has("camera_model") else "OPENCV"
-    if model not in CAMERA_MODELS:
-        fields.fail("camera_model", f"unknown camera model {model!r}; known are {', '.join(CAMERA_MODELS)}")
-    width, height = fields.integer("w", 1, 100_000), fields.integer("h", 1, 100_000)
-    bend = {key: fields.number(key, default=0.0) for key in _COEFFICIENTS}
-    if model == "PINHOLE" and any(bend.values()):
-        first = next(key for key, value in bend.items() if value)
-        fields.fail(first, f"a PINHOLE camera has no distortion, but {first} = {bend[first]:g}; say OPENCV")
-    hint = "focal lengths are given in pixels"
+def read_camera(fields: Fields, name: str, size: tuple[int, int] | None = None) -> Camera:
+    """A camera from one frame's fields (those the frame lacks come from the top of the file).
+
+    Args:
+        fields: the frame's.
+        name: what the camera is called.
+        size: (width, height) of the image where the file may leave size, principal point (the centre, then) and all
+            but one focal length out, as Blender's files do.
+
+    Raises:
+        MeasurementError: naming the field.
+    """
+    lens = fields.text("camera_model") if fields.has("camera_model") else "OPENCV"
+    if fields.has("is_fisheye"):
+        fisheye = fields.flag("is_fisheye")
+        if fisheye and not fields.has("camera_model"):
+            lens = FISHEYE
+        elif fisheye != (LENSES.get(lens, ("",))[0] == FISHEYE):
+            fields.fail("is_fisheye", f"{fisheye} contradicts the model {lens}; give one of both")
+    if lens not in LENSES:
+        fields.fail("camera_model", f"unknown camera model {lens!r}; known are {', '.join(LENSES)}")
+    model, parameters = LENSES[lens]
+    # nerfstudio's OPENCV has four radial coefficients, where COLMAP's has two.
+    known = _COEFFICIENTS if lens == "OPENCV" else parameters
+    for key in fields.names():
+        if _LENS_KEY.fullmatch(key) and key not in known and fields.raw(key) not in (0, False, [], None):
+            advice = "undistort the images first" if model == FISHEYE or key not in _COEFFICIENTS else "say OPENCV"
+            fields.fail(key, f"the model {lens} has no {key}, and this one is not 0; {advice}")
+    bend = {key: fields.number(key, default=0.0) for key in _COEFFICIENTS if key in known}
+    width, height = (
+        fields.integer(key, 1, 100_000) if size is None or fields.has(key) else size[axis]
+        for axis, key in enumerate("wh")
+    )
+    fx = _read_focal(fields, "x", width)
+    alike = not (fields.has("fl_y") or fields.has("camera_angle_y")) and ("f" in parameters or size is not None)
+    fy = fx if alike else _read_focal(fields, "y", height)
+    if "f" in parameters and abs(fx - fy) > _FOCAL_SLACK * fx:
+        fields.fail("fl_y", f"the model {lens} has one focal length, but fl_x = {fx:g} and fl_y = {fy:g}")
+    middle = (None, None) if size is None else (0.5 * width, 0.5 * height)
     camera = Camera(
         width=width,
         height=height,
-        fx=fields.number("fl_x", 0.05 * width, 1000.0 * width, hint=hint),
-        fy=fields.number("fl_y", 0.05 * height, 1000.0 * height, hint=hint),
-        cx=fields.number("cx", -10.0 * width, 11.0 * width),
-        cy=fields.number("cy", -10.0 * height, 11.0 * height),
+        fx=fx,
+        fy=fy,
+        cx=fields.number("cx", -10.0 * width, 11.0 * width, default=middle[0]),
+        cy=fields.number("cy", -10.0 * height, 11.0 * height, default=middle[1]),
         camera_to_world=_read_pose(fields),
         **bend,
         name=name,
@@ -147,6 +179,20 @@ def read_camera(fields: Fields, name: str) -> Camera:
     if not np.isfinite(camera.rays([[camera.cx, camera.cy]])[1]).all():
         fields.fail("k1", "the distortion leaves no image, not even at the principal point")
     return camera
+
+
+def _read_focal(fields: Fields, axis: str, length: int) -> float:
+    """The focal length along an axis in pixels, by ``fl_x`` or by ``camera_angle_x``, which must agree."""
+    key, angle_key = f"fl_{axis}", f"camera_angle_{axis}"
+    if fields.has(key) or not fields.has(angle_key):
+        focal = fields.number(key, 0.05 * length, 1000.0 * length, hint="focal lengths are given in pixels")
+    if not fields.has(angle_key):
+        return focal
+    hint = f"it is the field of view along {axis} in radians"
+    by_angle = 0.5 * length / math.tan(0.5 * fields.number(angle_key, 1e-3, math.pi - 1e-3, hint=hint))
+    if fields.has(key) and abs(focal - by_angle) > _FOCAL_SLACK * focal:
+        fields.fail(key, f"{focal:g} pixels contradict {angle_key}, by which they are {by_angle:g}; give one of both")
+    return focal if fields.has(key) else by_angle
 
 
 def _read_pose(fields: Fields) -> npt.NDArray[np.float64]:
