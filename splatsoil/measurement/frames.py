@@ -15,7 +15,7 @@ import numpy.typing as npt
 from splatsoil.errors import MeasurementError
 from splatsoil.measurement.camera import FISHEYE, LENSES, Camera
 from splatsoil.measurement.fields import Fields
-from splatsoil.measurement.images import check_image, read_alpha, read_image
+from splatsoil.measurement.images import check_image, check_photograph, read_alpha, read_image, read_mask
 from splatsoil.measurement.rotations import nearest_rigid, why_not_rigid
 
 FloatImage = npt.NDArray[np.float32]
@@ -37,7 +37,7 @@ class Frame:
         camera_name: which camera took it; empty where the set does not say.
         frame: its number on the tool motion's clock, negative before the motion (pre-roll), None for views.
         time: seconds on that clock, None for views.
-        mask_path: image that is black where pixels are to be ignored, or None.
+        mask_path: image that is dark where pixels are to be ignored, or None.
         depth_path: 16-bit image in millimetres, or .npy in metres, of the depth along the camera's axis, or None.
     """
 
@@ -56,7 +56,7 @@ class Frame:
     def mask(self) -> BoolImage | None:
         """Where the image is to be used, by its mask or its own transparency: (height, width) bool, or None."""
         if self.mask_path is not None:
-            return read_image(self.mask_path).max(axis=2) > 0.0
+            return read_mask(self.mask_path)
         return read_alpha(self.path)
 
     def depth(self) -> FloatImage | None:
@@ -117,9 +117,17 @@ def read_transforms(file: Path, root: Path, *, video: bool) -> tuple[Frame, ...]
     told = f"w and h of {file.name}"
     for i, frame in enumerate(frames):
         size = (frame.camera.width, frame.camera.height)
-        check_image(frame.path, size, sizes_from=told, field=f"frames[{i}].file_path")
+        key = f"frames[{i}].file_path" if frame.mask_path is None else f"frames[{i}].mask_path"
+        check_photograph(frame.path, size, sizes_from=told, field=f"frames[{i}].file_path")
         if frame.mask_path is not None:
-            check_image(frame.mask_path, size, sizes_from=told, field=f"frames[{i}].mask_path")
+            check_image(frame.mask_path, size, sizes_from=told, field=key)
+        mask = frame.mask()
+        if mask is not None and not mask.any():
+            raise MeasurementError(
+                "nothing of the photograph is left: all of it is masked or transparent",
+                file=frame.mask_path or frame.path,
+                field=key,
+            )
         if frame.depth_path is not None:
             _check_depth(frame.depth_path, size, told, f"frames[{i}].depth_file_path")
     return frames

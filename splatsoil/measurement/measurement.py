@@ -271,19 +271,22 @@ def _check_cameras(measurement: Measurement) -> None:
                     file=file,
                     field=f"frames[{i}].transform_matrix",
                 )
-        if not any(sees(frame.camera, bed) for frame in frames):
+        if not any(sees(frame, bed) for frame in frames):
             raise MeasurementError(
-                "no camera looks at the soil's box; matrices are camera to world, and cameras look down their -z axis",
+                "no camera looks at the soil's box; matrices are camera to world, cameras look down their -z axis, and"
+                " masks are black where pixels are ignored",
                 file=file,
                 field="frames[0].transform_matrix",
             )
 
 
-def sees(camera: Camera, bed: Bed) -> bool:
-    """Whether any of a grid of points of the bed's box falls into the image."""
+def sees(frame: Frame, bed: Bed) -> bool:
+    """Whether any of a grid of points of the bed's box falls into the image, where its mask allows it."""
+    camera, mask = frame.camera, frame.mask()
     steps = np.linspace(0.0, 1.0, 9)
     grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
     pixels, depth = camera.project(bed.lower + grid * bed.extents)
     with np.errstate(invalid="ignore"):
-        within = (pixels >= 0.0).all(axis=1) & (pixels[:, 0] <= camera.width) & (pixels[:, 1] <= camera.height)
-    return bool((within & (depth > 0.0)).any())
+        within = (pixels >= 0.0).all(axis=1) & (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
+    column, row = pixels[within & (depth > 0.0)].astype(int).T
+    return bool(column.size and (mask is None or mask[row, column].any()))

@@ -8,10 +8,10 @@ import numpy as np
 from PIL import Image
 
 from splatsoil.measurement.frames import Frame
+from splatsoil.measurement.images import is_turned
 from splatsoil.measurement.measurement import Measurement, sees
 
 _FEW_VIEWS = 12
-_ORIENTATION = 0x0112  # EXIF
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ def _on_views(measurement: Measurement) -> list[str]:
     n = len(measurement.views)
     if n < _FEW_VIEWS:
         out.append(f"There are only {n} views; the soil's surface gets reliable from about {_FEW_VIEWS} on.")
-    blind = [f.path.name for f in measurement.views if not sees(f.camera, measurement.bed)]
+    blind = [f.path.name for f in measurement.views if not sees(f, measurement.bed)]
     if blind:
         out.append(f"{len(blind)} of {n} views do not show the soil's box: {_some(blind)}.")
     below = [f.path.name for f in measurement.views if f.camera.position[2] < measurement.bed.lower[2]]
@@ -81,7 +81,7 @@ def _on_video(measurement: Measurement) -> list[str]:
         missing = [str(n) for n in frames if n not in own]
         if missing:
             out.append(f"Camera {name!r} lacks {len(missing)} frames that others have: {_some(missing)}.")
-        if not sees(cameras[name], measurement.bed):
+        if not any(sees(f, measurement.bed) for f in measurement.video if f.camera_name == name):
             out.append(f"Camera {name!r} does not show the soil's box.")
     lost = [str(n) for n in _lost(frames)]
     if lost:
@@ -174,7 +174,7 @@ def _first(measurement: Measurement, camera: str) -> int:
 
 def _turned(frame: Frame) -> bool:
     with Image.open(frame.path) as image:
-        return image.getexif().get(_ORIENTATION, 1) not in (0, 1)
+        return is_turned(image)
 
 
 def _some(names: list[str], most: int = 4) -> str:

@@ -141,6 +141,52 @@ def wrong_mask(folder: Path) -> None:
     edit(VIEWS, "frames", 1, "mask_path", to="mask.png")(folder)
 
 
+def photograph(make: Callable[[], Image.Image], name: str = "002.png") -> Callable[[Path], None]:
+    """Another image, of another type perhaps, for the third view."""
+
+    def spoil(folder: Path) -> None:
+        make().save(folder / "views/images" / name)
+        edit(VIEWS, "frames", 2, "file_path", to=f"images/{name}")(folder)
+
+    return spoil
+
+
+def even(level: int, noise: float = 0.0) -> Image.Image:
+    """One grey throughout but for a sensor's noise."""
+    values = level + noise * np.random.default_rng(0).normal(size=(240, 320, 3))
+    return Image.fromarray(np.clip(values.round(), 0, 255).astype(np.uint8))
+
+
+def ramp(high: float) -> Image.Image:
+    """A floating-point image from 0 to ``high``."""
+    return Image.fromarray(np.linspace(0.0, high, 240 * 320, dtype=np.float32).reshape(240, 320))
+
+
+def transparent() -> Image.Image:
+    image = Image.effect_noise((320, 240), 60).convert("RGBA")
+    image.putalpha(3)
+    return image
+
+
+def turned_by_exif(folder: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.effect_noise((240, 320), 60).save(folder / "views/images/002.jpg", exif=exif)
+
+
+def black_mask(folder: Path) -> None:
+    Image.new("L", (320, 240)).save(folder / "views/mask.png")
+    edit(VIEWS, "frames", 1, "mask_path", to="mask.png")(folder)
+
+
+def masks_round_the_soil(folder: Path) -> None:
+    """All views' masks the wrong way round: they keep what isn't soil, here the uppermost line."""
+    mask = np.zeros((240, 320), dtype=np.uint8)
+    mask[0] = 255
+    Image.fromarray(mask).save(folder / "views/mask.png")
+    edit(VIEWS, "mask_path", to="mask.png")(folder)
+
+
 def unknown_mesh(folder: Path) -> None:
     (folder / "tool.stl").rename(folder / "tool.dat")
     edit(SET, "tool", "mesh", to="tool.dat")(folder)
@@ -198,6 +244,24 @@ CASES = [
     Case("image-listed-twice", edit(VIEWS, "frames", 1, "file_path", to="images/000.jpg"), VIEWS, FIRST,
          "twice"),
     Case("mask-of-another-size", wrong_mask, "views/mask.png", "frames[1].mask_path", "3 x 4"),
+    Case("image-turned-by-exif", turned_by_exif, "views/images/002.jpg", SECOND, "EXIF"),
+    Case("image-black", photograph(lambda: even(0), "b.jpg"), "views/images/b.jpg", SECOND, "one even grey, 0 of 255"),
+    Case("image-white", photograph(lambda: even(255)), "views/images/002.png", SECOND, "one even grey, 255 of 255"),
+    Case("image-grey", photograph(lambda: even(127, 3.0)), "views/images/002.png", SECOND, "one even grey, 127"),
+    Case("image-grey-jpeg", photograph(lambda: even(127, 3.0), "g.jpg"), "views/images/g.jpg", SECOND, "one even grey"),
+    Case("video-black", lambda f: even(1, 1.0).save(f / "video/left/+010.jpg"), "video/left/+010.jpg",
+         "frames[6].file_path", "one even grey"),
+    Case("image-of-floats-to-255", photograph(lambda: ramp(255.0), "f.tif"), "views/images/f.tif", SECOND,
+         "lie in [0, 1]"),
+    Case("image-of-floats-nan", photograph(lambda: ramp(math.nan), "f.tif"), "views/images/f.tif", SECOND,
+         "lie in [0, 1]"),
+    Case("image-transparent", photograph(transparent), "views/images/002.png", SECOND, "masked or transparent"),
+    Case("image-heic",
+         lambda f: ((f / "views/images/a.heic").write_bytes(b"ftypheic"),
+                    edit(VIEWS, "frames", 2, "file_path", to="images/a.heic")(f)),
+         "views/images/a.heic", SECOND, "convert it to JPEG or PNG"),
+    Case("mask-black", black_mask, "views/mask.png", "frames[1].mask_path", "masked or transparent"),
+    Case("masks-the-wrong-way-round", masks_round_the_soil, VIEWS, "frames[0].transform_matrix", "masks are black"),
     # paths
     Case("path-absolute", outside("absolute"), VIEWS, FIRST, LEAVES),
     Case("path-with-dots", outside("dots"), VIEWS, FIRST, LEAVES),

@@ -207,7 +207,7 @@ def test_masks_transparency_and_depth(tmp_path: Path) -> None:
     by_alpha, by_mask = Frame(camera, tmp_path / "rgba.png"), Frame(
         camera, tmp_path / "rgba.png", mask_path=tmp_path / "mask.png", depth_path=tmp_path / "depth.png"
     )  # fmt: skip
-    np.testing.assert_array_equal(by_alpha.mask(), alpha > 0)
+    np.testing.assert_array_equal(by_alpha.mask(), alpha > 127)
     np.testing.assert_array_equal(by_mask.mask(), [[False, True, True, True], [True, True, True, False]])
     np.testing.assert_allclose(by_mask.depth(), [[0, 1.5, 65.535, 0.007], [0.001, 0.002, 0.003, 0.004]], rtol=1e-6)
     np.testing.assert_allclose(replace(by_mask, depth_path=tmp_path / "depth.npy").depth(), 1.25)
