@@ -15,7 +15,7 @@ import numpy.typing as npt
 from splatsoil.errors import MeasurementError
 from splatsoil.measurement.camera import FISHEYE, LENSES, Camera
 from splatsoil.measurement.fields import Fields
-from splatsoil.measurement.images import check_image, check_photograph, read_alpha, read_image, read_mask
+from splatsoil.measurement.images import check_image, check_photograph, read_alpha, read_depth, read_image, read_mask
 from splatsoil.measurement.rotations import nearest_rigid, why_not_rigid
 
 FloatImage = npt.NDArray[np.float32]
@@ -24,7 +24,6 @@ BoolImage = npt.NDArray[np.bool_]
 _COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 _LENS_KEY = re.compile(r"[kps]\d|skew|distortion_params")  # what bends an image in any of the formats alike
 _FOCAL_SLACK = 0.01  # further apart than digits that were cut off explain
-_DEPTH_UNIT = 1e-3  # nerfstudio's depth images are 16-bit millimetres
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +37,7 @@ class Frame:
         frame: its number on the tool motion's clock, negative before the motion (pre-roll), None for views.
         time: seconds on that clock, None for views.
         mask_path: image that is dark where pixels are to be ignored, or None.
-        depth_path: 16-bit image in millimetres, or .npy in metres, of the depth along the camera's axis, or None.
+        depth_path: image or .npy of the depth along the camera's axis, as ``read_depth`` takes it, or None.
     """
 
     camera: Camera
@@ -61,11 +60,7 @@ class Frame:
 
     def depth(self) -> FloatImage | None:
         """Depth along the camera's axis, (height, width) float32 metres, 0 where unknown; None if there is none."""
-        if self.depth_path is None:
-            return None
-        if self.depth_path.suffix == ".npy":
-            return np.load(self.depth_path, allow_pickle=False).astype(np.float32)
-        return read_image(self.depth_path)[:, :, 0] * np.float32(65535.0 * _DEPTH_UNIT)
+        return None if self.depth_path is None else read_depth(self.depth_path)
 
     def undistorted_image(self) -> FloatImage:
         """The image that ``camera.undistorted()`` would have taken; black where this lens did not see."""
@@ -286,10 +281,8 @@ def _check_times(frames: tuple[Frame, ...], file: Path) -> None:
 def _check_depth(path: Path, size: tuple[int, int], told: str, field: str) -> None:
     if path.suffix != ".npy":
         check_image(path, size, sizes_from=told, field=field)
-        return
-    try:
-        shape = np.load(path, mmap_mode="r", allow_pickle=False).shape
-    except (OSError, ValueError, EOFError) as error:
-        raise MeasurementError("not a NumPy array of numbers", file=path, field=field) from error
-    if shape != size[::-1]:
-        raise MeasurementError(f"the depth is {shape[::-1]} where {told} say {size}", file=path, field=field)
+    depth = read_depth(path, field)
+    if depth.shape != size[::-1]:
+        raise MeasurementError(f"the depth is {depth.shape[::-1]} where {told} say {size}", file=path, field=field)
+    if not depth.any():
+        raise MeasurementError("no depth is known: none is positive", file=path, field=field)

@@ -121,6 +121,36 @@ def read_alpha(path: Path) -> npt.NDArray[np.bool_] | None:
         return np.asarray(image.convert("RGBA").getchannel("A")) >= _OPAQUE
 
 
+def read_depth(path: Path, field: str | None = None) -> FloatImage:
+    """Depths of an image or a .npy file: (height, width) float32 metres, 0 where unknown.
+
+    Whole numbers are millimetres, as in nerfstudio's 16-bit images; floating-point ones are metres. What is not
+    positive, or not finite, is unknown.
+
+    Raises:
+        MeasurementError: it can't be read, or has 8 bits.
+    """
+    if path.suffix == ".npy":
+        try:
+            values = np.load(path, allow_pickle=False)
+        except (OSError, ValueError, EOFError) as error:
+            raise MeasurementError("not a NumPy array of numbers", file=path, field=field) from error
+    else:
+        with _opened(path, field) as image:
+            _decode(image, path, field)
+            values = np.asarray(image)
+    if not isinstance(values, np.ndarray) or values.dtype.kind not in "uif" or values.dtype.itemsize == 1:
+        raise MeasurementError(
+            "a depth is of 16-bit millimetres or floating-point metres, this one of "
+            + ("8 bits, which have no unit" if isinstance(values, np.ndarray) else "several arrays"),
+            file=path,
+            field=field,
+        )
+    with np.errstate(invalid="ignore"):
+        metres = values.astype(np.float64) * (1.0 if values.dtype.kind == "f" else 1e-3)
+        return np.where(np.isfinite(metres) & (metres > 0.0), metres, 0.0).astype(np.float32)
+
+
 def _values(image: Image.Image, path: Path, field: str | None = None) -> FloatImage:
     """(height, width, 3) float32 in [0, 1] of a decoded image."""
     if image.mode != "F" and not image.mode.startswith("I"):

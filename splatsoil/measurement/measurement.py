@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -29,6 +30,7 @@ _FARTHEST_BED = 1000.0  # from the origin: positions are single precision in pla
 _DENSITIES = (100.0, 20_000.0)
 _GRAVITIES = (1e-3, 300.0)
 _FAR_CAMERA = 100.0  # in diagonals of the bed
+_OTHER_UNIT = math.sqrt(1000.0)  # half-way between metres and millimetres
 _LARGE_TOOL, _SMALL_TOOL = 10.0, 1e-3  # in diagonals of the bed
 
 
@@ -270,6 +272,15 @@ def _check_cameras(measurement: Measurement) -> None:
                     f"the camera is {distance:g} m from a bed of {diagonal:.2g} m; positions are in metres",
                     file=file,
                     field=f"frames[{i}].transform_matrix",
+                )
+            depth = frame.depth()
+            typical = distance if depth is None else float(np.median(depth[depth > 0.0]))
+            if not distance / _OTHER_UNIT < typical < distance * _OTHER_UNIT:
+                raise MeasurementError(
+                    f"half of the depths are beyond {typical:g} m, where the bed is {distance:.2g} m away; whole numbers"
+                    " are millimetres, floating-point ones metres",
+                    file=frame.depth_path,
+                    field=f"frames[{i}].depth_file_path",
                 )
         if not any(sees(frame, bed) for frame in frames):
             raise MeasurementError(

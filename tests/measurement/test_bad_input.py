@@ -187,6 +187,19 @@ def masks_round_the_soil(folder: Path) -> None:
     edit(VIEWS, "mask_path", to="mask.png")(folder)
 
 
+def depth(name: str, values: np.ndarray) -> Callable[[Path], None]:
+    """Depth of the second view."""
+
+    def spoil(folder: Path) -> None:
+        if name.endswith(".npy"):
+            np.save(folder / "views" / name, values)
+        else:
+            Image.fromarray(values).save(folder / "views" / name)
+        edit(VIEWS, "frames", 1, "depth_file_path", to=name)(folder)
+
+    return spoil
+
+
 def unknown_mesh(folder: Path) -> None:
     (folder / "tool.stl").rename(folder / "tool.dat")
     edit(SET, "tool", "mesh", to="tool.dat")(folder)
@@ -219,6 +232,7 @@ def big_box() -> trimesh.Trimesh:
 
 FIRST = "frames[1].file_path"
 SECOND = "frames[2].file_path"
+DEPTH = "frames[1].depth_file_path"
 LEAVES = "leaves the measurement set"
 MATRIX = "frames[1].transform_matrix"
 VIEWS, VIDEO, SET = "views/transforms.json", "video/transforms.json", "experiment.json"
@@ -262,6 +276,13 @@ CASES = [
          "views/images/a.heic", SECOND, "convert it to JPEG or PNG"),
     Case("mask-black", black_mask, "views/mask.png", "frames[1].mask_path", "masked or transparent"),
     Case("masks-the-wrong-way-round", masks_round_the_soil, VIEWS, "frames[0].transform_matrix", "masks are black"),
+    Case("depth-of-8-bits", depth("d.png", np.full((240, 320), 150, np.uint8)), "views/d.png", DEPTH, "8 bits"),
+    Case("depth-of-8-bits-npy", depth("d.npy", np.full((240, 320), 150, np.uint8)), "views/d.npy", DEPTH, "8 bits"),
+    Case("depth-of-colours", depth("d.png", np.full((240, 320, 3), 150, np.uint8)), "views/d.png", DEPTH, "8 bits"),
+    Case("depth-float-millimetres", depth("d.npy", np.full((240, 320), 900.0)), "views/d.npy", DEPTH, "metres"),
+    Case("depth-whole-metres", depth("d.npy", np.full((240, 320), 1)), "views/d.npy", DEPTH, "millimetres"),
+    Case("depth-unknown", depth("d.npy", np.full((240, 320), math.nan)), "views/d.npy", DEPTH, "no depth is known"),
+    Case("depth-of-another-size", depth("d.npy", np.ones((320, 240))), "views/d.npy", DEPTH, "(240, 320)"),
     # paths
     Case("path-absolute", outside("absolute"), VIEWS, FIRST, LEAVES),
     Case("path-with-dots", outside("dots"), VIEWS, FIRST, LEAVES),

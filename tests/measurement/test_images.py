@@ -87,3 +87,30 @@ def test_masks_keep_what_is_bright(dark: int, bright: int, tmp_path: Path) -> No
     Image.fromarray(np.where(SEEN, bright, dark).astype(kind)).save(tmp_path / "mask.png")
     Image.fromarray(GREY).save(tmp_path / "a.png")
     np.testing.assert_array_equal(Frame(CAMERA, tmp_path / "a.png", mask_path=tmp_path / "mask.png").mask(), SEEN)
+
+
+@pytest.mark.parametrize(
+    ("name", "stored"),
+    [
+        ("d.png", np.uint16(1500)),
+        ("d.tif", np.uint16(1500)),
+        ("d.tif", np.int32(1500)),
+        ("d.tif", np.float32(1.5)),
+        ("d.npy", np.float32(1.5)),
+        ("d.npy", np.float64(1.5)),
+        ("d.npy", np.uint16(1500)),
+        ("d.npy", np.int64(1500)),
+    ],
+    ids=lambda v: v if isinstance(v, str) else f"{type(v).__name__}",
+)
+def test_depths_of_one_and_a_half_metres(name: str, stored: np.generic, tmp_path: Path) -> None:
+    """Whole numbers are millimetres, others metres; the upper left corner is unknown."""
+    values = np.full((2, 4), stored)
+    values[0, 0] = np.nan if values.dtype.kind == "f" else 0
+    if name.endswith(".npy"):
+        np.save(tmp_path / name, values)
+    else:
+        Image.fromarray(values).save(tmp_path / name)
+    depth = Frame(CAMERA, tmp_path / "none.png", depth_path=tmp_path / name).depth()
+    assert depth is not None and depth.dtype == np.float32
+    np.testing.assert_allclose(depth, [[0.0, 1.5, 1.5, 1.5], [1.5] * 4], rtol=1e-6)
