@@ -210,7 +210,7 @@ def _read_frame(fields: Fields, root: Path, *, video: bool) -> Frame:
     base = fields.file.parent
     name = fields.text("camera") if video or fields.has("camera") else ""
     number = fields.integer("frame", -(10**9), 10**9) if video else None
-    time = fields.number("time", -1e9, 1e9) if video else None
+    time = fields.number("time") if video else None
     optional = {
         key: fields.path(key, root, base) if fields.has(key) else None for key in ("mask_path", "depth_file_path")
     }

@@ -31,7 +31,9 @@ _DENSITIES = (100.0, 20_000.0)
 _GRAVITIES = (1e-3, 300.0)
 _FAR_CAMERA = 100.0  # in diagonals of the bed
 _OTHER_UNIT = math.sqrt(1000.0)  # half-way between metres and millimetres
-_LARGE_TOOL, _SMALL_TOOL = 10.0, 1e-3  # in diagonals of the bed
+_SLACK = 0.1  # of the bed: what its floor and walls, which the tool can't pass, may be off by
+_SMALL_TOOL = 1e5  # cubes of the tool's width in the bed; cells are a fraction of it, and no memory holds as many
+_FASTEST_TOOL = 100.0  # m/s, the speed of sound in loose soil: nothing is pushed through it faster
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +137,8 @@ class Measurement:
             assumed=assumed,
             sources=(file, *transforms.values(), tool_fields.path("motion", root, root)),
         )
-        _check_tool(measurement, tool_fields)
+        _check_clocks(measurement)
+        _check_tool(measurement)
         _check_cameras(measurement)
         return measurement
 
@@ -239,14 +242,33 @@ def _read_tool(fields: Fields, root: Path, assumed: dict[str, float]) -> Tool:
     )
 
 
-def _check_tool(measurement: Measurement, fields: Fields) -> None:
-    """The tool's size and path against the bed's."""
-    bed, tool = measurement.bed, measurement.tool
-    diagonal = float(np.linalg.norm(bed.extents))
-    size = float(np.max(tool.mesh.extents))
-    if not _SMALL_TOOL * diagonal <= size <= _LARGE_TOOL * diagonal:
+def _check_clocks(measurement: Measurement) -> None:
+    """Whether times are frame numbers by the frame rate, as all that moves is taken to be, within a frame."""
+    rate, motion = measurement.frame_rate, measurement.tool.motion
+    experiment, _, video, table = measurement.sources
+    off: list[tuple[Path, str, str]] = []
+    clocks = (
+        (table, [(f"time, frame {n}", int(n), float(t)) for n, t in zip(motion.frames, motion.times, strict=True)]),
+        (video, [(f"frames[{i}].time", f.frame or 0, f.time or 0.0) for i, f in enumerate(measurement.video)]),
+    )
+    for file, rows in clocks:
+        field, number, time = max(rows, key=lambda row: abs(row[2] - row[1] / rate))
+        if abs(time - number / rate) > 1.001 / rate:
+            there = f"frame {number} is at {time:.10g} s in {file.name}"
+            off.append((file, field, f"{there}, where {rate:g} frames a second put it at {number / rate:g} s"))
+    if off:
+        # What both contradict is itself at fault.
+        file, field = off[0][:2] if len(off) == 1 else (experiment, "frame_rate")
+        raise MeasurementError(f"{off[0][2]}; times are in seconds, 0 at frame 0", file=file, field=field)
+
+
+def _check_tool(measurement: Measurement) -> None:
+    """The tool's size, path and speed against the bed's and the soil's."""
+    bed, tool, motion = measurement.bed, measurement.tool, measurement.sources[3]
+    width = float(np.sort(tool.mesh.extents)[1])
+    if float(np.prod(bed.extents)) > _SMALL_TOOL * width**3:
         raise MeasurementError(
-            f"the tool is {size:g} m long, the bed's diagonal {diagonal:g} m; meshes are in metres",
+            f"the tool is {width:g} m wide, too small a part of the bed for cells that show it; meshes are in metres",
             file=tool.mesh_path,
             field="vertices",
         )
@@ -254,9 +276,58 @@ def _check_tool(measurement: Measurement, fields: Fields) -> None:
         raise MeasurementError(
             "the tool never touches the soil's box: it is outside of the bed for the whole run; "
             "are motion and bed in the same world, in metres?",
-            file=fields.file.parent / fields.text("motion"),
+            file=motion,
             field="x,y,z",
         )
+    for number, time in zip(tool.motion.frames, tool.motion.times, strict=True):
+        passes = _passes(tool, float(time), bed)
+        if passes:
+            size = float(np.max(tool.mesh.extents))
+            large = size > bed.extents[2]
+            raise MeasurementError(
+                f"the tool, {size:g} m long, passes the bed's {passes} in frame {number}; meshes and motions are in"
+                " metres",
+                file=tool.mesh_path if large else motion,
+                field="vertices" if large else "x,y,z",
+            )
+    ways = np.linalg.norm(np.diff(tool.motion.positions, axis=0), axis=1)
+    fastest = float((ways / np.diff(tool.motion.times)).max())
+    if fastest > _FASTEST_TOOL:
+        raise MeasurementError(
+            f"the tool moves at {fastest:g} m/s, faster than sound in soil; times are in seconds, positions in metres",
+            file=motion,
+            field="time",
+        )
+
+
+def _passes(tool: Tool, time: float, bed: Bed) -> str:
+    """Whether the tool is under the bed's floor at ``time``, or beyond two opposite walls at once; empty if neither.
+
+    One wall it may come in through: not every bed has them.
+    """
+    rotation, position = tool.motion.pose(time)
+    points = tool.mesh.vertices @ rotation.T + position
+    slack = _SLACK * bed.extents
+    under = _level(points, tool.mesh.edges_unique, float(bed.lower[2] - slack[2]))
+    if len(under) and np.all(under.min(axis=0) < bed.upper[:2]) and np.all(under.max(axis=0) > bed.lower[:2]):
+        return "floor"
+    inside = points[(points[:, 2] > bed.lower[2]) & (points[:, 2] < bed.upper[2]), :2]
+    ends = [_level(points, tool.mesh.edges_unique, float(z)) for z in (bed.lower[2], bed.upper[2])]
+    within = np.concatenate([inside, *ends])
+    if len(within) == 0:
+        return ""
+    low, high = within.min(axis=0), within.max(axis=0)
+    over = (low < (bed.lower - slack)[:2]) & (high > (bed.upper + slack)[:2])
+    return "walls" if over.any() and np.all(low < bed.upper[:2]) and np.all(high > bed.lower[:2]) else ""
+
+
+def _level(points: FloatArray, edges: npt.NDArray[np.int64], z: float) -> FloatArray:
+    """Where edges between points (n, 3) cross a level: (m, 2) x and y."""
+    start, end = points[edges[:, 0]], points[edges[:, 1]]
+    crosses = (start[:, 2] < z) != (end[:, 2] < z)
+    start, end = start[crosses], end[crosses]
+    share = (z - start[:, 2]) / (end[:, 2] - start[:, 2])
+    return (start + share[:, None] * (end - start))[:, :2]
 
 
 def _check_cameras(measurement: Measurement) -> None:
@@ -277,8 +348,8 @@ def _check_cameras(measurement: Measurement) -> None:
             typical = distance if depth is None else float(np.median(depth[depth > 0.0]))
             if not distance / _OTHER_UNIT < typical < distance * _OTHER_UNIT:
                 raise MeasurementError(
-                    f"half of the depths are beyond {typical:g} m, where the bed is {distance:.2g} m away; whole numbers"
-                    " are millimetres, floating-point ones metres",
+                    f"half of the depths are beyond {typical:g} m, where the bed is {distance:.2g} m away; whole"
+                    " numbers are millimetres, floating-point ones metres",
                     file=frame.depth_path,
                     field=f"frames[{i}].depth_file_path",
                 )

@@ -111,6 +111,9 @@ def _on_tool(measurement: Measurement) -> list[str]:
     steps = np.linalg.norm(np.diff(tool.motion.positions, axis=0), axis=1)
     if steps.size and steps.sum() == 0.0 and not np.abs(np.diff(tool.motion.quaternions, axis=0)).max():
         out.append("The tool never moves.")
+    if (np.abs(tool.motion.quaternions[:, 3]) > np.sqrt(0.5)).all():
+        # A half turn about the vertical, or no turn in another order: neither can be ruled out.
+        out.append("All of the tool's quaternions are large in qz, their last number; is their order x, y, z, w?")
     times = tool.motion.times
     if steps.size > 4:
         speeds = steps / np.diff(times)
@@ -161,11 +164,9 @@ def _lost(frames: tuple[int, ...]) -> list[int]:
 
 
 def _off_clock(frame: Frame, measurement: Measurement) -> bool:
-    """Whether a video frame's time is more than half a frame off its number, counted from the motion's first row."""
+    """Whether a video frame's time is more than half a frame off its number."""
     assert frame.frame is not None and frame.time is not None
-    motion = measurement.tool.motion
-    expected = motion.times[0] + (frame.frame - motion.frames[0]) / measurement.frame_rate
-    return abs(frame.time - expected) > 0.5 / measurement.frame_rate
+    return abs(frame.time - frame.frame / measurement.frame_rate) > 0.5 / measurement.frame_rate
 
 
 def _first(measurement: Measurement, camera: str) -> int:

@@ -71,7 +71,7 @@ def motion(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], None]
         file = folder / "tool_motion.csv"
         head, *rows = file.read_text().splitlines()
         table = change(np.array([[float(v) for v in row.split(",")] for row in rows]))
-        file.write_text("\n".join([head, *(",".join(f"{v:.10g}" for v in row) for row in table)]))
+        file.write_text("\n".join([head, *(",".join(f"{v:.12g}" for v in row) for row in table)]))
 
     return spoil
 
@@ -230,6 +230,44 @@ def big_box() -> trimesh.Trimesh:
     return trimesh.creation.box((12.0, 120.0, 120.0))
 
 
+def tool_scaled(factor: float, lift: float = 0.0) -> Callable[[Path], None]:
+    """The tool's mesh in another unit, about its middle or, lifted, about a point below."""
+
+    def spoil(folder: Path) -> None:
+        tool = trimesh.load_mesh(folder / "tool.stl")
+        tool.apply_translation([0.0, 0.0, lift])
+        tool.apply_scale(factor)
+        tool.apply_translation([0.0, 0.0, -lift])
+        tool.export(folder / "tool.stl")
+
+    return spoil
+
+
+def video_times(change: Callable[[float], float]) -> Callable[[Path], None]:
+    def spoil(folder: Path) -> None:
+        data = json.loads((folder / VIDEO).read_text())
+        for frame in data["frames"]:
+            frame["time"] = change(frame["time"])
+        (folder / VIDEO).write_text(json.dumps(data))
+
+    return spoil
+
+
+def both(*faults: Callable[[Path], object]) -> Callable[[Path], None]:
+    def spoil(folder: Path) -> None:
+        for fault in faults:
+            fault(folder)
+
+    return spoil
+
+
+def times(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], None]:
+    """Another clock for the tool's motion."""
+    return motion(lambda table: np.column_stack([table[:, 0], change(table[:, 1]), table[:, 2:]]))
+
+
+LAST = "time, frame 40"
+UNIX = 1.7e9
 FIRST = "frames[1].file_path"
 SECOND = "frames[2].file_path"
 DEPTH = "frames[1].depth_file_path"
@@ -403,6 +441,25 @@ CASES = [
          "never touches"),
     Case("motion-in-millimetres", motion(lambda t: t * [1, 1, 1e3, 1e3, 1e3, 1, 1, 1, 1]), "tool_motion.csv", "x,y,z",
          "never touches"),
+    Case("motion-in-milliseconds", times(lambda t: 1000.0 * t), "tool_motion.csv", LAST, "is at 800 s"),
+    Case("motion-at-half-its-times", times(lambda t: 0.5 * t), "tool_motion.csv", LAST, "is at 0.4 s"),
+    Case("motion-a-twentieth-too-slow", times(lambda t: 1.05 * t), "tool_motion.csv", LAST, "is at 0.84 s"),
+    Case("motion-a-thousandth-as-long", times(lambda t: 1e-3 * t), "tool_motion.csv", LAST, "is at 0.0008 s"),
+    Case("motion-in-unix-time", times(lambda t: UNIX + t), "tool_motion.csv", "time, frame 0", "is at 1700000000 s"),
+    Case("video-in-milliseconds", video_times(lambda t: 1000.0 * t), VIDEO, "frames[6].time", "is at 200 s"),
+    Case("all-in-unix-time", both(times(lambda t: UNIX + t), video_times(lambda t: UNIX + t)), SET, "frame_rate",
+         "0 at frame 0"),
+    Case("frame-rate-of-50-000", edit(SET, "frame_rate", to=50_000), SET, "frame_rate", "where 50000 frames a second"),
+    Case("frame-rate-of-25", edit(SET, "frame_rate", to=25.0), SET, "frame_rate", "where 25 frames a second"),
+    Case("all-a-thousand-times-as-fast",
+         both(edit(SET, "frame_rate", to=50_000), times(lambda t: 1e-3 * t), video_times(lambda t: 1e-3 * t)),
+         "tool_motion.csv", "time", "faster than sound"),
+    Case("motion-too-deep", motion(lambda t: t - np.eye(9)[4] * 0.2), "tool_motion.csv", "x,y,z",
+         "passes the bed's floor"),
+    Case("tool-ten-times-as-large", tool_scaled(10.0), "tool.stl", "vertices", "1.2 m long"),
+    Case("tool-ten-times-as-large-above-its-tip", tool_scaled(10.0, 0.06), "tool.stl", "vertices", "1.2 m long"),
+    Case("tool-in-inches", tool_scaled(39.37), "tool.stl", "vertices", "meshes and motions are in metres"),
+    Case("tool-by-inches-too-small", tool_scaled(1 / 39.37), "tool.stl", "vertices", "meshes are in metres"),
     Case("force-header", cell(0, 2, "force_x", "tool_force.csv"), "tool_force.csv", "line 1", "expected the header"),
     Case("force-nan", cell(3, 2, "nan", "tool_force.csv"), "tool_force.csv", "fx, line 4", "not a finite number"),
     Case("force-missing", lambda f: (f / "tool_force.csv").unlink(), "tool_force.csv", "tool.force", "no such file"),
