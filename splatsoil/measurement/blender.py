@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from splatsoil.errors import MeasurementError
-from splatsoil.measurement.fields import Fields
+from splatsoil.measurement.fields import Fields, named
 from splatsoil.measurement.frames import Frame, read_camera
 from splatsoil.measurement.images import check_image, image_size
 
@@ -26,12 +26,9 @@ def read_blender(file: str | Path) -> tuple[Frame, ...]:
         fields.raw("camera_angle_x")
     frames = []
     for item in fields.children("frames"):
-        name = item.text("file_path")
-        image = path.parent / name
+        image = named(item.text("file_path"), path.parent, path, item.path_of("file_path"))
         if not image.is_file():
-            image = path.parent / f"{name}.png"
-        if not image.is_file():
-            raise MeasurementError(f"no such image, though {path.name} names it", file=path.parent / name)
+            raise MeasurementError(f"no such image, though {path.name} names it", file=image)
         camera = read_camera(item, "", image_size(image))
         sizes_from = f"w and h of {path.name}" if item.has("w") or item.has("h") else "its own header"
         check_image(image, (camera.width, camera.height), sizes_from=sizes_from)

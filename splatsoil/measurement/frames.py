@@ -22,6 +22,13 @@ FloatImage = npt.NDArray[np.float32]
 BoolImage = npt.NDArray[np.bool_]
 
 _COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
+# Fields that are read; nerfstudio and others have more.
+LENS_FIELDS = (
+    *("camera_model", "is_fisheye", "w", "h", "fl_x", "fl_y", "cx", "cy", *_COEFFICIENTS),
+    *("camera_angle_x", "camera_angle_y"),
+)
+FRAME_FIELDS = (*LENS_FIELDS, "file_path", "transform_matrix", "mask_path", "depth_file_path")
+VIDEO_FIELDS = ("camera", "frame", "time")
 _LENS_KEY = re.compile(r"[kps]\d|skew|distortion_params")  # what bends an image in any of the formats alike
 _FOCAL_SLACK = 0.01  # further apart than digits that were cut off explain
 
@@ -104,6 +111,7 @@ def read_transforms(file: Path, root: Path, *, video: bool) -> tuple[Frame, ...]
         MeasurementError: naming file and field.
     """
     fields = Fields.read(file)
+    fields.check_names((*LENS_FIELDS, "frames"))
     frames = tuple(_read_frame(item, root, video=video) for item in fields.children("frames"))
     _check_unique(frames, file, video=video)
     if video:
@@ -208,6 +216,7 @@ def _read_pose(fields: Fields) -> npt.NDArray[np.float64]:
 
 def _read_frame(fields: Fields, root: Path, *, video: bool) -> Frame:
     base = fields.file.parent
+    fields.check_names((*FRAME_FIELDS, *VIDEO_FIELDS) if video else FRAME_FIELDS)
     name = fields.text("camera") if video or fields.has("camera") else ""
     number = fields.integer("frame", -(10**9), 10**9) if video else None
     time = fields.number("time") if video else None

@@ -23,6 +23,9 @@ FloatArray = npt.NDArray[np.float64]
 
 FORMAT = "splatsoil-measurement/1"
 EXPERIMENT = "experiment.json"
+FIELDS = ("format", "name", "up", "gravity", "frame_rate", "bed", "tool", "views", "video")
+BED_FIELDS = ("lower", "upper", "density", "wall_friction", "floor_friction")
+TOOL_FIELDS = ("mesh", "motion", "force", "friction")
 
 # What a laboratory or a field could hold; beyond it a unit is wrong (millimetres, g/cm³).
 _SMALLEST_BED, _LARGEST_BED = 0.01, 50.0
@@ -115,6 +118,7 @@ class Measurement:
         if not file.is_file():
             raise MeasurementError(f"no {EXPERIMENT} in this folder; it is no measurement set", file=file)
         fields = Fields.read(file)
+        fields.check_names(FIELDS)
         tag = fields.text("format")
         if tag != FORMAT:
             fields.fail("format", f"{tag!r} is not {FORMAT!r}; this is another format or another version of it")
@@ -186,6 +190,7 @@ class Measurement:
 
 
 def _read_bed(fields: Fields, assumed: dict[str, float]) -> Bed:
+    fields.check_names(BED_FIELDS)
     lower, upper = fields.vector("lower", 3), fields.vector("upper", 3)
     for axis, (low, high) in enumerate(zip(lower, upper, strict=True)):
         size = high - low
@@ -227,6 +232,7 @@ def _read_gravity(fields: Fields) -> FloatArray:
 
 
 def _read_tool(fields: Fields, root: Path, assumed: dict[str, float]) -> Tool:
+    fields.check_names(TOOL_FIELDS)
     if fields.has("give"):
         fields.fail("give", "soil does not give way to the tool; remove this field")
     mesh_path = fields.path("mesh", root, root)

@@ -47,6 +47,20 @@ def edit(file: str, *keys: str | int, to: Any = None, drop: bool = False) -> Cal
     return spoil
 
 
+def renamed(file: str, *keys: str, to: str) -> Callable[[Path], None]:
+    """Another name for a field of a JSON file."""
+
+    def spoil(folder: Path) -> None:
+        data = json.loads((folder / file).read_text())
+        place = data
+        for key in keys[:-1]:
+            place = place[key]
+        place[to] = place.pop(keys[-1])
+        (folder / file).write_text(json.dumps(data))
+
+    return spoil
+
+
 def replace(file: str, content: str | bytes) -> Callable[[Path], None]:
     """Replace a file's content."""
     raw = content.encode() if isinstance(content, str) else content
@@ -331,6 +345,10 @@ CASES = [
     Case("path-endless", edit(VIEWS, "frames", 1, "file_path", to="a" * 5000), VIEWS, FIRST,
          "no usable path"),
     Case("path-is-a-number", edit(VIEWS, "frames", 1, "file_path", to=7), VIEWS, FIRST, "expected text"),
+    Case("path-with-backslashes-leaves", edit(VIEWS, "frames", 1, "file_path", to="..\\..\\..\\x.jpg"), VIEWS, FIRST,
+         LEAVES),
+    Case("path-without-suffix-of-two", both(photograph(lambda: even(9), "001.png"),
+         edit(VIEWS, "frames", 1, "file_path", to="./images/001")), VIEWS, FIRST, "001.jpg, 001.png"),
     # matrices
     Case("matrix-stretches", edit(VIEWS, *POSE, to=STRETCHED), VIEWS, MATRIX, "not a rigid motion"),
     Case("matrix-scales", edit(VIEWS, *POSE, to=DOUBLED), VIEWS, MATRIX, "it scales by 2"),
@@ -375,6 +393,22 @@ CASES = [
     # experiment.json
     Case("set-missing", lambda f: (f / SET).unlink(), SET, None, "no experiment.json"),
     Case("set-not-json", replace(SET, "format: splatsoil"), SET, None, "not JSON"),
+    Case("set-with-a-comment", replace(SET, '{\n "name": "a", // mine\n "up": "z"}'), SET, None,
+         "comments, but there is one in line 2, column 15"),
+    Case("set-with-a-comment-line", replace(SET, '{\n # mine\n "up": "z"}'), SET, None, "in line 2, column 2"),
+    Case("set-with-a-trailing-comma", replace(SET, '{"name": "a",\n "up": "z",\n}'), SET, None, "omma"),
+    Case("set-with-a-trailing-comma-in-a-list", replace(SET, '{"gravity": [0, 0, -9.81,\n]}'), SET, None, "omma"),
+    Case("set-with-a-key-twice", replace(SET, '{"bed": {"density": 1, "density": 2}}'), SET, None,
+         "'density' is given twice"),
+    Case("key-misspelt", renamed(SET, "gravity", to="gravty"), SET, "gravty", "did you mean 'gravity'?"),
+    Case("key-misspelt-of-the-bed", renamed(SET, "bed", "floor_friction", to="floor_fricton"), SET,
+         "bed.floor_fricton", "did you mean 'floor_friction'?"),
+    Case("key-in-capitals", renamed(SET, "tool", "friction", to="Friction"), SET, "tool.Friction", "'friction'?"),
+    Case("key-with-a-hyphen", renamed(SET, "frame_rate", to="frame-rate"), SET, "frame-rate", "'frame_rate'?"),
+    Case("key-misspelt-of-the-lens", renamed(VIEWS, "camera_model", to="camera_modle"), VIEWS, "camera_modle",
+         "'camera_model'?"),
+    Case("key-misspelt-of-a-frame", edit(VIEWS, "frames", 1, "mask_pth", to="m.png"), VIEWS, "frames[1].mask_pth",
+         "'mask_path'?"),
     Case("set-is-binary", replace(SET, b"\x89PNG\xff\xfe"), SET, None, "not a text file"),
     Case("set-is-a-list", replace(SET, "[1, 2]"), SET, None, "expected a JSON object"),
     Case("set-nested-endlessly", replace(SET, "[" * 100_000), SET, None, "not usable JSON"),
@@ -416,6 +450,15 @@ CASES = [
     Case("motion-missing", lambda f: (f / "tool_motion.csv").unlink(), "tool_motion.csv", "tool.motion",
          "no such file"),
     Case("motion-header", cell(0, 5, "qx"), "tool_motion.csv", "line 1", "expected the header"),
+    Case("motion-header-lacks-a-column", cell(0, 5, "w"), "tool_motion.csv", "line 1", "; qw must be there once"),
+    Case("motion-in-other-units-by-its-header", cell(0, 2, "x [mm]"), "tool_motion.csv", "line 1", "; x must be there"),
+    Case("motion-without-header", replace("tool_motion.csv", "0,0,0.2,0.25,0.21,1,0,0,0\n"), "tool_motion.csv",
+         "line 1", "expected the header"),
+    Case("motion-with-decimal-commas-and-no-other-mark",
+         replace("tool_motion.csv", "frame,time,x,y,z,qw,qx,qy,qz\n0,0,0,2,0,25,0,21,1,0,0,0\n"), "tool_motion.csv",
+         "line 2", "12 values where the header has 9"),
+    Case("motion-with-thousands", replace("tool_motion.csv", "frame;time;x;y;z;qw;qx;qy;qz\n0;0;1.000,2;0;0;1;0;0;0\n"),
+         "tool_motion.csv", "x, line 2", "'1.000.2' is not a number"),
     Case("motion-empty", replace("tool_motion.csv", ""), "tool_motion.csv", "line 1", "expected the header"),
     Case("motion-without-rows", replace("tool_motion.csv", "frame,time,x,y,z,qw,qx,qy,qz\n"), "tool_motion.csv", None,
          "no rows"),
@@ -517,6 +560,27 @@ def test_an_error_as_json(small_set: Path, capsys: pytest.CaptureFixture[str]) -
 def test_links_inside_the_folder_are_allowed(small_set: Path) -> None:
     (small_set / "views/images/link.jpg").symlink_to(small_set / "views/images/001.jpg")
     edit(VIEWS, "frames", 1, "file_path", to="images/link.jpg")(small_set)
+    assert len(Measurement.load(small_set).views) == 4
+
+
+@pytest.mark.parametrize("name", ["images\\001.jpg", "./images/001", ".\\images\\001", "./images/001.jpg"])
+def test_paths_as_windows_and_blender_write_them(name: str, small_set: Path) -> None:
+    edit(VIEWS, "frames", 1, "file_path", to=name)(small_set)
+    assert Measurement.load(small_set).views[1].path.samefile(small_set / "views/images/001.jpg")
+
+
+def test_what_others_write_into_transforms_files_is_no_misspelling(small_set: Path) -> None:
+    """Fields of nerfstudio's, instant-ngp's, Polycam's and Record3D's files that are none of ours."""
+    file = small_set / VIEWS
+    top = ("aabb_scale", "scale", "offset", "applied_transform", "applied_scale", "ply_file_path", "train_filenames",
+           "orientation_override", "fisheye_crop_radius", "near", "far", "sharpness", "integer_depth_scale",
+           "camera_convention", "up", "version")  # fmt: skip
+    own = ("sharpness", "colmap_im_id", "rotation", "timestamp", "blur_score", "semantic_path", "normal_file_path")
+    data = json.loads(file.read_text())
+    data |= dict.fromkeys(top, 1)
+    for frame in data["frames"]:
+        frame |= dict.fromkeys(own, 1)
+    file.write_text(json.dumps(data))
     assert len(Measurement.load(small_set).views) == 4
 
 
