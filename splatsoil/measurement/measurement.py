@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -86,8 +86,8 @@ class Measurement:
         frame_rate: frames a second of the tool motion's and the video's numbering.
         bed: the box of soil.
         tool: the tool and its motion.
-        views: photographs before anything moves.
-        video: the fixed cameras' frames, pre-roll included.
+        views: photographs before anything moves, by their names.
+        video: the fixed cameras' frames, pre-roll included, by number and camera.
         assumed: fields that ``experiment.json`` leaves out, and the values taken for them.
     """
 
@@ -144,7 +144,12 @@ class Measurement:
         _check_clocks(measurement)
         _check_tool(measurement)
         _check_cameras(measurement)
-        return measurement
+        # Sums are taken in the frames' order: it must not be that in which a file happens to list them.
+        return replace(
+            measurement,
+            views=tuple(sorted(measurement.views, key=lambda f: f.path.relative_to(root).as_posix())),
+            video=tuple(sorted(measurement.video, key=lambda f: (f.frame, f.camera_name))),
+        )
 
     @cached_property
     def hash(self) -> str:

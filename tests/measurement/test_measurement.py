@@ -77,6 +77,24 @@ def test_the_hash_is_of_what_the_set_consists_of(small_set: Path) -> None:
     assert Measurement.load(moved).hash != before
 
 
+@pytest.mark.parametrize("kind", ["views", "video"])
+def test_the_order_of_frames_in_a_file_changes_nothing(kind: str, plow_dry: Path, tmp_path: Path) -> None:
+    shutil.copytree(plow_dry, tmp_path / "set")
+    file = tmp_path / "set" / kind / "transforms.json"
+    data = json.loads(file.read_text())
+    np.random.default_rng(0).shuffle(data["frames"])
+    file.write_text(json.dumps(data))
+    loaded = (Measurement.load(plow_dry), Measurement.load(tmp_path / "set"))
+    listed, shuffled = (
+        [
+            (f.path.relative_to(m.folder), f.camera_name, f.frame, f.time, f.camera.camera_to_world.tobytes())
+            for f in (*m.views, *m.video, *m.pre_roll)
+        ]
+        for m in loaded
+    )
+    assert shuffled == listed and list(loaded[1].cameras) == ["left", "right"]
+
+
 def made_up(**bend: float) -> dict:
     """The parts of a set that stands on nothing but this file."""
     matrix = np.eye(4)
