@@ -80,7 +80,7 @@ class Measurement:
     """A measurement set, checked.
 
     Attributes:
-        folder: where it lies; nothing in it is ever modified.
+        folder: where it lies, an absolute path; nothing in it is ever modified.
         name: what it calls itself.
         gravity: (3,) m/s².
         frame_rate: frames a second of the tool motion's and the video's numbering.
@@ -109,7 +109,7 @@ class Measurement:
         Raises:
             MeasurementError: at the first thing that is wrong, naming the file and the field.
         """
-        root = Path(folder)
+        root = Path(folder).absolute()  # images are read later, perhaps from another working folder
         if not root.exists():
             raise MeasurementError("no such folder; give the folder of a measurement set", file=root)
         if not root.is_dir():

@@ -95,6 +95,15 @@ def test_the_order_of_frames_in_a_file_changes_nothing(kind: str, plow_dry: Path
     assert shuffled == listed and list(loaded[1].cameras) == ["left", "right"]
 
 
+def test_a_relative_set_is_found_from_another_working_folder(small_set: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(small_set.parent)
+    m = Measurement.load(small_set.name)
+    monkeypatch.chdir("/")
+    there = Measurement.load(small_set)
+    assert m.hash == there.hash and remarks(m) == remarks(there) and m.folder == there.folder
+    np.testing.assert_array_equal(m.views[0].image(), there.views[0].image())
+
+
 def made_up(**bend: float) -> dict:
     """The parts of a set that stands on nothing but this file."""
     matrix = np.eye(4)
