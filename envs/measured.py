@@ -86,12 +86,12 @@ class MeasuredProblem:
         from splatsoil.reconstruction import Reconstruction
 
         recipe = {
-            "measurement": str(measurement),
+            "measurement": str(Path(measurement).absolute()),
             "parameters": tuple(parameters),
             "effects": tuple(effects),
             "preset": preset,
             "device": device,
-            "reconstruction": None if reconstruction is None else str(reconstruction),
+            "reconstruction": None if reconstruction is None else str(Path(reconstruction).absolute()),
         }
         device = resolve_device(device)
         measured = Measurement.load(measurement)

@@ -7,7 +7,10 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
 from contextvars import ContextVar
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
+
+if TYPE_CHECKING:
+    from splatsoil.measurement import Measurement
 
 _stdout: ContextVar[TextIO | None] = ContextVar("stdout", default=None)
 
@@ -30,3 +33,11 @@ def print_json(data: Mapping[str, Any]) -> None:
         ValueError: the data holds NaN or infinity, which JSON cannot.
     """
     print(json.dumps(data, indent=1, allow_nan=False), file=_stdout.get() or sys.stdout, flush=True)
+
+
+def say_remarks(measurement: Measurement) -> None:
+    """Print on stderr what is odd about a set that is about to be worked on."""
+    from splatsoil.measurement import remarks
+
+    for remark in remarks(measurement):
+        print(f"remark {remark.about}: {remark.text}", file=sys.stderr)

@@ -12,6 +12,7 @@ import numpy as np
 
 from splatsoil.commands._control import own_files
 from splatsoil.commands._options import EVALUATIONS, FitOptions, check_evaluations
+from splatsoil.commands._output import say_remarks
 from splatsoil.errors import MeasurementError, ParameterError, RunError
 
 if TYPE_CHECKING:
@@ -51,6 +52,7 @@ def prepare(options: FitOptions) -> tuple[Measurement, RunFolder]:
     effects = find_effects(options.effects)
     resolve_device(options.device)
     measurement = Measurement.load(options.set)
+    say_remarks(measurement)
     known = [p.name for p in Law(effect.for_measurement(measurement) for effect in effects).parameters]
     unknown = [name for name in options.parameters if name not in known]
     if unknown:

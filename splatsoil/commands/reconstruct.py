@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 from tyro.conf import Positional
 
 from splatsoil.commands._options import command_line
-from splatsoil.commands._output import print_json
+from splatsoil.commands._output import print_json, say_remarks
 
 if TYPE_CHECKING:
     from splatsoil.reconstruction import Reconstruction
@@ -50,6 +50,7 @@ def run(config: Config) -> int:
     hush()
     device = resolve_device(config.device)
     measurement = Measurement.load(config.set)
+    say_remarks(measurement)
     out = config.out or Path("runs") / f"{measurement.name}-reconstruction"
     check_folder(out)
     with progress_bar(quiet=config.json) as report:

@@ -2,52 +2,35 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 from splatsoil.errors import MeasurementError
-from splatsoil.measurement.camera import Camera
-from splatsoil.measurement.fields import Fields
-from splatsoil.measurement.frames import Frame
+from splatsoil.measurement.fields import Fields, named
+from splatsoil.measurement.frames import Frame, read_camera
 from splatsoil.measurement.images import check_image, image_size
-from splatsoil.measurement.rotations import nearest_rigid, why_not_rigid
 
 
 def read_blender(file: str | Path) -> tuple[Frame, ...]:
-    """Frames of a ``transforms_train.json``: one horizontal field of view, centred principal point, no distortion.
+    """Frames of a ``transforms_train.json``, ordered by image name.
 
-    File paths may lack their suffix (.png is meant, as in the NeRF-synthetic scenes); times, if any, are left out.
+    Most give one horizontal field of view (``camera_angle_x``): the principal point is in the middle then, pixels are
+    square, and nothing bends the image. What else of a lens a file gives (``camera_angle_y``, ``fl_x``, ``cx``, ``k1``
+    …) is read as in nerfstudio's. File paths may lack their suffix; times, if any, are left out.
 
     Raises:
         MeasurementError: naming file and field.
     """
     path = Path(file)
     fields = Fields.read(path)
-    angle = fields.number("camera_angle_x", 1e-3, math.pi - 1e-3, hint="it is the horizontal field of view in radians")
+    if not fields.has("fl_x"):
+        fields.raw("camera_angle_x")
     frames = []
     for item in fields.children("frames"):
-        name = item.text("file_path")
-        image = path.parent / name
+        image = named(item.text("file_path"), path.parent, path, item.path_of("file_path"))
         if not image.is_file():
-            image = path.parent / f"{name}.png"
-        if not image.is_file():
-            raise MeasurementError(f"no such image, though {path.name} names it", file=path.parent / name)
-        matrix = item.matrix("transform_matrix", 4, 4)
-        fault = why_not_rigid(matrix)
-        if fault:
-            item.fail("transform_matrix", f"not a rigid motion: {fault}")
-        width, height = image_size(image)
-        check_image(image, (width, height), sizes_from="its own header")
-        focal = 0.5 * width / math.tan(0.5 * angle)
-        camera = Camera(
-            width,
-            height,
-            focal,
-            focal,
-            0.5 * width,
-            0.5 * height,
-            camera_to_world=nearest_rigid(matrix),
-            model="PINHOLE",
-        )
+            raise MeasurementError(f"no such image, though {path.name} names it", file=image)
+        camera = read_camera(item, "", image_size(image))
+        sizes_from = f"w and h of {path.name}" if item.has("w") or item.has("h") else "its own header"
+        check_image(image, (camera.width, camera.height), sizes_from=sizes_from)
         frames.append(Frame(camera, image))
-    return tuple(frames)
+    return tuple(sorted(frames, key=lambda frame: frame.path))

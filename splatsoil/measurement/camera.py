@@ -23,6 +23,19 @@ FloatArray = npt.NDArray[np.float64]
 FISHEYE = "OPENCV_FISHEYE"
 CAMERA_MODELS = ("OPENCV", "PINHOLE", FISHEYE)
 
+# Names that COLMAP and nerfstudio have for lenses -> our model, and COLMAP's parameters ("f" stands for both focal
+# lengths). From COLMAP's src/colmap/sensor/models.h.
+LENSES: dict[str, tuple[str, tuple[str, ...]]] = {
+    "SIMPLE_PINHOLE": ("PINHOLE", ("f", "cx", "cy")),
+    "PINHOLE": ("PINHOLE", ("fx", "fy", "cx", "cy")),
+    "SIMPLE_RADIAL": ("OPENCV", ("f", "cx", "cy", "k1")),
+    "RADIAL": ("OPENCV", ("f", "cx", "cy", "k1", "k2")),
+    "OPENCV": ("OPENCV", ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")),
+    "OPENCV_FISHEYE": (FISHEYE, ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")),
+    "SIMPLE_RADIAL_FISHEYE": (FISHEYE, ("f", "cx", "cy", "k1")),
+    "RADIAL_FISHEYE": (FISHEYE, ("f", "cx", "cy", "k1", "k2")),
+}
+
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL camera axes <-> OpenCV camera axes
 _NEWTON_STEPS = 30
 _NEWTON_TOLERANCE = 1e-9  # normalised coordinates: far below a thousandth of a pixel for any focal length in use

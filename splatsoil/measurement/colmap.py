@@ -7,6 +7,7 @@ arbitrary unless it was geo-registered; ``similarity`` brings it into metres wit
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatsoil.errors import MeasurementError
-from splatsoil.measurement.camera import FISHEYE, Camera
+from splatsoil.measurement.camera import LENSES, Camera
 from splatsoil.measurement.fields import inside, read_text
 from splatsoil.measurement.frames import Frame
 from splatsoil.measurement.images import check_image
@@ -23,18 +24,12 @@ from splatsoil.measurement.rotations import quaternion_to_matrix
 
 FloatArray = npt.NDArray[np.float64]
 
-# COLMAP's number and name of a model -> what its parameters are, in our words ("f" stands for both focal lengths).
-_MODELS: dict[str, tuple[int, str, tuple[str, ...]]] = {
-    "SIMPLE_PINHOLE": (0, "PINHOLE", ("f", "cx", "cy")),
-    "PINHOLE": (1, "PINHOLE", ("fx", "fy", "cx", "cy")),
-    "SIMPLE_RADIAL": (2, "OPENCV", ("f", "cx", "cy", "k1")),
-    "RADIAL": (3, "OPENCV", ("f", "cx", "cy", "k1", "k2")),
-    "OPENCV": (4, "OPENCV", ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")),
-    "OPENCV_FISHEYE": (5, FISHEYE, ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")),
-    "SIMPLE_RADIAL_FISHEYE": (8, FISHEYE, ("f", "cx", "cy", "k1")),
-    "RADIAL_FISHEYE": (9, FISHEYE, ("f", "cx", "cy", "k1", "k2")),
-}
-_NAMES = {number: name for name, (number, _, _) in _MODELS.items()}
+# COLMAP's models by number, and how many parameters each has: what is not read is skipped where no image uses it.
+_MODELS = (
+    *(("SIMPLE_PINHOLE", 3), ("PINHOLE", 4), ("SIMPLE_RADIAL", 4), ("RADIAL", 5), ("OPENCV", 8), ("OPENCV_FISHEYE", 8)),
+    *(("FULL_OPENCV", 12), ("FOV", 5), ("SIMPLE_RADIAL_FISHEYE", 4), ("RADIAL_FISHEYE", 5), ("THIN_PRISM_FISHEYE", 12)),
+    ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+)
 
 _Calibration = tuple[str, int, int, tuple[float, ...]]  # model, width, height, parameters
 _Pose = tuple[int, str, FloatArray, FloatArray]  # camera id, image name, quaternion (4,), translation (3,)
@@ -54,10 +49,10 @@ def read_colmap(model: str | Path, images: str | Path, *, similarity: npt.ArrayL
     folder, root = Path(model), Path(images)
     if (folder / "cameras.bin").is_file() and (folder / "images.bin").is_file():
         calibrations, poses = _read_cameras_bin(folder / "cameras.bin"), _read_images_bin(folder / "images.bin")
-        source = folder / "images.bin"
+        source, cameras = folder / "images.bin", folder / "cameras.bin"
     else:
         calibrations, poses = _read_cameras_txt(folder / "cameras.txt"), _read_images_txt(folder / "images.txt")
-        source = folder / "images.txt"
+        source, cameras = folder / "images.txt", folder / "cameras.txt"
     if not poses:
         raise MeasurementError("the model has no registered image", file=source)
     frames = []
@@ -66,15 +61,21 @@ def read_colmap(model: str | Path, images: str | Path, *, similarity: npt.ArrayL
             raise MeasurementError(f"camera {camera_id} is not among the model's cameras", file=source, field=name)
         path = inside(name, root, root, source, "NAME")
         matrix = _camera_to_world(quaternion, translation, similarity, source, name)
-        camera = _camera(calibrations[camera_id], matrix, source)
+        camera = _camera(calibrations[camera_id], matrix, cameras, camera_id)
         check_image(path, (camera.width, camera.height), sizes_from=f"WIDTH and HEIGHT of camera {camera_id}")
         frames.append(Frame(camera, path))
     return tuple(frames)
 
 
-def _camera(calibration: _Calibration, matrix: FloatArray, file: Path) -> Camera:
+def _camera(calibration: _Calibration, matrix: FloatArray, file: Path, identity: int) -> Camera:
     name, width, height, values = calibration
-    _, model, keys = _MODELS[name]
+    if name not in LENSES:
+        raise MeasurementError(
+            f"camera model {name!r} cannot be imported, only {', '.join(LENSES)}; undistort with COLMAP first",
+            file=file,
+            field=f"camera {identity}, MODEL",
+        )
+    model, keys = LENSES[name]
     if len(values) != len(keys) or not np.isfinite(values).all():
         raise MeasurementError(f"{name} has {len(keys)} finite parameters, not {values}", file=file, field="PARAMS")
     given = dict(zip(keys, values, strict=True))
@@ -102,16 +103,6 @@ def _camera_to_world(
     return out
 
 
-def _known(model: str, file: Path, field: str) -> str:
-    if model not in _MODELS:
-        raise MeasurementError(
-            f"camera model {model!r} cannot be imported, only {', '.join(_MODELS)}; undistort with COLMAP first",
-            file=file,
-            field=field,
-        )
-    return model
-
-
 def _lines(file: Path) -> list[str]:
     return [line.strip() for line in read_text(file).splitlines() if not line.startswith("#")]
 
@@ -130,20 +121,17 @@ def _read_cameras_txt(file: Path) -> dict[int, _Calibration]:
         if len(words) < 5:
             raise MeasurementError("expected CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", file=file, field=line[:40])
         identity, width, height = (int(v) for v in _numbers([words[0], *words[2:4]], file, line[:40]))
-        model = _known(words[1], file, f"camera {identity}, MODEL")
-        out[identity] = model, width, height, _numbers(words[4:], file, f"camera {identity}, PARAMS")
+        out[identity] = words[1], width, height, _numbers(words[4:], file, f"camera {identity}, PARAMS")
     return out
 
 
 def _read_images_txt(file: Path) -> list[_Pose]:
-    lines = _lines(file)
-    while lines and not lines[0]:
-        lines.pop(0)
     out: list[_Pose] = []
-    for line in lines[::2]:  # every second line lists 2-D points and may be empty
-        if not line:
-            break
+    for line in filter(None, _lines(file)):
         words = line.split(maxsplit=9)
+        # The line of 2-D points after an image's own may be empty, or left out: it is known by what it holds.
+        if _are_points(line.split()):
+            continue
         if len(words) != 10:
             raise MeasurementError(
                 "expected IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", file=file, field=line[:40]
@@ -151,6 +139,14 @@ def _read_images_txt(file: Path) -> list[_Pose]:
         values = np.array(_numbers(words[1:9], file, words[9]))
         out.append((int(values[7]), words[9], values[:4], values[4:7]))
     return out
+
+
+def _are_points(words: list[str]) -> bool:
+    """Whether a line is one of 2-D points: triples of numbers, where an image's line ends in the name of a file."""
+    try:
+        return len(words) % 3 == 0 and all(math.isfinite(float(word)) for word in words)
+    except ValueError:
+        return False
 
 
 class _Bytes:
@@ -191,8 +187,10 @@ def _read_cameras_bin(file: Path) -> dict[int, _Calibration]:
     out: dict[int, _Calibration] = {}
     for _ in range(int(data.take("Q")[0])):
         identity, number, width, height = (int(v) for v in data.take("IiQQ"))
-        model = _known(_NAMES.get(number, f"number {number}"), file, f"camera {identity}, MODEL")
-        out[identity] = model, width, height, data.take(f"{len(_MODELS[model][2])}d")
+        if not 0 <= number < len(_MODELS):
+            raise MeasurementError(f"unknown model {number}", file=file, field=f"camera {identity}, MODEL")
+        model, count = _MODELS[number]
+        out[identity] = model, width, height, data.take(f"{count}d")
     return out
 
 

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import csv
+import difflib
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
 import numpy.typing as npt
+from PIL import Image
 
 from splatsoil.errors import MeasurementError
 
 FloatArray = npt.NDArray[np.float64]
+
+_ALIKE = 0.8  # difflib's ratio of two words one of which is the other misspelt: a letter of five, two of ten
 
 
 class Fields:
@@ -78,6 +82,25 @@ class Fields:
             if not isinstance(item, dict):
                 self.fail(name, f"expected an object, found {_kind(item)}")
             yield Fields(item, self.file, self.path_of(name), parent=self)
+
+    def check_names(self, known: Iterable[str]) -> None:
+        """Raise MeasurementError about a field that is none of those known, but spelt like one that isn't given."""
+        absent = [name for name in known if not self.has(name)]
+        for key in self.data:
+            meant = difflib.get_close_matches(key.lower().replace("-", "_"), absent, n=1, cutoff=_ALIKE)
+            if meant and key not in known:
+                self.fail(key, f"no field is called so; did you mean {meant[0]!r}?")
+
+    def names(self) -> list[str]:
+        """All fields' names, those of the enclosing object that values fall back to included."""
+        return [*self.data, *(self.parent.names() if self.parent is not None else ())]
+
+    def flag(self, key: str) -> bool:
+        """True or false."""
+        value = self.raw(key)
+        if not isinstance(value, bool):
+            self.fail(key, f"expected true or false, found {_kind(value)}")
+        return value
 
     def text(self, key: str) -> str:
         """A non-empty string."""
@@ -150,7 +173,7 @@ def inside(name: str, root: Path, base: Path, file: Path, field: str) -> Path:
         MeasurementError: about ``field`` of ``file`` when the path leaves the folder or is unusable, else about the
             missing file itself.
     """
-    path = base / name
+    path = named(name, base, file, field)
     try:
         leaves = Path(name).is_absolute() or not path.resolve().is_relative_to(root.resolve())
         found, is_file = path.exists(), path.is_file()
@@ -169,15 +192,53 @@ def inside(name: str, root: Path, base: Path, file: Path, field: str) -> Path:
     return path
 
 
+def named(name: str, base: Path, file: Path, field: str) -> Path:
+    """Where ``name`` is, relative to ``base``: as it stands, by Windows' backslashes, or an image without its suffix.
+
+    Raises:
+        MeasurementError: several images have the name.
+    """
+    path = base / name
+    try:
+        if path.exists():
+            return path
+        other = base / name.replace("\\", "/")
+        if other.exists():
+            return other
+        known = Image.registered_extensions()
+        images = [p for p in other.parent.iterdir() if p.stem == other.name and p.suffix.lower() in known]
+    except (OSError, ValueError):
+        return path
+    if len(images) > 1:
+        several = ", ".join(sorted(p.name for p in images))
+        raise MeasurementError(f"{name!r} lacks its suffix, and there are {several}", file=file, field=field)
+    return images[0] if images else other
+
+
 def read_json(file: Path) -> Any:
-    """What a JSON file holds; MeasurementError when it is missing, unreadable or not JSON."""
+    """What a JSON file holds; MeasurementError when it is missing, unreadable, not JSON, or gives a key twice."""
     text = read_text(file)
     try:
-        return json.loads(text)
+        return json.loads(text, object_pairs_hook=_once)
     except json.JSONDecodeError as error:
-        raise MeasurementError(f"not JSON: {error.msg} in line {error.lineno}", file=file) from error
+        rest = text[error.pos :]
+        fault = error.msg
+        if rest.startswith(("//", "/*", "#")):
+            fault = "JSON has no comments, but there is one"
+        elif rest[:1] in ("}", "]") and text[: error.pos].rstrip().endswith(","):
+            fault = "a comma stands before the closing bracket"
+        raise MeasurementError(f"not JSON: {fault} in line {error.lineno}, column {error.colno}", file=file) from error
     except (ValueError, RecursionError) as error:  # numbers of thousands of digits, endless nesting
         raise MeasurementError(f"not usable JSON: {error}", file=file) from error
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """The object of these pairs, whose keys must differ."""
+    out = dict(pairs)
+    if len(out) < len(pairs):
+        keys = [key for key, _ in pairs]
+        raise ValueError(f"the key {next(key for key in keys if keys.count(key) > 1)!r} is given twice")
+    return out
 
 
 def read_text(file: Path) -> str:
@@ -193,27 +254,68 @@ def read_text(file: Path) -> str:
 
 
 def read_table(file: Path, columns: Sequence[str]) -> FloatArray:
-    """A CSV file with exactly the header ``columns``: (rows, columns) finite numbers, at least one row."""
-    try:
-        rows = list(csv.reader(read_text(file).splitlines()))
-    except csv.Error as error:
-        raise MeasurementError(f"not a CSV table: {error}", file=file) from error
-    header = [name.strip() for name in rows[0]] if rows else []
-    if header != list(columns):
-        found = ",".join(header)[:80] or "nothing"
-        raise MeasurementError(f"expected the header {','.join(columns)}, found {found}", file=file, field="line 1")
+    """A CSV file with a header that has ``columns``: (rows, columns) finite numbers, at least one row.
+
+    Columns may be in any order, in capitals, and among others, which are left out. Cells are parted by commas, tabs or
+    semicolons; by the latter two, a comma is a decimal one. Lines that begin with # are comments, or the header.
+
+    Raises:
+        MeasurementError: naming the line and column.
+    """
+    places: list[int] | None = None
+    names: list[str] = []
+    delimiter = ","
     table: list[list[float]] = []
-    for line, row in enumerate(rows[1:], start=2):
-        if not any(cell.strip() for cell in row):
+    for line, text in enumerate(read_text(file).splitlines(), start=1):
+        is_comment = text.lstrip().startswith("#")
+        if not text.strip() or (is_comment and places is not None):
             continue
-        if len(row) != len(columns):
+        if places is None:
+            delimiter = next((mark for mark in ";\t" if mark in text), ",")
+        cells = _cells(text.lstrip(" #") if is_comment else text, delimiter, file)
+        if not any(cells):
+            continue
+        if places is None:
+            names = [cell.lower() for cell in cells]
+            while not names[-1]:
+                names.pop()
+            faulty = [name for name in columns if names.count(name) != 1]
+            if not faulty:
+                places = [names.index(name) for name in columns]
+            elif not is_comment:
+                raise _no_header(columns, ",".join(cells)[:80], faulty, file, line)
+            continue
+        if len(cells) < len(names) or any(cells[len(names) :]):
             raise MeasurementError(
-                f"{len(row)} values where the header has {len(columns)}", file=file, field=f"line {line}"
+                f"{len(cells)} values where the header has {len(names)}", file=file, field=f"line {line}"
             )
-        table.append([_cell(cell, file, f"{name}, line {line}") for name, cell in zip(columns, row, strict=True)])
+        table.append(
+            [
+                _cell(cells[k] if delimiter == "," else cells[k].replace(",", "."), file, f"{name}, line {line}")
+                for name, k in zip(columns, places, strict=True)
+            ]
+        )
+    if places is None:
+        raise _no_header(columns, "nothing", columns, file, 1)
     if not table:
         raise MeasurementError("the table has no rows", file=file)
     return np.array(table)
+
+
+def _no_header(columns: Sequence[str], found: str, faulty: Sequence[str], file: Path, line: int) -> MeasurementError:
+    return MeasurementError(
+        f"expected the header {','.join(columns)}, found {found}; {', '.join(faulty)} must be there once",
+        file=file,
+        field=f"line {line}",
+    )
+
+
+def _cells(text: str, delimiter: str, file: Path) -> list[str]:
+    """The cells of a line, without space around them."""
+    try:
+        return [cell.strip() for row in csv.reader([text], delimiter=delimiter, skipinitialspace=True) for cell in row]
+    except csv.Error as error:
+        raise MeasurementError(f"not a CSV table: {error}", file=file) from error
 
 
 def _cell(text: str, file: Path, field: str) -> float:

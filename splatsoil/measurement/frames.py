@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
@@ -11,16 +13,24 @@ import numpy as np
 import numpy.typing as npt
 
 from splatsoil.errors import MeasurementError
-from splatsoil.measurement.camera import CAMERA_MODELS, Camera
+from splatsoil.measurement.camera import FISHEYE, LENSES, Camera
 from splatsoil.measurement.fields import Fields
-from splatsoil.measurement.images import check_image, read_alpha, read_image
+from splatsoil.measurement.images import check_image, check_photograph, read_alpha, read_depth, read_image, read_mask
 from splatsoil.measurement.rotations import nearest_rigid, why_not_rigid
 
 FloatImage = npt.NDArray[np.float32]
 BoolImage = npt.NDArray[np.bool_]
 
 _COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
-_DEPTH_UNIT = 1e-3  # nerfstudio's depth images are 16-bit millimetres
+# Fields that are read; nerfstudio and others have more.
+LENS_FIELDS = (
+    *("camera_model", "is_fisheye", "w", "h", "fl_x", "fl_y", "cx", "cy", *_COEFFICIENTS),
+    *("camera_angle_x", "camera_angle_y"),
+)
+FRAME_FIELDS = (*LENS_FIELDS, "file_path", "transform_matrix", "mask_path", "depth_file_path")
+VIDEO_FIELDS = ("camera", "frame", "time")
+_LENS_KEY = re.compile(r"[kps]\d|skew|distortion_params")  # what bends an image in any of the formats alike
+_FOCAL_SLACK = 0.01  # further apart than digits that were cut off explain
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +43,8 @@ class Frame:
         camera_name: which camera took it; empty where the set does not say.
         frame: its number on the tool motion's clock, negative before the motion (pre-roll), None for views.
         time: seconds on that clock, None for views.
-        mask_path: image that is black where pixels are to be ignored, or None.
-        depth_path: 16-bit image in millimetres, or .npy in metres, of the depth along the camera's axis, or None.
+        mask_path: image that is dark where pixels are to be ignored, or None.
+        depth_path: image or .npy of the depth along the camera's axis, as ``read_depth`` takes it, or None.
     """
 
     camera: Camera
@@ -52,16 +62,12 @@ class Frame:
     def mask(self) -> BoolImage | None:
         """Where the image is to be used, by its mask or its own transparency: (height, width) bool, or None."""
         if self.mask_path is not None:
-            return read_image(self.mask_path).max(axis=2) > 0.0
+            return read_mask(self.mask_path)
         return read_alpha(self.path)
 
     def depth(self) -> FloatImage | None:
         """Depth along the camera's axis, (height, width) float32 metres, 0 where unknown; None if there is none."""
-        if self.depth_path is None:
-            return None
-        if self.depth_path.suffix == ".npy":
-            return np.load(self.depth_path, allow_pickle=False).astype(np.float32)
-        return read_image(self.depth_path)[:, :, 0] * np.float32(65535.0 * _DEPTH_UNIT)
+        return None if self.depth_path is None else read_depth(self.depth_path)
 
     def undistorted_image(self) -> FloatImage:
         """The image that ``camera.undistorted()`` would have taken; black where this lens did not see."""
@@ -105,6 +111,7 @@ def read_transforms(file: Path, root: Path, *, video: bool) -> tuple[Frame, ...]
         MeasurementError: naming file and field.
     """
     fields = Fields.read(file)
+    fields.check_names((*LENS_FIELDS, "frames"))
     frames = tuple(_read_frame(item, root, video=video) for item in fields.children("frames"))
     _check_unique(frames, file, video=video)
     if video:
@@ -113,32 +120,68 @@ def read_transforms(file: Path, root: Path, *, video: bool) -> tuple[Frame, ...]
     told = f"w and h of {file.name}"
     for i, frame in enumerate(frames):
         size = (frame.camera.width, frame.camera.height)
-        check_image(frame.path, size, sizes_from=told, field=f"frames[{i}].file_path")
+        key = f"frames[{i}].file_path" if frame.mask_path is None else f"frames[{i}].mask_path"
+        check_photograph(frame.path, size, sizes_from=told, field=f"frames[{i}].file_path")
         if frame.mask_path is not None:
-            check_image(frame.mask_path, size, sizes_from=told, field=f"frames[{i}].mask_path")
+            check_image(frame.mask_path, size, sizes_from=told, field=key)
+        mask = frame.mask()
+        if mask is not None and not mask.any():
+            raise MeasurementError(
+                "nothing of the photograph is left: all of it is masked or transparent",
+                file=frame.mask_path or frame.path,
+                field=key,
+            )
         if frame.depth_path is not None:
             _check_depth(frame.depth_path, size, told, f"frames[{i}].depth_file_path")
     return frames
 
 
-def read_camera(fields: Fields, name: str) -> Camera:
-    """A camera from one frame's fields (those the frame lacks come from the top of the file)."""
-    model = fields.text("camera_model") if fields.has("camera_model") else "OPENCV"
-    if model not in CAMERA_MODELS:
-        fields.fail("camera_model", f"unknown camera model {model!r}; known are {', '.join(CAMERA_MODELS)}")
-    width, height = fields.integer("w", 1, 100_000), fields.integer("h", 1, 100_000)
-    bend = {key: fields.number(key, default=0.0) for key in _COEFFICIENTS}
-    if model == "PINHOLE" and any(bend.values()):
-        first = next(key for key, value in bend.items() if value)
-        fields.fail(first, f"a PINHOLE camera has no distortion, but {first} = {bend[first]:g}; say OPENCV")
-    hint = "focal lengths are given in pixels"
+def read_camera(fields: Fields, name: str, size: tuple[int, int] | None = None) -> Camera:
+    """A camera from one frame's fields (those the frame lacks come from the top of the file).
+
+    Args:
+        fields: the frame's.
+        name: what the camera is called.
+        size: (width, height) of the image where the file may leave size, principal point (the centre, then) and all
+            but one focal length out, as Blender's files do.
+
+    Raises:
+        MeasurementError: naming the field.
+    """
+    lens = fields.text("camera_model") if fields.has("camera_model") else "OPENCV"
+    if fields.has("is_fisheye"):
+        fisheye = fields.flag("is_fisheye")
+        if fisheye and not fields.has("camera_model"):
+            lens = FISHEYE
+        elif fisheye != (LENSES.get(lens, ("",))[0] == FISHEYE):
+            fields.fail("is_fisheye", f"{fisheye} contradicts the model {lens}; give one of both")
+    if lens not in LENSES:
+        fields.fail("camera_model", f"unknown camera model {lens!r}; known are {', '.join(LENSES)}")
+    model, parameters = LENSES[lens]
+    # nerfstudio's OPENCV has four radial coefficients, where COLMAP's has two.
+    known = _COEFFICIENTS if lens == "OPENCV" else parameters
+    for key in fields.names():
+        if _LENS_KEY.fullmatch(key) and key not in known and fields.raw(key) not in (0, False, [], None):
+            advice = "undistort the images first" if model == FISHEYE or key not in _COEFFICIENTS else "say OPENCV"
+            fields.fail(key, f"the model {lens} has no {key}, and this one is not 0; {advice}")
+    bend = {key: fields.number(key, default=0.0) for key in _COEFFICIENTS if key in known}
+    width, height = (
+        fields.integer(key, 1, 100_000) if size is None or fields.has(key) else size[axis]
+        for axis, key in enumerate("wh")
+    )
+    fx = _read_focal(fields, "x", width)
+    alike = not (fields.has("fl_y") or fields.has("camera_angle_y")) and ("f" in parameters or size is not None)
+    fy = fx if alike else _read_focal(fields, "y", height)
+    if "f" in parameters and abs(fx - fy) > _FOCAL_SLACK * fx:
+        fields.fail("fl_y", f"the model {lens} has one focal length, but fl_x = {fx:g} and fl_y = {fy:g}")
+    middle = (None, None) if size is None else (0.5 * width, 0.5 * height)
     camera = Camera(
         width=width,
         height=height,
-        fx=fields.number("fl_x", 0.05 * width, 1000.0 * width, hint=hint),
-        fy=fields.number("fl_y", 0.05 * height, 1000.0 * height, hint=hint),
-        cx=fields.number("cx", -10.0 * width, 11.0 * width),
-        cy=fields.number("cy", -10.0 * height, 11.0 * height),
+        fx=fx,
+        fy=fy,
+        cx=fields.number("cx", -10.0 * width, 11.0 * width, default=middle[0]),
+        cy=fields.number("cy", -10.0 * height, 11.0 * height, default=middle[1]),
         camera_to_world=_read_pose(fields),
         **bend,
         name=name,
@@ -147,6 +190,20 @@ def read_camera(fields: Fields, name: str) -> Camera:
     if not np.isfinite(camera.rays([[camera.cx, camera.cy]])[1]).all():
         fields.fail("k1", "the distortion leaves no image, not even at the principal point")
     return camera
+
+
+def _read_focal(fields: Fields, axis: str, length: int) -> float:
+    """The focal length along an axis in pixels, by ``fl_x`` or by ``camera_angle_x``, which must agree."""
+    key, angle_key = f"fl_{axis}", f"camera_angle_{axis}"
+    if fields.has(key) or not fields.has(angle_key):
+        focal = fields.number(key, 0.05 * length, 1000.0 * length, hint="focal lengths are given in pixels")
+    if not fields.has(angle_key):
+        return focal
+    hint = f"it is the field of view along {axis} in radians"
+    by_angle = 0.5 * length / math.tan(0.5 * fields.number(angle_key, 1e-3, math.pi - 1e-3, hint=hint))
+    if fields.has(key) and abs(focal - by_angle) > _FOCAL_SLACK * focal:
+        fields.fail(key, f"{focal:g} pixels contradict {angle_key}, by which they are {by_angle:g}; give one of both")
+    return focal if fields.has(key) else by_angle
 
 
 def _read_pose(fields: Fields) -> npt.NDArray[np.float64]:
@@ -159,9 +216,10 @@ def _read_pose(fields: Fields) -> npt.NDArray[np.float64]:
 
 def _read_frame(fields: Fields, root: Path, *, video: bool) -> Frame:
     base = fields.file.parent
+    fields.check_names((*FRAME_FIELDS, *VIDEO_FIELDS) if video else FRAME_FIELDS)
     name = fields.text("camera") if video or fields.has("camera") else ""
     number = fields.integer("frame", -(10**9), 10**9) if video else None
-    time = fields.number("time", -1e9, 1e9) if video else None
+    time = fields.number("time") if video else None
     optional = {
         key: fields.path(key, root, base) if fields.has(key) else None for key in ("mask_path", "depth_file_path")
     }
@@ -232,10 +290,8 @@ def _check_times(frames: tuple[Frame, ...], file: Path) -> None:
 def _check_depth(path: Path, size: tuple[int, int], told: str, field: str) -> None:
     if path.suffix != ".npy":
         check_image(path, size, sizes_from=told, field=field)
-        return
-    try:
-        shape = np.load(path, mmap_mode="r", allow_pickle=False).shape
-    except (OSError, ValueError, EOFError) as error:
-        raise MeasurementError("not a NumPy array of numbers", file=path, field=field) from error
-    if shape != size[::-1]:
-        raise MeasurementError(f"the depth is {shape[::-1]} where {told} say {size}", file=path, field=field)
+    depth = read_depth(path, field)
+    if depth.shape != size[::-1]:
+        raise MeasurementError(f"the depth is {depth.shape[::-1]} where {told} say {size}", file=path, field=field)
+    if not depth.any():
+        raise MeasurementError("no depth is known: none is positive", file=path, field=field)

@@ -14,7 +14,12 @@ from splatsoil.errors import MeasurementError
 FloatImage = npt.NDArray[np.float32]
 
 
-def check_image(path: Path, size: tuple[int, int], *, sizes_from: str, field: str | None = None) -> None:
+_ORIENTATION = 0x0112  # EXIF
+_BLOCK = 8  # pixels over which noise is averaged before a photograph is asked for what it shows
+_OPAQUE = 128  # of 255: half, so that the pixel's centre belongs to what is shown
+
+
+def check_image(path: Path, size: tuple[int, int], *, sizes_from: str, field: str | None = None) -> Image.Image:
     """Raise MeasurementError unless ``path`` is a whole image of ``size`` (width, height) of the type its name says.
 
     Args:
@@ -22,26 +27,61 @@ def check_image(path: Path, size: tuple[int, int], *, sizes_from: str, field: st
         size: (width, height) in pixels.
         sizes_from: what told the size, for the message.
         field: what named the file, for the message.
+
+    Returns:
+        The image, a JPEG at an eighth of its size.
     """
-    known = Image.registered_extensions()
+    expected = Image.registered_extensions().get(path.suffix.lower())
+    if expected is None:
+        raise MeasurementError(
+            f"{path.suffix or 'a name without suffix'} is no known type of image; convert it to JPEG or PNG",
+            file=path,
+            field=field,
+        )
     with _opened(path, field) as image:
-        expected = known.get(path.suffix.lower())
-        if expected is None:
-            raise MeasurementError(
-                f"{path.suffix or 'a name without suffix'} is no known type of image", file=path, field=field
-            )
         if image.format != expected and {image.format, expected} != {"JPEG", "MPO"}:
             raise MeasurementError(
                 f"the name says {expected}, the content is {image.format}; rename or convert it", file=path, field=field
             )
         if image.size != size:
             found, wanted = "{} x {}".format(*image.size), "{} x {}".format(*size)
+            turned = image.size == size[::-1] and is_turned(image)
+            advice = ": its EXIF data turn it, and images are used as stored; save it turned, without EXIF"
             raise MeasurementError(
-                f"the image is {found} pixels where {sizes_from} say {wanted}", file=path, field=field
+                f"the image is {found} pixels where {sizes_from} say {wanted}{advice if turned else ''}",
+                file=path,
+                field=field,
             )
         # A JPEG decoded at an eighth of its size still reads the whole stream, at a fraction of the cost.
         image.draft(None, (1, 1))
         _decode(image, path, field)
+        return image
+
+
+def check_photograph(path: Path, size: tuple[int, int], *, sizes_from: str, field: str | None = None) -> None:
+    """`check_image`, and that the image shows something: a black, white or grey one tells nothing.
+
+    Raises:
+        MeasurementError: naming file and field.
+    """
+    image = check_image(path, size, sizes_from=sizes_from, field=field)
+    values = _values(image, path, field)
+    if image.size == size:
+        height, width = (max(1, n // _BLOCK) for n in values.shape[:2])
+        rows, columns = values.shape[0] // height, values.shape[1] // width
+        blocks = values[: height * rows, : width * columns].reshape(height, rows, width, columns, 3)
+        values = blocks.mean(axis=(1, 3))
+    # Averages of blocks are free of noise, and what differs by less than the step of 8-bit images isn't seen.
+    if values.std(axis=(0, 1)).max() < 1.0 / 255.0:
+        level = 255.0 * float(values.mean())
+        raise MeasurementError(
+            f"the photograph shows nothing but one even grey, {level:.0f} of 255; leave it out", file=path, field=field
+        )
+
+
+def is_turned(image: Image.Image) -> bool:
+    """Whether EXIF data ask for the image to be turned or mirrored."""
+    return image.getexif().get(_ORIENTATION, 1) not in (0, 1)
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -51,22 +91,79 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def read_image(path: Path) -> FloatImage:
-    """An image file's stored values: (height, width, 3) float32 in [0, 1]; grey is repeated, alpha left out."""
+    """An image file's stored values: (height, width, 3) float32 in [0, 1]; grey is repeated, alpha left out.
+
+    Raises:
+        MeasurementError: it can't be read, or has floating-point values outside [0, 1].
+    """
     with _opened(path) as image:
         _decode(image, path)
-        if image.mode.startswith("I;16") or image.mode == "I":
-            grey = np.asarray(image, dtype=np.float32) / np.float32(65535.0)
-            return np.repeat(grey[:, :, None], 3, axis=2)
-        return np.asarray(image.convert("RGB"), dtype=np.float32) / np.float32(255.0)
+        return _values(image, path)
+
+
+def read_mask(path: Path) -> npt.NDArray[np.bool_]:
+    """Where a mask is brighter than half of its brightest pixel: (height, width) bool."""
+    grey = read_image(path).max(axis=2)
+    return grey > 0.5 * grey.max()
 
 
 def read_alpha(path: Path) -> npt.NDArray[np.bool_] | None:
-    """Where an image is not wholly transparent: (height, width) bool; None without an alpha channel."""
+    """Where an image is opaque by half or more: (height, width) bool; None where it knows no transparency.
+
+    Transparency is an alpha channel, a palette's, or that of one colour (PNG's tRNS).
+    """
     with _opened(path) as image:
-        if image.mode not in ("RGBA", "LA", "PA"):
+        if not image.has_transparency_data:
             return None
         _decode(image, path)
-        return np.asarray(image.getchannel("A")) > 0
+        if image.mode.startswith("I"):
+            return np.asarray(image) != image.info["transparency"]
+        return np.asarray(image.convert("RGBA").getchannel("A")) >= _OPAQUE
+
+
+def read_depth(path: Path, field: str | None = None) -> FloatImage:
+    """Depths of an image or a .npy file: (height, width) float32 metres, 0 where unknown.
+
+    Whole numbers are millimetres, as in nerfstudio's 16-bit images; floating-point ones are metres. What is not
+    positive, or not finite, is unknown.
+
+    Raises:
+        MeasurementError: it can't be read, or has 8 bits.
+    """
+    if path.suffix == ".npy":
+        try:
+            values = np.load(path, allow_pickle=False)
+        except (OSError, ValueError, EOFError) as error:
+            raise MeasurementError("not a NumPy array of numbers", file=path, field=field) from error
+    else:
+        with _opened(path, field) as image:
+            _decode(image, path, field)
+            values = np.asarray(image)
+    if not isinstance(values, np.ndarray) or values.dtype.kind not in "uif" or values.dtype.itemsize == 1:
+        raise MeasurementError(
+            "a depth is of 16-bit millimetres or floating-point metres, this one of "
+            + ("8 bits, which have no unit" if isinstance(values, np.ndarray) else "several arrays"),
+            file=path,
+            field=field,
+        )
+    with np.errstate(invalid="ignore"):
+        metres = values.astype(np.float64) * (1.0 if values.dtype.kind == "f" else 1e-3)
+        return np.where(np.isfinite(metres) & (metres > 0.0), metres, 0.0).astype(np.float32)
+
+
+def _values(image: Image.Image, path: Path, field: str | None = None) -> FloatImage:
+    """(height, width, 3) float32 in [0, 1] of a decoded image."""
+    if image.mode != "F" and not image.mode.startswith("I"):
+        return np.asarray(image.convert("RGB"), dtype=np.float32) / np.float32(255.0)
+    grey = np.asarray(image, dtype=np.float32) / np.float32(1.0 if image.mode == "F" else 65535.0)
+    if not (grey.min() >= 0.0 and grey.max() <= 1.0):
+        raise MeasurementError(
+            f"values reach from {grey.min():g} to {grey.max():g}; those of floating-point images lie in [0, 1], whole"
+            " numbers have 8 or 16 bits",
+            file=path,
+            field=field,
+        )
+    return np.repeat(grey[:, :, None], 3, axis=2)
 
 
 def _opened(path: Path, field: str | None = None) -> Image.Image:
@@ -77,7 +174,9 @@ def _opened(path: Path, field: str | None = None) -> Image.Image:
     except FileNotFoundError as error:
         raise MeasurementError("no such image", file=path, field=field) from error
     except UnidentifiedImageError as error:
-        raise MeasurementError("not an image, or its beginning is damaged", file=path, field=field) from error
+        raise MeasurementError(
+            "not an image of a known kind, or its beginning is damaged", file=path, field=field
+        ) from error
     except Image.DecompressionBombError as error:
         raise MeasurementError("the image claims to be larger than any photograph", file=path, field=field) from error
     except (OSError, ValueError, SyntaxError) as error:

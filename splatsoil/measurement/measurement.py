@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -22,6 +23,9 @@ FloatArray = npt.NDArray[np.float64]
 
 FORMAT = "splatsoil-measurement/1"
 EXPERIMENT = "experiment.json"
+FIELDS = ("format", "name", "up", "gravity", "frame_rate", "bed", "tool", "views", "video")
+BED_FIELDS = ("lower", "upper", "density", "wall_friction", "floor_friction")
+TOOL_FIELDS = ("mesh", "motion", "force", "friction")
 
 # What a laboratory or a field could hold; beyond it a unit is wrong (millimetres, g/cm³).
 _SMALLEST_BED, _LARGEST_BED = 0.01, 50.0
@@ -29,7 +33,10 @@ _FARTHEST_BED = 1000.0  # from the origin: positions are single precision in pla
 _DENSITIES = (100.0, 20_000.0)
 _GRAVITIES = (1e-3, 300.0)
 _FAR_CAMERA = 100.0  # in diagonals of the bed
-_LARGE_TOOL, _SMALL_TOOL = 10.0, 1e-3  # in diagonals of the bed
+_OTHER_UNIT = math.sqrt(1000.0)  # half-way between metres and millimetres
+_SLACK = 0.1  # of the bed: what its floor and walls, which the tool can't pass, may be off by
+_SMALL_TOOL = 1e5  # cubes of the tool's width in the bed; cells are a fraction of it, and no memory holds as many
+_FASTEST_TOOL = 100.0  # m/s, the speed of sound in loose soil: nothing is pushed through it faster
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,14 +80,14 @@ class Measurement:
     """A measurement set, checked.
 
     Attributes:
-        folder: where it lies; nothing in it is ever modified.
+        folder: where it lies, an absolute path; nothing in it is ever modified.
         name: what it calls itself.
         gravity: (3,) m/s².
         frame_rate: frames a second of the tool motion's and the video's numbering.
         bed: the box of soil.
         tool: the tool and its motion.
-        views: photographs before anything moves.
-        video: the fixed cameras' frames, pre-roll included.
+        views: photographs before anything moves, by their names.
+        video: the fixed cameras' frames, pre-roll included, by number and camera.
         assumed: fields that ``experiment.json`` leaves out, and the values taken for them.
     """
 
@@ -102,7 +109,7 @@ class Measurement:
         Raises:
             MeasurementError: at the first thing that is wrong, naming the file and the field.
         """
-        root = Path(folder)
+        root = Path(folder).absolute()  # images are read later, perhaps from another working folder
         if not root.exists():
             raise MeasurementError("no such folder; give the folder of a measurement set", file=root)
         if not root.is_dir():
@@ -111,6 +118,7 @@ class Measurement:
         if not file.is_file():
             raise MeasurementError(f"no {EXPERIMENT} in this folder; it is no measurement set", file=file)
         fields = Fields.read(file)
+        fields.check_names(FIELDS)
         tag = fields.text("format")
         if tag != FORMAT:
             fields.fail("format", f"{tag!r} is not {FORMAT!r}; this is another format or another version of it")
@@ -133,9 +141,15 @@ class Measurement:
             assumed=assumed,
             sources=(file, *transforms.values(), tool_fields.path("motion", root, root)),
         )
-        _check_tool(measurement, tool_fields)
+        _check_clocks(measurement)
+        _check_tool(measurement)
         _check_cameras(measurement)
-        return measurement
+        # Sums are taken in the frames' order: it must not be that in which a file happens to list them.
+        return replace(
+            measurement,
+            views=tuple(sorted(measurement.views, key=lambda f: f.path.relative_to(root).as_posix())),
+            video=tuple(sorted(measurement.video, key=lambda f: (f.frame, f.camera_name))),
+        )
 
     @cached_property
     def hash(self) -> str:
@@ -181,6 +195,7 @@ class Measurement:
 
 
 def _read_bed(fields: Fields, assumed: dict[str, float]) -> Bed:
+    fields.check_names(BED_FIELDS)
     lower, upper = fields.vector("lower", 3), fields.vector("upper", 3)
     for axis, (low, high) in enumerate(zip(lower, upper, strict=True)):
         size = high - low
@@ -222,6 +237,7 @@ def _read_gravity(fields: Fields) -> FloatArray:
 
 
 def _read_tool(fields: Fields, root: Path, assumed: dict[str, float]) -> Tool:
+    fields.check_names(TOOL_FIELDS)
     if fields.has("give"):
         fields.fail("give", "soil does not give way to the tool; remove this field")
     mesh_path = fields.path("mesh", root, root)
@@ -237,14 +253,33 @@ def _read_tool(fields: Fields, root: Path, assumed: dict[str, float]) -> Tool:
     )
 
 
-def _check_tool(measurement: Measurement, fields: Fields) -> None:
-    """The tool's size and path against the bed's."""
-    bed, tool = measurement.bed, measurement.tool
-    diagonal = float(np.linalg.norm(bed.extents))
-    size = float(np.max(tool.mesh.extents))
-    if not _SMALL_TOOL * diagonal <= size <= _LARGE_TOOL * diagonal:
+def _check_clocks(measurement: Measurement) -> None:
+    """Whether times are frame numbers by the frame rate, as all that moves is taken to be, within a frame."""
+    rate, motion = measurement.frame_rate, measurement.tool.motion
+    experiment, _, video, table = measurement.sources
+    off: list[tuple[Path, str, str]] = []
+    clocks = (
+        (table, [(f"time, frame {n}", int(n), float(t)) for n, t in zip(motion.frames, motion.times, strict=True)]),
+        (video, [(f"frames[{i}].time", f.frame or 0, f.time or 0.0) for i, f in enumerate(measurement.video)]),
+    )
+    for file, rows in clocks:
+        field, number, time = max(rows, key=lambda row: abs(row[2] - row[1] / rate))
+        if abs(time - number / rate) > 1.001 / rate:
+            there = f"frame {number} is at {time:.10g} s in {file.name}"
+            off.append((file, field, f"{there}, where {rate:g} frames a second put it at {number / rate:g} s"))
+    if off:
+        # What both contradict is itself at fault.
+        file, field = off[0][:2] if len(off) == 1 else (experiment, "frame_rate")
+        raise MeasurementError(f"{off[0][2]}; times are in seconds, 0 at frame 0", file=file, field=field)
+
+
+def _check_tool(measurement: Measurement) -> None:
+    """The tool's size, path and speed against the bed's and the soil's."""
+    bed, tool, motion = measurement.bed, measurement.tool, measurement.sources[3]
+    width = float(np.sort(tool.mesh.extents)[1])
+    if float(np.prod(bed.extents)) > _SMALL_TOOL * width**3:
         raise MeasurementError(
-            f"the tool is {size:g} m long, the bed's diagonal {diagonal:g} m; meshes are in metres",
+            f"the tool is {width:g} m wide, too small a part of the bed for cells that show it; meshes are in metres",
             file=tool.mesh_path,
             field="vertices",
         )
@@ -252,9 +287,58 @@ def _check_tool(measurement: Measurement, fields: Fields) -> None:
         raise MeasurementError(
             "the tool never touches the soil's box: it is outside of the bed for the whole run; "
             "are motion and bed in the same world, in metres?",
-            file=fields.file.parent / fields.text("motion"),
+            file=motion,
             field="x,y,z",
         )
+    for number, time in zip(tool.motion.frames, tool.motion.times, strict=True):
+        passes = _passes(tool, float(time), bed)
+        if passes:
+            size = float(np.max(tool.mesh.extents))
+            large = size > bed.extents[2]
+            raise MeasurementError(
+                f"the tool, {size:g} m long, passes the bed's {passes} in frame {number}; meshes and motions are in"
+                " metres",
+                file=tool.mesh_path if large else motion,
+                field="vertices" if large else "x,y,z",
+            )
+    ways = np.linalg.norm(np.diff(tool.motion.positions, axis=0), axis=1)
+    fastest = float((ways / np.diff(tool.motion.times)).max())
+    if fastest > _FASTEST_TOOL:
+        raise MeasurementError(
+            f"the tool moves at {fastest:g} m/s, faster than sound in soil; times are in seconds, positions in metres",
+            file=motion,
+            field="time",
+        )
+
+
+def _passes(tool: Tool, time: float, bed: Bed) -> str:
+    """Whether the tool is under the bed's floor at ``time``, or beyond two opposite walls at once; empty if neither.
+
+    One wall it may come in through: not every bed has them.
+    """
+    rotation, position = tool.motion.pose(time)
+    points = tool.mesh.vertices @ rotation.T + position
+    slack = _SLACK * bed.extents
+    under = _level(points, tool.mesh.edges_unique, float(bed.lower[2] - slack[2]))
+    if len(under) and np.all(under.min(axis=0) < bed.upper[:2]) and np.all(under.max(axis=0) > bed.lower[:2]):
+        return "floor"
+    inside = points[(points[:, 2] > bed.lower[2]) & (points[:, 2] < bed.upper[2]), :2]
+    ends = [_level(points, tool.mesh.edges_unique, float(z)) for z in (bed.lower[2], bed.upper[2])]
+    within = np.concatenate([inside, *ends])
+    if len(within) == 0:
+        return ""
+    low, high = within.min(axis=0), within.max(axis=0)
+    over = (low < (bed.lower - slack)[:2]) & (high > (bed.upper + slack)[:2])
+    return "walls" if over.any() and np.all(low < bed.upper[:2]) and np.all(high > bed.lower[:2]) else ""
+
+
+def _level(points: FloatArray, edges: npt.NDArray[np.int64], z: float) -> FloatArray:
+    """Where edges between points (n, 3) cross a level: (m, 2) x and y."""
+    start, end = points[edges[:, 0]], points[edges[:, 1]]
+    crosses = (start[:, 2] < z) != (end[:, 2] < z)
+    start, end = start[crosses], end[crosses]
+    share = (z - start[:, 2]) / (end[:, 2] - start[:, 2])
+    return (start + share[:, None] * (end - start))[:, :2]
 
 
 def _check_cameras(measurement: Measurement) -> None:
@@ -271,19 +355,31 @@ def _check_cameras(measurement: Measurement) -> None:
                     file=file,
                     field=f"frames[{i}].transform_matrix",
                 )
-        if not any(sees(frame.camera, bed) for frame in frames):
+            depth = frame.depth()
+            typical = distance if depth is None else float(np.median(depth[depth > 0.0]))
+            if not distance / _OTHER_UNIT < typical < distance * _OTHER_UNIT:
+                raise MeasurementError(
+                    f"half of the depths are beyond {typical:g} m, where the bed is {distance:.2g} m away; whole"
+                    " numbers are millimetres, floating-point ones metres",
+                    file=frame.depth_path,
+                    field=f"frames[{i}].depth_file_path",
+                )
+        if not any(sees(frame, bed) for frame in frames):
             raise MeasurementError(
-                "no camera looks at the soil's box; matrices are camera to world, and cameras look down their -z axis",
+                "no camera looks at the soil's box; matrices are camera to world, cameras look down their -z axis, and"
+                " masks are black where pixels are ignored",
                 file=file,
                 field="frames[0].transform_matrix",
             )
 
 
-def sees(camera: Camera, bed: Bed) -> bool:
-    """Whether any of a grid of points of the bed's box falls into the image."""
+def sees(frame: Frame, bed: Bed) -> bool:
+    """Whether any of a grid of points of the bed's box falls into the image, where its mask allows it."""
+    camera, mask = frame.camera, frame.mask()
     steps = np.linspace(0.0, 1.0, 9)
     grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
     pixels, depth = camera.project(bed.lower + grid * bed.extents)
     with np.errstate(invalid="ignore"):
-        within = (pixels >= 0.0).all(axis=1) & (pixels[:, 0] <= camera.width) & (pixels[:, 1] <= camera.height)
-    return bool((within & (depth > 0.0)).any())
+        within = (pixels >= 0.0).all(axis=1) & (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
+    column, row = pixels[within & (depth > 0.0)].astype(int).T
+    return bool(column.size and (mask is None or mask[row, column].any()))

@@ -8,10 +8,10 @@ import numpy as np
 from PIL import Image
 
 from splatsoil.measurement.frames import Frame
+from splatsoil.measurement.images import is_turned
 from splatsoil.measurement.measurement import Measurement, sees
 
 _FEW_VIEWS = 12
-_ORIENTATION = 0x0112  # EXIF
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ def _on_views(measurement: Measurement) -> list[str]:
     n = len(measurement.views)
     if n < _FEW_VIEWS:
         out.append(f"There are only {n} views; the soil's surface gets reliable from about {_FEW_VIEWS} on.")
-    blind = [f.path.name for f in measurement.views if not sees(f.camera, measurement.bed)]
+    blind = [f.path.name for f in measurement.views if not sees(f, measurement.bed)]
     if blind:
         out.append(f"{len(blind)} of {n} views do not show the soil's box: {_some(blind)}.")
     below = [f.path.name for f in measurement.views if f.camera.position[2] < measurement.bed.lower[2]]
@@ -81,7 +81,7 @@ def _on_video(measurement: Measurement) -> list[str]:
         missing = [str(n) for n in frames if n not in own]
         if missing:
             out.append(f"Camera {name!r} lacks {len(missing)} frames that others have: {_some(missing)}.")
-        if not sees(cameras[name], measurement.bed):
+        if not any(sees(f, measurement.bed) for f in measurement.video if f.camera_name == name):
             out.append(f"Camera {name!r} does not show the soil's box.")
     lost = [str(n) for n in _lost(frames)]
     if lost:
@@ -111,6 +111,9 @@ def _on_tool(measurement: Measurement) -> list[str]:
     steps = np.linalg.norm(np.diff(tool.motion.positions, axis=0), axis=1)
     if steps.size and steps.sum() == 0.0 and not np.abs(np.diff(tool.motion.quaternions, axis=0)).max():
         out.append("The tool never moves.")
+    if (np.abs(tool.motion.quaternions[:, 3]) > np.sqrt(0.5)).all():
+        # A half turn about the vertical, or no turn in another order: neither can be ruled out.
+        out.append("All of the tool's quaternions are large in qz, their last number; is their order x, y, z, w?")
     times = tool.motion.times
     if steps.size > 4:
         speeds = steps / np.diff(times)
@@ -161,11 +164,9 @@ def _lost(frames: tuple[int, ...]) -> list[int]:
 
 
 def _off_clock(frame: Frame, measurement: Measurement) -> bool:
-    """Whether a video frame's time is more than half a frame off its number, counted from the motion's first row."""
+    """Whether a video frame's time is more than half a frame off its number."""
     assert frame.frame is not None and frame.time is not None
-    motion = measurement.tool.motion
-    expected = motion.times[0] + (frame.frame - motion.frames[0]) / measurement.frame_rate
-    return abs(frame.time - expected) > 0.5 / measurement.frame_rate
+    return abs(frame.time - frame.frame / measurement.frame_rate) > 0.5 / measurement.frame_rate
 
 
 def _first(measurement: Measurement, camera: str) -> int:
@@ -174,7 +175,7 @@ def _first(measurement: Measurement, camera: str) -> int:
 
 def _turned(frame: Frame) -> bool:
     with Image.open(frame.path) as image:
-        return image.getexif().get(_ORIENTATION, 1) not in (0, 1)
+        return is_turned(image)
 
 
 def _some(names: list[str], most: int = 4) -> str:

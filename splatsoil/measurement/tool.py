@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -55,20 +56,42 @@ class Tool:
 
 
 def read_mesh(file: Path) -> trimesh.Trimesh:
-    """A closed mesh with outward faces from any file that trimesh reads; MeasurementError otherwise."""
+    """A closed mesh in metres with outward faces, on each of its bodies, from any file that trimesh reads.
+
+    Corners that differ by texture or normal alone are joined, faces without area or given twice left out, and units
+    that the file tells (3MF does) converted.
+
+    Raises:
+        MeasurementError: it can't be read, or encloses no volume.
+    """
     try:
         mesh = trimesh.load_mesh(file)
     except Exception as error:  # trimesh's readers raise whatever their parsers do
+        reason = " ".join(str(error).split())[:160] or type(error).__name__
+        missing = re.search(r"No module named '(\w+)", reason) if isinstance(error, ImportError) else None
         # For bytes that are no text trimesh asks for a module that guesses encodings: no hint for a user.
-        guessing = isinstance(error, ImportError) and error.name in ("chardet", "charset_normalizer")
-        reason = "it is no text" if guessing else " ".join(str(error).split())[:160] or type(error).__name__
+        if missing and missing[1] not in ("chardet", "charset_normalizer"):
+            raise MeasurementError(
+                f"a file of this type is read by the package {missing[1]}, which is missing: pip install {missing[1]}",
+                file=file,
+            ) from error
+        reason = "it is no text" if missing else reason
         raise MeasurementError(f"the mesh cannot be read ({reason}); is it what its name says?", file=file) from error
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise MeasurementError("the file holds no triangles; is it what its name says?", file=file)
     if not np.isfinite(mesh.vertices).all():
         raise MeasurementError("the mesh has vertices that are not finite numbers", file=file, field="vertices")
-    mesh.merge_vertices()
-    extents = np.asarray(mesh.extents)
+    if mesh.units:
+        mesh.convert_units("meters")
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    edges = mesh.faces != np.roll(mesh.faces, 1, axis=1)
+    mesh.update_faces(mesh.unique_faces() & edges.all(axis=1))
+    if not mesh.is_watertight:  # else thin faces may be what closes it
+        mesh.update_faces(mesh.nondegenerate_faces())
+    mesh.remove_unreferenced_vertices()
+    # Bodies one by one: one that is inside out takes its volume from the others'.
+    trimesh.repair.fix_normals(mesh, multibody=True)
+    extents = np.zeros(3) if mesh.extents is None else np.asarray(mesh.extents)
     with np.errstate(all="ignore"):  # the centre of mass of a flat mesh divides by zero
         volume = abs(float(mesh.volume))
     if not volume > 1e-9 * float(np.prod(np.maximum(extents, extents.max() * 1e-3))):
@@ -79,7 +102,6 @@ def read_mesh(file: Path) -> trimesh.Trimesh:
         raise MeasurementError(
             "the mesh has holes or loose edges, so it has no volume; close its surface", file=file, field="faces"
         )
-    trimesh.repair.fix_normals(mesh)
     return mesh
 
 

@@ -47,6 +47,20 @@ def edit(file: str, *keys: str | int, to: Any = None, drop: bool = False) -> Cal
     return spoil
 
 
+def renamed(file: str, *keys: str, to: str) -> Callable[[Path], None]:
+    """Another name for a field of a JSON file."""
+
+    def spoil(folder: Path) -> None:
+        data = json.loads((folder / file).read_text())
+        place = data
+        for key in keys[:-1]:
+            place = place[key]
+        place[to] = place.pop(keys[-1])
+        (folder / file).write_text(json.dumps(data))
+
+    return spoil
+
+
 def replace(file: str, content: str | bytes) -> Callable[[Path], None]:
     """Replace a file's content."""
     raw = content.encode() if isinstance(content, str) else content
@@ -71,7 +85,7 @@ def motion(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], None]
         file = folder / "tool_motion.csv"
         head, *rows = file.read_text().splitlines()
         table = change(np.array([[float(v) for v in row.split(",")] for row in rows]))
-        file.write_text("\n".join([head, *(",".join(f"{v:.10g}" for v in row) for row in table)]))
+        file.write_text("\n".join([head, *(",".join(f"{v:.12g}" for v in row) for row in table)]))
 
     return spoil
 
@@ -141,6 +155,65 @@ def wrong_mask(folder: Path) -> None:
     edit(VIEWS, "frames", 1, "mask_path", to="mask.png")(folder)
 
 
+def photograph(make: Callable[[], Image.Image], name: str = "002.png") -> Callable[[Path], None]:
+    """Another image, of another type perhaps, for the third view."""
+
+    def spoil(folder: Path) -> None:
+        make().save(folder / "views/images" / name)
+        edit(VIEWS, "frames", 2, "file_path", to=f"images/{name}")(folder)
+
+    return spoil
+
+
+def even(level: int, noise: float = 0.0) -> Image.Image:
+    """One grey throughout but for a sensor's noise."""
+    values = level + noise * np.random.default_rng(0).normal(size=(240, 320, 3))
+    return Image.fromarray(np.clip(values.round(), 0, 255).astype(np.uint8))
+
+
+def ramp(high: float) -> Image.Image:
+    """A floating-point image from 0 to ``high``."""
+    return Image.fromarray(np.linspace(0.0, high, 240 * 320, dtype=np.float32).reshape(240, 320))
+
+
+def transparent() -> Image.Image:
+    image = Image.effect_noise((320, 240), 60).convert("RGBA")
+    image.putalpha(3)
+    return image
+
+
+def turned_by_exif(folder: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.effect_noise((240, 320), 60).save(folder / "views/images/002.jpg", exif=exif)
+
+
+def black_mask(folder: Path) -> None:
+    Image.new("L", (320, 240)).save(folder / "views/mask.png")
+    edit(VIEWS, "frames", 1, "mask_path", to="mask.png")(folder)
+
+
+def masks_round_the_soil(folder: Path) -> None:
+    """All views' masks the wrong way round: they keep what isn't soil, here the uppermost line."""
+    mask = np.zeros((240, 320), dtype=np.uint8)
+    mask[0] = 255
+    Image.fromarray(mask).save(folder / "views/mask.png")
+    edit(VIEWS, "mask_path", to="mask.png")(folder)
+
+
+def depth(name: str, values: np.ndarray) -> Callable[[Path], None]:
+    """Depth of the second view."""
+
+    def spoil(folder: Path) -> None:
+        if name.endswith(".npy"):
+            np.save(folder / "views" / name, values)
+        else:
+            Image.fromarray(values).save(folder / "views" / name)
+        edit(VIEWS, "frames", 1, "depth_file_path", to=name)(folder)
+
+    return spoil
+
+
 def unknown_mesh(folder: Path) -> None:
     (folder / "tool.stl").rename(folder / "tool.dat")
     edit(SET, "tool", "mesh", to="tool.dat")(folder)
@@ -171,8 +244,47 @@ def big_box() -> trimesh.Trimesh:
     return trimesh.creation.box((12.0, 120.0, 120.0))
 
 
+def tool_scaled(factor: float, lift: float = 0.0) -> Callable[[Path], None]:
+    """The tool's mesh in another unit, about its middle or, lifted, about a point below."""
+
+    def spoil(folder: Path) -> None:
+        tool = trimesh.load_mesh(folder / "tool.stl")
+        tool.apply_translation([0.0, 0.0, lift])
+        tool.apply_scale(factor)
+        tool.apply_translation([0.0, 0.0, -lift])
+        tool.export(folder / "tool.stl")
+
+    return spoil
+
+
+def video_times(change: Callable[[float], float]) -> Callable[[Path], None]:
+    def spoil(folder: Path) -> None:
+        data = json.loads((folder / VIDEO).read_text())
+        for frame in data["frames"]:
+            frame["time"] = change(frame["time"])
+        (folder / VIDEO).write_text(json.dumps(data))
+
+    return spoil
+
+
+def both(*faults: Callable[[Path], object]) -> Callable[[Path], None]:
+    def spoil(folder: Path) -> None:
+        for fault in faults:
+            fault(folder)
+
+    return spoil
+
+
+def times(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], None]:
+    """Another clock for the tool's motion."""
+    return motion(lambda table: np.column_stack([table[:, 0], change(table[:, 1]), table[:, 2:]]))
+
+
+LAST = "time, frame 40"
+UNIX = 1.7e9
 FIRST = "frames[1].file_path"
 SECOND = "frames[2].file_path"
+DEPTH = "frames[1].depth_file_path"
 LEAVES = "leaves the measurement set"
 MATRIX = "frames[1].transform_matrix"
 VIEWS, VIDEO, SET = "views/transforms.json", "video/transforms.json", "experiment.json"
@@ -198,6 +310,31 @@ CASES = [
     Case("image-listed-twice", edit(VIEWS, "frames", 1, "file_path", to="images/000.jpg"), VIEWS, FIRST,
          "twice"),
     Case("mask-of-another-size", wrong_mask, "views/mask.png", "frames[1].mask_path", "3 x 4"),
+    Case("image-turned-by-exif", turned_by_exif, "views/images/002.jpg", SECOND, "EXIF"),
+    Case("image-black", photograph(lambda: even(0), "b.jpg"), "views/images/b.jpg", SECOND, "one even grey, 0 of 255"),
+    Case("image-white", photograph(lambda: even(255)), "views/images/002.png", SECOND, "one even grey, 255 of 255"),
+    Case("image-grey", photograph(lambda: even(127, 3.0)), "views/images/002.png", SECOND, "one even grey, 127"),
+    Case("image-grey-jpeg", photograph(lambda: even(127, 3.0), "g.jpg"), "views/images/g.jpg", SECOND, "one even grey"),
+    Case("video-black", lambda f: even(1, 1.0).save(f / "video/left/+010.jpg"), "video/left/+010.jpg",
+         "frames[6].file_path", "one even grey"),
+    Case("image-of-floats-to-255", photograph(lambda: ramp(255.0), "f.tif"), "views/images/f.tif", SECOND,
+         "lie in [0, 1]"),
+    Case("image-of-floats-nan", photograph(lambda: ramp(math.nan), "f.tif"), "views/images/f.tif", SECOND,
+         "lie in [0, 1]"),
+    Case("image-transparent", photograph(transparent), "views/images/002.png", SECOND, "masked or transparent"),
+    Case("image-heic",
+         lambda f: ((f / "views/images/a.heic").write_bytes(b"ftypheic"),
+                    edit(VIEWS, "frames", 2, "file_path", to="images/a.heic")(f)),
+         "views/images/a.heic", SECOND, "convert it to JPEG or PNG"),
+    Case("mask-black", black_mask, "views/mask.png", "frames[1].mask_path", "masked or transparent"),
+    Case("masks-the-wrong-way-round", masks_round_the_soil, VIEWS, "frames[0].transform_matrix", "masks are black"),
+    Case("depth-of-8-bits", depth("d.png", np.full((240, 320), 150, np.uint8)), "views/d.png", DEPTH, "8 bits"),
+    Case("depth-of-8-bits-npy", depth("d.npy", np.full((240, 320), 150, np.uint8)), "views/d.npy", DEPTH, "8 bits"),
+    Case("depth-of-colours", depth("d.png", np.full((240, 320, 3), 150, np.uint8)), "views/d.png", DEPTH, "8 bits"),
+    Case("depth-float-millimetres", depth("d.npy", np.full((240, 320), 900.0)), "views/d.npy", DEPTH, "metres"),
+    Case("depth-whole-metres", depth("d.npy", np.full((240, 320), 1)), "views/d.npy", DEPTH, "millimetres"),
+    Case("depth-unknown", depth("d.npy", np.full((240, 320), math.nan)), "views/d.npy", DEPTH, "no depth is known"),
+    Case("depth-of-another-size", depth("d.npy", np.ones((320, 240))), "views/d.npy", DEPTH, "(240, 320)"),
     # paths
     Case("path-absolute", outside("absolute"), VIEWS, FIRST, LEAVES),
     Case("path-with-dots", outside("dots"), VIEWS, FIRST, LEAVES),
@@ -208,6 +345,10 @@ CASES = [
     Case("path-endless", edit(VIEWS, "frames", 1, "file_path", to="a" * 5000), VIEWS, FIRST,
          "no usable path"),
     Case("path-is-a-number", edit(VIEWS, "frames", 1, "file_path", to=7), VIEWS, FIRST, "expected text"),
+    Case("path-with-backslashes-leaves", edit(VIEWS, "frames", 1, "file_path", to="..\\..\\..\\x.jpg"), VIEWS, FIRST,
+         LEAVES),
+    Case("path-without-suffix-of-two", both(photograph(lambda: even(9), "001.png"),
+         edit(VIEWS, "frames", 1, "file_path", to="./images/001")), VIEWS, FIRST, "001.jpg, 001.png"),
     # matrices
     Case("matrix-stretches", edit(VIEWS, *POSE, to=STRETCHED), VIEWS, MATRIX, "not a rigid motion"),
     Case("matrix-scales", edit(VIEWS, *POSE, to=DOUBLED), VIEWS, MATRIX, "it scales by 2"),
@@ -252,6 +393,22 @@ CASES = [
     # experiment.json
     Case("set-missing", lambda f: (f / SET).unlink(), SET, None, "no experiment.json"),
     Case("set-not-json", replace(SET, "format: splatsoil"), SET, None, "not JSON"),
+    Case("set-with-a-comment", replace(SET, '{\n "name": "a", // mine\n "up": "z"}'), SET, None,
+         "comments, but there is one in line 2, column 15"),
+    Case("set-with-a-comment-line", replace(SET, '{\n # mine\n "up": "z"}'), SET, None, "in line 2, column 2"),
+    Case("set-with-a-trailing-comma", replace(SET, '{"name": "a",\n "up": "z",\n}'), SET, None, "omma"),
+    Case("set-with-a-trailing-comma-in-a-list", replace(SET, '{"gravity": [0, 0, -9.81,\n]}'), SET, None, "omma"),
+    Case("set-with-a-key-twice", replace(SET, '{"bed": {"density": 1, "density": 2}}'), SET, None,
+         "'density' is given twice"),
+    Case("key-misspelt", renamed(SET, "gravity", to="gravty"), SET, "gravty", "did you mean 'gravity'?"),
+    Case("key-misspelt-of-the-bed", renamed(SET, "bed", "floor_friction", to="floor_fricton"), SET,
+         "bed.floor_fricton", "did you mean 'floor_friction'?"),
+    Case("key-in-capitals", renamed(SET, "tool", "friction", to="Friction"), SET, "tool.Friction", "'friction'?"),
+    Case("key-with-a-hyphen", renamed(SET, "frame_rate", to="frame-rate"), SET, "frame-rate", "'frame_rate'?"),
+    Case("key-misspelt-of-the-lens", renamed(VIEWS, "camera_model", to="camera_modle"), VIEWS, "camera_modle",
+         "'camera_model'?"),
+    Case("key-misspelt-of-a-frame", edit(VIEWS, "frames", 1, "mask_pth", to="m.png"), VIEWS, "frames[1].mask_pth",
+         "'mask_path'?"),
     Case("set-is-binary", replace(SET, b"\x89PNG\xff\xfe"), SET, None, "not a text file"),
     Case("set-is-a-list", replace(SET, "[1, 2]"), SET, None, "expected a JSON object"),
     Case("set-nested-endlessly", replace(SET, "[" * 100_000), SET, None, "not usable JSON"),
@@ -293,6 +450,15 @@ CASES = [
     Case("motion-missing", lambda f: (f / "tool_motion.csv").unlink(), "tool_motion.csv", "tool.motion",
          "no such file"),
     Case("motion-header", cell(0, 5, "qx"), "tool_motion.csv", "line 1", "expected the header"),
+    Case("motion-header-lacks-a-column", cell(0, 5, "w"), "tool_motion.csv", "line 1", "; qw must be there once"),
+    Case("motion-in-other-units-by-its-header", cell(0, 2, "x [mm]"), "tool_motion.csv", "line 1", "; x must be there"),
+    Case("motion-without-header", replace("tool_motion.csv", "0,0,0.2,0.25,0.21,1,0,0,0\n"), "tool_motion.csv",
+         "line 1", "expected the header"),
+    Case("motion-with-decimal-commas-and-no-other-mark",
+         replace("tool_motion.csv", "frame,time,x,y,z,qw,qx,qy,qz\n0,0,0,2,0,25,0,21,1,0,0,0\n"), "tool_motion.csv",
+         "line 2", "12 values where the header has 9"),
+    Case("motion-with-thousands", replace("tool_motion.csv", "frame;time;x;y;z;qw;qx;qy;qz\n0;0;1.000,2;0;0;1;0;0;0\n"),
+         "tool_motion.csv", "x, line 2", "'1.000.2' is not a number"),
     Case("motion-empty", replace("tool_motion.csv", ""), "tool_motion.csv", "line 1", "expected the header"),
     Case("motion-without-rows", replace("tool_motion.csv", "frame,time,x,y,z,qw,qx,qy,qz\n"), "tool_motion.csv", None,
          "no rows"),
@@ -318,6 +484,25 @@ CASES = [
          "never touches"),
     Case("motion-in-millimetres", motion(lambda t: t * [1, 1, 1e3, 1e3, 1e3, 1, 1, 1, 1]), "tool_motion.csv", "x,y,z",
          "never touches"),
+    Case("motion-in-milliseconds", times(lambda t: 1000.0 * t), "tool_motion.csv", LAST, "is at 800 s"),
+    Case("motion-at-half-its-times", times(lambda t: 0.5 * t), "tool_motion.csv", LAST, "is at 0.4 s"),
+    Case("motion-a-twentieth-too-slow", times(lambda t: 1.05 * t), "tool_motion.csv", LAST, "is at 0.84 s"),
+    Case("motion-a-thousandth-as-long", times(lambda t: 1e-3 * t), "tool_motion.csv", LAST, "is at 0.0008 s"),
+    Case("motion-in-unix-time", times(lambda t: UNIX + t), "tool_motion.csv", "time, frame 0", "is at 1700000000 s"),
+    Case("video-in-milliseconds", video_times(lambda t: 1000.0 * t), VIDEO, "frames[6].time", "is at 200 s"),
+    Case("all-in-unix-time", both(times(lambda t: UNIX + t), video_times(lambda t: UNIX + t)), SET, "frame_rate",
+         "0 at frame 0"),
+    Case("frame-rate-of-50-000", edit(SET, "frame_rate", to=50_000), SET, "frame_rate", "where 50000 frames a second"),
+    Case("frame-rate-of-25", edit(SET, "frame_rate", to=25.0), SET, "frame_rate", "where 25 frames a second"),
+    Case("all-a-thousand-times-as-fast",
+         both(edit(SET, "frame_rate", to=50_000), times(lambda t: 1e-3 * t), video_times(lambda t: 1e-3 * t)),
+         "tool_motion.csv", "time", "faster than sound"),
+    Case("motion-too-deep", motion(lambda t: t - np.eye(9)[4] * 0.2), "tool_motion.csv", "x,y,z",
+         "passes the bed's floor"),
+    Case("tool-ten-times-as-large", tool_scaled(10.0), "tool.stl", "vertices", "1.2 m long"),
+    Case("tool-ten-times-as-large-above-its-tip", tool_scaled(10.0, 0.06), "tool.stl", "vertices", "1.2 m long"),
+    Case("tool-in-inches", tool_scaled(39.37), "tool.stl", "vertices", "meshes and motions are in metres"),
+    Case("tool-by-inches-too-small", tool_scaled(1 / 39.37), "tool.stl", "vertices", "meshes are in metres"),
     Case("force-header", cell(0, 2, "force_x", "tool_force.csv"), "tool_force.csv", "line 1", "expected the header"),
     Case("force-nan", cell(3, 2, "nan", "tool_force.csv"), "tool_force.csv", "fx, line 4", "not a finite number"),
     Case("force-missing", lambda f: (f / "tool_force.csv").unlink(), "tool_force.csv", "tool.force", "no such file"),
@@ -375,6 +560,27 @@ def test_an_error_as_json(small_set: Path, capsys: pytest.CaptureFixture[str]) -
 def test_links_inside_the_folder_are_allowed(small_set: Path) -> None:
     (small_set / "views/images/link.jpg").symlink_to(small_set / "views/images/001.jpg")
     edit(VIEWS, "frames", 1, "file_path", to="images/link.jpg")(small_set)
+    assert len(Measurement.load(small_set).views) == 4
+
+
+@pytest.mark.parametrize("name", ["images\\001.jpg", "./images/001", ".\\images\\001", "./images/001.jpg"])
+def test_paths_as_windows_and_blender_write_them(name: str, small_set: Path) -> None:
+    edit(VIEWS, "frames", 1, "file_path", to=name)(small_set)
+    assert Measurement.load(small_set).views[1].path.samefile(small_set / "views/images/001.jpg")
+
+
+def test_what_others_write_into_transforms_files_is_no_misspelling(small_set: Path) -> None:
+    """Fields of nerfstudio's, instant-ngp's, Polycam's and Record3D's files that are none of ours."""
+    file = small_set / VIEWS
+    top = ("aabb_scale", "scale", "offset", "applied_transform", "applied_scale", "ply_file_path", "train_filenames",
+           "orientation_override", "fisheye_crop_radius", "near", "far", "sharpness", "integer_depth_scale",
+           "camera_convention", "up", "version")  # fmt: skip
+    own = ("sharpness", "colmap_im_id", "rotation", "timestamp", "blur_score", "semantic_path", "normal_file_path")
+    data = json.loads(file.read_text())
+    data |= dict.fromkeys(top, 1)
+    for frame in data["frames"]:
+        frame |= dict.fromkeys(own, 1)
+    file.write_text(json.dumps(data))
     assert len(Measurement.load(small_set).views) == 4
 
 

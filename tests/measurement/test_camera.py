@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,10 @@ import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from splatsoil.errors import MeasurementError
 from splatsoil.measurement import Camera, Frame
+from splatsoil.measurement.fields import Fields
+from splatsoil.measurement.frames import read_camera
 
 POINTS = np.array([[0.1, -0.2, 1.0], [0.5, 0.4, 1.5], [-0.7, 0.3, 2.0], [0.0, 0.0, 1.0], [1.2, -0.9, 1.6]])
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -203,11 +207,56 @@ def test_masks_transparency_and_depth(tmp_path: Path) -> None:
     by_alpha, by_mask = Frame(camera, tmp_path / "rgba.png"), Frame(
         camera, tmp_path / "rgba.png", mask_path=tmp_path / "mask.png", depth_path=tmp_path / "depth.png"
     )  # fmt: skip
-    np.testing.assert_array_equal(by_alpha.mask(), alpha > 0)
+    np.testing.assert_array_equal(by_alpha.mask(), alpha > 127)
     np.testing.assert_array_equal(by_mask.mask(), [[False, True, True, True], [True, True, True, False]])
     np.testing.assert_allclose(by_mask.depth(), [[0, 1.5, 65.535, 0.007], [0.001, 0.002, 0.003, 0.004]], rtol=1e-6)
     np.testing.assert_allclose(replace(by_mask, depth_path=tmp_path / "depth.npy").depth(), 1.25)
     assert by_alpha.image().shape == (2, 4, 3)
+
+
+RADIAL = {"k1": 0.05, "k2": 0.01}
+LENS = {"w": 320, "h": 240, "fl_x": 300.0, "fl_y": 310.0, "cx": 160.0, "cy": 120.0}
+ONE = {key: value for key, value in LENS.items() if key != "fl_y"}
+POSED = {"transform_matrix": np.eye(4).tolist()}
+
+
+@pytest.mark.parametrize(
+    ("gives", "means"),
+    [
+        ({**ONE, "camera_model": "SIMPLE_PINHOLE"}, {"fy": 300.0, "model": "PINHOLE"}),
+        ({**ONE, "camera_model": "SIMPLE_RADIAL", "k1": 0.1}, {"fy": 300.0, "k1": 0.1, "model": "OPENCV"}),
+        ({**ONE, "fl_y": 300.0, "camera_model": "RADIAL", **RADIAL}, {"k1": 0.05, "k2": 0.01, "model": "OPENCV"}),
+        ({**LENS, "is_fisheye": True, **RADIAL}, {"k2": 0.01, "model": "OPENCV_FISHEYE"}),
+        ({**LENS, "is_fisheye": False, **RADIAL}, {"k2": 0.01, "model": "OPENCV"}),
+        ({**LENS, "k3": 0.3, "k4": 0.4, "k5": 0, "k6": 0.0}, {"k3": 0.3, "k4": 0.4, "model": "OPENCV"}),
+        ({**LENS, "camera_angle_x": 2 * math.atan(160 / 300.0)}, {"fx": 300.0, "fy": 310.0}),
+        ({**LENS, "fl_x": None, "camera_angle_x": 2 * math.atan(160 / 250.0)}, {"fx": 250.0, "fy": 310.0}),
+    ],
+)
+def test_lenses_as_nerfstudio_and_instant_ngp_name_them(gives: dict, means: dict) -> None:
+    camera = read_camera(Fields({**gives, **POSED}, Path("t.json")), "")
+    assert {key: pytest.approx(getattr(camera, key)) if key != "model" else camera.model for key in means} == means
+
+
+@pytest.mark.parametrize(
+    ("gives", "field", "says"),
+    [
+        ({"k5": 0.2}, "k5", "has no k5"),
+        ({"k6": -0.2, "is_fisheye": True}, "k6", "OPENCV_FISHEYE has no k6"),
+        ({"camera_model": "OPENCV_FISHEYE", "p1": 1e-3}, "p1", "has no p1"),
+        ({"camera_model": "SIMPLE_RADIAL", "fl_y": 300.0, "k2": 1e-3}, "k2", "has no k2"),
+        ({"distortion_params": [0.1, 0.0]}, "distortion_params", "has no distortion_params"),
+        ({"camera_model": "SIMPLE_PINHOLE"}, "fl_y", "one focal length"),
+        ({"camera_model": "OPENCV", "is_fisheye": True}, "is_fisheye", "contradicts"),
+        ({"camera_model": "OPENCV_FISHEYE", "is_fisheye": False}, "is_fisheye", "contradicts"),
+        ({"is_fisheye": 1}, "is_fisheye", "true or false"),
+        ({"camera_angle_y": 1.0}, "fl_y", "contradict camera_angle_y"),
+    ],
+)
+def test_what_of_a_lens_is_not_understood_is_refused(gives: dict, field: str, says: str) -> None:
+    with pytest.raises(MeasurementError, match=says) as caught:
+        read_camera(Fields({**LENS, **gives, **POSED}, Path("t.json")), "")
+    assert caught.value.field == field
 
 
 def test_wrong_cameras_are_refused() -> None:

@@ -130,6 +130,62 @@ def test_real_photographs_of_a_boulder(measured_data: Path) -> None:
         assert likeness(0) > max(likeness(4), likeness(-4)) + 0.1, "four pixels off, the colours no longer fit"
 
 
+def test_colmap_without_lines_of_points(poses: list[tuple], tmp_path: Path) -> None:
+    """All images are read, whether each one's points have a line, an empty line or none; some names are awkward."""
+    (tmp_path / "images" / "1 2 3.png").symlink_to(tmp_path / "images" / "a.png")
+    (tmp_path / "images" / "4.png").symlink_to(tmp_path / "images" / "a.png")
+    poses = [*poses, (*poses[0][:2], "1 2 3.png"), (*poses[1][:2], "4.png")]
+    colmap_text(tmp_path, "PINHOLE", MODELS[1][2], poses)
+    whole = read_colmap(tmp_path, tmp_path / "images")
+    assert [f.path.name for f in whole] == ["1 2 3.png", "4.png", "a.png", "c.png", "b 2.png"]
+    lines = (tmp_path / "images.txt").read_text().splitlines()
+    bare = [line for line in lines if line.startswith("#") or line.endswith(".png")]
+    for kept in (bare, lines[:3] + lines[4:], [*bare[:4], "1.0 2.0 -1", *bare[4:]]):
+        (tmp_path / "images.txt").write_text("\n".join(kept))
+        frames = read_colmap(tmp_path, tmp_path / "images")
+        assert [f.path for f in frames] == [f.path for f in whole]
+        for frame, same in zip(frames, whole, strict=True):
+            np.testing.assert_array_equal(frame.camera.camera_to_world, same.camera.camera_to_world)
+
+
+@pytest.mark.parametrize("binary", [False, True], ids=["text", "binary"])
+def test_a_colmap_camera_that_no_image_uses_may_be_of_any_model(
+    binary: bool, poses: list[tuple], tmp_path: Path
+) -> None:
+    if binary:
+        colmap_binary(tmp_path, 1, MODELS[1][2], poses)
+        raw = (tmp_path / "cameras.bin").read_bytes()
+        other = struct.pack("<IiQQ12d", 3, 6, 32, 24, *(1.0,) * 12)
+        (tmp_path / "cameras.bin").write_bytes(struct.pack("<Q", 2) + other + raw[8:])
+    else:
+        colmap_text(tmp_path, "PINHOLE", MODELS[1][2], poses)
+        text = (tmp_path / "cameras.txt").read_text()
+        (tmp_path / "cameras.txt").write_text("3 FULL_OPENCV 32 24" + " 1.0" * 12 + "\n" + text)
+    assert {f.camera.fy for f in read_colmap(tmp_path, tmp_path / "images")} == {51.0}
+
+
+@pytest.mark.parametrize(
+    ("gives", "fx", "fy", "cx", "k1"),
+    [
+        ({"camera_angle_x": 0.6911112070083618}, 1111.1110311937682, 1111.1110311937682, 400.0, 0.0),
+        ({"camera_angle_x": 0.6911112070083618, "camera_angle_y": 0.6}, 1111.1110311937682, 969.818, 400.0, 0.0),
+        ({"fl_x": 900.0, "cx": 390.0, "k1": 0.1}, 900.0, 900.0, 390.0, 0.1),
+        ({"camera_angle_x": 0.6911112, "fl_x": 1111.1, "fl_y": 1100.0, "cx": 1.0}, 1111.1, 1100.0, 1.0, 0.0),
+    ],
+)
+def test_what_blender_files_say_of_the_lens(
+    gives: dict, fx: float, fy: float, cx: float, k1: float, tmp_path: Path
+) -> None:
+    """Nothing of it is left out: 800 x 600 pixels, so that half of 600 by tan 0.3 are 969.8."""
+    Image.effect_noise((800, 600), 60).save(tmp_path / "a.png")
+    entry = {"file_path": "./a", "transform_matrix": np.eye(4).tolist()}
+    (tmp_path / "t.json").write_text(json.dumps({**gives, "frames": [entry]}))
+    (frame,) = read_blender(tmp_path / "t.json")
+    camera = frame.camera
+    assert (camera.fx, camera.fy, camera.cx, camera.k1) == pytest.approx((fx, fy, cx, k1), abs=1e-3)
+    assert camera.cy == 300.0 and camera.has_distortion == (k1 != 0.0)
+
+
 def test_blender_files(tmp_path: Path) -> None:
     """NeRF-synthetic's own numbers: 800 pixels and camera_angle_x 0.6911 make a focal length of 1111.1."""
     (tmp_path / "train").mkdir()
@@ -180,13 +236,18 @@ def test_faulty_imports_are_named(poses: list[tuple], tmp_path: Path) -> None:
         (tmp_path / "images.bin").write_bytes(raw[:length])
         assert "truncated" in complaint(f"byte {length}")
     colmap_binary(tmp_path, 6, (50.0,) * 12, poses)
-    assert "number 6" in complaint("camera 7, MODEL")
+    assert "FULL_OPENCV" in complaint("camera 7, MODEL")
+    colmap_binary(tmp_path, 77, (50.0,) * 12, poses)
+    assert "unknown model 77" in complaint("camera 7, MODEL")
 
     file = tmp_path / "transforms_train.json"
+    sized = {"file_path": "images/a", "transform_matrix": np.eye(4).tolist()}
     for data, says in (
         ({"frames": []}, "camera_angle_x: missing"),
-        ({"camera_angle_x": 40.0}, "radians"),
+        ({"camera_angle_x": 40.0, "frames": [{"file_path": "images/a"}]}, "radians"),
         ({"camera_angle_x": 0.7, "frames": [{"file_path": "x"}]}, "no such image"),
+        ({"camera_angle_x": 0.7, "fl_x": 30.0, "frames": [{"file_path": "images/a"}]}, "contradict camera_angle_x"),
+        ({"camera_angle_x": 0.7, "w": 64, "frames": [sized]}, "32 x 24 pixels where w and h"),
         ({"camera_angle_x": 0.7, "frames": [{"file_path": "images/a", "transform_matrix": [[2.0] * 4] * 4}]}, "rigid"),
     ):
         file.write_text(json.dumps(data))

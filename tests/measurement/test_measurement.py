@@ -77,6 +77,33 @@ def test_the_hash_is_of_what_the_set_consists_of(small_set: Path) -> None:
     assert Measurement.load(moved).hash != before
 
 
+@pytest.mark.parametrize("kind", ["views", "video"])
+def test_the_order_of_frames_in_a_file_changes_nothing(kind: str, plow_dry: Path, tmp_path: Path) -> None:
+    shutil.copytree(plow_dry, tmp_path / "set")
+    file = tmp_path / "set" / kind / "transforms.json"
+    data = json.loads(file.read_text())
+    np.random.default_rng(0).shuffle(data["frames"])
+    file.write_text(json.dumps(data))
+    loaded = (Measurement.load(plow_dry), Measurement.load(tmp_path / "set"))
+    listed, shuffled = (
+        [
+            (f.path.relative_to(m.folder), f.camera_name, f.frame, f.time, f.camera.camera_to_world.tobytes())
+            for f in (*m.views, *m.video, *m.pre_roll)
+        ]
+        for m in loaded
+    )
+    assert shuffled == listed and list(loaded[1].cameras) == ["left", "right"]
+
+
+def test_a_relative_set_is_found_from_another_working_folder(small_set: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(small_set.parent)
+    m = Measurement.load(small_set.name)
+    monkeypatch.chdir("/")
+    there = Measurement.load(small_set)
+    assert m.hash == there.hash and remarks(m) == remarks(there) and m.folder == there.folder
+    np.testing.assert_array_equal(m.views[0].image(), there.views[0].image())
+
+
 def made_up(**bend: float) -> dict:
     """The parts of a set that stands on nothing but this file."""
     matrix = np.eye(4)
@@ -174,7 +201,7 @@ def test_nothing_is_overwritten_and_faults_leave_nothing(tmp_path: Path) -> None
         (lambda e, v, w: w.update(frames=[f for f in w["frames"] if f["frame"] >= 0]), "no pre-roll"),
         (lambda e, v, w: w.update(frames=[f for f in w["frames"] if f["frame"] < 0]), "nothing to compare with"),
         (lambda e, v, w: w["frames"].pop(), "Camera 'right' lacks 1 frames that others have: 10"),
-        (lambda e, v, w: e.update(frame_rate=25.0), "are not where 25 frames a second"),
+        (lambda e, v, w: w["frames"][-1].update(time=0.215), "1 video frames are not where 50 frames a second"),
         (lambda e, v, w: [f.update(frame=90, time=1.8) for f in w["frames"] if f["frame"] == 10], "does not cover"),
         (lambda e, v, w: e["bed"].update(lower=[0.1, 0.2, -0.1], upper=[0.5, 0.3, 0.06]), "in only 44 %"),
         (lambda e, v, w: v.update(k1=-3.0), "folds over before the image's corners"),
@@ -221,6 +248,10 @@ def test_remarks_on_the_tools_motion(small_set: Path) -> None:
     assert "skips frames (first 7)" in said(rows[:7] + rows[8:])
     still = [",".join(row.split(",")[:2] + rows[0].split(",")[2:]) for row in rows]
     assert "never moves" in said(still)
+    w, x, y, z = (slice(k, k + 1) for k in range(5, 9))
+    swapped = [row.split(",") for row in rows]
+    swapped = [r[:5] + r[x] + r[y] + r[z] + r[w] for r in swapped]
+    assert "is their order x, y, z, w" in said([",".join(row) for row in swapped])
     jump = [row.replace(",0.2,", ",0.4,", 1) if i == 20 else row for i, row in enumerate(rows)]
     assert "jumps by 200 mm before frame 20" in said(jump)
 

@@ -79,6 +79,48 @@ def test_plow_drys_motion(plow_dry: Path) -> None:
     np.testing.assert_allclose(motion.twist(0.01)[0], [0, 0, -0.2], atol=1e-12)
 
 
+HEADER = ["frame", "time", "x", "y", "z", "qw", "qx", "qy", "qz"]
+ROWS = [[0, 0.0, 0.25, 1.5, -0.5, 1.0, 0.0, 0.0, 0.0], [1, 0.02, 0.26, 1.5, -0.5, 0.8, 0.6, 0.0, 0.0]]
+ORDER = [1, 0, 4, 3, 2, 6, 7, 8, 5]
+
+
+def csv(mark: str = ",", header: list[str] = HEADER, rows: list[list] = ROWS, first: str = "", end: str = "") -> str:
+    return first + "\n".join(mark.join(str(v) for v in row) + end for row in (header, *rows)) + "\n"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        csv(),
+        csv(first="# made by a robot\n\n"),
+        csv(first="# "),
+        csv().replace("\n1,", "\n# paused\n1,"),
+        csv("\t"),
+        csv("\t").replace(".", ","),
+        csv(";"),
+        csv(";").replace(".", ","),
+        csv("; ").replace(".", ","),
+        csv(header=[name.upper() for name in HEADER]),
+        csv(end=","),
+        csv(end=",").replace("0,\n", "0\n"),
+        csv(header=[*HEADER, "Torque"], rows=[[*row, 7.0] for row in ROWS]),
+        csv(header=["note", *HEADER], rows=[["", *row] for row in ROWS]),
+        csv(header=[HEADER[k] for k in ORDER], rows=[[row[k] for k in ORDER] for row in ROWS]),
+        "\ufeff" + csv().replace("\n", "\r\n"),
+    ],
+    ids=["plain", "comment", "header-in-comment", "comment-between", "tabs", "tabs-comma", "semicolons",
+         "semicolons-comma", "semicolons-space", "capitals", "trailing", "trailing-header", "further", "further-first",
+         "order", "windows"],
+)  # fmt: skip
+def test_tables_that_are_unambiguous_are_read(text: str, tmp_path: Path) -> None:
+    (tmp_path / "motion.csv").write_text(text, encoding="utf-8", newline="")
+    motion = ToolMotion.read(tmp_path / "motion.csv")
+    np.testing.assert_array_equal(motion.frames, [0, 1])
+    np.testing.assert_array_equal(motion.times, [0.0, 0.02])
+    np.testing.assert_array_equal(motion.positions, [row[2:5] for row in ROWS])
+    np.testing.assert_allclose(motion.quaternions, [row[5:] for row in ROWS], atol=1e-15)
+
+
 def test_one_row_is_a_resting_tool() -> None:
     motion = ToolMotion([0], [0.0], [[1, 2, 3]], [[1, 0, 0, 0]])
     np.testing.assert_array_equal(motion.pose(4.0)[1], [1, 2, 3])
