@@ -154,7 +154,7 @@ def compare(scene: Plough, repeats: int) -> Group:
     if None not in errors:
         notes.append(
             f"Not the same accuracy: heights at the set's true frames are {errors[0]:.1f} mm off with ours and "
-            f"{errors[1]:.1f} mm with the other (why: docs/numerics-evidence.md)."
+            f"{errors[1]:.1f} mm with the other (why: docs/numerics.md)."
         )
     return Group(title, tuple(_judged(row) for row in rows), tuple(notes))
 

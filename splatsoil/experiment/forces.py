@@ -1,7 +1,7 @@
 """The force on the tool, where it was measured: instruments beside the cameras.
 
 Pictures leave a valley in which friction and cohesion make up for each other. The force that moves the tool differs
-along it by a factor of three to four (docs/numerics-evidence.md), so even a force that is believed to 15 % shortens it.
+along it by a factor of three to four (docs/numerics.md), so even a force that is believed to 15 % shortens it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ ALONG, UP = "force along", "force up"
 REGION, UNIT = "tool", "% of the largest force"
 STAGE = "pushing"
 """In which the force is believed. Pressed in from above, a plate's edge bears up to 1.6 times what it bears in another
-solver's soil; when the tool stands, four fifths (docs/numerics-evidence.md)."""
+solver's soil; when the tool stands, four fifths (docs/numerics.md)."""
 LEAST = 0.25
 """Share of the largest force below which it isn't looked at: where soil is first touched is a matter of cells."""
 FEWEST = 2
@@ -32,7 +32,7 @@ SENSOR = 1.0
 """Standard deviation of what is measured, in the features' unit."""
 ERROR = 0.1
 """Standard deviation of all simulated forces over their size, together: at the true parameters ours are within 5 % of
-the example sets' and up to 14 % above another solver's in worlds of its own (docs/numerics-evidence.md), and 2 to 28 %
+the example sets' and up to 14 % above another solver's in worlds of its own (docs/numerics.md), and 2 to 28 %
 off Reece's equation (docs/validation.md)."""
 OWN = 0.1
 """Likewise of one instrument's, beside that: ours upwards are 0 to 9 % too small."""

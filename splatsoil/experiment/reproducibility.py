@@ -24,7 +24,7 @@ def between_solvers(parameter: Parameter, value: float, effects: Iterable[Effect
 
     Maximum likelihood over sealed worlds of an implicit solver, beyond all that a diagnosis finds by itself: sixteen
     with cohesion or viscosity hidden (docs/criticism-evidence.md, seeds 41 to 44), to which other effects of soil are
-    taken to be alike, and thirteen in which nothing of soil was seen (docs/hidden-worlds-before.md, seeds 86, 87 and
+    taken to be alike, and thirteen in which nothing of soil was seen (docs/hidden-worlds.md, seeds 86, 87 and
     93; not the weak layer, whose angle is a mean of two); all before soil gave way to the tool as it does now. What
     cameras report doesn't hang on a solver, and of what only shapes an effect nothing is known.
     """

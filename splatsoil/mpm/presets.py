@@ -22,8 +22,8 @@ class Preset:
         name: what the command line calls it.
         cells_across_tool: cells along the tool's second longest edge (a blade's width).
         particles_per_edge: particles along a cell's edge at the start.
-        young: Young's modulus in Pa. Dry sand under a tool is nearly rigid, so the answer must not hang on it; a soft
-            skeleton allows long steps.
+        young: Young's modulus in Pa. Sand is stiffer, but three times as much changes nothing (docs/numerics.md), and a
+            softer skeleton allows longer steps.
         poisson: Poisson's ratio.
         courant: sound-wave Courant number of a substep.
         transport: most cells the tool may travel in one step of the particles.
@@ -37,16 +37,16 @@ class Preset:
     poisson: float = 0.3
     courant: float = 0.5
     transport: float = 0.1
-    way: float = 0.1
+    way: float = 1.0 / 15.0
 
 
 PRESETS: dict[str, Preset] = {
     preset.name: preset
     for preset in (
         Preset("tiny", cells_across_tool=3.0, transport=0.2, way=0.2),
-        Preset("small", cells_across_tool=6.0, way=1.0 / 15.0),
-        Preset("fine", cells_across_tool=8.0, transport=0.05, way=0.05),
-        Preset("paper", cells_across_tool=3.2, young=1.0e6, poisson=0.2),
+        Preset("small", cells_across_tool=6.0),
+        Preset("fine", cells_across_tool=9.0),
+        Preset("paper", cells_across_tool=3.2, young=1.0e6, poisson=0.2, way=0.1),
     )
 }
 

@@ -80,7 +80,7 @@ def test_ours_are_read_as_what_they_are(plow_dry: Path, monkeypatch: pytest.Monk
     (found,) = bench.read(soil, (features, force), changed=False)
     # one seed scatters by 0.3°
     assert found.off["friction_angle"] == pytest.approx(1.5, abs=0.5)
-    # steeper soil bears more, by about 6 % a degree (docs/numerics-evidence.md, what the tool's force tells)
+    # steeper soil bears more, by about 6 % a degree (docs/numerics.md, what the tool's force tells)
     assert found.force == pytest.approx(0.92, abs=0.05)
 
 
