@@ -29,7 +29,7 @@ FloatArray = npt.NDArray[np.float64]
 
 SMOOTHING = 1.0
 """Standard deviation of the kernel in particle spacings. Less shows single particles, more rounds off trench and heaps,
-so that soil looks weaker than it is and a fit takes it to be stronger (docs/photographs.md)."""
+so that soil looks weaker than it is and a fit takes it to be stronger."""
 
 BLOCK = 64
 """Threads of a GPU's block that work on a map: few, so that it is shared out evenly."""
