@@ -78,22 +78,26 @@ def test_particles_fill_the_bed_and_keep_their_number(world: World) -> None:
 
 
 def test_the_soil_pushes_back(world: World) -> None:
-    """Nothing before the plate touches; then against the push along +x, and up, within 1.5 times of McKyes' blade."""
+    """Nothing before the plate touches; then against the push along +x, and up, between McKyes' blades in soil of the
+    angle that the cone has in triaxial compression (31) and of that which it has in plane strain (45.9 degrees)."""
     force = world.measurement.tool.force
     assert force is not None
     assert np.abs(force[:3, 2:]).max() == 0.0
     pushing = force[force[:, 0] > 45, 2:].mean(axis=0)
     assert pushing[0] < -20.0 and pushing[2] > 0.0 and abs(pushing[1]) < 0.1 * abs(pushing[0])
     depth, width, weight = 0.07, 0.12, 1600.0 * 9.81
-    # upright, delta = 16.7 deg, phi = 31 deg: N_gamma = 2.81 at beta = 19.4 deg, times 2.1 for a narrow blade
-    reach = depth / np.tan(np.radians(19.4))
-    narrow = 1.0 + 2.0 / 3.0 * reach / width
-    # and what it has pushed up by then, half the way on, as a surcharge on the wedge, for which N_q = 2 N_gamma
     along = world.measurement.tool.motion.positions[:, 0]
     way = along[45:].mean() - along[0]
-    heap = depth * width * way / (reach * width * narrow)
-    blade = weight * depth * (depth + 2.0 * heap) * width * 2.81 * narrow
-    assert blade / 1.5 < -pushing[0] < blade * 1.5
+
+    def blade(factor: float, slip_plane: float) -> float:
+        """Upright, delta = 16.7 deg, with N_gamma at its slip plane (deg), narrow, and with what it has pushed up by
+        then, half the way on, as a surcharge on the wedge, for which N_q = 2 N_gamma."""
+        reach = depth / np.tan(np.radians(slip_plane))
+        narrow = 1.0 + 2.0 / 3.0 * reach / width
+        heap = depth * width * way / (reach * width * narrow)
+        return float(weight * depth * (depth + 2.0 * heap) * width * factor * narrow)
+
+    assert blade(2.81, 19.4) < -pushing[0] < blade(7.46, 13.1)
 
 
 def test_nothing_moves_in_the_pre_roll_but_the_noise(world: World) -> None:
