@@ -24,6 +24,8 @@ YIELD_PRESSURE = 1.0e8
 """Pa; high enough never to be met, low enough that single precision still resolves the cohesion's share of it."""
 ROUGH = 1.0
 """Friction of an obstacle: soil sticks to it and shears within itself."""
+WIDTH = 0.12
+"""Of the blade by which `Numerics` are stated, m."""
 WALL = 0.1
 """Half the thickness of a wall, m."""
 
@@ -59,6 +61,16 @@ class Numerics:
             voxel=0.75 * self.voxel,
             substeps=math.ceil(self.substeps / 0.75),
             iterations=math.ceil(self.iterations / 0.75),
+        )
+
+    def across(self, width: float) -> Numerics:
+        """As these resolve a tool 120 mm wide, one of ``width`` m: nine voxels of the defaults' or more across it."""
+        share = min(1.0, round(width, 4) / WIDTH)
+        return replace(
+            self,
+            voxel=share * self.voxel,
+            substeps=math.ceil(self.substeps / share),
+            iterations=math.ceil(self.iterations / share),
         )
 
     @classmethod

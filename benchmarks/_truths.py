@@ -20,6 +20,8 @@ MIDDLE, NOTED = (0.4, 0.25), 0.3
 """Of the bed, m, and the friction that is noted for the tool; see `splatsoil.benchmarks._scenes`."""
 BESIDE = 0.01
 """Between an obstacle and the tool that passes it, m."""
+COVER = 0.015
+"""Of soil on an obstacle, m, so that no photograph shows it."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +127,9 @@ def _buried_obstacle(rng: np.random.Generator, hidden: Hidden) -> Hidden:
     size = rng.uniform(0.03, 0.045)
     # beside the tool's way, which it must not touch
     y = rng.choice([-1.0, 1.0]) * (0.5 * hidden.scene.width + BESIDE + size)
-    x, z = rng.uniform(0.32, 0.45), 0.06
+    x = rng.uniform(0.32, 0.45)
+    over = np.array([[x + s * size, MIDDLE[1] + y + t * size] for s in (-1, 0, 1) for t in (-1, 0, 1)])
+    z = min(0.06, float(hidden.scene.setup().surface.sample(over).min()) - COVER - size)
     values = {"obstacle_radius": size, "obstacle_x": x - MIDDLE[0], "obstacle_y": y, "obstacle_height": z}
     return replace(hidden, size=size, values=values, soil={"obstacle": (x, MIDDLE[1] + y, z, size)})
 

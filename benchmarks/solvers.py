@@ -5,7 +5,8 @@ scenes that are drawn by seed: flat, wavy and sloping beds of loose and dense sa
 drum that turns, friction angles from 22 to 48 degrees. What it ploughs is kept, a file a world, and a second call goes
 on from there; from these files our solver is judged with the package or without. Started from particles that fill the
 same surface, it runs at the true angle and at others: heights are compared in patches larger than chance, the angle
-whose heights lie nearest is told, and forces are compared by stage, each as the mean over the stage's frames.
+whose heights lie nearest is told, soil cut and soil heaped up are told apart, and forces are compared by stage, each as
+the mean over the stage's frames.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
@@ -27,7 +28,7 @@ from scipy.ndimage import gaussian_filter
 from splatsoil.benchmarks._common import at_least, here, stamp, write_result
 from splatsoil.benchmarks._newton import Numerics, Run, World, load_newton, plough
 from splatsoil.benchmarks._scenes import Scene, pair, scenes
-from splatsoil.benchmarks.numerics import PATCH, FloatArray, Scan, Truth, volume_range
+from splatsoil.benchmarks.numerics import CELL, PATCH, FloatArray, Scan, Truth, pushing, volume_range
 
 from splatsoil.errors import MeasurementError, ParameterError
 from splatsoil.experiment.scene_parts import heading_of, stages_of
@@ -41,11 +42,14 @@ from splatsoil.soil.library import find_effects
 from splatsoil.soil.settings import FRICTION_ANGLE
 
 FRAMES = (50, 100, 150, 199)
-"""At which worlds are compared."""
+"""At which drawn scenes are compared; sets at those of their true particles."""
 SCALE = 1.25e-5
 """Step of kept positions, m."""
 OFFSETS = (-6.0, -3.0, 0.0, 3.0, 6.0)
 """Of the angles of our runs from the true one, degrees."""
+SETTLED = 2.0e-3
+"""Change of a patch's height below which its soil counts as neither cut nor heaped, m: three times the scatter between
+particle seeds, which would else fill a bed of 0.4 m² with a hundred cm³ of both."""
 LEAST = 0.2
 """Of a stage's force that a component must have for its ratio to be told."""
 HEIGHTS_CLOSE, FORCE_CLOSE = 1.0e-3, 0.05
@@ -58,7 +62,10 @@ class Case:
 
     Attributes:
         name: of its file.
+        kind: worlds of one kind share a check by finer voxels.
         measurement: bed, tool and motion.
+        numerics: by which the independent solver ploughs it.
+        frames: at which it is compared, from 1 on.
         values: true parameters by name.
         effects: effects that are on, by name.
         about: what its file must tell to be this one, JSON-able.
@@ -67,7 +74,10 @@ class Case:
     """
 
     name: str
+    kind: str
     measurement: Measurement
+    numerics: Numerics
+    frames: tuple[int, ...]
     values: Mapping[str, float]
     effects: tuple[str, ...]
     about: Mapping[str, Any]
@@ -75,12 +85,15 @@ class Case:
     made: Kept | None = None
 
     @classmethod
-    def drawn(cls, name: str, scene: Scene) -> Case:
+    def drawn(cls, name: str, scene: Scene, numerics: Numerics) -> Case:
         """Of a scene."""
         setup = scene.setup()
         return cls(
             name,
+            f"{scene.tool} {scene.width:g} m, {scene.tilt:g}°, friction {scene.tool_friction:g}",
             setup.experiment(),
+            numerics,
+            FRAMES,
             {"friction_angle": scene.angle},
             (),
             asdict(scene),
@@ -89,9 +102,13 @@ class Case:
 
     @classmethod
     def of_set(cls, folder: Path, numerics: Numerics) -> Case:
-        """Of a measurement set with a truth; made already, where the set was ploughed with these numerics."""
+        """Of a measurement set with a truth; made already, where it was ploughed as these numerics are for its tool.
+
+        A tool's width is its second longest edge, as for our own solver.
+        """
         truth = Truth.load(folder)
         measurement, force = truth.measurement, truth.measurement.tool.force
+        numerics = numerics.across(float(np.sort(measurement.tool.mesh.extents)[1]))
         try:
             same = Numerics.of(folder) == numerics and force is not None
         except MeasurementError:
@@ -101,7 +118,10 @@ class Case:
         about = {"set": measurement.name, **truth.values}
         return cls(
             measurement.name,
+            measurement.name,
             measurement,
+            numerics,
+            tuple(frame for frame in sorted(truth.particles) if frame > 0),
             truth.values,
             truth.effects,
             about,
@@ -114,9 +134,13 @@ class Case:
         """True friction angle, degrees."""
         return self.values["friction_angle"]
 
-    def world(self, spacing: float) -> World:
-        """As Newton takes it, of particles so far apart."""
-        cohesion = self.values.get("cohesion", 0.0)
+    def finer(self) -> Case:
+        """The same with voxels of three quarters."""
+        return replace(self, numerics=self.numerics.refined())
+
+    def world(self) -> World:
+        """As Newton takes it."""
+        cohesion, spacing = self.values.get("cohesion", 0.0), self.numerics.spacing
         return World(self.name, self.measurement, self.angle, self.start(spacing), spacing, cohesion=cohesion)
 
     def truth(self, kept: Kept) -> Truth:
@@ -175,9 +199,9 @@ def read_particles(file: Path) -> tuple[dict[int, FloatArray], float]:
 
 
 def surfaces(measurement: Measurement, particles: dict[int, FloatArray], spacing: float) -> FloatArray:
-    """Heights (frames, ny, nx) in m at the frames that are compared, of particles (n, 3) by frame."""
+    """Heights (frames, ny, nx) in m at the frames after 0, of particles (n, 3) by frame."""
     truth = Truth(measurement, particles, spacing**3, {}, ())
-    return np.array([truth.heights(particles[f], truth.volume) for f in FRAMES])
+    return np.array([truth.heights(particles[f], truth.volume) for f in sorted(particles) if f > 0])
 
 
 def _archive(file: Path, **arrays: Any) -> None:
@@ -197,7 +221,6 @@ def check_about(file: Path, about: Mapping[str, Any]) -> dict[str, Any]:
 
 def plough_missing(
     cases: Sequence[Case],
-    numerics: Numerics,
     out: Path,
     device: str,
     side_by_side: int,
@@ -206,17 +229,15 @@ def plough_missing(
     fine: bool = False,
 ) -> None:
     """Make the worlds that the folder doesn't have, so many at a time; of fine ones keep heights, not particles."""
-    about = {case.name: told(case, numerics) for case in cases}
     missing = []
     for case in cases:
         if place(out, case, fine).is_file():
-            check_about(place(out, case, fine), about[case.name])
+            check_about(place(out, case, fine), told(case))
         elif fine or case.made is None:
             missing.append(case)
-    for begin in range(0, len(missing), side_by_side):
-        group = missing[begin : begin + side_by_side]
+    for group in _groups(missing, side_by_side):
         began = time.perf_counter()
-        worlds = [case.world(numerics.spacing) for case in group]
+        worlds = [case.world() for case in group]
         names = ", ".join(case.name for case in group)
         say(f"{names}: {sum(len(w.particles) for w in worlds)} particles")
 
@@ -224,17 +245,27 @@ def plough_missing(
             if frame in (1, 2, 5) or frame % 25 == 0:
                 say(f"{names}: frame {frame} of {last}")
 
-        runs = plough(worlds, numerics, FRAMES, device, progress=progress)
+        runs = plough(worlds, group[0].numerics, group[0].frames, device, progress=progress)
         seconds = time.perf_counter() - began
         more = {"newton": load_newton().__version__, "device": device.split(":")[0], "seconds": seconds}
         for case, world, run in zip(group, worlds, runs, strict=True):
-            _keep(place(out, case, fine), case, world, run, {**about[case.name], **more, "beside": len(group)}, fine)
+            _keep(place(out, case, fine), case, world, run, {**told(case), **more, "beside": len(group)}, fine)
         say(f"{names}: done in {seconds:.0f} s")
 
 
-def told(case: Case, numerics: Numerics) -> dict[str, Any]:
+def _groups(cases: Sequence[Case], most: int) -> list[list[Case]]:
+    """Those that can be ploughed side by side together, ``most`` at a time, in their order."""
+    alike: dict[Any, list[Case]] = {}
+    for case in cases:
+        bed = case.measurement.bed
+        floor = (float(bed.lower[2]), bed.floor_friction)
+        alike.setdefault((case.numerics, case.frames, case.measurement.frame_rate, floor), []).append(case)
+    return [group[k : k + most] for group in alike.values() for k in range(0, len(group), most)]
+
+
+def told(case: Case) -> dict[str, Any]:
     """What a file tells of the world in it."""
-    return {"scene": dict(case.about), "numerics": asdict(numerics)}
+    return {"scene": dict(case.about), "numerics": asdict(case.numerics)}
 
 
 def place(out: Path, case: Case, fine: bool = False) -> Path:
@@ -259,6 +290,19 @@ def in_patches(difference: FloatArray) -> float:
     """Root mean square of a difference of heights (…, ny, nx), smoothed to patches larger than chance."""
     width = (0.0,) * (difference.ndim - 2) + (PATCH, PATCH)
     return float(np.sqrt(np.mean(gaussian_filter(difference, width) ** 2)))
+
+
+def cut_and_heaped(before: FloatArray, after: FloatArray) -> FloatArray:
+    """Soil that is missing and soil that was added, (frames, 2) in cm³.
+
+    Args:
+        before: heights (ny, nx) in m.
+        after: heights (frames, ny, nx) in m.
+    """
+    change = gaussian_filter(after - before, (0.0, PATCH, PATCH))
+    change = np.where(np.abs(change) > SETTLED, change, 0.0)
+    parts = [np.clip(sign * change, 0.0, None).sum(axis=(1, 2)) for sign in (-1.0, 1.0)]
+    return np.stack(parts, axis=1) * CELL**2 * 1.0e6
 
 
 def stage_forces(measurement: Measurement, force: FloatArray) -> dict[str, tuple[float, float]]:
@@ -308,18 +352,20 @@ def judge(
     low, high = FRICTION_ANGLE.limits or (FRICTION_ANGLE.lower, FRICTION_ANGLE.upper)
     angles = sorted({case.angle + o for o in (*offsets, 0.0) if low <= case.angle + o <= high})
     at = angles.index(case.angle)
-    heights, forces, volumes = [], [], []
+    begun, heights, forces, volumes = [], [], [], []
     for seed in seeds:
         x = truth.start(resolution.spacing, seed)
         runs = _ours(case, x, angles, resolution, device)
         volume = resolution.spacing**3
+        begun.append(truth.heights(x, volume))
         heights.append([[truth.heights(p, volume) for p in run.positions] for run in runs])
-        forces.append(runs[at].force)
-        volumes.append(volume_range(truth.heights(x, volume), np.array(heights[-1][at])))
-    every = np.array(heights)
+        forces.append([run.force for run in runs])
+        volumes.append(volume_range(begun[-1], np.array(heights[-1][at])))
+    every, force = np.array(heights), np.mean(forces, axis=0)
     mean, theirs = every.mean(axis=0), case.heights(kept)
     scatter = float(np.sqrt(every.var(axis=0, ddof=1).mean())) if len(seeds) > 1 else None
-    scanned = Scan(np.array(angles), mean, scatter or 0.0, volumes[0]) if len(angles) > 2 else None
+    pushes = np.array([pushing(case.measurement, of_angle) for of_angle in force])
+    scanned = Scan(np.array(angles), mean, scatter or 0.0, volumes[0], pushes) if len(angles) > 2 else None
     first = truth.heights(kept.particles[0], truth.volume)
     return {
         "angle": case.angle,
@@ -328,13 +374,15 @@ def judge(
         "best_angle_by_slopes": scanned.best(theirs, slopes=True) if scanned else None,
         "heights_mm": 1e3 * in_patches(mean[at] - theirs),
         "heights_mm_by_frame": {
-            str(f): 1e3 * in_patches(a - b) for f, a, b in zip(FRAMES, mean[at], theirs, strict=True)
+            str(f): 1e3 * in_patches(a - b) for f, a, b in zip(case.frames, mean[at], theirs, strict=True)
         },
         "heights_mm_at_best": 1e3 * scanned.residual(theirs) if scanned else None,
         "chance_mm": None if scatter is None else 1e3 * scatter,
         "volume": np.mean(volumes, axis=0),
         "newton_volume": volume_range(first, theirs),
-        "stages": compare_forces(case.measurement, np.mean(forces, axis=0), kept.force),
+        "cut_and_heaped_cm3": cut_and_heaped(np.mean(begun, axis=0), mean[at]),
+        "newton_cut_and_heaped_cm3": cut_and_heaped(first, theirs),
+        "stages": compare_forces(case.measurement, force[at], kept.force),
         "resolution": asdict(resolution),
         "particles": len(x),
         "seconds": time.perf_counter() - began,
@@ -349,16 +397,18 @@ def _ours(case: Case, x: FloatArray, angles: Sequence[float], resolution: Resolu
     return [
         run
         for group in groups
-        for run in simulate(case.measurement, x, group, law=law, resolution=resolution, frames=FRAMES, device=device)
+        for run in simulate(
+            case.measurement, x, group, law=law, resolution=resolution, frames=case.frames, device=device
+        )
     ]
 
 
-def refinement(case: Case, kept: Kept, out: Path, numerics: Numerics) -> dict[str, Any] | None:
+def refinement(case: Case, kept: Kept, out: Path) -> dict[str, Any] | None:
     """What voxels of three quarters change in a world; None where that wasn't tried."""
     file = place(out, case, fine=True)
     if not file.is_file():
         return None
-    check_about(file, told(case, numerics.refined()))
+    check_about(file, told(case.finer()))
     fine = read_npz(file, ["heights", "force"])
     return moved(
         case.measurement, (case.heights(kept), kept.force), (fine["heights"], fine["force"].astype(np.float64))
@@ -400,18 +450,20 @@ def table(result: Mapping[str, Any]) -> str:
         stages = list(dict.fromkeys(s for row in rows.values() for s in row["stages"]))
         lines += [
             f"Preset `{preset}`, {result['seeds']} particle seeds, {result['made_by']['device']}. Heights in patches, "
-            f"frames {FRAMES[0]} to {FRAMES[-1]}; force, ours / Newton's in N: along the way, upwards (apart in all).",
+            "all frames that are kept; soil cut and heaped in the end, ours / Newton's; force, ours / Newton's in N: "
+            "along the way, upwards (apart in all).",
             "",
-            "| world | cell, mm | φ | best φ | heights at the truth, mm | at the best φ, mm | volume | "
-            + " | ".join(stages)
-            + " | s |",
-            "|---" * (8 + len(stages)) + "|",
+            "| world | cell, mm | φ | best φ | heights at the truth, mm | at the best φ, mm | volume | cut, cm³ "
+            "| heaped, cm³ | " + " | ".join(stages) + " | s |",
+            "|---" * (10 + len(stages)) + "|",
         ]
         for name, row in rows.items():
             best = "–" if row["best_angle"] is None else f"{_at_end(row)}{row['best_angle']:.1f}°"
             left = "–" if row["heights_mm_at_best"] is None else f"{row['heights_mm_at_best']:.2f}"
             volume = f"{100 * row['volume'][0]:+.2f} to {100 * row['volume'][1]:+.2f} %"
-            cells = [_forces(row["stages"][s]) if s in row["stages"] else "–" for s in stages]
+            last = zip(row["cut_and_heaped_cm3"][-1], row["newton_cut_and_heaped_cm3"][-1], strict=True)
+            cells = [f"{own:.0f} / {other:.0f}" for own, other in last]
+            cells += [_forces(row["stages"][s]) if s in row["stages"] else "–" for s in stages]
             lines.append(
                 f"| {name} | {1e3 * row['resolution']['cell']:.1f} | {row['angle']:.1f}° | {best} "
                 f"| {row['heights_mm']:.2f} | {left} | {volume} | " + " | ".join(cells) + f" | {row['seconds']:.0f} |"
@@ -447,22 +499,37 @@ def _summary(rows: Mapping[str, Mapping[str, Any]], stages: Sequence[str]) -> li
     off = [row["best_angle"] - row["angle"] for row in rows.values() if row["best_angle"] is not None]
     if off:
         lines.append(f"- best angle less the true one, degrees: mean {np.mean(off):+.2f}, {spread(off)}")
+    for k, what in enumerate(("cut", "heaped")):
+        shares = [
+            row["cut_and_heaped_cm3"][-1][k] / row["newton_cut_and_heaped_cm3"][-1][k]
+            for row in rows.values()
+            if row["newton_cut_and_heaped_cm3"][-1][k] > 0.0
+        ]
+        if shares:
+            lines.append(f"- soil {what} in the end, ours over Newton's: {_range(shares)}")
     for name in stages:
+        for k, what in enumerate(("along the way", "upwards")):
+            ratios = [row["stages"][name]["ratio"][k] for row in rows.values() if name in row["stages"]]
+            if known := [ratio for ratio in ratios if ratio is not None]:
+                lines.append(f"- force, {name}, {what}, ours over Newton's: {_range(known)}")
         apart = [row["stages"][name]["off"] for row in rows.values() if name in row["stages"]]
-        known = [100.0 * value for value in apart if value is not None]
-        if known:
+        if known := [100.0 * value for value in apart if value is not None]:
             lines.append(f"- force, {name}, apart in %: {spread(known)}")
     return lines
+
+
+def _range(values: Sequence[float]) -> str:
+    return f"mean {np.mean(values):.2f}, {np.min(values):.2f} to {np.max(values):.2f}"
 
 
 def asked(options: argparse.Namespace, numerics: Numerics) -> list[Case]:
     """The worlds that the command line names."""
     drawn = islice(scenes(options.seed), options.count)
-    cases = [Case.drawn(f"scene-{options.seed}-{k}", scene) for k, scene in enumerate(drawn)]
+    cases = [Case.drawn(f"scene-{options.seed}-{k}", scene, numerics) for k, scene in enumerate(drawn)]
     if options.pairs:
         for scene in pair(options.seed):
-            cases.append(Case.drawn(f"pair-{options.seed}-friction-{scene.tool_friction:g}", scene))
-    return cases + [Case.of_set(folder, numerics) for folder in options.set]
+            cases.append(Case.drawn(f"pair-{options.seed}-friction-{scene.tool_friction:g}", scene, numerics))
+    return cases + [Case.of_set(folder, numerics) for folder in options.sets]
 
 
 class Judgement:
@@ -471,23 +538,21 @@ class Judgement:
     Args:
         cases: all worlds that are asked for.
         options: the command line.
-        numerics: of the independent solver.
     """
 
-    def __init__(self, cases: Sequence[Case], options: argparse.Namespace, numerics: Numerics) -> None:
-        self.cases, self.options, self.numerics = cases, options, numerics
+    def __init__(self, cases: Sequence[Case], options: argparse.Namespace) -> None:
+        self.cases, self.options = cases, options
         self.result: dict[str, Any] = {
             "made_by": stamp(options.device),
-            "numerics": asdict(numerics),
             "seeds": options.seeds,
             "presets": options.presets,
-            "worlds": {c.name: {"scene": dict(c.about), "presets": {}} for c in cases},
+            "worlds": {c.name: {**told(c), "kind": c.kind, "presets": {}} for c in cases},
         }
 
     def kept(self, case: Case) -> Kept | None:
         """The world, where there is one."""
         file = place(self.options.out, case)
-        return Kept.load(file, told(case, self.numerics)) if file.is_file() else case.made
+        return Kept.load(file, told(case)) if file.is_file() else case.made
 
     @cached_property
     def worlds(self) -> list[tuple[Case, Kept]]:
@@ -499,7 +564,7 @@ class Judgement:
         o = self.options
         for case, kept in self.worlds:
             entry = self.result["worlds"][case.name]
-            entry["refinement"] = refinement(case, kept, o.out, self.numerics)
+            entry["refinement"] = refinement(case, kept, o.out)
             for preset in o.presets:
                 entry["presets"][preset] = judge(case, kept, preset, o.offsets, range(o.seeds), o.device)
                 say(f"{case.name}, {preset}: judged in {entry['presets'][preset]['seconds']:.0f} s")
@@ -513,28 +578,34 @@ class Judgement:
 def main(arguments: list[str] | None = None) -> int:
     """Command line; exit code 0 when every world was judged."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--count", type=int, default=6, help="scenes that are drawn")
+    parser.add_argument("--count", type=at_least(0), help="scenes that are drawn; 6, or with --sets none")
     parser.add_argument("--seed", type=int, default=1, help="of the scenes")
     parser.add_argument("--pairs", action="store_true", help="also one scene with tool friction 0.3 and 0.9")
-    parser.add_argument("--set", type=Path, nargs="+", default=[], metavar="DIR", help="also measurement sets' scenes")
+    parser.add_argument("--sets", type=Path, nargs="+", default=[], metavar="DIR", help="measurement sets with truths")
     parser.add_argument("--only", nargs="+", metavar="NAME", help="of these worlds, by name")
     parser.add_argument("--out", type=Path, default=Path("runs/solvers"), help="worlds, result.json and table.md")
     parser.add_argument("--device", type=here, default="cpu")
     parser.add_argument("--side-by-side", type=at_least(1), default=4, help="worlds that Newton ploughs at a time")
     parser.add_argument("--no-plough", action="store_true", help="judge the worlds that are there; needs no Newton")
     parser.add_argument("--worlds-only", action="store_true", help="make the worlds and stop")
-    parser.add_argument("--refine", nargs="*", metavar="NAME", help="plough these once more, finer; all without a name")
+    parser.add_argument(
+        "--refine", nargs="*", metavar="NAME", help="plough these with finer voxels too; one of each kind"
+    )
     parser.add_argument("--presets", nargs="+", default=["small"], help="of our solver")
     parser.add_argument(
         "--offsets", nargs="*", type=float, default=list(OFFSETS), help="of our angles, degrees; none: the truth alone"
     )
     parser.add_argument("--seeds", type=at_least(1), default=2, help="particle seeds that ours are averaged over")
-    parser.add_argument("--voxel", type=float, default=Numerics.voxel, help="edge of Newton's cells, m")
+    parser.add_argument(
+        "--voxel", type=float, default=Numerics.voxel, help="edge of Newton's cells, m; less for sets of narrow tools"
+    )
     parser.add_argument("--substeps", type=at_least(1), default=Numerics.substeps, help="of Newton in a frame")
     parser.add_argument("--iterations", type=at_least(1), default=Numerics.iterations, help="most in a substep")
     options = parser.parse_args(arguments)
-    if not options.voxel > 0.0 or options.count < 0:
-        raise ParameterError("--voxel must be positive, and --count 0 or more")
+    if not options.voxel > 0.0:
+        raise ParameterError("--voxel must be positive")
+    if options.count is None:
+        options.count = 0 if options.sets else 6
     hush()
     began = time.perf_counter()
 
@@ -549,13 +620,14 @@ def main(arguments: list[str] | None = None) -> int:
         raise ParameterError(f"{', '.join(unknown) or 'no world'}: asked for are {', '.join(names) or 'none'}")
     cases = [case for case in cases if not options.only or case.name in options.only]
     if not options.no_plough:
-        plough_missing(cases, numerics, options.out, options.device, options.side_by_side, say)
+        plough_missing(cases, options.out, options.device, options.side_by_side, say)
         if options.refine is not None:
-            finer = [case for case in cases if not options.refine or case.name in options.refine]
-            plough_missing(finer, numerics.refined(), options.out, options.device, options.side_by_side, say, fine=True)
+            first = {case.kind: case.name for case in reversed(cases)}.values()
+            finer = [case.finer() for case in cases if case.name in (options.refine or first)]
+            plough_missing(finer, options.out, options.device, options.side_by_side, say, fine=True)
     if options.worlds_only:
         return 0
-    judgement = Judgement(cases, options, numerics)
+    judgement = Judgement(cases, options)
     judgement.score(say)
     judgement.write()
     print(table(judgement.result))

@@ -80,6 +80,19 @@ def test_a_layer_lies_below_its_depth_and_a_stone_holds_no_sand() -> None:
     assert np.linalg.norm(soil_of(stone, setup, 0.01).particles - [x, y, z], axis=1).min() > radius
 
 
+def test_no_photograph_shows_a_stone_and_no_tool_meets_one() -> None:
+    """In beds that slope away from it, too; and all of it is above the floor."""
+    for number in range(12):
+        hidden = draw("buried_obstacle", number, 3)
+        x, y, z, radius = hidden.soil["obstacle"]
+        over = np.array(
+            [[x + radius * a, y + radius * b] for a in np.linspace(-1, 1, 9) for b in np.linspace(-1, 1, 9)]
+        )
+        assert hidden.scene.setup().surface.sample(over).min() - (z + radius) > 0.014
+        assert z > radius
+        assert abs(y - 0.25) - radius >= 0.5 * hidden.scene.width + 0.01 - 1e-9
+
+
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in (NOTHING, FIELD)])
 def test_both_solvers_are_told_the_same(kind: str) -> None:
     """Our library's settings against what the other solver is given."""

@@ -33,7 +33,7 @@ def test_a_world_between_two_angles_is_estimated_between_them() -> None:
     # a ridge that grows with the angle by 1 mm a degree, and its copies a fixed 2 mm higher
     ridge = 1e-3 * np.exp(-((np.arange(40) - 20.0) ** 2) / 50.0) * np.ones((1, 30, 1))
     angles = np.array([27.0, 30.0, 33.0, 36.0, 39.0])
-    found = Scan(angles, angles[:, None, None, None] * ridge, 0.0, (0.0, 0.0))
+    found = Scan(angles, angles[:, None, None, None] * ridge, 0.0, (0.0, 0.0), np.zeros(5))
     assert found.best(34.3 * ridge) == pytest.approx(34.3, abs=0.01)
     assert found.best(34.3 * ridge, slopes=True) == pytest.approx(34.3, abs=0.01)
     assert found.residual(34.3 * ridge) == pytest.approx(0.0, abs=1e-6)

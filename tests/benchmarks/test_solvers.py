@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -21,6 +22,7 @@ from splatsoil.benchmarks.solvers import (
     Case,
     Kept,
     compare_forces,
+    cut_and_heaped,
     in_patches,
     judge,
     main,
@@ -36,6 +38,7 @@ from splatsoil.mpm import Resolution, simulate
 from splatsoil.reconstruction import fill
 from splatsoil.synthetic import plow
 
+COARSE = Numerics(voxel=0.08)
 SLOPING = Scene(seed=7, angle=34.0, bed="sloping", slope=6.0, towards=30.0)
 
 
@@ -171,6 +174,21 @@ def test_patches_keep_what_is_wide_and_drop_what_is_narrow() -> None:
     assert in_patches(2e-3 * (-1.0) ** x * np.ones((2, 50, 1))) < 0.1e-3
 
 
+def test_soil_cut_and_heaped_is_told_apart_and_without_what_settles() -> None:
+    """A trench of 20 x 12 cm and 5 cm deep, a heap of half its soil beside it; a millimetre everywhere is settling."""
+    before = np.full((50, 80), 0.12)
+    after = np.repeat(before[None], 2, axis=0)
+    after[1, 10:22, 20:40] -= 0.05
+    after[1, 30:42, 20:40] += 0.025
+    (nothing, none), (cut, heaped) = cut_and_heaped(before, after)
+    assert (nothing, none) == (0.0, 0.0)
+    assert cut == pytest.approx(20 * 12 * 5, rel=0.02)
+    assert heaped == pytest.approx(20 * 12 * 2.5, rel=0.03)
+    assert cut_and_heaped(before, after[:1] - 1e-3)[0] == pytest.approx([0.0, 0.0])
+    noisy = after[:1] + 1e-3 * np.random.default_rng(0).standard_normal((1, 50, 80))
+    assert cut_and_heaped(before, noisy).max() < 5.0
+
+
 @pytest.mark.parametrize(
     ("raised", "stronger", "converged"), [(0.5e-3, 1.03, True), (2e-3, 1.0, False), (0.0, 1.08, False)]
 )
@@ -204,19 +222,18 @@ def groups(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
 
 
 def test_only_missing_worlds_are_ploughed_so_many_at_a_time(groups: list[list[str]], tmp_path: Path) -> None:
-    cases = [Case.drawn(f"scene-{k}", scene) for k, scene in enumerate(islice(scenes(1), 5))]
-    numerics = Numerics(voxel=0.08)
-    plough_missing(cases[:1], numerics, tmp_path, "cpu", 4, say)
-    plough_missing(cases, numerics, tmp_path, "cpu", 3, say)
-    plough_missing(cases, numerics, tmp_path, "cpu", 3, say)
+    cases = [Case.drawn(f"scene-{k}", scene, COARSE) for k, scene in enumerate(islice(scenes(1), 5))]
+    plough_missing(cases[:1], tmp_path, "cpu", 4, say)
+    plough_missing(cases, tmp_path, "cpu", 3, say)
+    plough_missing(cases, tmp_path, "cpu", 3, say)
     assert groups == [["scene-0"], ["scene-1", "scene-2", "scene-3"], ["scene-4"]]
 
 
 def test_a_kept_world_is_the_one_that_was_ploughed(groups: list[list[str]], tmp_path: Path) -> None:
-    case, numerics = Case.drawn("scene", SLOPING), Numerics(voxel=0.08)
-    plough_missing([case], numerics, tmp_path, "cpu", 1, say)
-    world = case.world(numerics.spacing)
-    kept = Kept.load(tmp_path / "scene.npz", told(case, numerics))
+    case = Case.drawn("scene", SLOPING, COARSE)
+    plough_missing([case], tmp_path, "cpu", 1, say)
+    world = case.world()
+    kept = Kept.load(tmp_path / "scene.npz", told(case))
     assert sorted(kept.particles) == [0, *FRAMES]
     for x in kept.particles.values():
         assert np.abs(x - world.particles).max() <= 0.5 * solvers.SCALE + 1e-9
@@ -225,33 +242,61 @@ def test_a_kept_world_is_the_one_that_was_ploughed(groups: list[list[str]], tmp_
 
 
 def test_another_scene_or_other_numerics_are_not_taken_for_it(groups: list[list[str]], tmp_path: Path) -> None:
-    numerics = Numerics(voxel=0.08)
-    plough_missing([Case.drawn("scene", SLOPING)], numerics, tmp_path, "cpu", 1, say)
-    steeper = Case.drawn("scene", replace(SLOPING, slope=6.5))
+    plough_missing([Case.drawn("scene", SLOPING, COARSE)], tmp_path, "cpu", 1, say)
+    steeper = Case.drawn("scene", replace(SLOPING, slope=6.5), COARSE)
     with pytest.raises(ParameterError, match="another --out"):
-        plough_missing([steeper], numerics, tmp_path, "cpu", 1, say)
-    with pytest.raises(ParameterError, match="another --out"):
-        Kept.load(tmp_path / "scene.npz", told(Case.drawn("scene", SLOPING), replace(numerics, iterations=99)))
+        plough_missing([steeper], tmp_path, "cpu", 1, say)
+    for change in ({"iterations": 99}, {"tolerance": 1.0e-4}):
+        with pytest.raises(ParameterError, match="another --out"):
+            Kept.load(tmp_path / "scene.npz", told(Case.drawn("scene", SLOPING, replace(COARSE, **change))))
 
 
 def test_a_refined_world_is_kept_beside_as_heights(groups: list[list[str]], tmp_path: Path) -> None:
-    case, numerics = Case.drawn("scene", SLOPING), Numerics(voxel=0.03)
-    plough_missing([case], numerics, tmp_path, "cpu", 1, say)
-    plough_missing([case], numerics.refined(), tmp_path, "cpu", 1, say, fine=True)
+    case = Case.drawn("scene", SLOPING, Numerics(voxel=0.03))
+    plough_missing([case], tmp_path, "cpu", 1, say)
+    plough_missing([case.finer()], tmp_path, "cpu", 1, say, fine=True)
     with np.load(tmp_path / "scene.fine.npz") as stored:
         assert set(stored.files) == {"heights", "force", "about"}
         assert stored["heights"].shape == (4, 50, 80)
         assert float(stored["heights"].mean()) == pytest.approx(SOIL, rel=0.01)
-    kept = Kept.load(tmp_path / "scene.npz", told(case, numerics))
-    found = solvers.refinement(case, kept, tmp_path, numerics)
+    kept = Kept.load(tmp_path / "scene.npz", told(case))
+    found = solvers.refinement(case, kept, tmp_path)
     assert found is not None and found["converged"], "nothing moves"
+
+
+def test_one_world_of_each_kind_is_ploughed_with_finer_voxels(groups: list[list[str]], tmp_path: Path) -> None:
+    """Six scenes take five tools in turns, so the sixth is of a tool that was checked."""
+    words = ["--voxel", "0.08", "--worlds-only", "--side-by-side", "6", "--out", str(tmp_path), "--refine"]
+    assert main(words) == 0 and main(words) == 0
+    assert groups == [[f"scene-1-{k}" for k in range(6)], [f"scene-1-{k}" for k in range(5)]]
+    assert main([*words, "scene-1-5"]) == 0
+    assert groups[2:] == [["scene-1-5"]]
+
+
+def test_a_narrower_tool_gets_as_many_voxels_and_is_ploughed_by_itself(
+    groups: list[list[str]], plow_dry: Path, tmp_path: Path
+) -> None:
+    narrow = tmp_path / "narrow"
+    shutil.copytree(plow_dry, narrow)
+    mesh = Measurement.load(plow_dry).tool.mesh.copy()
+    mesh.apply_scale([1.0, 0.5, 1.0])
+    mesh.export(narrow / Measurement.load(plow_dry).tool.mesh_path.name)
+    usual, case = (Case.of_set(folder, Numerics()) for folder in (plow_dry, narrow))
+    assert usual.numerics == Numerics() and usual.made is not None
+    assert case.made is None, "the set's own voxels are too coarse for it"
+    assert case.numerics.voxel == pytest.approx(0.06 / 9.0)
+    assert (case.numerics.substeps, case.numerics.iterations) == (6, 3000)
+    coarse = replace(case, numerics=COARSE.across(0.06))
+    scene = Case.drawn("scene", SLOPING, COARSE)
+    plough_missing([scene, coarse, replace(scene, name="other")], tmp_path / "out", "cpu", 4, say)
+    assert groups == [["scene", "other"], [case.name]]
 
 
 @pytest.fixture(scope="module")
 def ours() -> tuple[Case, Kept]:
     """A world of our own coarsest solver, of other particles than a judge begins with."""
     scene = Scene(seed=7, angle=36.0)
-    case, setup = Case.drawn("wavy", scene), scene.setup()
+    case, setup = Case.drawn("wavy", scene, Numerics()), scene.setup()
     resolution = Resolution.derive(case.measurement, "tiny")
     x = fill(setup.surface, setup.bed, resolution.spacing, seed=77)
     run = simulate(case.measurement, x, case.values, resolution=resolution, frames=FRAMES)[0]
@@ -266,6 +311,8 @@ def test_a_world_of_our_own_is_told_to_be_one(ours: tuple[Case, Kept]) -> None:
     assert found["best_angle"] == pytest.approx(36.0, abs=3.0)
     assert found["heights_mm"] < 1.3 * found["chance_mm"]
     assert found["stages"]["pushing"]["off"] < 0.1
+    for own, other in zip(found["cut_and_heaped_cm3"][1], found["newton_cut_and_heaped_cm3"][1], strict=True):
+        assert own == pytest.approx(other, rel=0.15) and 200.0 < other < 5000.0
     low = judge(replace(case, values={"friction_angle": 30.0}), kept, "tiny", (6.0, 12.0), (0,), "cpu")
     assert low["best_angle"] > 33.0
     assert low["stages"]["pushing"]["off"] > 0.1
@@ -275,8 +322,8 @@ def test_kept_worlds_are_judged_without_the_package(
     ours: tuple[Case, Kept], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "newton", None)
-    case = Case.drawn("scene-1-0", next(scenes(1)))
-    ours[1].save(tmp_path / "scene-1-0.npz", told(case, Numerics()))
+    case = Case.drawn("scene-1-0", next(scenes(1)), Numerics())
+    ours[1].save(tmp_path / "scene-1-0.npz", told(case))
     words = ["--presets", "tiny", "--seeds", "1", "--offsets", "-3", "3", "--no-plough", "--out", str(tmp_path)]
     assert main(["--count", "1", *words]) == 0
     result = json.loads((tmp_path / "result.json").read_text())
@@ -291,7 +338,7 @@ def test_a_set_that_these_numerics_made_needs_no_ploughing(
     plow_dry: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setitem(sys.modules, "newton", None)
-    words = ["--count", "0", "--set", str(plow_dry), "--presets", "tiny", "--seeds", "1", "--offsets", "--out"]
+    words = ["--sets", str(plow_dry), "--presets", "tiny", "--seeds", "1", "--offsets", "--out"]
     assert main([*words, str(tmp_path)]) == 0
     stages = json.loads((tmp_path / "result.json").read_text())["worlds"]["plow-dry"]["presets"]["tiny"]["stages"]
     force = np.loadtxt(plow_dry / "tool_force.csv", delimiter=",", skiprows=1)
@@ -303,7 +350,6 @@ def test_a_set_that_these_numerics_made_needs_no_ploughing(
     ("words", "match"),
     [
         (["--voxel", "0"], "--voxel"),
-        (["--count", "-1"], "--count"),
         (["--only", "scene-9-9"], "scene-9-9"),
         (["--count", "0"], "no world"),
     ],
