@@ -22,8 +22,8 @@ ALONG, UP = "force along", "force up"
 """Instruments: against the way the tool is pushed, and upwards."""
 REGION, UNIT = "tool", "% of the largest force"
 STAGE = "pushing"
-"""In which the force is believed. Pressed in from above, a plate's edge bears up to 1.6 times what it bears in another
-solver's soil; when the tool stands, four fifths (docs/numerics.md)."""
+"""In which the force is believed: that of lowering hangs on the cell, and that of standing on how the last moment of the
+motion is resolved, which measured poses leave open (docs/numerics.md)."""
 LEAST = 0.25
 """Share of the largest force below which it isn't looked at: where soil is first touched is a matter of cells."""
 FEWEST = 2
@@ -31,14 +31,12 @@ FEWEST = 2
 SENSOR = 1.0
 """Standard deviation of what is measured, in the features' unit."""
 ERROR = 0.1
-"""Standard deviation of all simulated forces over their size, together: at the true parameters ours are within 5 % of
-the example sets' and up to 14 % above another solver's in worlds of its own (docs/numerics.md), and 2 to 28 %
-off Reece's equation (docs/validation.md)."""
+"""Standard deviation of all simulated forces over their size, together: with cells of 20 mm ours are 12 to 16 % above a
+converged solver's, of 13.3 mm 4 to 6 % (docs/numerics.md), and 4 to 28 % off Reece's equation (docs/validation.md)."""
 OWN = 0.1
-"""Likewise of one instrument's, beside that: ours upwards are 0 to 9 % too small."""
+"""Likewise of one instrument's, beside that."""
 GROWTH = 0.1
-"""Likewise of the last row's, and of the first row's the other way: as soil gathers before the tool ours grew by up
-to 15 % more than another solver's, before soil gave way by the tool's way."""
+"""Likewise of the last row's, and of the first row's the other way: as soil gathers before the tool."""
 SHAPE = 0.05
 """Likewise of one row's: forces shake."""
 
