@@ -19,13 +19,18 @@ if TYPE_CHECKING:
 def model_of(folder: RunFolder, device: str, report: Report, *, anew: bool = True) -> Model:
     """The model that a run's latest fit is of, on one device; a reconstruction that isn't kept is made ``anew``.
 
+    Helpers, which don't make any, say no remarks on the set either: the first process has.
+
     Raises:
         RunError: it may not be.
     """
     from splatsoil.commands import _stages as stage
+    from splatsoil.commands._output import say_remarks
 
     setup = folder.fit()["setup"]
     measurement = stage.measurement_of(folder)
+    if anew:
+        say_remarks(measurement)
     reconstruction = stage.reconstructed(measurement, folder, device, report, anew=anew)
     return stage.model_on(measurement, folder, reconstruction, setup["effects"], setup["preset"], device)
 

@@ -10,7 +10,7 @@ from typing import Any
 from tyro.conf import Positional
 
 from splatsoil.commands._options import command_line
-from splatsoil.commands._output import print_json
+from splatsoil.commands._output import print_json, say_remarks
 
 
 @dataclass(frozen=True)
@@ -65,6 +65,7 @@ def run(config: Config) -> int:
             f"{folder.path}: the fit was made by other sources of splatsoil; fit again before the posterior"
         )
     measurement = stage.measurement_of(folder)
+    say_remarks(measurement)
     with stages(quiet=config.json) as begin, executor(config.executor) as pool:
         stage.reconstructed(measurement, folder, device, begin("reconstruct"))
         report = begin("posterior")
