@@ -143,6 +143,7 @@ class Measurement:
         )
         _check_clocks(measurement)
         _check_tool(measurement)
+        _check_force(measurement)
         _check_cameras(measurement)
         # Sums are taken in the frames' order: it must not be that in which a file happens to list them.
         return replace(
@@ -308,6 +309,27 @@ def _check_tool(measurement: Measurement) -> None:
             f"the tool moves at {fastest:g} m/s, faster than sound in soil; times are in seconds, positions in metres",
             file=motion,
             field="time",
+        )
+
+
+def _check_force(measurement: Measurement) -> None:
+    """Whether the force is one that soil has: it is passive, and takes energy from the tool.
+
+    Of a tool that turns the torque's part isn't known.
+    """
+    tool, motion = measurement.tool, measurement.tool.motion
+    if tool.force is None or np.ptp(motion.quaternions, axis=0).max() > 1e-6:
+        return
+    ends = tool.force[:, :1] - [0.0, 1.0]
+    way = np.stack([np.interp(ends, motion.frames, axis) for axis in motion.positions.T], axis=-1)
+    work = np.sum((way[:, 0] - way[:, 1]) * tool.force[:, 2:], axis=1)
+    # Noise by itself does and takes alike.
+    if work.sum() > 0.5 * np.abs(work).sum():
+        raise MeasurementError(
+            f"the force does {work.sum():.3g} J of work on the tool, where soil resists; it is the soil's on the tool,"
+            " in world axes",
+            file=tool.force_path,
+            field="fx,fy,fz",
         )
 
 

@@ -12,6 +12,9 @@ from splatsoil.measurement.images import is_turned
 from splatsoil.measurement.measurement import Measurement, sees
 
 _FEW_VIEWS = 12
+# Largest forces, by the weight of a cube of soil as wide as the tool: sand takes a tenth to ten of it where the cut is
+# a tenth to all of the width deep, clay hundreds where the tool is small. In kN the former are below, in mN above.
+_FORCES = (0.03, 1000.0)
 
 
 @dataclass(frozen=True)
@@ -115,6 +118,13 @@ def _on_tool(measurement: Measurement) -> list[str]:
         # A half turn about the vertical, or no turn in another order: neither can be ruled out.
         out.append("All of the tool's quaternions are large in qz, their last number; is their order x, y, z, w?")
     times = tool.motion.times
+    duration = float(times[-1] - times[0])
+    fall = 0.5 * float(np.linalg.norm(measurement.gravity)) * duration**2
+    if fall < np.sort(tool.mesh.extents)[1]:
+        out.append(
+            f"The tool's motion takes {duration:g} s, in which soil falls by {1000.0 * fall:.2g} mm, less than the"
+            " tool's width: weight hardly acts; is the frame rate in frames a second?"
+        )
     if steps.size > 4:
         speeds = steps / np.diff(times)
         typical = float(np.median(speeds[speeds > 0.0])) if (speeds > 0.0).any() else 0.0
@@ -148,8 +158,16 @@ def _on_force(measurement: Measurement) -> list[str]:
     moving = motion.frames[1:][speed > 0.1 * speed.max(initial=0.0)]
     if not np.isin(moving, force[:, 0]).any():
         out.append("The tool's force was measured in no frame in which the tool moves; it tells nothing.")
-    elif not np.abs(force[:, 2:]).max() > 0.0:
+    elif not (largest := float(np.linalg.norm(force[:, 2:], axis=1).max())) > 0.0:
         out.append("The tool's force is 0 throughout; it tells nothing.")
+    else:
+        width = float(np.sort(measurement.tool.mesh.extents)[1])
+        weight = measurement.bed.density * float(np.linalg.norm(measurement.gravity)) * width**3
+        if not _FORCES[0] < largest / weight < _FORCES[1]:
+            out.append(
+                f"The tool's force reaches {largest:.2g} N, where a cube of soil as wide as the tool weighs"
+                f" {weight:.2g} N; is it in newtons?"
+            )
     return out
 
 

@@ -78,11 +78,11 @@ def cell(row: int, column: int, value: str, file: str = "tool_motion.csv") -> Ca
     return spoil
 
 
-def motion(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], None]:
-    """Change the numbers of the tool's motion as a whole."""
+def numbers(change: Callable[[np.ndarray], np.ndarray], name: str = "tool_motion.csv") -> Callable[[Path], None]:
+    """Change the numbers of a CSV file as a whole."""
 
     def spoil(folder: Path) -> None:
-        file = folder / "tool_motion.csv"
+        file = folder / name
         head, *rows = file.read_text().splitlines()
         table = change(np.array([[float(v) for v in row.split(",")] for row in rows]))
         file.write_text("\n".join([head, *(",".join(f"{v:.12g}" for v in row) for row in table)]))
@@ -277,7 +277,7 @@ def both(*faults: Callable[[Path], object]) -> Callable[[Path], None]:
 
 def times(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], None]:
     """Another clock for the tool's motion."""
-    return motion(lambda table: np.column_stack([table[:, 0], change(table[:, 1]), table[:, 2:]]))
+    return numbers(lambda table: np.column_stack([table[:, 0], change(table[:, 1]), table[:, 2:]]))
 
 
 LAST = "time, frame 40"
@@ -476,13 +476,13 @@ CASES = [
     Case("motion-word", cell(10, 2, "left"), "tool_motion.csv", "x, line 11", "not a number"),
     Case("motion-short-row", short_row, "tool_motion.csv", "line 43",
          "2 values"),
-    Case("motion-quaternion-zero", motion(lambda t: t * [1, 1, 1, 1, 1, 0, 0, 0, 0]), "tool_motion.csv",
+    Case("motion-quaternion-zero", numbers(lambda t: t * [1, 1, 1, 1, 1, 0, 0, 0, 0]), "tool_motion.csv",
          "qw,qx,qy,qz, frame 0", "length 0"),
-    Case("motion-quaternion-long", motion(lambda t: t * [1, 1, 1, 1, 1, 2, 2, 2, 2]), "tool_motion.csv",
+    Case("motion-quaternion-long", numbers(lambda t: t * [1, 1, 1, 1, 1, 2, 2, 2, 2]), "tool_motion.csv",
          "qw,qx,qy,qz, frame 0", "instead of 1"),
-    Case("motion-outside-of-bed", motion(lambda t: t + np.eye(9)[4] * 3.0), "tool_motion.csv", "x,y,z",
+    Case("motion-outside-of-bed", numbers(lambda t: t + np.eye(9)[4] * 3.0), "tool_motion.csv", "x,y,z",
          "never touches"),
-    Case("motion-in-millimetres", motion(lambda t: t * [1, 1, 1e3, 1e3, 1e3, 1, 1, 1, 1]), "tool_motion.csv", "x,y,z",
+    Case("motion-in-millimetres", numbers(lambda t: t * [1, 1, 1e3, 1e3, 1e3, 1, 1, 1, 1]), "tool_motion.csv", "x,y,z",
          "never touches"),
     Case("motion-in-milliseconds", times(lambda t: 1000.0 * t), "tool_motion.csv", LAST, "is at 800 s"),
     Case("motion-at-half-its-times", times(lambda t: 0.5 * t), "tool_motion.csv", LAST, "is at 0.4 s"),
@@ -497,7 +497,7 @@ CASES = [
     Case("all-a-thousand-times-as-fast",
          both(edit(SET, "frame_rate", to=50_000), times(lambda t: 1e-3 * t), video_times(lambda t: 1e-3 * t)),
          "tool_motion.csv", "time", "faster than sound"),
-    Case("motion-too-deep", motion(lambda t: t - np.eye(9)[4] * 0.2), "tool_motion.csv", "x,y,z",
+    Case("motion-too-deep", numbers(lambda t: t - np.eye(9)[4] * 0.2), "tool_motion.csv", "x,y,z",
          "passes the bed's floor"),
     Case("tool-ten-times-as-large", tool_scaled(10.0), "tool.stl", "vertices", "1.2 m long"),
     Case("tool-ten-times-as-large-above-its-tip", tool_scaled(10.0, 0.06), "tool.stl", "vertices", "1.2 m long"),
@@ -505,6 +505,8 @@ CASES = [
     Case("tool-by-inches-too-small", tool_scaled(1 / 39.37), "tool.stl", "vertices", "meshes are in metres"),
     Case("force-header", cell(0, 2, "force_x", "tool_force.csv"), "tool_force.csv", "line 1", "expected the header"),
     Case("force-nan", cell(3, 2, "nan", "tool_force.csv"), "tool_force.csv", "fx, line 4", "not a finite number"),
+    Case("force-on-the-soil", numbers(lambda t: t * [1, 1, -1, -1, -1], "tool_force.csv"), "tool_force.csv",
+         "fx,fy,fz", "J of work on the tool"),
     Case("force-missing", lambda f: (f / "tool_force.csv").unlink(), "tool_force.csv", "tool.force", "no such file"),
 ]  # fmt: skip
 

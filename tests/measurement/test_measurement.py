@@ -256,6 +256,25 @@ def test_remarks_on_the_tools_motion(small_set: Path) -> None:
     assert "jumps by 200 mm before frame 20" in said(jump)
 
 
+@pytest.mark.parametrize("rate", [50, 5000])
+def test_a_motion_in_which_nothing_falls_gets_a_remark(rate: int, plow_dry: Path, tmp_path: Path) -> None:
+    """All clocks a hundredth as long, at once: soil falls by g (0.04 s)² / 2 in the whole of it, 7.8 mm."""
+    folder = tmp_path / "set"
+    shutil.copytree(plow_dry, folder)
+    for name in ("tool_motion.csv", "tool_force.csv"):
+        head, *rows = (row.split(",") for row in (folder / name).read_text().splitlines())
+        timed = [[row[0], str(int(row[0]) / rate), *row[2:]] for row in rows]
+        (folder / name).write_text("\n".join(",".join(row) for row in (head, *timed)))
+    for name, place in (("experiment.json", None), ("video/transforms.json", "frames")):
+        data = json.loads((folder / name).read_text())
+        data["frame_rate"] = rate
+        for frame in data[place] if place else ():
+            frame["time"] = frame["frame"] / rate
+        (folder / name).write_text(json.dumps(data))
+    said = " ".join(remark.text for remark in remarks(Measurement.load(folder)))
+    assert ("soil falls by 7.8 mm" in said) == (rate == 5000)
+
+
 def test_remarks_on_the_tools_force(small_set: Path) -> None:
     file = small_set / "tool_force.csv"
 
@@ -267,6 +286,9 @@ def test_remarks_on_the_tools_force(small_set: Path) -> None:
         return " ".join(remark.text for remark in remarks(Measurement.load(small_set)) if remark.about == "tool")
 
     rate = Measurement.load(small_set).frame_rate
+    # A litre of soil weighs 16 N, a cube as wide as the tool 27 N.
+    for size, odd in ((1.0, False), (500.0, False), (0.001, True), (1e4, True)):
+        assert ("is it in newtons" in said([f"{k},{k / rate},{-20 * size},0,0" for k in range(1, 30)])) == odd
     assert said([f"{k},{k / rate},-5,0,3" for k in range(1, 30)]) == ""
     assert "0 throughout" in said([f"{k},{k / rate},0,0,0" for k in range(1, 30)])
     assert "in no frame in which the tool moves" in said([f"{k},{k / rate},-5,0,3" for k in range(5000, 5003)])
