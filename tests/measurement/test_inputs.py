@@ -14,9 +14,12 @@ from splatsoil.errors import MeasurementError
 from splatsoil.measurement import Camera, Frame, ToolMotion
 from splatsoil.measurement import measurement as limits
 from splatsoil.measurement.camera import LENSES
-from splatsoil.measurement.frames import FRAME_FIELDS, VIDEO_FIELDS
+from splatsoil.measurement.colmap import _MODELS
+from splatsoil.measurement.fields import Fields
+from splatsoil.measurement.frames import FRAME_FIELDS, VIDEO_FIELDS, read_camera
 from splatsoil.measurement.images import check_photograph
 from splatsoil.measurement.motion import MOTION_COLUMNS
+from splatsoil.measurement.remarks import _FORCES
 from splatsoil.measurement.tool import FORCE_COLUMNS, read_mesh
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "inputs.md"
@@ -53,6 +56,13 @@ def images(folder: Path) -> Iterator[tuple[str, str]]:
         check_photograph(folder / "a.heic", (16, 16), sizes_from="w and h")
         return "read"
 
+    def turned() -> str:
+        exif = Image.Exif()
+        exif[0x0112] = 6
+        Image.fromarray((255 * HALF[:12]).round().astype(np.uint8)).save(folder / "a.jpg", exif=exif)
+        check_photograph(folder / "a.jpg", (12, 16), sizes_from="w and h")
+        return "read"
+
     eight = Image.fromarray((255 * HALF).round().astype(np.uint8))
     see_through = eight.convert("RGBA")
     see_through.putalpha(eight)
@@ -62,6 +72,7 @@ def images(folder: Path) -> Iterator[tuple[str, str]]:
     yield "floating-point TIFF to 255", outcome(of(Image.fromarray((255 * HALF).astype(np.float32)), "d.tif"))
     yield "alpha from 0 to 255 (opaque by half or more is used)", outcome(of(see_through, "e.png"))
     yield "a transparent colour, here the darkest (palette, tRNS)", outcome(of(eight, "f.png", transparency=0))
+    yield "turned by EXIF, where `w` and `h` are as displayed", outcome(turned)
     yield "one even grey", outcome(of(Image.new("RGB", (16, 16), (127, 127, 127)), "g.png"))
     yield "HEIC", outcome(heic)
 
@@ -134,6 +145,9 @@ def tables(folder: Path) -> Iterator[tuple[str, str]]:
 def lenses() -> Iterator[tuple[str, str]]:
     for name, (model, parameters) in LENSES.items():
         yield f"`{name}`", f"`{model}` of {', '.join(f'`{p}`' for p in parameters)}"
+    others = [name for name, _ in _MODELS if name not in LENSES]
+    unknown = Fields({"camera_model": others[0]}, Path("transforms.json"))
+    yield ", ".join(f"`{name}`" for name in others), outcome(lambda: read_camera(unknown, "").model)
 
 
 def sizes() -> Iterator[tuple[str, str]]:
@@ -150,6 +164,11 @@ def sizes() -> Iterator[tuple[str, str]]:
     yield "the tool under the floor, or beyond two opposite walls", f"to {100 * limits._SLACK:g} % of the bed"
     yield "the tool's speed", f"to {limits._FASTEST_TOOL:g} m/s"
     yield "time in motion and video", "frame number by `frame_rate`, within a frame"
+    yield "the force's work on a tool that does not turn", "negative"
+    yield (
+        "the largest force, by the weight of a cube of soil as wide as the tool",
+        "{:g} to {:g}, else a remark".format(*_FORCES),
+    )
 
 
 def page() -> str:
