@@ -22,8 +22,8 @@ ALONG, UP = "force along", "force up"
 """Instruments: against the way the tool is pushed, and upwards."""
 REGION, UNIT = "tool", "% of the largest force"
 STAGE = "pushing"
-"""In which the force is believed: that of lowering hangs on the cell, and that of standing on how the last moment of the
-motion is resolved, which measured poses leave open (docs/numerics.md)."""
+"""In which the force is believed: that of lowering depends on the cell, and that of standing on how the last moment of
+the motion is resolved, which measured poses leave open (docs/numerics.md)."""
 LEAST = 0.25
 """Share of the largest force below which it isn't looked at: where soil is first touched is a matter of cells."""
 FEWEST = 2
