@@ -87,7 +87,7 @@ class Scene:
         """The tool, hovering first and dipping into the soil later (a set's tool must)."""
         positions = np.tile(self.tool_centre, (5, 1))
         if touches:
-            positions[1:, 2] -= np.linspace(0.05, 0.2, 4)
+            positions[1:, 2] -= np.linspace(0.05, 0.17, 4)
         motion = ToolMotion(np.arange(5), np.arange(5) / 50.0, positions, np.tile([1.0, 0, 0, 0], (5, 1)))
         return Tool(trimesh.creation.box(2 * TOOL_HALF), motion)
 
