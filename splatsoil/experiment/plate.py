@@ -160,7 +160,6 @@ def _set_up(diameter: float, deepest: float, density: float, friction: float) ->
         gravity=np.array([0.0, 0.0, -9.81]),
         frame_rate=FRAME_RATE,
         bed=bed,
-        # Real soil bears a plate better than soil that gives way ever could.
         tool=Tool(plate, motion, friction=friction),
         views=(),
         video=(),

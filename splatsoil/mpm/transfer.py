@@ -209,7 +209,7 @@ def find_gaps(
     ``weight`` of the eight corners of the cell by which contact acts on them (entry 8 * listed + corner).
 
     Trilinear weights carry contact up to a cell beyond the tool's edges, as if it were wider and deeper. So a corner
-    counts by the share of the way to it, along the tangent plane from the point of contact, that lies on the tool.
+    counts by 1 - d / l: l is its way from the point of contact along the tangent plane, d how far off the tool it ends.
     """
     p = wp.tid()
     rotation = tool_rotation(pose)
