@@ -97,7 +97,7 @@ class World:
         particles: (n, 3) at frame 0, m.
         spacing: edge of the cube of soil that a particle stands for, m.
         young: Young's modulus, Pa.
-        cohesion: Pa; of the whole soil, with one friction angle.
+        cohesion: Pa; one, or (n,) one a particle; soil that has any has one friction angle.
         dilatancy: slope of the plastic potential over that of the yield surface: 1 is associated flow.
         viscosity: Pa s.
         tool_friction: None for the measurement's.
@@ -112,7 +112,7 @@ class World:
     particles: FloatArray = field(repr=False)
     spacing: float
     young: float = 1.0e7
-    cohesion: float = 0.0
+    cohesion: float | FloatArray = 0.0
     dilatancy: float = 0.0
     viscosity: float = 0.0
     tool_friction: float | None = None
@@ -285,7 +285,7 @@ def _model(newton: Any, worlds: Sequence[World], shifts: FloatArray, device: str
     material.friction.assign(each([np.vectorize(cone_slope)(w.angle) for w in worlds]))
     material.dilatancy.assign(each([w.dilatancy for w in worlds]))
     material.viscosity.assign(each([w.viscosity for w in worlds]))
-    if any(w.cohesion for w in worlds):
+    if any(np.any(w.cohesion) for w in worlds):
         # Newton's strength is yield_stress + friction (p + tension): the cone's apex alone makes the whole cohesion,
         # and a yield stress beside it would double that.
         material.yield_pressure.fill_(YIELD_PRESSURE)
@@ -293,12 +293,12 @@ def _model(newton: Any, worlds: Sequence[World], shifts: FloatArray, device: str
     return model
 
 
-def _tension(world: World) -> float:
-    """Pressure of the cone's apex, Pa."""
-    if not world.cohesion:
+def _tension(world: World) -> float | FloatArray:
+    """Pressure of the cone's apex, Pa; one, or (n,)."""
+    if not np.any(world.cohesion):
         return 0.0
     angle = float(world.angle)
-    return cone_intercept(angle, world.cohesion) / cone_slope(angle)
+    return world.cohesion * cone_intercept(angle, 1.0) / cone_slope(angle)
 
 
 def _walls(lower: FloatArray, upper: FloatArray) -> list[tuple[FloatArray, FloatArray]]:

@@ -30,7 +30,7 @@ from splatsoil.benchmarks._common import at_least, here, keep_to_one_protocol, s
 from splatsoil.benchmarks._mitsuba import MitsubaStage, load_mitsuba
 from splatsoil.benchmarks._newton import Numerics, World, plough
 from splatsoil.benchmarks._tally import confusion, wilson
-from splatsoil.benchmarks._truths import FIELD, KINDS, NOTHING, OBSERVATION, Hidden, draw
+from splatsoil.benchmarks._truths import KINDS, NOTHING, OBSERVATION, OUTSIDE, Hidden, draw
 from splatsoil.benchmarks.numerics import FloatArray
 from splatsoil.benchmarks.solvers import FRAMES, moved, read_particles, refinement_table, surfaces
 
@@ -64,6 +64,9 @@ def soil_of(hidden: Hidden, setup: Setup, spacing: float) -> World:
     if "across" in told:
         middle, half = setup.bed.lower[1] + 0.5 * setup.bed.extents[1], 0.5 * setup.bed.extents[1]
         angle = hidden.angle + told.pop("across") * (x[:, 1] - middle) / half
+    if "crust" in told:
+        cohesion, thick = told.pop("crust")
+        told["cohesion"] = np.where(setup.surface.sample(x[:, :2]) - x[:, 2] < thick, cohesion, 0.0)
     if "obstacle" in told:
         keep = np.linalg.norm(x - np.array(told["obstacle"][:3]), axis=1) > told["obstacle"][3]
         x = x[keep]
@@ -222,7 +225,7 @@ def score(hidden: Hidden, fit: Mapping[str, Any], told: Mapping[str, Any]) -> di
         "verdict": told["verdict"],
         "class": told["class"],
         "explained": told["explained"],
-        "right": hidden.kind in named if hidden.kind not in (NOTHING, FIELD) else not named,
+        "right": hidden.kind in named if hidden.kind not in (NOTHING, *OUTSIDE) else not named,
         "nearest": hidden.kind in told["class"],
         "fit": [fit["parameters"]["friction_angle"][key] for key in ("estimate", "std")],
         "before": [base["values"]["friction_angle"], base["stds"]["friction_angle"]],
@@ -263,10 +266,10 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
 
     firsts = [(r["hidden"], r["class"][0] if r["verdict"] == "missing" else NOTHING) for r in rows]
     lines += ["", confusion(firsts), ""]
-    library = [r for r in rows if r["hidden"] not in (NOTHING, FIELD)]
+    library = [r for r in rows if r["hidden"] not in (NOTHING, *OUTSIDE)]
     right = [r for r in library if r["class"][:1] == [r["hidden"]] and r["hidden"] not in OBSERVATION]
     plain_sand = [r for r in rows if r["hidden"] == NOTHING]
-    outside = [r for r in rows if r["hidden"] == FIELD]
+    outside = [r for r in rows if r["hidden"] in OUTSIDE]
     share("some effect named where nothing is hidden", plain_sand, lambda r: not r["right"])
     share("the class of what is missing holds the truth", library, lambda r: r["right"])
     share("the same, or the truth is the nearest of the library", library, lambda r: r["nearest"])
@@ -326,8 +329,10 @@ def main(arguments: list[str] | None = None) -> int:
     def say(what: str) -> None:
         print(f"{time.perf_counter() - began:6.0f} s  {what}", file=sys.stderr, flush=True)
 
-    if options.solver != NEWTON and FIELD in options.kinds:
-        raise ParameterError(f"{FIELD} is outside of our library: give --kinds without it, or --solver {NEWTON}")
+    foreign = [kind for kind in options.kinds if kind in OUTSIDE]
+    if options.solver != NEWTON and foreign:
+        said = " and ".join(foreign)
+        raise ParameterError(f"{said}: outside of our library; give --kinds without, or --solver {NEWTON}")
     if not options.voxel > 0.0 or options.iterations < 1:
         raise ParameterError("--voxel must be positive, and --iterations one at least")
     if options.refine and options.solver != NEWTON:
