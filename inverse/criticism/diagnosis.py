@@ -1,127 +1,129 @@
-"""Diagnosis: from an experiment and a fit to a verdict, with everything that led to it."""
+"""A comparison of models from beginning to end: simulations, evidence, predictive checks, what was set aside."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import zip_longest
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from splatsoil.errors import SimulationError
-from splatsoil.experiment.base import Calibration, Candidate, Experiment
+from splatsoil.errors import RunError, SimulationError
+from splatsoil.experiment.base import Candidate, Experiment
 
-from .confirmation import Confirmation, confirm, remainder_of
-from .derivatives import moved, rate
-from .estimates import Estimate, weighed, weighed_there
-from .evidence import Evidence, gather
-from .floor import Floor
-from .looks import Looks, foreseen, look, promising
-from .misfit import Block, Omnibus, left_over, shares
-from .naming import members_of
-from .outside import StrengthReading, read_strength
-from .own_floor import as_it_is, on_its_own_floor
-from .score import Score, Scorer
-from .sides import lopsided
-from .sight import Sight
-from .simulations import Simulations
-from .strokes import StrokeAdvice, advise
-from .verdicts import (
-    GATE,
-    LEVEL,
-    WITHIN,
-    EffectVerdict,
-    Verdict,
-    beyond,
-    explained,
-    explained_of_all,
-    of_effect,
-    overall,
-)
+from .checks import Check, Expected, checks, passes
+from .design import Prior, Run, effect_runs
+from .evidence import AS_IT_IS, ELSE, PRIOR, Comparison, Evidence
+from .noise import REMAINING, Noise, Tables, compared, noise_of, trend_of
+from .power import NAMED, detectable
+from .simulations import Simulate, Simulations
 
 FloatArray = npt.NDArray[np.float64]
-Report = Callable[[str, float], None]
+Verdict = Literal["adequate", "missing", "one of", "something else", "undecided"]
 
-
-MORE = 3
-"""Effects that are refitted beyond those asked for where the model is off: a refit's first steps cost little."""
+FINE = "fine"
+"""Numerics that make the fine run of a pair."""
+BASE, PAIRS, SCREENED = 10, 3, 4
+"""Simulations of the base model (half as many again for each parameter more), pairs, and of each effect."""
+REFINED, ROUNDS = 3, 2
+"""Effects, the most probable ones, that are simulated again at their posterior, and how often."""
+STEP = 4.0
+"""Of an observation effect's parameter, over its smallest meaningful size, at which it is drawn."""
+MOST_IN_SET = 4
+"""Effects that may be named together."""
+SHOWN = 0.05
+"""Probability from which an effect is worth a line of its own."""
 
 
 @dataclass(frozen=True)
-class Options:
-    """How thorough a diagnosis is.
+class HeldOut:
+    """What a model says of data that it hasn't seen.
 
     Attributes:
-        level: family-wise chance of naming an effect when none is missing.
-        repeats: simulations at the fit with other seeds.
-        refits: effects, the best ones, that are refitted; :data:`MORE` where the model is off.
-        refit_steps: a refit's first simulations at most; some ten to twenty more follow for what explains most.
-        seed: of draws.
+        model: its name.
+        error: root mean square of the residual, in the layout's unit.
+        noise: what would be left with nothing wrong.
+        log_score: mean logarithm of the predictive density of a feature.
     """
 
-    level: float = LEVEL
-    repeats: int = 4
-    refits: int = 3
-    refit_steps: int = 5
-    seed: int = 0
+    model: str
+    error: float
+    noise: float
+    log_score: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """All that was found.
+    """What a comparison of models came to.
 
     Attributes:
-        verdict: on the model.
-        members: the equivalence class: effects that explain the misfit about equally well, the best first.
-        effects: verdict on each effect.
-        scores: of each effect, alone.
-        given: of each effect, with the best one taken to be on; empty where none was named.
-        confusion: correlation of each pair of effects' scores.
-        estimates: the model's own parameters as it is, all of the floor and what is systematic counted, by name.
-        misfit: of the model as it is, on slow waves.
-        whole: how far it is off in all.
-        remainder: after the best effect; None where none was named.
-        whole_after: how far the model with it is off in all; None where none was named, where there is no chance, or
-            none could be simulated.
-        explained: share of the misfit beyond chance that the best effect explains, on slow waves where these show one.
-        confirmations: refits by effect, the model as it is under the empty name.
-        blocks: where the model fails.
-        where: share of the best effect's evidence in each (stage, region, channel).
-        residual: (t, s) what parameters and nuisances can't take up.
-        floor: noise and nuisances.
-        evidence: the simulations.
-        strength: what a free strength says where something outside the library is missing, else None.
-        strokes: which stroke would tell the class's members apart.
-        simulations: how many the diagnosis needed, coarse ones of other strokes aside.
-        unit: of the features.
-        notes: what went otherwise than planned.
+        verdict: in one word.
+        members: effects that are named; else the most probable ones, if any is worth a line.
+        evidence: of all models.
+        estimates: mean and standard deviation of the base model's parameters, averaged over models, by name.
+        determined: whether the data say more of them than the prior.
+        detectable: smallest size over the meaningful one that would have been named, by effect; None for none.
+        checks: of the most probable model.
+        residuals: (t, s) of the base model and of the best effect, by name.
+        predictions: (t, s) theirs.
+        expected: (t, s) variance with nothing wrong.
+        mask: (t, s) features that were compared.
+        held_out: on data set aside.
+        aside: what these are.
+        notes: for people.
     """
 
     verdict: Verdict
     members: tuple[str, ...]
-    effects: Mapping[str, EffectVerdict]
-    scores: Mapping[str, Score]
-    given: Mapping[str, Score]
-    confusion: Mapping[tuple[str, str], float]
-    estimates: Mapping[str, Estimate]
-    misfit: Omnibus
-    whole: Block
-    remainder: Omnibus | None
-    explained: float
-    confirmations: Mapping[str, Confirmation]
-    blocks: tuple[Block, ...]
-    where: Mapping[tuple[str, str, str], float]
-    residual: FloatArray
-    floor: Floor
     evidence: Evidence
-    whole_after: Block | None = None
-    strength: StrengthReading | None = None
-    strokes: tuple[StrokeAdvice, ...] = ()
-    simulations: int = 0
-    unit: str = ""
-    notes: tuple[str, ...] = ()
+    estimates: Mapping[str, tuple[float, float]]
+    determined: Mapping[str, bool]
+    detectable: Mapping[str, float | None]
+    checks: Sequence[Check]
+    residuals: Mapping[str, FloatArray]
+    predictions: Mapping[str, FloatArray]
+    expected: FloatArray
+    mask: npt.NDArray[np.bool_]
+    held_out: Sequence[HeldOut] = ()
+    aside: str = ""
+    notes: Sequence[str] = ()
+
+    @property
+    def passes(self) -> bool:
+        """Whether no predictive check stands out."""
+        return passes(list(self.checks))
+
+
+@dataclass
+class _Study:
+    """Simulations so far, and what failed."""
+
+    experiment: Experiment
+    simulate: Simulate
+    prior: Prior
+    seed: int
+    base: list[Run] = field(default_factory=list)
+    fine: list[Run] = field(default_factory=list)
+    effects: dict[str, list[Run]] = field(default_factory=dict)
+    failed: dict[str, str] = field(default_factory=dict)
+
+    def tables(self, drawn: Mapping[str, FloatArray], reference: FloatArray) -> Tables:
+        made = {name: self._made(runs) for name, runs in self.effects.items()}
+        enough = {name: found for name, found in made.items() if len(found[0]) > 1}
+        return Tables(self._made(self.base), self._made(self.fine), enough, drawn, reference)
+
+    def _made(self, runs: Sequence[Run]) -> tuple[list[Run], FloatArray]:
+        """Those that could be made, and their tables."""
+        kept, found = [], []
+        for run in runs:
+            try:
+                found.append(self.simulate(**run.arguments(), purpose=", ".join(run.effects) or run.numerics or "base"))
+            except SimulationError as error:
+                self.failed.setdefault(", ".join(run.effects) or "the model as it is", str(error))
+            else:
+                kept.append(run)
+        return kept, np.array(found).reshape(len(kept), *self.experiment.layout.shape)
 
 
 def diagnose(
@@ -129,264 +131,252 @@ def diagnose(
     values: Mapping[str, float],
     *,
     simulate: Simulations | None = None,
-    options: Options | None = None,
-    replays: Callable[[], FloatArray] | None = None,
-    calibration: Calibration | None = None,
-    progress: Report | None = None,
+    effects: bool = True,
+    seed: int = 0,
+    progress: Callable[[str, float], None] = lambda what, share: None,
 ) -> Diagnosis:
-    """Criticise a model at its fitted parameters.
+    """Compare models.
 
     Args:
-        experiment: what was observed, and the model.
-        values: the fitted parameters.
-        simulate: where predictions come from; the experiment itself by default.
-        options: how thorough.
-        replays: gives those of :class:`~splatsoil.inverse.criticism.evidence.Evidence`; asked once all is simulated.
-        calibration: likewise.
+        experiment: what was observed, and predicts.
+        values: a fit's, where drawings are made.
+        simulate: the experiment's simulations; new ones by default.
+        effects: whether effects that are off are models, too; else only the base model and "something else".
+        seed: of the design.
         progress: called with (what, share done).
 
     Raises:
-        SimulationError: the fit itself can't be simulated.
+        RunError: the base model could not be simulated.
     """
-    options, simulate = options or Options(), simulate or Simulations(experiment)
-    told = progress or (lambda what, share: None)
-    evidence = gather(
-        experiment, simulate, values, repeats=options.repeats, progress=lambda share: told("simulations", 0.4 * share)
+    ask = Simulations(experiment) if simulate is None else simulate
+    prior = Prior.of(experiment, values)
+    candidates = experiment.candidates if effects else ()
+    study = _design(experiment, ask, prior, candidates, seed)
+    ask.ahead(lambda noted: _ask_through(study, noted))
+    progress("drawings", 0.0)
+    drawn, reference = _drawings(experiment, ask, values, candidates)
+    progress("simulations", 0.1)
+    evidence, comparison, noise, tables = _judged(study, drawn, reference, candidates)
+    for number in range(ROUNDS if effects else 0):
+        progress("simulations where each effect is most probable", 0.7 + 0.1 * number)
+        rng = np.random.default_rng([seed, 19, number])
+        likely = sorted(study.effects, key=lambda name: -evidence.probability.get(name, 0.0))[:REFINED]
+        for name in likely:
+            if name in evidence.models:
+                drawn_values = evidence.models[name].drawn(SCREENED, rng)
+                first = 1000 * (1 + number) + seed
+                study.effects[name] += [Run(v, (name,), first + i) for i, v in enumerate(drawn_values)]
+        ask.ahead(lambda noted: _ask_through(study, noted))
+        evidence, comparison, noise, tables = _judged(study, drawn, reference, candidates)
+    progress("checks", 0.9)
+    best = max(
+        (n for n in evidence.probability if n not in (AS_IT_IS, ELSE)),
+        key=lambda n: evidence.probability[n],
+        default="",
     )
-    foreseen(experiment, evidence, simulate)
-    return judge(
-        experiment,
-        replace(evidence, replays=None if replays is None else replays(), calibration=calibration),
-        simulate,
-        options=options,
-        progress=told,
-    )
-
-
-def judge(
-    experiment: Experiment,
-    evidence: Evidence,
-    simulate: Simulations,
-    *,
-    options: Options,
-    progress: Report | None = None,
-) -> Diagnosis:
-    """From evidence to a verdict; simulates only to switch effects on and to refit the best of them."""
-    told = progress or (lambda what, share: None)
-    looks = look(experiment, evidence, simulate, level=options.level, seed=options.seed)
-    evidence, bench, off, vantage = looks.evidence, looks.bench, looks.off, looks.vantage
-    floor, scorer, seen = bench.floor, bench.scorer, experiment.seen
-    residual = (experiment.observed - evidence.mean)[seen]
-    misfit, (whole, parts) = bench.misfit(residual), bench.blocks(residual)
-    sides = lopsided(experiment, evidence, floor)
-
-    def scored(given: str | None = None) -> dict[str, Score]:
-        found = {} if scorer is None else scorer.score(residual, given=given)
-        return {n: s.on_the_weaker_side(sides.get(n, 1.0), candidates[n].measure.meaningful) for n, s in found.items()}
-
-    candidates = {c.name: c for c in bench.candidates}
-    scores = scored()
-    notes = [f"{name} could not be simulated: {why}" for name, why in evidence.failed.items()]
-    chosen = _chosen(experiment, looks, scores, residual, options)
-    confirmations: dict[str, Confirmation] = {}
-    members: tuple[str, ...] = ()
-    given: Mapping[str, Score] = {}
-    remainder, gone, before, left, whole_after = None, 0.0, misfit, False, None
-    if chosen and scorer is not None:
-        trials = [candidates[name] for name in chosen]
-        confirmations = confirm(
-            experiment, evidence, floor, trials, simulate, options.refit_steps, bench.basis, told, vantage
-        )
-        tried = {name: c for name, c in confirmations.items() if name}
-        # Not by what is left of χ²: an effect that stays off leaves what other pictures say of it unexplained.
-        costs = {name: scorer.price(candidates[name], refitted=True) - c.fall for name, c in tried.items()}
-        measures = {name: c.measure for name, c in candidates.items()}
-        members = members_of(confirmations, costs, off, scores, measures)
-        before = confirmations[""].remainder
-        if members:
-            best = members[0]
-            given = scored(best)
-            own = None
-            if experiment.chance:
-                told("the floor with the effect on", 0.97)
-                try:
-                    own = on_its_own_floor(experiment, evidence, tried[best], candidates[best], simulate, residual)
-                except SimulationError as error:
-                    notes.append(f"with {best} on, its noise could not be simulated: {error}")
-            if own is not None:
-                confirmations[best], before, remainder = own.refit, own.before, own.after
-                whole_after, left = own.whole, beyond(own.whole)
-                errors = own.whole_before.ratio, own.whole.ratio
-            else:
-                remainder = remainder_of(experiment, floor, tried[best], candidates, evidence, bench.basis)
-                asis, after = (c.held_out / c.floor for c in (confirmations[""], tried[best]))
-                errors, left = (asis, after), after > WITHIN
-            # Of slow waves there is no share where they show nothing, on either floor.
-            shown = misfit.p < GATE and before.excess > 0.0
-            gone = explained(before, remainder) if shown else explained_of_all(*errors)
-    effects = _effects(experiment, candidates, scores, given, members, confirmations, looks.astray, options.level)
-    # Where the best explanation is too small to matter, so is what is missing.
-    named = bool(members) and effects[members[0]] == "missing"
-    if chosen and not named:
-        effects = {n: "cannot tell" if v == "missing" else v for n, v in effects.items()}
-    verdict = overall(named, off, before, remainder, left=left)
-    strength = None
-    # Strength is told along slow waves: of what they don't show it explains nothing.
-    if verdict == "outside the library" and misfit.p < GATE:
-        try:
-            strength = read_strength(
-                experiment, evidence, floor, simulate, bench.basis, misfit, progress=lambda s: told("free strength", s)
-            )
-        except SimulationError as error:
-            notes.append(f"the free strength could not be simulated: {error}")
-    if verdict != "adequate":
-        estimates = weighed(experiment, evidence, floor, bench.basis)
-    elif experiment.model:
-        found = confirmations.get("")
-        estimates = as_it_is(experiment, evidence, floor, bench.basis, found, simulate, options.refit_steps, told)
-    else:
-        estimates = weighed_there(experiment, evidence, floor, bench.basis, simulate)
-    strokes = _advice(experiment, members, candidates, confirmations, told)
+    predictions = {AS_IT_IS: _predicted(study, tables, evidence, AS_IT_IS, ask)}
+    if best and evidence.probability[best] >= SHOWN:
+        predictions[best] = _predicted(study, tables, evidence, best, ask)
+    expected = _expected(study, noise, tables, evidence)
+    residuals = {name: experiment.observed - table for name, table in predictions.items()}
+    top = best if best in residuals and evidence.probability[best] > evidence.probability[AS_IT_IS] else AS_IT_IS
+    found = checks(experiment, residuals[top], expected, noise.mask, seed)
+    verdict, members = judged(evidence.probability, fits=passes(found))
+    held_out, aside = _held_out(study, tables, candidates, tuple(predictions), ask) if effects else ([], "")
+    power = {
+        c.name: size if size is None else size * c.measure.meaningful
+        for c in candidates
+        if c.name in evidence.models
+        for size in [detectable(comparison, evidence, c, seed)]
+    }
+    names = [p.name for p in prior.space]
+    estimates = {name: evidence.averaged(name) for name in names}
+    spread = {name: float(np.std(evidence.models[AS_IT_IS].values[name])) for name in names}
     return Diagnosis(
-        verdict=verdict,
-        members=members,
-        effects=effects,
-        scores=scores,
-        given=given,
-        confusion=_pairs(scorer),
-        estimates=estimates,
-        misfit=misfit,
-        whole=whole,
-        remainder=remainder,
-        whole_after=whole_after,
-        explained=gone,
-        confirmations=confirmations,
-        blocks=parts,
-        where=_where(experiment, floor, evidence, scores, members, residual),
-        residual=floor.noise.spread(left_over(floor.noise, floor.free, residual)),
-        floor=floor,
-        evidence=evidence,
-        strength=strength,
-        strokes=strokes,
-        simulations=simulate.asked,
-        unit=experiment.layout.unit,
-        notes=tuple(notes),
+        verdict,
+        members,
+        evidence,
+        estimates,
+        {name: estimates[name][1] < 0.5 * spread[name] for name in names},
+        power,
+        found,
+        residuals,
+        predictions,
+        expected.variance,
+        noise.mask,
+        held_out,
+        aside,
+        [f"{what.replace('_', ' ')}: some simulations failed ({why})" for what, why in study.failed.items()],
     )
 
 
-def _advice(
-    experiment: Experiment,
-    members: Sequence[str],
-    candidates: Mapping[str, Candidate],
-    confirmations: Mapping[str, Confirmation],
-    told: Report,
-) -> tuple[StrokeAdvice, ...]:
-    """Which other stroke tells the members of a class apart, each in the size and shape that its refit found."""
-    if len(members) < 2:
-        return ()
-    fitted = dict(confirmations[members[0]].values)
-    for name in members[1:]:
-        fitted |= {p.name: confirmations[name].values[p.name] for p in candidates[name].refitted}
-    chosen = [candidates[name] for name in members]
-    return advise(experiment, fitted, chosen, progress=lambda share: told("other strokes", share))
+def judged(probability: Mapping[str, float], *, fits: bool) -> tuple[Verdict, tuple[str, ...]]:
+    """The verdict by the models' probabilities and whether the most probable one passes its predictive checks, and the
+    effects that it names."""
+    effects = sorted((n for n in probability if n not in (AS_IT_IS, ELSE)), key=lambda n: -probability[n])
+    shown = tuple(n for n in effects if probability[n] >= SHOWN)
+    if effects and probability[effects[0]] >= NAMED:
+        return "missing", (effects[0],)
+    if probability[ELSE] >= NAMED or (probability[AS_IT_IS] >= PRIOR and not fits):
+        return "something else", shown
+    # the data haven't made the base model less probable than it was
+    if probability[AS_IT_IS] >= PRIOR:
+        return "adequate", shown
+    for count in range(2, MOST_IN_SET + 1):
+        if sum(probability[n] for n in effects[:count]) >= NAMED:
+            return "one of", tuple(effects[:count])
+    return "undecided", shown
 
 
-def _chosen(
-    experiment: Experiment,
-    looks: Looks,
-    scores: Mapping[str, Score],
-    residual: FloatArray,
-    options: Options,
-) -> list[str]:
-    """Effects to refit: significant ones, those first that explain most for their parameters.
-
-    Where the model is off, those too that would explain most if they were alone, in their best shapes, as seen from
-    soil as one would guess it where the fit is far from that: at a fit that a missing effect has led astray, it needn't
-    stand out.
-    """
-    evidence, bench, vantage, scorer = looks.evidence, looks.bench, looks.vantage, looks.bench.scorer
-    if scorer is None:
-        return []
-    prices = {c.name: scorer.price(c) for c in scorer.candidates}
-    found = [s for s in scores.values() if s.adjusted < options.level]
-    strong = [s.name for s in sorted(found, key=lambda s: s.statistic - prices[s.name], reverse=True)]
-    alone: list[str] = []
-    if looks.astray and vantage is not None:
-        sight = Sight.of(experiment, bench.floor, bench.basis, vantage)
-        alone = promising(experiment, vantage, sight, bench.candidates, scorer.price)
-    elif looks.off:
-        shaped = {} if vantage is None else {name: vantage.directions[name] for name in vantage.shapes}
-        best = bench.scored(experiment, evidence, {**evidence.directions, **shaped}) if shaped else scorer
-        alone = best.ranked(residual)
-    if not alone:
-        return strong[: options.refits]
-    # The two orders take turns, and more are tried than either would have: chance is in both.
-    turns = [name for pair in zip_longest(strong, alone) for name in pair if name is not None]
-    return list(dict.fromkeys(turns))[: options.refits + MORE]
+def _design(
+    experiment: Experiment, simulate: Simulate, prior: Prior, candidates: Iterable[Candidate], seed: int
+) -> _Study:
+    count = BASE + BASE // 2 * (len(prior.space) - 1)
+    study = _Study(experiment, simulate, prior, seed)
+    study.base = [Run(v, seed=seed + 1 + i) for i, v in enumerate(prior.values(_spread(prior, count, seed)))]
+    if FINE in experiment.numerics:
+        points = 0.7 * _spread(prior, PAIRS, seed + 1)
+        study.fine = [Run(v, seed=seed + 101 + i, numerics=FINE) for i, v in enumerate(prior.values(points))]
+    for number, candidate in enumerate(c for c in candidates if c.kind == "physics"):
+        study.effects[candidate.name] = effect_runs(candidate, prior, SCREENED, seed + 201 + 10 * number)
+    return study
 
 
-def _effects(
-    experiment: Experiment,
-    candidates: Mapping[str, Candidate],
-    scores: Mapping[str, Score],
-    given: Mapping[str, Score],
-    members: Sequence[str],
-    confirmations: Mapping[str, Confirmation],
-    astray: bool,
-    level: float,
-) -> dict[str, EffectVerdict]:
-    """A verdict for each effect: members by their refits, the others by what the best one leaves for them.
-
-    Where the fit was ``astray``, by one seed and of other soil than that which was fitted: that denies nothing.
-    """
-    out: dict[str, EffectVerdict] = {}
-    for name, candidate in candidates.items():
-        if name in members:
-            out[name] = "missing" if _matters(candidate, confirmations[name].values) else "trivial"
-        else:
-            score = given.get(name, scores[name])
-            out[name] = of_effect(candidate, score, level=level, apart=_apart(experiment, candidate, score))
-            if out[name] == "missing" or (astray and candidate.kind == "physics"):
-                # Significant beside the best one too, or because the best one's size is off: the next round tells.
-                out[name] = "cannot tell"
-    return out
+def _spread(prior: Prior, count: int, seed: int) -> FloatArray:
+    """(count, n) points in [-1, 1]: evenly for one parameter, else a Sobol sequence."""
+    if len(prior.space) == 1:
+        return (2.0 * (np.arange(count) + 0.5) / count - 1.0)[:, None]
+    return prior.points(1 << (count - 1).bit_length(), seed)[:count]
 
 
-def _apart(experiment: Experiment, candidate: Candidate, score: Score) -> float:
-    """Standard deviation between solvers of the size from which an effect matters, on the side where it is scored."""
-    size = candidate.measure
-    off = float(size.off or 0.0)
-    matters = moved(size, off, math.copysign(size.meaningful, score.estimate) / rate(size, off))
-    return experiment.reproducibility(size, matters, candidate.name)
+def _ask_through(study: _Study, simulate: Simulate) -> None:
+    """Ask for all that a study needs, through another function."""
+    other = replace(study, simulate=simulate, failed={})
+    other.tables({}, np.zeros(study.experiment.layout.shape))
 
 
-def _matters(candidate: Candidate, values: Mapping[str, float]) -> bool:
-    """Whether any of an effect's parameters is at least of its smallest meaningful size."""
-    sizes = [(abs(values[p.name] - float(p.off or 0.0)), p.meaningful) for p in candidate.parameters]
-    return any(size >= least and size > 0.0 for size, least in sizes)
+def _drawings(
+    experiment: Experiment, simulate: Simulate, values: Mapping[str, float], candidates: Iterable[Candidate]
+) -> tuple[dict[str, FloatArray], FloatArray]:
+    """One simulation reported or drawn otherwise, by guess or parameter (these for their smallest meaningful size), and
+    as usual."""
+    observed = [c for c in candidates if c.kind == "observation"]
+    # What needs more frames of it comes first, so that one simulation serves all.
+    observed.sort(key=lambda c: c.name != "time_offset")
+    at, tables = dict(values), {}
+    for candidate in observed:
+        for p in candidate.parameters:
+            assert p.off is not None
+            end = float(np.clip(p.off + STEP * p.meaningful, p.lower, p.upper))
+            table = simulate({**at, p.name: end}, effects=(candidate.name,), purpose=candidate.name)
+            tables[p.name] = (table, (end - p.off) / p.meaningful)
+    reference = simulate(at, purpose="as it is")
+    drawn = {name: reference + (table - reference) / step for name, (table, step) in tables.items()}
+    others = {name: simulate(at, numerics=name, purpose=name) for name in (*experiment.guesses, *experiment.redrawn)}
+    return {**drawn, **others}, reference
 
 
-def _pairs(scorer: Scorer | None) -> dict[tuple[str, str], float]:
-    if scorer is None:
-        return {}
-    matrix, names = scorer.confusion(), scorer.names
-    return {(a, b): float(matrix[i, j]) for i, a in enumerate(names) for j, b in enumerate(names) if j < i}
+def _judged(
+    study: _Study,
+    drawn: Mapping[str, FloatArray],
+    reference: FloatArray,
+    candidates: Sequence[Candidate],
+    aside: npt.NDArray[np.bool_] | None = None,
+) -> tuple[Evidence, Comparison, Noise, Tables]:
+    tables = study.tables(drawn, reference)
+    return (*_compared(study, tables, candidates, aside), tables)
 
 
-def _where(
-    experiment: Experiment,
-    floor: Floor,
-    evidence: Evidence,
-    scores: Mapping[str, Score],
-    members: Sequence[str],
-    residual: FloatArray,
-) -> dict[tuple[str, str, str], float]:
-    """Share of the best effect's evidence in each part of the data."""
-    if not members:
-        return {}
-    seen = experiment.seen
-    direction = evidence.directions[members[0]][:, seen].T @ np.array(list(scores[members[0]].steps.values()))
-    solver = floor.noise.solver.beside(floor.free)
-    parts = shares(experiment.layout, floor.noise, direction * solver.solve(residual))
-    whole = sum(parts.values())
-    return {key: value / whole for key, value in parts.items()} if whole > 0.0 else {}
+def _compared(
+    study: _Study, tables: Tables, candidates: Sequence[Candidate], aside: npt.NDArray[np.bool_] | None
+) -> tuple[Evidence, Comparison, Noise]:
+    if len(tables.base[0]) < BASE // 2:
+        why = study.failed.get("the model as it is", "")
+        raise RunError(f"the model as it is could be simulated {len(tables.base[0])} times only: {why}")
+    noise = noise_of(study.experiment, study.prior, tables, candidates, aside)
+    simulated = {name: (runs, noise.scores(found)) for name, (runs, found) in tables.effects.items()}
+    comparison = Comparison.of(noise, study.prior, candidates, simulated, study.seed)
+    return comparison.judge(), comparison, noise
+
+
+def _predicted(study: _Study, tables: Tables, evidence: Evidence, name: str, simulate: Simulate) -> FloatArray:
+    """(t, s) of a model at its posterior mean: by the base simulations' trend, or a simulation of an effect."""
+    model = evidence.models[name]
+    values = {parameter: model.moments(parameter)[0] for parameter in model.values}
+    if name in tables.effects:
+        return simulate(values, effects=(name,), seed=study.seed, purpose=name)
+    point = study.prior.space.to_unit(study.prior.space.to_vector(values))[None]
+    table = np.tensordot(trend_of(point, study.prior.unit(tables.base[0]))[0], tables.base[1], axes=1)
+    if name in evidence.noise.patterns:
+        table = table + _observed_otherwise(study, tables, evidence, name)
+    return np.asarray(table)
+
+
+def _observed_otherwise(study: _Study, tables: Tables, evidence: Evidence, name: str) -> FloatArray:
+    """(t, s) what an effect of observation adds, at the sizes that explain most of what the base model leaves."""
+    noise = evidence.noise
+    candidate = next(c for c in study.experiment.candidates if c.name == name)
+    pattern = noise.patterns[name]
+    precision = np.linalg.inv(noise.covariance(evidence.models[name].factor))
+    model = evidence.models[name]
+    values = {p: model.moments(p)[0] for p in model.values}
+    point = study.prior.space.to_unit(study.prior.space.to_vector(values))[None]
+    left = noise.observed - trend_of(point, noise.points)[0] @ noise.base
+    size = np.linalg.solve(pattern @ precision @ pattern.T + np.eye(len(pattern)) / 16.0, pattern @ precision @ left)
+    added = [
+        s * (tables.drawn[p.name] - tables.reference)
+        for s, p in zip(size, (p for p in candidate.parameters if p.name in tables.drawn), strict=True)
+    ]
+    return np.asarray(sum(added))
+
+
+def _expected(study: _Study, noise: Noise, tables: Tables, evidence: Evidence) -> Expected:
+    experiment, prior = study.experiment, study.prior
+    base = tables.base[1]
+    rest = np.tensordot(np.eye(len(base)) - noise.trend, base, axes=1)
+    rest /= np.sqrt(np.maximum(1.0 - np.diag(noise.trend), 1e-9))[:, None, None]
+    pairs = np.zeros((0, *experiment.layout.shape))
+    if len(tables.fine[0]):
+        hat = trend_of(prior.unit(tables.fine[0]), noise.points)
+        pairs = tables.fine[1] - np.tensordot(hat, base, axes=1)
+    factor = evidence.models[AS_IT_IS].factor
+    chance = rest if experiment.chance else rest[:0]
+    return Expected(np.asarray(experiment.sensor), chance, pairs, min(factor, 1.0))
+
+
+def _held_out(
+    study: _Study, tables: Tables, candidates: Sequence[Candidate], names: Sequence[str], simulate: Simulate
+) -> tuple[list[HeldOut], str]:
+    """Models fitted without one camera and the last stage, and their errors there."""
+    experiment = study.experiment
+    aside, what = set_aside(experiment)
+    mask = compared(experiment)
+    judged_on = mask & aside & experiment.layout.common[None]
+    if not judged_on.any() or not (mask & ~aside).any():
+        return [], ""
+    evidence, _, noise = _compared(study, tables, candidates, aside)
+    expected = _expected(study, replace(noise, mask=mask), tables, evidence)
+    variance = expected.variance[judged_on]
+    out = []
+    for name in names:
+        left = (experiment.observed - _predicted(study, tables, evidence, name, simulate))[judged_on]
+        score = -0.5 * float(np.mean(left**2 / variance + np.log(2.0 * np.pi * variance)))
+        out.append(HeldOut(name, float(np.sqrt(np.mean(left**2))), float(np.sqrt(variance.mean())), score))
+    return out, what
+
+
+def set_aside(experiment: Experiment) -> tuple[npt.NDArray[np.bool_], str]:
+    """(t, s) features of one camera (the last, where there are several) and of the last stage, and what they are."""
+    layout = experiment.layout
+    last = layout.stages[-1]
+    out = np.zeros(layout.shape, dtype=bool)
+    out[np.array(layout.stages) == last] = True
+    cameras = [
+        c
+        for c in layout.channels
+        if any(s.channel == c and p for s, p in zip(layout.sites, layout.placed, strict=True))
+    ]
+    if len(cameras) < 2:
+        return out, f"the {last}"
+    out[:, np.array([s.channel == cameras[-1] for s in layout.sites])] = True
+    return out, f"camera {cameras[-1]} and the {last}"

@@ -1,344 +1,248 @@
-"""What has to be simulated before anything can be said: repeats, other numerics, derivatives."""
+"""How probable each model is, and what its parameters are: quasi-Monte Carlo over emulators.
+
+The evidence of a model is the mean of its likelihood over its prior (MacKay 2003, Information Theory, Inference, and
+Learning Algorithms, ch. 28; Kass & Raftery 1995, J. Am. Stat. Assoc. 90:773). The likelihood is normal, with the
+emulator's own doubt beside the noise; the numerics' factor is integrated over, which gives it long tails. "Something
+else" is the base model with a discrepancy larger than numerics (Kennedy & O'Hagan 2001, J. R. Stat. Soc. B 63:425).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import solve_triangular
+from scipy.special import logsumexp
+from scipy.stats import qmc
 
-from splatsoil.errors import SimulationError
-from splatsoil.experiment.base import Calibration, Candidate, Experiment
-from splatsoil.parameters import Parameter, distance
+from splatsoil.experiment.base import Candidate
 
-from .derivatives import Run, around, derivatives, directions_of
+from .design import Prior, Run, effect_points, effect_values, sizes
+from .emulator import BaseEmulator, IncrementEmulator
+from .noise import FACTORS, SOMETHING_ELSE, Noise
 
 FloatArray = npt.NDArray[np.float64]
-Numerics = tuple[dict[str, FloatArray], dict[str, FloatArray]]
 
-STRIDE = 2.0
-"""By how much longer steps of an effect are whose simulations have chance, to stand above it."""
-
-
-@dataclass(frozen=True)
-class Visit:
-    """One simulation.
-
-    Attributes:
-        values: its parameters, by name.
-        effects: names of the candidates that were on.
-        table: (t, s) features.
-        seed: of what is chance in it.
-    """
-
-    values: Mapping[str, float]
-    effects: tuple[str, ...]
-    table: FloatArray
-    seed: int = 0
+POINTS = 4096
+"""Of the quasi-Monte Carlo sequence."""
+AS_IT_IS, ELSE = "", "something else"
+"""Names of the two models without an effect."""
+PRIOR = 0.5
+"""Probability of the base model beforehand; the others share the rest."""
+SLAB = 4.0
+"""Standard deviation of an observation effect's sizes, over the smallest meaningful ones: its drawings are linear."""
 
 
-def joined(visits: Iterable[Visit], more: Iterable[Visit]) -> tuple[Visit, ...]:
-    """Visits, and those of some more that aren't among them: to count a simulation twice is to believe its chance."""
-    there = tuple(visits)
-    return (*there, *(v for v in more if not any(np.array_equal(v.table, known.table) for known in there)))
-
-
-@dataclass(frozen=True)
-class Vantage:
-    """Predictions around one point.
+@dataclass(frozen=True, eq=False)
+class Model:
+    """One model that could be true.
 
     Attributes:
-        values: the model's parameters there.
-        prediction: (t, s) features there.
-        slopes: (t, s) derivative by each parameter of the model.
-        curves: (t, s) half the second derivative by each parameter where it was measured.
-        widths: the step of each parameter's derivative.
-        directions: (k, t, s) derivatives by each candidate's parameters, at off.
-        steps: the step of each of these.
-        failed: candidates whose simulation could not go on, with the reason.
-        visits: all simulations that were made.
-        shapes: by candidate, what shapes it where its directions were measured, if not the defaults.
-        doubts: by parameter of the model (t, s) and by candidate (k, t, s), half the difference between the derivatives
-            of two seeds, of which those above are the mean: as large as the chance in these. Empty with one seed.
+        name: the effect's; `AS_IT_IS`, `ELSE`.
+        values: parameters (q,) by name at the points.
+        mean: (q, p) scores that are predicted there.
+        variance: (q, p) the emulator's doubt of them, in the directions of `whitened` scores.
+        pattern: (k, p) of an effect of observation, else empty.
+        log_likelihood: (f, q) by the numerics' factor.
+        weights: (f, q) posterior, summing to 1.
+        log_evidence: of it.
     """
 
-    values: Mapping[str, float]
-    prediction: FloatArray
-    slopes: Mapping[str, FloatArray]
-    curves: Mapping[str, FloatArray]
-    widths: Mapping[str, float]
-    directions: Mapping[str, FloatArray]
-    steps: Mapping[str, float]
-    failed: Mapping[str, str]
-    visits: tuple[Visit, ...]
-    shapes: Mapping[str, Mapping[str, float]] = field(default_factory=dict, kw_only=True)
-    doubts: Mapping[str, FloatArray] = field(default_factory=dict, kw_only=True)
-
-    def doubt(self, name: str, like: FloatArray) -> FloatArray:
-        """Of one name, in the shape of its derivatives; 0 where there is none."""
-        return self.doubts[name] if name in self.doubts else np.zeros_like(like)
-
-
-@dataclass(frozen=True)
-class Evidence(Vantage):
-    """Predictions around a fit, and how far they can be believed.
-
-    Attributes:
-        mean: (t, s) mean prediction over seeds that derivatives don't share.
-        repeats: (r, t, s) deviations of those seeds from their mean, scaled to have the variance of one seed.
-        numerics: (t, s) what other numerics change, by name: the mean over two seeds where there is chance in it.
-        numerics_doubts: (t, s) half the difference between these two, as large as the chance that is left; by name.
-        guesses: (g, t, s) the same of other guesses of what no instrument shows, all drawn of one simulation.
-        replays: (k, t, s) residuals of known soils that went through the whole chain of pictures and reconstruction;
-            NaN where these don't tell.
-        calibration: what pictures say of cameras, light, clock and tool where soil plays no part.
-    """
-
+    name: str
+    values: Mapping[str, FloatArray]
     mean: FloatArray
-    repeats: FloatArray
-    numerics: Mapping[str, FloatArray]
-    guesses: FloatArray
-    replays: FloatArray | None = None
-    calibration: Calibration | None = None
-    numerics_doubts: Mapping[str, FloatArray] = field(default_factory=dict, kw_only=True)
+    variance: FloatArray
+    pattern: FloatArray
+    log_likelihood: FloatArray
+    weights: FloatArray
+    log_evidence: float
 
-    def with_effects(
-        self,
+    def moments(self, name: str) -> tuple[float, float]:
+        """Mean and standard deviation of a parameter."""
+        weights = self.weights.sum(axis=0)
+        mean = float(weights @ self.values[name])
+        return mean, float(np.sqrt(max(weights @ (self.values[name] - mean) ** 2, 0.0)))
+
+    @property
+    def factor(self) -> float:
+        """Geometric mean of the numerics' factor."""
+        return float(np.exp(self.weights.sum(axis=1) @ np.log(FACTORS)))
+
+    def drawn(self, count: int, rng: np.random.Generator) -> list[dict[str, float]]:
+        """Parameters drawn from the posterior."""
+        weights = self.weights.sum(axis=0)
+        chosen = rng.choice(len(weights), count, p=weights / weights.sum())
+        return [{name: float(v[i]) for name, v in self.values.items()} for i in chosen]
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """All models, against one observation.
+
+    Attributes:
+        noise: of the scores.
+        models: by name.
+        probability: of each.
+    """
+
+    noise: Noise
+    models: Mapping[str, Model]
+    probability: Mapping[str, float]
+
+    @property
+    def best(self) -> str:
+        """The most probable model."""
+        return max(self.probability, key=lambda name: self.probability[name])
+
+    def averaged(self, name: str) -> tuple[float, float]:
+        """Mean and standard deviation of a base parameter, averaged over models (Hoeting et al. 1999, Stat. Sci. 14)."""
+        known = [(self.probability[m], *model.moments(name)) for m, model in self.models.items()]
+        mean = sum(p * value for p, value, _ in known)
+        variance = sum(p * (std**2 + (value - mean) ** 2) for p, value, std in known)
+        return float(mean), float(np.sqrt(variance))
+
+
+@dataclass(frozen=True)
+class _Likelihood:
+    """Of scores whitened by the expected noise.
+
+    Attributes:
+        root: (p, p) Cholesky factor of that.
+        rotations: for each factor the variances (p,) and directions (p, p) in which its noise is independent.
+    """
+
+    root: FloatArray
+    rotations: Sequence[tuple[FloatArray, FloatArray]]
+
+    @classmethod
+    def of(cls, noise: Noise) -> _Likelihood:
+        root = np.linalg.cholesky(noise.covariance(1.0) + 1e-9 * np.eye(len(noise.fixed)))
+        rotations = []
+        for factor in FACTORS:
+            half = solve_triangular(root, noise.covariance(float(factor)), lower=True)
+            size, modes = np.linalg.eigh(solve_triangular(root, half.T, lower=True))
+            rotations.append((np.maximum(size, 1e-9), modes))
+        return cls(root, rotations)
+
+    def white(self, scores: FloatArray) -> FloatArray:
+        return np.asarray(solve_triangular(self.root, np.atleast_2d(scores).T, lower=True).T)
+
+    def log(self, left: FloatArray, variance: FloatArray, pattern: FloatArray, every: int = 1) -> FloatArray:
+        """(f, q) of whitened residuals (q, p) with the emulator's variance (q, p), and free sizes of a pattern (k, p);
+        for ``every`` so many factors."""
+        rotations = self.rotations[::every]
+        out = np.empty((len(rotations), len(left)))
+        for i, (size, modes) in enumerate(rotations):
+            turned, spread = left @ modes, size + variance @ modes**2
+            if len(pattern):
+                # one doubt for all points: a pattern's sizes are integrated over in closed form
+                common = spread.mean(axis=0)
+                inner = np.diag(common) + SLAB**2 * (pattern @ modes).T @ (pattern @ modes)
+                root = np.linalg.cholesky(inner)
+                z = solve_triangular(root, turned.T, lower=True)
+                out[i] = -0.5 * np.sum(z**2, axis=0) - np.log(np.diag(root)).sum()
+            else:
+                out[i] = -0.5 * np.sum(turned**2 / spread + np.log(spread), axis=1)
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Emulators of all models, ready to meet an observation.
+
+    Attributes:
+        noise: of the scores.
+        likelihood: of whitened ones.
+        models: name, values, whitened mean and variance, pattern.
+    """
+
+    noise: Noise
+    likelihood: _Likelihood
+    models: Sequence[tuple[str, Mapping[str, FloatArray], FloatArray, FloatArray, FloatArray]] = field(repr=False)
+
+    @classmethod
+    def of(
+        cls,
+        noise: Noise,
+        prior: Prior,
         candidates: Sequence[Candidate],
-        directions: Mapping[str, FloatArray],
-        *,
-        steps: Mapping[str, float],
-        failed: Mapping[str, str],
-        visits: tuple[Visit, ...] = (),
-        doubts: Mapping[str, FloatArray] | None = None,
-    ) -> Evidence:
-        """The same with more effects' derivatives, all in the order of ``candidates``; see :class:`Vantage`."""
-        both = {**self.directions, **directions}
-        return replace(
-            self,
-            directions={c.name: both[c.name] for c in candidates if c.name in both},
-            steps={**self.steps, **steps},
-            failed={**self.failed, **failed},
-            visits=(*self.visits, *visits),
-            doubts={**self.doubts, **(doubts or {})},
-        )
+        simulated: Mapping[str, tuple[Sequence[Run], FloatArray]],
+        seed: int = 0,
+    ) -> Comparison:
+        """Emulators.
 
-
-def gather(
-    experiment: Experiment,
-    simulate: Callable[..., FloatArray],
-    values: Mapping[str, float],
-    *,
-    repeats: int = 4,
-    progress: Callable[[float], None] | None = None,
-) -> Evidence:
-    """Simulate what a misfit is told by, and what cameras may report; :func:`switched_on` adds effects of physics.
-
-    The residual's prediction is the mean over seeds 1, 2, …; derivatives are differences at seed 0 and one more, the
-    same for both ends, so that a part of chance cancels in them. What is left of it looks like information: the two
-    seeds tell how much there is (`Vantage.doubts`). Sharing a seed with the residual would correlate its chance with
-    the derivatives' and raise false alarms that grow with the number of features. What other numerics change is told by
-    the same two.
-    """
-    base = dict(values)
-    seeds = range(1, 1 + (repeats if experiment.chance else 1))
-    jobs = (
-        len(seeds)
-        + len(experiment.guesses)
-        + (2 if experiment.chance else 1) * (1 + 2 * len(experiment.parameters) + len(experiment.numerics))
-    )
-    done = 0
-
-    def run(
-        purpose: str, at: Mapping[str, float], effects: tuple[str, ...] = (), seed: int = 0, numerics: str = ""
-    ) -> FloatArray:
-        nonlocal done
-        table = simulate(at, effects=effects, seed=seed, numerics=numerics, purpose=purpose)
-        done += 1
-        if progress is not None:
-            progress(min(done / jobs, 1.0))
-        return table
-
-    runs = np.stack([run(f"repeat {seed} of {len(seeds)}", base, seed=seed) for seed in seeds])
-    # Before the point itself: they are other drawings of its simulation.
-    guesses = [run(f"guess: {name}", base, numerics=name) for name in experiment.guesses]
-    for name in experiment.redrawn:
-        run(f"numerics: {name}", base, numerics=name)
-    pair = pair_of(experiment, len(seeds))
-    reported = [c for c in experiment.candidates if c.kind == "observation"]
-    found = look_from(experiment, base, reported, run, pair)
-    numerics, doubts = other_numerics(
-        experiment, lambda name, seed: run(f"numerics: {name or 'none'}", base, seed=seed, numerics=name), pair
-    )
-    at_the_point = tuple(Visit(base, (), table, seed) for table, seed in zip(runs, seeds, strict=True))
-    return Evidence(
-        **{**vars(found), "visits": (*found.visits, *at_the_point)},
-        mean=runs.mean(axis=0),
-        repeats=deviations(runs),
-        numerics=numerics,
-        guesses=deviations(guesses) if guesses else np.zeros((0, *experiment.layout.shape)),
-        numerics_doubts=doubts,
-    )
-
-
-def deviations(tables: Sequence[FloatArray] | FloatArray) -> FloatArray:
-    """(k, t, s) of k tables from their mean, scaled to have the variance of one."""
-    samples = np.asarray(tables)
-    return np.asarray((samples - samples.mean(axis=0)) * np.sqrt(len(samples) / max(len(samples) - 1, 1)))
-
-
-def pair_of(experiment: Experiment, repeats: int) -> tuple[int, ...]:
-    """Two seeds that repeats don't have, or one where there is no chance."""
-    return (0, repeats + 1) if experiment.chance else (0,)
-
-
-def other_numerics(experiment: Experiment, ask: Callable[[str, int], FloatArray], pair: tuple[int, ...]) -> Numerics:
-    """What other numerics change, by name: `Evidence.numerics` and their doubts.
-
-    Args:
-        experiment: whose numerics are tried; those that can't be simulated are left out.
-        ask: called with a name, or "" for the usual way, and a seed; keeps what it has answered.
-        pair: of seeds, or one.
-    """
-    means, doubts = dict[str, FloatArray](), dict[str, FloatArray]()
-    # Other drawings of a simulation while it is at hand, before another seed's.
-    for name in (*experiment.redrawn, *(n for n in experiment.numerics if n not in experiment.redrawn)):
-        seeds = pair[:1] if name in experiment.redrawn else pair
-        middles = [ask("", seed) for seed in seeds]
-        try:
-            changes = [ask(name, seed) - middle for seed, middle in zip(seeds, middles, strict=True)]
-        except SimulationError:
-            continue
-        means[name] = np.mean(changes, axis=0)
-        if len(changes) > 1:
-            doubts[name] = 0.5 * (changes[0] - changes[1])
-    return means, doubts
-
-
-def look_from(
-    experiment: Experiment,
-    values: Mapping[str, float],
-    candidates: Sequence[Candidate],
-    run: Run,
-    seeds: tuple[int, ...] = (0,),
-) -> Vantage:
-    """Simulate a point and its neighbours.
-
-    Args:
-        experiment: whose parameters are varied.
-        values: of these, at the point.
-        candidates: effects that are switched on there, one at a time, by the first seed.
-        run: called with (purpose, parameters by name), the name of an effect that is on in a tuple, and a seed.
-        seeds: one, or two whose mean derivatives are; the prediction is the first one's.
-
-    Raises:
-        SimulationError: the point or a neighbour without an effect can't be simulated.
-    """
-    base, failed = dict(values), dict[str, str]()
-    looks = [_Look(seed, run) for seed in seeds]
-    for look in looks:
-        look.see(base)
-        if look is looks[0]:
-            # Other reports of the point's simulation come first, while it is at hand.
-            look.switch_on([c for c in candidates if c.kind == "observation"], base, 1.0, failed)
-        look.vary(experiment.parameters, base)
-    times = STRIDE if experiment.chance else 1.0
-    looks[0].switch_on([c for c in candidates if c.kind == "physics"], base, times, failed)
-    slopes, doubts = _mean_of([look.slopes for look in looks])
-    first = looks[0]
-    return Vantage(
-        base,
-        first.middle,
-        slopes,
-        {name: np.mean([look.curves[name] for look in looks], axis=0) for name in first.curves},
-        first.widths,
-        {c.name: first.directions[c.name] for c in candidates if c.name not in failed},
-        first.steps,
-        failed,
-        tuple(visit for look in looks for visit in look.visits),
-        doubts=doubts,
-    )
-
-
-def switched_on(experiment: Experiment, simulate: Callable[..., FloatArray], evidence: Evidence) -> Evidence:
-    """The evidence with the derivatives by effects of physics, switched on at the fit one at a time, by two seeds."""
-    base, failed = dict(evidence.values), dict[str, str]()
-
-    def run(purpose: str, at: Mapping[str, float], effects: tuple[str, ...] = (), seed: int = 0) -> FloatArray:
-        return simulate(at, effects=effects, seed=seed, purpose=purpose)
-
-    looks, times = [], STRIDE if experiment.chance else 1.0
-    for seed in pair_of(experiment, len(evidence.repeats)):
-        look = _Look(seed, run)
-        look.see(base)
-        look.visits.clear()  # these the evidence has
-        physics = [c for c in experiment.candidates if c.kind == "physics" and c.name not in failed]
-        look.switch_on(physics, base, times, failed)
-        looks.append(look)
-    directions, doubts = _mean_of([look.directions for look in looks])
-    return evidence.with_effects(
-        experiment.candidates,
-        directions,
-        steps=looks[0].steps,
-        failed=failed,
-        visits=tuple(visit for look in looks for visit in look.visits),
-        doubts=doubts,
-    )
-
-
-def _mean_of(looks: Sequence[Mapping[str, FloatArray]]) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
-    """Mean derivatives of one or two looks, of what all of them tell, and half the difference where there are two."""
-    names = [name for name in looks[0] if all(name in look for look in looks)]
-    means = {name: np.mean([look[name] for look in looks], axis=0) for name in names}
-    doubts = {name: 0.5 * (looks[0][name] - looks[1][name]) for name in names} if len(looks) > 1 else {}
-    return means, doubts
-
-
-@dataclass
-class _Look:
-    """A point and its neighbours by one seed, run by run; see :class:`Vantage`."""
-
-    seed: int
-    run: Run
-    slopes: dict[str, FloatArray] = field(default_factory=dict)
-    curves: dict[str, FloatArray] = field(default_factory=dict)
-    widths: dict[str, float] = field(default_factory=dict)
-    directions: dict[str, FloatArray] = field(default_factory=dict)
-    steps: dict[str, float] = field(default_factory=dict)
-    visits: list[Visit] = field(default_factory=list)
-    middle: FloatArray = field(init=False)
-
-    def visit(self, purpose: str, at: Mapping[str, float], effects: tuple[str, ...] = ()) -> FloatArray:
-        """(t, s) features by parameters."""
-        self.visits.append(Visit(dict(at), effects, self.run(purpose, at, effects, self.seed), self.seed))
-        return self.visits[-1].table
-
-    def see(self, base: Mapping[str, float]) -> None:
-        """The point itself, which comes first."""
-        self.middle = self.visit("the point", base)
-
-    def vary(self, parameters: Sequence[Parameter], base: Mapping[str, float]) -> None:
-        """The model's own parameters, one at a time."""
-        for parameter in parameters:
-            value = base[parameter.name]
-            ends = around(parameter, value)
-            tables = [self.visit(parameter.name, {**base, parameter.name: end}) for end in ends]
-            offsets = [distance(parameter, value, end) for end in ends]
-            self.slopes[parameter.name], curve = derivatives(offsets, tables, self.middle)
-            self.widths[parameter.name] = max(abs(offset) for offset in offsets)
-            if curve is not None:
-                self.curves[parameter.name] = curve
-
-    def switch_on(
-        self, candidates: Sequence[Candidate], base: Mapping[str, float], times: float, failed: dict[str, str]
-    ) -> None:
-        """Effects, one at a time, by steps ``times`` as long as where nothing is left to chance; ``failed`` gets those
-        that can't be simulated."""
+        Args:
+            noise: of the observation.
+            prior: of the base model's parameters.
+            candidates: effects; those of physics that weren't simulated, and those of observation that weren't drawn,
+                are left out.
+            simulated: runs and scores (m, p) by effect.
+            seed: of the sequence.
+        """
+        likelihood = _Likelihood.of(noise)
+        n = len(prior.space)
+        most = max((len(c.parameters) + len(c.shapes) for c in candidates), default=0)
+        cube = qmc.Sobol(n + most, seed=seed).random(POINTS)
+        where = 2.0 * cube[:, :n] - 1.0
+        physical = prior.space.from_unit(where)
+        base_values = {p.name: physical[:, i] for i, p in enumerate(prior.space)}
+        chance = np.maximum(np.diag(likelihood.white(likelihood.white(noise.chance).T)), 1e-4)
+        white = likelihood.white(noise.base)
+        middle = white.mean(axis=0)
+        base = BaseEmulator.through(noise.points, white - middle, chance)
+        mean, variance = base.predict(where)
+        nothing = np.zeros((0, white.shape[1]))
+        models = [(AS_IT_IS, base_values, mean + middle, variance, nothing)]
         for candidate in candidates:
-            try:
-                self.directions[candidate.name] = directions_of(
-                    candidate, base, self.middle, self.visit, self.steps, times
-                )
-            except SimulationError as error:
-                failed[candidate.name] = str(error)
+            if candidate.name in noise.patterns:
+                pattern = likelihood.white(noise.patterns[candidate.name])
+                models.append((candidate.name, base_values, mean + middle, variance, pattern))
+            elif candidate.name in simulated:
+                runs, scores = simulated[candidate.name]
+                k = len(candidate.parameters)
+                size = sizes(candidate, cube[:, n : n + k])
+                shape = 2.0 * cube[:, n + k : n + k + len(candidate.shapes)] - 1.0
+                there, doubt = base.predict(prior.unit(runs))
+                increments = likelihood.white(scores) - middle - there
+                points = (prior.unit(runs), *effect_points(candidate, runs))
+                emulator = IncrementEmulator.through(points, increments, chance + doubt)
+                added, own = emulator.predict((where, size, shape))
+                values = {**base_values, **effect_values(candidate, size, shape)}
+                models.append((candidate.name, values, mean + middle + added, variance + own, nothing))
+        return cls(noise, likelihood, models)
+
+    def judge(self, observed: FloatArray | None = None) -> Evidence:
+        """Every model against scores (p,); the experiment's own by default."""
+        scores = self.noise.observed if observed is None else observed
+        white, factors = self.likelihood.white(scores)[0], self.noise.factors
+        found: dict[str, Model] = {}
+        for name, values, mean, variance, pattern in self.models:
+            log = self.likelihood.log(white - mean, variance, pattern)
+            found[name] = _model(name, values, mean, variance, pattern, log, factors)
+        base = found[AS_IT_IS]
+        beyond = np.where(FACTORS >= np.exp(SOMETHING_ELSE * self.noise.factor_std), 0.0, -np.inf)
+        beyond = beyond - logsumexp(beyond)
+        found[ELSE] = _model(ELSE, base.values, base.mean, base.variance, base.pattern, base.log_likelihood, beyond)
+        weight = {
+            name: model.log_evidence + np.log(PRIOR if name == AS_IT_IS else (1.0 - PRIOR) / (len(found) - 1))
+            for name, model in found.items()
+        }
+        total = logsumexp(list(weight.values()))
+        return Evidence(self.noise, found, {name: float(np.exp(w - total)) for name, w in weight.items()})
+
+
+def _model(
+    name: str,
+    values: Mapping[str, FloatArray],
+    mean: FloatArray,
+    variance: FloatArray,
+    pattern: FloatArray,
+    log: FloatArray,
+    factors: FloatArray,
+) -> Model:
+    joint = log + factors[:, None]
+    evidence = float(logsumexp(joint)) - float(np.log(joint.shape[1]))
+    weights = np.exp(joint - joint.max())
+    return Model(name, values, mean, variance, pattern, log, weights / weights.sum(), evidence)

@@ -1,308 +1,321 @@
-"""Noise of features: what differs between observation and prediction although nothing is wrong with the model.
+"""What observation and prediction differ by with nothing wrong, along the few directions in which any model acts.
 
-The covariance is a sum of parts, each separable: a scale for each feature, AR(1) in time, a correlation between
-instruments and a Matérn-3/2 correlation in space with a nugget. See :mod:`.sampled_noise` for where they come from.
+Squares of pictures are projected on the leading modes of all simulations (principal components whose variance is well
+above chance's); instruments without a place (forces, stresses) are kept as they are. Noise in these scores has parts:
+
+========== ============================================================================================================
+instruments from still frames; stated for the others
+chance      what base simulations with particles of their own scatter by about their trend, shrunk towards its diagonal
+            (Ledoit & Wolf 2004, J. Multivariate Anal. 88:365)
+guesses     colours that no photograph shows, other drawings of the same simulation
+nuisances   effects of observation in their smallest meaningful sizes
+numerics    the model's own error: as large as pairs of coarse and fine runs say, along what soil could do otherwise
+            (the effects' own simulations); its factor is unknown and integrated over
+========== ============================================================================================================
+
+Fine runs also correct coarse ones (Kennedy & O'Hagan 2000, Biometrika 87:1): their mean difference, as far as it stands
+above chance, is taken off the observation.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import LinAlgError
-from scipy.linalg.lapack import dpotrf, dtrtrs
 
-from splatsoil.experiment.features import Layout
+from splatsoil.experiment.base import Candidate, Experiment
 
-from .waves import smooth_waves
+from .design import Prior, Run
 
 FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 
-STILL = 1e-4
-"""Share of the largest standard deviation below which a feature isn't changed at all."""
-FARTHEST = 500.0
-"""Distance over a correlation's length at which nothing is left of it."""
-RIDGE = 1e-6
-"""Added to the diagonal of a correlation, for its Cholesky factor's sake, and, of the mean variance, to all others."""
+ABOVE_CHANCE = 4.0
+"""Variance of a mode over chance's from which it is kept: twice its standard deviation."""
+MOST_MODES = 40
+REMAINING = 1.3
+"""What a fine run's own error is expected to be over the difference of coarse and fine: 2 for an error of first order
+in the cell and cells of 1 and 1.5, 0.8 for second order (Roache 1994); the geometric mean."""
+DOUBT = 0.5
+"""Standard deviation of the logarithm of that factor, which holds both orders."""
+UNMEASURED, NO_PAIRS = 0.2, 1.0
+"""Numerics, over what soil could do otherwise, and the deviation of its logarithm, where there are no pairs."""
+FACTORS = np.exp(np.arange(-2.0, 5.5, 0.5) * DOUBT)
+"""Factors of the numerics that are integrated over, from a third of what is expected on."""
+SOMETHING_ELSE = 2.0
+"""Standard deviations above the expected factor from which the model's own error is more than numerics."""
+STAGE, CHANNEL = 0.9, 0.5
+"""Correlation of an unplaced instrument's numerics within a stage, and between two of one unit there."""
 
 
 @dataclass(frozen=True)
-class Part:
-    """One separable part of a covariance.
+class Tables:
+    """Simulations (m, t, s) by what they were made for.
 
     Attributes:
-        scale: (t, s) standard deviations.
-        memory: correlation of neighbouring times.
-        length: of the Matérn correlation, m; 0 for none.
-        nugget: share of the variance that is not correlated in space.
-        between: (c, c) correlation between instruments.
-        on_waves: factor on the variance of slow waves, beyond what all of this gives there.
-        on_directions: the same along directions of interest.
-        freedom: degrees of freedom that the variance on slow waves is known with.
+        base: of the model as it is.
+        fine: pairs' fine ones.
+        effects: by effect.
+        drawn: one base simulation reported or drawn otherwise, by guess or parameter.
+        reference: (t, s) that one, as usual.
     """
 
-    scale: FloatArray
-    memory: float = 0.0
-    length: float = 0.0
-    nugget: float = 0.0
-    between: FloatArray | None = None
-    on_waves: float = 1.0
-    on_directions: float = 1.0
-    freedom: float = math.inf
-
-    def across(self, layout: Layout) -> FloatArray:
-        """(s, s) correlation between sites at one time."""
-        return in_space(layout, self.length, self.nugget, self.between)
-
-    def covariance(self, layout: Layout, seen: BoolArray) -> FloatArray:
-        """(n, n) covariance of the features that were seen (t, s)."""
-        return _separable(self.across(layout), in_time(layout.steps, self.memory), self.scale, seen)
-
-    def solver(self, layout: Layout, seen: BoolArray) -> Solver:
-        """Of that covariance: of its correlation, which is decomposed once however often scales change."""
-        between = None if self.between is None else self.between.tobytes()
-        lower = _correlation_factor(layout, self.memory, self.length, self.nugget, between, seen.tobytes())
-        variance = self.scale[seen] ** 2
-        return Solver(lower, np.sqrt(variance + RIDGE * float(np.mean(variance))))
-
-
-def _separable(across: FloatArray, times: FloatArray, scale: FloatArray, seen: BoolArray) -> FloatArray:
-    """(n, n) scale × correlation in space (s, s) × in time (t, t) of the features that were seen (t, s), in blocks of
-    two times each."""
-    sites = [np.flatnonzero(row) for row in seen]
-    ends = np.cumsum([0, *(len(here) for here in sites)])
-    out = np.empty((ends[-1], ends[-1]))
-    for t, here in enumerate(sites):
-        rows = scale[t, here][:, None] * across.take(here, axis=0)
-        for u, there in enumerate(sites[: t + 1]):
-            block = rows.take(there, axis=1) * (times[t, u] * scale[u, there])
-            mine, other = slice(ends[t], ends[t + 1]), slice(ends[u], ends[u + 1])
-            out[mine, other], out[other, mine] = block, block.T
-    return out
-
-
-@lru_cache(maxsize=6)
-def _correlation_factor(
-    layout: Layout, memory: float, length: float, nugget: float, between: bytes | None, seen: bytes
-) -> FloatArray:
-    """(n, n) lower Cholesky factor of a part's correlation. A floor asks for each of its parts' several times."""
-    count = len(layout.channels)
-    link = None if between is None else np.frombuffer(between).reshape(count, count)
-    which = np.frombuffer(seen, dtype=bool).reshape(layout.shape)
-    across = in_space(layout, length, nugget, link)
-    return _factor(_separable(across, in_time(layout.steps, memory), np.ones(layout.shape), which))
-
-
-def _factor(covariance: FloatArray) -> FloatArray:
-    """(n, n) lower Cholesky factor.
-
-    Raises:
-        LinAlgError: not positive definite, or not finite.
-    """
-    lower, info = dpotrf(covariance.T, lower=1, clean=1)  # transposed: as LAPACK lays matrices out
-    if info or not np.isfinite(lower.diagonal()).all():
-        raise LinAlgError("a covariance isn't positive definite, or isn't finite")
-    return np.asarray(lower)
-
-
-def independent(scale: FloatArray, memory: float = 0.0) -> Part:
-    """Noise of instruments: independent between sites."""
-    return Part(scale=scale, memory=memory, nugget=1.0)
-
-
-def extra_noise(layout: Layout, part: Part, seen: BoolArray, directions: FloatArray | None = None) -> FloatArray:
-    """(n, r) low-rank noise by which a part has the variance that was found on slow waves and along directions (n, k).
-
-    Everywhere else the part's own stays as it is.
-    """
-    if not np.any(part.scale[seen]):
-        return np.zeros((int(seen.sum()), 0))
-    changed = alive(part, seen)
-    solver = part.solver(layout, changed)
-    nothing = np.zeros((int(changed.sum()), 0))
-    chosen = orthonormal(solver.whiten(nothing if directions is None else directions[changed[seen]]))
-    waves = solver.whiten(smooth_waves(layout, changed) * part.scale[changed][:, None])
-    waves = orthonormal(waves - chosen @ (chosen.T @ waves))
-    parts = [math.sqrt(part.on_directions - 1.0) * chosen, math.sqrt(part.on_waves - 1.0) * waves]
-    columns = solver.coloured(np.concatenate(parts, axis=1))
-    out = np.zeros((int(seen.sum()), columns.shape[1]))
-    out[changed[seen]] = columns
-    return out
-
-
-def alive(part: Part, seen: BoolArray) -> BoolArray:
-    """(t, s) features that a part changes: other guesses of colours leave forces as they are, and what acts on these
-    would hide all that acts on pictures."""
-    return seen & (part.scale > STILL * float(part.scale[seen].max()))
-
-
-def orthonormal(columns: FloatArray) -> FloatArray:
-    """(n, r) of the span of columns (n, k), whatever their lengths."""
-    size = np.linalg.norm(columns, axis=0)
-    columns = columns[:, size > 1e-9 * max(float(size.max(initial=0.0)), 1e-300)]
-    if not columns.size:
-        return np.zeros((len(columns), 0))
-    basis = columns / np.linalg.norm(columns, axis=0)
-    # By their products with each other, twice: the first time leaves errors where columns hardly differ. A tenth of
-    # the time of a singular value decomposition.
-    for _ in range(2):
-        values, vectors = np.linalg.eigh(basis.T @ basis)
-        kept = values > 1e-12 * values[-1]
-        basis = basis @ (vectors[:, kept] / np.sqrt(values[kept]))
-    return np.asarray(basis)
-
-
-def in_time(steps: FloatArray, memory: float) -> FloatArray:
-    """(t, t) correlation between times, of a memory from one to the next."""
-    gaps = np.abs(np.subtract.outer(steps, steps))
-    return np.where(gaps == 0.0, 1.0 + RIDGE, max(memory, 0.0) ** gaps if memory > 0.0 else 0.0)
-
-
-def in_space(layout: Layout, length: float, nugget: float, between: FloatArray | None) -> FloatArray:
-    """(s, s) correlation between sites; see :class:`Part`."""
-    channel, distance = layout.channel_numbers, layout.distances
-    link = np.eye(len(layout.channels)) if between is None else between
-    if length > 0.0:
-        far = np.minimum(math.sqrt(3.0) * distance / length, FARTHEST)
-        smooth = (1.0 + far) * np.exp(-far)
-    else:
-        smooth = np.where(distance == 0.0, 1.0, 0.0)
-    held = (1.0 - nugget) * link[channel[:, None], channel[None]] * smooth
-    return held + (nugget + RIDGE) * np.eye(len(channel))
+    base: tuple[Sequence[Run], FloatArray]
+    fine: tuple[Sequence[Run], FloatArray]
+    effects: Mapping[str, tuple[Sequence[Run], FloatArray]]
+    drawn: Mapping[str, FloatArray]
+    reference: FloatArray
 
 
 @dataclass(frozen=True)
 class Noise:
-    """The covariance of the features that were seen, ready to solve with.
+    """Scores and their noise.
 
     Attributes:
-        covariance: (n, n).
-        seen: (t, s) which features those are.
-        freedom: degrees of freedom that it is known with.
+        mask: (t, s) features that are compared.
+        mean: (n,) of them, taken off before they are projected.
+        basis: (n, p).
+        observed: (p,) scores, corrected for the cell.
+        correction: (p,) what is taken off for it.
+        base: (m, p) scores of the base simulations.
+        points: (m, k) of these.
+        chance: (p, p) covariance of one simulation's own.
+        fixed: (p, p) covariance of all parts but numerics.
+        numerics: (p, p) that of numerics of factor 1.
+        factor_std: standard deviation of the logarithm of the numerics' factor.
+        patterns: (k, p) what each observation effect does in its smallest meaningful sizes, by name.
+        trend: (m, m) projector on the base simulations' trend.
     """
 
-    covariance: FloatArray
-    seen: BoolArray
-    freedom: float = math.inf
+    mask: npt.NDArray[np.bool_]
+    mean: FloatArray
+    basis: FloatArray
+    observed: FloatArray
+    correction: FloatArray
+    base: FloatArray
+    points: FloatArray
+    chance: FloatArray
+    fixed: FloatArray
+    numerics: FloatArray
+    factor_std: float
+    patterns: Mapping[str, FloatArray]
+    trend: FloatArray
 
-    @classmethod
-    def of(cls, layout: Layout, parts: Sequence[tuple[float, Part]], seen: BoolArray) -> Noise:
-        """The sum of parts, each with the factor on its variance."""
-        count = np.count_nonzero(seen)
-        total = np.zeros((count, count))
-        for factor, part in parts:
-            total += factor * part.covariance(layout, seen)
-        ridge = RIDGE * float(np.mean(np.diag(total)))
-        total[np.diag_indices_from(total)] += ridge
-        # Welch (1947) and Satterthwaite: a sum of variances, each known with its own degrees of freedom.
-        one_unit = seen & layout.common[None]
-        variances = np.array([factor * float(np.mean(part.scale[one_unit] ** 2)) for factor, part in parts])
-        doubt = float(np.sum(variances**2 / np.array([part.freedom for _, part in parts])))
-        freedom = float(variances.sum()) ** 2 / doubt if doubt > 0.0 else math.inf
-        return cls(total, seen, freedom)
+    def scores(self, tables: FloatArray) -> FloatArray:
+        """(m, p) of tables (m, t, s)."""
+        return np.asarray((tables[:, self.mask] - self.mean) @ self.basis)
 
-    def pick(self, table: FloatArray) -> FloatArray:
-        """(..., t, s) to the features that were seen (..., n)."""
-        return table[..., self.seen]
-
-    def spread(self, vector: FloatArray) -> FloatArray:
-        """(n,) back to (t, s), 0 where nothing was seen."""
-        table = np.zeros(self.seen.shape)
-        table[self.seen] = vector
-        return table
+    def covariance(self, factor: float) -> FloatArray:
+        """(p, p) with numerics of a factor."""
+        return self.fixed + factor**2 * self.numerics
 
     @property
-    def scale(self) -> FloatArray:
-        """(n,) standard deviations."""
-        return np.sqrt(np.diag(self.covariance))
-
-    def plus(self, columns: FloatArray) -> Noise:
-        """With low-rank noise (n, k) added: columns times independent standard normal numbers."""
-        return replace(self, covariance=self.covariance + columns @ columns.T)
-
-    def rows(self, chosen: BoolArray) -> Noise:
-        """Only the features of some times (t,)."""
-        keep = self.seen & chosen[:, None]
-        inner = keep[self.seen]
-        return Noise(self.covariance[np.ix_(inner, inner)], keep, self.freedom)
-
-    @cached_property
-    def solver(self) -> Solver:
-        """Of its Cholesky factor."""
-        return Solver(_factor(self.covariance))
+    def factors(self) -> FloatArray:
+        """(f,) logarithms of the prior probability of each of `FACTORS`."""
+        density = -0.5 * (np.log(FACTORS) / self.factor_std) ** 2
+        return np.asarray(density - np.logaddexp.reduce(density))
 
 
-@dataclass(frozen=True)
-class Solver:
-    """Products with the inverse of a covariance D L Lᵀ D + F Fᵀ, which has been decomposed.
+def noise_of(
+    experiment: Experiment,
+    prior: Prior,
+    tables: Tables,
+    candidates: Sequence[Candidate],
+    aside: npt.NDArray[np.bool_] | None = None,
+) -> Noise:
+    """Projection and noise.
 
-    Attributes:
-        lower: (n, n) L.
-        scale: (n,) of which D is the diagonal; 1 everywhere if there is none.
-        columns: (n, q) L⁻¹D⁻¹F, low-rank noise beside; None for none.
-        modes: eigenvalues (q,) and eigenvectors (q, q) of what these columns give with themselves.
+    Args:
+        experiment: whose features these are.
+        prior: of the base model.
+        tables: the simulations.
+        candidates: effects, of which those of observation are nuisances.
+        aside: (t, s) features to leave out.
     """
+    mask = compared(experiment) if aside is None else compared(experiment) & ~aside
+    placed = np.broadcast_to(experiment.layout.placed, mask.shape)[mask]
+    (base_runs, base), (fine_runs, fine) = tables.base, tables.fine
+    points = prior.unit(base_runs)
+    varied = np.concatenate([base, *(found for _, found in tables.effects.values())])[:, mask]
+    mean = varied.mean(axis=0)
+    hat = trend_of(points, points)
+    rest = (base[:, mask] - hat @ base[:, mask]) / np.sqrt(np.maximum(1.0 - np.diag(hat), 1e-9))[:, None]
+    basis = _modes(varied - mean, rest, placed)
+    scores = {name: (found[:, mask] - mean) @ basis for name, found in _named(tables).items()}
+    own = scores["base"]
+    chance = shrunk(rest @ basis) if experiment.chance else np.zeros((basis.shape[1],) * 2)
 
-    lower: FloatArray
-    scale: FloatArray | None = None
-    columns: FloatArray | None = None
-    modes: tuple[FloatArray, FloatArray] | None = None
+    def trend(runs: Sequence[Run]) -> FloatArray:
+        return trend_of(prior.unit(runs), points) @ own
 
-    def beside(self, columns: FloatArray) -> Solver:
-        """With low-rank noise (n, q) more: columns times independent standard normal numbers. Nothing large is
-        decomposed again (Woodbury)."""
-        white = Solver(self.lower, self.scale).whiten(columns)
-        if self.columns is not None:
-            white = np.concatenate([self.columns, white], axis=1)
-        if not white.shape[1]:
-            return self
-        values, vectors = np.linalg.eigh(white.T @ white)
-        return replace(self, columns=white, modes=(np.maximum(values, 0.0), vectors))
+    effects = [name for name in tables.effects]
+    increments = [
+        (scores[name] - trend(tables.effects[name][0])) / np.sqrt(len(tables.effects[name][0]) * len(effects))
+        for name in effects
+    ] or [(own - own.mean(axis=0)) / np.sqrt(len(own))]
+    otherwise = _positive(sum(e.T @ e for e in increments) - (chance if effects else 0.0))
+    unplaced = np.zeros(basis.shape[1], dtype=bool)
+    unplaced[basis.shape[1] - int((~placed).sum()) :] = True
+    correction, factor_std = np.zeros(basis.shape[1]), NO_PAIRS
+    if len(fine_runs):
+        factor_std = DOUBT
+        apart = scores["fine"] - trend(fine_runs)
+        share = _share(
+            apart[:, ~unplaced], chance[np.ix_(~unplaced, ~unplaced)], otherwise[np.ix_(~unplaced, ~unplaced)]
+        )
+        numerics = np.where(np.outer(~unplaced, ~unplaced), share**2 * otherwise, 0.0)
+        pairs = numerics + chance * (1.0 + 1.0 / len(own)) / len(apart) + 1e-9 * np.eye(len(numerics))
+        correction = np.where(
+            unplaced, 0.0, numerics @ np.linalg.solve(pairs, np.where(unplaced, 0.0, apart.mean(axis=0)))
+        )
+        numerics = REMAINING**2 * (numerics + _of_unplaced(experiment, mask, placed, apart, unplaced))
+    else:
+        numerics = UNMEASURED**2 * otherwise
+    reference = (tables.reference[mask] - mean) @ basis
+    drawn = {name: (table[mask] - mean) @ basis - reference for name, table in tables.drawn.items()}
+    guessed = [drawn[name] for name in experiment.guesses if name in drawn]
+    low = [g / np.sqrt(len(guessed)) for g in guessed] + [drawn[name] for name in experiment.redrawn if name in drawn]
+    patterns = {
+        c.name: np.array([drawn[p.name] for p in c.parameters if p.name in drawn])
+        for c in candidates
+        if c.kind == "observation" and any(p.name in drawn for p in c.parameters)
+    }
+    low += [row for found in patterns.values() for row in found]
+    fixed = chance + _instruments(experiment, mask, basis)
+    for row in low:
+        fixed = fixed + np.outer(row, row)
+    observed = (experiment.observed[mask] - mean) @ basis + 0.0
+    return Noise(
+        mask,
+        mean,
+        basis,
+        observed - correction,
+        correction,
+        own,
+        points,
+        chance,
+        fixed,
+        numerics,
+        factor_std,
+        patterns,
+        hat,
+    )
 
-    def solve(self, columns: FloatArray) -> FloatArray:
-        """Inverse covariance times (n,) or (n, k)."""
-        white = self._shrunk(self._bare(columns), 1.0)
-        out = triangular(self.lower, white, transposed=True)
-        return out if self.scale is None else (out.T / self.scale).T
 
-    def whiten(self, columns: FloatArray) -> FloatArray:
-        """A root of the inverse times (n,) or (n, k): noise becomes independent with variance 1."""
-        return self._shrunk(self._bare(columns), 0.5)
-
-    def coloured(self, columns: FloatArray) -> FloatArray:
-        """The inverse of `whiten`: of (n, k) independent numbers, noise."""
-        out = self.lower @ self._shrunk(columns, -0.5)
-        return out if self.scale is None else (out.T * self.scale).T
-
-    def sample(self, generator: np.random.Generator, count: int) -> FloatArray:
-        """(n, count) draws of the noise."""
-        return self.coloured(generator.standard_normal((len(self.lower), count)))
-
-    def _bare(self, columns: FloatArray) -> FloatArray:
-        """Whitened as if there were no low-rank noise."""
-        scaled = columns if self.scale is None else (np.asarray(columns).T / self.scale).T
-        return triangular(self.lower, np.asarray_chkfinite(scaled))
-
-    def _shrunk(self, white: FloatArray, power: float) -> FloatArray:
-        """(1 + G Gᵀ)^-power times (n,) or (n, k), with the low-rank columns G."""
-        if self.columns is None or self.modes is None:
-            return white
-        values, vectors = self.modes
-        # ((1 + v)^-p - 1) / v, also where v is next to nothing
-        gain = np.expm1(-power * np.log1p(values)) / np.where(values > 0.0, values, 1.0)
-        gain = np.where(values > 0.0, gain, -power)
-        along = vectors.T @ (self.columns.T @ white)
-        return white + self.columns @ (vectors @ (gain * along.T).T)
+def compared(experiment: Experiment) -> npt.NDArray[np.bool_]:
+    """(t, s) features that are compared: all that are seen where something can move."""
+    return np.asarray(experiment.seen & ~experiment.quiet)
 
 
-def triangular(lower: FloatArray, columns: FloatArray, *, transposed: bool = False) -> FloatArray:
-    """Inverse of a lower triangular matrix, or of its transpose, times (n,) or (n, k)."""
-    if not columns.size:
-        return np.array(columns, dtype=np.float64)
-    out, _ = dtrtrs(lower, columns, lower=1, trans=int(transposed))
-    return np.asarray(out).reshape(np.shape(columns))
+def trend_of(where: FloatArray, points: FloatArray) -> FloatArray:
+    """(q, m) weights that make the trend at points (q, n) of values at points (m, n): cubic in one parameter, quadratic
+    in several, as far as the points allow (ridge)."""
+
+    def terms(x: FloatArray) -> FloatArray:
+        columns = [np.ones(len(x)), *x.T, *(x.T**2)]
+        if x.shape[1] == 1:
+            columns.append(x[:, 0] ** 3)
+        columns += [x[:, i] * x[:, j] for i in range(x.shape[1]) for j in range(i)]
+        return np.stack(columns, axis=1)
+
+    inner = terms(points)
+    return np.asarray(terms(where) @ np.linalg.solve(inner.T @ inner + 1e-6 * np.eye(inner.shape[1]), inner.T))
+
+
+def shrunk(rows: FloatArray) -> FloatArray:
+    """(p, p) covariance of rows (m, p) of mean 0, shrunk towards its diagonal by the amount that is best on average
+    (Ledoit & Wolf 2004; Schäfer & Strimmer 2005, Stat. Appl. Genet. Mol. Biol. 4:32)."""
+    m = len(rows)
+    products = rows[:, :, None] * rows[:, None, :]
+    covariance = products.mean(axis=0)
+    spread = products.var(axis=0).sum() - np.trace(products.var(axis=0))
+    between = np.sum(covariance**2) - np.sum(np.diag(covariance) ** 2)
+    share = float(np.clip(spread / max(m - 1, 1) / max(between, 1e-300), 0.0, 1.0))
+    return np.asarray((1.0 - share) * covariance + share * np.diag(np.diag(covariance)))
+
+
+def _named(tables: Tables) -> dict[str, FloatArray]:
+    return {
+        "base": tables.base[1],
+        "fine": tables.fine[1],
+        **{name: found for name, (_, found) in tables.effects.items()},
+    }
+
+
+def _modes(varied: FloatArray, rest: FloatArray, placed: npt.NDArray[np.bool_]) -> FloatArray:
+    """(n, p) leading modes of placed features, beside them the unplaced ones themselves."""
+    n, columns = varied.shape[1], []
+    if placed.any():
+        _, _, right = np.linalg.svd(varied[:, placed], full_matrices=False)
+        right = right[:MOST_MODES]
+        of_all = np.var(varied[:, placed] @ right.T, axis=0)
+        of_chance = np.mean((rest[:, placed] @ right.T) ** 2, axis=0)
+        kept = of_all > ABOVE_CHANCE * np.maximum(of_chance, 1e-12)
+        kept[0] = True
+        modes = np.zeros((n, int(kept.sum())))
+        modes[placed] = right[kept].T
+        columns.append(modes)
+    columns.append(np.eye(n)[:, ~placed])
+    return np.concatenate(columns, axis=1)
+
+
+def _share(apart: FloatArray, chance: FloatArray, otherwise: FloatArray) -> float:
+    """Most likely size of differences (m, p) of fine and coarse runs over what soil could do otherwise."""
+    if not apart.shape[1]:
+        return 0.0
+    best, found = -np.inf, 0.0
+    for share in np.geomspace(0.05, 2.0, 20):
+        covariance = 1.25 * chance + share**2 * otherwise + 1e-9 * np.eye(len(chance))
+        _, size = np.linalg.slogdet(covariance)
+        likelihood = -0.5 * (len(apart) * size + float(np.sum(apart * np.linalg.solve(covariance, apart.T).T)))
+        if likelihood > best:
+            best, found = likelihood, float(share)
+    return found
+
+
+def _of_unplaced(
+    experiment: Experiment,
+    mask: npt.NDArray[np.bool_],
+    placed: npt.NDArray[np.bool_],
+    apart: FloatArray,
+    unplaced: npt.NDArray[np.bool_],
+) -> FloatArray:
+    """(p, p) numerics of instruments without a place, one size for each channel and stage."""
+    out = np.zeros((len(unplaced),) * 2)
+    if not unplaced.any():
+        return out
+    layout = experiment.layout
+    rows, sites = (index[~placed] for index in np.nonzero(mask))
+    stages = np.array(layout.stages)[rows]
+    units = np.array([layout.sites[s].unit for s in sites])
+    channels = np.array([layout.sites[s].channel for s in sites])
+
+    spread = np.empty(len(rows))
+    for stage in np.unique(stages):
+        for channel in np.unique(channels):
+            mine = (stages == stage) & (channels == channel)
+            if mine.any():
+                spread[mine] = np.sqrt(np.mean(apart[:, unplaced][:, mine] ** 2))
+    alike = np.where(channels[:, None] == channels[None], STAGE, CHANNEL) * (stages[:, None] == stages[None])
+    alike *= units[:, None] == units[None]
+    np.fill_diagonal(alike, 1.0)
+    out[np.ix_(unplaced, unplaced)] = alike * np.outer(spread, spread)
+    return out
+
+
+def _instruments(experiment: Experiment, mask: npt.NDArray[np.bool_], basis: FloatArray) -> FloatArray:
+    """(p, p) covariance of what instruments add; neighbouring times of a site are correlated by the sensor's memory."""
+    std = experiment.sensor[mask]
+    if experiment.sensor_memory == 0.0:
+        scaled = std[:, None] * basis
+        return np.asarray(scaled.T @ scaled)
+    rows, sites = np.nonzero(mask)
+    alike = experiment.sensor_memory ** np.abs(rows[:, None] - rows[None]) * (sites[:, None] == sites[None])
+    return np.asarray(basis.T @ (alike * np.outer(std, std)) @ basis)
+
+
+def _positive(matrix: FloatArray) -> FloatArray:
+    """The nearest positive semidefinite matrix."""
+    size, modes = np.linalg.eigh(0.5 * (matrix + matrix.T))
+    return np.asarray((modes * np.maximum(size, 0.0)) @ modes.T)

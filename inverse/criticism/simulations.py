@@ -18,8 +18,8 @@ from splatsoil.inverse.evaluations import digest
 from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Experiment
 from splatsoil.files import read_npy, write_bytes
+from splatsoil.soil.effect import Effect
 
-from .free_strength import FreeStrength
 
 FloatArray = npt.NDArray[np.float64]
 Simulate = Callable[..., FloatArray]
@@ -95,7 +95,7 @@ class Simulations:
         self,
         values: Mapping[str, float],
         *,
-        effects: tuple[str | FreeStrength, ...] = (),
+        effects: tuple[str | Effect, ...] = (),
         seed: int = 0,
         numerics: str = "",
         purpose: str = "",
@@ -278,6 +278,6 @@ class Simulations:
         return made
 
 
-def _names(effects: Iterable[str | FreeStrength]) -> list[str]:
+def _names(effects: Iterable[str | Effect]) -> list[str]:
     """Of effects, in an order of their own."""
-    return sorted(e if isinstance(e, str) else e.identity for e in effects)
+    return sorted(e if isinstance(e, str) else e.name for e in effects)

@@ -5,10 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from shutil import rmtree
 from typing import TYPE_CHECKING, Any
-
-from splatsoil.commands._control import PLACES, Replay
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
@@ -29,7 +26,7 @@ class Crew:
 
     They begin at once, so that they have loaded what takes seconds when the first process has. All keep what they make
     in ``features/`` and find it there, and one that dies costs nothing but its help. Simulations wait until the first
-    process holds the folder's lock; the control, which is made in a place of its own and kept whole, doesn't. On a CPU
+    process holds the folder's lock. On a CPU
     each process keeps to one thread, the first one too: the results are those of one process, bit for bit, and with
     more they would wait for each other. A GPU is shared: each process makes simulations that are alike as one batch, as
     one leaves most of it idle, and cores are shared out.
@@ -38,26 +35,21 @@ class Crew:
         folder: the run folder.
         device: where it is computed, in the user's word.
         effects: the candidates, as `experiment_of` takes them; none for all.
-        control: whether one is to begin with the replay control, which others wait for in the end, unless that is kept.
     """
 
-    def __init__(self, folder: RunFolder, device: str, effects: Iterable[str], *, control: bool) -> None:
+    def __init__(self, folder: RunFolder, device: str, effects: Iterable[str]) -> None:
         from splatsoil.inverse.executors import Processes
         from splatsoil.threads import cores
 
         self.count = max(0, int(min(cores(), 1 + MOST_HELPERS, _memory() / SHARE["cpu"])) - 1)
         self._path, self._effects = folder.path, tuple(effects)
-        self._place = folder.path / f"{PLACES}{os.getpid()}"
         self._workers: Processes | None = None
-        self._control: Future[None] | None = None
         try:
             with _unheard():
                 self._workers = Processes(self.count) if self.count > 0 else None
             if self._workers is not None:
                 for _ in range(self.count):
                     self._workers.submit(_ready, device)
-                if control:
-                    self._control = self._replayed_by(self._workers, device)
         except BaseException:
             self.__exit__()
             raise
@@ -69,60 +61,42 @@ class Crew:
         """End those that never came to help."""
         if self._workers is not None:
             self._workers.kill()
-        rmtree(self._place, ignore_errors=True)  # a helper that was ended at the replay couldn't tidy up
 
     @contextmanager
-    def helping(self, experiment: PlowExperiment, simulate: Simulations) -> Iterator[Replay]:
+    def helping(self, experiment: PlowExperiment, simulate: Simulations) -> Iterator[None]:
         """While the block runs, where this process holds the folder's lock, they simulate.
 
         Args:
             experiment: of the latest fit.
             simulate: what is helped.
-
-        Yields:
-            What has a helper make the replay control, before what it is asked for later.
         """
         from splatsoil.inverse.criticism.simulations import Helpers
         from splatsoil.threads import at_most
 
         device = experiment.base.device
-        for place in self._path.glob(f"{PLACES}*"):  # left by what was killed
-            if place != self._place:
-                rmtree(place, ignore_errors=True)
         workers, self._workers = self._fitting(device), None
         with at_most(_threads(device, self.count)):
             if workers is None:
-                yield lambda: None
+                yield
                 return
 
             def together(jobs: Sequence[Mapping[str, Any]]) -> Future[None]:
                 made = [dict(job) for job in jobs]
                 return workers.submit(_simulate, self._path, device, self._effects, self.count, made)
 
-            def replay() -> Future[None]:
-                if self._control is None or self._control.done():
-                    self._control = self._replayed_by(workers, device)
-                return self._control
-
             try:
                 with simulate.helped(Helpers(self.count, together, experiment.together, experiment.prepare)):
-                    yield replay
+                    yield
                 workers.shutdown(cancel_futures=True)
             except BaseException:
                 workers.kill()
                 raise
 
-    def _replayed_by(self, workers: Processes, device: str) -> Future[None]:
-        """What is done when one of the helpers has made the control."""
-        return workers.submit(_replay, self._path, device, self._effects, self.count, self._place)
-
     def _fitting(self, device: str) -> Processes | None:
         """The helpers that a device has memory for, if any; the others end."""
         workers = self._workers
         if workers is not None and device != "cpu":
-            at_it = self._control is not None and not self._control.done()
-            room = _free(device) + SHARE["cuda"] * at_it  # one has its share already
-            count = max(0, min(self.count, int(room / SHARE["cuda"]) - 1))
+            count = max(0, min(self.count, int(_free(device) / SHARE["cuda"]) - 1))
             if count > 0:
                 workers.dismiss(self.count - count)
             else:
@@ -206,13 +180,6 @@ def _simulate(
                 simulate(**job)
 
     _quietly(make, device, helpers)
-
-
-def _replay(path: Path, device: str, effects: tuple[str, ...], helpers: int, place: Path) -> None:
-    """A helper's work, in a place for what lies about meanwhile."""
-    from splatsoil.commands._control import replayed
-
-    _quietly(lambda here: replayed(*_known_here(path, here, effects), place, lambda what: None), device, helpers)
 
 
 def _quietly(work: Callable[[str], object], device: str, helpers: int) -> None:

@@ -14,7 +14,6 @@ from splatsoil.commands._output import print_json
 
 if TYPE_CHECKING:
     from splatsoil.commands._progress import Report
-    from splatsoil.inverse.criticism.diagnosis import Options
     from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.model import Model
 
@@ -23,9 +22,9 @@ if TYPE_CHECKING:
 class Config:
     """Add effects to a run's latest model, one after the other, and fit again.
 
-    Each effect is first refitted on every other frame, features weighed by their chance and cleared of what numerics
-    could do, and judged on the other frames, which gives the falling error. What its simulations say by all frames is
-    the estimate kept. Then the loss is searched over all parameters, for the report. Earlier fits stay.
+    What a diagnosis says of the effect and of the other parameters is the estimate; one is made where there is none. Its
+    error on data that were set aside is the falling error. Then the loss is searched over all parameters, for the
+    report. Earlier fits stay.
     """
 
     run: Positional[Path]
@@ -34,8 +33,6 @@ class Config:
     """Effects to add, by name, or files that define one each."""
     budget: int | None = None
     """Evaluations of each fit; 10 for each free parameter if not given."""
-    repeats: int = 4
-    """Simulations with other seeds, to know what chance does."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda:0, …"""
     json: bool = False
@@ -43,7 +40,7 @@ class Config:
 
 
 def run(config: Config) -> int:
-    """Refit with each effect, keep the history, draw the report."""
+    """Fit with each effect, keep the history, draw the report."""
     from splatsoil.commands import _criticism as criticism
     from splatsoil.commands import _experiments as experiments
     from splatsoil.commands import _history as histories
@@ -51,7 +48,6 @@ def run(config: Config) -> int:
     from splatsoil.commands._progress import stages
     from splatsoil.envs.devices import resolve_device
     from splatsoil.errors import ParameterError
-    from splatsoil.inverse.criticism.diagnosis import Options
     from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.quiet import hush
     from splatsoil.report import write_report
@@ -60,8 +56,6 @@ def run(config: Config) -> int:
     from splatsoil.soil.library import find_effects
 
     hush()
-    options = Options(repeats=config.repeats)
-    criticism.check_budget(config.repeats)
     check_evaluations(config.budget)
     folder = RunFolder.open(config.run)
     fit = criticism.need_fit(folder)
@@ -85,7 +79,7 @@ def run(config: Config) -> int:
             finished(folder, experiments.model_of(folder, device, begin("reconstruct")), fit, before, begin)
         for name in left:
             model = experiments.model_of(folder, device, begin("reconstruct"))
-            added(folder, model, name, options, begin, budget=config.budget, command=config.effects)
+            added(folder, model, name, begin, budget=config.budget, command=config.effects)
         begin("report")("drawing figures", 0.0)
         page = write_report(folder.path)
     entries = histories.history(folder)
@@ -105,7 +99,6 @@ def interrupted(config: Config) -> str:
         (config.run, *config.effects),
         (
             ("--budget", config.budget, None),
-            ("--repeats", config.repeats, 4),
             ("--device", config.device, "auto"),
             ("--json", config.json, False),
         ),
@@ -139,19 +132,19 @@ def added(
     folder: RunFolder,
     model: Model,
     name: str,
-    options: Options,
     begin: Callable[[str], Report],
     *,
     budget: int | None = None,
     command: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """One effect more: confirmation on hidden frames, full fit, comparison; returns the new entry of the history.
+    """One effect more: a diagnosis that knows it, full fit, comparison; returns the new entry of the history.
 
     ``command`` is all the effects that are being added, where one command adds several.
     """
     from splatsoil.commands import _criticism as criticism
     from splatsoil.commands import _history as histories
     from splatsoil.commands import _stages as stage
+    from splatsoil.errors import RunError
     from splatsoil.soil.library import find_effects
 
     before, (effect,) = folder.fit(), find_effects([name])
@@ -161,16 +154,24 @@ def added(
     own = next(e for e in larger.law.effects if e.name == effect.name)
     mine = [p.name for p in own.parameters if p.off is not None or p.name in own.shapes]
     free = (*before["parameters"], *mine)
-    known = criticism.latest_diagnosis(folder, name) or {"refits": {}}
-    kept = known["refits"].get(effect.name, {"values": ()})
-    # It may be of a time when other parameters of the effect were free, or have stopped at its first steps.
-    if {*kept["values"]} != {*free} or kept.get("stopped", False):
-        known = criticism.confirmed(folder, model, name, options, begin(f"try {effect.name}"))
+    known = criticism.latest_diagnosis(folder, name)
+    compared = {} if known is None else {m["name"]: m for m in known["models"]}
+    # It may be of a time when other parameters of the effect were free.
+    if known is None or not {*free} <= {*compared.get(effect.name, {"values": ()})["values"]}:
+        known = criticism.diagnosed(folder, model, begin, (name,))
+        compared = {m["name"]: m for m in known["models"]}
+    if effect.name not in compared:
+        raise RunError(f"{effect.name} cannot be added: {'; '.join(known['notes']) or 'it could not be simulated'}")
     entries = histories.history(folder)
-    base, with_it = known["refits"]["as it is"], known["refits"][effect.name]
+    scores = {h["model"]: h for h in known["held_out"]}
+    if effect.name not in scores:
+        known = criticism.diagnosed(folder, model, begin, (name,))
+        compared = {m["name"]: m for m in known["models"]}
+        scores = {h["model"]: h for h in known["held_out"]}
+    base, with_it, best = scores[""], scores.get(effect.name, scores[""]), compared[effect.name]
     if not entries or entries[-1]["model"] != before["name"]:
         entries = [criticism.entry(before, base)]
-    entries[-1]["held_out"], entries[-1]["floor"] = base["held_out"], base["floor"]
+    entries[-1]["held_out"], entries[-1]["floor"] = base["error"], base["noise"]
     fitting = FitOptions(
         set=model.measurement.folder,
         parameters=free,
@@ -183,14 +184,14 @@ def added(
     )
     if not criticism.pictured(folder):
         stage.compared(folder, model, begin("compare"))
-    refitted = {name: (with_it["values"][name], with_it["stds"][name]) for name in fitting.parameters}
+    refitted = {name: (best["values"][name], best["stds"][name]) for name in fitting.parameters}
     under_way = {
         "command": list(command),
         "done": list(command[: command.index(name)]) if command else [],
         "effect": name,
         "effects": sorted(effects),
-        "refit": {key: with_it[key] for key in ("values", "held_out", "floor")},
-        "line": {"added": effect.name, "fall": base["chi2"] - with_it["chi2"]},
+        "held_out": with_it,
+        "line": {"added": effect.name},
     }
     # Before the fit is the latest one: from then on nothing else knows what it was made from.
     histories.remember(folder, entries, under_way)
@@ -214,7 +215,7 @@ def finished(
     if not criticism.pictured(folder):
         criticism.keep_pictures(folder)
         stage.compared(folder, model, begin("compare"))
-    fresh = {**criticism.entry(fit, under_way["refit"]), **under_way["line"]}
+    fresh = {**criticism.entry(fit, under_way["held_out"]), **under_way["line"]}
     # Until all of the command is done, what it has put in is known to be its own.
     command, done = under_way["command"], [*under_way["done"], under_way["effect"]]
     rest = {"command": command, "done": done} if command else None
@@ -230,7 +231,7 @@ def show(entries: list[dict[str, Any]]) -> None:
 
     from splatsoil.report.words import model_name, symbol, with_std
 
-    table = Table(title="error on frames that refits have not seen", title_justify="left")
+    table = Table(title="error on data that were set aside", title_justify="left")
     for column in ("model", "error", "noise alone", "loss, all frames", "parameters"):
         table.add_column(column, justify="right" if column in ("error", "noise alone", "loss, all frames") else "left")
     for entry in entries:

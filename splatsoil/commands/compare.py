@@ -29,18 +29,14 @@ TOLD = ("adequate", "misfit", "whole", "estimates", "blocks", "floor")
 class Config:
     """Compare the prediction at a run's latest estimate with every frame of the video: how far off, where and when.
 
-    What counts as far is learnt from simulations with other seeds and other numerics (about forty), which are kept.
+    What counts as far is learnt from simulations with other parameters, seeds and finer cells (about fifteen), which are
+    kept.
     """
 
     run: Positional[Path]
     """The run folder."""
-    repeats: int = 4
-    """Simulations with other seeds, to know what chance does."""
     quick: bool = False
     """Only pictures and losses: one simulation, and nothing said about where the model is wrong."""
-    no_replay: bool = False
-    """Leave out the control: a made-up bed of the same soil, photographed and taken through the whole chain, that
-    tells what pictures and reconstruction get wrong by themselves. Without it the floor is too low."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda:0, …"""
     json: bool = False
@@ -55,11 +51,10 @@ def run(config: Config) -> int:
     from splatsoil.commands._crew import Crew
     from splatsoil.inverse.run_folder import RunFolder
 
-    criticism.check_budget(config.repeats)
     folder = RunFolder.open(config.run)
     folder.fit()
     folder.check_writable()
-    with nullcontext() if config.quick else Crew(folder, config.device, (), control=not config.no_replay) as crew:
+    with nullcontext() if config.quick else Crew(folder, config.device, ()) as crew:
         result, misfit = _compared(config, folder, crew)
     if config.json:
         extra = {} if misfit is None else {"misfit": {k: misfit[k] for k in TOLD}}
@@ -79,11 +74,9 @@ def _compared(config: Config, folder: RunFolder, crew: Crew | None) -> tuple[dic
     from splatsoil.commands import _stages as stage
     from splatsoil.commands._progress import stages
     from splatsoil.envs.devices import resolve_device
-    from splatsoil.inverse.criticism.diagnosis import Options
     from splatsoil.quiet import hush
 
     hush()
-    options = Options(repeats=config.repeats)
     device = resolve_device(config.device)
     stage.note_other_sources(folder)
     with stages(quiet=config.json) as begin:
@@ -91,8 +84,7 @@ def _compared(config: Config, folder: RunFolder, crew: Crew | None) -> tuple[dic
         result = stage.compared(folder, model, begin("compare"))
         if crew is None:
             return result, None
-        floor = begin("floor")
-        return result, criticism.misfit(folder, model, options, floor, with_replay=not config.no_replay, crew=crew)
+        return result, criticism.misfit(folder, model, begin("models"), crew=crew)
 
 
 def interrupted(config: Config) -> str:
@@ -101,9 +93,7 @@ def interrupted(config: Config) -> str:
         "compare",
         (config.run,),
         (
-            ("--repeats", config.repeats, 4),
             ("--quick", config.quick, False),
-            ("--no-replay", config.no_replay, False),
             ("--device", config.device, "auto"),
             ("--json", config.json, False),
         ),

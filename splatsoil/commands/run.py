@@ -17,23 +17,18 @@ if TYPE_CHECKING:
     from splatsoil.model import Model
 
 
-#: Share of the misfit that an effect must explain for it to be put in although something else is missing, too: the
-#: falling error then says what it is worth, and the verdict stays what it is.
-WORTH_TRYING = 0.5
-
-
 @dataclass(frozen=True)
 class Config(FitOptions):
-    """All of it: check the set, reconstruct, fit, compare with the noise floor, write the report. Goes on where it was
+    """All of it: check the set, reconstruct, fit, compare with what noise leaves, write the report. Goes on where it was
     interrupted.
 
-    Where the model isn't adequate also: diagnose it, add the effect that is missing (or the nearest, where it explains
-    half of the misfit), fit again, and so on, until the model is adequate, no effect of the library explains what is
-    left, or the limit is reached. Each round takes two cores a quarter of an hour, or half an hour of a slow processor.
+    Where the model isn't adequate also: diagnose it, add the effect that is missing, fit again, and so on, until the
+    model is adequate, no effect is probable enough, or the limit is reached. Each round takes two cores some twenty
+    minutes.
     """
 
     criticise: bool = False
-    """Diagnose a model that the noise floor calls adequate, too: one effect may be seen before all that is left is."""
+    """Diagnose a model that leaves no more than noise, too: one effect may be seen before all that is left is."""
     stop_at_floor: bool = False
     """Only say whether the model is adequate; don't look for what is missing."""
     most_effects: int = 2
@@ -61,7 +56,6 @@ def run(config: Config) -> int:
     from splatsoil.envs.devices import resolve_device
     from splatsoil.errors import ParameterError, SplatsoilError
     from splatsoil.files import plain, read_json
-    from splatsoil.inverse.criticism.diagnosis import Options
     from splatsoil.quiet import hush
     from splatsoil.report import write_report
     from splatsoil.report.words import called_adequate
@@ -82,9 +76,9 @@ def run(config: Config) -> int:
         comparison = stage.compared(folder, model, begin("compare"))
         if not config.criticise:
             try:
-                misfit = criticism.misfit(folder, model, Options(), begin("floor"))
+                misfit = criticism.misfit(folder, model, begin("models"))
             except SplatsoilError as error:  # the fit stands all the same
-                unknown = f"the noise floor isn't known: {error}"
+                unknown = f"whether the model is adequate isn't known: {error}"
         if config.criticise or not (config.stop_at_floor or misfit is None or misfit["adequate"]):
             try:
                 diagnosis, stopped = loop(folder, model, config.most_effects, begin)
@@ -101,8 +95,7 @@ def run(config: Config) -> int:
         losses = {key: comparison[key] for key in ("loss", "total", "noise")}
         extra: dict[str, Any] = {} if misfit is None else {"misfit": {key: misfit[key] for key in compare.TOLD}}
         if diagnosis is not None:
-            judged = ("verdict", "class", "sentences", "misfit", "whole", "whole_after")
-            kept = (*judged, "effects", "estimates", "simulations")
+            kept = ("verdict", "class", "sentences", "models", "checks", "held_out", "estimates", "simulations")
             extra = {
                 "diagnosis": plain({key: diagnosis[key] for key in kept}),
                 "models": histories.history(folder),
@@ -127,22 +120,22 @@ def loop(folder: RunFolder, model: Model, most: int, begin: Callable[[str], Repo
     """Diagnose and add until there is nothing more to be told; the last diagnosis, and why it stopped."""
     from splatsoil.commands import _criticism as criticism
     from splatsoil.commands import add
-    from splatsoil.inverse.criticism.diagnosis import Options
 
-    options, count = Options(), 0
+    count = 0
     while True:
-        diagnosis = criticism.diagnosed(folder, model, options, begin)
+        diagnosis = criticism.diagnosed(folder, model, begin)
         if diagnosis["verdict"] == "adequate":
-            return diagnosis, "nothing stands above what noise, chance and numerics leave"
-        if diagnosis["verdict"] != "missing" and diagnosis["explained"] < WORTH_TRYING:
-            nearest = diagnosis["class"][0] if diagnosis["class"] else ""
-            tries = command_line("add", (folder.path, nearest))
-            hint = f"; the nearest is {nearest}: {tries} tries it" if nearest else ""
-            return diagnosis, f"no effect of the library explains all that is left{hint}"
+            return diagnosis, "nothing more is needed to explain the data"
+        if diagnosis["verdict"] != "missing":
+            hint = ""
+            if diagnosis["class"]:
+                nearest = diagnosis["class"][0]
+                tries = command_line("add", (folder.path, nearest))
+                hint = f"; the most probable is {nearest.replace('_', ' ')}: {tries} tries it"
+            return diagnosis, f"no single effect is probable enough to be added{hint}"
         if count == most:
             return diagnosis, f"{most} effects have been added, which is the limit (--most-effects)"
-        best = diagnosis["class"][0]
-        add.added(folder, model, best, options, begin)
+        add.added(folder, model, diagnosis["class"][0], begin)
         model = model.variant(effects=tuple(folder.fit()["setup"]["effects"]))
         count += 1
 

@@ -51,27 +51,6 @@ class Candidate:
         return (*self.parameters, *self.shapes)
 
 
-@dataclass(frozen=True)
-class Calibration:
-    """What pictures without moved soil tell of parameters of observation.
-
-    Attributes:
-        names: parameters, in the order asked for.
-        estimate: (k,) distance from each parameter's off value, in its unit.
-        covariance: (k, k), positive definite, 0 between parameters of different effects; very large for what the
-            pictures don't tell.
-    """
-
-    names: tuple[str, ...]
-    estimate: FloatArray
-    covariance: FloatArray
-
-    @property
-    def deviation(self) -> FloatArray:
-        """(k,) standard deviations."""
-        return np.sqrt(np.diag(self.covariance))
-
-
 class Experiment(Protocol):
     """Observed features, their noise, and predictions.
 
@@ -83,8 +62,6 @@ class Experiment(Protocol):
         quiet: (t, s) True where no physics of the model can act, so that what is left there is the instruments' doing.
         sensor: (t, s) standard deviation of what the instruments add, known or measured.
         sensor_memory: correlation of that between neighbouring times, in [0, 1).
-        systematic: (k, t, s) patterns by which model and instruments are known to differ as a whole (forces that are a
-            share too small throughout), each as large as one standard deviation.
         parameters: free parameters of the model.
         model: names of the effects that are on.
         candidates: effects that are off.
@@ -109,8 +86,6 @@ class Experiment(Protocol):
     @property
     def sensor_memory(self) -> float: ...
     @property
-    def systematic(self) -> FloatArray: ...
-    @property
     def parameters(self) -> tuple[Parameter, ...]: ...
     @property
     def model(self) -> tuple[str, ...]: ...
@@ -124,10 +99,6 @@ class Experiment(Protocol):
     def guesses(self) -> tuple[str, ...]: ...
     @property
     def chance(self) -> bool: ...
-
-    def reproducibility(self, parameter: Parameter, value: float, effect: str = "") -> float:
-        """Standard deviation of a parameter at a value between the model's solver and others of the same equations, in
-        its unit, with one candidate on or as the model is; 0 where solvers agree, or nothing is known of it."""
 
     def predict(
         self, values: Mapping[str, float], *, effects: Iterable[str | Effect] = (), seed: int = 0, numerics: str = ""

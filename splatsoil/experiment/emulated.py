@@ -41,8 +41,6 @@ class EmulatedExperiment:
         patterns: (t, s) what other numerics add, by name.
         guessed: (t, s) what other guesses of what no instrument shows add, by name.
         quiet: (t, s) where no physics acts.
-        systematic: (k, t, s) patterns by which what is measured may differ as a whole.
-        apart: standard deviations of parameters between solvers, by name; absent ones are 0.
         name: for people.
     """
 
@@ -59,8 +57,6 @@ class EmulatedExperiment:
     patterns: Mapping[str, FloatArray] = field(default_factory=dict)
     guessed: Mapping[str, FloatArray] = field(default_factory=dict)
     quiet: npt.NDArray[np.bool_] = field(default_factory=lambda: np.zeros((0, 0), dtype=bool))
-    systematic: FloatArray = field(default_factory=lambda: np.zeros((0, 0, 0)))
-    apart: Mapping[str, float] = field(default_factory=dict)
     name: str = "emulated"
     model: tuple[str, ...] = ()
     redrawn: tuple[str, ...] = ()
@@ -71,8 +67,6 @@ class EmulatedExperiment:
     def __post_init__(self) -> None:
         if self.quiet.size == 0:
             object.__setattr__(self, "quiet", np.zeros(self.layout.shape, dtype=bool))
-        if self.systematic.size == 0:
-            object.__setattr__(self, "systematic", np.zeros((0, *self.layout.shape)))
 
     @property
     def seen(self) -> npt.NDArray[np.bool_]:
@@ -88,11 +82,6 @@ class EmulatedExperiment:
     def guesses(self) -> tuple[str, ...]:
         """Names of the other guesses."""
         return tuple(self.guessed)
-
-    def reproducibility(self, parameter: Parameter, value: float, effect: str = "") -> float:
-        """As it was made."""
-        del value, effect
-        return self.apart.get(parameter.name, 0.0)
 
     def expected(self, values: Mapping[str, float], numerics: str = "") -> FloatArray:
         """(t, s) features without chance."""

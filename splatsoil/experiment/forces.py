@@ -29,7 +29,11 @@ LEAST = 0.25
 FEWEST = 2
 """Rows of forces that are worth having."""
 SENSOR = 1.0
-"""Standard deviation of what is measured, in the features' unit."""
+"""Standard deviation of what is measured, % of the largest force."""
+SCALE = 10.0
+"""% of the largest force up to which a comparison of models takes forces as they are; beyond, relative differences
+count (inverse hyperbolic sine: Burbidge, Magee & Robb 1988, J. Am. Stat. Assoc. 83:123), because forces grow tenfold
+from weak to strong soil and simulated ones err in proportion."""
 ERROR = 0.1
 """Standard deviation of all simulated forces over their size, together: with cells of 20 mm ours are 12 to 16 % above a
 converged solver's, of 13.3 mm 4 to 6 % (docs/numerics.md), and 4 to 28 % off Reece's equation (docs/validation.md)."""
@@ -48,7 +52,8 @@ class ToolForces:
     Attributes:
         channels: (c,) the instruments.
         observed: (t, c) measured means over each row's frames, in % of the largest.
-        seen: (t, c) rows in which they count.
+        seen: (t, c) rows in which they count for a fit's loss.
+        measured: (t, c) rows in which there are any.
         largest: what that is, N.
         axes: (c, 3) the instruments' directions.
         weights: (t, f) of frames 1, 2, …, f in each row.
@@ -58,6 +63,7 @@ class ToolForces:
     channels: tuple[str, ...]
     observed: FloatArray
     seen: npt.NDArray[np.bool_]
+    measured: npt.NDArray[np.bool_]
     largest: float
     axes: FloatArray
     weights: FloatArray
@@ -88,10 +94,10 @@ class ToolForces:
         for number, row, stage in zip(numbers, nearest, own, strict=True):
             weights[row, number - 1] = float(stage == stages[row])
         weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1.0)
-        measured = np.zeros((weights.shape[1], 3))
-        measured[numbers - 1] = force[:, 2:]
+        by_frame = np.zeros((weights.shape[1], 3))
+        by_frame[numbers - 1] = force[:, 2:]
         axes = np.stack([np.append(-heading_of(measurement), 0.0), [0.0, 0.0, 1.0]])
-        table = weights @ measured @ axes.T
+        table = weights @ by_frame @ axes.T
         size = np.linalg.norm(table, axis=1)
         moving = (np.array(stages) == STAGE) & (weights.sum(axis=1) > 0.0)
         largest = float(size[moving].max(initial=0.0))
@@ -99,12 +105,23 @@ class ToolForces:
         if rows_seen.sum() < FEWEST:
             return None
         seen = np.repeat(rows_seen[:, None], len(axes), axis=1)
+        there = np.repeat((weights.sum(axis=1) > 0.0)[:, None], len(axes), axis=1)
         last = tuple(row[-1] for row in rows)
-        return cls((ALONG, UP), 100.0 * table / largest, seen, largest, axes, weights, last)
+        return cls((ALONG, UP), 100.0 * table / largest, seen, there, largest, axes, weights, last)
 
     def predicted(self, force: FloatArray) -> FloatArray:
         """(t, c) features of a simulation's force (f', 3) in frames 1, 2, …; f' at least f."""
         return 100.0 * (self.weights @ force[: self.weights.shape[1]] @ self.axes.T) / self.largest
+
+    @property
+    def features(self) -> FloatArray:
+        """(t, c) what was measured, as a comparison of models takes it."""
+        return compressed(self.observed)
+
+    @property
+    def noise(self) -> FloatArray:
+        """(t, c) standard deviation of the instrument in these."""
+        return SENSOR / np.sqrt(1.0 + (self.observed / SCALE) ** 2)
 
     def residuals(self, force: FloatArray) -> dict[str, float]:
         """Observed minus predicted features that count, by name, for a simulation's force (f', 3)."""
@@ -149,3 +166,13 @@ class ToolForces:
     def _size(self) -> FloatArray:
         """(t, 1) of the measured force, in the features' unit."""
         return np.linalg.norm(self.observed, axis=1, keepdims=True)
+
+
+def compressed(forces: FloatArray) -> FloatArray:
+    """Forces in % of the largest, relative beyond `SCALE`."""
+    return np.asarray(SCALE * np.arcsinh(forces / SCALE))
+
+
+def expanded(features: FloatArray) -> FloatArray:
+    """The inverse."""
+    return np.asarray(SCALE * np.sinh(features / SCALE))

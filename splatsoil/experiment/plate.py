@@ -56,7 +56,7 @@ class PlateExperiment:
 
     chance = True
     sensor_memory = 0.8
-    numerics = tuple(name for name in NUMERICS if name != "contact")
+    numerics = tuple(NUMERICS)
     redrawn: tuple[str, ...] = ()
     guesses: tuple[str, ...] = ()
 
@@ -97,15 +97,9 @@ class PlateExperiment:
         self.observed = force[:, None]
         self.seen = np.ones(self.layout.shape, dtype=bool)
         self.quiet = np.zeros(self.layout.shape, dtype=bool)
-        self.systematic = np.zeros((0, *self.layout.shape))
         self.sensor = np.broadcast_to(np.asarray(spread, dtype=np.float64).reshape(-1), depth.shape)[:, None].copy()
         self.experiment = _set_up(diameter, float(depth[-1]), density, friction)
         self.resolution = Resolution.derive(self.experiment, preset)
-
-    def reproducibility(self, parameter: Parameter, value: float, effect: str = "") -> float:
-        """Not known: plates were pressed into no other solver's soil."""
-        del parameter, value, effect
-        return 0.0
 
     def predict(
         self, values: Mapping[str, float], *, effects: Iterable[str | Effect] = (), seed: int = 0, numerics: str = ""

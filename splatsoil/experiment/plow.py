@@ -14,13 +14,10 @@ import numpy.typing as npt
 
 from splatsoil.comparison import PATCH, Block, Comparator
 from splatsoil.errors import SplatsoilError
-from splatsoil.experiment.base import Calibration, Candidate, candidates_of
+from splatsoil.experiment.base import Candidate, candidates_of
 from splatsoil.experiment.features import Layout, Site
-from splatsoil.experiment.forces import REGION, UNIT, ToolForces
-from splatsoil.experiment.reproducibility import between_solvers
-from splatsoil.experiment.scene_parts import QUIET, bins_of, entered, regions_of, stages_of
-from splatsoil.experiment.states import States, plow_states
-from splatsoil.experiment.strokes import Predict, plow_strokes
+from splatsoil.experiment.forces import REGION, UNIT, ToolForces, compressed
+from splatsoil.experiment.scene_parts import QUIET, bins_of, regions_of, stages_of
 from splatsoil.model import Model, Prediction
 from splatsoil.mpm import Resolution, Trajectory, simulate_together
 from splatsoil.parameters import Parameter
@@ -37,12 +34,18 @@ UNKNOWN_NOISE = 0.5
 """Noise of a patch in grey levels where there are no frames to measure it on."""
 LEAST_NOISE = 0.05
 
+FINE = 2.0 / 3.0
+"""Cells of the fine run of a pair, over the model's: those of the next preset."""
 NUMERICS: Mapping[str, Callable[[Resolution], Resolution]] = {
-    "stiffness": lambda r: replace(r, bulk=3.0 * r.bulk, shear=3.0 * r.shear),
-    "step": lambda r: replace(r, steps=2 * r.steps),
-    "grid": lambda r: replace(r, cell=0.8 * r.cell, spacing=0.8 * r.spacing),
+    "fine": lambda r: replace(
+        r,
+        cell=FINE * r.cell,
+        spacing=FINE * r.spacing,
+        steps=math.ceil(r.steps / FINE - 1e-6),
+        relaxation=r.relaxation / FINE,
+    ),
 }
-"""Other ways to compute the same physics: three times as stiff, twice as many steps, a finer grid."""
+"""Other ways to compute the same physics."""
 ROUNDING = "rounding"
 """Another drawing of the same simulation, its surface rounded off twice as much. To first order that changes features
 by as much as the drawing has done already, so that one such change is what it gets wrong."""
@@ -127,7 +130,7 @@ class PlowExperiment:
     @cached_property
     def observed(self) -> FloatArray:
         """(t, s) measured changes, and forces."""
-        return self._beside(self._pictured, None if self.forces is None else self.forces.observed)
+        return self._beside(self._pictured, None if self.forces is None else self.forces.features)
 
     @cached_property
     def _pictured(self) -> FloatArray:
@@ -148,31 +151,15 @@ class PlowExperiment:
 
     @cached_property
     def seen(self) -> npt.NDArray[np.bool_]:
-        """(t, s) False where the tool hides most of a patch, where a camera looks beside the way by which the tool went
-        into the soil, or where forces don't count.
-
-        How far soil is dragged along beside a blade that is lowered is a matter of a solver's cells, and a wall that
-        stands there keeps it (docs/numerics.md). Where nothing else is seen of what the tool moves, it counts.
-        """
+        """(t, s) False where the tool hides most of a patch, or no force was measured."""
         shares = self._table(self.comparator.open_shares())
-        moved = self.layout.regions[:, : shares.shape[1]] != QUIET
-        others = np.where(self._entered, 0.0, shares)
-        if np.any(moved & (others > 0.5)):
-            shares = others
-        return self._beside(shares, None if self.forces is None else self.forces.seen.astype(float)) > 0.5
+        return self._beside(shares, None if self.forces is None else self.forces.measured.astype(float)) > 0.5
 
     @cached_property
     def _sites(self) -> tuple[Site, ...]:
         """Columns of cameras."""
         cameras = self.comparator.cameras
         return tuple(Site(camera, label.x, label.y) for camera in cameras for label in self._labels(camera))
-
-    @cached_property
-    def _entered(self) -> npt.NDArray[np.bool_]:
-        """Columns of cameras that show where the tool went into the soil."""
-        heights = self.base.reconstruction.surface.height
-        level, last = float(np.mean(heights[np.isfinite(heights)])), int(self.comparator.frames[-1])
-        return entered(self.base.measurement, level, last, self._sites, self.comparator.block)
 
     @cached_property
     def sensor(self) -> FloatArray:
@@ -187,20 +174,7 @@ class PlowExperiment:
             per_site.append(np.full(count, max(float(level), LEAST_NOISE)))
         frames = np.array([len(group) for group in self._bins], dtype=np.float64)
         pictured = np.concatenate(per_site)[None] / np.sqrt(frames)[:, None]
-        return self._beside(pictured, None if self.forces is None else self.forces.sensor)
-
-    @cached_property
-    def systematic(self) -> FloatArray:
-        """(k, t, s) what simulated forces get wrong together; see :class:`~splatsoil.experiment.forces.ToolForces`."""
-        if self.forces is None:
-            return np.zeros((0, *self.layout.shape))
-        pictured = np.zeros(self._pictured.shape)
-        return np.stack([self._beside(pictured, error) for error in self.forces.errors])
-
-    def reproducibility(self, parameter: Parameter, value: float, effect: str = "") -> float:
-        """See :class:`~splatsoil.experiment.base.Experiment`."""
-        on = self.base.law.effects + ((self._wanted[effect],) if effect else ())
-        return between_solvers(parameter, value, on)
+        return self._beside(pictured, None if self.forces is None else self.forces.noise)
 
     def predict(
         self, values: Mapping[str, float], *, effects: Iterable[str | Effect] = (), seed: int = 0, numerics: str = ""
@@ -216,7 +190,7 @@ class PlowExperiment:
         """
         pictured = self._pictured - self._table(self.comparator.blocks(prediction.images))
         return self._beside(
-            pictured, None if self.forces is None else self.forces.predicted(prediction.trajectory.force)
+            pictured, None if self.forces is None else compressed(self.forces.predicted(prediction.trajectory.force))
         )
 
     def prediction(
@@ -232,19 +206,6 @@ class PlowExperiment:
         images = model.draw(trajectory, seed, values, albedo=guess, rounding=rounding)
         seconds = {"simulation": simulated - began, "drawing": time.perf_counter() - simulated}
         return Prediction(dict(values), seed, images, trajectory, seconds)
-
-    def calibrate(self, values: Mapping[str, float]) -> Calibration | None:
-        """What pictures say of cameras, light, clock and tool where soil plays no part; None if no candidate asks."""
-        from splatsoil.experiment.calibration import calibrate
-
-        chosen = [c for c in self.candidates if c.kind == "observation"]
-        if not chosen:
-            return None
-        effects = [self._wanted.get(c.name, c.name) for c in chosen]
-        model = self._variant((*self.model, *effects), "")
-        trajectory = self._trajectory(model, values, 0, "")
-        parameters = [p for c in chosen for p in c.parameters]
-        return calibrate(model, self.comparator, parameters, trajectory)
 
     @cached_property
     def together(self) -> int:
@@ -298,14 +259,6 @@ class PlowExperiment:
         while len(self._kept) >= self.together:
             del self._kept[next(iter(self._kept))]
         self._kept[key] = trajectory
-
-    def states(self, values: Mapping[str, float]) -> States:
-        """States that the soil goes through while it yields, in a simulation of its own."""
-        return plow_states(self.base, values)
-
-    def strokes(self) -> Mapping[str, Predict]:
-        """Heights of the surface in other strokes of the tool, simulated coarsely."""
-        return plow_strokes(self.base, self._wanted)
 
     def _variant(self, effects: tuple[str | Effect, ...], numerics: str) -> Model:
         if effects == self.model and not numerics:

@@ -25,10 +25,6 @@ AHEAD = 0.6
 """Widths of the tool ahead of it that count as its face, and behind it as behind."""
 POINTS = 400
 """Of the tool's surface, to know where it stands in the soil."""
-BESIDE_WAY = 1.0 / 6.0
-"""Widths of the tool beside its way into the soil where solvers differ: a cell as they use them (docs/numerics.md)."""
-DENSE = 2000
-"""Points of the tool's surface, to know beside which places it went."""
 
 
 def stages_of(measurement: Measurement, frames: Sequence[float]) -> tuple[str, ...]:
@@ -80,59 +76,6 @@ def heading_of(measurement: Measurement) -> FloatArray:
         return np.zeros(2)
     first = int(np.argmax(length > 0.5 * length.max()))
     return np.asarray(level[first] / length[first])
-
-
-def entered(
-    measurement: Measurement, level: float, last: int, sites: Sequence[Site], sides: FloatArray
-) -> npt.NDArray[np.bool_]:
-    """(s,) squares of the bed through which a site's camera looks at soil beside the way by which the tool went in.
-
-    At the surface, or down into soil that the tool has opened. The way is where the tool is below the surface in stages
-    of lowering, if it is pushed on through soil from there: else there is little more to see. A way in that is flatter
-    than 45° is pushing.
-
-    Args:
-        measurement: tool, motion, cameras.
-        level: of the surface, m.
-        last: frame up to which it is looked at.
-        sites: places as cameras see them.
-        sides: (2,) of a square, m.
-    """
-    out = np.zeros(len(sites), dtype=bool)
-    frames = range(last + 1)
-    stages = stages_of(measurement, [float(frame) for frame in frames])
-    mesh = measurement.tool.mesh
-    reach = BESIDE_WAY * float(np.sort(mesh.extents)[1])
-    points = np.asarray(mesh.sample(DENSE, seed=0), dtype=np.float64)
-    places, lowest = [], []
-    for frame in frames:
-        at = _placed(measurement, points, float(frame))
-        at = at[at[:, 2] < level]
-        places.append(np.unique(np.round(at[:, :2] / (0.25 * reach)), axis=0) * (0.25 * reach))
-        lowest.append(at[:, 2].min(initial=level))
-    ways, on = [], False
-    for frame in reversed(frames):
-        on = len(places[frame]) > 0 and (on or stages[frame] == "pushing")
-        if on and stages[frame] == "lowering":
-            ways.append(frame)
-    if not ways or not heading_of(measurement).any():
-        return out
-    way = cKDTree(np.concatenate([places[f] for f in ways]))
-    opened = cKDTree(np.unique(np.concatenate(places), axis=0))
-    depth = level - min(lowest[f] for f in ways)
-    across = np.linspace(-0.5, 0.5, 1 + 2 * math.ceil(float(sides.max()) / reach))
-    square = np.stack(np.meshgrid(across * sides[0], across * sides[1]), axis=-1).reshape(-1, 2)
-    for index, site in enumerate(sites):
-        eye = measurement.cameras[site.channel].position
-        place = np.array([site.x, site.y]) + square
-        # What lies deeper is seen farther away; along the ground nothing deep is.
-        shift = (place - eye[:2]) * depth / max(float(eye[2]) - level, depth)
-        steps = 1 + math.ceil(2.0 * float(np.linalg.norm(shift, axis=1).max()) / reach)
-        rays = place + np.linspace(0.0, 1.0, steps)[:, None, None] * shift
-        visible = np.logical_and.accumulate(opened.query(rays)[0] <= reach, axis=0)
-        visible[0] = True
-        out[index] = bool((visible & (way.query(rays)[0] <= reach)).any())
-    return out
 
 
 def _placed(measurement: Measurement, points: FloatArray, moment: float) -> FloatArray:

@@ -14,8 +14,6 @@ import numpy.typing as npt
 from splatsoil.errors import MeasurementError, ParameterError, SimulationError
 from splatsoil.experiment.base import candidates_of
 from splatsoil.experiment.features import Layout, Site
-from splatsoil.experiment.states import States, with_history
-from splatsoil.experiment.strokes import MEASURED, Predict
 from splatsoil.parameters import Parameter
 from splatsoil.soil.effect import Effect
 from splatsoil.soil.element import ElementTest, triaxial
@@ -156,18 +154,12 @@ class TriaxialExperiment:
         self.observed = np.concatenate([self._features(c.ratio, c.volume) for c in self.curves], axis=1)
         self.seen = np.ones(self.layout.shape, dtype=bool)
         self.quiet = np.zeros(self.layout.shape, dtype=bool)
-        self.systematic = np.zeros((0, *self.layout.shape))
         self.sensor = np.ones(self.layout.shape)
 
     @property
     def curve(self) -> Curve:
         """The first test."""
         return self.curves[0]
-
-    def reproducibility(self, parameter: Parameter, value: float, effect: str = "") -> float:
-        """An element test is exact."""
-        del parameter, value, effect
-        return 0.0
 
     def predict(
         self,
@@ -188,34 +180,6 @@ class TriaxialExperiment:
                 raise SimulationError(f"the triaxial test with {dict(values)} came to no finite stress")
             out.append(self._features(ratio, 1.0 - np.exp(-test.volume_strain[0, 1:])))
         return np.concatenate(out, axis=1)
-
-    def states(self, values: Mapping[str, float]) -> States:
-        """States that the specimens go through while they yield."""
-        law = with_history(Law(find_effects(self.model)))
-        parts = []
-        for curve in self.curves:
-            test = self._test(law, values, curve)
-            seconds = np.diff(np.concatenate([[0.0], -np.log(1.0 - curve.strain)])) / curve.strain_rate
-            parts.append((test.p, test.plastic_strain, seconds))
-        return States.joined([States.of(*part) for part in parts])
-
-    def strokes(self) -> Mapping[str, Predict]:
-        """The same tests under other pressures and at other rates: what a plow's strokes are to a laboratory."""
-
-        def other(pressure: float, rate: float) -> Predict:
-            curves = [
-                replace(c, confining=pressure * c.confining, strain_rate=rate * c.strain_rate) for c in self.curves
-            ]
-            # Beside the tests that were made: a test at another pressure tells something only together with them.
-            both = TriaxialExperiment([*self.curves, *curves], self.model, void_ratio=self.void_ratio, candidates=())
-            return lambda values, effects: both.predict(values, effects=effects).reshape(-1)
-
-        return {
-            MEASURED: other(1.0, 1.0),
-            "at a fifth of the pressure": other(0.2, 1.0),
-            "at five times the pressure": other(5.0, 1.0),
-            "a thousand times as fast": other(1.0, 1.0e3),
-        }
 
     def _test(self, law: Law, values: Mapping[str, float], curve: Curve) -> ElementTest:
         return triaxial(

@@ -1,0 +1,116 @@
+"""Posterior predictive checks: by instrument, stage and region, is the observation like what the model would give?
+
+The statistic of a block is its mean square over what is expected of each feature; replicates drawn from the noise say how
+large it would be with nothing wrong (Gelman, Meng & Stern 1996, Stat. Sinica 6:733). Over blocks p is adjusted (Holm
+1979, Scand. J. Stat. 6:65).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from splatsoil.experiment.base import Experiment
+
+from .noise import REMAINING
+
+FloatArray = npt.NDArray[np.float64]
+
+DRAWS = 999
+FEWEST = 4
+"""Features that make a block."""
+SIGNIFICANT = 0.05
+
+
+@dataclass(frozen=True)
+class Check:
+    """One block.
+
+    Attributes:
+        stage, region, channel: what it is.
+        ratio: root mean square of the residual over what is expected.
+        p: chance of as much with nothing wrong, in any block.
+        features: how many.
+    """
+
+    stage: str
+    region: str
+    channel: str
+    ratio: float
+    p: float
+    features: int
+
+
+@dataclass(frozen=True, eq=False)
+class Expected:
+    """What a residual is made of with nothing wrong, feature by feature.
+
+    Attributes:
+        sensor: (t, s) standard deviation of instruments.
+        chance: (m, t, s) samples of one simulation's own.
+        pairs: (k, t, s) fine minus coarse; none where there are none.
+        factor: of the numerics.
+    """
+
+    sensor: FloatArray
+    chance: FloatArray
+    pairs: FloatArray
+    factor: float
+
+    @property
+    def variance(self) -> FloatArray:
+        """(t, s)."""
+        out = self.sensor**2
+        if len(self.chance):
+            out = out + np.mean(self.chance**2, axis=0)
+        if len(self.pairs):
+            out = out + (REMAINING * self.factor) ** 2 * np.mean(self.pairs**2, axis=0)
+        return np.asarray(out)
+
+    def replicate(self, rng: np.random.Generator) -> FloatArray:
+        """(t, s) a residual."""
+        out = self.sensor * rng.standard_normal(self.sensor.shape)
+        for samples, size in ((self.chance, 1.0), (self.pairs, REMAINING * self.factor)):
+            if len(samples):
+                weights = rng.standard_normal(len(samples)) / np.sqrt(len(samples))
+                out = out + size * np.tensordot(weights, samples, axes=1)
+        return out
+
+
+def checks(
+    experiment: Experiment, residual: FloatArray, expected: Expected, mask: npt.NDArray[np.bool_], seed: int = 0
+) -> list[Check]:
+    """Every block of a residual (t, s), the most surprising first."""
+    layout, rng = experiment.layout, np.random.default_rng([seed, 13])
+    blocks: dict[tuple[str, str, str], npt.NDArray[np.int64]] = {}
+    stages = np.broadcast_to(np.array(layout.stages)[:, None], mask.shape)[mask]
+    channels = np.broadcast_to(np.array([s.channel for s in layout.sites]), mask.shape)[mask]
+    for key in sorted(set(zip(stages, layout.regions[mask], channels, strict=True))):
+        inside = (stages == key[0]) & (layout.regions[mask] == key[1]) & (channels == key[2])
+        if inside.sum() >= FEWEST:
+            blocks[str(key[0]), str(key[1]), str(key[2])] = np.flatnonzero(inside)
+    variance = expected.variance[mask]
+
+    def statistics(table: FloatArray) -> FloatArray:
+        squares = table[mask] ** 2 / variance
+        return np.array([squares[index].mean() for index in blocks.values()])
+
+    own = statistics(residual)
+    replicates = np.array([statistics(expected.replicate(rng)) for _ in range(DRAWS)])
+    p = (1.0 + np.sum(replicates >= own, axis=0)) / (1.0 + DRAWS)
+    order, adjusted, worst = np.argsort(p), np.ones(len(p)), 0.0
+    for rank, index in enumerate(order):
+        worst = max(worst, float(p[index]) * (len(p) - rank))
+        adjusted[index] = min(worst, 1.0)
+    found = [
+        Check(*key, float(np.sqrt(own[i])), float(adjusted[i]), len(index))
+        for i, (key, index) in enumerate(blocks.items())
+    ]
+    return sorted(found, key=lambda c: (c.p, -c.ratio))
+
+
+def passes(found: list[Check]) -> bool:
+    """Whether no block stands out."""
+    return all(check.p >= SIGNIFICANT for check in found)

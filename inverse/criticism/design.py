@@ -1,0 +1,131 @@
+"""Which simulations a comparison of models asks for.
+
+Every model's parameters are spread by a Sobol sequence (Owen 1998, ACM Trans. Model. Comput. Simul. 8), the size of an
+effect log-uniformly between the smallest that matters and sixteen times that, on both sides where it has two. A
+derivative at size zero would not see a stone smaller than a cell, or friction that is already enough for soil to stick.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.stats import qmc
+
+from splatsoil.experiment.base import Candidate, Experiment
+from splatsoil.parameters import Parameter, ParameterSpace
+
+FloatArray = npt.NDArray[np.float64]
+
+LARGEST = 16.0
+"""Size of an effect, over the smallest that matters."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """A simulation: arguments of :meth:`~splatsoil.experiment.base.Experiment.predict`."""
+
+    values: Mapping[str, float]
+    effects: tuple[str, ...] = ()
+    seed: int = 0
+    numerics: str = ""
+
+    def arguments(self) -> dict[str, object]:
+        """By name."""
+        return {"values": dict(self.values), "effects": self.effects, "seed": self.seed, "numerics": self.numerics}
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is believed of the base model's parameters beforehand: uniform on a box of their scale.
+
+    Attributes:
+        space: the parameters, their bounds those of the box.
+    """
+
+    space: ParameterSpace
+
+    @classmethod
+    def of(cls, experiment: Experiment, values: Mapping[str, float]) -> Prior:
+        """The whole range of a parameter of the base law; of an effect that is on, from off to twice what was fitted.
+
+        Args:
+            experiment: its parameters.
+            values: fitted ones, by name.
+        """
+        return cls(ParameterSpace(_narrowed(p, values[p.name]) for p in experiment.parameters))
+
+    def points(self, count: int, seed: int) -> FloatArray:
+        """(count, n) in [-1, 1]."""
+        return 2.0 * qmc.Sobol(len(self.space), seed=seed).random(count) - 1.0
+
+    def values(self, points: FloatArray) -> list[dict[str, float]]:
+        """Of points (m, n)."""
+        return [self.space.to_dict(row) for row in self.space.from_unit(points)]
+
+    def unit(self, runs: Sequence[Run]) -> FloatArray:
+        """(m, n) points in [-1, 1] of runs."""
+        return self.space.to_unit(np.array([[r.values[p.name] for p in self.space] for r in runs]))
+
+
+def sizes(candidate: Candidate, cube: FloatArray) -> FloatArray:
+    """(m, k) sizes of an effect's parameters over their smallest meaningful ones, from points (m, k) of [0, 1]^k."""
+    out = np.empty_like(cube)
+    for i, p in enumerate(candidate.parameters):
+        side = np.full(len(cube), float(p.sign)) if p.sign else np.where(cube[:, i] > 0.5, 1.0, -1.0)
+        share = cube[:, i] if p.sign else 2.0 * np.abs(cube[:, i] - 0.5)
+        room = np.where(side > 0.0, p.upper - _off(p), _off(p) - p.lower) / p.meaningful
+        out[:, i] = side * np.minimum(LARGEST, np.maximum(room, 1.0)) ** share
+    return out
+
+
+def effect_values(candidate: Candidate, size: FloatArray, shape: FloatArray) -> dict[str, FloatArray]:
+    """(m,) values of an effect's parameters by name, from sizes (m, k) and shapes (m, j) in [-1, 1]."""
+    found = {
+        p.name: np.clip(_off(p) + size[:, i] * p.meaningful, p.lower, p.upper)
+        for i, p in enumerate(candidate.parameters)
+    }
+    if candidate.shapes:
+        shaped = ParameterSpace(candidate.shapes).from_unit(shape)
+        found |= {p.name: shaped[:, i] for i, p in enumerate(candidate.shapes)}
+    return found
+
+
+def effect_points(candidate: Candidate, runs: Sequence[Run]) -> tuple[FloatArray, FloatArray]:
+    """Sizes (m, k) and shapes (m, j) in [-1, 1] of runs with the effect on."""
+    size = np.array([[(r.values[p.name] - _off(p)) / p.meaningful for p in candidate.parameters] for r in runs])
+    if not candidate.shapes:
+        return size, np.zeros((len(runs), 0))
+    values = np.array([[r.values[p.name] for p in candidate.shapes] for r in runs])
+    return size, ParameterSpace(candidate.shapes).to_unit(values)
+
+
+def effect_runs(candidate: Candidate, prior: Prior, count: int, seed: int) -> list[Run]:
+    """Runs with an effect on, spread over all of its and the base model's parameters."""
+    n, k, j = len(prior.space), len(candidate.parameters), len(candidate.shapes)
+    cube = qmc.Sobol(n + k + j, seed=seed).random(1 << max(count - 1, 0).bit_length())[:count]
+    base = prior.values(2.0 * cube[:, :n] - 1.0)
+    own = effect_values(candidate, sizes(candidate, cube[:, n : n + k]), 2.0 * cube[:, n + k :] - 1.0)
+    return [
+        Run({**values, **{name: float(v[i]) for name, v in own.items()}}, (candidate.name,), seed + i)
+        for i, values in enumerate(base)
+    ]
+
+
+def _narrowed(parameter: Parameter, value: float) -> Parameter:
+    if parameter.off is None:
+        return parameter
+    reach = 2.0 * (value - parameter.off)
+    margin = 2.0 * parameter.meaningful
+    low, high = (parameter.off + min(reach, 0.0) - margin, parameter.off + max(reach, 0.0) + margin)
+    low, high = max(low, parameter.lower), min(high, parameter.upper)
+    return Parameter(
+        **{**vars(parameter), "lower": low, "upper": high, "default": min(max(parameter.default, low), high)}
+    )
+
+
+def _off(parameter: Parameter) -> float:
+    assert parameter.off is not None
+    return parameter.off

@@ -1,0 +1,88 @@
+"""Which sizes of an effect would have been seen: synthetic observations from its own emulator, judged like the real one."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import logsumexp
+
+from splatsoil.experiment.base import Candidate
+
+from .evidence import AS_IT_IS, PRIOR, Comparison, Evidence
+
+FloatArray = npt.NDArray[np.float64]
+
+POWER = 0.8
+NAMED = 0.9
+"""Probability from which an effect is named."""
+SIZES = (1.0, 2.0, 4.0, 8.0, 16.0)
+"""Over the smallest meaningful one."""
+WORLDS = 40
+THINNED = 8
+"""Of the quasi-Monte Carlo points, every so many serve here."""
+NEAR = 1.5
+"""Factor within which a point's size is taken for a size asked for."""
+
+
+def detectable(comparison: Comparison, evidence: Evidence, candidate: Candidate, seed: int = 0) -> float | None:
+    """Smallest size over the meaningful one, of `SIZES`, from which 80 % of synthetic worlds name the effect, the base
+    model being the only other one; None where none is.
+
+    Args:
+        comparison: emulators.
+        evidence: of the observation: synthetic worlds have base parameters of its posterior.
+        candidate: the effect.
+        seed: of the worlds.
+    """
+    models = {name: (values, mean, variance, pattern) for name, values, mean, variance, pattern in comparison.models}
+    if candidate.name not in models:
+        return None
+    rng = np.random.default_rng([seed, 17])
+    values, mean, variance, pattern = models[candidate.name]
+    base = models[AS_IT_IS]
+    measure = candidate.measure
+    odds = np.log(PRIOR / ((1.0 - PRIOR) / len(evidence.probability)) * NAMED / (1.0 - NAMED))
+    likely = evidence.models[AS_IT_IS].weights.sum(axis=0)
+    smallest = None
+    for size in reversed(SIZES):
+        if len(pattern):
+            direction = rng.standard_normal((WORLDS, len(pattern)))
+            direction *= size / np.linalg.norm(direction, axis=1, keepdims=True)
+            chosen = rng.choice(len(likely), WORLDS, p=likely / likely.sum())
+            truth = base[1][chosen] + direction @ pattern
+        else:
+            reached = np.abs(values[measure.name] - float(measure.off or 0.0)) / measure.meaningful
+            near = np.flatnonzero((reached > size / NEAR) & (reached < size * NEAR))
+            weight = _density(values, evidence)[near]
+            if not len(near) or not weight.sum() > 0.0:
+                continue
+            chosen = rng.choice(near, WORLDS, p=weight / weight.sum())
+            truth = mean[chosen] + np.sqrt(variance[chosen]) * rng.standard_normal((WORLDS, mean.shape[1]))
+        noisy = truth + rng.standard_normal(truth.shape)
+        named = 0
+        for world in noisy:
+            with_it = _evidence(comparison, world, mean, variance, pattern)
+            without = _evidence(comparison, world, *base[1:])
+            named += with_it - without > odds
+        if named < POWER * WORLDS:
+            break
+        smallest = size
+    return smallest
+
+
+def _density(values: dict[str, FloatArray], evidence: Evidence) -> FloatArray:
+    """(q,) how well base parameters at an effect's points agree with the averaged posterior."""
+    names = [p for p in evidence.models[AS_IT_IS].values]
+    z2 = np.zeros(len(next(iter(values.values()))))
+    for name in names:
+        middle, std = evidence.averaged(name)
+        z2 = z2 + ((values[name] - middle) / max(std, 1e-12)) ** 2
+    return np.asarray(np.exp(-0.5 * np.minimum(z2, 60.0)))
+
+
+def _evidence(
+    comparison: Comparison, world: FloatArray, mean: FloatArray, variance: FloatArray, pattern: FloatArray
+) -> float:
+    thin = slice(None, None, THINNED)
+    log = comparison.likelihood.log(world - mean[thin], variance[thin], pattern, every=3)
+    return float(logsumexp(log + comparison.noise.factors[::3, None])) - float(np.log(log.shape[1]))
