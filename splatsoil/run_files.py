@@ -12,8 +12,8 @@ from splatsoil.files import ANEW, read_json
 RUN_FORMAT = "splatsoil-run/1"
 FIT_FORMAT = "splatsoil-fit/1"
 COMPARISON_FORMAT = "splatsoil-comparison/1"
-DIAGNOSIS_FORMAT = "splatsoil-diagnosis/1"
-MISFIT_FORMAT = "splatsoil-misfit/1"
+DIAGNOSIS_FORMAT = "splatsoil-diagnosis/2"
+MISFIT_FORMAT = "splatsoil-misfit/2"
 POSTERIOR_FORMAT = "splatsoil-posterior/1"
 HISTORY_FORMAT = "splatsoil-history/1"
 RECONSTRUCTION_FORMAT = "splatsoil-reconstruction/1"
@@ -31,7 +31,7 @@ SHAPES: Mapping[str, Mapping[str, Any]] = {
         "setup": {"effects": [str], "preset": str},
     },
     COMPARISON_FORMAT: {"fit": str, "parameters": dict},
-    DIAGNOSIS_FORMAT: {"values": dict, "model": list, "refits": {EACH: {"values": dict}}},
+    DIAGNOSIS_FORMAT: {"values": dict, "model": list, "models": [{"name": str, "probability": NUMBER}]},
     MISFIT_FORMAT: {"fit": str, "values": dict},
     HISTORY_FORMAT: {"models": [{"model": str, "effects": [str], "parameters": {EACH: ESTIMATE}}]},
 }
