@@ -9,7 +9,7 @@ from typing import Any
 
 #: A residual up to this many times the noise is called noise: the noise itself is only known to about this.
 AT_THE_NOISE = 1.5
-#: Probabilities closer than this to none or to certain aren't told apart from it.
+#: Probabilities this close to 0 or to 1 are told as a limit: the evidences aren't known any better.
 LITTLE = 0.005
 
 
