@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,12 +16,12 @@ if TYPE_CHECKING:
     from splatsoil.commands._crew import Crew
     from splatsoil.inverse.run_folder import RunFolder
 
-#: Chance below which a block is called off: of any block, with nothing wrong.
+#: A check fails below this p.
 SURE = 0.05
-#: Blocks shown on the screen.
+#: Checks shown on the screen.
 SHOWN = 12
 #: What --json prints of the misfit.
-TOLD = ("adequate", "misfit", "whole", "estimates", "blocks", "floor")
+TOLD = ("adequate", "probability", "estimates", "checks", "passes")
 
 
 @dataclass(frozen=True)
@@ -126,38 +125,30 @@ def show(result: Mapping[str, Any], folder: str, adequate: bool | None = None) -
 
 
 def show_misfit(misfit: Mapping[str, Any], run: str) -> None:
-    """The worst blocks, and whether the model is adequate."""
+    """The worst checks, and whether the model is adequate."""
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
-    table = Table(title="residual in units of what noise leaves, the worst first", title_justify="left")
-    for column in ("stage", "region", "instrument", "times noise", "p"):
-        table.add_column(column, justify="right" if column in ("times noise", "p") else "left")
-    for block in misfit["blocks"][:SHOWN]:
-        cells = (
-            block["stage"],
-            block["region"],
-            escape(block["channel"]),
-            f"{block['ratio']:.2f}",
-            f"{block['p']:.2g}",
-        )
-        table.add_row(*cells, style=None if block["p"] < SURE else "dim")
+    from splatsoil.report.words import probability
+
+    table = Table(title="residual over what is expected, the worst first", title_justify="left")
+    for column in ("stage", "region", "instrument", "× expected", "p"):
+        table.add_column(column, justify="right" if column in ("× expected", "p") else "left")
+    for check in misfit["checks"][:SHOWN]:
+        where = (escape(check[key]) for key in ("stage", "region", "channel"))
+        style = None if check["p"] < SURE else "dim"
+        table.add_row(*where, f"{check['ratio']:.2f}", f"{check['p']:.2g}", style=style)
     console = Console(highlight=False)
     console.print(table)
-    test = misfit["misfit"]
-    off = sum(block["p"] < SURE for block in misfit["blocks"])
-    word = "[bold]adequate[/bold]" if misfit["adequate"] else "[bold]not adequate[/bold]"
-    whole = misfit["whole"]
-    waves = math.sqrt(test["dispersion"])
+    word = "adequate" if misfit["adequate"] else "not adequate"
+    failed = sum(check["p"] < SURE for check in misfit["checks"])
     console.print(
-        f"{word}: the residual is {whole['ratio']:.3g} times what noise leaves (p {whole['p']:.2g}), slow waves of it "
-        f"{waves:.3g} times (p {test['p']:.2g}); {off} of {len(misfit['blocks'])} blocks stand out"
+        f"[bold]{word}[/bold]: the model as it is has a probability of {probability(misfit['probability'])} against "
+        f"something else; {failed} of {len(misfit['checks'])} checks fail"
     )
-    if misfit["adequate"] and off:
-        console.print("A part may stand out by itself; the verdict goes by all of it, and by its slow waves.")
     for sentence in misfit["sentences"]:
-        console.print(sentence)
+        console.print(escape(sentence))
     ask = "Could these data show a missing effect?" if misfit["adequate"] else "Which effect is missing?"
     # Wrapped, it couldn't be pasted.
     console.print(f"{ask} {escape(command_line('diagnose', (run,)))}", soft_wrap=True)

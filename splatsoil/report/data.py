@@ -50,7 +50,7 @@ class RunData:
         fits: every finished fit by name.
         comparison: ``comparison/comparison.json`` when it belongs to the latest fit.
         before: the comparison of the model before the latest effect was added, from ``before/``.
-        misfit: ``comparison/misfit.json`` when it belongs to the latest fit: it against the noise floor.
+        misfit: ``comparison/misfit.json`` when it belongs to the latest fit: it against something else.
         diagnosis: the latest fit's diagnosis.
         posterior: ``posterior.json`` when it was sampled for the latest fit.
         history: models tried by adding effects, the first one first.
@@ -112,7 +112,7 @@ def _comparison(folder: Path, fit: Mapping[str, Any]) -> dict[str, Any] | None:
 
 
 def _misfit(path: Path, fit: Mapping[str, Any]) -> dict[str, Any] | None:
-    """The latest fit against the noise floor, unless that was another estimate."""
+    """The latest fit against something else, unless that was another estimate."""
     if not path.is_file():
         return None
     data = read_kept(path, MISFIT_FORMAT)

@@ -1,10 +1,14 @@
-"""Figures as SVG whose colours are the page's CSS variables, so that they follow its light or dark theme."""
+"""Figures as SVG whose colours are the page's CSS variables, so that they follow its light or dark theme.
+
+Each says in words what it shows, for who cannot see it.
+"""
 
 from __future__ import annotations
 
 import io
 import re
 from collections.abc import Mapping, Sequence
+from html import escape
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -40,8 +44,8 @@ STYLE = {
 }
 
 
-def _draw(draw: Any, size: tuple[float, float] = SIZE) -> str:
-    """SVG of what ``draw(figure, axes)`` draws."""
+def _draw(draw: Any, shows: str, size: tuple[float, float] = SIZE) -> str:
+    """SVG of what ``draw(figure, axes)`` draws, and what that ``shows`` in words."""
     import matplotlib as mpl
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
@@ -56,7 +60,8 @@ def _draw(draw: Any, size: tuple[float, float] = SIZE) -> str:
     svg = svg[svg.index("<svg") :]
     # The page sets the size and the typeface.
     head, rest = svg.split(">", 1)
-    svg = re.sub(r' (width|height)="[^"]*"', "", head) + ">" + rest
+    head = re.sub(r' (width|height)="[^"]*"', "", head)
+    svg = f'{head} role="img" aria-label="{escape(shows)}">{rest}'
     svg = re.sub(r"font: (\d+(?:\.\d+)?)px [^;\"]*", r"font-size: \1px", svg)
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
     for colour, variable in VARIABLES.items():
@@ -87,7 +92,7 @@ def surrogate(fit: Mapping[str, Any], name: str) -> str:
         axes.margins(x=0.01)
         figure.legend(fontsize=8, loc="outside upper center", ncols=2, columnspacing=1.0)
 
-    return _draw(draw, (SIZE[0], 2.9))
+    return _draw(draw, f"loss over the {name.replace('_', ' ')}", (SIZE[0], 2.9))
 
 
 def marginal(entry: Mapping[str, Any]) -> str:
@@ -118,7 +123,7 @@ def marginal(entry: Mapping[str, Any]) -> str:
         axes.set_xlabel(entry["title"])
         figure.legend(fontsize=8, loc="outside upper center", ncols=3, columnspacing=1.0)
 
-    return _draw(draw, (SIZE[0], 2.2))
+    return _draw(draw, f"prior and posterior of the {entry['title']}", (SIZE[0], 2.2))
 
 
 def losses(comparison: Mapping[str, Any]) -> str:
@@ -138,7 +143,7 @@ def losses(comparison: Mapping[str, Any]) -> str:
         axes.set_ylabel(f"loss ({name})")
         axes.legend(fontsize=8)
 
-    return _draw(draw)
+    return _draw(draw, "loss of each frame by camera")
 
 
 def surface_map(surface: Surface) -> str:
@@ -154,7 +159,7 @@ def surface_map(surface: Surface) -> str:
         axes.set_xlabel("x [m]")
         axes.set_ylabel("y [m]")
 
-    return _draw(draw)
+    return _draw(draw, "height of the bed from above")
 
 
 def history(fits: Mapping[str, Mapping[str, Any]], order: Sequence[str]) -> str:
@@ -170,76 +175,74 @@ def history(fits: Mapping[str, Mapping[str, Any]], order: Sequence[str]) -> str:
         axes.set_xlabel("loss at the estimate (± 2 std)")
         axes.set_xlim(left=0.0)
 
-    return _draw(draw, (SIZE[0], 0.8 + 0.36 * len(order)))
+    return _draw(draw, "loss at the estimate of each model", (SIZE[0], 0.8 + 0.36 * len(order)))
 
 
-def falling(models: Sequence[Mapping[str, Any]], names: Sequence[str]) -> str:
-    """The error on hidden frames as effects are added, above what noise alone leaves."""
+def falling(errors: Sequence[float], noise: Sequence[float], names: Sequence[str], unit: str) -> str:
+    """The error on what was set aside of models in turn, above what noise alone leaves."""
 
     def draw(_: Figure, axes: Axes) -> None:
-        places = np.arange(len(models))
-        errors = [entry["held_out"] for entry in models]
+        places = np.arange(len(errors))
         axes.bar(places, errors, color=ACCENT, alpha=0.75, width=0.55)
         for place, error in zip(places, errors, strict=True):
             axes.text(float(place), error, f"{error:.2g}", ha="center", va="bottom", color=INK)
-        floors = [entry["floor"] for entry in models]
-        axes.step(
-            [-0.45, *(places + 0.5)],
-            [floors[0], *floors],
-            color=SECOND,
-            linestyle="--",
-            linewidth=1.4,
-            label="noise alone",
-        )
+        edges = [-0.45, *(places + 0.5)]
+        axes.step(edges, [noise[0], *noise], color=SECOND, linestyle="--", linewidth=1.4, label="noise alone")
         axes.set_xticks(places, names)
-        axes.set_xlim(-0.5, len(models) - 0.5)
-        axes.set_ylim(0.0, 1.18 * max(*errors, *floors))
-        axes.set_ylabel("error, grey levels")
+        axes.set_xlim(-0.5, len(errors) - 0.5)
+        axes.set_ylim(0.0, 1.18 * max(*errors, *noise))
+        axes.set_ylabel(f"error, {unit}")
         axes.legend(fontsize=8)
 
-    return _draw(draw)
+    told = (f"{name}: {error:.2g}, noise {floor:.2g}" for name, error, floor in zip(names, errors, noise, strict=True))
+    return _draw(draw, f"error of models on what was set aside, {unit}; {'; '.join(told)}")
 
 
-def curves(diagnosis: Mapping[str, Any]) -> str:
-    """What instruments without a place measured, and what is predicted before and with the best effect."""
-    shown = [("as it is", "before", ACCENT, "-")]
-    # The refit that is judged, which has seen every other row.
-    shown += [
-        (f"with {name.replace('_', ' ')}, by every other row", name, SECOND, "--") for name in diagnosis["class"][:1]
-    ]
-    times = np.array(diagnosis["times"], dtype=np.float64)
+def curves(judged: Mapping[str, Any], which: Sequence[tuple[str, str]]) -> str:
+    """What instruments without a place measured, and what models predict.
+
+    Args:
+        judged: a diagnosis or a comparison.
+        which: a title and a key of the predictions for each line, two at most.
+    """
+    times = np.array(judged["times"], dtype=np.float64)
 
     def draw(figure: Figure, axes: Axes) -> None:
         axes.remove()
-        panels = figure.subplots(len(diagnosis["curves"]), 1, squeeze=False, sharex=True)[:, 0]
-        for place, curve in zip(panels, diagnosis["curves"], strict=True):
+        panels = figure.subplots(len(judged["curves"]), 1, squeeze=False, sharex=True)[:, 0]
+        for place, curve in zip(panels, judged["curves"], strict=True):
             measured, std = (np.array(curve[key], dtype=np.float64) for key in ("measured", "std"))
             place.errorbar(times, measured, yerr=std, fmt="o", markersize=3, color=INK, capsize=2, label="measured")
-            for label, key, colour, style in shown:
+            for (title, key), colour, style in zip(which, (ACCENT, SECOND), ("-", "--"), strict=False):
                 if key in curve["predicted"]:
                     predicted = np.array(curve["predicted"][key], dtype=np.float64)
-                    place.plot(times, predicted, color=colour, linestyle=style, label=label)
+                    place.plot(times, predicted, color=colour, linestyle=style, label=title)
             place.set_title(curve["channel"], fontsize=9)
             place.set_ylabel(curve["unit"], fontsize=8)
             place.tick_params(labelsize=7)
         legend = panels[0].get_legend_handles_labels()
         figure.legend(*legend, fontsize=8, loc="outside upper center", ncols=2, columnspacing=1.0)
-        panels[-1].set_xlabel(diagnosis["time_name"])
+        panels[-1].set_xlabel(judged["time_name"])
 
-    return _draw(draw, (SIZE[0], 1.0 + 1.4 * len(diagnosis["curves"])))
+    channels = ", ".join(str(curve["channel"]) for curve in judged["curves"])
+    return _draw(draw, f"measured and predicted: {channels}", (SIZE[0], 1.0 + 1.4 * len(judged["curves"])))
 
 
-def plan_maps(diagnosis: Mapping[str, Any], which: Sequence[str]) -> list[str]:
-    """Residuals over noise from above, one row for each stage, one column for each instrument that has places; the
-    chosen maps, in colours of one scale."""
-    placed = [i for i, site in enumerate(diagnosis["sites"]) if site[1] is not None]
-    tables = [np.array(diagnosis["maps"][name], dtype=np.float64)[:, placed] for name in which]
+def plan_maps(judged: Mapping[str, Any], which: Sequence[tuple[str, str]]) -> list[str]:
+    """Residuals over expected noise from above: one row for each stage, one column for each instrument that has places.
+
+    Args:
+        judged: a diagnosis or a comparison.
+        which: a title and a key of the maps for each figure; all have colours of one scale.
+    """
+    placed = [i for i, site in enumerate(judged["sites"]) if site[1] is not None]
+    tables = [np.array(judged["maps"][key], dtype=np.float64)[:, placed] for _, key in which]
     limit = max(3.0, min(max(float(np.nanpercentile(np.abs(table), 99.0)) for table in tables), 15.0))
-    return [_plan_map(diagnosis, placed, table, limit) for table in tables]
+    return [_plan_map(judged, placed, table, limit, title) for table, (title, _) in zip(tables, which, strict=True)]
 
 
-def _plan_map(diagnosis: Mapping[str, Any], placed: Sequence[int], table: np.ndarray, limit: float) -> str:
-    sites, stages = [diagnosis["sites"][i] for i in placed], diagnosis["stages"]
+def _plan_map(judged: Mapping[str, Any], placed: Sequence[int], table: np.ndarray, limit: float, title: str) -> str:
+    sites, stages = [judged["sites"][i] for i in placed], judged["stages"]
     channels = list(dict.fromkeys(site[0] for site in sites))
     names = list(dict.fromkeys(stages))
 
@@ -268,9 +271,9 @@ def _plan_map(diagnosis: Mapping[str, Any], placed: Sequence[int], table: np.nda
                 place.tick_params(labelsize=7)
         assert shown is not None
         bar = figure.colorbar(shown, ax=grid.ravel().tolist(), shrink=0.8, pad=0.02)
-        bar.set_label("residual / noise")
+        bar.set_label("residual / expected")
 
-    return _draw(draw, (SIZE[0], 0.5 + 1.05 * len(names)))
+    return _draw(draw, f"residual over expected noise from above: {title}", (SIZE[0], 0.5 + 1.05 * len(names)))
 
 
 def _cycle() -> list[str]:

@@ -10,7 +10,7 @@ from typing import Any
 import splatsoil
 from splatsoil.errors import RunError
 from splatsoil.files import write_text
-from splatsoil.report import figures, strength, words
+from splatsoil.report import figures, words
 from splatsoil.report.data import RunData, load
 
 HERE = Path(__file__).parent
@@ -45,11 +45,13 @@ def render(data: RunData) -> str:
     environment = Environment(
         loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters["duration"] = words.duration
-    environment.filters["symbol"] = words.symbol
-    environment.filters["rounded"] = words.rounded
-    environment.filters["model"] = words.model_name
-    environment.filters["estimate"] = words.estimate
+    environment.filters.update(
+        duration=words.duration,
+        estimate=words.estimate,
+        label=words.model_label,
+        model=words.model_name,
+        probability=words.probability,
+    )
     comparison, diagnosis = data.comparison, data.diagnosis
     # A diagnosis may be of the model that the latest one was made from.
     own = diagnosis is not None and diagnosis["fit"] == data.fit["name"]
@@ -82,14 +84,13 @@ def render(data: RunData) -> str:
         pictures=pictures,
         kinds=kinds,
         titles={"predicted": "after"} if "before" in kinds else {},
-        diagnosis=diagnosis,
-        verdict=None if diagnosis is None else words.verdict(diagnosis),
-        standing=None if diagnosis is not None or data.misfit is None else words.misfit_verdict(data.misfit),
-        maps=None if diagnosis is None else _maps(diagnosis),
-        curves=None if diagnosis is None or not diagnosis.get("curves") else Markup(figures.curves(diagnosis)),
+        findings=_findings(data, judged),
+        models=[] if diagnosis is None else diagnosis["models"],
+        little=words.LITTLE,
+        judged=judged,
+        failing=None if judged is None else _failing(judged),
         posterior=None if data.posterior is None else _posterior(data.folder, data.posterior),
-        strength=[] if diagnosis is None else _strength(diagnosis),
-        falling=Markup(figures.falling(data.history, words.steps(data.history))) if len(data.history) > 1 else None,
+        falling=_falling(data),
         surface=None if data.surface is None else Markup(figures.surface_map(data.surface)),
         order=order,
         history=Markup(figures.history(data.fits, order)) if len(order) > 1 else None,
@@ -143,22 +144,51 @@ def _posterior(folder: Path, posterior: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _maps(diagnosis: Mapping[str, Any]) -> list[tuple[str, Any]]:
-    """Plan views of the residual, before anything is added and with the best effect."""
+def _findings(data: RunData, judged: Mapping[str, Any] | None) -> list[dict[str, Any]]:
+    """What the diagnosis says, and what a comparison says of the latest fit where the diagnosis is of a smaller one."""
+    out = []
+    if data.diagnosis is not None:
+        named = data.diagnosis["class"] if data.diagnosis["verdict"] in ("missing", "one of") else ()
+        added, of = set(named) & set(data.fit["name"].split("+")), data.diagnosis["fit"]
+        later = "" if of == data.fit["name"] else "Added." if added else f"({words.model_name(of)})"
+        calm = data.diagnosis["verdict"] == "adequate"
+        sentences = data.diagnosis["sentences"]
+        out.append({"text": words.verdict(data.diagnosis), "calm": calm, "later": later, "sentences": sentences})
+    if judged is not None and judged is data.misfit:
+        said = {"text": words.misfit_verdict(judged), "calm": judged["adequate"], "later": ""}
+        out.append({**said, "sentences": judged["sentences"]})
+    return out
+
+
+def _failing(judged: Mapping[str, Any]) -> dict[str, Any]:
+    """Plan views of the residual and curves, of the model as it is and with the best effect."""
     from markupsafe import Markup
 
-    shown = [("The model as it is", "before")]
-    shown += [(f"With {name.replace('_', ' ')}", name) for name in diagnosis["class"][:1] if name in diagnosis["maps"]]
-    drawn = figures.plan_maps(diagnosis, [which for _, which in shown])
-    return [(title, Markup(svg)) for (title, _), svg in zip(shown, drawn, strict=True)]
+    which = [("as it is", "before")]
+    which += [(f"with {words.model_label(n)}", n) for n in judged.get("class", ())[:1] if n in judged["maps"]]
+    drawn = figures.plan_maps(judged, which)
+    return {
+        "maps": [(title, Markup(svg)) for (title, _), svg in zip(which, drawn, strict=True)],
+        "curves": Markup(figures.curves(judged, which)) if judged["curves"] else None,
+    }
 
 
-def _strength(diagnosis: Mapping[str, Any]) -> list[tuple[str, Any]]:
-    """Curves of a free strength, the argument and what it looks like above each."""
+def _falling(data: RunData) -> dict[str, Any] | None:
+    """The error on what was set aside: of the models tried or, where there is only one, of those that were compared."""
     from markupsafe import Markup
 
-    found = diagnosis.get("strength")
-    return [] if found is None else [(s["reading"], Markup(strength.curve(s))) for s in found["shapes"]]
+    told = data.diagnosis or {"held_out": [], "aside": "data set aside", "unit": "grey levels"}
+    if len(data.history) > 1:
+        rows = [(entry["held_out"], entry["floor"]) for entry in data.history]
+        names = words.steps(data.history)
+    else:
+        rows = [(entry["error"], entry["noise"]) for entry in told["held_out"]]
+        names = [words.model_label(entry["model"]) for entry in told["held_out"]]
+    if len(rows) < 2:
+        return None
+    errors, noise = zip(*rows, strict=True)
+    figure = Markup(figures.falling(errors, noise, names, told["unit"]))
+    return {"figure": figure, "falls": errors[-1] < errors[0], "aside": told["aside"]}
 
 
 def data_url(path: Path) -> str:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 #: A residual up to this many times the noise is called noise: the noise itself is only known to about this.
 AT_THE_NOISE = 1.5
+#: Probabilities this close to 0 or to 1 are told as a limit: the evidences aren't known any better.
+LITTLE = 0.005
 
 
 @dataclass(frozen=True)
@@ -48,69 +51,59 @@ def symbol(unit: str) -> str:
     return {"deg": "°", "1": ""}.get(unit, f" {unit}")
 
 
-def weighed(fit: Mapping[str, Any], judged: Mapping[str, Any] | None) -> Mapping[str, Any]:
-    """What a diagnosis, or a comparison with the floor, that calls this very fit adequate tells of its parameters, by
-    name; empty without one."""
-    if judged is None or not called_adequate(fit, judged):
+def averaged(fit: Mapping[str, Any], judged: Mapping[str, Any] | None) -> Mapping[str, Any]:
+    """The parameters by name, averaged over models by a diagnosis, or a comparison, of this very fit; empty without
+    one."""
+    if judged is None or judged["fit"] != fit["name"]:
         return {}
-    known: Mapping[str, Any] = judged.get("estimates", {})
+    known: Mapping[str, Any] = judged["estimates"]
     return known
 
 
 def called_adequate(fit: Mapping[str, Any], judged: Mapping[str, Any] | None) -> bool | None:
-    """Whether a diagnosis, or a comparison with the floor, calls this very fit adequate; None where it is of another,
-    or there is none."""
+    """Whether a diagnosis, or a comparison, calls this very fit adequate; None where it is of another, or there is
+    none."""
     if judged is None or judged["fit"] != fit["name"]:
         return None
     return bool(judged.get("verdict") == "adequate" or judged.get("adequate"))
 
 
 def answers(fit: Mapping[str, Any], judged: Mapping[str, Any] | None = None) -> list[Answer]:
-    """The parameters: as fitted, or with the floor weighed where a diagnosis or a comparison calls it adequate."""
-    out, better = [], weighed(fit, judged)
+    """The parameters: averaged over models where a diagnosis or a comparison of this fit is there, else as fitted."""
+    out, better = [], averaged(fit, judged)
     for name, entry in fit["parameters"].items():
-        value, std = with_std(entry["estimate"], entry["std"])
-        plain = name.replace("_", " ")
-        state, remark = "determined", ""
-        determined = entry["determined"]
+        plain, state, remark = name.replace("_", " "), "determined", ""
         if name in better:
             value, std = with_std(better[name]["value"], better[name]["std"])
-            determined = better[name].get("determined", determined)
+            determined, why = better[name]["determined"], undetermined(name)
+        else:
+            value, std = with_std(entry["estimate"], entry["std"])
+            determined = entry["determined"]
+            why = f"These evaluations do not determine the {plain}: they hardly say where the loss is least."
         if not determined:
-            state = "open"
-            remark = f"These evaluations do not determine the {plain}: they hardly say where the loss is least."
-            if name in better:
-                remark = undetermined(name)
+            state, remark = "open", why
         elif entry["at_bound"] is not None:
             state = "bound"
             remark = (
                 f"The {plain} lies on the {entry['at_bound']} bound of its range: "
                 "the best value may lie beyond it, or the model may lack an effect."
             )
-        elif called_adequate(fit, judged) is False:
-            remark = f"The model lacks something, which the {plain} makes up for: the ± doesn't hold that."
         out.append(Answer(plain, value, std, symbol(entry["unit"]), state, remark))
     return out
 
 
 def undetermined(name: str) -> str:
-    """Of a parameter that noise, chance and numerics leave open."""
-    return f"All that was measured doesn't determine the {name.replace('_', ' ')}: its bounds say about as much."
+    """Of a parameter that the data leave open."""
+    return f"The data do not determine the {name.replace('_', ' ')}: the bounds of its range say about as much."
 
 
 def fitted_sentence(fit: Mapping[str, Any], judged: Mapping[str, Any] | None) -> str:
-    """Where the answers are weighed ones: what they hold, and what the fit says by itself; otherwise empty."""
-    better = weighed(fit, judged)
-    if not better:
+    """What the ± holds where the answers are averaged over models; otherwise empty."""
+    if not averaged(fit, judged):
         return ""
-    alone = [
-        f"{name.replace('_', ' ')} {estimate(entry['estimate'], entry['std'], entry['unit'])}"
-        for name, entry in fit["parameters"].items()
-    ]
     return (
-        "Noise, chance and numerics weighed: the ± holds these, what numerics that weren't tried may do, and how far "
-        "solvers are apart (in soil that has an effect also parts of the data that contradict each other), not a bias "
-        f"that all of them have. The fit by itself says: {', '.join(alone)}."
+        "The ± holds noise, the chance of particles, numerics (measured by pairs of coarse and fine runs) and the "
+        "other models, weighed by their probability."
     )
 
 
@@ -146,7 +139,7 @@ def residual_sentence(comparison: Mapping[str, Any] | None, adequate: bool | Non
 
     Args:
         comparison: with the pictures; None where there is none.
-        adequate: what a judgement by the floor says of this very fit; None without one.
+        adequate: whether a diagnosis or a comparison calls this very fit adequate; None without one.
     """
     if comparison is None:
         return "The prediction has not been compared with the pictures frame by frame yet."
@@ -164,7 +157,7 @@ def residual_sentence(comparison: Mapping[str, Any] | None, adequate: bool | Non
     above = f"{ratio:.{1 if ratio < 10.0 else 0}f} × what the cameras' noise alone leaves"
     said = f"{left}; that is {above}." if left else f"The residual is {above}."
     if adequate:
-        return f"{said} Patches don't stand above what noise, chance and numerics leave together."
+        return f"{said} Noise, the chance of particles and numerics together leave as much."
     if adequate is not None:
         return said
     return (
@@ -173,33 +166,34 @@ def residual_sentence(comparison: Mapping[str, Any] | None, adequate: bool | Non
     )
 
 
-VERDICTS = {
-    "adequate": "The model is adequate.",
-    "missing": "An effect is missing.",
-    "outside the library": "Something is missing that the library does not have.",
-}
-
-
 def verdict(diagnosis: Mapping[str, Any]) -> str:
     """The diagnosis in one line."""
-    if diagnosis["verdict"] == "missing" and diagnosis["class"]:
-        names = [name.replace("_", " ") for name in diagnosis["class"]]
-        return f"Missing: {' or '.join(names)}."
-    if diagnosis["verdict"] == "outside the library" and diagnosis["class"]:
-        nearest = str(diagnosis["class"][0]).replace("_", " ")
-        return (
-            f"Something is missing: {nearest} explains most, not all of it."
-            if diagnosis["explained"] > 0.5
-            else (f"Something is missing that the library does not have; {nearest} comes nearest.")
-        )
-    return VERDICTS.get(str(diagnosis["verdict"]), str(diagnosis["verdict"]))
+    named = _joined([name.replace("_", " ") for name in diagnosis["class"]], "or")
+    said = {
+        "adequate": "The model is adequate.",
+        "missing": f"Missing: {named}.",
+        "one of": f"Missing: {named}.",
+        "something else": "Something is missing that the library does not have.",
+        "undecided": "Undecided: the data do not tell.",
+    }
+    return said[str(diagnosis["verdict"])]
 
 
 def misfit_verdict(misfit: Mapping[str, Any]) -> str:
-    """A comparison with the floor in one line."""
-    if misfit["adequate"]:
-        return "Nothing stands above what noise, chance and numerics leave."
-    return "More is left than noise, chance and numerics leave: an effect may be missing."
+    """A comparison of the model as it is with something else, in one line."""
+    return "The model is adequate." if misfit["adequate"] else "The model is not adequate: something may be missing."
+
+
+def model_label(name: str) -> str:
+    """A compared model for readers: "as it is", "cohesion", "something else"."""
+    return name.replace("_", " ") or "as it is"
+
+
+def probability(share: float) -> str:
+    """A probability for readers: "87 %", "1.2 %", "< 0.5 %", "> 99.5 %"."""
+    if share < LITTLE:
+        return f"< {100.0 * LITTLE:g} %"
+    return percent(share) if share <= 1.0 - LITTLE else f"> {100.0 * (1.0 - LITTLE):g} %"
 
 
 def steps(models: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -238,12 +232,26 @@ def posterior_notes(posterior: Mapping[str, Any]) -> list[str]:
 
 def estimate(value: Any, std: Any, unit: str) -> str:
     """An estimate that may not exist."""
-    if value is None:
-        return "–"
-    if std is None:
-        return "nothing of it is seen"
-    number, spread = with_std(float(value), float(std))
-    return f"{number} ± {spread}{symbol(unit)}"
+    return "–" if value is None else amount(float(value), float(std or 0.0), unit)
+
+
+def amount(value: float, std: float, unit: str) -> str:
+    """A value with its spread, if it has one, and unit."""
+    return (" ± ".join(with_std(value, std)) if 0.0 < std < math.inf else rounded(value)) + symbol(unit)
+
+
+def title(name: str) -> str:
+    """An effect's name at the beginning of a sentence."""
+    return name.replace("_", " ").capitalize()
+
+
+def listed(words: list[str]) -> str:
+    """a, b and c."""
+    return _joined(words, "and")
+
+
+def _joined(words: Sequence[str], last: str) -> str:
+    return f" {last} ".join(part for part in (", ".join(words[:-1]), *words[-1:]) if part)
 
 
 def rounded(value: float) -> str:

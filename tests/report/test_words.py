@@ -3,7 +3,6 @@ from __future__ import annotations
 import math
 
 import pytest
-from splatsoil.inverse.criticism.words import amount
 
 from splatsoil.report import words
 
@@ -27,9 +26,40 @@ def test_a_value_is_quoted_to_the_digits_its_std_allows(value: float, std: float
 
 
 def test_amounts_have_as_many_digits_as_are_known() -> None:
-    assert amount(553.73, 160.7, "Pa") == "550 ± 160 Pa"
-    assert amount(37.19, 2.53, "deg") == "37.2 ± 2.5°"
-    assert amount(33.2, 0.0, "Pa") == amount(33.2, math.inf, "Pa") == "33.2 Pa"
+    assert words.amount(553.73, 160.7, "Pa") == words.estimate(553.73, 160.7, "Pa") == "550 ± 160 Pa"
+    assert words.amount(37.19, 2.53, "deg") == "37.2 ± 2.5°"
+    assert words.amount(33.2, 0.0, "Pa") == words.amount(33.2, math.inf, "Pa") == "33.2 Pa"
+    assert words.estimate(33.2, None, "Pa") == "33.2 Pa" and words.estimate(None, None, "Pa") == "–"
+
+
+@pytest.mark.parametrize(
+    ("share", "text"),
+    [(0.0, "< 0.5 %"), (0.0049, "< 0.5 %"), (0.012, "1.2 %"), (0.873, "87 %"), (0.994, "99 %"), (0.9999, "> 99.5 %")],
+)
+def test_a_probability_claims_no_more_than_is_known(share: float, text: str) -> None:
+    assert words.probability(share) == text
+
+
+@pytest.mark.parametrize(
+    ("verdict", "names", "text"),
+    [
+        ("adequate", [], "The model is adequate."),
+        ("adequate", ["cohesion"], "The model is adequate."),
+        ("missing", ["tool_friction"], "Missing: tool friction."),
+        ("one of", ["cohesion", "tool_adhesion"], "Missing: cohesion or tool adhesion."),
+        ("one of", ["cohesion", "tool_adhesion", "tilt"], "Missing: cohesion, tool adhesion or tilt."),
+        ("something else", [], "Something is missing that the library does not have."),
+        ("undecided", ["cohesion"], "Undecided: the data do not tell."),
+    ],
+)
+def test_a_verdict_is_one_line(verdict: str, names: list[str], text: str) -> None:
+    assert words.verdict({"verdict": verdict, "class": names}) == text
+
+
+def test_names_in_sentences() -> None:
+    assert words.title("tool_friction") == "Tool friction"
+    assert [words.listed(list("abc"[:n])) for n in (1, 2, 3)] == ["a", "a and b", "a, b and c"]
+    assert [words.model_label(name) for name in ("", "tool_friction")] == ["as it is", "tool friction"]
 
 
 def comparison(total: float, noise: float | None) -> dict:
@@ -49,10 +79,10 @@ def test_the_verdict_follows_the_ratio_to_the_noise() -> None:
 
 def test_a_residual_far_above_the_cameras_noise_is_no_fault_of_an_adequate_model() -> None:
     said = words.residual_sentence(comparison(0.52, 0.01), True)
-    assert "52 ×" in said and "don't stand above" in said
+    assert "52 ×" in said and "numerics together leave as much" in said
     short = words.residual_sentence(comparison(0.52, 0.01), False)
     assert "52 ×" in short and "numerics" not in short
-    # nor does little noise hide what stands above the floor
+    # nor does little noise of the cameras hide what fails
     assert "nothing more" not in words.residual_sentence(comparison(0.011, 0.01), False)
 
 
@@ -84,30 +114,41 @@ def test_a_force_that_counts_is_told_with_what_pictures_say_alone() -> None:
     assert "isn't counted" in words.force_sentence({**fit, "force": {"counted": False, "pictures_alone": alone}})
 
 
-def test_an_adequate_fit_is_quoted_as_a_comparison_with_the_floor_weighs_it() -> None:
-    entry = {"estimate": 36.0, "std": 0.5, "unit": "deg", "at_bound": None, "determined": True}
-    fit = {"name": "base", "parameters": {"friction_angle": entry}}
-    misfit = {"adequate": True, "fit": "base", "estimates": {"friction_angle": {"value": 37.1, "std": 3.2}}}
-    for judged, quoted in ((misfit, "37"), ({**misfit, "adequate": False, "estimates": {}}, "36.0"), (None, "36.0")):
-        assert words.answers(fit, judged)[0].value == quoted
-    assert "missing" in words.misfit_verdict({"adequate": False}) and "missing" not in words.misfit_verdict(misfit)
+ENTRY = {"estimate": 36.0, "std": 0.5, "unit": "deg", "at_bound": None, "determined": True}
+AVERAGED = {"friction_angle": {"value": 37.1, "std": 3.2, "determined": True}}
 
 
-@pytest.mark.parametrize(("of", "quoted"), [("base", "37"), ("base+tilt", "36.0")])
-def test_an_adequate_fit_is_quoted_as_its_own_diagnosis_weighs_it(of: str, quoted: str) -> None:
-    entry = {"estimate": 36.0, "std": 0.5, "unit": "deg", "at_bound": None, "determined": True}
-    fit = {"name": "base", "parameters": {"friction_angle": entry}}
-    diagnosis = {"verdict": "adequate", "fit": of, "estimates": {"friction_angle": {"value": 37.1, "std": 3.2}}}
-    (answer,) = words.answers(fit, diagnosis)
-    assert answer.value == quoted
-    assert ("36.0 ± 0.5°" in words.fitted_sentence(fit, diagnosis)) is (quoted == "37")
-    (short,) = words.answers(fit, {**diagnosis, "verdict": "missing"})
-    assert short.value == "36.0" and ("lacks something" in short.remark) is (quoted == "37")
-    told = {"friction_angle": {"value": 37.1, "std": 8.2, "determined": False}}
-    (wide,) = words.answers(fit, {**diagnosis, "estimates": told})
-    assert (wide.state == "open") is (quoted == "37") and ("its bounds" in wide.remark) is (quoted == "37")
-    (known,) = words.answers(
-        {**fit, "parameters": {"friction_angle": {**entry, "determined": False}}},
-        {**diagnosis, "estimates": {"friction_angle": {"value": 37.1, "std": 3.2, "determined": True}}},
-    )
-    assert (known.state == "determined") is (quoted == "37")
+@pytest.mark.parametrize(
+    "judged",
+    [
+        {"fit": "base", "verdict": "adequate"},
+        {"fit": "base", "verdict": "missing"},
+        {"fit": "base", "verdict": "undecided"},
+        {"fit": "base", "adequate": True},
+        {"fit": "base", "adequate": False},
+    ],
+)
+def test_the_answer_is_averaged_over_models_whatever_the_verdict(judged: dict) -> None:
+    fit = {"name": "base", "parameters": {"friction_angle": {**ENTRY, "determined": False}}}
+    judged = {**judged, "estimates": AVERAGED}
+    (answer,) = words.answers(fit, judged)
+    assert (answer.value, answer.std, answer.state, answer.remark) == ("37", "3", "determined", "")
+    assert "probability" in words.fitted_sentence(fit, judged)
+    adequate = judged.get("adequate", judged.get("verdict") == "adequate")
+    assert words.called_adequate(fit, judged) is adequate
+    judged["estimates"] = {"friction_angle": {**AVERAGED["friction_angle"], "determined": False}}
+    (wide,) = words.answers(fit, judged)
+    assert wide.state == "open" and "do not determine the friction angle" in wide.remark
+
+
+@pytest.mark.parametrize("judged", [None, {"fit": "tilt", "verdict": "adequate", "estimates": AVERAGED}])
+def test_without_a_judgement_of_this_fit_the_answer_is_its_own(judged: dict | None) -> None:
+    fit = {"name": "base", "parameters": {"friction_angle": ENTRY}}
+    (answer,) = words.answers(fit, judged)
+    assert (answer.value, answer.std) == ("36.0", "0.5")
+    assert words.fitted_sentence(fit, judged) == "" and words.called_adequate(fit, judged) is None
+
+
+def test_a_comparison_is_told_in_one_line() -> None:
+    assert words.misfit_verdict({"adequate": True}) == "The model is adequate."
+    assert "not adequate" in words.misfit_verdict({"adequate": False})
