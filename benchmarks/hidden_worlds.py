@@ -14,23 +14,23 @@ the solvers' difference, and what the photographs' or the estimates' fault.
 from __future__ import annotations
 
 import argparse
-import json
+import math
 import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import binomtest
 from splatsoil.benchmarks._common import at_least, here, keep_to_one_protocol, sources, stamp
 from splatsoil.benchmarks._mitsuba import MitsubaStage, load_mitsuba
 from splatsoil.benchmarks._newton import Numerics, World, plough
-from splatsoil.benchmarks._tally import confusion, wilson
-from splatsoil.benchmarks._truths import KINDS, NOTHING, OBSERVATION, OUTSIDE, Hidden, draw
+from splatsoil.benchmarks._truths import KINDS, NOTHING, OBSERVATION, OUTSIDE, TIMES, Hidden, draw
 from splatsoil.benchmarks.numerics import FloatArray
 from splatsoil.benchmarks.solvers import FRAMES, moved, read_particles, refinement_table, surfaces
 
@@ -51,6 +51,11 @@ AT_A_TIME = 4
 RENDERERS: dict[str, Callable[..., Renderer]] = {"own": Stage, "mitsuba": MitsubaStage}
 NEWTON = "newton"
 """The other solver; ours go by their presets."""
+ELSE = "something else"
+"""The model of what no effect explains, and its verdict."""
+OPEN = (ELSE, "undecided")
+LEAST = 1e-6
+"""Probability from which on down the log score falls no further."""
 
 
 def soil_of(hidden: Hidden, setup: Setup, spacing: float) -> World:
@@ -206,92 +211,95 @@ def criticise(name: str, out: Path, preset: str, device: str, say: Callable[[str
 
 
 def score(hidden: Hidden, fit: Mapping[str, Any], told: Mapping[str, Any]) -> dict[str, Any]:
-    """What fit and diagnosis said of a world, beside the truth; the best effect's refit is what ``add`` keeps."""
-    refits = told["refits"]
-    weighed = told["estimates"]["friction_angle"]
-    asis = {"values": {"friction_angle": weighed["value"]}, "stds": {"friction_angle": weighed["std"]}}
-    # Without any significant effect nothing was refitted; without a named one the diagnosis tells the weighed estimate.
-    base = refits.get("as it is", asis)
-    last = refits[told["class"][0]] if told["class"] else {**base, **asis}
-    named = told["class"] if told["verdict"] == "missing" else []
-    off = [(last["values"]["friction_angle"] - hidden.angle) / last["stds"]["friction_angle"]]
-    if told["class"][:1] == [hidden.kind] and hidden.kind not in OBSERVATION:
-        size = next(e["parameter"] for e in told["effects"] if e["name"] == hidden.kind)
-        off.append((last["values"][size] - hidden.size) / last["stds"][size])
-    return {
+    """What fit and diagnosis said of a world, beside the truth.
+
+    ``size`` is that of the effect's parameter, ``times`` and ``detectable`` are over its smallest meaningful change.
+    """
+    models = {model["name"]: model for model in told["models"]}
+    truth = {NOTHING: "", **dict.fromkeys(OUTSIDE, ELSE)}.get(hidden.kind, hidden.kind)
+    best, angle, verdict = told["models"][0], told["estimates"]["friction_angle"], told["verdict"]
+    named = told["class"] if verdict in ("missing", "one of") else []
+    row = {
         "hidden": hidden.kind,
+        "truth": truth,
         "size": hidden.size,
         "angle": hidden.angle,
-        "verdict": told["verdict"],
+        "verdict": verdict,
         "class": told["class"],
-        "explained": told["explained"],
-        "right": hidden.kind in named if hidden.kind not in (NOTHING, *OUTSIDE) else not named,
-        "nearest": hidden.kind in told["class"],
-        "fit": [fit["parameters"]["friction_angle"][key] for key in ("estimate", "std")],
-        "before": [base["values"]["friction_angle"], base["stds"]["friction_angle"]],
-        "after": [last["values"]["friction_angle"], last["stds"]["friction_angle"]],
-        "sizes": {k: [v, last["stds"][k]] for k, v in last["values"].items() if k != "friction_angle"},
-        "off": off,
-        # Each over what noise leaves in such soil.
-        "errors": [refit["held_out"] / refit["floor"] for refit in (base, last) if "floor" in refit],
-        # In all, without what numerics and parameters can make up for.
-        "whole": [told[key]["ratio"] for key in ("whole", "whole_after") if told.get(key)],
-        "z": {e["name"]: e["z"] for e in told["effects"]},
+        "named": named,
+        "right": truth in {"adequate": [""], ELSE: [ELSE]}.get(verdict, named),
+        "best": best["name"],
+        "probabilities": {name: model["probability"] for name, model in models.items()},
+        "angle_found": [angle["value"], angle["std"]],
+        "z": (angle["value"] - hidden.angle) / angle["std"],
         "seconds": [fit["seconds"], told["seconds"]],
     }
+    if hidden.values and truth in models:
+        model = models[truth]
+        size, meaningful = hidden.values[model["parameter"]], model["meaningful"]
+        row |= {"size": size, "times": abs(size - model["off"]) / meaningful}
+        row["detectable"] = model["detectable"] and model["detectable"] / meaningful
+        if best is model:
+            row["size_found"] = [model["estimate"], model["std"]]
+            row["size_error"] = (model["estimate"] - size) / abs(size - model["off"])
+    return row
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """All worlds and what they come to, as Markdown."""
+    """All worlds, those whose truth was not told first, and what they come to, as Markdown."""
     lines = [
-        "| hidden | size | verdict | class | share explained | size found | error over floor, before → after | "
-        "angle: true; fit, refit → with the best effect |",
+        "| hidden | size (over the smallest meaningful) | verdict | class | probability: truth, base law | "
+        "angle: true; found (error over ±) | size found | fit, diagnosis |",
         "|---" * 8 + "|",
     ]
-    for r in rows:
-        size = "–" if r["hidden"] == NOTHING else f"{r['size']:.3g}"
-        found = ", ".join(f"{k} {v:.3g} ± {std:.2g}" for k, (v, std) in r["sizes"].items()) or "–"
-        errors = " → ".join(f"{e:.2f}" for e in r["errors"]) or "–"
-        refit = f"{r['before'][0]:.1f} → " if r["sizes"] else ""
-        angles = f"{r['angle']:.1f}°; {r['fit'][0]:.1f}, {refit}{r['after'][0]:.1f} ± {r['after'][1]:.1f}°"
-        members = ", ".join(r["class"]) or "–"
-        cells = (r["hidden"], size, r["verdict"], members, f"{100 * r['explained']:.0f} %", found, errors, angles)
+    for r in sorted(rows, key=lambda r: (r["right"], r["hidden"])):
+        size = f"{r['size']:.3g}" + (f" ({r['times']:.1f})" if "times" in r else "") if r["truth"] else "–"
+        chances = f"{_chance(r, [r['truth']]):.2f}, {_chance(r, ['']):.2f}"
+        angle = f"{r['angle']:.1f}°; {r['angle_found'][0]:.1f} ± {r['angle_found'][1]:.1f}° ({r['z']:+.1f})"
+        found = "{:.3g} ± {:.2g}".format(*r["size_found"]) if "size_found" in r else "–"
+        seconds = "{:.0f}, {:.0f} s".format(*r["seconds"])
+        cells = (r["hidden"], size, r["verdict"], ", ".join(r["class"]) or "–", chances, angle, found, seconds)
         lines.append("| " + " | ".join(cells) + " |")
+    lines.append("")
 
-    def share(what: str, among: Sequence[Any], test: Callable[[Any], bool]) -> None:
-        if among:
-            hits = sum(map(test, among))
-            low, high = wilson(hits, len(among))
-            lines.append(f"- {what}: {hits} of {len(among)} ({100 * low:.0f}–{100 * high:.0f} %)")
+    def share(what: str, hits: Sequence[bool]) -> None:
+        if hits:
+            low, high = binomtest(sum(hits), len(hits)).proportion_ci(method="wilson")
+            lines.append(f"- {what}: {sum(hits)} of {len(hits)} ({100 * low:.0f}–{100 * high:.0f} %)")
 
-    firsts = [(r["hidden"], r["class"][0] if r["verdict"] == "missing" else NOTHING) for r in rows]
-    lines += ["", confusion(firsts), ""]
-    library = [r for r in rows if r["hidden"] not in (NOTHING, *OUTSIDE)]
-    right = [r for r in library if r["class"][:1] == [r["hidden"]] and r["hidden"] not in OBSERVATION]
-    plain_sand = [r for r in rows if r["hidden"] == NOTHING]
+    def rms(what: str, values: Sequence[float]) -> None:
+        if values:
+            lines.append(f"- {what}, root mean square of {len(values)}: {np.sqrt(np.mean(np.square(values))):.2f}")
+
+    dry = [r for r in rows if r["hidden"] == NOTHING]
     outside = [r for r in rows if r["hidden"] in OUTSIDE]
-    share("some effect named where nothing is hidden", plain_sand, lambda r: not r["right"])
-    share("the class of what is missing holds the truth", library, lambda r: r["right"])
-    share("the same, or the truth is the nearest of the library", library, lambda r: r["nearest"])
-    share("another effect named", library, lambda r: r["verdict"] == "missing" and not r["right"])
-    share("something named that is outside the library", outside, lambda r: not r["right"])
-    share("the right effect of soil or tool first: angle within 2.5° after", right, _near)
-    share("the same: error ends within 1.2 × the floor", right, lambda r: r["errors"][-1] <= 1.2)
-    judged = [r for r in right if len(r["whole"]) > 1]
-    share("the same: the whole ends within 1.2 × noise", judged, lambda r: r["whole"][-1] <= 1.2)
-    share("nothing hidden: angle within 2.5°", plain_sand, _near)
-    if rows:
-        stated = [r["off"] for r in rows if r["class"][:1] == [r["hidden"]] or (r["hidden"] == NOTHING and r["right"])]
-        for times in (1.0, 2.0):
-            inside = [abs(z) <= times for of_one in stated for z in of_one]
-            share(f"last angles and right effects' sizes within {times:.0f} × their ±", inside, bool)
-        off = np.array([r["after"][0] - r["angle"] for r in rows])
-        lines.append(f"- error of the last angle: {off.mean():+.1f} ± {off.std(ddof=min(1, len(rows) - 1)):.1f}°")
-    return "\n".join(lines)
+    library = [r for r in rows if r["hidden"] not in (NOTHING, *OUTSIDE)]
+    large = [r for r in library if r.get("detectable") and r["times"] >= r["detectable"]]
+    share("nothing hidden: some effect named", [bool(r["named"]) for r in dry])
+    share("an effect hidden: it alone named", [r["named"] == [r["truth"]] for r in library])
+    share("the same, of what is at least as large as told detectable", [r["named"] == [r["truth"]] for r in large])
+    share("an effect hidden: named, or in the set", [r["right"] for r in library])
+    share("hidden outside the library: something else, or undecided", [r["verdict"] in OPEN for r in outside])
+    share(
+        "named wrongly, of all with something hidden", [bool(r["named"]) and not r["right"] for r in library + outside]
+    )
+    for what, some in (("nothing hidden", dry), ("an effect hidden", library), ("outside the library", outside)):
+        rms(f"{what}: error of the angle, degrees", [r["angle_found"][0] - r["angle"] for r in some])
+        rms(f"{what}: error of the angle over its ±", [r["z"] for r in some])
+    rms("relative error of the size", [r["size_error"] for r in rows if "size_error" in r])
+    for what, told in (
+        ("effects named", [(r, r["named"]) for r in rows if r["named"]]),
+        ("the most probable model", [(r, [r["best"]]) for r in rows]),
+    ):
+        mean = np.mean([_chance(*each) for each in told]) if told else math.nan
+        share(f"{what}, of probability {mean:.2f} on average: right", [r["truth"] in names for r, names in told])
+    scores = [math.log(max(_chance(r, [r["truth"]]), LEAST)) for r in rows]
+    return "\n".join([*lines, f"- log score of the true model, mean: {np.mean(scores):.2f}"] if rows else lines)
 
 
-def _near(row: Mapping[str, Any]) -> bool:
-    return bool(abs(row["after"][0] - row["angle"]) <= 2.5)
+def _chance(row: Mapping[str, Any], names: Iterable[str]) -> float:
+    """Probability that one of these models is true; 0 for one that was not compared."""
+    return float(sum(row["probabilities"].get(name, 0.0) for name in names))
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -302,6 +310,14 @@ def main(arguments: list[str] | None = None) -> int:
         "--count", type=at_least(1), default=1, help="worlds of each kind; three times as many without anything"
     )
     parser.add_argument("--seed", type=int, default=1, help="of the truths")
+    parser.add_argument(
+        "--times",
+        nargs=2,
+        type=float,
+        default=list(TIMES),
+        metavar=("LOW", "HIGH"),
+        help="range of the effects' sizes over the smallest meaningful ones",
+    )
     parser.add_argument("--preset", default="small")
     parser.add_argument("--device", type=here, default="cpu")
     parser.add_argument("--side-by-side", type=int, default=1, help="chains at a time")
@@ -312,7 +328,7 @@ def main(arguments: list[str] | None = None) -> int:
         "--solver",
         choices=[NEWTON, *PRESETS],
         default=NEWTON,
-        help="ploughs the worlds: newton needs the package, the others are ours by preset (not friction_field)",
+        help="ploughs the worlds: newton needs the package, the others are ours by preset (not friction_field, crust)",
     )
     parser.add_argument("--voxel", type=float, default=Numerics.voxel, help="edge of the other solver's cells, m")
     parser.add_argument(
@@ -333,6 +349,8 @@ def main(arguments: list[str] | None = None) -> int:
     if options.solver != NEWTON and foreign:
         said = " and ".join(foreign)
         raise ParameterError(f"{said}: outside of our library; give --kinds without, or --solver {NEWTON}")
+    if not 0.0 < options.times[0] <= options.times[1] < math.inf:
+        raise ParameterError("--times: give two positive numbers, the smaller one first")
     if not options.voxel > 0.0 or options.iterations < 1:
         raise ParameterError("--voxel must be positive, and --iterations one at least")
     if options.refine and options.solver != NEWTON:
@@ -340,11 +358,12 @@ def main(arguments: list[str] | None = None) -> int:
     if options.renderer == "mitsuba":
         load_mitsuba()  # says what is missing before worlds are made
     own = [Path(__file__).with_name(f"{name}.py") for name in OWN]
-    decides = {name: getattr(options, name) for name in ("seed", "preset", "solver", "renderer", "voxel", "iterations")}
+    named = ("seed", "times", "preset", "solver", "renderer", "voxel", "iterations")
+    decides = {name: getattr(options, name) for name in named}
     decides["code"] = sources(own)
     keep_to_one_protocol(options.out, decides)
     truths = [
-        draw(kind, k, options.seed)
+        draw(kind, k, options.seed, tuple(options.times))
         for kind in options.kinds
         for k in range((3 if kind == NOTHING else 1) * options.count)
     ]
@@ -363,12 +382,12 @@ def main(arguments: list[str] | None = None) -> int:
             pool.submit(criticise, h.name, options.out, options.preset, options.device, say) for h in truths
         ]:
             future.result()
-    rows = []
-    for hidden in truths:
-        run = options.out / "runs" / hidden.name
-        if (run / "diagnosis.json").is_file():
-            fit, told = (json.loads((run / file).read_text()) for file in ("fit.json", "diagnosis.json"))
-            rows.append(score(hidden, fit, told))
+    runs = [(hidden, options.out / "runs" / hidden.name) for hidden in truths]
+    rows = [
+        score(hidden, read_json(run / "fit.json"), read_json(run / "diagnosis.json"))
+        for hidden, run in runs
+        if (run / "diagnosis.json").is_file()
+    ]
     file = options.out / "refinement.json"
     checked = read_json(file) if file.is_file() else {}
     result = {"made_by": stamp(options.device), **decides, "rows": rows, "refinement": checked}

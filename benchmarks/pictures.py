@@ -20,7 +20,6 @@ import numpy.typing as npt
 from splatsoil.benchmarks._common import here, output_options, stamp, write_result
 from splatsoil.benchmarks._newton import Numerics, World, load_newton, plough
 from splatsoil.benchmarks.numerics import Truth, variants
-from splatsoil.inverse.criticism.dilution import informed
 
 from splatsoil.commands._output import print_json
 from splatsoil.errors import ParameterError, RunError
@@ -88,7 +87,9 @@ def amplitudes(
     for doubt in () if doubts is None else doubts:
         wrong = (doubt * weight).reshape(len(flat), -1)
         chance += wrong @ wrong.T
-    found = np.linalg.pinv(informed(flat @ flat.T, chance), hermitian=True) @ flat @ (difference * weight).ravel()
+    values, vectors = np.linalg.eigh(flat @ flat.T - chance)
+    informed = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    found = np.linalg.pinv(informed, hermitian=True) @ flat @ (difference * weight).ravel()
     return np.asarray(found, dtype=np.float64)
 
 

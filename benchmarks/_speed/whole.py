@@ -50,9 +50,7 @@ def considered(count: int = EFFECTS) -> tuple[str, ...]:
     return tuple(sorted(library()))[:count]
 
 
-def diagnosis(
-    folder: Path, preset: str, device: str, work: Path, effects: tuple[str, ...] = (), replay: bool = True
-) -> Group:
+def diagnosis(folder: Path, preset: str, device: str, work: Path, effects: tuple[str, ...] = ()) -> Group:
     """A diagnosis of eight effects of the fit in ``work / "run"``, which is made before if there is none."""
     chosen = effects or considered()
     run = work / "run"
@@ -60,7 +58,7 @@ def diagnosis(
         invert(folder, run, preset, device)
     began = time.perf_counter()
     with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
-        diagnose.run(diagnose.Config(run=run, effects=chosen, device=device, no_replay=not replay))
+        diagnose.run(diagnose.Config(run=run, effects=chosen, device=device))
     synchronise(device)
     seconds = Sample((time.perf_counter() - began,))
     row = Row(
@@ -70,6 +68,4 @@ def diagnosis(
         target=f"≤ {DIAGNOSIS:g} s",
         met=judged(seconds, DIAGNOSIS, "less"),
     )
-    control = "with" if replay else "without"
-    note = f"Effects {', '.join(chosen)}; {control} the control that takes a made-up bed through the whole chain."
-    return Group("Diagnosis", (row,), (note,))
+    return Group("Diagnosis", (row,), (f"Effects {', '.join(chosen)}.",))

@@ -34,7 +34,7 @@ def test_an_unknown_name_is_told_the_known_ones(capsys: pytest.CaptureFixture[st
     ("words", "says"),
     [
         ("numerics examples/plow-dry --seeds 0", "--seeds: 0: give 1 or more"),
-        ("hidden-effects --count -2", "--count: -2: give 1 or more"),
+        ("hidden-worlds --count -2", "--count: -2: give 1 or more"),
         ("hidden-worlds --count few", "--count: invalid number value: 'few'"),
         ("validate --device cuda:99", "there is no device 'cuda:99' here"),
         ("rasteriser --device gpu", "there is no device 'gpu' here"),
