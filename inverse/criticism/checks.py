@@ -1,8 +1,8 @@
 """Posterior predictive checks: by instrument, stage and region, is the observation like what the model would give?
 
-The statistic of a block is its mean square over what is expected of each feature; replicates drawn from the noise say how
-large it would be with nothing wrong (Gelman, Meng & Stern 1996, Stat. Sinica 6:733). Over blocks p is adjusted (Holm
-1979, Scand. J. Stat. 6:65).
+The statistic of a block is its mean square over what is expected of that; replicates drawn from the noise say
+how large it would be with nothing wrong (Gelman, Meng & Stern 1996, Stat. Sinica 6:733). Over blocks p is adjusted
+(Holm 1979, Scand. J. Stat. 6:65).
 """
 
 from __future__ import annotations
@@ -94,8 +94,8 @@ def checks(
     variance = expected.variance[mask]
 
     def statistics(table: FloatArray) -> FloatArray:
-        squares = table[mask] ** 2 / variance
-        return np.array([squares[index].mean() for index in blocks.values()])
+        squares = table[mask] ** 2
+        return np.array([squares[index].sum() / variance[index].sum() for index in blocks.values()])
 
     own = statistics(residual)
     replicates = np.array([statistics(expected.replicate(rng)) for _ in range(DRAWS)])

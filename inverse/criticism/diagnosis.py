@@ -15,7 +15,7 @@ from splatsoil.experiment.base import Candidate, Experiment
 from .checks import Check, Expected, checks, passes
 from .design import Prior, Run, effect_runs
 from .evidence import AS_IT_IS, ELSE, PRIOR, Comparison, Evidence
-from .noise import REMAINING, Noise, Tables, compared, noise_of, trend_of
+from .noise import Noise, Tables, compared, noise_of, trend_of
 from .power import NAMED, detectable
 from .simulations import Simulate, Simulations
 
@@ -341,7 +341,7 @@ def _expected(study: _Study, noise: Noise, tables: Tables, evidence: Evidence) -
         pairs = tables.fine[1] - np.tensordot(hat, base, axes=1)
     factor = evidence.models[AS_IT_IS].factor
     chance = rest if experiment.chance else rest[:0]
-    return Expected(np.asarray(experiment.sensor), chance, pairs, min(factor, 1.0))
+    return Expected(np.asarray(experiment.sensor), chance, pairs, factor)
 
 
 def _held_out(

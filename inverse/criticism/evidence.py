@@ -97,7 +97,7 @@ class Evidence:
         return max(self.probability, key=lambda name: self.probability[name])
 
     def averaged(self, name: str) -> tuple[float, float]:
-        """Mean and standard deviation of a base parameter, averaged over models (Hoeting et al. 1999, Stat. Sci. 14)."""
+        """Mean and standard deviation of a base parameter over models (Hoeting et al. 1999, Stat. Sci. 14:382)."""
         known = [(self.probability[m], *model.moments(name)) for m, model in self.models.items()]
         mean = sum(p * value for p, value, _ in known)
         variance = sum(p * (std**2 + (value - mean) ** 2) for p, value, std in known)
@@ -124,7 +124,7 @@ class _Likelihood:
             half = solve_triangular(root, noise.covariance(float(factor)), lower=True)
             size, modes = np.linalg.eigh(solve_triangular(root, half.T, lower=True))
             rotations.append((np.maximum(size, 1e-9), modes))
-        return cls(root, rotations)
+        return cls(np.asarray(root, dtype=np.float64), rotations)
 
     def white(self, scores: FloatArray) -> FloatArray:
         return np.asarray(solve_triangular(self.root, np.atleast_2d(scores).T, lower=True).T)
@@ -222,7 +222,8 @@ class Comparison:
             log = self.likelihood.log(white - mean, variance, pattern)
             found[name] = _model(name, values, mean, variance, pattern, log, factors)
         base = found[AS_IT_IS]
-        beyond = np.where(FACTORS >= np.exp(SOMETHING_ELSE * self.noise.factor_std), 0.0, -np.inf)
+        least = np.exp(SOMETHING_ELSE * self.noise.factor_std)
+        beyond = np.where(least <= FACTORS, 0.0, -np.inf)
         beyond = beyond - logsumexp(beyond)
         found[ELSE] = _model(ELSE, base.values, base.mean, base.variance, base.pattern, base.log_likelihood, beyond)
         weight = {

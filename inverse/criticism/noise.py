@@ -135,7 +135,7 @@ def noise_of(
     """
     mask = compared(experiment) if aside is None else compared(experiment) & ~aside
     placed = np.broadcast_to(experiment.layout.placed, mask.shape)[mask]
-    (base_runs, base), (fine_runs, fine) = tables.base, tables.fine
+    (base_runs, base), (fine_runs, _) = tables.base, tables.fine
     points = prior.unit(base_runs)
     varied = np.concatenate([base, *(found for _, found in tables.effects.values())])[:, mask]
     mean = varied.mean(axis=0)
@@ -149,7 +149,7 @@ def noise_of(
     def trend(runs: Sequence[Run]) -> FloatArray:
         return trend_of(prior.unit(runs), points) @ own
 
-    effects = [name for name in tables.effects]
+    effects = list(tables.effects)
     increments = [
         (scores[name] - trend(tables.effects[name][0])) / np.sqrt(len(tables.effects[name][0]) * len(effects))
         for name in effects

@@ -1,6 +1,8 @@
-"""Which sizes of an effect would have been seen: synthetic observations from its own emulator, judged like the real one."""
+"""Which sizes of an effect would have been seen: synthetic observations from its emulator, judged like the real one."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import numpy as np
 import numpy.typing as npt
@@ -70,9 +72,9 @@ def detectable(comparison: Comparison, evidence: Evidence, candidate: Candidate,
     return smallest
 
 
-def _density(values: dict[str, FloatArray], evidence: Evidence) -> FloatArray:
+def _density(values: Mapping[str, FloatArray], evidence: Evidence) -> FloatArray:
     """(q,) how well base parameters at an effect's points agree with the averaged posterior."""
-    names = [p for p in evidence.models[AS_IT_IS].values]
+    names = list(evidence.models[AS_IT_IS].values)
     z2 = np.zeros(len(next(iter(values.values()))))
     for name in names:
         middle, std = evidence.averaged(name)

@@ -20,7 +20,6 @@ from splatsoil.experiment.base import Experiment
 from splatsoil.files import read_npy, write_bytes
 from splatsoil.soil.effect import Effect
 
-
 FloatArray = npt.NDArray[np.float64]
 Simulate = Callable[..., FloatArray]
 T = TypeVar("T")

@@ -39,14 +39,12 @@ def sentences(diagnosis: Diagnosis, candidates: Mapping[str, Candidate]) -> list
     else:
         others = "" if not candidates else f" Its probability is {percent(evidence.probability[AS_IT_IS])}."
         out.append(f"The model as it is explains the data.{others}")
-    for name, (value, std) in diagnosis.estimates.items():
-        if not diagnosis.determined[name]:
-            out.append(undetermined(name))
+    out += [undetermined(name) for name, determined in diagnosis.determined.items() if not determined]
     if len(diagnosis.held_out) > 1:
         before, after = diagnosis.held_out[:2]
         out.append(
-            f"On {diagnosis.aside}, which were set aside, the error is {before.error:.2g} without and {after.error:.2g} "
-            f"with {after.model.replace('_', ' ')}; noise leaves {after.noise:.2g}."
+            f"On {diagnosis.aside}, which were set aside, the error is {before.error:.2g} without and "
+            f"{after.error:.2g} with {after.model.replace('_', ' ')}; noise leaves {after.noise:.2g}."
         )
     worst = next((c for c in diagnosis.checks if c.p < SIGNIFICANT), None)
     if worst is not None:

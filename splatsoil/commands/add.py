@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 class Config:
     """Add effects to a run's latest model, one after the other, and fit again.
 
-    What a diagnosis says of the effect and of the other parameters is the estimate; one is made where there is none. Its
-    error on data that were set aside is the falling error. Then the loss is searched over all parameters, for the
+    What a diagnosis says of the effect and of the other parameters is the estimate; one is made where there is none.
+    Its error on data that were set aside is the falling error. Then the loss is searched over all parameters, for the
     report. Earlier fits stay.
     """
 

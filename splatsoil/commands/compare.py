@@ -28,7 +28,7 @@ TOLD = ("adequate", "probability", "estimates", "checks", "passes")
 class Config:
     """Compare the prediction at a run's latest estimate with every frame of the video: how far off, where and when.
 
-    What counts as far is learnt from simulations with other parameters, seeds and finer cells (about fifteen), which are
+    What counts as far is learnt from some fifteen simulations with other parameters, seeds and finer cells, which are
     kept.
     """
 
@@ -46,7 +46,6 @@ def run(config: Config) -> int:
     """Simulate, draw, compare; pictures, losses and the misfit by block go into the run folder."""
     from contextlib import nullcontext
 
-    from splatsoil.commands import _criticism as criticism
     from splatsoil.commands._crew import Crew
     from splatsoil.inverse.run_folder import RunFolder
 

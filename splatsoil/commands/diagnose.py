@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 class Config:
     """Say which effect, if any, a run's latest model lacks, how probable that is, and what cannot be told.
 
-    Simulates the model as it is, each effect that is off at several sizes, and the most probable ones again; all of them
-    are compared with all data. Simulations are kept: an interrupted diagnosis goes on.
+    Simulates the model as it is, each effect that is off at several sizes, and the most probable ones again; all are
+    compared with all data. Simulations are kept: an interrupted diagnosis goes on.
     """
 
     run: Positional[Path]

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Config(FitOptions):
-    """All of it: check the set, reconstruct, fit, compare with what noise leaves, write the report. Goes on where it was
-    interrupted.
+    """All of it: check the set, reconstruct, fit, compare with what noise leaves, write the report. Goes on where it
+    was interrupted.
 
     Where the model isn't adequate also: diagnose it, add the effect that is missing, fit again, and so on, until the
     model is adequate, no effect is probable enough, or the limit is reached. Each round takes two cores some twenty

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
 from splatsoil.experiment.features import Site
 from splatsoil.measurement import Measurement

@@ -7,11 +7,11 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from splatsoil.experiment.strokes import MEASURED
 
 from splatsoil.commands._experiments import off_effects
 from splatsoil.errors import ParameterError, SimulationError
 from splatsoil.experiment.plow import MOST_TOGETHER, PlowExperiment
-from splatsoil.experiment.strokes import MEASURED
 from splatsoil.measurement import Measurement
 from splatsoil.model import Model
 from splatsoil.reconstruction import HeightField
