@@ -156,8 +156,7 @@ def added(
     free = (*before["parameters"], *mine)
     known = criticism.latest_diagnosis(folder, name)
     compared = {} if known is None else {m["name"]: m for m in known["models"]}
-    # It may be of a time when other parameters of the effect were free.
-    if known is None or not {*free} <= {*compared.get(effect.name, {"values": ()})["values"]}:
+    if known is None or effect.name not in compared:
         known = criticism.diagnosed(folder, model, begin, (name,))
         compared = {m["name"]: m for m in known["models"]}
     if effect.name not in compared:
@@ -184,7 +183,9 @@ def added(
     )
     if not criticism.pictured(folder):
         stage.compared(folder, model, begin("compare"))
-    refitted = {name: (best["values"][name], best["stds"][name]) for name in fitting.parameters}
+    # Of what only cameras report otherwise a diagnosis tells no size: the fit finds it.
+    told = {*free} <= {*best["values"]}
+    refitted = {p: (best["values"][p], best["stds"][p]) for p in free} if told else None
     under_way = {
         "command": list(command),
         "done": list(command[: command.index(name)]) if command else [],

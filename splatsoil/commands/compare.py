@@ -86,7 +86,7 @@ def _compared(config: Config, folder: RunFolder, crew: Crew | None) -> tuple[dic
 
 
 def interrupted(config: Config) -> str:
-    """Simulations for the floor are kept one by one."""
+    """Simulations are kept one by one."""
     again = command_line(
         "compare",
         (config.run,),
@@ -100,7 +100,8 @@ def interrupted(config: Config) -> str:
 
 
 def show(result: Mapping[str, Any], folder: str, adequate: bool | None = None) -> None:
-    """Losses of each camera, and what the whole comes to; ``adequate`` is what a judgement by the floor says of it."""
+    """Losses of each camera, and what the whole comes to; ``adequate`` is what a comparison with something else
+    says of it."""
     import numpy as np
     from rich.console import Console
     from rich.markup import escape

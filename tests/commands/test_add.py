@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
-from splatsoil.inverse.criticism.diagnosis import Options
 
 from splatsoil.commands import _control, _criticism, _history, _stages
 from splatsoil.commands._options import FitOptions
 from splatsoil.commands.add import added
+from splatsoil.errors import RunError
 from splatsoil.files import write_json
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
@@ -33,12 +33,35 @@ class Crust(Effect):
 """
 
 
+def diagnosis(
+    models: Mapping[str, Mapping[str, float]], held_out: Sequence[str] | None = None, notes: Sequence[str] = ()
+) -> dict[str, Any]:
+    """What is used of a diagnosis.
+
+    Args:
+        models: parameters' means by effect; each std is a tenth of them.
+        held_out: effects whose error on what was set aside is told; that of all by default.
+        notes: for people.
+    """
+    told = [{"model": "", "error": 5.0, "noise": 1.0}]
+    told += [{"model": name, "error": 2.0, "noise": 1.5} for name in (models if held_out is None else held_out)]
+    return {
+        "models": [
+            {"name": name, "values": dict(values), "stds": {key: 0.1 * value for key, value in values.items()}}
+            for name, values in {"": {"friction_angle": 31.0}, **models}.items()
+        ],
+        "held_out": told,
+        "notes": list(notes),
+    }
+
+
 @dataclass
 class Bench:
-    """A run that has a fit of the friction angle, and what was asked of it."""
+    """A run that has a fit of the friction angle, what is kept of its diagnosis, and what was asked of it."""
 
-    refits: dict[str, Any]
-    confirmed: dict[str, Any] | None = None
+    kept: dict[str, Any] | None = None
+    new: dict[str, Any] = field(default_factory=dict)
+    diagnosed: list[Sequence[str]] = field(default_factory=list)
     fit_of: dict[str, Any] = field(
         default_factory=lambda: {
             "name": "base",
@@ -48,13 +71,21 @@ class Bench:
         }
     )
     options: FitOptions | None = None
-    refitted: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    refitted: Mapping[str, tuple[float, float]] | None = None
     history: list[dict[str, Any]] = field(default_factory=list)
 
-    def fitted(self, options: FitOptions, *others: Any, refitted: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
-        """What the fit would keep: the refit's values."""
+    def diagnose(self, folder: object, model: object, begin: object, effects: Sequence[str]) -> dict[str, Any]:
+        """A new diagnosis."""
+        self.diagnosed.append(effects)
+        return self.new
+
+    def fitted(
+        self, options: FitOptions, *others: Any, refitted: Mapping[str, tuple[float, float]] | None
+    ) -> dict[str, Any]:
+        """What the fit would keep: the diagnosis' values, or some of its own."""
         self.options, self.refitted = options, refitted
-        shown = {n: {"estimate": v, "std": s, "unit": "1", "title": n} for n, (v, s) in refitted.items()}
+        values = dict.fromkeys(options.parameters, (1.0, 0.5)) if refitted is None else refitted
+        shown = {n: {"estimate": v, "std": s, "unit": "1", "title": n} for n, (v, s) in values.items()}
         setup = {"effects": list(options.effects), "preset": options.preset}
         return {"name": "with it", "loss": 1.0, "parameters": shown, "setup": setup}
 
@@ -66,24 +97,14 @@ class Bench:
             device="cpu",
             variant=lambda effects: SimpleNamespace(law=Law(find_effects(effects))),
         )
-        return added(cast(Any, folder), cast(Any, model), name, Options(), lambda stage: lambda what, share: None)
-
-
-def refit(values: Mapping[str, float], chi2: float) -> dict[str, Any]:
-    return {
-        "values": dict(values),
-        "stds": {name: 0.1 * value for name, value in values.items()},
-        "chi2": chi2,
-        "held_out": 0.1 * chi2,
-        "floor": 1.0,
-    }
+        return added(cast(Any, folder), cast(Any, model), name, lambda stage: lambda what, share: None)
 
 
 @pytest.fixture
 def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
-    made = Bench({"as it is": refit({"friction_angle": 30.0}, 50.0)})
-    monkeypatch.setattr(_criticism, "latest_diagnosis", lambda folder, effect: {"refits": made.refits})
-    monkeypatch.setattr(_criticism, "confirmed", lambda *others: {"refits": made.confirmed})
+    made = Bench()
+    monkeypatch.setattr(_criticism, "latest_diagnosis", lambda folder, effect: made.kept)
+    monkeypatch.setattr(_criticism, "diagnosed", made.diagnose)
     monkeypatch.setattr(_history, "history", lambda folder: made.history)
     monkeypatch.setattr(_history, "remember", lambda folder, entries, *_: setattr(made, "history", entries))
     monkeypatch.setattr(_criticism, "pictured", lambda folder: True)
@@ -112,33 +133,72 @@ def test_what_shapes_an_effect_is_fitted_with_it(
     (known,) = find_effects([effect])
     assert {p.name for p in known.parameters} == {*free, *held}
     found = {"friction_angle": 33.0, **{name: 2.0 + k for k, name in enumerate(free)}}
-    bench.refits[known.name] = refit(found, 20.0)
+    bench.kept = diagnosis({known.name: found})
     entry = bench.add(effect)
     assert bench.options is not None
     assert bench.options.effects == (effect,)
     assert bench.options.parameters == ("friction_angle", *free)
     assert bench.refitted == {name: (value, pytest.approx(0.1 * value)) for name, value in found.items()}
     assert entry == bench.history[-1]
-    assert (entry["added"], entry["fall"]) == (known.name, 30.0)
+    assert entry["added"] == known.name
     assert {name: p["estimate"] for name, p in entry["parameters"].items()} == found
 
 
-def test_a_refit_that_stopped_at_its_first_steps_is_made_anew(bench: Bench) -> None:
-    first, whole = ({"friction_angle": 33.0, "cohesion": size} for size in (200.0, 300.0))
-    bench.confirmed = {"as it is": refit({"friction_angle": 30.0}, 50.0), "cohesion": refit(whole, 20.0)}
-    bench.refits["cohesion"] = {**refit(first, 40.0), "stopped": False}
+def test_the_history_holds_errors_on_what_was_set_aside(bench: Bench) -> None:
+    bench.kept = diagnosis({"cohesion": {"friction_angle": 33.0, "cohesion": 300.0}})
     bench.add("cohesion")
-    assert bench.refitted["cohesion"] == (200.0, pytest.approx(20.0))
-    bench.refits["cohesion"]["stopped"] = True
-    bench.add("cohesion")
-    assert bench.refitted["cohesion"] == (300.0, pytest.approx(30.0))
+    assert [(entry["model"], entry["held_out"], entry["floor"]) for entry in bench.history] == [
+        ("base", 5.0, 1.0),
+        ("with it", 2.0, 1.5),
+    ]
+
+
+WITH_COHESION = {"friction_angle": 33.0, "cohesion": 300.0}
+WITH_TILT = {"friction_angle": 30.0, "tilt_x": 1.0, "tilt_y": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("kept", "asked"),
+    [
+        (diagnosis({"cohesion": WITH_COHESION, "tilt": WITH_TILT}), []),
+        (None, [("cohesion",)]),
+        (diagnosis({"tilt": WITH_TILT}), [("cohesion",)]),
+        (diagnosis({"cohesion": WITH_COHESION, "tilt": WITH_TILT}, held_out=["tilt"]), [("cohesion",)]),
+    ],
+    ids=["all-known", "no-diagnosis", "effect-unknown", "error-unknown"],
+)
+def test_what_the_kept_diagnosis_does_not_say_is_asked_of_a_new_one(
+    bench: Bench, kept: dict[str, Any] | None, asked: list[tuple[str, ...]]
+) -> None:
+    bench.kept, bench.new = kept, diagnosis({"cohesion": {"friction_angle": 34.0, "cohesion": 200.0}})
+    entry = bench.add("cohesion")
+    assert bench.diagnosed == asked
+    assert bench.refitted is not None
+    assert bench.refitted["cohesion"][0] == (200.0 if asked else 300.0)
+    assert entry["held_out"] == 2.0
+
+
+def test_an_effect_that_cannot_be_simulated_is_refused(bench: Bench) -> None:
+    bench.new = diagnosis({}, notes=["cohesion: some simulations failed (soil left the bin)"])
+    with pytest.raises(RunError, match=r"cohesion cannot be added: .*soil left the bin"):
+        bench.add("cohesion")
+    assert bench.options is None and bench.history == []
+
+
+def test_the_fit_finds_the_size_of_what_cameras_report_otherwise(bench: Bench) -> None:
+    """A diagnosis tells how probable such an effect is, and integrates over its sizes."""
+    bench.kept = diagnosis({"blur": {"friction_angle": 31.0}})
+    entry = bench.add("blur")
+    assert bench.diagnosed == [] and bench.refitted is None
+    assert bench.options is not None and bench.options.parameters == ("friction_angle", "blur")
+    assert (entry["added"], entry["held_out"]) == ("blur", 2.0)
 
 
 def test_a_diagnosis_by_other_code_is_none(tmp_path: Path) -> None:
     fit = {"name": "base", "setup": {"effects": []}, "parameters": {"friction_angle": {"estimate": 30.0}}}
     folder = cast(Any, SimpleNamespace(fit=lambda: fit, path=tmp_path))
     assert _criticism.latest_diagnosis(folder, "cohesion") is None
-    data = {"format": "splatsoil-diagnosis/1", "model": [], "refits": {}, "values": {"friction_angle": 30.0}}
+    data = {"format": "splatsoil-diagnosis/2", "model": [], "models": [], "values": {"friction_angle": 30.0}}
     data |= {"code": _control.code_of(()), "judged_by": _control.judged_by()}
     other = [{key: "of yesterday"} for key in ("code", "judged_by")] + [{"values": {"friction_angle": 31.0}}]
     for change, known in ({}, True), *((change, False) for change in other):
@@ -146,18 +206,3 @@ def test_a_diagnosis_by_other_code_is_none(tmp_path: Path) -> None:
         assert (_criticism.latest_diagnosis(folder, "cohesion") is not None) is known
     (tmp_path / "own.py").write_text(OWN)
     assert _criticism.latest_diagnosis(folder, str(tmp_path / "own.py")) is None
-
-
-@pytest.mark.parametrize("kept", [None, ("friction_angle", "dilatancy_angle")], ids=["none", "before-shapes"])
-def test_a_diagnosis_from_before_shapes_were_free_is_none(bench: Bench, kept: tuple[str, ...] | None) -> None:
-    if kept is not None:
-        bench.refits["dilatancy"] = refit(dict.fromkeys(kept, 9.0), 40.0)
-    found = {"friction_angle": 33.0, "dilatancy_angle": 10.0, "dilatancy_strain": 2.0}
-    bench.confirmed = {
-        "as it is": refit({"friction_angle": 31.0}, 60.0),
-        "dilatancy": refit(found, 20.0) | {"floor": 1.5},
-    }
-    entry = bench.add("dilatancy")
-    assert {name: value for name, (value, _) in bench.refitted.items()} == found
-    assert (entry["fall"], bench.history[0]["held_out"]) == (40.0, pytest.approx(6.0))
-    assert [each["floor"] for each in bench.history] == [1.0, 1.5], "each model has what its own soil leaves"

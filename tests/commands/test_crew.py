@@ -11,12 +11,10 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from splatsoil.inverse.criticism.diagnosis import Options
 from splatsoil.inverse.criticism.simulations import Simulations
 from splatsoil.inverse.executors import Processes
 
 from splatsoil.commands import _crew, _criticism
-from splatsoil.commands._control import PLACES
 from splatsoil.errors import RunError, SimulationError
 
 
@@ -74,41 +72,40 @@ def three_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("splatsoil.threads.cores", lambda: 3)
 
 
+def experiment_on(device: str) -> Any:
+    """What helpers need of one."""
+    layout = SimpleNamespace(shape=(1, 1))
+    base = SimpleNamespace(device=device)
+    return SimpleNamespace(together=1, prepare=len, base=base, layout=layout, guesses=(), redrawn=())
+
+
 @pytest.mark.usefixtures("three_cores")
 @pytest.mark.parametrize(("helps", "fails"), [(False, False), (False, True), (True, False), (True, True)])
-@pytest.mark.parametrize("control", [False, True])
-def test_helpers_begin_with_the_command_and_nothing_outlives_it(
-    helps: bool, fails: bool, control: bool, tmp_path: Path
-) -> None:
-    """The control is first, if it is wanted at all, and one of it is enough. Only who holds the folder's lock, so that
-    helpers help, tidies up what another process may be at."""
+def test_helpers_begin_with_the_command_and_nothing_outlives_it(helps: bool, fails: bool, tmp_path: Path) -> None:
     folder: Any = SimpleNamespace(path=tmp_path)
-    other = tmp_path / f"{PLACES}1"
-    other.mkdir()
-    experiment: Any = SimpleNamespace(together=1, prepare=len, base=SimpleNamespace(device="cpu"))
-    first = [_crew._ready] * 2 + [_crew._replay] * control
-    with suppress(SimulationError), _crew.Crew(folder, "cpu", (), control=control) as crew:
+    experiment = experiment_on("cpu")
+    simulate = Simulations(experiment)
+    with suppress(SimulationError), _crew.Crew(folder, "cpu", ("tilt",)) as crew:
         (workers,) = made
-        assert crew.count == 2 and workers.jobs == first
+        assert crew.count == 2 and workers.jobs == [_crew._ready] * 2
         if helps:
-            with crew.helping(experiment, Simulations(experiment)) as replay:
-                making = replay()
-                assert replay() is making and workers.jobs == first + [_crew._replay] * (not control)
-                place = workers.words[-1][-1]
-                place.mkdir()  # what a helper has begun with when it is ended
-                assert making is not None
-                making.set_result(None)
-                assert replay() is not making, "it came to nothing: once more"
+            with crew.helping(experiment, simulate):
+                simulate.ahead(lambda ask: [ask({"angle": 30.0}, seed=seed) for seed in (1, 2)])
+                assert workers.jobs[2:] == [_crew._simulate] * 2
+                *known, (job,) = workers.words[-1]
+                assert known == [tmp_path, "cpu", ("tilt",), 2]
+                assert (job["values"], job["seed"]) == ({"angle": 30.0}, 1), "the first ones are made here"
                 if fails:
                     raise SimulationError("blew up")
+            simulate.ahead(lambda ask: ask({"angle": 31.0}))
+            assert len(workers.jobs) == 4, "nobody helps any more"
         elif fails:
             raise SimulationError("blew up")
     assert workers.ended == ["let go" if helps and not fails else "killed"]
-    assert list(tmp_path.iterdir()) == ([] if helps else [other])
 
 
 @pytest.mark.usefixtures("three_cores")
-@pytest.mark.parametrize("stage", ["diagnosed", "misfit", "confirmed"])
+@pytest.mark.parametrize("stage", ["diagnosed", "misfit"])
 def test_who_is_not_alone_in_a_folder_has_no_helpers(stage: str, monkeypatch: pytest.MonkeyPatch) -> None:
     @contextmanager
     def taken() -> Iterator[None]:
@@ -117,34 +114,31 @@ def test_who_is_not_alone_in_a_folder_has_no_helpers(stage: str, monkeypatch: py
 
     folder: Any = SimpleNamespace(lock=taken, fit=lambda: {"parameters": {}})
     model: Any = SimpleNamespace(device="cpu")
-    experiment = SimpleNamespace(candidates=[SimpleNamespace(name="cohesion")])
-    monkeypatch.setattr(_criticism, "experiment_of", lambda *words: (experiment, SimpleNamespace()))
-    words = {
-        "diagnosed": (Options(), lambda what: lambda *told: None),
-        "misfit": (Options(), lambda *told: None),
-        "confirmed": ("cohesion", Options(), lambda *told: None),
-    }[stage]
+    monkeypatch.setattr(_criticism, "experiment_of", lambda *words: (SimpleNamespace(), SimpleNamespace()))
+
+    def told(*words: Any) -> Any:
+        return lambda *words: None
+
     with pytest.raises(RunError, match="another process"):
-        getattr(_criticism, stage)(folder, model, *words)
+        getattr(_criticism, stage)(folder, model, told)
     assert not made
 
 
 @pytest.mark.usefixtures("three_cores")
-@pytest.mark.parametrize(
-    ("free", "control", "left"), [(20.0, True, 2), (9.0, False, 1), (5.0, False, 0), (5.0, True, 1), (3.0, True, 0)]
-)
+@pytest.mark.parametrize(("free", "left"), [(20.0, 2), (9.0, 1), (5.0, 0), (3.0, 0)])
 def test_a_gpu_with_little_memory_keeps_few_helpers(
-    free: float, control: bool, left: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    free: float, left: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """They began before it was known how much is free there; what the control has taken is its own."""
+    """They began before it was known how much is free there."""
     monkeypatch.setattr(_crew, "_free", {"cuda:0": free}.__getitem__)
     folder: Any = SimpleNamespace(path=tmp_path)
-    experiment: Any = SimpleNamespace(together=1, prepare=len, base=SimpleNamespace(device="cuda:0"))
-    helping = _crew.Crew(folder, "auto", (), control=control)
-    with helping as crew, crew.helping(experiment, Simulations(experiment)) as ask:
+    experiment = experiment_on("cuda:0")
+    simulate = Simulations(experiment)
+    with _crew.Crew(folder, "auto", ()) as crew, crew.helping(experiment, simulate):
         (workers,) = made
         assert crew.count == left
-        assert (ask() is None) is (left == 0)
+        simulate.ahead(lambda ask: ask({"angle": 30.0}))
+        assert (_crew._simulate in workers.jobs) is (left > 0)
     assert workers.ended == (["dismissed"] * (2 - left) + ["let go"] if left else ["killed"])
 
 
@@ -173,7 +167,7 @@ class Helpers:
         pass
 
     def submit(self, job, *words):
-        if job is _crew._replay:
+        if job is _crew._ready:
             sys.exit(1 if {{"torch", "kornia"}} & sys.modules.keys() else 0)
 
     def kill(self):
@@ -191,6 +185,6 @@ sys.exit(2)
 
 @pytest.mark.parametrize("command", ["diagnose", "compare"])
 def test_helpers_begin_before_what_takes_seconds_is_loaded(command: str) -> None:
-    """They load the same, beside it; and the control, which all wait for in the end, begins as early."""
+    """They load the same, beside it."""
     script = "import splatsoil.threads\n" + EARLY.format(command=command)
     assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0

@@ -11,15 +11,14 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
-import numpy as np
 import pytest
 from splatsoil.inverse.run_folder import RunFolder
 
 from splatsoil import cli
-from splatsoil.commands import _control, _criticism, _experiments, _history, _stages
+from splatsoil.commands import _criticism, _experiments, _history, _stages
 from splatsoil.commands._options import FitOptions
 from splatsoil.errors import RunError
-from splatsoil.files import write_json, write_npz
+from splatsoil.files import write_json
 
 ALL = ("compare", "diagnose", "add", "report", "posterior")
 
@@ -57,7 +56,14 @@ def words(command: str, run: RunFolder) -> list[str]:
             "lacks models.0.model",
             ("add", "report"),
         ),
-        ("diagnoses/base.json", "{}", "isn't of format splatsoil-diagnosis/1", ("add", "report")),
+        ("diagnoses/base.json", "{}", "isn't of format splatsoil-diagnosis/2", ("add", "report")),
+        (
+            "diagnoses/base.json",
+            '{"format": "splatsoil-diagnosis/2", "values": {}, "model": [], "models": [{"name": ""}]}',
+            "lacks models.0.probability",
+            ("add", "report"),
+        ),
+        ("comparison/misfit.json", "{}", "isn't of format splatsoil-misfit/2", ("add", "report")),
         ("comparison/comparison.json", "{}", "isn't of format splatsoil-comparison/1", ("add", "report")),
     ],
 )
@@ -125,50 +131,6 @@ def test_pictures_are_written_by_one_process_at_a_time(run: RunFolder) -> None:
         _stages.compared(run, cast(Any, None), lambda what, share: pytest.fail("work has begun"))
 
 
-class Kept:
-    """What criticism keeps in ``features/`` of a run: where, and how to ask for it."""
-
-    def __init__(self, run: RunFolder) -> None:
-        self.run = run
-        self.experiment = cast(Any, SimpleNamespace(candidates=()))
-        self.simulate = cast(Any, SimpleNamespace(identity={"preset": "tiny"}))
-
-    def control(self) -> np.ndarray:
-        """As a diagnosis asks for it, before it simulates."""
-        return _control.control(self.run, self.experiment, self.simulate, lambda: pytest.fail("made"), print)()
-
-    def calibration(self) -> Any:
-        return _control.calibrated(self.run, self.experiment, self.simulate, {})
-
-
-@pytest.mark.parametrize("length", [0, 40, -60])
-def test_a_control_that_was_cut_short_is_named_at_once(run: RunFolder, length: int) -> None:
-    kept = Kept(run)
-    path = _control.replay_path(run, kept.simulate)
-    path.parent.mkdir()
-    np.save(path, np.ones((3, 4)))
-    assert kept.control().shape == (1, 3, 4)
-    path.write_bytes(path.read_bytes()[:length])
-    with pytest.raises(RunError, match=rf"{path.name}: cannot be read .*; delete it and run the command again"):
-        _control.control(run, kept.experiment, kept.simulate, lambda: pytest.fail("made"), print)
-
-
-@pytest.mark.parametrize("length", [0, 40, -60])
-def test_a_calibration_that_was_cut_short_is_named(run: RunFolder, length: int) -> None:
-    kept = Kept(run)
-    kept.experiment.calibrate = lambda values: SimpleNamespace(
-        names=("pan",), estimate=np.zeros(1), covariance=np.eye(1)
-    )
-    assert kept.calibration().names == ("pan",)
-    (path,) = run.path.glob("features/calibration-*.npz")
-    path.write_bytes(path.read_bytes()[:length])
-    with pytest.raises(RunError, match=rf"{path.name}: cannot be read .*; delete it and run the command again"):
-        kept.calibration()
-    write_npz(path, names=np.array(["pan"]))
-    with pytest.raises(RunError, match="estimate"):
-        kept.calibration()
-
-
 def test_a_damaged_reconstruction_is_to_be_deleted(run: RunFolder) -> None:
     write_json(run.reconstruction / "reconstruction.json", {"format": "splatsoil-reconstruction/1"})
     measurement = cast(Any, SimpleNamespace(hash="a" * 64))
@@ -211,7 +173,7 @@ def test_a_model_with_added_effects_is_made_anew_by_adding_them(
     run: RunFolder, capsys: pytest.CaptureFixture[str], fit_of: Callable[..., dict[str, Any]]
 ) -> None:
     fits = [fit_of(), fit_of(["tilt"], tilt_x=1.0), fit_of(["cohesion", "tilt"], tilt_x=1.0, cohesion=100.0)]
-    entries = [_criticism.entry(fit, {"held_out": 1.0, "floor": 1.0, "values": {}}) for fit in fits]
+    entries = [_criticism.entry(fit, {"error": 1.0, "noise": 1.0}) for fit in fits]
     _history.remember(run, entries)
     fits[-1]["setup"]["code"] = "of yesterday"
     run.write_fit("cohesion+tilt", fits[-1])

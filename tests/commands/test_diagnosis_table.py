@@ -1,4 +1,4 @@
-"""A diagnosis on a terminal: whatever its width, names and numbers can be read."""
+"""A diagnosis on a narrow terminal: names and numbers can be read."""
 
 from __future__ import annotations
 
@@ -7,48 +7,22 @@ from typing import Any
 import pytest
 
 from splatsoil.commands._diagnosis_table import show
-
-SIZES = {
-    "pressure_dependence": ("", 0.16, 0.05),
-    "tool_adhesion": ("Pa", 139.0, 190.0),
-    "buried_obstacle": ("m", 0.003, 0.004),
-}
+from splatsoil.soil.library import library
 
 
-def effect(name: str) -> dict[str, Any]:
-    unit, estimate, std = SIZES[name]
-    told = {
-        "verdict": "cannot tell",
-        "z": -12.3,
-        "p": 1.2e-10,
-        "mde": 25400.0,
-        "predicted_fall": 153.3,
-        "achieved_fall": 360.6,
-    }
-    return {"name": name, "unit": unit, "estimate": estimate, "std": std, **told}
+def model(name: str) -> dict[str, Any]:
+    return {"name": name, "probability": 0.0312, "unit": "Pa", "estimate": -25400.0, "std": 1900.0, "detectable": 31400}
 
 
-RESULT = {
-    "fit": "base",
-    "effects": [effect(name) for name in SIZES],
-    "verdict": "adequate",
-    "sentences": [],
-    "notes": [],
-    "simulations": 3,
-    "simulated_now": 0,
-    "seconds": 1.0,
-}
-
-
-@pytest.mark.parametrize(("width", "all_columns"), [(80, False), (120, True)])
-def test_an_effect_has_one_line_with_its_whole_name_at_any_width(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, width: int, all_columns: bool
+def test_a_model_has_one_line_with_its_whole_name(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("COLUMNS", str(width))
-    show(RESULT)
+    monkeypatch.setenv("COLUMNS", "80")
+    names = [*library(), "something else"]
+    told = {"fit": "base", "verdict": "adequate", "class": [], "sentences": [], "notes": []}
+    show({**told, "models": [model(n) for n in names], "simulations": 3, "simulated_now": 0, "seconds": 1.0})
     lines = capsys.readouterr().out.splitlines()
-    assert max(map(len, lines)) <= width
-    for name in SIZES:
-        (line,) = (line for line in lines if name in line)
-        assert "cannot tell" in line and "1.2e-10" in line and "±" in line and "25400" in line
-        assert ("360.6" in line and "-12.3" in line) is all_columns
+    assert max(map(len, lines)) <= 80
+    for name in names:
+        (line,) = (line for line in lines if line.strip().startswith(f"{name.replace('_', ' ')}  "))
+        assert "3.1 %" in line and "-25400 ± 1900 Pa" in line and "31400 Pa" in line

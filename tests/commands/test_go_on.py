@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -18,7 +18,7 @@ from splatsoil.report.data import estimates
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
 
-CHI2 = {"base": 90.0, "cohesion": 50.0, "cohesion+tilt": 30.0}
+ERRORS = {"base": 9.0, "cohesion": 5.0, "cohesion+tilt": 3.0}
 SIZES = {"cohesion": 300.0, "tilt_x": 2.0, "tilt_y": 1.0}
 
 
@@ -30,7 +30,7 @@ class Stages:
         self.stops_at: tuple[str, int] | None = None
         for place, name in (
             (_experiments, "model_of"),
-            (_criticism, "confirmed"),
+            (_criticism, "diagnosed"),
             (_stages, "fitted"),
             (_stages, "compared"),
         ):
@@ -54,24 +54,18 @@ class Stages:
             law=Law(find_effects(effects)), variant=self.model, measurement=measurement, device="cpu"
         )
 
-    def confirmed(self, folder: RunFolder, model: Any, name: str, *_: object) -> dict[str, Any]:
-        self.passed(f"try {name}")
+    def diagnosed(self, folder: RunFolder, model: object, begin: object, effects: Sequence[str]) -> dict[str, Any]:
+        (name,) = effects
+        self.passed(f"diagnose {name}")
         before = folder.fit()
         (effect,) = find_effects([name])
-        mine = {p.name: SIZES[p.name] for p in effect.parameters}
+        values = {**estimates(before), **{p.name: SIZES[p.name] for p in effect.parameters}}
         after = "+".join(sorted([*before["setup"]["effects"], name]))
-        sizes = {"as it is": (before["name"], {}), name: (after, mine)}
         return {
-            "refits": {
-                key: {
-                    "values": {**estimates(before), **more},
-                    "stds": dict.fromkeys({**estimates(before), **more}, 1.0),
-                    "chi2": CHI2[model_name],
-                    "held_out": 0.1 * CHI2[model_name],
-                    "floor": 1.0,
-                }
-                for key, (model_name, more) in sizes.items()
-            }
+            "models": [{"name": name, "values": values, "stds": dict.fromkeys(values, 1.0)}],
+            "held_out": [
+                {"model": key, "error": ERRORS[fit], "noise": 1.0} for key, fit in (("", before["name"]), (name, after))
+            ],
         }
 
     def fitted(self, options: FitOptions, *_: object, refitted: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
@@ -103,7 +97,7 @@ def stages(run: RunFolder, fit_of: Callable[..., dict[str, Any]], monkeypatch: p
     return Stages(run, fit_of, monkeypatch)
 
 
-STOPS = [("try cohesion", 1), ("fit", 1), ("fitted", 1), ("compare", 1), ("compared", 1), ("report", 1)]
+STOPS = [("diagnose cohesion", 1), ("fit", 1), ("fitted", 1), ("compare", 1), ("compared", 1), ("report", 1)]
 
 
 @pytest.mark.parametrize(
@@ -111,7 +105,7 @@ STOPS = [("try cohesion", 1), ("fit", 1), ("fitted", 1), ("compare", 1), ("compa
     [
         *((["cohesion"], stop) for stop in STOPS),
         *((["cohesion", "tilt"], stop) for stop in STOPS),
-        *((["cohesion", "tilt"], stop) for stop in [("try tilt", 1), *((what, 2) for what, _ in STOPS[1:-1])]),
+        *((["cohesion", "tilt"], stop) for stop in [("diagnose tilt", 1), *((what, 2) for what, _ in STOPS[1:-1])]),
     ],
 )
 def test_the_same_command_goes_on_to_the_same_end(
@@ -129,8 +123,7 @@ def test_the_same_command_goes_on_to_the_same_end(
     models = kept["models"]
     assert [entry["model"] for entry in models] == ["base", "cohesion", "cohesion+tilt"][: len(effects) + 1]
     assert [entry.get("added") for entry in models] == [None, *effects]
-    assert [entry["held_out"] for entry in models] == [pytest.approx(0.1 * CHI2[e["model"]]) for e in models]
-    assert [entry.get("fall") for entry in models] == [None, 40.0, 20.0][: len(effects) + 1]
+    assert [entry["held_out"] for entry in models] == [ERRORS[entry["model"]] for entry in models]
     assert before == models[-2]["model"] and fit["name"] == models[-1]["model"]
     assert "adding" not in kept, "nothing is under way any more"
     assert stages.done[-1] == "report" and first != stages.done
