@@ -66,32 +66,34 @@ def test_a_run_is_compared_diagnosed_and_added_to(place: Path, repository: Path)
     assert set(TOLD) == compared["misfit"].keys()
     assert {"stage", "region", "channel", "ratio", "p"} <= compared["misfit"]["checks"][0].keys()
 
+    few = command("diagnose", "run", "--effects", "exposure", cwd=place)
+    assert {m["name"] for m in few["models"]} == {"", "something else", "exposure"}
+    assert few["simulated_now"] < few["simulations"], "those of the comparison are there"
+
     own = str(repository / "examples" / "effects" / "suction.py")
-    words = ("--effects", "cohesion", "exposure", own)
+    words = ("--effects", "exposure", own)
     shutil.copytree(place / "run", place / "alone")
     alone = command("diagnose", "alone", *words, cwd=place, cores=1)
     first = command("diagnose", "run", *words, cwd=place)
     assert first["models"] == alone["models"], "a second core changes nothing"
     if len(os.sched_getaffinity(0)) > 1:
         assert first["simulated_now"] == alone["simulated_now"], "and makes nothing twice"
-    assert {m["name"] for m in first["models"]} == {"", "something else", "cohesion", "exposure", "suction"}
+    assert {m["name"] for m in first["models"]} == {"", "something else", "exposure", "suction"}
     assert sum(m["probability"] for m in first["models"]) == pytest.approx(1.0)
-    assert first["simulated_now"] < first["simulations"], "those of the comparison are there"
-    kept = json.loads((place / "run" / "diagnosis.json").read_text())
-    assert kept["models"] == first["models"]
+    run = place / "run"
+    assert json.loads((run / "diagnosis.json").read_text())["models"] == first["models"]
     again = command("diagnose", "run", *words, cwd=place)
     assert again["simulated_now"] == 0, "everything was kept"
     assert again["models"] == first["models"]
 
-    added = command("add", "run", "cohesion", "--budget", "3", cwd=place)
-    assert [m["model"] for m in added["models"]] == ["base", "cohesion"]
-    assert added["models"][1]["added"] == "cohesion"
-    assert set(added["models"][1]["parameters"]) == {"friction_angle", "cohesion"}
-    run = place / "run"
-    assert json.loads((run / "fit.json").read_text())["name"] == "cohesion"
-    assert (run / "before" / "comparison.json").is_file()
+    added = command("add", "run", own, "--budget", "3", cwd=place)
+    before, after = added["models"]
+    assert (before["model"], after["added"]) == ("base", "suction")
+    assert set(after["parameters"]) == {"friction_angle", "suction_gradient"}
+    assert json.loads((run / "fit.json").read_text())["setup"]["effects"] == [own]
+    assert json.loads((run / "before" / "comparison.json").read_text())["fit"] == "base"
     page = (run / "report.html").read_text()
-    falls = added["models"][1]["held_out"] < added["models"][0]["held_out"]
+    falls = after["held_out"] < before["held_out"]
     assert f"The error {'falls' if falls else 'does not fall'}" in page
     assert "Observed, before, after, difference" in page
 
