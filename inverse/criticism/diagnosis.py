@@ -175,11 +175,11 @@ def diagnose(
         default="",
     )
     predictions = {AS_IT_IS: _predicted(study, tables, evidence, AS_IT_IS, ask)}
-    if best and evidence.probability[best] >= SHOWN:
+    if best:
         predictions[best] = _predicted(study, tables, evidence, best, ask)
-    expected = _expected(study, noise, tables, evidence)
     residuals = {name: experiment.observed - table for name, table in predictions.items()}
-    top = best if best in residuals and evidence.probability[best] > evidence.probability[AS_IT_IS] else AS_IT_IS
+    top = best if best and evidence.probability[best] > evidence.probability[AS_IT_IS] else AS_IT_IS
+    expected = _expected(study, noise, tables, evidence.models[top].factor)
     found = checks(experiment, residuals[top], expected, noise.mask, seed)
     verdict, members = judged(evidence.probability, fits=passes(found))
     held_out, aside = _held_out(study, tables, candidates, tuple(predictions), ask) if effects else ([], "")
@@ -215,10 +215,10 @@ def judged(probability: Mapping[str, float], *, fits: bool) -> tuple[Verdict, tu
     effects that it names."""
     effects = sorted((n for n in probability if n not in (AS_IT_IS, ELSE)), key=lambda n: -probability[n])
     shown = tuple(n for n in effects if probability[n] >= SHOWN)
+    if probability[ELSE] >= NAMED or not fits:
+        return "something else", shown
     if effects and probability[effects[0]] >= NAMED:
         return "missing", (effects[0],)
-    if probability[ELSE] >= NAMED or (probability[AS_IT_IS] >= PRIOR and not fits):
-        return "something else", shown
     # the data haven't made the base model less probable than it was
     if probability[AS_IT_IS] >= PRIOR:
         return "adequate", shown
@@ -330,7 +330,7 @@ def _observed_otherwise(study: _Study, tables: Tables, evidence: Evidence, name:
     return np.asarray(sum(added))
 
 
-def _expected(study: _Study, noise: Noise, tables: Tables, evidence: Evidence) -> Expected:
+def _expected(study: _Study, noise: Noise, tables: Tables, factor: float) -> Expected:
     experiment, prior = study.experiment, study.prior
     base = tables.base[1]
     rest = np.tensordot(np.eye(len(base)) - noise.trend, base, axes=1)
@@ -339,7 +339,6 @@ def _expected(study: _Study, noise: Noise, tables: Tables, evidence: Evidence) -
     if len(tables.fine[0]):
         hat = trend_of(prior.unit(tables.fine[0]), noise.points)
         pairs = tables.fine[1] - np.tensordot(hat, base, axes=1)
-    factor = evidence.models[AS_IT_IS].factor
     chance = rest if experiment.chance else rest[:0]
     return Expected(np.asarray(experiment.sensor), chance, pairs, factor)
 
@@ -355,10 +354,9 @@ def _held_out(
     if not judged_on.any() or not (mask & ~aside).any():
         return [], ""
     evidence, _, noise = _compared(study, tables, candidates, aside)
-    expected = _expected(study, replace(noise, mask=mask), tables, evidence)
-    variance = expected.variance[judged_on]
     out = []
     for name in names:
+        variance = _expected(study, noise, tables, evidence.models[name].factor).variance[judged_on]
         left = (experiment.observed - _predicted(study, tables, evidence, name, simulate))[judged_on]
         score = -0.5 * float(np.mean(left**2 / variance + np.log(2.0 * np.pi * variance)))
         out.append(HeldOut(name, float(np.sqrt(np.mean(left**2))), float(np.sqrt(variance.mean())), score))

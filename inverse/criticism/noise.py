@@ -10,7 +10,7 @@ chance      what base simulations with particles of their own scatter by about t
 guesses     colours that no photograph shows, other drawings of the same simulation
 nuisances   effects of observation in their smallest meaningful sizes
 numerics    the model's own error: as large as pairs of coarse and fine runs say, along what soil could do otherwise
-            (the effects' own simulations); its factor is unknown and integrated over
+            (all simulations); its factor is unknown and integrated over
 ========== ============================================================================================================
 
 Fine runs also correct coarse ones (Kennedy & O'Hagan 2000, Biometrika 87:1): their mean difference, as far as it stands
@@ -149,12 +149,9 @@ def noise_of(
     def trend(runs: Sequence[Run]) -> FloatArray:
         return trend_of(prior.unit(runs), points) @ own
 
-    effects = list(tables.effects)
-    increments = [
-        (scores[name] - trend(tables.effects[name][0])) / np.sqrt(len(tables.effects[name][0]) * len(effects))
-        for name in effects
-    ] or [(own - own.mean(axis=0)) / np.sqrt(len(own))]
-    otherwise = _positive(sum(e.T @ e for e in increments) - (chance if effects else 0.0))
+    # What soil could do otherwise: every effect's simulations about the trend, and the base model's about their mean.
+    varied_by = [scores[name] - trend(runs) for name, (runs, _) in tables.effects.items()] + [own - own.mean(axis=0)]
+    otherwise = _positive(sum(e.T @ e / len(e) for e in varied_by) / len(varied_by) - chance)
     unplaced = np.zeros(basis.shape[1], dtype=bool)
     unplaced[basis.shape[1] - int((~placed).sum()) :] = True
     correction, factor_std = np.zeros(basis.shape[1]), NO_PAIRS

@@ -45,8 +45,7 @@ def detectable(comparison: Comparison, evidence: Evidence, candidate: Candidate,
     measure = candidate.measure
     odds = np.log(PRIOR / ((1.0 - PRIOR) / len(evidence.probability)) * NAMED / (1.0 - NAMED))
     likely = evidence.models[AS_IT_IS].weights.sum(axis=0)
-    smallest = None
-    for size in reversed(SIZES):
+    for size in SIZES:
         if len(pattern):
             direction = rng.standard_normal((WORLDS, len(pattern)))
             direction *= size / np.linalg.norm(direction, axis=1, keepdims=True)
@@ -66,10 +65,9 @@ def detectable(comparison: Comparison, evidence: Evidence, candidate: Candidate,
             with_it = _evidence(comparison, world, mean, variance, pattern)
             without = _evidence(comparison, world, *base[1:])
             named += with_it - without > odds
-        if named < POWER * WORLDS:
-            break
-        smallest = size
-    return smallest
+        if named >= POWER * WORLDS:
+            return size
+    return None
 
 
 def _density(values: Mapping[str, FloatArray], evidence: Evidence) -> FloatArray:

@@ -161,13 +161,13 @@ def added(
         compared = {m["name"]: m for m in known["models"]}
     if effect.name not in compared:
         raise RunError(f"{effect.name} cannot be added: {'; '.join(known['notes']) or 'it could not be simulated'}")
-    entries = histories.history(folder)
-    scores = {h["model"]: h for h in known["held_out"]}
-    if effect.name not in scores:
+    if effect.name not in {h["model"] for h in known["held_out"]}:
+        # Only the best effect's error is told: alone, it is that.
         known = criticism.diagnosed(folder, model, begin, (name,))
         compared = {m["name"]: m for m in known["models"]}
-        scores = {h["model"]: h for h in known["held_out"]}
-    base, with_it, best = scores[""], scores.get(effect.name, scores[""]), compared[effect.name]
+    entries = histories.history(folder)
+    scores = {h["model"]: h for h in known["held_out"]}
+    base, with_it, best = scores[""], scores[effect.name], compared[effect.name]
     if not entries or entries[-1]["model"] != before["name"]:
         entries = [criticism.entry(before, base)]
     entries[-1]["held_out"], entries[-1]["floor"] = base["error"], base["noise"]

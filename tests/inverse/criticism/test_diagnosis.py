@@ -1,0 +1,93 @@
+"""A whole comparison of models on experiments whose truth is known."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from splatsoil.inverse.criticism.diagnosis import diagnose, judged, set_aside
+from splatsoil.inverse.criticism.record import misfit_of, record
+
+from splatsoil.experiment.emulated import EmulatedExperiment
+from splatsoil.files import plain
+
+Make = Callable[..., EmulatedExperiment]
+WORLDS = range(6)
+START = {"friction_angle": 35.0}
+
+
+def test_nothing_hidden_is_not_named_and_the_angle_is_covered(make: Make) -> None:
+    z, named = [], 0
+    for seed in WORLDS:
+        found = diagnose(make(seed=seed), START, seed=seed)
+        value, std = found.estimates["friction_angle"]
+        z.append((value - 33.0) / std)
+        named += found.verdict in ("missing", "one of")
+        assert found.determined["friction_angle"]
+    assert named == 0
+    assert np.sqrt(np.mean(np.square(z))) < 1.6
+
+
+@pytest.mark.parametrize(("name", "size"), [("one", 6.0), ("two", -6.0), ("blurred", 6.0)])
+def test_an_effect_that_is_hidden_is_named_with_its_size_and_takes_the_error_away(
+    make: Make, name: str, size: float
+) -> None:
+    found = diagnose(make({f"{name}_size": size}), START)
+    assert (found.verdict, found.members) == ("missing", (name,))
+    value, std = found.estimates["friction_angle"]
+    assert abs(value - 33.0) < 3.0 * std
+    if name != "blurred":
+        mean, deviation = found.evidence.models[name].moments(f"{name}_size")
+        assert abs(mean - size) < 3.0 * deviation and deviation < 1.0
+    before, after = found.held_out
+    assert (before.model, after.model) == ("", name)
+    assert after.error < 0.6 * before.error and after.error < 1.3 * after.noise
+    assert after.log_score > before.log_score
+
+
+def test_a_pattern_that_no_effect_has_is_not_given_a_name(make: Make, waves: Callable[..., np.ndarray]) -> None:
+    experiment = make(extra=8.0 * waves(50, make().layout))
+    found = diagnose(experiment, START)
+    assert found.verdict not in ("missing", "one of", "adequate")
+
+
+def test_without_effects_only_the_base_model_is_judged(make: Make) -> None:
+    good = diagnose(make(), START, effects=False)
+    assert set(good.evidence.probability) == {"", "something else"} and good.verdict == "adequate"
+    bad = diagnose(make({"one_size": 12.0}), START, effects=False)
+    assert bad.verdict == "something else"
+
+
+def test_the_same_seed_gives_the_same_answer_and_the_record_is_plain_json(make: Make) -> None:
+    experiment = make({"one_size": 6.0})
+    first, second = (record(experiment, diagnose(experiment, START), 3) for _ in range(2))
+    assert json.dumps(plain(first)) == json.dumps(plain(second))
+    assert sum(m["probability"] for m in first["models"]) == pytest.approx(1.0)
+    assert first["models"][0]["name"] == "one" and first["models"][0]["detectable"] is not None
+    assert misfit_of({**first, "fit": "base", "values": START})["adequate"] is False
+
+
+def test_what_is_set_aside_is_the_last_camera_and_the_last_stage(make: Make) -> None:
+    layout = make().layout
+    aside, what = set_aside(make())
+    assert what == "camera right and the withdrawal"
+    right = np.array([s.channel == "right" for s in layout.sites])
+    assert aside[:, right].all() and aside[4:].all() and not aside[:4, ~right].any()
+
+
+@pytest.mark.parametrize(
+    ("probability", "fits", "verdict", "members"),
+    [
+        ({"": 0.6, "something else": 0.1, "a": 0.3}, True, "adequate", ("a",)),
+        ({"": 0.6, "something else": 0.1, "a": 0.3}, False, "something else", ("a",)),
+        ({"": 0.02, "something else": 0.03, "a": 0.95}, True, "missing", ("a",)),
+        ({"": 0.02, "something else": 0.03, "a": 0.95}, False, "something else", ("a",)),
+        ({"": 0.02, "something else": 0.03, "a": 0.55, "b": 0.4}, True, "one of", ("a", "b")),
+        ({"": 0.04, "something else": 0.95, "a": 0.01}, True, "something else", ()),
+        ({"": 0.4, "something else": 0.2, "a": 0.4}, True, "undecided", ("a",)),
+    ],
+)
+def test_verdicts(probability: dict[str, float], fits: bool, verdict: str, members: tuple[str, ...]) -> None:
+    assert judged(probability, fits=fits) == (verdict, members)
