@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatsoil.commands._control import CALIBRATION, FEATURES, JUDGING, REPLAY
+from splatsoil.commands._control import FEATURES, JUDGING
 from splatsoil.errors import RunError
 from splatsoil.files import FORWARD, RECONSTRUCTING, code_digest, read_npy, read_npz, write_npz
 
@@ -26,15 +26,6 @@ NEUTRAL = {
     "envs/devices.py": "the device, which each key has by itself",
     "envs/levels.py": "which resolution is asked for, which each key has by itself",
     "envs/problem.py": "what an evaluation is",
-}
-#: Of features: what is computed anew each time, or has a digest of its own.
-BESIDES = {
-    "experiment/bands.py": "of the calibration",
-    "experiment/calibration.py": "of the calibration",
-    "experiment/calibration_bench.py": "of the calibration",
-    "experiment/reproducibility.py": "what an estimate's std holds",
-    "experiment/states.py": "what a free strength is read over",
-    "experiment/strokes.py": "advice on other experiments",
 }
 
 
@@ -89,9 +80,7 @@ def reached(repository: Path, start: str) -> set[str]:
         ("reconstruction.pipeline", RECONSTRUCTING, {}),
         ("model", FORWARD, {}),
         ("envs.measured", FORWARD, {}),
-        ("experiment.plow", (*FORWARD, *FEATURES), BESIDES),
-        ("experiment.replay", (*FORWARD, *FEATURES, *REPLAY), BESIDES),
-        ("experiment.calibration", (*FORWARD, *FEATURES, *CALIBRATION), {}),
+        ("experiment.plow", (*FORWARD, *FEATURES), {}),
         (
             "inverse.criticism.diagnosis",
             (*FORWARD, *FEATURES, *JUDGING),
@@ -111,7 +100,7 @@ def test_the_code_that_decides_a_result_is_in_its_digest(
 def test_every_part_of_a_digest_is_there(tmp_path: Path) -> None:
     """One that were not would change nothing, unnoticed."""
     nothing = code_digest(())
-    for name in (*FORWARD, *FEATURES, *REPLAY, *CALIBRATION, *JUDGING):
+    for name in (*FORWARD, *FEATURES, *JUDGING):
         assert code_digest((name,)) != nothing, name
 
 

@@ -45,11 +45,6 @@ class Candidate:
         """The parameter that measures the effect."""
         return next(p for p in self.parameters if p.name == self.size)
 
-    @property
-    def refitted(self) -> tuple[Parameter, ...]:
-        """All that is free once the effect is on."""
-        return (*self.parameters, *self.shapes)
-
 
 class Experiment(Protocol):
     """Observed features, their noise, and predictions.
@@ -101,13 +96,13 @@ class Experiment(Protocol):
     def chance(self) -> bool: ...
 
     def predict(
-        self, values: Mapping[str, float], *, effects: Iterable[str | Effect] = (), seed: int = 0, numerics: str = ""
+        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
     ) -> FloatArray:
         """(t, s) predicted features.
 
         Args:
             values: parameters by name, those of ``effects`` included.
-            effects: candidates to switch on, by name; or an effect itself that is none.
+            effects: candidates to switch on, by name.
             seed: of what is chance in the simulation.
             numerics: one of ``numerics`` or ``guesses``, or nothing for the usual way.
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -13,7 +11,6 @@ import numpy.typing as npt
 from splatsoil.experiment.base import Candidate
 from splatsoil.experiment.features import Layout
 from splatsoil.parameters import Parameter
-from splatsoil.soil.effect import Effect
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -23,8 +20,7 @@ class EmulatedExperiment:
     """Features that are known functions of parameters, with chance and instruments' noise drawn from known covariances.
 
     A prediction is the middle, plus each parameter's (and effect's) slope times its distance from home, plus half its
-    curve times the square of that, plus chance: a part of it depends on the seed alone, a part is another one whenever
-    soil is (what cameras report changes none).
+    curve times the square of that, plus chance of the seed.
 
     Attributes:
         layout: labels.
@@ -35,7 +31,6 @@ class EmulatedExperiment:
         parameters: free parameters of the model.
         candidates: effects that are off.
         chance_root: (t s, t s) lower Cholesky factor of one simulation's chance.
-        chaos: share of the chance's variance that is another one whenever soil is.
         sensor: (t, s) standard deviation of the instruments.
         observed: (t, s).
         patterns: (t, s) what other numerics add, by name.
@@ -62,7 +57,6 @@ class EmulatedExperiment:
     redrawn: tuple[str, ...] = ()
     chance: bool = True
     sensor_memory: float = 0.0
-    chaos: float = 0.0
 
     def __post_init__(self) -> None:
         if self.quiet.size == 0:
@@ -97,18 +91,11 @@ class EmulatedExperiment:
         return out
 
     def predict(
-        self, values: Mapping[str, float], *, effects: Iterable[str | Effect] = (), seed: int = 0, numerics: str = ""
+        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
     ) -> FloatArray:
-        """(t, s) features; the same seed has the same chance but for what is chaos."""
+        """(t, s) features; the same seed has the same chance."""
         del effects
-        reported = {p.name for c in self.candidates if c.kind == "observation" for p in c.parameters}
-        off = {p.name: float(p.off or 0.0) for c in self.candidates for p in c.parameters}
-        soil = sorted((n, v) for n, v in values.items() if n not in reported and v != off.get(n))
-        own = zlib.crc32(repr((soil, numerics if numerics in self.patterns else "")).encode())
-        chance = math.sqrt(1.0 - self.chaos) * self.drawn(seed)
-        if self.chaos:
-            chance += math.sqrt(self.chaos) * self.drawn([seed, own])
-        return self.expected(values, numerics) + chance
+        return self.expected(values, numerics) + self.drawn(seed)
 
     def drawn(self, seed: int | Sequence[int]) -> FloatArray:
         """(t, s) chance of one seed."""

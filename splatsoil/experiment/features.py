@@ -9,8 +9,6 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
-
 
 @dataclass(frozen=True)
 class Site:
@@ -74,31 +72,3 @@ class Layout:
     def placed(self) -> npt.NDArray[np.bool_]:
         """(s,) sites that have a place."""
         return np.array([math.isfinite(site.x) and math.isfinite(site.y) for site in self.sites])
-
-    @cached_property
-    def channel_numbers(self) -> npt.NDArray[np.int64]:
-        """(s,) index of each site's instrument in ``channels``."""
-        numbers = {channel: i for i, channel in enumerate(self.channels)}
-        return np.array([numbers[site.channel] for site in self.sites], dtype=np.int64)
-
-    @cached_property
-    def parts(self) -> npt.NDArray[np.int64]:
-        """(t, s) number of each feature's part of the data: what one instrument says in one stage."""
-        numbers = {stage: i for i, stage in enumerate(dict.fromkeys(self.stages))}
-        stages = np.array([numbers[stage] for stage in self.stages], dtype=np.int64)
-        return stages[:, None] * len(self.channels) + self.channel_numbers[None]
-
-    @cached_property
-    def steps(self) -> FloatArray:
-        """(t,) times in units of their median spacing."""
-        times = np.array(self.times)
-        return times / float(np.median(np.diff(times))) if len(times) > 1 else times
-
-    @cached_property
-    def distances(self) -> FloatArray:
-        """(s, s) distance between sites in m; 0 between two without a place, infinite where one has one."""
-        place, placed = np.array([[site.x, site.y] for site in self.sites]), self.placed
-        distance = np.linalg.norm(place[:, None] - place[None], axis=-1)
-        distance[~placed[:, None] & ~placed[None]] = 0.0
-        distance[placed[:, None] != placed[None]] = np.inf
-        return np.asarray(distance)

@@ -171,8 +171,3 @@ class ToolForces:
 def compressed(forces: FloatArray) -> FloatArray:
     """Forces in % of the largest, relative beyond `SCALE`."""
     return np.asarray(SCALE * np.arcsinh(forces / SCALE))
-
-
-def expanded(features: FloatArray) -> FloatArray:
-    """The inverse."""
-    return np.asarray(SCALE * np.sinh(features / SCALE))

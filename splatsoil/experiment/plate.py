@@ -17,7 +17,6 @@ from splatsoil.measurement import Bed, Measurement, Tool, ToolMotion
 from splatsoil.mpm import Resolution, simulate
 from splatsoil.parameters import Parameter
 from splatsoil.reconstruction import HeightField, fill
-from splatsoil.soil.effect import Effect
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects, library
 
@@ -102,7 +101,7 @@ class PlateExperiment:
         self.resolution = Resolution.derive(self.experiment, preset)
 
     def predict(
-        self, values: Mapping[str, float], *, effects: Iterable[str | Effect] = (), seed: int = 0, numerics: str = ""
+        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
     ) -> FloatArray:
         """(t, 1) forces in N; see :class:`~splatsoil.experiment.base.Experiment`."""
         resolution = NUMERICS[numerics](self.resolution) if numerics else self.resolution

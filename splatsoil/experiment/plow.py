@@ -96,7 +96,7 @@ class PlowExperiment:
         self.redrawn = tuple(name for name in self.numerics if name == ROUNDING)
         self.progress = progress
         wanted = tuple(library().values()) if candidates is None else find_effects(candidates)
-        self._wanted: dict[str | Effect, Effect] = {effect.name: effect for effect in wanted if not effect.numerical}
+        self._wanted: dict[str, Effect] = {effect.name: effect for effect in wanted if not effect.numerical}
         self.candidates: tuple[Candidate, ...] = candidates_of(
             (e.for_measurement(model.measurement) for e in self._wanted.values()), model.law.effects
         )
@@ -177,7 +177,7 @@ class PlowExperiment:
         return self._beside(pictured, None if self.forces is None else self.forces.noise)
 
     def predict(
-        self, values: Mapping[str, float], *, effects: Iterable[str | Effect] = (), seed: int = 0, numerics: str = ""
+        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
     ) -> FloatArray:
         """(t, s) features; see :class:`~splatsoil.experiment.base.Experiment`."""
         return self.features(self.prediction(values, effects=effects, seed=seed, numerics=numerics))
@@ -194,7 +194,7 @@ class PlowExperiment:
         )
 
     def prediction(
-        self, values: Mapping[str, float], *, effects: Iterable[str | Effect] = (), seed: int = 0, numerics: str = ""
+        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
     ) -> Prediction:
         """The pictures behind the features. What only changes the observation is drawn without a new simulation."""
         guess = 1 + self.guesses.index(numerics) if numerics in self.guesses else None
@@ -239,7 +239,7 @@ class PlowExperiment:
                 if isinstance(trajectory, Trajectory):
                     self._keep(asked, trajectory)
 
-    def _computed(self, effects: Iterable[str | Effect], numerics: str) -> tuple[Model, str]:
+    def _computed(self, effects: Iterable[str], numerics: str) -> tuple[Model, str]:
         """The model with candidates on, computed in one of the numerics; what only draws otherwise is none of them."""
         way = "" if numerics in self.guesses or numerics == ROUNDING else numerics
         return self._variant(tuple(dict.fromkeys((*self.model, *effects))), way), way
@@ -260,7 +260,7 @@ class PlowExperiment:
             del self._kept[next(iter(self._kept))]
         self._kept[key] = trajectory
 
-    def _variant(self, effects: tuple[str | Effect, ...], numerics: str) -> Model:
+    def _variant(self, effects: tuple[str, ...], numerics: str) -> Model:
         if effects == self.model and not numerics:
             return self.base
         resolution = NUMERICS[numerics](self.base.resolution) if numerics else None

@@ -15,7 +15,6 @@ from splatsoil.errors import MeasurementError, ParameterError, SimulationError
 from splatsoil.experiment.base import candidates_of
 from splatsoil.experiment.features import Layout, Site
 from splatsoil.parameters import Parameter
-from splatsoil.soil.effect import Effect
 from splatsoil.soil.element import ElementTest, triaxial
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects, library
@@ -165,7 +164,7 @@ class TriaxialExperiment:
         self,
         values: Mapping[str, float],
         *,
-        effects: Iterable[str | Effect] = (),
+        effects: Iterable[str] = (),
         seed: int = 0,
         numerics: str = "",
     ) -> FloatArray:

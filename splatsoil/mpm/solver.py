@@ -376,16 +376,6 @@ class Solver:
         stiffness = self.resolution.bulk * self._table.numpy()[:, STIFFNESS].astype(np.float64)
         return -stiffness[:, None] * self._particles.elastic.numpy().astype(np.float64).reshape(self.simulations, -1)
 
-    def plastic_strains(self) -> npt.NDArray[np.float64]:
-        """Plastic shear strain so far, (simulations, n).
-
-        Raises:
-            SimulationError: no effect of the law keeps it.
-        """
-        if not self.law.history:
-            raise SimulationError("this soil law keeps no plastic strain; no effect in it depends on any")
-        return self._particles.history.numpy()[:, 0].astype(np.float64).reshape(self.simulations, -1)
-
     def momentum(self) -> npt.NDArray[np.float64]:
         """Total momentum (simulations, 3) in kg m/s."""
         p = self._particles

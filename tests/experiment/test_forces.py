@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatsoil.experiment.forces import ALONG, ERROR, GROWTH, OWN, SENSOR, SHAPE, UP, ToolForces
+from splatsoil.experiment.forces import ALONG, ERROR, GROWTH, OWN, SCALE, SENSOR, SHAPE, UP, ToolForces, compressed
 from splatsoil.measurement import Measurement, ToolMotion
 
 ROWS = [[frame, frame + 10] for frame in range(10, 200, 20)]
@@ -126,6 +126,18 @@ def test_independent_combinations_have_the_variance_that_is_stated(dry: Measurem
     drawn = generator.standard_normal((2000, len(parts))) @ parts + rows * generator.standard_normal((2000, len(rows)))
     white = np.stack([found.independent(dict(zip(found.names, row, strict=True))) for row in drawn])
     assert np.allclose(np.cov(white.T), np.eye(len(rows)), atol=0.12)
+
+
+def test_a_comparison_of_models_takes_large_forces_by_their_ratio_and_small_ones_as_they_are(dry: Measurement) -> None:
+    large, small = np.array([40.0, 90.0, -90.0]), np.array([0.5, -0.5])
+    assert np.allclose(compressed(1.1 * large) - compressed(large), np.sign(large) * SCALE * np.log(1.1), rtol=0.05)
+    assert np.allclose(compressed(small), small, rtol=1e-3)
+    found = forces_of(dry)
+    assert np.array_equal(found.features, compressed(found.observed))
+    # What the instrument adds, in the same features.
+    shift = 1e-3 * SENSOR
+    moved = (compressed(found.observed + shift) - compressed(found.observed - shift)) / (2e-3)
+    assert np.allclose(found.noise, moved, rtol=1e-4)
 
 
 def test_residuals_are_named_by_instrument_and_frame(dry: Measurement) -> None:

@@ -7,7 +7,6 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from splatsoil.experiment.strokes import MEASURED
 
 from splatsoil.commands._experiments import off_effects
 from splatsoil.errors import ParameterError, SimulationError
@@ -15,8 +14,7 @@ from splatsoil.experiment.plow import MOST_TOGETHER, PlowExperiment
 from splatsoil.measurement import Measurement
 from splatsoil.model import Model
 from splatsoil.reconstruction import HeightField
-from splatsoil.soil.law import Law
-from splatsoil.soil.library import find_effects, library
+from splatsoil.soil.library import library
 
 
 def asked(numerics: str) -> tuple[list[Any], list[Any]]:
@@ -49,7 +47,7 @@ def asked(numerics: str) -> tuple[list[Any], list[Any]]:
     ("numerics", "way", "drawing"),
     [
         ("", "", (None, 1.0)),
-        ("grid", "grid", (None, 1.0)),
+        ("fine", "fine", (None, 1.0)),
         ("albedo 1", "", (1, 1.0)),
         ("albedo 6", "", (6, 1.0)),
         ("rounding", "", (None, 2.0)),
@@ -64,12 +62,12 @@ def test_guesses_and_rounding_are_other_drawings_of_the_same_simulation(
 
 
 def test_an_unknown_way_is_not_taken_for_the_usual_one() -> None:
-    assert asked("gird")[0] == [(("cohesion", "tilt"), "gird"), "gird"]
+    assert asked("finer")[0] == [(("cohesion", "tilt"), "finer"), "finer"]
     base = SimpleNamespace(resolution=None, variant=lambda **changes: base)
     experiment: Any = SimpleNamespace(model=("cohesion",), base=base, _wanted={})
     assert PlowExperiment._variant(experiment, ("cohesion",), "") is base
-    with pytest.raises(KeyError, match="gird"):
-        PlowExperiment._variant(experiment, ("cohesion",), "gird")
+    with pytest.raises(KeyError, match="finer"):
+        PlowExperiment._variant(experiment, ("cohesion",), "finer")
 
 
 def test_what_is_numerics_is_no_candidate(small_set: Path) -> None:
@@ -101,7 +99,7 @@ def test_soil_prepared_together_is_that_of_single_simulations(small_set: Path, m
         job(effects=("exposure",), exposure_gain=0.9),
         job(effects=("cohesion",), cohesion=300.0),
         job(1, effects=("cohesion",), cohesion=300.0),
-        job(numerics="step"),
+        job(numerics="fine"),
     ]
     unseen = job(effects=("buried_obstacle",), obstacle_radius=0.001)
     alone = [experiment().prediction(**each).trajectory.positions for each in jobs]
@@ -148,41 +146,3 @@ def test_what_cannot_be_prepared_is_left_to_predictions(monkeypatch: pytest.Monk
     jobs = [{"values": {"angle": a}, "effects": (), "seed": 0, "numerics": ""} for a in (1.0, 2.0)]
     PlowExperiment.prepare(experiment, jobs)
     assert not experiment._kept
-
-
-class Asked(Exception):
-    pass
-
-
-def test_other_strokes_know_an_effect_of_ones_own(monkeypatch: pytest.MonkeyPatch, repository: Path) -> None:
-    """One from a file, which the library can't find by its name."""
-    (suction,) = find_effects([str(repository / "examples" / "effects" / "suction.py")])
-    asked: list[Any] = []
-
-    def model(*_: Any, effects: Any, **__: Any) -> None:
-        asked.append(effects)
-        raise Asked
-
-    monkeypatch.setattr("splatsoil.model.Model", model)
-    measurement = Measurement.load(repository / "examples" / "plow-dry")
-    reconstruction = SimpleNamespace(surface=SimpleNamespace(height=np.full((2, 2), 0.12)))
-    base = SimpleNamespace(
-        effects=("cohesion",), frames=(0, 6), measurement=measurement, reconstruction=reconstruction, device="cpu"
-    )
-    experiment: Any = SimpleNamespace(base=base, _wanted={"suction": suction})
-    with pytest.raises(Asked):
-        PlowExperiment.strokes(experiment)[MEASURED]({}, ("suction", "tilt"))
-    assert asked == [("cohesion", suction, "tilt")]
-
-
-def test_solvers_are_farther_apart_where_the_model_or_the_effect_asked_for_changes_soil() -> None:
-    (angle,) = (p for p in Law().parameters if p.name == "friction_angle")
-    wanted = {effect.name: effect for effect in find_effects(("cohesion", "exposure"))}
-
-    def apart(*on: str, effect: str = "") -> float:
-        base = SimpleNamespace(law=Law(find_effects(on)))
-        experiment: Any = SimpleNamespace(base=base, _wanted=wanted)
-        return PlowExperiment.reproducibility(experiment, angle, 35.0, effect)
-
-    assert apart() == apart(effect="exposure") == apart("exposure") > 0.0
-    assert apart(effect="cohesion") == apart("tilt") == apart("viscosity", effect="exposure") > apart()

@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from splatsoil.inverse.criticism.diagnosis import Diagnosis, diagnose
-from splatsoil.inverse.criticism.refit import optimum
-from splatsoil.inverse.criticism.simulations import Simulations
+from splatsoil.inverse.criticism.evidence import AS_IT_IS, ELSE
 
 from splatsoil.errors import MeasurementError
 from splatsoil.experiment.triaxial import Curve, TriaxialExperiment, read_triaxial
@@ -27,9 +26,13 @@ STRAINS = np.concatenate([np.linspace(0.005, 0.02, 4), np.linspace(0.03, 0.2, 18
 
 def criticised(curve: Curve, void_ratio: float) -> Diagnosis:
     experiment = TriaxialExperiment(curve, void_ratio=void_ratio)
-    simulate = Simulations(experiment)
-    values = optimum(experiment, simulate, {p.name: p.default for p in experiment.parameters})
-    return diagnose(experiment, values, simulate=simulate)
+    return diagnose(experiment, {p.name: p.default for p in experiment.parameters})
+
+
+def effects(found: Diagnosis) -> dict[str, float]:
+    """Probabilities of the library's effects, the most probable first."""
+    known = {name: p for name, p in found.evidence.probability.items() if name not in (AS_IT_IS, ELSE)}
+    return dict(sorted(known.items(), key=lambda item: -item[1]))
 
 
 def made(effects: tuple[str, ...], values: dict[str, float]) -> Curve:
@@ -43,34 +46,36 @@ def made(effects: tuple[str, ...], values: dict[str, float]) -> Curve:
     return Curve("made", STRAINS, volume, ratio, 1e5)
 
 
-def test_sand_of_the_base_law_is_adequate() -> None:
+def test_sand_of_the_base_law_is_not_said_to_miss_anything() -> None:
     found = criticised(made((), {"friction_angle": 34.0}), 0.8)
-    assert found.verdict == "adequate"
-    assert found.evidence.values["friction_angle"] == pytest.approx(34.0, abs=0.5)
+    assert found.verdict in ("adequate", "undecided"), found.evidence.probability
+    value, std = found.estimates["friction_angle"]
+    assert abs(value - 34.0) < 2.0 * std and value == pytest.approx(34.0, abs=1.0)
 
 
-def test_dilatancy_is_named_where_it_is_hidden() -> None:
+def test_hidden_dilatancy_comes_first_with_its_size() -> None:
     found = criticised(made(("dilatancy",), {"friction_angle": 38.0, "dilatancy_angle": 12.0}), 0.8)
-    assert found.verdict == "missing"
-    assert found.members[0] == "dilatancy"
-    best = found.confirmations["dilatancy"]
-    assert best.values["dilatancy_angle"] == pytest.approx(12.0, abs=2.0)
-    assert best.held_out < 0.2 * found.confirmations[""].held_out
+    assert next(iter(effects(found))) == "dilatancy", found.evidence.probability
+    assert found.evidence.models["dilatancy"].moments("dilatancy_angle")[0] == pytest.approx(12.0, abs=3.0)
+    before, after = found.held_out
+    assert after.model == "dilatancy" and after.error < 0.5 * before.error
 
 
 @pytest.mark.skipif(not KARLSRUHE.is_file(), reason="SPLATSOIL_MEASURED names no folder with karlsruhe_triaxial")
-def test_dilatancy_is_named_on_dense_real_sand_and_not_on_loose() -> None:
+def test_dilatancy_is_by_far_the_likeliest_effect_on_dense_real_sand_and_not_named_on_loose() -> None:
     tests = read_triaxial(KARLSRUHE)
     dense = criticised(tests["TMD22"], 0.7351)
-    assert dense.members == ("dilatancy",) and dense.effects["dilatancy"] == "missing" and dense.explained > 0.9
-    # Dense sand also softens: 2.7 spreads between specimens remain, so dilatancy is not said to be all.
-    assert dense.verdict == "outside the library"
+    (first, highest), (_, second), *_ = effects(dense).items()
+    assert first == "dilatancy" and highest > 0.5 and highest > 10.0 * second
     # Published: 16.7° at most; the law's angle is that at the start, before it decays.
-    assert 10.0 < dense.confirmations["dilatancy"].values["dilatancy_angle"] < 25.0
-    assert dense.confirmations["dilatancy"].held_out < 0.4 * dense.confirmations[""].held_out
+    assert 8.0 < dense.evidence.models["dilatancy"].moments("dilatancy_angle")[0] < 25.0
+    # Dense sand also softens: dilatancy is not all.
+    assert not dense.passes
+    before, after = dense.held_out
+    assert after.model == "dilatancy" and after.error < 0.5 * before.error
     loose = criticised(tests["TMD2"], 0.9753)
-    assert "dilatancy" not in loose.members
-    assert loose.effects["dilatancy"] != "missing"
+    assert loose.verdict not in ("missing", "one of") or "dilatancy" not in loose.members
+    assert effects(loose)["dilatancy"] < 0.05
 
 
 def test_a_bad_file_is_refused_with_its_line(tmp_path: Path) -> None:
