@@ -24,14 +24,16 @@ Verdict = Literal["adequate", "missing", "one of", "something else", "undecided"
 
 FINE = "fine"
 """Numerics that make the fine run of a pair."""
-BASE, PAIRS, SCREENED = 10, 3, 4
-"""Simulations of the base model (half as many again for each parameter more), pairs, and of each effect."""
-REFINED, ROUNDS = 3, 2
-"""Effects, the most probable ones, that are simulated again at their posterior, and how often."""
+BASE, PAIRS, SCREENED = 10, 3, 2
+"""Simulations of the base model (half as many again for each parameter more), pairs, and of each effect beside one for
+each free parameter."""
+REFINED, AGAIN = 3, 4
+"""Effects, the most probable ones, that are simulated again at their posterior, and simulations of each and of the base
+model."""
+FEWEST_ROUNDS, MOST_ROUNDS = 2, 4
+"""Times that this is done: until the most probable effect's parameters move by less than their standard deviation."""
 STEP = 4.0
 """Of an observation effect's parameter, over its smallest meaningful size, at which it is drawn."""
-MOST_IN_SET = 4
-"""Effects that may be named together."""
 SHOWN = 0.05
 """Probability from which an effect is worth a line of its own."""
 
@@ -157,17 +159,14 @@ def diagnose(
     drawn, reference = _drawings(experiment, ask, values, candidates)
     progress("simulations", 0.1)
     evidence, comparison, noise, tables = _judged(study, drawn, reference, candidates)
-    for number in range(ROUNDS if effects else 0):
-        progress("simulations where each effect is most probable", 0.7 + 0.1 * number)
-        rng = np.random.default_rng([seed, 19, number])
-        likely = sorted(study.effects, key=lambda name: -evidence.probability.get(name, 0.0))[:REFINED]
-        for name in likely:
-            if name in evidence.models:
-                drawn_values = evidence.models[name].drawn(SCREENED, rng)
-                first = 1000 * (1 + number) + seed
-                study.effects[name] += [Run(v, (name,), first + i) for i, v in enumerate(drawn_values)]
+    for number in range(MOST_ROUNDS if effects else 0):
+        progress("simulations where models are most probable", 0.7 + 0.05 * number)
+        before = evidence
+        _refine(study, before, number)
         ask.ahead(lambda noted: _ask_through(study, noted))
         evidence, comparison, noise, tables = _judged(study, drawn, reference, candidates)
+        if number + 1 >= FEWEST_ROUNDS and _settled(before, evidence):
+            break
     progress("checks", 0.9)
     best = max(
         (n for n in evidence.probability if n not in (AS_IT_IS, ELSE)),
@@ -191,7 +190,7 @@ def diagnose(
     }
     names = [p.name for p in prior.space]
     estimates = {name: evidence.averaged(name) for name in names}
-    spread = {name: float(np.std(evidence.models[AS_IT_IS].values[name])) for name in names}
+    spread = {p.name: (p.upper - p.lower) / np.sqrt(12.0) for p in prior.space}
     return Diagnosis(
         verdict,
         members,
@@ -222,9 +221,8 @@ def judged(probability: Mapping[str, float], *, fits: bool) -> tuple[Verdict, tu
     # the data haven't made the base model less probable than it was
     if probability[AS_IT_IS] >= PRIOR:
         return "adequate", shown
-    for count in range(2, MOST_IN_SET + 1):
-        if sum(probability[n] for n in effects[:count]) >= NAMED:
-            return "one of", tuple(effects[:count])
+    if len(shown) > 1 and sum(probability[n] for n in shown) >= NAMED:
+        return "one of", shown
     return "undecided", shown
 
 
@@ -238,8 +236,26 @@ def _design(
         points = 0.7 * _spread(prior, PAIRS, seed + 1)
         study.fine = [Run(v, seed=seed + 101 + i, numerics=FINE) for i, v in enumerate(prior.values(points))]
     for number, candidate in enumerate(c for c in candidates if c.kind == "physics"):
-        study.effects[candidate.name] = effect_runs(candidate, prior, SCREENED, seed + 201 + 10 * number)
+        free = len(prior.space) + len(candidate.parameters) + len(candidate.shapes)
+        study.effects[candidate.name] = effect_runs(candidate, prior, SCREENED + free, seed + 201 + 100 * number)
     return study
+
+
+def _refine(study: _Study, evidence: Evidence, number: int) -> None:
+    """More simulations where the base model and the most probable effects are most probable."""
+    rng = np.random.default_rng([study.seed, 19, number])
+    first = 10_000 * (1 + number) + study.seed
+    likely = sorted(study.effects, key=lambda name: -evidence.probability.get(name, 0.0))[:REFINED]
+    for name in (n for n in likely if n in evidence.models):
+        drawn = evidence.models[name].drawn(AGAIN, rng)
+        study.effects[name] += [Run(v, (name,), first + i) for i, v in enumerate(drawn)]
+    study.base += [Run(v, seed=first + 100 + i) for i, v in enumerate(evidence.models[AS_IT_IS].drawn(AGAIN, rng))]
+
+
+def _settled(before: Evidence, now: Evidence) -> bool:
+    """Whether the most probable model's parameters have moved by less than their standard deviation."""
+    model, old = now.models[now.best], before.models[now.best]
+    return all(abs(model.moments(p)[0] - old.moments(p)[0]) < max(model.moments(p)[1], 1e-12) for p in model.values)
 
 
 def _spread(prior: Prior, count: int, seed: int) -> FloatArray:

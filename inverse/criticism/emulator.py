@@ -24,9 +24,9 @@ LENGTH = 0.8
 """Of the smooth rest, in halves of the parameters' ranges."""
 HALFWAY = 4.0
 """Size, over the meaningful one, at which an increment has its prior amplitude."""
-AMPLITUDES = np.array([0.0, *np.geomspace(0.03, 3000.0, 11)])
-"""Prior variances of an increment that are tried, over chance's."""
-LENGTHS = ((0.7, 2.0), (4.0, 10.0), (0.5, 1.2))
+AMPLITUDES = np.array([0.0, *np.geomspace(0.01, 10.0, 10)])
+"""Prior variances of an increment that are tried, over what its simulations have."""
+LENGTHS = ((0.7, 2.0), (4.0, 10.0), (0.3, 0.8))
 """Lengths that are tried of an increment in base parameters, sizes and shapes."""
 
 
@@ -90,10 +90,11 @@ class IncrementEmulator:
         shaped = LENGTHS[2] if points[2].shape[1] else LENGTHS[2][:1]
         for lengths in product(LENGTHS[0], LENGTHS[1], shaped):
             kernel = _increment_kernel(points, points, lengths)
-            likelihoods = np.stack([_likelihoods(kernel, a * noise, noise, increments) for a in AMPLITUDES])
+            scale = np.mean(increments**2, axis=0) / float(np.mean(np.diag(kernel)))
+            likelihoods = np.stack([_likelihoods(kernel, a * scale, noise, increments) for a in AMPLITUDES])
             total = float(likelihoods.max(axis=0).sum())
             if total > best:
-                amplitude = AMPLITUDES[likelihoods.argmax(axis=0)] * noise.mean(axis=0)
+                amplitude = AMPLITUDES[likelihoods.argmax(axis=0)] * scale
                 best, found = total, cls(points, lengths, amplitude, noise, increments)
         assert found is not None
         return found
@@ -113,9 +114,9 @@ class IncrementEmulator:
 
 
 def _likelihoods(kernel: FloatArray, amplitude: FloatArray, noise: FloatArray, values: FloatArray) -> FloatArray:
-    """(p,) log likelihoods of columns of values (m, p) under a kernel (m, m) times an amplitude, plus noise (m, p)."""
+    """(p,) log likelihoods of columns of values (m, p): kernel (m, m) times amplitudes (p,), plus noise (m, p)."""
     m = len(values)
-    covariance = kernel * amplitude.mean(axis=0)[:, None, None] + np.eye(m) * noise.T[:, None]
+    covariance = kernel * amplitude[:, None, None] + np.eye(m) * noise.T[:, None]
     factor = np.linalg.cholesky(covariance)
     z = np.linalg.solve(factor, values.T[..., None])[..., 0]
     return np.asarray(-np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1) - 0.5 * np.sum(z**2, axis=1))

@@ -2,20 +2,22 @@
 
 The evidence of a model is the mean of its likelihood over its prior (MacKay 2003, Information Theory, Inference, and
 Learning Algorithms, ch. 28; Kass & Raftery 1995, J. Am. Stat. Assoc. 90:773). The likelihood is normal, with the
-emulator's own doubt beside the noise; the numerics' factor is integrated over, which gives it long tails. "Something
+emulator's own doubt beside the noise; the numerics' factor is integrated over, which gives it long tails. Points are a
+Sobol sequence over the prior, then draws where the posterior is (adaptive importance sampling with a defensive share of
+the prior: Cappé et al. 2008, Stat. Comput. 18:447; Hesterberg 1995, Technometrics 37:185). "Something
 else" is the base model with a discrepancy larger than numerics (Kennedy & O'Hagan 2001, J. R. Stat. Soc. B 63:425).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 from scipy.linalg import solve_triangular
 from scipy.special import logsumexp
-from scipy.stats import qmc
+from scipy.stats import multivariate_t, qmc
 
 from splatsoil.experiment.base import Candidate
 
@@ -24,9 +26,15 @@ from .emulator import BaseEmulator, IncrementEmulator
 from .noise import FACTORS, SOMETHING_ELSE, Noise
 
 FloatArray = npt.NDArray[np.float64]
+Prediction = tuple[Mapping[str, FloatArray], FloatArray, FloatArray]
+"""Values by name (q,), mean and variance (q, p) of whitened scores."""
 
-POINTS = 4096
-"""Of the quasi-Monte Carlo sequence."""
+POINTS = 2048
+"""Of the sequence, and of each later round's draws."""
+ROUNDS, DEFENSIVE, HEAVY = 2, 0.2, 5.0
+"""Later rounds, the prior's share in them, and degrees of freedom of Student's distribution that makes the rest."""
+FEWEST = 40.0
+"""Effective points from which a distribution is fitted: weights are flattened until there are as many."""
 AS_IT_IS, ELSE = "", "something else"
 """Names of the two models without an effect."""
 PRIOR = 0.5
@@ -46,6 +54,7 @@ class Model:
         variance: (q, p) the emulator's doubt of them, in the directions of `whitened` scores.
         pattern: (k, p) of an effect of observation, else empty.
         log_likelihood: (f, q) by the numerics' factor.
+        importance: (q,) logarithms of the prior's density over that of the points.
         weights: (f, q) posterior, summing to 1.
         log_evidence: of it.
     """
@@ -56,6 +65,7 @@ class Model:
     variance: FloatArray
     pattern: FloatArray
     log_likelihood: FloatArray
+    importance: FloatArray
     weights: FloatArray
     log_evidence: float
 
@@ -149,18 +159,39 @@ class _Likelihood:
 
 
 @dataclass(frozen=True, eq=False)
+class Emulated:
+    """A model's emulator over the unit cube, on which its prior is uniform.
+
+    Attributes:
+        name: the effect's; `AS_IT_IS`.
+        dimension: of the cube.
+        predict: values by name, mean and variance (q, p) of whitened scores, at points (q, d) of the cube.
+        pattern: (k, p) of an effect of observation, else empty.
+        prior: what it predicts at a Sobol sequence.
+    """
+
+    name: str
+    dimension: int
+    predict: Callable[[FloatArray], Prediction]
+    pattern: FloatArray
+    prior: tuple[FloatArray, Prediction]
+
+
+@dataclass(frozen=True, eq=False)
 class Comparison:
     """Emulators of all models, ready to meet an observation.
 
     Attributes:
         noise: of the scores.
         likelihood: of whitened ones.
-        models: name, values, whitened mean and variance, pattern.
+        models: all but "something else".
+        seed: of draws.
     """
 
     noise: Noise
     likelihood: _Likelihood
-    models: Sequence[tuple[str, Mapping[str, FloatArray], FloatArray, FloatArray, FloatArray]] = field(repr=False)
+    models: Sequence[Emulated] = field(repr=False)
+    seed: int = 0
 
     @classmethod
     def of(
@@ -179,59 +210,103 @@ class Comparison:
             candidates: effects; those of physics that weren't simulated, and those of observation that weren't drawn,
                 are left out.
             simulated: runs and scores (m, p) by effect.
-            seed: of the sequence.
+            seed: of sequences and draws.
         """
         likelihood = _Likelihood.of(noise)
         n = len(prior.space)
-        most = max((len(c.parameters) + len(c.shapes) for c in candidates), default=0)
-        cube = qmc.Sobol(n + most, seed=seed).random(POINTS)
-        where = 2.0 * cube[:, :n] - 1.0
-        physical = prior.space.from_unit(where)
-        base_values = {p.name: physical[:, i] for i, p in enumerate(prior.space)}
         chance = np.maximum(np.diag(likelihood.white(likelihood.white(noise.chance).T)), 1e-4)
         white = likelihood.white(noise.base)
         middle = white.mean(axis=0)
         base = BaseEmulator.through(noise.points, white - middle, chance)
-        mean, variance = base.predict(where)
+
+        def as_it_is(cube: FloatArray) -> Prediction:
+            where = 2.0 * cube[:, :n] - 1.0
+            physical = prior.space.from_unit(where)
+            mean, variance = base.predict(where)
+            return {p.name: physical[:, i] for i, p in enumerate(prior.space)}, mean + middle, variance
+
+        def with_effect(candidate: Candidate, runs: Sequence[Run], scores: FloatArray) -> Callable[..., Prediction]:
+            k = len(candidate.parameters)
+            there, doubt = base.predict(prior.unit(runs))
+            points = (prior.unit(runs), *effect_points(candidate, runs))
+            emulator = IncrementEmulator.through(points, likelihood.white(scores) - middle - there, chance + doubt)
+
+            def predict(cube: FloatArray) -> Prediction:
+                values, mean, variance = as_it_is(cube)
+                size, shape = sizes(candidate, cube[:, n : n + k]), 2.0 * cube[:, n + k :] - 1.0
+                added, own = emulator.predict((2.0 * cube[:, :n] - 1.0, size, shape))
+                return {**values, **effect_values(candidate, size, shape)}, mean + added, variance + own
+
+            return predict
+
         nothing = np.zeros((0, white.shape[1]))
-        models = [(AS_IT_IS, base_values, mean + middle, variance, nothing)]
+        made: list[tuple[str, int, Callable[[FloatArray], Prediction], FloatArray]] = [(AS_IT_IS, n, as_it_is, nothing)]
         for candidate in candidates:
             if candidate.name in noise.patterns:
-                pattern = likelihood.white(noise.patterns[candidate.name])
-                models.append((candidate.name, base_values, mean + middle, variance, pattern))
+                made.append((candidate.name, n, as_it_is, likelihood.white(noise.patterns[candidate.name])))
             elif candidate.name in simulated:
-                runs, scores = simulated[candidate.name]
-                k = len(candidate.parameters)
-                size = sizes(candidate, cube[:, n : n + k])
-                shape = 2.0 * cube[:, n + k : n + k + len(candidate.shapes)] - 1.0
-                there, doubt = base.predict(prior.unit(runs))
-                increments = likelihood.white(scores) - middle - there
-                points = (prior.unit(runs), *effect_points(candidate, runs))
-                emulator = IncrementEmulator.through(points, increments, chance + doubt)
-                added, own = emulator.predict((where, size, shape))
-                values = {**base_values, **effect_values(candidate, size, shape)}
-                models.append((candidate.name, values, mean + middle + added, variance + own, nothing))
-        return cls(noise, likelihood, models)
+                dimension = n + len(candidate.parameters) + len(candidate.shapes)
+                made.append((candidate.name, dimension, with_effect(candidate, *simulated[candidate.name]), nothing))
+        models = []
+        for name, dimension, predict, pattern in made:
+            cube = qmc.Sobol(dimension, seed=seed).random(POINTS)
+            models.append(Emulated(name, dimension, predict, pattern, (cube, predict(cube))))
+        return cls(noise, likelihood, models, seed)
 
     def judge(self, observed: FloatArray | None = None) -> Evidence:
         """Every model against scores (p,); the experiment's own by default."""
         scores = self.noise.observed if observed is None else observed
         white, factors = self.likelihood.white(scores)[0], self.noise.factors
-        found: dict[str, Model] = {}
-        for name, values, mean, variance, pattern in self.models:
-            log = self.likelihood.log(white - mean, variance, pattern)
-            found[name] = _model(name, values, mean, variance, pattern, log, factors)
+        found = {model.name: self._integrated(model, white, factors) for model in self.models}
         base = found[AS_IT_IS]
         least = np.exp(SOMETHING_ELSE * self.noise.factor_std)
         beyond = np.where(least <= FACTORS, 0.0, -np.inf)
         beyond = beyond - logsumexp(beyond)
-        found[ELSE] = _model(ELSE, base.values, base.mean, base.variance, base.pattern, base.log_likelihood, beyond)
+        given = (base.values, base.mean, base.variance, base.pattern, base.log_likelihood, base.importance)
+        found[ELSE] = _model(ELSE, *given, beyond)
         weight = {
             name: model.log_evidence + np.log(PRIOR if name == AS_IT_IS else (1.0 - PRIOR) / (len(found) - 1))
             for name, model in found.items()
         }
         total = logsumexp(list(weight.values()))
         return Evidence(self.noise, found, {name: float(np.exp(w - total)) for name, w in weight.items()})
+
+    def _integrated(self, model: Emulated, white: FloatArray, factors: FloatArray) -> Model:
+        """A model's evidence and posterior."""
+        rng = np.random.default_rng([self.seed, 23])
+        cube, (values, mean, variance) = model.prior
+        importance = np.zeros(len(cube))
+        for number in range(ROUNDS + 1):
+            log = self.likelihood.log(white - mean, variance, model.pattern)
+            if number == ROUNDS:
+                break
+            cube, importance = _drawn(cube, logsumexp(log + factors[:, None], axis=0) + importance, rng)
+            values, mean, variance = model.predict(cube)
+        return _model(model.name, values, mean, variance, model.pattern, log, importance, factors)
+
+
+def _drawn(cube: FloatArray, weights: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """New points (q, d) of the cube where weights (their logarithms) are large, and the logarithms of the prior's
+    density over theirs."""
+    power, d = 1.0, cube.shape[1]
+    while True:
+        flat = np.exp(power * (weights - weights.max()))
+        flat /= flat.sum()
+        if 1.0 / np.sum(flat**2) >= FEWEST or power < 1e-4:
+            break
+        power *= 0.7
+    middle = flat @ cube
+    spread = (cube - middle).T @ ((cube - middle) * flat[:, None]) + 1e-8 * np.eye(d)
+    student = multivariate_t(middle, spread, df=HEAVY)
+    points = np.concatenate(
+        [rng.uniform(size=(round(DEFENSIVE * POINTS), d)), student.rvs(POINTS, random_state=rng).reshape(POINTS, d)]
+    )
+    points = points[np.all((points >= 0.0) & (points <= 1.0), axis=1)]
+    # Draws outside of the cube are left out: what is inside is the share that counts.
+    inside = max(len(points) - round(DEFENSIVE * POINTS), 1) / POINTS
+    share = DEFENSIVE / (DEFENSIVE + inside)
+    density = share + (1.0 - share) * student.pdf(points).reshape(-1) / inside
+    return points, -np.log(density)
 
 
 def _model(
@@ -241,9 +316,10 @@ def _model(
     variance: FloatArray,
     pattern: FloatArray,
     log: FloatArray,
+    importance: FloatArray,
     factors: FloatArray,
 ) -> Model:
-    joint = log + factors[:, None]
+    joint = log + importance + factors[:, None]
     evidence = float(logsumexp(joint)) - float(np.log(joint.shape[1]))
     weights = np.exp(joint - joint.max())
-    return Model(name, values, mean, variance, pattern, log, weights / weights.sum(), evidence)
+    return Model(name, values, mean, variance, pattern, log, importance, weights / weights.sum(), evidence)

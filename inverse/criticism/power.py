@@ -20,7 +20,7 @@ NAMED = 0.9
 SIZES = (1.0, 2.0, 4.0, 8.0, 16.0)
 """Over the smallest meaningful one."""
 WORLDS = 40
-THINNED = 8
+THINNED = 4
 """Of the quasi-Monte Carlo points, every so many serve here."""
 NEAR = 1.5
 """Factor within which a point's size is taken for a size asked for."""
@@ -36,7 +36,7 @@ def detectable(comparison: Comparison, evidence: Evidence, candidate: Candidate,
         candidate: the effect.
         seed: of the worlds.
     """
-    models = {name: (values, mean, variance, pattern) for name, values, mean, variance, pattern in comparison.models}
+    models = {m.name: (*m.prior[1], m.pattern) for m in comparison.models}
     if candidate.name not in models:
         return None
     rng = np.random.default_rng([seed, 17])
@@ -44,7 +44,7 @@ def detectable(comparison: Comparison, evidence: Evidence, candidate: Candidate,
     base = models[AS_IT_IS]
     measure = candidate.measure
     odds = np.log(PRIOR / ((1.0 - PRIOR) / len(evidence.probability)) * NAMED / (1.0 - NAMED))
-    likely = evidence.models[AS_IT_IS].weights.sum(axis=0)
+    likely = _density(base[0], evidence)
     for size in SIZES:
         if len(pattern):
             direction = rng.standard_normal((WORLDS, len(pattern)))
