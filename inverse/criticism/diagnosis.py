@@ -36,6 +36,8 @@ STEP = 4.0
 """Of an observation effect's parameter, over its smallest meaningful size, at which it is drawn."""
 SHOWN = 0.05
 """Probability from which an effect is worth a line of its own."""
+STRONG = 10.0
+"""Bayes factor from which the evidence against the base model is strong (Jeffreys 1961, Theory of Probability)."""
 
 
 @dataclass(frozen=True)
@@ -218,8 +220,8 @@ def judged(probability: Mapping[str, float], *, fits: bool) -> tuple[Verdict, tu
         return "something else", shown
     if effects and probability[effects[0]] >= NAMED:
         return "missing", (effects[0],)
-    # the data haven't made the base model less probable than it was
-    if probability[AS_IT_IS] >= PRIOR:
+    odds = max(p for name, p in probability.items() if name != AS_IT_IS) / max(probability[AS_IT_IS], 1e-300)
+    if odds * (len(probability) - 1) * PRIOR / (1.0 - PRIOR) < STRONG:
         return "adequate", shown
     if len(shown) > 1 and sum(probability[n] for n in shown) >= NAMED:
         return "one of", shown
@@ -383,8 +385,11 @@ def set_aside(experiment: Experiment) -> tuple[npt.NDArray[np.bool_], str]:
     """(t, s) features of one camera (the last, where there are several) and of the last stage, and what they are."""
     layout = experiment.layout
     last = layout.stages[-1]
+    rows = np.array(layout.stages) == last
+    if rows.all():
+        rows, last = np.arange(len(rows)) >= 2 * len(rows) // 3, f"last third of the {last}"
     out = np.zeros(layout.shape, dtype=bool)
-    out[np.array(layout.stages) == last] = True
+    out[rows] = True
     cameras = [
         c
         for c in layout.channels

@@ -86,7 +86,8 @@ def test_what_is_set_aside_is_the_last_camera_and_the_last_stage(make: Make) -> 
         ({"": 0.02, "something else": 0.03, "a": 0.95}, False, "something else", ("a",)),
         ({"": 0.02, "something else": 0.03, "a": 0.55, "b": 0.4}, True, "one of", ("a", "b")),
         ({"": 0.04, "something else": 0.95, "a": 0.01}, True, "something else", ()),
-        ({"": 0.4, "something else": 0.2, "a": 0.4}, True, "undecided", ("a",)),
+        ({"": 0.05, "something else": 0.15, "a": 0.8}, True, "undecided", ("a",)),
+        ({"": 0.4, "something else": 0.2, "a": 0.4}, True, "adequate", ("a",)),
     ],
 )
 def test_verdicts(probability: dict[str, float], fits: bool, verdict: str, members: tuple[str, ...]) -> None:
