@@ -12,6 +12,7 @@ import trimesh
 from splatsoil.errors import ParameterError
 from splatsoil.experiment.base import candidates_of
 from splatsoil.experiment.features import Layout, Site
+from splatsoil.experiment.forces import SCALE, UNIT, compressed
 from splatsoil.experiment.plow import NUMERICS
 from splatsoil.measurement import Bed, Measurement, Tool, ToolMotion
 from splatsoil.mpm import Resolution, simulate
@@ -36,7 +37,8 @@ SMOOTH = 2
 class PlateExperiment:
     """A flat circular plate pressed straight down into level soil.
 
-    Features are forces in newtons at the depths that were measured.
+    Features are forces at the depths that were measured, in % of the largest and relative where they are large, see
+    :func:`~splatsoil.experiment.forces.compressed`.
 
     Args:
         diameter: of the plate, m.
@@ -89,21 +91,31 @@ class PlateExperiment:
             times=tuple(float(1e3 * d) for d in depth),
             sites=(Site("force"),),
             time_name="depth, mm",
-            unit="N",
+            unit=UNIT,
             stages=tuple("shallow" if d <= half else "deep" for d in depth),
             regions=np.full((len(depth), 1), "plate"),
         )
-        self.observed = force[:, None]
+        self._largest = float(np.abs(force).max())
+        share = 100.0 * force[:, None] / self._largest
+        self.observed = compressed(share)
         self.seen = np.ones(self.layout.shape, dtype=bool)
         self.quiet = np.zeros(self.layout.shape, dtype=bool)
-        self.sensor = np.broadcast_to(np.asarray(spread, dtype=np.float64).reshape(-1), depth.shape)[:, None].copy()
+        error = np.broadcast_to(np.asarray(spread, dtype=np.float64).reshape(-1), depth.shape)[:, None]
+        self.sensor = 100.0 * error / self._largest / np.sqrt(1.0 + (share / SCALE) ** 2)
         self.experiment = _set_up(diameter, float(depth[-1]), density, friction)
         self.resolution = Resolution.derive(self.experiment, preset)
 
     def predict(
         self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
     ) -> FloatArray:
-        """(t, 1) forces in N; see :class:`~splatsoil.experiment.base.Experiment`."""
+        """(t, 1) features; see :class:`~splatsoil.experiment.base.Experiment`."""
+        force = self.forces(values, effects=effects, seed=seed, numerics=numerics)
+        return compressed(100.0 * force[:, None] / self._largest)
+
+    def forces(
+        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
+    ) -> FloatArray:
+        """(t,) upward forces in N; arguments as for `predict`."""
         resolution = NUMERICS[numerics](self.resolution) if numerics else self.resolution
         bed = self.experiment.bed
         low, span = bed.lower, bed.upper - bed.lower
@@ -124,7 +136,7 @@ class PlateExperiment:
         smooth = np.convolve(np.pad(upward, SMOOTH, mode="edge"), np.full(width, 1.0 / width), mode="valid")
         # A frame's force is the mean over the frame that ends there.
         depth = (np.arange(len(smooth)) - 0.5) * SPEED / FRAME_RATE
-        return np.interp(self.depths, depth, smooth)[:, None]
+        return np.interp(self.depths, depth, smooth)
 
 
 def _surface_of(bed: Bed) -> float:
