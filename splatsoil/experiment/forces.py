@@ -20,7 +20,7 @@ FloatArray = npt.NDArray[np.float64]
 
 ALONG, UP = "force along", "force up"
 """Instruments: against the way the tool is pushed, and upwards."""
-REGION, UNIT = "tool", "% of the largest force"
+REGION, UNIT = "tool", "% of the largest force, asinh"
 STAGE = "pushing"
 """In which the force is believed: that of lowering depends on the cell, and that of standing on how the last moment of
 the motion is resolved, which measured poses leave open (docs/numerics.md)."""
