@@ -35,8 +35,12 @@ def record(experiment: Experiment, diagnosis: Diagnosis, simulations: int) -> di
         "class": list(diagnosis.members),
         "sentences": sentences(diagnosis, candidates),
         "estimates": {
-            name: {"value": value, "std": std, "determined": bool(diagnosis.determined[name])}
-            for name, (value, std) in diagnosis.estimates.items()
+            p.name: {
+                **dict(zip(("value", "std"), diagnosis.estimates[p.name], strict=True)),
+                "unit": p.unit,
+                "determined": bool(diagnosis.determined[p.name]),
+            }
+            for p in experiment.parameters
         },
         "models": [_model(diagnosis, name, candidates.get(name)) for name in order],
         "held_out": [

@@ -12,7 +12,7 @@ def show(result: dict[str, Any]) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from splatsoil.report.words import LITTLE, estimate, model_label, probability, verdict
+    from splatsoil.report.words import LITTLE, averaged_sentence, estimate, model_label, probability, verdict
 
     console = Console(highlight=False)
     table = Table(title=f"models compared with {escape(str(result['fit']))}", title_justify="left", box=SIMPLE_HEAD)
@@ -28,6 +28,7 @@ def show(result: dict[str, Any]) -> None:
         )
     console.print(table)
     console.print(f"[bold]{escape(verdict(result))}[/bold]")
+    console.print(escape(averaged_sentence(result["estimates"])))
     for sentence in result["sentences"]:
         console.print(escape(sentence))
     for note in result["notes"]:

@@ -130,7 +130,7 @@ def show_misfit(misfit: Mapping[str, Any], run: str) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from splatsoil.report.words import probability
+    from splatsoil.report.words import averaged_sentence, probability
 
     table = Table(title="residual over what is expected, the worst first", title_justify="left")
     for column in ("stage", "region", "instrument", "× expected", "p"):
@@ -147,6 +147,7 @@ def show_misfit(misfit: Mapping[str, Any], run: str) -> None:
         f"[bold]{word}[/bold]: the model as it is has a probability of {probability(misfit['probability'])} against "
         f"something else; {failed} of {len(misfit['checks'])} checks fail"
     )
+    console.print(escape(averaged_sentence(misfit["estimates"])))
     for sentence in misfit["sentences"]:
         console.print(escape(sentence))
     ask = "Could these data show a missing effect?" if misfit["adequate"] else "Which effect is missing?"

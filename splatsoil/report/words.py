@@ -92,6 +92,15 @@ def answers(fit: Mapping[str, Any], judged: Mapping[str, Any] | None = None) -> 
     return out
 
 
+def averaged_sentence(estimates: Mapping[str, Mapping[str, Any]]) -> str:
+    """The parameters, averaged over models, in one line."""
+    told = [
+        f"{name.replace('_', ' ')} {amount(e['value'], e['std'], e.get('unit', '1'))}" for name, e in estimates.items()
+    ]
+    said = listed(told)
+    return f"{said[:1].upper()}{said[1:]}, averaged over models."
+
+
 def undetermined(name: str) -> str:
     """Of a parameter that the data leave open."""
     return f"The data do not determine the {name.replace('_', ' ')}: the bounds of its range say about as much."

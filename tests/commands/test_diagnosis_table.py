@@ -19,7 +19,14 @@ def test_a_model_has_one_line_with_its_whole_name(
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     names = [*library(), "something else"]
-    told = {"fit": "base", "verdict": "adequate", "class": [], "sentences": [], "notes": []}
+    told = {
+        "fit": "base",
+        "verdict": "adequate",
+        "class": [],
+        "estimates": {"friction_angle": {"value": 34.9, "std": 1.7, "unit": "deg", "determined": True}},
+        "sentences": [],
+        "notes": [],
+    }
     show({**told, "models": [model(n) for n in names], "simulations": 3, "simulated_now": 0, "seconds": 1.0})
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= 80

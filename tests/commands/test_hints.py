@@ -63,7 +63,13 @@ def test_the_hints_after_a_fit_and_a_comparison_can_be_pasted(
     """From a terminal that is too narrow for them, too."""
     monkeypatch.setenv("COLUMNS", "40")
     folder = "runs/of the year/with a long name"
-    told = {"checks": [], "probability": 0.01, "adequate": False, "sentences": []}
+    told = {
+        "checks": [],
+        "probability": 0.01,
+        "adequate": False,
+        "sentences": [],
+        "estimates": {"friction_angle": {"value": 34.8, "std": 1.0, "unit": "deg", "determined": True}},
+    }
     compare.show_misfit(told, folder)
     assert f"Which effect is missing? splatsoil diagnose '{folder}'\n" in capsys.readouterr().out
 
