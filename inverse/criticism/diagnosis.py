@@ -299,10 +299,9 @@ def _judged(
     drawn: Mapping[str, FloatArray],
     reference: FloatArray,
     candidates: Sequence[Candidate],
-    aside: npt.NDArray[np.bool_] | None = None,
 ) -> tuple[Evidence, Comparison, Noise, Tables]:
     tables = study.tables(drawn, reference)
-    return (*_compared(study, tables, candidates, aside), tables)
+    return (*_compared(study, tables, candidates, None), tables)
 
 
 def _compared(

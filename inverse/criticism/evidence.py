@@ -1,4 +1,4 @@
-"""How probable each model is, and what its parameters are: quasi-Monte Carlo over emulators.
+"""How probable each model is, and what its parameters are: importance sampling over emulators.
 
 The evidence of a model is the mean of its likelihood over its prior (MacKay 2003, Information Theory, Inference, and
 Learning Algorithms, ch. 28; Kass & Raftery 1995, J. Am. Stat. Assoc. 90:773). The likelihood is normal, with the
@@ -253,10 +253,9 @@ class Comparison:
             models.append(Emulated(name, dimension, predict, pattern, (cube, predict(cube))))
         return cls(noise, likelihood, models, seed)
 
-    def judge(self, observed: FloatArray | None = None) -> Evidence:
-        """Every model against scores (p,); the experiment's own by default."""
-        scores = self.noise.observed if observed is None else observed
-        white, factors = self.likelihood.white(scores)[0], self.noise.factors
+    def judge(self) -> Evidence:
+        """Every model against the observation."""
+        white, factors = self.likelihood.white(self.noise.observed)[0], self.noise.factors
         found = {model.name: self._integrated(model, white, factors) for model in self.models}
         base = found[AS_IT_IS]
         least = np.exp(SOMETHING_ELSE * self.noise.factor_std)

@@ -182,7 +182,7 @@ def noise_of(
     fixed = chance + _instruments(experiment, mask, basis)
     for row in low:
         fixed = fixed + np.outer(row, row)
-    observed = (experiment.observed[mask] - mean) @ basis + 0.0
+    observed = (experiment.observed[mask] - mean) @ basis
     return Noise(
         mask,
         mean,

@@ -5,14 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from splatsoil.experiment.base import Candidate
-from splatsoil.report.words import amount, listed, title, undetermined
+from splatsoil.report.words import amount, listed, probability, title, undetermined
 
 from .checks import SIGNIFICANT
 from .diagnosis import Diagnosis
 from .evidence import AS_IT_IS
-
-CERTAIN = 0.995
-"""Probability that is told as "more than 99 %"."""
 
 
 def sentences(diagnosis: Diagnosis, candidates: Mapping[str, Candidate]) -> list[str]:
@@ -23,21 +20,21 @@ def sentences(diagnosis: Diagnosis, candidates: Mapping[str, Candidate]) -> list
         (name,) = diagnosis.members
         out.append(
             f"{title(name)} is missing{_size(diagnosis, candidates[name])}: of all models that were compared, its "
-            f"probability is {percent(evidence.probability[name])}."
+            f"probability is {probability(evidence.probability[name])}."
         )
     elif diagnosis.verdict == "one of":
-        told = [f"{n.replace('_', ' ')} ({percent(evidence.probability[n])})" for n in diagnosis.members]
+        told = [f"{n.replace('_', ' ')} ({probability(evidence.probability[n])})" for n in diagnosis.members]
         out.append(f"One of these is missing: {listed(told)}. The data do not tell them apart.")
     elif diagnosis.verdict == "something else":
         out.append("The model leaves more than noise and numerics, and no effect of the library explains it.")
     elif diagnosis.verdict == "undecided":
         shares = [
-            f"{(name or 'the model as it is').replace('_', ' ')} {percent(evidence.probability[name])}"
+            f"{(name or 'the model as it is').replace('_', ' ')} {probability(evidence.probability[name])}"
             for name in sorted(evidence.probability, key=lambda n: -evidence.probability[n])[:4]
         ]
         out.append(f"No model is probable enough to be named: {listed(shares)}.")
     else:
-        others = "" if not candidates else f" Its probability is {percent(evidence.probability[AS_IT_IS])}."
+        others = "" if not candidates else f" Its probability is {probability(evidence.probability[AS_IT_IS])}."
         out.append(f"The model as it is explains the data.{others}")
     out += [undetermined(name) for name, determined in diagnosis.determined.items() if not determined]
     if len(diagnosis.held_out) > 1:
@@ -81,10 +78,3 @@ def _sight(diagnosis: Diagnosis, candidates: Mapping[str, Candidate]) -> list[st
     if blind:
         out.append(f"These data cannot show {listed(blind)}.")
     return out
-
-
-def percent(probability: float) -> str:
-    """A probability for people."""
-    if probability > CERTAIN:
-        return "more than 99 %"
-    return f"{100.0 * probability:.0f} %" if probability >= 0.01 else "less than 1 %"

@@ -69,6 +69,16 @@ def test_the_same_seed_gives_the_same_answer_and_the_record_is_plain_json(make: 
     assert misfit_of({**first, "fit": "base", "values": START})["adequate"] is False
 
 
+def test_what_fine_runs_add_is_taken_off_the_observation(make: Make) -> None:
+    experiment = make(numerics=4.0)
+    noise = diagnose(experiment, START, effects=False).evidence.noise
+    added = experiment.patterns["fine"][noise.mask] @ noise.basis
+    # Only pictures are corrected: the last scores are the force's.
+    wanted, found = (scores[: -experiment.layout.shape[0]] for scores in (added, noise.correction))
+    assert wanted @ found > 0.8 * np.linalg.norm(wanted) * np.linalg.norm(found)
+    assert 0.5 < np.linalg.norm(found) / np.linalg.norm(wanted) < 1.2
+
+
 def test_what_is_set_aside_is_the_last_camera_and_the_last_stage(make: Make) -> None:
     layout = make().layout
     aside, what = set_aside(make())
