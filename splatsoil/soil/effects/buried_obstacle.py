@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import ClassVar
 
+from splatsoil.measurement import Measurement
 from splatsoil.parameters import Parameter
 from splatsoil.soil.effect import Effect
 from splatsoil.soil.settings import Settings
@@ -29,6 +30,20 @@ class BuriedObstacle(Effect):
         "from the middle of the bed and its floor. The tool itself passes through it."
     )
     source = "rigid inclusion by definition"
+
+    def for_measurement(self, measurement: Measurement) -> Effect:
+        """The effect with a place that lies within the bed."""
+        half = dict(zip(self.shapes, 0.5 * (measurement.bed.upper - measurement.bed.lower)[:2], strict=True))
+
+        class OfMeasurement(BuriedObstacle):
+            parameters = tuple(
+                replace(p, lower=-float(half[p.name]), upper=float(half[p.name]), limits=(p.lower, p.upper))
+                if p.name in half
+                else p
+                for p in self.parameters
+            )
+
+        return OfMeasurement()
 
     def settings(self, settings: Settings, values: Mapping[str, float]) -> Settings:
         """Place the sphere."""
