@@ -19,8 +19,8 @@ from splatsoil.files import code_digest, read_json, write_bytes, write_json, wri
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from splatsoil.benchmarks._simulations import Data
     from splatsoil.inverse.executors import Executor
-    from splatsoil.inverse.posterior import Data
 
 #: Everything that a benchmark's numbers may hang on: parts of the package, and packages beside it.
 PARTS = ("measurement", "splats", "reconstruction", "soil", "mpm", "scene", "experiment", "synthetic")
@@ -63,7 +63,7 @@ def world_options(parser: argparse.ArgumentParser) -> None:
 
 def simulated(options: argparse.Namespace, count: int, pool: Executor, seed: int = 0) -> tuple[Data, Path]:
     """Simulations at ``count`` Sobol points of the world that `world_options` chose, and where they are kept."""
-    from splatsoil.inverse.simulations import simulations
+    from splatsoil.benchmarks._simulations import simulations
 
     return simulations(
         count,

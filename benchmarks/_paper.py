@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from splatsoil.benchmarks._simulations import FEWEST, density_of
 from splatsoil.inverse.bayesopt import PAPER, BayesianOptimiser, Told
-from splatsoil.inverse.emulator import FEWEST
-from splatsoil.inverse.posterior import Data, sample_posterior
+from splatsoil.inverse.marginal import Marginal
 
-from splatsoil.comparison import Block, Comparator
+from splatsoil.comparison import Comparator
 from splatsoil.errors import SimulationError
 from splatsoil.files import write_json, write_npz
 from splatsoil.measurement import Measurement
@@ -185,10 +185,7 @@ class Trial:
     def told(self) -> list[Told]:
         """What an optimiser is told."""
         points = SPACE.to_unit(np.array(self.angles)[:, None]) if self.angles else np.zeros((0, 1))
-        return [
-            Told(p, None if k is None else k.loss(self.way), None if k is None else k.blocks)
-            for p, k in zip(points, self.looks, strict=True)
-        ]
+        return [Told(p, None if k is None else k.loss(self.way)) for p, k in zip(points, self.looks, strict=True)]
 
     def seed(self, step: int) -> int:
         """Of the particles in a step."""
@@ -200,7 +197,7 @@ def optimiser_of(way: str, seed: int, told: Sequence[Told]) -> BayesianOptimiser
     """The search of a way, with what it has been told."""
     optimiser = BayesianOptimiser(1, seed=seed, search=PAPER if way == "published" else None)
     for t in told:
-        optimiser.tell(t.action, t.loss, t.residuals)
+        optimiser.tell(t.action, t.loss)
     return optimiser
 
 
@@ -220,17 +217,17 @@ def conclude(way: str, seed: int, told: Sequence[Told]) -> dict[str, float]:
 
 
 def by_features(
-    space: ParameterSpace, angles: FloatArray, blocks: FloatArray, labels: Sequence[Block], sensor: float, seed: int
+    space: ParameterSpace, angles: FloatArray, blocks: FloatArray, sensor: float, seed: int
 ) -> dict[str, float] | None:
     """The posterior that features allow, None where they are too few or nothing is seen."""
     seen = np.all(blocks != 0.0, axis=0) if len(blocks) else np.zeros(0, dtype=bool)
-    if len(blocks) < 1 + FEWEST or not seen.any():
+    if len(blocks) < FEWEST or not seen.any():
         return None
-    places = tuple(p for p, s in zip(labels, seen, strict=True) if s)
-    data = Data(space, space.to_unit(angles[:, None]), blocks[:, seen], places, sensor)
-    values = sample_posterior(data, seed=seed, evidence=False).values[:, 0]
-    low, high = (float(q) for q in np.quantile(values, [0.05, 0.95]))
-    return {"estimate": float(values.mean()), "std": float(values.std()), "low": low, "high": high}
+    points, residuals = space.to_unit(angles[:, None]), blocks[:, seen]
+    density = density_of(space, points, -residuals, np.zeros(residuals.shape[1]), sensor, seed)
+    marginal = Marginal.of(next(iter(space)), density.comparison.judge())
+    low, high = marginal.quantile(0.05), marginal.quantile(0.95)
+    return {"estimate": marginal.mean, "std": marginal.std, "low": low, "high": high}
 
 
 def play(sight: Sight, trials: Sequence[Trial], folder: Path, say: Say) -> None:
@@ -277,7 +274,7 @@ def search(sight: Sight, angle: float, numbers: Sequence[int], out: Path, where:
         result: dict[str, Any] = {t.way: conclude(t.way, t.number, t.told) if good else None, "calls": calls}
         if t.way == "ours":
             angles, blocks = np.array([a for a, _ in good]), np.array([k.blocks for _, k in good])
-            result["features"] = by_features(SPACE, angles, blocks, sight.comparator.labels, sensor, t.number)
+            result["features"] = by_features(SPACE, angles, blocks, sensor, t.number)
         result["seconds"] = (time.perf_counter() - began) / len(trials)
         write_json(out / "trials" / f"{angle:g}-{t.number}-{t.way}.json", result)
     say(f"{angle:g}°: {len(trials)} searches in {time.perf_counter() - began:.0f} s")

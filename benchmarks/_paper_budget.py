@@ -63,7 +63,7 @@ def error_budget(sight: Sight, angle: float, say: Say) -> dict[str, Any]:
             groups = [[(a, k.loss(way)) for a, s, k in known if s == seed] for seed in range(1, seeds + 1)]
             minima[way].setdefault(kind, []).append([minimum(space, g) for g in groups if len(g) > 3])
         angles, blocks = np.array([a for a, _, _ in known]), np.array([k.blocks for _, _, k in known])
-        found = by_features(space, angles, blocks, observer.labels, observer.block_noise(), 0)
+        found = by_features(space, angles, blocks, observer.block_noise(), 0)
         minima["features"].setdefault(kind, []).append([] if found is None else [found["estimate"]])
     out["ways"] = {way: shares(mine, angle) for way, mine in minima.items()}
     return out

@@ -4,10 +4,10 @@
 
 | way | what it does with N calls |
 |---|---|
-| `bo` | what `splatsoil fit` does: expected improvement of the features' misfit, their least squares |
+| `bo` | the search of `splatsoil fit`: log noisy expected improvement of the loss, and where that is least |
 | `paper` | the same with Hsiao and Kumar's settings: one random start, expected improvement |
-| `mcmc` | emcee on an emulator of the features, trained on N space-filling calls |
-| `both` | emcee on an emulator trained on the N calls that `bo` chose |
+| `mcmc` | emcee on a comparison's posterior, by an emulator of the features trained on N space-filling calls |
+| `both` | the same, trained on the N calls that `bo` chose: what `splatsoil fit` says |
 | `direct` | emcee on the simulator itself: N calls are N steps of walkers |
 
 The calls go to an emulated landscape: real simulations of the world, made once and kept, through an emulator of many
@@ -29,17 +29,16 @@ import emcee
 import numpy as np
 import numpy.typing as npt
 from splatsoil.benchmarks._common import output_options, simulated, stamp, ticker, world_options, write_result
+from splatsoil.benchmarks._simulations import FEWEST, density_of
 from splatsoil.envs.synthetic import SyntheticProblem
 from splatsoil.envs.together import attempt
 from splatsoil.inverse.bayesopt import PAPER, BayesianOptimiser, Search
-from splatsoil.inverse.emulator import FEWEST, Emulator
 from splatsoil.inverse.executors import Executor, Serial, executor, in_order
-from splatsoil.inverse.feature_fit import by_features
 from splatsoil.inverse.mcmc import sample
-from splatsoil.inverse.posterior import Data, likelihood_of
-from splatsoil.inverse.surrogate import Minimum, Surrogate, sobol
+from splatsoil.inverse.posterior import Density
+from splatsoil.inverse.surrogate import sobol
 
-from splatsoil.errors import ParameterError, RunError
+from splatsoil.errors import ParameterError
 from splatsoil.parameters import ParameterSpace
 from splatsoil.quiet import hush
 
@@ -71,16 +70,17 @@ class World(Protocol):
 class EmulatedWorld:
     """Calls answered by an emulator of many real simulations, with chance drawn from its measured covariance.
 
-    Features are the scores of the principal components; the loss is their mean square residual over what the prior's
-    middle would leave on average.
+    Features are a comparison's scores; the loss is their mean square residual over what the prior's middle would leave
+    on average.
     """
 
-    def __init__(self, space: ParameterSpace, emulator: Emulator) -> None:
-        self.space, self.emulator = space, emulator
-        self.factor = np.linalg.cholesky(emulator.chance + 1e-12 * np.eye(emulator.count))
-        spread = emulator.predict(sobol(256, len(space), 0))[0]
+    def __init__(self, density: Density) -> None:
+        self.space, self.density = density.prior.space, density
+        self.count = len(density.noise.chance)
+        self.factor = np.linalg.cholesky(density.noise.chance + 1e-12 * np.eye(self.count))
+        spread = self._emulated(sobol(256, len(self.space), 0))
         self.unit = float(np.mean(np.sum((spread - spread.mean(axis=0)) ** 2, axis=1)))
-        self.observed = np.zeros(emulator.count)
+        self.observed = np.zeros(self.count)
 
     def observe(self, truth: FloatArray, rng: np.random.Generator) -> None:
         self.observed = self._simulate(truth, rng)
@@ -89,8 +89,12 @@ class EmulatedWorld:
         residual = self._simulate(point, rng) - self.observed
         return float(np.sum(residual**2)) / self.unit, residual
 
+    def _emulated(self, points: FloatArray) -> FloatArray:
+        """(q, p) mean scores at points (q, n)."""
+        return self.density.predict(points)[0] @ self.density.comparison.likelihood.root.T
+
     def _simulate(self, point: FloatArray, rng: np.random.Generator) -> FloatArray:
-        return self.emulator.predict(point[None])[0][0] + self.factor @ rng.standard_normal(self.emulator.count)
+        return self._emulated(point[None])[0] + self.factor @ rng.standard_normal(self.count)
 
 
 class SimulatedWorld:
@@ -134,44 +138,25 @@ def play(world: World, budgets: Sequence[int], seed: int, search: Search | None)
         action = optimiser.ask().astype(np.float64)
         spent += time.perf_counter() - began
         loss, residual = world.call(action, rng)
-        optimiser.tell(action, loss, residual)
+        optimiser.tell(action, loss)
         points.append(action)
         features.append(residual)
         if len(points) in budgets:
             began = time.perf_counter()
             found = optimiser.result()
-            if search is None:
-                found = _as_fitted(world, optimiser.surrogate(), found, points, features, seed)
             seconds = spent + time.perf_counter() - began
             answers[len(points)] = Answer(found.estimate, found.low, found.high, seconds)
     return answers, (np.array(points), np.array(features))
 
 
-def _as_fitted(
-    world: World,
-    surrogate: Surrogate,
-    found: Minimum,
-    points: Sequence[FloatArray],
-    features: Sequence[FloatArray],
-    seed: int,
-) -> Minimum:
-    """What `splatsoil fit` says after these calls: the features' estimate where there is one, else the loss' own."""
-    data = Data(world.space, np.array(points), -np.array(features))
-    try:
-        told = by_features(data, surrogate, found, seed=seed)
-        return found if told is None else told.minimum
-    except RunError:  # too few calls
-        return found
-
-
 def sample_emulated(space: ParameterSpace, points: FloatArray, features: FloatArray, seed: int) -> Answer:
     """emcee on an emulator of calls (k, n), (k, b); features are residuals, so the observed ones are 0."""
     began = time.perf_counter()
-    likelihood = likelihood_of(Data(space, points, -features), seed=seed)
-    chains = sample(likelihood, likelihood.lower, likelihood.upper, seed=seed, ensembles=2, most_steps=1000)
-    flat = chains.flat[:, : len(space)]  # without the misfit's size
-    low, high = np.quantile(flat, [0.05, 0.95], axis=0)
-    return Answer(flat.mean(axis=0), low, high, time.perf_counter() - began)
+    ends, count = np.ones(len(space)), features.shape[1]
+    density = density_of(space, points, features, np.zeros(count), 0.0, seed)
+    chains = sample(density, -ends, ends, seed=seed, ensembles=2, most_steps=1000)
+    low, high = np.quantile(chains.flat, [0.05, 0.95], axis=0)
+    return Answer(chains.flat.mean(axis=0), low, high, time.perf_counter() - began)
 
 
 def sample_directly(world: World, budgets: Sequence[int], seed: int, chance: FloatArray) -> dict[int, Answer]:
@@ -209,7 +194,7 @@ def trial(
     n = len(world.space)
     rng = np.random.default_rng([seed, 29])
     world.observe(rng.uniform(-INNER, INNER, n), rng)
-    usable = [b for b in budgets if b >= n + FEWEST]
+    usable = [b for b in budgets if b >= FEWEST]
     out: dict[str, dict[int, Answer]] = {}
     calls = None
     if "bo" in ways or "both" in ways:
@@ -357,18 +342,19 @@ def main(arguments: list[str] | None = None) -> int:
 def _run(options: argparse.Namespace, pool: Executor, began: float) -> int:
     """Simulate, compare, write, print."""
     data, file = simulated(options, options.simulations, pool)
-    emulator = Emulator(data.points, -data.residuals)
+    density = density_of(data.space, data.points, -data.residuals, np.zeros(data.residuals.shape[1]), 0.0)
+    noise = density.noise
     if options.direct_simulator:
         world: World = SimulatedWorld(options.parameters, options.effects, options.preset, options.device)
         landscape = f"The simulator of the made-up world itself, preset `{options.preset}`"
-        # The scatter of features between seeds, as far as the components show it, in the features' own space.
-        chance = emulator.basis @ emulator.chance @ emulator.basis.T + np.diag(emulator.outside_variance)
+        # The scatter of features between seeds, as far as the scores show it, in the features' own space.
+        chance = noise.basis @ noise.chance @ noise.basis.T
     else:
-        world, chance = EmulatedWorld(data.space, emulator), emulator.chance
+        world, chance = EmulatedWorld(density), noise.chance
         source = "the made-up world" if options.set is None else str(options.set)
         landscape = (
-            f"An emulated landscape: {emulator.count} components of {len(data.points)} simulations of {source}, preset "
-            f"`{options.preset}`, skill {emulator.left_out.skill.min():.2f} to {emulator.left_out.skill.max():.2f}"
+            f"An emulated landscape: {len(chance)} scores of {len(data.points)} simulations of {source}, preset "
+            f"`{options.preset}`"
         )
     result = {
         "benchmark": "bo-vs-mcmc",

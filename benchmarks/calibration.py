@@ -1,15 +1,11 @@
 """Do intervals hold what they promise? Simulation-based calibration of posteriors.
 
 Truths are drawn from the prior and simulated, each with particles of its own; sensor noise is added. For each, an
-emulator is trained on the other simulations only, and the posterior is sampled exactly as ``splatsoil posterior`` does.
+emulator is trained on other simulations only, and the posterior is sampled as ``splatsoil posterior`` does.
 Over many truths, 50 % and 90 % intervals should hold the truth in 50 % and 90 % of cases, and its rank among posterior
 draws should be uniform (Talts et al. 2018, arXiv:1804.06788).
 
     splatsoil benchmark calibration --out runs/calibration
-    splatsoil benchmark calibration --full --truths 24 --device cuda:0 --executor processes:8 --out runs/full
-
-With ``--full`` nothing is shared between truths: each goes the whole way of ``splatsoil fit`` and ``splatsoil
-posterior``, with simulations for it alone. What is done is kept in the folder, and an interrupted one goes on.
 
 The world is the made-up one of PlowSand-v0 unless a set is named; every truth is a real simulation of it, and the model
 is right but for chance. What a wrong model does to a posterior is not tested here.
@@ -21,20 +17,16 @@ import argparse
 import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 from scipy.stats import binom, chisquare
-from splatsoil.benchmarks._calibration_full import one_truth
 from splatsoil.benchmarks._common import output_options, simulated, stamp, ticker, world_options, write_result
-from splatsoil.envs.synthetic import SENSOR_NOISE, SyntheticProblem
+from splatsoil.benchmarks._simulations import Data, density_of
 from splatsoil.inverse.executors import Executor, Serial, executor, in_order
 from splatsoil.inverse.mcmc import sample
-from splatsoil.inverse.posterior import Data, likelihood_of
 
-from splatsoil.errors import ParameterError
 from splatsoil.parameters import ParameterSpace
 from splatsoil.quiet import hush
 
@@ -106,19 +98,16 @@ def one_fold(
     """Entries of the truths ``test``, by emulators of the simulations ``train``; a worker's job."""
     rng = np.random.default_rng([seed, 24, number])
     out: list[dict[str, Any]] = []
+    features, ends = -data.residuals, np.ones(len(data.space))
     for index in test:
-        observed = -data.residuals[index] + sensor_std * rng.standard_normal(data.residuals.shape[1])
-        seen = replace(
-            data, points=data.points[train], residuals=observed + data.residuals[train], sensor_std=sensor_std
-        )
-        likelihood = likelihood_of(seen, seed=seed + 1000 * number)
-        chains = sample(likelihood, likelihood.lower, likelihood.upper, seed=int(index), ensembles=2, most_steps=2000)
-        draws = chains.flat[:, : len(data.space)]
-        draws = draws[rng.choice(len(draws), DRAWS, replace=False)]
+        observed = features[index] + sensor_std * rng.standard_normal(features.shape[1])
+        density = density_of(data.space, data.points[train], features[train], observed, sensor_std, seed)
+        chains = sample(density, -ends, ends, seed=int(index), ensembles=2, most_steps=2000)
+        draws = chains.flat[rng.choice(len(chains.flat), DRAWS, replace=False)]
         truth = data.points[index]
         within = {}
         for level in LEVELS:
-            low, high = np.quantile(chains.flat[:, : len(truth)], [0.5 - level / 2, 0.5 + level / 2], axis=0)
+            low, high = np.quantile(chains.flat, [0.5 - level / 2, 0.5 + level / 2], axis=0)
             within[str(level)] = [bool(a <= t <= b) for a, t, b in zip(low, truth, high, strict=True)]
         out.append(
             {
@@ -127,7 +116,6 @@ def one_fold(
                 "within": within,
                 "mean": draws.mean(axis=0).tolist(),
                 "std": draws.std(axis=0).tolist(),
-                "misfit": likelihood.with_misfit,
                 "converged": chains.converged,
             }
         )
@@ -157,7 +145,6 @@ def summarise(entries: Sequence[dict[str, Any]], space: ParameterSpace) -> dict[
         "truths": count,
         "expected": expected,
         "parameters": parameters,
-        "with_misfit": sum(e["misfit"] for e in entries),
         "not_converged": sum(not e["converged"] for e in entries),
     }
 
@@ -166,7 +153,7 @@ def table(result: dict[str, Any]) -> str:
     """The result as Markdown."""
     lines = [
         f"{result['world']}, preset `{result['preset']}`, {result['device']}: {result['truths']} truths, each a "
-        f"simulation of its own, {_trained(result)}; {result['seconds']:.0f} s.",
+        f"simulation of its own, emulators trained on {result['training']} others; {result['seconds']:.0f} s.",
         "",
         "| parameter | 50 % intervals hold | 90 % intervals hold | ranks uniform, p | rms z | width / prior |",
         "|---|---|---|---|---|---|",
@@ -182,18 +169,8 @@ def table(result: dict[str, Any]) -> str:
         for level in LEVELS
     )
     lines += ["", f"95 % of perfectly calibrated posteriors would land within {ranges} with so many truths."]
-    lines.append(
-        f"{result['with_misfit']} posteriors saw a misfit, {result['not_converged']} chains had not "
-        "converged in 2000 steps."
-    )
+    lines.append(f"{result['not_converged']} chains had not converged in 2000 steps.")
     return "\n".join(lines)
-
-
-def _trained(result: dict[str, Any]) -> str:
-    if result["full"]:
-        count = np.mean([entry["simulations"] for entry in result["entries"]])
-        return f"each with a fit and a posterior of its own ({count:.0f} simulations)"
-    return f"emulators trained on {result['training']} others"
 
 
 def figure(result: dict[str, Any]) -> Figure:
@@ -215,47 +192,6 @@ def figure(result: dict[str, Any]) -> Figure:
     return drawn
 
 
-def through_the_emulator(
-    options: argparse.Namespace, pool: Executor
-) -> tuple[list[dict[str, Any]], ParameterSpace, dict[str, Any]]:
-    """Entries of truths that share their simulations: each is recovered by an emulator of others."""
-    data, file = simulated(options, options.truths, pool, options.seed)
-    data = replace(data, sensor_std=options.sensor)
-    truths = min(options.truths, len(data.points))
-    chosen: dict[str, Any] = {"training": options.training, "sensor_std": options.sensor, "seed": options.seed}
-    entries = calibrate(data, truths, **chosen, pool=pool, progress=ticker("truths"))
-    trained = options.training or len(data.points) - truths // FOLDS
-    return entries, data.space, {"training": trained, "sensor": options.sensor, "simulations": str(file)}
-
-
-def through_the_simulator(
-    options: argparse.Namespace, pool: Executor
-) -> tuple[list[dict[str, Any]], ParameterSpace, dict[str, Any]]:
-    """Entries of truths drawn from the prior, each through a fit and a posterior of its own.
-
-    Raises:
-        ParameterError: a measured set, whose truth is one, or no folder to keep the runs in.
-    """
-    if options.set is not None:
-        raise ParameterError("--full: the truth of a measured set is one; only the made-up world has many")
-    if options.out is None:
-        raise ParameterError("--full: name a folder for the runs with --out")
-    space = SyntheticProblem(options.parameters, options.effects, preset=options.preset, device=options.device).space
-    truths = np.random.default_rng([options.seed, 22]).uniform(-1.0, 1.0, (options.truths, len(space)))
-    chosen = (tuple(options.parameters), tuple(options.effects), options.preset, options.device)
-    first = 10_000 * options.seed
-    jobs = [
-        (*chosen, t.tolist(), first + k, options.out / "truths" / str(first + k), DRAWS, LEVELS)
-        for k, t in enumerate(truths)
-    ]
-    report = ticker("truths")
-    entries = []
-    for entry in in_order(pool, one_truth, jobs):
-        entries.append(entry)
-        report(len(entries), len(jobs))
-    return entries, space, {"training": None, "sensor": SENSOR_NOISE}
-
-
 def main(arguments: list[str] | None = None) -> int:
     """Command line; exit code 0."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -263,25 +199,25 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--truths", type=int, default=128)
     parser.add_argument("--training", type=int, help="simulations for each emulator; all others by default")
     parser.add_argument("--sensor", type=float, default=1.0, help="noise added to a truth's features, grey levels")
-    parser.add_argument("--full", action="store_true", help="a fit and a posterior of its own for each truth")
     parser.add_argument("--seed", type=int, default=0)
     output_options(parser)
     options = parser.parse_args(arguments)
     hush()
     began = time.perf_counter()
     with executor(options.executor) as pool:
-        if options.full:
-            entries, space, about = through_the_simulator(options, pool)
-        else:
-            entries, space, about = through_the_emulator(options, pool)
+        data, file = simulated(options, options.truths, pool, options.seed)
+        truths = min(options.truths, len(data.points))
+        chosen: dict[str, Any] = {"training": options.training, "sensor_std": options.sensor, "seed": options.seed}
+        entries = calibrate(data, truths, **chosen, pool=pool, progress=ticker("truths"))
     result = {
         "benchmark": "calibration",
         "world": "the made-up world of PlowSand-v0" if options.set is None else str(options.set),
         "preset": options.preset,
-        "full": options.full,
         "seed": options.seed,
-        **about,
-        **summarise(entries, space),
+        "training": options.training or len(data.points) - truths // FOLDS,
+        "sensor": options.sensor,
+        "simulations": str(file),
+        **summarise(entries, data.space),
         **stamp(options.device),
         "seconds": time.perf_counter() - began,
         "entries": entries,

@@ -9,8 +9,8 @@ one:
 | way | cells | loss | search |
 |---|---|---|---|
 | `published` | 3.2 | mean square colour difference, four frames, whole pictures | random start, expected improvement |
-| `ours` | 6.4 | the robust loss, all frames | Sobol start, expected improvement of the features |
-| `features` | | none: the posterior's mean, from the features of `ours`' evaluations | |
+| `ours` | 6.4 | the robust loss, all frames | Sobol start, log noisy expected improvement |
+| `features` | | none: a comparison's posterior mean, from the features of `ours`' evaluations | |
 
 The angle is searched in [25°, 55°]. All trials of a world go on side by side: one batch of simulations for each step.
 An error budget says what the landscapes' minima owe to reconstruction, grid, loss and chance. Every evaluation is kept

@@ -207,26 +207,18 @@ def angle(task: Task) -> list[Row]:
     options = ("run", "--stop-at-floor", "--seed")
     runs = [_fitted(task, task.dry, f"{task.dry.name}-{seed}", *options, str(seed)) for seed in FIT_SEEDS]
     seconds, memory = runs[0].seconds, runs[0].memory
-    rows = []
-    forces = [run.fit["force"] for run in runs]
-    read = {"photographs": [run.fit["parameters"]["friction_angle"] for run in runs]}
-    if all(force and force["counted"] for force in forces):
-        read = {
-            "photographs and the force on the tool": read["photographs"],
-            "photographs alone": [force["pictures_alone"]["friction_angle"] for force in forces],
-        }
-    for what, angles in read.items():
-        stds = sorted(found["std"] for found in angles)
-        estimates = ", ".join(f"{found['estimate']:.1f}" for found in angles)
-        rows.append(
-            Row(
-                f"friction angle of `{task.dry.name}` from {what} (true {true:g}°), seeds "
-                f"{', '.join(map(str, FIT_SEEDS))}",
-                f"{estimates} ± {stds[0]:.1f} to {stds[-1]:.1f}°",
-                "within 2°",
-                all(abs(found["estimate"] - true) <= 2.0 for found in angles),
-            )
+    angles = [run.fit["parameters"]["friction_angle"] for run in runs]
+    stds = sorted(found["std"] for found in angles)
+    estimates = ", ".join(f"{found['estimate']:.1f}" for found in angles)
+    rows = [
+        Row(
+            f"friction angle of `{task.dry.name}` from photographs and force (true {true:g}°), seeds "
+            f"{', '.join(map(str, FIT_SEEDS))}",
+            f"{estimates} ± {stds[0]:.1f} to {stds[-1]:.1f}°",
+            "within 2°",
+            all(abs(found["estimate"] - true) <= 2.0 for found in angles),
         )
+    ]
     if fresh:
         rows.append(
             Row(

@@ -6,7 +6,6 @@ import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,41 +17,30 @@ from .devices import resolve_device
 from .problem import Evaluation, FloatArray, Image
 
 if TYPE_CHECKING:
-    from splatsoil.comparison import Block, Comparator, Comparison
-    from splatsoil.experiment.forces import ToolForces
+    from splatsoil.experiment.plow import PlowExperiment
     from splatsoil.measurement import Measurement
-    from splatsoil.model import Model, Prediction
+    from splatsoil.model import Prediction
     from splatsoil.reconstruction import Reconstruction
 
 #: Name of the loss that is fitted, part of what identifies an evaluation.
 LOSS = "robust"
-#: Rows that forces are told in: each has an error of its own, however many frames there are.
-FORCE_ROWS = 10
 
 
 class MeasuredProblem:
     """A model and a measured video.
 
     Args:
-        model: predicts the pictures.
-        space: the free parameters.
-        progress: called with (frame, last frame) while a simulation runs.
+        experiment: predicts, and knows what was observed.
     """
 
     #: A loss of 1 is as good as predicting that nothing moves; ten times that is cut.
     worst_loss = 10.0
 
-    def __init__(
-        self, model: Model, space: ParameterSpace, *, progress: Callable[[int, int], None] | None = None
-    ) -> None:
-        from splatsoil.comparison import Comparator
-
-        self.model = model
-        self.space = space
-        self.progress = progress
-        self.comparator: Comparator = Comparator(
-            model.measurement, surface=model.reconstruction.surface, frames=model.frames
-        )
+    def __init__(self, experiment: PlowExperiment) -> None:
+        self.experiment = experiment
+        self.model = experiment.base
+        self.space = ParameterSpace(experiment.parameters)
+        self.comparator = experiment.comparator
         self._shown = (self.comparator.cameras[0], self.comparator.frames[-1])
         self._recipe: dict[str, Any] | None = None
 
@@ -81,6 +69,7 @@ class MeasuredProblem:
         Raises:
             MeasurementError, ParameterError, RunError: what is wrong, before anything is simulated.
         """
+        from splatsoil.experiment.plow import PlowExperiment
         from splatsoil.measurement import Measurement
         from splatsoil.model import Model
         from splatsoil.reconstruction import Reconstruction
@@ -100,38 +89,14 @@ class MeasuredProblem:
         else:
             scene = Reconstruction.load(reconstruction)
         model = Model(measured, scene, effects=effects, preset=preset, device=device)
-        problem = cls(model, model.space(parameters))
+        problem = cls(PlowExperiment(model, parameters, candidates=()))
         problem._recipe = recipe
         return problem
 
     @property
     def block_count(self) -> int:
-        """Length of the block residuals: squares of the bed, for each camera and frame."""
-        return len(self.comparator.labels)
-
-    @property
-    def places(self) -> tuple[Block, ...]:
-        """Where each block residual is taken."""
-        return self.comparator.labels
-
-    @cached_property
-    def sensor_std(self) -> float:
-        """Standard deviation of a block residual by the cameras' noise alone."""
-        return self.comparator.block_noise()
-
-    @cached_property
-    def forces(self) -> ToolForces | None:
-        """What the force on the tool says, in percent of the largest; their residuals are among the extras."""
-        from splatsoil.experiment.forces import ToolForces
-        from splatsoil.experiment.scene_parts import bins_of
-
-        frames = self.comparator.frames
-        rows = [[frames[i] for i in group] for group in bins_of(self.model.measurement, frames, FORCE_ROWS)]
-        return ToolForces.of(self.model.measurement, rows)
-
-    def beside(self, extras: Mapping[str, float]) -> FloatArray:
-        """(k,) residuals of instruments beside the cameras, in independent units of what they may be off."""
-        return np.zeros(0) if self.forces is None else self.forces.independent(extras)
+        """Length of the block residuals: the experiment's features, row by row."""
+        return int(np.prod(self.experiment.layout.shape))
 
     @property
     def image_size(self) -> tuple[int, int]:
@@ -150,15 +115,6 @@ class MeasuredProblem:
         """The first camera's last frame."""
         return self.comparator.observed[self._shown]
 
-    def predict(self, parameters: Mapping[str, float], seed: int) -> tuple[Prediction, Comparison]:
-        """Simulate, draw, compare, and keep everything.
-
-        Raises:
-            SimulationError: the simulation could not go on.
-        """
-        prediction = self.model.predict(parameters, seed, self.progress)
-        return prediction, self.comparator.compare(prediction.images)
-
     def evaluate(self, parameters: Mapping[str, float], seed: int) -> Evaluation:
         """Simulate, draw, compare.
 
@@ -166,8 +122,7 @@ class MeasuredProblem:
             SimulationError: the simulation could not go on.
         """
         began = time.perf_counter()
-        prediction = self.model.predict(parameters, seed, self.progress)
-        evaluation = self.judge(prediction.images, prediction.trajectory.force)
+        evaluation = self.judge(self.experiment.prediction(parameters, seed=seed))
         return replace(evaluation, seconds=time.perf_counter() - began)
 
     def cheaper(self, preset: str) -> tuple[Callable[[Mapping[str, float], int], Evaluation], float]:
@@ -184,24 +139,26 @@ class MeasuredProblem:
         coarse = model.variant(resolution=Resolution.derive(model.measurement, preset))
 
         def evaluate(parameters: Mapping[str, float], seed: int) -> Evaluation:
-            prediction = coarse.predict(parameters, seed, self.progress)
-            return self.judge(prediction.images, prediction.trajectory.force)
+            return self.judge(coarse.predict(parameters, seed, self.experiment.progress))
 
         return evaluate, relative_cost(model.resolution, coarse.resolution)
 
-    def judge(self, images: Mapping[tuple[str, int], Image], force: FloatArray) -> Evaluation:
-        """Predicted pictures, by camera and frame, and forces (f, 3) on the tool in frames 1, 2, …, compared with the
-        measured ones.
-        """
-        comparison = self.comparator.compare(images)
-        forces = {} if self.forces is None else self.forces.residuals(force)
+    def judge(self, prediction: Prediction) -> Evaluation:
+        """A prediction compared with what was measured."""
+        experiment = self.experiment
+        comparison = self.comparator.compare(prediction.images)
+        features = experiment.features_of(comparison.blocks, prediction.trajectory.force)
         return Evaluation(
             loss=min(comparison.loss, self.worst_loss),
-            blocks=comparison.blocks,
-            extras={"rgb": comparison.rgb, **forces},
+            blocks=np.where(experiment.seen, experiment.observed - features, 0.0).reshape(-1),
+            extras={"rgb": comparison.rgb},
             observed=self.observed_image(),
-            predicted=images[self._shown],
+            predicted=prediction.images[self._shown],
         )
+
+    def features(self, blocks: Sequence[float]) -> FloatArray:
+        """(t, s) predicted features of an evaluation with these block residuals, where they are seen."""
+        return np.asarray(self.experiment.observed - np.reshape(blocks, self.experiment.layout.shape))
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Scenes and solver kernels don't travel between processes; folders and names do.

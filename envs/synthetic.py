@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -21,7 +21,7 @@ from splatsoil.parameters import ParameterSpace
 
 from .devices import resolve_device
 from .problem import Evaluation, Image
-from .synthetic_world import COMPARED, HEIGHT, WIDTH, World, cameras
+from .synthetic_world import COMPARED, HEIGHT, WIDTH, World
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -58,16 +58,6 @@ def compare(observed: Image, predicted: Image, still: Image) -> tuple[float, Flo
     return loss, 255.0 * patches.mean(axis=(2, 4, 5)).reshape(-1)
 
 
-@dataclass(frozen=True)
-class Patch:
-    """Where a block residual is taken: camera, frame, and place in the picture, in patches."""
-
-    camera: str
-    frame: int
-    x: float
-    y: float
-
-
 class SyntheticProblem:
     """Simulate-and-compare against a hidden truth.
 
@@ -85,8 +75,6 @@ class SyntheticProblem:
     worst_loss = 10.0
     image_size = (HEIGHT, WIDTH)
     block_count = 2 * len(COMPARED) * BLOCKS[0] * BLOCKS[1]
-    #: Of a block residual, grey levels of 255.
-    sensor_std = 255.0 * SENSOR_NOISE / (WIDTH * HEIGHT / (BLOCKS[0] * BLOCKS[1]) * 3) ** 0.5
 
     def __init__(
         self,
@@ -156,18 +144,6 @@ class SyntheticProblem:
         """Take pictures (k, h, w, 3) of the world's own simulation as what the cameras saw, but for their noise."""
         noise = np.random.default_rng([self._truth_seed, 1]).standard_normal(clean.shape)
         self._observed = np.clip(clean + SENSOR_NOISE * noise, 0.0, 1.0).astype(np.float32)
-
-    @property
-    def places(self) -> tuple[Patch, ...]:
-        """Where each block residual is taken."""
-        rows, columns = BLOCKS
-        return tuple(
-            Patch(camera, frame, float(column), float(row))
-            for camera in cameras()
-            for frame in COMPARED
-            for row in range(rows)
-            for column in range(columns)
-        )
 
     def observed_image(self) -> Image:
         """The left camera's last picture."""

@@ -82,17 +82,19 @@ def _synthetic(problems: Sequence[SyntheticProblem], jobs: Sequence[Job]) -> lis
 
 
 def _measured(problem: MeasuredProblem, jobs: Sequence[Job]) -> list[Evaluation]:
+    from splatsoil.model import Prediction
     from splatsoil.mpm import simulate_together
 
     began = time.perf_counter()
     model = problem.model
     particles = [model.particles(seed) for _, seed in jobs]
-    found = simulate_together(model.measurement, particles, [v for v, _ in jobs], model, problem.progress)
+    found = simulate_together(model.measurement, particles, [v for v, _ in jobs], model, problem.experiment.progress)
     out = []
     for (values, seed), trajectory in zip(jobs, found, strict=True):
         if isinstance(trajectory, SimulationError):
             out.append(failed(problem, trajectory))
         else:
-            out.append(problem.judge(model.draw(trajectory, seed, values), trajectory.force))
+            images = model.draw(trajectory, seed, values)
+            out.append(problem.judge(Prediction(dict(values), seed, images, trajectory, {})))
     seconds = (time.perf_counter() - began) / len(out)
     return [replace(evaluation, seconds=seconds) for evaluation in out]

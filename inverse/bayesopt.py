@@ -6,7 +6,7 @@ evaluations of an interrupted one goes on as that one would have.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -16,7 +16,6 @@ import numpy.typing as npt
 import torch
 
 from .surrogate import FloatArray, Minimum, Surrogate, quiet, seeded, sobol
-from .target_search import propose
 
 #: Space-filling evaluations before the first acquisition: at least, and for each parameter. With fewer, a search in
 #: many dimensions runs into corners and stays there.
@@ -38,18 +37,15 @@ class Search:
         acquisition: ``noisy`` (log noisy expected improvement: what is best so far is itself uncertain) or ``ei`` (log
             expected improvement over the best mean at an evaluated point).
         random: the start is drawn uniformly, not from a Sobol sequence.
-        features: where every evaluation came with residuals, it is their sum of squares that is expected to improve, by
-            an emulator of each (:func:`splatsoil.inverse.target_search.propose`); the loss is the fallback.
     """
 
     start: int = START
     acquisition: Literal["noisy", "ei"] = "noisy"
     random: bool = False
-    features: bool = True
 
 
 #: The settings of Hsiao and Kumar: one random start, expected improvement; with 10 evaluations in [25°, 55°].
-PAPER = Search(start=1, acquisition="ei", random=True, features=False)
+PAPER = Search(start=1, acquisition="ei", random=True)
 
 
 @dataclass(frozen=True)
@@ -59,12 +55,10 @@ class Told:
     Attributes:
         action: (n,) in [-1, 1].
         loss: None where the evaluation failed.
-        residuals: (b,) of its features, 0 where hidden; None where only the loss is known.
     """
 
     action: FloatArray
     loss: float | None
-    residuals: FloatArray | None = None
 
 
 class BayesianOptimiser:
@@ -95,12 +89,11 @@ class BayesianOptimiser:
         self.seed = seed
         self.told: list[Told] = []
 
-    def tell(self, action: npt.ArrayLike, loss: float | None, residuals: npt.ArrayLike | None = None) -> None:
-        """Learn the loss (None: the evaluation failed) at a point (n,) of [-1, 1]^n, and residuals if there are any."""
+    def tell(self, action: npt.ArrayLike, loss: float | None) -> None:
+        """Learn the loss (None: the evaluation failed) at a point (n,) of [-1, 1]^n."""
         point = np.array(action, dtype=np.float64).reshape(self.dimension)
         usable = loss is not None and np.isfinite(loss)
-        features = None if residuals is None else np.array(residuals, dtype=np.float64).reshape(-1)
-        self.told.append(Told(point, float(loss) if usable and loss is not None else None, features))
+        self.told.append(Told(point, float(loss) if usable and loss is not None else None))
 
     def ask(self) -> npt.NDArray[np.float32]:
         """The next point (n,) to evaluate, in float32 as environments take it."""
@@ -113,10 +106,7 @@ class BayesianOptimiser:
             # Beyond the start only while nothing has succeeded: keep filling the space.
             return self._fill(done + count)[done:].astype(np.float32)
         seed = self._stream(done)
-        proposals = self._by_features(seed, count)
-        if proposals is None:
-            proposals = self._by_loss(seed, count)
-        return self._apart(proposals, seed).astype(np.float32)
+        return self._apart(self._most_improving(seed, count), seed).astype(np.float32)
 
     def _fill(self, count: int) -> FloatArray:
         if self.search.random:
@@ -148,14 +138,7 @@ class BayesianOptimiser:
         """An independent seed for each use."""
         return int(np.random.SeedSequence([self.seed, index]).generate_state(1)[0])
 
-    def _by_features(self, seed: int, count: int) -> FloatArray | None:
-        """Proposals by emulated features; None where some aren't known, or evaluations failed: the loss keeps clear."""
-        residuals = [t.residuals for t in self.told if t.residuals is not None and t.loss is not None]
-        if not self.search.features or len(residuals) < len(self.told):
-            return None
-        return propose(np.array([t.action for t in self.told]), np.array(residuals), count, seed=seed % 2**31)
-
-    def _by_loss(self, seed: int, count: int) -> FloatArray:
+    def _most_improving(self, seed: int, count: int) -> FloatArray:
         with quiet():
             from botorch.acquisition.logei import qLogExpectedImprovement, qLogNoisyExpectedImprovement
             from botorch.optim import optimize_acqf
@@ -239,8 +222,7 @@ def optimise(
     """Play one episode of an environment whose reward is minus a loss, until it truncates or terminates.
 
     Args:
-        env: action space Box(-1, 1, (n,)); ``info["status"] == "failed"`` marks an evaluation without a loss. Where its
-            observation holds ``block_residuals``, these guide the search.
+        env: action space Box(-1, 1, (n,)); ``info["status"] == "failed"`` marks an evaluation without a loss.
         seed: of environment and agent.
         start: Sobol points before the first acquisition.
         noise_std: standard deviation of one evaluation's noise, if measured.
@@ -268,10 +250,9 @@ def optimise(
             if before_batch is not None and len(known) < at_once:
                 before_batch(batch)
         action = np.asarray(batch.pop(0), dtype=np.float32)
-        observation, reward, terminated, truncated, info = env.step(action.reshape(space.shape))
+        _, reward, terminated, truncated, info = env.step(action.reshape(space.shape))
         failed = info.get("status") == "failed"
-        residuals = observation.get("block_residuals") if isinstance(observation, Mapping) else None
-        optimiser.tell(action, None if failed else -float(reward), residuals)
+        optimiser.tell(action, None if failed else -float(reward))
         over = terminated or truncated
         if after_step is not None:
             after_step(done + 1, info)

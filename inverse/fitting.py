@@ -15,17 +15,18 @@ from splatsoil.envs.plow_sand import PlowSandEnv
 from splatsoil.envs.problem import Evaluation, Problem, WrappedProblem
 from splatsoil.envs.together import attempt, evaluate_together
 
-from splatsoil.errors import RunError
+from splatsoil.errors import RunError, SimulationError
 from splatsoil.parameters import Parameter, ParameterSpace
+from splatsoil.report.words import undetermined
 from splatsoil.run_files import FIT_FORMAT
 from splatsoil.threads import one_thread
 
 from .bayesopt import PAPER, START, Episode, optimise
 from .campaign import Job, make_record
+from .criticism.diagnosis import Diagnosis
 from .evaluations import EvaluationRecord, EvaluationStore, digest
-from .feature_fit import FORCE_DENIED, FeatureFit, by_features
+from .marginal import Marginal
 from .multifidelity import most_steps, optimise_two_levels
-from .posterior import Data
 from .run_folder import RunFolder
 from .surrogate import FloatArray, Minimum, Surrogate
 
@@ -190,7 +191,7 @@ def fit(
     *,
     budget: int = 10,
     facts: Mapping[str, Any] | None = None,
-    refitted: Mapping[str, tuple[float, float]] | None = None,
+    compare: Callable[[dict[str, Any]], Diagnosis] | None = None,
     after_evaluation: Callable[[int, EvaluationRecord], None] | None = None,
 ) -> dict[str, Any]:
     """Fit the free parameters and write ``fit.json``; goes on where an interrupted fit of the same setup stopped.
@@ -201,8 +202,8 @@ def fit(
         setup: what is fitted and how.
         budget: evaluations, those already stored included; with a coarse preset their cost, in full ones.
         facts: what the fit should say of how it was computed (time step, spacing, ...).
-        refitted: estimate and standard deviation of each parameter by a refit that weighed features by their chance and
-            numerics, as a diagnosis makes it; it is then the fit's estimate, and the evaluations tell the loss around.
+        compare: compares the model with something else, given what the search came to as ``fit.json`` will hold it; the
+            parameters are its. Without it, and where simulations are too few for it, they are the loss' minimum.
         after_evaluation: called with the number done and the record of the last.
 
     Returns:
@@ -249,8 +250,8 @@ def fit(
             first = records[0].message if records else str(error)
             raise RunError(f"{run.path}: all {len(records)} simulations failed; the first said: {first}") from error
         records = store.records(stored.fit)[: len(episode.told)]
-    seconds = earlier + time.perf_counter() - began
-    result = summarise(episode, problem, setup, records, seconds=seconds, refitted=refitted)
+        result = summarise(episode, problem.space, setup, records, compare)
+    result["seconds"] = round(earlier + time.perf_counter() - began, 3)
     result["run"] = {"measurement": dict(run.description["measurement"])}
     result["facts"] = dict(facts or {})
     run.write_fit(setup.name, result)
@@ -259,51 +260,38 @@ def fit(
 
 def summarise(
     episode: Episode,
-    problem: Problem,
+    space: ParameterSpace,
     setup: FitSetup,
     records: list[EvaluationRecord],
-    *,
-    seconds: float,
-    refitted: Mapping[str, tuple[float, float]] | None = None,
+    compare: Callable[[dict[str, Any]], Diagnosis] | None = None,
 ) -> dict[str, Any]:
-    """A fit in plain numbers, physical units and words."""
-    space = problem.space
-    surrogate = episode.optimiser.surrogate()
+    """A fit in plain numbers, physical units and words; see :func:`fit`."""
+    surrogate, minimum = episode.optimiser.surrogate(), episode.minimum
     good = [record for record in records if record.status == "ok"]
-    told = None
-    if refitted is not None:
-        source, minimum = "refit", episode.minimum.moved(*_unit(space, refitted), surrogate)
-    elif (told := _from_features(problem, records, surrogate, episode.minimum, setup.seed)) is not None:
-        source, minimum = told.source, told.minimum
-    else:
-        source, minimum = "loss", episode.minimum
     done = [record for record in good if is_full(record.parameters)]
     best = min(done, key=lambda record: record.loss if record.loss is not None else math.inf)
-    return {
+    searched = {p.name: _minimiser(p, i, minimum, space) for i, p in enumerate(space)}
+    result: dict[str, Any] = {
         "format": FIT_FORMAT,
         "name": setup.name,
-        "parameters": {p.name: _estimate(p, i, minimum, space) for i, p in enumerate(space)},
-        "estimated_from": source,
-        "force": None if told is None or told.pictures is None else _beside_force(told, space),
-        "loss": minimum.loss,
-        "loss_std": minimum.loss_std,
+        "parameters": searched,
+        "estimated_from": "loss",
+        "minimum": {name: {key: entry[key] for key in ("estimate", "low", "high")} for name, entry in searched.items()},
         "noise_std": minimum.noise_std,
         "evaluations": len(records),
         "failed": len(records) - len(good),
         "best": {"parameters": _without_level(best.parameters), "loss": best.loss, "step": best.step},
-        "seconds": round(seconds, 3),
         "seed": setup.seed,
         "device": setup.device,
         "preset": setup.preset,
         "version": setup.version,
         "setup": setup.description(),
-        "notes": notes(minimum, space, failed=len(records) - len(good), total=len(records), told=told),
-        "curves": {p.name: _curve(i, minimum, surrogate, space) for i, p in enumerate(space)},
         "history": [
             {
                 "step": record.step,
                 "parameters": _without_level(record.parameters),
                 "level": "full" if is_full(record.parameters) else "coarse",
+                "seed": record.seed,
                 "loss": record.loss,
                 "status": record.status,
                 "message": record.message,
@@ -313,71 +301,75 @@ def summarise(
             for record in records
         ],
     }
-
-
-def _from_features(
-    problem: Problem, records: list[EvaluationRecord], surrogate: Surrogate, fallback: Minimum, seed: int
-) -> FeatureFit | None:
-    """What the emulated features say; None where evaluations are too few or too unlike each other for that."""
-    try:
-        return by_features(Data.of(problem, records), surrogate, fallback, seed=seed)
-    except RunError:
-        return None
-
-
-def _unit(space: ParameterSpace, told: Mapping[str, tuple[float, float]]) -> tuple[FloatArray, FloatArray]:
-    """Estimates (n,) and standard deviations (n,) in [-1, 1]^n."""
-    values = np.array([told[p.name][0] for p in space])
-    stds = np.array([told[p.name][1] for p in space])
-    lower, upper = np.array([p.lower for p in space]), np.array([p.upper for p in space])
-    ends = [np.clip(values + side * stds, lower, upper) for side in (-1.0, 1.0)]
-    width = np.maximum(ends[1] - ends[0], 1e-300)
-    # A bound that cuts an end off does not make the estimate any surer.
-    low, high = (space.to_unit(end) for end in ends)
-    return space.to_unit(values), 0.5 * (high - low) * (2.0 * stds / width)
+    remarks = []
+    if compare is not None:
+        try:
+            found = compare(result)
+        except SimulationError as error:
+            remarks = [f"The estimate is the loss' minimum alone: the model could not be compared ({error})."]
+        else:
+            result["estimated_from"] = "comparison"
+            result["parameters"] = {p.name: _averaged(p, found) for p in space}
+    point = space.to_unit(np.array([entry["estimate"] for entry in result["parameters"].values()]))
+    loss, loss_std = surrogate.mean_and_std(point[None])
+    return {
+        **result,
+        "loss": float(loss[0]),
+        "loss_std": float(loss_std[0]),
+        "notes": [*remarks, *notes(result, space)],
+        "curves": {p.name: _curve(i, point, surrogate, space) for i, p in enumerate(space)},
+    }
 
 
 def _without_level(parameters: Mapping[str, float]) -> dict[str, float]:
     return {name: value for name, value in parameters.items() if name != FIDELITY.name}
 
 
-def _beside_force(told: FeatureFit, space: ParameterSpace) -> dict[str, Any]:
-    """What the measured force on the tool did to the estimate."""
-    assert told.pictures is not None
-    return {
-        "agreement": told.agreement,
-        "counted": not told.denied,
-        "pictures_alone": {
-            p.name: {key: entry[key] for key in ("estimate", "std", "determined")}
-            for i, p in enumerate(space)
-            for entry in (_estimate(p, i, told.pictures, space),)
-        },
-    }
-
-
-def notes(
-    minimum: Minimum, space: ParameterSpace, *, failed: int, total: int, told: FeatureFit | None = None
-) -> list[str]:
+def notes(result: Mapping[str, Any], space: ParameterSpace) -> list[str]:
     """What a reader must know before believing the numbers."""
-    out = [FORCE_DENIED] if told is not None and told.denied else []
-    for parameter, determined in zip(space, minimum.determined, strict=True):
-        if not determined:
+    out = []
+    for name, entry in result["parameters"].items():
+        if not entry["determined"]:
             out.append(
-                f"The evaluations hardly say where the loss is least: {parameter.name} is not determined by them."
+                f"The evaluations hardly say where the loss is least: {name} is not determined by them."
+                if result["estimated_from"] == "loss"
+                else undetermined(name)
             )
-    for parameter, bound in zip(space, minimum.at_bound, strict=True):
+    for parameter in space:
+        bound = result["parameters"][parameter.name]["at_bound"]
         if bound is not None:
             value = parameter.lower if bound == "lower" else parameter.upper
             out.append(
                 f"The estimate of {parameter.name} lies on its {bound} bound ({value:g} {parameter.unit}): "
                 "the minimum may lie beyond it, or the model may lack an effect."
             )
-    if failed:
-        out.append(f"{failed} of {total} simulations failed and were left out.")
+    if result["failed"]:
+        out.append(f"{result['failed']} of {result['evaluations']} simulations failed and were left out.")
     return out
 
 
-def _estimate(parameter: Parameter, index: int, minimum: Minimum, space: ParameterSpace) -> dict[str, Any]:
+def _averaged(parameter: Parameter, found: Diagnosis) -> dict[str, Any]:
+    """A parameter, averaged over the models of a comparison."""
+    marginal = Marginal.of(parameter, found.evidence)
+    determined = bool(found.determined[parameter.name])
+    return {
+        "estimate": found.estimates[parameter.name][0],
+        "std": found.estimates[parameter.name][1],
+        "low": marginal.quantile(0.05),
+        "high": marginal.quantile(0.95),
+        **_about(parameter),
+        "at_bound": next(iter(marginal.at_bounds), None) if determined else None,
+        "determined": determined,
+    }
+
+
+def _about(parameter: Parameter) -> dict[str, Any]:
+    return {"unit": parameter.unit, "title": parameter.title, "bounds": [parameter.lower, parameter.upper]}
+
+
+def _minimiser(parameter: Parameter, index: int, minimum: Minimum, space: ParameterSpace) -> dict[str, Any]:
+    """A parameter where the loss is least."""
+
     def physical(unit: float) -> float:
         point = minimum.estimate.copy()
         point[index] = unit
@@ -393,17 +385,15 @@ def _estimate(parameter: Parameter, index: int, minimum: Minimum, space: Paramet
         "std": 0.5 * (physical(middle + std) - physical(middle - std)),
         "low": physical(float(minimum.low[index])),
         "high": physical(float(minimum.high[index])),
-        "unit": parameter.unit,
-        "title": parameter.title,
-        "bounds": [parameter.lower, parameter.upper],
+        **_about(parameter),
         "at_bound": minimum.at_bound[index],
         "determined": minimum.determined[index],
     }
 
 
-def _curve(index: int, minimum: Minimum, surrogate: Surrogate, space: ParameterSpace) -> dict[str, list[float]]:
+def _curve(index: int, point: FloatArray, surrogate: Surrogate, space: ParameterSpace) -> dict[str, list[float]]:
     """The GP along one parameter, the others at their estimates."""
-    points = np.repeat(minimum.estimate[None], CURVE, axis=0)
+    points = np.repeat(point[None], CURVE, axis=0)
     points[:, index] = np.linspace(-1.0, 1.0, CURVE)
     mean, std = surrogate.mean_and_std(points)
     return {"x": space.from_unit(points)[:, index].tolist(), "mean": mean.tolist(), "std": std.tolist()}

@@ -82,8 +82,8 @@ class TwoLevelOptimiser(BayesianOptimiser):
         super().tell(action, loss)
         self.levels.append(int(level))
 
-    def tell(self, action: npt.ArrayLike, loss: float | None, residuals: npt.ArrayLike | None = None) -> None:
-        """Learn the full loss at a point; residuals of two levels don't mix, and are left aside."""
+    def tell(self, action: npt.ArrayLike, loss: float | None) -> None:
+        """Learn the full loss at a point."""
         self.tell_level(action, FULL, loss)
 
     def ask_batch(self, count: int) -> npt.NDArray[np.float32]:

@@ -6,14 +6,16 @@ import io
 import os
 import tempfile
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from splatsoil.errors import RunError
 from splatsoil.files import write_bytes
+from splatsoil.parameters import Parameter, ParameterSpace
 
 from .posterior import verdicts
 
@@ -32,28 +34,23 @@ PREDICTIVE = 200
 def inference_data(posterior: Posterior) -> arviz.InferenceData:
     """Groups ``posterior``, ``sample_stats``, ``posterior_predictive``, ``observed_data`` and ``prior``.
 
-    A chain is an ensemble of walkers. Features are in the emulator's basis (``component``).
+    A chain is an ensemble of walkers. Features are projected, as a comparison projects them (``score``).
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # a remark on its next major version
         import arviz
 
-    space, chains = posterior.data.space, posterior.chains
+    space, chains = posterior.density.prior.space, posterior.chains
     n = len(space)
-    unit = chains.samples[..., :n]
-    values = space.from_unit(unit).reshape(unit.shape[0], -1, n)
-    drawn: dict[str, Any] = {name: values[..., i] for i, name in enumerate(space.names)}
-    if posterior.likelihood.with_misfit:
-        drawn["ln_misfit"] = chains.samples[..., n].reshape(unit.shape[0], -1)
-    rng = np.random.default_rng(0)
-    prior = space.from_unit(rng.uniform(-1.0, 1.0, (1, 4000, n)))
+    values = space.from_unit(chains.samples).reshape(chains.samples.shape[0], -1, n)
+    prior = space.from_unit(np.random.default_rng(0).uniform(-1.0, 1.0, (1, 4000, n)))
     return arviz.from_dict(
-        posterior=drawn,
-        sample_stats={"lp": chains.log_density.reshape(unit.shape[0], -1)},
+        posterior={name: values[..., i] for i, name in enumerate(space.names)},
+        sample_stats={"lp": chains.log_density.reshape(values.shape[0], -1)},
         posterior_predictive={"scores": predictive_scores(posterior, PREDICTIVE)[None]},
-        observed_data={"scores": posterior.likelihood.scores},
+        observed_data={"scores": posterior.density.noise.observed},
         prior={name: prior[..., i] for i, name in enumerate(space.names)},
-        dims={"scores": ["component"]},
+        dims={"scores": ["score"]},
         attrs={"made_by": "splatsoil", "units": ", ".join(f"{p.name}: {p.unit}" for p in space)},
     )
 
@@ -78,21 +75,26 @@ def write_inference_data(posterior: Posterior, path: Path) -> Path:
 def predictive_scores(posterior: Posterior, count: int, seed: int = 0) -> FloatArray:
     """(count, p) scores that would be observed again, every source of doubt included."""
     rng = np.random.default_rng(seed)
-    points = posterior.chains.flat[rng.choice(len(posterior.chains.flat), count)]
-    mean, covariance = posterior.likelihood.covariance(points)
-    factor = np.linalg.cholesky(covariance)
-    return mean + (factor @ rng.standard_normal(mean.shape)[..., None])[..., 0]
+    points = posterior.unit[rng.choice(len(posterior.unit), count)]
+    return posterior.density.replicates(points, rng)
 
 
-def write_figures(posterior: Posterior, folder: Path) -> list[str]:
-    """Write corner, trace, scores and, where features have places, predictive ``.png``; their names."""
+def write_figures(posterior: Posterior, own: Sequence[Parameter], folder: Path) -> list[str]:
+    """Write corner, trace and scores ``.png``; their names.
+
+    Args:
+        posterior: to draw.
+        own: the parameters with their own bounds, which frame the corner.
+        folder: where to.
+    """
     import matplotlib
 
     with matplotlib.rc_context({"font.size": 9, "figure.dpi": 110}):
-        figures = {"corner.png": corner_figure(posterior), "trace.png": trace_figure(posterior)}
-        figures["scores.png"] = scores_figure(posterior)
-        if posterior.data.places is not None:
-            figures["predictive.png"] = predictive_figure(posterior)
+        figures = {
+            "corner.png": corner_figure(posterior, own),
+            "trace.png": trace_figure(posterior),
+            "scores.png": scores_figure(posterior),
+        }
         for name, figure in figures.items():
             stream = io.BytesIO()
             figure.savefig(stream, format="png", bbox_inches="tight")
@@ -100,12 +102,12 @@ def write_figures(posterior: Posterior, folder: Path) -> list[str]:
     return list(figures)
 
 
-def corner_figure(posterior: Posterior) -> Figure:
-    """Every parameter and every pair; the frame is the prior, and what is not determined gets no number."""
+def corner_figure(posterior: Posterior, own: Sequence[Parameter]) -> Figure:
+    """Every parameter and every pair; the frame is their own bounds, and what is not determined gets no number."""
     import corner
     from matplotlib.figure import Figure
 
-    space = posterior.data.space
+    space = ParameterSpace(own)
     figure = Figure(figsize=(2.2 * len(space) + 1.0, 2.2 * len(space) + 1.0))
     corner.corner(
         posterior.values,
@@ -129,10 +131,10 @@ def trace_figure(posterior: Posterior) -> Figure:
     """Each ensemble's median and central 90 % of walkers against steps."""
     from matplotlib.figure import Figure
 
-    space, samples = posterior.data.space, posterior.chains.samples
+    space, samples = posterior.density.prior.space, posterior.chains.samples
     figure = Figure(figsize=(8.0, 1.8 * len(space) + 0.4), layout="constrained")
     axes = np.atleast_1d(figure.subplots(len(space), 1, sharex=True))
-    values = space.from_unit(samples[..., : len(space)])
+    values = space.from_unit(samples)
     for i, (axis, p) in enumerate(zip(axes, space, strict=True)):
         for e in range(len(samples)):
             low, middle, high = np.quantile(values[e, :, :, i], [0.05, 0.5, 0.95], axis=1)
@@ -145,55 +147,19 @@ def trace_figure(posterior: Posterior) -> Figure:
 
 
 def scores_figure(posterior: Posterior) -> Figure:
-    """The observed features, in the emulator's basis, among those that the posterior predicts."""
+    """The observed scores among those that the posterior predicts."""
     from matplotlib.figure import Figure
 
     draws = predictive_scores(posterior, PREDICTIVE)
-    observed = posterior.likelihood.scores
+    observed = posterior.density.noise.observed
     unit = draws.std(axis=0)
-    figure = Figure(figsize=(0.7 * len(observed) + 2.5, 2.8), layout="constrained")
+    figure = Figure(figsize=(min(0.7 * len(observed) + 2.5, 14.0), 2.8), layout="constrained")
     axis = figure.subplots()
     centre = draws.mean(axis=0)
     axis.violinplot(list(((draws - centre) / unit).T), positions=range(1, len(observed) + 1), showextrema=False)
     axis.plot(range(1, len(observed) + 1), (observed - centre) / unit, "kx", label="observed")
     axis.axhline(0.0, color="grey", linewidth=0.5)
-    axis.set_xticks(range(1, len(observed) + 1))
-    axis.set_xlabel("component")
+    axis.set_xlabel("score")
     axis.set_ylabel("predictive std")
     axis.legend(fontsize=7)
-    return figure
-
-
-def predictive_figure(posterior: Posterior) -> Figure:
-    """The bed from above, for each camera at its last frame: residual at the posterior's mean, its spread, and both."""
-    from matplotlib.figure import Figure
-
-    places = posterior.data.places
-    assert places is not None
-    emulator = posterior.emulator
-    rng = np.random.default_rng(0)
-    draws = posterior.unit[rng.choice(len(posterior.unit), PREDICTIVE)]
-    predicted = emulator.features(draws)
-    mean, spread = predicted.mean(axis=0), predicted.std(axis=0)
-    chance = np.sqrt(emulator.chance_variance() + posterior.likelihood.sensor)
-    residual = posterior.likelihood.observed - mean
-    cameras = sorted({p.camera for p in places})
-    last = max(p.frame for p in places)
-    figure = Figure(figsize=(10.0, 2.6 * len(cameras)), layout="constrained")
-    axes = figure.subplots(len(cameras), 3, squeeze=False, sharex=True, sharey=True)
-    for row, camera in zip(axes, cameras, strict=True):
-        chosen = [k for k, p in enumerate(places) if p.camera == camera and p.frame == last]
-        x, y = (np.array([getattr(places[k], name) for k in chosen]) for name in ("x", "y"))
-        panels = (
-            ("observed − mean [grey levels]", residual[chosen], "RdBu_r"),
-            ("its spread over the posterior", spread[chosen], "viridis"),
-            ("residual / (spread, chance and noise)", (residual / np.hypot(spread, chance))[chosen], "RdBu_r"),
-        )
-        for axis, (title, shown, colours) in zip(row, panels, strict=True):
-            top = float(np.abs(shown).max()) or 1.0
-            low = -top if colours == "RdBu_r" else 0.0
-            image = axis.scatter(x, y, c=shown, cmap=colours, vmin=low, vmax=top, marker="s", s=60)
-            axis.set_aspect("equal")
-            axis.set_title(f"{camera}, frame {last}: {title}", fontsize=7)
-            figure.colorbar(image, ax=axis, shrink=0.8)
     return figure

@@ -10,7 +10,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Literal
 
@@ -40,8 +40,6 @@ AT_BOUND = 0.01
 UNIFORM_STD = 2.0 / np.sqrt(12.0)
 #: Minimisers whose root mean square distance from the estimate is more than this part of it say next to nothing.
 UNINFORMED = 0.6
-#: Central 90 % of a normal distribution, in standard deviations.
-CENTRAL_90 = 1.6449
 
 
 @contextmanager
@@ -78,23 +76,6 @@ class Minimum:
     noise_std: float
     at_bound: tuple[Literal["lower", "upper"] | None, ...]
     determined: tuple[bool, ...]
-
-    def moved(self, estimate: FloatArray, std: FloatArray, surrogate: Surrogate) -> Minimum:
-        """To an estimate (n,) ± std (n,) in [-1, 1]^n of something that knows more than the loss; the loss there."""
-        std = np.maximum(std, RESOLUTION)
-        determined = std < UNINFORMED * UNIFORM_STD
-        loss, loss_std = surrogate.mean_and_std(estimate[None])
-        return replace(
-            self,
-            estimate=estimate,
-            std=np.where(determined, std, np.minimum(std, UNIFORM_STD)),
-            low=np.maximum(estimate - CENTRAL_90 * std, -1.0),
-            high=np.minimum(estimate + CENTRAL_90 * std, 1.0),
-            loss=float(loss[0]),
-            loss_std=float(loss_std[0]),
-            at_bound=tuple(bound_of(value) for value in estimate),
-            determined=tuple(bool(d) for d in determined),
-        )
 
 
 class Surrogate:

@@ -160,7 +160,8 @@ FORWARD = (
     *RECONSTRUCTING,
     *("soil", "mpm", "scene", "parameters.py", "model.py", "observation.py", "colour.py"),
     *("comparison.py", "robust_loss.py", "envs/measured.py"),
-    *("experiment/features.py", "experiment/forces.py", "experiment/scene_parts.py"),
+    *("experiment/base.py", "experiment/features.py", "experiment/forces.py", "experiment/plow.py"),
+    "experiment/scene_parts.py",
 )
 
 

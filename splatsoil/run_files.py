@@ -10,11 +10,11 @@ from splatsoil.errors import RunError
 from splatsoil.files import ANEW, read_json
 
 RUN_FORMAT = "splatsoil-run/1"
-FIT_FORMAT = "splatsoil-fit/1"
+FIT_FORMAT = "splatsoil-fit/2"
 COMPARISON_FORMAT = "splatsoil-comparison/1"
 DIAGNOSIS_FORMAT = "splatsoil-diagnosis/2"
 MISFIT_FORMAT = "splatsoil-misfit/2"
-POSTERIOR_FORMAT = "splatsoil-posterior/1"
+POSTERIOR_FORMAT = "splatsoil-posterior/2"
 HISTORY_FORMAT = "splatsoil-history/1"
 RECONSTRUCTION_FORMAT = "splatsoil-reconstruction/1"
 
@@ -29,10 +29,13 @@ SHAPES: Mapping[str, Mapping[str, Any]] = {
         "name": str,
         "parameters": {EACH: {**ESTIMATE, "title": str}},
         "setup": {"effects": [str], "preset": str},
+        "minimum": {EACH: {"estimate": NUMBER, "low": NUMBER, "high": NUMBER}},
+        "history": [{"parameters": {EACH: NUMBER}, "seed": int, "level": str, "status": str}],
     },
     COMPARISON_FORMAT: {"fit": str, "parameters": dict},
     DIAGNOSIS_FORMAT: {"values": dict, "model": list, "models": [{"name": str, "probability": NUMBER}]},
     MISFIT_FORMAT: {"fit": str, "values": dict},
+    POSTERIOR_FORMAT: {"fit": str, "values": dict},
     HISTORY_FORMAT: {"models": [{"model": str, "effects": [str], "parameters": {EACH: ESTIMATE}}]},
 }
 """By format: of each key a type (or several), a shape of its own, or a list of one, which each element must be of."""

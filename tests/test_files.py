@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatsoil.commands._control import FEATURES, JUDGING
+from splatsoil.commands._control import JUDGING
 from splatsoil.errors import RunError
 from splatsoil.files import FORWARD, RECONSTRUCTING, code_digest, read_npy, read_npz, write_npz
 
@@ -80,10 +80,10 @@ def reached(repository: Path, start: str) -> set[str]:
         ("reconstruction.pipeline", RECONSTRUCTING, {}),
         ("model", FORWARD, {}),
         ("envs.measured", FORWARD, {}),
-        ("experiment.plow", (*FORWARD, *FEATURES), {}),
+        ("experiment.plow", FORWARD, {}),
         (
             "inverse.criticism.diagnosis",
-            (*FORWARD, *FEATURES, *JUDGING),
+            (*FORWARD, *JUDGING),
             {"inverse/evaluations.py": "names what is kept"},
         ),
     ],
@@ -100,7 +100,7 @@ def test_the_code_that_decides_a_result_is_in_its_digest(
 def test_every_part_of_a_digest_is_there(tmp_path: Path) -> None:
     """One that were not would change nothing, unnoticed."""
     nothing = code_digest(())
-    for name in (*FORWARD, *FEATURES, *JUDGING):
+    for name in (*FORWARD, *JUDGING):
         assert code_digest((name,)) != nothing, name
 
 

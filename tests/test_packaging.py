@@ -155,7 +155,7 @@ def test_the_command_line_works(elsewhere: Path, plow_dry: Path, project: dict[s
 def test_the_made_up_world_finds_its_own_source(elsewhere: Path, tmp_path: Path) -> None:
     """Its source is part of what a kept simulation is known by; installed, it lies elsewhere than in the repository."""
     code = (
-        "from splatsoil.inverse.simulations import simulations\n"
+        "from splatsoil.benchmarks._simulations import simulations\n"
         "data, file = simulations(4, repeats=2)\n"
         "assert file.is_file() and data.residuals.shape[0] == 6\n"
     )

@@ -48,14 +48,18 @@ class Prior:
     space: ParameterSpace
 
     @classmethod
-    def of(cls, experiment: Experiment, values: Mapping[str, float]) -> Prior:
+    def of(cls, experiment: Experiment, *values: Mapping[str, float]) -> Prior:
         """The whole range of a parameter of the base law; of an effect that is on, from off to twice what was fitted.
 
         Args:
             experiment: its parameters.
-            values: fitted ones, by name.
+            values: fitted ones, by name; or both ends of what a search leaves possible.
         """
-        return cls(ParameterSpace(_narrowed(p, values[p.name]) for p in experiment.parameters))
+        return cls(ParameterSpace(_narrowed(p, [v[p.name] for v in values]) for p in experiment.parameters))
+
+    def inside(self, runs: Sequence[Run]) -> list[Run]:
+        """Those of some runs whose parameters lie in the box."""
+        return [r for r, point in zip(runs, self.unit(runs), strict=True) if np.abs(point).max() <= 1.0 + 1e-9]
 
     def points(self, count: int, seed: int) -> FloatArray:
         """(count, n) in [-1, 1]."""
@@ -67,7 +71,8 @@ class Prior:
 
     def unit(self, runs: Sequence[Run]) -> FloatArray:
         """(m, n) points in [-1, 1] of runs."""
-        return self.space.to_unit(np.array([[r.values[p.name] for p in self.space] for r in runs]))
+        values = np.array([[r.values[p.name] for p in self.space] for r in runs])
+        return self.space.to_unit(values.reshape(len(runs), len(self.space)))
 
 
 def sizes(candidate: Candidate, cube: FloatArray) -> FloatArray:
@@ -114,12 +119,12 @@ def effect_runs(candidate: Candidate, prior: Prior, count: int, seed: int) -> li
     ]
 
 
-def _narrowed(parameter: Parameter, value: float) -> Parameter:
+def _narrowed(parameter: Parameter, values: Sequence[float]) -> Parameter:
     if parameter.off is None:
         return parameter
-    reach = 2.0 * (value - parameter.off)
+    reach = [0.0, *(2.0 * (value - parameter.off) for value in values)]
     margin = 2.0 * parameter.meaningful
-    low, high = (parameter.off + min(reach, 0.0) - margin, parameter.off + max(reach, 0.0) + margin)
+    low, high = parameter.off + min(reach) - margin, parameter.off + max(reach) + margin
     low, high = max(low, parameter.lower), min(high, parameter.upper)
     return Parameter(
         **{**vars(parameter), "lower": low, "upper": high, "default": min(max(parameter.default, low), high)}

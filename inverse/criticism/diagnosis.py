@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from splatsoil.errors import RunError, SimulationError
+from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Candidate, Experiment
 
 from .checks import Check, Expected, checks, passes
@@ -137,6 +137,8 @@ def diagnose(
     simulate: Simulations | None = None,
     effects: bool = True,
     seed: int = 0,
+    known: Sequence[Run] = (),
+    prior: Prior | None = None,
     progress: Callable[[str, float], None] = lambda what, share: None,
 ) -> Diagnosis:
     """Compare models.
@@ -147,15 +149,17 @@ def diagnose(
         simulate: the experiment's simulations; new ones by default.
         effects: whether effects that are off are models, too; else only the base model and "something else".
         seed: of the design.
+        known: simulations of the base model that a search has made; the design adds what is missing.
+        prior: of the base model's parameters; about ``values`` by default.
         progress: called with (what, share done).
 
     Raises:
-        RunError: the base model could not be simulated.
+        SimulationError: the base model could not be simulated.
     """
     ask = Simulations(experiment) if simulate is None else simulate
-    prior = Prior.of(experiment, values)
+    prior = Prior.of(experiment, values) if prior is None else prior
     candidates = experiment.candidates if effects else ()
-    study = _design(experiment, ask, prior, candidates, seed)
+    study = _design(experiment, ask, prior, candidates, seed, known)
     ask.ahead(lambda noted: _ask_through(study, noted))
     progress("drawings", 0.0)
     drawn, reference = _drawings(experiment, ask, values, candidates)
@@ -229,11 +233,21 @@ def judged(probability: Mapping[str, float], *, fits: bool) -> tuple[Verdict, tu
 
 
 def _design(
-    experiment: Experiment, simulate: Simulate, prior: Prior, candidates: Iterable[Candidate], seed: int
+    experiment: Experiment,
+    simulate: Simulate,
+    prior: Prior,
+    candidates: Iterable[Candidate],
+    seed: int,
+    known: Sequence[Run] = (),
 ) -> _Study:
     count = BASE + BASE // 2 * (len(prior.space) - 1)
     study = _Study(experiment, simulate, prior, seed)
-    study.base = [Run(v, seed=seed + 1 + i) for i, v in enumerate(prior.values(_spread(prior, count, seed)))]
+    study.base = prior.inside(known)
+    points = _spread(prior, count, seed)
+    # each simulation that is there stands for the nearest point of the design
+    for there in prior.unit(study.base)[: len(points)]:
+        points = np.delete(points, np.argmin(np.sum((points - there) ** 2, axis=1)), axis=0)
+    study.base += [Run(v, seed=seed + 1 + i) for i, v in enumerate(prior.values(points))]
     if FINE in experiment.numerics:
         points = 0.7 * _spread(prior, PAIRS, seed + 1)
         study.fine = [Run(v, seed=seed + 101 + i, numerics=FINE) for i, v in enumerate(prior.values(points))]
@@ -309,7 +323,7 @@ def _compared(
 ) -> tuple[Evidence, Comparison, Noise]:
     if len(tables.base[0]) < BASE // 2:
         why = study.failed.get("the model as it is", "")
-        raise RunError(f"the model as it is could be simulated {len(tables.base[0])} times only: {why}")
+        raise SimulationError(f"the model as it is could be simulated {len(tables.base[0])} times only: {why}")
     noise = noise_of(study.experiment, study.prior, tables, candidates, aside)
     simulated = {name: (runs, noise.scores(found)) for name, (runs, found) in tables.effects.items()}
     comparison = Comparison.of(noise, study.prior, candidates, simulated, study.seed)

@@ -62,6 +62,7 @@ class Simulations:
         folder: where feature tables are kept; None keeps them in memory only.
         identity: everything beside the arguments of ``predict`` that decides a prediction.
         told: called before each new simulation with what it is for.
+        sources: digests of the files that define effects, by their names, where these are a user's own.
     """
 
     def __init__(
@@ -70,9 +71,11 @@ class Simulations:
         folder: Path | None = None,
         identity: Mapping[str, Any] | None = None,
         told: Callable[[str], None] | None = None,
+        sources: Mapping[str, str] | None = None,
     ) -> None:
         self.experiment, self.folder = experiment, folder
         self.identity, self.told = dict(identity or {}), told
+        self.sources = dict(sources or {})
         self.made = 0
         """Simulations made, not read."""
         self._tables: dict[str, FloatArray | SimulationError] = {}
@@ -110,6 +113,18 @@ class Simulations:
         if isinstance(table, SimulationError):
             raise table
         return table
+
+    def keep(self, table: FloatArray, values: Mapping[str, float], seed: int) -> None:
+        """A prediction (t, s) of the base model that was made elsewhere; one that is there already stays.
+
+        Raises:
+            RunError: the folder can't be written to.
+        """
+        key = self._key({"values": dict(values), "effects": (), "seed": seed, "numerics": ""})
+        if self.folder is None:
+            self._tables.setdefault(key, table)
+        elif self._kept(key) is None:
+            self._write(key, table)
 
     @contextmanager
     def helped(self, helpers: Helpers) -> Iterator[None]:
@@ -153,7 +168,8 @@ class Simulations:
             self._planned |= dict.fromkeys(jobs, plan)
 
     def _key(self, what: Mapping[str, Any]) -> str:
-        return digest({**self.identity, **what, "effects": sorted(what["effects"])})
+        effects = sorted(f"{name} {self.sources.get(name, '')}".rstrip() for name in what["effects"])
+        return digest({**self.identity, **what, "effects": effects})
 
     def _path(self, key: str) -> Path | None:
         return None if self.folder is None else self.folder / f"{key[:32]}.npy"
@@ -208,9 +224,12 @@ class Simulations:
             what["values"], effects=tuple(what["effects"]), seed=what["seed"], numerics=what["numerics"]
         )
         self.made += 1
+        self._write(key, made)
+        return made
+
+    def _write(self, key: str, table: FloatArray) -> None:
         path = self._path(key)
         if path is not None:
             stream = io.BytesIO()
-            np.save(stream, made, allow_pickle=False)
+            np.save(stream, table, allow_pickle=False)
             write_bytes(path, stream.getvalue())
-        return made

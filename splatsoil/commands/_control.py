@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-#: Parts of the package that decide features, besides those that simulate; and verdicts.
-FEATURES = ("experiment/plow.py", "experiment/base.py")
+#: Parts of the package that decide verdicts.
 JUDGING = ("inverse/criticism",)
 
 
 def code_of(effects: Iterable[str]) -> str:
     """Digest of the code that decides features, users' own effects in it."""
-    from splatsoil.files import FORWARD, code_digest
+    from splatsoil.files import code_digest
 
-    return code_digest((*FORWARD, *FEATURES), own_files(effects))
+    return code_digest(others=own_files(effects))
 
 
 def judged_by() -> str:

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from concurrent.futures import Future
     from pathlib import Path
 
+    from splatsoil.commands._experiments import Chosen
     from splatsoil.experiment.plow import PlowExperiment
     from splatsoil.inverse.criticism.simulations import Simulations
     from splatsoil.inverse.executors import Processes
@@ -63,11 +64,12 @@ class Crew:
             self._workers.kill()
 
     @contextmanager
-    def helping(self, experiment: PlowExperiment, simulate: Simulations) -> Iterator[None]:
+    def helping(self, chosen: Chosen, experiment: PlowExperiment, simulate: Simulations) -> Iterator[None]:
         """While the block runs, where this process holds the folder's lock, they simulate.
 
         Args:
-            experiment: of the latest fit.
+            chosen: the model.
+            experiment: of it.
             simulate: what is helped.
         """
         from splatsoil.inverse.criticism.simulations import Helpers
@@ -82,7 +84,7 @@ class Crew:
 
             def together(jobs: Sequence[Mapping[str, Any]]) -> Future[None]:
                 made = [dict(job) for job in jobs]
-                return workers.submit(_simulate, self._path, device, self._effects, self.count, made)
+                return workers.submit(_simulate, self._path, device, chosen, self._effects, self.count, made)
 
             try:
                 with simulate.helped(Helpers(self.count, together, experiment.together, experiment.prepare)):
@@ -144,7 +146,7 @@ def _threads(device: str, helpers: int) -> int:
     return 1 if device == "cpu" or helpers == 0 else max(1, cores() // (1 + helpers))
 
 
-_known: dict[tuple[Path, str, tuple[str, ...]], tuple[RunFolder, PlowExperiment, Simulations]] = {}
+_known: dict[tuple[Path, str, Chosen, tuple[str, ...]], tuple[PlowExperiment, Simulations]] = {}
 
 
 def _ready(device: str) -> None:
@@ -165,13 +167,13 @@ def _ready(device: str) -> None:
 
 
 def _simulate(
-    path: Path, device: str, effects: tuple[str, ...], helpers: int, jobs: Sequence[Mapping[str, Any]]
+    path: Path, device: str, chosen: Chosen, effects: tuple[str, ...], helpers: int, jobs: Sequence[Mapping[str, Any]]
 ) -> None:
     """A helper's work."""
     from splatsoil.errors import SplatsoilError
 
     def make(here: str) -> None:
-        _, experiment, simulate = _known_here(path, here, effects)
+        experiment, simulate = _known_here(path, here, chosen, effects)
         if len(jobs) > 1:
             experiment.prepare(jobs)
         for job in jobs:
@@ -194,7 +196,9 @@ def _quietly(work: Callable[[str], object], device: str, helpers: int) -> None:
             work(here)
 
 
-def _known_here(path: Path, device: str, effects: tuple[str, ...]) -> tuple[RunFolder, PlowExperiment, Simulations]:
+def _known_here(
+    path: Path, device: str, chosen: Chosen, effects: tuple[str, ...]
+) -> tuple[PlowExperiment, Simulations]:
     """What a helper works with, made once."""
     import signal
 
@@ -202,12 +206,12 @@ def _known_here(path: Path, device: str, effects: tuple[str, ...]) -> tuple[RunF
     from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.quiet import hush
 
-    key = (path, device, effects)
+    key = (path, device, chosen, effects)
     if key not in _known:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process ends this one
         hush()
         folder = RunFolder.open(path)
         # a reconstruction that isn't kept is the first process's to make
-        model = model_of(folder, device, lambda what, share: None, anew=False)
-        _known[key] = (folder, *experiment_of(folder, model, effects or None))
+        model = model_of(folder, device, lambda what, share: None, chosen=chosen, anew=False)
+        _known[key] = experiment_of(folder, model, chosen, effects or None)
     return _known[key]

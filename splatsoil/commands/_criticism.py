@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any
 
-from splatsoil.commands._experiments import experiment_of
+from splatsoil.commands._experiments import Chosen, experiment_of
 from splatsoil.errors import RunError
 
 if TYPE_CHECKING:
     from splatsoil.commands._crew import Crew
     from splatsoil.commands._progress import Report
+    from splatsoil.experiment.base import Experiment
+    from splatsoil.inverse.criticism.design import Prior
+    from splatsoil.inverse.criticism.diagnosis import Diagnosis
+    from splatsoil.inverse.criticism.simulations import Simulations
     from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.model import Model
 
@@ -68,14 +72,61 @@ def _compared_models(
     with_effects: bool,
 ) -> dict[str, Any]:
     from splatsoil import __version__
-    from splatsoil.commands._control import judged_by
-    from splatsoil.inverse.criticism.diagnosis import diagnose
+    from splatsoil.commands._control import code_of, judged_by
     from splatsoil.inverse.criticism.record import record
     from splatsoil.report.data import estimates
 
     began = time.perf_counter()
-    fit = folder.fit()
-    experiment, simulate = experiment_of(folder, model, (effects or None) if with_effects else ())
+    fit, seed = folder.fit(), folder.description["seed"]
+    chosen = Chosen.of(fit)
+    experiment, simulate = experiment_of(folder, model, chosen, (effects or None) if with_effects else ())
+    with (
+        folder.lock(),
+        _team(crew, folder, model.device, effects) as mine,
+        mine.helping(chosen, experiment, simulate),
+    ):
+        found = judged(experiment, simulate, fit, report, seed, with_effects=with_effects)
+    return {
+        **record(experiment, found, simulate.asked),
+        "fit": fit["name"],
+        "values": estimates(fit),
+        "preset": model.preset,
+        "device": model.device,
+        "version": __version__,
+        "code": code_of((*chosen.effects, *effects)),
+        "judged_by": judged_by(),
+        "seed": seed,
+        "seconds": round(time.perf_counter() - began, 1),
+        "simulated_now": simulate.made,
+    }
+
+
+def judged(
+    experiment: Experiment,
+    simulate: Simulations,
+    fit: Mapping[str, Any],
+    report: Report,
+    seed: int,
+    *,
+    with_effects: bool,
+) -> Diagnosis:
+    """A fit's model against something else, and against models with an effect more; it starts from what the search has
+    found and simulated.
+
+    Args:
+        experiment: of the model.
+        simulate: its simulations.
+        fit: what ``fit.json`` holds, or will hold.
+        report: progress.
+        seed: of the run.
+        with_effects: whether effects that are off are models, too.
+
+    Raises:
+        SimulationError: the model as it is could not be simulated often enough.
+    """
+    from splatsoil.inverse.criticism.design import Run
+    from splatsoil.inverse.criticism.diagnosis import diagnose
+
     stage, share = "", 0.0
 
     def told(what: str, done: float) -> None:
@@ -87,28 +138,28 @@ def _compared_models(
         report(f"{stage}, {simulate.made + 1}: {purpose.replace('_', ' ')}", share)
 
     simulate.told = starting
-    with folder.lock(), _team(crew, folder, model.device, effects) as mine, mine.helping(experiment, simulate):
-        found = diagnose(
-            experiment,
-            estimates(fit),
-            simulate=simulate,
-            effects=with_effects,
-            seed=folder.description["seed"],
-            progress=told,
-        )
-    return {
-        **record(experiment, found, simulate.asked),
-        "fit": fit["name"],
-        "values": estimates(fit),
-        "preset": model.preset,
-        "device": model.device,
-        "version": __version__,
-        "code": simulate.identity["code"],
-        "judged_by": judged_by(),
-        "seed": folder.description["seed"],
-        "seconds": round(time.perf_counter() - began, 1),
-        "simulated_now": simulate.made,
-    }
+    return diagnose(
+        experiment,
+        {name: entry["estimate"] for name, entry in fit["minimum"].items()},
+        simulate=simulate,
+        effects=with_effects,
+        seed=seed,
+        known=[
+            Run(step["parameters"], seed=step["seed"])
+            for step in fit["history"]
+            if step["status"] == "ok" and step["level"] == "full"
+        ],
+        prior=prior_of(experiment, fit),
+        progress=told,
+    )
+
+
+def prior_of(experiment: Experiment, fit: Mapping[str, Any]) -> Prior:
+    """What is believed of the parameters beforehand, given what the search for a fit leaves possible."""
+    from splatsoil.inverse.criticism.design import Prior
+
+    low, high = ({name: entry[end] for name, entry in fit["minimum"].items()} for end in ("low", "high"))
+    return Prior.of(experiment, low, high)
 
 
 def entry(fit: dict[str, Any], held_out: dict[str, Any]) -> dict[str, Any]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 from splatsoil.errors import ParameterError
 
@@ -16,8 +17,32 @@ if TYPE_CHECKING:
     from splatsoil.soil.effect import Effect
 
 
-def model_of(folder: RunFolder, device: str, report: Report, *, anew: bool = True) -> Model:
-    """The model that a run's latest fit is of, on one device; a reconstruction that isn't kept is made ``anew``.
+@dataclass(frozen=True)
+class Chosen:
+    """What makes a run's model, beside its set and reconstruction.
+
+    Attributes:
+        effects: names of those that are on, or files.
+        preset: resolution of the solver.
+        parameters: names of the free ones.
+    """
+
+    effects: tuple[str, ...]
+    preset: str
+    parameters: tuple[str, ...]
+
+    @classmethod
+    def of(cls, fit: Mapping[str, Any]) -> Chosen:
+        """What ``fit.json`` is a fit of."""
+        setup = fit["setup"]
+        return cls(tuple(setup["effects"]), setup["preset"], tuple(fit["parameters"]))
+
+
+def model_of(
+    folder: RunFolder, device: str, report: Report, *, chosen: Chosen | None = None, anew: bool = True
+) -> Model:
+    """The model that a run's latest fit is of, or a chosen one, on one device; a reconstruction that isn't kept is made
+    ``anew``.
 
     Helpers, which don't make any, say no remarks on the set either: the first process has.
 
@@ -27,16 +52,16 @@ def model_of(folder: RunFolder, device: str, report: Report, *, anew: bool = Tru
     from splatsoil.commands import _stages as stage
     from splatsoil.commands._output import say_remarks
 
-    setup = folder.fit()["setup"]
+    chosen = chosen or Chosen.of(folder.fit())
     measurement = stage.measurement_of(folder)
     if anew:
         say_remarks(measurement)
     reconstruction = stage.reconstructed(measurement, folder, device, report, anew=anew)
-    return stage.model_on(measurement, folder, reconstruction, setup["effects"], setup["preset"], device)
+    return stage.model_on(measurement, folder, reconstruction, chosen.effects, chosen.preset, device)
 
 
 def experiment_of(
-    folder: RunFolder, model: Model, effects: Iterable[str] | None = None
+    folder: RunFolder, model: Model, chosen: Chosen, effects: Iterable[str] | None = None
 ) -> tuple[PlowExperiment, Simulations]:
     """The run as criticism sees it, with some effects as candidates or all, and its simulations, kept in ``features/``.
 
@@ -44,15 +69,16 @@ def experiment_of(
         ParameterError: an effect that is unknown or on already.
     """
     from splatsoil import __version__
-    from splatsoil.commands._control import code_of
+    from splatsoil.commands._control import code_of, own_files
     from splatsoil.commands._stages import digest_of
     from splatsoil.experiment.plow import PlowExperiment
+    from splatsoil.files import code_digest
     from splatsoil.inverse.criticism.simulations import Simulations
+    from splatsoil.soil.library import find_effects
 
     named = None if effects is None else tuple(effects)
     wanted = None if named is None else off_effects(named, model.law.effects)
-    fit = folder.fit()
-    experiment = PlowExperiment(model, tuple(fit["parameters"]), candidates=wanted)
+    experiment = PlowExperiment(model, chosen.parameters, candidates=wanted)
     identity = {
         "measurement": folder.description["measurement"]["hash"],
         "reconstruction": digest_of(model.reconstruction),
@@ -60,10 +86,12 @@ def experiment_of(
         "preset": model.preset,
         "device": model.device.split(":")[0],
         "version": __version__,
-        "code": code_of((*fit["setup"]["effects"], *(named or ()))),
+        "code": code_of(chosen.effects),
         "layout": list(experiment.layout.shape),
     }
-    return experiment, Simulations(experiment, folder.path / "features", identity)
+    # A file counts for what it is on in alone: simulations of the model as it is are there already.
+    own = {e.name: code_digest((), [file]) for file in own_files(named or ()) for e in find_effects([file])}
+    return experiment, Simulations(experiment, folder.path / "features", identity, sources=own)
 
 
 def off_effects(names: Iterable[str], on: Iterable[Effect]) -> tuple[Effect, ...]:

@@ -4,25 +4,28 @@ from __future__ import annotations
 
 import hashlib
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from splatsoil.commands._control import own_files
+from splatsoil.commands._control import code_of
 from splatsoil.commands._options import EVALUATIONS, FitOptions, check_evaluations
 from splatsoil.commands._output import say_remarks
 from splatsoil.errors import MeasurementError, ParameterError, RunError
 
 if TYPE_CHECKING:
     from splatsoil.commands._progress import Report
+    from splatsoil.inverse.criticism.diagnosis import Diagnosis
     from splatsoil.inverse.evaluations import EvaluationRecord
     from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.measurement import Measurement
     from splatsoil.model import Model
     from splatsoil.reconstruction import Reconstruction
 
+#: Share of a fit's time that is its search.
+SEARCH = 0.5
 #: Differences are shown this many times as strong as they are.
 GAIN = 4.0
 #: Evaluations of a fit that are chosen and simulated together: as many cores as a small laptop has.
@@ -166,18 +169,14 @@ def facts(model: Model) -> dict[str, str]:
 
 
 def fitted(
-    options: FitOptions,
-    measurement: Measurement,
-    run: RunFolder,
-    model: Model,
-    report: Report,
-    *,
-    refitted: Mapping[str, tuple[float, float]] | None = None,
+    options: FitOptions, measurement: Measurement, run: RunFolder, model: Model, report: Report
 ) -> dict[str, Any]:
-    """Fit, evaluation by evaluation; what is in the run folder already isn't simulated again.
-
-    ``refitted`` is the estimate and its std of a diagnosis' refit, where there is one: it is kept as the fit's.
+    """Search, evaluation by evaluation, and compare the model with something else by what was simulated, and more; what
+    is in the run folder already isn't simulated again. The paper's search ends with itself.
     """
+    from splatsoil.commands import _criticism as criticism
+    from splatsoil.commands._crew import Crew
+    from splatsoil.commands._experiments import Chosen, experiment_of
     from splatsoil.envs.levels import is_full
     from splatsoil.envs.measured import LOSS, MeasuredProblem
     from splatsoil.inverse.fitting import FitSetup, fit
@@ -200,34 +199,53 @@ def fitted(
         coarse=options.coarse,
         at_once=1 if options.coarse is not None or options.search == "paper" else TOGETHER,
     )
+    report("reading the video", 0.0)
+    chosen = Chosen(tuple(options.effects), options.preset, space.names)
+    experiment, simulate = experiment_of(run, model, chosen, ())
+    problem = MeasuredProblem(experiment)
     units = {p.name: "°" if p.unit == "deg" else f" {p.unit}" for p in space}
-
     finished, spent = 0, 0.0
 
     def told(done: int, record: EvaluationRecord) -> None:
         nonlocal finished, spent
         finished, spent = done, spent + record.extras.get("cost", 1.0)
-        values = ", ".join(f"{name} {record.parameters[name]:.4g}{unit}" for name, unit in units.items())
+        if record.status == "ok" and is_full(record.parameters):
+            values = {name: record.parameters[name] for name in space.names}
+            simulate.keep(problem.features(record.blocks), values, record.seed)
+        said = ", ".join(f"{name} {record.parameters[name]:.4g}{unit}" for name, unit in units.items())
         outcome = "failed" if record.loss is None else f"loss {record.loss:.4g}"
         level = "" if is_full(record.parameters) else ", coarse"
-        report(f"{spent:.3g} of {budget}: {values}, {outcome}{level}", spent / budget)
+        report(f"{spent:.3g} of {budget}: {said}, {outcome}{level}", SEARCH * spent / budget)
 
     def simulating(frame: int, last: int) -> None:
-        report(
-            f"simulation {finished + 1}, frame {frame}", min((spent + setup.at_once * frame / (last + 1)) / budget, 1.0)
-        )
+        share = min((spent + setup.at_once * frame / (last + 1)) / budget, 1.0)
+        report(f"simulation {finished + 1}, frame {frame}", SEARCH * share)
 
-    report("reading the video", 0.0)
-    problem = MeasuredProblem(model, space, progress=simulating)
-    return fit(problem, run, setup, budget=budget, facts=facts(model), refitted=refitted, after_evaluation=told)
+    def compared(found: dict[str, Any]) -> Diagnosis:
+        def comparing(what: str, share: float) -> None:
+            report(what, SEARCH + (1.0 - SEARCH) * share)
+
+        experiment.progress = None
+        with Crew(run, model.device, ()) as crew, crew.helping(chosen, experiment, simulate):
+            return criticism.judged(experiment, simulate, found, comparing, options.seed, with_effects=False)
+
+    experiment.progress = simulating
+    return fit(
+        problem,
+        run,
+        setup,
+        budget=budget,
+        facts=facts(model),
+        compare=None if options.search == "paper" else compared,
+        after_evaluation=told,
+    )
 
 
 def sources(effects: Iterable[str]) -> tuple[str, str]:
     """Version and digest of the code that a fit with some effects would be made by now."""
     from splatsoil import __version__
-    from splatsoil.files import code_digest
 
-    return __version__, code_digest(others=own_files(effects))
+    return __version__, code_of(effects)
 
 
 def note_other_sources(run: RunFolder) -> None:
@@ -258,7 +276,8 @@ def compared(run: RunFolder, model: Model, report: Report) -> dict[str, Any]:
 
 def _compared(run: RunFolder, model: Model, report: Report) -> dict[str, Any]:
     from splatsoil import __version__
-    from splatsoil.envs.measured import LOSS, MeasuredProblem
+    from splatsoil.comparison import Comparator
+    from splatsoil.envs.measured import LOSS
     from splatsoil.files import write_json
     from splatsoil.report.data import estimates
     from splatsoil.run_files import COMPARISON_FORMAT
@@ -266,11 +285,9 @@ def _compared(run: RunFolder, model: Model, report: Report) -> dict[str, Any]:
     result = run.fit()
     values = estimates(result)
     report("reading the video", 0.0)
-    problem = MeasuredProblem(
-        model, model.space(tuple(values)), progress=lambda frame, last: report(f"frame {frame}", 0.9 * frame / last)
-    )
-    prediction, comparison = problem.predict(values, 0)
-    comparator = problem.comparator
+    comparator = Comparator(model.measurement, surface=model.reconstruction.surface, frames=model.frames)
+    prediction = model.predict(values, 0, lambda frame, last: report(f"frame {frame}", 0.9 * frame / last))
+    comparison = comparator.compare(prediction.images)
     report("writing pictures", 0.95)
     frames = []
     for camera, frame in comparator.keys:

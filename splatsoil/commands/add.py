@@ -22,9 +22,8 @@ if TYPE_CHECKING:
 class Config:
     """Add effects to a run's latest model, one after the other, and fit again.
 
-    What a diagnosis says of the effect and of the other parameters is the estimate; one is made where there is none.
-    Its error on data that were set aside is the falling error. Then the loss is searched over all parameters, for the
-    report. Earlier fits stay.
+    A diagnosis that knows the effect tells the error on data that were set aside, which is to fall; one is made where
+    there is none. Earlier fits stay.
     """
 
     run: Positional[Path]
@@ -155,19 +154,14 @@ def added(
     mine = [p.name for p in own.parameters if p.off is not None or p.name in own.shapes]
     free = (*before["parameters"], *mine)
     known = criticism.latest_diagnosis(folder, name)
-    compared = {} if known is None else {m["name"]: m for m in known["models"]}
-    if known is None or effect.name not in compared:
-        known = criticism.diagnosed(folder, model, begin, (name,))
-        compared = {m["name"]: m for m in known["models"]}
-    if effect.name not in compared:
-        raise RunError(f"{effect.name} cannot be added: {'; '.join(known['notes']) or 'it could not be simulated'}")
-    if effect.name not in {h["model"] for h in known["held_out"]}:
+    if known is None or effect.name not in {h["model"] for h in known["held_out"]}:
         # Only the best effect's error is told: alone, it is that.
         known = criticism.diagnosed(folder, model, begin, (name,))
-        compared = {m["name"]: m for m in known["models"]}
-    entries = histories.history(folder)
     scores = {h["model"]: h for h in known["held_out"]}
-    base, with_it, best = scores[""], scores[effect.name], compared[effect.name]
+    if effect.name not in scores:
+        raise RunError(f"{effect.name} cannot be added: {'; '.join(known['notes']) or 'it could not be simulated'}")
+    entries = histories.history(folder)
+    base, with_it = scores[""], scores[effect.name]
     if not entries or entries[-1]["model"] != before["name"]:
         entries = [criticism.entry(before, base)]
     entries[-1]["held_out"], entries[-1]["floor"] = base["error"], base["noise"]
@@ -183,9 +177,6 @@ def added(
     )
     if not criticism.pictured(folder):
         stage.compared(folder, model, begin("compare"))
-    # Of what only cameras report otherwise a diagnosis tells no size: the fit finds it.
-    told = {*free} <= {*best["values"]}
-    refitted = {p: (best["values"][p], best["stds"][p]) for p in free} if told else None
     under_way = {
         "command": list(command),
         "done": list(command[: command.index(name)]) if command else [],
@@ -196,8 +187,7 @@ def added(
     }
     # Before the fit is the latest one: from then on nothing else knows what it was made from.
     histories.remember(folder, entries, under_way)
-    begun = begin(f"fit with {effect.name}")
-    result = stage.fitted(fitting, model.measurement, folder, larger, begun, refitted=refitted)
+    result = stage.fitted(fitting, model.measurement, folder, larger, begin(f"fit with {effect.name}"))
     return finished(folder, larger, result, under_way, begin)
 
 

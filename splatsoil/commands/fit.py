@@ -12,7 +12,12 @@ from splatsoil.commands._output import print_json
 
 @dataclass(frozen=True)
 class Config(FitOptions):
-    """Find the parameters whose simulated pictures are nearest to the measured ones. An interrupted fit goes on."""
+    """Find the parameters whose simulated pictures and forces are nearest to the measured ones, and how well they are
+    known.
+
+    A search, and a comparison of the model with something else by what it simulated, finer cells among it. An
+    interrupted fit goes on.
+    """
 
 
 def run(config: Config) -> int:
@@ -33,8 +38,7 @@ def run(config: Config) -> int:
         print_json({"ok": True, "run": str(folder.path), **result})
     else:
         show(result, str(folder.path))
-        print("The ± leaves out what other numerics would say. Where the model is adequate, they are weighed, too, by:")
-        print(command_line("compare", (folder.path,)))
+        print("Does the model leave more than noise, and where?", command_line("compare", (folder.path,)))
     return 0
 
 
@@ -51,7 +55,7 @@ def show(result: Mapping[str, Any], folder: str) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from splatsoil.report.words import duration, force_sentence, model_name, symbol, with_std
+    from splatsoil.report.words import duration, model_name, symbol, with_std
 
     table = Table(title=escape(f"{model_name(result['name'])}"), title_justify="left")
     for column in ("parameter", "estimate", "5 to 95 %"):
@@ -62,8 +66,6 @@ def show(result: Mapping[str, Any], folder: str) -> None:
         table.add_row(escape(name), f"{value} ± {std}{unit}", f"{entry['low']:.4g} to {entry['high']:.4g}{unit}")
     console = Console(highlight=False)
     console.print(table)
-    if result["force"] and result["force"]["counted"]:
-        console.print(force_sentence(result))
     for note in result["notes"]:
         console.print(f"[yellow]note[/yellow] {escape(note)}")
     console.print(

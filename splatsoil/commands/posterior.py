@@ -10,76 +10,76 @@ from typing import Any
 from tyro.conf import Positional
 
 from splatsoil.commands._options import command_line
-from splatsoil.commands._output import print_json, say_remarks
+from splatsoil.commands._output import print_json
 
 
 @dataclass(frozen=True)
 class Config:
-    """Sample the posterior of a run's latest fit. An interrupted one goes on where it stopped."""
+    """Sample the posterior of a run's latest fit, the one that its estimate and ± are of. An interrupted one goes on
+    where it stopped."""
 
     run: Positional[Path]
     """The run folder."""
-    design: int | None = None
-    """Simulations that fill the parameters' bounds; 8 for each parameter and 4 more, if not given."""
-    repeats: int = 4
-    """Simulations at the fit's estimate with other particles, which measure chance."""
     checks: int = 3
     """Simulations at places drawn from the posterior, which hold the emulator to its word."""
-    executor: str = "serial"
-    """Where simulations run: serial, processes:N, or dask:ADDRESS (extra cluster)."""
     device: str = "auto"
     """Where to compute: auto (what the fit used), cpu, cuda:0, …"""
     seed: int = 0
-    """Of design and chains."""
+    """Of chains and checks."""
     json: bool = False
     """Print one JSON object instead of a table."""
 
 
 def run(config: Config) -> int:
-    """Simulate what is missing, emulate, sample; ``posterior.json`` and the folder ``posterior`` are kept."""
+    """Compare as the fit did, sample, check; ``posterior.json`` and the folder ``posterior`` are kept."""
+    from splatsoil.commands import _criticism as criticism
+    from splatsoil.commands import _experiments as experiments
     from splatsoil.commands import _stages as stage
+    from splatsoil.commands._crew import Crew
     from splatsoil.commands._progress import stages
     from splatsoil.envs.devices import resolve_device
-    from splatsoil.envs.measured import MeasuredProblem
     from splatsoil.errors import ParameterError
-    from splatsoil.inverse.executors import executor
-    from splatsoil.inverse.posterior_run import Effort, run_posterior, setup_of
+    from splatsoil.inverse.posterior_run import run_posterior
     from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.quiet import hush
 
-    for name in ("design", "repeats", "checks", "seed"):
+    for name in ("checks", "seed"):
         value = getattr(config, name)
-        if value is not None and value < 0:
+        if value < 0:
             raise ParameterError(f"--{name}: must be 0 or more, not {value}")
     hush()
     folder = RunFolder.open(config.run)
-    setup = setup_of(folder.fit()["setup"])
-    wanted = ("cuda:0" if setup.device == "cuda" else "cpu") if config.device == "auto" else config.device
+    fit = folder.fit()
+    setup = fit["setup"]
+    wanted = ("cuda:0" if setup["device"] == "cuda" else "cpu") if config.device == "auto" else config.device
     device = resolve_device(wanted)
-    if device.split(":")[0] != setup.device:
+    if device.split(":")[0] != setup["device"]:
         raise ParameterError(
-            f"--device {config.device}: the fit in {folder.path} was made on {setup.device}; give the same or fit again"
+            f"--device {config.device}: the fit in {folder.path} was made on {setup['device']}; give the same or fit "
+            "again"
         )
-    if (setup.version, setup.code) != stage.sources(setup.effects):
+    if (setup["version"], setup["code"]) != stage.sources(setup["effects"]):
         raise ParameterError(
             f"{folder.path}: the fit was made by other sources of splatsoil; fit again before the posterior"
         )
-    measurement = stage.measurement_of(folder)
-    say_remarks(measurement)
-    with stages(quiet=config.json) as begin, executor(config.executor) as pool:
-        stage.reconstructed(measurement, folder, device, begin("reconstruct"))
-        report = begin("posterior")
-        report("reading the video", 0.0)
-        problem = MeasuredProblem.load(
-            measurement.folder,
-            setup.parameters,
-            setup.effects,
-            preset=setup.preset,
-            device=device,
-            reconstruction=folder.reconstruction,
-        )
-        effort = Effort(config.design, config.repeats, config.checks)
-        result = run_posterior(problem, folder, setup, effort=effort, executor=pool, seed=config.seed, progress=report)
+    folder.check_writable()
+    chosen = experiments.Chosen.of(fit)
+    with stages(quiet=config.json) as begin:
+        model = experiments.model_of(folder, device, begin("reconstruct"))
+        experiment, simulate = experiments.experiment_of(folder, model, chosen, ())
+        with folder.lock(), Crew(folder, device, ()) as crew, crew.helping(chosen, experiment, simulate):
+            seed = folder.description["seed"]
+            found = criticism.judged(experiment, simulate, fit, begin("models"), seed, with_effects=False)
+            result = run_posterior(
+                folder,
+                experiment,
+                simulate,
+                found.evidence.noise,
+                criticism.prior_of(experiment, fit),
+                checks=config.checks,
+                seed=config.seed,
+                progress=begin("posterior"),
+            )
     if config.json:
         print_json({"ok": True, "run": str(folder.path), **result})
     else:
@@ -93,10 +93,7 @@ def interrupted(config: Config) -> str:
         "posterior",
         (config.run,),
         (
-            ("--design", config.design, None),
-            ("--repeats", config.repeats, 4),
             ("--checks", config.checks, 3),
-            ("--executor", config.executor, "serial"),
             ("--device", config.device, "auto"),
             ("--seed", config.seed, 0),
             ("--json", config.json, False),
@@ -130,11 +127,9 @@ def show(result: Mapping[str, Any], folder: str) -> None:
     console.print(table)
     for note in result["notes"]:
         console.print(f"[yellow]note[/yellow] {escape(note)}")
-    chains, emulator = result["chains"], result["emulator"]
+    chains = result["chains"]
     console.print(
-        f"{result['evaluations']} simulations, {emulator['components']} components, skill "
-        f"{min(emulator['skill']):.2f} to {max(emulator['skill']):.2f}; R-hat {chains['r_hat']:.3f}, acceptance "
-        f"{chains['acceptance']:.2f}, {chains['effective']:.0f} independent samples; ln evidence "
-        f"{result['evidence']['log']:.1f} ± {result['evidence']['std']:.1f}; {duration(result['seconds'])}"
+        f"{result['simulations']} simulations; R-hat {chains['r_hat']:.3f}, acceptance {chains['acceptance']:.2f}, "
+        f"{chains['effective']:.0f} independent samples; {duration(result['seconds'])}"
     )
     console.print(f"kept in {escape(folder)}: posterior.json, posterior/")

@@ -183,15 +183,18 @@ class PlowExperiment:
         return self.features(self.prediction(values, effects=effects, seed=seed, numerics=numerics))
 
     def features(self, prediction: Prediction) -> FloatArray:
-        """(t, s) predicted changes, and forces.
+        """(t, s) predicted changes, and forces."""
+        return self.features_of(self.comparator.blocks(prediction.images), prediction.trajectory.force)
+
+    def features_of(self, blocks: FloatArray, force: FloatArray) -> FloatArray:
+        """(t, s) predicted features, from what a comparison of pictures leaves of each block and frame (b,), and the
+        force (f, 3) on the tool in frames 1, 2, ….
 
         Changes are the measured ones minus the difference, because both sides must leave out the same pixels: those in
         which either shows the tool.
         """
-        pictured = self._pictured - self._table(self.comparator.blocks(prediction.images))
-        return self._beside(
-            pictured, None if self.forces is None else compressed(self.forces.predicted(prediction.trajectory.force))
-        )
+        pictured = self._pictured - self._table(blocks)
+        return self._beside(pictured, None if self.forces is None else compressed(self.forces.predicted(force)))
 
     def prediction(
         self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""

@@ -145,7 +145,7 @@ def _posterior(path: Path, fit: Mapping[str, Any]) -> dict[str, Any] | None:
     if not path.is_file():
         return None
     data = read_kept(path, POSTERIOR_FORMAT)
-    return data if data["setup"] == fit.get("setup") else None
+    return data if data["fit"] == fit["name"] and data["values"] == estimates(fit) else None
 
 
 def _history(path: Path) -> list[dict[str, Any]]:

@@ -74,7 +74,6 @@ def render(data: RunData) -> str:
         data=data,
         fit=data.fit,
         coarse=sum(step.get("level") == "coarse" for step in data.fit["history"]),
-        force=words.force_sentence(data.fit),
         answers=words.answers(data.fit, judged),
         fitted=words.fitted_sentence(data.fit, judged),
         residual=words.residual_sentence(comparison, adequate),
@@ -138,8 +137,7 @@ def _posterior(folder: Path, posterior: Mapping[str, Any]) -> dict[str, Any]:
         "notes": words.posterior_notes(posterior),
         "marginals": [Markup(figures.marginal(entry)) for entry in posterior["parameters"].values()],
         "corner": data_url(corner) if len(posterior["parameters"]) > 1 and corner.is_file() else None,
-        "evaluations": posterior["evaluations"],
-        "evidence": posterior["evidence"],
+        "simulations": posterior["simulations"],
         "chains": posterior["chains"],
     }
 

@@ -78,8 +78,9 @@ def answers(fit: Mapping[str, Any], judged: Mapping[str, Any] | None = None) -> 
             determined, why = better[name]["determined"], undetermined(name)
         else:
             value, std = with_std(entry["estimate"], entry["std"])
-            determined = entry["determined"]
-            why = f"These evaluations do not determine the {plain}: they hardly say where the loss is least."
+            determined, why = entry["determined"], undetermined(name)
+            if fit["estimated_from"] == "loss":
+                why = f"These evaluations do not determine the {plain}: they hardly say where the loss is least."
         if not determined:
             state, remark = "open", why
         elif entry["at_bound"] is not None:
@@ -107,31 +108,16 @@ def undetermined(name: str) -> str:
 
 
 def fitted_sentence(fit: Mapping[str, Any], judged: Mapping[str, Any] | None) -> str:
-    """What the ± holds where the answers are averaged over models; otherwise empty."""
-    if not averaged(fit, judged):
-        return ""
+    """What the ± holds."""
+    if fit["estimated_from"] == "loss" and not averaged(fit, judged):
+        return (
+            f"The ± is one standard deviation of where the loss is least, given {fit['evaluations']} evaluations of "
+            "this model. It does not contain what the model itself gets wrong."
+        )
     return (
         "The ± holds noise, the chance of particles, numerics (measured by pairs of coarse and fine runs) and the "
         "other models, weighed by their probability."
     )
-
-
-def force_sentence(fit: Mapping[str, Any]) -> str:
-    """What a measured force on the tool did to the estimate; empty where there is none."""
-    force = fit.get("force")
-    if not force:
-        return ""
-    if not force["counted"]:
-        return (
-            "The measured force on the tool isn't counted: it can't be what this model needs where the pictures agree."
-        )
-    alone = []
-    for name, entry in force["pictures_alone"].items():
-        value, std = with_std(entry["estimate"], entry["std"])
-        unit = symbol(fit["parameters"][name]["unit"])
-        said = f"{value} ± {std}{unit}" if entry["determined"] else "anything"
-        alone.append(f"{said} for the {name.replace('_', ' ')}")
-    return f"The measured force on the tool is counted, too; pictures alone say {' and '.join(alone)}."
 
 
 def ratio_to_noise(comparison: Mapping[str, Any] | None) -> float | None:

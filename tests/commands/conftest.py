@@ -20,7 +20,7 @@ def fit_of() -> Callable[..., dict[str, Any]]:
         version, code = _stages.sources(effects)
         estimates = {"friction_angle": 35.0, **values}
         return {
-            "format": "splatsoil-fit/1",
+            "format": "splatsoil-fit/2",
             "name": "+".join(sorted(effects)) or "base",
             "loss": 1.0,
             "loss_std": 0.1,
@@ -28,6 +28,8 @@ def fit_of() -> Callable[..., dict[str, Any]]:
             "parameters": {
                 name: {"estimate": value, "std": 1.0, "unit": "1", "title": name} for name, value in estimates.items()
             },
+            "minimum": {name: {"estimate": v, "low": v - 1.0, "high": v + 1.0} for name, v in estimates.items()},
+            "history": [],
             "setup": {"effects": sorted(effects), "preset": "tiny", "version": version, "code": code},
         }
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
@@ -33,26 +33,16 @@ class Crust(Effect):
 """
 
 
-def diagnosis(
-    models: Mapping[str, Mapping[str, float]], held_out: Sequence[str] | None = None, notes: Sequence[str] = ()
-) -> dict[str, Any]:
+def diagnosis(held_out: Sequence[str], notes: Sequence[str] = ()) -> dict[str, Any]:
     """What is used of a diagnosis.
 
     Args:
-        models: parameters' means by effect; each std is a tenth of them.
-        held_out: effects whose error on what was set aside is told; that of all by default.
+        held_out: effects whose error on what was set aside is told.
         notes: for people.
     """
     told = [{"model": "", "error": 5.0, "noise": 1.0}]
-    told += [{"model": name, "error": 2.0, "noise": 1.5} for name in (models if held_out is None else held_out)]
-    return {
-        "models": [
-            {"name": name, "values": dict(values), "stds": {key: 0.1 * value for key, value in values.items()}}
-            for name, values in {"": {"friction_angle": 31.0}, **models}.items()
-        ],
-        "held_out": told,
-        "notes": list(notes),
-    }
+    told += [{"model": name, "error": 2.0, "noise": 1.5} for name in held_out]
+    return {"held_out": told, "notes": list(notes)}
 
 
 @dataclass
@@ -71,7 +61,6 @@ class Bench:
         }
     )
     options: FitOptions | None = None
-    refitted: Mapping[str, tuple[float, float]] | None = None
     history: list[dict[str, Any]] = field(default_factory=list)
 
     def diagnose(self, folder: object, model: object, begin: object, effects: Sequence[str]) -> dict[str, Any]:
@@ -79,13 +68,10 @@ class Bench:
         self.diagnosed.append(effects)
         return self.new
 
-    def fitted(
-        self, options: FitOptions, *others: Any, refitted: Mapping[str, tuple[float, float]] | None
-    ) -> dict[str, Any]:
-        """What the fit would keep: the diagnosis' values, or some of its own."""
-        self.options, self.refitted = options, refitted
-        values = dict.fromkeys(options.parameters, (1.0, 0.5)) if refitted is None else refitted
-        shown = {n: {"estimate": v, "std": s, "unit": "1", "title": n} for n, (v, s) in values.items()}
+    def fitted(self, options: FitOptions, *others: Any) -> dict[str, Any]:
+        """What the fit would keep."""
+        self.options = options
+        shown = {n: {"estimate": 1.0, "std": 0.5, "unit": "1", "title": n} for n in options.parameters}
         setup = {"effects": list(options.effects), "preset": options.preset}
         return {"name": "with it", "loss": 1.0, "parameters": shown, "setup": setup}
 
@@ -132,20 +118,18 @@ def test_what_shapes_an_effect_is_fitted_with_it(
         effect = str(tmp_path / effect)
     (known,) = find_effects([effect])
     assert {p.name for p in known.parameters} == {*free, *held}
-    found = {"friction_angle": 33.0, **{name: 2.0 + k for k, name in enumerate(free)}}
-    bench.kept = diagnosis({known.name: found})
+    bench.kept = diagnosis([known.name])
     entry = bench.add(effect)
     assert bench.options is not None
     assert bench.options.effects == (effect,)
     assert bench.options.parameters == ("friction_angle", *free)
-    assert bench.refitted == {name: (value, pytest.approx(0.1 * value)) for name, value in found.items()}
     assert entry == bench.history[-1]
     assert entry["added"] == known.name
-    assert {name: p["estimate"] for name, p in entry["parameters"].items()} == found
+    assert set(entry["parameters"]) == {"friction_angle", *free}
 
 
 def test_the_history_holds_errors_on_what_was_set_aside(bench: Bench) -> None:
-    bench.kept = diagnosis({"cohesion": {"friction_angle": 33.0, "cohesion": 300.0}})
+    bench.kept = diagnosis(["cohesion"])
     bench.add("cohesion")
     assert [(entry["model"], entry["held_out"], entry["floor"]) for entry in bench.history] == [
         ("base", 5.0, 1.0),
@@ -153,45 +137,29 @@ def test_the_history_holds_errors_on_what_was_set_aside(bench: Bench) -> None:
     ]
 
 
-WITH_COHESION = {"friction_angle": 33.0, "cohesion": 300.0}
-WITH_TILT = {"friction_angle": 30.0, "tilt_x": 1.0, "tilt_y": 1.0}
-
-
 @pytest.mark.parametrize(
     ("kept", "asked"),
     [
-        (diagnosis({"cohesion": WITH_COHESION, "tilt": WITH_TILT}), []),
+        (diagnosis(["cohesion", "tilt"]), []),
         (None, [("cohesion",)]),
-        (diagnosis({"tilt": WITH_TILT}), [("cohesion",)]),
-        (diagnosis({"cohesion": WITH_COHESION, "tilt": WITH_TILT}, held_out=["tilt"]), [("cohesion",)]),
+        (diagnosis(["tilt"]), [("cohesion",)]),
     ],
-    ids=["all-known", "no-diagnosis", "effect-unknown", "error-unknown"],
+    ids=["all-known", "no-diagnosis", "error-unknown"],
 )
 def test_what_the_kept_diagnosis_does_not_say_is_asked_of_a_new_one(
     bench: Bench, kept: dict[str, Any] | None, asked: list[tuple[str, ...]]
 ) -> None:
-    bench.kept, bench.new = kept, diagnosis({"cohesion": {"friction_angle": 34.0, "cohesion": 200.0}})
+    bench.kept, bench.new = kept, diagnosis(["cohesion"])
     entry = bench.add("cohesion")
     assert bench.diagnosed == asked
-    assert bench.refitted is not None
-    assert bench.refitted["cohesion"][0] == (200.0 if asked else 300.0)
     assert entry["held_out"] == 2.0
 
 
 def test_an_effect_that_cannot_be_simulated_is_refused(bench: Bench) -> None:
-    bench.new = diagnosis({}, notes=["cohesion: some simulations failed (soil left the bin)"])
+    bench.new = diagnosis([], notes=["cohesion: some simulations failed (soil left the bin)"])
     with pytest.raises(RunError, match=r"cohesion cannot be added: .*soil left the bin"):
         bench.add("cohesion")
     assert bench.options is None and bench.history == []
-
-
-def test_the_fit_finds_the_size_of_what_cameras_report_otherwise(bench: Bench) -> None:
-    """A diagnosis tells how probable such an effect is, and integrates over its sizes."""
-    bench.kept = diagnosis({"blur": {"friction_angle": 31.0}})
-    entry = bench.add("blur")
-    assert bench.diagnosed == [] and bench.refitted is None
-    assert bench.options is not None and bench.options.parameters == ("friction_angle", "blur")
-    assert (entry["added"], entry["held_out"]) == ("blur", 2.0)
 
 
 def test_a_diagnosis_by_other_code_is_none(tmp_path: Path) -> None:

@@ -15,7 +15,10 @@ from splatsoil.inverse.criticism.simulations import Simulations
 from splatsoil.inverse.executors import Processes
 
 from splatsoil.commands import _crew, _criticism
+from splatsoil.commands._experiments import Chosen
 from splatsoil.errors import RunError, SimulationError
+
+BASE = Chosen((), "tiny", ("friction_angle",))
 
 
 @pytest.mark.parametrize("count", [1, 3])
@@ -31,9 +34,9 @@ def test_a_helper_prepares_what_goes_together_and_makes_what_can_be_made(
         made.append(number)
 
     experiment = SimpleNamespace(prepare=prepared.append)
-    monkeypatch.setitem(_crew._known, (tmp_path, "cpu", ()), (None, experiment, simulate))  # type: ignore[misc]
+    monkeypatch.setitem(_crew._known, (tmp_path, "cpu", BASE, ()), (experiment, simulate))  # type: ignore[misc]
     jobs = [{"number": number} for number in range(count)]
-    _crew._simulate(tmp_path, "cpu", (), 2, jobs)
+    _crew._simulate(tmp_path, "cpu", BASE, (), 2, jobs)
     assert made == [number for number in range(count) if number != 1]
     assert prepared == ([] if count == 1 else [jobs])
 
@@ -89,11 +92,11 @@ def test_helpers_begin_with_the_command_and_nothing_outlives_it(helps: bool, fai
         (workers,) = made
         assert crew.count == 2 and workers.jobs == [_crew._ready] * 2
         if helps:
-            with crew.helping(experiment, simulate):
+            with crew.helping(BASE, experiment, simulate):
                 simulate.ahead(lambda ask: [ask({"angle": 30.0}, seed=seed) for seed in (1, 2)])
                 assert workers.jobs[2:] == [_crew._simulate] * 2
                 *known, (job,) = workers.words[-1]
-                assert known == [tmp_path, "cpu", ("tilt",), 2]
+                assert known == [tmp_path, "cpu", BASE, ("tilt",), 2]
                 assert (job["values"], job["seed"]) == ({"angle": 30.0}, 1), "the first ones are made here"
                 if fails:
                     raise SimulationError("blew up")
@@ -112,7 +115,8 @@ def test_who_is_not_alone_in_a_folder_has_no_helpers(stage: str, monkeypatch: py
         raise RunError("another process is writing")
         yield
 
-    folder: Any = SimpleNamespace(lock=taken, fit=lambda: {"parameters": {}})
+    fit = {"parameters": {}, "setup": {"effects": [], "preset": "tiny"}}
+    folder: Any = SimpleNamespace(lock=taken, fit=lambda: fit, description={"seed": 0})
     model: Any = SimpleNamespace(device="cpu")
     monkeypatch.setattr(_criticism, "experiment_of", lambda *words: (SimpleNamespace(), SimpleNamespace()))
 
@@ -134,7 +138,7 @@ def test_a_gpu_with_little_memory_keeps_few_helpers(
     folder: Any = SimpleNamespace(path=tmp_path)
     experiment = experiment_on("cuda:0")
     simulate = Simulations(experiment)
-    with _crew.Crew(folder, "auto", ()) as crew, crew.helping(experiment, simulate):
+    with _crew.Crew(folder, "auto", ()) as crew, crew.helping(BASE, experiment, simulate):
         (workers,) = made
         assert crew.count == left
         simulate.ahead(lambda ask: ask({"angle": 30.0}))

@@ -31,18 +31,18 @@ def words(command: str, run: RunFolder) -> list[str]:
 @pytest.mark.parametrize(
     ("file", "text", "says", "commands"),
     [
-        ("fit.json", "{}", "isn't of format splatsoil-fit/1", ALL),
-        ("fit.json", "[]", "isn't of format splatsoil-fit/1", ALL),
-        ("fit.json", '{"format": "splatsoil-fit/1", "name": "base"}', "lacks parameters", ALL),
+        ("fit.json", "{}", "isn't of format splatsoil-fit/2", ALL),
+        ("fit.json", "[]", "isn't of format splatsoil-fit/2", ALL),
+        ("fit.json", '{"format": "splatsoil-fit/2", "name": "base"}', "lacks parameters", ALL),
         (
             "fit.json",
-            '{"format": "splatsoil-fit/1", "name": "base", "parameters": {"friction_angle": {}}}',
+            '{"format": "splatsoil-fit/2", "name": "base", "parameters": {"friction_angle": {}}}',
             "lacks parameters.friction_angle.estimate",
             ALL,
         ),
         (
             "fit.json",
-            '{"format": "splatsoil-fit/1", "name": "base", "parameters": {}, "setup": {"effects": [3]}}',
+            '{"format": "splatsoil-fit/2", "name": "base", "parameters": {}, "setup": {"effects": [3]}}',
             "lacks setup.effects.0",
             ALL,
         ),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -58,18 +58,12 @@ class Stages:
         (name,) = effects
         self.passed(f"diagnose {name}")
         before = folder.fit()
-        (effect,) = find_effects([name])
-        values = {**estimates(before), **{p.name: SIZES[p.name] for p in effect.parameters}}
         after = "+".join(sorted([*before["setup"]["effects"], name]))
-        return {
-            "models": [{"name": name, "values": values, "stds": dict.fromkeys(values, 1.0)}],
-            "held_out": [
-                {"model": key, "error": ERRORS[fit], "noise": 1.0} for key, fit in (("", before["name"]), (name, after))
-            ],
-        }
+        told = (("", before["name"]), (name, after))
+        return {"held_out": [{"model": key, "error": ERRORS[fit], "noise": 1.0} for key, fit in told]}
 
-    def fitted(self, options: FitOptions, *_: object, refitted: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
-        fit = self.fit_of(options.effects, **{name: value for name, (value, _) in refitted.items()})
+    def fitted(self, options: FitOptions, *_: object) -> dict[str, Any]:
+        fit = self.fit_of(options.effects, **{name: SIZES.get(name, 35.0) for name in options.parameters})
         self.passed("fit")
         self.run.write_fit(fit["name"], fit)
         self.passed("fitted")

@@ -47,7 +47,6 @@ class AnalyticProblem:
         parameters: tuple[Parameter, ...] = (FRICTION,),
         *,
         noise: float = 0.02,
-        feature_noise: float = 0.0,
         fails_below: float = -np.inf,
         delay: float = 0.0,
         constant: bool = False,
@@ -56,7 +55,6 @@ class AnalyticProblem:
         self.space = ParameterSpace(parameters)
         self.noise, self.fails_below, self.delay, self.constant = noise, fails_below, delay, constant
         self.target = truth
-        self.feature_noise = feature_noise
         self.calls = 0
 
     def begin(self, seed: int) -> None:
@@ -75,20 +73,17 @@ class AnalyticProblem:
         picture = np.full((*self.image_size, 3), 0.5, dtype=np.float32)
         return Evaluation(
             loss=0.5 if self.constant else float(max(loss, 0.0)),
-            blocks=self._blocks(parameters, seed),
+            blocks=self._blocks(parameters),
             extras={"rgb": 0.01},
             observed=picture,
             predicted=picture + 0.1,
         )
 
-    def _blocks(self, parameters: Mapping[str, float], seed: int) -> npt.NDArray[np.float64]:
-        off = [parameters["friction_angle"] - self.target + self._chance(seed), 0.0, 1.0]
+    def _blocks(self, parameters: Mapping[str, float]) -> npt.NDArray[np.float64]:
+        off = [parameters["friction_angle"] - self.target, 0.0, 1.0]
         if "cohesion" in parameters:
             off[1] = 10.0 * (parameters["cohesion"] - 300.0) / 500.0
         return (np.array([0.0, 0.0, 1.0]) if self.constant else np.array(off)) @ DIRECTIONS
-
-    def _chance(self, seed: int) -> float:
-        return self.feature_noise * float(np.random.default_rng([seed, 1]).normal())
 
     def observed_image(self) -> Image:
         return np.full((*self.image_size, 3), 0.5, dtype=np.float32)

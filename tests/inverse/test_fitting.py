@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -14,7 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from splatsoil.envs.problem import Evaluation
 from splatsoil.inverse import fitting
 from splatsoil.inverse.bayesopt import PAPER, BayesianOptimiser
 from splatsoil.inverse.evaluations import EvaluationRecord, digest
@@ -54,10 +52,9 @@ def test_the_angle_is_found_and_written_down(uninterrupted: dict[str, Any]) -> N
     assert len(uninterrupted["history"]) == BUDGET
     curve = uninterrupted["curves"]["friction_angle"]
     assert curve["x"][0] == 20.0 and curve["x"][-1] == 50.0
-    # The loss has noise, the features have none.
-    assert curve["x"][int(np.argmin(curve["mean"]))] == pytest.approx(angle["estimate"], abs=2.0)
-    assert uninterrupted["estimated_from"] == "features"
-    assert angle["estimate"] == pytest.approx(36.0, abs=0.1)
+    assert curve["x"][int(np.argmin(curve["mean"]))] == pytest.approx(angle["estimate"], abs=0.2)
+    assert uninterrupted["estimated_from"] == "loss"
+    assert uninterrupted["minimum"]["friction_angle"] == {key: angle[key] for key in ("estimate", "low", "high")}
 
 
 def test_what_is_returned_is_what_is_on_disk(analytic: ModuleType, tmp_path: Path) -> None:
@@ -65,48 +62,6 @@ def test_what_is_returned_is_what_is_on_disk(analytic: ModuleType, tmp_path: Pat
     result = fit(analytic.AnalyticProblem(), run, analytic.SETUP, budget=4)
     assert run.fit() == json.loads(json.dumps(result))
     assert json.loads((tmp_path / "fits" / "base.json").read_text()) == run.fit()
-
-
-def test_a_refit_that_knew_more_is_the_estimate(analytic: ModuleType, tmp_path: Path) -> None:
-    run = analytic.prepare(tmp_path)
-    parameters = (analytic.FRICTION, analytic.COHESION)
-    setup = replace(analytic.SETUP, parameters=("friction_angle", "cohesion"))
-    told = {"friction_angle": (33.5, 0.4), "cohesion": (10.0, 25.0)}
-    result = fit(analytic.AnalyticProblem(parameters), run, setup, budget=8, refitted=told)
-    assert result["estimated_from"] == "refit"
-    for name, (estimate, std) in told.items():
-        found = result["parameters"][name]
-        assert found["estimate"] == pytest.approx(estimate) and found["std"] == pytest.approx(std, rel=1e-6), name
-    # the bound cuts the interval and not the spread
-    assert result["parameters"]["cohesion"]["low"] == 0.0 and result["parameters"]["cohesion"]["at_bound"] == "lower"
-    assert run.fit()["history"], "the search's evaluations are kept beside it"
-
-
-@pytest.mark.parametrize(("force_says", "counted"), [(37.0, True), (80.0, False)])
-def test_a_measured_force_counts_unless_it_cannot_be(
-    analytic: ModuleType, tmp_path: Path, force_says: float, counted: bool
-) -> None:
-    """Beside pictures that say 36 degrees, by features that scatter by one."""
-
-    class Pushed(analytic.AnalyticProblem):  # type: ignore[name-defined, misc]
-        def evaluate(self, parameters: Mapping[str, float], seed: int) -> Evaluation:
-            residuals = {f"force, frame {k}": force_says - parameters["friction_angle"] for k in range(3)}
-            return replace(super().evaluate(parameters, seed), extras=residuals)
-
-        def beside(self, extras: Mapping[str, float]) -> np.ndarray:
-            return np.array([extras[f"force, frame {k}"] for k in range(3)])
-
-    result = fit(Pushed(feature_noise=1.0), analytic.prepare(tmp_path), analytic.SETUP, budget=9)
-    angle, alone = result["parameters"]["friction_angle"], result["force"]["pictures_alone"]["friction_angle"]
-    assert result["force"]["counted"] is counted
-    if counted:
-        # Three numbers, each known to a degree.
-        assert alone["estimate"] < angle["estimate"] < force_says
-        assert angle["std"] < min(alone["std"], 1.0 / np.sqrt(3.0))
-        assert not result["notes"]
-    else:
-        assert angle["estimate"] == alone["estimate"]
-        assert "force" in result["notes"][0]
 
 
 class StopError(Exception):
@@ -149,7 +104,7 @@ def test_evaluations_chosen_together_are_made_together_and_none_beyond_the_budge
 ) -> None:
     found, sizes = pairs
     assert sizes == [2, 2, 2] and found["evaluations"] == BUDGET
-    assert found["parameters"]["friction_angle"]["estimate"] == pytest.approx(36.0, abs=0.1)
+    assert found["parameters"]["friction_angle"]["estimate"] == pytest.approx(36.0, abs=1.5)
     start = analytic.SETUP.start
     first = [[step["parameters"], step["loss"]] for step in found["history"][:start]]
     assert first == [[step["parameters"], step["loss"]] for step in uninterrupted["history"][:start]]

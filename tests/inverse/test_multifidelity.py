@@ -13,13 +13,11 @@ import numpy as np
 import pytest
 import torch
 from scipy.optimize import minimize_scalar
-from splatsoil.envs.levels import TwoLevelProblem, is_full
+from splatsoil.envs.levels import TwoLevelProblem
 from splatsoil.envs.problem import Evaluation
 from splatsoil.inverse.bayesopt import BayesianOptimiser
-from splatsoil.inverse.evaluations import digest
 from splatsoil.inverse.fitting import fit
 from splatsoil.inverse.multifidelity import CHEAP, FULL, TwoLevelOptimiser, optimise_two_levels
-from splatsoil.inverse.posterior import Data
 
 from splatsoil.errors import ParameterError
 
@@ -172,14 +170,6 @@ def test_a_fit_with_a_coarse_preset(analytic: ModuleType, tmp_path: Path) -> Non
     levels = [step["level"] for step in result["history"]]
     assert set(levels) == {"full", "coarse"}
     assert sum(1.0 if level == "full" else COST for level in levels) <= 6.0 + 1e-9
-    # A posterior learns from full simulations only.
-    with run.evaluations() as store:
-        records = store.records(digest(setup.description()))
-    space = analytic.AnalyticProblem().space
-    good = [r for r in records if r.status == "ok" and is_full(r.parameters)]
-    full = [replace(r, step=r.step + k * len(records)) for k in range(4) for r in good]
-    coarse = [r for r in records if not is_full(r.parameters)]
-    assert coarse and len(Data.from_records(space, [*coarse, *full]).points) == len(full)
 
 
 def test_the_agent_plays_any_environment_with_a_level(analytic: ModuleType) -> None:

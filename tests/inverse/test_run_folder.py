@@ -73,7 +73,14 @@ def test_the_latest_fit_and_the_earlier_ones(tmp_path: Path) -> None:
     with pytest.raises(RunError, match="no fit"):
         run.fit()
     first, second = (
-        {"format": "splatsoil-fit/1", "name": name, "parameters": {}, "setup": {"effects": [], "preset": "tiny"}}
+        {
+            "format": "splatsoil-fit/2",
+            "name": name,
+            "parameters": {},
+            "minimum": {},
+            "history": [],
+            "setup": {"effects": [], "preset": "tiny"},
+        }
         for name in ("base", "cohesion")
     )
     run.write_fit("base", first)

@@ -39,7 +39,7 @@ def fit(name: str, angle: float, effects: list[str], extra: dict[str, float]) ->
     }
     step = {"step": 0, "parameters": dict.fromkeys(parameters, 0.0), "loss": 0.3, "status": "ok", "message": ""}
     return {
-        "format": "splatsoil-fit/1",
+        "format": "splatsoil-fit/2",
         "name": name,
         "parameters": parameters,
         "loss": 0.2,

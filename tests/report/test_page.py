@@ -26,7 +26,7 @@ FRAMES = (0, 50)
 def fit(name: str = "base", **changes: Any) -> dict[str, Any]:
     x = np.linspace(20.0, 50.0, 31)
     return {
-        "format": "splatsoil-fit/1",
+        "format": "splatsoil-fit/2",
         "name": name,
         "parameters": {
             "friction_angle": {
@@ -288,7 +288,7 @@ def cut_short(path: Path) -> None:
         (lambda f: (f / "fit.json").unlink(), "no fit has been finished"),
         (lambda f: (f / "fit.json").write_text("{"), "fit.json"),
         (lambda f: (f / "fit.json").write_text("{}"), "fit.json: isn't of format"),
-        (lambda f: (f / "fit.json").write_text('{"format": "splatsoil-fit/1", "name": "base"}'), "lacks .*parameters"),
+        (lambda f: (f / "fit.json").write_text('{"format": "splatsoil-fit/2", "name": "base"}'), "lacks .*parameters"),
         (lambda f: (f / "comparison" / "left_0_observed.jpg").unlink(), "left_0_observed.jpg"),
         (lambda f: (f / "comparison" / "left_0_observed.jpg").write_text("<svg>"), "neither PNG nor JPEG"),
         (lambda f: (f / "reconstruction" / "surface.npz").write_text("x"), r"surface\.npz"),
@@ -376,7 +376,7 @@ def posterior(folder: Path, setup: dict[str, Any]) -> None:
     write_json(
         folder / "posterior.json",
         {
-            "format": "splatsoil-posterior/1",
+            "format": "splatsoil-posterior/2",
             "parameters": {
                 "friction_angle": marginal("determined", 0.12, "friction angle [°]", "deg"),
                 "cohesion": marginal("not determined", 0.97, "cohesion [Pa]", "Pa"),

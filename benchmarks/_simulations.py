@@ -1,33 +1,100 @@
-"""Simulations of a world over its parameters, made once and kept: what benchmarks draw synthetic truths from."""
+"""Simulations of a world over its parameters, made once and kept: what benchmarks draw synthetic truths from; and the
+posterior that a comparison gives from such simulations."""
 
 from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from splatsoil.envs.levels import is_full
 from splatsoil.envs.measured import LOSS, MeasuredProblem, cache_folder
 from splatsoil.envs.problem import Problem
 from splatsoil.envs.synthetic import SyntheticProblem
 from splatsoil.envs.synthetic_world import World
+from splatsoil.inverse.campaign import Job, run_campaign
+from splatsoil.inverse.criticism.design import Prior, Run
+from splatsoil.inverse.criticism.diagnosis import BASE
+from splatsoil.inverse.criticism.noise import Tables, noise_of
+from splatsoil.inverse.evaluations import EvaluationRecord, EvaluationStore, digest, writer_lock
+from splatsoil.inverse.posterior import Density
+from splatsoil.inverse.surrogate import sobol
 
 import splatsoil
+from splatsoil.experiment import Layout, Site
+from splatsoil.experiment.emulated import EmulatedExperiment
 from splatsoil.files import FORWARD, code_digest
 from splatsoil.parameters import ParameterSpace
 
-from .campaign import Job, run_campaign
-from .evaluations import EvaluationStore, digest, writer_lock
-from .posterior import Data
-from .surrogate import sobol
-
 FloatArray = npt.NDArray[np.float64]
+
+#: Simulations that a comparison needs.
+FEWEST = BASE // 2
 
 #: Seed of the made-up world's own truth, which cancels in all that is made from its simulations.
 WORLD = 1
+
+
+@dataclass(frozen=True)
+class Data:
+    """Simulations.
+
+    Attributes:
+        space: the free parameters.
+        points: (m, n) in [-1, 1].
+        residuals: (m, b) observed minus predicted features.
+    """
+
+    space: ParameterSpace
+    points: FloatArray
+    residuals: FloatArray
+
+    @classmethod
+    def of(cls, space: ParameterSpace, records: Sequence[EvaluationRecord]) -> Data:
+        """Those that succeeded, at full resolution; blocks hidden in any of them are left out."""
+        good = [r for r in records if r.status == "ok" and is_full(r.parameters)]
+        blocks = np.array([r.blocks for r in good])
+        points = space.to_unit(np.stack([space.to_vector(r.parameters) for r in good]))
+        return cls(space, points, blocks[:, np.all(blocks != 0.0, axis=0)])
+
+
+def density_of(
+    space: ParameterSpace, points: FloatArray, features: FloatArray, observed: FloatArray, sensor: float, seed: int = 0
+) -> Density:
+    """The posterior in a world whose model is right but for chance: numerics leave nothing.
+
+    Args:
+        space: the free parameters.
+        points: (m, n) of simulations, in [-1, 1].
+        features: (m, b) of these.
+        observed: (b,).
+        sensor: standard deviation of what instruments add to an observed one.
+        seed: of sequences.
+    """
+    b = features.shape[1]
+    layout = Layout((0.0,), tuple(Site("all", float(k), 0.0) for k in range(b)), "", "", ("",), np.full((1, b), ""))
+    nothing = np.zeros((1, b))
+    experiment = EmulatedExperiment(
+        layout=layout,
+        middle=nothing,
+        home={},
+        slopes={},
+        parameters=tuple(space),
+        candidates=(),
+        chance_root=np.zeros((b, b)),
+        sensor=nothing + sensor,
+        observed=observed[None],
+    )
+    prior = Prior(space)
+    made = [Run(values) for values in prior.values(points)], features[:, None]
+    tables = Tables(base=made, fine=([], np.zeros((0, 1, b))), effects={}, drawn={}, reference=features[:1])
+    noise = noise_of(experiment, prior, tables, ())
+    return Density.of(replace(noise, numerics=np.zeros_like(noise.numerics)), prior, seed)
 
 
 def simulations(
@@ -83,7 +150,7 @@ def simulations(
             executor=executor,
             after_evaluation=None if progress is None else lambda done, _: progress(done, len(jobs)),
         )
-    return Data.of(problem, records), file
+    return Data.of(problem.space, records), file
 
 
 def jobs_at(space: ParameterSpace, points: FloatArray, seed: int) -> list[Job]:
