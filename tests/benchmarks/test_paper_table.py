@@ -15,7 +15,7 @@ import torch
 from splatsoil.benchmarks import _paper, _paper_budget, paper_table
 from splatsoil.benchmarks._common import keep_to_one_protocol
 from splatsoil.benchmarks._paper import FRAMES, Look, Protocol, Trial
-from splatsoil.inverse import emulator
+from splatsoil.inverse import surrogate
 from splatsoil.inverse.executors import Serial
 
 from splatsoil.comparison import Block
@@ -157,10 +157,9 @@ def test_failed_simulations_are_left_out(tmp_path: Path) -> None:
 
 
 def test_what_is_asked_hangs_on_what_was_told_alone() -> None:
-    blocks = np.array([0.5, -0.25])
-    trial = Trial(3, "ours", [30.0, 50.0], [Look(1.0, 1.21, blocks), None])
+    trial = Trial(3, "ours", [30.0, 50.0], [Look(1.0, 1.21, np.array([0.5, -0.25])), None])
     first, second = trial.told
-    assert first.action == pytest.approx(-2.0 / 3.0) and first.loss == 1.21 and first.residuals is blocks
+    assert first.action == pytest.approx(-2.0 / 3.0) and first.loss == 1.21
     assert second.action == pytest.approx(2.0 / 3.0) and second.loss is None
     assert _paper.propose("ours", 3, trial.told) == _paper.propose("ours", 3, trial.told)
 
@@ -242,9 +241,9 @@ def test_a_folder_keeps_one_protocol(tmp_path: Path) -> None:
 def test_trials_of_another_search_are_not_gone_on_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     keep_to_one_protocol(tmp_path, paper_table.kept_protocol(Protocol()))
     other = tmp_path / "inverse"
-    shutil.copytree(Path(emulator.__file__).parent, other)
-    changed = other / "emulator.py"
-    changed.write_text(changed.read_text() + "\n# another emulator\n")
+    shutil.copytree(Path(surrogate.__file__).parent, other)
+    changed = other / "surrogate.py"
+    changed.write_text(changed.read_text() + "\n# another surrogate\n")
     monkeypatch.setattr(importlib.util.find_spec("splatsoil.inverse"), "submodule_search_locations", [str(other)])
     with pytest.raises(ParameterError, match="other sources"):
         keep_to_one_protocol(tmp_path, paper_table.kept_protocol(Protocol()))

@@ -94,23 +94,14 @@ def test_what_the_solver_misses_is_seen() -> None:
 def test_what_fits_miss_is_seen(
     plow_dry: Path, plow_damp: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def rows(
-        estimates: tuple[float, ...], seconds: float, memory: int, pictures: float | None = None
-    ) -> list[bool | None]:
-        told = [{"friction_angle": {"estimate": e, "std": 0.5}} for e in estimates]
-        alone = (
-            None
-            if pictures is None
-            else {"counted": True, "pictures_alone": {"friction_angle": {"estimate": pictures, "std": 1.0}}}
-        )
-        found = iter({"parameters": one, "force": alone} for one in told)
+    def rows(estimates: tuple[float, ...], seconds: float, memory: int) -> list[bool | None]:
+        found = iter({"parameters": {"friction_angle": {"estimate": e, "std": 0.5}}} for e in estimates)
         monkeypatch.setattr(whole_path, "_fitted", lambda *words: whole_path.Run(next(found), seconds, memory))
         return [row.met for row in whole_path.angle(tiny(plow_dry, plow_damp, tmp_path))]
 
     assert rows((34.1, 36.0, 37.9), 479.0, 2**31) == [True, True]
     assert rows((34.1, 36.0, 38.1), 481.0, 2**30) == [False, False]
     assert rows((33.9, 36.0, 36.0), 1.0, 2**31 + 1) == [False, False]
-    assert rows((36.0, 36.0, 37.9), 1.0, 1, pictures=38.1) == [True, False, True]
 
 
 def test_a_command_that_fails_is_told(plow_dry: Path, plow_damp: Path, tmp_path: Path) -> None:

@@ -62,8 +62,10 @@ def place(plow_damp: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 def test_a_run_is_compared_diagnosed_and_added_to(place: Path, repository: Path) -> None:
+    made = len(list((place / "run" / "features").glob("*.npy")))
     compared = command("compare", "run", cwd=place)
     assert set(TOLD) == compared["misfit"].keys()
+    assert len(list((place / "run" / "features").glob("*.npy"))) == made, "the fit has simulated all of it"
     assert {"stage", "region", "channel", "ratio", "p"} <= compared["misfit"]["checks"][0].keys()
 
     few = command("diagnose", "run", "--effects", "exposure", cwd=place)
@@ -74,6 +76,7 @@ def test_a_run_is_compared_diagnosed_and_added_to(place: Path, repository: Path)
     words = ("--effects", "exposure", own)
     shutil.copytree(place / "run", place / "alone")
     alone = command("diagnose", "alone", *words, cwd=place, cores=1)
+    assert alone["simulated_now"] <= alone["simulations"] - made, "a file counts for its own effect alone"
     first = command("diagnose", "run", *words, cwd=place)
     assert first["models"] == alone["models"], "a second core changes nothing"
     if len(os.sched_getaffinity(0)) > 1:

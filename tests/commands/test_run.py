@@ -94,7 +94,9 @@ def test_one_command_leads_from_photographs_to_the_report(place: Path, whole: di
     assert comparison["noise"]["robust"] > 0.0
     misfit = json.loads((run / "comparison" / "misfit.json").read_text())
     assert misfit["adequate"] is whole["misfit"]["adequate"] and misfit["checks"] == whole["misfit"]["checks"]
-    assert whole["misfit"]["estimates"]["friction_angle"] == misfit["estimates"]["friction_angle"]
+    told = misfit["estimates"]["friction_angle"]
+    assert whole["misfit"]["estimates"]["friction_angle"] == told, "one answer"
+    assert (told["value"], told["std"]) == (angle["estimate"], angle["std"])
     assert len(list((run / "features").glob("*.npy"))) == misfit["simulations"], "each is kept"
     page = (run / "report.html").read_text()
     assert "friction angle" in page and misfit_verdict(misfit) in page

@@ -15,6 +15,7 @@ from splatsoil.envs import measured
 from splatsoil.envs.measured import MeasuredProblem
 
 from splatsoil.errors import MeasurementError, ParameterError, RunError
+from splatsoil.experiment.forces import SCALE
 from splatsoil.measurement import Measurement
 from splatsoil.reconstruction import reconstruct
 
@@ -55,27 +56,33 @@ def test_a_step_is_a_simulation_compared_with_the_video(small_set: Path, reconst
 
 @pytest.mark.slow
 def test_what_is_left_of_a_measured_force_is_told(plow_dry: Path, reconstruction: Path, tmp_path: Path) -> None:
-    """The example's own force, and one that is larger by half of it everywhere: what is left is as much larger."""
+    """Beside the example's own force, and one that is larger by half of it everywhere: the same force is predicted."""
     folder = Path(shutil.copytree(plow_dry, tmp_path / "set", copy_function=shutil.copyfile))
     folder.chmod(0o755)
     head, *rows = (plow_dry / "tool_force.csv").read_text().splitlines()
     table = np.array([[float(v) for v in row.split(",")] for row in rows])
-    residuals = []
+    predicted, largest = [], []
     for factor in (1.0, 1.5):
         scaled = table * np.array([1.0, 1.0, factor, factor, factor])
         (folder / "tool_force.csv").write_text(
             "\n".join([head, *(f"{int(row[0])}," + ",".join(map(str, row[1:])) for row in scaled)])
         )
         problem = MeasuredProblem.load(folder, preset="tiny", reconstruction=reconstruction)
-        assert problem.forces is not None
-        extras = problem.evaluate({"friction_angle": 36.0}, 0).extras
-        assert set(problem.forces.names) < set(extras)
-        assert problem.beside(extras).shape == (len(problem.forces.names),)
-        newtons = 0.01 * problem.forces.largest
-        residuals.append(newtons * np.array([extras[name] for name in problem.forces.names]))
-        measured = newtons * problem.forces.observed[problem.forces.seen]
-    assert residuals[1] - residuals[0] == pytest.approx(measured / 3.0, rel=1e-6)
-    assert np.abs(residuals[0]).max() < 0.6 * np.abs(measured).max()
+        experiment = problem.experiment
+        assert experiment.forces is not None
+        evaluation = problem.evaluate({"friction_angle": 36.0}, 0)
+        assert evaluation.blocks.shape == (problem.block_count,) == (experiment.observed.size,)
+        assert not evaluation.blocks.reshape(experiment.layout.shape)[~experiment.seen].any()
+        force = ~experiment.layout.placed
+        shares = SCALE * np.sinh(problem.features(list(evaluation.blocks))[:, force] / SCALE)
+        predicted.append(0.01 * experiment.forces.largest * shares[experiment.seen[:, force]])
+        largest.append(experiment.forces.largest)
+    assert largest[1] == pytest.approx(1.5 * largest[0])
+    assert predicted[1] == pytest.approx(predicted[0], rel=1e-6, abs=1e-9)
+    assert 0.5 * largest[0] < np.abs(predicted[0]).max() < 2.0 * largest[0]
+    # What a comparison of models would be told of the same simulation.
+    direct = experiment.predict({"friction_angle": 36.0}, seed=0)
+    assert problem.features(list(evaluation.blocks))[experiment.seen] == pytest.approx(direct[experiment.seen])
 
 
 @pytest.mark.parametrize(

@@ -37,13 +37,14 @@ def fit(name: str, angle: float, effects: list[str], extra: dict[str, float]) ->
         }
         for key, value in {"angle": angle, **extra}.items()
     }
-    step = {"step": 0, "parameters": dict.fromkeys(parameters, 0.0), "loss": 0.3, "status": "ok", "message": ""}
+    step = {"step": 0, "seed": 1, "level": "full", "parameters": dict.fromkeys(parameters, 0.0), "loss": 0.3, "status": "ok", "message": ""}
     return {
         "format": "splatsoil-fit/2",
         "name": name,
         "parameters": parameters,
         "loss": 0.2,
-        "estimated_from": "features",
+        "estimated_from": "comparison",
+        "minimum": {k: {"estimate": p["estimate"], "low": -1.0, "high": 1.0} for k, p in parameters.items()},
         "loss_std": 0.01,
         "noise_std": 0.01,
         "evaluations": 1,

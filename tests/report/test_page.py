@@ -43,6 +43,7 @@ def fit(name: str = "base", **changes: Any) -> dict[str, Any]:
         },
         "loss": 0.123,
         "estimated_from": "loss",
+        "minimum": {"friction_angle": {"estimate": 35.6, "low": 34.0, "high": 37.1}},
         "loss_std": 0.01,
         "noise_std": 0.02,
         "evaluations": 3,
@@ -59,6 +60,8 @@ def fit(name: str = "base", **changes: Any) -> dict[str, Any]:
         "history": [
             {
                 "step": 0,
+                "seed": 7,
+                "level": "full",
                 "parameters": {"friction_angle": 30.0},
                 "loss": 31.0,
                 "status": "ok",
@@ -67,6 +70,8 @@ def fit(name: str = "base", **changes: Any) -> dict[str, Any]:
             },
             {
                 "step": 1,
+                "seed": 7,
+                "level": "full",
                 "parameters": {"friction_angle": 40.0},
                 "loss": 20.0,
                 "status": "ok",
@@ -75,6 +80,8 @@ def fit(name: str = "base", **changes: Any) -> dict[str, Any]:
             },
             {
                 "step": 2,
+                "seed": 7,
+                "level": "full",
                 "parameters": {"friction_angle": 21.0},
                 "loss": None,
                 "status": "failed",
@@ -372,7 +379,7 @@ def marginal(verdict: str, contraction: float, title: str, unit: str) -> dict[st
     }
 
 
-def posterior(folder: Path, setup: dict[str, Any]) -> None:
+def posterior(folder: Path, fitted: str, angle: float) -> None:
     write_json(
         folder / "posterior.json",
         {
@@ -382,10 +389,10 @@ def posterior(folder: Path, setup: dict[str, Any]) -> None:
                 "cohesion": marginal("not determined", 0.97, "cohesion [Pa]", "Pa"),
             },
             "notes": ["cohesion is not determined by this experiment: …", "The chains have not converged."],
-            "evaluations": 31,
-            "evidence": {"log": -14.4, "std": 0.1},
+            "simulations": 31,
             "chains": {"effective": 5268.0, "r_hat": 1.001},
-            "setup": setup,
+            "fit": fitted,
+            "values": {"friction_angle": angle},
         },
     )
     (folder / "posterior").mkdir(exist_ok=True)
@@ -393,10 +400,10 @@ def posterior(folder: Path, setup: dict[str, Any]) -> None:
 
 
 def test_a_posterior_is_told_and_what_it_leaves_open_has_no_number(tmp_path: Path) -> None:
-    folder = make_run(tmp_path, setup={"agent": "bayesopt", "effects": [], "preset": "small"})
+    folder = make_run(tmp_path)
     before = write_report(folder).read_text()
     assert "What the pictures leave possible" not in before
-    posterior(folder, {"agent": "bayesopt", "effects": [], "preset": "small"})
+    posterior(folder, "base", 35.62)
     text = write_report(folder).read_text()
     page = Page(text)
     told = " ".join(" ".join(page.words).split())
@@ -411,9 +418,10 @@ def test_a_posterior_is_told_and_what_it_leaves_open_has_no_number(tmp_path: Pat
     assert all(address.startswith(("data:", "#")) for address in page.addresses)
 
 
-def test_a_posterior_of_another_fit_is_not_shown(tmp_path: Path) -> None:
-    folder = make_run(tmp_path, setup={"agent": "bayesopt", "effects": ["cohesion"], "preset": "small"})
-    posterior(folder, {"agent": "bayesopt", "effects": []})
+@pytest.mark.parametrize(("fitted", "angle"), [("cohesion", 35.62), ("base", 35.0)])
+def test_a_posterior_of_another_fit_is_not_shown(tmp_path: Path, fitted: str, angle: float) -> None:
+    folder = make_run(tmp_path)
+    posterior(folder, fitted, angle)
     assert "What the pictures leave possible" not in write_report(folder).read_text()
 
 

@@ -92,7 +92,7 @@ def test_a_residual_far_above_the_cameras_noise_is_no_fault_of_an_adequate_model
 )
 def test_an_answer_that_is_none_says_so(determined: bool, at_bound: str | None, state: str) -> None:
     entry = {"estimate": 36.0, "std": 1.0, "unit": "deg", "at_bound": at_bound, "determined": determined}
-    (answer,) = words.answers({"parameters": {"friction_angle": entry}})
+    (answer,) = words.answers({"estimated_from": "loss", "parameters": {"friction_angle": entry}})
     assert answer.state == state
     assert bool(answer.remark) == (state != "determined")
 
@@ -100,18 +100,6 @@ def test_an_answer_that_is_none_says_so(determined: bool, at_bound: str | None, 
 @pytest.mark.parametrize(("seconds", "text"), [(48.2, "48 s"), (200.0, "3 min 20 s"), (7500.0, "2 h 5 min")])
 def test_durations(seconds: float, text: str) -> None:
     assert words.duration(seconds) == text
-
-
-def test_a_force_that_counts_is_told_with_what_pictures_say_alone() -> None:
-    fit = {"parameters": {"friction_angle": {"unit": "deg"}, "cohesion": {"unit": "Pa"}}, "force": None}
-    assert words.force_sentence(fit) == "" == words.force_sentence({"parameters": {}})
-    alone = {
-        "friction_angle": {"estimate": 38.21, "std": 0.94, "determined": True},
-        "cohesion": {"estimate": 700.0, "std": 433.0, "determined": False},
-    }
-    told = words.force_sentence({**fit, "force": {"counted": True, "pictures_alone": alone}})
-    assert "38.2 ± 0.9° for the friction angle and anything for the cohesion" in told
-    assert "isn't counted" in words.force_sentence({**fit, "force": {"counted": False, "pictures_alone": alone}})
 
 
 ENTRY = {"estimate": 36.0, "std": 0.5, "unit": "deg", "at_bound": None, "determined": True}
@@ -129,7 +117,8 @@ AVERAGED = {"friction_angle": {"value": 37.1, "std": 3.2, "determined": True}}
     ],
 )
 def test_the_answer_is_averaged_over_models_whatever_the_verdict(judged: dict) -> None:
-    fit = {"name": "base", "parameters": {"friction_angle": {**ENTRY, "determined": False}}}
+    entry = {**ENTRY, "determined": False}
+    fit = {"name": "base", "estimated_from": "loss", "parameters": {"friction_angle": entry}}
     judged = {**judged, "estimates": AVERAGED}
     (answer,) = words.answers(fit, judged)
     assert (answer.value, answer.std, answer.state, answer.remark) == ("37", "3", "determined", "")
@@ -142,11 +131,12 @@ def test_the_answer_is_averaged_over_models_whatever_the_verdict(judged: dict) -
 
 
 @pytest.mark.parametrize("judged", [None, {"fit": "tilt", "verdict": "adequate", "estimates": AVERAGED}])
-def test_without_a_judgement_of_this_fit_the_answer_is_its_own(judged: dict | None) -> None:
-    fit = {"name": "base", "parameters": {"friction_angle": ENTRY}}
+@pytest.mark.parametrize(("source", "said"), [("loss", "10 evaluations"), ("comparison", "numerics")])
+def test_without_a_judgement_of_this_fit_the_answer_is_its_own(judged: dict | None, source: str, said: str) -> None:
+    fit = {"name": "base", "estimated_from": source, "evaluations": 10, "parameters": {"friction_angle": ENTRY}}
     (answer,) = words.answers(fit, judged)
     assert (answer.value, answer.std) == ("36.0", "0.5")
-    assert words.fitted_sentence(fit, judged) == "" and words.called_adequate(fit, judged) is None
+    assert said in words.fitted_sentence(fit, judged) and words.called_adequate(fit, judged) is None
 
 
 def test_a_comparison_is_told_in_one_line() -> None:
