@@ -8,11 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatsoil.experiment.forces import ALONG, ERROR, GROWTH, OWN, SCALE, SENSOR, SHAPE, UP, ToolForces, compressed
+from splatsoil.experiment.forces import ALONG, SCALE, SENSOR, UP, ToolForces, compressed
 from splatsoil.measurement import Measurement, ToolMotion
 
 ROWS = [[frame, frame + 10] for frame in range(10, 200, 20)]
 """Compared frames of the example set, two to a row."""
+PUSHED = slice(1, 5)
+"""Rows in which the tool is pushed: from frame 25 to 100."""
 LAST = 200
 
 
@@ -37,7 +39,7 @@ def forces_of(measurement: Measurement, rows: list[list[int]] | None = None) -> 
 def test_a_prediction_that_is_right_is_what_was_measured(dry: Measurement) -> None:
     assert dry.tool.force is not None
     found = forces_of(dry)
-    assert np.allclose(found.predicted(dry.tool.force[:, 2:])[found.seen], found.observed[found.seen])
+    assert np.allclose(found.predicted(dry.tool.force[:, 2:]), found.observed)
 
 
 def test_rows_are_means_over_their_frames_in_newtons_of_the_largest(dry: Measurement) -> None:
@@ -50,13 +52,7 @@ def test_rows_are_means_over_their_frames_in_newtons_of_the_largest(dry: Measure
     push, lift = (0.01 * found.largest * found.observed[2, k] for k in (0, 1))
     assert push == pytest.approx(-fx[row].mean(), rel=0.02)
     assert lift == pytest.approx(fz[row].mean(), rel=0.02)
-    assert np.linalg.norm(found.observed[found.seen[:, 0]], axis=1).max() == pytest.approx(100.0)
-
-
-def test_only_rows_count_in_which_the_tool_is_pushed(dry: Measurement) -> None:
-    # Pushed from frame 25 to 100.
-    found = forces_of(dry)
-    assert [frame for frame, seen in zip(found.frames, found.seen[:, 0], strict=True) if seen] == [40, 60, 80, 100]
+    assert np.linalg.norm(found.observed[PUSHED], axis=1).max() == pytest.approx(100.0)
 
 
 def test_a_way_through_the_air_is_no_push(dry: Measurement) -> None:
@@ -74,14 +70,8 @@ def test_a_way_through_the_air_is_no_push(dry: Measurement) -> None:
     later = replace(dry, tool=replace(dry.tool, motion=carried))
     found = forces_of(with_force(later, force), [[a + 40, b + 40] for a, b in ROWS])
     whole = forces_of(dry)
-    assert found.seen.tolist() == whole.seen.tolist()
-    assert np.allclose(found.observed[found.seen], whole.observed[whole.seen])
-
-
-def test_where_nothing_pushes_yet_nothing_counts(dry: Measurement) -> None:
-    force = np.zeros((LAST, 3))
-    force[60:100, 0] = -50.0
-    assert forces_of(with_force(dry, force)).seen[:, 0].tolist() == [False] * 3 + [True, True] + [False] * 5
+    assert found.largest == pytest.approx(whole.largest)
+    assert np.allclose(found.observed[PUSHED], whole.observed[PUSHED])
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.7, 2.5])
@@ -107,27 +97,6 @@ def test_a_tool_that_is_only_lowered_tells_nothing(dry: Measurement) -> None:
     assert ToolForces.of(with_force(replace(dry, tool=replace(dry.tool, motion=straight)), force), ROWS) is None
 
 
-def test_a_rows_variance_is_that_of_its_errors(dry: Measurement) -> None:
-    """The whole, its growth (from end to end of four rows), an instrument's, a row's own, and the sensor's."""
-    found = forces_of(dry)
-    way = np.array([-1.0, -1.0 / 3.0, 1.0 / 3.0, 1.0])
-    variance = (found.sensor**2 + (found.errors**2).sum(axis=0))[found.seen]
-    size = np.linalg.norm(found.observed, axis=1, keepdims=True)
-    expected = (ERROR * found.observed) ** 2 + (OWN**2 + SHAPE**2) * size**2 + SENSOR**2
-    growth = GROWTH * way[:, None] * found.observed[found.seen[:, 0]]
-    assert np.allclose(variance, (expected[found.seen[:, 0]] + growth**2).ravel())
-
-
-def test_independent_combinations_have_the_variance_that_is_stated(dry: Measurement) -> None:
-    """Of forces that are off as is said, by draws."""
-    found = forces_of(dry)
-    generator = np.random.default_rng(3)
-    parts, rows = found.errors[:, found.seen], found.sensor[found.seen]
-    drawn = generator.standard_normal((2000, len(parts))) @ parts + rows * generator.standard_normal((2000, len(rows)))
-    white = np.stack([found.independent(dict(zip(found.names, row, strict=True))) for row in drawn])
-    assert np.allclose(np.cov(white.T), np.eye(len(rows)), atol=0.12)
-
-
 def test_a_comparison_of_models_takes_large_forces_by_their_ratio_and_small_ones_as_they_are(dry: Measurement) -> None:
     large, small = np.array([40.0, 90.0, -90.0]), np.array([0.5, -0.5])
     assert np.allclose(compressed(1.1 * large) - compressed(large), np.sign(large) * SCALE * np.log(1.1), rtol=0.05)
@@ -138,14 +107,6 @@ def test_a_comparison_of_models_takes_large_forces_by_their_ratio_and_small_ones
     shift = 1e-3 * SENSOR
     moved = (compressed(found.observed + shift) - compressed(found.observed - shift)) / (2e-3)
     assert np.allclose(found.noise, moved, rtol=1e-4)
-
-
-def test_residuals_are_named_by_instrument_and_frame(dry: Measurement) -> None:
-    assert dry.tool.force is not None
-    found = forces_of(dry)
-    told = found.residuals(0.9 * dry.tool.force[:, 2:])
-    assert set(told) == {f"{c}, frame {f}" for c in (ALONG, UP) for f in (40, 60, 80, 100)}
-    assert told["force along, frame 100"] == pytest.approx(0.1 * found.observed[4, 0])
 
 
 @pytest.mark.parametrize("frames", [(0, 0), (150, 200), (1, 12)])
@@ -160,5 +121,5 @@ def test_forces_that_end_early_count_as_far_as_they_go(dry: Measurement) -> None
     assert dry.tool.force is not None
     whole = forces_of(dry)
     part = forces_of(with_force(dry, dry.tool.force[:64, 2:]))
-    assert part.seen[:, 0].tolist() == [False] + [True] * 2 + [False] * 7
+    assert part.measured[:, 0].tolist() == [True] * 3 + [False] * 7
     assert np.allclose(part.largest * part.observed[1:2], whole.largest * whole.observed[1:2])

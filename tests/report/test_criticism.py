@@ -37,7 +37,15 @@ def fit(name: str, angle: float, effects: list[str], extra: dict[str, float]) ->
         }
         for key, value in {"angle": angle, **extra}.items()
     }
-    step = {"step": 0, "seed": 1, "level": "full", "parameters": dict.fromkeys(parameters, 0.0), "loss": 0.3, "status": "ok", "message": ""}
+    step = {
+        "step": 0,
+        "seed": 1,
+        "level": "full",
+        "parameters": dict.fromkeys(parameters, 0.0),
+        "loss": 0.3,
+        "status": "ok",
+        "message": "",
+    }
     return {
         "format": "splatsoil-fit/2",
         "name": name,
