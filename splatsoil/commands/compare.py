@@ -28,8 +28,7 @@ TOLD = ("adequate", "probability", "estimates", "checks", "passes")
 class Config:
     """Compare the prediction at a run's latest estimate with every frame of the video: how far off, where and when.
 
-    What counts as far is learnt from some fifteen simulations with other parameters, seeds and finer cells, which are
-    kept.
+    What counts as far is learnt from simulations with other parameters, seeds and finer cells, which the fit has made.
     """
 
     run: Positional[Path]

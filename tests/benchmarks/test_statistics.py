@@ -35,7 +35,6 @@ def entry(truth: float, rank: int, inside: tuple[bool, bool]) -> dict:
         "within": within,
         "mean": [0.0],
         "std": [0.5],
-        "converged": True,
     }
 
 
