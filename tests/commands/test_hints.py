@@ -18,7 +18,7 @@ GIVEN = {
     "reconstruct": "'my set' --out a/b --preset tiny --seed 3 --device cpu --holdout 0 --json",
     "simulate": "out --friction-angle 31.5 --with cohesion tilt --set cohesion=300 tilt_x=-2 --scene plow --depth 0.09 "
     "--preset tiny --seed 4 --particle-seed 5 --views 12 --picture-scale 0.5 --device cuda:0 --like 'a set' --json",
-    "posterior": "runs/a --design 7 --repeats 2 --checks 0 --executor processes:2 --device cpu --seed 1 --json",
+    "posterior": "runs/a --checks 0 --device cpu --seed 1 --json",
     "fit": "nowhere --parameters friction_angle --with cohesion --budget 9 --coarse tiny --preset fine --device cpu "
     "--seed 2 --run 'a run' --json",
     "run": "nowhere --parameters friction_angle --with cohesion --budget 9 --coarse tiny --preset fine --device cpu "
@@ -78,7 +78,7 @@ def test_the_hints_after_a_fit_and_a_comparison_can_be_pasted(
         monkeypatch.setattr(_stages, stage, lambda *_: {})
     monkeypatch.setattr(fit, "show", lambda *_: None)
     assert fit.run(fit.Config(Path("set"))) == 0
-    assert f"\nsplatsoil compare '{folder}'\n" in capsys.readouterr().out
+    assert f"and where? splatsoil compare '{folder}'\n" in capsys.readouterr().out
 
     diagnosis = {"verdict": "undecided", "class": ["tilt"]}
     monkeypatch.setattr(_criticism, "diagnosed", lambda *_: diagnosis)

@@ -167,3 +167,21 @@ def test_a_helper_that_fails_or_dies_costs_nothing_but_its_help(tmp_path: Path, 
             with pytest.raises(SimulationError, match="blew up"):
                 simulate({"angle": 2.0})
     assert len(mine.calls) == 2 and simulate.asked == 1
+
+
+def test_a_file_that_defines_an_effect_counts_for_what_it_is_on_in(tmp_path: Path) -> None:
+    """Another file of the same name: only what it is on in is made anew."""
+    for digest, made in (("one", 2), ("other", 1), ("one", 0)):
+        simulate = Simulations(Watched(), tmp_path, sources={"own": digest})  # type: ignore[arg-type]
+        simulate(AT)
+        simulate(AT, effects=("own",))
+        assert simulate.made == made
+
+
+def test_what_was_made_elsewhere_is_kept_and_not_made_again(tmp_path: Path) -> None:
+    experiment = Watched()
+    simulations(experiment, tmp_path).keep(table(AT, 7), AT, 7)
+    later = simulations(experiment, tmp_path)
+    later.keep(table(AT, 8), AT, 7)
+    assert np.array_equal(later(AT, seed=7), table(AT, 7)), "the first one stays"
+    assert experiment.calls == [] and (later.made, later.asked) == (0, 1)
