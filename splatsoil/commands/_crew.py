@@ -197,8 +197,10 @@ def _quietly(work: Callable[[str], object], device: str, helpers: int) -> None:
 def _known_here(path: Path, device: str, effects: tuple[str, ...]) -> tuple[RunFolder, PlowExperiment, Simulations]:
     """What a helper works with, made once."""
     import signal
+    import warnings
 
     from splatsoil.commands._experiments import experiment_of, model_of
+    from splatsoil.errors import SetWarning
     from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.quiet import hush
 
@@ -206,6 +208,7 @@ def _known_here(path: Path, device: str, effects: tuple[str, ...]) -> tuple[RunF
     if key not in _known:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process ends this one
         hush()
+        warnings.simplefilter("ignore", SetWarning)  # the first process has said it
         folder = RunFolder.open(path)
         # a reconstruction that isn't kept is the first process's to make
         model = model_of(folder, device, lambda what, share: None, anew=False)
