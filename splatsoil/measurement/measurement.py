@@ -131,7 +131,7 @@ class Measurement:
         transforms = {key: fields.path(key, root, root) for key in ("views", "video")}
         measurement = cls(
             folder=root,
-            name=fields.text("name") if fields.has("name") else root.resolve().name,
+            name=fields.name("name") if fields.has("name") else root.resolve().name,
             gravity=_read_gravity(fields),
             frame_rate=fields.number("frame_rate", 1e-3, 1e6, hint="it is in frames a second"),
             bed=bed,
