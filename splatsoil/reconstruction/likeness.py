@@ -7,8 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.stats import median_abs_deviation
-from scipy.stats import t as student
 
 from splatsoil.measurement import Bed
 from splatsoil.reconstruction.views import Views
@@ -16,8 +14,6 @@ from splatsoil.splats import Gaussians, rasterise
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
-
-CHANCE = 1e-3  # that a set without fault is remarked on, where its fixed cameras are such as took the photographs
 
 
 @dataclass(frozen=True)
@@ -35,19 +31,14 @@ class Likeness:
     upside_down: Array
 
     def unlike(self, fixed: int) -> Flags:
-        """Which of the last ``fixed`` pictures are less like the scene than the others' scatter explains.
+        """Which of the last ``fixed`` pictures differ from the scene by more than it differs from the others.
 
-        By Fisher's z, with which correlations are normally distributed: one more of the others would fall below
-        Student's prediction limit with the probability CHANCE, any of ``fixed`` ones included. Median and median
-        absolute deviation stand for mean and standard deviation, as one of the others may itself be at fault.
+        Of a picture's variance 1 - ρ² is left unexplained. As much as in the median of the others is the scene's own
+        error. Where a picture leaves more than twice that, most of its error is its own.
         """
-        with np.errstate(divide="ignore"):
-            z = np.arctanh(self.upright)
-        others = z[:-fixed][np.isfinite(z[:-fixed])]
-        if len(others) < 2:
-            return np.zeros(fixed, dtype=bool)
-        spread = median_abs_deviation(others, scale="normal") * np.sqrt(1.0 + 1.0 / len(others))
-        return z[-fixed:] < np.median(others) - student.isf(CHANCE / fixed, len(others) - 1) * spread
+        left = 1.0 - self.upright**2
+        others = left[:-fixed][np.isfinite(left[:-fixed])]
+        return left[-fixed:] > 2.0 * np.median(others) if len(others) else np.zeros(fixed, dtype=bool)
 
     def unrelated(self, fixed: int) -> Flags:
         """Which of the last ``fixed`` pictures are no more like the scene than any picture is upside down.

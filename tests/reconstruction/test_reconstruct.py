@@ -163,7 +163,7 @@ def test_a_video_of_the_same_world_is_not_remarked_on(result):
     assert result.metadata["remarks"] == []
 
 
-@pytest.mark.parametrize("scale", [1.05, 2.0])
+@pytest.mark.parametrize("scale", [1.05, 3.0])
 def test_views_of_another_scale_than_the_video_are_remarked_on(measurement, scale, tmp_path):
     with pytest.warns(SetWarning, match="The bed that camera 'left'"):
         made = reconstruct(moved(measurement, scale=scale), preset="tiny")
@@ -212,14 +212,15 @@ def test_likeness_is_of_the_soil_and_whatever_the_exposure(measurement, result):
     assert np.isnan(none.upright).all() and not none.unlike(2).any() and not none.unrelated(2).any()
 
 
-def test_a_camera_like_the_others_is_seldom_unlike():
-    """Drawn by construction, z normal: of 2000 sets 2 are remarked on, a few more by the median's own scatter."""
-    random = np.random.default_rng(0)
-    sets = [Likeness(np.tanh(random.normal(1.5, 0.2, 32)), np.full(32, 0.1)) for _ in range(2000)]
-    assert sum(found.unlike(2).any() for found in sets) < 20
-    for found in sets[:50]:
-        found.upright[-1] = np.tanh(np.arctanh(found.upright[:-2]).mean() - 10 * 0.2)
-        assert found.unlike(2).tolist()[1] and found.unrelated(2)[1] == (found.upright[-1] <= 0.1)
+def test_twice_the_error_of_the_others_and_no_more_than_chance():
+    """Unexplained variances by construction: 0.1 in the median view, which one that is at fault doesn't change."""
+    views = 1.0 - np.array([0.08, 0.1, 0.1, 0.12, 0.9])
+    fixed = 1.0 - np.array([0.19, 0.21, 0.96, np.nan])
+    found = Likeness(np.sqrt(np.append(views, fixed)), np.full(9, 0.25))
+    assert found.unlike(4).tolist() == [False, True, True, False]
+    assert found.unrelated(4).tolist() == [False, False, True, False]
+    found.upside_down[0] = 0.35  # a view itself is no more alike than that
+    assert not found.unrelated(4).any()
 
 
 def test_views_that_tell_no_height_are_refused(measurement):
