@@ -3,12 +3,31 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
+import threading
+from types import FrameType
+
+_AGAIN = 0.05  # seconds until an interrupt that came while a module was being loaded is tried again
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    """Raise KeyboardInterrupt, but only once no module is being loaded: some catch it meanwhile, and go on."""
+    while frame is not None:
+        if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
+            again = threading.Timer(_AGAIN, os.kill, (os.getpid(), number))
+            again.daemon = True
+            again.start()
+            return
+        frame = frame.f_back
+    raise KeyboardInterrupt
 
 
 def main() -> int:
     """Run the command line. Ctrl-C while that is still being loaded ends without a traceback, too, and so does a reader
     of the output (head, less) that has gone, of a help page as well."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _interrupt)
     try:
         from splatsoil.cli import main as run
 

@@ -13,8 +13,9 @@ from __future__ import annotations
 import importlib
 import pkgutil
 import sys
-from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,7 +24,7 @@ import tyro
 import splatsoil.commands
 from splatsoil import __version__
 from splatsoil.commands._output import only_json, print_json
-from splatsoil.errors import SplatsoilError
+from splatsoil.errors import SetWarning, SplatsoilError
 
 DESCRIPTION = "Soil properties from photographs of a tool moving through it."
 
@@ -54,6 +55,25 @@ def commands() -> dict[str, Command]:
     return out
 
 
+@contextmanager
+def _saying_remarks() -> Iterator[None]:
+    """Print warnings about a set as its remarks, each once; all others are Python's."""
+    said: set[str] = set()
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", SetWarning)
+        others = warnings.showwarning
+
+        def show(message: Warning | str, category: type[Warning], *rest: Any) -> None:
+            if not issubclass(category, SetWarning):
+                others(message, category, *rest)
+            elif str(message) not in said:
+                said.add(str(message))
+                print(f"remark {message}", file=sys.stderr)
+
+        warnings.showwarning = show  # type: ignore[assignment]
+        yield
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code; help and usage errors leave by SystemExit (0 and 2)."""
     words = list(sys.argv[1:] if arguments is None else arguments)
@@ -75,7 +95,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
     command = next(c for c in known.values() if isinstance(config, c.config))
     wants_json = bool(getattr(config, "json", False))
-    with only_json() if wants_json else nullcontext():
+    with only_json() if wants_json else nullcontext(), _saying_remarks():
         try:
             return command.run(config)
         except SplatsoilError as error:

@@ -40,3 +40,7 @@ class CombinationError(ParameterError, SimulationError):
 
 class RunError(SplatsoilError):
     """A run folder is missing, unreadable, or belongs to another experiment."""
+
+
+class SetWarning(UserWarning):
+    """Something odd about a measurement set, which can be used all the same; the command line prints it as a remark."""

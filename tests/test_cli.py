@@ -253,3 +253,49 @@ def test_the_readmes_make_targets_exist(repository: Path) -> None:
             ["make", "--dry-run", target], cwd=repository, capture_output=True, timeout=60, check=False
         )
         assert asked.returncode == 0, asked.stderr
+
+
+def test_ctrl_c_is_heard_though_a_module_swallows_it_while_it_loads(tmp_path: Path) -> None:
+    """As trimesh does, which imports scipy under `except BaseException`."""
+    (tmp_path / "swallows.py").write_text(
+        "import os, signal\n"
+        "try:\n"
+        "    os.kill(os.getpid(), signal.SIGINT)\n"
+        "    for _ in range(1000): pass\n"
+        "except BaseException:\n"
+        "    print('swallowed')\n"
+    )
+    program = (
+        "import signal, time\n"
+        "from splatsoil.__main__ import _interrupt\n"
+        "signal.signal(signal.SIGINT, _interrupt)\n"
+        "try:\n"
+        "    import swallows\n"
+        "    time.sleep(60)\n"
+        "except KeyboardInterrupt:\n"
+        "    print('heard')\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, timeout=50, check=False
+    )
+    assert done.stdout == "heard\n", done.stderr
+
+
+def test_kernels_go_elsewhere_where_their_folder_cannot_be_written_to(tmp_path: Path) -> None:
+    in_the_way = tmp_path / "file"
+    in_the_way.write_text("")
+    program = (
+        "import os, warp\n"
+        "from splatsoil.quiet import hush\n"
+        "hush()\n"
+        "folder = warp.config.kernel_cache_dir\n"
+        "print(folder.startswith(os.environ['WARP_CACHE_PATH']), os.access(folder, os.W_OK))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        env={**os.environ, "WARP_CACHE_PATH": str(in_the_way), "TMPDIR": str(tmp_path)},
+        cwd=tmp_path, capture_output=True, text=True, timeout=100, check=False,
+    )  # fmt: skip
+    assert done.stdout == "True True\n", done.stderr
+    assert done.stderr.count("\n") == 1 and "let WARP_CACHE_PATH name a folder" in done.stderr
+    assert list(tmp_path.iterdir()) == [in_the_way], "it goes with the process"

@@ -201,8 +201,10 @@ def _known_here(
 ) -> tuple[PlowExperiment, Simulations]:
     """What a helper works with, made once."""
     import signal
+    import warnings
 
     from splatsoil.commands._experiments import experiment_of, model_of
+    from splatsoil.errors import SetWarning
     from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.quiet import hush
 
@@ -210,6 +212,7 @@ def _known_here(
     if key not in _known:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process ends this one
         hush()
+        warnings.simplefilter("ignore", SetWarning)  # the first process has said it
         folder = RunFolder.open(path)
         # a reconstruction that isn't kept is the first process's to make
         model = model_of(folder, device, lambda what, share: None, chosen=chosen, anew=False)

@@ -19,6 +19,7 @@ from splatsoil.errors import MeasurementError
 FloatArray = npt.NDArray[np.float64]
 
 _ALIKE = 0.8  # difflib's ratio of two words one of which is the other misspelt: a letter of five, two of ten
+_LONGEST_NAME = 60  # characters, of four bytes at most, where a file's name has 255 bytes and more is added
 
 
 class Fields:
@@ -107,6 +108,17 @@ class Fields:
         value = self.raw(key)
         if not isinstance(value, str) or not value.strip():
             self.fail(key, f"expected text, found {_kind(value)}")
+        return value
+
+    def name(self, key: str) -> str:
+        """A string that can be part of a file's name, as those of results made from a set are."""
+        value = self.text(key)
+        if not value.isprintable() or set(value) & set("/\\") or value.startswith(".") or len(value) > _LONGEST_NAME:
+            self.fail(
+                key,
+                f"{value[:40]!r} names files: at most {_LONGEST_NAME} characters, none of them a slash, a backslash or"
+                " unprintable, nor a point at the beginning",
+            )
         return value
 
     def number(
@@ -320,7 +332,7 @@ def _cells(text: str, delimiter: str, file: Path) -> list[str]:
 
 def _cell(text: str, file: Path, field: str) -> float:
     try:
-        number = float(text)
+        number = float(text.replace("_", "?"))  # Python's grouping of digits is no one else's
     except ValueError as error:
         raise MeasurementError(f"{text.strip()[:40]!r} is not a number", file=file, field=field) from error
     if not math.isfinite(number):

@@ -131,7 +131,7 @@ class Measurement:
         transforms = {key: fields.path(key, root, root) for key in ("views", "video")}
         measurement = cls(
             folder=root,
-            name=fields.text("name") if fields.has("name") else root.resolve().name,
+            name=fields.name("name") if fields.has("name") else root.resolve().name,
             gravity=_read_gravity(fields),
             frame_rate=fields.number("frame_rate", 1e-3, 1e6, hint="it is in frames a second"),
             bed=bed,
@@ -378,7 +378,9 @@ def _check_cameras(measurement: Measurement) -> None:
                     field=f"frames[{i}].transform_matrix",
                 )
             depth = frame.depth()
-            typical = distance if depth is None else float(np.median(depth[depth > 0.0]))
+            if depth is None:
+                continue
+            typical = float(np.median(depth[depth > 0.0]))
             if not distance / _OTHER_UNIT < typical < distance * _OTHER_UNIT:
                 raise MeasurementError(
                     f"half of the depths are beyond {typical:g} m, where the bed is {distance:.2g} m away; whole"

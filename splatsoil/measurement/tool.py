@@ -89,10 +89,10 @@ def read_mesh(file: Path) -> trimesh.Trimesh:
     if not mesh.is_watertight:  # else thin faces may be what closes it
         mesh.update_faces(mesh.nondegenerate_faces())
     mesh.remove_unreferenced_vertices()
-    # Bodies one by one: one that is inside out takes its volume from the others'.
-    trimesh.repair.fix_normals(mesh, multibody=True)
     extents = np.zeros(3) if mesh.extents is None else np.asarray(mesh.extents)
     with np.errstate(all="ignore"):  # the centre of mass of a flat mesh divides by zero
+        # Bodies one by one: one that is inside out takes its volume from the others'.
+        trimesh.repair.fix_normals(mesh, multibody=True)
         volume = abs(float(mesh.volume))
     if not volume > 1e-9 * float(np.prod(np.maximum(extents, extents.max() * 1e-3))):
         raise MeasurementError(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -19,6 +19,7 @@ from splatsoil.measurement import Bed, Measurement
 from splatsoil.reconstruction.height_field import HeightField
 from splatsoil.reconstruction.hidden import reaching_into_soil
 from splatsoil.reconstruction.initial import TOOL, first_gaussians
+from splatsoil.reconstruction.likeness import Likeness, likeness
 from splatsoil.reconstruction.presets import preset_named
 from splatsoil.reconstruction.result import HeldOut, Reconstruction
 from splatsoil.reconstruction.surface import find_relief, soil_mesh, surface_through
@@ -30,6 +31,7 @@ from splatsoil.threads import one_thread
 Array = NDArray[np.float64]
 
 FEWEST_VIEWS = 3
+NO_BACKGROUND = (0.0, 0.0, 0.0)
 
 
 @one_thread()
@@ -53,7 +55,7 @@ def reconstruct(
         progress: called with what is being done and how much of that is done (0 to 1).
 
     Raises:
-        MeasurementError: too few views.
+        MeasurementError: too few views, views that do not tell the soil's height, or a video that shows another scene.
         ParameterError: an unknown preset, a negative holdout.
     """
     report = progress or (lambda what, share: None)
@@ -80,12 +82,25 @@ def reconstruct(
     relief = find_relief(views.to(device), bed, silhouettes(views, tool), chosen, report)
     spacing = chosen.soil_spacing * max(relief.surface.cell)
     report("placing Gaussians", 0.0)
+    cameras: list[str] = []
     still = still_video(measurement, chosen.longest_side)
     if still is not None:
         # The fixed cameras see sides of things that no photograph needs to show.
+        cameras = [camera.name for camera in still.cameras]
         views = views.joined(still)
         relief = replace(relief, trust=(views.valid * (1.0 - silhouettes(views, tool))).to(device))
     first, label = first_gaussians(views.to(device), bed, tool, relief, spacing)
+    if cameras:
+        # Before training, which bends the scene to what it is shown.
+        level = float(np.median(relief.surface.height))
+        alike = likeness(first.to(device), views, relief.trust, bed, level, NO_BACKGROUND)
+        for camera in unlike_cameras(alike, cameras, alike.unrelated(len(cameras))):
+            raise MeasurementError(
+                f"the bed that {camera} sees is not that in the views: their poses and lenses must be of one world and"
+                " scale, and the bed the same",
+                file=measurement.folder,
+                field="video",
+            )
     trained = train(
         first, label, views, relief.surface, float(bed.lower[2]),
         iterations=chosen.iterations, growth=chosen.growth, seed=seed, device=device, report=report,
@@ -96,8 +111,19 @@ def reconstruct(
     kept = torch.ones(len(soil), dtype=torch.bool)
     kept[around] = ~reaching_into_soil(trained.gaussians[around], surface, float(bed.lower[2]))
     gaussians, soil, on_tool = trained.gaussians[kept], soil[kept], on_tool[kept]
-    held_out = judged(gaussians.to(device), every.subset(aside), trained.background)
-    return Reconstruction(
+    scene = gaussians.to(device)
+    remarks = []
+    if cameras:
+        report("comparing with the video", 0.0)
+        level = float(np.median(surface.height))
+        alike = likeness(scene, views, relief.trust, bed, level, trained.background)
+        remarks = [
+            f"video: The bed that {camera} sees differs from that in the views; are their poses and lenses of one world"
+            " and scale, and is the bed the same?"
+            for camera in unlike_cameras(alike, cameras, alike.unlike(len(cameras)))
+        ]
+    held_out = judged(scene, every.subset(aside), trained.background)
+    made = Reconstruction(
         gaussians=gaussians,
         soil=soil,
         tool=on_tool,
@@ -117,9 +143,22 @@ def reconstruct(
             "ground": relief.ground,
             "first_loss": float(np.mean(trained.losses[: len(views)])),
             "last_loss": float(np.mean(trained.losses[-len(views) :])),
+            "remarks": remarks,
         },
         seconds=time.monotonic() - started,
     )
+    made.say_remarks()
+    return made
+
+
+def unlike_cameras(alike: Likeness, cameras: Sequence[str], which: NDArray[np.bool_]) -> list[str]:
+    """Fixed cameras, whose pictures come last, in words: ``which`` of them, and how like the scene theirs are."""
+    usual = np.nanmedian(alike.upright[: -len(cameras)])
+    return [
+        f"camera {name!r} (its picture correlates with the reconstruction by {value:.2f}, the views by {usual:.2f})"
+        for name, value, said in zip(cameras, alike.upright[-len(cameras) :], which, strict=True)
+        if said
+    ]
 
 
 def segments(
@@ -145,15 +184,20 @@ def segments(
 
 
 def judged(gaussians: Gaussians, views: Views, background: tuple[float, float, float]) -> tuple[HeldOut, ...]:
-    """Likeness of the drawn pictures to photographs that were set aside (pixels that are masked do not count)."""
+    """Likeness of the drawn pictures to photographs that were set aside (pixels that are masked do not count).
+
+    A photograph of which nothing is left tells nothing and is left out.
+    """
     result = []
     for k, camera in enumerate(views.cameras):
+        if not views.valid[k].any():
+            continue
         photograph = views.photograph(k).contiguous().to(gaussians.device)
         valid = views.valid[k, : camera.height, : camera.width, None].to(gaussians.device)
         with torch.no_grad():
             seen = rasterise(gaussians, camera, background=background, antialias=True, normals=False)
             mixed = seen.colour.clamp(0.0, 1.0) * valid + photograph * (1.0 - valid)
             share = float(valid.mean())
-            value = float(psnr(mixed, photograph) + 10.0 * np.log10(max(share, 1e-6)))
+            value = float(psnr(mixed, photograph) + 10.0 * np.log10(share))
             result.append(HeldOut(views.names[k], value, float(ssim(mixed, photograph))))
     return tuple(result)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import torch
 import trimesh
 from numpy.typing import NDArray
 
-from splatsoil.errors import RunError
+from splatsoil.errors import RunError, SetWarning
 from splatsoil.files import read_json, write_bytes, write_json
 from splatsoil.reconstruction.height_field import HeightField
 from splatsoil.run_files import RECONSTRUCTION_FORMAT
@@ -79,8 +80,13 @@ class Reconstruction:
         """Mean over the photographs that were set aside; NaN if there are none."""
         return float(np.mean([view.ssim for view in self.held_out])) if self.held_out else float("nan")
 
+    def say_remarks(self) -> None:
+        """Warn of what was odd about the set when it was reconstructed."""
+        for text in self.metadata.get("remarks", ()):
+            warnings.warn(text, SetWarning, stacklevel=3)
+
     def summary(self) -> dict[str, Any]:
-        """The numbers, in JSON's types."""
+        """The numbers, in JSON's types: without photographs set aside there is no PSNR, and it is None."""
         return {
             "format": RECONSTRUCTION_FORMAT,
             **self.metadata,
@@ -89,8 +95,8 @@ class Reconstruction:
             "soil_gaussians": int(self.soil.sum()),
             "tool_gaussians": int(self.tool.sum()),
             "background": list(self.background),
-            "psnr": self.psnr,
-            "ssim": self.ssim,
+            "psnr": self.psnr if self.held_out else None,
+            "ssim": self.ssim if self.held_out else None,
             "held_out": [{"name": v.name, "psnr": v.psnr, "ssim": v.ssim} for v in self.held_out],
             "surface": {
                 "cells": [len(self.surface.x), len(self.surface.y)],
@@ -127,7 +133,7 @@ class Reconstruction:
 
     @classmethod
     def load(cls, folder: str | Path) -> Reconstruction:
-        """Read what `save` wrote.
+        """Read what `save` wrote, and warn again of what was odd about the set.
 
         Raises:
             RunError: a file is missing, damaged or of another format.
@@ -157,7 +163,7 @@ class Reconstruction:
                 "ssim",
             )
             red, green, blue = facts["background"]
-            return cls(
+            out = cls(
                 gaussians=Gaussians(**tensors),
                 soil=torch.from_numpy(arrays["soil"]),
                 tool=torch.from_numpy(arrays["tool"]),
@@ -170,6 +176,8 @@ class Reconstruction:
             )
         except (OSError, KeyError, TypeError, ValueError, BadZipFile) as error:
             raise RunError(f"{source}: the reconstruction cannot be read ({error}); reconstruct again") from error
+        out.say_remarks()
+        return out
 
 
 def _number(value: float | None) -> float:

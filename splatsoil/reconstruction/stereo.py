@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
 from torch.nn import functional
 
+from splatsoil.errors import MeasurementError
 from splatsoil.reconstruction.height_field import HeightField
 from splatsoil.reconstruction.views import Views
 
@@ -253,6 +254,9 @@ def refine(
 
     Returns:
         (ny, nx) heights and (ny, nx) their standard deviations, metres.
+
+    Raises:
+        MeasurementError: the photographs tell no height in half of the cells or more.
     """
     inside = cells.mask.cpu().numpy() > 0
     smoothness = Smoothness(inside)
@@ -282,6 +286,13 @@ def refine(
         information = np.maximum(3.0 * (above - 2.0 * here + below) / (2.0 * delta**2), 0.0)
         information[~inside] = 0.0
         floor = 1e-3 * float(np.median(information[inside]))
+        if not floor > 0.0:
+            # Where a height means nothing to the photographs, its misfit curves upwards or downwards by chance.
+            raise MeasurementError(
+                "the photographs do not tell the height of half of the bed: several must show each place of it, sharply"
+                " and from different directions; are they taken of it, and their poses right?",
+                field="views",
+            )
         damped = np.where(inside, information + floor, 1e-6)
         move = np.clip(-slope / damped, -2.0 * delta, 2.0 * delta)
         move[~inside] = 0.0

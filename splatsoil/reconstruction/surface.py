@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_propagation, distance_transform_edt
 from scipy.spatial import cKDTree
 
+from splatsoil.errors import MeasurementError
 from splatsoil.measurement import Bed
 from splatsoil.reconstruction.height_field import HeightField
 from splatsoil.reconstruction.presets import Preset
@@ -25,6 +26,7 @@ Report = Callable[[str, float], None]
 RIM = 0.04  # width of what is taken to border the bed (a bin's wall), in square roots of the bed's area
 # How many times better the soil's level must explain the surroundings than the bed's floor, to be their height.
 LEVEL_GAIN = 1.5
+CELLS = 4  # along each side of the bed, at least: a cubic spline needs them
 NEIGHBOURS = 24  # Gaussians that a height is drawn from
 DOUBTFUL = 3.0  # times the median standard deviation: at the bed's border, the height of something behind it
 
@@ -68,12 +70,21 @@ def find_relief(views: Views, bed: Bed, tool_silhouettes: torch.Tensor, preset: 
         tool_silhouettes: (v, h, w) 1 where the tool hides what is behind it.
         preset: how much work.
         report: called with what is being done and how much of it is done.
+
+    Raises:
+        MeasurementError: the photographs are too far away, or tell no height in half of the bed or more.
     """
     length, device = scale_of(bed), views.images.device
     cell = max(length / preset.cells**0.5, 1.2 * footprint(views, bed))
     trust = views.valid * (1.0 - tool_silhouettes.to(device))
     step = float(bed.upper[2] - bed.lower[2]) / (preset.candidates - 1)
     coarse = HeightField.over(bed.lower, bed.upper, 2.0 * cell)
+    if min(coarse.height.shape) < CELLS:
+        raise MeasurementError(
+            f"in half of the photographs a pixel covers {1e3 * footprint(views, bed):.3g} mm, too much to see the bed's"
+            " relief; take them from nearer, and see that their poses are in metres",
+            field="views",
+        )
     cells = Cells.of(coarse, device=device)
     everything = torch.ones(len(views), *cells.mask.shape, device=device)
     report("sweeping the bed's height", 0.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -309,6 +310,8 @@ CASES = [
     Case("image-is-a-folder", edit(VIEWS, "frames", 1, "file_path", to="images"), VIEWS, FIRST, "not a file"),
     Case("image-listed-twice", edit(VIEWS, "frames", 1, "file_path", to="images/000.jpg"), VIEWS, FIRST,
          "twice"),
+    Case("image-copied", lambda f: shutil.copy(f / "views/images/000.jpg", f / "views/images/001.jpg"), VIEWS, FIRST,
+         "the same as that of frames[0]"),
     Case("mask-of-another-size", wrong_mask, "views/mask.png", "frames[1].mask_path", "3 x 4"),
     Case("image-turned-by-exif", turned_by_exif, "views/images/002.jpg", SECOND, "EXIF"),
     Case("image-black", photograph(lambda: even(0), "b.jpg"), "views/images/b.jpg", SECOND, "one even grey, 0 of 255"),
@@ -384,6 +387,8 @@ CASES = [
     Case("video-frame-twice", duplicate_video_frame, VIDEO, "frames[2].frame", "given twice"),
     Case("video-time-backwards", edit(VIDEO, "frames", 6, "time", to=-5.0), VIDEO, "frames[6].time", "runs backwards"),
     Case("video-without-camera", edit(VIDEO, "frames", 0, "camera", drop=True), VIDEO, "frames[0].camera", "missing"),
+    Case("video-camera-with-dots", edit(VIDEO, "frames", 0, "camera", to="../left"), VIDEO, "frames[0].camera",
+         "names files"),
     Case("video-without-number", edit(VIDEO, "frames", 0, "frame", drop=True), VIDEO, "frames[0].frame", "missing"),
     Case("video-without-time", edit(VIDEO, "frames", 0, "time", drop=True), VIDEO, "frames[0].time", "missing"),
     Case("video-number-not-whole", edit(VIDEO, "frames", 0, "frame", to=0.5), VIDEO, "frames[0].frame", "whole number"),
@@ -432,6 +437,10 @@ CASES = [
     Case("frame-rate-zero", edit(SET, "frame_rate", to=0), SET, "frame_rate", "outside"),
     Case("friction-is-an-angle", edit(SET, "tool", "friction", to=17.0), SET, "tool.friction", "not an angle"),
     Case("friction-negative", edit(SET, "bed", "floor_friction", to=-0.1), SET, "bed.floor_friction", "outside"),
+    Case("name-with-dots", edit(SET, "name", to="../../elsewhere"), SET, "name", "names files"),
+    Case("name-of-two-lines", edit(SET, "name", to="a\nb"), SET, "name", "unprintable"),
+    Case("name-endless", edit(SET, "name", to="a" * 300), SET, "name", "at most 60"),
+    Case("name-not-unicode", edit(SET, "name", to="\ud800"), SET, "name", "unprintable"),
     Case("give", edit(SET, "tool", "give", to=0.0), SET, "tool.give", "remove this field"),
     Case("views-missing", edit(SET, "views", drop=True), SET, "views", "missing"),
     Case("video-file-missing", lambda f: (f / VIDEO).unlink(), VIDEO, "video", "no such file"),
@@ -459,6 +468,7 @@ CASES = [
          "line 2", "12 values where the header has 9"),
     Case("motion-with-thousands", replace("tool_motion.csv", "frame;time;x;y;z;qw;qx;qy;qz\n0;0;1.000,2;0;0;1;0;0;0\n"),
          "tool_motion.csv", "x, line 2", "'1.000.2' is not a number"),
+    Case("motion-with-underscores", cell(10, 2, "0_2"), "tool_motion.csv", "x, line 11", "'0_2' is not a number"),
     Case("motion-empty", replace("tool_motion.csv", ""), "tool_motion.csv", "line 1", "expected the header"),
     Case("motion-without-rows", replace("tool_motion.csv", "frame,time,x,y,z,qw,qx,qy,qz\n"), "tool_motion.csv", None,
          "no rows"),
@@ -557,6 +567,13 @@ def test_an_error_as_json(small_set: Path, capsys: pytest.CaptureFixture[str]) -
     data = json.loads(out)
     assert data["ok"] is False and "bed.upper[0]" in data["error"]
     assert "bed.upper[0]" in err
+
+
+def test_a_camera_in_the_middle_of_the_bed_has_no_depth_to_be_wrong(small_set: Path) -> None:
+    bed = Measurement.load(small_set).bed
+    for row in range(3):
+        edit(VIEWS, "frames", 1, "transform_matrix", row, 3, to=float((bed.lower + bed.upper)[row] / 2))(small_set)
+    assert len(Measurement.load(small_set).views) == 4
 
 
 def test_links_inside_the_folder_are_allowed(small_set: Path) -> None:

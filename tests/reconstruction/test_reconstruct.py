@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from splatsoil.cli import main
-from splatsoil.errors import MeasurementError, ParameterError, RunError
+from splatsoil.errors import MeasurementError, ParameterError, RunError, SetWarning
 from splatsoil.measurement import Measurement, Picture, write_measurement
 from splatsoil.reconstruction import HeightField, Reconstruction, reconstruct
 from splatsoil.reconstruction.hidden import reaching_into_soil
 from splatsoil.reconstruction.initial import SOIL, Seeds, discs
+from splatsoil.reconstruction.likeness import Likeness, likeness
 from splatsoil.reconstruction.surface import surface_through
+from splatsoil.reconstruction.views import load_views
 from splatsoil.splats import load_ply, rasterise
 
 LENS = {"k1": -0.12, "k2": 0.02, "p1": 0.002, "p2": -0.001, "cx": 70.0, "cy": 44.0}
@@ -140,6 +144,118 @@ def test_a_damaged_result_is_an_error_of_one_line(result, tmp_path):
     (tmp_path / "reconstruction.json").write_text('{"format": "something else"}')
     with pytest.raises(RunError, match="format"):
         Reconstruction.load(tmp_path)
+
+
+def moved(measurement, scale=1.0, turn=0.0):
+    """The set with its views scaled and turned (rad) about the bed's middle, and its video as it was."""
+    centre = (measurement.bed.lower + measurement.bed.upper) / 2
+    about = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+    views = []
+    for view in measurement.views:
+        pose = view.camera.camera_to_world.copy()
+        pose[:3, :3] = about @ pose[:3, :3]
+        pose[:3, 3] = centre + scale * about @ (pose[:3, 3] - centre)
+        views.append(replace(view, camera=replace(view.camera, camera_to_world=pose)))
+    return replace(measurement, views=tuple(views))
+
+
+def test_a_video_of_the_same_world_is_not_remarked_on(result):
+    assert result.metadata["remarks"] == []
+
+
+@pytest.mark.parametrize("scale", [1.05, 3.0])
+def test_views_of_another_scale_than_the_video_are_remarked_on(measurement, scale, tmp_path):
+    with pytest.warns(SetWarning, match="The bed that camera 'left'"):
+        made = reconstruct(moved(measurement, scale=scale), preset="tiny")
+    made.save(tmp_path)
+    with pytest.warns(SetWarning, match="camera 'left'"):
+        again = Reconstruction.load(tmp_path)
+    assert again.metadata["remarks"] == made.metadata["remarks"]
+
+
+@pytest.mark.parametrize("turn", [np.pi, 0.5 * np.pi])
+def test_views_of_another_world_than_the_video_are_refused(measurement, turn):
+    with pytest.raises(MeasurementError, match=r"camera 'left' \(.*\) sees is not that in the views"):
+        reconstruct(moved(measurement, turn=turn), preset="tiny")
+
+
+def test_the_command_line_says_remarks_once_and_on_stderr(measurement, result, tmp_path, monkeypatch, capsys):
+    odd = replace(result, metadata={**result.metadata, "remarks": ["video: is it so?"]})
+
+    def found(*_, **__):
+        odd.say_remarks()
+        odd.say_remarks()
+        return odd
+
+    monkeypatch.setattr("splatsoil.reconstruction.reconstruct", found)
+    assert main(["reconstruct", str(measurement.folder), "--out", str(tmp_path / "r"), "--json"]) == 0
+    out, err = capsys.readouterr()
+    assert json.loads(out)["remarks"] == ["video: is it so?"]
+    assert err.count("remark video: is it so?\n") == 1 and "Warning" not in err
+
+
+def test_likeness_is_of_the_soil_and_whatever_the_exposure(measurement, result):
+    views = load_views(measurement.views[:4], 160)
+    level = float(np.median(result.surface.height))
+
+    def alike(images):
+        return likeness(
+            result.gaussians, replace(views, images=images), views.valid, measurement.bed, level, result.background
+        )
+
+    plain = alike(views.images)
+    assert plain.upright.min() > 0.8 > 0.4 > np.abs(plain.upside_down).max()
+    np.testing.assert_allclose(alike(0.2 + 0.5 * views.images).upright, plain.upright, atol=1e-4)
+    assert np.isnan(alike(torch.full_like(views.images, 0.5)).upright).all()
+    away = replace(measurement.bed, lower=measurement.bed.lower + 50.0, upper=measurement.bed.upper + 50.0)
+    none = likeness(result.gaussians, views, views.valid, away, level, result.background)
+    assert np.isnan(none.upright).all() and not none.unlike(2).any() and not none.unrelated(2).any()
+
+
+def test_twice_the_error_of_the_others_and_no_more_than_chance():
+    """Unexplained variances by construction: 0.1 in the median view, which one that is at fault doesn't change."""
+    views = 1.0 - np.array([0.08, 0.1, 0.1, 0.12, 0.9])
+    fixed = 1.0 - np.array([0.19, 0.21, 0.96, np.nan])
+    found = Likeness(np.sqrt(np.append(views, fixed)), np.full(9, 0.25))
+    assert found.unlike(4).tolist() == [False, True, True, False]
+    assert found.unrelated(4).tolist() == [False, False, True, False]
+    found.upside_down[0] = 0.35  # a view itself is no more alike than that
+    assert not found.unrelated(4).any()
+
+
+def test_views_that_tell_no_height_are_refused(measurement):
+    one = measurement.views[1]
+    same = tuple(replace(view, camera=one.camera, path=one.path) for view in measurement.views)
+    with pytest.raises(MeasurementError, match="do not tell the height"):
+        reconstruct(replace(measurement, views=same), preset="tiny")
+    far = []
+    for view in measurement.views:
+        pose = view.camera.camera_to_world.copy()
+        pose[:3, 3] += 20.0 * pose[:3, 2]
+        far.append(replace(view, camera=replace(view.camera, camera_to_world=pose)))
+    with pytest.raises(MeasurementError, match="from nearer"):
+        reconstruct(replace(measurement, views=tuple(far)), preset="tiny")
+
+
+def test_without_photographs_to_judge_by_there_is_no_likeness(measurement, tmp_path, capsys):
+    """None set aside, or one of which its mask leaves nothing where it is shrunk."""
+    out = tmp_path / "none"
+    command = ["reconstruct", str(measurement.folder), "--preset", "tiny", "--json"]
+    assert main([*command, "--holdout", "0", "--out", str(out)]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["psnr"] is None and said["ssim"] is None and said["held_out"] == []
+    assert np.isnan(Reconstruction.load(out).psnr)
+
+    mask = np.zeros((96, 128), dtype=np.uint8)
+    mask[0, 0] = 255
+    folder = tmp_path / "set"
+    shutil.copytree(measurement.folder, folder)
+    Image.fromarray(mask).save(folder / "mask.png")
+    masked = Measurement.load(folder)
+    first = replace(masked.views[0], mask_path=folder / "mask.png")
+    made = reconstruct(replace(masked, views=(first, *masked.views[1:])), preset="tiny")
+    assert [view.name for view in made.held_out] == [measurement.views[8].path.name]
+    assert np.isfinite(made.psnr)
 
 
 def test_options_that_make_no_sense(measurement):

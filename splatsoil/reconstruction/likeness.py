@@ -1,0 +1,94 @@
+"""Whether the fixed cameras see the bed that the photographs show: a photometric check of poses, lenses and scale."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from splatsoil.measurement import Bed
+from splatsoil.reconstruction.views import Views
+from splatsoil.splats import Gaussians, rasterise
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Likeness:
+    """How like what is drawn pictures are where they show soil, by correlation.
+
+    Exposure and white balance, which cameras need not have in common, do not count.
+
+    Attributes:
+        upright: (v,) correlation of each picture with what is drawn; NaN where it shows no soil.
+        upside_down: (v,) the same with the drawn soil turned by half a turn in the image: what chance makes alike.
+    """
+
+    upright: Array
+    upside_down: Array
+
+    def unlike(self, fixed: int) -> Flags:
+        """Which of the last ``fixed`` pictures differ from the scene by more than it differs from the others.
+
+        Of a picture's variance 1 - ρ² is left unexplained. As much as in the median of the others is the scene's own
+        error. Where a picture leaves more than twice that, most of its error is its own.
+        """
+        left = 1.0 - self.upright**2
+        others = left[:-fixed][np.isfinite(left[:-fixed])]
+        return left[-fixed:] > 2.0 * np.median(others) if len(others) else np.zeros(fixed, dtype=bool)
+
+    def unrelated(self, fixed: int) -> Flags:
+        """Which of the last ``fixed`` pictures are no more like the scene than any picture is upside down.
+
+        A rank test: of pictures that have nothing in common with the scene, one in v + 1 passes. It tells nothing where
+        one of the others does not pass.
+        """
+        chance = np.max(self.upside_down, initial=-1.0, where=np.isfinite(self.upside_down))
+        told = not np.any(self.upright[:-fixed] <= chance)
+        return (self.upright[-fixed:] <= chance) & told
+
+
+def likeness(
+    gaussians: Gaussians, views: Views, trust: torch.Tensor, bed: Bed, level: float, background: tuple[float, ...]
+) -> Likeness:
+    """How like the scene each picture is.
+
+    Args:
+        gaussians: the scene, on the device where it is to be drawn.
+        views: the pictures.
+        trust: (v, h, w) 1 where they may be used.
+        bed: the box that holds the soil.
+        level: height of the soil, metres.
+        background: sRGB colour behind all Gaussians.
+    """
+    out = []
+    for k, camera in enumerate(views.cameras):
+        columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+        origin, ray = camera.rays(np.stack([columns, rows], axis=-1))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            away = (level - origin[:, 2]) / ray[:, 2]
+            place = (origin + away[:, None] * ray)[:, :2]
+            soil = (away > 0.0) & np.all((place > bed.lower[:2]) & (place < bed.upper[:2]), axis=1)
+        seen = soil.reshape(camera.height, camera.width)
+        seen = seen & (trust[k, : camera.height, : camera.width] > 0.0).cpu().numpy()
+        if not seen.any():
+            out.append((np.nan, np.nan))
+            continue
+        with torch.no_grad():
+            drawn = rasterise(gaussians, camera, background=background, antialias=True, normals=False).colour
+        box = tuple(slice(where.min(), where.max() + 1) for where in np.nonzero(seen))
+        ours, theirs = (p.mean(dim=2).cpu().numpy()[box] for p in (drawn, views.photograph(k)))
+        seen = seen[box]
+        out.append((_correlation(ours, theirs, seen), _correlation(ours[::-1, ::-1], theirs, seen & seen[::-1, ::-1])))
+    return Likeness(*np.array(out).reshape(-1, 2).T)
+
+
+def _correlation(one: NDArray[np.float32], other: NDArray[np.float32], where: Flags) -> float:
+    """Pearson's, NaN where there are no two values to compare."""
+    a, b = one[where], other[where]
+    if a.size < 2 or np.ptp(a) == 0.0 or np.ptp(b) == 0.0:
+        return float("nan")
+    return float(np.corrcoef(a, b)[0, 1])
