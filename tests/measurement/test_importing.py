@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import shlex
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,9 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+import tyro
 from scipy.spatial.transform import Rotation
 
 from splatsoil import cli
+from splatsoil.commands import import_
 from splatsoil.errors import MeasurementError
 from splatsoil.measurement import Camera, Frame, Measurement, ToolMotion
 from splatsoil.measurement.importing.clock import Footage, clock_offset
@@ -197,7 +201,7 @@ def test_world_scale_and_clocks_come_back(
         assert np.degrees(turn.magnitude()) < 0.2
         assert (now.fx, now.cy, now.k1) == (then.fx, then.cy, then.k1)
     assert made.tool.mesh.volume == pytest.approx(true.tool.mesh.volume, rel=1e-4)
-    # What is filmed at a time is where the tool is then: 5 ms are 2 mm at this tool's speed.
+    # What is filmed at a time is where the tool is then: 5 ms are 1 mm at this tool's speed.
     zero = len(made.pre_roll) // 2 - BEFORE
     assert zero in (-1, 0), "the last frame before the tool moves is number 0"
     for frame in made.frames:
@@ -421,3 +425,26 @@ def test_help_fits_a_screen(capsys: pytest.CaptureFixture[str], monkeypatch: pyt
     with pytest.raises(SystemExit):
         cli.main(["import", "--help"])
     assert len(capsys.readouterr().out.splitlines()) <= 40
+
+
+def test_the_commands_of_the_page_parse(repository: Path) -> None:
+    page = (repository / "docs" / "own-photographs.md").read_text()
+    text = "\n".join(re.findall(r"```sh\n(.*?)```", page, re.DOTALL)).replace("\\\n", "")
+    lines = [shlex.split(line) for line in text.splitlines() if line.startswith("splatsoil")]
+    assert [words[1] for words in lines] == ["import", "check", "import", "import"]
+    known = cli.commands()
+    for _, name, *words in lines:
+        tyro.cli(known[name].config, args=words)
+
+
+@pytest.mark.parametrize("how", ["everything", "nothing"])
+def test_the_hint_after_ctrl_c_is_the_command_that_was_given(how: str) -> None:
+    text = (
+        "'a folder' out --images i --scale 2 --distance a b 0.5 --known k.csv --points p.csv --up 0 -1 0 --tool t.stl mm"
+        " --motion m.csv m --force f.csv --robot-to-world r.txt --mesh-to-flange f.txt --video 'a b.mp4=c.jpg' d.mp4=e.png"
+        " --video-every 3 --clock-offset -0.5 --experiment e.json --json"
+    )
+    config = tyro.cli(import_.Config, args=shlex.split(text)[: None if how == "everything" else 2])
+    hint = import_.interrupted(config)
+    words = shlex.split(hint[hint.index("splatsoil ") :])
+    assert words[:2] == ["splatsoil", "import"] and tyro.cli(import_.Config, args=words[2:]) == config
