@@ -39,6 +39,8 @@ class Config:
     """Length of SOURCE's unit."""
     distance: Annotated[tuple[str, str, float] | None, _option("A B METRES")] = None
     """Between two of --points, for the scale."""
+    tags: Annotated[float | None, _option("METRES")] = None
+    """Edge of AprilTags (36h11) in photographs, for the scale."""
     known: Annotated[Path | None, _option("CSV")] = None
     """point,x,y,z in the set's world: scale, turn, origin."""
     points: Annotated[Path | None, _option("CSV")] = None
@@ -78,7 +80,7 @@ def run(config: Config) -> int:
     videos = names_of(config.video)
     if videos and config.motion is not None and config.clock_offset is None:
         hush()
-    alignment = Alignment(config.scale, config.distance, config.known, config.points, config.up)
+    alignment = Alignment(config.scale, config.distance, config.tags, config.known, config.points, config.up)
     parts = Parts(
         tool=config.tool,
         motion=config.motion,
@@ -130,7 +132,7 @@ def _as_json(config: Config, made: Imported) -> dict[str, Any]:
 
 def _show(config: Config, made: Imported) -> None:
     print(f"{made.views} views of {made.kind}, {made.scale:.6g} m a unit")
-    if config.points is not None:
+    if config.points is not None or config.tags is not None:
         known = "" if made.points is None else f"; known points {1e3 * made.points:.2g} mm off (root mean square)"
         print(f"marked points {made.marks:.2g} px off{known}")
     for name, count in made.frames.items():

@@ -6,6 +6,7 @@ import json
 import re
 import shlex
 import shutil
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 import trimesh
 import tyro
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from splatsoil import cli
@@ -172,6 +174,7 @@ def importing(
 
     def act(source: Recorded, *words: str, out: str = "made") -> dict[str, Any]:
         monkeypatch.chdir(source.folder)
+        capsys.readouterr()  # what making the set has printed
         code = cli.main(["import", ".", str(tmp_path / out), *words, "--json"])
         return {"code": code, **json.loads(capsys.readouterr().out)}
 
@@ -311,6 +314,88 @@ def test_up_becomes_z(up: tuple[float, float, float]) -> None:
     np.testing.assert_allclose(matrix[:3, :3] @ matrix[:3, :3].T, 4.0 * np.eye(3), atol=1e-12)
 
 
+CODES = (0xD5D628584, 0xD97F18B49)
+"""The first two of the family 36h11: 36 bits, row after row."""
+
+
+def photographs_of_tags(folder: Path, edges: tuple[float, ...], unit: float) -> None:
+    """A nerfstudio set of level, grey ground with a tag each 0.3 m along x, in a world of another unit (m)."""
+    (folder / "images").mkdir(parents=True)
+    squares = []
+    for code in CODES:
+        square = np.zeros((8, 8))
+        square[1:7, 1:7] = [[code >> (35 - 6 * i - j) & 1 for j in range(6)] for i in range(6)]
+        squares.append(square)
+    frames = []
+    for k, (x, y) in enumerate([(-0.3, -0.5), (0.2, -0.6), (0.6, -0.4), (0.1, 0.6)]):
+        eye, look = np.array([x, y, 0.6]), np.array([0.15, 0.0, 0.0])
+        back = (eye - look) / np.linalg.norm(eye - look)
+        right = np.cross([0.0, 0.0, 1.0], back) / np.linalg.norm(np.cross([0.0, 0.0, 1.0], back))
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = np.stack([right, np.cross(back, right), back], axis=1), eye
+        camera = Camera(640, 480, 700.0, 700.0, 320.0, 240.0, pose)
+        fine = camera.scaled(3)
+        v, u = np.mgrid[: fine.height, : fine.width] + 0.5
+        origins, ways = fine.rays(np.stack([u, v], axis=-1).reshape(-1, 2))
+        ground = origins - ways * (origins[:, 2:] / ways[:, 2:])
+        shade = np.full(len(ground), 0.8)
+        for number, (edge, square) in enumerate(zip(edges, squares, strict=True)):
+            column = np.floor(8.0 * ((ground[:, 0] - 0.3 * number) / edge + 0.5)).astype(int)
+            row = np.floor(8.0 * (0.5 - ground[:, 1] / edge)).astype(int)
+            inside = (column >= 0) & (column < 8) & (row >= 0) & (row < 8)
+            shade[inside] = 0.05 + 0.85 * square[row[inside], column[inside]]
+        picture = shade.reshape(480, 3, 640, 3).mean(axis=(1, 3))
+        Image.fromarray(np.rint(255.0 * picture).astype(np.uint8)).save(folder / "images" / f"{k}.png")
+        pose[:3, 3] /= unit
+        frames.append({"file_path": f"images/{k}.png", "transform_matrix": pose.tolist()})
+    lens = {"w": 640, "h": 480, "fl_x": 700.0, "fl_y": 700.0, "cx": 320.0, "cy": 240.0}
+    (folder / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
+
+
+def test_scale_from_tags(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("pupil_apriltags")
+    photographs_of_tags(tmp_path / "alike", (0.1, 0.1), 0.37)
+    assert cli.main(["import", str(tmp_path / "alike"), str(tmp_path / "out"), "--tags", "0.1", "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["scale"] == pytest.approx(0.37, rel=0.005) and said["marks_px"] < 0.5
+    photographs_of_tags(tmp_path / "unlike", (0.1, 0.14), 0.37)
+    assert cli.main(["import", str(tmp_path / "unlike"), str(tmp_path / "other"), "--tags", "0.1"]) == 2
+    assert "edges of the tags 0, 1 differ by" in capsys.readouterr().err
+    assert not (tmp_path / "other").exists()
+
+
+def test_photographs_without_tags(plow: Recorded, importing: Callable[..., dict[str, Any]]) -> None:
+    pytest.importorskip("pupil_apriltags")
+    said = importing(plow, "--tags", "0.1", "--up", "0", "0", "1")
+    assert said["code"] == 2 and "no tag of the family tag36h11 is seen in two photographs" in said["error"]
+
+
+@pytest.mark.parametrize(
+    ("module", "words", "said"),
+    [
+        ("pupil_apriltags", ["--tags", "0.1"], "--tags: needs pupil-apriltags; pip install 'splatsoil[tags]'"),
+        (
+            "imageio_ffmpeg",
+            ["--scale", "1", "--video", "left.mp4=left.jpg"],
+            "--video: needs imageio-ffmpeg; pip install 'splatsoil[video]'",
+        ),
+    ],
+)
+def test_a_missing_package_is_one_sentence(
+    module: str,
+    words: list[str],
+    said: str,
+    plow: Recorded,
+    importing: Callable[..., dict[str, Any]],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    result = importing(plow, *words, "--up", "0", "0", "1")
+    assert (result["code"], result["error"]) == (2, said)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_forces_are_means_over_frames_in_world_axes(tmp_path: Path) -> None:
     """Of F = (t, t², 0) along a robot's axes, one of which is the world's y."""
     times = np.linspace(3.0, 5.0, 2001)
@@ -440,9 +525,9 @@ def test_the_commands_of_the_page_parse(repository: Path) -> None:
 @pytest.mark.parametrize("how", ["everything", "nothing"])
 def test_the_hint_after_ctrl_c_is_the_command_that_was_given(how: str) -> None:
     text = (
-        "'a folder' out --images i --scale 2 --distance a b 0.5 --known k.csv --points p.csv --up 0 -1 0 --tool t.stl mm"
-        " --motion m.csv m --force f.csv --robot-to-world r.txt --mesh-to-flange f.txt --video 'a b.mp4=c.jpg' d.mp4=e.png"
-        " --video-every 3 --clock-offset -0.5 --experiment e.json --json"
+        "'a folder' out --images i --scale 2 --distance a b 0.5 --tags 0.1 --known k.csv --points p.csv --up 0 -1 0"
+        " --tool t.stl mm --motion m.csv m --force f.csv --robot-to-world r.txt --mesh-to-flange f.txt"
+        " --video 'a b.mp4=c.jpg' d.mp4=e.png --video-every 3 --clock-offset -0.5 --experiment e.json --json"
     )
     config = tyro.cli(import_.Config, args=shlex.split(text)[: None if how == "everything" else 2])
     hint = import_.interrupted(config)

@@ -28,6 +28,7 @@ from splatsoil.measurement.importing.similarity import (
     read_points,
 )
 from splatsoil.measurement.importing.source import Source, find_image, read_source
+from splatsoil.measurement.importing.tags import tag_scale
 from splatsoil.measurement.importing.video import Video
 from splatsoil.measurement.measurement import EXPERIMENT, FORMAT, Measurement
 from splatsoil.measurement.motion import MOTION_COLUMNS, ToolMotion
@@ -45,11 +46,12 @@ QUALITY = 95
 
 @dataclass(frozen=True)
 class Alignment:
-    """How the source's world becomes metres with z up; one of `scale`, `distance` and `known`.
+    """How the source's world becomes metres with z up; one of `scale`, `distance`, `tags` and `known`.
 
     Attributes:
         scale: metres for each of its units.
         distance: two marked points, and the metres between them.
+        tags: edge of the AprilTags in its photographs, m.
         known: file of points' places in the new world.
         points: file of the same points in the source's world, or in its photographs.
         up: direction in the source's world that points up; with `known` it is told by these.
@@ -57,6 +59,7 @@ class Alignment:
 
     scale: float | None = None
     distance: tuple[str, str, float] | None = None
+    tags: float | None = None
     known: Path | None = None
     points: Path | None = None
     up: tuple[float, float, float] | None = None
@@ -199,12 +202,17 @@ def import_set(
 
 def _similarity(source: Source, alignment: Alignment) -> tuple[FloatArray, float, float | None]:
     """From the source's world to the set's; errors of marks in px, of known points in m."""
-    ways = {"--scale": alignment.scale, "--distance": alignment.distance, "--known": alignment.known}
+    ways = {
+        "--scale": alignment.scale,
+        "--distance": alignment.distance,
+        "--tags": alignment.tags,
+        "--known": alignment.known,
+    }
     given = [name for name, value in ways.items() if value is not None]
     if len(given) != 1:
-        what = "and ".join(f"{name} " for name in given) + "contradict each other" if given else "no scale is given"
-        raise MeasurementError(f"{what}; give one of --scale, --distance and --known")
-    if alignment.scale is None and alignment.points is None:
+        what = f"{' and '.join(given)} contradict each other" if given else "no scale is given"
+        raise MeasurementError(f"{what}; give one of --scale, --distance, --tags and --known")
+    if given[0] in ("--distance", "--known") and alignment.points is None:
         raise MeasurementError(f"{given[0]}: needs --points, which say where these points are in the source")
     marked = None if alignment.points is None else read_marked(alignment.points, source.frames)
     if alignment.known is not None:
@@ -215,10 +223,14 @@ def _similarity(source: Source, alignment: Alignment) -> tuple[FloatArray, float
         return similarity, marked.error, left
     if alignment.up is None and not source.has_up:
         raise MeasurementError(f"{source.kind} doesn't know which way is up; give --up or --known")
-    scale = alignment.scale
-    if scale is None:
-        assert marked is not None and alignment.distance is not None
+    if alignment.tags is not None:
+        scale, marked = tag_scale(source.frames, alignment.tags)
+    elif alignment.distance is not None:
+        assert marked is not None
         scale = distance_scale(marked.places, *alignment.distance)
+    else:
+        assert alignment.scale is not None
+        scale = alignment.scale
     return by_scale(scale, alignment.up or (0.0, 0.0, 1.0)), 0.0 if marked is None else marked.error, None
 
 

@@ -17,8 +17,10 @@ from splatsoil.measurement.importing.source import find_image
 from splatsoil.measurement.rotations import rotation_matrix
 
 FloatArray = npt.NDArray[np.float64]
+Marks = dict[str, list[tuple[Frame, FloatArray]]]
+"""Photographs, and pixels (2,) in them, by point."""
 
-PIXELS, PLACE = ("point", "image", "u", "v"), ("point", "x", "y", "z")
+PLACE = ("point", "x", "y", "z")
 _PARALLEL = 1e-4  # squared sine of the angle between rays that meet nowhere in particular
 _FLAT = 1e-3  # of known points' spread along one line, across it: they tell no turn about it
 
@@ -60,17 +62,24 @@ def read_marked(file: Path, frames: Sequence[Frame]) -> Marked:
         return Marked(read_points(file))
     names, table = _named(file, ("point", "u", "v"))
     images = [row["image"].strip() for row in _rows(file)]
-    by_name: dict[str, list[tuple[Frame, FloatArray]]] = {}
+    marks: Marks = {}
     try:
         for name, image, pixel in zip(names, images, table, strict=True):
-            by_name.setdefault(name, []).append((find_image(frames, image), pixel))
-        places = {name: _triangulated(name, marks) for name, marks in by_name.items()}
+            marks.setdefault(name, []).append((find_image(frames, image), pixel))
+        return intersected(marks)
     except MeasurementError as error:
         raise MeasurementError(str(error), file=file) from error
+
+
+def intersected(marks: Marks) -> Marked:
+    """Points where the rays through their pixels meet.
+
+    Raises:
+        MeasurementError: one is marked in fewer than two photographs from different places.
+    """
+    places = {name: _triangulated(name, seen) for name, seen in marks.items()}
     errors = [
-        frame.camera.project(places[name][None])[0][0] - pixel
-        for name, marks in by_name.items()
-        for frame, pixel in marks
+        frame.camera.project(places[name][None])[0][0] - pixel for name, seen in marks.items() for frame, pixel in seen
     ]
     return Marked(places, float(np.sqrt(np.mean(np.sum(np.square(errors), axis=1)))))
 
