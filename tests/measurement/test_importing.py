@@ -290,6 +290,16 @@ def test_transforms_files(kind: str, plow_dry: Path, tmp_path: Path) -> None:
         np.testing.assert_allclose(matrix[:3, :3], frame.camera.camera_to_world[:3, :3])
 
 
+def test_files_that_an_experiment_names_are_missing_unless_they_are_imported(
+    plow: Recorded, importing: Callable[..., dict[str, Any]]
+) -> None:
+    notes = json.loads((plow.folder / "rest.json").read_text())
+    tool = {"mesh": "tool.stl", "motion": "robot.csv", "friction": 0.4}
+    (plow.folder / "whole.json").write_text(json.dumps({**notes, "frame_rate": 5, "tool": tool, "video": "v.json"}))
+    said = importing(plow, "--experiment", "whole.json", "--scale", "1", "--up", "0", "0", "1")
+    assert said["code"] == 0 and said["missing"] == ["video", "tool.mesh", "tool.motion"]
+
+
 def test_known_points_undo_any_similarity() -> None:
     rng = np.random.default_rng(5)
     places = {str(k): rng.normal(size=3) for k in range(5)}

@@ -318,7 +318,9 @@ def _finish(root: Path, experiment: dict[str, Any], rate: float, out: Path) -> t
     keys = {"mesh": "tool.stl", "motion": "tool_motion.csv", "force": "tool_force.csv"}
     tool = {k: v for k, v in tool.items() if k not in keys} | {k: v for k, v in keys.items() if v in there}
     parts = {kind: f"{kind}/transforms.json" for kind in ("views", "video") if (root / kind).is_dir()}
-    whole = {"format": FORMAT, **experiment, "tool": tool, "frame_rate": rate, **parts}
+    # What a file names that is not imported isn't in the new folder.
+    notes = {key: value for key, value in experiment.items() if key not in ("views", "video")}
+    whole = {"format": FORMAT, **notes, "tool": tool, "frame_rate": rate, **parts}
     missing = [name for name, key in (("bed", "bed"), ("gravity", "gravity"), ("video", "video")) if key not in whole]
     missing += [f"tool.{key}" for key in ("mesh", "motion") if key not in tool]
     try:
