@@ -213,9 +213,14 @@ def test_splats_show_what_the_model_draws(model: Model, trajectory: Trajectory, 
     torch.testing.assert_close(gaussians.covariances()[:count], posed.covariances, rtol=1e-3, atol=1e-9)
     camera = model.measurement.cameras["top"]
     seen = rasterise(gaussians, camera, antialias=True).colour.numpy()
-    drawn = model.draw(trajectory)["top", 6]
+    pictures = model.draw(trajectory)
+    drawn = pictures["top", 6]
     pixels, _ = camera.project([[0.15 + SPEED * 6 / RATE, 0.2, 0.13]])
     away = np.hypot(*(np.indices((90, 90))[::-1] + 0.5 - pixels[0][:, None, None])) > 20.0
     assert np.abs(seen - drawn)[away].mean() < 0.02
+    # Where the box's shadow has come to, and soil has been moved.
+    darkened = away & ((pictures["top", 0] - drawn).mean(axis=2) > 0.1)
+    assert darkened.sum() > 20
+    assert np.abs(seen - drawn)[darkened].mean() < 0.5 * np.abs(pictures["top", 0] - drawn)[darkened].mean()
     tool = seen[int(pixels[0, 1]), int(pixels[0, 0])]
     assert tool[2] - tool[0] > 0.5, "the box is blue"
