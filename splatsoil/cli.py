@@ -1,9 +1,9 @@
 """The command line: assembles the modules of ``splatsoil.commands`` and handles what they have in common.
 
-A module there is a command of the same name. It has a frozen dataclass ``Config`` (its docstring is the help; a field
-``json`` makes the command print one JSON object and nothing else on stdout), a function ``run(config) -> int`` that
-returns the exit code, and optionally ``interrupted(config) -> str``, a sentence on what is kept and how to go on.
-Whatever is slow to import belongs inside ``run``.
+A module there is a command of the same name (``import_`` of ``import``, a word of Python's own). It has a frozen
+dataclass ``Config`` (its docstring is the help; a field ``json`` makes the command print one JSON object and nothing
+else on stdout), a function ``run(config) -> int`` that returns the exit code, and optionally ``interrupted(config) ->
+str``, a sentence on what is kept and how to go on. Whatever is slow to import belongs inside ``run``.
 
 Exit codes: what ``run`` returns; 2 for a mistake of the user's (one line on stderr, no traceback), 130 after Ctrl-C.
 """
@@ -51,7 +51,7 @@ def commands() -> dict[str, Command]:
         if not info.name.startswith("_"):
             module = importlib.import_module(f"splatsoil.commands.{info.name}")
             interrupted = getattr(module, "interrupted", lambda _: "start the command again")
-            out[info.name.replace("_", "-")] = Command(module.Config, module.run, interrupted)
+            out[info.name.rstrip("_").replace("_", "-")] = Command(module.Config, module.run, interrupted)
     return out
 
 

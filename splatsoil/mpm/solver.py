@@ -376,6 +376,12 @@ class Solver:
         stiffness = self.resolution.bulk * self._table.numpy()[:, STIFFNESS].astype(np.float64)
         return -stiffness[:, None] * self._particles.elastic.numpy().astype(np.float64).reshape(self.simulations, -1)
 
+    def plastic_strains(self) -> npt.NDArray[np.float32] | None:
+        """Plastic shear strain so far, (simulations, n); None where no effect of the law keeps it."""
+        if not self.law.history:
+            return None
+        return self._particles.history.numpy()[:, 0].reshape(self.simulations, -1).copy()
+
     def momentum(self) -> npt.NDArray[np.float64]:
         """Total momentum (simulations, 3) in kg m/s."""
         p = self._particles

@@ -1,0 +1,164 @@
+"""``splatsoil export``: a run's prediction for other programs."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from tyro.conf import Positional
+
+from splatsoil.commands._options import command_line
+from splatsoil.commands._output import print_json
+from splatsoil.errors import ParameterError, RunError
+
+if TYPE_CHECKING:
+    from splatsoil.inverse.run_folder import RunFolder
+    from splatsoil.model import Model
+
+Format = Literal["vtk", "usd", "csv", "ply"]
+USUAL: tuple[Format, ...] = ("vtk", "usd", "csv", "ply")
+
+
+@dataclass(frozen=True)
+class Config:
+    """Simulate at a run's estimate, and write what other programs read.
+
+    vtk: ParaView; usd: Omniverse, Blender; csv: spreadsheets; ply: viewers of Gaussian splats.
+    """
+
+    run: Positional[Path]
+    """The run folder."""
+    to: tuple[Format, ...] = USUAL
+    """Formats; vtk and usd need `pip install 'splatsoil[export]'`."""
+    out: Path | None = None
+    """Folder for them, new or empty; RUN/export, where an older one is replaced, if not given."""
+    model: Literal["fit", "diagnosis"] = "fit"
+    """The latest fit, or the most probable model of its diagnosis."""
+    every: int | None = None
+    """Frames from one that is written to the next; those of the video are written if not given."""
+    device: str = "auto"
+    """Where to compute: auto, cpu, cuda:0, …"""
+    json: bool = False
+    """Print one JSON object instead of sentences."""
+
+
+def run(config: Config) -> int:
+    """Simulate and write; all of it or nothing."""
+    from splatsoil.export.writers import check_installed
+    from splatsoil.files import check_folder
+    from splatsoil.inverse.run_folder import RunFolder
+
+    if not config.to:
+        raise ParameterError("--to: name a format: vtk, usd, csv or ply")
+    if config.every is not None and config.every < 1:
+        raise ParameterError(f"--every: must be 1 or more, not {config.every}")
+    formats = tuple(dict.fromkeys(config.to))
+    check_installed(formats)
+    folder = RunFolder.open(config.run)
+    folder.fit()
+    target = folder.path / "export" if config.out is None else config.out
+    if config.out is not None and target.is_dir() and any(target.iterdir()):
+        raise ParameterError(f"--out: {target} is not empty; nothing is overwritten")
+    check_folder(target)
+    about = _exported(config, folder, formats, target)
+    if config.json:
+        print_json({"ok": True, **about})
+    else:
+        _show(about)
+    return 0
+
+
+def interrupted(config: Config) -> str:
+    """An export is written when it is complete."""
+    again = command_line(
+        "export",
+        (config.run,),
+        (
+            ("--to", config.to, USUAL),
+            ("--out", config.out, None),
+            ("--model", config.model, "fit"),
+            ("--every", config.every, None),
+            ("--device", config.device, "auto"),
+            ("--json", config.json, False),
+        ),
+    )
+    return f"nothing was written; start again with: {again}"
+
+
+def _exported(config: Config, folder: RunFolder, formats: tuple[str, ...], target: Path) -> dict[str, Any]:
+    """Write into a folder beside the target, then move it there; returns what ``export.json`` says."""
+    from splatsoil import __version__
+    from splatsoil.commands import _experiments as experiments
+    from splatsoil.commands import _stages as stage
+    from splatsoil.commands._progress import stages
+    from splatsoil.envs.devices import resolve_device
+    from splatsoil.export import make_writers, replay
+    from splatsoil.files import plain, write_json
+    from splatsoil.quiet import hush
+
+    hush()
+    device = resolve_device(config.device)
+    stage.note_other_sources(folder)
+    with stages(quiet=config.json) as begin:
+        model = experiments.model_of(folder, device, begin("reconstruct"))
+        model, values = _chosen(config, folder, model)
+        frames = model.frames if config.every is None else tuple(range(0, model.frames[-1] + 1, config.every))
+        report = begin("export")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}-") as temporary:
+            made = Path(temporary) / target.name
+            writers = make_writers(made, formats, model, frames)
+            replay(
+                model,
+                values,
+                frames,
+                writers,
+                progress=lambda frame, last: report(f"frame {frame}", frame / (last or 1)),
+            )
+            about = {
+                "run": str(folder.path),
+                "measurement": folder.description["measurement"]["name"],
+                "model": [effect.name for effect in model.effects],
+                "parameters": values,
+                "preset": model.preset,
+                "device": model.device,
+                "version": __version__,
+                "frames": list(frames),
+                "files": {name: sorted(p.name for p in (made / name).iterdir()) for name in formats},
+            }
+            write_json(made / "export.json", about)
+            with folder.lock() if config.out is None else nullcontext():
+                if config.out is None:
+                    shutil.rmtree(target, ignore_errors=True)
+                elif target.is_dir():
+                    target.rmdir()
+                shutil.move(made, target)
+    return {**plain(about), "out": str(target)}
+
+
+def _chosen(config: Config, folder: RunFolder, model: Model) -> tuple[Model, dict[str, float]]:
+    """The model to simulate, and its parameters."""
+    from splatsoil.report.data import estimates, load
+
+    if config.model == "fit":
+        return model, estimates(folder.fit())
+    diagnosis = load(folder.path).diagnosis
+    if diagnosis is None or set(diagnosis["model"]) != {effect.name for effect in model.effects}:
+        raise RunError(f"{folder.path}: its latest fit has no diagnosis; splatsoil diagnose makes one")
+    best = max((m for m in diagnosis["models"] if m["kind"] != "discrepancy"), key=lambda m: m["probability"])
+    if best["kind"] != "base":
+        model = model.variant(effects=(*(effect.name for effect in model.effects), best["name"]))
+    known = {p.name for p in model.parameters}
+    return model, {name: value for name, value in best["values"].items() if name in known}
+
+
+def _show(about: dict[str, Any]) -> None:
+    values = ", ".join(f"{name} {value:.4g}" for name, value in about["parameters"].items())
+    print(f"{about['measurement']} at {values}: {len(about['frames'])} frames")
+    for name, files in about["files"].items():
+        shown = [f for f in files if not f.endswith(".vtu")]
+        print(f"{name}: {', '.join(str(Path(about['out']) / name / f) for f in shown)}")

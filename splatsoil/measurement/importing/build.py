@@ -1,0 +1,351 @@
+"""A measurement set, or parts of one, out of what others recorded: all of it or nothing."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+
+from splatsoil.errors import MeasurementError
+from splatsoil.measurement.camera import Camera
+from splatsoil.measurement.fields import Fields
+from splatsoil.measurement.frames import Frame, read_transforms
+from splatsoil.measurement.importing.clock import WIDTH, ClockOffset, Footage, clock_offset, moving
+from splatsoil.measurement.importing.robot import UNITS, Grid, read_force, read_motion, read_rigid, resampled
+from splatsoil.measurement.importing.similarity import (
+    by_known_points,
+    by_scale,
+    distance_scale,
+    moved,
+    read_marked,
+    read_points,
+)
+from splatsoil.measurement.importing.source import Source, find_image, read_source
+from splatsoil.measurement.importing.tags import tag_scale
+from splatsoil.measurement.importing.video import Video
+from splatsoil.measurement.measurement import EXPERIMENT, FORMAT, Measurement
+from splatsoil.measurement.motion import MOTION_COLUMNS, ToolMotion
+from splatsoil.measurement.tool import FORCE_COLUMNS, read_mesh
+from splatsoil.measurement.writer import _write_frames, _write_json, _write_table
+
+FloatArray = npt.NDArray[np.float64]
+
+PRE_ROLL = 8
+"""Frames before anything moves that are kept of a video, at most: they measure the noise."""
+LOOKED_AT = 60
+"""Pictures of each video that its clock is told from."""
+QUALITY = 95
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """How the source's world becomes metres with z up; one of `scale`, `distance`, `tags` and `known`.
+
+    Attributes:
+        scale: metres for each of its units.
+        distance: two marked points, and the metres between them.
+        tags: edge of the AprilTags in its photographs, m.
+        known: file of points' places in the new world.
+        points: file of the same points in the source's world, or in its photographs.
+        up: direction in the source's world that points up; with `known` it is told by these.
+    """
+
+    scale: float | None = None
+    distance: tuple[str, str, float] | None = None
+    tags: float | None = None
+    known: Path | None = None
+    points: Path | None = None
+    up: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What is imported besides the views.
+
+    Attributes:
+        tool: mesh and its unit.
+        motion: the robot's record, and the unit of its positions.
+        force: the robot's record.
+        robot_to_world, mesh_to_flange: files of rigid motions, m.
+        video: by camera, the file and the photograph of the source that has the camera's pose.
+        every: frames of a video from one that is kept to the next.
+        clock_offset: what is added to the video's times to get the robot's, s; estimated if None.
+        experiment: an experiment.json with the rest.
+    """
+
+    tool: tuple[Path, str] | None = None
+    motion: tuple[Path, str] | None = None
+    force: Path | None = None
+    robot_to_world: Path | None = None
+    mesh_to_flange: Path | None = None
+    video: dict[str, tuple[Path, str]] = field(default_factory=dict)
+    every: int = 1
+    clock_offset: float | None = None
+    experiment: Path | None = None
+
+
+@dataclass(frozen=True)
+class Imported:
+    """What was made.
+
+    Attributes:
+        kind: of the source.
+        views: photographs.
+        similarity: (4, 4) from the source's world to the set's.
+        marks: root mean square of the marked points' distance from their pixels, px.
+        points: the same of the known points, m; None without any.
+        frames: of the video, by camera.
+        clock: of the video, where it was told from the pictures.
+        missing: parts that a set needs and this lacks.
+    """
+
+    kind: str
+    views: int
+    similarity: FloatArray
+    marks: float
+    points: float | None
+    frames: dict[str, int]
+    clock: ClockOffset | None
+    missing: tuple[str, ...]
+
+    @property
+    def scale(self) -> float:
+        """Metres for each unit of the source's world."""
+        return float(np.cbrt(np.linalg.det(self.similarity[:3, :3])))
+
+
+Report = Callable[[str, float], None]
+
+
+def import_set(
+    source: Path, out: Path, alignment: Alignment, parts: Parts, *, images: Path | None = None, report: Report
+) -> Imported:
+    """Write ``out``: its views, and whatever else of a set is given; with an experiment.json, a whole set, checked.
+
+    Args:
+        source: see `read_source`.
+        out: a folder, new or empty.
+        alignment: of the source's world.
+        parts: the rest.
+        images: see `read_source`.
+        report: called with what is being done, and the share of it that is done.
+
+    Raises:
+        MeasurementError: something is missing or faulty; nothing is written.
+        ParameterError: a package is missing.
+    """
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise MeasurementError("already there and not an empty folder; nothing is overwritten", file=out)
+    report("reading the views", 0.0)
+    found = read_source(source, images)
+    similarity, marks, left = _similarity(found, alignment)
+    stills = {name: find_image(found.frames, image) for name, (_, image) in parts.video.items()}
+    aside = {still.path for still in stills.values()}
+    views = [moved(frame, similarity) for frame in found.frames if frame.path not in aside]
+    if not views:
+        raise MeasurementError("no view is left: all photographs give the video's cameras their poses", file=source)
+    cameras = {name: moved(still, similarity).camera for name, still in stills.items()}
+    videos = _opened(parts, cameras)
+    mesh = None if parts.tool is None else _mesh(*parts.tool)
+    to_world, to_flange = read_rigid(parts.robot_to_world), read_rigid(parts.mesh_to_flange)
+    motion = None if parts.motion is None else read_motion(*parts.motion, to_world, to_flange)
+    experiment = {} if parts.experiment is None else dict(Fields.read(parts.experiment).data)
+    rate = _rate(videos, experiment, motion)
+
+    clock, offset = None, parts.clock_offset or 0.0
+    if videos and motion is not None and parts.clock_offset is None:
+        if mesh is None:
+            raise MeasurementError("the clock's offset is told from the tool's mesh; give --tool or --clock-offset")
+        report("finding the clock's offset", 0.1)
+        clock = clock_offset([_footage(video, cameras[name]) for name, video in videos.items()], mesh, motion)
+        offset = clock.seconds
+    # The video's frame that is the last one before the tool moves is number 0.
+    zero = 0 if motion is None or not videos else int(np.floor((moving(motion)[0] - offset) * rate + 1e-6))
+    grid = Grid(rate, zero / rate + offset)
+
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}-") as temporary:
+        root = Path(temporary) / out.name
+        root.mkdir()
+        _write_frames(root / "views", views, video=False, suffix=".jpg", quality=QUALITY)
+        last = None
+        if mesh is not None:
+            mesh.export(root / "tool.stl")
+        if motion is not None:
+            steps = resampled(motion, grid)
+            table = np.column_stack([steps.frames, steps.times, steps.positions, steps.quaternions])
+            _write_table(root / "tool_motion.csv", MOTION_COLUMNS, table)
+            last = int(steps.frames[-1])
+        if parts.force is not None:
+            _write_table(root / "tool_force.csv", FORCE_COLUMNS, read_force(parts.force, to_world, grid))
+        taken = []
+        for k, (name, video) in enumerate(videos.items()):
+            report(f"video {name}", 0.4 + 0.5 * k / len(videos))
+            taken += _extracted(video, cameras[name], name, Path(temporary) / "video" / name, zero, last, parts.every)
+        if taken:
+            _write_frames(root / "video", taken, video=True, suffix=".jpg", quality=QUALITY)
+        report("checking", 0.9)
+        missing = _finish(root, experiment, rate, out)
+        if out.exists():
+            out.rmdir()
+        shutil.move(root, out)
+    count = {name: sum(frame.camera_name == name for frame in taken) for name in videos}
+    return Imported(found.kind, len(views), similarity, marks, left, count, clock, missing)
+
+
+def _similarity(source: Source, alignment: Alignment) -> tuple[FloatArray, float, float | None]:
+    """From the source's world to the set's; errors of marks in px, of known points in m."""
+    ways = {
+        "--scale": alignment.scale,
+        "--distance": alignment.distance,
+        "--tags": alignment.tags,
+        "--known": alignment.known,
+    }
+    given = [name for name, value in ways.items() if value is not None]
+    if len(given) != 1:
+        what = f"{' and '.join(given)} contradict each other" if given else "no scale is given"
+        raise MeasurementError(f"{what}; give one of --scale, --distance, --tags and --known")
+    if given[0] in ("--distance", "--known") and alignment.points is None:
+        raise MeasurementError(f"{given[0]}: needs --points, which say where these points are in the source")
+    marked = None if alignment.points is None else read_marked(alignment.points, source.frames)
+    if alignment.known is not None:
+        if alignment.up is not None:
+            raise MeasurementError("--up: the known points tell it; leave it out")
+        assert marked is not None
+        similarity, left = by_known_points(marked.places, read_points(alignment.known))
+        return similarity, marked.error, left
+    if alignment.up is None and not source.has_up:
+        raise MeasurementError(f"{source.kind} doesn't know which way is up; give --up or --known")
+    if alignment.tags is not None:
+        scale, marked = tag_scale(source.frames, alignment.tags)
+    elif alignment.distance is not None:
+        assert marked is not None
+        scale = distance_scale(marked.places, *alignment.distance)
+    else:
+        assert alignment.scale is not None
+        scale = alignment.scale
+    return by_scale(scale, alignment.up or (0.0, 0.0, 1.0)), 0.0 if marked is None else marked.error, None
+
+
+def _mesh(file: Path, unit: str) -> Any:
+    mesh = read_mesh(file)
+    told = mesh.units is not None
+    if told and unit != "m":
+        raise MeasurementError(f"the file itself tells its unit, and was read in metres; say m, not {unit}", file=file)
+    return mesh if told else mesh.apply_scale(UNITS[unit])
+
+
+def _opened(parts: Parts, cameras: dict[str, Camera]) -> dict[str, Video]:
+    out = {}
+    for name, (path, image) in parts.video.items():
+        video, camera = Video.open(path), cameras[name]
+        if video.size != (camera.width, camera.height):
+            raise MeasurementError(
+                f"its frames have {video.size[0]} x {video.size[1]} pixels, {image} has {camera.width} x"
+                f" {camera.height}",
+                file=path,
+            )
+        out[name] = video
+    return out
+
+
+def _rate(videos: dict[str, Video], experiment: dict[str, Any], motion: ToolMotion | None) -> float:
+    """The set's frames a second: the videos', or the experiment's."""
+    told = experiment.get("frame_rate")
+    rates = {video.rate for video in videos.values()} | ({float(told)} if isinstance(told, int | float) else set())
+    if len(rates) > 1 and max(rates) > 1.001 * min(rates):
+        raise MeasurementError(
+            f"videos and experiment.json have different frame rates: {', '.join(f'{r:g}' for r in sorted(rates))}"
+        )
+    if not rates and motion is not None:
+        raise MeasurementError("a motion needs frames: give --video, or --experiment with a frame_rate")
+    return next((video.rate for video in videos.values()), max(rates, default=1.0))
+
+
+def _footage(video: Video, camera: Camera) -> Footage:
+    """Pictures over all of a video, small ones."""
+    factor = 1.0
+    while factor * camera.width > WIDTH:
+        factor *= 0.5
+    small = camera.scaled(factor)
+    numbers = set(np.unique(np.linspace(0, video.count - 1, LOOKED_AT).astype(int)).tolist())
+    times, pictures = [], []
+    for number, picture in video.pictures(numbers):
+        image = Image.fromarray(picture).resize((small.width, small.height), Image.Resampling.BOX)
+        times.append(number / video.rate)
+        pictures.append(_without_distortion(np.asarray(image), small))
+    return Footage(small.undistorted(), np.array(times), np.stack(pictures))
+
+
+def _without_distortion(picture: npt.NDArray[np.uint8], camera: Camera) -> npt.NDArray[np.uint8]:
+    """Each pixel's nearest one in the picture (h, w, 3) of a lens that bends."""
+    if not camera.has_distortion:
+        return picture
+    where = np.nan_to_num(camera.undistortion_map(), nan=0.0)
+    columns, rows = (np.clip(where[..., k].astype(int), 0, picture.shape[1 - k] - 1) for k in (0, 1))
+    return picture[rows, columns]
+
+
+def _extracted(
+    video: Video, camera: Camera, name: str, folder: Path, zero: int, last: int | None, every: int
+) -> list[Frame]:
+    """Frames of a video as files: every so many from ``zero`` on until the tool rests, and those just before."""
+    end = video.count if last is None else min(video.count, zero + last + 1)
+    wanted = {*range(max(zero, zero % every), end, every), *range(max(zero - PRE_ROLL, 0), min(zero, video.count))}
+    if not wanted:
+        raise MeasurementError("the video ends before the tool moves, or begins after; is the clock's offset right?")
+    folder.mkdir(parents=True)
+    out = []
+    named = replace(camera, name=name)
+    for number, picture in video.pictures(wanted):
+        path = folder / f"{number:06d}.jpg"
+        Image.fromarray(picture).save(path, quality=QUALITY, subsampling=0)
+        out.append(Frame(named, path, name, number - zero, (number - zero) / video.rate))
+    return out
+
+
+def _finish(root: Path, experiment: dict[str, Any], rate: float, out: Path) -> tuple[str, ...]:
+    """Write experiment.json and check the set, or what there is of it; returns the parts that it lacks."""
+    there = {name: name for name in ("tool.stl", "tool_motion.csv", "tool_force.csv") if (root / name).is_file()}
+    tool = dict(experiment["tool"]) if isinstance(experiment.get("tool"), dict) else {}
+    keys = {"mesh": "tool.stl", "motion": "tool_motion.csv", "force": "tool_force.csv"}
+    tool = {k: v for k, v in tool.items() if k not in keys} | {k: v for k, v in keys.items() if v in there}
+    parts = {kind: f"{kind}/transforms.json" for kind in ("views", "video") if (root / kind).is_dir()}
+    # What a file names that is not imported isn't in the new folder.
+    notes = {key: value for key, value in experiment.items() if key not in ("views", "video")}
+    whole = {"format": FORMAT, **notes, "tool": tool, "frame_rate": rate, **parts}
+    missing = [name for name, key in (("bed", "bed"), ("gravity", "gravity"), ("video", "video")) if key not in whole]
+    missing += [f"tool.{key}" for key in ("mesh", "motion") if key not in tool]
+    try:
+        if missing:
+            read_transforms(root / "views" / "transforms.json", root, video=False)
+        else:
+            _write_json(root / EXPERIMENT, whole)
+            Measurement.load(root)
+    except MeasurementError as error:
+        raise MeasurementError(str(error).replace(str(root.absolute()), str(out))) from error
+    return tuple(missing)
+
+
+def names_of(videos: Sequence[str]) -> dict[str, tuple[Path, str]]:
+    """``FILE=IMAGE`` words by camera, which is called as its file.
+
+    Raises:
+        MeasurementError: another form, or two files of one name.
+    """
+    out: dict[str, tuple[Path, str]] = {}
+    for word in videos:
+        file, sign, image = word.partition("=")
+        if not sign or not file or not image:
+            raise MeasurementError(f"--video {word}: write FILE=IMAGE, with the photograph of SOURCE it was posed by")
+        if Path(file).stem in out:
+            raise MeasurementError(f"--video {word}: two cameras would be called {Path(file).stem}")
+        out[Path(file).stem] = Path(file), image
+    return out

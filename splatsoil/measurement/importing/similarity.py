@@ -1,0 +1,187 @@
+"""From a reconstruction's own world to metres with z up."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from splatsoil.errors import MeasurementError
+from splatsoil.measurement.fields import read_table, read_text
+from splatsoil.measurement.frames import Frame
+from splatsoil.measurement.importing.source import find_image
+from splatsoil.measurement.rotations import rotation_matrix
+
+FloatArray = npt.NDArray[np.float64]
+Marks = dict[str, list[tuple[Frame, FloatArray]]]
+"""Photographs, and pixels (2,) in them, by point."""
+
+PLACE = ("point", "x", "y", "z")
+_PARALLEL = 1e-4  # squared sine of the angle between rays that meet nowhere in particular
+_FLAT = 1e-3  # of known points' spread along one line, across it: they tell no turn about it
+
+
+@dataclass(frozen=True)
+class Marked:
+    """Points in the reconstruction's world.
+
+    Attributes:
+        places: (3,) by name.
+        error: root mean square of the distance from where they were marked, px; 0 where places were given.
+    """
+
+    places: Mapping[str, FloatArray]
+    error: float = 0.0
+
+
+def read_points(file: Path) -> dict[str, FloatArray]:
+    """Points (3,) by name, from a CSV file of ``point,x,y,z``.
+
+    Raises:
+        MeasurementError: naming file and line.
+    """
+    names, table = _named(file, PLACE)
+    if len(set(names)) < len(names):
+        raise MeasurementError("a point is given twice", file=file, field="point")
+    return dict(zip(names, table, strict=True))
+
+
+def read_marked(file: Path, frames: Sequence[Frame]) -> Marked:
+    """Points in the reconstruction's world, from ``point,x,y,z``, or ``point,image,u,v``: pixels of photographs, from
+    the image's left and top edge, at least two of each point.
+
+    Raises:
+        MeasurementError: naming file and what is wrong.
+    """
+    header = read_text(file).split("\n", 1)[0].lower()
+    if "image" not in header:
+        return Marked(read_points(file))
+    names, table = _named(file, ("point", "u", "v"))
+    images = [row["image"].strip() for row in _rows(file)]
+    marks: Marks = {}
+    try:
+        for name, image, pixel in zip(names, images, table, strict=True):
+            marks.setdefault(name, []).append((find_image(frames, image), pixel))
+        return intersected(marks)
+    except MeasurementError as error:
+        raise MeasurementError(str(error), file=file) from error
+
+
+def intersected(marks: Marks) -> Marked:
+    """Points where the rays through their pixels meet.
+
+    Raises:
+        MeasurementError: one is marked in fewer than two photographs from different places.
+    """
+    places = {name: _triangulated(name, seen) for name, seen in marks.items()}
+    errors = [
+        frame.camera.project(places[name][None])[0][0] - pixel for name, seen in marks.items() for frame, pixel in seen
+    ]
+    return Marked(places, float(np.sqrt(np.mean(np.sum(np.square(errors), axis=1)))))
+
+
+def _triangulated(name: str, marks: Sequence[tuple[Frame, FloatArray]]) -> FloatArray:
+    """The point nearest to all rays, in least squares."""
+    rays = [frame.camera.rays(pixel[None]) for frame, pixel in marks]
+    origins, ways = (np.concatenate([ray[k] for ray in rays]) for k in (0, 1))
+    across = np.eye(3) - ways[:, :, None] * ways[:, None, :]
+    if not np.isfinite(across).all():
+        raise MeasurementError(f"point {name!r} is marked where its photograph shows nothing")
+    if len(marks) < 2 or np.linalg.eigvalsh(across.sum(axis=0))[0] < _PARALLEL:
+        raise MeasurementError(f"point {name!r} needs marks in two photographs from different places")
+    return np.asarray(np.linalg.solve(across.sum(axis=0), np.einsum("nij,nj->i", across, origins)))
+
+
+def by_known_points(marked: Mapping[str, FloatArray], known: Mapping[str, FloatArray]) -> tuple[FloatArray, float]:
+    """The similarity (4, 4) that takes marked points to known places, and the root mean square of what is left, m.
+
+    Least squares of S. Umeyama (1991), IEEE PAMI 13:376.
+
+    Raises:
+        MeasurementError: fewer than three points have both, or they lie on a line.
+    """
+    names = sorted(marked.keys() & known.keys())
+    if len(names) < 3:
+        raise MeasurementError(f"a scale and a turn need three known points that are marked, not {len(names)}")
+    x, y = (np.stack([places[name] for name in names]) for places in (marked, known))
+    dx, dy = x - x.mean(axis=0), y - y.mean(axis=0)
+    for spread, what in ((dx, "marked"), (dy, "known")):
+        sizes = np.linalg.svd(spread, compute_uv=False)
+        if sizes[1] <= _FLAT * sizes[0]:
+            raise MeasurementError(f"the {what} points lie on one line; take one that doesn't")
+    u, sizes, vt = np.linalg.svd(dy.T @ dx)
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
+    out = np.eye(4)
+    scale = float(sizes @ signs) / float(np.sum(dx**2))
+    out[:3, :3] = scale * (u * signs) @ vt
+    out[:3, 3] = y.mean(axis=0) - out[:3, :3] @ x.mean(axis=0)
+    left = x @ out[:3, :3].T + out[:3, 3] - y
+    return out, float(np.sqrt(np.mean(np.sum(left**2, axis=1))))
+
+
+def by_scale(scale: float, up: npt.ArrayLike = (0.0, 0.0, 1.0)) -> FloatArray:
+    """The similarity (4, 4) of a scale, in m, and the smallest turn that takes the direction ``up`` to +z.
+
+    Raises:
+        MeasurementError: a scale that isn't positive, or no direction.
+    """
+    if not (np.isfinite(scale) and scale > 0.0):
+        raise MeasurementError(f"a scale is a positive number of metres, not {scale:g}")
+    way = np.asarray(up, dtype=np.float64)
+    length = float(np.linalg.norm(way))
+    if not (np.isfinite(length) and length > 0.0):
+        raise MeasurementError("up is a direction: three numbers that are not all 0")
+    way = way / length
+    axis = np.cross(way, [0.0, 0.0, 1.0])
+    sine = float(np.linalg.norm(axis))
+    # Of half a turn any horizontal axis will do.
+    unit = axis / sine if sine > 1e-12 else np.array([1.0, 0.0, 0.0])
+    out = np.eye(4)
+    out[:3, :3] = scale * rotation_matrix(np.arctan2(sine, way[2]) * unit)
+    return out
+
+
+def distance_scale(marked: Mapping[str, FloatArray], first: str, second: str, metres: float) -> float:
+    """Metres for each unit of the reconstruction's world, by the distance between two marked points.
+
+    Raises:
+        MeasurementError: one isn't marked, or there is no distance between them.
+    """
+    missing = [name for name in (first, second) if name not in marked]
+    if missing:
+        raise MeasurementError(f"point {missing[0]!r} is not marked; marked are {', '.join(marked)}")
+    apart = float(np.linalg.norm(marked[first] - marked[second]))
+    if not apart > 0.0:
+        raise MeasurementError(f"points {first!r} and {second!r} are in one place")
+    return metres / apart
+
+
+def moved(frame: Frame, similarity: FloatArray) -> Frame:
+    """A photograph in the new world. Its depth, whose unit was the old one's, is left out where the scale changes."""
+    scale = float(np.cbrt(np.linalg.det(similarity[:3, :3])))
+    pose = frame.camera.camera_to_world.copy()
+    pose[:3, 3] = similarity[:3, :3] @ pose[:3, 3] + similarity[:3, 3]
+    pose[:3, :3] = similarity[:3, :3] @ pose[:3, :3] / scale
+    depth = frame.depth_path if abs(scale - 1.0) < 1e-3 else None
+    return replace(frame, camera=replace(frame.camera, camera_to_world=pose), depth_path=depth)
+
+
+def _named(file: Path, columns: Sequence[str]) -> tuple[list[str], FloatArray]:
+    """The names in the first column, and a table (n, k) of numbers in the others."""
+    table = read_table(file, columns[1:])
+    names = [row.get(columns[0], "").strip() for row in _rows(file)]
+    if len(names) != len(table) or not all(names):
+        raise MeasurementError(f"each row needs a name; the header is {','.join(columns)}", file=file)
+    return names, table
+
+
+def _rows(file: Path) -> list[dict[str, str]]:
+    """Rows of a CSV file by lower-case column."""
+    lines = [line for line in read_text(file).splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    delimiter = next((mark for mark in ";\t" if mark in lines[0]), ",")
+    rows = csv.DictReader(lines, delimiter=delimiter, skipinitialspace=True)
+    return [{(key or "").strip().lower(): value or "" for key, value in row.items() if key} for row in rows]

@@ -1,0 +1,132 @@
+"""``splatsoil export``: what it refuses, which model it takes, and all of it once."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import re
+import shlex
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import tyro
+from splatsoil.inverse.run_folder import RunFolder
+
+from splatsoil import cli
+from splatsoil.commands import export
+from splatsoil.errors import RunError
+from splatsoil.files import write_json
+
+
+@pytest.mark.usefixtures("no_work")
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--every", "0"], "--every: must be 1 or more"),
+        (["--out", "full"], "full is not empty; nothing is overwritten"),
+        (["--out", "full/note.txt"], "is a file and no folder"),
+        (["--to"], "--to: name a format"),
+        (["--device", "abacus"], "abacus"),
+    ],
+)
+def test_mistakes_are_one_line_and_nothing_is_written(
+    words: list[str], said: str, run: RunFolder, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = run.path.parent
+    monkeypatch.chdir(folder)
+    (folder / "full").mkdir()
+    (folder / "full" / "note.txt").write_text("mine")
+    before = sorted(folder.rglob("*"))
+    assert cli.main(["export", str(run.path), *(words if "--to" in words else ["--to", "csv", *words])]) == 2
+    error = capsys.readouterr().err
+    assert said in error and error.count("\n") == 1
+    assert sorted(folder.rglob("*")) == before
+
+
+@pytest.mark.usefixtures("no_work")
+def test_a_missing_package_is_one_sentence(
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    there = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *_: None if name == "pxr" else there(name))
+    assert cli.main(["export", str(run.path), "--to", "csv", "usd"]) == 2
+    wanted = "splatsoil: --to usd: needs packages that aren't installed; pip install 'splatsoil[export]'\n"
+    assert capsys.readouterr().err == wanted
+    assert not (run.path / "export").exists()
+
+
+def model_with(*effects: str) -> Any:
+    """A model as far as a choice needs it."""
+    names = {"": ["friction_angle"], "cohesion": ["friction_angle", "cohesion"]}
+    return SimpleNamespace(
+        effects=tuple(SimpleNamespace(name=name) for name in effects),
+        parameters=tuple(SimpleNamespace(name=name) for name in names["+".join(effects)]),
+        variant=lambda effects: model_with(*effects),
+    )
+
+
+def diagnosis(fit: dict[str, Any], best: str) -> dict[str, Any]:
+    chances = {"else": 0.5, best: 0.3, "tilt": 0.1}
+    kinds = {"else": "discrepancy", "": "base"}
+    values = {"friction_angle": 31.0, **({"cohesion": 250.0} if best else {})}
+    models = [
+        {"name": name, "kind": kinds.get(name, "physics"), "probability": chance, "values": values}
+        for name, chance in chances.items()
+    ]
+    estimates = {name: entry["estimate"] for name, entry in fit["parameters"].items()}
+    return {"format": "splatsoil-diagnosis/2", "values": estimates, "model": [], "models": models}
+
+
+@pytest.mark.parametrize("best", ["", "cohesion"])
+def test_the_most_probable_model_of_the_diagnosis(
+    best: str, run: RunFolder, fit_of: Callable[..., dict[str, Any]]
+) -> None:
+    config = export.Config(run.path, model="diagnosis")
+    with pytest.raises(RunError, match="splatsoil diagnose makes one"):
+        export._chosen(config, run, model_with())
+    write_json(run.path / "diagnoses" / "base.json", diagnosis(fit_of(), best))
+    model, values = export._chosen(config, run, model_with())
+    assert [effect.name for effect in model.effects] == ([best] if best else [])
+    assert values == {"friction_angle": 31.0, **({"cohesion": 250.0} if best else {})}
+    assert export._chosen(export.Config(run.path), run, model_with())[1] == {"friction_angle": 35.0}
+
+
+def test_help_fits_a_screen(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit):
+        cli.main(["export", "--help"])
+    assert len(capsys.readouterr().out.splitlines()) <= 40
+
+
+def test_the_commands_of_the_page_parse(repository: Path) -> None:
+    (block,) = re.findall(r"```sh\n(.*?)```", (repository / "docs" / "export.md").read_text(), re.DOTALL)
+    lines = [shlex.split(line) for line in block.splitlines() if line.startswith("splatsoil")]
+    assert len(lines) == 3
+    for _, name, *words in lines:
+        tyro.cli(cli.commands()[name].config, args=words)
+
+
+@pytest.mark.slow
+def test_a_fitted_run_is_exported_and_replaced(
+    small_set: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    fit = ["fit", str(small_set), "--preset", "tiny", "--budget", "2", "--run", "run", "--device", "cpu", "--json"]
+    assert cli.main(fit) == 0
+    estimate = json.loads(capsys.readouterr().out)["parameters"]["friction_angle"]["estimate"]
+    assert cli.main(["export", "run", "--to", "csv", "ply", "--device", "cpu", "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["ok"] is True and said["parameters"] == {"friction_angle": estimate} and said["frames"] == [0, 10]
+    folder = tmp_path / "run" / "export"
+    wanted = {"csv": ["force.csv", "surface.csv"], "ply": ["splats_000000.ply", "splats_000010.ply"]}
+    assert said["files"] == wanted
+    assert {name: sorted(p.name for p in (folder / name).iterdir()) for name in wanted} == wanted
+    assert json.loads((folder / "export.json").read_text())["preset"] == "tiny"
+    assert cli.main(["export", "run", "--to", "csv", "--every", "5", "--device", "cpu"]) == 0
+    assert sorted(p.name for p in folder.iterdir()) == ["csv", "export.json"], "the older one is gone"
+    header = (folder / "csv" / "surface.csv").read_text().splitlines()[0]
+    assert header == "x,y,reconstructed,frame_0,frame_5,frame_10"
+    assert not [p for p in (tmp_path / "run").iterdir() if p.name.startswith(".")]
