@@ -67,9 +67,9 @@ class Resolution:
         relaxation: exchanges between particles and grid a second of which hourglass modes and the tool's contact shall
             know, whatever the number of ``steps``: the former are damped as that many plain APIC exchanges would, soil
             sunk into the tool comes out at twice the rate. 0 for as many as there are.
-        skin: of the spacing, how far from the faces of a plate thinner than a cell particles stop, because they stand
-            for soil half a spacing around them. Its edges need none: contact acts through the grid, which widens them.
-            Thick bodies have none, because nothing was measured on them.
+        skin: of the spacing, how far from a tool's faces particles stop, because they stand for soil half a spacing
+            around them. The edges of a plate thinner than a cell need none: contact acts through the grid, which
+            widens them.
     """
 
     cell: float

@@ -103,9 +103,13 @@ def _measure_thickness(
 
 
 def thickened(mesh: trimesh.Trimesh, skin: float, thin: float) -> trimesh.Trimesh:
-    """A body whose faces have moved outward by ``skin`` (m) where another one lies behind, nearly parallel and within
-    ``thin`` (m), and by less, with the square of the ratio, where it is farther. A plate's edges stay where they are.
+    """A body whose faces have moved outward by ``skin`` (m): all, where it is thicker than ``thin`` (m) on average.
+
+    Of a plate or shell, a face moves so far where another one lies behind, nearly parallel and within ``thin``, and by
+    less, with the square of the ratio, where it is farther: its edges stay where they are.
     """
+    if 2.0 * mesh.volume > thin * mesh.area:
+        return _offset(mesh, np.full(len(mesh.faces), skin))
     surface = _surface(mesh, "cpu")
     thickness = wp.zeros(len(mesh.faces), dtype=float, device="cpu")
     places = [
@@ -115,6 +119,11 @@ def thickened(mesh: trimesh.Trimesh, skin: float, thin: float) -> trimesh.Trimes
     inputs = [surface.id, *places, inside, thickness]
     wp.launch(_measure_thickness, dim=len(mesh.faces), inputs=inputs, device="cpu")
     moved = skin * np.minimum(thin / thickness.numpy().astype(np.float64), 1.0) ** 2
+    return _offset(mesh, moved)
+
+
+def _offset(mesh: trimesh.Trimesh, moved: npt.NDArray[np.float64]) -> trimesh.Trimesh:
+    """Each face moved outward by its own distance (f,) in m."""
     # each corner goes where the planes that met in it meet again: least squares, of the least length
     matrices, targets = np.zeros((len(mesh.vertices), 3, 3)), np.zeros((len(mesh.vertices), 3))
     for corner in np.asarray(mesh.faces).T:
@@ -135,8 +144,7 @@ def _surface(mesh: trimesh.Trimesh, device: str) -> wp.Mesh:
 def build_tool(
     mesh: trimesh.Trimesh, *, margin: float, stiffness: float, damping: float, device: str, skin: float, thin: float
 ) -> Tool:
-    """Sample the distance field of ``mesh`` (its own frame, m) out to ``margin`` in m, :func:`thickened` by ``skin``
-    where it is no thicker than ``thin``.
+    """Sample the distance field of ``mesh`` (its own frame, m), :func:`thickened`, out to ``margin`` in m.
 
     Raises:
         SimulationError: the mesh encloses no volume.

@@ -78,8 +78,8 @@ def test_soil_stops_before_a_plates_faces_and_not_before_its_edges() -> None:
     np.testing.assert_allclose(distance[middle[0], middle[1], below], -0.1 - axes[2][below], atol=1e-4)
 
 
-def test_curved_plates_grow_across_and_blocks_hardly() -> None:
-    """A pipe 12 mm thick by the skin on either side and not along; a ball of 10 cm by the square of 2 cm over that."""
+def test_curved_plates_grow_across_and_blocks_all_around() -> None:
+    """A pipe 12 mm thick by the skin on either side and not along; a ball and a drum by the skin everywhere."""
     pipe = trimesh.creation.annulus(0.1, 0.112, 0.12, sections=96)
     grown = thickened(pipe, skin=0.005, thin=0.02)
     radii = np.linalg.norm(grown.vertices[:, :2], axis=1)
@@ -87,7 +87,10 @@ def test_curved_plates_grow_across_and_blocks_hardly() -> None:
     np.testing.assert_allclose([radii.min(), radii.max()], [0.095, 0.117], atol=1e-4)
     assert grown.extents[2] == pytest.approx(0.12, abs=5e-4)
     ball = thickened(trimesh.creation.icosphere(4, 0.05), skin=0.005, thin=0.02)
-    np.testing.assert_allclose(np.linalg.norm(ball.vertices, axis=1), 0.05 + 0.005 * 0.04, atol=2e-5)
+    np.testing.assert_allclose(np.linalg.norm(ball.vertices, axis=1), 0.055, atol=2e-5)
+    drum = thickened(trimesh.creation.cylinder(0.06, 0.12, sections=96), skin=0.005, thin=0.02)
+    assert drum.is_volume
+    np.testing.assert_allclose(drum.extents, [0.13, 0.13, 0.13], atol=2e-4)
 
 
 def test_the_flat_foot_of_a_raked_plate_stays() -> None:
