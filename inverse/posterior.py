@@ -18,7 +18,7 @@ from splatsoil.parameters import Parameter
 from splatsoil.run_files import POSTERIOR_FORMAT
 
 from .criticism.design import Prior
-from .criticism.evidence import PRIOR, SOMETHING_ELSE, Comparison
+from .criticism.evidence import PRIOR, Comparison
 from .criticism.noise import FACTORS, Noise
 from .marginal import Marginal
 from .mcmc import Chains
@@ -56,10 +56,7 @@ class Density:
     @property
     def beliefs(self) -> FloatArray:
         """(f,) logarithms of the probability of each of the numerics' factors beforehand, over both models."""
-        usual = self.noise.factors
-        beyond = np.where(np.exp(SOMETHING_ELSE * self.noise.factor_std) <= FACTORS, 0.0, -np.inf)
-        beyond = beyond - logsumexp(beyond)
-        return np.asarray(np.logaddexp(np.log(PRIOR) + usual, np.log(1.0 - PRIOR) + beyond))
+        return np.asarray(np.logaddexp(np.log(PRIOR) + self.noise.expected, np.log(1.0 - PRIOR) + self.noise.beyond))
 
     def predict(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Mean (q, p) of whitened scores at points (q, n), and the emulator's variance."""
@@ -91,7 +88,7 @@ class Density:
         share = np.exp(log - logsumexp(log, axis=0))
         scores = (mean + np.sqrt(variance) * rng.standard_normal(mean.shape)) @ root.T
         for row, weights in zip(scores, share.T, strict=True):
-            covariance = self.noise.covariance(float(rng.choice(FACTORS, p=weights)))
+            covariance = self.noise.covariance(rng.choice(FACTORS, p=weights))
             row += rng.multivariate_normal(np.zeros(len(row)), covariance, method="eigh")
         return np.asarray(scores)
 

@@ -14,8 +14,6 @@ import numpy.typing as npt
 
 from splatsoil.experiment.base import Experiment
 
-from .noise import REMAINING
-
 FloatArray = npt.NDArray[np.float64]
 
 DRAWS = 999
@@ -49,34 +47,25 @@ class Expected:
 
     Attributes:
         sensor: (t, s) standard deviation of instruments.
-        chance: (m, t, s) samples of one simulation's own.
-        pairs: (k, t, s) fine minus coarse; none where there are none.
-        factor: of the numerics.
+        chance: (m, t, s) one simulation's own: independent parts, each of a standard normal size.
+        numerics: (k, t, s) the model's own error, likewise.
     """
 
     sensor: FloatArray
     chance: FloatArray
-    pairs: FloatArray
-    factor: float
+    numerics: FloatArray
 
     @property
     def variance(self) -> FloatArray:
         """(t, s)."""
-        out = self.sensor**2
-        if len(self.chance):
-            out = out + np.mean(self.chance**2, axis=0)
-        if len(self.pairs):
-            out = out + (REMAINING * self.factor) ** 2 * np.mean(self.pairs**2, axis=0)
-        return np.asarray(out)
+        return np.asarray(self.sensor**2 + np.sum(self.chance**2, axis=0) + np.sum(self.numerics**2, axis=0))
 
     def replicate(self, rng: np.random.Generator) -> FloatArray:
         """(t, s) a residual."""
         out = self.sensor * rng.standard_normal(self.sensor.shape)
-        for samples, size in ((self.chance, 1.0), (self.pairs, REMAINING * self.factor)):
-            if len(samples):
-                weights = rng.standard_normal(len(samples)) / np.sqrt(len(samples))
-                out = out + size * np.tensordot(weights, samples, axes=1)
-        return out
+        for parts in (self.chance, self.numerics):
+            out = out + np.tensordot(rng.standard_normal(len(parts)), parts, axes=1)
+        return np.asarray(out)
 
 
 def checks(

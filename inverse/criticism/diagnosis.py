@@ -15,7 +15,7 @@ from splatsoil.experiment.base import Candidate, Experiment
 from .checks import Check, Expected, checks, passes
 from .design import Prior, Run, effect_runs
 from .evidence import AS_IT_IS, ELSE, PRIOR, Comparison, Evidence
-from .noise import Noise, Tables, compared, noise_of, trend_of
+from .noise import REMAINING, Noise, Tables, compared, noise_of, trend_of
 from .power import NAMED, detectable
 from .simulations import Simulate, Simulations
 
@@ -184,7 +184,7 @@ def diagnose(
         predictions[best] = _predicted(study, tables, evidence, best, ask)
     residuals = {name: experiment.observed - table for name, table in predictions.items()}
     top = best if best and evidence.probability[best] > evidence.probability[AS_IT_IS] else AS_IT_IS
-    expected = _expected(study, noise, tables, evidence.models[top].factor)
+    expected = _expected(study, noise, tables, evidence.models[top].factors)
     found = checks(experiment, residuals[top], expected, noise.mask, seed)
     verdict, members = judged(evidence.probability, fits=passes(found))
     held_out, aside = _held_out(study, tables, candidates, tuple(predictions), ask) if effects else ([], "")
@@ -331,16 +331,17 @@ def _compared(
 
 
 def _predicted(study: _Study, tables: Tables, evidence: Evidence, name: str, simulate: Simulate) -> FloatArray:
-    """(t, s) of a model at its posterior mean: by the base simulations' trend, or a simulation of an effect."""
+    """(t, s) of a model at its posterior mean, of finer cells: by the base simulations' trend, or a simulation of an
+    effect."""
     model = evidence.models[name]
     values = {parameter: model.moments(parameter)[0] for parameter in model.values}
     if name in tables.effects:
-        return simulate(values, effects=(name,), seed=study.seed, purpose=name)
+        return simulate(values, effects=(name,), seed=study.seed, purpose=name) + evidence.noise.cell
     point = study.prior.space.to_unit(study.prior.space.to_vector(values))[None]
     table = np.tensordot(trend_of(point, study.prior.unit(tables.base[0]))[0], tables.base[1], axes=1)
     if name in evidence.noise.patterns:
         table = table + _observed_otherwise(study, tables, evidence, name)
-    return np.asarray(table)
+    return np.asarray(table + evidence.noise.cell)
 
 
 def _observed_otherwise(study: _Study, tables: Tables, evidence: Evidence, name: str) -> FloatArray:
@@ -348,7 +349,7 @@ def _observed_otherwise(study: _Study, tables: Tables, evidence: Evidence, name:
     noise = evidence.noise
     candidate = next(c for c in study.experiment.candidates if c.name == name)
     pattern = noise.patterns[name]
-    precision = np.linalg.inv(noise.covariance(evidence.models[name].factor))
+    precision = np.linalg.inv(noise.covariance(evidence.models[name].factors))
     model = evidence.models[name]
     values = {p: model.moments(p)[0] for p in model.values}
     point = study.prior.space.to_unit(study.prior.space.to_vector(values))[None]
@@ -361,17 +362,27 @@ def _observed_otherwise(study: _Study, tables: Tables, evidence: Evidence, name:
     return np.asarray(sum(added))
 
 
-def _expected(study: _Study, noise: Noise, tables: Tables, factor: float) -> Expected:
+def _expected(study: _Study, noise: Noise, tables: Tables, factors: FloatArray) -> Expected:
+    """The same parts as in the noise of scores, for each feature."""
     experiment, prior = study.experiment, study.prior
-    base = tables.base[1]
+    placed, base = experiment.layout.placed, tables.base[1]
+
+    def about_trend(runs: Sequence[Run], found: FloatArray) -> FloatArray:
+        hat = trend_of(prior.unit(runs), noise.points)
+        return np.asarray((found - np.tensordot(hat, base, axes=1)) / np.sqrt(max(len(found), 1)))
+
     rest = np.tensordot(np.eye(len(base)) - noise.trend, base, axes=1)
-    rest /= np.sqrt(np.maximum(1.0 - np.diag(noise.trend), 1e-9))[:, None, None]
-    pairs = np.zeros((0, *experiment.layout.shape))
+    rest /= np.sqrt(np.maximum(1.0 - np.diag(noise.trend), 1e-9) * len(base))[:, None, None]
+    otherwise = [about_trend(*made) for made in tables.effects.values()]
+    otherwise.append((base - base.mean(axis=0)) / np.sqrt(len(base)))
+    numerics = [
+        factors[0] * noise.share / np.sqrt(len(otherwise)) * np.where(placed, found, 0.0) for found in otherwise
+    ]
     if len(tables.fine[0]):
-        hat = trend_of(prior.unit(tables.fine[0]), noise.points)
-        pairs = tables.fine[1] - np.tensordot(hat, base, axes=1)
-    chance = rest if experiment.chance else rest[:0]
-    return Expected(np.asarray(experiment.sensor), chance, pairs, factor)
+        numerics.append(factors[1] * REMAINING * np.where(placed, 0.0, about_trend(*tables.fine)))
+    return Expected(
+        np.asarray(experiment.sensor), rest if experiment.chance else rest[:0], np.concatenate(numerics, axis=0)
+    )
 
 
 def _held_out(
@@ -387,7 +398,7 @@ def _held_out(
     evidence, _, noise = _compared(study, tables, candidates, aside)
     out = []
     for name in names:
-        variance = _expected(study, noise, tables, evidence.models[name].factor).variance[judged_on]
+        variance = _expected(study, noise, tables, evidence.models[name].factors).variance[judged_on]
         left = (experiment.observed - _predicted(study, tables, evidence, name, simulate))[judged_on]
         score = -0.5 * float(np.mean(left**2 / variance + np.log(2.0 * np.pi * variance)))
         out.append(HeldOut(name, float(np.sqrt(np.mean(left**2))), float(np.sqrt(variance.mean())), score))

@@ -2,10 +2,10 @@
 
 The evidence of a model is the mean of its likelihood over its prior (MacKay 2003, Information Theory, Inference, and
 Learning Algorithms, ch. 28; Kass & Raftery 1995, J. Am. Stat. Assoc. 90:773). The likelihood is normal, with the
-emulator's own doubt beside the noise; the numerics' factor is integrated over, which gives it long tails. Points are a
-Sobol sequence over the prior, then draws where the posterior is (adaptive importance sampling with a defensive share of
-the prior: Cappé et al. 2008, Stat. Comput. 18:447; Hesterberg 1995, Technometrics 37:185). "Something
-else" is the base model with a discrepancy larger than numerics (Kennedy & O'Hagan 2001, J. R. Stat. Soc. B 63:425).
+emulator's own doubt beside the noise; the numerics' factors are integrated over, which makes its tails long. Points are
+a Sobol sequence over the prior, then draws where the posterior is (adaptive importance sampling with a defensive share
+of the prior: Cappé et al. 2008, Stat. Comput. 18:447; Hesterberg 1995, Technometrics 37:185). "Something else" is the
+base model with a discrepancy larger than numerics (Kennedy & O'Hagan 2001, J. R. Stat. Soc. B 63:425).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from splatsoil.experiment.base import Candidate
 
 from .design import Prior, Run, effect_points, effect_values, sizes
 from .emulator import BaseEmulator, IncrementEmulator
-from .noise import FACTORS, SOMETHING_ELSE, Noise
+from .noise import FACTORS, Noise
 
 FloatArray = npt.NDArray[np.float64]
 Prediction = tuple[Mapping[str, FloatArray], FloatArray, FloatArray]
@@ -53,7 +53,7 @@ class Model:
         mean: (q, p) scores that are predicted there.
         variance: (q, p) the emulator's doubt of them, in the directions of `whitened` scores.
         pattern: (k, p) of an effect of observation, else empty.
-        log_likelihood: (f, q) by the numerics' factor.
+        log_likelihood: (f, q) by the numerics' factors.
         importance: (q,) logarithms of the prior's density over that of the points.
         weights: (f, q) posterior, summing to 1.
         log_evidence: of it.
@@ -76,9 +76,9 @@ class Model:
         return mean, float(np.sqrt(max(weights @ (self.values[name] - mean) ** 2, 0.0)))
 
     @property
-    def factor(self) -> float:
-        """Geometric mean of the numerics' factor."""
-        return float(np.exp(self.weights.sum(axis=1) @ np.log(FACTORS)))
+    def factors(self) -> FloatArray:
+        """(2,) geometric means of the numerics' factors."""
+        return np.asarray(np.exp(self.weights.sum(axis=1) @ np.log(FACTORS)))
 
     def drawn(self, count: int, rng: np.random.Generator) -> list[dict[str, float]]:
         """Parameters drawn from the posterior."""
@@ -128,10 +128,10 @@ class _Likelihood:
 
     @classmethod
     def of(cls, noise: Noise) -> _Likelihood:
-        root = np.linalg.cholesky(noise.covariance(1.0) + 1e-9 * np.eye(len(noise.fixed)))
+        root = np.linalg.cholesky(noise.covariance(np.ones(2)) + 1e-9 * np.eye(len(noise.fixed)))
         rotations = []
         for factor in FACTORS:
-            half = solve_triangular(root, noise.covariance(float(factor)), lower=True)
+            half = solve_triangular(root, noise.covariance(factor), lower=True)
             size, modes = np.linalg.eigh(solve_triangular(root, half.T, lower=True))
             rotations.append((np.maximum(size, 1e-9), modes))
         return cls(np.asarray(root, dtype=np.float64), rotations)
@@ -255,14 +255,11 @@ class Comparison:
 
     def judge(self) -> Evidence:
         """Every model against the observation."""
-        white, factors = self.likelihood.white(self.noise.observed)[0], self.noise.factors
+        white, factors = self.likelihood.white(self.noise.observed)[0], self.noise.expected
         found = {model.name: self._integrated(model, white, factors) for model in self.models}
         base = found[AS_IT_IS]
-        least = np.exp(SOMETHING_ELSE * self.noise.factor_std)
-        beyond = np.where(least <= FACTORS, 0.0, -np.inf)
-        beyond = beyond - logsumexp(beyond)
         given = (base.values, base.mean, base.variance, base.pattern, base.log_likelihood, base.importance)
-        found[ELSE] = _model(ELSE, *given, beyond)
+        found[ELSE] = _model(ELSE, *given, self.noise.beyond)
         weight = {
             name: model.log_evidence + np.log(PRIOR if name == AS_IT_IS else (1.0 - PRIOR) / (len(found) - 1))
             for name, model in found.items()

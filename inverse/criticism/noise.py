@@ -10,7 +10,7 @@ chance      what base simulations with particles of their own scatter by about t
 guesses     colours that no photograph shows, other drawings of the same simulation
 nuisances   effects of observation in their smallest meaningful sizes
 numerics    the model's own error: as large as pairs of coarse and fine runs say, along what soil could do otherwise
-            (all simulations); its factor is unknown and integrated over
+            (all simulations); its factors, one for pictures and one for forces, are unknown and integrated over
 ========== ============================================================================================================
 
 Fine runs also correct coarse ones (Kennedy & O'Hagan 2000, Biometrika 87:1): their mean difference, as far as it stands
@@ -21,9 +21,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import logsumexp
 
 from splatsoil.experiment.base import Candidate, Experiment
 
@@ -41,8 +43,11 @@ DOUBT = 0.5
 """Standard deviation of the logarithm of that factor, which holds both orders."""
 UNMEASURED, NO_PAIRS = 0.2, 1.0
 """Numerics, over what soil could do otherwise, and the deviation of its logarithm, where there are no pairs."""
-FACTORS = np.exp(np.arange(-2.0, 5.5, 0.5) * DOUBT)
-"""Factors of the numerics that are integrated over, from a third of what is expected on."""
+STEPS = np.array(list(product(range(6), range(6))))
+"""(f, 2) standard deviations by which the logarithms of both factors of the numerics, of placed instruments and of
+others, exceed what is expected. None is less: that most features agree is no proof that the one which counts does."""
+FACTORS = np.exp(DOUBT * STEPS)
+"""(f, 2) factors that are integrated over."""
 SOMETHING_ELSE = 2.0
 """Standard deviations above the expected factor from which the model's own error is more than numerics."""
 STAGE, CHANNEL = 0.9, 0.5
@@ -82,7 +87,9 @@ class Noise:
         points: (m, k) of these.
         chance: (p, p) covariance of one simulation's own.
         fixed: (p, p) covariance of all parts but numerics.
-        numerics: (p, p) that of numerics of factor 1.
+        numerics: (p, p) that of numerics of factors 1.
+        placed: (p,) scores of instruments that have a place.
+        share: of what soil could do otherwise, that numerics of factor 1 is for these.
         factor_std: standard deviation of the logarithm of the numerics' factor.
         patterns: (k, p) what each observation effect does in its smallest meaningful sizes, by name.
         trend: (m, m) projector on the base simulations' trend.
@@ -98,6 +105,8 @@ class Noise:
     chance: FloatArray
     fixed: FloatArray
     numerics: FloatArray
+    placed: npt.NDArray[np.bool_]
+    share: float
     factor_std: float
     patterns: Mapping[str, FloatArray]
     trend: FloatArray
@@ -106,15 +115,33 @@ class Noise:
         """(m, p) of tables (m, t, s)."""
         return np.asarray((tables[:, self.mask] - self.mean) @ self.basis)
 
-    def covariance(self, factor: float) -> FloatArray:
-        """(p, p) with numerics of a factor."""
-        return self.fixed + factor**2 * self.numerics
+    @property
+    def cell(self) -> FloatArray:
+        """(t, s) what finer cells add to a prediction."""
+        out = np.zeros(self.mask.shape)
+        out[self.mask] = self.basis @ self.correction
+        return out
+
+    def covariance(self, factors: FloatArray) -> FloatArray:
+        """(p, p) with numerics of factors (2,): that of placed instruments and that of others."""
+        size = np.where(self.placed, *factors)
+        return self.fixed + np.outer(size, size) * self.numerics
 
     @property
-    def factors(self) -> FloatArray:
-        """(f,) logarithms of the prior probability of each of `FACTORS`."""
-        density = -0.5 * (np.log(FACTORS) / self.factor_std) ** 2
-        return np.asarray(density - np.logaddexp.reduce(density))
+    def expected(self) -> FloatArray:
+        """(f,) logarithms of the probability of each of `FACTORS`, if nothing is wrong."""
+        return self._probability(np.zeros(FACTORS.shape, dtype=bool))
+
+    @property
+    def beyond(self) -> FloatArray:
+        """(f,) the same where one of the factors at least is more than numerics: any such one is as probable."""
+        large = np.log(FACTORS) > (SOMETHING_ELSE - 0.1) * self.factor_std
+        density = np.where(large.any(axis=1), self._probability(large), -np.inf)
+        return np.asarray(density - logsumexp(density))
+
+    def _probability(self, free: npt.NDArray[np.bool_]) -> FloatArray:
+        density = np.sum(np.where(free, 0.0, -0.5 * (np.log(FACTORS) / self.factor_std) ** 2), axis=1)
+        return np.asarray(density - logsumexp(density))
 
 
 def noise_of(
@@ -154,7 +181,7 @@ def noise_of(
     otherwise = _positive(sum(e.T @ e / len(e) for e in varied_by) / len(varied_by) - chance)
     unplaced = np.zeros(basis.shape[1], dtype=bool)
     unplaced[basis.shape[1] - int((~placed).sum()) :] = True
-    correction, factor_std = np.zeros(basis.shape[1]), NO_PAIRS
+    correction, share, factor_std = np.zeros(basis.shape[1]), UNMEASURED, NO_PAIRS
     if len(fine_runs):
         factor_std = DOUBT
         apart = scores["fine"] - trend(fine_runs)
@@ -167,8 +194,9 @@ def noise_of(
             unplaced, 0.0, numerics @ np.linalg.solve(pairs, np.where(unplaced, 0.0, apart.mean(axis=0)))
         )
         numerics = REMAINING**2 * (numerics + _of_unplaced(experiment, mask, placed, apart, unplaced))
+        share = REMAINING * share
     else:
-        numerics = UNMEASURED**2 * otherwise
+        numerics = share**2 * otherwise
     reference = (tables.reference[mask] - mean) @ basis
     drawn = {name: (table[mask] - mean) @ basis - reference for name, table in tables.drawn.items()}
     guessed = [drawn[name] for name in experiment.guesses if name in drawn]
@@ -194,6 +222,8 @@ def noise_of(
         chance,
         fixed,
         numerics,
+        ~unplaced,
+        share,
         factor_std,
         patterns,
         hat,

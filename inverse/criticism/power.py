@@ -84,5 +84,5 @@ def _evidence(
     comparison: Comparison, world: FloatArray, mean: FloatArray, variance: FloatArray, pattern: FloatArray
 ) -> float:
     thin = slice(None, None, THINNED)
-    log = comparison.likelihood.log(world - mean[thin], variance[thin], pattern, every=3)
-    return float(logsumexp(log + comparison.noise.factors[::3, None])) - float(np.log(log.shape[1]))
+    log = comparison.likelihood.log(world - mean[thin], variance[thin], pattern, every=THINNED)
+    return float(logsumexp(log + comparison.noise.expected[::THINNED, None])) - float(np.log(log.shape[1]))

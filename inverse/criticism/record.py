@@ -52,7 +52,7 @@ def record(experiment: Experiment, diagnosis: Diagnosis, simulations: int) -> di
             for c in diagnosis.checks
         ],
         "passes": diagnosis.passes,
-        "numerics": evidence.models[evidence.best].factor,
+        "numerics": float(evidence.models[evidence.best].factors.max()),
         "unit": layout.unit,
         "time_name": layout.time_name,
         "times": list(layout.times),

@@ -20,8 +20,8 @@ FloatArray = npt.NDArray[np.float64]
 ALONG, UP = "force along", "force up"
 """Instruments: against the way the tool is pushed, and upwards."""
 REGION, UNIT = "tool", "% of the largest force, asinh"
-STAGE = "pushing"
-"""Whose largest force is the unit."""
+STAGE, PAUSE = "pushing", "pause"
+"""The one whose largest force is the unit, and the one in which the tool stands."""
 LEAST, FEWEST = 0.25, 2
 """Rows in which the tool is pushed with this share of the largest force: with fewer there is nothing to go by."""
 SENSOR = 1.0
@@ -39,6 +39,7 @@ class ToolForces:
     Attributes:
         channels: (c,) the instruments.
         observed: (t, c) measured means over each row's frames, in % of the largest.
+        noise: (t, c) standard deviation of the instrument in `features`.
         measured: (t, c) rows in which there are any.
         largest: what that is, N.
         axes: (c, 3) the instruments' directions.
@@ -47,6 +48,7 @@ class ToolForces:
 
     channels: tuple[str, ...]
     observed: FloatArray
+    noise: FloatArray
     measured: npt.NDArray[np.bool_]
     largest: float
     axes: FloatArray
@@ -87,7 +89,9 @@ class ToolForces:
         if (moving & (size > LEAST * largest)).sum() < FEWEST:
             return None
         there = np.repeat((weights.sum(axis=1) > 0.0)[:, None], len(axes), axis=1)
-        return cls((ALONG, UP), 100.0 * table / largest, there, largest, axes, weights)
+        observed = 100.0 * table / largest
+        noise = np.hypot(SENSOR / np.sqrt(1.0 + (observed / SCALE) ** 2), _standing(compressed(observed), stages))
+        return cls((ALONG, UP), observed, noise, there, largest, axes, weights)
 
     def predicted(self, force: FloatArray) -> FloatArray:
         """(t, c) features of a simulation's force (f', 3) in frames 1, 2, …; f' at least f."""
@@ -98,12 +102,20 @@ class ToolForces:
         """(t, c) what was measured, as a comparison of models takes it."""
         return compressed(self.observed)
 
-    @property
-    def noise(self) -> FloatArray:
-        """(t, c) standard deviation of the instrument in these."""
-        return SENSOR / np.sqrt(1.0 + (self.observed / SCALE) ** 2)
-
 
 def compressed(forces: FloatArray) -> FloatArray:
     """Forces in % of the largest, relative beyond `SCALE`."""
     return np.asarray(SCALE * np.arcsinh(forces / SCALE))
+
+
+def _standing(features: FloatArray, stages: Sequence[str]) -> FloatArray:
+    """(t, c) what a set leaves open of features (t, c): how a tool stops within a frame isn't recorded, and soil stays
+    pressed against it or not. A standing tool may bear anything from nothing to what it bore last (uniform)."""
+    out = np.zeros(features.shape)
+    last = np.zeros(features.shape[1])
+    for row, stage in enumerate(stages):
+        if stage == PAUSE:
+            out[row] = np.abs(last) / np.sqrt(12.0)
+        else:
+            last = features[row]
+    return out

@@ -36,6 +36,8 @@ def linear_noise(slope: np.ndarray, observed: np.ndarray, points: np.ndarray) ->
         1e-6 * np.eye(p),
         np.eye(p),
         np.eye(p),
+        np.array([True, False]),
+        0.5,
         0.5,
         {},
         np.zeros((len(points), len(points))),
@@ -49,11 +51,11 @@ def test_evidence_is_the_integral_of_the_likelihood() -> None:
     prior = Prior(ParameterSpace([ANGLE]))
     found = Comparison.of(noise, prior, (), {}).judge()
     grid = np.linspace(-1.0, 1.0, 2001)
-    weights = np.exp(noise.factors)
+    weights = np.exp(noise.expected)
     likelihood = np.array(
         [
             sum(
-                w * multivariate_normal.pdf(observed, x * slope, (1.0 + f**2) * np.eye(2))
+                w * multivariate_normal.pdf(observed, x * slope, np.diag(1.0 + f**2))
                 for w, f in zip(weights, FACTORS, strict=True)
             )
             for x in grid
@@ -62,7 +64,7 @@ def test_evidence_is_the_integral_of_the_likelihood() -> None:
     # The likelihood's constant is left out.
     wanted = np.log(likelihood.mean()) + np.log(2.0 * np.pi)
     base = found.models[""]
-    whitening = 0.5 * np.log(np.linalg.det(noise.covariance(1.0)))
+    whitening = 0.5 * np.log(np.linalg.det(noise.covariance(np.ones(2))))
     assert base.log_evidence - whitening == pytest.approx(wanted, abs=0.05)
     unit = grid @ likelihood / likelihood.sum()
     # Points are draws: a twentieth of the posterior's standard deviation.
@@ -141,8 +143,8 @@ def test_checks_find_a_block_that_is_off_and_hardly_ever_one_that_is_not(make: M
     experiment = make()
     shape = experiment.layout.shape
     rng = np.random.default_rng(4)
-    chance = rng.standard_normal((12, *shape))
-    expected = Expected(np.full(shape, 0.5), chance, np.zeros((0, *shape)), 1.0)
+    chance = rng.standard_normal((12, *shape)) / np.sqrt(12.0)
+    expected = Expected(np.full(shape, 0.5), chance, np.zeros((0, *shape)))
     mask = np.ones(shape, dtype=bool)
     false = sum(not passes(checks(experiment, expected.replicate(rng), expected, mask, seed=k)) for k in range(40))
     assert false <= 6
