@@ -49,11 +49,13 @@ class Expected:
         sensor: (t, s) standard deviation of instruments.
         chance: (m, t, s) one simulation's own: independent parts, each of a standard normal size.
         numerics: (k, t, s) the model's own error, likewise.
+        doubt: standard deviation of the logarithm of a factor of that, which no block need share with another.
     """
 
     sensor: FloatArray
     chance: FloatArray
     numerics: FloatArray
+    doubt: float = 0.0
 
     @property
     def variance(self) -> FloatArray:
@@ -62,9 +64,10 @@ class Expected:
 
     def replicate(self, rng: np.random.Generator) -> FloatArray:
         """(t, s) a residual."""
+        factor = np.exp(self.doubt * np.abs(rng.standard_normal()))
         out = self.sensor * rng.standard_normal(self.sensor.shape)
-        for parts in (self.chance, self.numerics):
-            out = out + np.tensordot(rng.standard_normal(len(parts)), parts, axes=1)
+        for parts, size in ((self.chance, 1.0), (self.numerics, factor)):
+            out = out + size * np.tensordot(rng.standard_normal(len(parts)), parts, axes=1)
         return np.asarray(out)
 
 

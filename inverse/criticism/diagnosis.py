@@ -36,8 +36,9 @@ STEP = 4.0
 """Of an observation effect's parameter, over its smallest meaningful size, at which it is drawn."""
 SHOWN = 0.05
 """Probability from which an effect is worth a line of its own."""
-STRONG = 10.0
-"""Bayes factor from which the evidence against the base model is strong (Jeffreys 1961, Theory of Probability)."""
+MENTIONED = 10.0**0.5
+"""Bayes factor from which evidence against the base model is worth more than a bare mention (Jeffreys 1961, Theory of
+Probability, app. B)."""
 
 
 @dataclass(frozen=True)
@@ -225,7 +226,7 @@ def judged(probability: Mapping[str, float], *, fits: bool) -> tuple[Verdict, tu
     if effects and probability[effects[0]] >= NAMED:
         return "missing", (effects[0],)
     odds = max(p for name, p in probability.items() if name != AS_IT_IS) / max(probability[AS_IT_IS], 1e-300)
-    if odds * (len(probability) - 1) * PRIOR / (1.0 - PRIOR) < STRONG:
+    if odds * (len(probability) - 1) * PRIOR / (1.0 - PRIOR) < MENTIONED:
         return "adequate", shown
     if len(shown) > 1 and sum(probability[n] for n in shown) >= NAMED:
         return "one of", shown
@@ -380,9 +381,8 @@ def _expected(study: _Study, noise: Noise, tables: Tables, factors: FloatArray) 
     ]
     if len(tables.fine[0]):
         numerics.append(factors[1] * REMAINING * np.where(placed, 0.0, about_trend(*tables.fine)))
-    return Expected(
-        np.asarray(experiment.sensor), rest if experiment.chance else rest[:0], np.concatenate(numerics, axis=0)
-    )
+    chance = rest if experiment.chance else rest[:0]
+    return Expected(np.asarray(experiment.sensor), chance, np.concatenate(numerics, axis=0), noise.factor_std)
 
 
 def _held_out(

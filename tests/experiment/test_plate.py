@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from splatsoil.inverse.criticism.diagnosis import STRONG, diagnose
+from splatsoil.inverse.criticism.diagnosis import MENTIONED, diagnose
 
 from splatsoil.errors import ParameterError
 from splatsoil.experiment.plate import PlateExperiment
@@ -41,7 +41,7 @@ def test_six_forces_do_not_claim_what_they_cannot_tell() -> None:
     assert (found.detectable["cohesion"] or np.inf) > 600.0
     # There is no strong evidence against cohesion, which is there, and the truth stays possible.
     models = found.evidence.models
-    assert models["cohesion"].log_evidence - models[""].log_evidence > -np.log(STRONG)
+    assert models["cohesion"].log_evidence - models[""].log_evidence > -np.log(MENTIONED)
     cohesion = models["cohesion"]
     assert cohesion.weights.sum(axis=0)[cohesion.values["cohesion"] > 600.0].sum() > 0.025
     for name, truth_of in (("friction_angle", 33.0), ("cohesion", 600.0)):
