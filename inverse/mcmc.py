@@ -145,7 +145,9 @@ def _checked(log_density: LogDensity) -> LogDensity:
         if wrong.any():
             first = int(np.argmax(wrong))
             where = ", ".join(f"{x:g}" for x in points[first])
-            raise RunError(f"the logarithm of the posterior is {logs[first]:g} at ({where}), where it has to be finite or −∞")
+            raise RunError(
+                f"the logarithm of the posterior is {logs[first]:g} at ({where}), where it has to be finite or −∞"
+            )
         return logs
 
     return checked

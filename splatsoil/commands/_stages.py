@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from splatsoil.commands._control import code_of
-from splatsoil.commands._options import EVALUATIONS, FitOptions, check_evaluations
+from splatsoil.commands._options import EVALUATIONS, FitOptions, RunOptions, check_evaluations, command_line
 from splatsoil.commands._output import say_remarks
 from splatsoil.errors import MeasurementError, ParameterError, RunError
 
@@ -334,21 +334,54 @@ def write_jpeg(path: Path, picture: np.ndarray) -> None:
     write_bytes(path, stream.getvalue())
 
 
-def measurement_of(run: RunFolder) -> Measurement:
-    """The set that a run was made from.
+def opened(options: RunOptions) -> RunFolder:
+    """The run folder of a command, which knows where its set is now if the command says so.
 
     Raises:
-        RunError: it has moved or changed since.
+        RunError: there is none, or the set is another one.
+        MeasurementError: there is no set.
     """
+    from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.measurement import Measurement
 
-    folder = Path(run.description["measurement"]["folder"])
-    if not folder.is_dir():
-        raise RunError(f"{run.path}: its measurement set {folder} isn't there any more; put it back")
-    measurement = Measurement.load(folder)
+    run = RunFolder.open(options.run)
+    if options.set is None:
+        return run
+    measurement = Measurement.load(options.set)
     if measurement.hash != run.description["measurement"]["hash"]:
-        raise RunError(f"{run.path}: its measurement set {folder} has changed since; fit again into another --run")
-    return measurement
+        raise RunError(f"{run.path}: --set {options.set} isn't the set that it was made from, or has changed since")
+    return run.moved(measurement.folder.resolve())
+
+
+def measurement_of(run: RunFolder) -> Measurement:
+    """The set that a run was made from: where it was, or beside the run if both have moved.
+
+    Raises:
+        RunError: it is at none of these places, or has changed since.
+    """
+    from splatsoil.measurement import Measurement
+    from splatsoil.measurement.measurement import EXPERIMENT
+
+    first, *others = run.measurement_places()
+    changed = ""
+    for folder in (first, *others):
+        if not (folder / EXPERIMENT).is_file():
+            continue
+        try:
+            measurement = Measurement.load(folder)
+        except MeasurementError:
+            if folder == first:
+                raise
+            continue
+        if measurement.hash == run.description["measurement"]["hash"]:
+            return measurement
+        changed = changed or f"{run.path}: its measurement set {folder} has changed since; fit again into another --run"
+    note = command_line("report", (run.path,), (("--set", "FOLDER", None),))
+    raise RunError(
+        changed
+        or f"{run.path}: its measurement set {first} isn't there any more, nor beside the run; `{note}` notes "
+        "where it is now"
+    )
 
 
 def kept(options: FitOptions) -> str:

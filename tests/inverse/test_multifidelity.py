@@ -194,7 +194,7 @@ def test_a_search_whose_cheap_evaluations_all_failed(full_fails: bool) -> None:
         failed = ask.level == CHEAP or full_fails
         optimiser.tell_level(ask.action, ask.level, None if failed else valleys(ask.action.astype(np.float64)))
     if full_fails:
-        with pytest.raises(RunError, match="no full evaluation succeeded .* there is no loss to model"):
+        with pytest.raises(RunError, match=r"no full evaluation succeeded .* there is no loss to model"):
             optimiser.result()
     else:
         assert abs(optimiser.result().estimate[0] - MINIMUM) < 0.1
