@@ -25,6 +25,7 @@ from typing import Any
 from splatsoil.errors import RunError
 from splatsoil.files import check_folder, write_json
 from splatsoil.run_files import RUN_FORMAT, read_description, read_fit
+from splatsoil.trust import check_trusted
 
 from .evaluations import EvaluationStore, writer_lock
 
@@ -170,9 +171,12 @@ class RunFolder:
         """The latest finished fit.
 
         Raises:
-            RunError: no fit has been finished, or what is kept of it is damaged.
+            RunError: no fit has been finished, what is kept of it is damaged, or one of its effects is a file that the
+                user hasn't named.
         """
-        return read_fit(self.path)
+        fit = read_fit(self.path)
+        check_trusted(fit["setup"]["effects"], self.path)
+        return fit
 
 
 def _way(run: Path, measurement: str | Path) -> str:

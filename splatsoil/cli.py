@@ -26,6 +26,7 @@ import splatsoil.commands
 from splatsoil import __version__
 from splatsoil.commands._output import only_json, print_json
 from splatsoil.errors import NoAnswer, SetWarning, SplatsoilError
+from splatsoil.trust import trust
 
 DESCRIPTION = "Soil properties from photographs of a tool moving through it."
 
@@ -95,6 +96,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             config=(tyro.conf.FlagCreatePairsOff,),
         )
     command = next(c for c in known.values() if isinstance(config, c.config))
+    trust(getattr(config, "effects", ()))
     wants_json = bool(getattr(config, "json", False))
     with only_json() if wants_json else nullcontext(), _saying_remarks():
         try:

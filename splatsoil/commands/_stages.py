@@ -251,8 +251,9 @@ def sources(effects: Iterable[str]) -> tuple[str, str]:
 def note_other_sources(run: RunFolder) -> None:
     """Say on stderr, in one line, if the latest fit was made by other sources than these."""
     from splatsoil.commands._anew import anew
+    from splatsoil.run_files import read_fit
 
-    fit = run.fit()
+    fit = read_fit(run.path)
     setup = fit["setup"]
     then = (setup.get("version"), setup.get("code"))
     try:

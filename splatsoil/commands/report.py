@@ -21,11 +21,12 @@ def run(config: Config) -> int:
     """Write the page; RunError when the folder has no finished fit."""
     from splatsoil.commands import _stages as stage
     from splatsoil.report import write_report
+    from splatsoil.run_files import read_fit
 
     folder = stage.opened(config)
     stage.note_other_sources(folder)
     path = write_report(folder.path)
-    need_answer(folder.fit(), f"report: {path}")
+    need_answer(read_fit(folder.path), f"report: {path}")
     if config.json:
         print_json({"ok": True, "report": str(path)})
     else:
