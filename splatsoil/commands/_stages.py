@@ -33,12 +33,13 @@ TOGETHER = 2
 
 
 def prepare(options: FitOptions) -> tuple[Measurement, RunFolder]:
-    """The checked set and its run folder. Nothing is written before all of it is found good.
+    """The checked set and its run folder; says what the fit will need. Nothing is written before all is found good.
 
     Raises:
         MeasurementError, ParameterError, RunError: what is wrong, before any work.
     """
     from splatsoil import __version__
+    from splatsoil.commands._limits import check_memory, needs
     from splatsoil.envs.devices import resolve_device
     from splatsoil.envs.levels import relative_cost
     from splatsoil.inverse.run_folder import RunFolder
@@ -53,7 +54,7 @@ def prepare(options: FitOptions) -> tuple[Measurement, RunFolder]:
     if not 0 <= options.seed < 2**63:
         raise ParameterError(f"--seed: must be 0 or more and less than 2^63, not {options.seed}")
     effects = find_effects(options.effects)
-    resolve_device(options.device)
+    device = resolve_device(options.device)
     measurement = Measurement.load(options.set)
     say_remarks(measurement)
     known = [p.name for p in Law(effect.for_measurement(measurement) for effect in effects).parameters]
@@ -64,6 +65,10 @@ def prepare(options: FitOptions) -> tuple[Measurement, RunFolder]:
         relative_cost(*(Resolution.derive(measurement, preset) for preset in (options.preset, options.coarse)))
     if not measurement.frames:
         raise MeasurementError("has no video frames from 0 on: there is nothing to compare with", file=options.set)
+    budget = options.budget or EVALUATIONS * max(1, len(options.parameters))
+    need = needs(measurement, options.preset, device, budget, particles=1)
+    check_memory(need, device, options.set)  # pictures alone; how much soil there is isn't known yet
+    print(needs(measurement, options.preset, device, budget).sentence(device, bound=True), file=sys.stderr)
     run = RunFolder.prepare(
         options.folder(measurement.name),
         measurement={
@@ -177,12 +182,15 @@ def fitted(
     from splatsoil.commands import _criticism as criticism
     from splatsoil.commands._crew import Crew
     from splatsoil.commands._experiments import Chosen, experiment_of
+    from splatsoil.commands._limits import check_memory, needs
     from splatsoil.envs.levels import is_full
     from splatsoil.envs.measured import LOSS, MeasuredProblem
     from splatsoil.inverse.fitting import FitSetup, fit
 
     space = model.space(options.parameters or None)
     budget = options.budget or EVALUATIONS * len(space)
+    need = needs(measurement, options.preset, model.device, budget, particles=len(model.particles(0)))
+    check_memory(need, model.device, measurement.folder)
     version, code = sources(options.effects)
     setup = FitSetup(
         measurement=measurement.hash,
