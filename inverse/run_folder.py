@@ -76,7 +76,7 @@ class RunFolder:
             run = cls.open(folder)
             run._must_match(measurement["hash"], preset, seed)
             return run.moved(measurement["folder"])
-        if folder.exists() and (not folder.is_dir() or any(p.name != "writer.lock" for p in folder.iterdir())):
+        if folder.exists() and (not folder.is_dir() or not all(_is_left(p) for p in folder.iterdir())):
             raise RunError(f"{folder}: exists and isn't a run folder; choose another --run")
         description = {
             "format": RUN_FORMAT,
@@ -177,6 +177,11 @@ class RunFolder:
         fit = read_fit(self.path)
         check_trusted(fit["setup"]["effects"], self.path)
         return fit
+
+
+def _is_left(path: Path) -> bool:
+    """Whether a process that was killed before it had described its run may have left it."""
+    return path.name in ("writer.lock", "writer.lock-journal") or path.match(".run.json.*.tmp")
 
 
 def _way(run: Path, measurement: str | Path) -> str:

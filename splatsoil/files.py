@@ -93,8 +93,8 @@ def write_npz(path: str | Path, **arrays: Any) -> Path:
     return write_bytes(path, stream.getvalue())
 
 
-def read_json(path: str | Path) -> Any:
-    """Read a JSON file of a run folder.
+def read_json(path: str | Path, *, remedy: str = ANEW) -> Any:
+    """Read a JSON file of a run folder; the remedy is for where that can't be done.
 
     Raises:
         RunError: the file is missing, unreadable or not JSON.
@@ -107,11 +107,11 @@ def read_json(path: str | Path) -> Any:
     except OSError as error:
         raise RunError(f"{source}: cannot be read ({error.strerror})") from error
     except ValueError as error:
-        raise RunError(f"{source}: is not JSON ({error}); {ANEW}") from error
+        raise RunError(f"{source}: is not JSON ({error}); {remedy}") from error
     except RecursionError as error:
-        raise RunError(f"{source}: is not JSON of ours (it is nested without end); {ANEW}") from error
+        raise RunError(f"{source}: is not JSON of ours (it is nested without end); {remedy}") from error
     if _hides(data):
-        raise RunError(f"{source}: holds control characters, which could act on a terminal; {ANEW}")
+        raise RunError(f"{source}: holds control characters, which could act on a terminal; {remedy}")
     return data
 
 

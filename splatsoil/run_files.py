@@ -75,7 +75,7 @@ def read_kept(path: str | Path, tag: str, *, remedy: str = ANEW) -> dict[str, An
     Raises:
         RunError: it is missing, can't be read, or is something else or damaged.
     """
-    data = read_json(path)
+    data = read_json(path, remedy=remedy)
     if not isinstance(data, dict) or data.get("format") != tag:
         raise RunError(f"{path}: isn't of format {tag}; {remedy}")
     place = _astray(data, SHAPES.get(tag, {}))
