@@ -37,8 +37,8 @@ def _why_none(fit: Mapping[str, Any]) -> str:
     if loss >= NOTHING_MOVES:
         where = "everywhere it was tried" if least >= NOTHING_MOVES else "where pictures and force together put it"
         return (
-            f"no answer: {where} the model explains the video no better than soil that never moves (loss {loss:.3g}, "
-            f"which has {NOTHING_MOVES:g}); photographs, poses, clock or tool are wrong, or the soil is of another kind"
+            f"no answer: {where} the model explains the video no better than soil that never moves (loss {loss:.3g}; "
+            f"such soil has {NOTHING_MOVES:g}); photographs, poses, clock or tool are wrong, or the soil is another"
         )
     for name, entry in fit["parameters"].items():
         if entry["at_bound"] is None:

@@ -46,25 +46,24 @@ class Needs:
     seconds: float
     simulations: int
 
-    def sentence(self, device: str, *, bound: bool) -> str:
-        """The needs in one line; ``bound``: they hold for a bed that is full to its top."""
+    def sentence(self, device: str) -> str:
+        """The needs in one line, where the soil isn't known yet."""
         from splatsoil.report.words import duration
 
-        some = "up to" if bound else "about"
         return (
-            f"needs {some} {self.memory:.2g} of {memory():.2g} GiB of memory and {duration(self.seconds)} a simulation "
+            f"needs up to {self.memory:.2g} of {memory():.2g} GiB of memory and {duration(self.seconds)} a simulation "
             f"({self.particles} particles, {device}), {self.simulations} simulations"
         )
 
 
-def needs(measurement: Measurement, preset: str, device: str, budget: int, particles: int | None = None) -> Needs:
+def needs(measurement: Measurement, preset: str, device: str, simulations: int, particles: int | None = None) -> Needs:
     """What a fit takes.
 
     Args:
         measurement: the set.
         preset: of the solver and the reconstruction.
         device: ``cpu`` or ``cuda:N``.
-        budget: evaluations of the search.
+        simulations: about how many there will be.
         particles: of the soil; those of a bed that is full to its top if not given.
     """
     from splatsoil.mpm import Resolution
@@ -84,7 +83,7 @@ def needs(measurement: Measurement, preset: str, device: str, budget: int, parti
         memory=PROGRAM + pictures + (simulation if device == "cpu" else 0.0),
         simulation=simulation,
         seconds=work / RATE[device.split(":")[0]],
-        simulations=budget + COMPARISON,
+        simulations=simulations,
     )
 
 

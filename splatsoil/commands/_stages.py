@@ -39,7 +39,7 @@ def prepare(options: FitOptions) -> tuple[Measurement, RunFolder]:
         MeasurementError, ParameterError, RunError: what is wrong, before any work.
     """
     from splatsoil import __version__
-    from splatsoil.commands._limits import check_memory, needs
+    from splatsoil.commands._limits import COMPARISON, check_memory, needs
     from splatsoil.envs.devices import resolve_device
     from splatsoil.envs.levels import relative_cost
     from splatsoil.inverse.run_folder import RunFolder
@@ -65,10 +65,11 @@ def prepare(options: FitOptions) -> tuple[Measurement, RunFolder]:
         relative_cost(*(Resolution.derive(measurement, preset) for preset in (options.preset, options.coarse)))
     if not measurement.frames:
         raise MeasurementError("has no video frames from 0 on: there is nothing to compare with", file=options.set)
-    budget = options.budget or EVALUATIONS * max(1, len(options.parameters))
-    need = needs(measurement, options.preset, device, budget, particles=1)
-    check_memory(need, device, options.set)  # pictures alone; how much soil there is isn't known yet
-    print(needs(measurement, options.preset, device, budget).sentence(device, bound=True), file=sys.stderr)
+    simulations = options.budget or EVALUATIONS * max(1, len(options.parameters))
+    simulations += 0 if options.search == "paper" else COMPARISON
+    pictures = needs(measurement, options.preset, device, simulations, particles=1)
+    check_memory(pictures, device, options.set)  # how much soil there is isn't known yet
+    print(needs(measurement, options.preset, device, simulations).sentence(device), file=sys.stderr)
     run = RunFolder.prepare(
         options.folder(measurement.name),
         measurement={

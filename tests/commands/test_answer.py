@@ -53,8 +53,8 @@ def spoilt(fit: dict[str, Any], name: str) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("name", "says"),
     [
-        ("turned", "no better than soil that never moves (loss 1.29, which has 1); photographs, poses, clock or tool"),
-        ("cap", "(loss 10, which has 1)"),
+        ("turned", "no better than soil that never moves (loss 1.29; such soil has 1); photographs, poses"),
+        ("cap", "(loss 10; such soil has 1)"),
         ("bound", "no answer: the friction angle ends at the upper bound of its range (50°)"),
     ],
 )  # fmt: skip
