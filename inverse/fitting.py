@@ -364,7 +364,8 @@ def _averaged(parameter: Parameter, found: Diagnosis) -> dict[str, Any]:
 
 
 def _about(parameter: Parameter) -> dict[str, Any]:
-    return {"unit": parameter.unit, "title": parameter.title, "bounds": [parameter.lower, parameter.upper]}
+    bounds = [parameter.lower, parameter.upper]
+    return {"unit": parameter.unit, "title": parameter.title, "bounds": bounds, "off": parameter.off}
 
 
 def _minimiser(parameter: Parameter, index: int, minimum: Minimum, space: ParameterSpace) -> dict[str, Any]:

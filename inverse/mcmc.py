@@ -85,7 +85,7 @@ def sample(
     """Sample a density inside a box.
 
     Args:
-        log_density: (k, d) to (k,), up to a constant; −∞ where there is none.
+        log_density: (k, d) to (k,), up to a constant; −∞ where there is none, never NaN or +∞.
         lower, upper: (d,) the box in which walkers start.
         seed: the same seed gives the same chains.
         ensembles: independent groups of walkers.
@@ -96,8 +96,9 @@ def sample(
         progress: called with (steps done, most).
 
     Raises:
-        RunError: the density is −∞ everywhere, or the file can't be written.
+        RunError: the density is −∞ everywhere, NaN or +∞ somewhere, or the file can't be written.
     """
+    log_density = _checked(log_density)
     low, high = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
     d = len(low)
     count = walkers or max(WALKERS, 4 * d)
@@ -133,6 +134,23 @@ def sample(
         r_hat=r_hat,
         converged=bool(done > LENGTHS * times.max() and np.all(r_hat < AGREE)),
     )
+
+
+def _checked(log_density: LogDensity) -> LogDensity:
+    """The density, which says where it is none: NaN and +∞ would end a chain without a word on the point."""
+
+    def checked(points: FloatArray) -> FloatArray:
+        logs = np.asarray(log_density(points))
+        wrong = np.isnan(logs) | np.isposinf(logs)
+        if wrong.any():
+            first = int(np.argmax(wrong))
+            where = ", ".join(f"{x:g}" for x in points[first])
+            raise RunError(
+                f"the logarithm of the posterior is {logs[first]:g} at ({where}), where it has to be finite or −∞"
+            )
+        return logs
+
+    return checked
 
 
 class _Blocks(emcee.backends.HDFBackend):

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from splatsoil.errors import ParameterError
+from splatsoil.errors import ParameterError, RunError
 
 from .bayesopt import DRAWS, NEAREST, RAW, RESTARTS, START, START_EACH, BayesianOptimiser, Episode, Told
 from .surrogate import FloatArray, Surrogate, quiet, seeded, sobol
@@ -112,7 +112,16 @@ class TwoLevelOptimiser(BayesianOptimiser):
         return self._propose(self._stream(len(self.told)))
 
     def surrogate(self) -> Surrogate:
-        """The GP over every evaluation that succeeded; it speaks of the full loss."""
+        """The GP over every evaluation that succeeded; it speaks of the full loss.
+
+        Raises:
+            RunError: none of the full loss has succeeded.
+        """
+        if FULL not in [level for _, level in self._succeeded_levels()]:
+            raise RunError(
+                f"no full evaluation succeeded ({self.levels.count(FULL)} full and {self.levels.count(CHEAP)} cheap "
+                "ones were told): there is no loss to model"
+            )
         return self._surrogate(self._succeeded_levels(), self._stream(0))
 
     def _succeeded_levels(self) -> list[tuple[Told, int]]:

@@ -2,7 +2,7 @@
 
 | file | what |
 |---|---|
-| `run.json` | what the folder is for: measurement (name, folder, hash), preset, seed, version |
+| `run.json` | what the folder is for: measurement (name, folder, hash), the way to it, preset, seed, version |
 | `reconstruction/` | Gaussians, surface, metrics |
 | `evaluations.db` | every simulate-and-compare (SQLite) |
 | `features/` | light and albedo, what criticism simulated |
@@ -13,10 +13,11 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from typing import Any
 from splatsoil.errors import RunError
 from splatsoil.files import check_folder, write_json
 from splatsoil.run_files import RUN_FORMAT, read_description, read_fit
+from splatsoil.trust import check_trusted
 
 from .evaluations import EvaluationStore, writer_lock
 
@@ -73,12 +75,13 @@ class RunFolder:
         if (folder / "run.json").exists():
             run = cls.open(folder)
             run._must_match(measurement["hash"], preset, seed)
-            return run
-        if folder.exists() and (not folder.is_dir() or any(p.name != "writer.lock" for p in folder.iterdir())):
+            return run.moved(measurement["folder"])
+        if folder.exists() and (not folder.is_dir() or not all(_is_left(p) for p in folder.iterdir())):
             raise RunError(f"{folder}: exists and isn't a run folder; choose another --run")
         description = {
             "format": RUN_FORMAT,
             "measurement": dict(measurement),
+            "way": _way(folder, measurement["folder"]),
             "preset": preset,
             "seed": seed,
             "version": version,
@@ -102,6 +105,28 @@ class RunFolder:
                     else f"{name} {found[name]}, not {value}"
                 )
                 raise RunError(f"{self.path}: belongs to {what}; choose another --run")
+
+    def moved(self, measurement: str | Path) -> RunFolder:
+        """The run, which knows from now on that its measurement set, the same as ever, lies in this folder.
+
+        Raises:
+            RunError: that isn't known yet, and the run can't be written to.
+        """
+        if str(measurement) == self.description["measurement"]["folder"]:
+            return self
+        noted = {**self.description["measurement"], "folder": str(measurement)}
+        description = {**self.description, "measurement": noted, "way": _way(self.path, measurement)}
+        with self.lock():
+            write_json(self.path / "run.json", description)
+        return replace(self, description=description)
+
+    def measurement_places(self) -> tuple[Path, ...]:
+        """Folders in which the measurement set may lie: the one that was noted, the same way from here, and beside the
+        run."""
+        noted, here = Path(self.description["measurement"]["folder"]), self.path.resolve()
+        # runs of earlier versions know no way
+        way = str(self.description.get("way", noted))
+        return tuple(dict.fromkeys(Path(os.path.normpath(p)) for p in (noted, here / way, here.parent / noted.name)))
 
     @property
     def reconstruction(self) -> Path:
@@ -146,6 +171,19 @@ class RunFolder:
         """The latest finished fit.
 
         Raises:
-            RunError: no fit has been finished, or what is kept of it is damaged.
+            RunError: no fit has been finished, what is kept of it is damaged, or one of its effects is a file that the
+                user hasn't named.
         """
-        return read_fit(self.path)
+        fit = read_fit(self.path)
+        check_trusted(fit["setup"]["effects"], self.path)
+        return fit
+
+
+def _is_left(path: Path) -> bool:
+    """Whether a process that was killed before it had described its run may have left it."""
+    return path.name in ("writer.lock", "writer.lock-journal") or path.match(".run.json.*.tmp")
+
+
+def _way(run: Path, measurement: str | Path) -> str:
+    """From a run folder to its set: both may be moved together."""
+    return os.path.relpath(Path(measurement).resolve(), run.resolve())

@@ -8,6 +8,8 @@ import sys
 import threading
 from types import FrameType
 
+from splatsoil.starting import SAID, end
+
 _AGAIN = 0.05  # seconds until an interrupt that came while a module was being loaded is tried again
 
 
@@ -26,7 +28,7 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 def main() -> int:
     """Run the command line. Ctrl-C while that is still being loaded ends without a traceback, too, and so does a reader
     of the output (head, less) that has gone, of a help page as well."""
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    if signal.getsignal(signal.SIGINT) in (signal.default_int_handler, end):
         signal.signal(signal.SIGINT, _interrupt)
     try:
         from splatsoil.cli import main as run
@@ -39,7 +41,7 @@ def main() -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except KeyboardInterrupt:
-        print("\nsplatsoil: interrupted; start the command again", file=sys.stderr)
+        print(f"\n{SAID}", file=sys.stderr)
         return 130
 
 

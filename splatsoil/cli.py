@@ -5,7 +5,8 @@ dataclass ``Config`` (its docstring is the help; a field ``json`` makes the comm
 else on stdout), a function ``run(config) -> int`` that returns the exit code, and optionally ``interrupted(config) ->
 str``, a sentence on what is kept and how to go on. Whatever is slow to import belongs inside ``run``.
 
-Exit codes: what ``run`` returns; 2 for a mistake of the user's (one line on stderr, no traceback), 130 after Ctrl-C.
+Exit codes: what ``run`` returns; 2 for a mistake of the user's (one line on stderr, no traceback), 3 where all was done
+and the data give no answer (the first line on stdout says why), 130 after Ctrl-C.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ import tyro
 import splatsoil.commands
 from splatsoil import __version__
 from splatsoil.commands._output import only_json, print_json
-from splatsoil.errors import SetWarning, SplatsoilError
+from splatsoil.errors import NoAnswer, SetWarning, SplatsoilError
+from splatsoil.trust import trust
 
 DESCRIPTION = "Soil properties from photographs of a tool moving through it."
 
@@ -94,16 +96,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
             config=(tyro.conf.FlagCreatePairsOff,),
         )
     command = next(c for c in known.values() if isinstance(config, c.config))
+    trust(getattr(config, "effects", ()))
     wants_json = bool(getattr(config, "json", False))
     with only_json() if wants_json else nullcontext(), _saying_remarks():
         try:
             return command.run(config)
         except SplatsoilError as error:
             message = " ".join(str(error).split())
-            print(f"splatsoil: {message}", file=sys.stderr)
+            if isinstance(error, NoAnswer):  # a result
+                print(message)
+            else:
+                print(f"splatsoil: {message}", file=sys.stderr)
             if wants_json:
                 print_json({"ok": False, "error": message})
-            return 2
+            return error.code
         except KeyboardInterrupt:
             message = f"interrupted; {command.interrupted(config)}"
             print(f"\nsplatsoil: {message}", file=sys.stderr)

@@ -6,7 +6,13 @@ from pathlib import Path
 
 
 class SplatsoilError(Exception):
-    """Base of every error that is the user's to mend; the command line prints it without a traceback."""
+    """Base of every error that is the user's to mend; the command line prints it without a traceback.
+
+    Attributes:
+        code: exit code of a command that ends by it.
+    """
+
+    code = 2
 
 
 class MeasurementError(SplatsoilError):
@@ -36,6 +42,12 @@ class SimulationError(SplatsoilError):
 
 class CombinationError(ParameterError, SimulationError):
     """Values, each within its bounds, that have no meaning together: a search takes it for a failed simulation."""
+
+
+class NoAnswer(SplatsoilError):
+    """All was computed and is kept, but the data give no estimate that means anything."""
+
+    code = 3
 
 
 class RunError(SplatsoilError):

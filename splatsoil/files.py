@@ -7,17 +7,22 @@ import io
 import json
 import math
 import os
+import re
 import tempfile
+import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
-from zipfile import BadZipFile
+from typing import IO, Any
+from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 
 from splatsoil.errors import RunError
 
+#: Most bytes that an archive of a set or a run folder unpacks to: twenty times what the finest preset leaves.
+MOST_UNPACKED = 2**30
+_HIDDEN = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 #: What helps where a file is damaged that is made anew when it isn't there.
 ANEW = "delete it and run the command again"
 
@@ -88,21 +93,35 @@ def write_npz(path: str | Path, **arrays: Any) -> Path:
     return write_bytes(path, stream.getvalue())
 
 
-def read_json(path: str | Path) -> Any:
-    """Read a JSON file of a run folder.
+def read_json(path: str | Path, *, remedy: str = ANEW) -> Any:
+    """Read a JSON file of a run folder; the remedy is for where that can't be done.
 
     Raises:
         RunError: the file is missing, unreadable or not JSON.
     """
     source = Path(path)
     try:
-        return json.loads(source.read_text(encoding="utf-8"))
+        data = json.loads(source.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise RunError(f"{source}: there is no such file") from error
     except OSError as error:
         raise RunError(f"{source}: cannot be read ({error.strerror})") from error
     except ValueError as error:
-        raise RunError(f"{source}: is not JSON ({error}); {ANEW}") from error
+        raise RunError(f"{source}: is not JSON ({error}); {remedy}") from error
+    except RecursionError as error:
+        raise RunError(f"{source}: is not JSON of ours (it is nested without end); {remedy}") from error
+    if _hides(data):
+        raise RunError(f"{source}: holds control characters, which could act on a terminal; {remedy}")
+    return data
+
+
+def _hides(data: Any) -> bool:
+    """Whether any text in it has a character that isn't shown, but for ends of lines and tabs."""
+    if isinstance(data, dict):
+        return any(_hides(key) or _hides(value) for key, value in data.items())
+    if isinstance(data, list):
+        return any(map(_hides, data))
+    return isinstance(data, str) and _HIDDEN.search(data) is not None
 
 
 def read_npy(path: str | Path) -> np.ndarray:
@@ -113,8 +132,8 @@ def read_npy(path: str | Path) -> np.ndarray:
     """
     with _readable(path):
         array = np.load(path, allow_pickle=False)
-        if not isinstance(array, np.ndarray):
-            raise ValueError("is no single array")
+        if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
+            raise ValueError("is no single array of numbers")
         return array
 
 
@@ -124,8 +143,25 @@ def read_npz(path: str | Path, names: Iterable[str], *, remedy: str = ANEW) -> d
     Raises:
         RunError: it can't be read, or lacks one.
     """
-    with _readable(path, remedy), np.load(path, allow_pickle=False) as kept:
-        return {name: kept[name] for name in names}
+    with _readable(path, remedy):
+        check_unpacked(path)
+        with np.load(path, allow_pickle=False) as kept:
+            return {name: kept[name] for name in names}
+
+
+def check_unpacked(archive: str | Path | IO[bytes]) -> None:
+    """See that a ZIP archive doesn't unpack to more than `MOST_UNPACKED`, as one made to fill a machine does.
+
+    Raises:
+        ValueError: it does.
+        OSError, BadZipFile: it is none.
+    """
+    with ZipFile(archive) as opened:
+        size = sum(entry.file_size for entry in opened.infolist())
+    if size > MOST_UNPACKED:
+        raise ValueError(
+            f"it would unpack to {size / 2**30:.3g} GiB, more than the {MOST_UNPACKED / 2**30:g} GiB allowed"
+        )
 
 
 @contextmanager
@@ -133,7 +169,7 @@ def _readable(path: str | Path, remedy: str = ANEW) -> Iterator[None]:
     """Say in one sentence what NumPy thinks of a file that was cut short, or is no array."""
     try:
         yield
-    except (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile) as error:
+    except (OSError, ValueError, KeyError, TypeError, EOFError, MemoryError, BadZipFile, zlib.error) as error:
         raise RunError(f"{path}: cannot be read ({error}); {remedy}") from error
 
 

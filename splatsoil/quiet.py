@@ -19,7 +19,7 @@ def hush() -> None:
     Where its folder for compiled kernels can't be written to, they go into one that ends with the process.
 
     Raises:
-        RunError: no folder can be written to.
+        RunError: no folder can be written to, or Warp lacks its compiler for CPUs.
     """
     import warp
 
@@ -43,6 +43,11 @@ def hush() -> None:
         os.dup2(kept, 2)
         os.close(kept)
         os.close(nowhere)
+    if not warp.is_cpu_available():
+        raise RunError(
+            "warp: its compiler for CPUs (warp-clang) cannot be loaded, and work on a GPU needs it, too, for the "
+            "tool's mesh and what is drawn of it; install warp-lang anew, from a wheel of this machine's architecture"
+        )
     if fault is not None:
         print(
             f"splatsoil: kernels are compiled anew each time: {fault.filename or 'their folder'} cannot be written"

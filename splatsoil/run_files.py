@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
+from types import FunctionType
 from typing import Any
 
 from splatsoil.errors import RunError
@@ -18,6 +20,26 @@ POSTERIOR_FORMAT = "splatsoil-posterior/2"
 HISTORY_FORMAT = "splatsoil-history/1"
 RECONSTRUCTION_FORMAT = "splatsoil-reconstruction/1"
 
+
+def _is_name(value: Any) -> bool:
+    """Whether it can be a file's name, and leads nowhere else."""
+    return isinstance(value, str) and value not in ("", ".", "..") and not set(value) & set("/\\\0")
+
+
+def _is_effect(value: Any) -> bool:
+    """Whether it is the name of an effect, or of none, and no program's."""
+    return value == "" or (_is_name(value) and not value.endswith(".py"))
+
+
+def _are_pictures(frames: Any) -> bool:
+    """Whether a comparison's frames, if it has any, name their pictures by names alone."""
+    kinds = ("observed", "predicted", "difference")
+    return frames is None or (
+        isinstance(frames, list)
+        and all(isinstance(f, dict) and all(_is_name(f[kind]) for kind in kinds if kind in f) for f in frames)
+    )
+
+
 EACH = "*"
 """Stands for every key there is, in a shape."""
 NUMBER = (int, float)
@@ -26,19 +48,20 @@ ESTIMATE = {"estimate": NUMBER, "std": NUMBER, "unit": str}
 SHAPES: Mapping[str, Mapping[str, Any]] = {
     RUN_FORMAT: {"measurement": {"name": str, "folder": str, "hash": str}, "preset": str, "seed": int},
     FIT_FORMAT: {
-        "name": str,
+        "name": _is_name,
         "parameters": {EACH: {**ESTIMATE, "title": str}},
         "setup": {"effects": [str], "preset": str},
         "minimum": {EACH: {"estimate": NUMBER, "low": NUMBER, "high": NUMBER}},
         "history": [{"parameters": {EACH: NUMBER}, "seed": int, "level": str, "status": str}],
     },
-    COMPARISON_FORMAT: {"fit": str, "parameters": dict},
-    DIAGNOSIS_FORMAT: {"values": dict, "model": list, "models": [{"name": str, "probability": NUMBER}]},
+    COMPARISON_FORMAT: {"fit": str, "parameters": dict, "frames": _are_pictures},
+    DIAGNOSIS_FORMAT: {"values": dict, "model": list, "models": [{"name": _is_effect, "probability": NUMBER}]},
     MISFIT_FORMAT: {"fit": str, "values": dict},
     POSTERIOR_FORMAT: {"fit": str, "values": dict},
-    HISTORY_FORMAT: {"models": [{"model": str, "effects": [str], "parameters": {EACH: ESTIMATE}}]},
+    HISTORY_FORMAT: {"models": [{"model": _is_name, "effects": [str], "parameters": {EACH: ESTIMATE}}]},
 }
-"""By format: of each key a type (or several), a shape of its own, or a list of one, which each element must be of."""
+"""By format: of each key a type (or several), a shape of its own, a list of one, which each element must be of, or what
+tells whether a value is right."""
 
 
 def read_kept(path: str | Path, tag: str, *, remedy: str = ANEW) -> dict[str, Any]:
@@ -52,7 +75,7 @@ def read_kept(path: str | Path, tag: str, *, remedy: str = ANEW) -> dict[str, An
     Raises:
         RunError: it is missing, can't be read, or is something else or damaged.
     """
-    data = read_json(path)
+    data = read_json(path, remedy=remedy)
     if not isinstance(data, dict) or data.get("format") != tag:
         raise RunError(f"{path}: isn't of format {tag}; {remedy}")
     place = _astray(data, SHAPES.get(tag, {}))
@@ -65,12 +88,32 @@ def read_description(folder: Path) -> dict[str, Any]:
     """What a run folder is for, from its ``run.json``.
 
     Raises:
-        RunError: it isn't a run folder, or is one of another version.
+        RunError: it isn't a run folder, is one of another version, or has links that lead out of it.
     """
     path = folder / "run.json"
     if not path.is_file():
         raise RunError(f"{folder}: has no run.json, so it isn't a run folder; name one made by `splatsoil fit`")
+    _check_links(folder)
     return read_kept(path, RUN_FORMAT, remedy="choose another run folder")
+
+
+def _check_links(folder: Path) -> None:
+    """What is written into a run folder stays there, and so does what is read."""
+    root = folder.resolve()
+    for place, folders, files in os.walk(root):
+        for entry in (Path(place) / name for name in (*folders, *files)):
+            if entry.is_symlink() and not _resolved(entry).is_relative_to(root):
+                raise RunError(
+                    f"{entry}: is a link that leads out of the run folder; put what it stands for there instead"
+                )
+
+
+def _resolved(path: Path) -> Path:
+    """Where a link leads; itself in no folder where it leads in a circle."""
+    try:
+        return path.resolve()
+    except (OSError, RuntimeError):
+        return Path(path.name)
 
 
 def read_fit(folder: Path) -> dict[str, Any]:
@@ -96,6 +139,8 @@ def _astray(data: Any, shape: Any, place: str = "") -> str | None:
             return place
         wanted = dict.fromkeys(data, shape[EACH]) if EACH in shape else shape
         parts = [(key, data.get(key), inner) for key, inner in wanted.items()]
+    elif isinstance(shape, FunctionType):
+        return None if shape(data) else place
     else:
         return None if isinstance(data, shape) else place
     found = (_astray(item, inner, f"{place}.{key}") for key, item, inner in parts)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -169,6 +171,33 @@ def test_ctrl_c_while_the_program_loads_leaves_no_traceback(tmp_path: Path) -> N
     assert done.stderr.strip() == "splatsoil: interrupted; start the command again"
 
 
+def test_ctrl_c_while_the_package_loads_leaves_no_traceback(tmp_path: Path) -> None:
+    """Before the command line is there, and though the module that is being loaded would swallow it."""
+    (tmp_path / "gymnasium.py").write_text(
+        "import os, signal, time\n"
+        "try:\n    os.kill(os.getpid(), signal.SIGINT)\n    time.sleep(9)\n"
+        "except BaseException:\n    pass\n"
+        "print('has gone on')\n"
+    )
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(tmp_path), *os.environ.get("PYTHONPATH", "").split()]),
+    }
+
+    def heard(*words: str) -> subprocess.CompletedProcess[str]:
+        # a shell's background jobs, tests in one among them, ignore the signal
+        return subprocess.run(
+            [sys.executable, *words], env=environment, capture_output=True, text=True, timeout=120, check=False,
+            preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL),
+        )  # fmt: skip
+
+    done = heard("-m", "splatsoil", "check", "nothing")
+    assert (done.returncode, done.stdout) == (130, "")
+    assert done.stderr.strip() == "splatsoil: interrupted; start the command again"
+    # of other programs that import the package the signal is theirs
+    assert "has gone on" in heard("-c", "import splatsoil").stdout
+
+
 def test_a_new_command_is_one_new_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -276,8 +305,9 @@ def test_ctrl_c_is_heard_though_a_module_swallows_it_while_it_loads(tmp_path: Pa
         "    print('heard')\n"
     )
     done = subprocess.run(
-        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, timeout=50, check=False
-    )
+        [sys.executable, "-c", f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n{program}"],
+        capture_output=True, text=True, timeout=50, check=False,
+    )  # fmt: skip
     assert done.stdout == "heard\n", done.stderr
 
 
@@ -299,3 +329,13 @@ def test_kernels_go_elsewhere_where_their_folder_cannot_be_written_to(tmp_path: 
     assert done.stdout == "True True\n", done.stderr
     assert done.stderr.count("\n") == 1 and "let WARP_CACHE_PATH name a folder" in done.stderr
     assert list(tmp_path.iterdir()) == [in_the_way], "it goes with the process"
+
+
+def test_a_machine_whose_warp_compiles_nothing_for_cpus_is_told_so(
+    monkeypatch: pytest.MonkeyPatch, plow_dry: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Before any work, also for a GPU."""
+    monkeypatch.setattr("warp.is_cpu_available", lambda: False)
+    assert cli.main(["fit", str(plow_dry), "--device", "cuda:0", "--run", str(tmp_path / "run")]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "compiler for CPUs" in said and not (tmp_path / "run").exists()

@@ -17,6 +17,7 @@ from splatsoil.files import FORWARD, RECONSTRUCTING, code_digest, read_npy, read
 NEUTRAL = {
     "__init__.py": "the version, which each key has by itself",
     "_version.py": "the version, which each key has by itself",
+    "starting.py": "what Ctrl-C does while the package is being loaded",
     "deterministic.py": "the same numbers, always in the same order",
     "errors.py": "words",
     "files.py": "files, and the digest itself",

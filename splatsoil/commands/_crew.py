@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
@@ -39,10 +38,11 @@ class Crew:
     """
 
     def __init__(self, folder: RunFolder, device: str, effects: Iterable[str]) -> None:
+        from splatsoil.commands._limits import memory
         from splatsoil.inverse.executors import Processes
         from splatsoil.threads import cores
 
-        self.count = max(0, int(min(cores(), 1 + MOST_HELPERS, _memory() / SHARE["cpu"])) - 1)
+        self.count = max(0, int(min(cores(), 1 + MOST_HELPERS, memory() / SHARE["cpu"])) - 1)
         self._path, self._effects = folder.path, tuple(effects)
         self._workers: Processes | None = None
         try:
@@ -122,14 +122,6 @@ def _unheard() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _memory() -> float:
-    """The machine's, GiB."""
-    try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
-    except (AttributeError, ValueError, OSError):  # not every system tells
-        return float("inf")
 
 
 def _free(device: str) -> float:

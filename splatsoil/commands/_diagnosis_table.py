@@ -6,7 +6,7 @@ from typing import Any
 
 
 def show(result: dict[str, Any]) -> None:
-    """The table of models, the verdict, and why."""
+    """The table of models, the verdict, and why; the parameters where ``result`` has them."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.markup import escape
@@ -28,7 +28,8 @@ def show(result: dict[str, Any]) -> None:
         )
     console.print(table)
     console.print(f"[bold]{escape(verdict(result))}[/bold]")
-    console.print(escape(averaged_sentence(result["estimates"])))
+    if "estimates" in result:
+        console.print(escape(averaged_sentence(result["estimates"])))
     for sentence in result["sentences"]:
         console.print(escape(sentence))
     for note in result["notes"]:

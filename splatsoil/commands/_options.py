@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -72,6 +72,20 @@ class FitOptions:
                 ("--json", self.json, False),
             ),
         )
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """What a command on a run folder takes."""
+
+    run: Positional[Path]
+    """The run folder."""
+    set: Path | None = field(default=None, kw_only=True)
+    """Where the measurement set is now, if it has moved; later commands know it, too."""
+
+    def again(self, command: str, *others: Option, positional: Iterable[object] = ()) -> str:
+        """The command line that means this, with other words and options besides."""
+        return command_line(command, (self.run, *positional), (("--set", self.set, None), *others))
 
 
 def command_line(command: str, positional: Iterable[object], options: Iterable[Option] = ()) -> str:

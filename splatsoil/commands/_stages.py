@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from splatsoil.commands._control import code_of
-from splatsoil.commands._options import EVALUATIONS, FitOptions, check_evaluations
+from splatsoil.commands._options import EVALUATIONS, FitOptions, RunOptions, check_evaluations, command_line
 from splatsoil.commands._output import say_remarks
 from splatsoil.errors import MeasurementError, ParameterError, RunError
 
@@ -33,12 +33,13 @@ TOGETHER = 2
 
 
 def prepare(options: FitOptions) -> tuple[Measurement, RunFolder]:
-    """The checked set and its run folder. Nothing is written before all of it is found good.
+    """The checked set and its run folder; says what the fit will need. Nothing is written before all is found good.
 
     Raises:
         MeasurementError, ParameterError, RunError: what is wrong, before any work.
     """
     from splatsoil import __version__
+    from splatsoil.commands._limits import COMPARISON, check_memory, needs
     from splatsoil.envs.devices import resolve_device
     from splatsoil.envs.levels import relative_cost
     from splatsoil.inverse.run_folder import RunFolder
@@ -53,7 +54,7 @@ def prepare(options: FitOptions) -> tuple[Measurement, RunFolder]:
     if not 0 <= options.seed < 2**63:
         raise ParameterError(f"--seed: must be 0 or more and less than 2^63, not {options.seed}")
     effects = find_effects(options.effects)
-    resolve_device(options.device)
+    device = resolve_device(options.device)
     measurement = Measurement.load(options.set)
     say_remarks(measurement)
     known = [p.name for p in Law(effect.for_measurement(measurement) for effect in effects).parameters]
@@ -64,6 +65,11 @@ def prepare(options: FitOptions) -> tuple[Measurement, RunFolder]:
         relative_cost(*(Resolution.derive(measurement, preset) for preset in (options.preset, options.coarse)))
     if not measurement.frames:
         raise MeasurementError("has no video frames from 0 on: there is nothing to compare with", file=options.set)
+    simulations = options.budget or EVALUATIONS * max(1, len(options.parameters))
+    simulations += 0 if options.search == "paper" else COMPARISON
+    pictures = needs(measurement, options.preset, device, simulations, particles=1)
+    check_memory(pictures, device, options.set)  # how much soil there is isn't known yet
+    print(needs(measurement, options.preset, device, simulations).sentence(device), file=sys.stderr)
     run = RunFolder.prepare(
         options.folder(measurement.name),
         measurement={
@@ -177,12 +183,15 @@ def fitted(
     from splatsoil.commands import _criticism as criticism
     from splatsoil.commands._crew import Crew
     from splatsoil.commands._experiments import Chosen, experiment_of
+    from splatsoil.commands._limits import check_memory, needs
     from splatsoil.envs.levels import is_full
     from splatsoil.envs.measured import LOSS, MeasuredProblem
     from splatsoil.inverse.fitting import FitSetup, fit
 
     space = model.space(options.parameters or None)
     budget = options.budget or EVALUATIONS * len(space)
+    need = needs(measurement, options.preset, model.device, budget, particles=len(model.particles(0)))
+    check_memory(need, model.device, measurement.folder)
     version, code = sources(options.effects)
     setup = FitSetup(
         measurement=measurement.hash,
@@ -251,8 +260,9 @@ def sources(effects: Iterable[str]) -> tuple[str, str]:
 def note_other_sources(run: RunFolder) -> None:
     """Say on stderr, in one line, if the latest fit was made by other sources than these."""
     from splatsoil.commands._anew import anew
+    from splatsoil.run_files import read_fit
 
-    fit = run.fit()
+    fit = read_fit(run.path)
     setup = fit["setup"]
     then = (setup.get("version"), setup.get("code"))
     try:
@@ -334,21 +344,54 @@ def write_jpeg(path: Path, picture: np.ndarray) -> None:
     write_bytes(path, stream.getvalue())
 
 
-def measurement_of(run: RunFolder) -> Measurement:
-    """The set that a run was made from.
+def opened(options: RunOptions) -> RunFolder:
+    """The run folder of a command, which knows where its set is now if the command says so.
 
     Raises:
-        RunError: it has moved or changed since.
+        RunError: there is none, or the set is another one.
+        MeasurementError: there is no set.
     """
+    from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.measurement import Measurement
 
-    folder = Path(run.description["measurement"]["folder"])
-    if not folder.is_dir():
-        raise RunError(f"{run.path}: its measurement set {folder} isn't there any more; put it back")
-    measurement = Measurement.load(folder)
+    run = RunFolder.open(options.run)
+    if options.set is None:
+        return run
+    measurement = Measurement.load(options.set)
     if measurement.hash != run.description["measurement"]["hash"]:
-        raise RunError(f"{run.path}: its measurement set {folder} has changed since; fit again into another --run")
-    return measurement
+        raise RunError(f"{run.path}: --set {options.set} isn't the set that it was made from, or has changed since")
+    return run.moved(measurement.folder.resolve())
+
+
+def measurement_of(run: RunFolder) -> Measurement:
+    """The set that a run was made from: where it was, or beside the run if both have moved.
+
+    Raises:
+        RunError: it is at none of these places, or has changed since.
+    """
+    from splatsoil.measurement import Measurement
+    from splatsoil.measurement.measurement import EXPERIMENT
+
+    first, *others = run.measurement_places()
+    changed = ""
+    for folder in (first, *others):
+        if not (folder / EXPERIMENT).is_file():
+            continue
+        try:
+            measurement = Measurement.load(folder)
+        except MeasurementError:
+            if folder == first:
+                raise
+            continue
+        if measurement.hash == run.description["measurement"]["hash"]:
+            return measurement
+        changed = changed or f"{run.path}: its measurement set {folder} has changed since; fit again into another --run"
+    note = command_line("report", (run.path,), (("--set", "FOLDER", None),))
+    raise RunError(
+        changed
+        or f"{run.path}: its measurement set {first} isn't there any more, nor beside the run; `{note}` notes "
+        "where it is now"
+    )
 
 
 def kept(options: FitOptions) -> str:

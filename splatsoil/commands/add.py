@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
-from splatsoil.commands._options import FitOptions, check_evaluations, command_line
+from splatsoil.commands._answer import need_answer
+from splatsoil.commands._options import FitOptions, RunOptions, check_evaluations
 from splatsoil.commands._output import print_json
 
 if TYPE_CHECKING:
@@ -19,15 +19,13 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(RunOptions):
     """Add effects to a run's latest model, one after the other, and fit again.
 
     A diagnosis that knows the effect tells the error on data that were set aside, which is to fall; one is made where
     there is none. Earlier fits stay.
     """
 
-    run: Positional[Path]
-    """The run folder."""
     effects: Positional[tuple[str, ...]]
     """Effects to add, by name, or files that define one each."""
     budget: int | None = None
@@ -47,7 +45,6 @@ def run(config: Config) -> int:
     from splatsoil.commands._progress import stages
     from splatsoil.envs.devices import resolve_device
     from splatsoil.errors import ParameterError
-    from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.quiet import hush
     from splatsoil.report import write_report
     from splatsoil.report.data import load
@@ -56,7 +53,7 @@ def run(config: Config) -> int:
 
     hush()
     check_evaluations(config.budget)
-    folder = RunFolder.open(config.run)
+    folder = stage.opened(config)
     fit = criticism.need_fit(folder)
     on = fit["setup"]["effects"]
     if not config.effects:
@@ -83,6 +80,7 @@ def run(config: Config) -> int:
         page = write_report(folder.path)
     entries = histories.history(folder)
     histories.remember(folder, entries)
+    need_answer(folder.fit(), f"report: {page}")
     if config.json:
         print_json({"ok": True, "run": str(folder.path), "report": str(page), "models": entries})
     else:
@@ -93,14 +91,12 @@ def run(config: Config) -> int:
 
 def interrupted(config: Config) -> str:
     """Simulations and evaluations are kept one by one."""
-    again = command_line(
+    again = config.again(
         "add",
-        (config.run, *config.effects),
-        (
-            ("--budget", config.budget, None),
-            ("--device", config.device, "auto"),
-            ("--json", config.json, False),
-        ),
+        ("--budget", config.budget, None),
+        ("--device", config.device, "auto"),
+        ("--json", config.json, False),
+        positional=config.effects,
     )
     return f"finished simulations are kept; go on with: {again}"
 

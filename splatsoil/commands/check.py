@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
+from splatsoil.commands._options import command_line
 from splatsoil.commands._output import print_json
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ def run(config: Config) -> int:
 
 def interrupted(config: Config) -> str:
     """Checking keeps nothing."""
-    return f"nothing was written; start again with: splatsoil check {config.set}"
+    return f"nothing was written; start again with: {command_line('check', (config.set,))}"
 
 
 def _as_json(measurement: Measurement, said: tuple[Remark, ...]) -> dict[str, Any]:

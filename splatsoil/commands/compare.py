@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tyro.conf import Positional
-
-from splatsoil.commands._options import command_line
+from splatsoil.commands._answer import why_none
+from splatsoil.commands._options import RunOptions, command_line
 from splatsoil.commands._output import print_json
 
 if TYPE_CHECKING:
@@ -25,14 +23,12 @@ TOLD = ("adequate", "probability", "estimates", "checks", "passes")
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(RunOptions):
     """Compare the prediction at a run's latest estimate with every frame of the video: how far off, where and when.
 
     What counts as far is learnt from simulations with other parameters, seeds and finer cells, which the fit has made.
     """
 
-    run: Positional[Path]
-    """The run folder."""
     quick: bool = False
     """Only pictures and losses: one simulation, and nothing said about where the model is wrong."""
     device: str = "auto"
@@ -45,22 +41,29 @@ def run(config: Config) -> int:
     """Simulate, draw, compare; pictures, losses and the misfit by block go into the run folder."""
     from contextlib import nullcontext
 
+    from splatsoil.commands import _stages as stage
     from splatsoil.commands._crew import Crew
-    from splatsoil.inverse.run_folder import RunFolder
+    from splatsoil.errors import NoAnswer
 
-    folder = RunFolder.open(config.run)
-    folder.fit()
+    folder = stage.opened(config)
+    none = why_none(folder.fit())
     folder.check_writable()
     with nullcontext() if config.quick else Crew(folder, config.device, ()) as crew:
         result, misfit = _compared(config, folder, crew)
+    told = tuple(key for key in TOLD if not (none and key == "estimates"))
     if config.json:
-        extra = {} if misfit is None else {"misfit": {k: misfit[k] for k in TOLD}}
-        print_json({"ok": True, "run": str(folder.path), **result, **extra})
+        extra = {} if misfit is None else {"misfit": {k: misfit[k] for k in told}}
+        said = {"ok": False, "error": none} if none else {"ok": True}
+        print_json({**said, "run": str(folder.path), **result, **extra})
     else:
+        if none:
+            print(none)
         show(result, str(folder.comparison), None if misfit is None else bool(misfit["adequate"]))
         if misfit is not None:
-            show_misfit(misfit, str(folder.path))
-    return 0
+            show_misfit(
+                {key: value for key, value in misfit.items() if key != "estimates" or not none}, str(folder.path)
+            )
+    return NoAnswer.code if none else 0
 
 
 def _compared(config: Config, folder: RunFolder, crew: Crew | None) -> tuple[dict[str, Any], dict[str, Any] | None]:
@@ -86,14 +89,8 @@ def _compared(config: Config, folder: RunFolder, crew: Crew | None) -> tuple[dic
 
 def interrupted(config: Config) -> str:
     """Simulations are kept one by one."""
-    again = command_line(
-        "compare",
-        (config.run,),
-        (
-            ("--quick", config.quick, False),
-            ("--device", config.device, "auto"),
-            ("--json", config.json, False),
-        ),
+    again = config.again(
+        "compare", ("--quick", config.quick, False), ("--device", config.device, "auto"), ("--json", config.json, False)
     )
     return f"the comparison was not finished; start again with: {again}"
 
@@ -124,7 +121,7 @@ def show(result: Mapping[str, Any], folder: str, adequate: bool | None = None) -
 
 
 def show_misfit(misfit: Mapping[str, Any], run: str) -> None:
-    """The worst checks, and whether the model is adequate."""
+    """The worst checks, and whether the model is adequate; the parameters where ``misfit`` has them."""
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
@@ -146,7 +143,8 @@ def show_misfit(misfit: Mapping[str, Any], run: str) -> None:
         f"[bold]{word}[/bold]: the model as it is has a probability of {probability(misfit['probability'])} against "
         f"something else; {failed} of {len(misfit['checks'])} checks fail"
     )
-    console.print(escape(averaged_sentence(misfit["estimates"])))
+    if "estimates" in misfit:
+        console.print(escape(averaged_sentence(misfit["estimates"])))
     for sentence in misfit["sentences"]:
         console.print(escape(sentence))
     ask = "Could these data show a missing effect?" if misfit["adequate"] else "Which effect is missing?"

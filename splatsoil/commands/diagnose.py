@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tyro.conf import Positional
-
-from splatsoil.commands._options import command_line
+from splatsoil.commands._answer import why_none
+from splatsoil.commands._options import RunOptions
 from splatsoil.commands._output import print_json
 
 if TYPE_CHECKING:
@@ -17,15 +15,13 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(RunOptions):
     """Say which effect, if any, a run's latest model lacks, how probable that is, and what cannot be told.
 
     Simulates the model as it is, each effect that is off at several sizes, and the most probable ones again; all are
     compared with all data. Simulations are kept: an interrupted diagnosis goes on.
     """
 
-    run: Positional[Path]
-    """The run folder."""
     effects: tuple[str, ...] = ()
     """Effects to consider, by name, or files that define some; all of the library that are off, if not given."""
     device: str = "auto"
@@ -37,21 +33,28 @@ class Config:
 def run(config: Config) -> int:
     """Diagnose; the result goes into the run folder."""
     from splatsoil.commands import _criticism as criticism
+    from splatsoil.commands import _stages as stage
     from splatsoil.commands._crew import Crew
     from splatsoil.commands._diagnosis_table import show
-    from splatsoil.inverse.run_folder import RunFolder
+    from splatsoil.errors import NoAnswer
 
-    folder = RunFolder.open(config.run)
-    criticism.need_fit(folder)
+    folder = stage.opened(config)
+    none = why_none(criticism.need_fit(folder))
     folder.check_writable()
     with Crew(folder, config.device, config.effects) as crew:
         result = _diagnosed(config, folder, crew)
+    if none:
+        del result["estimates"]
     if config.json:
-        print_json({"ok": True, "run": str(folder.path), **_finite(result)})
+        print_json(
+            {**({"ok": False, "error": none} if none else {"ok": True}), **_finite(result), "run": str(folder.path)}
+        )
     else:
+        if none:
+            print(none)
         show(result)
         print(f"kept in {folder.path / 'diagnosis.json'}")
-    return 0
+    return NoAnswer.code if none else 0
 
 
 def _diagnosed(config: Config, folder: RunFolder, crew: Crew) -> dict[str, Any]:
@@ -77,14 +80,11 @@ def _diagnosed(config: Config, folder: RunFolder, crew: Crew) -> dict[str, Any]:
 
 def interrupted(config: Config) -> str:
     """Simulations are kept one by one."""
-    again = command_line(
+    again = config.again(
         "diagnose",
-        (config.run,),
-        (
-            ("--effects", config.effects, ()),
-            ("--device", config.device, "auto"),
-            ("--json", config.json, False),
-        ),
+        ("--effects", config.effects, ()),
+        ("--device", config.device, "auto"),
+        ("--json", config.json, False),
     )
     return f"finished simulations are kept; go on with: {again}"
 

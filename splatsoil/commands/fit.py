@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from splatsoil.commands._answer import need_answer
 from splatsoil.commands._options import FitOptions, command_line
 from splatsoil.commands._output import print_json
 
@@ -34,8 +35,9 @@ def run(config: Config) -> int:
         reconstruction = stage.reconstructed(measurement, folder, device, begin("reconstruct"))
         model = stage.model_on(measurement, folder, reconstruction, config.effects, config.preset, device)
         result = stage.fitted(config, measurement, folder, model, begin("fit"))
+    need_answer(result, f"`{command_line('compare', (folder.path,))}` shows where")
     if config.json:
-        print_json({"ok": True, "run": str(folder.path), **result})
+        print_json({"ok": True, **result, "run": str(folder.path)})
     else:
         show(result, str(folder.path))
         print("Does the model leave more than noise, and where?", command_line("compare", (folder.path,)))

@@ -4,22 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-from tyro.conf import Positional
-
-from splatsoil.commands._options import command_line
+from splatsoil.commands._answer import need_answer
+from splatsoil.commands._options import RunOptions, command_line
 from splatsoil.commands._output import print_json
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(RunOptions):
     """Sample the posterior of a run's latest fit, the one that its estimate and ± are of. An interrupted one goes on
     where it stopped."""
 
-    run: Positional[Path]
-    """The run folder."""
     checks: int = 3
     """Simulations at places drawn from the posterior, which hold the emulator to its word."""
     device: str = "auto"
@@ -40,7 +36,6 @@ def run(config: Config) -> int:
     from splatsoil.envs.devices import resolve_device
     from splatsoil.errors import ParameterError
     from splatsoil.inverse.posterior_run import run_posterior
-    from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.quiet import hush
 
     for name in ("checks", "seed"):
@@ -48,8 +43,9 @@ def run(config: Config) -> int:
         if value < 0:
             raise ParameterError(f"--{name}: must be 0 or more, not {value}")
     hush()
-    folder = RunFolder.open(config.run)
+    folder = stage.opened(config)
     fit = folder.fit()
+    need_answer(fit, f"so there is nothing to sample; `{command_line('compare', (folder.path,))}` shows where")
     setup = fit["setup"]
     wanted = ("cuda:0" if setup["device"] == "cuda" else "cpu") if config.device == "auto" else config.device
     device = resolve_device(wanted)
@@ -81,7 +77,7 @@ def run(config: Config) -> int:
                 progress=begin("posterior"),
             )
     if config.json:
-        print_json({"ok": True, "run": str(folder.path), **result})
+        print_json({"ok": True, **result, "run": str(folder.path)})
     else:
         show(result, str(folder.path))
     return 0
@@ -89,15 +85,12 @@ def run(config: Config) -> int:
 
 def interrupted(config: Config) -> str:
     """What is kept, and the command that goes on."""
-    again = command_line(
+    again = config.again(
         "posterior",
-        (config.run,),
-        (
-            ("--checks", config.checks, 3),
-            ("--device", config.device, "auto"),
-            ("--seed", config.seed, 0),
-            ("--json", config.json, False),
-        ),
+        ("--checks", config.checks, 3),
+        ("--device", config.device, "auto"),
+        ("--seed", config.seed, 0),
+        ("--json", config.json, False),
     )
     return f"what was simulated and sampled is kept; go on with: {again}"
 

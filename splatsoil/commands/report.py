@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
-from tyro.conf import Positional
-
-from splatsoil.commands._options import command_line
+from splatsoil.commands._answer import need_answer
+from splatsoil.commands._options import RunOptions
 from splatsoil.commands._output import print_json
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(RunOptions):
     """Write report.html, one self-contained page, from what is in a run folder."""
 
-    run: Positional[Path]
-    """The run folder."""
     json: bool = False
     """Print one JSON object instead of a sentence."""
 
@@ -24,11 +20,13 @@ class Config:
 def run(config: Config) -> int:
     """Write the page; RunError when the folder has no finished fit."""
     from splatsoil.commands import _stages as stage
-    from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.report import write_report
+    from splatsoil.run_files import read_fit
 
-    stage.note_other_sources(RunFolder.open(config.run))
-    path = write_report(config.run)
+    folder = stage.opened(config)
+    stage.note_other_sources(folder)
+    path = write_report(folder.path)
+    need_answer(read_fit(folder.path), f"report: {path}")
     if config.json:
         print_json({"ok": True, "report": str(path)})
     else:
@@ -38,5 +36,5 @@ def run(config: Config) -> int:
 
 def interrupted(config: Config) -> str:
     """The page is written whole or not at all."""
-    again = command_line("report", (config.run,), (("--json", config.json, False),))
+    again = config.again("report", ("--json", config.json, False))
     return f"the page was not written; start again with: {again}"

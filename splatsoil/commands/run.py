@@ -6,6 +6,7 @@ import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from splatsoil.commands._answer import need_answer
 from splatsoil.commands._options import FitOptions, Option, command_line
 from splatsoil.commands._output import print_json
 
@@ -91,6 +92,7 @@ def run(config: Config) -> int:
         page = write_report(folder.path)
     if unknown:
         print(unknown, file=sys.stderr)
+    need_answer(result, f"report: {page}")
     if config.json:
         losses = {key: comparison[key] for key in ("loss", "total", "noise")}
         extra: dict[str, Any] = {} if misfit is None else {"misfit": {key: misfit[key] for key in compare.TOLD}}
@@ -101,7 +103,7 @@ def run(config: Config) -> int:
                 "models": histories.history(folder),
                 "stopped": stopped,
             }
-        print_json({"ok": True, "run": str(folder.path), "report": str(page), "comparison": losses, **extra, **result})
+        print_json({"ok": True, "report": str(page), "comparison": losses, **extra, **result, "run": str(folder.path)})
         return 0
     fit.show(result, str(folder.path))
     compare.show(comparison, str(folder.comparison), called_adequate(result, diagnosis or misfit))

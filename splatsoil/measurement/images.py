@@ -14,6 +14,8 @@ from splatsoil.errors import MeasurementError
 FloatImage = npt.NDArray[np.float32]
 
 
+#: Pillow's names of the types that are read. It knows more, among them ones that it hands to other programs (EPS).
+FORMATS = ("AVIF", "BMP", "GIF", "JPEG", "JPEG2000", "MPO", "PNG", "PPM", "TGA", "TIFF", "WEBP")
 _ORIENTATION = 0x0112  # EXIF
 _BLOCK = 8  # pixels over which noise is averaged before a photograph is asked for what it shows
 _OPAQUE = 128  # of 255: half, so that the pixel's centre belongs to what is shown
@@ -32,7 +34,7 @@ def check_image(path: Path, size: tuple[int, int], *, sizes_from: str, field: st
         The image, a JPEG at an eighth of its size.
     """
     expected = Image.registered_extensions().get(path.suffix.lower())
-    if expected is None:
+    if expected not in FORMATS:
         raise MeasurementError(
             f"{path.suffix or 'a name without suffix'} is no known type of image; convert it to JPEG or PNG",
             file=path,
@@ -133,7 +135,7 @@ def read_depth(path: Path, field: str | None = None) -> FloatImage:
     if path.suffix == ".npy":
         try:
             values = np.load(path, allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
+        except (OSError, ValueError, EOFError, MemoryError) as error:
             raise MeasurementError("not a NumPy array of numbers", file=path, field=field) from error
     else:
         with _opened(path, field) as image:
@@ -167,10 +169,11 @@ def _values(image: Image.Image, path: Path, field: str | None = None) -> FloatIm
 
 
 def _opened(path: Path, field: str | None = None) -> Image.Image:
+    Image.init()  # or types of the list are unknown yet
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            return Image.open(path)
+            return Image.open(path, formats=[name for name in FORMATS if name in Image.OPEN])
     except FileNotFoundError as error:
         raise MeasurementError("no such image", file=path, field=field) from error
     except UnidentifiedImageError as error:
@@ -186,7 +189,7 @@ def _opened(path: Path, field: str | None = None) -> Image.Image:
 def _decode(image: Image.Image, path: Path, field: str | None = None) -> None:
     try:
         image.load()
-    except (OSError, ValueError, SyntaxError, EOFError) as error:
+    except (OSError, ValueError, SyntaxError, EOFError, MemoryError) as error:
         raise MeasurementError(
             f"the image is damaged or truncated ({error}); copy it again", file=path, field=field
         ) from error

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from splatsoil.errors import MeasurementError
 from splatsoil.measurement.camera import Camera
-from splatsoil.measurement.fields import Fields
+from splatsoil.measurement.fields import Fields, inside
 from splatsoil.measurement.frames import Frame, read_transforms
 from splatsoil.measurement.motion import ToolMotion
 from splatsoil.measurement.tool import DEFAULT_FRICTION, Tool, read_force, read_mesh
@@ -117,7 +117,7 @@ class Measurement:
         file = root / EXPERIMENT
         if not file.is_file():
             raise MeasurementError(f"no {EXPERIMENT} in this folder; it is no measurement set", file=file)
-        fields = Fields.read(file)
+        fields = Fields.read(inside(EXPERIMENT, root, root, file, ""))
         fields.check_names(FIELDS)
         tag = fields.text("format")
         if tag != FORMAT:

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import io
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from zipfile import is_zipfile
 
 import numpy as np
 import numpy.typing as npt
 import trimesh
 
 from splatsoil.errors import MeasurementError
+from splatsoil.files import check_unpacked
 from splatsoil.measurement.fields import read_table
 from splatsoil.measurement.motion import ToolMotion, check_clock
 
 FloatArray = npt.NDArray[np.float64]
 
+#: Types of mesh, by their suffix. Others run readers that follow paths, or unpack whatever is in an archive.
+FORMATS = ("stl", "obj", "ply", "off", "glb", "gltf", "3mf")
 FORCE_COLUMNS = ("frame", "time", "fx", "fy", "fz")
 DEFAULT_FRICTION = 0.3
 
@@ -56,7 +61,8 @@ class Tool:
 
 
 def read_mesh(file: Path) -> trimesh.Trimesh:
-    """A closed mesh in metres with outward faces, on each of its bodies, from any file that trimesh reads.
+    """A closed mesh in metres with outward faces, on each of its bodies, from a file of one of the types `FORMATS`.
+    Nothing that the file names is read.
 
     Corners that differ by texture or normal alone are joined, faces without area or given twice left out, and units
     that the file tells (3MF does) converted.
@@ -64,8 +70,18 @@ def read_mesh(file: Path) -> trimesh.Trimesh:
     Raises:
         MeasurementError: it can't be read, or encloses no volume.
     """
+    kind = file.suffix.lower().removeprefix(".")
+    if kind not in FORMATS:
+        raise MeasurementError(
+            f"{file.suffix or 'a name without suffix'} is no type of mesh that is read, as STL, OBJ and PLY are; is it"
+            " what its name says?",
+            file=file,
+        )
     try:
-        mesh = trimesh.load_mesh(file)
+        data = file.read_bytes()
+        if is_zipfile(io.BytesIO(data)):
+            check_unpacked(io.BytesIO(data))
+        mesh = trimesh.load_mesh(io.BytesIO(data), file_type=kind)
     except Exception as error:  # trimesh's readers raise whatever their parsers do
         reason = " ".join(str(error).split())[:160] or type(error).__name__
         missing = re.search(r"No module named '(\w+)", reason) if isinstance(error, ImportError) else None

@@ -15,7 +15,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from splatsoil.errors import RunError, SetWarning
-from splatsoil.files import read_json, write_bytes, write_json
+from splatsoil.files import check_unpacked, read_json, write_bytes, write_json
 from splatsoil.reconstruction.height_field import HeightField
 from splatsoil.run_files import RECONSTRUCTION_FORMAT
 from splatsoil.splats import Gaussians, save_ply
@@ -193,6 +193,7 @@ def _npz(**arrays: torch.Tensor | NDArray[Any]) -> bytes:
 
 
 def _load_npz(path: Path) -> dict[str, NDArray[Any]]:
+    check_unpacked(path)
     with np.load(path, allow_pickle=False) as file:
         return {name: file[name] for name in file.files}
 

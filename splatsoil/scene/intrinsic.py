@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
 from splatsoil.errors import ParameterError, RunError
-from splatsoil.files import write_npz
+from splatsoil.files import read_npz, write_npz
 from splatsoil.scene.light import Light
 from splatsoil.scene.render import Scene
 
@@ -47,12 +46,13 @@ class Intrinsic:
         Raises:
             RunError: it can't be read.
         """
+        names = ("direction", "ambient", "level", "softness", "soil", "grains", "tool")
+        kept = read_npz(path, names, remedy="delete it, it will be made anew")
         try:
-            with np.load(path, allow_pickle=False) as kept:
-                light = Light(kept["direction"], kept["ambient"], kept["level"], float(kept["softness"]))
-                return cls(light, kept["soil"], kept["grains"], kept["tool"])
-        except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
-            raise RunError(f"{path}: cannot be read ({error}); delete it, it will be made anew") from error
+            light = Light(kept["direction"], kept["ambient"], kept["level"], float(kept["softness"]))
+        except (TypeError, ValueError, ParameterError) as error:
+            raise RunError(f"{path}: holds no light ({error}); delete it, it will be made anew") from error
+        return cls(light, kept["soil"], kept["grains"], kept["tool"])
 
     def save(self, path: Path) -> None:
         """Write a NumPy archive, whole or not at all.

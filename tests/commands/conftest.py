@@ -22,11 +22,21 @@ def fit_of() -> Callable[..., dict[str, Any]]:
         return {
             "format": "splatsoil-fit/2",
             "name": "+".join(sorted(effects)) or "base",
-            "loss": 1.0,
+            "loss": 0.5,
             "loss_std": 0.1,
+            "best": {"loss": 0.5},
             "evaluations": 10,
             "parameters": {
-                name: {"estimate": value, "std": 1.0, "unit": "1", "title": name} for name, value in estimates.items()
+                name: {
+                    "estimate": value,
+                    "std": 1.0,
+                    "unit": "1",
+                    "title": name,
+                    "bounds": [value - 10.0, value + 10.0],
+                    "at_bound": None,
+                    "off": None,
+                }
+                for name, value in estimates.items()
             },
             "minimum": {name: {"estimate": v, "low": v - 1.0, "high": v + 1.0} for name, v in estimates.items()},
             "history": [],

@@ -18,15 +18,15 @@ GIVEN = {
     "reconstruct": "'my set' --out a/b --preset tiny --seed 3 --device cpu --holdout 0 --json",
     "simulate": "out --friction-angle 31.5 --with cohesion tilt --set cohesion=300 tilt_x=-2 --scene plow --depth 0.09 "
     "--preset tiny --seed 4 --particle-seed 5 --views 12 --picture-scale 0.5 --device cuda:0 --like 'a set' --json",
-    "posterior": "runs/a --checks 0 --device cpu --seed 1 --json",
+    "posterior": "runs/a --set 'a set' --checks 0 --device cpu --seed 1 --json",
     "fit": "nowhere --parameters friction_angle --with cohesion --budget 9 --coarse tiny --preset fine --device cpu "
     "--seed 2 --run 'a run' --json",
     "run": "nowhere --parameters friction_angle --with cohesion --budget 9 --coarse tiny --preset fine --device cpu "
     "--seed 2 --run 'a run' --criticise --most-effects 3 --json",
-    "compare": "'a run' --quick --device cpu --json",
-    "diagnose": "'a run' --effects cohesion 'my effects/crust.py' --device cpu --json",
-    "add": "'a run' --budget 9 --device cpu --json",
-    "report": "'a run' --json",
+    "compare": "'a run' --set 'a set' --quick --device cpu --json",
+    "diagnose": "'a run' --set 'a set' --effects cohesion 'my effects/crust.py' --device cpu --json",
+    "add": "'a run' --set 'a set' --budget 9 --device cpu --json",
+    "report": "'a run' --set 'a set' --json",
     "export": "'a run' --to csv ply --out 'a folder' --model diagnosis --every 5 --device cpu --json",
     "element": "--test isotropic --confining 5e4 --friction-angle 30 --with dilatancy 'my effects/crust.py' --set "
     "dilatancy_angle=9 --strain 0.1 --pressure 1e6 --records 20 --void-ratio 0.7 --young 1e7 --poisson 0.3 "
@@ -76,7 +76,7 @@ def test_the_hints_after_a_fit_and_a_comparison_can_be_pasted(
 
     monkeypatch.setattr(_stages, "prepare", lambda config: (None, SimpleNamespace(path=folder)))
     for stage in ("reconstructed", "model_on", "fitted"):
-        monkeypatch.setattr(_stages, stage, lambda *_: {})
+        monkeypatch.setattr(_stages, stage, lambda *_: {"loss": 0.5, "best": {"loss": 0.5}, "parameters": {}})
     monkeypatch.setattr(fit, "show", lambda *_: None)
     assert fit.run(fit.Config(Path("set"))) == 0
     assert f"and where? splatsoil compare '{folder}'\n" in capsys.readouterr().out

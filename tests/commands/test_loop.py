@@ -14,6 +14,8 @@ from splatsoil.commands import run as command
 from splatsoil.commands.run import Config, loop
 from splatsoil.errors import ParameterError, SimulationError
 
+LAST = {"name": "last", "loss": 0.5, "best": {"loss": 0.5}, "parameters": {}}
+
 
 def said(verdict: str, *effects: str) -> dict[str, Any]:
     return {"verdict": verdict, "class": list(effects)}
@@ -57,9 +59,9 @@ def stand_in(monkeypatch: pytest.MonkeyPatch, place: Path, adequate: bool) -> No
     """All of the stages but the loop."""
     comparison = {"loss": "robust", "total": {}, "noise": {}}
     (place / "comparison.json").write_text(json.dumps(comparison))
-    folder = SimpleNamespace(path=place, comparison=place, fit=lambda: {"name": "last"})
+    folder = SimpleNamespace(path=place, comparison=place, fit=lambda: LAST)
     monkeypatch.setattr(_stages, "prepare", lambda config: (None, folder))
-    for name, found in (("reconstructed", None), ("model_on", None), ("fitted", {}), ("compared", comparison)):
+    for name, found in (("reconstructed", None), ("model_on", None), ("fitted", LAST), ("compared", comparison)):
         monkeypatch.setattr(_stages, name, lambda *_, found=found: found)
     told = {"adequate": adequate, "probability": 0.9, "estimates": {}, "checks": [], "passes": adequate}
     monkeypatch.setattr(_criticism, "misfit", lambda *_: told)

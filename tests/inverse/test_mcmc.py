@@ -78,3 +78,15 @@ def test_nothing_to_sample(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(RunError, match="cannot be written"):
         sample(bell, LOW, HIGH, file=tmp_path / "file" / "chains.h5")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("beyond", [-2.0, 0.3])
+def test_a_density_that_is_no_number_somewhere_is_said_to_be_none_there(value: float, beyond: float) -> None:
+    """At the starts, and where walkers come later."""
+
+    def broken(points: np.ndarray) -> np.ndarray:
+        return np.where(points[:, 0] > beyond, value, bell(points))
+
+    with pytest.raises(RunError, match=rf"is {value} at \(-?\d.*finite or −∞"):
+        sample(broken, LOW, [0.0, 1.0] if beyond == 0.3 else HIGH)

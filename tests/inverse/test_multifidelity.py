@@ -19,7 +19,7 @@ from splatsoil.inverse.bayesopt import BayesianOptimiser
 from splatsoil.inverse.fitting import fit
 from splatsoil.inverse.multifidelity import CHEAP, FULL, TwoLevelOptimiser, optimise_two_levels
 
-from splatsoil.errors import ParameterError
+from splatsoil.errors import ParameterError, RunError
 
 COST = 0.2
 Loss = Callable[[np.ndarray], float]
@@ -184,3 +184,17 @@ def test_the_agent_plays_any_environment_with_a_level(analytic: ModuleType) -> N
 def test_a_problem_without_a_coarse_likeness(analytic: ModuleType) -> None:
     with pytest.raises(ParameterError, match="no coarse likeness"):
         TwoLevelProblem(analytic.AnalyticProblem(), "tiny")
+
+
+@pytest.mark.parametrize("full_fails", [False, True])
+def test_a_search_whose_cheap_evaluations_all_failed(full_fails: bool) -> None:
+    optimiser = TwoLevelOptimiser(1, cost=COST, budget=9.0)
+    while not optimiser.over:
+        ask = optimiser.ask_level()
+        failed = ask.level == CHEAP or full_fails
+        optimiser.tell_level(ask.action, ask.level, None if failed else valleys(ask.action.astype(np.float64)))
+    if full_fails:
+        with pytest.raises(RunError, match=r"no full evaluation succeeded .* there is no loss to model"):
+            optimiser.result()
+    else:
+        assert abs(optimiser.result().estimate[0] - MINIMUM) < 0.1

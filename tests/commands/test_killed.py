@@ -1,0 +1,256 @@
+"""``kill -9`` at any moment, and files cut short by a power cut: the same command comes to the same end, or says why.
+
+The set is small and its answer means nothing; that it is the same to the last bit is the point.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import random
+import shutil
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from PIL import Image
+
+from splatsoil import cli
+
+#: What a clock or an interruption, but nothing else, may change.
+CLOCKS = {"seconds", "created", "simulated_now"}
+QUICK = ("--preset", "tiny", "--budget", "2", "--search", "paper", "--device", "cpu")
+WHOLE = ("--preset", "tiny", "--budget", "2", "--stop-at-floor", "--device", "cpu")
+
+#: Runs the program and kills it at a certain one of the moments at which it touches a file of a folder.
+KILLER = """
+import os, signal, sys
+folder, moment = os.path.abspath(sys.argv[1]), int(sys.argv[2])
+seen = 0
+def touched(event, given):
+    global seen
+    writes = event == "open" and isinstance(given[2], int) and given[2] & (os.O_WRONLY | os.O_RDWR | os.O_CREAT)
+    if writes or event in ("os.rename", "os.mkdir", "os.remove", "os.chmod", "sqlite3.connect"):
+        if isinstance(given[0], (str, os.PathLike)) and os.path.abspath(given[0]).startswith(folder):
+            seen += 1
+            if seen == moment:
+                os.kill(os.getpid(), signal.SIGKILL)
+sys.addaudithook(touched)
+from splatsoil.cli import main
+code = main(sys.argv[3:])
+print(seen, file=sys.stderr)
+sys.exit(code)
+"""
+
+
+@pytest.fixture(scope="module")
+def place(plow_dry: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a set: five views and four frames of one camera, at half the size."""
+    folder = tmp_path_factory.mktemp("killed")
+    made = folder / "set"
+    made.mkdir()
+    for name in ("experiment.json", "tool.stl", "tool_motion.csv", "tool_force.csv"):
+        shutil.copy(plow_dry / name, made)
+    for kind in ("views", "video"):
+        data = json.loads((plow_dry / kind / "transforms.json").read_text())
+        frames = data["frames"]
+        in_video = [f for f in frames if f.get("frame") in (-2, -1, 0, 10) and f.get("camera") == "left"]
+        data["frames"] = frames[::8] if kind == "views" else in_video
+        for entry in (data, *data["frames"]):
+            for key in {"w", "h", "fl_x", "fl_y", "cx", "cy"} & entry.keys():
+                entry[key] = entry[key] // 2 if key in "wh" else entry[key] / 2.0
+        for frame in data["frames"]:
+            target = made / kind / frame["file_path"]
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with Image.open(plow_dry / kind / frame["file_path"]) as image:
+                half = (image.width // 2, image.height // 2)
+                image.resize(half, Image.Resampling.BOX).save(target, quality=95)
+        (made / kind / "transforms.json").write_text(json.dumps(data))
+    return folder
+
+
+def start(place: Path, words: tuple[str, ...], *, run: str, moment: int = 0) -> subprocess.Popen[str]:
+    command = [sys.executable, "-c", KILLER, run, str(moment), words[0], "set", *words[1:], "--run", run, "--json"]
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    pipe = subprocess.PIPE
+    return subprocess.Popen(command, cwd=place, stdout=pipe, stderr=pipe, text=True, env=environment)
+
+
+def finish(place: Path, words: tuple[str, ...], *, run: str) -> tuple[dict[str, Any], int]:
+    """What the command prints, and how often it touched a file."""
+    process = start(place, words, run=run)
+    out, err = process.communicate(timeout=600)
+    assert process.returncode == 0, err
+    return json.loads(out), int(err.splitlines()[-1])
+
+
+def timeless(data: Any) -> Any:
+    if isinstance(data, dict):
+        return {key: timeless(value) for key, value in data.items() if key not in CLOCKS}
+    return [timeless(item) for item in data] if isinstance(data, list) else data
+
+
+def essence(run: Path) -> dict[str, Any]:
+    """All that a run came to, but for what clocks say: JSON, evaluations, and the bytes of arrays and pictures."""
+    out: dict[str, Any] = {}
+    for file in sorted(run.rglob("*")):
+        name = file.relative_to(run).as_posix()
+        if file.suffix == ".json" and not file.name.startswith("."):
+            out[name] = timeless(json.loads(file.read_text()))
+        elif file.suffix in (".npy", ".npz", ".ply", ".jpg", ".png") and not file.name.startswith("."):
+            out[name] = file.read_bytes()
+    with contextlib.closing(sqlite3.connect(run / "evaluations.db")) as database:
+        columns = "fit, step, key, parameters, action, seed, status, loss, blocks"
+        out["evaluations"] = database.execute(f"SELECT {columns} FROM evaluations ORDER BY fit, step").fetchall()
+    return out
+
+
+def helpers(process: subprocess.Popen[str]) -> list[int]:
+    """Children of a process, by their numbers."""
+    found = []
+    for status in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):
+            words = status.read_text().rsplit(")", 1)[1].split()
+            if int(words[1]) == process.pid:
+                found.append(int(status.parent.name))
+    return found
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").is_file(), reason="moments are told by what a system's kernel tells")
+def test_a_fit_killed_while_it_writes_comes_to_the_same_end(place: Path) -> None:
+    """Twice: at the file that describes the run, and later."""
+    words = ("fit", *QUICK)
+    told, touched = finish(place, words, run="quick")
+    for moment in (3, random.Random(0).randrange(8, touched)):
+        process = start(place, words, run="quick-killed", moment=moment)
+        _, err = process.communicate(timeout=600)
+        assert process.returncode == -signal.SIGKILL, err
+    again, _ = finish(place, words, run="quick-killed")
+    assert timeless(again) | {"run": ""} == timeless(told) | {"run": ""}
+    whole, killed = essence(place / "quick"), essence(place / "quick-killed")
+    assert without_places(killed) == without_places(whole)
+
+
+def without_places(result: dict[str, Any]) -> dict[str, Any]:
+    """A run but for the folder it is in."""
+    return {name: data for name, data in result.items() if name != "run.json"}
+
+
+@pytest.fixture(scope="module")
+def whole(place: Path) -> Path:
+    """``run``, undisturbed."""
+    finish(place, ("run", *WHOLE), run="whole")
+    return place / "whole"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [int(os.environ.get("SPLATSOIL_KILL_SEED", "0"))])
+def test_a_run_killed_at_random_moments_comes_to_the_same_end(place: Path, whole: Path, seed: int) -> None:
+    """Ten moments: half of them where a file is touched, half at any time; and now and then a helper alone."""
+    chance, words, killed, run = random.Random(seed), ("run", *WHOLE), 0, f"killed-{seed}"
+    for number in range(100):
+        if killed == 10:
+            break
+        moment = chance.randrange(1, 25) if number % 2 else 0
+        process = start(place, words, run=run, moment=moment)
+        if moment == 0:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.communicate(timeout=chance.uniform(4.0, 20.0))
+            for helper in helpers(process)[:1]:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(helper, signal.SIGKILL)
+            time.sleep(chance.uniform(0.0, 1.0))
+            process.kill()
+        process.communicate(timeout=600)
+        killed += process.returncode == -signal.SIGKILL
+        if process.returncode == 0:  # it had come to its end
+            shutil.rmtree(place / run)
+    finish(place, words, run=run)
+    assert killed == 10
+    same, other = without_places(essence(whole)), without_places(essence(place / run))
+    assert {name: other.get(name) for name in same} == same
+    assert "<html" in (place / run / "report.html").read_text()
+
+
+def kinds(run: Path) -> list[Path]:
+    """One file of each kind that a run folder has."""
+    found: dict[tuple[str, str], Path] = {}
+    for file in sorted(p for p in run.rglob("*") if p.is_file()):
+        name = file.relative_to(run)
+        alike = name.suffix if name.parent.name in ("features", "comparison") and name.suffix != ".json" else name.name
+        found.setdefault((name.parent.name, alike), name)
+    return list(found.values())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("left", ["nothing", "half", "all but a byte"])
+def test_files_cut_short_are_made_anew_or_named(
+    place: Path,
+    whole: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    left: str,
+) -> None:
+    monkeypatch.chdir(place)
+    monkeypatch.setattr("splatsoil.threads.cores", lambda: 1)
+    for name in kinds(whole):
+        size = (whole / name).stat().st_size
+        length = {"nothing": 0, "half": size // 2, "all but a byte": size - 1}[left]
+        if length < 0:
+            continue
+        shutil.rmtree("cut", ignore_errors=True)
+        shutil.copytree(whole, "cut")
+        with (Path("cut") / name).open("r+b") as stream:
+            stream.truncate(length)
+        for command, words in (("report", ["report", "cut"]), ("run", ["run", "set", *WHOLE, "--run", "cut"])):
+            code = cli.main(words)
+            said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("splatsoil: ")]
+            assert code in (0, 2) and len(said) == (1 if code else 0), (name, command, code, said)
+            if code:
+                part = name.parent if name.parent.name == "reconstruction" else name
+                assert str(Path("cut") / part) in said[0], (name, command, said)
+            elif command == "run":
+                assert timeless(json.loads(Path("cut/fit.json").read_text())) == timeless(
+                    json.loads((whole / "fit.json").read_text())
+                ), name
+
+
+def test_two_commands_on_one_run_folder(place: Path, run_elsewhere: Callable[[], Path]) -> None:
+    """The second says so in one sentence, and the first goes on."""
+    folder = run_elsewhere()
+    done = subprocess.run(
+        [sys.executable, "-m", "splatsoil", "fit", "set", *QUICK, "--run", str(folder)],
+        cwd=place, capture_output=True, text=True, timeout=100, check=False,
+    )  # fmt: skip
+    assert done.returncode == 2
+    said = done.stderr.splitlines()[-1]
+    assert "another process is writing into this run folder" in said and "Traceback" not in done.stderr
+
+
+@pytest.fixture
+def run_elsewhere(place: Path, tmp_path: Path) -> Any:
+    """Makes a run folder into which another process is writing until the test ends."""
+    holder: list[subprocess.Popen[str]] = []
+
+    def begin() -> Path:
+        script = (
+            "import sys, time\nfrom splatsoil.inverse.evaluations import writer_lock\n"
+            "with writer_lock(sys.argv[1]):\n    print('held', flush=True)\n    time.sleep(300)\n"
+        )
+        folder = tmp_path / "run"
+        process = subprocess.Popen([sys.executable, "-c", script, str(folder)], stdout=subprocess.PIPE, text=True)
+        holder.append(process)
+        assert process.stdout is not None and process.stdout.readline() == "held\n"
+        return folder
+
+    yield begin
+    for process in holder:
+        process.kill()
+        process.communicate()

@@ -1,0 +1,107 @@
+"""A measurement set or a run folder that has moved, as all commands meet it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from splatsoil.inverse.run_folder import RunFolder
+
+from splatsoil import cli
+from splatsoil.commands import _stages
+from splatsoil.commands._options import FitOptions
+from splatsoil.errors import RunError
+
+COMMANDS = ("compare", "diagnose", "add", "posterior")
+
+
+@pytest.fixture
+def project(small_set: Path, tmp_path: Path, fit_of: Callable[..., dict[str, Any]]) -> Path:
+    """A folder with a set and its run: ``data/set`` and ``runs/run``."""
+    place = tmp_path / "project"
+    shutil.move(small_set, place / "data" / "set")
+    _, run = _stages.prepare(FitOptions(place / "data" / "set", preset="tiny", run=place / "runs" / "run"))
+    run.write_fit("base", {**fit_of(), "setup": {**fit_of()["setup"], "device": "cpu"}})
+    return place
+
+
+@pytest.fixture
+def reaches(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+    """Folders of the sets with which reconstructions were asked for."""
+    found: list[Path] = []
+
+    def asked(measurement: Any, *_: object, **__: object) -> None:
+        found.append(measurement.folder)
+        raise RunError("far enough")
+
+    monkeypatch.setattr(_stages, "reconstructed", asked)
+    return found
+
+
+def words(command: str, run: Path, *more: object) -> list[str]:
+    return [command, str(run), *(["cohesion"] if command == "add" else []), *map(str, more)]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_set_elsewhere_is_asked_for_and_then_known(
+    project: Path, reaches: list[Path], capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    run, new = project / "runs" / "run", project / "elsewhere" / "new"
+    shutil.move(project / "data" / "set", new)
+    assert cli.main(words(command, run)) == 2
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert f"`splatsoil report {run} --set FOLDER` notes where it is now" in said
+    assert cli.main(words(command, run, "--set", new)) == 2
+    assert "far enough" in capsys.readouterr().err
+    assert cli.main(words(command, run)) == 2
+    assert reaches == [new, new], "once told, it is known"
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_project_on_another_machine(project: Path, reaches: list[Path], tmp_path: Path, command: str) -> None:
+    other = tmp_path / "other" / "machine"
+    shutil.move(project, other)
+    before = (other / "runs" / "run" / "run.json").read_bytes()
+    assert cli.main(words(command, other / "runs" / "run")) == 2
+    assert reaches == [other / "data" / "set"]
+    assert (other / "runs" / "run" / "run.json").read_bytes() == before
+
+
+def test_a_run_without_its_way_finds_a_set_beside_it(project: Path) -> None:
+    """As one of an earlier version, whose set lies beside it now."""
+    run = project / "runs" / "run"
+    data = json.loads((run / "run.json").read_text())
+    del data["way"]
+    (run / "run.json").write_text(json.dumps(data))
+    shutil.move(project / "data" / "set", project / "runs" / "set")
+    assert _stages.measurement_of(RunFolder.open(run)).folder == project / "runs" / "set"
+
+
+@pytest.mark.usefixtures("reaches")
+def test_a_fit_takes_the_new_place(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run, new = project / "runs" / "run", project / "elsewhere" / "new"
+    shutil.move(project / "data" / "set", new)
+    assert cli.main(["fit", str(new), "--preset", "tiny", "--run", str(run)]) == 2
+    assert "far enough" in capsys.readouterr().err
+    assert _stages.measurement_of(RunFolder.open(run)).folder == new
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_another_set_is_not_taken(project: Path, capsys: pytest.CaptureFixture[str], told: bool) -> None:
+    run, place = project / "runs" / "run", project / "data" / "set"
+    before = (run / "run.json").read_bytes()
+    (place / "experiment.json").write_text((place / "experiment.json").read_text().replace("1600", "1700"))
+    assert cli.main(words("compare", run, *(["--set", place] if told else []))) == 2
+    assert "has changed since" in capsys.readouterr().err.splitlines()[-1]
+    assert (run / "run.json").read_bytes() == before
+
+
+def test_the_command_that_goes_on_says_where_the_set_is(project: Path) -> None:
+    from splatsoil.commands import add, compare, diagnose, posterior, report
+
+    for module, more in ((add, {"effects": ("tilt",)}), (compare, {}), (diagnose, {}), (posterior, {}), (report, {})):
+        assert "--set new" in module.interrupted(module.Config(run=Path("run"), set=Path("new"), **more))
