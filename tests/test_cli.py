@@ -11,9 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+import tyro
 
 import splatsoil.commands
 from splatsoil import cli
+from splatsoil.commands._help import options_of
 from splatsoil.commands._output import only_json, print_json
 from splatsoil.errors import RunError
 
@@ -108,6 +110,46 @@ def test_usage_errors_and_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert "check" in capsys.readouterr().out
     assert cli.main(["--version"]) == 0
     assert capsys.readouterr().out == f"splatsoil {splatsoil.__version__}\n"
+
+
+def test_help_is_short_and_begins_with_run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """As an 80-column terminal of 40 lines shows it."""
+    monkeypatch.setenv("COLUMNS", "80")
+    commands = cli.commands()
+    for words in ([], *([name] for name in commands)):
+        with pytest.raises(SystemExit) as left:
+            cli.main([*words, "--help"])
+        page = capsys.readouterr().out
+        assert left.value.code == 0 and len(page.splitlines()) <= 40, words
+        assert max(map(len, page.splitlines())) <= 80, words
+        if not words:
+            listed = re.findall(r"^  ([a-z-]+) ", page, flags=re.MULTILINE)
+            assert listed[0] == "run" and sorted(listed) == sorted(commands)
+
+
+@pytest.mark.parametrize("command", sorted(cli.commands()))
+def test_help_says_what_every_option_is(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Every option that the parser takes, under the parser's name, with a text."""
+    config = cli.commands()[command].config
+    with pytest.raises(SystemExit):
+        tyro.cli(config, args=["--help"], config=(tyro.conf.FlagCreatePairsOff,))
+    taken = set(re.findall(r"^│ (?:-h, )?(--[a-z-]+)", capsys.readouterr().out, flags=re.MULTILINE)) - {"--help"}
+    known = options_of(config)
+    assert {option.shown.split()[0] for option in known if not option.positional} == taken
+    assert all(option.text for option in known)
+
+
+@pytest.mark.parametrize(
+    ("words", "hint"),
+    [(["fti", "set"], "did you mean fit?"), (["chek"], "did you mean check?"), (["xyzzy"], "no command 'xyzzy';")],
+)
+def test_a_command_that_is_misspelt_gets_a_hint(
+    words: list[str], hint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as left:
+        cli.main(words)
+    out, err = capsys.readouterr()
+    assert left.value.code == 2 and hint in err and out == "" and err.count("\n") == 1
 
 
 def test_help_and_check_do_not_load_the_heavy_packages(plow_dry: Path) -> None:

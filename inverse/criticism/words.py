@@ -26,7 +26,8 @@ def sentences(diagnosis: Diagnosis, candidates: Mapping[str, Candidate]) -> list
         told = [f"{n.replace('_', ' ')} ({probability(evidence.probability[n])})" for n in diagnosis.members]
         out.append(f"One of these is missing: {listed(told)}. The data do not tell them apart.")
     elif diagnosis.verdict == "something else":
-        out.append("The model leaves more than noise and numerics, and no effect of the library explains it.")
+        none = ", and no effect of the library explains it" if candidates else ""
+        out.append(f"The residual is larger than noise and discretisation error{none}.")
     elif diagnosis.verdict == "undecided":
         shares = [
             f"{(name or 'the model as it is').replace('_', ' ')} {probability(evidence.probability[name])}"

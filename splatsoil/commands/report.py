@@ -13,7 +13,7 @@ from splatsoil.commands._output import print_json
 
 @dataclass(frozen=True)
 class Config:
-    """Write report.html, one self-contained page, from what is in a run folder."""
+    """Write the page report.html of a run."""
 
     run: Positional[Path]
     """The run folder."""
