@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shlex
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -133,7 +134,8 @@ def test_help_says_what_every_option_is(command: str, capsys: pytest.CaptureFixt
     config = cli.commands()[command].config
     with pytest.raises(SystemExit):
         tyro.cli(config, args=["--help"], config=(tyro.conf.FlagCreatePairsOff,))
-    taken = set(re.findall(r"^│ (?:-h, )?(--[a-z-]+)", capsys.readouterr().out, flags=re.MULTILINE)) - {"--help"}
+    page = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
+    taken = set(re.findall(r"^[^\w-]*(--[a-z][a-z-]*)", page, flags=re.MULTILINE))
     known = options_of(config)
     assert {option.shown.split()[0] for option in known if not option.positional} == taken
     assert all(option.text for option in known)
@@ -281,9 +283,43 @@ def test_a_command_that_simulates_says_nothing_of_what_the_machine_lacks(tmp_pat
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_the_readme_lists_the_commands_there_are(repository: Path) -> None:
-    listed = re.findall(r"^\| `splatsoil ([a-z-]+)", (repository / "README.md").read_text(), flags=re.MULTILINE)
-    assert sorted(listed) == sorted(cli.commands())
+def test_the_readmes_commands_are_taken(repository: Path) -> None:
+    """Each line of a shell in the README that calls the program, with its options; values are left to the program."""
+    text = (repository / "README.md").read_text()
+    assert len(text.splitlines()) <= 120
+    shells = "".join(re.findall(r"```(?:sh)?\n(.*?)```", text, flags=re.DOTALL))
+    lines = re.findall(r"^(?:\$ )?splatsoil ([^#\n]+)", shells, flags=re.MULTILINE)
+    known = cli.commands()
+    parsed = []
+    for line in lines:
+        name, *words = shlex.split(line.replace("…", ""))
+        if name in known:
+            tyro.cli(known[name].config, args=words, config=(tyro.conf.FlagCreatePairsOff,))
+            parsed.append(name)
+        else:
+            assert [name, *words] == ["--help"]
+    assert parsed == ["run", "check", "import", "element"]
+
+
+def test_what_the_readme_shows_is_what_commands_print(
+    repository: Path,
+    plow_dry: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    text = (repository / "README.md").read_text()
+
+    def cells(lines: str) -> str:
+        return " ".join(re.sub(r"[│┃]", " ", lines).split())
+
+    for words in (["check", str(plow_dry)], ["element", "--friction-angle", "35"]):
+        assert cli.main(words) == 0
+        printed = cells(capsys.readouterr().out)
+        (shown,) = re.findall(rf"^\$ splatsoil {words[0]} .*\n((?:.+\n)+)", text, flags=re.MULTILINE)
+        for line in shown.replace("```", "").splitlines():
+            assert cells(line) in printed, line
 
 
 def test_the_readmes_make_targets_exist(repository: Path) -> None:
