@@ -74,6 +74,12 @@ class RunData:
     surface: Surface | None
     truth: Mapping[str, float]
 
+    @property
+    def judged(self) -> Mapping[str, Any] | None:
+        """What judges the model: the latest fit's diagnosis or comparison, else the diagnosis of the smaller model."""
+        own = self.diagnosis is not None and self.diagnosis["fit"] == self.fit["name"]
+        return self.diagnosis if own or self.misfit is None else self.misfit
+
 
 def load(folder: str | Path) -> RunData:
     """Read a run folder.
@@ -115,7 +121,11 @@ def true_values(folder: str | Path, names: Iterable[str]) -> dict[str, float]:
         return {}
     known = {**said, **(said["parameters"] if isinstance(said.get("parameters"), dict) else {})}
     found = {name: known.get(name, known.get(ELSEWHERE.get(name, name))) for name in names}
-    return {name: float(value) for name, value in found.items() if type(value) in (int, float)}
+    return {
+        name: float(value)
+        for name, value in found.items()
+        if isinstance(value, (int, float)) and not isinstance(value, bool)
+    }
 
 
 def estimates(fit: Mapping[str, Any]) -> dict[str, float]:

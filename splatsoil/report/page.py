@@ -57,9 +57,7 @@ def render(data: RunData) -> str:
         probability=words.probability,
     )
     comparison, diagnosis = data.comparison, data.diagnosis
-    # A diagnosis may be of the model that the latest one was made from.
-    own = diagnosis is not None and diagnosis["fit"] == data.fit["name"]
-    judged = diagnosis if own or data.misfit is None else data.misfit
+    judged = data.judged
     adequate = words.called_adequate(data.fit, judged)
     ratio = words.ratio_to_noise(comparison)
     at_the_noise = ratio is not None and ratio <= words.AT_THE_NOISE
