@@ -407,6 +407,21 @@ def test_every_picture_is_as_large_as_the_next_on_a_phone(tmp_path: Path) -> Non
     assert len(sizes) == 6 and len(set(sizes)) == 1
 
 
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="needs chromium")
+def test_a_keyboard_reaches_what_scrolls(tmp_path: Path, misfit: dict[str, Any]) -> None:
+    make_run(tmp_path)
+    misfit["estimates"] = {"friction_angle": {"value": 33.21, "std": 1.64, "determined": True}}
+    misfit["checks"][1]["region"] = "behind-the-tool-and-beside-it"
+    write_json(tmp_path / "comparison" / "misfit.json", {**misfit, "values": {"friction_angle": 35.62}})
+    found = in_a_frame(
+        write_report(tmp_path),
+        250,
+        "[...document.querySelectorAll('main *')].filter(e => e.scrollWidth > e.clientWidth + 1"
+        " && getComputedStyle(e).overflowX == 'auto').map(e => e.tabIndex).join(' ')",
+    )
+    assert set(found.split()) == {"0"}
+
+
 def axe() -> Path | None:
     """The rules of accessibility that a browser is to check, where they are installed."""
     if find_spec("axe_core_python") is None:
@@ -415,8 +430,8 @@ def axe() -> Path | None:
 
 
 @pytest.mark.skipif(shutil.which("chromium") is None or axe() is None, reason="needs chromium and axe-core")
-@pytest.mark.parametrize("adequate", [True, False])
-def test_accessibility_has_no_serious_fault(tmp_path: Path, misfit: dict[str, Any], adequate: bool) -> None:
+@pytest.mark.parametrize(("adequate", "width"), [(True, 1200), (False, 390)])
+def test_accessibility_has_no_serious_fault(tmp_path: Path, misfit: dict[str, Any], adequate: bool, width: int) -> None:
     rules = axe()
     assert rules is not None
     make_run(tmp_path)
@@ -425,7 +440,7 @@ def test_accessibility_has_no_serious_fault(tmp_path: Path, misfit: dict[str, An
     write_json(tmp_path / "comparison" / "misfit.json", said)
     found = in_a_frame(
         write_report(tmp_path),
-        1200,
+        width,
         "JSON.stringify((await axe.run(document)).violations.filter(v => ['serious', 'critical'].includes(v.impact))"
         ".map(v => [v.id, v.nodes.map(n => n.html.slice(0, 200))]))",
         script=rules.read_text(encoding="utf-8"),
