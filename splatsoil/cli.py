@@ -24,6 +24,7 @@ import tyro
 
 import splatsoil.commands
 from splatsoil import __version__
+from splatsoil.commands._help import answer
 from splatsoil.commands._output import only_json, print_json
 from splatsoil.errors import NoAnswer, SetWarning, SplatsoilError
 from splatsoil.trust import trust
@@ -84,7 +85,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     known = commands()
     config: Any
-    if words[:1] == ["benchmark"] and len(words) > 1 and not words[1].startswith("-"):
+    its_own = words[:1] == ["benchmark"] and len(words) > 1 and not words[1].startswith("-")
+    if not its_own:
+        answer(words, {name: command.config for name, command in known.items()}, DESCRIPTION)
+    if its_own:
         # What follows a benchmark's name is its own, options too.
         config = known["benchmark"].config(words[1], tuple(words[2:]))
     else:

@@ -154,7 +154,7 @@ class Comparator:
             for c in self.cameras
             for f in (self.reference, *self.frames)
         }
-        relief = _relief(measurement, surface, level)
+        self._relief = relief = _relief(measurement, surface, level)
         self.ground = self._places(relief, RISE * float(np.sort(measurement.tool.mesh.extents)[1]))
         self.bed = {c: np.isfinite(place[..., 0]) for c, place in self._places(relief, -1.0).items()}
         self.interior = {c: np.isfinite(place[..., 0]) for c, place in self.ground.items()}
@@ -255,6 +255,18 @@ class Comparator:
         observed, predicted = self.observed[camera, frame], images[camera, frame]
         difference = np.clip(0.5 + gain * (observed - predicted), 0.0, 1.0)
         return np.concatenate([observed, predicted, difference], axis=1).astype(np.float32)
+
+    def outlines(self, camera: str) -> FloatArray:
+        """(blocks, 4, 2) corners of each block on the undisturbed surface, in the undistorted picture of a camera, as
+        shares of its width and height; blocks in the order of ``labels``."""
+        centres = np.array([(b.x, b.y) for b in self.labels if (b.camera, b.frame) == (camera, self.frames[0])])
+        around = 0.5 * self.block * np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
+        flat = (centres[:, None] + around).reshape(-1, 2)
+        xy = torch.from_numpy(flat.astype(np.float32))
+        height = self._relief.sample(self._relief.height, xy).numpy().astype(np.float64)
+        view = self._views[camera]
+        pixels, _ = view.project(np.column_stack([flat, height]))
+        return (pixels / (view.width, view.height)).reshape(-1, 4, 2)
 
     def _places(self, relief: Relief, rise: float) -> dict[str, FloatArray]:
         """Where each pixel looks, a strip along the walls left out."""

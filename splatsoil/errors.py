@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
 from pathlib import Path
 
 
@@ -56,3 +58,9 @@ class RunError(SplatsoilError):
 
 class SetWarning(UserWarning):
     """Something odd about a measurement set, which can be used all the same; the command line prints it as a remark."""
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """ ", did you mean …?" where a known word is much like this one, else nothing."""
+    near = difflib.get_close_matches(word, list(known), n=1)
+    return f", did you mean {near[0]}?" if near else ""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -13,9 +14,11 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+import tyro
 
 import splatsoil.commands
 from splatsoil import cli
+from splatsoil.commands._help import options_of
 from splatsoil.commands._output import only_json, print_json
 from splatsoil.errors import RunError
 
@@ -110,6 +113,47 @@ def test_usage_errors_and_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert "check" in capsys.readouterr().out
     assert cli.main(["--version"]) == 0
     assert capsys.readouterr().out == f"splatsoil {splatsoil.__version__}\n"
+
+
+def test_help_is_short_and_begins_with_run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """As an 80-column terminal of 40 lines shows it."""
+    monkeypatch.setenv("COLUMNS", "80")
+    commands = cli.commands()
+    for words in ([], *([name] for name in commands)):
+        with pytest.raises(SystemExit) as left:
+            cli.main([*words, "--help"])
+        page = capsys.readouterr().out
+        assert left.value.code == 0 and len(page.splitlines()) <= 40, words
+        assert max(map(len, page.splitlines())) <= 80, words
+        if not words:
+            listed = re.findall(r"^  ([a-z-]+) ", page, flags=re.MULTILINE)
+            assert listed[0] == "run" and sorted(listed) == sorted(commands)
+
+
+@pytest.mark.parametrize("command", sorted(cli.commands()))
+def test_help_says_what_every_option_is(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Every option that the parser takes, under the parser's name, with a text."""
+    config = cli.commands()[command].config
+    with pytest.raises(SystemExit):
+        tyro.cli(config, args=["--help"], config=(tyro.conf.FlagCreatePairsOff,))
+    page = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
+    taken = set(re.findall(r"^[^\w-]*(--[a-z][a-z-]*)", page, flags=re.MULTILINE))
+    known = options_of(config)
+    assert {option.shown.split()[0] for option in known if not option.positional} == taken
+    assert all(option.text for option in known)
+
+
+@pytest.mark.parametrize(
+    ("words", "hint"),
+    [(["fti", "set"], "did you mean fit?"), (["chek"], "did you mean check?"), (["xyzzy"], "no command 'xyzzy';")],
+)
+def test_a_command_that_is_misspelt_gets_a_hint(
+    words: list[str], hint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as left:
+        cli.main(words)
+    out, err = capsys.readouterr()
+    assert left.value.code == 2 and hint in err and out == "" and err.count("\n") == 1
 
 
 def test_help_and_check_do_not_load_the_heavy_packages(plow_dry: Path) -> None:
@@ -268,9 +312,43 @@ def test_a_command_that_simulates_says_nothing_of_what_the_machine_lacks(tmp_pat
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_the_readme_lists_the_commands_there_are(repository: Path) -> None:
-    listed = re.findall(r"^\| `splatsoil ([a-z-]+)", (repository / "README.md").read_text(), flags=re.MULTILINE)
-    assert sorted(listed) == sorted(cli.commands())
+def test_the_readmes_commands_are_taken(repository: Path) -> None:
+    """Each line of a shell in the README that calls the program, with its options; values are left to the program."""
+    text = (repository / "README.md").read_text()
+    assert len(text.splitlines()) <= 120
+    shells = "".join(re.findall(r"```(?:sh)?\n(.*?)```", text, flags=re.DOTALL))
+    lines = re.findall(r"^(?:\$ )?splatsoil ([^#\n]+)", shells, flags=re.MULTILINE)
+    known = cli.commands()
+    parsed = []
+    for line in lines:
+        name, *words = shlex.split(line.replace("…", ""))
+        if name in known:
+            tyro.cli(known[name].config, args=words, config=(tyro.conf.FlagCreatePairsOff,))
+            parsed.append(name)
+        else:
+            assert [name, *words] == ["--help"]
+    assert parsed == ["run", "check", "import", "element"]
+
+
+def test_what_the_readme_shows_is_what_commands_print(
+    repository: Path,
+    plow_dry: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    text = (repository / "README.md").read_text()
+
+    def cells(lines: str) -> str:
+        return " ".join(re.sub(r"[│┃]", " ", lines).split())
+
+    for words in (["check", str(plow_dry)], ["element", "--friction-angle", "35"]):
+        assert cli.main(words) == 0
+        printed = cells(capsys.readouterr().out)
+        (shown,) = re.findall(rf"^\$ splatsoil {words[0]} .*\n((?:.+\n)+)", text, flags=re.MULTILINE)
+        for line in shown.replace("```", "").splitlines():
+            assert cells(line) in printed, line
 
 
 def test_the_readmes_make_targets_exist(repository: Path) -> None:

@@ -158,6 +158,21 @@ def test_what_is_missing_is_named(comparator, seen):
         comparator.compare(seen)
 
 
+def test_a_blocks_outline_goes_around_its_pixels(comparator):
+    for camera in comparator.cameras:
+        patches, outlines = comparator.patches[camera], comparator.outlines(camera)
+        assert outlines.shape == (patches.max() + 1, 4, 2)
+        height, width = patches.shape
+        y, x = np.mgrid[:height, :width] + 0.5
+        for block, corners in enumerate(outlines * (width, height)):
+            a, b = corners, np.roll(corners, -1, axis=0)
+            mine = np.stack([x[patches == block], y[patches == block]], axis=1)[:, None]
+            (u, v), (p, q) = (b - a).T, np.moveaxis(mine - a, -1, 0)
+            side = np.sign(u * q - v * p)
+            # At the picture's edges, and past crests, a block shows only in part.
+            assert np.mean(np.abs(side.sum(axis=1)) == 4) > 0.6, (camera, block)
+
+
 def test_pixels_look_at_the_surface(comparator):
     """A slope: where rays meet it, by hand; cells that nobody knows are as the ones beside them."""
     measurement = comparator.measurement

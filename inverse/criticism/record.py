@@ -16,7 +16,7 @@ from .words import sentences
 
 ABOUT_MISFIT = (
     *("estimates", "sentences", "checks", "passes", "numerics", "unit", "time_name", "times", "stages", "sites"),
-    *("curves", "maps", "simulations", "fit", "values"),
+    *("curves", "regions", "maps", "simulations", "fit", "values"),
 )
 
 
@@ -59,9 +59,10 @@ def record(experiment: Experiment, diagnosis: Diagnosis, simulations: int) -> di
         "stages": list(layout.stages),
         # What has no place is drawn as curves instead.
         "sites": [
-            [s.channel, *((s.x, s.y) if there else (None, None))]
+            [s.channel, *((s.x, s.y) if there else (None, None)), [[round(u, 5), round(v, 5)] for u, v in s.outline]]
             for s, there in zip(layout.sites, layout.placed, strict=True)
         ],
+        "regions": layout.regions.tolist(),
         "curves": [_curve(experiment, diagnosis, column) for column, there in enumerate(layout.placed) if not there],
         # In units of what each feature is expected to be off; null where nothing is compared.
         "maps": {names.get(name, name): _map(table, diagnosis) for name, table in diagnosis.residuals.items()},
@@ -107,17 +108,21 @@ def _model(diagnosis: Diagnosis, name: str, candidate: Candidate | None) -> dict
 
 
 def _curve(experiment: Experiment, diagnosis: Diagnosis, column: int) -> dict[str, Any]:
-    """An instrument without a place: what it measured, what is predicted, and how far these may lie apart."""
-    layout, seen = experiment.layout, experiment.seen
+    """An instrument without a place, in its unit: what it measured, one expected standard deviation below and above
+    that, and what is predicted."""
+    site, seen = experiment.layout.sites[column], experiment.seen
+    std = np.sqrt(diagnosis.expected)
 
     def values(table: np.ndarray) -> list[float | None]:
-        return [float(v) if there else None for v, there in zip(table[:, column], seen[:, column], strict=True)]
+        read = table[:, column] if site.reading is None else site.reading(table[:, column])
+        return [float(v) if there else None for v, there in zip(read, seen[:, column], strict=True)]
 
     return {
-        "channel": layout.sites[column].channel,
-        "unit": layout.sites[column].unit or layout.unit,
+        "channel": site.channel,
+        "unit": site.unit or experiment.layout.unit,
         "measured": values(experiment.observed),
-        "std": values(np.sqrt(diagnosis.expected)),
+        "low": values(experiment.observed - std),
+        "high": values(experiment.observed + std),
         "predicted": {name or "before": values(table) for name, table in diagnosis.predictions.items()},
     }
 

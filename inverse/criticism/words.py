@@ -26,7 +26,8 @@ def sentences(diagnosis: Diagnosis, candidates: Mapping[str, Candidate]) -> list
         told = [f"{n.replace('_', ' ')} ({probability(evidence.probability[n])})" for n in diagnosis.members]
         out.append(f"One of these is missing: {listed(told)}. The data do not tell them apart.")
     elif diagnosis.verdict == "something else":
-        out.append("The model leaves more than noise and numerics, and no effect of the library explains it.")
+        none = ", and no effect of the library explains it" if candidates else ""
+        out.append(f"The residual is larger than noise and discretisation error{none}.")
     elif diagnosis.verdict == "undecided":
         shares = [
             f"{(name or 'the model as it is').replace('_', ' ')} {probability(evidence.probability[name])}"
@@ -41,7 +42,7 @@ def sentences(diagnosis: Diagnosis, candidates: Mapping[str, Candidate]) -> list
         before, after = diagnosis.held_out[:2]
         out.append(
             f"On {diagnosis.aside}, which were set aside, the error is {before.error:.2g} without and "
-            f"{after.error:.2g} with {after.model.replace('_', ' ')}; noise leaves {after.noise:.2g}."
+            f"{after.error:.2g} with {after.model.replace('_', ' ')}; the noise level is {after.noise:.2g}."
         )
     worst = next((c for c in diagnosis.checks if c.p < SIGNIFICANT), None)
     if worst is not None:

@@ -16,6 +16,24 @@ from splatsoil.errors import ParameterError
 Option = tuple[str, object, object]
 """Name, value and usual value of an option."""
 
+#: Commands as help lists them, by what they are for.
+ORDER = {
+    "all at once": ("run",),
+    "into a measurement set": ("import", "check", "simulate"),
+    "step by step": ("reconstruct", "fit", "compare", "diagnose", "add", "report"),
+    "more of a run": ("posterior", "export"),
+    "by themselves": ("element", "benchmark"),
+}
+
+#: Options that a first run does without.
+EXPERT = frozenset(
+    (
+        *("budget", "search", "coarse", "criticise", "most_effects", "seed", "particle_seed", "holdout", "checks"),
+        *("scene", "like", "depth", "views", "picture_scale", "model", "every", "records", "void_ratio", "young"),
+        *("poisson", "strain_rate", "matching", "known", "points", "robot_to_world", "mesh_to_flange", "video_every"),
+    )
+)
+
 #: Evaluations for each free parameter, unless the user says how many.
 EVALUATIONS = 10
 
@@ -27,23 +45,23 @@ class FitOptions:
     set: Positional[Path]
     """Folder of the measurement set."""
     parameters: tuple[str, ...] = ()
-    """Free parameters; the friction angle and those of the effects that are on, if not given."""
-    effects: Annotated[tuple[str, ...], tyro.conf.arg(name="with", metavar="EFFECT")] = ()
-    """Effects to add to the base model, by name, or files that define some."""
+    """Free parameters; friction angle and those of effects that are on if not given."""
+    effects: Annotated[tuple[str, ...], tyro.conf.arg(name="with", metavar="EFFECT …")] = ()
+    """Effects of the model, by name, or files that define some."""
     budget: int | None = None
     """Evaluations; 10 for each free parameter if not given."""
     search: Literal["usual", "paper"] = "usual"
-    """How to search; paper: as Hsiao and Kumar did, from one random start by expected improvement."""
+    """paper: as Hsiao and Kumar, expected improvement from one random start."""
     coarse: Literal["tiny", "small", "paper"] | None = None
-    """Let the search use cheap simulations at this coarser preset, too; the budget is then their cost in full ones."""
+    """Search with simulations at this coarser preset, too; --budget counts their cost."""
     preset: Literal["tiny", "small", "paper", "fine"] = "small"
-    """How finely to reconstruct and simulate; small suits a laptop without a graphics card."""
+    """Resolution; small suits a laptop without a graphics card."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda:0, …"""
     seed: int = 0
-    """Of everything random; the same seed on the CPU gives the same bits (on a GPU with SPLATSOIL_DETERMINISTIC=1)."""
+    """Of random numbers; one seed gives one result on one processor."""
     run: Path | None = None
-    """Run folder; runs/NAME-PRESET if not given, with the seed when it isn't 0. A fit that was interrupted goes on."""
+    """Run folder; runs/NAME-PRESET, with the seed if it is not 0, if not given."""
     json: bool = False
     """Print one JSON object and nothing else."""
 

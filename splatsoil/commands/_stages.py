@@ -288,6 +288,7 @@ def _compared(run: RunFolder, model: Model, report: Report) -> dict[str, Any]:
     from splatsoil import __version__
     from splatsoil.comparison import Comparator
     from splatsoil.envs.measured import LOSS
+    from splatsoil.experiment.forces import force_record
     from splatsoil.files import write_json
     from splatsoil.report.data import estimates
     from splatsoil.run_files import COMPARISON_FORMAT
@@ -324,6 +325,7 @@ def _compared(run: RunFolder, model: Model, report: Report) -> dict[str, Any]:
         "gain": GAIN,
         "cameras": list(comparator.cameras),
         "frames": frames,
+        "force": force_record(model.measurement, comparator.frames, prediction.trajectory.force),
         "seconds": sum(prediction.seconds.values()),
     }
     write_json(run.comparison / "comparison.json", data)

@@ -20,10 +20,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Config(RunOptions):
-    """Add effects to a run's latest model, one after the other, and fit again.
+    """Add effects to the model, and fit again.
 
-    A diagnosis that knows the effect tells the error on data that were set aside, which is to fall; one is made where
-    there is none. Earlier fits stay.
+    Reports the error on data set aside without and with the effect. Earlier fits stay.
     """
 
     effects: Positional[tuple[str, ...]]

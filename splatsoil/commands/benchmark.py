@@ -16,7 +16,10 @@ from splatsoil.errors import ParameterError
 
 @dataclass(frozen=True)
 class Config:
-    """List the benchmarks, or run one: splatsoil benchmark NAME --help shows its options."""
+    """List the benchmarks, or run one.
+
+    splatsoil benchmark NAME --help lists a benchmark's options.
+    """
 
     name: Positional[str] = ""
     """Of the benchmark; without one they are listed."""

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Config:
-    """Check a measurement set and say what it holds. Writes nothing."""
+    """List what a measurement set contains and what is wrong with it. Writes nothing."""
 
     set: Positional[Path]
     """Folder of the measurement set."""

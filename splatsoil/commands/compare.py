@@ -24,13 +24,14 @@ TOLD = ("adequate", "probability", "estimates", "checks", "passes")
 
 @dataclass(frozen=True)
 class Config(RunOptions):
-    """Compare the prediction at a run's latest estimate with every frame of the video: how far off, where and when.
+    """Test whether the fitted model is adequate, and where and when it fails.
 
-    What counts as far is learnt from simulations with other parameters, seeds and finer cells, which the fit has made.
+    Pictures, losses and forces at the latest estimate; residuals over their expected standard deviation, which
+    simulations with other seeds and finer cells give.
     """
 
     quick: bool = False
-    """Only pictures and losses: one simulation, and nothing said about where the model is wrong."""
+    """Only pictures, losses and forces, from one simulation; no test."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda:0, …"""
     json: bool = False

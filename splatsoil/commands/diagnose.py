@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Config(RunOptions):
-    """Say which effect, if any, a run's latest model lacks, how probable that is, and what cannot be told.
+    """Name the effect that the model lacks, with its probability.
 
-    Simulates the model as it is, each effect that is off at several sizes, and the most probable ones again; all are
-    compared with all data. Simulations are kept: an interrupted diagnosis goes on.
+    Simulates the model as it is and with each effect that is off, at several sizes; all are compared with all data. A
+    diagnosis that was interrupted goes on.
     """
 
     effects: tuple[str, ...] = ()
-    """Effects to consider, by name, or files that define some; all of the library that are off, if not given."""
+    """Effects to consider, by name, or files that define some; the whole library if not given."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda:0, …"""
     json: bool = False

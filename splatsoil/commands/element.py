@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Config:
-    """Test the soil law as a laboratory would: stresses, volume and void ratio over strain, as a table and a plot."""
+    """A laboratory test on the soil law, as a table and a plot."""
 
     test: Literal["triaxial", "extension", "simple-shear", "isotropic"] = "triaxial"
     """Drained triaxial compression or extension, simple shear, or isotropic compression."""

@@ -25,7 +25,7 @@ USUAL: tuple[Format, ...] = ("vtk", "usd", "csv", "ply")
 
 @dataclass(frozen=True)
 class Config:
-    """Simulate at a run's estimate, and write what other programs read.
+    """The prediction for ParaView, Omniverse, spreadsheets, splat viewers.
 
     vtk: ParaView; usd: Omniverse, Blender; csv: spreadsheets; ply: viewers of Gaussian splats.
     """

@@ -13,11 +13,10 @@ from splatsoil.commands._output import print_json
 
 @dataclass(frozen=True)
 class Config(FitOptions):
-    """Find the parameters whose simulated pictures and forces are nearest to the measured ones, and how well they are
-    known.
+    """Estimate the parameters, with their uncertainty.
 
-    A search, and a comparison of the model with something else by what it simulated, finer cells among it. An
-    interrupted fit goes on.
+    A search over simulations, then the posterior, which contains discretisation error and model discrepancy. A fit that
+    was interrupted goes on.
     """
 
 

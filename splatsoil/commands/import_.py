@@ -27,7 +27,7 @@ def _option(metavar: str) -> Any:
 
 @dataclass(frozen=True)
 class Config:
-    """Make a measurement set of SOURCE: nerfstudio, instant-ngp, Blender, COLMAP."""
+    """A set from nerfstudio, instant-ngp, Blender or COLMAP."""
 
     source: Annotated[Positional[Path], tyro.conf.arg(metavar="SOURCE", help_behavior_hint="")]
     """transforms.json, or the folder of it or of a COLMAP model."""

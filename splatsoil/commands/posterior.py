@@ -13,11 +13,13 @@ from splatsoil.commands._output import print_json
 
 @dataclass(frozen=True)
 class Config(RunOptions):
-    """Sample the posterior of a run's latest fit, the one that its estimate and ± are of. An interrupted one goes on
-    where it stopped."""
+    """Sample the posterior: intervals, correlations, ArviZ file.
+
+    It is the posterior that the estimate and ± of the latest fit are of. Sampling that was interrupted goes on.
+    """
 
     checks: int = 3
-    """Simulations at places drawn from the posterior, which hold the emulator to its word."""
+    """Simulations at points drawn from the posterior, which test the emulator."""
     device: str = "auto"
     """Where to compute: auto (what the fit used), cpu, cuda:0, …"""
     seed: int = 0

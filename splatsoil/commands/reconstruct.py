@@ -17,16 +17,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Config:
-    """Reconstruct the scene before anything moves, from a measurement set's views."""
+    """Photographs to Gaussians, soil surface and mesh."""
 
     set: Positional[Path]
     """Folder of the measurement set."""
     out: Path | None = None
     """Folder for the result; runs/NAME-reconstruction if not given."""
     preset: Literal["tiny", "small", "paper", "fine"] = "small"
-    """How much work to do; small suits a laptop without a graphics card."""
+    """Resolution; small suits a laptop without a graphics card."""
     seed: int = 0
-    """Of everything random; the same seed on the CPU gives the same bits."""
+    """Of random numbers; one seed gives one result on one processor."""
     device: str = "auto"
     """Where to train: auto, cpu, cuda:0, …"""
     holdout: int = 8

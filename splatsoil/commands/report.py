@@ -11,7 +11,7 @@ from splatsoil.commands._output import print_json
 
 @dataclass(frozen=True)
 class Config(RunOptions):
-    """Write report.html, one self-contained page, from what is in a run folder."""
+    """Write the page report.html of a run."""
 
     json: bool = False
     """Print one JSON object instead of a sentence."""

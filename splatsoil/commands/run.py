@@ -20,20 +20,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Config(FitOptions):
-    """All of it: check the set, reconstruct, fit, compare with what noise leaves, write the report. Goes on where it
-    was interrupted.
+    """From a set to the report: check, reconstruct, fit, compare, and name what the model lacks.
 
-    Where the model isn't adequate also: diagnose it, add the effect that is missing, fit again, and so on, until the
-    model is adequate, no effect is probable enough, or the limit is reached. Each round takes two cores some twenty
-    minutes.
+    A model that is not adequate is diagnosed; the missing effect is added and fitted, until the model is adequate, no
+    effect is probable enough, or the limit is reached. A run that was interrupted goes on.
     """
 
     criticise: bool = False
-    """Diagnose a model that leaves no more than noise, too: one effect may be seen before all that is left is."""
+    """Diagnose an adequate model, too."""
     stop_at_floor: bool = False
-    """Only say whether the model is adequate; don't look for what is missing."""
+    """Only say whether the model is adequate; do not look for missing effects."""
     most_effects: int = 2
-    """Most effects that may be added."""
+    """Largest number of effects that are added."""
 
     def again(self, command: str, *others: Option) -> str:
         """The command line that means this, and other options besides."""

@@ -20,7 +20,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Config:
-    """Make a synthetic measurement set: simulated sand, photographed by a path tracer, with its truth beside it."""
+    """Make a synthetic set of known soil.
+
+    Simulated sand, photographed by a path tracer; truth.json says the parameters.
+    """
 
     out: Positional[Path]
     """Folder of the new set; must not exist, or be empty."""
@@ -39,7 +42,7 @@ class Config:
     preset: Literal["tiny", "small", "paper", "fine"] | None = None
     """Resolution of the solver; small unless given, paper for the paper's scene."""
     seed: int = 0
-    """Of the soil's surface, of all looks and of the noise; the same seed on the CPU gives the same bits."""
+    """Of surface, appearance and noise; one seed gives one set on one processor."""
     particle_seed: int | None = None
     """Of the particles' places; drawn by the seed unless given."""
     device: str = "cpu"

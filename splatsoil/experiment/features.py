@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -18,13 +19,18 @@ class Site:
         channel: the instrument (a camera's name, ``force z``, ``volume strain``).
         x: place in m; NaN for an instrument that has none.
         y: place in m; NaN for an instrument that has none.
-        unit: of its features; empty for the layout's.
+        unit: of its readings; empty for the layout's.
+        reading: increasing function from features to what the instrument reads; None where they are the same.
+        outline: corners in the channel's undistorted picture, as shares of its width and height; empty where there is
+            none.
     """
 
     channel: str
     x: float = math.nan
     y: float = math.nan
     unit: str = ""
+    reading: Callable[[npt.NDArray[np.float64]], npt.NDArray[np.float64]] | None = None
+    outline: tuple[tuple[float, float], ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

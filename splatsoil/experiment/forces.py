@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +20,7 @@ FloatArray = npt.NDArray[np.float64]
 
 ALONG, UP = "force along", "force up"
 """Instruments: against the way the tool is pushed, and upwards."""
-REGION, UNIT = "tool", "% of the largest force, asinh"
+REGION, UNIT = "tool", "N"
 STAGE, PAUSE = "pushing", "pause"
 """The one whose largest force is the unit, and the one in which the tool stands."""
 LEAST, FEWEST = 0.25, 2
@@ -101,6 +102,42 @@ class ToolForces:
     def features(self) -> FloatArray:
         """(t, c) what was measured, as a comparison of models takes it."""
         return compressed(self.observed)
+
+    def newtons(self, features: FloatArray) -> FloatArray:
+        """Features as forces in N: `compressed` undone."""
+        return np.asarray(0.01 * self.largest * SCALE * np.sinh(features / SCALE))
+
+
+def force_record(measurement: Measurement, frames: Sequence[int], force: FloatArray) -> dict[str, Any] | None:
+    """Measured and predicted force around each compared frame, in N, as plain data.
+
+    Args:
+        measurement: with the measured force.
+        frames: compared ones.
+        force: (f, 3) predicted force on the tool in frames 1, 2, …, in N.
+
+    Returns:
+        ``unit``, ``frames`` and, for each of ``channels``, its name and what was ``measured`` and ``predicted``; null
+        in frames without a measurement. None where too little was measured.
+    """
+    forces = ToolForces.of(measurement, [[frame] for frame in frames])
+    if forces is None:
+        return None
+    predicted = 0.01 * forces.largest * forces.predicted(force)
+    measured = 0.01 * forces.largest * forces.observed
+
+    def column(table: FloatArray, number: int) -> list[float | None]:
+        there = forces.measured[:, number]
+        return [round(float(v), 4) if known else None for v, known in zip(table[:, number], there, strict=True)]
+
+    return {
+        "unit": UNIT,
+        "frames": list(frames),
+        "channels": [
+            {"channel": name, "measured": column(measured, i), "predicted": column(predicted, i)}
+            for i, name in enumerate(forces.channels)
+        ],
+    }
 
 
 def compressed(forces: FloatArray) -> FloatArray:

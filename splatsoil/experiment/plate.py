@@ -12,7 +12,7 @@ import trimesh
 from splatsoil.errors import ParameterError
 from splatsoil.experiment.base import candidates_of
 from splatsoil.experiment.features import Layout, Site
-from splatsoil.experiment.forces import SCALE, UNIT, compressed
+from splatsoil.experiment.forces import SCALE, compressed
 from splatsoil.experiment.plow import NUMERICS
 from splatsoil.measurement import Bed, Measurement, Tool, ToolMotion
 from splatsoil.mpm import Resolution, simulate
@@ -91,7 +91,7 @@ class PlateExperiment:
             times=tuple(float(1e3 * d) for d in depth),
             sites=(Site("force"),),
             time_name="depth, mm",
-            unit=UNIT,
+            unit="% of the largest force, asinh",
             stages=tuple("shallow" if d <= half else "deep" for d in depth),
             regions=np.full((len(depth), 1), "plate"),
         )

@@ -123,7 +123,7 @@ class PlowExperiment:
         regions = regions_of(measurement, self.base.reconstruction.surface, frames, sites)
         if self.forces is not None:
             channels = self.forces.channels
-            sites += tuple(Site(channel, unit=UNIT) for channel in channels)
+            sites += tuple(Site(channel, unit=UNIT, reading=self.forces.newtons) for channel in channels)
             regions = np.concatenate([regions, np.full((len(frames), len(channels)), REGION)], axis=1)
         return Layout(frames, sites, "frame", "grey levels", stages_of(measurement, frames), regions)
 
@@ -158,8 +158,11 @@ class PlowExperiment:
     @cached_property
     def _sites(self) -> tuple[Site, ...]:
         """Columns of cameras."""
-        cameras = self.comparator.cameras
-        return tuple(Site(camera, label.x, label.y) for camera in cameras for label in self._labels(camera))
+        return tuple(
+            Site(camera, label.x, label.y, outline=tuple(map(tuple, corners)))
+            for camera in self.comparator.cameras
+            for label, corners in zip(self._labels(camera), self.comparator.outlines(camera), strict=True)
+        )
 
     @cached_property
     def sensor(self) -> FloatArray:

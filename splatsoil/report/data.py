@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from splatsoil.files import read_npz
+from splatsoil.errors import RunError
+from splatsoil.files import read_json, read_npz
 from splatsoil.run_files import (
     COMPARISON_FORMAT,
     DIAGNOSIS_FORMAT,
@@ -56,6 +57,7 @@ class RunData:
         history: models tried by adding effects, the first one first.
         reconstruction: ``reconstruction/reconstruction.json``.
         surface: the reconstructed surface.
+        truth: true values of the latest fit's parameters by name, where the set is simulated and says them.
     """
 
     folder: Path
@@ -70,6 +72,13 @@ class RunData:
     history: Sequence[Mapping[str, Any]]
     reconstruction: Mapping[str, Any] | None
     surface: Surface | None
+    truth: Mapping[str, float]
+
+    @property
+    def judged(self) -> Mapping[str, Any] | None:
+        """What judges the model: the latest fit's diagnosis or comparison, else the diagnosis of the smaller model."""
+        own = self.diagnosis is not None and self.diagnosis["fit"] == self.fit["name"]
+        return self.diagnosis if own or self.misfit is None else self.misfit
 
 
 def load(folder: str | Path) -> RunData:
@@ -94,7 +103,29 @@ def load(folder: str | Path) -> RunData:
         history=_history(path / "history.json"),
         reconstruction=_reconstruction(path / "reconstruction"),
         surface=_surface(path / "reconstruction" / "surface.npz"),
+        truth=true_values(run["measurement"]["folder"], fit["parameters"]),
     )
+
+
+#: Parameters under the names that other simulators give them in ``truth.json``.
+ELSEWHERE = {"friction_angle": "phi", "tool_friction": "tool_mu"}
+
+
+def true_values(folder: str | Path, names: Iterable[str]) -> dict[str, float]:
+    """What the ``truth.json`` of a simulated set says of parameters, in their units; only those that it says."""
+    try:
+        said = read_json(Path(folder) / "truth.json")
+    except RunError:  # measured sets have none
+        return {}
+    if not isinstance(said, dict):
+        return {}
+    known = {**said, **(said["parameters"] if isinstance(said.get("parameters"), dict) else {})}
+    found = {name: known.get(name, known.get(ELSEWHERE.get(name, name))) for name in names}
+    return {
+        name: float(value)
+        for name, value in found.items()
+        if isinstance(value, (int, float)) and not isinstance(value, bool)
+    }
 
 
 def estimates(fit: Mapping[str, Any]) -> dict[str, float]:

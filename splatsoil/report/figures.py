@@ -8,12 +8,14 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from html import escape
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from splatsoil.report.data import Surface
+from splatsoil.report.words import BEYOND, SIGNIFICANT, block
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -127,7 +129,7 @@ def marginal(entry: Mapping[str, Any]) -> str:
 
 
 def losses(comparison: Mapping[str, Any]) -> str:
-    """Loss of each compared frame, for each camera, with the level that noise alone leaves."""
+    """Loss of each compared frame, for each camera, and the noise level."""
     name = comparison["loss"]
 
     def draw(_: Figure, axes: Axes) -> None:
@@ -137,7 +139,7 @@ def losses(comparison: Mapping[str, Any]) -> str:
             axes.plot(frames, [f["losses"][name] for f in steps], color=colour, marker=marker, ms=3.5, label=camera)
         noise = comparison.get("noise", {}).get(name)
         if noise:
-            axes.axhline(noise, color=FAINT, linestyle="--", linewidth=1.2, label="noise alone")
+            axes.axhline(noise, color=FAINT, linestyle="--", linewidth=1.2, label="noise level")
         axes.set_ylim(bottom=0.0)
         axes.set_xlabel("frame")
         axes.set_ylabel(f"loss ({name})")
@@ -179,7 +181,7 @@ def history(fits: Mapping[str, Mapping[str, Any]], order: Sequence[str]) -> str:
 
 
 def falling(errors: Sequence[float], noise: Sequence[float], names: Sequence[str], unit: str) -> str:
-    """The error on what was set aside of models in turn, above what noise alone leaves."""
+    """The error on data set aside of models in turn, and the noise level."""
 
     def draw(_: Figure, axes: Axes) -> None:
         places = np.arange(len(errors))
@@ -187,45 +189,53 @@ def falling(errors: Sequence[float], noise: Sequence[float], names: Sequence[str
         for place, error in zip(places, errors, strict=True):
             axes.text(float(place), error, f"{error:.2g}", ha="center", va="bottom", color=INK)
         edges = [-0.45, *(places + 0.5)]
-        axes.step(edges, [noise[0], *noise], color=SECOND, linestyle="--", linewidth=1.4, label="noise alone")
+        axes.step(edges, [noise[0], *noise], color=SECOND, linestyle="--", linewidth=1.4, label="noise level")
         axes.set_xticks(places, names)
         axes.set_xlim(-0.5, len(errors) - 0.5)
         axes.set_ylim(0.0, 1.18 * max(*errors, *noise))
         axes.set_ylabel(f"error, {unit}")
         axes.legend(fontsize=8)
 
-    told = (f"{name}: {error:.2g}, noise {floor:.2g}" for name, error, floor in zip(names, errors, noise, strict=True))
-    return _draw(draw, f"error of models on what was set aside, {unit}; {'; '.join(told)}")
+    rows = (f"{name}: {error:.2g}, noise {level:.2g}" for name, error, level in zip(names, errors, noise, strict=True))
+    return _draw(draw, f"error of models on data set aside, {unit}; {'; '.join(rows)}")
 
 
-def curves(judged: Mapping[str, Any], which: Sequence[tuple[str, str]]) -> str:
-    """What instruments without a place measured, and what models predict.
+@dataclass(frozen=True)
+class Readings:
+    """One instrument without a place.
 
-    Args:
-        judged: a diagnosis or a comparison.
-        which: a title and a key of the predictions for each line, two at most.
+    Attributes:
+        channel: its name.
+        unit: of what it reads.
+        measured: times and readings (n,), NaN where there is none.
+        expected: times, and readings one expected standard deviation below and above what was measured; None where
+            that has not been estimated.
+        predicted: times and readings by model.
     """
-    times = np.array(judged["times"], dtype=np.float64)
+
+    channel: str
+    unit: str
+    measured: tuple[np.ndarray, np.ndarray]
+    expected: tuple[np.ndarray, np.ndarray, np.ndarray] | None
+    predicted: Mapping[str, tuple[np.ndarray, np.ndarray]]
+
+
+def readings(one: Readings, time_name: str) -> str:
+    """What an instrument without a place measured, and what models predict."""
 
     def draw(figure: Figure, axes: Axes) -> None:
-        axes.remove()
-        panels = figure.subplots(len(judged["curves"]), 1, squeeze=False, sharex=True)[:, 0]
-        for place, curve in zip(panels, judged["curves"], strict=True):
-            measured, std = (np.array(curve[key], dtype=np.float64) for key in ("measured", "std"))
-            place.errorbar(times, measured, yerr=std, fmt="o", markersize=3, color=INK, capsize=2, label="measured")
-            for (title, key), colour, style in zip(which, (ACCENT, SECOND), ("-", "--"), strict=False):
-                if key in curve["predicted"]:
-                    predicted = np.array(curve["predicted"][key], dtype=np.float64)
-                    place.plot(times, predicted, color=colour, linestyle=style, label=title)
-            place.set_title(curve["channel"], fontsize=9)
-            place.set_ylabel(curve["unit"], fontsize=8)
-            place.tick_params(labelsize=7)
-        legend = panels[0].get_legend_handles_labels()
-        figure.legend(*legend, fontsize=8, loc="outside upper center", ncols=2, columnspacing=1.0)
-        panels[-1].set_xlabel(judged["time_name"])
+        if one.expected is not None:
+            axes.fill_between(*one.expected, color=FAINT, alpha=0.3, linewidth=0, label="± expected std")
+        axes.plot(*one.measured, "o", markersize=3.5, color=INK, label="measured")
+        lines = zip(one.predicted.items(), (ACCENT, SECOND), ("-", "--"), strict=False)
+        for (title, line), colour, style in lines:
+            axes.plot(*line, color=colour, linestyle=style, label=title)
+        axes.axhline(0.0, color=FAINT, linewidth=0.6)
+        axes.set_ylabel(f"{one.channel} [{one.unit}]")
+        axes.set_xlabel(time_name)
+        figure.legend(fontsize=8, loc="outside upper center", ncols=2, columnspacing=1.0)
 
-    channels = ", ".join(str(curve["channel"]) for curve in judged["curves"])
-    return _draw(draw, f"measured and predicted: {channels}", (SIZE[0], 1.0 + 1.4 * len(judged["curves"])))
+    return _draw(draw, f"measured and predicted {one.channel} [{one.unit}]", (SIZE[0], 2.7))
 
 
 def plan_maps(judged: Mapping[str, Any], which: Sequence[tuple[str, str]]) -> list[str]:
@@ -245,24 +255,29 @@ def _plan_map(judged: Mapping[str, Any], placed: Sequence[int], table: np.ndarra
     sites, stages = [judged["sites"][i] for i in placed], judged["stages"]
     channels = list(dict.fromkeys(site[0] for site in sites))
     names = list(dict.fromkeys(stages))
+    failing = [check for check in judged["checks"] if check["p"] < SIGNIFICANT]
 
     def draw(figure: Figure, axes: Axes) -> None:
         axes.remove()
         grid = figure.subplots(len(names), len(channels), squeeze=False, sharex=True, sharey=True)
         shown = None
         for row, name in enumerate(names):
-            rows = table[[i for i, stage in enumerate(stages) if stage == name]]
+            own = [i for i, stage in enumerate(stages) if stage == name]
+            rows = table[own]
             for column, channel in enumerate(channels):
                 mine = [i for i, site in enumerate(sites) if site[0] == channel]
                 part = rows[:, mine]
                 count = np.sum(np.isfinite(part), axis=0)
                 value = np.where(count > 0, np.nansum(part, axis=0) / np.maximum(count, 1), np.nan)
-                x, y = np.array([sites[i][1:] for i in mine], dtype=np.float64).T
+                x, y = np.array([sites[i][1:3] for i in mine], dtype=np.float64).T
                 xs, ys = np.unique(x.round(6)), np.unique(y.round(6))
                 image = np.full((len(ys), len(xs)), np.nan)
                 image[np.searchsorted(ys, y.round(6)), np.searchsorted(xs, x.round(6))] = value
                 place = grid[row][column]
                 shown = place.pcolormesh(xs, ys, image, cmap="RdBu_r", vmin=-limit, vmax=limit, rasterized=False)
+                failed = [c["region"] for c in failing if (c["stage"], c["channel"]) == (name, channel)]
+                outlined = [i for i in mine if {judged["regions"][r][placed[i]] for r in own} & set(failed)]
+                _outline(place, xs, ys, [sites[i][1:3] for i in outlined])
                 place.set_aspect("equal")
                 if row == 0:
                     place.set_title(channel, fontsize=9)
@@ -270,10 +285,43 @@ def _plan_map(judged: Mapping[str, Any], placed: Sequence[int], table: np.ndarra
                     place.set_ylabel(name, fontsize=8)
                 place.tick_params(labelsize=7)
         assert shown is not None
+        for place in grid[-1]:
+            place.set_xlabel("x [m]", fontsize=8)
+        figure.supylabel("y [m]", fontsize=8)
         bar = figure.colorbar(shown, ax=grid.ravel().tolist(), shrink=0.8, pad=0.02)
-        bar.set_label("residual / expected")
+        bar.set_label("residual / expected std")
 
-    return _draw(draw, f"residual over expected noise from above: {title}", (SIZE[0], 0.5 + 1.05 * len(names)))
+    return _draw(draw, f"residual over expected noise from above: {title}", (SIZE[0], 0.7 + 0.82 * len(names)))
+
+
+def _outline(place: Axes, xs: np.ndarray, ys: np.ndarray, centres: Sequence[Sequence[float]]) -> None:
+    """Draw a line around cells of a plan, given their centres (x, y)."""
+    from matplotlib.patches import Rectangle
+
+    width, height = (float(np.diff(axis).min(initial=np.inf)) for axis in (xs, ys))
+    for x, y in centres if np.isfinite([width, height]).all() else ():
+        corner = (x - 0.5 * width, y - 0.5 * height)
+        place.add_patch(Rectangle(corner, width, height, fill=False, edgecolor=INK, linewidth=0.7))
+
+
+def outlined(check: Mapping[str, Any], judged: Mapping[str, Any], squares: Mapping[int, float]) -> str:
+    """Squares of a block that fails, to lie over the picture in which they were seen.
+
+    Args:
+        check: the block.
+        judged: a diagnosis or a comparison.
+        squares: residual over expected standard deviation by site.
+    """
+    shapes = [
+        f'<polygon points="{" ".join(f"{u},{v}" for u, v in judged["sites"][site][3])}"'
+        f' class="{"beyond" if abs(value) > BEYOND else "within"}"/>'
+        for site, value in sorted(squares.items(), key=lambda item: abs(item[1]))
+    ]
+    shows = f"outlined: {block(check)}"
+    return (
+        f'<svg viewBox="0 0 1 1" preserveAspectRatio="none" role="img" aria-label="{escape(shows)}">'
+        f"{''.join(shapes)}</svg>"
+    )
 
 
 def _cycle() -> list[str]:

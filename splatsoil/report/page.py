@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 import splatsoil
 from splatsoil.errors import RunError
@@ -15,6 +17,8 @@ from splatsoil.report.data import RunData, load
 
 HERE = Path(__file__).parent
 KINDS = ("observed", "predicted", "difference")
+OUTLINED = 3
+"""Blocks that fail and are drawn on their photographs."""
 
 
 def write_report(folder: str | Path) -> Path:
@@ -53,9 +57,7 @@ def render(data: RunData) -> str:
         probability=words.probability,
     )
     comparison, diagnosis = data.comparison, data.diagnosis
-    # A diagnosis may be of the model that the latest one was made from.
-    own = diagnosis is not None and diagnosis["fit"] == data.fit["name"]
-    judged = diagnosis if own or data.misfit is None else data.misfit
+    judged = data.judged
     adequate = words.called_adequate(data.fit, judged)
     ratio = words.ratio_to_noise(comparison)
     at_the_noise = ratio is not None and ratio <= words.AT_THE_NOISE
@@ -74,10 +76,13 @@ def render(data: RunData) -> str:
         data=data,
         fit=data.fit,
         coarse=sum(step.get("level") == "coarse" for step in data.fit["history"]),
-        answers=words.answers(data.fit, judged),
+        answers=words.answers(data.fit, judged, data.truth),
+        adequate=adequate,
         fitted=words.fitted_sentence(data.fit, judged),
-        residual=words.residual_sentence(comparison, adequate),
+        residual=words.residual_sentence(comparison, adequate) if judged is None else words.misfit_sentence(judged),
         calm=at_the_noise if adequate is None else adequate,
+        by_comparison=data.fit["estimated_from"] == "comparison",
+        forces=_forces(data, judged),
         surrogates={name: Markup(figures.surrogate(data.fit, name)) for name in data.fit["parameters"]},
         losses=None if comparison is None else Markup(figures.losses(comparison)),
         pictures=pictures,
@@ -87,7 +92,9 @@ def render(data: RunData) -> str:
         models=[] if diagnosis is None else diagnosis["models"],
         little=words.LITTLE,
         judged=judged,
-        failing=None if judged is None else _failing(judged),
+        failing=None if judged is None else _failing(judged, comparison, data.folder / "comparison"),
+        significant=words.SIGNIFICANT,
+        beyond=words.BEYOND,
         posterior=None if data.posterior is None else _posterior(data.folder, data.posterior),
         falling=_falling(data),
         surface=None if data.surface is None else Markup(figures.surface_map(data.surface)),
@@ -158,8 +165,8 @@ def _findings(data: RunData, judged: Mapping[str, Any] | None) -> list[dict[str,
     return out
 
 
-def _failing(judged: Mapping[str, Any]) -> dict[str, Any]:
-    """Plan views of the residual and curves, of the model as it is and with the best effect."""
+def _failing(judged: Mapping[str, Any], comparison: Mapping[str, Any] | None, folder: Path) -> dict[str, Any]:
+    """Plan views of the residual, of the model as it is and with the best effect, and pictures of what fails."""
     from markupsafe import Markup
 
     which = [("as it is", "before")]
@@ -167,26 +174,93 @@ def _failing(judged: Mapping[str, Any]) -> dict[str, Any]:
     drawn = figures.plan_maps(judged, which)
     return {
         "maps": [(title, Markup(svg)) for (title, _), svg in zip(which, drawn, strict=True)],
-        "curves": Markup(figures.curves(judged, which)) if judged["curves"] else None,
+        "pictures": [] if comparison is None else _outlined(judged, comparison, folder),
     }
 
 
-def _falling(data: RunData) -> dict[str, Any] | None:
-    """The error on what was set aside: of the models tried or, where there is only one, of those that were compared."""
+def _outlined(judged: Mapping[str, Any], comparison: Mapping[str, Any], folder: Path) -> list[dict[str, Any]]:
+    """The blocks that fail most: each on the photograph nearest to where it fails most, with words on when it
+    begins."""
     from markupsafe import Markup
 
-    told = data.diagnosis or {"held_out": [], "aside": "data set aside", "unit": "grey levels"}
+    out: list[dict[str, Any]] = []
+    for check in judged["checks"]:
+        if check["p"] >= words.SIGNIFICANT or check["channel"] not in comparison["cameras"] or len(out) == OUTLINED:
+            continue
+        row, squares = words.worst_row(judged, check)
+        mine = (entry for entry in comparison["frames"] if entry["camera"] == check["channel"])
+        entry = min(mine, key=lambda entry: abs(entry["frame"] - judged["times"][row]))
+        name = words.block(check)
+        out.append(
+            {
+                "title": name[:1].upper() + name[1:],
+                "ratio": check["ratio"],
+                "begins": words.begins(judged, check),
+                "frame": entry["frame"],
+                "photograph": data_url(folder / entry["observed"]),
+                "squares": Markup(figures.outlined(check, judged, squares)),
+            }
+        )
+    return out
+
+
+def _forces(data: RunData, judged: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    """Force on the tool, measured and predicted: by the comparison at each frame, before and after an addition, and
+    what a diagnosis of this fit expects and predicts."""
+    from markupsafe import Markup
+
+    own = judged if judged is not None and judged["fit"] == data.fit["name"] else None
+    curves = {} if own is None else {curve["channel"]: curve for curve in own["curves"]}
+    now, before = ((c or {}).get("force") for c in (data.comparison, data.before))
+    if now is None:
+        return None
+    drawn, sentences = [], []
+    for number, channel in enumerate(now["channels"]):
+        frames, measured, predicted = _series(now["frames"], channel["measured"], channel["predicted"])
+        lines = {"predicted": (frames, predicted)}
+        if before is not None:
+            was = before["channels"][number]
+            earlier, _, old = _series(before["frames"], was["measured"], was["predicted"])
+            lines = {"before": (earlier, old), "after": (frames, predicted)}
+        expected, curve = None, curves.get(channel["channel"])
+        if own is not None and curve is not None:
+            times, low, high = _series(own["times"], curve["low"], curve["high"])
+            expected = (times, low, high)
+            for name in own.get("class", ())[:1] if before is None else ():
+                if name in curve["predicted"]:
+                    times, values = _series(own["times"], curve["predicted"][name])
+                    lines[f"with {words.model_label(name)}"] = (times, values)
+        one = figures.Readings(channel["channel"], now["unit"], (frames, measured), expected, lines)
+        drawn.append(Markup(figures.readings(one, "frame")))
+        error, largest = np.sqrt(np.nanmean((predicted - measured) ** 2)), np.nanmax(np.abs(measured))
+        sentences.append(
+            f"{channel['channel'].capitalize()}: root mean square error {words.rounded(float(error))} {now['unit']}; "
+            f"largest measured {words.rounded(float(largest))} {now['unit']}."
+        )
+    return {"figures": drawn, "sentences": sentences}
+
+
+def _series(*columns: Sequence[float | None]) -> tuple[np.ndarray, ...]:
+    """Columns as arrays (n,), null as NaN."""
+    return tuple(np.array(column, dtype=np.float64) for column in columns)
+
+
+def _falling(data: RunData) -> dict[str, Any] | None:
+    """The error on data set aside: of the models tried or, where there is only one, of those that were compared."""
+    from markupsafe import Markup
+
+    diagnosis = data.diagnosis or {"held_out": [], "aside": "data set aside", "unit": "grey levels"}
     if len(data.history) > 1:
         rows = [(entry["held_out"], entry["floor"]) for entry in data.history]
         names = words.steps(data.history)
     else:
-        rows = [(entry["error"], entry["noise"]) for entry in told["held_out"]]
-        names = [words.model_label(entry["model"]) for entry in told["held_out"]]
+        rows = [(entry["error"], entry["noise"]) for entry in diagnosis["held_out"]]
+        names = [words.model_label(entry["model"]) for entry in diagnosis["held_out"]]
     if len(rows) < 2:
         return None
     errors, noise = zip(*rows, strict=True)
-    figure = Markup(figures.falling(errors, noise, names, told["unit"]))
-    return {"figure": figure, "falls": errors[-1] < errors[0], "aside": told["aside"]}
+    figure = Markup(figures.falling(errors, noise, names, diagnosis["unit"]))
+    return {"figure": figure, "falls": errors[-1] < errors[0], "aside": diagnosis["aside"]}
 
 
 def data_url(path: Path) -> str:

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 #: A residual up to this many times the noise is called noise: the noise itself is only known to about this.
 AT_THE_NOISE = 1.5
-#: Probabilities this close to 0 or to 1 are told as a limit: the evidences aren't known any better.
+#: A check fails below this p.
+SIGNIFICANT = 0.05
+#: Expected standard deviations beyond which a block is said to have begun to fail.
+BEYOND = 2.0
+#: Key of the residuals of the model as it is.
+BEFORE = "before"
+#: Probabilities this close to 0 or to 1 are given as a limit: the evidences aren't known any better.
 LITTLE = 0.005
 
 
@@ -24,6 +30,7 @@ class Answer:
         unit: "°".
         state: ``determined``, ``bound`` or ``open``.
         remark: one sentence when the state isn't ``determined``.
+        truth: "36.0°" where the set is simulated and says it, else empty.
     """
 
     name: str
@@ -32,6 +39,7 @@ class Answer:
     unit: str
     state: str
     remark: str
+    truth: str = ""
 
 
 def with_std(value: float, std: float) -> tuple[str, str]:
@@ -68,7 +76,9 @@ def called_adequate(fit: Mapping[str, Any], judged: Mapping[str, Any] | None) ->
     return bool(judged.get("verdict") == "adequate" or judged.get("adequate"))
 
 
-def answers(fit: Mapping[str, Any], judged: Mapping[str, Any] | None = None) -> list[Answer]:
+def answers(
+    fit: Mapping[str, Any], judged: Mapping[str, Any] | None = None, truth: Mapping[str, float] | None = None
+) -> list[Answer]:
     """The parameters: averaged over models where a diagnosis or a comparison of this fit is there, else as fitted."""
     out, better = [], averaged(fit, judged)
     for name, entry in fit["parameters"].items():
@@ -89,16 +99,18 @@ def answers(fit: Mapping[str, Any], judged: Mapping[str, Any] | None = None) -> 
                 f"The {plain} lies on the {entry['at_bound']} bound of its range: "
                 "the best value may lie beyond it, or the model may lack an effect."
             )
-        out.append(Answer(plain, value, std, symbol(entry["unit"]), state, remark))
+        true, unit = "", symbol(entry["unit"])
+        if truth and name in truth:
+            true = f"{truth[name]:.{len(value.partition('.')[2])}f}{unit}"
+        out.append(Answer(plain, value, std, unit, state, remark, true))
     return out
 
 
 def averaged_sentence(estimates: Mapping[str, Mapping[str, Any]]) -> str:
     """The parameters, averaged over models, in one line."""
-    told = [
-        f"{name.replace('_', ' ')} {amount(e['value'], e['std'], e.get('unit', '1'))}" for name, e in estimates.items()
-    ]
-    said = listed(told)
+    said = listed(
+        [f"{n.replace('_', ' ')} {amount(e['value'], e['std'], e.get('unit', '1'))}" for n, e in estimates.items()]
+    )
     return f"{said[:1].upper()}{said[1:]}, averaged over models."
 
 
@@ -108,20 +120,21 @@ def undetermined(name: str) -> str:
 
 
 def fitted_sentence(fit: Mapping[str, Any], judged: Mapping[str, Any] | None) -> str:
-    """What the ± holds."""
+    """What the ± contains."""
     if fit["estimated_from"] == "loss" and not averaged(fit, judged):
         return (
-            f"The ± is one standard deviation of where the loss is least, given {fit['evaluations']} evaluations of "
-            "this model. It does not contain what the model itself gets wrong."
+            f"The ± is one standard deviation of the loss minimum, given {fit['evaluations']} evaluations of this "
+            "model. It does not contain model discrepancy."
         )
     return (
-        "The ± holds noise, the chance of particles, numerics (measured by pairs of coarse and fine runs) and the "
-        "other models, weighed by their probability."
+        "The ± is one standard deviation of the posterior, averaged over models. It contains instrument noise, "
+        "seed-to-seed scatter, discretisation error (measured by pairs of coarse and fine runs) and unknown albedo of "
+        "buried soil."
     )
 
 
 def ratio_to_noise(comparison: Mapping[str, Any] | None) -> float | None:
-    """The residual in units of what the cameras' noise alone would leave; None where it isn't known."""
+    """The loss over that of camera noise alone; None where that isn't known."""
     if comparison is None:
         return None
     name = comparison["loss"]
@@ -130,7 +143,7 @@ def ratio_to_noise(comparison: Mapping[str, Any] | None) -> float | None:
 
 
 def residual_sentence(comparison: Mapping[str, Any] | None, adequate: bool | None = None) -> str:
-    """How far the prediction is from the pictures, and what that does and doesn't mean.
+    """How far the prediction is from the pictures, and what that means.
 
     Args:
         comparison: with the pictures; None where there is none.
@@ -140,24 +153,22 @@ def residual_sentence(comparison: Mapping[str, Any] | None, adequate: bool | Non
         return "The prediction has not been compared with the pictures frame by frame yet."
     name = comparison["loss"]
     total, rest = float(comparison["total"][name]), comparison.get("motionless", {}).get(name)
-    left = f"The prediction leaves {percent(total / rest)} of the misfit that soil at rest would leave" if rest else ""
+    left = f"The misfit is {percent(total / rest)} of that of soil at rest" if rest else ""
     ratio = ratio_to_noise(comparison)
     if ratio is None:
-        unknown = (
-            "How far that is above the cameras' noise is unknown: the set has no pre-roll frames to measure it on."
-        )
+        unknown = "Its ratio to the camera noise is unknown: the set has no pre-roll frames to measure the noise on."
         return f"{left}. {unknown}" if left else unknown
     if ratio <= AT_THE_NOISE and adequate is not False:
-        return f"The residual is {ratio:.1f} × what the cameras' noise alone leaves: nothing more to explain here."
-    above = f"{ratio:.{1 if ratio < 10.0 else 0}f} × what the cameras' noise alone leaves"
-    said = f"{left}; that is {above}." if left else f"The residual is {above}."
+        return f"The misfit is {ratio:.1f} × the camera noise: nothing more to explain here."
+    above = f"{ratio:.{1 if ratio < 10.0 else 0}f} × the camera noise"
+    said = f"{left}, {above}." if left else f"The misfit is {above}."
     if adequate:
-        return f"{said} Noise, the chance of particles and numerics together leave as much."
+        return f"{said} Camera noise, seed-to-seed scatter and discretisation error together are as large."
     if adequate is not None:
         return said
     return (
-        f"{said} Part of the rest is the chance of where grains fall; the other part is the model's, the "
-        "reconstruction's or the light's, and this page cannot tell which."
+        f"{said} Part of the rest is seed-to-seed scatter. Whether the other part is the model's, the reconstruction's "
+        "or the light's, has not been estimated yet."
     )
 
 
@@ -169,7 +180,7 @@ def verdict(diagnosis: Mapping[str, Any]) -> str:
         "missing": f"Missing: {named}.",
         "one of": f"Missing: {named}.",
         "something else": "Something is missing that the library does not have.",
-        "undecided": "Undecided: the data do not tell.",
+        "undecided": "Undecided: the data do not discriminate between the models.",
     }
     return said[str(diagnosis["verdict"])]
 
@@ -177,6 +188,72 @@ def verdict(diagnosis: Mapping[str, Any]) -> str:
 def misfit_verdict(misfit: Mapping[str, Any]) -> str:
     """A comparison of the model as it is with something else, in one line."""
     return "The model is adequate." if misfit["adequate"] else "The model is not adequate: something may be missing."
+
+
+def misfit_sentence(judged: Mapping[str, Any]) -> str:
+    """The standardised residual of the most probable model, and its largest block."""
+    size = misfit(judged)
+    said = "" if size is None else f"Misfit {size:.2f} × the expected standard deviation"
+    if not judged["checks"]:
+        return f"{said}." if said else ""
+    largest = max(judged["checks"], key=lambda check: check["ratio"])
+    return f"{said or 'Misfit'}; largest: {block(largest)}, {largest['ratio']:.1f} ×."
+
+
+def misfit(judged: Mapping[str, Any]) -> float | None:
+    """Root mean square of residual over expected standard deviation, all features of the most probable model; None
+    where nothing is compared."""
+    values = [v for row in judged["maps"][most_probable(judged)] for v in row if v is not None]
+    return math.sqrt(sum(v * v for v in values) / len(values)) if values else None
+
+
+def most_probable(judged: Mapping[str, Any]) -> str:
+    """Key of the most probable model's residuals in ``maps``; checks are of that one."""
+    share = {model["name"] or BEFORE: model["probability"] for model in judged.get("models", ())}
+    return max(judged["maps"], key=lambda name: share.get(name, 0.0))
+
+
+def block(check: Mapping[str, Any]) -> str:
+    """A check's block: "berm while pushing, left camera"."""
+    stage, channel = str(check["stage"]), str(check["channel"])
+    when = f"while {stage}" if stage.endswith("ing") else f"during {stage}"
+    return f"{check['region']} {when}, {channel if channel.startswith('force') else f'{channel} camera'}"
+
+
+def begins(judged: Mapping[str, Any], check: Mapping[str, Any]) -> str:
+    """When a check's block begins to fail: the first time at which its root mean square residual is beyond `BEYOND`
+    expected standard deviations."""
+    rows = block_rows(judged, check)
+    first = next((row for row, values in rows.items() if _root_mean_square(values.values()) > BEYOND), None)
+    if first is None:
+        return f"No {judged['time_name']} by itself is beyond {BEYOND:g} expected standard deviations."
+    return f"It begins at {judged['time_name']} {judged['times'][first]:g}."
+
+
+def worst_row(judged: Mapping[str, Any], check: Mapping[str, Any]) -> tuple[int, dict[int, float]]:
+    """The row in which a check's block fails most, and its residuals there by site."""
+    return max(block_rows(judged, check).items(), key=lambda item: _root_mean_square(item[1].values()))
+
+
+def block_rows(judged: Mapping[str, Any], check: Mapping[str, Any]) -> dict[int, dict[int, float]]:
+    """Residual over expected standard deviation by row and site in a check's block."""
+    table, channels = judged["maps"][most_probable(judged)], [site[0] for site in judged["sites"]]
+    out = {}
+    for row, stage in enumerate(judged["stages"]):
+        places = zip(table[row], judged["regions"][row], channels, strict=True)
+        mine = {
+            site: float(value)
+            for site, (value, region, channel) in enumerate(places)
+            if value is not None and (region, channel) == (check["region"], check["channel"])
+        }
+        if stage == check["stage"] and mine:
+            out[row] = mine
+    return out
+
+
+def _root_mean_square(values: Iterable[float]) -> float:
+    squares = [v * v for v in values]
+    return math.sqrt(sum(squares) / len(squares))
 
 
 def model_label(name: str) -> str:

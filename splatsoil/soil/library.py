@@ -15,7 +15,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from splatsoil.errors import ParameterError
+from splatsoil.errors import ParameterError, did_you_mean
 from splatsoil.parameters import Parameter
 from splatsoil.soil import effects as builtin
 from splatsoil.soil.effect import Effect
@@ -51,7 +51,8 @@ def find_effects(names: Iterable[str | Effect]) -> tuple[Effect, ...]:
         elif name in library():
             chosen.append(library()[name])
         else:
-            raise ParameterError(f"effect {name!r} is unknown; known are {', '.join(library())}")
+            hint = did_you_mean(name, library())
+            raise ParameterError(f"effect {name!r} is unknown{hint}; known are {', '.join(library())}")
     repeated = {e.name for e in chosen if sum(o.name == e.name for o in chosen) > 1}
     if repeated:
         raise ParameterError(f"effect named twice: {', '.join(sorted(repeated))}")

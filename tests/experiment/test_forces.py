@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatsoil.experiment.forces import ALONG, SCALE, SENSOR, UP, ToolForces, compressed
+from splatsoil.experiment.forces import ALONG, SCALE, SENSOR, UP, ToolForces, compressed, force_record
 from splatsoil.measurement import Measurement, ToolMotion
 
 ROWS = [[frame, frame + 10] for frame in range(10, 200, 20)]
@@ -53,6 +53,27 @@ def test_rows_are_means_over_their_frames_in_newtons_of_the_largest(dry: Measure
     assert push == pytest.approx(-fx[row].mean(), rel=0.02)
     assert lift == pytest.approx(fz[row].mean(), rel=0.02)
     assert np.linalg.norm(found.observed[PUSHED], axis=1).max() == pytest.approx(100.0)
+
+
+def test_features_are_read_in_newtons(dry: Measurement) -> None:
+    found = forces_of(dry)
+    assert np.allclose(found.newtons(found.features), 0.01 * found.largest * found.observed)
+
+
+def test_what_is_shown_of_a_set_is_its_own_table_in_newtons(dry: Measurement) -> None:
+    assert dry.tool.force is not None
+    force = dry.tool.force[:, 2:]
+    shown = force_record(dry, [40, 50, 60, 150], 2.0 * force)
+    assert shown is not None
+    along, up = shown["channels"]
+    assert (shown["unit"], shown["frames"], along["channel"], up["channel"]) == ("N", [40, 50, 60, 150], ALONG, UP)
+    # Frame 50 stands for those from 46 to 55; the tool is pushed along x, the soil pushes back.
+    assert along["measured"][1] == pytest.approx(-force[45:54, 0].mean(), rel=0.02)
+    assert up["measured"][1] == pytest.approx(force[45:54, 2].mean(), rel=0.02)
+    for channel in (along, up):
+        assert np.allclose(channel["predicted"], 2.0 * np.array(channel["measured"]), atol=2e-4)
+    still = replace(dry, tool=replace(dry.tool, force=None))
+    assert force_record(still, [40, 50], force) is None
 
 
 def test_a_way_through_the_air_is_no_push(dry: Measurement) -> None:

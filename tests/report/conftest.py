@@ -7,7 +7,12 @@ from typing import Any
 import pytest
 
 STAGES = ["plunge", "push", "push", "withdrawal"]
-SITES = [["left", x, y] for y in (0.0, 0.1) for x in (0.0, 0.1, 0.2)] + [["force", None, None]]
+SITES = [
+    ["left", x, y, [[x, y], [x + 0.1, y], [x + 0.1, y + 0.1], [x, y + 0.1]]]
+    for y in (0.0, 0.1)
+    for x in (0.0, 0.1, 0.2)
+] + [["force", None, None, []]]
+REGIONS = [["track"] * 3 + ["berm"] * 3 + ["tool"]] * len(STAGES)
 
 
 def compared(name: str, probability: float, **size: Any) -> dict[str, Any]:
@@ -37,12 +42,14 @@ def judgement() -> dict[str, Any]:
         "times": [10, 20, 30, 40],
         "stages": STAGES,
         "sites": SITES,
+        "regions": REGIONS,
         "curves": [
             {
                 "channel": "force",
                 "unit": "N",
                 "measured": [1.0, 4.0, None, 2.0],
-                "std": [0.1, 0.4, None, 0.2],
+                "low": [0.9, 3.6, None, 1.8],
+                "high": [1.1, 4.4, None, 2.2],
                 "predicted": {"before": [1.0, 3.0, None, 2.0]},
             }
         ],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import re
 import shutil
@@ -158,17 +159,47 @@ def test_checks_that_hold_stand_back(run: Path) -> None:
     section = page[page.index('id="checks"') :]
     assert re.search(r"<tr><td>push</td><td>berm</td><td>left</td><td>2.3</td><td>0.003</td>", section)
     assert re.search(r'<tr class="little"><td>push</td><td>track</td>', section)
-    assert "1.3 × what pairs of coarse and fine runs say" in words_of(section)
+    assert "1.3 × that of pairs of coarse and fine runs" in words_of(section)
+
+
+def test_blocks_that_fail_are_outlined_on_their_photographs(run: Path, diagnosis: dict[str, Any]) -> None:
+    diagnosis["maps"]["effect_2"][2][3:6] = [2.5, 3.0, -1.0]
+    write_json(run / "diagnoses" / "base.json", diagnosis)
+    page = write_report(run).read_text()
+    (figure,) = re.findall(r'<figure class="outlined">.*?</figure>', page, re.DOTALL)
+    assert words_of(figure) == "Berm during push, left camera : 2.3 × expected. It begins at frame 30."
+    # The compared frame nearest to 30 is 20.
+    seen = base64.b64encode((run / "comparison" / "left_20_observed.jpg").read_bytes()).decode()
+    assert seen in figure
+    squares = re.findall(r'<polygon points="([^"]+)" class="(\w+)"', figure)
+    assert sorted(kind for _, kind in squares) == ["beyond", "beyond", "within"]
+    corners = " ".join(f"{u},{v}" for u, v in diagnosis["sites"][4][3])
+    assert (corners, "beyond") in squares
+
+
+def test_force_before_and_after_an_addition_is_in_newtons_without_a_diagnosis(run: Path) -> None:
+    (run / "diagnoses" / "base.json").unlink()
+    for folder, predicted in (("before", [10.0, 20.0]), ("comparison", [33.0, None])):
+        path = run / folder / "comparison.json"
+        channel = {"channel": "force along", "measured": [30.0, None], "predicted": predicted}
+        told = {"unit": "N", "frames": list(FRAMES), "channels": [channel]}
+        write_json(path, {**json.loads(path.read_text()), "force": told})
+    page = write_report(run).read_text()
+    section = page[page.index('id="force"') :].split("</section>")[0]
+    assert "Force along: root mean square error 3 N; largest measured 30 N." in words_of(section)
+    for label in ("measured", "before", "after", "force along [N]"):
+        assert f">{label}<" in section
+    assert "± expected" not in section
 
 
 def test_one_answer_is_averaged_over_models(run: Path, diagnosis: dict[str, Any]) -> None:
     write_json(run / "fit.json", json.loads((run / "fits" / "base.json").read_text()))
     text = words_of(write_report(run).read_text())
     assert "angle 1.0 ± 0.4°" in text and "Added." not in text
-    assert "weighed by their probability" in text
+    assert "averaged over models" in text
     write_json(run / "diagnoses" / "base.json", {**diagnosis, "verdict": "undecided"})
     text = words_of(write_report(run).read_text())
-    assert "Undecided: the data do not tell." in text and "angle 1.0 ± 0.4°" in text
+    assert "Undecided: the data do not discriminate" in text and "angle 1.0 ± 0.4°" in text
 
 
 def test_without_an_added_effect_the_error_is_of_the_models_compared(run: Path, diagnosis: dict[str, Any]) -> None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import html
 import json
 import re
 import shutil
 import subprocess
 import sys
 from html.parser import HTMLParser
+from importlib.resources import files
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -183,7 +186,7 @@ def test_everything_is_on_the_page(tmp_path: Path) -> None:
     assert page.open == []
     for phrase in (
         "35.6 ± 0.8°",
-        "leaves 2 % of the misfit that soil at rest would leave; that is 4.0 × what the cameras' noise alone leaves",
+        "The misfit is 2 % of that of soil at rest, 4.0 × the camera noise",
         "4 times as strong",
         "31.2 dB",
         "0.931",
@@ -265,10 +268,43 @@ def test_a_comparison_judges_the_estimate_that_it_was_made_at(tmp_path: Path, mi
         page = write_report(tmp_path).read_text()
         text = Page(page).text
         assert quoted in text and verdict in text
-        assert all((said in text) is bool(verdict) for said in ("Where it fails", misfit["sentences"][0]))
+        assert (misfit["sentences"][0] in text) is bool(verdict) is ('id="checks"' in page)
         assert "Which model?" not in text
         # what is left is no alarm where noise and numerics leave as much
         assert ('class="verdict open"' in page) is not (verdict == "The model is adequate.")
+
+
+def test_the_truth_of_a_simulated_set_stands_beside_the_estimate(tmp_path: Path) -> None:
+    make_run(tmp_path)
+    truths = tmp_path / "set"
+    described = json.loads((tmp_path / "run.json").read_text())
+    described["measurement"]["folder"] = str(truths)
+    write_json(tmp_path / "run.json", described)
+    assert "true" not in Page(write_report(tmp_path).read_text()).text.lower()
+    for truth in ({"parameters": {"friction_angle": 36}}, {"phi": 36.04}):
+        write_json(truths / "truth.json", truth)
+        assert "35.6 ± 0.8° true: 36.0°" in Page(write_report(tmp_path).read_text()).text
+    write_json(truths / "truth.json", {"phi": "36", "parameters": 3})
+    assert "true:" not in Page(write_report(tmp_path).read_text()).text
+
+
+def test_an_adequate_page_has_no_alarm_and_only_an_adequate_one_has_a_large_number(
+    tmp_path: Path, misfit: dict[str, Any]
+) -> None:
+    make_run(tmp_path)
+    misfit["values"] = {"friction_angle": 35.62}
+    misfit["estimates"] = {"friction_angle": {"value": 33.21, "std": 1.64, "determined": True}}
+    for adequate in (True, False, None):
+        if adequate is None:
+            (tmp_path / "comparison" / "misfit.json").unlink()
+        else:
+            write_json(tmp_path / "comparison" / "misfit.json", {**misfit, "adequate": adequate})
+        page = write_report(tmp_path).read_text()
+        # A simulation failed and the cameras' noise is small: neither is an alarm where the model is adequate.
+        body = re.sub(r"<style>.*?</style>", "", page, flags=re.DOTALL)
+        assert bool(re.search(r'class="(warning|[a-z]+ open)"', body)) is not (adequate is True)
+        assert bool(re.search(r'class="answer determined small"', body)) is not (adequate is True)
+        assert ("of a model that is not adequate" in body) is (adequate is False)
 
 
 def test_several_models_are_set_side_by_side(tmp_path: Path) -> None:
@@ -318,37 +354,98 @@ def test_what_is_missing_or_damaged_is_named(tmp_path: Path, damage: Any, says: 
     assert not (tmp_path / "report.html").exists()
 
 
-@pytest.mark.skipif(shutil.which("chromium") is None, reason="needs chromium")
-@pytest.mark.parametrize("width", [390, 1200])
-def test_a_browser_lays_it_out_without_sideways_scrolling(tmp_path: Path, width: int) -> None:
-    path = write_report(make_run(tmp_path))
+def in_a_frame(page: Path, width: int, expression: str, script: str = "") -> str:
+    """What a JavaScript expression gives in a page, once it is loaded. Headless windows are never narrower than 500
+    pixels: a frame is."""
     probe = (
-        "<script>addEventListener('load', () => { const s = document.getElementById('frame'); s.value = 0;"
-        "s.dispatchEvent(new Event('input')); document.title = [document.documentElement.scrollWidth, innerWidth,"
-        "document.querySelector('.frame').textContent].join(' '); });</script></body>"
+        f"<script>{script}</script><script>addEventListener('load', async () => {{ "
+        f"parent.document.querySelector('output').textContent = {expression}; }});</script></body>"
     )
-    # Headless windows are never narrower than 500 pixels: a frame is.
-    framed = tmp_path / "framed.html"
-    inner = path.read_text().replace("</body>", probe.replace("document.title =", "parent.document.title ="))
+    inner = page.read_text().replace("</body>", probe)
+    framed = page.parent / "framed.html"
     framed.write_text(
-        f'<title></title><iframe style="border:0;width:{width}px;height:900px" '
-        f'srcdoc="{inner.replace("&", "&amp;").replace(chr(34), "&quot;")}"></iframe>'
+        f'<title></title><iframe style="border:0;width:{width}px;height:900px" srcdoc="{html.escape(inner)}"></iframe>'
+        "<output></output>"
     )
-    command = ["chromium", "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path}/profile"]
+    command = ["chromium", "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={page.parent}/profile"]
     out = subprocess.run(
-        [*command, "--virtual-time-budget=3000", "--dump-dom", framed.as_uri()],
+        [*command, "--virtual-time-budget=20000", "--dump-dom", framed.as_uri()],
         capture_output=True,
         text=True,
         timeout=120,
         check=True,
     ).stdout
-    found = re.search(r"<title>(\d+) (\d+) (\d+)</title>", out)
-    assert found is not None
-    content, window, frame = (int(group) for group in found.groups())
+    found = re.search(r"<output>(.*)</output>", out, re.DOTALL)
+    assert found is not None and found.group(1)
+    return html.unescape(found.group(1))
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="needs chromium")
+@pytest.mark.parametrize("width", [390, 1200])
+def test_a_browser_lays_it_out_without_sideways_scrolling(tmp_path: Path, width: int) -> None:
+    found = in_a_frame(
+        write_report(make_run(tmp_path)),
+        width,
+        "(() => { const s = document.getElementById('frame'); s.value = 0; s.dispatchEvent(new Event('input'));"
+        "return [document.documentElement.scrollWidth, innerWidth, document.querySelector('.frame').textContent]"
+        ".join(' '); })()",
+    )
+    content, window, frame = map(int, found.split())
     assert window == width
     assert content <= window
     # Moving the slider to the left end shows the first frame.
     assert frame == FRAMES[0]
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="needs chromium")
+def test_every_picture_is_as_large_as_the_next_on_a_phone(tmp_path: Path) -> None:
+    sizes = in_a_frame(
+        write_report(make_run(tmp_path)),
+        390,
+        "[...document.querySelectorAll('.strip img')].map(i => Math.round(i.getBoundingClientRect().width)).join(' ')",
+    ).split()
+    assert len(sizes) == 6 and len(set(sizes)) == 1
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="needs chromium")
+def test_a_keyboard_reaches_what_scrolls(tmp_path: Path, misfit: dict[str, Any]) -> None:
+    make_run(tmp_path)
+    misfit["estimates"] = {"friction_angle": {"value": 33.21, "std": 1.64, "determined": True}}
+    misfit["checks"][1]["region"] = "behind-the-tool-and-beside-it"
+    write_json(tmp_path / "comparison" / "misfit.json", {**misfit, "values": {"friction_angle": 35.62}})
+    found = in_a_frame(
+        write_report(tmp_path),
+        250,
+        "[...document.querySelectorAll('main *')].filter(e => e.scrollWidth > e.clientWidth + 1"
+        " && getComputedStyle(e).overflowX == 'auto').map(e => e.tabIndex).join(' ')",
+    )
+    assert set(found.split()) == {"0"}
+
+
+def axe() -> Path | None:
+    """The rules of accessibility that a browser is to check, where they are installed."""
+    if find_spec("axe_core_python") is None:
+        return None
+    return Path(str(files("axe_core_python") / "axe.min.js"))
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None or axe() is None, reason="needs chromium and axe-core")
+@pytest.mark.parametrize(("adequate", "width"), [(True, 1200), (False, 390)])
+def test_accessibility_has_no_serious_fault(tmp_path: Path, misfit: dict[str, Any], adequate: bool, width: int) -> None:
+    rules = axe()
+    assert rules is not None
+    make_run(tmp_path)
+    misfit["estimates"] = {"friction_angle": {"value": 33.21, "std": 1.64, "determined": True}}
+    said = {**misfit, "values": {"friction_angle": 35.62}, "adequate": adequate}
+    write_json(tmp_path / "comparison" / "misfit.json", said)
+    found = in_a_frame(
+        write_report(tmp_path),
+        width,
+        "JSON.stringify((await axe.run(document)).violations.filter(v => ['serious', 'critical'].includes(v.impact))"
+        ".map(v => [v.id, v.nodes.map(n => n.html.slice(0, 200))]))",
+        script=rules.read_text(encoding="utf-8"),
+    )
+    assert json.loads(found) == []
 
 
 def test_the_report_knows_nothing_of_how_a_fit_is_made() -> None:

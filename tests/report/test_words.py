@@ -49,11 +49,32 @@ def test_a_probability_claims_no_more_than_is_known(share: float, text: str) -> 
         ("one of", ["cohesion", "tool_adhesion"], "Missing: cohesion or tool adhesion."),
         ("one of", ["cohesion", "tool_adhesion", "tilt"], "Missing: cohesion, tool adhesion or tilt."),
         ("something else", [], "Something is missing that the library does not have."),
-        ("undecided", ["cohesion"], "Undecided: the data do not tell."),
+        ("undecided", ["cohesion"], "Undecided: the data do not discriminate between the models."),
     ],
 )
 def test_a_verdict_is_one_line(verdict: str, names: list[str], text: str) -> None:
     assert words.verdict({"verdict": verdict, "class": names}) == text
+
+
+def test_a_block_begins_to_fail_at_its_first_row_beyond_two_standard_deviations(diagnosis: dict) -> None:
+    push = {"stage": "push", "region": "berm", "channel": "left"}
+    # Of the most probable model, effect 2: a row's root mean square over the berm's three squares.
+    rows = {1: [0.5, -0.5, 2.0], 2: [2.5, 3.0, -2.0]}
+    for row, values in rows.items():
+        diagnosis["maps"]["effect_2"][row][3:6] = values
+    assert words.begins(diagnosis, push) == "It begins at frame 30."
+    assert words.worst_row(diagnosis, push) == (2, dict(zip((3, 4, 5), rows[2], strict=True)))
+    diagnosis["maps"]["effect_2"][2][3:6] = [2.0, 2.0, None]
+    assert words.begins(diagnosis, push) == "No frame by itself is beyond 2 expected standard deviations."
+    diagnosis["maps"]["effect_2"][1][3:6] = [None, None, -2.1]
+    assert words.begins(diagnosis, push) == "It begins at frame 20."
+
+
+def test_the_misfit_is_that_of_the_most_probable_model(diagnosis: dict) -> None:
+    diagnosis["maps"]["effect_2"] = [[None, 3.0], [-4.0, None]]
+    largest = "largest: berm during push, left camera, 2.3 ×."
+    assert words.misfit_sentence(diagnosis) == f"Misfit 3.54 × the expected standard deviation; {largest}"
+    assert words.block({"stage": "pushing", "region": "tool", "channel": "force up"}) == "tool while pushing, force up"
 
 
 def test_names_in_sentences() -> None:
@@ -69,19 +90,19 @@ def comparison(total: float, noise: float | None) -> dict:
 def test_the_verdict_follows_the_ratio_to_the_noise() -> None:
     assert "nothing more to explain" in words.residual_sentence(comparison(0.011, 0.01))
     far = words.residual_sentence(comparison(0.038, 0.01))
-    assert "3.8 ×" in far and "cannot tell which" in far
+    assert "3.8 ×" in far and "not been estimated yet" in far
     assert "unknown" in words.residual_sentence(comparison(0.038, None))
     assert "160 ×" in words.residual_sentence(comparison(1.6, 0.01))
     with_unit = comparison(0.073, 0.01) | {"motionless": {"robust": 1.0}}
-    assert "leaves 7.3 % of the misfit that soil at rest would leave" in words.residual_sentence(with_unit)
+    assert "7.3 % of that of soil at rest, 7.3 × the camera noise" in words.residual_sentence(with_unit)
     assert "not been compared" in words.residual_sentence(None)
 
 
 def test_a_residual_far_above_the_cameras_noise_is_no_fault_of_an_adequate_model() -> None:
     said = words.residual_sentence(comparison(0.52, 0.01), True)
-    assert "52 ×" in said and "numerics together leave as much" in said
+    assert "52 ×" in said and "discretisation error together are as large" in said
     short = words.residual_sentence(comparison(0.52, 0.01), False)
-    assert "52 ×" in short and "numerics" not in short
+    assert "52 ×" in short and "discretisation" not in short
     # nor does little noise of the cameras hide what fails
     assert "nothing more" not in words.residual_sentence(comparison(0.011, 0.01), False)
 
@@ -122,7 +143,7 @@ def test_the_answer_is_averaged_over_models_whatever_the_verdict(judged: dict) -
     judged = {**judged, "estimates": AVERAGED}
     (answer,) = words.answers(fit, judged)
     assert (answer.value, answer.std, answer.state, answer.remark) == ("37", "3", "determined", "")
-    assert "probability" in words.fitted_sentence(fit, judged)
+    assert "averaged over models" in words.fitted_sentence(fit, judged)
     adequate = judged.get("adequate", judged.get("verdict") == "adequate")
     assert words.called_adequate(fit, judged) is adequate
     judged["estimates"] = {"friction_angle": {**AVERAGED["friction_angle"], "determined": False}}
@@ -131,7 +152,7 @@ def test_the_answer_is_averaged_over_models_whatever_the_verdict(judged: dict) -
 
 
 @pytest.mark.parametrize("judged", [None, {"fit": "tilt", "verdict": "adequate", "estimates": AVERAGED}])
-@pytest.mark.parametrize(("source", "said"), [("loss", "10 evaluations"), ("comparison", "numerics")])
+@pytest.mark.parametrize(("source", "said"), [("loss", "10 evaluations"), ("comparison", "discretisation error")])
 def test_without_a_judgement_of_this_fit_the_answer_is_its_own(judged: dict | None, source: str, said: str) -> None:
     fit = {"name": "base", "estimated_from": source, "evaluations": 10, "parameters": {"friction_angle": ENTRY}}
     (answer,) = words.answers(fit, judged)

@@ -160,6 +160,8 @@ def test_unknown_and_absurd_parameters_are_named() -> None:
         Law().settings(BASE, {"cohesion": 100.0})
     with pytest.raises(ParameterError, match=r"friction_angle: 80 deg lies outside \[20, 55\]"):
         Law().settings(BASE, {"friction_angle": 80.0})
+    with pytest.raises(ParameterError, match=r"'cohesiom' is unknown, did you mean cohesion\?"):
+        find_effects(["cohesiom"])
     with pytest.raises(ParameterError, match=r"'magic' is unknown; known are .*cohesion"):
         find_effects(["magic"])
     with pytest.raises(ParameterError, match="twice"):

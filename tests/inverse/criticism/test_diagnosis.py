@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -51,6 +52,19 @@ def test_a_pattern_that_no_effect_has_is_not_given_a_name(make: Make, waves: Cal
     experiment = make(extra=8.0 * waves(50, make().layout))
     found = diagnose(experiment, START)
     assert found.verdict not in ("missing", "one of", "adequate")
+
+
+def test_instruments_without_a_place_are_recorded_as_they_read(make: Make) -> None:
+    experiment = make()
+    found = diagnose(experiment, START, effects=False)
+    sites = tuple(replace(s, reading=np.exp) if s.channel == "force" else s for s in experiment.layout.sites)
+    read = record(replace(experiment, layout=replace(experiment.layout, sites=sites)), found, 3)
+    (before,), (after,) = record(experiment, found, 3)["curves"], read["curves"]
+    for key in ("measured", "low", "high"):
+        assert np.allclose(after[key], np.exp(before[key]))
+    assert np.allclose(after["predicted"]["before"], np.exp(before["predicted"]["before"]))
+    middle = 0.5 * (np.array(before["low"]) + np.array(before["high"]))
+    assert np.allclose(middle, before["measured"]) and np.all(np.array(before["high"]) > middle)
 
 
 def test_without_effects_only_the_base_model_is_judged(make: Make) -> None:
