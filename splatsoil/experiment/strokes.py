@@ -139,7 +139,14 @@ class StrokeExperiment(PlowExperiment):
         super().__init__(model, [p.name for p in measured.parameters], candidates=candidates)
         if self.forces is not None and measured.forces is not None:
             self.forces = replace(self.forces, largest=measured.forces.largest)
-        self._pictures_noise = self.sensor[:, : len(self._sites)]
+        # One level for each camera, less by the frames that make a row.
+        level = {
+            site.channel: std * np.sqrt(len(measured._bins[0]))
+            for site, std in zip(measured.layout.sites, measured.sensor[0], strict=True)
+        }
+        frames = np.array([[len(group)] for group in self._bins], dtype=np.float64)
+        self._pictures_noise = np.array([level[site.channel] for site in self._sites]) / np.sqrt(frames)
+        self.sensor = self._beside(self._pictures_noise, None if self.forces is None else self.forces.noise)
         seen = self.comparator.observed
         self.comparator = self.comparator.against({(c, f): seen[c, self.comparator.reference] for c, f in seen})
 

@@ -25,6 +25,7 @@ GIVEN = {
     "--seed 2 --run 'a run' --criticise --most-effects 3 --json",
     "compare": "'a run' --quick --device cpu --json",
     "diagnose": "'a run' --effects cohesion 'my effects/crust.py' --device cpu --json",
+    "design": "'a run' --draws 5 --preset small --device cpu --json",
     "add": "'a run' --budget 9 --device cpu --json",
     "report": "'a run' --json",
     "element": "--test isotropic --confining 5e4 --friction-angle 30 --with dilatancy 'my effects/crust.py' --set "
