@@ -129,6 +129,8 @@ def expected_information(
     draws: Mapping[str, Sequence[Mapping[str, float]]],
     probability: Mapping[str, float],
     simulate: Simulate,
+    *,
+    numerics: float = 1.0,
     seed: int = 0,
 ) -> Information:
     """What an experiment would tell, by simulations of it.
@@ -138,6 +140,7 @@ def expected_information(
         draws: parameters by model, as many for each; the model as it is among them, by which noise is known.
         probability: of the models that may be right.
         simulate: the experiment's simulations.
+        numerics: factor of the numerics' error that the diagnosis has found.
         seed: of particles and noise; the same for experiments that are compared with each other.
 
     Raises:
@@ -166,7 +169,7 @@ def expected_information(
     tables = Tables(base, there.get(FINE, ([], base[1][:0])), effects, drawn, base[1][0])
     noise = noise_of(experiment, _among(experiment, draws[AS_IT_IS]), tables, ())
     # One simulation's own chance is in all of them.
-    covariance = noise.covariance(1.0) - noise.chance
+    covariance = noise.covariance(numerics) - noise.chance
     scores = {name: noise.scores(there[name][1]) for name in probability}
     found = information(scores, probability, covariance, seed)
     bits = {name: np.full(len(made[name]), np.nan) for name in probability}

@@ -14,7 +14,7 @@ from splatsoil.commands._output import print_json
 
 if TYPE_CHECKING:
     from splatsoil.commands._experiments import Chosen
-    from splatsoil.commands._progress import Report
+    from splatsoil.commands._progress import Report, Stage
     from splatsoil.experiment.plow import PlowExperiment
     from splatsoil.experiment.strokes import Stroke
     from splatsoil.inverse.criticism.next_stroke import Information
@@ -61,14 +61,14 @@ def run(config: Config) -> int:
     folder = RunFolder.open(config.run)
     criticism.need_fit(folder)
     diagnosis = diagnosis_of(folder)
-    probability = probable(diagnosis)
+    probable(diagnosis)  # refused before the rest is loaded
     folder.check_writable()
     check_folder(folder.path / "design")
     hush()
     device = resolve_device(config.device)
     stage.note_other_sources(folder)
     with stages(quiet=config.json) as begin:
-        result = _designed(config, folder, diagnosis, probability, device, begin)
+        result = _designed(config, folder, diagnosis, device, begin)
     if config.json:
         print_json({"ok": True, "run": str(folder.path), **result})
     else:
@@ -116,14 +116,82 @@ def diagnosis_of(folder: RunFolder) -> dict[str, Any]:
     return data
 
 
+@dataclass(frozen=True)
+class _Design:
+    """What strokes are compared by.
+
+    Attributes:
+        folder: the run.
+        model: of the measured stroke.
+        chosen: what makes it.
+        measured: the experiment of that stroke.
+        kept: its simulations.
+        diagnosis: what ``diagnosis.json`` holds.
+        probability: of the models to be told apart.
+        draws: parameters of each, and of the model as it is.
+    """
+
+    folder: RunFolder
+    model: Model
+    chosen: Chosen
+    measured: PlowExperiment
+    kept: Simulations
+    diagnosis: Mapping[str, Any]
+    probability: Mapping[str, float]
+    draws: Mapping[str, Sequence[Mapping[str, float]]]
+
+    @classmethod
+    def of(cls, folder: RunFolder, model: Model, chosen: Chosen, diagnosis: Mapping[str, Any], draws: int) -> _Design:
+        from splatsoil.commands._experiments import experiment_of
+        from splatsoil.inverse.criticism.evidence import AS_IT_IS
+        from splatsoil.inverse.criticism.next_stroke import probable
+
+        measured, kept = experiment_of(folder, model, chosen, diagnosis["candidates"] or None)
+        probability = probable(diagnosis)
+        drawn = {name: diagnosis["draws"][name][:draws] for name in dict.fromkeys((AS_IT_IS, *probability))}
+        return cls(folder, model, chosen, measured, kept, diagnosis, probability, drawn)
+
+    def expected(self, stroke: Stroke, report: Report) -> tuple[Information, int]:
+        """What a stroke is expected to tell, and how many new simulations and drawings that took."""
+        from concurrent.futures import Future
+        from contextlib import nullcontext
+
+        from splatsoil.commands._stages import model_on
+        from splatsoil.experiment.strokes import StrokeExperiment
+        from splatsoil.files import code_digest
+        from splatsoil.inverse.criticism.next_stroke import expected_information, runs_of
+        from splatsoil.inverse.criticism.simulations import Helpers, Simulations
+        from splatsoil.inverse.evaluations import digest
+
+        seed, chosen, model = int(self.folder.description["seed"]), self.chosen, self.model
+        measurement = stroke.prepared(self.measured)
+        other = model_on(measurement, self.folder, model.reconstruction, chosen.effects, chosen.preset, model.device)
+        experiment = StrokeExperiment(other, self.measured, self.diagnosis["candidates"] or None)
+        motion = table(stroke.measurement.tool.motion)
+        identity = {
+            **self.kept.identity,
+            "stroke": digest({"motion": motion, "rate": stroke.measurement.frame_rate, "start": stroke.start}),
+            "strokes": code_digest(("experiment/strokes.py",)),
+            "layout": list(experiment.layout.shape),
+        }
+        runs = [run for mine in runs_of(self.draws, seed).values() for run in mine]
+        simulate = Simulations(experiment, self.kept.folder, identity, sources=self.kept.sources)
+        count = len(runs) + len(experiment.guesses) + len(experiment.redrawn)
+        simulate.told = lambda purpose: report(purpose.replace("_", " "), simulate.asked / count)
+        # A GPU makes several at a time, all of them in this process.
+        batch = Helpers(0, lambda jobs: Future(), experiment.together, experiment.prepare)
+        with simulate.helped(batch) if experiment.together > 1 else nullcontext():
+            simulate.ahead(lambda ask: [ask(**run.arguments()) for run in runs])
+            found = expected_information(
+                experiment, self.draws, self.probability, simulate, numerics=self.diagnosis["numerics"], seed=seed
+            )
+        return found, simulate.made
+
+
 def _designed(
-    config: Config,
-    folder: RunFolder,
-    diagnosis: Mapping[str, Any],
-    probability: Mapping[str, float],
-    device: str,
-    begin: Any,
+    config: Config, folder: RunFolder, diagnosis: Mapping[str, Any], device: str, begin: Stage
 ) -> dict[str, Any]:
+    """The strokes, the most informative first; kept in ``design/``."""
     import time
 
     import numpy as np
@@ -133,7 +201,6 @@ def _designed(
     from splatsoil.errors import SimulationError
     from splatsoil.experiment.strokes import strokes
     from splatsoil.files import write_json, write_text
-    from splatsoil.inverse.criticism.evidence import AS_IT_IS
     from splatsoil.inverse.criticism.next_stroke import entropy
     from splatsoil.run_files import DESIGN_FORMAT
 
@@ -142,105 +209,56 @@ def _designed(
     model = experiments.model_of(folder, device, begin("reconstruct"), chosen=chosen)
     report = begin("design")
     report("light and colours", 0.0)
-    model.scene(0)  # kept: other strokes begin with the tool elsewhere than photographs show it
-    candidates = diagnosis["candidates"] or None
-    measured, kept = experiments.experiment_of(folder, model, chosen, candidates)
-    draws = {name: diagnosis["draws"][name][: config.draws] for name in dict.fromkeys((AS_IT_IS, *probability))}
-    surface = float(np.nanmean(model.reconstruction.surface.height))
-    proposed = strokes(model.measurement, surface)
+    model.scene()  # kept: in other strokes the tool may begin elsewhere than photographs show it
+    design = _Design.of(folder, model, chosen, diagnosis, config.draws)
+    proposed = {s.name: s for s in strokes(model.measurement, float(np.nanmean(model.reconstruction.surface.height)))}
     found: dict[str, Information] = {}
     notes, made = [], 0
     with folder.lock():
-        for number, stroke in enumerate(proposed):
+        for number, (name, stroke) in enumerate(proposed.items()):
 
-            def told(what: str, share: float, number: int = number, name: str = stroke.name) -> None:
+            def told(what: str, share: float, number: int = number, name: str = name) -> None:
                 report(f"{name}, {what}", (number + share) / len(proposed))
 
             try:
-                found[stroke.name], simulated = _expected(
-                    folder, stroke, model, measured, kept, candidates, chosen, draws, probability, told
-                )
-                made += simulated
+                found[name], new = design.expected(stroke, told)
+                made += new
             except SimulationError as error:
-                notes.append(f"{stroke.name}: could not be simulated ({error})")
+                notes.append(f"{name}: {error}")
         if not found:
-            raise SimulationError(f"no stroke could be simulated: {notes[0]}")
+            raise SimulationError(f"no stroke could be simulated ({notes[0]})")
         order = sorted(found, key=lambda name: -found[name].mean)
         best = found[order[0]]
-        motion = next(s for s in proposed if s.name == order[0]).motion(model.measurement.frame_rate)
         result = {
             "format": DESIGN_FORMAT,
             "fit": diagnosis["fit"],
-            "models": dict(probability),
-            "most": entropy(probability),
+            "models": dict(design.probability),
+            "most": entropy(design.probability),
+            "stroke": order[0],
             "strokes": [
                 {
                     "name": name,
                     "bits": found[name].mean,
                     "std": found[name].std,
                     "told_apart": [list(pair) for pair in found[name].told_apart],
-                    "pairs": [[*pair, p] for pair, p in found[name].pairs.items()],
+                    "pairs": [[*pair, right] for pair, right in found[name].pairs.items()],
                     "less_than_best": best.beyond(found[name]),
                 }
                 for name in order
             ],
-            "stroke": order[0],
             "draws": config.draws,
             "preset": config.preset,
             "device": device,
             "version": __version__,
+            "seed": folder.description["seed"],
             "notes": notes,
             "simulated_now": made,
             "seconds": round(time.perf_counter() - began, 1),
         }
+        motion = proposed[order[0]].motion(model.measurement.frame_rate)
         write_text(folder.path / "design" / "tool_motion.csv", table(motion))
         write_json(folder.path / "design" / "design.json", result)
     return result
-
-
-def _expected(
-    folder: RunFolder,
-    stroke: Stroke,
-    model: Model,
-    measured: PlowExperiment,
-    kept: Simulations,
-    candidates: Sequence[str] | None,
-    chosen: Chosen,
-    draws: Mapping[str, Sequence[Mapping[str, float]]],
-    probability: Mapping[str, float],
-    report: Report,
-) -> tuple[Information, int]:
-    """What a stroke is expected to tell, and how many new simulations and drawings that took."""
-    from concurrent.futures import Future
-    from contextlib import nullcontext
-
-    from splatsoil.commands._stages import model_on
-    from splatsoil.experiment.strokes import StrokeExperiment
-    from splatsoil.files import code_digest
-    from splatsoil.inverse.criticism.next_stroke import expected_information, runs_of
-    from splatsoil.inverse.criticism.simulations import Helpers, Simulations
-    from splatsoil.inverse.evaluations import digest
-
-    seed = int(folder.description["seed"])
-    other = model_on(
-        stroke.prepared(measured), folder, model.reconstruction, chosen.effects, chosen.preset, model.device
-    )
-    experiment = StrokeExperiment(other, measured, candidates=candidates)
-    motion = stroke.measurement.tool.motion
-    identity = {
-        **kept.identity,
-        "stroke": digest({"motion": table(motion), "rate": stroke.measurement.frame_rate, "start": stroke.start}),
-        "strokes": code_digest(("experiment/strokes.py",)),
-        "layout": list(experiment.layout.shape),
-    }
-    runs = [run for mine in runs_of(draws, seed).values() for run in mine]
-    simulate = Simulations(experiment, kept.folder, identity, sources=kept.sources)
-    simulate.told = lambda purpose: report(purpose.replace("_", " "), min(simulate.asked / (len(runs) + 7), 1.0))
-    # A GPU makes several at a time.
-    batch = Helpers(0, lambda jobs: Future(), experiment.together, experiment.prepare)
-    with simulate.helped(batch) if experiment.together > 1 else nullcontext():
-        simulate.ahead(lambda ask: [ask(**run.arguments()) for run in runs])
-        return expected_information(experiment, draws, probability, simulate, seed), simulate.made
 
 
 def table(motion: ToolMotion) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,8 +20,9 @@ from splatsoil.inverse.criticism.next_stroke import (
     information,
     posterior_draws,
     probable,
+    runs_of,
 )
-from splatsoil.inverse.criticism.simulations import Simulations
+from splatsoil.inverse.criticism.simulations import Helpers, Simulations
 
 from splatsoil.errors import RunError, SimulationError
 from splatsoil.experiment.emulated import EmulatedExperiment
@@ -183,6 +185,24 @@ def test_a_simulation_that_cannot_go_on_costs_itself_alone(make: Callable[..., E
     assert np.isfinite(found.mean)
     with pytest.raises(SimulationError, match="one could hardly be simulated"):
         expected_information(experiment, draws, EVEN_NAMES, fails(4))
+
+
+def test_simulations_made_several_at_a_time_tell_the_same(make: Callable[..., EmulatedExperiment]) -> None:
+    """As on a GPU: a share is prepared, then asked for one by one."""
+    experiment = proposed(make({}))
+    draws = {
+        "": [{"friction_angle": 34.0 + 0.25 * i} for i in range(6)],
+        "one": [{"friction_angle": 34.0 + 0.25 * i, "one_size": 3.0} for i in range(6)],
+    }
+    alone = expected_information(experiment, draws, EVEN_NAMES, Simulations(experiment))
+    shares: list[Any] = []
+    simulate = Simulations(experiment)
+    with simulate.helped(Helpers(0, lambda jobs: Future(), 4, shares.append)):
+        simulate.ahead(lambda ask: [ask(**run.arguments()) for runs in runs_of(draws, 0).values() for run in runs])
+        together = expected_information(experiment, draws, EVEN_NAMES, simulate)
+    assert together.mean == alone.mean and together.std == alone.std
+    prepared = [(*job["effects"], job["seed"]) for share in shares for job in share]
+    assert max(map(len, shares)) == 4 and len(set(prepared)) == len(prepared)
 
 
 def test_draws_are_of_the_posterior(make: Callable[..., EmulatedExperiment]) -> None:
