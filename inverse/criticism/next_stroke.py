@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import solve_triangular
 from scipy.special import expit, logsumexp
+from scipy.stats import t as student
 
 from splatsoil.errors import RunError, SimulationError
 from splatsoil.experiment.base import Experiment
@@ -41,8 +42,8 @@ FEWEST = 3
 MOST_MODELS = 4
 NOISES = 200
 """Drawings of the noise for each simulation; their error is part of the simulations' scatter."""
-CLEAR = 2.0
-"""Standard errors from which a difference between two strokes is one."""
+CONFIDENCE = 0.95
+"""With which a difference between two strokes is one."""
 
 
 class Proposed(Experiment, Protocol):
@@ -84,8 +85,9 @@ class Information:
 
     def beyond(self, other: Information) -> bool:
         """Whether this is more than another, of the same draws, beyond what chance of simulations explains."""
-        mean, std = _weighted({m: self.bits[m] - other.bits[m] for m in self.bits}, self.probability)
-        return mean > CLEAR * std
+        apart = {m: self.bits[m] - other.bits[m] for m in self.bits}
+        mean, std, freedom = _weighted(apart, self.probability)
+        return bool(mean > student.ppf(0.5 + 0.5 * CONFIDENCE, freedom) * std)
 
 
 def entropy(probability: Mapping[str, float]) -> float:
@@ -116,9 +118,10 @@ def probable(diagnosis: Mapping[str, Any]) -> dict[str, float]:
     models = {m["name"]: m["probability"] for m in diagnosis["models"] if m["kind"] in kinds}
     chosen = sorted((n for n, p in models.items() if p >= SHOWN), key=lambda n: -models[n])[:MOST_MODELS]
     if len(chosen) < 2:
+        only = f"only {chosen[0].replace('_', ' ') or 'the model as it is'}" if chosen else "none"
         raise RunError(
-            f"{len(chosen) or 'none'} of the models that soil can follow has a probability of {SHOWN:g} or more: "
-            "there are no two that a stroke could tell apart"
+            f"{only} of the models that soil can follow has a probability of {SHOWN:g} or more: there are no two that "
+            "a stroke could tell apart"
         )
     total = sum(models[name] for name in chosen)
     return {name: models[name] / total for name in chosen}
@@ -237,14 +240,17 @@ def _densities(white: Mapping[str, FloatArray], held: str, index: int, noise: Fl
     return out
 
 
-def _weighted(bits: Mapping[str, FloatArray], probability: Mapping[str, float]) -> tuple[float, float]:
-    """Mean over models of the simulations' means, and its standard error."""
-    mean = variance = 0.0
+def _weighted(bits: Mapping[str, FloatArray], probability: Mapping[str, float]) -> tuple[float, float, float]:
+    """Mean over models of the simulations' means, its standard error, and the degrees of freedom of that (Welch 1947,
+    Biometrika 34:28)."""
+    mean = variance = spread = 0.0
     for name, weight in probability.items():
         found = bits[name][np.isfinite(bits[name])]
+        own = weight**2 * float(found.var(ddof=1)) / len(found)
         mean += weight * float(found.mean())
-        variance += weight**2 * float(found.var(ddof=1)) / len(found)
-    return mean, float(np.sqrt(variance))
+        variance += own
+        spread += own**2 / (len(found) - 1)
+    return mean, float(np.sqrt(variance)), variance**2 / max(spread, 1e-300)
 
 
 def _made(simulate: Callable[..., FloatArray], run: Run) -> FloatArray | None:

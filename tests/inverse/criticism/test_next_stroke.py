@@ -98,6 +98,20 @@ def test_only_what_differs_beyond_its_error_is_better() -> None:
     assert not far.beyond(again) and not again.beyond(far)
 
 
+def test_few_simulations_must_differ_by_more() -> None:
+    """Differences of 1 ± 0.35, from 3 simulations or from 12 (ends of 95 % of Student's t: 4.30 and 2.20)."""
+    zero = np.zeros(12)
+    for count, clear in ((3, False), (12, True)):
+        more = 1.0 + 0.35 * np.sqrt(count) * scaled(np.arange(count, dtype=np.float64))
+        few = Information({"a": more, "b": zero[:count]}, {"a": 1.0, "b": 0.0}, {})
+        assert few.std == pytest.approx(0.35)
+        assert few.beyond(Information({"a": zero[:count], "b": zero[:count]}, few.probability, {})) is clear
+
+
+def scaled(values: np.ndarray) -> np.ndarray:
+    return np.asarray((values - values.mean()) / values.std(ddof=1))
+
+
 def test_a_simulation_that_failed_is_left_out_of_both() -> None:
     bits = {"a": np.array([0.5, np.nan, 0.7]), "b": np.array([0.4, 0.6, 0.5])}
     found = Information(bits, EVEN, {})
