@@ -135,7 +135,10 @@ def test_a_diagnosed_run_gets_its_next_stroke(plow_damp: Path, tmp_path: Path) -
     motion = ToolMotion.read(run / "design" / "tool_motion.csv")
     rate = Measurement.load(plow_damp).frame_rate
     assert (abs(motion.times - motion.frames / rate) < 1e-9).all()
-    # A set with this motion is one.
+    # A set with this motion is one; its force is still to be measured.
     shutil.copytree(tmp_path / "set", tmp_path / "next")
     shutil.copy(run / "design" / "tool_motion.csv", tmp_path / "next")
+    experiment = read_json(tmp_path / "next" / "experiment.json")
+    del experiment["tool"]["force"]
+    write_json(tmp_path / "next" / "experiment.json", experiment)
     assert Measurement.load(tmp_path / "next").tool.motion.times[-1] == motion.times[-1]
