@@ -8,6 +8,7 @@
 | `features/` | light and albedo, what criticism simulated |
 | `fits/NAME.json` | each finished fit (`base`, `cohesion`, ...), `fit.json` is the latest |
 | `comparison/` | pictures and losses at the latest estimate |
+| `design/` | the stroke to make next |
 | `report.html` | for reading |
 """
 

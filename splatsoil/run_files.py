@@ -17,6 +17,7 @@ COMPARISON_FORMAT = "splatsoil-comparison/1"
 DIAGNOSIS_FORMAT = "splatsoil-diagnosis/2"
 MISFIT_FORMAT = "splatsoil-misfit/2"
 POSTERIOR_FORMAT = "splatsoil-posterior/2"
+DESIGN_FORMAT = "splatsoil-design/1"
 HISTORY_FORMAT = "splatsoil-history/1"
 RECONSTRUCTION_FORMAT = "splatsoil-reconstruction/1"
 

@@ -73,6 +73,7 @@ def _compared_models(
 ) -> dict[str, Any]:
     from splatsoil import __version__
     from splatsoil.commands._control import code_of, judged_by
+    from splatsoil.inverse.criticism.next_stroke import posterior_draws
     from splatsoil.inverse.criticism.record import record
     from splatsoil.report.data import estimates
 
@@ -88,6 +89,8 @@ def _compared_models(
         found = judged(experiment, simulate, fit, report, seed, with_effects=with_effects)
     return {
         **record(experiment, found, simulate.asked),
+        "draws": posterior_draws(found.evidence, seed),
+        "candidates": list(effects),
         "fit": fit["name"],
         "values": estimates(fit),
         "preset": model.preset,
