@@ -30,18 +30,18 @@ from splatsoil.inverse.criticism.noise import Noise, Tables, noise_of, trend_of
 from splatsoil.inverse.criticism.simulations import Simulations
 
 from splatsoil.commands._output import only_json, print_json
-from splatsoil.errors import ParameterError, RunError
+from splatsoil.errors import RunError
 from splatsoil.experiment import Candidate, Layout, Site
 from splatsoil.experiment.plow import MOST_ROWS, PlowExperiment
 from splatsoil.experiment.scene_parts import bins_of
-from splatsoil.files import plain, write_text
+from splatsoil.files import write_text
 from splatsoil.measurement import Measurement
 from splatsoil.model import Model
 from splatsoil.mpm import PRESETS
 from splatsoil.parameters import Parameter
 from splatsoil.quiet import hush
 from splatsoil.reconstruction import Reconstruction, reconstruct
-from splatsoil.soil.library import find_effects
+from splatsoil.soil.library import library
 from splatsoil.synthetic import make_set, plow
 
 FloatArray = npt.NDArray[np.float64]
@@ -249,7 +249,7 @@ def measure(effects: Sequence[str], preset: str, seeds: int, device: str, out: P
         ask = Simulations(experiment, out / "features", {"experiment": kind.__name__}, say)
         prior = Prior.of(experiment, TRUTH)
         prepared.append((experiment, simulated(experiment, ask, prior, wanted, seeds, kind is PlowExperiment)))
-    return left(*prepared, prior, wanted)
+    return left(prepared[0], prepared[1], prior, wanted)
 
 
 def written(page: Path, preset: str, new: str) -> str:
@@ -267,7 +267,8 @@ def written(page: Path, preset: str, new: str) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure, print the table, and write it into a page; exit code 0."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--effects", nargs="+", default=[], metavar="EFFECT", help="of the library; all by default")
+    known = [name for name, effect in library().items() if not effect.numerical]
+    parser.add_argument("--effects", nargs="+", default=[], choices=known, metavar="EFFECT", help="all by default")
     parser.add_argument("--preset", default="tiny", choices=sorted(PRESETS))
     parser.add_argument("--seeds", type=at_least(2), default=3, help="of the particles, with each effect")
     parser.add_argument("--device", type=here, default="cpu")
@@ -276,8 +277,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
     options = parser.parse_args(arguments)
     hush()
-    if numerical := [effect.name for effect in find_effects(options.effects) if effect.numerical]:
-        raise ParameterError(f"effect {numerical[0]} can't be told from other numerics; leave it out")
     if options.page:
         written(options.page, options.preset, "")  # a page without a place for the table fails now, not at the end
     decides = {"preset": options.preset, "device": options.device.split(":")[0], "code": sources([Path(__file__)])}
@@ -286,7 +285,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         rows = measure(options.effects, options.preset, options.seeds, options.device, options.out)
         told = {"made_by": stamp(options.device), "preset": options.preset, "seeds": options.seeds, **TRUTH}
         shown = f"{COMPUTED}\n\n{table(rows)}"
-        write_result(options.out, plain({**told, "computed": COMPUTED, "rows": rows}), shown, {})
+        write_result(options.out, {**told, "computed": COMPUTED, "rows": rows}, shown, {})
         if options.page:
             head = f"Preset `{options.preset}`, {options.seeds} seeds. "
             write_text(options.page, written(options.page, options.preset, head + shown))

@@ -95,8 +95,8 @@ def test_the_page_has_a_place_and_other_pages_are_left_alone(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("--effects", "glue"), "'glue' is unknown"),
-        (("--effects", "stiffness"), "numerics"),
+        (("--effects", "glue"), "invalid choice: 'glue'"),
+        (("--effects", "stiffness"), "invalid choice: 'stiffness'"),
         (("--page", "no.md"), "read"),
     ],
 )
