@@ -51,6 +51,8 @@ ANGLE, WORLD = 35.0, 1
 """Of the soil, degrees, and the seed of its surface, its looks and the cameras' noise."""
 TRUTH = {"friction_angle": ANGLE}
 HEIGHT = "height"
+LEVEL = 1.645
+"""Standard deviations that chance passes in one of 20 cases."""
 COMPUTED = (
     f"Each effect is on at {STEP:g} times its smallest meaningful size; σ is the Mahalanobis length of what it changes "
     "along the modes of all simulations, by products of different particle seeds, in which chance cancels. In (a) to "
@@ -60,10 +62,8 @@ COMPUTED = (
 
 
 class TrueSoil(PlowExperiment):
-    """Pictures of soil whose surface is known, and before them its true heights.
-
-    Heights are changes since the first frame in mm, on a grid of `CELL`, averaged over the same frames as pictures.
-    """
+    """Pictures of soil whose surface is known, and before them its true heights: changes since the first frame in mm,
+    on a grid of `CELL`, averaged over the same frames as pictures."""
 
     @cached_property
     def layout(self) -> Layout:
@@ -73,11 +73,6 @@ class TrueSoil(PlowExperiment):
         sites = tuple(Site(HEIGHT, float(u), float(v), "mm") for v in y for u in x)
         regions = np.concatenate([np.full((len(seen.times), len(sites)), HEIGHT), seen.regions], axis=1)
         return replace(seen, sites=sites + seen.sites, regions=regions)
-
-    @property
-    def heights(self) -> BoolArray:
-        """(s,) columns that are heights."""
-        return np.array([site.channel == HEIGHT for site in self.layout.sites])
 
     @cached_property
     def observed(self) -> FloatArray:
@@ -106,27 +101,34 @@ class TrueSoil(PlowExperiment):
         return np.concatenate([np.reshape(rows, (len(rows), -1)), self.features(prediction)], axis=1)
 
     def _after(self, height: float, features: npt.NDArray[Any]) -> FloatArray:
-        return np.concatenate([np.full((len(features), int(self.heights.sum())), height), features], axis=1)
+        count = len(self.layout.sites) - features.shape[1]
+        return np.concatenate([np.full((len(features), count), height), features], axis=1)
 
 
-def sigmas(changes: FloatArray, covariance: FloatArray, free: FloatArray | None = None) -> float:
-    """Mahalanobis length of a change: how many standard deviations of the noise it is.
+def precision_of(covariance: FloatArray, free: FloatArray | None = None) -> FloatArray:
+    """(p, p) inverse of a covariance; with what an unknown parameter changes (p,), of what is orthogonal to that."""
+    precision = np.linalg.inv(covariance + 1e-9 * np.eye(len(covariance)))
+    along = precision @ (np.zeros(len(covariance)) if free is None else free)
+    return np.asarray(precision if free is None else precision - np.outer(along, along) / (free @ along))
 
-    Its square is the mean product of different rows (a U-statistic: Hoeffding 1948, Ann. Math. Stat. 19:293), whose own
-    chance cancels. Where that is negative, 0 is returned: chance hides the change.
+
+def sigmas(changes: FloatArray, precision: FloatArray, chance: FloatArray) -> tuple[float, float]:
+    """Mahalanobis length of a change, in standard deviations of the noise, and what chance alone reaches in one of 20.
+
+    The length's square is the mean product of different rows (a U-statistic: Hoeffding 1948, Ann. Math. Stat. 19:293),
+    whose own chance cancels. Where that is negative it is 0.
 
     Args:
         changes: (k, p) the same change, each with chance of its own; a single one has none.
-        covariance: (p, p) of the noise.
-        free: (p,) what an unknown parameter changes; only what is orthogonal to it, under the noise, counts.
+        precision: (p, p) of the noise.
+        chance: (p, p) covariance of the changes.
     """
-    precision = np.linalg.inv(covariance + 1e-9 * np.eye(len(covariance)))
-    if free is not None:
-        along = precision @ free
-        precision = precision - np.outer(along, along) / (free @ along)
     products, k = changes @ precision @ changes.T, len(changes)
-    square = products.sum() if k == 1 else (products.sum() - np.trace(products)) / (k * (k - 1))
-    return float(np.sqrt(max(square, 0.0)))
+    if k == 1:
+        return float(np.sqrt(products.sum())), 0.0
+    square = (products.sum() - np.trace(products)) / (k * (k - 1))
+    spread = np.sqrt(2.0 * np.trace(precision @ chance @ precision @ chance) / (k * (k - 1)))
+    return float(np.sqrt(max(square, 0.0))), float(np.sqrt(LEVEL * spread))
 
 
 def size_of(p: Parameter) -> tuple[float, float]:
@@ -146,11 +148,11 @@ def simulated(
     guesses, and pairs of coarse and fine runs are there.
     """
 
-    def told(run: Run) -> str:
-        return f"{type(experiment).__name__}: {', '.join(run.effects) or run.numerics or 'as it is'}, seed {run.seed}"
-
     def made(runs: Sequence[Run]) -> tuple[Sequence[Run], FloatArray]:
-        tables = [ask(r.values, effects=r.effects, seed=r.seed, numerics=r.numerics, purpose=told(r)) for r in runs]
+        told = (
+            f"{type(experiment).__name__}: {', '.join(runs[0].effects) or runs[0].numerics or 'base'}" if runs else ""
+        )
+        tables = [ask(r.values, effects=r.effects, seed=r.seed, numerics=r.numerics, purpose=told) for r in runs]
         return runs, np.array(tables).reshape(len(runs), *experiment.layout.shape)
 
     def spread(count: int, first: int, numerics: str = "") -> list[Run]:
@@ -192,42 +194,45 @@ def left(
         everywhere = np.broadcast_to(aside, experiment.layout.shape)
         return noise_of(experiment, prior, replace(tables, drawn={}), (), everywhere), tables
 
-    heights, placed = true[0].heights, true[0].layout.placed
+    layout = true[0].layout
+    heights, placed = np.array([site.channel == HEIGHT for site in layout.sites]), layout.placed
     views = {"soil": bare(*true, placed & ~heights), "drawn": bare(*true, heights)}
     views["reconstructed"] = bare(*seen, np.array(False))
     whole = noise_of(seen[0], prior, seen[1], seen[0].candidates)
     at = prior.space.to_unit(prior.space.to_vector(TRUTH))[None]
     free = ((trend_of(at + 0.01, whole.points) - trend_of(at - 0.01, whole.points)) @ whole.base)[0]
-    after = (views["reconstructed"][0].fixed, whole.fixed, whole.covariance(1.0))
+    steps = {name: (noise, tables, precision_of(noise.fixed)) for name, (noise, tables) in views.items()}
+    steps["angle"] = whole, seen[1], precision_of(views["reconstructed"][0].fixed, free)
+    steps["observation"] = whole, seen[1], precision_of(whole.fixed, free)
+    steps["numerics"] = whole, seen[1], precision_of(whole.covariance(1.0), free)
     rows = []
     for c in effects:
-        found = {name: sigmas(changes_of(c, noise, tables), noise.fixed) for name, (noise, tables) in views.items()}
-        refitted = (sigmas(changes_of(c, whole, seen[1]), covariance, free) for covariance in after)
-        found |= zip(("angle", "observation", "numerics"), refitted, strict=True)
+        found = {n: sigmas(changes_of(c, noise, t), p, 2.0 * noise.chance) for n, (noise, t, p) in steps.items()}
         if c.kind == "observation":
             del found["soil"]
         value, times = size_of(c.measure)
         row = {"effect": c.name, "parameter": c.size, "value": value, "unit": c.measure.unit, "times": times}
-        factors = {b: found[a] / max(found[b], 1e-9) for a, b in pairwise(found)}
-        loss = next(iter(found.values())) / max(found["numerics"], 1e-9)
-        rows.append({**row, "sigmas": found, "factors": factors, "loss": loss})
+        known = {name: max(*pair, 1e-9) for name, pair in found.items()}
+        row["sigmas"], row["least"] = ({name: pair[k] for name, pair in found.items()} for k in (0, 1))
+        row["factors"] = {b: known[a] / known[b] for a, b in pairwise(known)}
+        rows.append({**row, "loss": next(iter(known.values())) / known["numerics"]})
     return rows
 
 
 def table(rows: Iterable[Mapping[str, Any]]) -> str:
-    """Markdown, what loses most first."""
+    """Markdown, what loses most first; what chance alone could be is a limit."""
     lines = [
         "| effect | (a) heights, force | (b) drawn | (c) reconstructed | (d) after nuisances | (a) / (d) | most by |",
         "|---" * 7 + "|",
     ]
     for row in sorted(rows, key=lambda row: -row["loss"]):
+        hidden = {name: value < row["least"][name] for name, value in row["sigmas"].items()}
+        told = {n: f"< {row['least'][n]:.1f} σ" if hidden[n] else f"{v:.1f} σ" for n, v in row["sigmas"].items()}
+        loss, most = f"{'≥ ' * hidden['numerics']}{row['loss']:.1f}", max(row["factors"], key=row["factors"].get)
         unit = "" if row["unit"] == "1" else " " + row["unit"].replace("deg", "°")
-        sigma = [row["sigmas"].get(name) for name in ("soil", "drawn", "reconstructed", "numerics")]
-        most = max(row["factors"], key=lambda name: row["factors"][name])
-        loss, by = (f"{f:.1f}" if f < 1e3 else "all" for f in (row["loss"], row["factors"][most]))
-        cells = ["–" if value is None else f"{value:.1f} σ" for value in sigma]
-        named = f"{row['effect'].replace('_', ' ')}, {row['value']:g}{unit}"
-        lines.append("| " + " | ".join([named, *cells, loss, f"{most}: {by}"]) + " |")
+        cells = [told.get(name, "–") for name in ("soil", "drawn", "reconstructed", "numerics")]
+        cells += ["–", "–"] if next(iter(hidden.values())) else [loss, f"{most}: {row['factors'][most]:.1f}"]
+        lines.append("| " + " | ".join([f"{row['effect'].replace('_', ' ')}, {row['value']:g}{unit}", *cells]) + " |")
     return "\n".join(lines)
 
 
@@ -279,16 +284,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     hush()
     if options.page:
         written(options.page, options.preset, "")  # a page without a place for the table fails now, not at the end
-    decides = {"preset": options.preset, "device": options.device.split(":")[0], "code": sources([Path(__file__)])}
-    keep_to_one_protocol(options.out, decides)
+    device, own = options.device.split(":")[0], sources([Path(__file__)])
+    keep_to_one_protocol(options.out, {"preset": options.preset, "device": device, "code": own})
     with only_json() if options.json else nullcontext():
         rows = measure(options.effects, options.preset, options.seeds, options.device, options.out)
         told = {"made_by": stamp(options.device), "preset": options.preset, "seeds": options.seeds, **TRUTH}
         shown = f"{COMPUTED}\n\n{table(rows)}"
         write_result(options.out, {**told, "computed": COMPUTED, "rows": rows}, shown, {})
         if options.page:
-            head = f"Preset `{options.preset}`, {options.seeds} seeds. "
-            write_text(options.page, written(options.page, options.preset, head + shown))
+            new = f"Preset `{options.preset}`, {options.seeds} seeds. {shown}"
+            write_text(options.page, written(options.page, options.preset, new))
         if options.json:
             print_json({"ok": True, **told, "rows": rows})
         else:
