@@ -45,14 +45,11 @@ from splatsoil.soil.library import library
 from splatsoil.synthetic import make_set, plow
 
 FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 
 ANGLE, WORLD = 35.0, 1
 """Of the soil, degrees, and the seed of its surface, its looks and the cameras' noise."""
 TRUTH = {"friction_angle": ANGLE}
 HEIGHT = "height"
-LEVEL = 1.645
-"""Standard deviations that chance passes in one of 20 cases."""
 COMPUTED = (
     f"Each effect is on at {STEP:g} times its smallest meaningful size; σ is the Mahalanobis length of what it changes "
     "along the modes of all simulations, by products of different particle seeds, in which chance cancels. In (a) to "
@@ -80,7 +77,7 @@ class TrueSoil(PlowExperiment):
         return self._after(0.0, super().observed)
 
     @cached_property
-    def seen(self) -> BoolArray:
+    def seen(self) -> npt.NDArray[np.bool_]:
         """(t, s): heights are known everywhere."""
         return self._after(1.0, super().seen).astype(bool)
 
@@ -128,7 +125,7 @@ def sigmas(changes: FloatArray, precision: FloatArray, chance: FloatArray) -> tu
         return float(np.sqrt(products.sum())), 0.0
     square = (products.sum() - np.trace(products)) / (k * (k - 1))
     spread = np.sqrt(2.0 * np.trace(precision @ chance @ precision @ chance) / (k * (k - 1)))
-    return float(np.sqrt(max(square, 0.0))), float(np.sqrt(LEVEL * spread))
+    return float(np.sqrt(max(square, 0.0))), float(np.sqrt(1.645 * spread))  # the normal distribution's 95 %
 
 
 def size_of(p: Parameter) -> tuple[float, float]:
@@ -190,13 +187,12 @@ def left(
 ) -> list[dict[str, Any]]:
     """One row for each effect: its size, the sigmas that are left after each step, and what each step divides by."""
 
-    def bare(experiment: PlowExperiment, tables: Tables, aside: BoolArray) -> tuple[Noise, Tables]:
+    def bare(experiment: PlowExperiment, tables: Tables, aside: npt.NDArray[np.bool_]) -> tuple[Noise, Tables]:
         everywhere = np.broadcast_to(aside, experiment.layout.shape)
         return noise_of(experiment, prior, replace(tables, drawn={}), (), everywhere), tables
 
-    layout = true[0].layout
-    heights, placed = np.array([site.channel == HEIGHT for site in layout.sites]), layout.placed
-    views = {"soil": bare(*true, placed & ~heights), "drawn": bare(*true, heights)}
+    heights = np.array([site.channel == HEIGHT for site in true[0].layout.sites])
+    views = {"soil": bare(*true, true[0].layout.placed & ~heights), "drawn": bare(*true, heights)}
     views["reconstructed"] = bare(*seen, np.array(False))
     whole = noise_of(seen[0], prior, seen[1], seen[0].candidates)
     at = prior.space.to_unit(prior.space.to_vector(TRUTH))[None]
@@ -289,11 +285,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with only_json() if options.json else nullcontext():
         rows = measure(options.effects, options.preset, options.seeds, options.device, options.out)
         told = {"made_by": stamp(options.device), "preset": options.preset, "seeds": options.seeds, **TRUTH}
-        shown = f"{COMPUTED}\n\n{table(rows)}"
+        shown = f"Preset `{options.preset}`, {options.seeds} seeds. {COMPUTED}\n\n{table(rows)}"
         write_result(options.out, {**told, "computed": COMPUTED, "rows": rows}, shown, {})
         if options.page:
-            new = f"Preset `{options.preset}`, {options.seeds} seeds. {shown}"
-            write_text(options.page, written(options.page, options.preset, new))
+            write_text(options.page, written(options.page, options.preset, shown))
         if options.json:
             print_json({"ok": True, **told, "rows": rows})
         else:
