@@ -1,0 +1,300 @@
+"""How much of each effect do the data hold? Standard deviations of it that are left, from the soil to the comparison.
+
+``splatsoil benchmark information --page docs/information.md`` makes a set of known soil with our own solver, and holds
+what each effect changes against the noise in four representations: (a) true heights and the force on the tool; (b) the
+comparison's features of particles that fill the true surface, drawn by us; (c) the same from the reconstructed surface;
+(d) those once the angle is refitted and all of the comparison's noise counts. Simulations are kept in the folder, and a
+second call goes on from there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import replace
+from functools import cached_property, partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from splatsoil.benchmarks._common import at_least, here, keep_to_one_protocol, sources, stamp, write_result
+from splatsoil.benchmarks._speed.page import replaced
+from splatsoil.benchmarks.numerics import CELL, Truth
+from splatsoil.inverse.criticism.design import Prior, Run
+from splatsoil.inverse.criticism.diagnosis import BASE, FINE, PAIRS, STEP
+from splatsoil.inverse.criticism.noise import Noise, Tables, noise_of, trend_of
+from splatsoil.inverse.criticism.simulations import Simulations
+
+from splatsoil.commands._output import only_json, print_json
+from splatsoil.errors import RunError
+from splatsoil.experiment import Candidate, Layout, Site
+from splatsoil.experiment.plow import MOST_ROWS, PlowExperiment
+from splatsoil.experiment.scene_parts import bins_of
+from splatsoil.files import write_text
+from splatsoil.measurement import Measurement
+from splatsoil.model import Model
+from splatsoil.mpm import PRESETS
+from splatsoil.parameters import Parameter
+from splatsoil.quiet import hush
+from splatsoil.reconstruction import Reconstruction, reconstruct
+from splatsoil.soil.library import library
+from splatsoil.synthetic import make_set, plow
+
+FloatArray = npt.NDArray[np.float64]
+
+ANGLE, WORLD = 35.0, 1
+"""Of the soil, degrees, and the seed of its surface, its looks and the cameras' noise."""
+TRUTH = {"friction_angle": ANGLE}
+HEIGHT = "height"
+COMPUTED = (
+    f"Each effect is on at {STEP:g} times its smallest meaningful size; σ is the Mahalanobis length of what it changes "
+    "along the modes of all simulations, by products of different particle seeds, in which chance cancels. In (a) to "
+    "(c) the noise is chance of particles and instruments; true heights have none of these. In (d) it is the "
+    "comparison's own, with guesses, observation and numerics, and what a change of the angle does is left out."
+)
+
+
+class TrueSoil(PlowExperiment):
+    """Pictures of soil whose surface is known, and before them its true heights: changes since the first frame in mm,
+    on a grid of `CELL`, averaged over the same frames as pictures."""
+
+    @cached_property
+    def layout(self) -> Layout:
+        """Labels of heights and features."""
+        seen, bed = super().layout, self.base.measurement.bed
+        x, y = (bed.lower[k] + CELL * (np.arange(round(bed.extents[k] / CELL)) + 0.5) for k in (0, 1))
+        sites = tuple(Site(HEIGHT, float(u), float(v), "mm") for v in y for u in x)
+        regions = np.concatenate([np.full((len(seen.times), len(sites)), HEIGHT), seen.regions], axis=1)
+        return replace(seen, sites=sites + seen.sites, regions=regions)
+
+    @cached_property
+    def observed(self) -> FloatArray:
+        """(t, s): of heights 0, as nobody has seen them."""
+        return self._after(0.0, super().observed)
+
+    @cached_property
+    def seen(self) -> npt.NDArray[np.bool_]:
+        """(t, s): heights are known everywhere."""
+        return self._after(1.0, super().seen).astype(bool)
+
+    @cached_property
+    def sensor(self) -> FloatArray:
+        """(t, s): heights are known exactly."""
+        return self._after(0.0, super().sensor)
+
+    def predict(
+        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
+    ) -> FloatArray:
+        """(t, s) true heights, and what would be seen."""
+        prediction = self.prediction(values, effects=effects, seed=seed, numerics=numerics)
+        run, measurement, frames = prediction.trajectory, self.base.measurement, self.comparator.frames
+        truth = Truth(measurement, {}, run.spacing**3, dict(values), ())
+        first, *later = (1e3 * truth.heights(run.at(f)[0], truth.volume) for f in (self.comparator.reference, *frames))
+        rows = [np.mean([later[i] - first for i in group], axis=0) for group in bins_of(measurement, frames, MOST_ROWS)]
+        return np.concatenate([np.reshape(rows, (len(rows), -1)), self.features(prediction)], axis=1)
+
+    def _after(self, height: float, features: npt.NDArray[Any]) -> FloatArray:
+        count = len(self.layout.sites) - features.shape[1]
+        return np.concatenate([np.full((len(features), count), height), features], axis=1)
+
+
+def precision_of(covariance: FloatArray, free: FloatArray | None = None) -> FloatArray:
+    """(p, p) inverse of a covariance; with what an unknown parameter changes (p,), of what is orthogonal to that."""
+    precision = np.linalg.inv(covariance + 1e-9 * np.eye(len(covariance)))
+    along = precision @ (np.zeros(len(covariance)) if free is None else free)
+    return np.asarray(precision if free is None else precision - np.outer(along, along) / (free @ along))
+
+
+def sigmas(changes: FloatArray, precision: FloatArray, chance: FloatArray) -> tuple[float, float]:
+    """Mahalanobis length of a change, in standard deviations of the noise, and what chance alone reaches in one of 20.
+
+    The length's square is the mean product of different rows (a U-statistic: Hoeffding 1948, Ann. Math. Stat. 19:293),
+    whose own chance cancels. Where that is negative it is 0.
+
+    Args:
+        changes: (k, p) the same change, each with chance of its own; a single one has none.
+        precision: (p, p) of the noise.
+        chance: (p, p) covariance of the changes.
+    """
+    products, k = changes @ precision @ changes.T, len(changes)
+    if k == 1:
+        return float(np.sqrt(products.sum())), 0.0
+    square = (products.sum() - np.trace(products)) / (k * (k - 1))
+    spread = np.sqrt(2.0 * np.trace(precision @ chance @ precision @ chance) / (k * (k - 1)))
+    return float(np.sqrt(max(square, 0.0))), float(np.sqrt(1.645 * spread))  # the normal distribution's 95 %
+
+
+def size_of(p: Parameter) -> tuple[float, float]:
+    """The value at which an effect's parameter is on, upwards where it has two sides, and its size over the smallest
+    meaningful one: `STEP`, or what its bounds leave."""
+    assert p.off is not None  # of a candidate's parameters
+    value = float(np.clip(p.off + (p.sign or 1) * STEP * p.meaningful, p.lower, p.upper))
+    return value, (value - p.off) / p.meaningful
+
+
+def simulated(
+    experiment: PlowExperiment, ask: Simulations, prior: Prior, effects: Sequence[Candidate], seeds: int, whole: bool
+) -> Tables:
+    """Simulations: with each effect, and of the model as it is with the same seeds and over its prior.
+
+    Observation effects are drawn as changes by their smallest meaningful size; with ``whole`` all of them are, as are
+    guesses, and pairs of coarse and fine runs are there.
+    """
+
+    def made(runs: Sequence[Run]) -> tuple[Sequence[Run], FloatArray]:
+        told = (
+            f"{type(experiment).__name__}: {', '.join(runs[0].effects) or runs[0].numerics or 'base'}" if runs else ""
+        )
+        tables = [ask(r.values, effects=r.effects, seed=r.seed, numerics=r.numerics, purpose=told) for r in runs]
+        return runs, np.array(tables).reshape(len(runs), *experiment.layout.shape)
+
+    def spread(count: int, first: int, numerics: str = "") -> list[Run]:
+        points = (2.0 * (np.arange(count) + 0.5) / max(count, 1) - 1.0)[:, None]
+        return [Run(v, seed=first + i, numerics=numerics) for i, v in enumerate(prior.values(points))]
+
+    drawn = {}
+    # What needs more frames of the simulation comes first, so that one serves all.
+    for c in sorted(experiment.candidates if whole else effects, key=lambda c: c.name != "time_offset"):
+        for p in c.parameters if c.kind == "observation" else ():
+            value, times = size_of(p)
+            drawn[p.name] = made([Run({**TRUTH, p.name: value}, (c.name,))])[1][0], times
+    reference = made([Run(TRUTH)])[1][0]
+    drawings = {name: reference + (table - reference) / times for name, (table, times) in drawn.items()}
+    for name in (*experiment.guesses, *experiment.redrawn) if whole else ():
+        drawings[name] = made([Run(TRUTH, numerics=name)])[1][0]
+    base = made([*(Run(TRUTH, seed=s) for s in range(seeds)), *spread(BASE, 101)])
+    fine = made(spread(PAIRS if whole else 0, 201, FINE))
+    values = {c.name: {**TRUTH, c.size: size_of(c.measure)[0]} for c in effects if c.kind == "physics"}
+    with_effect = {name: made([Run(v, (name,), s) for s in range(seeds)]) for name, v in values.items()}
+    return Tables(base, fine, with_effect, drawings, reference)
+
+
+def changes_of(candidate: Candidate, noise: Noise, tables: Tables) -> FloatArray:
+    """(k, p) what an effect changes, seed by seed; one row for an effect of observation, which has no chance."""
+    if candidate.kind == "observation":
+        off, on = noise.scores(np.stack([tables.reference, tables.drawn[candidate.size]]))
+        return np.asarray(size_of(candidate.measure)[1] * (on - off)[None])
+    found = noise.scores(tables.effects[candidate.name][1])
+    return np.asarray(found - noise.base[: len(found)])
+
+
+def left(
+    true: tuple[TrueSoil, Tables], seen: tuple[PlowExperiment, Tables], prior: Prior, effects: Iterable[Candidate]
+) -> list[dict[str, Any]]:
+    """One row for each effect: its size, the sigmas that are left after each step, and what each step divides by."""
+
+    def bare(experiment: PlowExperiment, tables: Tables, aside: npt.NDArray[np.bool_]) -> tuple[Noise, Tables]:
+        everywhere = np.broadcast_to(aside, experiment.layout.shape)
+        return noise_of(experiment, prior, replace(tables, drawn={}), (), everywhere), tables
+
+    heights = np.array([site.channel == HEIGHT for site in true[0].layout.sites])
+    views = {"soil": bare(*true, true[0].layout.placed & ~heights), "drawn": bare(*true, heights)}
+    views["reconstructed"] = bare(*seen, np.array(False))
+    whole = noise_of(seen[0], prior, seen[1], seen[0].candidates)
+    at = prior.space.to_unit(prior.space.to_vector(TRUTH))[None]
+    free = ((trend_of(at + 0.01, whole.points) - trend_of(at - 0.01, whole.points)) @ whole.base)[0]
+    steps = {name: (noise, tables, precision_of(noise.fixed)) for name, (noise, tables) in views.items()}
+    steps["angle"] = whole, seen[1], precision_of(views["reconstructed"][0].fixed, free)
+    steps["observation"] = whole, seen[1], precision_of(whole.fixed, free)
+    steps["numerics"] = whole, seen[1], precision_of(whole.covariance(1.0), free)
+    rows = []
+    for c in effects:
+        found = {n: sigmas(changes_of(c, noise, t), p, 2.0 * noise.chance) for n, (noise, t, p) in steps.items()}
+        if c.kind == "observation":
+            del found["soil"]
+        value, times = size_of(c.measure)
+        row = {"effect": c.name, "parameter": c.size, "value": value, "unit": c.measure.unit, "times": times}
+        known = {name: max(*pair, 1e-9) for name, pair in found.items()}
+        row["sigmas"], row["least"] = ({name: pair[k] for name, pair in found.items()} for k in (0, 1))
+        row["factors"] = {b: known[a] / known[b] for a, b in pairwise(known)}
+        rows.append({**row, "loss": next(iter(known.values())) / known["numerics"]})
+    return rows
+
+
+def table(rows: Iterable[Mapping[str, Any]]) -> str:
+    """Markdown, what loses most first; what chance alone could be is a limit."""
+    lines = [
+        "| effect | (a) heights, force | (b) drawn | (c) reconstructed | (d) after nuisances | (a) / (d) | most by |",
+        "|---" * 7 + "|",
+    ]
+    for row in sorted(rows, key=lambda row: -row["loss"]):
+        hidden = {name: value < row["least"][name] for name, value in row["sigmas"].items()}
+        told = {n: f"< {row['least'][n]:.1f} σ" if hidden[n] else f"{v:.1f} σ" for n, v in row["sigmas"].items()}
+        loss, most = f"{'≥ ' * hidden['numerics']}{row['loss']:.1f}", max(row["factors"], key=row["factors"].get)
+        unit = "" if row["unit"] == "1" else " " + row["unit"].replace("deg", "°")
+        cells = [told.get(name, "–") for name in ("soil", "drawn", "reconstructed", "numerics")]
+        cells += ["–", "–"] if next(iter(hidden.values())) else [loss, f"{most}: {row['factors'][most]:.1f}"]
+        lines.append("| " + " | ".join([f"{row['effect'].replace('_', ' ')}, {row['value']:g}{unit}", *cells]) + " |")
+    return "\n".join(lines)
+
+
+def measure(effects: Sequence[str], preset: str, seeds: int, device: str, out: Path) -> list[dict[str, Any]]:
+    """`left` of the effects of these names, or of all; what is not in the folder is made."""
+    place, made = out / "set", out / "reconstruction"
+    if not (place / "truth.json").is_file():
+        make_set(place, plow(WORLD), friction_angle=ANGLE, preset=preset, seed=WORLD, device=device)
+    measurement = Measurement.load(place)
+    if not (made / "reconstruction.json").is_file():
+        reconstruct(measurement, preset=preset, device=device).save(made)
+    reconstruction = Reconstruction.load(made)
+    known = replace(reconstruction, surface=plow(WORLD).surface)
+    prepared: list[Any] = []
+    say = partial(print, file=sys.stderr, flush=True)
+    for kind, start in ((TrueSoil, known), (PlowExperiment, reconstruction)):
+        experiment = kind(Model(measurement, start, preset=preset, device=device), TRUTH)
+        wanted = [c for c in experiment.candidates if not effects or c.name in effects]
+        ask = Simulations(experiment, out / "features", {"experiment": kind.__name__}, say)
+        prior = Prior.of(experiment, TRUTH)
+        prepared.append((experiment, simulated(experiment, ask, prior, wanted, seeds, kind is PlowExperiment)))
+    return left(prepared[0], prepared[1], prior, wanted)
+
+
+def written(page: Path, preset: str, new: str) -> str:
+    """A page with the table of a preset replaced.
+
+    Raises:
+        RunError: it cannot be read, or has no place for the table.
+    """
+    try:
+        return replaced(page.read_text(encoding="utf-8"), f"information {preset}", new)
+    except (OSError, UnicodeDecodeError) as error:
+        raise RunError(f"{page}: cannot be read as text ({error})") from error
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure, print the table, and write it into a page; exit code 0."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    known = [name for name, effect in library().items() if not effect.numerical]
+    parser.add_argument("--effects", nargs="+", default=[], choices=known, metavar="EFFECT", help="all by default")
+    parser.add_argument("--preset", default="tiny", choices=sorted(PRESETS))
+    parser.add_argument("--seeds", type=at_least(2), default=3, help="of the particles, with each effect")
+    parser.add_argument("--device", type=here, default="cpu")
+    parser.add_argument("--out", type=Path, default=Path("runs/information"))
+    parser.add_argument("--page", type=Path, help="write the table into this page")
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+    options = parser.parse_args(arguments)
+    hush()
+    if options.page:
+        written(options.page, options.preset, "")  # a page without a place for the table fails now, not at the end
+    device, own = options.device.split(":")[0], sources([Path(__file__)])
+    keep_to_one_protocol(options.out, {"preset": options.preset, "device": device, "code": own})
+    with only_json() if options.json else nullcontext():
+        rows = measure(options.effects, options.preset, options.seeds, options.device, options.out)
+        told = {"made_by": stamp(options.device), "preset": options.preset, "seeds": options.seeds, **TRUTH}
+        shown = f"Preset `{options.preset}`, {options.seeds} seeds. {COMPUTED}\n\n{table(rows)}"
+        write_result(options.out, {**told, "computed": COMPUTED, "rows": rows}, shown, {})
+        if options.page:
+            write_text(options.page, written(options.page, options.preset, shown))
+        if options.json:
+            print_json({"ok": True, **told, "rows": rows})
+        else:
+            print(shown)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
