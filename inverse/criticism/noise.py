@@ -122,9 +122,9 @@ class Noise:
         out[self.mask] = self.basis @ self.correction
         return out
 
-    def covariance(self, factors: FloatArray) -> FloatArray:
-        """(p, p) with numerics of factors (2,): that of placed instruments and that of others."""
-        size = np.where(self.placed, *factors)
+    def covariance(self, factors: npt.ArrayLike) -> FloatArray:
+        """(p, p) with numerics of factors (2,), that of placed instruments and that of others, or of one for both."""
+        size = np.where(self.placed, *np.broadcast_to(np.asarray(factors, dtype=np.float64), 2))
         return self.fixed + np.outer(size, size) * self.numerics
 
     @property
