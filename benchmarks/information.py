@@ -220,12 +220,12 @@ def left(
 
 
 def table(rows: Iterable[Mapping[str, Any]]) -> str:
-    """Markdown, what loses most first; what chance alone could be is a limit."""
+    """Markdown: physics, then observation, what loses most first; what chance alone could be is a limit."""
     lines = [
-        "| effect | (a) heights, force | (b) drawn | (c) reconstructed | (d) after nuisances | (a) / (d) | most by |",
+        "| effect | (a) heights, force | (b) drawn | (c) reconstructed | (d) after nuisances | loss | most by |",
         "|---" * 7 + "|",
     ]
-    for row in sorted(rows, key=lambda row: -row["loss"]):
+    for row in sorted(rows, key=lambda row: ("soil" not in row["sigmas"], -row["loss"])):
         hidden = {name: value < row["least"][name] for name, value in row["sigmas"].items()}
         told = {n: f"< {row['least'][n]:.1f} σ" if hidden[n] else f"{v:.1f} σ" for n, v in row["sigmas"].items()}
         loss, most = f"{'≥ ' * hidden['numerics']}{row['loss']:.1f}", max(row["factors"], key=row["factors"].get)
