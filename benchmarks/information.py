@@ -12,7 +12,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import replace
 from functools import cached_property, partial
 from itertools import pairwise
@@ -30,7 +30,7 @@ from splatsoil.inverse.criticism.noise import Noise, Tables, noise_of, trend_of
 from splatsoil.inverse.criticism.simulations import Simulations
 
 from splatsoil.commands._output import only_json, print_json
-from splatsoil.errors import RunError
+from splatsoil.errors import RunError, SimulationError
 from splatsoil.experiment import Candidate, Layout, Site
 from splatsoil.experiment.plow import MOST_ROWS, PlowExperiment
 from splatsoil.experiment.scene_parts import bins_of
@@ -142,15 +142,19 @@ def simulated(
     """Simulations: with each effect, and of the model as it is with the same seeds and over its prior.
 
     Observation effects are drawn as changes by their smallest meaningful size; with ``whole`` all of them are, as are
-    guesses, and pairs of coarse and fine runs are there.
+    guesses, and pairs of coarse and fine runs are there. An effect that fails but for one seed is left out.
     """
 
-    def made(runs: Sequence[Run]) -> tuple[Sequence[Run], FloatArray]:
-        told = (
-            f"{type(experiment).__name__}: {', '.join(runs[0].effects) or runs[0].numerics or 'base'}" if runs else ""
-        )
-        tables = [ask(r.values, effects=r.effects, seed=r.seed, numerics=r.numerics, purpose=told) for r in runs]
-        return runs, np.array(tables).reshape(len(runs), *experiment.layout.shape)
+    def made(runs: Sequence[Run], *allowed: type[Exception]) -> tuple[Sequence[Run], FloatArray]:
+        kept, tables = list[Run](), list[FloatArray]()
+        for r in runs:
+            told = f"{type(experiment).__name__}: {', '.join(r.effects) or r.numerics or 'base'}"
+            with suppress(*allowed):
+                tables.append(ask(r.values, effects=r.effects, seed=r.seed, numerics=r.numerics, purpose=told))
+                kept.append(r)
+        if len(kept) < len(runs):
+            print(f"{told}: {len(kept)} of {len(runs)} could be simulated", file=sys.stderr)
+        return kept, np.array(tables).reshape(len(kept), *experiment.layout.shape)
 
     def spread(count: int, first: int, numerics: str = "") -> list[Run]:
         points = (2.0 * (np.arange(count) + 0.5) / max(count, 1) - 1.0)[:, None]
@@ -169,8 +173,8 @@ def simulated(
     base = made([*(Run(TRUTH, seed=s) for s in range(seeds)), *spread(BASE, 101)])
     fine = made(spread(PAIRS if whole else 0, 201, FINE))
     values = {c.name: {**TRUTH, c.size: size_of(c.measure)[0]} for c in effects if c.kind == "physics"}
-    with_effect = {name: made([Run(v, (name,), s) for s in range(seeds)]) for name, v in values.items()}
-    return Tables(base, fine, with_effect, drawings, reference)
+    found = {n: made([Run(v, (n,), s) for s in range(seeds)], SimulationError) for n, v in values.items()}
+    return Tables(base, fine, {n: f for n, f in found.items() if len(f[0]) > 1}, drawings, reference)
 
 
 def changes_of(candidate: Candidate, noise: Noise, tables: Tables) -> FloatArray:
@@ -178,8 +182,8 @@ def changes_of(candidate: Candidate, noise: Noise, tables: Tables) -> FloatArray
     if candidate.kind == "observation":
         off, on = noise.scores(np.stack([tables.reference, tables.drawn[candidate.size]]))
         return np.asarray(size_of(candidate.measure)[1] * (on - off)[None])
-    found = noise.scores(tables.effects[candidate.name][1])
-    return np.asarray(found - noise.base[: len(found)])
+    runs, found = tables.effects[candidate.name]
+    return np.asarray(noise.scores(found) - noise.base[[run.seed for run in runs]])
 
 
 def left(
@@ -202,7 +206,7 @@ def left(
     steps["observation"] = whole, seen[1], precision_of(whole.fixed, free)
     steps["numerics"] = whole, seen[1], precision_of(whole.covariance(1.0), free)
     rows = []
-    for c in effects:
+    for c in (c for c in effects if c.kind == "observation" or c.name in true[1].effects.keys() & seen[1].effects):
         found = {n: sigmas(changes_of(c, noise, t), p, 2.0 * noise.chance) for n, (noise, t, p) in steps.items()}
         if c.kind == "observation":
             del found["soil"]
@@ -216,12 +220,12 @@ def left(
 
 
 def table(rows: Iterable[Mapping[str, Any]]) -> str:
-    """Markdown, what loses most first; what chance alone could be is a limit."""
+    """Markdown: physics, then observation, what loses most first; what chance alone could be is a limit."""
     lines = [
-        "| effect | (a) heights, force | (b) drawn | (c) reconstructed | (d) after nuisances | (a) / (d) | most by |",
+        "| effect | (a) heights, force | (b) drawn | (c) reconstructed | (d) after nuisances | loss | most by |",
         "|---" * 7 + "|",
     ]
-    for row in sorted(rows, key=lambda row: -row["loss"]):
+    for row in sorted(rows, key=lambda row: ("soil" not in row["sigmas"], -row["loss"])):
         hidden = {name: value < row["least"][name] for name, value in row["sigmas"].items()}
         told = {n: f"< {row['least'][n]:.1f} σ" if hidden[n] else f"{v:.1f} σ" for n, v in row["sigmas"].items()}
         loss, most = f"{'≥ ' * hidden['numerics']}{row['loss']:.1f}", max(row["factors"], key=row["factors"].get)
@@ -243,22 +247,17 @@ def measure(effects: Sequence[str], preset: str, seeds: int, device: str, out: P
     reconstruction = Reconstruction.load(made)
     known = replace(reconstruction, surface=plow(WORLD).surface)
     prepared: list[Any] = []
-    say = partial(print, file=sys.stderr, flush=True)
     for kind, start in ((TrueSoil, known), (PlowExperiment, reconstruction)):
         experiment = kind(Model(measurement, start, preset=preset, device=device), TRUTH)
         wanted = [c for c in experiment.candidates if not effects or c.name in effects]
-        ask = Simulations(experiment, out / "features", {"experiment": kind.__name__}, say)
+        ask = Simulations(experiment, out / "features", {"experiment": kind.__name__}, partial(print, file=sys.stderr))
         prior = Prior.of(experiment, TRUTH)
         prepared.append((experiment, simulated(experiment, ask, prior, wanted, seeds, kind is PlowExperiment)))
     return left(prepared[0], prepared[1], prior, wanted)
 
 
 def written(page: Path, preset: str, new: str) -> str:
-    """A page with the table of a preset replaced.
-
-    Raises:
-        RunError: it cannot be read, or has no place for the table.
-    """
+    """A page with the table of a preset replaced; RunError where it cannot be read, or has no place for the table."""
     try:
         return replaced(page.read_text(encoding="utf-8"), f"information {preset}", new)
     except (OSError, UnicodeDecodeError) as error:

@@ -396,12 +396,13 @@ def _held_out(
     if not judged_on.any() or not (mask & ~aside).any():
         return [], ""
     evidence, _, noise = _compared(study, tables, candidates, aside)
+    nothing_wrong = _expected(study, noise, tables, np.ones(2)).variance[judged_on]
     out = []
     for name in names:
         variance = _expected(study, noise, tables, evidence.models[name].factors).variance[judged_on]
         left = (experiment.observed - _predicted(study, tables, evidence, name, simulate))[judged_on]
         score = -0.5 * float(np.mean(left**2 / variance + np.log(2.0 * np.pi * variance)))
-        out.append(HeldOut(name, float(np.sqrt(np.mean(left**2))), float(np.sqrt(variance.mean())), score))
+        out.append(HeldOut(name, float(np.sqrt(np.mean(left**2))), float(np.sqrt(nothing_wrong.mean())), score))
     return out, what
 
 

@@ -103,8 +103,8 @@ def test_a_row_says_how_much_is_lost_and_by_what() -> None:
     ]
     assert table(rows).splitlines()[2:] == [
         "| tilt, 4 ° | 40.0 σ | 20.0 σ | 20.0 σ | 2.0 σ | 20.0 | angle: 5.0 |",
-        "| light, 4 ° | – | 8.0 σ | 8.0 σ | < 1.0 σ | ≥ 8.0 | angle: 4.0 |",
         "| gravity, 4 ° | < 1.0 σ | 3.0 σ | 3.0 σ | 3.0 σ | – | – |",
+        "| light, 4 ° | – | 8.0 σ | 8.0 σ | < 1.0 σ | ≥ 8.0 | angle: 4.0 |",
     ]
 
 
