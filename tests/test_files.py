@@ -47,7 +47,8 @@ def part(repository: Path, file: Path) -> str:
 
 
 def imported(repository: Path, file: Path) -> Iterator[Path]:
-    """Files of the package whose modules, or whose members, a file imports somewhere."""
+    """Files of the package whose modules, or whose members, a file imports somewhere; not the commands as functions,
+    which the package loads for who asks it for them."""
     package = ["splatsoil", *part(repository, file).split("/")[:-1]]
     for node in ast.walk(ast.parse(file.read_text())):
         names: list[str] = []
@@ -59,7 +60,7 @@ def imported(repository: Path, file: Path) -> Iterator[Path]:
             names = [module, *(f"{module}.{alias.name}" for alias in node.names)]
         for name in names:
             found = source(repository, name) if name.split(".")[0] == "splatsoil" else None
-            if found is not None:
+            if found is not None and part(repository, found) != "api.py":
                 yield found
 
 

@@ -40,7 +40,7 @@ class ToolForces:
     Attributes:
         channels: (c,) the instruments.
         observed: (t, c) measured means over each row's frames, in % of the largest.
-        noise: (t, c) standard deviation of the instrument in `features`.
+        stages: (t,) the part of the motion that each row belongs to.
         measured: (t, c) rows in which there are any.
         largest: what that is, N.
         axes: (c, 3) the instruments' directions.
@@ -49,7 +49,7 @@ class ToolForces:
 
     channels: tuple[str, ...]
     observed: FloatArray
-    noise: FloatArray
+    stages: tuple[str, ...]
     measured: npt.NDArray[np.bool_]
     largest: float
     axes: FloatArray
@@ -90,9 +90,7 @@ class ToolForces:
         if (moving & (size > LEAST * largest)).sum() < FEWEST:
             return None
         there = np.repeat((weights.sum(axis=1) > 0.0)[:, None], len(axes), axis=1)
-        observed = 100.0 * table / largest
-        noise = np.hypot(SENSOR / np.sqrt(1.0 + (observed / SCALE) ** 2), _standing(compressed(observed), stages))
-        return cls((ALONG, UP), observed, noise, there, largest, axes, weights)
+        return cls((ALONG, UP), 100.0 * table / largest, stages, there, largest, axes, weights)
 
     def predicted(self, force: FloatArray) -> FloatArray:
         """(t, c) features of a simulation's force (f', 3) in frames 1, 2, …; f' at least f."""
@@ -102,6 +100,11 @@ class ToolForces:
     def features(self) -> FloatArray:
         """(t, c) what was measured, as a comparison of models takes it."""
         return compressed(self.observed)
+
+    @property
+    def noise(self) -> FloatArray:
+        """(t, c) standard deviation of the instrument in these, and of what it leaves open."""
+        return np.hypot(SENSOR / np.sqrt(1.0 + (self.observed / SCALE) ** 2), _standing(self.features, self.stages))
 
     def newtons(self, features: FloatArray) -> FloatArray:
         """Features as forces in N: `compressed` undone."""
