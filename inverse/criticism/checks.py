@@ -49,7 +49,7 @@ class Expected:
         sensor: (t, s) standard deviation of instruments.
         chance: (m, t, s) one simulation's own: independent parts, each of a standard normal size.
         numerics: (k, t, s) the model's own error, likewise.
-        doubt: standard deviation of the logarithm of a factor of that, which no block need share with another.
+        doubt: standard deviation of the logarithm of a factor of that, drawn anew for each replicate.
     """
 
     sensor: FloatArray

@@ -135,7 +135,7 @@ class Noise:
     @property
     def beyond(self) -> FloatArray:
         """(f,) the same where one of the factors at least is more than numerics: any such one is as probable."""
-        large = np.log(FACTORS) > (SOMETHING_ELSE - 0.1) * self.factor_std
+        large = np.log(FACTORS) >= SOMETHING_ELSE * self.factor_std - 1e-9
         density = np.where(large.any(axis=1), self._probability(large), -np.inf)
         return np.asarray(density - logsumexp(density))
 

@@ -21,7 +21,7 @@ SIZES = (1.0, 2.0, 4.0, 8.0, 16.0)
 """Over the smallest meaningful one."""
 WORLDS = 40
 THINNED = 4
-"""Of the quasi-Monte Carlo points, every so many serve here."""
+"""Of the sequence's points and of the numerics' factors, every so many serve here."""
 NEAR = 1.5
 """Factor within which a point's size is taken for a size asked for."""
 

@@ -80,11 +80,11 @@ def write_measurement(
         tool.mesh.export(root / "tool.stl")
         motion = tool.motion
         table = np.column_stack([motion.frames, motion.times, motion.positions, motion.quaternions])
-        _write_table(root / "tool_motion.csv", MOTION_COLUMNS, table)
+        write_table(root / "tool_motion.csv", MOTION_COLUMNS, table)
         if tool.force is not None:
-            _write_table(root / "tool_force.csv", FORCE_COLUMNS, tool.force)
+            write_table(root / "tool_force.csv", FORCE_COLUMNS, tool.force)
         for kind, frames in (("views", views), ("video", video)):
-            _write_frames(root / kind, frames, video=kind == "video", suffix=suffix, quality=quality)
+            write_frames(root / kind, frames, video=kind == "video", suffix=suffix, quality=quality)
         experiment = {
             "format": FORMAT,
             "name": name,
@@ -107,9 +107,9 @@ def write_measurement(
             "views": "views/transforms.json",
             "video": "video/transforms.json",
         }
-        _write_json(root / EXPERIMENT, experiment)
+        write_json(root / EXPERIMENT, experiment)
         if truth is not None:
-            _write_json(root / "truth.json", dict(truth))
+            write_json(root / "truth.json", dict(truth))
         Measurement.load(root)
         if target.exists():
             target.rmdir()
@@ -132,7 +132,12 @@ def transforms(camera: Camera) -> dict[str, Any]:
     }
 
 
-def _write_frames(folder: Path, frames: Sequence[Picture | Frame], *, video: bool, suffix: str, quality: int) -> None:
+def write_frames(folder: Path, frames: Sequence[Picture | Frame], *, video: bool, suffix: str, quality: int) -> None:
+    """Pictures, masks and ``transforms.json`` of views or of a video.
+
+    Raises:
+        MeasurementError: a camera's name cannot be a folder's.
+    """
     entries: list[dict[str, Any]] = []
     for i, frame in enumerate(frames):
         camera = frame.camera
@@ -158,7 +163,7 @@ def _write_frames(folder: Path, frames: Sequence[Picture | Frame], *, video: boo
             entry |= {"camera": place, "frame": frame.frame, "time": frame.time}
         entries.append(entry | transforms(camera))
     folder.mkdir(exist_ok=True)
-    _write_json(folder / "transforms.json", {"frames": entries})
+    write_json(folder / "transforms.json", {"frames": entries})
 
 
 def _encode(picture: Picture, path: Path, quality: int) -> None:
@@ -181,11 +186,13 @@ def _copy(source: Path, folder: Path, name: str) -> str:
     return target.relative_to(folder).as_posix()
 
 
-def _write_table(path: Path, columns: Sequence[str], table: npt.NDArray[np.float64]) -> None:
+def write_table(path: Path, columns: Sequence[str], table: npt.NDArray[np.float64]) -> None:
+    """Rows (n, c) as CSV, the first column as whole numbers."""
     rows = [",".join(columns)]
     rows += [",".join([str(int(row[0])), *(repr(float(v)) for v in row[1:])]) for row in table]
     path.write_text("\n".join(rows) + "\n", encoding="utf-8")
 
 
-def _write_json(path: Path, data: Mapping[str, Any]) -> None:
+def write_json(path: Path, data: Mapping[str, Any]) -> None:
+    """A file of a set."""
     path.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")

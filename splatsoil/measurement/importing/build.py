@@ -33,7 +33,7 @@ from splatsoil.measurement.importing.video import Video
 from splatsoil.measurement.measurement import EXPERIMENT, FORMAT, Measurement
 from splatsoil.measurement.motion import MOTION_COLUMNS, ToolMotion
 from splatsoil.measurement.tool import FORCE_COLUMNS, read_mesh
-from splatsoil.measurement.writer import _write_frames, _write_json, _write_table
+from splatsoil.measurement.writer import write_frames, write_json, write_table
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -174,23 +174,23 @@ def import_set(
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}-") as temporary:
         root = Path(temporary) / out.name
         root.mkdir()
-        _write_frames(root / "views", views, video=False, suffix=".jpg", quality=QUALITY)
+        write_frames(root / "views", views, video=False, suffix=".jpg", quality=QUALITY)
         last = None
         if mesh is not None:
             mesh.export(root / "tool.stl")
         if motion is not None:
             steps = resampled(motion, grid)
             table = np.column_stack([steps.frames, steps.times, steps.positions, steps.quaternions])
-            _write_table(root / "tool_motion.csv", MOTION_COLUMNS, table)
+            write_table(root / "tool_motion.csv", MOTION_COLUMNS, table)
             last = int(steps.frames[-1])
         if parts.force is not None:
-            _write_table(root / "tool_force.csv", FORCE_COLUMNS, read_force(parts.force, to_world, grid))
+            write_table(root / "tool_force.csv", FORCE_COLUMNS, read_force(parts.force, to_world, grid))
         taken = []
         for k, (name, video) in enumerate(videos.items()):
             report(f"video {name}", 0.4 + 0.5 * k / len(videos))
             taken += _extracted(video, cameras[name], name, Path(temporary) / "video" / name, zero, last, parts.every)
         if taken:
-            _write_frames(root / "video", taken, video=True, suffix=".jpg", quality=QUALITY)
+            write_frames(root / "video", taken, video=True, suffix=".jpg", quality=QUALITY)
         report("checking", 0.9)
         missing = _finish(root, experiment, rate, out)
         if out.exists():
@@ -327,7 +327,7 @@ def _finish(root: Path, experiment: dict[str, Any], rate: float, out: Path) -> t
         if missing:
             read_transforms(root / "views" / "transforms.json", root, video=False)
         else:
-            _write_json(root / EXPERIMENT, whole)
+            write_json(root / EXPERIMENT, whole)
             Measurement.load(root)
     except MeasurementError as error:
         raise MeasurementError(str(error).replace(str(root.absolute()), str(out))) from error

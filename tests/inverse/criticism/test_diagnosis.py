@@ -85,12 +85,17 @@ def test_the_same_seed_gives_the_same_answer_and_the_record_is_plain_json(make: 
 
 def test_what_fine_runs_add_is_taken_off_the_observation(make: Make) -> None:
     experiment = make(numerics=4.0)
-    noise = diagnose(experiment, START, effects=False).evidence.noise
+    diagnosis = diagnose(experiment, START, effects=False)
+    noise = diagnosis.evidence.noise
     added = experiment.patterns["fine"][noise.mask] @ noise.basis
     # Only pictures are corrected: the last scores are the force's.
     wanted, found = (scores[: -experiment.layout.shape[0]] for scores in (added, noise.correction))
     assert wanted @ found > 0.8 * np.linalg.norm(wanted) * np.linalg.norm(found)
     assert 0.5 < np.linalg.norm(found) / np.linalg.norm(wanted) < 1.2
+    # Predictions have it, so that little of it is left in what is checked.
+    pictures = noise.mask & experiment.layout.placed
+    fine, left = (table[pictures] for table in (experiment.patterns["fine"], diagnosis.residuals[""]))
+    assert abs(left @ fine) < 0.5 * fine @ fine
 
 
 def test_what_is_set_aside_is_the_last_camera_and_the_last_stage(make: Make) -> None:

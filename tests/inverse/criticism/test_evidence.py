@@ -66,6 +66,10 @@ def test_evidence_is_the_integral_of_the_likelihood() -> None:
     base = found.models[""]
     whitening = 0.5 * np.log(np.linalg.det(noise.covariance(np.ones(2))))
     assert base.log_evidence - whitening == pytest.approx(wanted, abs=0.05)
+    # In "something else" one of the factors at least is beyond two standard deviations, in both kinds or in one.
+    weights = np.exp(noise.beyond)
+    assert weights.sum() == pytest.approx(1.0)
+    assert np.array_equal(weights > 0.0, (np.log(FACTORS) >= 0.999 * 2.0 * noise.factor_std).any(axis=1))
     unit = grid @ likelihood / likelihood.sum()
     # Points are draws: a twentieth of the posterior's standard deviation.
     mean, std = base.moments("friction_angle")
