@@ -101,7 +101,7 @@ def test_a_run_folders_program_is_not_run_before_its_user_names_it(
     program.write_text(f"{source}\nopen({str(mark)!r}, 'w')\n")
     setup = {**fit()["setup"], "effects": [str(program)], "code": "x"}
     write_json(run / "fit.json", fit(setup=setup, name="my effect"))
-    words = [command, str(run), *(["cohesion"] if command == "add" else [])]
+    words = [command, str(run), *{"add": ["cohesion"], "export": ["--to", "csv"]}.get(command, [])]
     assert cli.main(words) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and f"splatsoil element --with '{program}'" in said and not mark.exists()
