@@ -3,7 +3,8 @@
 #   make demo     the whole path on examples/plow-dry, ending in runs/demo/report.html
 #   make test     the tests
 #   make test-slow  the tests that take minutes: whole reconstructions and simulations of the example sets
-#   make lint     formatting, lint and types
+#   make lint     formatting, lint, unused code and types
+#   make docs     the documentation as a site, build/site/index.html
 #   make clean    remove what these made, the virtual environment included; runs/ stays
 #
 # PYTHON        interpreter to make the virtual environment with
@@ -21,7 +22,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 PACKAGES := splatsoil envs inverse benchmarks
 SOURCES := $(shell find $(PACKAGES) -type f -not -path '*/__pycache__/*')
 
-.PHONY: demo test test-slow lint clean
+.PHONY: demo test test-slow lint docs clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.use
@@ -40,6 +41,9 @@ lint: $(VENV)/.develop build/installed/.stamp
 	$(BIN)/ruff check $(PACKAGES) tests examples
 	cd build/installed && "$(abspath $(BIN))/mypy" --config-file "$(CURDIR)/pyproject.toml" -p splatsoil
 
+docs: $(VENV)/.docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
+
 clean:
 	rm -rf build .pytest_cache .mypy_cache .ruff_cache *.egg-info $(VENV)
 
@@ -56,6 +60,10 @@ $(VENV)/.use: pyproject.toml | $(BIN)/python
 
 $(VENV)/.develop: pyproject.toml | $(VENV)/.use
 	$(PIP) install --editable '.[dev]'
+	@touch $(VENV)/.use $@
+
+$(VENV)/.docs: pyproject.toml | $(VENV)/.use
+	$(PIP) install --editable '.[docs]'
 	@touch $(VENV)/.use $@
 
 build/installed/.stamp: $(SOURCES) pyproject.toml README.md LICENSE $(VENV)/.develop
