@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Sequence
@@ -11,8 +12,6 @@ from typing import Any
 import matplotlib
 import numpy as np
 import numpy.typing as npt
-import viser
-from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from splatsoil.comparison import Comparator
@@ -43,7 +42,8 @@ class Column:
 
     Attributes:
         positions: particles (n, 3) in m by frame.
-        splats: Gaussians by frame: centres (n, 3) and covariances (n, 3, 3) in m, colours (n, 3), opacities (n, 1).
+        splats: Gaussians over the bed by frame: centres (n, 3) in m, covariances (n, 3, 3), colours (n, 3), opacities
+            (n, 1).
         quantities: by name and frame, (n,) of each particle in `UNITS`. The misfit is that of the block of the bed that
             the particle is in, in the camera in which it is largest: |observed − predicted| change since frame 0.
         pictures: (h, w, 3) by one of `PICTURES`, camera and frame.
@@ -66,8 +66,10 @@ class Column:
             return
         scene = self.model.scene()
         g = lit_gaussians(scene, scene.pose(moment.positions, moment.deformations, moment.tool))
-        arrays = (g.means, g.covariances(), g.colours, g.opacities[:, None])
-        self.splats[moment.frame] = tuple(array.numpy() for array in arrays)
+        bed, arrays = self.model.measurement.bed, (g.means, g.covariances(), g.colours, g.opacities[:, None])
+        # What surrounds the bed would hide what stands beside it.
+        outside = np.abs(arrays[0].numpy() - 0.5 * (bed.lower + bed.upper))[:, :2] > 0.55 * bed.extents[:2]
+        self.splats[moment.frame] = tuple(array.numpy()[~outside.any(axis=1)] for array in arrays)
         self._keep("speed", moment.frame, np.linalg.norm(moment.velocities, axis=1))
         self._keep("shear strain", moment.frame, shear_strain(moment.deformations))
         if moment.plastic_strains is not None:
@@ -75,9 +77,9 @@ class Column:
 
     def finish(self, force: FloatArray) -> None:
         """Draw the pictures and compare them."""
-        states = (np.stack(list(by_frame.values())) for by_frame in (self.positions, self._deformations))
-        resolution = self.model.resolution
-        trajectory = Trajectory(tuple(self.positions), *states, force, resolution.spacing, resolution)
+        positions, deformations = (np.stack(list(kept.values())) for kept in (self.positions, self._deformations))
+        frames, resolution = tuple(self.positions), self.model.resolution
+        trajectory = Trajectory(frames, positions, deformations, force, resolution.spacing, resolution)
         images = self.model.draw(trajectory, values=self.values)
         for camera, frame in images:
             strip = _bytes(self.comparator.picture(images, camera, frame))
@@ -90,14 +92,15 @@ class Column:
         """Misfit of every particle, from the residual of each block of the comparison."""
         bed, size = self.model.measurement.bed, self.comparator.block
         count = np.round(bed.extents[:2] / size).astype(int)
-        largest = {frame: np.zeros(count, dtype=np.float32) for frame in self.model.frames}
-        for label, residual in zip(self.comparator.labels, blocks, strict=True):
-            place = tuple(((np.array([label.x, label.y]) - bed.lower[:2]) / size).astype(int))
-            largest[label.frame][place] = max(largest[label.frame][place], abs(residual))
-        for frame, plan in largest.items():
-            place = ((self.positions[frame][:, :2] - bed.lower[:2]) / size).astype(int)
-            x, y = np.clip(place, 0, count - 1).T
-            self._keep("misfit", frame, plan[x, y])
+
+        def cell(places: npt.NDArray[np.floating]) -> tuple[npt.NDArray[np.int64], ...]:
+            return tuple(np.clip(((places - bed.lower[:2]) / size).astype(int), 0, count - 1).T)
+
+        labels = np.array([(label.frame, label.x, label.y) for label in self.comparator.labels])
+        for frame in self.model.frames:
+            largest, here = np.zeros(count), labels[:, 0] == frame
+            np.maximum.at(largest, cell(labels[here, 1:]), np.abs(blocks[here]))
+            self._keep("misfit", frame, largest[cell(self.positions[frame][:, :2])])
 
     def _keep(self, name: str, frame: int, values: npt.NDArray[np.floating]) -> None:
         self.quantities.setdefault(name, {})[frame] = values.astype(np.float32)
@@ -111,20 +114,17 @@ def shear_strain(deformations: npt.NDArray[np.floating]) -> Floats:
 
 
 class Viewer:
-    """What a browser shows of a set, with predictions side by side.
+    """A set, with predictions side by side or none, in the browsers that a `viser.ViserServer` serves."""
 
-    Args:
-        server: of viser.
-        measurement: bed, tool, cameras and their pictures.
-        columns: finished predictions of it; none shows the set alone.
-    """
-
-    def __init__(self, server: viser.ViserServer, measurement: Measurement, columns: Sequence[Column] = ()) -> None:
+    def __init__(self, server: Any, measurement: Measurement, columns: Sequence[Column] = ()) -> None:
         self.server, self.measurement, self.columns = server, measurement, tuple(columns)
         self.frames = self.columns[0].model.frames if columns else measurement.frames
         self._lock = threading.Lock()
-        common = set.intersection(*(set(c.quantities) for c in columns)) if columns else set()
-        self.limits = {name: self._limit(name) for name in UNITS if name in common}
+        self.limits: dict[str, float] = {}
+        for name in UNITS if columns else ():
+            if all(name in column.quantities for column in columns):
+                values = [v for column in columns for v in column.quantities[name].values()]
+                self.limits[name] = float(np.quantile(np.concatenate(values), QUANTILE)) or 1.0
         self._add_controls()
         self._add_scene()
         self.show()
@@ -134,20 +134,22 @@ class Viewer:
         with self._lock, self.server.atomic():
             frame = self.frames[self.slider.value]
             moment = frame / self.measurement.frame_rate
-            self.text.content = f"frame {frame}, {moment:.2f} s{self._scale()}"
+            name, largest = self.colour.value, self.limits.get(self.colour.value)
+            scale = f"; {name} from 0 (blue) to {largest:.3g} {UNITS[name]} (yellow)" if largest else ""
+            self.text.content = f"frame {frame}, {moment:.2f} s{scale}"
             rotation, position = self.measurement.tool.motion.pose(moment)
             for tool in self._tools:
                 tool.wxyz, tool.position = _quaternion(rotation), position
-            for name, node in self._video.items():
-                node.image = self._picture(name, frame)
+            for camera, node in self._video.items():
+                node.image = self._picture(camera, frame)
             for column, (splats, particles) in zip(self.columns, self._soil, strict=True):
-                splats.visible = self.colour.value == GAUSSIANS
-                particles.visible = not splats.visible
-                if splats.visible:
-                    splats.set_gaussians(*self._within(column.splats[frame]))
+                splats.visible, particles.visible = largest is None, largest is not None
+                if largest is None:
+                    splats.set_gaussians(*column.splats[frame])
                 else:
                     particles.points = column.positions[frame]
-                    particles.colors = self._colours(column.quantities[self.colour.value][frame])
+                    shares = np.clip(column.quantities[name][frame] / largest, 0.0, 1.0)
+                    particles.colors = _bytes(matplotlib.colormaps["viridis"](shares)[:, :3])
             for node in self._photographs:
                 node.visible = self.photographs.value
 
@@ -176,12 +178,13 @@ class Viewer:
         scene, bed, mesh = self.server.scene, self.measurement.bed, self.measurement.tool.mesh
         centre, size = 0.5 * (bed.lower + bed.upper), float(np.linalg.norm(bed.extents[:2]))
         aside = np.array([0.0, 1.2 * bed.extents[1], 0.0])
-        middle = centre - 0.5 * max(len(self.columns) - 1, 0) * aside
+        others = max(len(self.columns) - 1, 0)
         scene.set_up_direction("+z")
-        self.server.initial_camera.look_at = middle
-        self.server.initial_camera.position = middle + size * np.array([-0.3, -1.5, 1.1])
-        self._tools: list[Any] = []
-        self._soil: list[tuple[Any, Any]] = []
+        self.server.initial_camera.look_at = middle = centre - 0.5 * others * aside
+        # Photographs are taken from farther away than a prediction is looked at.
+        distance = size * (0.6 + 0.3 * others if self.columns else 1.2)
+        self.server.initial_camera.position = middle + distance * np.array([-0.3, -1.2, 1.0])
+        self._tools, self._soil = [], []
         for k in range(max(len(self.columns), 1)):
             # The first stands at the back, where labels don't hide another.
             name, shift = f"/prediction {k}" if self.columns else "/set", -k * aside
@@ -193,29 +196,27 @@ class Viewer:
                 column, above = self.columns[k], [centre[0], bed.upper[1], bed.upper[2]]
                 scene.add_label(f"{name}/title", column.title, position=above, anchor="bottom-center")
                 first = self.frames[0]
-                splats = scene.add_gaussian_splats(f"{name}/splats", *self._within(column.splats[first]))
+                splats = scene.add_gaussian_splats(f"{name}/splats", *column.splats[first])
                 points, spacing = column.positions[first], column.model.resolution.spacing
-                particles = scene.add_point_cloud(
-                    f"{name}/particles", points, (0, 0, 0), point_size=spacing, point_shape="circle", visible=False
-                )
+                how: dict[str, Any] = {"point_size": spacing, "point_shape": "circle", "precision": "float32"}
+                particles = scene.add_point_cloud(f"{name}/particles", points, (0, 0, 0), visible=False, **how)
                 self._soil.append((splats, particles))
         self._photographs = [
             self._add_camera(f"/photographs/{k}", view.camera, _small(view), 0.05 * size)
             for k, view in enumerate(self.measurement.views)
         ]
         self._video = {
-            name: self._add_camera(f"/video/{name}", camera, self._picture(name, self.frames[0]), 0.12 * size)
+            name: self._add_camera(f"/video/{name}", camera, self._picture(name, self.frames[0]), 0.08 * size)
             for name, camera in self.measurement.cameras.items()
         }
 
     def _add_camera(self, name: str, camera: Camera, picture: Bytes, scale: float) -> Any:
         """A frustum with its picture, through which a click looks. That its axis pierces the middle is viser's idea."""
         opencv = camera.camera_to_world[:3, :3] * [1.0, -1.0, -1.0]
-        field_of_view, aspect = 2.0 * np.arctan(0.5 * camera.height / camera.fy), camera.width / camera.height
-        pose = {"wxyz": _quaternion(opencv), "position": camera.position}
-        node = self.server.scene.add_camera_frustum(
-            name, float(field_of_view), aspect, scale=scale, thickness=0.01 * scale, image=picture, **pose
-        )
+        shape = 2.0 * math.atan(0.5 * camera.height / camera.fy), camera.width / camera.height
+        pose: dict[str, Any] = {"wxyz": _quaternion(opencv), "position": camera.position}
+        how: dict[str, Any] = {"scale": scale, "thickness": 0.01 * scale, "image": picture}
+        node = self.server.scene.add_camera_frustum(name, *shape, **pose, **how)
 
         @node.on_click
         def _(event: Any) -> None:
@@ -229,39 +230,13 @@ class Viewer:
             return self.columns[0].pictures[self.picture.value, camera, frame]
         return _small(self.measurement.video_frame(camera, frame))
 
-    def _within(self, splats: tuple[Floats, ...]) -> tuple[Floats, ...]:
-        """Gaussians at the bed alone, where the surroundings of one prediction would cover another."""
-        if len(self.columns) == 1:
-            return splats
-        bed = self.measurement.bed
-        slack = 0.05 * bed.extents[:2]
-        plan = splats[0][:, :2]
-        inside = np.all((plan > bed.lower[:2] - slack) & (plan < bed.upper[:2] + slack), axis=1)
-        return tuple(array[inside] for array in splats)
-
-    def _limit(self, name: str) -> float:
-        values = np.concatenate([v for column in self.columns for v in column.quantities[name].values()])
-        return float(np.quantile(values, QUANTILE)) or 1.0
-
-    def _colours(self, values: Floats) -> Bytes:
-        """(n, 3), from dark blue at 0 to yellow at the limit."""
-        shares = np.clip(values / self.limits[self.colour.value], 0.0, 1.0)
-        return _bytes(matplotlib.colormaps["viridis"](shares)[:, :3])
-
-    def _scale(self) -> str:
-        name = self.colour.value
-        return f"; {name} from 0 (blue) to {self.limits[name]:.3g} {UNITS[name]} (yellow)" if name in UNITS else ""
-
 
 def _small(frame: Frame) -> Bytes:
-    """A photograph without distortion, no wider than `WIDEST`."""
-    picture = Image.fromarray(_bytes(frame.undistorted_image()))
-    picture.thumbnail((WIDEST, WIDEST))
-    return np.asarray(picture)
+    step = math.ceil(frame.camera.width / WIDEST)
+    return _bytes(frame.undistorted_image()[::step, ::step])
 
 
 def _bytes(colours: npt.NDArray[np.floating]) -> Bytes:
-    """Colours in [0, 1] as whole numbers."""
     return np.rint(255.0 * np.clip(colours, 0.0, 1.0)).astype(np.uint8)
 
 

@@ -6,7 +6,6 @@ import importlib.util
 import io
 from contextlib import redirect_stdout
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -17,7 +16,6 @@ from splatsoil.commands._options import command_line
 from splatsoil.errors import ParameterError, RunError
 
 if TYPE_CHECKING:
-    from splatsoil.commands._progress import Report
     from splatsoil.measurement import Measurement
     from splatsoil.view import Column
 
@@ -64,7 +62,7 @@ def run(config: Config) -> int:
 
 
 def interrupted(config: Config) -> str:
-    """Nothing is kept."""
+    """How to see it again."""
     options = (("--beside", config.beside, None), ("--port", config.port, 8080), ("--device", config.device, "auto"))
     return f"show it again with: {command_line('view', (config.folder,), options)}"
 
@@ -99,13 +97,10 @@ def _loaded(config: Config) -> tuple[Measurement, list[Column]]:
         comparator = Comparator(model.measurement, surface=model.reconstruction.surface, frames=model.frames)
         for fit in (data.fit, *([data.fits[config.beside]] if config.beside else [])):
             values, report = estimates(fit), begin(fit["name"])
-            title = f"{fit['name']}: " + ", ".join(f"{name} {value:.4g}" for name, value in values.items())
+            said = (f"{n} {p['estimate']:.4g} ± {p['std']:.2g} {p['unit']}" for n, p in fit["parameters"].items())
             shown = model.variant(effects=experiments.Chosen.of(fit).effects)
-            column = Column(title, shown, values, comparator)
-            replay(shown, values, shown.recorded, [column], progress=partial(_say, report))
+            column = Column(f"{fit['name']}: {', '.join(said)}", shown, values, comparator)
+            progress = lambda frame, last, say=report: say(f"frame {frame}", frame / last)  # noqa: E731
+            replay(shown, values, shown.recorded, [column], progress=progress)
             columns.append(column)
     return model.measurement, columns
-
-
-def _say(report: Report, frame: int, last: int) -> None:
-    report(f"frame {frame}", frame / (last or 1))
