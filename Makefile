@@ -4,6 +4,7 @@
 #   make test     the tests
 #   make test-slow  the tests that take minutes: whole reconstructions and simulations of the example sets
 #   make lint     formatting, lint, unused code and types
+#   make readme   docs/readme.webp, the README's picture, from the run of make demo
 #   make docs     the documentation as a site, build/site/index.html
 #   make clean    remove what these made, the virtual environment included; runs/ stays
 #
@@ -22,7 +23,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 PACKAGES := splatsoil envs inverse benchmarks
 SOURCES := $(shell find $(PACKAGES) -type f -not -path '*/__pycache__/*')
 
-.PHONY: demo test test-slow lint docs clean
+.PHONY: demo test test-slow lint readme docs clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.use
@@ -37,9 +38,13 @@ test-slow: $(VENV)/.develop
 
 # Static checkers cannot see that envs/, inverse/ and benchmarks/ install as splatsoil.*, so mypy gets the built package.
 lint: $(VENV)/.develop build/installed/.stamp
-	$(BIN)/ruff format --check $(PACKAGES) tests examples
-	$(BIN)/ruff check $(PACKAGES) tests examples
+	$(BIN)/ruff format --check $(PACKAGES) tests examples mkdocs_hooks.py
+	$(BIN)/ruff check $(PACKAGES) tests examples mkdocs_hooks.py
+	$(BIN)/vulture
 	cd build/installed && "$(abspath $(BIN))/mypy" --config-file "$(CURDIR)/pyproject.toml" -p splatsoil
+
+readme: demo
+	$(BIN)/splatsoil benchmark readme runs/demo docs/readme.webp
 
 docs: $(VENV)/.docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
