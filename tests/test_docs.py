@@ -27,6 +27,6 @@ def test_the_site_builds_without_a_warning(repository: Path, tmp_path: Path) -> 
     )
     assert built.returncode == 0, built.stderr
     readme = (repository / "README.md").read_text()
-    bold = re.findall(r"\*\*([^`*]+)\*\*", readme.split("## When not to trust it\n")[1].split("\n## ")[0])
+    bold = re.findall(r"^- \*\*([^`*]+)\*\*", readme.split("## When not to trust it\n")[1], flags=re.MULTILINE)
     page = (tmp_path / "site" / "trust" / "index.html").read_text()
     assert bold and all(words in page for words in bold), "the README's list is a page"
