@@ -177,7 +177,7 @@ class Viewer:
     def _add_scene(self) -> None:
         scene, bed, mesh = self.server.scene, self.measurement.bed, self.measurement.tool.mesh
         centre, size = 0.5 * (bed.lower + bed.upper), float(np.linalg.norm(bed.extents[:2]))
-        aside = np.array([0.0, 1.2 * bed.extents[1], 0.0])
+        aside = np.array([0.0, 1.4 * bed.extents[1], 0.0])
         others = max(len(self.columns) - 1, 0)
         scene.set_up_direction("+z")
         self.server.initial_camera.look_at = middle = centre - 0.5 * others * aside
