@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from matplotlib.font_manager import findfont
@@ -13,7 +14,7 @@ from PIL import Image, ImageDraw, ImageFont
 from splatsoil.api import Run, open_run
 from splatsoil.errors import RunError
 
-KINDS = ("observed", "predicted", "difference")
+KINDS: tuple[Literal["observed", "predicted", "difference"], ...] = ("observed", "predicted", "difference")
 HEADING = 28
 """Rows of pixels above the pictures."""
 PACE = 300
