@@ -37,17 +37,14 @@ def imported(name: str, file: Path) -> Iterator[str]:
 
 
 def test_no_part_imports_one_below_it(repository: Path) -> None:
-    table = (repository / "docs" / "architecture.md").read_text()
-    rows = re.findall(r"^\| (`.+?`) \|", table, flags=re.MULTILINE)
+    rows = re.findall(r"^\| (`.+?`) \|", (repository / "docs" / "architecture.md").read_text(), flags=re.MULTILINE)
     level = {part: k for k, row in enumerate(rows) for part in re.findall(r"`(.+?)`", row)}
 
     def part(name: str) -> str | None:
         found = [p for p in level if f"{name}.".startswith(f"splatsoil.{p}.")]
         return max(found, key=len, default=None)
 
-    known = modules()
-    assert len(known) > 200
-    for name, file in known.items():
+    for name, file in modules().items():
         mine = part(name)
         assert mine or name == "splatsoil", f"{name} is in no row of docs/architecture.md"
         for other in filter(None, map(part, imported(name, file))):
