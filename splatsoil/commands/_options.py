@@ -21,7 +21,7 @@ ORDER = {
     "all at once": ("run",),
     "into a measurement set": ("import", "check", "simulate"),
     "step by step": ("reconstruct", "fit", "compare", "diagnose", "add", "report"),
-    "more of a run": ("posterior", "export"),
+    "more of a run": ("posterior", "view", "export"),
     "by themselves": ("element", "benchmark"),
 }
 

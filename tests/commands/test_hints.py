@@ -28,6 +28,7 @@ GIVEN = {
     "add": "'a run' --set 'a set' --budget 9 --device cpu --json",
     "report": "'a run' --set 'a set' --json",
     "export": "'a run' --to csv ply --out 'a folder' --model diagnosis --every 5 --device cpu --json",
+    "view": "'a run' --beside base --port 8081 --device cpu",
     "design": "'a run' --set 'a set' --draws 5 --preset small --device cpu --json",
     "element": "--test isotropic --confining 5e4 --friction-angle 30 --with dilatancy 'my effects/crust.py' --set "
     "dilatancy_angle=9 --strain 0.1 --pressure 1e6 --records 20 --void-ratio 0.7 --young 1e7 --poisson 0.3 "
