@@ -49,9 +49,7 @@ def test_mckyes_factors_are_the_published_ones(angles: tuple[int, int, int], fac
     assert mckyes(*angles)[0] == pytest.approx(factor, rel=1e-3)
 
 
-@pytest.mark.parametrize(
-    "blade", [Blade(0.08, cells=8.0), Blade(0.08, rake=60.0, cells=8.0), Blade(0.08, friction_angle=25.0, cells=8.0)]
-)
+@pytest.mark.parametrize("blade", [Blade(0.08), Blade(0.08, rake=60.0, cells=8.0), Blade(0.08, friction_angle=25.0)])
 def test_a_smooth_blade_bears_passive_pressure(blade: Blade) -> None:
     assert blade.force("cpu") == pytest.approx(blade.expected, rel=SCATTER)
 
