@@ -181,8 +181,5 @@ def _patterned(body: Body, generator: np.random.Generator) -> Body:
     factor = 1.0 + body.grain * cube[place[:, 0], place[:, 1], place[:, 2]]
     normals = np.repeat(np.asarray(mesh.face_normals), 3, axis=0)
     return Body(
-        corners,
-        np.arange(len(corners)).reshape(-1, 3),
-        normals,
-        np.clip(body.colours[:1] * factor[:, None], 0.0, 1.0),
+        corners, np.arange(len(corners)).reshape(-1, 3), normals, np.clip(body.colours[:1] * factor[:, None], 0.0, 1.0)
     )

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import warp as wp
-from splatsoil.benchmarks.numerics import FloatArray
+from splatsoil.benchmarks._truth import FloatArray
 
 from splatsoil.errors import MeasurementError, RunError, SimulationError
 from splatsoil.measurement import Measurement
@@ -154,6 +154,7 @@ def plough(
     frames: Iterable[int],
     device: str = "cpu",
     *,
+    begin: int = 0,
     progress: Callable[[int, int], None] = lambda frame, last: None,
 ) -> list[Run]:
     """Run the worlds side by side, each in a box of its own, to the last frame.
@@ -161,8 +162,9 @@ def plough(
     Args:
         worlds: soils, beds, tools and motions.
         numerics: of the solver.
-        frames: to keep, of those from 1 on.
+        frames: to keep, of those after the first.
         device: Warp device name.
+        begin: frame at which the worlds' particles rest and the run begins.
         progress: called with (frame, last frame) after each.
 
     Returns:
@@ -190,11 +192,11 @@ def plough(
     now, following = states
     frame_time = 1.0 / rates.pop()
     step = frame_time / numerics.substeps
-    wanted = sorted(f for f in frames if f > 0)
+    wanted = sorted(f for f in frames if f > begin)
     ends = np.cumsum([len(w.particles) for w in worlds])[:-1]
     found: list[dict[int, FloatArray]] = [{} for _ in worlds]
     force = np.zeros((len(worlds), wanted[-1], 3))
-    for frame in range(1, wanted[-1] + 1):
+    for frame in range(begin + 1, wanted[-1] + 1):
         start = (frame - 1) * frame_time
         ways = [step_poses(m.tool.motion, start, frame_time, numerics.substeps) for m in measurements]
         for poses in zip(*ways, strict=True):

@@ -10,26 +10,24 @@
 | `both` | the same, trained on the N calls that `bo` chose: what `splatsoil fit` says |
 | `direct` | emcee on the simulator itself: N calls are N steps of walkers |
 
-The calls go to an emulated landscape: real simulations of the world, made once and kept, through an emulator of many
-points; chance is drawn from the measured scatter between seeds. So a thousand calls take a second, and every way meets
-the same landscape; what the emulator doesn't show of the simulator isn't tested. ``--direct-simulator`` calls the
-simulator itself instead (hours on a CPU).
+The calls go to an emulator of real simulations, made once and kept; each call has a draw of the measured seed-to-seed
+scatter. So a thousand calls take a second, and every way meets the same landscape; what the emulator does not show of
+the simulator is not tested. ``--direct-simulator`` calls the simulator itself instead (hours on a CPU).
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
 import emcee
 import numpy as np
 import numpy.typing as npt
-from splatsoil.benchmarks._common import output_options, simulated, stamp, ticker, world_options, write_result
-from splatsoil.benchmarks._simulations import FEWEST, density_of
+from splatsoil.benchmarks._common import at_least, output_options, stamp, ticker, write_result
+from splatsoil.benchmarks._simulations import FEWEST, density_of, simulated, world_parser
 from splatsoil.envs.synthetic import SyntheticProblem
 from splatsoil.envs.together import attempt
 from splatsoil.inverse.bayesopt import PAPER, BayesianOptimiser, Search
@@ -223,12 +221,11 @@ def run(
     direct: Sequence[int] = DIRECT_BUDGETS,
     seeds: int = 12,
     pool: Executor | None = None,
-    progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
     """Errors, widths and coverage of all ways over seeds, in physical units."""
     space = world.space
     rows: dict[tuple[str, int], list[dict[str, Any]]] = {}
-    pool = pool or Serial()
+    report, pool = ticker("truths"), pool or Serial()
     jobs = [(world, ways, budgets, direct, chance, seed) for seed in range(seeds)]
     for seed, answers_of in enumerate(in_order(pool, trial, jobs)):
         truth = np.random.default_rng([seed, 29]).uniform(-INNER, INNER, len(space))
@@ -242,8 +239,7 @@ def run(
                     "seconds": answer.seconds,
                 }
                 rows.setdefault((way, budget), []).append(entry)
-        if progress is not None:
-            progress(seed + 1, seeds)
+        report(seed + 1, seeds)
     entries = []
     for (way, budget), found in rows.items():
         error, width = (np.array([f[key] for f in found]) for key in ("error", "width"))
@@ -275,7 +271,7 @@ def table(result: dict[str, Any]) -> str:
             "",
             f"**{parameter['name']}**",
             "",
-            "| way | calls | mean abs. error ± its spread | 90 % interval's width | holds the truth | own time |",
+            "| way | calls | mean abs. error ± its spread | 90 % interval's width | contains the truth | own time |",
             "|---|---|---|---|---|---|",
         ]
         for e in result["entries"]:
@@ -289,29 +285,20 @@ def table(result: dict[str, Any]) -> str:
 def figure(result: dict[str, Any]) -> Figure:
     """Error and interval width against calls, for each parameter."""
     from matplotlib.figure import Figure
-    from matplotlib.ticker import FixedLocator, FormatStrFormatter, LogLocator, NullLocator
 
     count = len(result["parameters"])
     drawn = Figure(figsize=(8.4, 2.8 * count), layout="constrained")
-    axes = drawn.subplots(count, 2, squeeze=False)
-    for i, (row, parameter) in enumerate(zip(axes, result["parameters"], strict=True)):
+    for i, (row, parameter) in enumerate(
+        zip(drawn.subplots(count, 2, squeeze=False), result["parameters"], strict=True)
+    ):
         for way in WAYS:
             found = [e for e in result["entries"] if e["way"] == way]
-            if not found:
-                continue
             calls = [e["calls"] for e in found]
             standard = [e["mae_std"][i] / result["seeds"] ** 0.5 for e in found]
             row[0].errorbar(calls, [e["mae"][i] for e in found], standard, color=COLOURS[way], marker="o", label=way)
             row[1].plot(calls, [e["width_90"][i] for e in found], color=COLOURS[way], marker="o", label=way)
         for axis, what in zip(row, ("mean absolute error", "90 % interval's width"), strict=True):
-            axis.set_xscale("log")
-            axis.set_yscale("log")
-            axis.xaxis.set_major_locator(FixedLocator(sorted({e["calls"] for e in result["entries"]})))
-            axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-            for one in (axis.xaxis, axis.yaxis):
-                one.set_major_formatter(FormatStrFormatter("%g"))
-                one.set_minor_locator(NullLocator())
-            axis.set_xlabel("simulator calls")
+            axis.set(xscale="log", yscale="log", xlabel="simulator calls")
             axis.set_title(f"{parameter['name'].replace('_', ' ')}: {what} [{parameter['unit']}]", fontsize=9)
         row[0].legend(fontsize=7)
     return drawn
@@ -319,56 +306,49 @@ def figure(result: dict[str, Any]) -> Figure:
 
 def main(arguments: list[str] | None = None) -> int:
     """Command line; exit code 0."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    world_options(parser)
-    parser.add_argument("--seeds", type=int, default=12, help="truths, each with its own chance")
+    parser = world_parser(__doc__)
+    parser.add_argument("--seeds", type=at_least(1), default=12, help="truths, each with its own scatter")
     parser.add_argument("--budgets", type=int, nargs="+", default=list(BUDGETS))
     parser.add_argument(
         "--direct-budgets", type=int, nargs="+", default=list(DIRECT_BUDGETS), help="calls of emcee on the simulator"
     )
     parser.add_argument("--ways", nargs="+", choices=WAYS, default=list(WAYS))
-    parser.add_argument("--simulations", type=int, default=64, help="behind the emulated landscape")
-    parser.add_argument("--direct-simulator", action="store_true", help="call the made-up world's simulator itself")
+    parser.add_argument("--simulations", type=at_least(1), default=64, help="behind the emulated landscape")
+    parser.add_argument("--direct-simulator", action="store_true", help="call the synthetic set's simulator itself")
     output_options(parser)
     options = parser.parse_args(arguments)
     hush()
     if options.direct_simulator and options.set is not None:
-        raise ParameterError("--direct-simulator: the truth of a measured set is one; only the made-up world has many")
+        raise ParameterError("--direct-simulator: the truth of a measured set is one; only the synthetic one has many")
     began = time.perf_counter()
     with executor(options.executor) as pool:
-        return _run(options, pool, began)
-
-
-def _run(options: argparse.Namespace, pool: Executor, began: float) -> int:
-    """Simulate, compare, write, print."""
-    data, file = simulated(options, options.simulations, pool)
-    density = density_of(data.space, data.points, -data.residuals, np.zeros(data.residuals.shape[1]), 0.0)
-    noise = density.noise
-    if options.direct_simulator:
-        world: World = SimulatedWorld(options.parameters, options.effects, options.preset, options.device)
-        landscape = f"The simulator of the made-up world itself, preset `{options.preset}`"
-        # The scatter of features between seeds, as far as the scores show it, in the features' own space.
-        chance = noise.basis @ noise.chance @ noise.basis.T
-    else:
-        world, chance = EmulatedWorld(density), noise.chance
-        source = "the made-up world" if options.set is None else str(options.set)
-        landscape = (
-            f"An emulated landscape: {len(chance)} scores of {len(data.points)} simulations of {source}, preset "
-            f"`{options.preset}`"
-        )
-    result = {
-        "benchmark": "bo-vs-mcmc",
-        "landscape": landscape,
-        **run(
+        data, file = simulated(options, options.simulations, pool)
+        density = density_of(data.space, data.points, -data.residuals, np.zeros(data.residuals.shape[1]), 0.0)
+        noise = density.noise
+        if options.direct_simulator:
+            world: World = SimulatedWorld(options.parameters, options.effects, options.preset, options.device)
+            landscape = f"The simulator of the synthetic set itself, preset `{options.preset}`"
+            # the scatter of features between seeds, as far as the scores show it, in the features' own space
+            scatter = noise.basis @ noise.chance @ noise.basis.T
+        else:
+            world, scatter = EmulatedWorld(density), noise.chance
+            source = "the synthetic set" if options.set is None else str(options.set)
+            landscape = (
+                f"{len(scatter)} scores of {len(data.points)} simulations of {source}, `{options.preset}`, emulated"
+            )
+        found = run(
             world,
-            chance,
+            scatter,
             ways=options.ways,
             budgets=options.budgets,
             direct=options.direct_budgets,
             seeds=options.seeds,
             pool=pool,
-            progress=ticker("truths"),
-        ),
+        )
+    result = {
+        "benchmark": "bo-vs-mcmc",
+        "landscape": landscape,
+        **found,
         "simulations": str(file),
         **stamp(options.device),
         "seconds": time.perf_counter() - began,
