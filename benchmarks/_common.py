@@ -29,7 +29,7 @@ PARTS = ("measurement", "splats", "reconstruction", "soil", "mpm", "scene", "exp
 FILES = ("parameters.py", "model.py", "comparison.py", "robust_loss.py")
 BESIDE = ("splatsoil.envs", "splatsoil.inverse")
 #: Packages whose versions are stated.
-PACKAGES = ("numpy", "torch", "warp-lang", "newton", "gsplat")
+PACKAGES = ("numpy", "torch", "warp-lang", "newton")
 
 
 def here(name: str) -> str:

@@ -8,11 +8,11 @@
 | `paper` | the same with Hsiao and Kumar's settings: one random start, expected improvement |
 | `mcmc` | emcee on a comparison's posterior, by an emulator of the features trained on N space-filling calls |
 | `both` | the same, trained on the N calls that `bo` chose: what `splatsoil fit` says |
-| `direct` | emcee on the simulator itself: N calls are N steps of walkers |
+| `direct` | emcee on the calls themselves: N calls are N steps of walkers |
 
 The calls go to an emulator of real simulations, made once and kept; each call has a draw of the measured seed-to-seed
 scatter. So a thousand calls take a second, and every way meets the same landscape; what the emulator does not show of
-the simulator is not tested. ``--direct-simulator`` calls the simulator itself instead (hours on a CPU).
+the simulator is not tested.
 """
 
 from __future__ import annotations
@@ -21,22 +21,20 @@ import json
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import emcee
 import numpy as np
 import numpy.typing as npt
 from splatsoil.benchmarks._common import at_least, output_options, stamp, ticker, write_result
 from splatsoil.benchmarks._simulations import FEWEST, density_of, simulated, world_parser
-from splatsoil.envs.synthetic import SyntheticProblem
-from splatsoil.envs.together import attempt
 from splatsoil.inverse.bayesopt import PAPER, BayesianOptimiser, Search
 from splatsoil.inverse.executors import Executor, Serial, executor, in_order
 from splatsoil.inverse.mcmc import sample
 from splatsoil.inverse.posterior import Density
 from splatsoil.inverse.surrogate import sobol
 
-from splatsoil.errors import ParameterError
+from splatsoil.files import plain
 from splatsoil.parameters import ParameterSpace
 from splatsoil.quiet import hush
 
@@ -53,20 +51,8 @@ INNER = 0.8
 COLOURS = {"bo": "#c44e52", "paper": "#dd8452", "mcmc": "#4c72b0", "both": "#8172b3", "direct": "#55a868"}
 
 
-class World(Protocol):
-    """A simulator with an observation."""
-
-    space: ParameterSpace
-
-    def observe(self, truth: FloatArray, rng: np.random.Generator) -> None:
-        """Make an observation of a truth (n,) in [-1, 1]^n."""
-
-    def call(self, point: FloatArray, rng: np.random.Generator) -> tuple[float, FloatArray]:
-        """Simulate a point (n,): loss, and predicted minus observed features (b,)."""
-
-
 class EmulatedWorld:
-    """Calls answered by an emulator of many real simulations, with chance drawn from its measured covariance.
+    """Calls answered by an emulator of many real simulations, with seed-to-seed scatter of its measured covariance.
 
     Features are a comparison's scores; the loss is their mean square residual over what the prior's middle would leave
     on average.
@@ -81,9 +67,11 @@ class EmulatedWorld:
         self.observed = np.zeros(self.count)
 
     def observe(self, truth: FloatArray, rng: np.random.Generator) -> None:
+        """Make an observation of a truth (n,) in [-1, 1]^n."""
         self.observed = self._simulate(truth, rng)
 
     def call(self, point: FloatArray, rng: np.random.Generator) -> tuple[float, FloatArray]:
+        """Simulate a point (n,): loss, and predicted minus observed features (b,)."""
         residual = self._simulate(point, rng) - self.observed
         return float(np.sum(residual**2)) / self.unit, residual
 
@@ -93,24 +81,6 @@ class EmulatedWorld:
 
     def _simulate(self, point: FloatArray, rng: np.random.Generator) -> FloatArray:
         return self._emulated(point[None])[0] + self.factor @ rng.standard_normal(self.count)
-
-
-class SimulatedWorld:
-    """Calls answered by the simulator of PlowSand-v0's made-up world."""
-
-    def __init__(self, parameters: Sequence[str], effects: Sequence[str], preset: str, device: str) -> None:
-        self.problem = SyntheticProblem(parameters, effects, preset=preset, device=device)
-        self.space = self.problem.space
-
-    def observe(self, truth: FloatArray, rng: np.random.Generator) -> None:
-        self.problem.place(self.space.to_dict(self.space.from_unit(truth)), int(rng.integers(2**31)))
-
-    def call(self, point: FloatArray, rng: np.random.Generator) -> tuple[float, FloatArray]:
-        values = self.space.to_dict(self.space.from_unit(point))
-        found = attempt(self.problem, values, int(rng.integers(2**31)))
-        if found.loss is None:
-            raise ParameterError(f"a simulation failed at {values} ({found.message}); choose other parameters")
-        return found.loss, -found.blocks
 
 
 @dataclass(frozen=True)
@@ -123,7 +93,9 @@ class Answer:
     seconds: float
 
 
-def play(world: World, budgets: Sequence[int], seed: int, search: Search | None) -> tuple[dict[int, Answer], Any]:
+def play(
+    world: EmulatedWorld, budgets: Sequence[int], seed: int, search: Search | None
+) -> tuple[dict[int, Answer], Any]:
     """Bayesian optimisation: an answer at each budget, and the calls (points, features)."""
     rng = np.random.default_rng([seed, 31])
     optimiser = BayesianOptimiser(len(world.space), seed=seed, search=search)
@@ -157,11 +129,10 @@ def sample_emulated(space: ParameterSpace, points: FloatArray, features: FloatAr
     return Answer(chains.flat.mean(axis=0), low, high, time.perf_counter() - began)
 
 
-def sample_directly(world: World, budgets: Sequence[int], seed: int, chance: FloatArray) -> dict[int, Answer]:
-    """emcee on the simulator: each density is a call. Its own chance adds to the observation's."""
-    rng = np.random.default_rng([seed, 37])
-    n = len(world.space)
-    inverse = np.linalg.pinv(2.0 * chance)
+def sample_directly(world: EmulatedWorld, budgets: Sequence[int], seed: int) -> dict[int, Answer]:
+    """emcee on the calls: each density is one. A call's seed-to-seed scatter adds to the observation's."""
+    rng, n = np.random.default_rng([seed, 37]), len(world.space)
+    inverse = np.linalg.pinv(2.0 * world.density.noise.chance)
 
     def density(point: FloatArray) -> float:
         if np.any(np.abs(point) > 1.0):
@@ -185,36 +156,35 @@ def sample_directly(world: World, budgets: Sequence[int], seed: int, chance: Flo
     return answers
 
 
+def truth_of(seed: int, n: int) -> FloatArray:
+    """A truth (n,) in the middle of [-1, 1]^n."""
+    return np.random.default_rng([seed, 29]).uniform(-INNER, INNER, n)
+
+
 def trial(
-    world: World, ways: Sequence[str], budgets: Sequence[int], direct: Sequence[int], chance: FloatArray, seed: int
+    world: EmulatedWorld, ways: Sequence[str], budgets: Sequence[int], direct: Sequence[int], seed: int
 ) -> dict[str, dict[int, Answer]]:
     """All ways on one truth, drawn by the seed."""
-    n = len(world.space)
-    rng = np.random.default_rng([seed, 29])
-    world.observe(rng.uniform(-INNER, INNER, n), rng)
+    n, rng = len(world.space), np.random.default_rng([seed, 41])
+    world.observe(truth_of(seed, n), rng)
     usable = [b for b in budgets if b >= FEWEST]
     out: dict[str, dict[int, Answer]] = {}
-    calls = None
     if "bo" in ways or "both" in ways:
-        answers, calls = play(world, budgets, seed, None)
-        out["bo"] = answers
+        out["bo"], (points, features) = play(world, budgets, seed, None)
+        out["both"] = {b: sample_emulated(world.space, points[:b], features[:b], seed) for b in usable}
     if "paper" in ways:
-        out["paper"] = play(world, budgets, seed, PAPER)[0]
+        out["paper"], _ = play(world, budgets, seed, PAPER)
     if "mcmc" in ways:
-        noise = np.random.default_rng([seed, 41])
         points = sobol(max(budgets), n, seed)
-        features = np.array([world.call(p, noise)[1] for p in points])
+        features = np.array([world.call(p, rng)[1] for p in points])
         out["mcmc"] = {b: sample_emulated(world.space, points[:b], features[:b], seed) for b in usable}
-    if "both" in ways and calls is not None:
-        out["both"] = {b: sample_emulated(world.space, calls[0][:b], calls[1][:b], seed) for b in usable}
     if "direct" in ways:
-        out["direct"] = sample_directly(world, direct, seed, chance)
+        out["direct"] = sample_directly(world, direct, seed)
     return {way: answers for way, answers in out.items() if way in ways}
 
 
 def run(
-    world: World,
-    chance: FloatArray,
+    world: EmulatedWorld,
     *,
     ways: Sequence[str] = WAYS,
     budgets: Sequence[int] = BUDGETS,
@@ -223,43 +193,26 @@ def run(
     pool: Executor | None = None,
 ) -> dict[str, Any]:
     """Errors, widths and coverage of all ways over seeds, in physical units."""
-    space = world.space
-    rows: dict[tuple[str, int], list[dict[str, Any]]] = {}
-    report, pool = ticker("truths"), pool or Serial()
-    jobs = [(world, ways, budgets, direct, chance, seed) for seed in range(seeds)]
-    for seed, answers_of in enumerate(in_order(pool, trial, jobs)):
-        truth = np.random.default_rng([seed, 29]).uniform(-INNER, INNER, len(space))
+    space, report = world.space, ticker("truths")
+    rows: dict[tuple[str, int], list[tuple[FloatArray, FloatArray, npt.NDArray[np.bool_], float]]] = {}
+    jobs = [(world, ways, budgets, direct, seed) for seed in range(seeds)]
+    for seed, answers_of in enumerate(in_order(pool or Serial(), trial, jobs)):
+        truth = truth_of(seed, len(space))
         for way, answers in answers_of.items():
             for budget, answer in answers.items():
-                low, high = space.from_unit(answer.low), space.from_unit(answer.high)
-                entry = {
-                    "error": (space.from_unit(answer.estimate) - space.from_unit(truth)).tolist(),
-                    "width": (high - low).tolist(),
-                    "holds": ((answer.low <= truth) & (truth <= answer.high)).tolist(),
-                    "seconds": answer.seconds,
-                }
-                rows.setdefault((way, budget), []).append(entry)
+                error = space.from_unit(answer.estimate) - space.from_unit(truth)
+                width = space.from_unit(answer.high) - space.from_unit(answer.low)
+                inside = (answer.low <= truth) & (truth <= answer.high)
+                rows.setdefault((way, budget), []).append((error, width, inside, answer.seconds))
         report(seed + 1, seeds)
     entries = []
-    for (way, budget), found in rows.items():
-        error, width = (np.array([f[key] for f in found]) for key in ("error", "width"))
-        entries.append(
-            {
-                "way": way,
-                "calls": budget,
-                "mae": np.abs(error).mean(axis=0).tolist(),
-                "mae_std": np.abs(error).std(axis=0, ddof=1).tolist() if len(found) > 1 else [0.0] * len(space),
-                "width_90": width.mean(axis=0).tolist(),
-                "coverage_90": np.mean([f["holds"] for f in found], axis=0).tolist(),
-                "seconds": float(np.mean([f["seconds"] for f in found])),
-                "trials": found,
-            }
-        )
-    return {
-        "parameters": [{"name": p.name, "unit": p.unit} for p in space],
-        "seeds": seeds,
-        "entries": sorted(entries, key=lambda e: (WAYS.index(e["way"]), e["calls"])),
-    }
+    for (way, budget), found in sorted(rows.items(), key=lambda row: (WAYS.index(row[0][0]), row[0][1])):
+        error, width, inside, seconds = (np.array(column) for column in zip(*found, strict=True))
+        spread = np.abs(error).std(axis=0, ddof=1) if len(found) > 1 else np.zeros(len(space))
+        entry = {"way": way, "calls": budget, "mae": np.abs(error).mean(axis=0), "mae_std": spread}
+        entry |= {"width_90": width.mean(axis=0), "coverage_90": inside.mean(axis=0), "seconds": float(seconds.mean())}
+        entries.append(plain({**entry, "errors": error}))
+    return {"parameters": [{"name": p.name, "unit": p.unit} for p in space], "seeds": seeds, "entries": entries}
 
 
 def table(result: dict[str, Any]) -> str:
@@ -314,37 +267,18 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--ways", nargs="+", choices=WAYS, default=list(WAYS))
     parser.add_argument("--simulations", type=at_least(1), default=64, help="behind the emulated landscape")
-    parser.add_argument("--direct-simulator", action="store_true", help="call the synthetic set's simulator itself")
     output_options(parser)
     options = parser.parse_args(arguments)
     hush()
-    if options.direct_simulator and options.set is not None:
-        raise ParameterError("--direct-simulator: the truth of a measured set is one; only the synthetic one has many")
     began = time.perf_counter()
     with executor(options.executor) as pool:
         data, file = simulated(options, options.simulations, pool)
         density = density_of(data.space, data.points, -data.residuals, np.zeros(data.residuals.shape[1]), 0.0)
-        noise = density.noise
-        if options.direct_simulator:
-            world: World = SimulatedWorld(options.parameters, options.effects, options.preset, options.device)
-            landscape = f"The simulator of the synthetic set itself, preset `{options.preset}`"
-            # the scatter of features between seeds, as far as the scores show it, in the features' own space
-            scatter = noise.basis @ noise.chance @ noise.basis.T
-        else:
-            world, scatter = EmulatedWorld(density), noise.chance
-            source = "the synthetic set" if options.set is None else str(options.set)
-            landscape = (
-                f"{len(scatter)} scores of {len(data.points)} simulations of {source}, `{options.preset}`, emulated"
-            )
-        found = run(
-            world,
-            scatter,
-            ways=options.ways,
-            budgets=options.budgets,
-            direct=options.direct_budgets,
-            seeds=options.seeds,
-            pool=pool,
-        )
+        chosen = {"ways": options.ways, "budgets": options.budgets, "direct": options.direct_budgets}
+        found = run(EmulatedWorld(density), **chosen, seeds=options.seeds, pool=pool)
+    source = "the synthetic set" if options.set is None else str(options.set)
+    count = len(density.noise.chance)
+    landscape = f"{count} scores of {len(data.points)} simulations of {source}, preset `{options.preset}`, emulated"
     result = {
         "benchmark": "bo-vs-mcmc",
         "landscape": landscape,

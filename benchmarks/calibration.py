@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,6 +26,7 @@ from splatsoil.benchmarks._simulations import Data, density_of, simulated, world
 from splatsoil.inverse.executors import Executor, Serial, executor, in_order
 from splatsoil.inverse.marginal import Marginal
 
+from splatsoil.files import plain
 from splatsoil.parameters import ParameterSpace
 from splatsoil.quiet import hush
 
@@ -55,7 +56,6 @@ def calibrate(
     sensor_std: float = 1.0,
     seed: int = 0,
     pool: Executor | None = None,
-    progress: Callable[[int, int], None] | None = None,
 ) -> list[dict[str, Any]]:
     """One entry for each truth: its rank, and whether intervals contain it, for each parameter.
 
@@ -66,9 +66,7 @@ def calibrate(
         sensor_std: noise added to a truth's features, in their unit.
         seed: of noise, training sets and draws.
         pool: where the folds are worked on; here, one after the other, by default.
-        progress: called with (done, truths).
     """
-    pool = pool or Serial()
     jobs = []
     for number, (train, test) in enumerate(folds(data, truths)):
         if training is not None and training < len(train):
@@ -79,10 +77,10 @@ def calibrate(
             train = np.concatenate([np.sort(chosen), train[train >= truths]])
         jobs.append((data, train, test, sensor_std, seed, number))
     out: list[dict[str, Any]] = []
-    for entries in in_order(pool, one_fold, jobs):
+    report = ticker("truths")
+    for entries in in_order(pool or Serial(), one_fold, jobs):
         out += entries
-        if progress is not None:
-            progress(len(out), truths)
+        report(len(out), truths)
     return out
 
 
@@ -103,19 +101,13 @@ def one_fold(
         draws = space.to_unit(np.stack([m.values[chosen] for m in marginals], axis=1))
         truth = data.points[index]
         physical = space.from_unit(truth)
-        within = {}
-        for level in LEVELS:
-            ends = [[m.quantile(0.5 + side * level / 2) for side in (-1.0, 1.0)] for m in marginals]
-            within[str(level)] = [bool(a <= t <= b) for (a, b), t in zip(ends, physical, strict=True)]
-        out.append(
-            {
-                "truth": truth.tolist(),
-                "rank": [int(r) for r in (draws < truth).sum(axis=0)],
-                "within": within,
-                "mean": draws.mean(axis=0).tolist(),
-                "std": draws.std(axis=0).tolist(),
-            }
-        )
+        ends = {level: [[m.quantile(0.5 + s * level / 2) for s in (-1, 1)] for m in marginals] for level in LEVELS}
+        inside = {
+            str(level): [bool(a <= t <= b) for (a, b), t in zip(found, physical, strict=True)]
+            for level, found in ends.items()
+        }
+        entry = {"truth": truth, "rank": (draws < truth).sum(axis=0), "within": inside}
+        out.append(plain({**entry, "mean": draws.mean(axis=0), "std": draws.std(axis=0)}))
     return out
 
 
@@ -127,14 +119,12 @@ def summarise(entries: Sequence[dict[str, Any]], space: ParameterSpace) -> dict[
         ranks = np.array([e["rank"][i] for e in entries])
         bins = np.histogram(ranks, bins=BINS, range=(-0.5, DRAWS + 0.5))[0]
         z = np.array([(e["mean"][i] - e["truth"][i]) / e["std"][i] for e in entries])
-        half = 0.5 * (p.upper - p.lower)
         parameters[p.name] = {
             "coverage": {str(level): float(np.mean([e["within"][str(level)][i] for e in entries])) for level in LEVELS},
             "ranks": bins.tolist(),
             "p_uniform": float(chisquare(bins).pvalue),
             "rms_z": float(np.sqrt(np.mean(z**2))),
             "contraction": float(np.mean([e["std"][i] for e in entries]) * np.sqrt(3.0)),
-            "mean_std": None if p.log else float(np.mean([e["std"][i] for e in entries]) * half),
             "unit": p.unit,
         }
     expected = {str(level): [float(v) / count for v in binom.interval(0.95, count, level)] for level in LEVELS}
@@ -198,7 +188,7 @@ def main(arguments: list[str] | None = None) -> int:
         data, file = simulated(options, options.truths, pool, seed=options.seed)
         truths = min(options.truths, len(data.points))
         chosen: dict[str, Any] = {"training": options.training, "sensor_std": options.sensor, "seed": options.seed}
-        entries = calibrate(data, truths, **chosen, pool=pool, progress=ticker("truths"))
+        entries = calibrate(data, truths, **chosen, pool=pool)
     result = {
         "benchmark": "calibration",
         "world": "the synthetic set of PlowSand-v0" if options.set is None else str(options.set),

@@ -230,6 +230,7 @@ def agreement(truth: Truth, found: Scan) -> dict[str, Any]:
     assert truth.force is not None
     return {
         "angle": truth.values["friction_angle"],
+        "angles": found.angles,
         "best_angle": found.best(theirs) if several else None,
         "heights_mm": 1e3 * in_patches(found.heights[at] - theirs),
         "heights_mm_at_best": 1e3 * found.residual(theirs) if several else None,
@@ -331,6 +332,7 @@ def _agreement_table(preset: str, rows: Mapping[str, Mapping[str, Any]]) -> list
     ]
     for name, row in rows.items():
         best = "–" if row["best_angle"] is None else f"{row['best_angle']:.1f}°"
+        best += " (end of the scan)" if row["best_angle"] in (row["angles"][0], row["angles"][-1]) else ""
         least = "–" if row["heights_mm_at_best"] is None else f"{row['heights_mm_at_best']:.2f}"
         cells = [name, f"{row['angle']:.1f}°", best, f"{row['heights_mm']:.2f}", least]
         soil = zip(row["cut_and_heaped_cm3"], row["their_cut_and_heaped_cm3"], strict=True)
