@@ -54,36 +54,25 @@ class Numerics:
         """Edge of the cube of soil that a particle stands for, m: two along a voxel."""
         return 0.5 * self.voxel
 
-    def refined(self) -> Numerics:
-        """Voxels of three quarters, with steps and iterations in proportion."""
-        return replace(
-            self,
-            voxel=0.75 * self.voxel,
-            substeps=math.ceil(self.substeps / 0.75),
-            iterations=math.ceil(self.iterations / 0.75),
-        )
+    def refined(self, share: float = 0.75) -> Numerics:
+        """Voxels of a share, with steps and iterations in proportion."""
+        steps, most = math.ceil(self.substeps / share), math.ceil(self.iterations / share)
+        return replace(self, voxel=share * self.voxel, substeps=steps, iterations=most)
 
     def across(self, width: float) -> Numerics:
         """As these resolve a tool 120 mm wide, one of ``width`` m: nine voxels of the defaults' or more across it."""
-        share = min(1.0, round(width, 4) / WIDTH)
-        return replace(
-            self,
-            voxel=share * self.voxel,
-            substeps=math.ceil(self.substeps / share),
-            iterations=math.ceil(self.iterations / share),
-        )
+        return self.refined(min(1.0, round(width, 4) / WIDTH))
 
     @classmethod
     def of(cls, folder: Path) -> Numerics:
-        """Those that made the measurement set; MeasurementError when ``truth.json`` doesn't tell."""
+        """Those that made the measurement set; MeasurementError when ``truth.json`` does not state them."""
         file = folder / "truth.json"
-        told = json.loads(file.read_text())
+        truth = json.loads(file.read_text())
         try:
-            return cls(float(told["voxel"]), int(told["sub"]), int(told["iterations"]))
+            return cls(float(truth["voxel"]), int(truth["sub"]), int(truth["iterations"]))
         except KeyError as error:
-            raise MeasurementError(
-                "the benchmark needs the numerics that the set was made with", file=file, field=str(error)
-            ) from error
+            text = "the benchmark needs the numerics that the set was made with"
+            raise MeasurementError(text, file=file, field=str(error)) from error
 
 
 @dataclass(frozen=True)

@@ -275,10 +275,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
     options = parser.parse_args(arguments)
     hush()
+    mark = f"information {options.preset}"
     if options.page:
-        with_section(
-            options.page, f"information {options.preset}", ""
-        )  # a page without a place for the table fails now, not at the end
+        with_section(options.page, mark, "")  # a page without a place for the table fails now, not at the end
     device, own = options.device.split(":")[0], sources([Path(__file__)])
     keep_to_one_protocol(options.out, {"preset": options.preset, "device": device, "code": own})
     with only_json() if options.json else nullcontext():
@@ -287,11 +286,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         shown = f"Preset `{options.preset}`, {options.seeds} seeds. {COMPUTED}\n\n{table(rows)}"
         write_result(options.out, {**told, "computed": COMPUTED, "rows": rows}, shown, {})
         if options.page:
-            write_text(options.page, with_section(options.page, f"information {options.preset}", shown))
-        if options.json:
-            print_json({"ok": True, **told, "rows": rows})
-        else:
-            print(shown)
+            write_text(options.page, with_section(options.page, mark, shown))
+        print_json({"ok": True, **told, "rows": rows}) if options.json else print(shown)
     return 0
 
 

@@ -48,7 +48,7 @@ from splatsoil.inverse.marginal import Marginal
 
 from splatsoil.comparison import Comparator
 from splatsoil.errors import SimulationError
-from splatsoil.files import read_json, write_json
+from splatsoil.files import plain, read_json, write_json
 from splatsoil.measurement import Measurement
 from splatsoil.model import Model
 from splatsoil.mpm import PRESETS, Preset, Resolution, simulate_together
@@ -277,29 +277,18 @@ def collect(protocol: Protocol, out: Path) -> dict[str, Any]:
     """Errors of the trials in the folder."""
     entries = []
     for angle in protocol.angles:
-        kept = [
-            read_json(out / "trials" / f"{angle:g}-{trial}-{way}.json")
-            for trial in range(protocol.trials)
-            for way in SEARCHES
-        ]
+        files = [out / "trials" / f"{angle:g}-{n}-{way}.json" for n in range(protocol.trials) for way in SEARCHES]
+        kept = [read_json(file) for file in files]
         for way in WAYS:
             trials = [entry[way] for entry in kept if entry.get(way) is not None]
             if not trials:
                 continue
-            errors, several = np.array([t["estimate"] for t in trials]) - angle, len(trials) > 1
-            entries.append(
-                {
-                    "angle": angle,
-                    "way": way,
-                    "trials": len(trials),
-                    "mae": float(np.abs(errors).mean()),
-                    "std": float(np.abs(errors).std(ddof=1)) if several else None,
-                    "bias": float(errors.mean()),
-                    "scatter": float(errors.std(ddof=1)) if several else None,
-                    "width_90": float(np.mean([t["high"] - t["low"] for t in trials])),
-                    "coverage_90": float(np.mean([t["low"] <= angle <= t["high"] for t in trials])),
-                }
-            )
+            errors = np.array([t["estimate"] for t in trials]) - angle
+            spread = {"std": np.abs(errors).std(ddof=1), "scatter": errors.std(ddof=1)} if len(trials) > 1 else {}
+            entry = {"angle": angle, "way": way, "mae": np.abs(errors).mean(), "bias": errors.mean(), **spread}
+            entry["width_90"] = np.mean([t["high"] - t["low"] for t in trials])
+            entry["coverage_90"] = np.mean([t["low"] <= angle <= t["high"] for t in trials])
+            entries.append(plain(entry))
     return {"benchmark": "paper-table", "protocol": vars(protocol), "published": PUBLISHED, "entries": entries}
 
 
@@ -316,7 +305,7 @@ def table(result: Mapping[str, Any]) -> str:
     ]
     for angle in p["angles"]:
         found = {e["way"]: e for e in result["entries"] if e["angle"] == angle}
-        cells = [f"{e['mae']:.2f}{_spread(e['std'])}°" if (e := found.get(way)) else "–" for way in WAYS]
+        cells = [_error(found[way]) if way in found else "–" for way in WAYS]
         printed = "{:.2f} ± {:.2f}°".format(*PUBLISHED[angle]) if angle in PUBLISHED else "–"
         lines.append(f"| {angle:g}° | {printed} | {' | '.join(cells)} | {TARGET[0]:g} ± {TARGET[1]:g}° |")
     lines += [
@@ -325,7 +314,7 @@ def table(result: Mapping[str, Any]) -> str:
         "|---" * 6 + "|",
     ]
     for e in result["entries"]:
-        scatter = "–" if e["scatter"] is None else f"{e['scatter']:.2f}°"
+        scatter = f"{e['scatter']:.2f}°" if "scatter" in e else "–"
         lines.append(
             f"| {e['angle']:g}° | {e['way']} | {e['bias']:+.2f}° | {scatter} | {e['width_90']:.2f}° | "
             f"{100.0 * e['coverage_90']:.0f} % |"
@@ -333,9 +322,9 @@ def table(result: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _spread(value: float | None) -> str:
-    """Of several trials; one has none."""
-    return "" if value is None else f" ± {value:.2f}"
+def _error(entry: Mapping[str, Any]) -> str:
+    """Mean absolute error, and its spread over several trials."""
+    return f"{entry['mae']:.2f} ± {entry['std']:.2f}°" if "std" in entry else f"{entry['mae']:.2f}°"
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -50,7 +50,6 @@ class Case:
 
     Attributes:
         name: of its file.
-        kind: one case of each kind is simulated on finer voxels.
         truth: bed, tool, motion and true parameters; its particles are used only if ``made``.
         numerics: of the independent solver.
         frames: at which solvers are compared, from 1 on.
@@ -60,7 +59,6 @@ class Case:
     """
 
     name: str
-    kind: str
     truth: Truth
     numerics: Numerics
     frames: tuple[int, ...]
@@ -74,7 +72,6 @@ class Case:
         setup = scene.setup()
         return cls(
             name,
-            f"{scene.tool} {scene.width:g} m, {scene.tilt:g}°, friction {scene.tool_friction:g}",
             Truth(setup.experiment(), {}, 0.0, {"friction_angle": scene.angle}, ()),
             numerics,
             FRAMES,
@@ -96,7 +93,7 @@ class Case:
         except MeasurementError:
             made = False
         about = {"set": name, **truth.values, "numerics": asdict(numerics)}
-        return cls(name, name, truth, numerics, truth.frames, about, lambda spacing: truth.start(spacing, 0), made)
+        return cls(name, truth, numerics, truth.frames, about, lambda spacing: truth.start(spacing, 0), made)
 
     @property
     def angle(self) -> float:
@@ -397,7 +394,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--offsets", nargs="*", type=float, default=list(OFFSETS), help="of our angles, degrees")
     parser.add_argument("--seeds", type=at_least(1), default=2, help="particle seeds that ours are averaged over")
     parser.add_argument("--side-by-side", type=at_least(1), default=4, help="scenes that Newton ploughs at a time")
-    parser.add_argument("--refine", action="store_true", help="Newton on finer voxels, too, for one scene of each kind")
+    parser.add_argument("--refine", action="store_true", help="Newton on finer voxels, too")
     parser.add_argument("--voxel", type=float, default=Numerics.voxel, help="edge of Newton's cells, m")
     parser.add_argument("--substeps", type=at_least(1), default=Numerics.substeps, help="of Newton in a frame")
     parser.add_argument("--iterations", type=at_least(1), default=Numerics.iterations, help="most in a substep")
@@ -418,8 +415,8 @@ def main(arguments: list[str] | None = None) -> int:
         raise ParameterError("there is nothing to compare: give --count or --sets")
     hush()
     say = Clock()
-    first = {case.kind: case for case in reversed(cases)}.values() if options.refine else ()
-    plough_missing([*cases, *(c.refined() for c in first)], options.out, options.device, options.side_by_side, say)
+    finer = [case.refined() for case in cases] if options.refine else []
+    plough_missing([*cases, *finer], options.out, options.device, options.side_by_side, say)
     result = {"made_by": stamp(options.device), "seeds": options.seeds, "presets": options.presets, "cases": {}}
     for case in cases:
         result["cases"][case.name] = measure(case, options, say)

@@ -321,12 +321,8 @@ def whole_path(task: Task) -> Section:
     return Section("Whole path", text, tuple(rows))
 
 
-def parts(task: Task) -> dict[str, Callable[[], Section]]:
-    """By name, in the page's order."""
-    measured = [simulation, newton, effects, rasteriser, reconstruction, whole_path]
-    if find_spec("newton") is None:
-        measured.remove(newton)
-    return {part.__name__.replace("_", "-"): partial(part, task) for part in measured}
+PARTS = (simulation, newton, effects, rasteriser, reconstruction, whole_path)
+"""In the page's order."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -345,7 +341,9 @@ def main(arguments: list[str] | None = None) -> int:
     key: dict[str, Any] = {"code": digest, "set": task.truth.measurement.hash, "preset": task.preset, **own}
     key["repeats"] = task.repeats
     options.out = options.out / made["device"]
-    return run_parts(options, parts(task), lambda _: key, f"speed {made['device']}")
+    measured = [part for part in PARTS if part is not newton or find_spec("newton")]
+    parts = {part.__name__.replace("_", "-"): partial(part, task) for part in measured}
+    return run_parts(options, parts, lambda _: key, f"speed {made['device']}")
 
 
 if __name__ == "__main__":

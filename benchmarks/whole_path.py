@@ -10,9 +10,9 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -231,14 +231,8 @@ def _fitted(task: Task, folder: Path, name: str, command: str, *options: str) ->
     return Run(read_json(run / "fit.json"), time.monotonic() - began, memory)
 
 
-def parts(task: Task) -> dict[str, Callable[[], Section]]:
-    """All parts by name, in the page's order."""
-    return {
-        "reconstruction": lambda: reconstruction(task),
-        "renderer": lambda: renderer(task),
-        "angle": lambda: angle(task),
-        "missing-effect": lambda: missing_effect(task),
-    }
+PARTS = (reconstruction, renderer, angle, missing_effect)
+"""In the page's order."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -253,7 +247,8 @@ def main(arguments: list[str] | None = None) -> int:
     task = Task(options.dry, options.damp, options.preset, options.device, options.out)
     sets = {name: Measurement.load(folder).hash for name, folder in (("dry", task.dry), ("damp", task.damp))}
     key = {"code": sources([Path(__file__)]), "preset": task.preset, **sets}
-    return run_parts(options, parts(task), lambda _: key, "whole path")
+    parts = {part.__name__.replace("_", "-"): partial(part, task) for part in PARTS}
+    return run_parts(options, parts, lambda _: key, "whole path")
 
 
 if __name__ == "__main__":

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
-from splatsoil.benchmarks.information import precision_of, sigmas, size_of, table, written
+from splatsoil.benchmarks.information import precision_of, sigmas, size_of, table
 
 from splatsoil.cli import main as command_line
-from splatsoil.errors import RunError
 from splatsoil.files import read_json
 from splatsoil.parameters import Parameter
 from splatsoil.soil.library import library
@@ -106,14 +105,6 @@ def test_a_row_says_how_much_is_lost_and_by_what() -> None:
         "| gravity, 4 ° | < 1.0 σ | 3.0 σ | 3.0 σ | 3.0 σ | – | – |",
         "| light, 4 ° | – | 8.0 σ | 8.0 σ | < 1.0 σ | ≥ 8.0 | angle: 4.0 |",
     ]
-
-
-def test_the_page_has_a_place_and_other_pages_are_left_alone(tmp_path: Path) -> None:
-    assert "new table" in written(PAGE, "tiny", "new table")
-    other = tmp_path / "page.md"
-    other.write_text("mine")
-    with pytest.raises(RunError, match="no lines"):
-        written(other, "tiny", "new table")
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from splatsoil.benchmarks._newton import WALL, Numerics, Run, World, _model, _shifts, _walls, plough
 from splatsoil.benchmarks._scenes import Scene
-from splatsoil.benchmarks.numerics import Truth
+from splatsoil.benchmarks._truth import Truth
 
 from splatsoil.errors import MeasurementError, RunError
 from splatsoil.measurement import Bed, Measurement

@@ -70,7 +70,6 @@ def test_ways_meet_the_same_world_and_more_calls_do_not_hurt() -> None:
     density = density_of(SPACE, data.points, -data.residuals, np.zeros(data.residuals.shape[1]), 0.0)
     found = bo_vs_mcmc.run(
         bo_vs_mcmc.EmulatedWorld(density),
-        density.noise.chance,
         ways=("mcmc", "direct"),
         budgets=(6, 16),
         direct=(20, 400),
