@@ -86,7 +86,7 @@ def test_parts_are_kept_and_put_together(tmp_path: Path, capsys: pytest.CaptureF
     told = json.loads(capsys.readouterr().out)
     assert list(told["parts"]) == ["first"] and told["parts"]["first"]["rows"][0]["held"] is True
     written = file.read_text()
-    assert written.index("row of first") < written.index("row of second") and "1 of 2 comparisons hold" in written
+    assert written.index("### first") < written.index("### second") and "1 of 2 comparisons hold" in written
     assert written.count("written meanwhile") == 2, "what was written while parts were measured stays"
     assert measured() == 0 and done == ["second", "first"], "what is there is not measured again"
     assert measured("--again", "--only", "first") == 0 and done[2:] == ["first"]
