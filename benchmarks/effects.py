@@ -54,6 +54,16 @@ def acting(effect: Effect) -> dict[str, float]:
     return {p.name: float(np.clip(off + (p.sign or 1) * TIMES_MEANINGFUL * p.meaningful, p.lower, p.upper))}
 
 
+def strong() -> list[str]:
+    """Names of effects on strength that act together: of those that exclude each other, the first."""
+    effects, chosen = library(), list[str]()
+    for name, effect in effects.items():
+        excluded = {*effect.conflicts, *(n for n in chosen if name in effects[n].conflicts)}
+        if effect.strength is not None and not excluded.intersection(chosen):
+            chosen.append(name)
+    return chosen
+
+
 def heights(
     truth: Truth, preset: str, angle: float, device: str, seeds: int
 ) -> tuple[FloatArray, float, dict[str, FloatArray]]:

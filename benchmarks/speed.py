@@ -28,7 +28,7 @@ from splatsoil.benchmarks._newton import Numerics, World, plough
 from splatsoil.benchmarks._parts import part_options, run_parts
 from splatsoil.benchmarks._truth import FloatArray, Truth
 from splatsoil.benchmarks._validation.page import Row, Section
-from splatsoil.benchmarks.effects import acting
+from splatsoil.benchmarks.effects import acting, strong
 
 from splatsoil.errors import RunError
 from splatsoil.measurement import Camera, Measurement
@@ -37,7 +37,7 @@ from splatsoil.mpm.simulate import base_settings, step_poses
 from splatsoil.quiet import hush
 from splatsoil.reconstruction import Reconstruction, fill, reconstruct
 from splatsoil.soil.law import Law
-from splatsoil.soil.library import find_effects, library
+from splatsoil.soil.library import find_effects
 from splatsoil.splats import Gaussians, rasterise, reference
 from splatsoil.synthetic import paper
 from splatsoil.threads import at_most
@@ -72,7 +72,8 @@ class Times:
 
     def over(self, other: Times, name: str) -> str:
         """This time, the other's, and how many times as fast this is."""
-        return f"{self}; {name} {other}: {other.median / self.median:.3g} × as fast"
+        ratio = other.median / self.median
+        return f"{self}; {name} {other}: {f'{ratio:.0f}' if ratio >= 100 else f'{ratio:.3g}'} × as fast"
 
 
 def timed(task: Callable[[], object], repeats: int, device: str, *, warm: int = 1, wall: bool = False) -> Times:
@@ -221,7 +222,7 @@ def newton(task: Task) -> Section:
 
 def effects(task: Task) -> Section:
     """A step with all effects on strength that act together, over the base law's."""
-    names = [n for n, e in library().items() if e.strength is not None and n != "compaction"]
+    names = strong()
     acts = find_effects(names)
     values = {key: value for effect in acts for key, value in acting(effect).items()}
     scene, spent = task.scene, ([], [])  # type: ignore[var-annotated]

@@ -9,6 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
+from splatsoil.benchmarks.effects import strong
 
 from splatsoil.mpm.substep import make_stress_kernel
 from splatsoil.soil.law import Law
@@ -27,6 +28,8 @@ sys.meta_path.insert(0, Blocked())
 PRINT = """
 import warp as wp
 wp.config.log_level = wp.LOG_ERROR
+from splatsoil.benchmarks.effects import strong
+
 from splatsoil.mpm.substep import make_stress_kernel
 from splatsoil.soil.law import Law
 law = Law()
@@ -97,8 +100,8 @@ def test_a_combination_compiles_once_and_an_effect_that_is_off_not_at_all(tmp_pa
         env = os.environ | {"WARP_CACHE_PATH": str(tmp_path)}
         return int(subprocess.run(words, capture_output=True, text=True, check=True, env=env).stdout.split()[-1])
 
-    strong = [n for n, effect in library().items() if effect.strength is not None and n != "compaction"]
+    names = strong()
     assert compiled([]) > 0
     assert compiled([], before=BLOCK) == 0
-    assert compiled(strong) > 0
-    assert compiled(strong[::-1], 0.5) == 0
+    assert compiled(names) > 0
+    assert compiled(names[::-1], 0.5) == 0
