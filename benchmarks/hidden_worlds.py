@@ -1,10 +1,9 @@
 """Hidden effects in synthetic experiments of an independent solver: does the whole chain name the right one?
 
 Each is one run of Newton's implicit MPM (extra ``independent``) with one thing that its measurement set does not state,
-or with nothing, photographed by the path tracer, or by Mitsuba 3 (``--renderer mitsuba``). ``splatsoil fit`` and
-``diagnose`` then get the set alone. Truths (what is hidden, how much, the friction angle, bed, tool, appearance) are
-drawn by a stream of random numbers of their own, and opened only to score. What was made is kept in the folder, and a
-second call continues from there.
+or with nothing, photographed by the path tracer. ``splatsoil fit`` and ``diagnose`` then get the set alone. Truths (what
+is hidden, how much, the friction angle, bed, tool, appearance) are drawn by a stream of random numbers of their own, and
+opened only to score. What was made is kept in the folder, and a second call continues from there.
 
 The same truths simulated by this project's own solver (``--solver small``, or another preset) show which part of an
 error is the model discrepancy, and which the photographs' or the estimates' fault.
@@ -37,7 +36,6 @@ from splatsoil.benchmarks._common import (
     write_result,
 )
 from splatsoil.benchmarks._hidden import KINDS, NOTHING, OUTSIDE, TIMES, Hidden, draw
-from splatsoil.benchmarks._mitsuba import MitsubaStage, load_mitsuba
 from splatsoil.benchmarks._newton import Numerics, World, plough
 from splatsoil.benchmarks._truth import FloatArray
 
@@ -48,11 +46,10 @@ from splatsoil.quiet import hush
 from splatsoil.reconstruction import fill
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
-from splatsoil.synthetic import Appearance, Renderer, Setup, Stage, photograph_run
+from splatsoil.synthetic import Appearance, Setup, photograph_run
 
-OWN = ("_hidden", "_mitsuba", "_newton", "_scenes", "hidden_worlds")
+OWN = ("_hidden", "_newton", "_scenes", "hidden_worlds")
 """Modules beside the package by which the experiments are made."""
-RENDERERS: dict[str, Callable[..., Renderer]] = {"own": Stage, "mitsuba": MitsubaStage}
 NEWTON = "newton"
 """The other solver; ours go by their presets."""
 ELSE = "something else"
@@ -146,7 +143,6 @@ def make_worlds(truths: Sequence[Hidden], options: argparse.Namespace, say: Call
                 observation=observation,
                 seed=hidden.seed,
                 device=options.device,
-                renderer=RENDERERS[options.renderer],
             )
             say(f"{hidden.name} simulated and photographed")
 
@@ -279,7 +275,6 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--preset", default="small")
     parser.add_argument("--side-by-side", type=at_least(1), default=1, help="fits and diagnoses at a time")
-    parser.add_argument("--renderer", choices=list(RENDERERS), default="own", help="mitsuba needs the package")
     parser.add_argument(
         "--solver",
         choices=[NEWTON, *PRESETS],
@@ -303,9 +298,7 @@ def main(arguments: list[str] | None = None) -> int:
         raise ParameterError("--times: give two positive numbers, the smaller one first")
     if not options.voxel > 0.0:
         raise ParameterError("--voxel must be positive")
-    if options.renderer == "mitsuba":
-        load_mitsuba()  # says what is missing before anything is made
-    named = ("seed", "times", "preset", "solver", "renderer", "voxel", "iterations")
+    named = ("seed", "times", "preset", "solver", "voxel", "iterations")
     decides = {name: getattr(options, name) for name in named}
     decides["code"] = sources([Path(__file__).with_name(f"{name}.py") for name in OWN])
     keep_to_one_protocol(options.out, decides)

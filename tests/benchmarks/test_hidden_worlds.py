@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from splatsoil.benchmarks import hidden_worlds
 from splatsoil.benchmarks._hidden import FIELD, KINDS, NOTHING, OBSERVATION, OUTSIDE, Hidden, draw
-from splatsoil.benchmarks._newton import Numerics, World
 from splatsoil.benchmarks._scenes import ANGLES, BEDS, TOOLS, Scene
-from splatsoil.benchmarks.hidden_worlds import ELSE, main, ploughed_by_us, score, soil_of, table
+from splatsoil.benchmarks.hidden_worlds import ELSE, main, score, soil_of, table
 
-from splatsoil.errors import ParameterError, RunError
+from splatsoil.errors import ParameterError
 from splatsoil.mpm.simulate import base_settings
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects, library
@@ -55,18 +51,6 @@ def test_no_part_of_the_soil_is_outside_of_what_the_model_takes(kind: str) -> No
         hidden = draw(kind, number, 1)
         angles = np.asarray(soil_of(hidden, hidden.scene.setup(), 0.04).angle)
         assert low <= angles.min() < angles.max() <= high
-
-
-def test_a_layer_lies_below_its_depth_and_a_stone_holds_no_sand() -> None:
-    setup = WAVY.setup()
-    layered = soil_of(replace(placed(draw("layering", 0, 1)), soil={"layer": (-8.0, 0.05)}), setup, 0.01)
-    weak = np.asarray(layered.angle) < 33.0 - 7.9
-    top = float(setup.surface.height.max())
-    assert weak[layered.particles[:, 2] < 0.02].all(), "the soil is 8 cm deep and more"
-    assert not weak[layered.particles[:, 2] > top - 0.05].any()
-    stone = draw("buried_obstacle", 0, 1)
-    x, y, z, radius = stone.soil["obstacle"]
-    assert np.linalg.norm(soil_of(stone, setup, 0.01).particles - [x, y, z], axis=1).min() > radius
 
 
 def test_no_photograph_shows_a_stone_and_no_tool_meets_one() -> None:
@@ -115,17 +99,6 @@ def test_both_solvers_are_told_the_same(kind: str) -> None:
         assert told.obstacle == pytest.approx((*place, values["obstacle_radius"]))
 
 
-def test_our_solver_ploughs_a_truth_of_its_own() -> None:
-    setup = WAVY.setup()
-    dry, damp = (
-        ploughed_by_us(placed(draw(kind, 0, 1), seed=2000), setup, [0, 2], "tiny", "cpu")
-        for kind in (NOTHING, "cohesion")
-    )
-    assert dry.frames == damp.frames == (0, 2)
-    assert np.array_equal(dry.positions[0], damp.positions[0])
-    assert not np.array_equal(dry.positions[1], damp.positions[1])
-
-
 @pytest.mark.parametrize("kind", OUTSIDE)
 def test_what_our_library_lacks_our_solver_cannot_plough(kind: str, tmp_path: Path) -> None:
     with pytest.raises(ParameterError, match=kind):
@@ -142,26 +115,6 @@ def test_numbers_that_make_no_sense_are_refused(tmp_path: Path, wrong: list[str]
     with pytest.raises(ParameterError, match=match):
         main(["--kinds", NOTHING, "--out", str(tmp_path / "worlds"), *wrong])
     assert not (tmp_path / "worlds").exists()
-
-
-def test_the_other_solver_gets_the_numerics_that_are_asked_for(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    asked: list[tuple[Any, ...]] = []
-
-    class Ploughed(Exception):
-        """Far enough."""
-
-    def plough(worlds: Sequence[World], numerics: Numerics, *_: object) -> None:
-        spacings = sorted({world.spacing for world in worlds})
-        asked.append((numerics.voxel, numerics.iterations, *spacings, len(worlds)))
-        raise Ploughed
-
-    monkeypatch.setattr(hidden_worlds, "plough", plough)
-    coarse = ["--voxel", "0.04", "--iterations", "60", "--worlds-side-by-side", "2"]
-    for name, words in (("usual", []), ("coarse", coarse)):
-        with pytest.raises(Ploughed):
-            main(["--kinds", "tilt", NOTHING, "gravity", "--out", str(tmp_path / name), *words])
-    usual = Numerics()
-    assert asked == [(usual.voxel, usual.iterations, usual.spacing, 4), (0.04, 60, 0.02, 2)]
 
 
 def judged(kind: str, verdict: str, members: list[str], sure: float = 0.95) -> dict[str, Any]:
@@ -232,29 +185,3 @@ def test_probabilities_are_held_against_how_often_they_are_right() -> None:
     assert f"log score of the true model, mean: {np.log([0.97, 0.03, 0.94]).mean():.2f}" in told
     not_compared = judged("cohesion", "missing", ["tilt"])
     assert "mean: -13.82" in table([not_compared]), "as improbable as it counts at most"
-
-
-def test_sizes_are_drawn_from_the_range_that_is_asked_for(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    made: list[Hidden] = []
-    monkeypatch.setattr(hidden_worlds, "make_worlds", lambda truths, *_: made.extend(truths))
-    assert main(["--kinds", "tilt", "--times", "3", "3", "--worlds-only", "--out", str(tmp_path)]) == 0
-    (candidate,) = (p for p in library()["tilt"].parameters if p.name == "tilt_x")
-    assert abs(made[0].size) == pytest.approx(3.0 * candidate.meaningful)
-
-
-def test_a_missing_renderer_is_said_before_anything_is_made(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setitem(sys.modules, "mitsuba", None)
-    with pytest.raises(RunError, match="independent"):
-        main(["--renderer", "mitsuba", "--kinds", NOTHING, "--out", str(tmp_path / "worlds")])
-    assert not (tmp_path / "worlds").exists()
-
-
-def test_a_folder_keeps_one_renderer_and_one_solver(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Worlds that the path tracer photographed aren't told as Mitsuba's."""
-    monkeypatch.setattr(hidden_worlds, "make_worlds", lambda *_: None)
-    monkeypatch.setattr(hidden_worlds, "load_mitsuba", lambda: None)
-    own = ["--kinds", NOTHING, "--worlds-only", "--out", str(tmp_path)]
-    assert main(own) == 0 and main(own) == 0
-    for other in (["--renderer", "mitsuba"], ["--solver", "small"], ["--voxel", "0.015"], ["--iterations", "240"]):
-        with pytest.raises(ParameterError, match="another --out"):
-            main([*own, *other])

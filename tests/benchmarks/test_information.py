@@ -9,12 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
-from splatsoil.benchmarks.information import precision_of, sigmas, size_of, table
+from splatsoil.benchmarks.information import precision_of, sigmas, table
 
 from splatsoil.cli import main as command_line
 from splatsoil.files import read_json
-from splatsoil.parameters import Parameter
-from splatsoil.soil.library import library
 
 PAGE = Path(__file__).parents[2] / "docs" / "information.md"
 
@@ -74,13 +72,6 @@ def test_chance_alone_passes_its_limit_in_one_of_twenty(rng: np.random.Generator
     drawn = rng.multivariate_normal(np.zeros(40), chance, size=(2000, 3))
     found = [sigmas(own, precision_of(noise), chance) for own in drawn]
     assert np.mean([value > least for value, least in found]) == pytest.approx(0.05, abs=0.025)
-
-
-def test_an_effect_is_on_at_four_times_what_matters_or_at_its_bound() -> None:
-    cohesion = library()["cohesion"].parameters[0]
-    assert size_of(cohesion) == (4.0 * cohesion.meaningful, 4.0)
-    low = Parameter("p", "1", 0.0, 1.0, 1.0, off=1.0, meaningful=0.5, sign=-1)
-    assert size_of(low) == (0.0, -2.0)
 
 
 def test_a_row_says_how_much_is_lost_and_by_what() -> None:

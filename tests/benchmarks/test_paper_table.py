@@ -13,7 +13,6 @@ import torch
 from splatsoil.benchmarks import paper_table
 from splatsoil.benchmarks._common import keep_to_one_protocol
 from splatsoil.benchmarks.paper_table import FRAMES, SPACE, Protocol, published_loss, search
-from splatsoil.inverse.executors import Serial
 
 from splatsoil.errors import ParameterError
 from splatsoil.files import read_json, write_json
@@ -90,22 +89,6 @@ def test_failed_simulations_are_left_out(tmp_path: Path) -> None:
         failed = [c for c in found[name]["calls"] if c["loss"] is None]
         assert failed and all(c["angle"] > 45.0 for c in failed)
         assert found[name]["ours"]["estimate"] == pytest.approx(TRUTH, abs=2.5)
-
-
-@pytest.mark.usefixtures("no_features")
-def test_experiments_take_the_devices_in_turn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    used: list[str] = []
-
-    def sight(measurement: str, reconstruction: str, protocol: Protocol) -> KnownSight:
-        used.append(protocol.device)
-        return KnownSight()
-
-    monkeypatch.setattr(paper_table, "world", lambda *_: ("measurement", "reconstruction"))
-    monkeypatch.setattr(paper_table, "Sight", sight)
-    protocol = Protocol(angles=(TRUTH,), trials=4, worlds=2, evaluations=3)
-    result = paper_table.run(protocol, tmp_path, Serial(), ["first", "second"])
-    assert used == ["first", "second"] and len(list((tmp_path / "trials").glob("*.json"))) == 2 * 4
-    assert [e["way"] for e in result["entries"]] == ["published", "ours"]
 
 
 def test_the_published_loss_is_the_mean_square_over_four_frames() -> None:

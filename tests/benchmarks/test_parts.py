@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from splatsoil.benchmarks._common import keep_to_one_protocol, parser_of, sentence, stamp, with_section
+from splatsoil.benchmarks._common import keep_to_one_protocol, parser_of, with_section
 from splatsoil.benchmarks._parts import part_options, run_parts
 from splatsoil.benchmarks._validation.page import Row, Section, text
 
@@ -118,9 +118,3 @@ def test_a_folder_keeps_one_protocol(tmp_path: Path) -> None:
     keep_to_one_protocol(tmp_path, {"seed": 1, "sizes": (1, 2)})
     with pytest.raises(ParameterError, match="another protocol"):
         keep_to_one_protocol(tmp_path, {"seed": 2, "sizes": (1, 2)})
-
-
-def test_a_stamp_says_what_made_a_result() -> None:
-    made = stamp("cpu")
-    told = sentence(made)
-    assert all(made[name] in told for name in ("processor", "code", "version", "numpy", "torch", "warp-lang"))

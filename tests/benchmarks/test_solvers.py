@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from splatsoil.benchmarks import solvers
 from splatsoil.benchmarks._newton import Numerics, Run, World
-from splatsoil.benchmarks._scenes import ANGLES, BEDS, RADIUS, SOIL, TOOLS, Scene, pair, scenes
+from splatsoil.benchmarks._scenes import ANGLES, BEDS, RADIUS, TOOLS, Scene, scenes
 from splatsoil.benchmarks._truth import Truth
 from splatsoil.benchmarks.solvers import FRAMES, Case, Scan, agreement, compare_stages, main, plough_missing, scan
 
@@ -40,22 +40,6 @@ def test_scenes_are_one_stream_in_which_every_bed_and_tool_has_its_turn() -> Non
     for begin in range(0, 15, 5):
         assert {(s.tool, s.width, s.tilt) for s in more[begin : begin + 5]} == set(TOOLS)
     assert all(ANGLES[0] <= s.angle <= ANGLES[1] for s in more)
-
-
-def test_a_pair_differs_by_the_tools_friction_alone() -> None:
-    smooth, rough = pair(3)
-    assert (smooth.tool_friction, rough.tool_friction) == (0.3, 0.9)
-    assert replace(rough, tool_friction=0.3) == smooth
-    assert smooth.setup().tool.friction == 0.3
-
-
-def test_a_sloping_bed_rises_as_steeply_and_where_it_says() -> None:
-    surface = SLOPING.setup().surface
-    down, across = np.gradient(surface.height, *surface.cell[::-1])
-    rise = np.tan(np.radians(6.0))
-    assert across == pytest.approx(rise * np.cos(np.radians(30.0)))
-    assert down == pytest.approx(rise * np.sin(np.radians(30.0)))
-    assert surface.height.mean() == pytest.approx(SOIL)
 
 
 @pytest.mark.parametrize("seed", range(3))
