@@ -1,9 +1,9 @@
 """Hidden effects in synthetic experiments of an independent solver: does the whole chain name the right one?
 
 Each is one run of Newton's implicit MPM (extra ``independent``) with one thing that its measurement set does not state,
-or with nothing, photographed by the path tracer. ``splatsoil fit`` and ``diagnose`` then get the set alone. Truths (what
-is hidden, how much, the friction angle, bed, tool, appearance) are drawn by a stream of random numbers of their own, and
-opened only to score. What was made is kept in the folder, and a second call continues from there.
+or with nothing, photographed by the path tracer. ``splatsoil fit`` and ``diagnose`` then get the set alone. Truths are
+drawn by a stream of random numbers of their own (what is hidden, how much, the friction angle, bed, tool, appearance),
+and opened only to score. What was made is kept in the folder, and a second call continues from there.
 
 The same truths simulated by this project's own solver (``--solver small``, or another preset) show which part of an
 error is the model discrepancy, and which the photographs' or the estimates' fault.

@@ -50,13 +50,6 @@ def test_a_change_like_that_of_the_angle_is_nothing_and_one_orthogonal_to_it_is_
     assert length(apart + 2.0 * angle, covariance, angle) == pytest.approx(length(apart, covariance), rel=1e-6)
 
 
-def test_a_free_angle_leaves_what_generalised_least_squares_leaves(rng: np.random.Generator) -> None:
-    covariance, angle, change = covariance_of(rng, 5), rng.standard_normal(5), rng.standard_normal(5)
-    white = np.linalg.inv(np.linalg.cholesky(covariance))
-    _, left, *_ = np.linalg.lstsq((white @ angle)[:, None], white @ change, rcond=None)
-    assert length(change, covariance, angle) == pytest.approx(np.sqrt(left[0]), rel=1e-6)
-
-
 def test_chance_of_the_simulations_adds_nothing(rng: np.random.Generator) -> None:
     """Lengths of means of three changes, each with as much chance as noise, would be 40 / 3 too long, squared."""
     covariance, change = covariance_of(rng, 40), 4.0 * np.eye(40)[0]
@@ -96,22 +89,6 @@ def test_a_row_says_how_much_is_lost_and_by_what() -> None:
         "| gravity, 4 ° | < 1.0 σ | 3.0 σ | 3.0 σ | 3.0 σ | – | – |",
         "| light, 4 ° | – | 8.0 σ | 8.0 σ | < 1.0 σ | ≥ 8.0 | angle: 4.0 |",
     ]
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (("--effects", "glue"), "invalid choice: 'glue'"),
-        (("--effects", "stiffness"), "invalid choice: 'stiffness'"),
-        (("--page", "no.md"), "read"),
-    ],
-)
-def test_bad_options_are_told_before_anything_is_made(
-    words: tuple[str, ...], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "out"
-    assert command_line(["benchmark", "information", *words, "--out", str(out)]) == 2
-    assert said in capsys.readouterr().err and not out.exists()
 
 
 @pytest.mark.slow

@@ -101,15 +101,6 @@ def test_only_missing_scenes_are_ploughed_so_many_at_a_time(groups: list[list[st
     assert kept.force == pytest.approx(still(world).force)
 
 
-def test_another_scene_or_other_numerics_are_not_taken_for_it(groups: list[list[str]], tmp_path: Path) -> None:
-    plough_missing([Case.drawn("scene", SLOPING, COARSE)], tmp_path, "cpu", 1, say)
-    steeper = Case.drawn("scene", replace(SLOPING, slope=6.5), COARSE)
-    other = [Case.drawn("scene", SLOPING, replace(COARSE, **c)) for c in ({"iterations": 99}, {"tolerance": 1.0e-4})]
-    for case in (steeper, *other):
-        with pytest.raises(ParameterError, match="another --out"):
-            plough_missing([case], tmp_path, "cpu", 1, say)
-
-
 def test_a_narrower_tool_gets_as_many_voxels_and_is_ploughed_by_itself(
     groups: list[list[str]], plow_dry: Path, tmp_path: Path
 ) -> None:

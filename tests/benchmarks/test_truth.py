@@ -20,7 +20,7 @@ from splatsoil.benchmarks._truth import (
 )
 
 from splatsoil.errors import MeasurementError, ParameterError
-from splatsoil.measurement import Measurement, ToolMotion
+from splatsoil.measurement import ToolMotion
 
 STAGES = {"lowering": (2.0, 60.0), "pushing": (-150.0, 70.0), "pause": (-40.0, 25.0), "withdrawal": (30.0, 5.0)}
 """Force along the way and upwards, N."""
@@ -90,14 +90,6 @@ def test_forces_are_means_by_stage_along_the_way_and_upwards(heading: tuple[floa
     assert list(found) == list(STAGES)
     for name, parts in STAGES.items():
         assert found[name] == pytest.approx(parts, abs=1e-9)
-
-
-def test_forces_of_the_example_are_those_of_its_file(plow_dry: Path) -> None:
-    table = np.loadtxt(plow_dry / "tool_force.csv", delimiter=",", skiprows=1)
-    pushed = table[(table[:, 0] > 25) & (table[:, 0] <= 100)]
-    truth, measurement = Truth.load(plow_dry), Measurement.load(plow_dry)
-    assert truth.force is not None
-    assert stage_forces(measurement, truth.force)["pushing"] == pytest.approx(pushed[:, [2, 4]].mean(axis=0))
 
 
 def test_patches_keep_what_is_wide_and_drop_what_is_narrow() -> None:
