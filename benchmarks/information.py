@@ -211,7 +211,7 @@ def left(
     steps = {name: (noise, tables, precision_of(noise.fixed)) for name, (noise, tables) in views.items()}
     steps["angle"] = whole, seen[1], precision_of(views["reconstructed"][0].fixed, free)
     steps["observation"] = whole, seen[1], precision_of(whole.fixed, free)
-    steps["numerics"] = whole, seen[1], precision_of(whole.covariance(1.0), free)
+    steps["discretisation"] = whole, seen[1], precision_of(whole.covariance(1.0), free)
     rows = []
     for c in (c for c in effects if c.kind == "observation" or c.name in true[1].effects.keys() & seen[1].effects):
         found = {n: sigmas(changes_of(c, noise, t), p, 2.0 * noise.chance) for n, (noise, t, p) in steps.items()}
@@ -222,12 +222,12 @@ def left(
         known = {name: max(*pair, 1e-9) for name, pair in found.items()}
         row["sigmas"], row["least"] = ({name: pair[k] for name, pair in found.items()} for k in (0, 1))
         row["factors"] = {b: known[a] / known[b] for a, b in pairwise(known)}
-        rows.append({**row, "loss": next(iter(known.values())) / known["numerics"]})
+        rows.append({**row, "loss": next(iter(known.values())) / known["discretisation"]})
     return rows
 
 
 def table(rows: Iterable[Mapping[str, Any]]) -> str:
-    """Markdown: physics, then observation, what loses most first; what chance alone could be is a limit."""
+    """Markdown: physics, then observation, what loses most first; what scatter alone could reach is a limit."""
     lines = [
         "| effect | (a) heights, force | (b) drawn | (c) reconstructed | (d) after nuisances | loss | most by |",
         "|---" * 7 + "|",
@@ -235,9 +235,9 @@ def table(rows: Iterable[Mapping[str, Any]]) -> str:
     for row in sorted(rows, key=lambda row: ("soil" not in row["sigmas"], -row["loss"])):
         hidden = {name: value < row["least"][name] for name, value in row["sigmas"].items()}
         told = {n: f"< {row['least'][n]:.1f} σ" if hidden[n] else f"{v:.1f} σ" for n, v in row["sigmas"].items()}
-        loss, most = f"{'≥ ' * hidden['numerics']}{row['loss']:.1f}", max(row["factors"], key=row["factors"].get)
+        loss, most = f"{'≥ ' * hidden['discretisation']}{row['loss']:.1f}", max(row["factors"], key=row["factors"].get)
         unit = "" if row["unit"] == "1" else " " + row["unit"].replace("deg", "°")
-        cells = [told.get(name, "–") for name in ("soil", "drawn", "reconstructed", "numerics")]
+        cells = [told.get(name, "–") for name in ("soil", "drawn", "reconstructed", "discretisation")]
         cells += ["–", "–"] if next(iter(hidden.values())) else [loss, f"{most}: {row['factors'][most]:.1f}"]
         lines.append("| " + " | ".join([f"{row['effect'].replace('_', ' ')}, {row['value']:g}{unit}", *cells]) + " |")
     return "\n".join(lines)

@@ -337,10 +337,9 @@ def main(arguments: list[str] | None = None) -> int:
     hush()
     task = Task(options.set, options.preset, options.device, options.repeats)
     made = stamp(options.device)
-    own = {name: made[name] for name in ("processor", "cores", "gpu") if name in made}
-    digest = sources([Path(__file__)])
-    key: dict[str, Any] = {"code": digest, "set": task.truth.measurement.hash, "preset": task.preset, **own}
-    key["repeats"] = task.repeats
+    key: dict[str, Any] = {name: made.get(name) for name in ("processor", "cores", "gpu")}
+    key |= {"code": sources([Path(__file__)]), "set": task.truth.measurement.hash}
+    key |= {"preset": task.preset, "repeats": task.repeats}
     options.out = options.out / made["device"]
     measured = [part for part in PARTS if part is not newton or find_spec("newton")]
     parts = {part.__name__.replace("_", "-"): partial(part, task) for part in measured}

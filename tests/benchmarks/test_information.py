@@ -68,7 +68,7 @@ def test_chance_alone_passes_its_limit_in_one_of_twenty(rng: np.random.Generator
 
 
 def test_a_row_says_how_much_is_lost_and_by_what() -> None:
-    names = ("soil", "drawn", "reconstructed", "angle", "observation", "numerics")
+    names = ("soil", "drawn", "reconstructed", "angle", "observation", "discretisation")
 
     def row(effect: str, sigmas: Sequence[float], loss: float, factors: Sequence[float]) -> dict[str, Any]:
         own = names[-len(sigmas) :]
@@ -103,7 +103,7 @@ def test_all_of_it_with_one_effect_and_a_second_call_simulates_nothing(
     result = read_json(out / "result.json")
     found = result["rows"][0]["sigmas"]
     assert [row["effect"] for row in result["rows"]] == ["gravity"]
-    assert found["soil"] > found["angle"] >= found["observation"] >= found["numerics"] >= 0.0
+    assert found["soil"] > found["angle"] >= found["observation"] >= found["discretisation"] >= 0.0
     assert found["reconstructed"] > found["angle"]
     assert command_line([*words, "--page", str(page)]) == 0
     assert "base" not in capsys.readouterr().err
