@@ -1,4 +1,4 @@
-"""Sealed truths of hidden worlds: what is hidden, how much of it, and everything else of a world that isn't told."""
+"""Sealed truths of synthetic experiments: what is hidden, its size, and all else that their sets do not state."""
 
 from __future__ import annotations
 
@@ -82,9 +82,14 @@ class Hidden:
         return law.observation(law.require_on(self.values))
 
 
-def _cohesion(rng: np.random.Generator, hidden: Hidden) -> Hidden:
-    size = _size(rng, hidden, "cohesion")
-    return replace(hidden, size=size, values={"cohesion": size}, soil={"cohesion": size})
+def _same(name: str) -> Callable[[np.random.Generator, Hidden], Hidden]:
+    """An effect whose parameter Newton takes by the same name and in the same unit."""
+
+    def hide(rng: np.random.Generator, hidden: Hidden) -> Hidden:
+        size = _size(rng, hidden, name)
+        return replace(hidden, size=size, values={name: size}, soil={name: size})
+
+    return hide
 
 
 def _dilatancy(rng: np.random.Generator, hidden: Hidden) -> Hidden:
@@ -93,20 +98,10 @@ def _dilatancy(rng: np.random.Generator, hidden: Hidden) -> Hidden:
     return replace(hidden, size=size, values={"dilatancy_angle": size}, soil={"dilatancy": size / hidden.angle})
 
 
-def _viscosity(rng: np.random.Generator, hidden: Hidden) -> Hidden:
-    size = _size(rng, hidden, "viscosity")
-    return replace(hidden, size=size, values={"viscosity": size}, soil={"viscosity": size})
-
-
 def _tool_friction(rng: np.random.Generator, hidden: Hidden) -> Hidden:
     change = max(_size(rng, hidden, "tool_friction"), -NOTED)
     size = NOTED + change
     return replace(hidden, size=size, values={"tool_friction_change": change}, soil={"tool_friction": size})
-
-
-def _tool_adhesion(rng: np.random.Generator, hidden: Hidden) -> Hidden:
-    size = _size(rng, hidden, "tool_adhesion")
-    return replace(hidden, size=size, values={"tool_adhesion": size}, soil={"tool_adhesion": size})
 
 
 def _tilt(rng: np.random.Generator, hidden: Hidden) -> Hidden:
@@ -179,11 +174,11 @@ def _size(rng: np.random.Generator, hidden: Hidden, name: str) -> float:
 
 KINDS: dict[str, Callable[[np.random.Generator, Hidden], Hidden]] = {
     NOTHING: lambda rng, hidden: hidden,
-    "cohesion": _cohesion,
+    "cohesion": _same("cohesion"),
     "dilatancy": _dilatancy,
-    "viscosity": _viscosity,
+    "viscosity": _same("viscosity"),
     "tool_friction": _tool_friction,
-    "tool_adhesion": _tool_adhesion,
+    "tool_adhesion": _same("tool_adhesion"),
     "tilt": _tilt,
     "gravity": _gravity,
     "layering": _layering,
