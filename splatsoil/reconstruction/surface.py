@@ -61,7 +61,9 @@ def footprint(views: Views, bed: Bed) -> float:
     return float(np.median([np.linalg.norm(c.position - centre) / np.sqrt(c.fx * c.fy) for c in views.cameras]))
 
 
-def find_relief(views: Views, bed: Bed, tool_silhouettes: torch.Tensor, preset: Preset, report: Report) -> Relief:
+def find_relief(
+    views: Views, bed: Bed, tool_silhouettes: torch.Tensor, preset: Preset, report: Report, *, bare: bool = False
+) -> Relief:
     """Heights of the soil over the bed's box.
 
     Args:
@@ -70,6 +72,7 @@ def find_relief(views: Views, bed: Bed, tool_silhouettes: torch.Tensor, preset: 
         tool_silhouettes: (v, h, w) 1 where the tool hides what is behind it.
         preset: how much work.
         report: called with what is being done and how much of it is done.
+        bare: whether no wall is seen around the soil, so that photographs look past its edge at the ground behind.
 
     Raises:
         MeasurementError: the photographs are too far away, or tell no height in half of the bed or more.
@@ -88,17 +91,18 @@ def find_relief(views: Views, bed: Bed, tool_silhouettes: torch.Tensor, preset: 
     cells = Cells.of(coarse, device=device)
     everything = torch.ones(len(views), *cells.mask.shape, device=device)
     report("sweeping the bed's height", 0.0)
-    height = sweep(
-        views, cells, trust, everything, np.linspace(bed.lower[2], bed.upper[2], preset.candidates), sigma=1.5
-    )
+    levels = np.linspace(bed.lower[2], bed.upper[2], preset.candidates)
+    height = sweep(views, cells, trust, everything, levels, sigma=1.5, normalised=bare)
     report("refining heights", 0.4)
-    height, deviation = refine(views, cells, trust, everything, height, sigma=1.0, reach=step, length=length)
+    height, deviation = refine(
+        views, cells, trust, everything, height, sigma=1.0, reach=step, length=length, normalised=bare
+    )
     height, _ = without_backdrop(height, deviation, length)
 
     fine = HeightField.over(bed.lower, bed.upper, cell)
     where = fine.points[..., :2].reshape(-1, 2)
     height = HeightField(coarse.x, coarse.y, height).smooth(where).reshape(fine.height.shape)
-    rim = RIM * length
+    rim = 0.0 if bare else RIM * length
     for last in (False, True):
         report("refining heights", 0.6 + 0.2 * last)
         now = HeightField(fine.x, fine.y, height)
@@ -115,6 +119,7 @@ def find_relief(views: Views, bed: Bed, tool_silhouettes: torch.Tensor, preset: 
             reach=0.5 * step,
             length=length,
             iterations=6 if last else 3,
+            normalised=bare,
         )
         height, deviation = without_backdrop(height, deviation, length)
     surface = HeightField(fine.x, fine.y, np.clip(height, bed.lower[2], None), deviation)

@@ -1,0 +1,67 @@
+"""Whether photographs show soil at the sides of the bed's box, as behind glass."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.stats import chi2
+from torch.nn import functional
+
+from splatsoil.colour import linear
+from splatsoil.measurement import Bed
+from splatsoil.reconstruction.height_field import HeightField
+from splatsoil.reconstruction.initial import around
+from splatsoil.reconstruction.stereo import draw, visibility
+from splatsoil.reconstruction.surface import Relief, with_rim
+from splatsoil.reconstruction.views import Views
+
+Array = NDArray[np.float64]
+
+_USUAL = float(chi2.ppf(0.99, 2))
+"""Squared Mahalanobis distance within which 99 % of the soil's own colours lie."""
+
+
+def sides_seen(views: Views, bed: Bed, relief: Relief) -> bool:
+    """Whether most of what is seen where the box's sides are, below the soil, has the soil's colour.
+
+    Colour without brightness (chromaticity), which shade changes little, is compared with that of the soil's surface. A
+    bed whose surroundings are as high as the soil has no sides to be seen.
+
+    Args:
+        views: the photographs.
+        bed: the box.
+        relief: the soil's surface, found as if walls hid its sides.
+    """
+    surface, floor = relief.surface, float(bed.lower[2])
+    level = float(np.median(surface.height))
+    if relief.ground > floor:
+        return False
+    xy, outward = around(bed.lower[:2], bed.upper[:2], max(surface.cell))
+    # Where photographs look past the soil's edge its height is not known well: stay in the lower half.
+    top = 0.5 * (np.minimum(surface.sample(xy), level) - floor)
+    heights = floor + top[:, None] * np.array([0.25, 0.5, 0.75, 1.0])
+    side = np.concatenate([np.column_stack([xy, z]) for z in heights.T])
+    flat = HeightField(surface.x, surface.y, np.full_like(surface.height, level))
+    seen = _chromaticity(views, side, np.tile(outward, (4, 1)), relief.trust, with_rim(flat, bed, 0.0))
+    soil = _chromaticity(
+        views, surface.points.reshape(-1, 3), surface.normals.reshape(-1, 3), relief.trust, relief.occluder
+    )
+    if min(len(seen), len(soil)) < 3:
+        return False
+    away = seen - np.median(soil, axis=0)
+    square = np.einsum("ni,ij,nj->n", away, np.linalg.pinv(np.cov(soil.T)), away)
+    return bool(np.mean(square < _USUAL) > 0.5)
+
+
+def _chromaticity(views: Views, points: Array, normals: Array, trust: torch.Tensor, occluder: HeightField) -> Array:
+    """Red and green (m, 2) of the sum of linear red, green and blue, of those points (n, 3) that are seen: the median
+    over photographs."""
+    place, facing = (torch.tensor(a, dtype=torch.float32, device=views.images.device) for a in (points, normals))
+    drawn, sure = draw(views, functional.pad(place, (0, 1), value=1.0)[None], trust)
+    clearance = 0.1 * max(occluder.cell)
+    open_to = visibility(views, points + clearance * normals, occluder, clearance=clearance)
+    weight = sure[:, 0] * open_to * (((views.positions[:, None] - place) * facing).sum(-1) > 0)
+    colours = torch.where((weight > 0)[:, None], drawn[:, :, 0], torch.nan).nanmedian(dim=0).values.T
+    colours = linear(colours[torch.isfinite(colours).all(dim=1)].cpu().numpy().astype(np.float64))
+    return colours[:, :2] / np.maximum(colours.sum(axis=1, keepdims=True), 1e-6)
