@@ -202,7 +202,7 @@ def test_no_gaussian_reaches_out_of_the_soil():
     albedo = torch.tensor(generator.random((count, 3)), dtype=torch.float32)
     out = [torch.zeros(count - 20, *shape) for shape in ((3,), (3, 3), (), (4,))]
     chosen = torch.arange(20, count, dtype=torch.int32)
-    render._settle(relief, chosen, (*tensors, albedo), out)
+    render._settle(relief, chosen, (*tensors, albedo), torch.zeros(0, 6), out)
     centres, covariances, opacities, features = (t.double().numpy() for t in out)
     before, left = shapes[20:], depth[20:]
     across = np.sqrt(np.einsum("i,nij,j->n", slope, before, slope))
@@ -219,7 +219,7 @@ def test_no_gaussian_reaches_out_of_the_soil():
     assert np.array_equal(opacities, tensors[3].double().numpy()[20:]) and np.all(features[:, 3] == 1.0)
     assert np.array_equal(features[:, :3], albedo.double().numpy()[20:])
 
-    render._draw_grains(relief, chosen, (tensors[0], albedo), SPACING, out)
+    render._draw_grains(relief, chosen, (tensors[0], albedo), torch.zeros(0, 6), SPACING, out)
     centres, covariances, opacities, _ = (t.double().numpy() for t in out)
     deep = left > 2.0 * render.BURIED_SIZE * SPACING
     assert 5 < deep.sum() < 175 and np.allclose(centres, place[20:], atol=1e-6) and np.allclose(opacities, 0.95)
@@ -266,7 +266,7 @@ def coloured_surface(measurement, particles, spacing, cell=0.004):
     scales = torch.tensor([0.6, 0.6, 0.1]).mul(cell).expand(len(points), 3).contiguous()
     gaussians = Gaussians(points, scales, turn, torch.full((len(points),), 0.9), encoded(colours))
     soil = torch.ones(len(points), dtype=torch.bool)
-    return SimpleNamespace(gaussians=gaussians, soil=soil, tool=~soil, background=(0.0, 0.0, 0.0))
+    return SimpleNamespace(gaussians=gaussians, soil=soil, tool=~soil, background=(0.0, 0.0, 0.0), container="bin")
 
 
 @pytest.mark.parametrize("turned", [0.0, 40.0, 90.0])
