@@ -36,6 +36,7 @@ _DENSITIES = (100.0, 20_000.0)
 _GRAVITIES = (1e-3, 300.0)
 _FAR_CAMERA = 100.0  # in diagonals of the bed
 _OTHER_UNIT = math.sqrt(1000.0)  # half-way between metres and millimetres
+_AROUND = 0.2  # of the bed's narrower side: how much beyond it is simulated where nothing stands at its sides
 _SLACK = 0.1  # of the bed: what its floor and walls, which the tool can't pass, may be off by
 _SMALL_TOOL = 1e5  # cubes of the tool's width in the bed; cells are a fraction of it, and no memory holds as many
 _FASTEST_TOOL = 100.0  # m/s, the speed of sound in loose soil: nothing is pushed through it faster
@@ -73,6 +74,15 @@ class Bed:
     def extents(self) -> FloatArray:
         """Lengths (3,) of the box's edges in metres."""
         return self.upper - self.lower
+
+    @property
+    def domain(self) -> Bed:
+        """What of the world is simulated: the box, or where nothing stands at its sides, more around it for soil to go
+        on or to run out to."""
+        if self.container not in (OPEN, HEAP):
+            return self
+        margin = _AROUND * float(self.extents[:2].min()) * np.array([1.0, 1.0, 0.0])
+        return replace(self, lower=self.lower - margin, upper=self.upper + margin)
 
     @property
     def corners(self) -> FloatArray:

@@ -81,12 +81,11 @@ def reconstruct(
     tool.apply_transform(measurement.tool.motion.matrix(float(measurement.tool.motion.times[0])))
     report("finding the tool", 0.0)
     hidden = silhouettes(views, tool)
-    bare = bed.container in (TRANSPARENT, HEAP)
-    relief = find_relief(views.to(device), bed, hidden, chosen, report, bare=bare)
     container, remarks = bed.container or BIN, []
+    relief = find_relief(views.to(device), bed, hidden, chosen, report, container=container)
     if bed.container is None and sides_seen(views.to(device), bed, relief):
         container = TRANSPARENT
-        relief = find_relief(views.to(device), bed, hidden, chosen, report, bare=True)
+        relief = find_relief(views.to(device), bed, hidden, chosen, report, container=container)
         remarks.append(
             "bed: bed.container is not given; photographs show soil at the bed's sides, so transparent walls are taken."
         )
@@ -117,7 +116,12 @@ def reconstruct(
         iterations=chosen.iterations, growth=chosen.growth, seed=seed, device=device, report=report,
     )  # fmt: skip
     on_top, on_tool = segments(trained.gaussians, trained.label, relief.surface, bed, tool)
+    if container == HEAP:
+        on_top &= torch.from_numpy(relief.surface.sample(trained.gaussians.means.numpy()[:, :2]) > bed.lower[2])
     surface = surface_through(trained.gaussians[on_top], relief.surface)
+    if container == HEAP:
+        bare = relief.surface.height <= bed.lower[2]
+        surface = replace(surface, height=np.where(bare, bed.lower[2], np.maximum(surface.height, bed.lower[2])))
     soil = on_top | (at_sides(trained.gaussians, trained.label, surface, bed) & ~on_tool) if sides else on_top
     around = torch.nonzero(~soil & ~on_tool)[:, 0]
     kept = torch.ones(len(soil), dtype=torch.bool)

@@ -13,7 +13,7 @@ from scipy.ndimage import binary_propagation, distance_transform_edt
 from scipy.spatial import cKDTree
 
 from splatsoil.errors import MeasurementError
-from splatsoil.measurement import Bed
+from splatsoil.measurement import BIN, HEAP, TRANSPARENT, Bed
 from splatsoil.reconstruction.height_field import HeightField
 from splatsoil.reconstruction.presets import Preset
 from splatsoil.reconstruction.stereo import Cells, disagreement, refine, sweep, visibility
@@ -62,7 +62,7 @@ def footprint(views: Views, bed: Bed) -> float:
 
 
 def find_relief(
-    views: Views, bed: Bed, tool_silhouettes: torch.Tensor, preset: Preset, report: Report, *, bare: bool = False
+    views: Views, bed: Bed, tool_silhouettes: torch.Tensor, preset: Preset, report: Report, *, container: str = BIN
 ) -> Relief:
     """Heights of the soil over the bed's box.
 
@@ -72,12 +72,14 @@ def find_relief(
         tool_silhouettes: (v, h, w) 1 where the tool hides what is behind it.
         preset: how much work.
         report: called with what is being done and how much of it is done.
-        bare: whether no wall is seen around the soil, so that photographs look past its edge at the ground behind.
+        container: what holds the soil, see `measurement.Bed`. Where no wall is seen around it, photographs look past
+            its edge at the ground behind.
 
     Raises:
         MeasurementError: the photographs are too far away, or tell no height in half of the bed or more.
     """
     length, device = scale_of(bed), views.images.device
+    bare = container in (TRANSPARENT, HEAP)
     cell = max(length / preset.cells**0.5, 1.2 * footprint(views, bed))
     trust = views.valid * (1.0 - tool_silhouettes.to(device))
     step = float(bed.upper[2] - bed.lower[2]) / (preset.candidates - 1)
@@ -122,7 +124,9 @@ def find_relief(
             normalised=bare,
         )
         height, deviation = without_backdrop(height, deviation, length)
-    surface = HeightField(fine.x, fine.y, np.clip(height, bed.lower[2], None), deviation)
+    # Around a heap the floor is bare: what is less high than a cell is wide is not told from it.
+    least = bed.lower[2] + (0.5 * cell if container == HEAP else 0.0)
+    surface = HeightField(fine.x, fine.y, np.where(height > least, height, bed.lower[2]), deviation)
     occluder = with_rim(surface, bed, rim)
     return Relief(surface, occluder, ground_level(views, bed, surface, occluder, rim), trust, rim)
 

@@ -91,7 +91,8 @@ def build_scene(
     if len(soil) == 0:
         raise ParameterError("the reconstruction has no soil")
     body = ToolBody(measurement.tool.mesh, device)
-    relief = relief_of_particles(x, spacing, measurement.bed.lower, measurement.bed.upper)
+    bed = measurement.bed.domain
+    relief = relief_of_particles(x, spacing, bed.lower, bed.upper)
     if intrinsic is not None:
         light = intrinsic.light
     elif light is None:
@@ -108,10 +109,10 @@ def build_scene(
         light=light,
         tool=body,
         tool_albedo=np.ones(3),
-        bed=measurement.bed,
+        bed=bed,
         spacing=spacing,
         background=np.asarray(reconstruction.background, dtype=np.float64),
-        side_light=_side_light(soil, relief, light, measurement.bed)
+        side_light=_side_light(soil, relief, light, bed)
         if reconstruction.container == TRANSPARENT
         else None,
     )
