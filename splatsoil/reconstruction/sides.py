@@ -13,20 +13,25 @@ from splatsoil.measurement import Bed
 from splatsoil.reconstruction.height_field import HeightField
 from splatsoil.reconstruction.initial import around
 from splatsoil.reconstruction.stereo import draw, visibility
-from splatsoil.reconstruction.surface import Relief, with_rim
+from splatsoil.reconstruction.surface import Relief, scale_of, with_rim
 from splatsoil.reconstruction.views import Views
 
 Array = NDArray[np.float64]
 
-_USUAL = float(chi2.ppf(0.99, 2))
-"""Squared Mahalanobis distance within which 99 % of the soil's own colours lie."""
+_ALIKE = float(chi2.ppf(0.99, 2))
+"""Squared Mahalanobis distance within which 99 % of one kind of colours lie."""
+
+_RING = np.array([0.1, 0.2, 0.3])
+"""Where around the bed the ground's colour is looked at, in square roots of the bed's area."""
 
 
 def sides_seen(views: Views, bed: Bed, relief: Relief) -> bool:
-    """Whether most of what is seen where the box's sides are, below the soil, has the soil's colour.
+    """Whether what is seen where the box's sides are, below the soil, has the soil's colour, and the ground around has
+    another.
 
-    Colour without brightness (chromaticity), which shade changes little, is compared with that of the soil's surface. A
-    bed whose surroundings are as high as the soil has no sides to be seen.
+    Colour without brightness (chromaticity), which shade changes little, is compared with that of the soil's surface:
+    two are of one kind if their medians differ by no more than colours of one kind do. Where soil goes on beyond the
+    box, all around has its colour, and it has no sides to be seen.
 
     Args:
         views: the photographs.
@@ -35,9 +40,8 @@ def sides_seen(views: Views, bed: Bed, relief: Relief) -> bool:
     """
     surface, floor = relief.surface, float(bed.lower[2])
     level = float(np.median(surface.height))
-    if relief.ground > floor:
-        return False
-    xy, outward = around(bed.lower[:2], bed.upper[:2], max(surface.cell))
+    cell = max(surface.cell)
+    xy, outward = around(bed.lower[:2], bed.upper[:2], cell)
     # Where photographs look past the soil's edge its height is not known well: stay in the lower half.
     top = 0.5 * (np.minimum(surface.sample(xy), level) - floor)
     heights = floor + top[:, None] * np.array([0.25, 0.5, 0.75, 1.0])
@@ -47,11 +51,21 @@ def sides_seen(views: Views, bed: Bed, relief: Relief) -> bool:
     soil = _chromaticity(
         views, surface.points.reshape(-1, 3), surface.normals.reshape(-1, 3), relief.trust, relief.occluder
     )
-    if min(len(seen), len(soil)) < 3:
+    length = scale_of(bed)
+    ring = np.concatenate([around(bed.lower[:2] - out, bed.upper[:2] + out, cell)[0] for out in _RING * length])
+    ground = np.column_stack([ring, np.full(len(ring), relief.ground)])
+    upward = np.tile([0.0, 0.0, 1.0], (len(ground), 1))
+    beside = _chromaticity(views, ground, upward, relief.trust, with_rim(flat, bed, relief.rim))
+    return _alike(seen, soil) and not _alike(beside, soil)
+
+
+def _alike(some: Array, others: Array) -> bool:
+    """Whether two sets of colours (n, 2) are of one kind, by the distance of their medians in their mean spread."""
+    if min(len(some), len(others)) < 3:
         return False
-    away = seen - np.median(soil, axis=0)
-    square = np.einsum("ni,ij,nj->n", away, np.linalg.pinv(np.cov(soil.T)), away)
-    return bool(np.mean(square < _USUAL) > 0.5)
+    apart = np.median(some, axis=0) - np.median(others, axis=0)
+    spread = 0.5 * (np.cov(some.T) + np.cov(others.T))
+    return bool(apart @ np.linalg.pinv(spread) @ apart < _ALIKE)
 
 
 def _chromaticity(views: Views, points: Array, normals: Array, trust: torch.Tensor, occluder: HeightField) -> Array:
