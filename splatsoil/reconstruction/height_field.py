@@ -109,13 +109,13 @@ class HeightField:
                 (self.cell[1], (self.y[0] - lower[1], upper[1] - self.y[-1])),
             )
         ]
-        axes = [
+        x, y = (
             axis[0] + (axis[1] - axis[0]) * np.arange(-before, len(axis) + after)
             for axis, (before, after) in zip((self.x, self.y), count, strict=True)
-        ]
+        )
         around = (tuple(count[1]), tuple(count[0]))
         deviation = None if self.deviation is None else np.pad(self.deviation, around, mode="edge")
-        return HeightField(*axes, np.pad(self.height, around, mode="edge"), deviation)
+        return HeightField(x, y, np.pad(self.height, around, mode="edge"), deviation)
 
     def difference(self, other: HeightField) -> Array:
         """(ny, nx) this height minus the other's at this field's cells; NaN where either is unknown."""

@@ -76,6 +76,6 @@ def _chromaticity(views: Views, points: Array, normals: Array, trust: torch.Tens
     clearance = 0.1 * max(occluder.cell)
     open_to = visibility(views, points + clearance * normals, occluder, clearance=clearance)
     weight = sure[:, 0] * open_to * (((views.positions[:, None] - place) * facing).sum(-1) > 0)
-    colours = torch.where((weight > 0)[:, None], drawn[:, :, 0], torch.nan).nanmedian(dim=0).values.T
-    colours = linear(colours[torch.isfinite(colours).all(dim=1)].cpu().numpy().astype(np.float64))
+    median = torch.where((weight > 0)[:, None], drawn[:, :, 0], torch.nan).nanmedian(dim=0).values.T
+    colours = linear(median[torch.isfinite(median).all(dim=1)].cpu().numpy().astype(np.float64))
     return colours[:, :2] / np.maximum(colours.sum(axis=1, keepdims=True), 1e-6)

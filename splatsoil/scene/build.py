@@ -112,9 +112,7 @@ def build_scene(
         bed=bed,
         spacing=spacing,
         background=np.asarray(reconstruction.background, dtype=np.float64),
-        side_light=_side_light(soil, relief, light, bed)
-        if reconstruction.container == TRANSPARENT
-        else None,
+        side_light=_side_light(soil, relief, light, bed) if reconstruction.container == TRANSPARENT else None,
     )
     if intrinsic is not None:
         return intrinsic.coloured(scene)
@@ -155,7 +153,9 @@ def _albedo(soil: Gaussians, lit: LitRelief, scene: Scene) -> dict[str, Tensor]:
         behind = nearer_side(grains, lit.relief, bed) >= 0
         behind &= to_sides(grains, bed)[0] < scene.spacing
         k = min(_NEAREST, int((~on_top).sum()))
-        _, nearest = cKDTree(soil.means[~on_top].cpu().numpy()).query(grains[behind].cpu().numpy(), k=[*range(1, k + 1)])
+        _, nearest = cKDTree(soil.means[~on_top].cpu().numpy()).query(
+            grains[behind].cpu().numpy(), k=[*range(1, k + 1)]
+        )
         beneath[behind] = albedo[~on_top][torch.from_numpy(nearest).to(albedo.device)].median(dim=1).values
     return {"soil_albedo": encoded(albedo), "grain_albedo": encoded(beneath)}
 

@@ -35,7 +35,7 @@ def _side(sides: wp.array2d(dtype=float), point: wp.vec3, depth: float) -> int:
 
     Sides are rows of outward x and y, distance from the origin along these, and light.
     """
-    nearest = int(-1)
+    nearest = int(-1)  # noqa: RUF046, UP018 - Warp takes a bare literal for a constant
     least = float(depth)
     for k in range(sides.shape[0]):
         distance = sides[k, 2] - sides[k, 0] * point[0] - sides[k, 1] * point[1]

@@ -251,9 +251,7 @@ def nearer_side(points: Tensor, relief: Relief, bed: Bed) -> Tensor:
     return torch.where(distance < relief.depth_below(points), which, -1)
 
 
-def _settle(
-    relief: Relief, chosen: Tensor, carried: Sequence[Tensor], sides: Tensor, out: Sequence[Tensor]
-) -> None:
+def _settle(relief: Relief, chosen: Tensor, carried: Sequence[Tensor], sides: Tensor, out: Sequence[Tensor]) -> None:
     """Write soil's Gaussians, none of which reaches out of the surface.
 
     Args:

@@ -106,8 +106,8 @@ class Photographer:
     def soil(self, frame: int, seen: Observation, colours: FloatArray) -> Body:
         """Of one frame of the video; particle albedo (n, 3), linear."""
         particles, _ = self.trajectory.at(self._moment(frame, seen))
-        bed, seen = self.setup.bed.domain, self.setup.bed.container in (TRANSPARENT, HEAP)
-        return soil_surface(particles, colours, self.trajectory.spacing, bed, sides=seen)
+        bed, sides = self.setup.bed.domain, self.setup.bed.container in (TRANSPARENT, HEAP)
+        return soil_surface(particles, colours, self.trajectory.spacing, bed, sides=sides)
 
     def stage(self, frame: int, seen: Observation, soil: Body) -> Renderer:
         """Soil, tool, bin and ground of one frame of the video."""

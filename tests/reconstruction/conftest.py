@@ -151,7 +151,9 @@ class Scene:
             # Met well beneath the surface: an upright side.
             sunk = (kind == 2) & (point[:, 2] < self.height(point[:, 0], point[:, 1]) - 2e-3)
             colour[sunk] = self.soil_colour(*point.T)[sunk]
-            out = np.stack([lower[0] - point[:, 0], point[:, 0] - upper[0], lower[1] - point[:, 1], point[:, 1] - upper[1]])
+            out = np.stack(
+                [lower[0] - point[:, 0], point[:, 0] - upper[0], lower[1] - point[:, 1], point[:, 1] - upper[1]]
+            )
             outward = np.array([[-1.0, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0]])[out.argmax(0)]
             normal[sunk] = outward[sunk]
         normal[kind < 2] = [0.0, 0.0, 1.0]
