@@ -114,16 +114,13 @@ def plow(seed: int = 0, *, views: int = VIEWS, depth: float | None = None, conta
     tool = Tool(plate(), motion, friction=0.3)
     target = (0.4, 0.25, 0.08)
     focal = 343.12
-    surface = wavy_surface(bed, 0.12 if depth is None else depth, seed, tool)
-    if container == HEAP:
-        surface = heaped(surface, bed)
 
     def camera(eye: npt.ArrayLike, aim: npt.ArrayLike, name: str = "") -> Camera:
         return Camera(320, 240, focal, focal, 160.0, 120.0, look_at(eye, aim), name=name)
 
     return Setup(
         bed=bed,
-        surface=surface,
+        surface=wavy_surface(bed, 0.12 if depth is None else depth, seed, tool),
         tool=tool,
         gravity=np.array(GRAVITY),
         frame_rate=FRAME_RATE,
@@ -245,12 +242,14 @@ def staged_motion(
 
 
 def wavy_surface(bed: Bed, depth: float, seed: int, tool: Tool) -> HeightField:
-    """`waves` that are clear of the tool where it starts.
+    """`waves`, of a heap cut down to one, that are clear of the tool where it starts.
 
     Raises:
         ParameterError: a depth that does not fit the bed, or soil that would reach the tool before it moves.
     """
     field = waves(bed, depth, seed)
+    if bed.container == HEAP:
+        field = heaped(field, bed)
     low, high = tool.bounds(0.0)
     reach = highest(field, low, high)
     if reach + CLEARANCE > low[2]:

@@ -93,6 +93,28 @@ def test_level_soil_shows_its_albedo():
     assert np.allclose(image[pixel(view, (0.2, 0.2, 0.1))], encoded(ALBEDO).numpy(), atol=0.01)
 
 
+def test_sides_that_are_seen_are_drawn_in_their_own_light():
+    """A wall's picture from beside it: soil's albedo in the side's light, down to the floor and up to the surface."""
+    bed, view = level_bed(), camera(eye=(0.2, -0.6, 0.12), target=(0.2, 0.0, 0.05))
+    hidden = scene_of(bed)
+    light = np.full((4, 3), 0.9)
+    light[2] = [0.3, 0.4, 0.5]  # the side at the least y
+    image = hidden.replace(side_light=light).render(bed, None, None, view)
+    for height in (0.01, 0.03, 0.05):  # nearer to the side than to the surface, two layers in
+        shown = linear(torch.tensor(image[pixel(view, (0.2, 0.0, height))])).numpy()
+        assert np.allclose(shown, ALBEDO.numpy() * light[2], rtol=0.15)
+    assert np.all(image[pixel(view, (0.2, 0.0, -0.02))] < 0.02)
+    through = linear(torch.tensor(hidden.render(bed, None, None, view)[pixel(view, (0.2, 0.0, 0.03))])).numpy()
+    assert not np.allclose(through, ALBEDO.numpy() * light[2], rtol=0.15)
+    # Soil that sinks at the wall is seen to: the surface's own light falls on what is left of it.
+    sunk = bed.clone()
+    sunk[:, 2] *= 0.5
+    lower = hidden.replace(side_light=light).render(sunk, None, None, view)
+    assert np.allclose(linear(torch.tensor(lower[pixel(view, (0.2, 0.0, 0.02))])), ALBEDO.numpy() * light[2], rtol=0.1)
+    above = linear(torch.tensor(lower[pixel(view, (0.2, 0.0, 0.085))])).numpy()
+    assert not np.allclose(above, ALBEDO.numpy() * light[2], rtol=0.1)
+
+
 def test_soil_in_the_shadow_of_a_box_keeps_the_sky_alone():
     bed, view = level_bed(), camera()
     box = trimesh.creation.box((0.08, 0.08, 0.02))
