@@ -37,6 +37,8 @@ class Config:
     """plow: a plate of 12 cm in a bed of 0.8 x 0.5 m; paper: Hsiao and Kumar's cube of 1 m, pictures of 1280 x 720."""
     like: Path | None = None
     """Take bed, tool, motion and cameras from this set instead of a scene."""
+    container: Literal["bin", "transparent", "open", "heap"] | None = None
+    """What holds the soil of the scene plow; a bin of opaque walls if not given."""
     depth: float | None = None
     """Mean depth of the soil in metres (not for the paper's scene, whose surface is a formula)."""
     preset: Literal["tiny", "small", "paper", "fine"] | None = None
@@ -100,6 +102,7 @@ def interrupted(config: Config) -> str:
             ("--set", config.values, ()),
             ("--scene", config.scene, "plow"),
             ("--like", config.like, None),
+            ("--container", config.container, None),
             ("--depth", config.depth, None),
             ("--preset", config.preset, None),
             ("--seed", config.seed, 0),
@@ -132,7 +135,7 @@ def parse_values(words: Sequence[str]) -> dict[str, float]:
 
 def choose_setup(config: Config) -> Setup:
     """The scene that the options describe."""
-    from splatsoil.measurement import Measurement
+    from splatsoil.measurement import BIN, Measurement
     from splatsoil.synthetic import like, paper, plow
     from splatsoil.synthetic.setups import VIEWS
 
@@ -142,13 +145,15 @@ def choose_setup(config: Config) -> Setup:
         raise ParameterError(f"--seed {config.seed}: seeds are whole numbers from 0 on")
     if config.scene == "paper" and (config.like is not None or config.depth is not None):
         raise ParameterError("--scene paper is a scene of its own; leave --like and --depth out")
+    if config.container is not None and (config.scene == "paper" or config.like is not None):
+        raise ParameterError("--container is for the scene plow; leave --scene paper and --like out")
     views = config.views or VIEWS
     if config.like is not None:
         setup = like(Measurement.load(config.like), config.seed, views=config.views, depth=config.depth)
     elif config.scene == "paper":
         setup = paper(views=views)
     else:
-        setup = plow(config.seed, views=views, depth=config.depth)
+        setup = plow(config.seed, views=views, depth=config.depth, container=config.container or BIN)
     return setup if config.picture_scale == 1.0 else setup.resized(config.picture_scale)
 
 
