@@ -40,6 +40,12 @@ ELEMENT = 1.0
 STEPS, SETS = 10_000, 100
 SPEED = np.array([0.3, 0.0, 0.0])
 ROUNDS = 15
+EXCLUDED = ("compaction", "critical_state")
+"""Effects that others exclude."""
+TOGETHER = {
+    "all but compaction and critical state": EXCLUDED,
+    "all but dilatancy and critical state": ("dilatancy", "critical_state"),
+}
 
 
 def ploughed(cell: float = 0.015) -> Scene:
@@ -86,16 +92,16 @@ def _lawless() -> Law:
     return law
 
 
-def strong(without: str) -> tuple[str, ...]:
-    """All effects on strength but one: dilatancy and compaction exclude each other."""
-    return tuple(name for name, effect in library().items() if effect.strength is not None and name != without)
+def strong(*without: str) -> tuple[str, ...]:
+    """All effects on strength but those that others exclude."""
+    return tuple(name for name, effect in library().items() if effect.strength is not None and name not in without)
 
 
 def step_times() -> dict[str, float]:
     """Least seconds of a step, by what the law does, measured in turns; and the number of particles."""
     scene = ploughed()
-    names = {"base": (), "all but compaction": strong("compaction"), "all but dilatancy": strong("dilatancy")}
-    names |= {name: (name,) for name in strong("")}
+    names = {"base": (), **{case: strong(*without) for case, without in TOGETHER.items()}}
+    names |= {name: (name,) for name in strong()}
     runs = {}
     for case, effects in names.items():
         values: dict[str, float] = {}
@@ -117,7 +123,7 @@ def step_times() -> dict[str, float]:
 
 def element_seconds() -> float:
     """Least seconds of three triaxial tests of ``STEPS`` steps on ``SETS`` sets of parameters, all effects on."""
-    law = Law(find_effects(strong("compaction")))
+    law = Law(find_effects(strong(*EXCLUDED)))
     angles = np.linspace(25.0, 45.0, SETS)
     values: dict[str, float] = {}
     for effect in law.effects:
@@ -155,7 +161,7 @@ def compiling() -> dict[str, float]:
         return time.perf_counter() - began
 
     result = {"base": seconds((), {}), "base, modules": float(modules())}
-    names = strong("compaction")
+    names = strong(*EXCLUDED)
     values: dict[str, float] = {}
     for effect in find_effects(names):
         values |= acting(effect)
@@ -237,12 +243,12 @@ def validate() -> Section:
     base, made = times["base"], compiled()
     share = 1.0 - times["no law"] / base
     rows = [Row("the law's share of a step", f"{100 * share:.0f} %", "≤ 40 %", share <= LAWS_SHARE)]
-    for case in ("all but compaction", "all but dilatancy"):
+    for case in TOGETHER:
         ratio = times[case] / base
         rows.append(
             Row(f"a step with all effects on strength ({case}) / base", f"{ratio:.2f}", "≤ 2", ratio <= ALL_EFFECTS)
         )
-    single = {name: times[name] / base for name in strong("")}
+    single = {name: times[name] / base for name in strong()}
     least, most = min(single, key=lambda n: single[n]), max(single, key=lambda n: single[n])
     text = f"{single[least]:.2f} ({least}) to {single[most]:.2f} ({most})"
     rows.append(Row("a step with a single effect on strength / base", text, "reported"))
