@@ -23,11 +23,17 @@ from splatsoil.soil.library import find_effects, library
 
 FloatArray = npt.NDArray[np.float64]
 
-SPEED = 0.05
-"""Of the simulated plate, m/s: slow enough that its inertia is nothing beside the soil's strength."""
-FRAME_RATE = 50.0
-WIDE, DEEP = 3.2, 1.4
-"""The bed's width and depth in plate diameters: what the plate moves stays inside (Prandtl's mechanism)."""
+FROUDE = 0.1
+"""Of the simulated plate's speed, by its diameter: its inertia is a hundredth of the weight of soil as deep as it is
+wide, and the soil bears ten times that weight and more."""
+FRAMES = 100
+"""In which the plate goes as deep as it is wide."""
+WIDE, DEEP = 2.0, 1.5
+"""The quarter bed's width, and its depth below the deepest place of the plate, in plate diameters: what the plate moves
+stays inside (Prandtl's mechanism)."""
+ROOM = 0.25
+"""Of the bed's depth, above its surface."""
+GRAVITY = 9.81
 CELLS = 8
 """Of the level surface, along each side."""
 SMOOTH = 2
@@ -35,7 +41,7 @@ SMOOTH = 2
 
 
 class PlateExperiment:
-    """A flat circular plate pressed straight down into level soil.
+    """A flat circular plate pressed straight down into level soil, of which a quarter is simulated.
 
     Features are forces at the depths that were measured, in % of the largest and relative where they are large, see
     :func:`~splatsoil.experiment.forces.compressed`.
@@ -78,7 +84,8 @@ class PlateExperiment:
         depth, force = (np.asarray(v, dtype=np.float64).reshape(-1) for v in (depths, forces))
         if depth.shape != force.shape or len(depth) < 2 or np.any(np.diff(depth) <= 0.0) or depth[0] <= 0.0:
             raise ParameterError("a plate test needs at least two increasing depths, each with its force")
-        self.name, self.preset, self.device, self.depths = name, preset, device, depth
+        self.name, self.preset, self.device = name, preset, device
+        self.diameter, self.depths = diameter, depth
         self.model = tuple(effects)
         law = Law(find_effects(self.model))
         self.parameters: tuple[Parameter, ...] = tuple(
@@ -131,39 +138,44 @@ class PlateExperiment:
             frames=(0, last),
             device=self.device,
         )[0]
-        upward = np.concatenate([[0.0], run.force[:, 2]])
+        upward = np.concatenate([[0.0], 4.0 * run.force[:, 2]])
         width = 2 * SMOOTH + 1
         smooth = np.convolve(np.pad(upward, SMOOTH, mode="edge"), np.full(width, 1.0 / width), mode="valid")
         # A frame's force is the mean over the frame that ends there.
-        depth = (np.arange(len(smooth)) - 0.5) * SPEED / FRAME_RATE
+        depth = (np.arange(len(smooth)) - 0.5) * self.diameter / FRAMES
         return np.interp(self.depths, depth, smooth)
 
 
 def _surface_of(bed: Bed) -> float:
     """Height of the level soil: the rest of the bed's box is room for what rises."""
-    return float(bed.lower[2] + (bed.upper[2] - bed.lower[2]) * 0.7)
+    return float(bed.lower[2] + (bed.upper[2] - bed.lower[2]) / (1.0 + ROOM))
 
 
 def _set_up(diameter: float, deepest: float, density: float, friction: float) -> Measurement:
-    """Bed and plate as the solver takes them; there are no cameras."""
-    width, depth = WIDE * diameter, DEEP * diameter
+    """Bed and plate as the solver takes them; smooth walls stand for the symmetry, and there are no cameras."""
+    width, depth = WIDE * diameter, DEEP * diameter + deepest
     bed = Bed(
-        np.zeros(3), np.array([width, width, depth / 0.7]), density=density, wall_friction=0.0, floor_friction=0.6
+        np.zeros(3),
+        np.array([width, width, (1.0 + ROOM) * depth]),
+        density=density,
+        wall_friction=0.0,
+        floor_friction=0.6,
     )
     thick = 0.25 * diameter
     plate = trimesh.creation.cylinder(radius=0.5 * diameter, height=thick, sections=48)
-    count = int(np.ceil((deepest * FRAME_RATE) / SPEED)) + SMOOTH + 2
+    step = diameter / FRAMES
+    frame_rate = FROUDE * float(np.sqrt(GRAVITY * diameter)) / step
+    count = int(np.ceil(deepest / step)) + SMOOTH + 2
     frames = np.arange(count)
     positions = np.zeros((count, 3))
-    positions[:, :2] = 0.5 * width
-    positions[:, 2] = _surface_of(bed) + 0.5 * thick - frames * SPEED / FRAME_RATE
+    positions[:, 2] = _surface_of(bed) + 0.5 * thick - frames * step
     still = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
-    motion = ToolMotion(frames, frames / FRAME_RATE, positions, still)
+    motion = ToolMotion(frames, frames / frame_rate, positions, still)
     return Measurement(
         folder=Path(),
         name="plate",
-        gravity=np.array([0.0, 0.0, -9.81]),
-        frame_rate=FRAME_RATE,
+        gravity=np.array([0.0, 0.0, -GRAVITY]),
+        frame_rate=frame_rate,
         bed=bed,
         tool=Tool(plate, motion, friction=friction),
         views=(),

@@ -93,6 +93,19 @@ def _chain(previous: Any, effect: Any, column: int) -> Any:
     return strength
 
 
+@wp.func
+def _lode(normal: wp.vec3, shear: wp.vec3) -> float:
+    """Cosine of three times the Lode angle of a deviator (tension positive), 1 in triaxial compression."""
+    j2 = 0.5 * wp.dot(normal, normal) + wp.dot(shear, shear)
+    j3 = (
+        2.0 * shear[0] * shear[1] * shear[2]
+        + normal[0] * (normal[1] * normal[2] - shear[2] * shear[2])
+        - normal[1] * shear[1] * shear[1]
+        - normal[2] * shear[0] * shear[0]
+    )
+    return wp.clamp(wp.static(-1.5 * 3.0**0.5) * j3 / wp.max(j2 * wp.sqrt(j2), 1.0e-12), -1.0, 1.0)
+
+
 def _stress_update(strength_of: Any, history: bool) -> Any:
     @wp.func
     def update(
@@ -145,6 +158,7 @@ def _stress_update(strength_of: Any, history: bool) -> Any:
             state.plastic_strain = stress.plastic_strain
             state.dilated = stress.dilated
             state.depth = stress.depth
+            state.lode = _lode(normal, tangent)
         strength = strength_of(state, values, row)
         apex = -strength.intercept / wp.max(strength.slope, 1.0e-6)
         if pressure < apex:

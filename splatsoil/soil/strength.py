@@ -16,6 +16,7 @@ class SoilState:
         plastic_strain: plastic shear strain gone through so far, in the same measure as the shear rate.
         dilated: logarithmic volume gained (+) or lost (-) by plastic shear so far.
         depth: how far below the surface this soil was at the start, m.
+        lode: cosine of three times the Lode angle; 1 in triaxial compression, -1 in extension.
     """
 
     pressure: float
@@ -24,6 +25,7 @@ class SoilState:
     plastic_strain: float
     dilated: float
     depth: float
+    lode: float
 
 
 @wp.struct
