@@ -5,10 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from splatsoil.errors import CombinationError
+from splatsoil.errors import CombinationError, ParameterError
 from splatsoil.soil.effects.critical_state import CriticalState
 
 DEFAULT = {p.name: p.default for p in CriticalState.parameters}
+
+
+def of_limits(void_ratio: float, least: float, most: float) -> dict[str, float]:
+    """Parameters of `critical_state` from the void ratio and its limits in index tests (ASTM D4253, D4254).
+
+    Raises:
+        ParameterError: limits without meaning.
+    """
+    if not 0.0 < least < most:
+        raise ParameterError(f"void ratio limits {least:g} and {most:g}: give the densest, then the loosest packing's")
+    width = math.log((1.0 + most) / (1.0 + least))
+    return {"relative_density": math.log((1.0 + most) / (1.0 + void_ratio)) / width, "volume_range": width}
 
 
 def at_void_ratio(values: Mapping[str, float], before: float, after: float) -> dict[str, float]:

@@ -47,8 +47,8 @@ class IntermediateStress(Effect):
         ),
     )
     note = (
-        "The cone that agrees with a triaxial test is too strong where soil is squeezed from two sides: beside a plate, "
-        "before a blade, in a shear box. Sand has about one friction angle in all of them."
+        "The cone that agrees with a triaxial test is too strong where soil is squeezed from two sides: under a "
+        "plate, before a blade, in a shear box. Sand has about one friction angle in all of them."
     )
     source = "Matsuoka & Nakai (1974), Proc. JSCE 232; its root: Panteghini & Lagioia (2014), Géotechnique 64(12)"
     strength = matsuoka_nakai
