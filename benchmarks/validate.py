@@ -1,10 +1,9 @@
-"""The soil against exact answers, laboratories and real sand: the table of docs/validation.md."""
+"""The soil against exact answers and laboratories: the table of docs/validation.md; for real sand see `real-sand`."""
 
 from __future__ import annotations
 
 import argparse
 import io
-import os
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -21,22 +20,17 @@ from splatsoil.benchmarks._validation import (
     cuts,
     element,
     inclines,
-    plates,
     refinement,
-    sand,
 )
 from splatsoil.benchmarks._validation.page import Section, page, table
 
 from splatsoil.errors import SplatsoilError
 from splatsoil.files import code_digest, plain, read_json, write_bytes, write_json, write_text
 
-MEASURED = "SPLATSOIL_MEASURED"
-"""Environment variable that names the folder of measured data."""
 
-
-def parts(measured: Path | None, device: str) -> dict[str, Callable[[], Section]]:
-    """All parts by name, in the page's order; those on real sand only where there are data."""
-    result: dict[str, Callable[[], Section]] = {
+def parts(device: str) -> dict[str, Callable[[], Section]]:
+    """All parts by name, in the page's order."""
+    return {
         "element": element.validate,
         "costs": costs.validate,
         "basics": lambda: basics.validate(device),
@@ -46,10 +40,6 @@ def parts(measured: Path | None, device: str) -> dict[str, Callable[[], Section]
         "inclines": lambda: inclines.validate(device),
         "refinement": lambda: refinement.validate(device),
     }
-    if measured is not None:
-        result["sand"] = lambda: sand.validate(measured)
-        result["plates"] = lambda: plates.validate(measured, device)
-    return result
 
 
 #: Files of ``_validation`` that a part's numbers hang on, beside its own and ``scene.py``.
@@ -59,15 +49,13 @@ BESIDE = {"basics": ("columns",), "refinement": ("blades", "columns")}
 def digest(name: str) -> str:
     """Of all code that a part's numbers may hang on."""
     folder = Path(__file__).parent / "_validation"
-    package = ("soil", "mpm", "experiment") if name == "sand" else ("soil", "mpm")
-    return code_digest(package, [folder / f"{file}.py" for file in ("scene", name, *BESIDE.get(name, ()))])
+    return code_digest(("soil", "mpm"), [folder / f"{file}.py" for file in ("scene", name, *BESIDE.get(name, ()))])
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the parts that are asked for and not done yet, and write the page of all that are done."""
     parser = argparse.ArgumentParser(prog="splatsoil benchmark validate", description=__doc__)
     parser.add_argument("--only", nargs="+", metavar="PART", help="parts to run; all by default")
-    parser.add_argument("--measured", type=Path, help=f"folder of measured data; default: {MEASURED}, else none")
     parser.add_argument(
         "--out", type=Path, default=Path("runs/validation"), help="results of the parts, to resume from"
     )
@@ -77,12 +65,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of tables")
     options = parser.parse_args(arguments)
     wp.config.log_level = wp.LOG_ERROR
-    known = os.environ.get(MEASURED)
-    measured = options.measured or (Path(known) if known else None)
-    todo = parts(measured, options.device)
+    todo = parts(options.device)
     unknown = sorted(set(options.only or ()) - set(todo))
     if unknown:
-        parser.error(f"part {unknown[0]!r} is not among {', '.join(todo)} (real sand needs --measured or {MEASURED})")
+        parser.error(f"part {unknown[0]!r} is not among {', '.join(todo)}")
     done = {}
     for name, validate in todo.items():
         if not options.only or name in options.only:
@@ -132,7 +118,7 @@ def _write_page(file: Path, out: Path, names: Sequence[str], device: str) -> Non
             found[name] = (Section.restored(data), bool(data["figure"]))
             if data["figure"]:
                 write_bytes(file.parent / f"validation-{name}.png", (out / f"validation-{name}.png").read_bytes())
-    command = f"{MEASURED}=FOLDER splatsoil benchmark validate --page docs/validation.md"
+    command = "splatsoil benchmark validate --page docs/validation.md"
     write_text(file, page(found, command, device))
 
 

@@ -69,11 +69,11 @@ class Section:
 
 INTRODUCTION = """# Is the soil right?
 
-The soil law and the solver against exact answers, laboratories and real sand. A row *holds* when its number lies within
-what its third column allows: what was asked for where there is an exact answer and for the plates, our own estimate of
-a source's scatter, or of what a grid does, where there is a fit to experiments or a bound (columns, cuts, blades,
-incline). Negative controls show that each of these estimates can be missed. Rows that fail stay on the page, with the
-reason as far as it is known. A dash marks a number that is reported and not judged.
+The soil law and the solver against exact answers and laboratories; [real-sand.md](real-sand.md) is about real sand. A
+row *holds* when its number lies within what its third column allows: what was asked for where there is an exact answer,
+our own estimate of a source's scatter, or of what a grid does, where there is a fit to experiments or a bound (columns,
+cuts, blades, incline). Negative controls show that each of these estimates can be missed. Rows that fail stay on the
+page, with the reason as far as it is known. A dash marks a number that is reported and not judged.
 """
 
 

@@ -51,7 +51,7 @@ def _compared(
         effects=effects,
         seed=seed,
         known=known,
-        prior=Prior(ParameterSpace(experiment.parameters)),
+        prior=Prior.of(experiment, values),
         progress=report,
     )
     return {

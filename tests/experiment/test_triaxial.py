@@ -11,10 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from splatsoil.benchmarks._validation.sand import karlsruhe
+from splatsoil.inverse.criticism.design import Prior
 from splatsoil.inverse.criticism.diagnosis import Diagnosis, diagnose
 from splatsoil.inverse.criticism.evidence import AS_IT_IS, ELSE
+from splatsoil.inverse.criticism.simulations import Simulations
 
 from splatsoil.experiment.triaxial import Curve, TriaxialExperiment
+from splatsoil.laboratory.answer import search
 from splatsoil.soil.element import triaxial
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
@@ -26,7 +29,9 @@ STRAINS = np.concatenate([np.linspace(0.005, 0.02, 4), np.linspace(0.03, 0.2, 18
 
 def criticised(curve: Curve) -> Diagnosis:
     experiment = TriaxialExperiment(curve)
-    return diagnose(experiment, {p.name: p.default for p in experiment.parameters})
+    simulations = Simulations(experiment)
+    values, known = search(experiment, simulations, 0, lambda what, share: None)
+    return diagnose(experiment, values, simulate=simulations, known=known, prior=Prior.of(experiment, values))
 
 
 def effects(found: Diagnosis) -> dict[str, float]:
