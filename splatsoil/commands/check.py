@@ -29,8 +29,11 @@ class Config:
 
 def run(config: Config) -> int:
     """Print the table or the object; MeasurementError when the set breaks the format's rules."""
+    from splatsoil.commands import _laboratory as laboratory
     from splatsoil.measurement import Measurement, remarks
 
+    if laboratory.is_test(config.set):
+        return laboratory.check(config.set, quiet=config.json)
     measurement = Measurement.load(config.set)
     said = remarks(measurement)
     if config.json:

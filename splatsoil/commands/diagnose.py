@@ -33,11 +33,14 @@ class Config(RunOptions):
 def run(config: Config) -> int:
     """Diagnose; the result goes into the run folder."""
     from splatsoil.commands import _criticism as criticism
+    from splatsoil.commands import _laboratory as laboratory
     from splatsoil.commands import _stages as stage
     from splatsoil.commands._crew import Crew
     from splatsoil.commands._diagnosis_table import show
     from splatsoil.errors import NoAnswer
 
+    if laboratory.is_run(config.run) or laboratory.is_test(config.run):
+        return laboratory.diagnose(config.run, config.effects, config.device, config.set, quiet=config.json)
     folder = stage.opened(config)
     none = why_none(criticism.need_fit(folder))
     folder.check_writable()

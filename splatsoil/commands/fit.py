@@ -22,11 +22,14 @@ class Config(FitOptions):
 
 def run(config: Config) -> int:
     """Reconstruct (unless the run folder has it), fit, print; everything is kept in the run folder."""
+    from splatsoil.commands import _laboratory as laboratory
     from splatsoil.commands import _stages as stage
     from splatsoil.commands._progress import stages
     from splatsoil.envs.devices import resolve_device
     from splatsoil.quiet import hush
 
+    if laboratory.is_test(config.set):
+        return laboratory.fit(config)
     hush()
     measurement, folder = stage.prepare(config)
     device = resolve_device(config.device)

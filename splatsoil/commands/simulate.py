@@ -33,8 +33,9 @@ class Config:
     """Effects that act, or files that define some."""
     values: Annotated[tuple[str, ...], tyro.conf.arg(name="set", metavar="NAME=VALUE …")] = ()
     """Parameters of the effects."""
-    scene: Literal["plow", "paper"] = "plow"
-    """plow: a plate of 12 cm in a bed of 0.8 x 0.5 m; paper: Hsiao and Kumar's cube of 1 m, pictures of 1280 x 720."""
+    scene: Literal["plow", "paper", "triaxial", "shear_box", "plate", "repose", "column"] = "plow"
+    """plow: a plate of 12 cm in a bed of 0.8 x 0.5 m; paper: Hsiao and Kumar's cube of 1 m, pictures of 1280 x 720; the
+    others: a laboratory's test, without cameras."""
     like: Path | None = None
     """Take bed, tool, motion and cameras from this set instead of a scene."""
     container: Literal["bin", "transparent", "open", "heap"] | None = None
@@ -62,6 +63,14 @@ def run(config: Config) -> int:
     values = parse_values(config.values)
     if "friction_angle" in values:
         raise ParameterError("the friction angle is given by --friction-angle, not by --set")
+    if config.scene not in ("plow", "paper"):
+        from splatsoil.commands import _laboratory as laboratory
+
+        values = {"friction_angle": config.friction_angle, **values}
+        preset = config.preset or "small"
+        return laboratory.simulate(
+            config.scene, config.out, values, config.effects, preset, config.seed, quiet=config.json
+        )
     from splatsoil.quiet import hush
     from splatsoil.reconstruction.progress import progress_bar
     from splatsoil.synthetic import make_set
