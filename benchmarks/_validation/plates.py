@@ -36,7 +36,7 @@ WITHIN = 0.30
 """Asked of a prediction there."""
 ANGLES = (28.0, 34.0, 40.0, 46.0)
 """Of the base law, between which friction is read off a plate, degrees."""
-REACHED = np.arange(1, 54) * 0.01
+REACHED = np.linspace(0.01, 0.53, 53)
 """Depths over the diameter at which the base law's plate is read."""
 CELLS = (4, 8, 16)
 """Across the plate, to see what they do, at an angle of 35°."""
@@ -146,7 +146,7 @@ def similar(forces: FloatArray, diameter: float) -> float:
 
 def refinement(device: str) -> list[Row]:
     """What cells and particles do, and theory."""
-    rows, depth = [], np.arange(1, 31) * 0.01
+    rows, depth = [], np.linspace(0.01, 0.3, 30)
     asked = np.array([0.1, 0.2, 0.3])
     for angle in (30.0, 35.0):
         text = "; ".join(f"{vesic(angle, z):.0f} … {meyerhof(angle, z):.0f}" for z in asked)

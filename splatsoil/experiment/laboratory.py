@@ -81,21 +81,22 @@ class LaboratoryExperiment(ABC):
         self,
         observed: FloatArray,
         sensor: FloatArray,
-        times: Sequence[float],
+        times: npt.ArrayLike,
         time_name: str,
         unit: str,
         channels: Sequence[str],
         region: str,
     ) -> None:
         """Take features (t, s) and their standard deviations (t, s); stages are the halves of the test."""
-        middle = 0.5 * float(times[-1])
+        along = np.asarray(times, dtype=np.float64).reshape(-1)
+        middle = 0.5 * float(along[-1])
         self.layout = Layout(
-            times=tuple(float(t) for t in times),
+            times=tuple(float(t) for t in along),
             sites=tuple(Site(channel) for channel in channels),
             time_name=time_name,
             unit=unit,
-            stages=tuple("first half" if t <= middle else "second half" for t in times),
-            regions=np.full((len(times), len(channels)), region),
+            stages=tuple("first half" if t <= middle else "second half" for t in along),
+            regions=np.full((len(along), len(channels)), region),
         )
         self.observed, self.sensor = observed, sensor
         self.seen = np.ones(self.layout.shape, dtype=bool)

@@ -182,7 +182,7 @@ EVERY_VALUE = {
     "dilatancy_angle": 8.0, "rate_gain": 0.5, "viscosity": 5.0, "softening_angle": 4.0, "cohesion": 100.0,
     "pressure_exponent": 0.05, "layer_friction": 2.0, "density_gradient": 0.5, "tool_adhesion": 100.0,
     "tilt_x": 2.0, "gravity_factor": 0.9, "obstacle_radius": 0.03, "stiffness_factor": 1.5,
-    "hardening_strain": 0.01,
+    "hardening_strain": 0.01, "intermediate_share": 0.5,
 }  # fmt: skip
 
 

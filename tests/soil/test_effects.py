@@ -10,7 +10,7 @@ import pytest
 from splatsoil.envs.together import attempt
 
 from splatsoil.errors import CombinationError, ParameterError
-from splatsoil.soil.element import ElementTest, isotropic_compression, simple_shear, triaxial
+from splatsoil.soil.element import ElementTest, drive, isotropic_compression, simple_shear, triaxial
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects, library
 from splatsoil.soil.matching import Matching, cone_slope
@@ -224,6 +224,21 @@ def test_hardening_mobilises_friction_by_a_hyperbola() -> None:
     rowe = 9.0 * stress_ratio / (9.0 + 3.0 * stress_ratio) / math.sqrt(3.0)
     lost = np.sum(rowe * (1.0 - 0.5 * (share[1:] + share[:-1])) * np.diff(plastic))
     assert test.volume_strain[0, -1] - elastic[-1] == pytest.approx(lost, rel=0.03)
+
+
+def test_one_friction_angle_in_compression_and_extension_and_matsuoka_nakai_between() -> None:
+    """(s1 - s3) / (s1 + s3) = sin phi in both, and I1 I2 / I3 = (9 - sin^2 phi) / (1 - sin^2 phi) in plane strain."""
+    law = Law(find_effects(["intermediate_stress"]))
+    values = {"friction_angle": ANGLE, "intermediate_share": 1.0}
+    sine = math.sin(math.radians(ANGLE))
+    for strain in (0.05, -0.05):
+        stress = np.sort(triaxial(law, values, confining=PRESSURE, strains=[strain]).stress[0, -1])
+        assert (stress[2] - stress[0]) / (stress[2] + stress[0]) == pytest.approx(sine, rel=1e-3)
+    plane = drive(
+        law, values, np.array([[PRESSURE, 0.0, 0.05, 0.0]]), by_stress=(True, False, False), confining=PRESSURE
+    ).stress[0, -1]
+    second = plane[0] * plane[1] + plane[1] * plane[2] + plane[2] * plane[0]
+    assert plane.sum() * second / plane.prod() == pytest.approx((9.0 - sine**2) / (1.0 - sine**2), rel=1e-3)
 
 
 def test_another_packing_changes_density_and_hardening_alone() -> None:
