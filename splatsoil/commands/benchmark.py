@@ -8,8 +8,7 @@ import runpy
 import sys
 from dataclasses import dataclass
 
-from tyro.conf import Positional
-
+from splatsoil.commands._options import argument, option
 from splatsoil.commands._output import print_json
 from splatsoil.errors import ParameterError
 
@@ -21,12 +20,9 @@ class Config:
     splatsoil benchmark NAME --help lists a benchmark's options.
     """
 
-    name: Positional[str] = ""
-    """Of the benchmark; without one they are listed."""
-    arguments: Positional[tuple[str, ...]] = ()
-    """The benchmark's own arguments."""
-    json: bool = False
-    """List as one JSON object; as an argument of a benchmark, it is the benchmark's own."""
+    name: str = argument("Of the benchmark; without one they are listed.", default="")
+    arguments: tuple[str, ...] = argument("The benchmark's own arguments.", default=())
+    json: bool = option(False, "List as one JSON object; as an argument of a benchmark, it is the benchmark's own.")
 
 
 def benchmarks() -> dict[str, str]:

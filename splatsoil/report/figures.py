@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from splatsoil.report.data import Surface
-from splatsoil.report.words import BEYOND, SIGNIFICANT, block
+from splatsoil.report.text import BEYOND, SIGNIFICANT, block
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

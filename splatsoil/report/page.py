@@ -12,7 +12,7 @@ import numpy as np
 import splatsoil
 from splatsoil.errors import RunError
 from splatsoil.files import write_text
-from splatsoil.report import figures, words
+from splatsoil.report import figures, text
 from splatsoil.report.data import RunData, load
 
 HERE = Path(__file__).parent
@@ -50,17 +50,17 @@ def render(data: RunData) -> str:
         loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     environment.filters.update(
-        duration=words.duration,
-        estimate=words.estimate,
-        label=words.model_label,
-        model=words.model_name,
-        probability=words.probability,
+        duration=text.duration,
+        estimate=text.estimate,
+        label=text.model_label,
+        model=text.model_name,
+        probability=text.probability,
     )
     comparison, diagnosis = data.comparison, data.diagnosis
     judged = data.judged
-    adequate = words.called_adequate(data.fit, judged)
-    ratio = words.ratio_to_noise(comparison)
-    at_the_noise = ratio is not None and ratio <= words.AT_THE_NOISE
+    adequate = text.called_adequate(data.fit, judged)
+    ratio = text.ratio_to_noise(comparison)
+    at_the_noise = ratio is not None and ratio <= text.AT_THE_NOISE
     pictures = None if comparison is None else _pictures(data.folder / "comparison", comparison)
     kinds = list(KINDS)
     if pictures is not None and data.before is not None:
@@ -76,10 +76,10 @@ def render(data: RunData) -> str:
         data=data,
         fit=data.fit,
         coarse=sum(step.get("level") == "coarse" for step in data.fit["history"]),
-        answers=words.answers(data.fit, judged, data.truth),
+        answers=text.answers(data.fit, judged, data.truth),
         adequate=adequate,
-        fitted=words.fitted_sentence(data.fit, judged),
-        residual=words.residual_sentence(comparison, adequate) if judged is None else words.misfit_sentence(judged),
+        fitted=text.fitted_sentence(data.fit, judged),
+        residual=text.residual_sentence(comparison, adequate) if judged is None else text.misfit_sentence(judged),
         calm=at_the_noise if adequate is None else adequate,
         by_comparison=data.fit["estimated_from"] == "comparison",
         forces=_forces(data, judged),
@@ -90,11 +90,11 @@ def render(data: RunData) -> str:
         titles={"predicted": "after"} if "before" in kinds else {},
         findings=_findings(data, judged),
         models=[] if diagnosis is None else diagnosis["models"],
-        little=words.LITTLE,
+        little=text.LITTLE,
         judged=judged,
         failing=None if judged is None else _failing(judged, comparison, data.folder / "comparison"),
-        significant=words.SIGNIFICANT,
-        beyond=words.BEYOND,
+        significant=text.SIGNIFICANT,
+        beyond=text.BEYOND,
         posterior=None if data.posterior is None else _posterior(data.folder, data.posterior),
         falling=_falling(data),
         surface=None if data.surface is None else Markup(figures.surface_map(data.surface)),
@@ -140,8 +140,8 @@ def _posterior(folder: Path, posterior: Mapping[str, Any]) -> dict[str, Any]:
 
     corner = folder / "posterior" / "corner.png"
     return {
-        "sentences": words.posterior_sentences(posterior),
-        "notes": words.posterior_notes(posterior),
+        "sentences": text.posterior_sentences(posterior),
+        "notes": text.posterior_notes(posterior),
         "marginals": [Markup(figures.marginal(entry)) for entry in posterior["parameters"].values()],
         "corner": data_url(corner) if len(posterior["parameters"]) > 1 and corner.is_file() else None,
         "simulations": posterior["simulations"],
@@ -155,12 +155,12 @@ def _findings(data: RunData, judged: Mapping[str, Any] | None) -> list[dict[str,
     if data.diagnosis is not None:
         named = data.diagnosis["class"] if data.diagnosis["verdict"] in ("missing", "one of") else ()
         added, of = set(named) & set(data.fit["name"].split("+")), data.diagnosis["fit"]
-        later = "" if of == data.fit["name"] else "Added." if added else f"({words.model_name(of)})"
+        later = "" if of == data.fit["name"] else "Added." if added else f"({text.model_name(of)})"
         calm = data.diagnosis["verdict"] == "adequate"
         sentences = data.diagnosis["sentences"]
-        out.append({"text": words.verdict(data.diagnosis), "calm": calm, "later": later, "sentences": sentences})
+        out.append({"text": text.verdict(data.diagnosis), "calm": calm, "later": later, "sentences": sentences})
     if judged is not None and judged is data.misfit:
-        said = {"text": words.misfit_verdict(judged), "calm": judged["adequate"], "later": ""}
+        said = {"text": text.misfit_verdict(judged), "calm": judged["adequate"], "later": ""}
         out.append({**said, "sentences": judged["sentences"]})
     return out
 
@@ -170,7 +170,7 @@ def _failing(judged: Mapping[str, Any], comparison: Mapping[str, Any] | None, fo
     from markupsafe import Markup
 
     which = [("as it is", "before")]
-    which += [(f"with {words.model_label(n)}", n) for n in judged.get("class", ())[:1] if n in judged["maps"]]
+    which += [(f"with {text.model_label(n)}", n) for n in judged.get("class", ())[:1] if n in judged["maps"]]
     drawn = figures.plan_maps(judged, which)
     return {
         "maps": [(title, Markup(svg)) for (title, _), svg in zip(which, drawn, strict=True)],
@@ -185,17 +185,17 @@ def _outlined(judged: Mapping[str, Any], comparison: Mapping[str, Any], folder: 
 
     out: list[dict[str, Any]] = []
     for check in judged["checks"]:
-        if check["p"] >= words.SIGNIFICANT or check["channel"] not in comparison["cameras"] or len(out) == OUTLINED:
+        if check["p"] >= text.SIGNIFICANT or check["channel"] not in comparison["cameras"] or len(out) == OUTLINED:
             continue
-        row, squares = words.worst_row(judged, check)
+        row, squares = text.worst_row(judged, check)
         mine = (entry for entry in comparison["frames"] if entry["camera"] == check["channel"])
         entry = min(mine, key=lambda entry: abs(entry["frame"] - judged["times"][row]))
-        name = words.block(check)
+        name = text.block(check)
         out.append(
             {
                 "title": name[:1].upper() + name[1:],
                 "ratio": check["ratio"],
-                "begins": words.begins(judged, check),
+                "begins": text.begins(judged, check),
                 "frame": entry["frame"],
                 "photograph": data_url(folder / entry["observed"]),
                 "squares": Markup(figures.outlined(check, judged, squares)),
@@ -229,13 +229,13 @@ def _forces(data: RunData, judged: Mapping[str, Any] | None) -> dict[str, Any] |
             for name in own.get("class", ())[:1] if before is None else ():
                 if name in curve["predicted"]:
                     times, values = _series(own["times"], curve["predicted"][name])
-                    lines[f"with {words.model_label(name)}"] = (times, values)
+                    lines[f"with {text.model_label(name)}"] = (times, values)
         one = figures.Readings(channel["channel"], now["unit"], (frames, measured), expected, lines)
         drawn.append(Markup(figures.readings(one, "frame")))
         error, largest = np.sqrt(np.nanmean((predicted - measured) ** 2)), np.nanmax(np.abs(measured))
         sentences.append(
-            f"{channel['channel'].capitalize()}: root mean square error {words.rounded(float(error))} {now['unit']}; "
-            f"largest measured {words.rounded(float(largest))} {now['unit']}."
+            f"{channel['channel'].capitalize()}: root mean square error {text.rounded(float(error))} {now['unit']}; "
+            f"largest measured {text.rounded(float(largest))} {now['unit']}."
         )
     return {"figures": drawn, "sentences": sentences}
 
@@ -252,10 +252,10 @@ def _falling(data: RunData) -> dict[str, Any] | None:
     diagnosis = data.diagnosis or {"held_out": [], "aside": "data set aside", "unit": "grey levels"}
     if len(data.history) > 1:
         rows = [(entry["held_out"], entry["floor"]) for entry in data.history]
-        names = words.steps(data.history)
+        names = text.steps(data.history)
     else:
         rows = [(entry["error"], entry["noise"]) for entry in diagnosis["held_out"]]
-        names = [words.model_label(entry["model"]) for entry in diagnosis["held_out"]]
+        names = [text.model_label(entry["model"]) for entry in diagnosis["held_out"]]
     if len(rows) < 2:
         return None
     errors, noise = zip(*rows, strict=True)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
-import shlex
 import shutil
 import sys
 from collections.abc import Callable
@@ -15,12 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-import tyro
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from splatsoil import cli
-from splatsoil.commands import import_
 from splatsoil.errors import MeasurementError
 from splatsoil.measurement import Camera, Frame, Measurement, ToolMotion
 from splatsoil.measurement.importing.clock import Footage, clock_offset
@@ -513,33 +509,3 @@ def test_the_clock_of_a_box_that_crosses_the_picture() -> None:
 def test_no_clock_is_told_from_noise() -> None:
     with pytest.raises(MeasurementError, match="cannot be told from what is behind it"):
         clock_offset(*([one] if isinstance(one, Footage) else one for one in footage(shown=False)))
-
-
-def test_help_fits_a_screen(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "80")
-    with pytest.raises(SystemExit):
-        cli.main(["import", "--help"])
-    assert len(capsys.readouterr().out.splitlines()) <= 40
-
-
-def test_the_commands_of_the_page_parse(repository: Path) -> None:
-    page = (repository / "docs" / "own-photographs.md").read_text()
-    text = "\n".join(re.findall(r"```sh\n(.*?)```", page, re.DOTALL)).replace("\\\n", "")
-    lines = [shlex.split(line) for line in text.splitlines() if line.startswith("splatsoil")]
-    assert [words[1] for words in lines] == ["import", "check", "import", "import"]
-    known = cli.commands()
-    for _, name, *words in lines:
-        tyro.cli(known[name].config, args=words)
-
-
-@pytest.mark.parametrize("how", ["everything", "nothing"])
-def test_the_hint_after_ctrl_c_is_the_command_that_was_given(how: str) -> None:
-    text = (
-        "'a folder' out --images i --scale 2 --distance a b 0.5 --tags 0.1 --known k.csv --points p.csv --up 0 -1 0"
-        " --tool t.stl mm --motion m.csv m --force f.csv --robot-to-world r.txt --mesh-to-flange f.txt"
-        " --video 'a b.mp4=c.jpg' d.mp4=e.png --video-every 3 --clock-offset -0.5 --experiment e.json --json"
-    )
-    config = tyro.cli(import_.Config, args=shlex.split(text)[: None if how == "everything" else 2])
-    hint = import_.interrupted(config)
-    words = shlex.split(hint[hint.index("splatsoil ") :])
-    assert words[:2] == ["splatsoil", "import"] and tyro.cli(import_.Config, args=words[2:]) == config

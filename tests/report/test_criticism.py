@@ -16,7 +16,7 @@ from PIL import Image
 
 from splatsoil.files import write_json
 from splatsoil.report import figures, write_report
-from splatsoil.report.words import steps
+from splatsoil.report.text import steps
 
 CHROMIUM = shutil.which("chromium")
 FRAMES = (10, 20)
