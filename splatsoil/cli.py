@@ -1,7 +1,7 @@
 """The command line: assembles the modules of ``splatsoil.commands`` and handles what they have in common.
 
 A module there is a command of the same name (``import_`` of ``import``, a word of Python's own). It has a frozen
-dataclass ``Config`` whose fields are its options (see `splatsoil.commands._options`; its docstring is the help; a field
+dataclass ``Config`` whose fields are its options (see `splatsoil.options`; its docstring is the help; a field
 ``json`` makes the command print one JSON object and nothing else on stdout) and a function ``run(config) -> int`` that
 returns the exit code. ``INTERRUPTED`` says, after Ctrl-C, what is kept and how to go on, before the command line that
 does: a text, or a function of the options. Whatever is slow to import belongs inside ``run``.

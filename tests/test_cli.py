@@ -16,9 +16,9 @@ import pytest
 
 import splatsoil.commands
 from splatsoil import cli
-from splatsoil.commands._options import option
 from splatsoil.commands._output import only_json, print_json
 from splatsoil.errors import RunError
+from splatsoil.options import option
 
 
 def run(*words: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
@@ -212,7 +212,7 @@ def test_a_new_command_is_one_new_file(
 ) -> None:
     (tmp_path / "dig_deep.py").write_text(
         "from dataclasses import dataclass\n"
-        "from splatsoil.commands._options import option\n"
+        "from splatsoil.options import option\n"
         "@dataclass(frozen=True)\n"
         "class Config:\n    'Dig.'\n    depth: float = option(1.0, 'Metres.')\n"
         "def run(config):\n    print(config.depth)\n    return 7\n"

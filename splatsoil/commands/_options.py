@@ -1,6 +1,6 @@
-"""Options of the commands: each is declared once, as a field of a dataclass.
+"""Options of the commands: the parser, the help page, and the command line that says the same again.
 
-The parser, the help page and the command line that says the same again are made from these fields.
+All are made from the fields of a dataclass, see `splatsoil.options`.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, Literal, NoReturn
 
 from splatsoil.errors import ParameterError, did_you_mean
+from splatsoil.options import JSON, argument, option
 
 Preset = Literal["tiny", "small", "paper", "fine"]
 
@@ -31,7 +32,6 @@ DEVICE = "Where to compute: auto, cpu, cuda:0, …"
 SEED = "Of random numbers; one seed gives one result on one processor."
 EFFECTS = "Effects of the model, by name, or files that define some."
 BUDGET = "Evaluations; 10 for each free parameter if not given."
-JSON = "Print one JSON object and nothing else."
 
 #: Commands as help lists them, by what they are for.
 ORDER = {
@@ -49,25 +49,6 @@ WIDEST = 100
 KINDS = {int: "N", float: "X", Path: "PATH", str: "NAME"}
 """What stands for a value of some type in help."""
 NUMBERS = {int: "a whole number", float: "a number"}
-
-
-def option(default: Any, text: str, *, name: str = "", metavar: str = "", expert: bool = False) -> Any:
-    """A field that is given as ``--name VALUE``.
-
-    Args:
-        default: value if not given.
-        text: for help.
-        name: if it isn't the field's.
-        metavar: what stands for the value in help; one word for each of several values.
-        expert: a first run does without it.
-    """
-    metadata = {"text": text, "name": name, "metavar": metavar, "expert": expert}
-    return dataclasses.field(default=default, kw_only=True, metadata=metadata)
-
-
-def argument(text: str, *, default: Any = dataclasses.MISSING, metavar: str = "") -> Any:
-    """A field that is given by its place."""
-    return dataclasses.field(default=default, metadata={"text": text, "metavar": metavar, "positional": True})
 
 
 @dataclass(frozen=True)

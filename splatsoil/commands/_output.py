@@ -53,7 +53,7 @@ def print_table(
     columns: Sequence[str],
     rows: Iterable[Sequence[str]],
     *,
-    left: Collection[str] = (),
+    left: Collection[str] | None = None,
     faint: Collection[int] = (),
 ) -> None:
     """Print a table.
@@ -62,7 +62,7 @@ def print_table(
         title: above it.
         columns: headings; none for rows of a name and what it is.
         rows: texts.
-        left: columns that are aligned left, beside the first.
+        left: columns that are aligned left; the first if not given.
         faint: numbers of rows that matter less.
     """
     from rich.box import SIMPLE_HEAD
@@ -71,9 +71,9 @@ def print_table(
     from rich.table import Table
 
     table = Table(title=escape(title), title_justify="left", show_header=bool(columns), box=SIMPLE_HEAD)
-    for number, column in enumerate(columns):
-        aligned_left = number == 0 or column in left
-        table.add_column(escape(column), justify="left" if aligned_left else "right", no_wrap=number == 0)
+    for column in columns:
+        aligned = "left" if column in (columns[:1] if left is None else left) else "right"
+        table.add_column(escape(column), justify=aligned, no_wrap=column == columns[0])
     for number, row in enumerate(rows):
         table.add_row(*map(escape, row), style="dim" if number in faint else None)
     Console(highlight=False).print(table)

@@ -7,18 +7,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from splatsoil.commands import _folder, _model, _stages
-from splatsoil.commands._options import (
-    BUDGET,
-    DEVICE,
-    JSON,
-    FitOptions,
-    RunOptions,
-    argument,
-    check_evaluations,
-    option,
-)
+from splatsoil.commands._options import BUDGET, DEVICE, FitOptions, RunOptions, check_evaluations
 from splatsoil.commands._output import print_json, print_table
 from splatsoil.errors import ParameterError, RunError
+from splatsoil.options import JSON, argument, option
 
 if TYPE_CHECKING:
     from splatsoil.commands._output import Stage
@@ -183,5 +175,5 @@ def show(entries: Sequence[Mapping[str, Any]]) -> None:
             )
             for entry in entries
         ),
-        left=("parameters",),
+        left=("model", "parameters"),
     )

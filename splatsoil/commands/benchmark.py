@@ -8,9 +8,9 @@ import runpy
 import sys
 from dataclasses import dataclass
 
-from splatsoil.commands._options import argument, option
 from splatsoil.commands._output import print_json
 from splatsoil.errors import ParameterError
+from splatsoil.options import argument, option
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,9 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from splatsoil.commands._options import JSON, SET, argument, option
+from splatsoil.commands._options import SET
 from splatsoil.commands._output import print_json, print_table, print_text
+from splatsoil.options import JSON, argument, option
 
 if TYPE_CHECKING:
     from splatsoil.measurement import Measurement, Remark

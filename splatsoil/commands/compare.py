@@ -8,9 +8,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from splatsoil.commands import _folder, _model, _stages
-from splatsoil.commands._options import DEVICE, JSON, RunOptions, command_line, option
+from splatsoil.commands._options import DEVICE, RunOptions, command_line
 from splatsoil.commands._output import print_json, print_table, print_text
 from splatsoil.errors import NoAnswer
+from splatsoil.options import JSON, option
 
 INTERRUPTED = "the comparison was not finished; start again with"
 #: Checks shown on the screen.
@@ -88,7 +89,7 @@ def show_misfit(misfit: Mapping[str, Any], run: str) -> None:
         "residual over what is expected, the worst first",
         ("stage", "region", "instrument", "× expected", "p"),
         ((c["stage"], c["region"], c["channel"], f"{c['ratio']:.2f}", f"{c['p']:.2g}") for c in checks[:SHOWN]),
-        left=("region", "instrument"),
+        left=("stage", "region", "instrument"),
         faint=set(range(len(checks))) - failed,
     )
     print_text(

@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from splatsoil.commands import _folder, _model
-from splatsoil.commands._options import DEVICE, JSON, Preset, RunOptions, command_line, option
+from splatsoil.commands._options import DEVICE, Preset, RunOptions, command_line
 from splatsoil.commands._output import print_json, print_notes, print_table, print_text
 from splatsoil.errors import ParameterError, RunError, SimulationError
+from splatsoil.options import JSON, option
 
 if TYPE_CHECKING:
     from splatsoil.commands._model import ModelSpec
@@ -250,7 +251,7 @@ def show(result: Mapping[str, Any]) -> None:
             )
             for stroke in result["strokes"]
         ),
-        left=("would tell apart",),
+        left=("motion", "would tell apart"),
     )
     print_text(best_sentence(result))
     print_notes(result["notes"])

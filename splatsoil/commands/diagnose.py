@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from splatsoil.commands import _folder, _model, _stages
-from splatsoil.commands._options import DEVICE, JSON, RunOptions, option
+from splatsoil.commands._options import DEVICE, RunOptions
 from splatsoil.commands._output import print_json, print_notes, print_table, print_text
 from splatsoil.errors import NoAnswer
+from splatsoil.options import JSON, option
 
 INTERRUPTED = "finished simulations are kept; go on with"
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from splatsoil.commands._options import JSON, option
 from splatsoil.commands._output import print_json, print_table
 from splatsoil.commands.simulate import ACTING, VALUES, parse_values
 from splatsoil.errors import ParameterError
+from splatsoil.options import JSON, option
 
 if TYPE_CHECKING:
     from splatsoil.soil.element import ElementTest
@@ -186,5 +186,5 @@ def show(columns: dict[str, Any], config: Config) -> None:
     total = len(next(iter(columns.values())))
     shown = np.unique(np.linspace(0, total - 1, min(ROWS, total)).astype(int))
     rows = ([f"{column[k]:.5g}" for column in columns.values()] for k in shown)
-    print_table(f"{config.test} test at {config.confining:g} Pa", tuple(columns), rows)
+    print_table(f"{config.test} test at {config.confining:g} Pa", tuple(columns), rows, left=())
     print(f"plot: {config.plot}")

@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from splatsoil.commands import _model
-from splatsoil.commands._options import DEVICE, JSON, argument, option
+from splatsoil.commands._options import DEVICE
 from splatsoil.commands._output import print_json
 from splatsoil.errors import ParameterError, RunError
+from splatsoil.options import JSON, argument, option
 
 if TYPE_CHECKING:
     from splatsoil.inverse.run_folder import RunFolder

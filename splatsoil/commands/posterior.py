@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from splatsoil.commands import _folder, _model, _stages
-from splatsoil.commands._options import JSON, RunOptions, command_line, option
+from splatsoil.commands._options import RunOptions, command_line
 from splatsoil.commands._output import print_json, print_notes, print_table, print_text, stages
 from splatsoil.errors import ParameterError
+from splatsoil.options import JSON, option
 
 INTERRUPTED = "what was simulated and sampled is kept; go on with"
 
@@ -93,7 +94,7 @@ def show(result: Mapping[str, Any], folder: str) -> None:
             (name, amount(p["mean"], p["std"], p["unit"]), interval(p), f"{p['contraction']:.2f}", p["verdict"])
             for name, p in result["parameters"].items()
         ),
-        left=("",),
+        left=("parameter", ""),
     )
     print_notes(result["notes"])
     chains = result["chains"]

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from splatsoil.commands._options import JSON, PRESET, SEED, SET, Preset, argument, option
+from splatsoil.commands._options import PRESET, SEED, SET, Preset
 from splatsoil.commands._output import print_json, print_remarks, print_table, print_text
+from splatsoil.options import JSON, argument, option
 
 if TYPE_CHECKING:
     from splatsoil.reconstruction import Reconstruction

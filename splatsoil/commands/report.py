@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from splatsoil.commands import _folder
-from splatsoil.commands._options import JSON, RunOptions, option
+from splatsoil.commands._options import RunOptions
 from splatsoil.commands._output import print_json
+from splatsoil.options import JSON, option
 
 INTERRUPTED = "the page was not written; start again with"
 

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from splatsoil.commands import _folder, _model, _stages, add, compare, diagnose, fit
-from splatsoil.commands._options import FitOptions, command_line, option
+from splatsoil.commands._options import FitOptions, command_line
 from splatsoil.commands._output import print_json, stages
 from splatsoil.errors import ParameterError, SplatsoilError
+from splatsoil.options import option
 
 if TYPE_CHECKING:
     from splatsoil.commands._output import Stage

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from splatsoil.commands._options import JSON, Preset, argument, option
+from splatsoil.commands._options import Preset
 from splatsoil.commands._output import print_json, print_table
 from splatsoil.errors import ParameterError
+from splatsoil.options import JSON, argument, option
 
 if TYPE_CHECKING:
     from splatsoil.synthetic import Setup, World

@@ -12,7 +12,8 @@ from typing import Literal
 import pytest
 
 from splatsoil import cli
-from splatsoil.commands._options import FitOptions, argument, option, parse, parser_of, same_again
+from splatsoil.commands._options import FitOptions, parse, parser_of, same_again
+from splatsoil.options import argument, option
 
 #: Options of each command, none of them as usual.
 GIVEN = {

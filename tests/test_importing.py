@@ -18,11 +18,11 @@ from scipy.spatial.transform import Rotation
 
 from splatsoil import cli
 from splatsoil.errors import MeasurementError
+from splatsoil.importing.clock import Footage, clock_offset
+from splatsoil.importing.robot import Grid, read_force
+from splatsoil.importing.similarity import by_known_points, by_scale, read_marked
+from splatsoil.importing.source import read_source
 from splatsoil.measurement import Camera, Frame, Measurement, ToolMotion
-from splatsoil.measurement.importing.clock import Footage, clock_offset
-from splatsoil.measurement.importing.robot import Grid, read_force
-from splatsoil.measurement.importing.similarity import by_known_points, by_scale, read_marked
-from splatsoil.measurement.importing.source import read_source
 
 RATE = 5.0
 """Frames a second of the videos: a tenth of the sets'."""

@@ -11,9 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from splatsoil.errors import MeasurementError
+from splatsoil.importing.source import find_image
 from splatsoil.measurement.fields import read_table, read_text
 from splatsoil.measurement.frames import Frame
-from splatsoil.measurement.importing.source import find_image
 from splatsoil.measurement.rotations import rotation_matrix
 
 FloatArray = npt.NDArray[np.float64]
