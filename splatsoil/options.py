@@ -23,6 +23,6 @@ def option(default: Any, text: str, *, name: str = "", metavar: str = "", expert
     return dataclasses.field(default=default, kw_only=True, metadata=metadata)
 
 
-def argument(text: str, *, default: Any = dataclasses.MISSING, metavar: str = "") -> Any:
+def argument(text: str, *, default: Any = dataclasses.MISSING) -> Any:
     """A field that is given by its place."""
-    return dataclasses.field(default=default, metadata={"text": text, "metavar": metavar, "positional": True})
+    return dataclasses.field(default=default, metadata={"text": text, "positional": True})

@@ -28,40 +28,34 @@ def run(*words: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str
     )
 
 
-def test_check_shows_a_table_and_json(plow_dry: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["check", str(plow_dry)]) == 0
-    table = capsys.readouterr().out
+def test_check_shows_a_table_and_json_and_writes_nothing(
+    plow_dry: Path, small_set: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = sorted(tmp_path.rglob("*"))
+    done = run("check", str(plow_dry), cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
     for words in ("plow-dry", "0.8 x 0.5 x 0.27 m", "40 of 320 x 240 pixels", "left, right", "complete and consistent"):
-        assert words in table
+        assert words in done.stdout
     assert cli.main(["check", str(plow_dry), "--json"]) == 0
     data = json.loads(capsys.readouterr().out)
     assert data["ok"] is True and data["views"] == 40 and data["remarks"] == []
     assert data["video"]["pre_roll"] == [-4, -3, -2, -1] and data["bed"]["density"] == 1600.0
-
-
-def test_check_says_what_is_odd(small_set: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Remarks are no failure."""
+    # Remarks are no failure.
     assert cli.main(["check", str(small_set)]) == 0
     assert "only 4 views" in " ".join(capsys.readouterr().out.split())
     assert cli.main(["check", str(small_set), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["remarks"][0]["about"] == "views"
+    assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_check_writes_nothing_even_where_it_cannot(plow_dry: Path, tmp_path: Path) -> None:
-    done = run("check", str(plow_dry), cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("command", ["--help", "check"])
-def test_a_reader_that_has_gone_is_told_nothing(plow_dry: Path, command: str) -> None:
-    words = [command, *([str(plow_dry)] if command == "check" else [])]
+@pytest.mark.parametrize("words", [["--help"], ["check"], ["check", "--json"]], ids=" ".join)
+def test_a_reader_that_has_gone_is_no_error(plow_dry: Path, words: list[str]) -> None:
+    """``splatsoil check SET --json | true``."""
     reader, writer = os.pipe()
     os.close(reader)
+    command = [sys.executable, "-m", "splatsoil", *words, *([str(plow_dry)] if words[0] == "check" else [])]
     with os.fdopen(writer, "wb") as gone:
-        done = subprocess.run(
-            [sys.executable, "-m", "splatsoil", *words], stdout=gone, stderr=subprocess.PIPE, timeout=120, check=False
-        )
+        done = subprocess.run(command, stdout=gone, stderr=subprocess.PIPE, timeout=120, check=False)
     assert done.stderr == b""
 
 
@@ -261,16 +255,6 @@ def test_json_holds_no_nan(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(ValueError, match="JSON"), only_json():
         print_json({"loss": float("nan")})
     assert capsys.readouterr().out == ""
-
-
-def test_a_reader_that_goes_away_is_no_error(plow_dry: Path) -> None:
-    """``splatsoil check SET --json | true``."""
-    read, write = os.pipe()
-    os.close(read)
-    words = [sys.executable, "-m", "splatsoil", "check", str(plow_dry), "--json"]
-    done = subprocess.run(words, stdout=write, stderr=subprocess.PIPE, text=True, timeout=120, check=False)
-    os.close(write)
-    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_a_command_that_simulates_says_nothing_of_what_the_machine_lacks(tmp_path: Path) -> None:

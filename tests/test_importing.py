@@ -443,13 +443,14 @@ def test_forces_are_means_over_frames_in_world_axes(tmp_path: Path) -> None:
         (["--motion", "robot.csv", "mm", "--robot-to-world", "known.csv"], "four rows of four numbers"),
         (["--motion", "robot.csv", "mm", "--video", "left.mp4=left.jpg"], "give --tool or --clock-offset"),
         (["--tool", "known.csv", "mm"], "known.csv"),
+        (["--motion", "robot.csv", "km"], "its unit 'km' is none of m, cm, mm, in"),
     ],
 )
 def test_mistakes_are_one_sentence_and_nothing_is_written(
     words: list[str], said: str, plow: Recorded, importing: Callable[..., dict[str, Any]], tmp_path: Path
 ) -> None:
     if said.startswith(
-        ("write", "two", "no posed", "cannot", "--video", "a motion", "expected", "four", "give", "known")
+        ("write", "two", "no posed", "cannot", "--video", "a motion", "expected", "four", "give", "known", "its unit")
     ):
         words = [*words, "--scale", "1", "--up", "0", "0", "1"]
     result = importing(plow, *words)

@@ -14,7 +14,7 @@ import sys
 import textwrap
 import types
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -48,7 +48,6 @@ WIDEST = 100
 """Columns of a help page, at most."""
 KINDS = {int: "N", float: "X", Path: "PATH", str: "NAME"}
 """What stands for a value of some type in help."""
-NUMBERS = {int: "a whole number", float: "a number"}
 
 
 @dataclass(frozen=True)
@@ -121,25 +120,32 @@ class _Parser(argparse.ArgumentParser):
         raise SystemExit(2)
 
 
+class _Tuple(argparse.Action):
+    """Several values, each of its own type."""
+
+    def __init__(self, *names: Any, kinds: Sequence[Callable[[str], Any]], **settings: Any) -> None:
+        super().__init__(*names, nargs=len(kinds), **settings)
+        self.kinds = kinds
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+        try:
+            setattr(namespace, self.dest, tuple(kind(word) for kind, word in zip(self.kinds, values, strict=True)))
+        except ValueError as error:
+            raise argparse.ArgumentError(self, str(error)) from None
+
+
 def parse(command: str, config: type, words: Sequence[str]) -> Any:
     """A dataclass of options from a command's words; ``--help`` leaves with 0, and usage errors with 2."""
-    hints, fields = typing.get_type_hints(config), {field.name: field for field in dataclasses.fields(config)}
     parser = parser_of(command, config)
     found, unknown = parser.parse_known_intermixed_args(list(words))
     if unknown:
-        parser.error(f"unknown {unknown[0]}{did_you_mean(unknown[0], map(_flag, fields.values()))}")
-    values = {}
-    for name, given in vars(found).items():
-        try:
-            values[name] = given is True or _converted(hints[name], given if isinstance(given, list) else [given])
-        except ValueError as error:
-            shown = name.upper() if fields[name].metadata.get("positional") else _flag(fields[name])
-            parser.error(f"{shown}: {error}")
-    return config(**values)
+        hint = did_you_mean(unknown[0], map(_flag, dataclasses.fields(config)))
+        parser.error(f"unrecognized argument: {unknown[0]}{hint}")
+    return config(**{name: tuple(value) if isinstance(value, list) else value for name, value in vars(found).items()})
 
 
 def parser_of(command: str, config: type) -> argparse.ArgumentParser:
-    """What reads a command's words as text, and prints its help page."""
+    """What reads a command's words, and prints its help page."""
     fields, hints = dataclasses.fields(config), typing.get_type_hints(config)
     places = [_shown(field) for field in fields if field.metadata.get("positional")]
     parser = _Parser(
@@ -152,26 +158,30 @@ def parser_of(command: str, config: type) -> argparse.ArgumentParser:
     )
     expert = parser.add_argument_group("expert")
     for field in fields:
-        hint, text = _single(hints[field.name]), field.metadata.get("text", "") + _usual(field.default)
-        inner, more = typing.get_args(hint), field.metadata.get("metavar", "")
-        several = typing.get_origin(hint) is tuple
-        open_ended = several and Ellipsis in inner
-        settings: dict[str, Any] = {"help": text.replace("%", "%%")}
-        if hint is bool:
-            settings["action"] = "store_true"
+        about, required = field.metadata, field.default is dataclasses.MISSING
+        settings = _settings(hints[field.name], about.get("metavar", ""))
+        settings["help"] = (about.get("text", "") + _usual(field.default)).replace("%", "%%")
+        if about.get("positional"):
+            many = ("+" if required else "*") if "nargs" in settings else None if required else "?"
+            parser.add_argument(field.name, **settings | {"metavar": field.name.upper(), "nargs": many})
         else:
-            kinds = tuple(more.split()) or tuple(_kind(part) for part in (inner if several else (hint,)))
-            settings["metavar"] = kinds if several and not open_ended else kinds[0]
-        if field.metadata.get("positional"):
-            required = field.default is dataclasses.MISSING
-            many = ("+" if required else "*") if open_ended else None if required else "?"
-            parser.add_argument(field.name, **settings | {"metavar": more or field.name.upper()}, nargs=many)
-            continue
-        if several:
-            settings["nargs"] = "*" if open_ended else len(inner)
-        group = expert if field.metadata.get("expert") else parser
-        group.add_argument(_flag(field), dest=field.name, **settings)
+            group = expert if about.get("expert") else parser
+            group.add_argument(_flag(field), dest=field.name, **settings)
     return parser
+
+
+def _settings(hint: Any, metavar: str) -> dict[str, Any]:
+    """How argparse reads a value of some type."""
+    inner, origin = typing.get_args(hint), typing.get_origin(hint)
+    if origin in (typing.Union, types.UnionType):
+        return _settings(next(part for part in inner if part is not type(None)), metavar)
+    if origin is Literal:
+        return {"choices": inner}
+    if origin is tuple and Ellipsis in inner:
+        return {**_settings(inner[0], metavar), "nargs": "*"}
+    if origin is tuple:
+        return {"action": _Tuple, "kinds": inner, "metavar": tuple(metavar.split())}
+    return {"action": "store_true"} if hint is bool else {"type": hint, "metavar": metavar or KINDS[hint]}
 
 
 def program_page(configs: Mapping[str, type], description: str) -> str:
@@ -197,21 +207,8 @@ def _flag(field: dataclasses.Field[Any]) -> str:
 
 def _shown(field: dataclasses.Field[Any]) -> str:
     """A positional one in the usage."""
-    name = (field.metadata.get("metavar") or field.name.upper()) + " …" * str(field.type).startswith("tuple")
+    name = field.name.upper() + " …" * str(field.type).startswith("tuple")
     return name if field.default is dataclasses.MISSING else f"[{name}]"
-
-
-def _single(hint: Any) -> Any:
-    """A type without None."""
-    if typing.get_origin(hint) in (typing.Union, types.UnionType):
-        return next(part for part in typing.get_args(hint) if part is not type(None))
-    return hint
-
-
-def _kind(hint: Any) -> str:
-    if typing.get_origin(hint) is Literal:
-        return "{" + ",".join(typing.get_args(hint)) + "}"
-    return KINDS.get(hint, "")
 
 
 def _usual(value: Any) -> str:
@@ -220,21 +217,3 @@ def _usual(value: Any) -> str:
         return ""
     words = value if isinstance(value, tuple) else (value,)
     return f" [{' '.join(f'{word:g}' if isinstance(word, float) else str(word) for word in words)}]"
-
-
-def _converted(hint: Any, words: Sequence[str]) -> Any:
-    """Words as a value of a type; ValueError says what they are not."""
-    hint = _single(hint)
-    inner = typing.get_args(hint)
-    if typing.get_origin(hint) is tuple:
-        kinds = [inner[0]] * len(words) if Ellipsis in inner else inner
-        return tuple(_converted(kind, [word]) for kind, word in zip(kinds, words, strict=True))
-    (word,) = words
-    if inner:
-        if word not in inner:
-            raise ValueError(f"{word!r} is none of {', '.join(inner)}")
-        return word
-    try:
-        return hint(word)
-    except ValueError:
-        raise ValueError(f"{word!r} is not {NUMBERS[hint]}") from None

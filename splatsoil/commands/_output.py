@@ -72,8 +72,8 @@ def print_table(
 
     table = Table(title=escape(title), title_justify="left", show_header=bool(columns), box=SIMPLE_HEAD)
     for column in columns:
-        aligned = "left" if column in (columns[:1] if left is None else left) else "right"
-        table.add_column(escape(column), justify=aligned, no_wrap=column == columns[0])
+        aligned_left = column in (columns[:1] if left is None else left)
+        table.add_column(escape(column), justify="left" if aligned_left else "right", no_wrap=column == columns[0])
     for number, row in enumerate(rows):
         table.add_row(*map(escape, row), style="dim" if number in faint else None)
     Console(highlight=False).print(table)

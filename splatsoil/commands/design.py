@@ -83,75 +83,60 @@ def diagnosis_of(folder: RunFolder) -> dict[str, Any]:
     return data
 
 
-@dataclass(frozen=True)
-class _Design:
-    """What strokes are compared by.
+def _expected(
+    stroke: Stroke,
+    measured: PlowExperiment,
+    kept: Simulations,
+    folder: RunFolder,
+    spec: ModelSpec,
+    diagnosis: Mapping[str, Any],
+    draws: Mapping[str, Sequence[Mapping[str, float]]],
+    report: Report,
+) -> tuple[Information, int]:
+    """What a stroke is expected to tell, and how many new simulations and drawings that took.
 
-    Attributes:
-        folder: the run.
-        model: of the measured stroke.
-        spec: what makes it.
-        measured: the experiment of that stroke.
+    Args:
+        stroke: another one than was measured.
+        measured: the experiment of the measured one.
         kept: its simulations.
+        folder: the run.
+        spec: of its model.
         diagnosis: what ``diagnosis.json`` holds.
-        probability: of the models to be told apart.
-        draws: parameters of each, and of the model as it is.
+        draws: parameters of the model as it is, and of each that is to be told apart.
+        report: progress.
     """
+    from concurrent.futures import Future
+    from contextlib import nullcontext
 
-    folder: RunFolder
-    model: Model
-    spec: ModelSpec
-    measured: PlowExperiment
-    kept: Simulations
-    diagnosis: Mapping[str, Any]
-    probability: Mapping[str, float]
-    draws: Mapping[str, Sequence[Mapping[str, float]]]
+    from splatsoil.experiment.strokes import StrokeExperiment
+    from splatsoil.files import code_digest
+    from splatsoil.inverse.criticism.next_stroke import expected_information, probable, runs_of
+    from splatsoil.inverse.criticism.simulations import Helpers, Simulations
+    from splatsoil.inverse.evaluations import digest
 
-    @classmethod
-    def of(cls, folder: RunFolder, model: Model, spec: ModelSpec, diagnosis: Mapping[str, Any], draws: int) -> _Design:
-        from splatsoil.inverse.criticism.evidence import AS_IT_IS
-        from splatsoil.inverse.criticism.next_stroke import probable
-
-        measured, kept = _model.experiment_of(folder, model, spec, diagnosis["candidates"] or None)
-        probability = probable(diagnosis)
-        drawn = {name: diagnosis["draws"][name][:draws] for name in dict.fromkeys((AS_IT_IS, *probability))}
-        return cls(folder, model, spec, measured, kept, diagnosis, probability, drawn)
-
-    def expected(self, stroke: Stroke, report: Report) -> tuple[Information, int]:
-        """What a stroke is expected to tell, and how many new simulations and drawings that took."""
-        from concurrent.futures import Future
-        from contextlib import nullcontext
-
-        from splatsoil.experiment.strokes import StrokeExperiment
-        from splatsoil.files import code_digest
-        from splatsoil.inverse.criticism.next_stroke import expected_information, runs_of
-        from splatsoil.inverse.criticism.simulations import Helpers, Simulations
-        from splatsoil.inverse.evaluations import digest
-
-        seed, spec, model = int(self.folder.description["seed"]), self.spec, self.model
-        measurement = stroke.prepared(self.measured)
-        reconstruction, device = model.reconstruction, model.device
-        other = _model.model_on(measurement, self.folder, reconstruction, spec.effects, spec.preset, device)
-        experiment = StrokeExperiment(other, self.measured, self.diagnosis["candidates"] or None)
-        motion = motion_csv(stroke.measurement.tool.motion)
-        identity = {
-            **self.kept.identity,
-            "stroke": digest({"motion": motion, "rate": stroke.measurement.frame_rate, "start": stroke.start}),
-            "strokes": code_digest(("experiment/strokes.py",)),
-            "layout": list(experiment.layout.shape),
-        }
-        runs = [run for mine in runs_of(self.draws, seed).values() for run in mine]
-        simulate = Simulations(experiment, self.kept.folder, identity, sources=self.kept.sources)
-        count = len(runs) + len(experiment.guesses) + len(experiment.redrawn)
-        simulate.told = lambda purpose: report(purpose.replace("_", " "), simulate.asked / count)
-        # A GPU makes several at a time, all of them in this process.
-        batch = Helpers(0, lambda jobs: Future(), experiment.together, experiment.prepare)
-        with simulate.helped(batch) if experiment.together > 1 else nullcontext():
-            simulate.ahead(lambda ask: [ask(**run.arguments()) for run in runs])
-            found = expected_information(
-                experiment, self.draws, self.probability, simulate, numerics=self.diagnosis["numerics"], seed=seed
-            )
-        return found, simulate.made
+    seed, model = int(folder.description["seed"]), measured.base
+    measurement, reconstruction = stroke.prepared(measured), model.reconstruction
+    other = _model.model_on(measurement, folder, reconstruction, spec.effects, spec.preset, model.device)
+    experiment = StrokeExperiment(other, measured, diagnosis["candidates"] or None)
+    motion = motion_csv(stroke.measurement.tool.motion)
+    identity = {
+        **kept.identity,
+        "stroke": digest({"motion": motion, "rate": stroke.measurement.frame_rate, "start": stroke.start}),
+        "strokes": code_digest(("experiment/strokes.py",)),
+        "layout": list(experiment.layout.shape),
+    }
+    runs = [run for mine in runs_of(draws, seed).values() for run in mine]
+    simulate = Simulations(experiment, kept.folder, identity, sources=kept.sources)
+    count = len(runs) + len(experiment.guesses) + len(experiment.redrawn)
+    simulate.told = lambda purpose: report(purpose.replace("_", " "), simulate.asked / count)
+    # A GPU makes several at a time, all of them in this process.
+    batch = Helpers(0, lambda jobs: Future(), experiment.together, experiment.prepare)
+    with simulate.helped(batch) if experiment.together > 1 else nullcontext():
+        simulate.ahead(lambda ask: [ask(**run.arguments()) for run in runs])
+        found = expected_information(
+            experiment, draws, probable(diagnosis), simulate, numerics=diagnosis["numerics"], seed=seed
+        )
+    return found, simulate.made
 
 
 def _designed(
@@ -163,24 +148,27 @@ def _designed(
     from splatsoil import __version__
     from splatsoil.experiment.strokes import strokes
     from splatsoil.files import write_json, write_text
-    from splatsoil.inverse.criticism.next_stroke import entropy
+    from splatsoil.inverse.criticism.evidence import AS_IT_IS
+    from splatsoil.inverse.criticism.next_stroke import entropy, probable
     from splatsoil.run_files import DESIGN_FORMAT
 
     began = time.perf_counter()
     report("light and colours", 0.0)
     model.scene()  # kept: in other strokes the tool may begin elsewhere than photographs show it
-    design = _Design.of(folder, model, spec, diagnosis, config.draws)
+    measured, kept = _model.experiment_of(folder, model, spec, diagnosis["candidates"] or None)
+    probability = probable(diagnosis)
+    draws = {name: diagnosis["draws"][name][: config.draws] for name in dict.fromkeys((AS_IT_IS, *probability))}
     proposed = {s.name: s for s in strokes(model.measurement, float(np.nanmean(model.reconstruction.surface.height)))}
     found: dict[str, Information] = {}
     notes, made = [], 0
     with folder.lock():
         for number, (name, stroke) in enumerate(proposed.items()):
 
-            def told(what: str, share: float, number: int = number, name: str = name) -> None:
+            def progress(what: str, share: float, number: int = number, name: str = name) -> None:
                 report(f"{name}, {what}", (number + share) / len(proposed))
 
             try:
-                found[name], new = design.expected(stroke, told)
+                found[name], new = _expected(stroke, measured, kept, folder, spec, diagnosis, draws, progress)
                 made += new
             except SimulationError as error:
                 notes.append(f"{name}: {error}")
@@ -191,8 +179,8 @@ def _designed(
         result = {
             "format": DESIGN_FORMAT,
             "fit": diagnosis["fit"],
-            "models": dict(design.probability),
-            "most": entropy(design.probability),
+            "models": dict(probability),
+            "most": entropy(probability),
             "stroke": order[0],
             "strokes": [
                 {

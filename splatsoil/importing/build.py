@@ -16,7 +16,7 @@ from PIL import Image
 from splatsoil.errors import MeasurementError, ParameterError
 from splatsoil.importing.clock import WIDTH, ClockOffset, Footage, clock_offset, moving
 from splatsoil.importing.options import ImportOptions
-from splatsoil.importing.robot import UNITS, Grid, read_force, read_motion, read_rigid, resampled
+from splatsoil.importing.robot import Grid, metres, read_force, read_motion, read_rigid, resampled
 from splatsoil.importing.similarity import (
     by_known_points,
     by_scale,
@@ -186,7 +186,7 @@ def _mesh(file: Path, unit: str) -> Any:
     told = mesh.units is not None
     if told and unit != "m":
         raise MeasurementError(f"the file itself tells its unit, and was read in metres; say m, not {unit}", file=file)
-    return mesh if told else mesh.apply_scale(UNITS[unit])
+    return mesh if told else mesh.apply_scale(metres(unit, file))
 
 
 def _opened(path: Path, image: str, camera: Camera) -> Video:

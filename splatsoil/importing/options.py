@@ -5,12 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
 
 from splatsoil.errors import MeasurementError
 from splatsoil.options import argument, option
-
-Unit = Literal["m", "cm", "mm", "in"]
 
 
 @dataclass(frozen=True)
@@ -32,8 +29,8 @@ class ImportOptions:
     up: tuple[float, float, float] | None = option(
         None, "What is up in SOURCE's world; z but for COLMAP.", metavar="X Y Z"
     )
-    tool: tuple[Path, Unit] | None = option(None, "The tool; m, cm, mm or in.", metavar="MESH UNIT")
-    motion: tuple[Path, Unit] | None = option(
+    tool: tuple[Path, str] | None = option(None, "The tool; m, cm, mm or in.", metavar="MESH UNIT")
+    motion: tuple[Path, str] | None = option(
         None, "Flange in the robot's frame: time,x,y,z,qw,qx,qy,qz.", metavar="CSV UNIT"
     )
     force: Path | None = option(None, "On the tool, robot's axes: time,fx,fy,fz (N).", metavar="CSV")

@@ -41,6 +41,13 @@ class Grid:
         return self.zero + np.arange(max(count, 1) + 1) / self.rate
 
 
+def metres(unit: str, file: Path) -> float:
+    """In a unit of a file's lengths; MeasurementError for one that is unknown."""
+    if unit not in UNITS:
+        raise MeasurementError(f"its unit {unit!r} is none of {', '.join(UNITS)}", file=file)
+    return UNITS[unit]
+
+
 def read_rigid(file: Path | None) -> FloatArray:
     """A rigid motion (4, 4) from a text file of four rows of four numbers; none at all without a file.
 
@@ -87,7 +94,7 @@ def read_motion(file: Path, unit: str, robot_to_world: FloatArray, mesh_to_flang
         )
     flange = np.tile(np.eye(4), (len(table), 1, 1))
     flange[:, :3, :3] = Rotation.from_quat(table[:, 4:], scalar_first=True).as_matrix()
-    flange[:, :3, 3] = UNITS[unit] * table[:, 1:4]
+    flange[:, :3, 3] = metres(unit, file) * table[:, 1:4]
     poses = robot_to_world @ flange @ mesh_to_flange
     quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat(scalar_first=True)
     return ToolMotion(rows.astype(np.int64), table[:, 0], poses[:, :3, 3], quaternions)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 import splatsoil
 from splatsoil.errors import RunError
@@ -44,7 +45,6 @@ def write_report(folder: str | Path) -> Path:
 def render(data: RunData) -> str:
     """The page as a string."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
-    from markupsafe import Markup
 
     environment = Environment(
         loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
@@ -83,8 +83,8 @@ def render(data: RunData) -> str:
         calm=at_the_noise if adequate is None else adequate,
         by_comparison=data.fit["estimated_from"] == "comparison",
         forces=_forces(data, judged),
-        surrogates={name: Markup(figures.surrogate(data.fit, name)) for name in data.fit["parameters"]},
-        losses=None if comparison is None else Markup(figures.losses(comparison)),
+        surrogates={name: figures.surrogate(data.fit, name) for name in data.fit["parameters"]},
+        losses=None if comparison is None else figures.losses(comparison),
         pictures=pictures,
         kinds=kinds,
         titles={"predicted": "after"} if "before" in kinds else {},
@@ -97,9 +97,9 @@ def render(data: RunData) -> str:
         beyond=text.BEYOND,
         posterior=None if data.posterior is None else _posterior(data.folder, data.posterior),
         falling=_falling(data),
-        surface=None if data.surface is None else Markup(figures.surface_map(data.surface)),
+        surface=None if data.surface is None else figures.surface_map(data.surface),
         order=order,
-        history=Markup(figures.history(data.fits, order)) if len(order) > 1 else None,
+        history=figures.history(data.fits, order) if len(order) > 1 else None,
     )
 
 
@@ -136,13 +136,11 @@ def _join(pictures: list[dict[str, Any]], earlier: list[dict[str, Any]]) -> bool
 
 def _posterior(folder: Path, posterior: Mapping[str, Any]) -> dict[str, Any]:
     """Sentences, one figure for each parameter, and the corner picture where there are several."""
-    from markupsafe import Markup
-
     corner = folder / "posterior" / "corner.png"
     return {
         "sentences": text.posterior_sentences(posterior),
         "notes": text.posterior_notes(posterior),
-        "marginals": [Markup(figures.marginal(entry)) for entry in posterior["parameters"].values()],
+        "marginals": [figures.marginal(entry) for entry in posterior["parameters"].values()],
         "corner": data_url(corner) if len(posterior["parameters"]) > 1 and corner.is_file() else None,
         "simulations": posterior["simulations"],
         "chains": posterior["chains"],
@@ -167,13 +165,11 @@ def _findings(data: RunData, judged: Mapping[str, Any] | None) -> list[dict[str,
 
 def _failing(judged: Mapping[str, Any], comparison: Mapping[str, Any] | None, folder: Path) -> dict[str, Any]:
     """Plan views of the residual, of the model as it is and with the best effect, and pictures of what fails."""
-    from markupsafe import Markup
-
     which = [("as it is", "before")]
     which += [(f"with {text.model_label(n)}", n) for n in judged.get("class", ())[:1] if n in judged["maps"]]
     drawn = figures.plan_maps(judged, which)
     return {
-        "maps": [(title, Markup(svg)) for (title, _), svg in zip(which, drawn, strict=True)],
+        "maps": [(title, svg) for (title, _), svg in zip(which, drawn, strict=True)],
         "pictures": [] if comparison is None else _outlined(judged, comparison, folder),
     }
 
@@ -181,8 +177,6 @@ def _failing(judged: Mapping[str, Any], comparison: Mapping[str, Any] | None, fo
 def _outlined(judged: Mapping[str, Any], comparison: Mapping[str, Any], folder: Path) -> list[dict[str, Any]]:
     """The blocks that fail most: each on the photograph nearest to where it fails most, with words on when it
     begins."""
-    from markupsafe import Markup
-
     out: list[dict[str, Any]] = []
     for check in judged["checks"]:
         if check["p"] >= text.SIGNIFICANT or check["channel"] not in comparison["cameras"] or len(out) == OUTLINED:
@@ -198,7 +192,7 @@ def _outlined(judged: Mapping[str, Any], comparison: Mapping[str, Any], folder: 
                 "begins": text.begins(judged, check),
                 "frame": entry["frame"],
                 "photograph": data_url(folder / entry["observed"]),
-                "squares": Markup(figures.outlined(check, judged, squares)),
+                "squares": figures.outlined(check, judged, squares),
             }
         )
     return out
@@ -207,8 +201,6 @@ def _outlined(judged: Mapping[str, Any], comparison: Mapping[str, Any], folder: 
 def _forces(data: RunData, judged: Mapping[str, Any] | None) -> dict[str, Any] | None:
     """Force on the tool, measured and predicted: by the comparison at each frame, before and after an addition, and
     what a diagnosis of this fit expects and predicts."""
-    from markupsafe import Markup
-
     own = judged if judged is not None and judged["fit"] == data.fit["name"] else None
     curves = {} if own is None else {curve["channel"]: curve for curve in own["curves"]}
     now, before = ((c or {}).get("force") for c in (data.comparison, data.before))
@@ -231,7 +223,7 @@ def _forces(data: RunData, judged: Mapping[str, Any] | None) -> dict[str, Any] |
                     times, values = _series(own["times"], curve["predicted"][name])
                     lines[f"with {text.model_label(name)}"] = (times, values)
         one = figures.Readings(channel["channel"], now["unit"], (frames, measured), expected, lines)
-        drawn.append(Markup(figures.readings(one, "frame")))
+        drawn.append(figures.readings(one, "frame"))
         error, largest = np.sqrt(np.nanmean((predicted - measured) ** 2)), np.nanmax(np.abs(measured))
         sentences.append(
             f"{channel['channel'].capitalize()}: root mean square error {text.rounded(float(error))} {now['unit']}; "
@@ -247,8 +239,6 @@ def _series(*columns: Sequence[float | None]) -> tuple[np.ndarray, ...]:
 
 def _falling(data: RunData) -> dict[str, Any] | None:
     """The error on data set aside: of the models tried or, where there is only one, of those that were compared."""
-    from markupsafe import Markup
-
     diagnosis = data.diagnosis or {"held_out": [], "aside": "data set aside", "unit": "grey levels"}
     if len(data.history) > 1:
         rows = [(entry["held_out"], entry["floor"]) for entry in data.history]
@@ -259,7 +249,7 @@ def _falling(data: RunData) -> dict[str, Any] | None:
     if len(rows) < 2:
         return None
     errors, noise = zip(*rows, strict=True)
-    figure = Markup(figures.falling(errors, noise, names, diagnosis["unit"]))
+    figure = figures.falling(errors, noise, names, diagnosis["unit"])
     return {"figure": figure, "falls": errors[-1] < errors[0], "aside": diagnosis["aside"]}
 
 

@@ -86,13 +86,13 @@ def test_words_become_values_wherever_they_stand() -> None:
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        ("a --depth deep", "--depth: 'deep' is not a number"),
-        ("a --holes 2.5", "--holes: '2.5' is not a whole number"),
-        ("a --kind drie", "--kind: 'drie' is none of wet, dry"),
-        ("a --tool spade wide", "--tool: 'wide' is not a number"),
-        ("a --tool spade", "--tool: expected 2 arguments"),
-        ("a --dept 2", "unknown --dept, did you mean --depth?"),
-        ("a --count 2", "unknown --count"),
+        ("a --depth deep", "argument --depth: invalid float value: 'deep'"),
+        ("a --holes 2.5", "argument --holes: invalid int value: '2.5'"),
+        ("a --kind drie", "argument --kind: invalid choice: 'drie'"),
+        ("a --tool spade wide", "argument --tool: could not convert string to float: 'wide'"),
+        ("a --tool spade", "argument --tool: expected 2 arguments"),
+        ("a --dept 2", "unrecognized argument: --dept, did you mean --depth?"),
+        ("a --count 2", "unrecognized argument: --count"),
         ("", "are required: PLACES"),
     ],
 )
