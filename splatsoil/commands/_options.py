@@ -123,8 +123,10 @@ class _Parser(argparse.ArgumentParser):
 class _Tuple(argparse.Action):
     """Several values, each of its own type."""
 
-    def __init__(self, *names: Any, kinds: Sequence[Callable[[str], Any]], **settings: Any) -> None:
-        super().__init__(*names, nargs=len(kinds), **settings)
+    def __init__(
+        self, option_strings: Sequence[str], dest: str, *, kinds: Sequence[Callable[[str], Any]], **settings: Any
+    ) -> None:
+        super().__init__(option_strings, dest, nargs=len(kinds), **settings)
         self.kinds = kinds
 
     def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
 from splatsoil.errors import MeasurementError
@@ -127,17 +128,8 @@ def read_force(file: Path, robot_to_world: FloatArray, grid: Grid) -> FloatArray
     ends = ends[(ends >= times[0]) & (ends <= times[-1])]
     if len(ends) < 2:
         raise MeasurementError("the force's times cover no frame of the tool's motion; is it on its clock?", file=file)
-    # A frame's mean is the integral's growth: trapezoids between rows are exact for what is linear there.
-    steps = 0.5 * np.diff(times)[:, None] * (table[1:, 1:] + table[:-1, 1:])
-    integral = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-    means = grid.rate * np.diff([_integral(times, table[:, 1:], integral, end) for end in ends], axis=0)
+    # A frame's mean is the growth of the integral of what is linear between rows.
+    integral = make_interp_spline(times, table[:, 1:], k=1).antiderivative()
+    means = grid.rate * np.diff(integral(ends), axis=0)
     frames = np.rint((ends[1:] - grid.zero) * grid.rate)
     return np.column_stack([frames, frames / grid.rate, means @ robot_to_world[:3, :3].T])
-
-
-def _integral(times: FloatArray, values: FloatArray, integral: FloatArray, end: float) -> FloatArray:
-    """Of values (n, 3), linear between times, up to ``end``; ``integral`` (n, 3) is up to each time."""
-    k = int(np.clip(np.searchsorted(times, end, side="right") - 1, 0, len(times) - 2))
-    rest = end - times[k]
-    slope = (values[k + 1] - values[k]) / (times[k + 1] - times[k])
-    return np.asarray(integral[k] + rest * (values[k] + 0.5 * rest * slope))
