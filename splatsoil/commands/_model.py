@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -47,23 +47,22 @@ class ModelSpec:
         return cls(tuple(setup["effects"]), setup["preset"], tuple(fit["parameters"]))
 
 
-class _Computing(Protocol):
-    @property
-    def device(self) -> str: ...
-    @property
-    def json(self) -> bool: ...
-
-
 @contextmanager
-def loaded(options: _Computing, folder: RunFolder, spec: ModelSpec | None = None) -> Iterator[tuple[Model, Stage]]:
-    """The model of a run on the device that a command names, while its stages last; says who else made the fit."""
+def loaded(options: Any, folder: RunFolder, spec: ModelSpec | None = None) -> Iterator[tuple[Model, Stage]]:
+    """The model of a run, and what begins a stage, while these last; says if other sources made the fit.
+
+    Args:
+        options: of a command; ``device`` is where it computes, with ``json`` nothing is said of progress.
+        folder: the run.
+        spec: of the model; that of the latest fit if not given.
+    """
     from splatsoil.envs.devices import resolve_device
     from splatsoil.quiet import hush
 
     hush()
     device = resolve_device(options.device)
     note_other_sources(folder)
-    with stages(quiet=options.json) as begin:
+    with stages(quiet=getattr(options, "json", False)) as begin:
         yield model_of(folder, device, begin("reconstruct"), spec=spec), begin
 
 

@@ -129,7 +129,7 @@ class _Tuple(argparse.Action):
         super().__init__(option_strings, dest, nargs=len(kinds), **settings)
         self.kinds = kinds
 
-    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+    def __call__(self, parser: Any, namespace: Any, values: Any, *_: Any) -> None:
         try:
             setattr(namespace, self.dest, tuple(kind(word) for kind, word in zip(self.kinds, values, strict=True)))
         except ValueError as error:

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-import importlib
 import importlib.util
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from splatsoil.errors import ParameterError
 from splatsoil.export.replay import Writer
 from splatsoil.model import Model
 
-FORMATS = {
-    "vtk": ("vtk", "VtkWriter"),
-    "usd": ("usd", "UsdWriter"),
-    "csv": ("tables", "CsvWriter"),
-    "ply": ("splats", "SplatWriter"),
+FORMATS: Mapping[str, Callable[[], Any]] = {
+    "vtk": lambda: import_module("splatsoil.export.vtk").VtkWriter,
+    "usd": lambda: import_module("splatsoil.export.usd").UsdWriter,
+    "csv": lambda: import_module("splatsoil.export.tables").CsvWriter,
+    "ply": lambda: import_module("splatsoil.export.splats").SplatWriter,
 }
-"""By name, a format's module here, which is loaded when it is used, and its writer."""
+"""By name, what loads a format's writer, which takes an empty folder, the model, and its frames that come."""
 
 _PACKAGES = {"vtk": "meshio", "usd": "pxr"}
 
@@ -39,8 +40,6 @@ def make_writers(folder: Path, formats: Iterable[str], model: Model, frames: tup
     """A writer for each format, into a new folder of its name; frames rise."""
     writers = []
     for name in formats:
-        module, kind = FORMATS[name]
         (folder / name).mkdir(parents=True)
-        writer = getattr(importlib.import_module(f"splatsoil.export.{module}"), kind)
-        writers.append(writer(folder / name, model, frames))
+        writers.append(FORMATS[name]()(folder / name, model, frames))
     return writers
