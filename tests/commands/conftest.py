@@ -8,7 +8,9 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -16,7 +18,7 @@ from splatsoil.inverse.run_folder import RunFolder
 
 from splatsoil import __version__
 from splatsoil.commands import _model, _stages
-from splatsoil.files import code_of
+from splatsoil.files import code_of, write_json
 
 
 @pytest.fixture
@@ -67,6 +69,60 @@ def no_work(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whoever begins to work, fails."""
     for place, name in ((_model, "model_of"), (_model, "reconstructed"), (_stages, "run_fit")):
         monkeypatch.setattr(place, name, lambda *_, **__: pytest.fail("work has begun"))
+
+
+MISFIT = {
+    "adequate": True,
+    "probability": 0.9,
+    "passes": True,
+    "checks": [],
+    "sentences": [],
+    "estimates": {"friction_angle": {"value": 35.1, "std": 2.8, "unit": "deg", "determined": True}},
+}
+DIAGNOSIS = {
+    **MISFIT,
+    "fit": "base",
+    "verdict": "adequate",
+    "class": [],
+    "models": [],
+    "notes": [],
+    "held_out": [{"model": ""}],
+    "simulations": 1,
+    "simulated_now": 0,
+    "seconds": 1.0,
+}
+
+
+@pytest.fixture
+def results(run: RunFolder, fit_of: Callable[..., dict[str, Any]], monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """What stages give that aren't run, by their names; an error is raised."""
+    comparison = {"loss": "robust", "total": {"robust": 1.29, "rgb": 1.0}, "noise": {}, "cameras": [], "frames": []}
+    found: dict[str, Any] = {
+        "prepare": (None, run),
+        "reconstructed": None,
+        "model_on": None,
+        "model_of": SimpleNamespace(law=None),
+        "run_fit": fit_of(),
+        "draw_comparison": comparison,
+        "check_adequacy": dict(MISFIT),
+        "run_diagnosis": dict(DIAGNOSIS),
+    }
+
+    def giving(name: str) -> Callable[..., Any]:
+        def give(*_: object, **__: object) -> Any:
+            if isinstance(found[name], Exception):
+                raise found[name]
+            return found[name]
+
+        return give
+
+    for name in found:
+        monkeypatch.setattr(_model if hasattr(_model, name) else _stages, name, giving(name))
+    monkeypatch.setattr("splatsoil.report.write_report", lambda path: path / "report.html")
+    monkeypatch.setattr("splatsoil.commands._crew.Crew", lambda *_: nullcontext())
+    file = {"format": "splatsoil-comparison/1", "fit": "another", "parameters": {}, **comparison}
+    write_json(run.comparison / "comparison.json", file)
+    return found
 
 
 @pytest.fixture(scope="session")

@@ -4,66 +4,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from contextlib import nullcontext
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from splatsoil.inverse.run_folder import RunFolder
 
 from splatsoil import cli
-from splatsoil.commands import _folder, _model, _stages, add
+from splatsoil.commands import _folder, add
 from splatsoil.errors import NoAnswer, RunError
 
 FitOf = Callable[..., dict[str, Any]]
-MISFIT = {
-    "adequate": True,
-    "probability": 0.9,
-    "passes": True,
-    "checks": [],
-    "sentences": [],
-    "estimates": {"friction_angle": {"value": 35.1, "std": 2.8, "unit": "deg", "determined": True}},
-}
-DIAGNOSIS = {
-    **MISFIT,
-    "fit": "base",
-    "verdict": "adequate",
-    "class": [],
-    "models": [],
-    "notes": [],
-    "held_out": [{"model": ""}],
-    "simulations": 1,
-    "simulated_now": 0,
-    "seconds": 1.0,
-}
-COMPARISON = {
-    "loss": "robust",
-    "total": {"robust": 1.29, "rgb": 1.0},
-    "motionless": {"robust": 1.0},
-    "noise": {},
-    "cameras": [],
-    "frames": [],
-}
-
-
-def stand_in(run: RunFolder, fit: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Results of stages that aren't run."""
-    run.write_fit("base", fit)
-    for place, what, found in (
-        (_stages, "prepare", (None, run)),
-        (_model, "reconstructed", None),
-        (_model, "model_on", None),
-        (_stages, "run_fit", fit),
-        (_stages, "draw_comparison", COMPARISON),
-        (_model, "model_of", SimpleNamespace(law=None)),
-        (_stages, "check_adequacy", dict(MISFIT)),
-        (_stages, "run_diagnosis", dict(DIAGNOSIS)),
-        (add, "add_effect", None),
-        (_folder, "history", []),
-    ):
-        monkeypatch.setattr(place, what, lambda *_, found=found, **__: found)
-    monkeypatch.setattr("splatsoil.report.write_report", lambda path: path / "report.html")
-    monkeypatch.setattr("splatsoil.commands._crew.Crew", lambda *_: nullcontext())
 
 
 @pytest.mark.parametrize(
@@ -78,17 +28,19 @@ def stand_in(run: RunFolder, fit: dict[str, Any], monkeypatch: pytest.MonkeyPatc
 @pytest.mark.parametrize("command", ["fit", "run", "compare", "diagnose", "add", "posterior", "report"])
 def test_no_command_tells_an_estimate_that_means_nothing(
     run: RunFolder,
-    fit_of: FitOf,
+    results: dict[str, Any],
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     change: dict[str, Any],
     says: str,
     command: str,
 ) -> None:
-    fit = fit_of() | change
+    fit = results["run_fit"]
+    fit |= change
     if not change:
         fit["parameters"]["friction_angle"] |= {"at_bound": "upper", "bounds": [20.0, 50.0], "unit": "deg"}
-    stand_in(run, fit, monkeypatch)
+    run.write_fit("base", fit)
+    monkeypatch.setattr(add, "add_effect", lambda *_, **__: None)
     words = [command, str(run.path), *(["cohesion"] if command == "add" else [])]
     for in_json in (False, True):
         assert cli.main([*words, *["--json"] * in_json]) == NoAnswer.code == 3
@@ -117,9 +69,9 @@ def test_what_is_an_answer(fit_of: FitOf) -> None:
 
 @pytest.mark.parametrize("command", ["fit", "run"])
 def test_json_has_the_run_folder_under_run(
-    run: RunFolder, fit_of: FitOf, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], command: str
+    run: RunFolder, results: dict[str, Any], capsys: pytest.CaptureFixture[str], command: str
 ) -> None:
     """Not the set, which ``fit.json`` has there."""
-    stand_in(run, {**fit_of(), "run": {"measurement": {"name": "plow"}}}, monkeypatch)
+    results["run_fit"]["run"] = {"measurement": {"name": "plow"}}
     assert cli.main([command, "set", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["run"] == str(run.path)

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from splatsoil import cli
-from splatsoil.commands import _folder, _model, _stages, add, run
+from splatsoil.commands import _stages, add, run
 from splatsoil.errors import SimulationError
 
-LAST = {"name": "last", "loss": 0.5, "best": {"loss": 0.5}, "parameters": {}}
 ENOUGH = "nothing more is needed to explain the data"
 NONE = "no single effect is probable enough to be added"
 TRY = f"{NONE}; the most probable is buried obstacle: splatsoil add 'my run' buried_obstacle tries it"
@@ -49,33 +47,16 @@ def test_the_loop_adds_what_is_missing_and_says_why_it_stops(
 
 
 @pytest.fixture
-def stand_in(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict[str, Any]:
-    """Results of all stages; an error is raised."""
-    comparison = {"loss": "robust", "total": {}, "noise": {}}
-    (tmp_path / "comparison.json").write_text(json.dumps(comparison))
-    folder = SimpleNamespace(path=tmp_path, comparison=tmp_path, fit=lambda: LAST)
-    results: dict[str, Any] = {
-        "misfit": dict.fromkeys(("probability", "estimates", "checks", "passes"), 0) | {"adequate": True},
-        "missing": (dict.fromkeys(run.DIAGNOSIS, ""), "enough"),
-    }
+def missing(results: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """Stages that aren't run, and the search for what is missing."""
+    results["add_missing"] = (dict.fromkeys(run.DIAGNOSIS, ""), "enough")
 
-    def result(name: str) -> Any:
-        if isinstance(results[name], Exception):
-            raise results[name]
-        return results[name]
+    def add_missing(*_: object) -> Any:
+        if isinstance(results["add_missing"], Exception):
+            raise results["add_missing"]
+        return results["add_missing"]
 
-    for place, name, found in (
-        (_stages, "prepare", lambda *_: (None, folder)),
-        (_model, "reconstructed", lambda *_: None),
-        (_model, "model_on", lambda *_: None),
-        (_stages, "run_fit", lambda *_: LAST),
-        (_stages, "draw_comparison", lambda *_: comparison),
-        (_stages, "check_adequacy", lambda *_: result("misfit")),
-        (run, "add_missing", lambda *_: result("missing")),
-        (_folder, "history", lambda _: []),
-    ):
-        monkeypatch.setattr(place, name, found)
-    monkeypatch.setattr("splatsoil.report.write_report", lambda path: path)
+    monkeypatch.setattr(run, "add_missing", add_missing)
     return results
 
 
@@ -90,9 +71,9 @@ def stand_in(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict[str, Any]:
     ],
 )
 def test_run_looks_for_what_is_missing_where_the_model_is_not_adequate(
-    stand_in: dict[str, Any], capsys: pytest.CaptureFixture[str], flags: list[str], adequate: bool, looks: bool
+    missing: dict[str, Any], capsys: pytest.CaptureFixture[str], flags: list[str], adequate: bool, looks: bool
 ) -> None:
-    stand_in["misfit"]["adequate"] = adequate
+    missing["check_adequacy"]["adequate"] = adequate
     assert cli.main(["run", "set", "--json", *flags]) == 0
     told = json.loads(capsys.readouterr().out)
     assert (told.get("stopped") == "enough") is looks and ("diagnosis" in told) is looks
@@ -106,16 +87,19 @@ def test_run_cannot_both_look_and_not_look(capsys: pytest.CaptureFixture[str]) -
 
 @pytest.mark.parametrize(
     ("fails", "says"),
-    [("missing", "what is missing isn't known"), ("misfit", "whether the model is adequate isn't known")],
+    [
+        ("add_missing", "what is missing isn't known"),
+        ("check_adequacy", "whether the model is adequate isn't known"),
+    ],
 )
 def test_what_fails_after_the_fit_costs_no_report_unless_it_was_asked_for(
-    stand_in: dict[str, Any], capsys: pytest.CaptureFixture[str], fails: str, says: str
+    missing: dict[str, Any], capsys: pytest.CaptureFixture[str], fails: str, says: str
 ) -> None:
-    stand_in["misfit"]["adequate"] = False
-    stand_in[fails] = SimulationError("soil left the bin")
+    missing["check_adequacy"]["adequate"] = False
+    missing[fails] = SimulationError("soil left the bin")
     assert cli.main(["run", "set", "--json"]) == 0
     out, err = capsys.readouterr()
-    assert f"{says}: soil left the bin" in err and json.loads(out)["name"] == "last"
-    assert ("misfit" in json.loads(out)) is (fails == "missing") and "diagnosis" not in json.loads(out)
-    if fails == "missing":
+    assert f"{says}: soil left the bin" in err and json.loads(out)["name"] == "base"
+    assert ("misfit" in json.loads(out)) is (fails == "add_missing") and "diagnosis" not in json.loads(out)
+    if fails == "add_missing":
         assert cli.main(["run", "set", "--criticise"]) == 2

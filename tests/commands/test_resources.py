@@ -39,24 +39,22 @@ def test_needs_follow_from_the_set(small_set: Path) -> None:
     assert on_gpu.memory < more.memory and on_gpu.simulation == more.simulation
 
 
-def test_a_fit_says_what_it_needs_before_it_works(
-    small_set: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    _stages.prepare(FitOptions(small_set, preset="tiny", device="cpu", run=tmp_path / "run"))
-    said = capsys.readouterr().err.splitlines()[-1]
-    assert said.startswith("needs up to ") and "(13500 particles, cpu), 30 simulations" in said
-
-
 @pytest.mark.parametrize("preset", ["tiny", "fine"])
-def test_pictures_that_no_memory_holds_are_refused_before_anything_is_written(
+def test_what_a_fit_needs_is_said_and_refused_where_no_memory_holds_it(
     small_set: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], preset: str
 ) -> None:
+    """Before anything is written."""
+    options = FitOptions(small_set, preset="tiny", device="cpu", run=tmp_path / "run")
     monkeypatch.setattr(_resources, "memory", lambda: 0.5)
-    words = ["fit", str(small_set), "--preset", preset, "--device", "cpu", "--run", str(tmp_path / "run"), "--json"]
+    words = ["fit", str(small_set), "--preset", preset, "--device", "cpu", "--run", str(options.run), "--json"]
     assert cli.main(words) == 2
     told = capsys.readouterr()
     assert "and this machine has 0.5 GiB; choose a coarser --preset" in json.loads(told.out)["error"]
     assert not (tmp_path / "run").exists()
+    monkeypatch.undo()
+    _stages.prepare(options)
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert said.startswith("needs up to ") and "(13500 particles, cpu), 30 simulations" in said
 
 
 def test_soil_that_no_memory_holds_is_refused_before_it_is_simulated(
