@@ -3,7 +3,9 @@
 #   make demo     the whole path on examples/plow-dry, ending in runs/demo/report.html
 #   make test     the tests
 #   make test-slow  the tests that take minutes: whole reconstructions and simulations of the example sets
-#   make lint     formatting, lint and types
+#   make lint     formatting, lint, unused code and types
+#   make readme   docs/readme.webp, the README's picture, from the run of make demo
+#   make docs     the documentation as a site, build/site/index.html
 #   make clean    remove what these made, the virtual environment included; runs/ stays
 #
 # PYTHON        interpreter to make the virtual environment with
@@ -21,7 +23,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 PACKAGES := splatsoil envs inverse benchmarks
 SOURCES := $(shell find $(PACKAGES) -type f -not -path '*/__pycache__/*')
 
-.PHONY: demo test test-slow lint clean
+.PHONY: demo test test-slow lint readme docs clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.use
@@ -36,9 +38,16 @@ test-slow: $(VENV)/.develop
 
 # Static checkers cannot see that envs/, inverse/ and benchmarks/ install as splatsoil.*, so mypy gets the built package.
 lint: $(VENV)/.develop build/installed/.stamp
-	$(BIN)/ruff format --check $(PACKAGES) tests examples
-	$(BIN)/ruff check $(PACKAGES) tests examples
+	$(BIN)/ruff format --check $(PACKAGES) tests examples mkdocs_hooks.py
+	$(BIN)/ruff check $(PACKAGES) tests examples mkdocs_hooks.py
+	$(BIN)/vulture
 	cd build/installed && "$(abspath $(BIN))/mypy" --config-file "$(CURDIR)/pyproject.toml" -p splatsoil
+
+readme: demo
+	$(BIN)/splatsoil benchmark readme runs/demo docs/readme.webp
+
+docs: $(VENV)/.docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 
 clean:
 	rm -rf build .pytest_cache .mypy_cache .ruff_cache *.egg-info $(VENV)
@@ -56,6 +65,10 @@ $(VENV)/.use: pyproject.toml | $(BIN)/python
 
 $(VENV)/.develop: pyproject.toml | $(VENV)/.use
 	$(PIP) install --editable '.[dev]'
+	@touch $(VENV)/.use $@
+
+$(VENV)/.docs: pyproject.toml | $(VENV)/.use
+	$(PIP) install --editable '.[docs]'
 	@touch $(VENV)/.use $@
 
 build/installed/.stamp: $(SOURCES) pyproject.toml README.md LICENSE $(VENV)/.develop

@@ -1,31 +1,35 @@
-"""What benchmarks share: options, and results as files."""
+"""What benchmarks share: options, progress, where results go, and what they were made with."""
 
 from __future__ import annotations
 
 import argparse
 import io
 import json
+import os
 import platform
 import sys
+import time
 from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatsoil import __version__
-from splatsoil.errors import ParameterError
-from splatsoil.files import code_digest, read_json, write_bytes, write_json, write_text
+from splatsoil.errors import ParameterError, RunError
+from splatsoil.files import code_digest, plain, read_json, write_bytes, write_json, write_text
+from splatsoil.threads import cores
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-    from splatsoil.benchmarks._simulations import Data
-    from splatsoil.inverse.executors import Executor
 
-#: Everything that a benchmark's numbers may hang on: parts of the package, and packages beside it.
+#: All that a benchmark's numbers may depend on: parts of the package, and packages beside it.
 PARTS = ("measurement", "splats", "reconstruction", "soil", "mpm", "scene", "experiment", "synthetic")
 FILES = ("parameters.py", "model.py", "comparison.py", "robust_loss.py")
 BESIDE = ("splatsoil.envs", "splatsoil.inverse")
+#: Packages whose versions are stated.
+PACKAGES = ("numpy", "torch", "warp-lang", "newton")
 
 
 def here(name: str) -> str:
@@ -50,33 +54,11 @@ def at_least(least: int) -> Callable[[str], int]:
     return number
 
 
-def world_options(parser: argparse.ArgumentParser) -> None:
-    """Options that choose a world to simulate."""
-    parser.add_argument("set", type=Path, nargs="?", help="measurement set; none: the made-up world of PlowSand-v0")
-    parser.add_argument("--reconstruction", type=Path, help="of the set, if there is one already")
-    parser.add_argument("--parameters", nargs="+", default=["friction_angle"])
-    parser.add_argument("--with", dest="effects", nargs="*", default=[], metavar="EFFECT")
-    parser.add_argument("--preset", default="tiny")
-    parser.add_argument("--device", type=here, default="cpu")
-    parser.add_argument("--executor", default="serial", help="serial, processes:N or dask:ADDRESS")
-
-
-def simulated(options: argparse.Namespace, count: int, pool: Executor, seed: int = 0) -> tuple[Data, Path]:
-    """Simulations at ``count`` Sobol points of the world that `world_options` chose, and where they are kept."""
-    from splatsoil.benchmarks._simulations import simulations
-
-    return simulations(
-        count,
-        options.parameters,
-        options.effects,
-        measurement=options.set,
-        reconstruction=options.reconstruction,
-        preset=options.preset,
-        device=options.device,
-        seed=seed,
-        executor=pool,
-        progress=ticker("simulations"),
-    )
+def parser_of(module_doc: str | None) -> argparse.ArgumentParser:
+    """An argument parser that shows a module's text as it is, with the option ``--device``."""
+    parser = argparse.ArgumentParser(description=module_doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", type=here, default="cpu", help="cpu or cuda:0")
+    return parser
 
 
 def output_options(parser: argparse.ArgumentParser) -> None:
@@ -93,47 +75,111 @@ def sources(others: Iterable[Path] = ()) -> str:
 
 
 def keep_to_one_protocol(out: Path, described: Mapping[str, Any]) -> None:
-    """Write down in a folder what decides its results, sources included; what is there goes on only with the same.
+    """Write what determines a folder's results, sources included; a folder of the same protocol is continued.
 
     Raises:
-        ParameterError: the folder holds results of something else.
+        ParameterError: the folder contains results of another protocol.
     """
-    file, told = out / "protocol.json", json.loads(json.dumps(dict(described)))
-    if file.is_file() and read_json(file) != told:
+    file, protocol = out / "protocol.json", json.loads(json.dumps(dict(described)))
+    if file.is_file() and read_json(file) != protocol:
         raise ParameterError(f"{out}: holds results of another protocol or other sources; choose another --out")
-    write_json(file, told)
+    write_json(file, protocol)
 
 
-def stamp(device: str) -> dict[str, Any]:
-    """What made a result."""
-    return {
+def stamp(device: str) -> dict[str, str]:
+    """What makes a result: code, device, processor, versions of packages, date."""
+    made = {
         "version": __version__,
         "code": sources(),
         "device": device.split(":")[0],
-        "machine": platform.machine(),
+        "processor": _processor(),
+        "cores": str(cores()),
+        "system": f"{platform.system()} {platform.machine()}, Python {platform.python_version()}",
+        "load": f"{os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else "",
         "made": datetime.now(UTC).isoformat(timespec="seconds"),
     }
+    for name in PACKAGES:
+        try:
+            made[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    if device != "cpu":
+        import torch
+
+        made["gpu"] = f"{torch.cuda.get_device_name(device)} (CUDA {torch.version.cuda})"
+    return made
+
+
+def sentence(made: Mapping[str, str]) -> str:
+    """A stamp in words."""
+    packages = ", ".join(f"{name} {made[name]}" for name in PACKAGES if name in made)
+    gpu = f"{made['gpu']}, " if "gpu" in made else ""
+    return (
+        f"{made['made'][:10]}: {gpu}{made['processor']}, {made['cores']} cores; {made['system']}; splatsoil "
+        f"{made['version']} (code {made['code']}), {packages}; load {made['load']}"
+    )
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor() or "unknown processor"
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "unknown processor")
 
 
 def write_result(out: Path, result: Mapping[str, Any], table: str, figures: Mapping[str, Figure]) -> None:
     """A benchmark's folder, each file whole or not there."""
-    write_json(out / "result.json", dict(result))
+    write_json(out / "result.json", plain(dict(result)))
     write_text(out / "table.md", table + "\n")
     for name, figure in figures.items():
-        stream = io.BytesIO()
-        figure.savefig(stream, format="svg" if name.endswith(".svg") else "png", bbox_inches="tight")
-        write_bytes(out / name, stream.getvalue())
+        write_figure(out / name, figure)
+
+
+def write_figure(file: Path, figure: Figure) -> None:
+    """A figure in the format of the file's name."""
+    stream = io.BytesIO()
+    figure.savefig(stream, format=file.suffix[1:] or "png", dpi=110, bbox_inches="tight")
+    write_bytes(file, stream.getvalue())
+
+
+def with_section(page: Path, name: str, text: str) -> str:
+    """A page's text with what stands between its two lines ``<!-- NAME: … -->`` and ``<!-- NAME: end -->`` replaced.
+
+    Raises:
+        RunError: the page cannot be read, or does not have each of the lines once.
+    """
+    first, last = f"<!-- {name}: written by the command, what stands here is overwritten -->", f"<!-- {name}: end -->"
+    try:
+        old = page.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise RunError(f"{page}: cannot be read as text ({error}); choose another page") from error
+    before, begin, rest = old.partition(f"{first}\n")
+    _, end, after = rest.partition(last)
+    if not begin or not end or old.count(first) + old.count(last) > 2:
+        raise RunError(f"{page}: has no lines {first!r} and {last!r}, once each, to write between")
+    return f"{before}{begin}{text}\n{end}{after}"
 
 
 def ticker(what: str) -> Callable[[int, int], None]:
     """Progress as lines on stderr, one each tenth."""
-    told = -1
+    last = -1
 
     def report(done: int, total: int) -> None:
-        nonlocal told
+        nonlocal last
         tenth = 10 * done // max(total, 1)
-        if tenth != told:
-            told = tenth
+        if tenth != last:
+            last = tenth
             print(f"{what}: {done} of {total}", file=sys.stderr, flush=True)
 
     return report
+
+
+class Clock:
+    """Says on stderr what goes on, and how long after the start; several processes may share one."""
+
+    def __init__(self) -> None:
+        self.began = time.time()
+
+    def __call__(self, what: str) -> None:
+        print(f"{time.time() - self.began:7.0f} s  {what}", file=sys.stderr, flush=True)

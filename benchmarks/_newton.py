@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import warp as wp
-from splatsoil.benchmarks.numerics import FloatArray
+from splatsoil.benchmarks._truth import FloatArray
 
 from splatsoil.errors import MeasurementError, RunError, SimulationError
 from splatsoil.measurement import Measurement
@@ -54,36 +54,25 @@ class Numerics:
         """Edge of the cube of soil that a particle stands for, m: two along a voxel."""
         return 0.5 * self.voxel
 
-    def refined(self) -> Numerics:
-        """Voxels of three quarters, with steps and iterations in proportion."""
-        return replace(
-            self,
-            voxel=0.75 * self.voxel,
-            substeps=math.ceil(self.substeps / 0.75),
-            iterations=math.ceil(self.iterations / 0.75),
-        )
+    def refined(self, share: float = 0.75) -> Numerics:
+        """Voxels of a share, with steps and iterations in proportion."""
+        steps, most = math.ceil(self.substeps / share), math.ceil(self.iterations / share)
+        return replace(self, voxel=share * self.voxel, substeps=steps, iterations=most)
 
     def across(self, width: float) -> Numerics:
         """As these resolve a tool 120 mm wide, one of ``width`` m: nine voxels of the defaults' or more across it."""
-        share = min(1.0, round(width, 4) / WIDTH)
-        return replace(
-            self,
-            voxel=share * self.voxel,
-            substeps=math.ceil(self.substeps / share),
-            iterations=math.ceil(self.iterations / share),
-        )
+        return self.refined(min(1.0, round(width, 4) / WIDTH))
 
     @classmethod
     def of(cls, folder: Path) -> Numerics:
-        """Those that made the measurement set; MeasurementError when ``truth.json`` doesn't tell."""
+        """Those that made the measurement set; MeasurementError when ``truth.json`` does not state them."""
         file = folder / "truth.json"
-        told = json.loads(file.read_text())
+        truth = json.loads(file.read_text())
         try:
-            return cls(float(told["voxel"]), int(told["sub"]), int(told["iterations"]))
+            return cls(float(truth["voxel"]), int(truth["sub"]), int(truth["iterations"]))
         except KeyError as error:
-            raise MeasurementError(
-                "the benchmark needs the numerics that the set was made with", file=file, field=str(error)
-            ) from error
+            text = "the benchmark needs the numerics that the set was made with"
+            raise MeasurementError(text, file=file, field=str(error)) from error
 
 
 @dataclass(frozen=True)
@@ -154,6 +143,7 @@ def plough(
     frames: Iterable[int],
     device: str = "cpu",
     *,
+    begin: int = 0,
     progress: Callable[[int, int], None] = lambda frame, last: None,
 ) -> list[Run]:
     """Run the worlds side by side, each in a box of its own, to the last frame.
@@ -161,8 +151,9 @@ def plough(
     Args:
         worlds: soils, beds, tools and motions.
         numerics: of the solver.
-        frames: to keep, of those from 1 on.
+        frames: to keep, of those after the first.
         device: Warp device name.
+        begin: frame at which the worlds' particles rest and the run begins.
         progress: called with (frame, last frame) after each.
 
     Returns:
@@ -190,11 +181,11 @@ def plough(
     now, following = states
     frame_time = 1.0 / rates.pop()
     step = frame_time / numerics.substeps
-    wanted = sorted(f for f in frames if f > 0)
+    wanted = sorted(f for f in frames if f > begin)
     ends = np.cumsum([len(w.particles) for w in worlds])[:-1]
     found: list[dict[int, FloatArray]] = [{} for _ in worlds]
     force = np.zeros((len(worlds), wanted[-1], 3))
-    for frame in range(1, wanted[-1] + 1):
+    for frame in range(begin + 1, wanted[-1] + 1):
         start = (frame - 1) * frame_time
         ways = [step_poses(m.tool.motion, start, frame_time, numerics.substeps) for m in measurements]
         for poses in zip(*ways, strict=True):

@@ -1,10 +1,10 @@
-"""Simulations of a world over its parameters, made once and kept: what benchmarks draw synthetic truths from; and the
-posterior that a comparison gives from such simulations."""
+"""Simulations of a scene over its parameters, made once and kept, and the posterior that they give."""
 
 from __future__ import annotations
 
+import argparse
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from splatsoil.benchmarks._common import parser_of, ticker
 from splatsoil.envs.levels import is_full
 from splatsoil.envs.measured import LOSS, MeasuredProblem, cache_folder
 from splatsoil.envs.problem import Problem
@@ -36,7 +37,7 @@ FloatArray = npt.NDArray[np.float64]
 #: Simulations that a comparison needs.
 FEWEST = BASE // 2
 
-#: Seed of the made-up world's own truth, which cancels in all that is made from its simulations.
+#: Seed of the synthetic set's own truth, which cancels in all that is made from its simulations.
 WORLD = 1
 
 
@@ -66,7 +67,7 @@ class Data:
 def density_of(
     space: ParameterSpace, points: FloatArray, features: FloatArray, observed: FloatArray, sensor: float, seed: int = 0
 ) -> Density:
-    """The posterior in a world whose model is right but for chance: numerics leave nothing.
+    """The posterior where the model is right but for seed-to-seed scatter: there is no discretisation error.
 
     Args:
         space: the free parameters.
@@ -97,82 +98,69 @@ def density_of(
     return Density.of(replace(noise, numerics=np.zeros_like(noise.numerics)), prior, seed)
 
 
-def simulations(
-    count: int,
-    parameters: Sequence[str] = ("friction_angle",),
-    effects: Sequence[str] = (),
-    *,
-    measurement: Path | None = None,
-    reconstruction: Path | None = None,
-    preset: str = "tiny",
-    device: str = "cpu",
-    seed: int = 0,
-    repeats: int = 8,
-    executor: Executor | None = None,
-    progress: Callable[[int, int], None] | None = None,
+def world_parser(module_doc: str | None) -> argparse.ArgumentParser:
+    """An argument parser with options that choose what is simulated."""
+    parser = parser_of(module_doc)
+    parser.add_argument("set", type=Path, nargs="?", help="measurement set; none: the synthetic one of PlowSand-v0")
+    parser.add_argument("--reconstruction", type=Path, help="of the set, if there is one already")
+    parser.add_argument("--parameters", nargs="+", default=["friction_angle"])
+    parser.add_argument("--with", dest="effects", nargs="*", default=[], metavar="EFFECT")
+    parser.add_argument("--preset", default="tiny")
+    parser.add_argument("--executor", default="serial", help="serial, processes:N or dask:ADDRESS")
+    return parser
+
+
+def simulated(
+    options: argparse.Namespace, count: int, pool: Executor | None = None, *, seed: int = 0, repeats: int = 8
 ) -> tuple[Data, Path]:
     """Simulations at Sobol points of the prior, each with particles of its own, and some repeated in the middle.
 
     Args:
+        options: of :func:`world_parser`.
         count: points; their number is best a power of two.
-        parameters, effects: of the model.
-        measurement: folder of a set; None: the made-up world of PlowSand-v0.
-        reconstruction: of the set; made and kept where there is none.
-        preset, device: of the solver.
+        pool: where; in this process by default.
         seed: of points and particles.
         repeats: simulations in the middle of the prior that differ in their particles only, after the others.
-        executor: where; in this process by default.
-        progress: called with (done, all).
 
     Returns:
         The simulations, and the database that keeps them in the user's cache.
     """
-    problem, world = _problem(parameters, effects, measurement, reconstruction, preset, device)
+    problem, world = _problem(options)
     model = {
         **world,
-        "effects": sorted(effects),
-        "preset": preset,
-        "device": device.split(":")[0],
+        "effects": sorted(options.effects),
+        "preset": options.preset,
+        "device": options.device.split(":")[0],
         "version": splatsoil.__version__,
-        "code": code_digest((*FORWARD,), others=[name for name in effects if name.endswith(".py")]),
+        "code": code_digest((*FORWARD,), others=[name for name in options.effects if name.endswith(".py")]),
         "loss": LOSS,
     }
-    points = sobol(count, len(problem.space), seed)
-    jobs = jobs_at(problem.space, np.concatenate([points, np.zeros((repeats, len(problem.space)))]), seed)
-    file = cache_folder() / "simulations" / f"{digest({**model, 'parameters': list(parameters)})[:16]}.db"
+    asked = {"parameters": list(options.parameters), "count": count, "seed": seed, "repeats": repeats}
+    points = np.concatenate([sobol(count, len(problem.space), seed), np.zeros((repeats, len(problem.space)))])
+    seeds = np.random.SeedSequence([seed, 9]).generate_state(len(points)) % 2**31
+    jobs = [Job(problem.space.to_dict(problem.space.from_unit(p)), int(s)) for p, s in zip(points, seeds, strict=True)]
+    file = cache_folder() / "simulations" / f"{digest({**model, 'parameters': asked['parameters']})[:16]}.db"
+    report = ticker("simulations")
     with writer_lock(file.parent), EvaluationStore(file) as store:
         records = run_campaign(
             problem,
             jobs,
             store,
             model,
-            {"agent": "simulations", "parameters": list(parameters), "count": count, "seed": seed, "repeats": repeats},
-            executor=executor,
-            after_evaluation=None if progress is None else lambda done, _: progress(done, len(jobs)),
+            {"agent": "simulations", **asked},
+            executor=pool,
+            after_evaluation=lambda done, _: report(done, len(jobs)),
         )
     return Data.of(problem.space, records), file
 
 
-def jobs_at(space: ParameterSpace, points: FloatArray, seed: int) -> list[Job]:
-    """One evaluation at each point (k, n) of [-1, 1]^n, no two with the same particles."""
-    seeds = np.random.SeedSequence([seed, 9]).generate_state(len(points)) % 2**31
-    return [Job(space.to_dict(space.from_unit(p)), int(s)) for p, s in zip(points, seeds, strict=True)]
-
-
-def _problem(
-    parameters: Sequence[str],
-    effects: Sequence[str],
-    measurement: Path | None,
-    reconstruction: Path | None,
-    preset: str,
-    device: str,
-) -> tuple[Problem, dict[str, Any]]:
-    if measurement is None:
-        world = SyntheticProblem(parameters, effects, preset=preset, device=device)
+def _problem(options: argparse.Namespace) -> tuple[Problem, dict[str, Any]]:
+    chosen: dict[str, Any] = {"preset": options.preset, "device": options.device}
+    if options.set is None:
+        world = SyntheticProblem(options.parameters, options.effects, **chosen)
         world.begin(WORLD)
         sources = [inspect.getfile(part) for part in (SyntheticProblem, World)]
         return world, {"world": "synthetic", "seed": WORLD, "source": code_digest((), sources)}
-    problem = MeasuredProblem.load(
-        measurement, parameters, effects, preset=preset, device=device, reconstruction=reconstruction
-    )
-    return problem, {"measurement": problem.model.measurement.hash, "reconstruction": str(reconstruction)}
+    made = options.reconstruction
+    problem = MeasuredProblem.load(options.set, options.parameters, options.effects, reconstruction=made, **chosen)
+    return problem, {"measurement": problem.model.measurement.hash, "reconstruction": str(made)}

@@ -8,37 +8,33 @@
 | `paper` | the same with Hsiao and Kumar's settings: one random start, expected improvement |
 | `mcmc` | emcee on a comparison's posterior, by an emulator of the features trained on N space-filling calls |
 | `both` | the same, trained on the N calls that `bo` chose: what `splatsoil fit` says |
-| `direct` | emcee on the simulator itself: N calls are N steps of walkers |
+| `direct` | emcee on the calls themselves: N calls are N steps of walkers |
 
-The calls go to an emulated landscape: real simulations of the world, made once and kept, through an emulator of many
-points; chance is drawn from the measured scatter between seeds. So a thousand calls take a second, and every way meets
-the same landscape; what the emulator doesn't show of the simulator isn't tested. ``--direct-simulator`` calls the
-simulator itself instead (hours on a CPU).
+The calls go to an emulator of real simulations, made once and kept; each call has a draw of the measured seed-to-seed
+scatter. So a thousand calls take a second, and every way meets the same landscape; what the emulator does not show of
+the simulator is not tested.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import emcee
 import numpy as np
 import numpy.typing as npt
-from splatsoil.benchmarks._common import output_options, simulated, stamp, ticker, world_options, write_result
-from splatsoil.benchmarks._simulations import FEWEST, density_of
-from splatsoil.envs.synthetic import SyntheticProblem
-from splatsoil.envs.together import attempt
+from splatsoil.benchmarks._common import at_least, output_options, stamp, ticker, write_result
+from splatsoil.benchmarks._simulations import FEWEST, density_of, simulated, world_parser
 from splatsoil.inverse.bayesopt import PAPER, BayesianOptimiser, Search
 from splatsoil.inverse.executors import Executor, Serial, executor, in_order
 from splatsoil.inverse.mcmc import sample
 from splatsoil.inverse.posterior import Density
 from splatsoil.inverse.surrogate import sobol
 
-from splatsoil.errors import ParameterError
+from splatsoil.files import plain
 from splatsoil.parameters import ParameterSpace
 from splatsoil.quiet import hush
 
@@ -55,20 +51,8 @@ INNER = 0.8
 COLOURS = {"bo": "#c44e52", "paper": "#dd8452", "mcmc": "#4c72b0", "both": "#8172b3", "direct": "#55a868"}
 
 
-class World(Protocol):
-    """A simulator with an observation."""
-
-    space: ParameterSpace
-
-    def observe(self, truth: FloatArray, rng: np.random.Generator) -> None:
-        """Make an observation of a truth (n,) in [-1, 1]^n."""
-
-    def call(self, point: FloatArray, rng: np.random.Generator) -> tuple[float, FloatArray]:
-        """Simulate a point (n,): loss, and predicted minus observed features (b,)."""
-
-
 class EmulatedWorld:
-    """Calls answered by an emulator of many real simulations, with chance drawn from its measured covariance.
+    """Calls answered by an emulator of many real simulations, with seed-to-seed scatter of its measured covariance.
 
     Features are a comparison's scores; the loss is their mean square residual over what the prior's middle would leave
     on average.
@@ -83,9 +67,11 @@ class EmulatedWorld:
         self.observed = np.zeros(self.count)
 
     def observe(self, truth: FloatArray, rng: np.random.Generator) -> None:
+        """Make an observation of a truth (n,) in [-1, 1]^n."""
         self.observed = self._simulate(truth, rng)
 
     def call(self, point: FloatArray, rng: np.random.Generator) -> tuple[float, FloatArray]:
+        """Simulate a point (n,): loss, and predicted minus observed features (b,)."""
         residual = self._simulate(point, rng) - self.observed
         return float(np.sum(residual**2)) / self.unit, residual
 
@@ -95,24 +81,6 @@ class EmulatedWorld:
 
     def _simulate(self, point: FloatArray, rng: np.random.Generator) -> FloatArray:
         return self._emulated(point[None])[0] + self.factor @ rng.standard_normal(self.count)
-
-
-class SimulatedWorld:
-    """Calls answered by the simulator of PlowSand-v0's made-up world."""
-
-    def __init__(self, parameters: Sequence[str], effects: Sequence[str], preset: str, device: str) -> None:
-        self.problem = SyntheticProblem(parameters, effects, preset=preset, device=device)
-        self.space = self.problem.space
-
-    def observe(self, truth: FloatArray, rng: np.random.Generator) -> None:
-        self.problem.place(self.space.to_dict(self.space.from_unit(truth)), int(rng.integers(2**31)))
-
-    def call(self, point: FloatArray, rng: np.random.Generator) -> tuple[float, FloatArray]:
-        values = self.space.to_dict(self.space.from_unit(point))
-        found = attempt(self.problem, values, int(rng.integers(2**31)))
-        if found.loss is None:
-            raise ParameterError(f"a simulation failed at {values} ({found.message}); choose other parameters")
-        return found.loss, -found.blocks
 
 
 @dataclass(frozen=True)
@@ -125,7 +93,9 @@ class Answer:
     seconds: float
 
 
-def play(world: World, budgets: Sequence[int], seed: int, search: Search | None) -> tuple[dict[int, Answer], Any]:
+def play(
+    world: EmulatedWorld, budgets: Sequence[int], seed: int, search: Search | None
+) -> tuple[dict[int, Answer], Any]:
     """Bayesian optimisation: an answer at each budget, and the calls (points, features)."""
     rng = np.random.default_rng([seed, 31])
     optimiser = BayesianOptimiser(len(world.space), seed=seed, search=search)
@@ -159,11 +129,10 @@ def sample_emulated(space: ParameterSpace, points: FloatArray, features: FloatAr
     return Answer(chains.flat.mean(axis=0), low, high, time.perf_counter() - began)
 
 
-def sample_directly(world: World, budgets: Sequence[int], seed: int, chance: FloatArray) -> dict[int, Answer]:
-    """emcee on the simulator: each density is a call. Its own chance adds to the observation's."""
-    rng = np.random.default_rng([seed, 37])
-    n = len(world.space)
-    inverse = np.linalg.pinv(2.0 * chance)
+def sample_directly(world: EmulatedWorld, budgets: Sequence[int], seed: int) -> dict[int, Answer]:
+    """emcee on the calls: each density is one. A call's seed-to-seed scatter adds to the observation's."""
+    rng, n = np.random.default_rng([seed, 37]), len(world.space)
+    inverse = np.linalg.pinv(2.0 * world.density.noise.chance)
 
     def density(point: FloatArray) -> float:
         if np.any(np.abs(point) > 1.0):
@@ -187,83 +156,63 @@ def sample_directly(world: World, budgets: Sequence[int], seed: int, chance: Flo
     return answers
 
 
+def truth_of(seed: int, n: int) -> FloatArray:
+    """A truth (n,) in the middle of [-1, 1]^n."""
+    return np.random.default_rng([seed, 29]).uniform(-INNER, INNER, n)
+
+
 def trial(
-    world: World, ways: Sequence[str], budgets: Sequence[int], direct: Sequence[int], chance: FloatArray, seed: int
+    world: EmulatedWorld, ways: Sequence[str], budgets: Sequence[int], direct: Sequence[int], seed: int
 ) -> dict[str, dict[int, Answer]]:
     """All ways on one truth, drawn by the seed."""
-    n = len(world.space)
-    rng = np.random.default_rng([seed, 29])
-    world.observe(rng.uniform(-INNER, INNER, n), rng)
+    n, rng = len(world.space), np.random.default_rng([seed, 41])
+    world.observe(truth_of(seed, n), rng)
     usable = [b for b in budgets if b >= FEWEST]
     out: dict[str, dict[int, Answer]] = {}
-    calls = None
     if "bo" in ways or "both" in ways:
-        answers, calls = play(world, budgets, seed, None)
-        out["bo"] = answers
+        out["bo"], (points, features) = play(world, budgets, seed, None)
+        out["both"] = {b: sample_emulated(world.space, points[:b], features[:b], seed) for b in usable}
     if "paper" in ways:
-        out["paper"] = play(world, budgets, seed, PAPER)[0]
+        out["paper"], _ = play(world, budgets, seed, PAPER)
     if "mcmc" in ways:
-        noise = np.random.default_rng([seed, 41])
         points = sobol(max(budgets), n, seed)
-        features = np.array([world.call(p, noise)[1] for p in points])
+        features = np.array([world.call(p, rng)[1] for p in points])
         out["mcmc"] = {b: sample_emulated(world.space, points[:b], features[:b], seed) for b in usable}
-    if "both" in ways and calls is not None:
-        out["both"] = {b: sample_emulated(world.space, calls[0][:b], calls[1][:b], seed) for b in usable}
     if "direct" in ways:
-        out["direct"] = sample_directly(world, direct, seed, chance)
+        out["direct"] = sample_directly(world, direct, seed)
     return {way: answers for way, answers in out.items() if way in ways}
 
 
 def run(
-    world: World,
-    chance: FloatArray,
+    world: EmulatedWorld,
     *,
     ways: Sequence[str] = WAYS,
     budgets: Sequence[int] = BUDGETS,
     direct: Sequence[int] = DIRECT_BUDGETS,
     seeds: int = 12,
     pool: Executor | None = None,
-    progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
     """Errors, widths and coverage of all ways over seeds, in physical units."""
-    space = world.space
-    rows: dict[tuple[str, int], list[dict[str, Any]]] = {}
-    pool = pool or Serial()
-    jobs = [(world, ways, budgets, direct, chance, seed) for seed in range(seeds)]
-    for seed, answers_of in enumerate(in_order(pool, trial, jobs)):
-        truth = np.random.default_rng([seed, 29]).uniform(-INNER, INNER, len(space))
+    space, report = world.space, ticker("truths")
+    rows: dict[tuple[str, int], list[tuple[FloatArray, FloatArray, npt.NDArray[np.bool_], float]]] = {}
+    jobs = [(world, ways, budgets, direct, seed) for seed in range(seeds)]
+    for seed, answers_of in enumerate(in_order(pool or Serial(), trial, jobs)):
+        truth = truth_of(seed, len(space))
         for way, answers in answers_of.items():
             for budget, answer in answers.items():
-                low, high = space.from_unit(answer.low), space.from_unit(answer.high)
-                entry = {
-                    "error": (space.from_unit(answer.estimate) - space.from_unit(truth)).tolist(),
-                    "width": (high - low).tolist(),
-                    "holds": ((answer.low <= truth) & (truth <= answer.high)).tolist(),
-                    "seconds": answer.seconds,
-                }
-                rows.setdefault((way, budget), []).append(entry)
-        if progress is not None:
-            progress(seed + 1, seeds)
+                error = space.from_unit(answer.estimate) - space.from_unit(truth)
+                width = space.from_unit(answer.high) - space.from_unit(answer.low)
+                inside = (answer.low <= truth) & (truth <= answer.high)
+                rows.setdefault((way, budget), []).append((error, width, inside, answer.seconds))
+        report(seed + 1, seeds)
     entries = []
-    for (way, budget), found in rows.items():
-        error, width = (np.array([f[key] for f in found]) for key in ("error", "width"))
-        entries.append(
-            {
-                "way": way,
-                "calls": budget,
-                "mae": np.abs(error).mean(axis=0).tolist(),
-                "mae_std": np.abs(error).std(axis=0, ddof=1).tolist() if len(found) > 1 else [0.0] * len(space),
-                "width_90": width.mean(axis=0).tolist(),
-                "coverage_90": np.mean([f["holds"] for f in found], axis=0).tolist(),
-                "seconds": float(np.mean([f["seconds"] for f in found])),
-                "trials": found,
-            }
-        )
-    return {
-        "parameters": [{"name": p.name, "unit": p.unit} for p in space],
-        "seeds": seeds,
-        "entries": sorted(entries, key=lambda e: (WAYS.index(e["way"]), e["calls"])),
-    }
+    for (way, budget), found in sorted(rows.items(), key=lambda row: (WAYS.index(row[0][0]), row[0][1])):
+        error, width, inside, seconds = (np.array(column) for column in zip(*found, strict=True))
+        spread = np.abs(error).std(axis=0, ddof=1) if len(found) > 1 else np.zeros(len(space))
+        entry = {"way": way, "calls": budget, "mae": np.abs(error).mean(axis=0), "mae_std": spread}
+        entry |= {"width_90": width.mean(axis=0), "coverage_90": inside.mean(axis=0), "seconds": float(seconds.mean())}
+        entries.append(plain({**entry, "errors": error}))
+    return {"parameters": [{"name": p.name, "unit": p.unit} for p in space], "seeds": seeds, "entries": entries}
 
 
 def table(result: dict[str, Any]) -> str:
@@ -275,7 +224,7 @@ def table(result: dict[str, Any]) -> str:
             "",
             f"**{parameter['name']}**",
             "",
-            "| way | calls | mean abs. error ± its spread | 90 % interval's width | holds the truth | own time |",
+            "| way | calls | mean abs. error ± its spread | 90 % interval's width | contains the truth | own time |",
             "|---|---|---|---|---|---|",
         ]
         for e in result["entries"]:
@@ -289,29 +238,20 @@ def table(result: dict[str, Any]) -> str:
 def figure(result: dict[str, Any]) -> Figure:
     """Error and interval width against calls, for each parameter."""
     from matplotlib.figure import Figure
-    from matplotlib.ticker import FixedLocator, FormatStrFormatter, LogLocator, NullLocator
 
     count = len(result["parameters"])
     drawn = Figure(figsize=(8.4, 2.8 * count), layout="constrained")
-    axes = drawn.subplots(count, 2, squeeze=False)
-    for i, (row, parameter) in enumerate(zip(axes, result["parameters"], strict=True)):
+    for i, (row, parameter) in enumerate(
+        zip(drawn.subplots(count, 2, squeeze=False), result["parameters"], strict=True)
+    ):
         for way in WAYS:
             found = [e for e in result["entries"] if e["way"] == way]
-            if not found:
-                continue
             calls = [e["calls"] for e in found]
             standard = [e["mae_std"][i] / result["seeds"] ** 0.5 for e in found]
             row[0].errorbar(calls, [e["mae"][i] for e in found], standard, color=COLOURS[way], marker="o", label=way)
             row[1].plot(calls, [e["width_90"][i] for e in found], color=COLOURS[way], marker="o", label=way)
         for axis, what in zip(row, ("mean absolute error", "90 % interval's width"), strict=True):
-            axis.set_xscale("log")
-            axis.set_yscale("log")
-            axis.xaxis.set_major_locator(FixedLocator(sorted({e["calls"] for e in result["entries"]})))
-            axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-            for one in (axis.xaxis, axis.yaxis):
-                one.set_major_formatter(FormatStrFormatter("%g"))
-                one.set_minor_locator(NullLocator())
-            axis.set_xlabel("simulator calls")
+            axis.set(xscale="log", yscale="log", xlabel="simulator calls")
             axis.set_title(f"{parameter['name'].replace('_', ' ')}: {what} [{parameter['unit']}]", fontsize=9)
         row[0].legend(fontsize=7)
     return drawn
@@ -319,56 +259,30 @@ def figure(result: dict[str, Any]) -> Figure:
 
 def main(arguments: list[str] | None = None) -> int:
     """Command line; exit code 0."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    world_options(parser)
-    parser.add_argument("--seeds", type=int, default=12, help="truths, each with its own chance")
+    parser = world_parser(__doc__)
+    parser.add_argument("--seeds", type=at_least(1), default=12, help="truths, each with its own scatter")
     parser.add_argument("--budgets", type=int, nargs="+", default=list(BUDGETS))
     parser.add_argument(
         "--direct-budgets", type=int, nargs="+", default=list(DIRECT_BUDGETS), help="calls of emcee on the simulator"
     )
     parser.add_argument("--ways", nargs="+", choices=WAYS, default=list(WAYS))
-    parser.add_argument("--simulations", type=int, default=64, help="behind the emulated landscape")
-    parser.add_argument("--direct-simulator", action="store_true", help="call the made-up world's simulator itself")
+    parser.add_argument("--simulations", type=at_least(1), default=64, help="behind the emulated landscape")
     output_options(parser)
     options = parser.parse_args(arguments)
     hush()
-    if options.direct_simulator and options.set is not None:
-        raise ParameterError("--direct-simulator: the truth of a measured set is one; only the made-up world has many")
     began = time.perf_counter()
     with executor(options.executor) as pool:
-        return _run(options, pool, began)
-
-
-def _run(options: argparse.Namespace, pool: Executor, began: float) -> int:
-    """Simulate, compare, write, print."""
-    data, file = simulated(options, options.simulations, pool)
-    density = density_of(data.space, data.points, -data.residuals, np.zeros(data.residuals.shape[1]), 0.0)
-    noise = density.noise
-    if options.direct_simulator:
-        world: World = SimulatedWorld(options.parameters, options.effects, options.preset, options.device)
-        landscape = f"The simulator of the made-up world itself, preset `{options.preset}`"
-        # The scatter of features between seeds, as far as the scores show it, in the features' own space.
-        chance = noise.basis @ noise.chance @ noise.basis.T
-    else:
-        world, chance = EmulatedWorld(density), noise.chance
-        source = "the made-up world" if options.set is None else str(options.set)
-        landscape = (
-            f"An emulated landscape: {len(chance)} scores of {len(data.points)} simulations of {source}, preset "
-            f"`{options.preset}`"
-        )
+        data, file = simulated(options, options.simulations, pool)
+        density = density_of(data.space, data.points, -data.residuals, np.zeros(data.residuals.shape[1]), 0.0)
+        chosen = {"ways": options.ways, "budgets": options.budgets, "direct": options.direct_budgets}
+        found = run(EmulatedWorld(density), **chosen, seeds=options.seeds, pool=pool)
+    source = "the synthetic set" if options.set is None else str(options.set)
+    count = len(density.noise.chance)
+    landscape = f"{count} scores of {len(data.points)} simulations of {source}, preset `{options.preset}`, emulated"
     result = {
         "benchmark": "bo-vs-mcmc",
         "landscape": landscape,
-        **run(
-            world,
-            chance,
-            ways=options.ways,
-            budgets=options.budgets,
-            direct=options.direct_budgets,
-            seeds=options.seeds,
-            pool=pool,
-            progress=ticker("truths"),
-        ),
+        **found,
         "simulations": str(file),
         **stamp(options.device),
         "seconds": time.perf_counter() - began,

@@ -1,32 +1,32 @@
-"""Do intervals hold what they promise? Simulation-based calibration of posteriors.
+"""Are the posteriors calibrated? Simulation-based calibration.
 
 Truths are drawn from the prior and simulated, each with particles of its own; sensor noise is added. For each, an
 emulator is trained on other simulations only, and the posterior is that of ``splatsoil fit``.
-Over many truths, 50 % and 90 % intervals should hold the truth in 50 % and 90 % of cases, and its rank among posterior
-draws should be uniform (Talts et al. 2018, arXiv:1804.06788).
+Over many truths, 50 % and 90 % intervals should contain the truth in 50 % and 90 % of cases, and its rank among
+posterior draws should be uniform (Talts et al. 2018, arXiv:1804.06788).
 
     splatsoil benchmark calibration --out runs/calibration
 
-The world is the made-up one of PlowSand-v0 unless a set is named; every truth is a real simulation of it, and the model
-is right but for chance. What a wrong model does to a posterior is not tested here.
+The set is the synthetic one of PlowSand-v0 unless one is named; every truth is a real simulation of it, and the model
+is right but for seed-to-seed scatter. What a wrong model does to a posterior is not tested here.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 from scipy.stats import binom, chisquare
-from splatsoil.benchmarks._common import output_options, simulated, stamp, ticker, world_options, write_result
-from splatsoil.benchmarks._simulations import Data, density_of
+from splatsoil.benchmarks._common import at_least, output_options, stamp, ticker, write_result
+from splatsoil.benchmarks._simulations import Data, density_of, simulated, world_parser
 from splatsoil.inverse.executors import Executor, Serial, executor, in_order
 from splatsoil.inverse.marginal import Marginal
 
+from splatsoil.files import plain
 from splatsoil.parameters import ParameterSpace
 from splatsoil.quiet import hush
 
@@ -56,9 +56,8 @@ def calibrate(
     sensor_std: float = 1.0,
     seed: int = 0,
     pool: Executor | None = None,
-    progress: Callable[[int, int], None] | None = None,
 ) -> list[dict[str, Any]]:
-    """One entry for each truth: its rank, and whether intervals hold it, for each parameter.
+    """One entry for each truth: its rank, and whether intervals contain it, for each parameter.
 
     Args:
         data: simulations; the first ``truths`` at points of the prior.
@@ -67,33 +66,26 @@ def calibrate(
         sensor_std: noise added to a truth's features, in their unit.
         seed: of noise, training sets and draws.
         pool: where the folds are worked on; here, one after the other, by default.
-        progress: called with (done, truths).
     """
-    pool = pool or Serial()
     jobs = []
     for number, (train, test) in enumerate(folds(data, truths)):
         if training is not None and training < len(train):
-            # Repeats stand at the end of the simulations: they stay, since chance is measured from them.
+            # Repeats stand at the end of the simulations: they stay, since seed-to-seed scatter is measured from them.
             inner = train[train < truths]
             keep = max(training - (len(train) - len(inner)), len(data.space) + 4)
             chosen = np.random.default_rng([seed, 21, number]).choice(inner, keep, replace=False)
             train = np.concatenate([np.sort(chosen), train[train >= truths]])
         jobs.append((data, train, test, sensor_std, seed, number))
     out: list[dict[str, Any]] = []
-    for entries in in_order(pool, one_fold, jobs):
+    report = ticker("truths")
+    for entries in in_order(pool or Serial(), one_fold, jobs):
         out += entries
-        if progress is not None:
-            progress(len(out), truths)
+        report(len(out), truths)
     return out
 
 
 def one_fold(
-    data: Data,
-    train: npt.NDArray[np.int64],
-    test: npt.NDArray[np.int64],
-    sensor_std: float,
-    seed: int,
-    number: int,
+    data: Data, train: npt.NDArray[np.int64], test: npt.NDArray[np.int64], sensor_std: float, seed: int, number: int
 ) -> list[dict[str, Any]]:
     """Entries of the truths ``test``, by emulators of the simulations ``train``; a worker's job."""
     rng = np.random.default_rng([seed, 24, number])
@@ -109,19 +101,13 @@ def one_fold(
         draws = space.to_unit(np.stack([m.values[chosen] for m in marginals], axis=1))
         truth = data.points[index]
         physical = space.from_unit(truth)
-        within = {}
-        for level in LEVELS:
-            ends = [[m.quantile(0.5 + side * level / 2) for side in (-1.0, 1.0)] for m in marginals]
-            within[str(level)] = [bool(a <= t <= b) for (a, b), t in zip(ends, physical, strict=True)]
-        out.append(
-            {
-                "truth": truth.tolist(),
-                "rank": [int(r) for r in (draws < truth).sum(axis=0)],
-                "within": within,
-                "mean": draws.mean(axis=0).tolist(),
-                "std": draws.std(axis=0).tolist(),
-            }
-        )
+        ends = {level: [[m.quantile(0.5 + s * level / 2) for s in (-1, 1)] for m in marginals] for level in LEVELS}
+        inside = {
+            str(level): [bool(a <= t <= b) for (a, b), t in zip(found, physical, strict=True)]
+            for level, found in ends.items()
+        }
+        entry = {"truth": truth, "rank": (draws < truth).sum(axis=0), "within": inside}
+        out.append(plain({**entry, "mean": draws.mean(axis=0), "std": draws.std(axis=0)}))
     return out
 
 
@@ -133,22 +119,16 @@ def summarise(entries: Sequence[dict[str, Any]], space: ParameterSpace) -> dict[
         ranks = np.array([e["rank"][i] for e in entries])
         bins = np.histogram(ranks, bins=BINS, range=(-0.5, DRAWS + 0.5))[0]
         z = np.array([(e["mean"][i] - e["truth"][i]) / e["std"][i] for e in entries])
-        half = 0.5 * (p.upper - p.lower)
         parameters[p.name] = {
             "coverage": {str(level): float(np.mean([e["within"][str(level)][i] for e in entries])) for level in LEVELS},
             "ranks": bins.tolist(),
             "p_uniform": float(chisquare(bins).pvalue),
             "rms_z": float(np.sqrt(np.mean(z**2))),
             "contraction": float(np.mean([e["std"][i] for e in entries]) * np.sqrt(3.0)),
-            "mean_std": None if p.log else float(np.mean([e["std"][i] for e in entries]) * half),
             "unit": p.unit,
         }
     expected = {str(level): [float(v) / count for v in binom.interval(0.95, count, level)] for level in LEVELS}
-    return {
-        "truths": count,
-        "expected": expected,
-        "parameters": parameters,
-    }
+    return {"truths": count, "expected": expected, "parameters": parameters}
 
 
 def table(result: dict[str, Any]) -> str:
@@ -157,11 +137,11 @@ def table(result: dict[str, Any]) -> str:
         f"{result['world']}, preset `{result['preset']}`, {result['device']}: {result['truths']} truths, each a "
         f"simulation of its own, emulators trained on {result['training']} others; {result['seconds']:.0f} s.",
         "",
-        "| parameter | 50 % intervals hold | 90 % intervals hold | ranks uniform, p | rms z | width / prior |",
+        "| parameter | truth in 50 % intervals | in 90 % intervals | ranks uniform, p | rms z | std / prior's |",
         "|---|---|---|---|---|---|",
     ]
     for name, entry in result["parameters"].items():
-        held = " | ".join(f"**{100.0 * entry['coverage'][str(level)]:.0f} %**" for level in LEVELS)
+        held = " | ".join(f"{100.0 * entry['coverage'][str(level)]:.0f} %" for level in LEVELS)
         lines.append(
             f"| {name} | {held} | {entry['p_uniform']:.2f} | {entry['rms_z']:.2f} | {entry['contraction']:.2f} |"
         )
@@ -195,9 +175,8 @@ def figure(result: dict[str, Any]) -> Figure:
 
 def main(arguments: list[str] | None = None) -> int:
     """Command line; exit code 0."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    world_options(parser)
-    parser.add_argument("--truths", type=int, default=128)
+    parser = world_parser(__doc__)
+    parser.add_argument("--truths", type=at_least(1), default=128)
     parser.add_argument("--training", type=int, help="simulations for each emulator; all others by default")
     parser.add_argument("--sensor", type=float, default=1.0, help="noise added to a truth's features, grey levels")
     parser.add_argument("--seed", type=int, default=0)
@@ -206,13 +185,13 @@ def main(arguments: list[str] | None = None) -> int:
     hush()
     began = time.perf_counter()
     with executor(options.executor) as pool:
-        data, file = simulated(options, options.truths, pool, options.seed)
+        data, file = simulated(options, options.truths, pool, seed=options.seed)
         truths = min(options.truths, len(data.points))
         chosen: dict[str, Any] = {"training": options.training, "sensor_std": options.sensor, "seed": options.seed}
-        entries = calibrate(data, truths, **chosen, pool=pool, progress=ticker("truths"))
+        entries = calibrate(data, truths, **chosen, pool=pool)
     result = {
         "benchmark": "calibration",
-        "world": "the made-up world of PlowSand-v0" if options.set is None else str(options.set),
+        "world": "the synthetic set of PlowSand-v0" if options.set is None else str(options.set),
         "preset": options.preset,
         "seed": options.seed,
         "training": options.training or len(data.points) - truths // FOLDS,

@@ -6,22 +6,21 @@ that of a measurement set which carries its true particles.
 
 from __future__ import annotations
 
-import argparse
-import io
+import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-import warp as wp
-from splatsoil.benchmarks._common import here
-from splatsoil.benchmarks.numerics import Truth
+from splatsoil.benchmarks._common import at_least, parser_of, write_figure
+from splatsoil.benchmarks._truth import FloatArray, Truth
 
-from splatsoil.files import write_bytes
+from splatsoil.errors import SimulationError
 from splatsoil.measurement import Measurement
 from splatsoil.model import Model
 from splatsoil.mpm import Resolution, simulate
 from splatsoil.parameters import Parameter
+from splatsoil.quiet import hush
 from splatsoil.reconstruction import reconstruct
 from splatsoil.soil.effect import Effect
 from splatsoil.soil.law import Law
@@ -57,63 +56,47 @@ def acting(effect: Effect) -> dict[str, float]:
     return {p.name: float(np.clip(off + (p.sign or 1) * TIMES_MEANINGFUL * p.meaningful, p.lower, p.upper))}
 
 
-def simulated() -> dict[str, Effect]:
-    """Those that need a simulation."""
-    return {n: e for n, e in library().items() if not e.observes}
+def strong() -> list[str]:
+    """Names of effects on strength that act together: of those that exclude each other, the first."""
+    effects, chosen = library(), list[str]()
+    for name, effect in effects.items():
+        excluded = {*effect.conflicts, *(n for n in chosen if name in effects[n].conflicts)}
+        if effect.strength is not None and not excluded.intersection(chosen):
+            chosen.append(name)
+    return chosen
 
 
-def pictures(truth: Truth, preset: str, angle: float, device: str, seeds: int = 3) -> dict[str, Any]:
-    """Height maps (ny, nx) in m at the last frame: the base law's, its scatter, and what each effect changes."""
+def heights(
+    truth: Truth, preset: str, angle: float, device: str, seeds: int
+) -> tuple[FloatArray, float, dict[str, FloatArray]]:
+    """Heights (ny, nx), m, of the last frame by the base law, their scatter between seeds, what each effect changes."""
     measurement = truth.measurement
     resolution = Resolution.derive(measurement, preset)
-    last = max(truth.particles)
 
-    def height(law: Law, values: Mapping[str, float], seed: int) -> Any:
-        x = truth.start(resolution.spacing, seed)
-        given = {"friction_angle": angle, **values}
-        run = simulate(measurement, x, given, law=law, resolution=resolution, frames=[last], device=device)[0]
+    def height(law: Law, values: Mapping[str, float], seed: int) -> FloatArray:
+        x, given = truth.start(resolution.spacing, seed), {"friction_angle": angle, **values}
+        frames = [max(truth.particles)]
+        run = simulate(measurement, x, given, law=law, resolution=resolution, frames=frames, device=device)[0]
         return truth.heights(run.positions[-1], resolution.spacing**3)
 
-    base = [height(Law(), {}, seed) for seed in range(seeds)]
-    chance = np.sqrt(np.mean([np.mean((b - np.mean(base, axis=0)) ** 2) for b in base]) * seeds / max(seeds - 1, 1))
+    base = np.array([height(Law(), {}, seed) for seed in range(seeds)])
+    scatter = float(np.sqrt(base.var(axis=0, ddof=1).mean()))
     changes = {}
-    for name, effect in simulated().items():
-        effect = effect.for_measurement(measurement)
-        runs = [height(Law([effect]), acting(effect), seed) - base[seed] for seed in range(seeds)]
-        changes[name] = np.mean(runs, axis=0)
-        print(f"{name}: {1e3 * np.sqrt(np.mean(changes[name] ** 2)):.1f} mm", flush=True)
-    return {"base": np.mean(base, axis=0), "chance": float(chance), "changes": changes}
+    for name, effect in library().items():
+        if not effect.observes:
+            law, values = Law([effect.for_measurement(measurement)]), acting(effect)
+            try:
+                found = [height(law, values, seed) - base[seed] for seed in range(seeds)]
+            except SimulationError as error:  # a coarse grid does not bear every size
+                print(f"{name}: left out: {error}", file=sys.stderr)
+                continue
+            changes[name] = np.mean(found, axis=0)
+            print(f"{name}: {1e3 * np.sqrt(np.mean(changes[name] ** 2)):.1f} mm", flush=True)
+    return base.mean(axis=0), scatter, changes
 
 
-def figure(result: Mapping[str, Any], truth: Truth) -> Figure:
-    """The base law's bed, and beside it how each effect changes it."""
-    from matplotlib.figure import Figure
-
-    bed = truth.measurement.bed
-    extent = (bed.lower[0], bed.upper[0], bed.lower[1], bed.upper[1])
-    panels = {"base law": result["base"], **result["changes"]}
-    rows = -(-len(panels) // 4)
-    drawn = Figure(figsize=(12.0, 2.0 * rows), layout="constrained")
-    axes = drawn.subplots(rows, 4, squeeze=False).reshape(-1)
-    for ax in axes:
-        ax.set_axis_off()
-    for ax, (name, data) in zip(axes, panels.items(), strict=False):
-        base = name == "base law"
-        image = ax.imshow(
-            1e3 * data,
-            extent=extent,
-            origin="lower",
-            cmap="viridis" if base else "RdBu_r",
-            **({} if base else {"vmin": -15.0, "vmax": 15.0}),
-        )
-        size = "" if base else ", ".join(f"{v:g}" for v in acting(library()[name]).values())
-        ax.set_title(f"{name} {size}", fontsize=9)
-        drawn.colorbar(image, ax=ax, shrink=0.7, label="mm" if base else "change, mm")
-    return drawn
-
-
-def reported(measurement: Measurement, angle: float, device: str) -> dict[str, Any]:
-    """Pictures (h, w, 3) of the first camera while the tool is fast, in grey levels: as is, and what effects change."""
+def reported(measurement: Measurement, angle: float, device: str) -> tuple[FloatArray, dict[str, FloatArray]]:
+    """Picture (h, w, 3) of the first camera while the tool is fast, in grey levels: as is, and what effects change."""
     motion = measurement.tool.motion
     speed = np.linalg.norm(np.gradient(motion.positions, motion.times, axis=0), axis=1)
     at = {int(f): float(np.interp(f / measurement.frame_rate, motion.times, speed)) for f in measurement.frames}
@@ -124,66 +107,62 @@ def reported(measurement: Measurement, angle: float, device: str) -> dict[str, A
     model = Model(measurement, scene, effects=names, preset="tiny", device=device, frames=[frame])
     trajectory = model.simulate({"friction_angle": angle})
 
-    def seen(values: Mapping[str, float]) -> Any:
+    def seen(values: Mapping[str, float]) -> FloatArray:
         return 255.0 * np.asarray(model.draw(trajectory, 0, values)[camera, frame], dtype=np.float64)
 
     base = seen({})
-    effects = {name: library()[name].for_measurement(measurement) for name in names}
-    return {"base": base, "changes": {name: seen(acting(effect)) - base for name, effect in effects.items()}}
+    return base, {name: seen(acting(library()[name].for_measurement(measurement))) - base for name in names}
 
 
-def film(result: Mapping[str, Any]) -> Figure:
-    """The picture as it is, and beside it what each observation effect changes in brightness."""
+def figure(first: FloatArray, title: str, changes: Mapping[str, FloatArray], limit: float, unit: str) -> Figure:
+    """A map or picture as it is, and beside it what each effect changes, between ``limit`` downwards and upwards."""
     from matplotlib.figure import Figure
 
-    changes = result["changes"]
     rows = -(-(1 + len(changes)) // 4)
-    drawn = Figure(figsize=(12.0, 2.2 * rows), layout="constrained")
+    drawn = Figure(figsize=(12.0, 2.1 * rows), layout="constrained")
     axes = drawn.subplots(rows, 4, squeeze=False).reshape(-1)
     for ax in axes:
         ax.set_axis_off()
-    axes[0].imshow(np.clip(result["base"] / 255.0, 0.0, 1.0))
-    axes[0].set_title("as it is", fontsize=9)
+    origin = "lower" if first.ndim == 2 else "upper"
+    image = axes[0].imshow(first, origin=origin)
+    axes[0].set_title(title, fontsize=9)
+    if first.ndim == 2:
+        drawn.colorbar(image, ax=axes[0], shrink=0.7, label=unit)
     for ax, (name, change) in zip(axes[1:], changes.items(), strict=False):
-        image = ax.imshow(change.mean(axis=2), cmap="RdBu_r", vmin=-25.0, vmax=25.0)
-        p = library()[name].parameters[0]
-        (value,) = acting(library()[name]).values()
-        ax.set_title(f"{name}: {p.name} {value:g}" + ("" if p.unit == "1" else f" {p.unit}"), fontsize=9)
-        drawn.colorbar(image, ax=ax, shrink=0.7, label="change, grey levels")
+        image = ax.imshow(change, origin=origin, cmap="RdBu_r", vmin=-limit, vmax=limit)
+        ((parameter, value),) = acting(library()[name]).items()
+        ax.set_title(f"{name}: {parameter} {value:g}", fontsize=9)
+        drawn.colorbar(image, ax=ax, shrink=0.7, label=f"change, {unit}")
     return drawn
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Print the table, or measure."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("set", type=Path, nargs="?", help="measurement set with its true particles")
     parser.add_argument("--table", action="store_true", help="print the table of all effects")
     parser.add_argument("--pictures", type=Path, metavar="FILE", help="draw what every effect does to the bed")
     parser.add_argument("--video", type=Path, metavar="FILE", help="draw what observation effects do to a frame")
     parser.add_argument("--preset", default="tiny")
     parser.add_argument("--angle", type=float, default=35.0, help="friction angle of the pictures, degrees")
-    parser.add_argument("--seeds", type=int, default=3, help="particle seeds that the pictures average over")
-    parser.add_argument("--device", type=here, default="cpu", help="of the pictures")
+    parser.add_argument("--seeds", type=at_least(2), default=3, help="particle seeds that the pictures average over")
     options = parser.parse_args(arguments)
-    wp.config.log_level = wp.LOG_ERROR
+    hush()
     if options.table:
         print(table())
     if (options.video or options.pictures) and options.set is None:
         parser.error("--video and --pictures need a measurement set")
     if options.video:
-        _save(film(reported(Measurement.load(options.set), options.angle, options.device)), options.video)
+        base, changes = reported(Measurement.load(options.set), options.angle, options.device)
+        grey = {name: change.mean(axis=2) for name, change in changes.items()}
+        write_figure(options.video, figure(np.clip(base / 255.0, 0.0, 1.0), "as it is", grey, 25.0, "grey levels"))
     if options.pictures:
         truth = Truth.load(options.set)
-        result = pictures(truth, options.preset, options.angle, options.device, options.seeds)
-        print(f"chance: {1e3 * result['chance']:.1f} mm")
-        _save(figure(result, truth), options.pictures)
+        bed, scatter, changes = heights(truth, options.preset, options.angle, options.device, options.seeds)
+        print(f"seed-to-seed scatter: {1e3 * scatter:.1f} mm")
+        mm = {name: 1e3 * change for name, change in changes.items()}
+        write_figure(options.pictures, figure(1e3 * bed, "base law", mm, 15.0, "mm"))
     return 0
-
-
-def _save(drawn: Figure, file: Path) -> None:
-    stream = io.BytesIO()
-    drawn.savefig(stream, format=file.suffix[1:] or "png", dpi=110)
-    write_bytes(file, stream.getvalue())
 
 
 if __name__ == "__main__":

@@ -1,24 +1,22 @@
-"""Hidden effects in an independent solver's worlds: does the whole chain name the right one?
+"""Hidden effects in synthetic experiments of an independent solver: does the whole chain name the right one?
 
-Each world is one run of Newton's implicit MPM (extra ``independent``) with one thing that its measurement set doesn't
-tell, or with nothing, photographed by the path tracer, or by Mitsuba 3 (``--renderer mitsuba``). ``splatsoil fit`` and
-``diagnose`` then get the set alone. Truths (what is hidden, how much, the friction angle, bed, tool, looks) are drawn
-by a stream of random numbers of their own, and opened only to score. What was made is kept in the folder, and a second
-call goes on from there. With ``--refine`` the first world of each kind is ploughed once more with finer voxels, which
-says whether the other solver has converged on such soil; the result stays beside the worlds.
+Each is one run of Newton's implicit MPM (extra ``independent``) with one thing that its measurement set does not state,
+or with nothing, photographed by the path tracer. ``splatsoil fit`` and ``diagnose`` then get the set alone. Truths are
+drawn by a stream of random numbers of their own (what is hidden, how much, the friction angle, bed, tool, appearance),
+and opened only to score. What was made is kept in the folder, and a second call continues from there.
 
-The same truths ploughed by this project's own solver (``--solver small``, or another preset) tell what of an error is
-the solvers' difference, and what the photographs' or the estimates' fault.
+The same truths simulated by this project's own solver (``--solver small``, or another preset) show which part of an
+error is the model discrepancy, and which the photographs' or the estimates' fault.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
@@ -27,28 +25,31 @@ from typing import Any
 
 import numpy as np
 from scipy.stats import binomtest
-from splatsoil.benchmarks._common import at_least, here, keep_to_one_protocol, sources, stamp
-from splatsoil.benchmarks._mitsuba import MitsubaStage, load_mitsuba
+from splatsoil.benchmarks._common import (
+    Clock,
+    at_least,
+    keep_to_one_protocol,
+    output_options,
+    parser_of,
+    sources,
+    stamp,
+    write_result,
+)
+from splatsoil.benchmarks._hidden import KINDS, NOTHING, OUTSIDE, TIMES, Hidden, draw
 from splatsoil.benchmarks._newton import Numerics, World, plough
-from splatsoil.benchmarks._truths import KINDS, NOTHING, OBSERVATION, OUTSIDE, TIMES, Hidden, draw
-from splatsoil.benchmarks.numerics import FloatArray
-from splatsoil.benchmarks.solvers import FRAMES, moved, read_particles, refinement_table, surfaces
+from splatsoil.benchmarks._truth import FloatArray
 
 from splatsoil.errors import ParameterError
-from splatsoil.files import plain, read_json, write_json
-from splatsoil.measurement import Measurement
+from splatsoil.files import plain, read_json
 from splatsoil.mpm import PRESETS, Resolution, Trajectory, frames_around, simulate
 from splatsoil.quiet import hush
 from splatsoil.reconstruction import fill
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
-from splatsoil.synthetic import Appearance, Renderer, Setup, Stage, photograph_run
+from splatsoil.synthetic import Appearance, Setup, photograph_run
 
-OWN = ("_mitsuba", "_newton", "_scenes", "_truths", "hidden_worlds")
-"""Modules beside the package by which worlds are made."""
-AT_A_TIME = 4
-"""Worlds that the independent solver ploughs side by side."""
-RENDERERS: dict[str, Callable[..., Renderer]] = {"own": Stage, "mitsuba": MitsubaStage}
+OWN = ("_hidden", "_newton", "_scenes", "hidden_worlds")
+"""Modules beside the package by which the experiments are made."""
 NEWTON = "newton"
 """The other solver; ours go by their presets."""
 ELSE = "something else"
@@ -116,79 +117,34 @@ def ploughed_by_us(hidden: Hidden, setup: Setup, frames: Sequence[int], preset: 
     )[0]
 
 
-def make_worlds(
-    truths: Sequence[Hidden],
-    out: Path,
-    device: str,
-    say: Callable[[str], None],
-    solver: str | Numerics,
-    renderer: Callable[..., Renderer] = Stage,
-    at_a_time: int = AT_A_TIME,
-) -> None:
-    """Simulate and photograph the worlds that the folder doesn't have, so many at a time."""
-    missing = [h for h in truths if not (out / "sets" / h.name / "truth.json").is_file()]
-    for first in range(0, len(missing), at_a_time):
-        group = missing[first : first + at_a_time]
-        setups = [h.scene.setup() for h in group]
-        seen = [h.observation() for h in group]
+def make_worlds(truths: Sequence[Hidden], options: argparse.Namespace, say: Callable[[str], None]) -> None:
+    """Simulate and photograph the experiments that the folder does not have, so many at a time."""
+    sets, numerics = options.out / "sets", Numerics(voxel=options.voxel, iterations=options.iterations)
+    missing = [h for h in truths if not (sets / h.name / "truth.json").is_file()]
+    count = options.worlds_side_by_side
+    for group in (missing[k : k + count] for k in range(0, len(missing), count)):
+        setups, seen = [h.scene.setup() for h in group], [h.observation() for h in group]
         rate = setups[0].frame_rate
         frames = sorted({f for o in seen for f in frames_around(setups[0].frames, o.time_offset * rate)})
-        began = time.perf_counter()
-        if isinstance(solver, Numerics):
-            trajectories = ploughed_by_newton(group, setups, frames, device, solver)
+        if options.solver == NEWTON:
+            trajectories = ploughed_by_newton(group, setups, frames, options.device, numerics)
         else:
             ours = zip(group, setups, strict=True)
-            trajectories = [ploughed_by_us(h, setup, frames, solver, device) for h, setup in ours]
-        say(f"{len(group)} worlds ploughed in {time.perf_counter() - began:.0f} s: {', '.join(h.name for h in group)}")
+            trajectories = [ploughed_by_us(h, s, frames, options.solver, options.device) for h, s in ours]
+        solver = asdict(numerics) if options.solver == NEWTON else options.solver
         for hidden, setup, trajectory, observation in zip(group, setups, trajectories, seen, strict=True):
+            truth = {"hidden": hidden.kind, "size": hidden.size, "values": hidden.values, "solver": solver}
             photograph_run(
-                out / "sets" / hidden.name,
+                sets / hidden.name,
                 setup,
                 trajectory,
-                plain(
-                    {
-                        "hidden": hidden.kind,
-                        "size": hidden.size,
-                        "values": hidden.values,
-                        "scene": asdict(hidden.scene),
-                        "solver": asdict(solver) if isinstance(solver, Numerics) else solver,
-                    }
-                ),
+                plain({**truth, "scene": asdict(hidden.scene)}),
                 appearance=Appearance.drawn(hidden.seed),
                 observation=observation,
                 seed=hidden.seed,
-                device=device,
-                renderer=renderer,
+                device=options.device,
             )
-            say(f"{hidden.name} photographed, {time.perf_counter() - began:.0f} s")
-
-
-def refine(
-    truths: Sequence[Hidden], out: Path, device: str, say: Callable[[str], None], numerics: Numerics, at_a_time: int
-) -> None:
-    """Plough the first world of each kind of soil once more with finer voxels, unless that is done; what they change is
-    kept in ``refinement.json``, by world."""
-    file = out / "refinement.json"
-    done: dict[str, Any] = read_json(file) if file.is_file() else {}
-    missing = [h for h in truths if h.number == 0 and h.kind not in OBSERVATION and h.name not in done]
-    finer = numerics.refined()
-    for begin in range(0, len(missing), at_a_time):
-        group = missing[begin : begin + at_a_time]
-        began = time.perf_counter()
-        soils = [soil_of(h, h.scene.setup(), finer.spacing) for h in group]
-        for hidden, soil, run in zip(group, soils, plough(soils, finer, FRAMES, device), strict=True):
-            measurement = Measurement.load(out / "sets" / hidden.name)
-            made, spacing = read_particles(measurement.folder / "truth_particles.npz")
-            force = measurement.tool.force
-            assert force is not None  # of every world that the other solver made
-            heights = [
-                surfaces(measurement, particles, size)
-                for particles, size in ((made, spacing), (run.particles, soil.spacing))
-            ]
-            done[hidden.name] = moved(measurement, (heights[0], force[:, 2:]), (heights[1], run.force))
-        write_json(file, plain(done))
-        names = ", ".join(h.name for h in group)
-        say(f"{names} ploughed with voxels of {1e3 * finer.voxel:.1f} mm in {time.perf_counter() - began:.0f} s")
+            say(f"{hidden.name} simulated and photographed")
 
 
 def criticise(name: str, out: Path, preset: str, device: str, say: Callable[[str], None]) -> None:
@@ -197,7 +153,6 @@ def criticise(name: str, out: Path, preset: str, device: str, say: Callable[[str
     if (run / "diagnosis.json").is_file():
         return
     run.mkdir(parents=True, exist_ok=True)
-    began = time.perf_counter()
     commands = (
         ["fit", str(out / "sets" / name), "--run", str(run), "--preset", preset, "--device", device],
         ["diagnose", str(run), "--device", device],
@@ -207,7 +162,7 @@ def criticise(name: str, out: Path, preset: str, device: str, say: Callable[[str
             subprocess.run([sys.executable, "-m", "splatsoil", *words], stdout=log, stderr=log, check=False).returncode
             for words in commands
         ]
-    say(f"{name}: {'done' if not any(codes) else f'exit codes {codes}'}, {time.perf_counter() - began:.0f} s")
+    say(f"{name}: {'done' if not any(codes) else f'exit codes {codes}'}")
 
 
 def score(hidden: Hidden, fit: Mapping[str, Any], told: Mapping[str, Any]) -> dict[str, Any]:
@@ -303,11 +258,11 @@ def _chance(row: Mapping[str, Any], names: Iterable[str]) -> float:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Command line; exit code 0 when every world was judged."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    """Command line; exit code 0 when every experiment was judged."""
+    parser = parser_of(__doc__)
     parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=list(KINDS), metavar="KIND")
     parser.add_argument(
-        "--count", type=at_least(1), default=1, help="worlds of each kind; three times as many without anything"
+        "--count", type=at_least(1), default=1, help="experiments of each kind; three times as many with nothing hidden"
     )
     parser.add_argument("--seed", type=int, default=1, help="of the truths")
     parser.add_argument(
@@ -319,80 +274,56 @@ def main(arguments: list[str] | None = None) -> int:
         help="range of the effects' sizes over the smallest meaningful ones",
     )
     parser.add_argument("--preset", default="small")
-    parser.add_argument("--device", type=here, default="cpu")
-    parser.add_argument("--side-by-side", type=int, default=1, help="chains at a time")
-    parser.add_argument(
-        "--renderer", choices=list(RENDERERS), default="own", help="takes the photographs; mitsuba needs the package"
-    )
+    parser.add_argument("--side-by-side", type=at_least(1), default=1, help="fits and diagnoses at a time")
     parser.add_argument(
         "--solver",
         choices=[NEWTON, *PRESETS],
         default=NEWTON,
-        help="ploughs the worlds: newton needs the package, the others are ours by preset (not friction_field, crust)",
+        help="newton needs the package, the others are ours by preset (not friction_field, crust)",
     )
     parser.add_argument("--voxel", type=float, default=Numerics.voxel, help="edge of the other solver's cells, m")
-    parser.add_argument(
-        "--iterations", type=int, default=Numerics.iterations, help="most of the other solver's in a substep"
-    )
-    parser.add_argument("--worlds-side-by-side", type=at_least(1), default=AT_A_TIME, help="ploughed at a time")
-    parser.add_argument("--refine", action="store_true", help="check the first world of each kind with finer voxels")
+    parser.add_argument("--iterations", type=at_least(1), default=Numerics.iterations, help="most in its substep")
+    parser.add_argument("--worlds-side-by-side", type=at_least(1), default=4, help="simulated at a time by Newton")
     parser.add_argument("--worlds-only", action="store_true", help="make the sets and stop")
-    parser.add_argument("--out", type=Path, default=Path("runs/hidden-worlds"))
+    output_options(parser)
     options = parser.parse_args(arguments)
     hush()
-    began = time.perf_counter()
-
-    def say(what: str) -> None:
-        print(f"{time.perf_counter() - began:6.0f} s  {what}", file=sys.stderr, flush=True)
-
+    options.out = options.out or Path("runs/hidden-worlds")
     foreign = [kind for kind in options.kinds if kind in OUTSIDE]
     if options.solver != NEWTON and foreign:
-        said = " and ".join(foreign)
-        raise ParameterError(f"{said}: outside of our library; give --kinds without, or --solver {NEWTON}")
+        raise ParameterError(
+            f"{' and '.join(foreign)}: outside of our library; give --kinds without, or --solver {NEWTON}"
+        )
     if not 0.0 < options.times[0] <= options.times[1] < math.inf:
         raise ParameterError("--times: give two positive numbers, the smaller one first")
-    if not options.voxel > 0.0 or options.iterations < 1:
-        raise ParameterError("--voxel must be positive, and --iterations one at least")
-    if options.refine and options.solver != NEWTON:
-        raise ParameterError(f"--refine is of the other solver: leave it out, or give --solver {NEWTON}")
-    if options.renderer == "mitsuba":
-        load_mitsuba()  # says what is missing before worlds are made
-    own = [Path(__file__).with_name(f"{name}.py") for name in OWN]
-    named = ("seed", "times", "preset", "solver", "renderer", "voxel", "iterations")
+    if not options.voxel > 0.0:
+        raise ParameterError("--voxel must be positive")
+    named = ("seed", "times", "preset", "solver", "voxel", "iterations")
     decides = {name: getattr(options, name) for name in named}
-    decides["code"] = sources(own)
+    decides["code"] = sources([Path(__file__).with_name(f"{name}.py") for name in OWN])
     keep_to_one_protocol(options.out, decides)
     truths = [
         draw(kind, k, options.seed, tuple(options.times))
         for kind in options.kinds
         for k in range((3 if kind == NOTHING else 1) * options.count)
     ]
-    other = Numerics(voxel=options.voxel, iterations=options.iterations)
-    solver = other if options.solver == NEWTON else options.solver
-    at_a_time = options.worlds_side_by_side
-    make_worlds(truths, options.out, options.device, say, solver, RENDERERS[options.renderer], at_a_time)
-    if options.refine:
-        refine(truths, options.out, options.device, say, other, at_a_time)
+    say = Clock()
+    make_worlds(truths, options, say)
     if options.worlds_only:
         return 0
     threads = max(1, (os.cpu_count() or 1) // options.side_by_side)
     os.environ.setdefault("OMP_NUM_THREADS", str(threads))
     with ThreadPoolExecutor(options.side_by_side) as pool:
-        for future in [
-            pool.submit(criticise, h.name, options.out, options.preset, options.device, say) for h in truths
-        ]:
-            future.result()
+        list(pool.map(lambda h: criticise(h.name, options.out, options.preset, options.device, say), truths))
     runs = [(hidden, options.out / "runs" / hidden.name) for hidden in truths]
     rows = [
         score(hidden, read_json(run / "fit.json"), read_json(run / "diagnosis.json"))
         for hidden, run in runs
         if (run / "diagnosis.json").is_file()
     ]
-    file = options.out / "refinement.json"
-    checked = read_json(file) if file.is_file() else {}
-    result = {"made_by": stamp(options.device), **decides, "rows": rows, "refinement": checked}
-    write_json(options.out / "result.json", plain(result))
-    print(table(rows), *(["", *refinement_table(checked)] if checked else ()), sep="\n")
+    result = {"made_by": stamp(options.device), **decides, "rows": rows}
+    write_result(options.out, result, table(rows), {})
+    print(json.dumps(plain(result), indent=1) if options.json else table(rows))
     return 0 if len(rows) == len(truths) else 1
 
 

@@ -1,15 +1,14 @@
-"""How much of each effect do the data hold? Standard deviations of it that are left, from the soil to the comparison.
+"""How much of each effect do the data contain? Its signal-to-noise ratio, from the soil to the comparison.
 
-``splatsoil benchmark information --page docs/information.md`` makes a set of known soil with our own solver, and holds
-what each effect changes against the noise in four representations: (a) true heights and the force on the tool; (b) the
-comparison's features of particles that fill the true surface, drawn by us; (c) the same from the reconstructed surface;
-(d) those once the angle is refitted and all of the comparison's noise counts. Simulations are kept in the folder, and a
-second call goes on from there.
+``splatsoil benchmark information --page docs/information.md`` makes a set of known soil with our own solver, and
+compares what each effect changes with the noise in four representations: (a) true heights and the force on the tool;
+(b) the comparison's features of particles that fill the true surface, drawn by us; (c) the same from the reconstructed
+surface; (d) those once the angle is refitted and all of the comparison's noise counts. Simulations are kept in the
+folder, and a second call continues from there.
 """
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext, suppress
@@ -21,16 +20,23 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from splatsoil.benchmarks._common import at_least, here, keep_to_one_protocol, sources, stamp, write_result
-from splatsoil.benchmarks._speed.page import replaced
-from splatsoil.benchmarks.numerics import CELL, Truth
+from splatsoil.benchmarks._common import (
+    at_least,
+    keep_to_one_protocol,
+    parser_of,
+    sources,
+    stamp,
+    with_section,
+    write_result,
+)
+from splatsoil.benchmarks._truth import CELL, Truth
 from splatsoil.inverse.criticism.design import Prior, Run
 from splatsoil.inverse.criticism.diagnosis import BASE, FINE, PAIRS, STEP
 from splatsoil.inverse.criticism.noise import Noise, Tables, noise_of, trend_of
 from splatsoil.inverse.criticism.simulations import Simulations
 
 from splatsoil.commands._output import only_json, print_json
-from splatsoil.errors import RunError, SimulationError
+from splatsoil.errors import SimulationError
 from splatsoil.experiment import Candidate, Layout, Site
 from splatsoil.experiment.plow import MOST_ROWS, PlowExperiment
 from splatsoil.experiment.scene_parts import bins_of
@@ -52,9 +58,10 @@ TRUTH = {"friction_angle": ANGLE}
 HEIGHT = "height"
 COMPUTED = (
     f"Each effect is on at {STEP:g} times its smallest meaningful size; σ is the Mahalanobis length of what it changes "
-    "along the modes of all simulations, by products of different particle seeds, in which chance cancels. In (a) to "
-    "(c) the noise is chance of particles and instruments; true heights have none of these. In (d) it is the "
-    "comparison's own, with guesses, observation and numerics, and what a change of the angle does is left out."
+    "along the modes of all simulations, by products of different particle seeds, in which their scatter cancels. In "
+    "(a) to (c) the noise is seed-to-seed scatter and that of instruments; true heights have no other. In (d) it "
+    "is the comparison's own, with unknown albedo, observation and discretisation error, and what a change of the "
+    "angle does is left out."
 )
 
 
@@ -204,7 +211,7 @@ def left(
     steps = {name: (noise, tables, precision_of(noise.fixed)) for name, (noise, tables) in views.items()}
     steps["angle"] = whole, seen[1], precision_of(views["reconstructed"][0].fixed, free)
     steps["observation"] = whole, seen[1], precision_of(whole.fixed, free)
-    steps["numerics"] = whole, seen[1], precision_of(whole.covariance(1.0), free)
+    steps["discretisation"] = whole, seen[1], precision_of(whole.covariance(1.0), free)
     rows = []
     for c in (c for c in effects if c.kind == "observation" or c.name in true[1].effects.keys() & seen[1].effects):
         found = {n: sigmas(changes_of(c, noise, t), p, 2.0 * noise.chance) for n, (noise, t, p) in steps.items()}
@@ -215,12 +222,12 @@ def left(
         known = {name: max(*pair, 1e-9) for name, pair in found.items()}
         row["sigmas"], row["least"] = ({name: pair[k] for name, pair in found.items()} for k in (0, 1))
         row["factors"] = {b: known[a] / known[b] for a, b in pairwise(known)}
-        rows.append({**row, "loss": next(iter(known.values())) / known["numerics"]})
+        rows.append({**row, "loss": next(iter(known.values())) / known["discretisation"]})
     return rows
 
 
 def table(rows: Iterable[Mapping[str, Any]]) -> str:
-    """Markdown: physics, then observation, what loses most first; what chance alone could be is a limit."""
+    """Markdown: physics, then observation, what loses most first; what scatter alone could reach is a limit."""
     lines = [
         "| effect | (a) heights, force | (b) drawn | (c) reconstructed | (d) after nuisances | loss | most by |",
         "|---" * 7 + "|",
@@ -228,9 +235,9 @@ def table(rows: Iterable[Mapping[str, Any]]) -> str:
     for row in sorted(rows, key=lambda row: ("soil" not in row["sigmas"], -row["loss"])):
         hidden = {name: value < row["least"][name] for name, value in row["sigmas"].items()}
         told = {n: f"< {row['least'][n]:.1f} σ" if hidden[n] else f"{v:.1f} σ" for n, v in row["sigmas"].items()}
-        loss, most = f"{'≥ ' * hidden['numerics']}{row['loss']:.1f}", max(row["factors"], key=row["factors"].get)
+        loss, most = f"{'≥ ' * hidden['discretisation']}{row['loss']:.1f}", max(row["factors"], key=row["factors"].get)
         unit = "" if row["unit"] == "1" else " " + row["unit"].replace("deg", "°")
-        cells = [told.get(name, "–") for name in ("soil", "drawn", "reconstructed", "numerics")]
+        cells = [told.get(name, "–") for name in ("soil", "drawn", "reconstructed", "discretisation")]
         cells += ["–", "–"] if next(iter(hidden.values())) else [loss, f"{most}: {row['factors'][most]:.1f}"]
         lines.append("| " + " | ".join([f"{row['effect'].replace('_', ' ')}, {row['value']:g}{unit}", *cells]) + " |")
     return "\n".join(lines)
@@ -256,29 +263,21 @@ def measure(effects: Sequence[str], preset: str, seeds: int, device: str, out: P
     return left(prepared[0], prepared[1], prior, wanted)
 
 
-def written(page: Path, preset: str, new: str) -> str:
-    """A page with the table of a preset replaced; RunError where it cannot be read, or has no place for the table."""
-    try:
-        return replaced(page.read_text(encoding="utf-8"), f"information {preset}", new)
-    except (OSError, UnicodeDecodeError) as error:
-        raise RunError(f"{page}: cannot be read as text ({error})") from error
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure, print the table, and write it into a page; exit code 0."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     known = [name for name, effect in library().items() if not effect.numerical]
     parser.add_argument("--effects", nargs="+", default=[], choices=known, metavar="EFFECT", help="all by default")
     parser.add_argument("--preset", default="tiny", choices=sorted(PRESETS))
     parser.add_argument("--seeds", type=at_least(2), default=3, help="of the particles, with each effect")
-    parser.add_argument("--device", type=here, default="cpu")
     parser.add_argument("--out", type=Path, default=Path("runs/information"))
     parser.add_argument("--page", type=Path, help="write the table into this page")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
     options = parser.parse_args(arguments)
     hush()
+    mark = f"information {options.preset}"
     if options.page:
-        written(options.page, options.preset, "")  # a page without a place for the table fails now, not at the end
+        with_section(options.page, mark, "")  # a page without a place for the table fails now, not at the end
     device, own = options.device.split(":")[0], sources([Path(__file__)])
     keep_to_one_protocol(options.out, {"preset": options.preset, "device": device, "code": own})
     with only_json() if options.json else nullcontext():
@@ -287,11 +286,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         shown = f"Preset `{options.preset}`, {options.seeds} seeds. {COMPUTED}\n\n{table(rows)}"
         write_result(options.out, {**told, "computed": COMPUTED, "rows": rows}, shown, {})
         if options.page:
-            write_text(options.page, written(options.page, options.preset, shown))
-        if options.json:
-            print_json({"ok": True, **told, "rows": rows})
-        else:
-            print(shown)
+            write_text(options.page, with_section(options.page, mark, shown))
+        print_json({"ok": True, **told, "rows": rows}) if options.json else print(shown)
     return 0
 
 

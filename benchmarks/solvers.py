@@ -1,40 +1,37 @@
-"""How close does our solver come to an independent one that has converged: heights, angle, force in every stage?
+"""How far do our solver's answers depend on its numbers, and how close is it to an independent solver?
 
 The independent solver is Newton's implicit MPM (``newton`` on PyPI; extra ``independent``), run until it converges, on
 scenes that are drawn by seed: flat, wavy and sloping beds of loose and dense sand, blades of two widths and rakes, a
-drum that turns, friction angles from 22 to 48 degrees. What it ploughs is kept, a file a world, and a second call goes
-on from there; from these files our solver is judged with the package or without. Started from particles that fill the
-same surface, it runs at the true angle and at others: heights are compared in patches larger than chance, the angle
-whose heights lie nearest is told, soil cut and soil heaped up are told apart, and forces are compared by stage, each as
-the mean over the stage's frames.
+drum that turns, friction angles from 22 to 48 degrees; or on measurement sets with true particles. What it simulates is
+kept, a file a scene, and a second call continues from there.
+
+Our solver starts from particles that fill the same surface and runs at the true angle and at others. Compared are
+heights in patches wider than seed-to-seed scatter, the angle whose heights lie nearest, soil cut and heaped up, and
+forces by stage, each as the mean over the stage's frames. ``--cells`` and ``--changes`` compare our solver with itself,
+on finer cells and with one of its numbers changed at a time; neither needs the other solver.
 """
 
 from __future__ import annotations
 
 import argparse
-import io
 import json
-import sys
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter
-from splatsoil.benchmarks._common import at_least, here, stamp, write_result
-from splatsoil.benchmarks._newton import Numerics, Run, World, load_newton, plough
+from splatsoil.benchmarks._common import Clock, at_least, parser_of, stamp, write_result
+from splatsoil.benchmarks._newton import Numerics, World, plough
 from splatsoil.benchmarks._scenes import Scene, pair, scenes
-from splatsoil.benchmarks.numerics import CELL, PATCH, FloatArray, Scan, Truth, pushing, volume_range
+from splatsoil.benchmarks._truth import PATCH, FloatArray, Truth, cut_and_heaped, in_patches, stage_forces, volume_range
 
 from splatsoil.errors import MeasurementError, ParameterError
-from splatsoil.experiment.scene_parts import heading_of, stages_of
-from splatsoil.files import plain, read_npz, write_bytes
-from splatsoil.measurement import Measurement
-from splatsoil.mpm import Resolution, simulate
+from splatsoil.files import plain
+from splatsoil.mpm import PRESETS, Resolution, simulate
 from splatsoil.quiet import hush
 from splatsoil.reconstruction import fill
 from splatsoil.soil.law import Law
@@ -43,46 +40,31 @@ from splatsoil.soil.settings import FRICTION_ANGLE
 
 FRAMES = (50, 100, 150, 199)
 """At which drawn scenes are compared; sets at those of their true particles."""
-SCALE = 1.25e-5
-"""Step of kept positions, m."""
 OFFSETS = (-6.0, -3.0, 0.0, 3.0, 6.0)
 """Of the angles of our runs from the true one, degrees."""
-SETTLED = 2.0e-3
-"""Change of a patch's height below which its soil counts as neither cut nor heaped, m: three times the scatter between
-particle seeds, which would else fill a bed of 0.4 m² with a hundred cm³ of both."""
-LEAST = 0.2
-"""Of a stage's force that a component must have for its ratio to be told."""
-HEIGHTS_CLOSE, FORCE_CLOSE = 1.0e-3, 0.05
-"""By how much voxels of three quarters may move a world that counts as converged: m in patches, share of a force."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """A world that is asked for.
+    """Soil that both solvers plough.
 
     Attributes:
         name: of its file.
-        kind: worlds of one kind share a check by finer voxels.
-        measurement: bed, tool and motion.
-        numerics: by which the independent solver ploughs it.
-        frames: at which it is compared, from 1 on.
-        values: true parameters by name.
-        effects: effects that are on, by name.
-        about: what its file must tell to be this one, JSON-able.
+        truth: bed, tool, motion and true parameters; its particles are used only if ``made``.
+        numerics: of the independent solver.
+        frames: at which solvers are compared, from 1 on.
+        about: what its file must state, JSON-able.
         start: (n, 3) particles at frame 0 by their spacing, m.
-        made: the world, where it comes with a measurement set that converged numerics made.
+        made: whether the truth comes with particles that these numerics made.
     """
 
     name: str
-    kind: str
-    measurement: Measurement
+    truth: Truth
     numerics: Numerics
     frames: tuple[int, ...]
-    values: Mapping[str, float]
-    effects: tuple[str, ...]
     about: Mapping[str, Any]
     start: Callable[[float], FloatArray]
-    made: Kept | None = None
+    made: bool = False
 
     @classmethod
     def drawn(cls, name: str, scene: Scene, numerics: Numerics) -> Case:
@@ -90,548 +72,357 @@ class Case:
         setup = scene.setup()
         return cls(
             name,
-            f"{scene.tool} {scene.width:g} m, {scene.tilt:g}°, friction {scene.tool_friction:g}",
-            setup.experiment(),
+            Truth(setup.experiment(), {}, 0.0, {"friction_angle": scene.angle}, ()),
             numerics,
             FRAMES,
-            {"friction_angle": scene.angle},
-            (),
-            asdict(scene),
+            {"scene": asdict(scene), "numerics": asdict(numerics)},
             lambda spacing: fill(setup.surface, setup.bed, spacing, seed=scene.seed),
         )
 
     @classmethod
     def of_set(cls, folder: Path, numerics: Numerics) -> Case:
-        """Of a measurement set with a truth; made already, where it was ploughed as these numerics are for its tool.
+        """Of a measurement set; made already if its particles are of these numerics, scaled to its tool's width.
 
         A tool's width is its second longest edge, as for our own solver.
         """
         truth = Truth.load(folder)
-        measurement, force = truth.measurement, truth.measurement.tool.force
-        numerics = numerics.across(float(np.sort(measurement.tool.mesh.extents)[1]))
+        name, extents = truth.measurement.name, truth.measurement.tool.mesh.extents
+        numerics = numerics.across(float(np.sort(extents)[1]))
         try:
-            same = Numerics.of(folder) == numerics and force is not None
+            made = Numerics.of(folder) == numerics and truth.force is not None
         except MeasurementError:
-            same = False
-        # the table has a row for each frame from 1 on
-        made = Kept(truth.particles, truth.volume ** (1.0 / 3.0), force[:, 2:]) if same and force is not None else None
-        about = {"set": measurement.name, **truth.values}
-        return cls(
-            measurement.name,
-            measurement.name,
-            measurement,
-            numerics,
-            tuple(frame for frame in sorted(truth.particles) if frame > 0),
-            truth.values,
-            truth.effects,
-            about,
-            lambda spacing: truth.start(spacing, 0),
-            made,
-        )
+            made = False
+        about = {"set": name, **truth.values, "numerics": asdict(numerics)}
+        return cls(name, truth, numerics, truth.frames, about, lambda spacing: truth.start(spacing, 0), made)
 
     @property
     def angle(self) -> float:
         """True friction angle, degrees."""
-        return self.values["friction_angle"]
+        return self.truth.values["friction_angle"]
 
-    def finer(self) -> Case:
+    def refined(self) -> Case:
         """The same with voxels of three quarters."""
-        return replace(self, numerics=self.numerics.refined())
+        finer = self.numerics.refined()
+        about = {**self.about, "numerics": asdict(finer)}
+        return replace(self, name=f"{self.name}.fine", numerics=finer, about=about, made=False)
 
     def world(self) -> World:
         """As Newton takes it."""
-        cohesion, spacing = self.values.get("cohesion", 0.0), self.numerics.spacing
-        return World(self.name, self.measurement, self.angle, self.start(spacing), spacing, cohesion=cohesion)
+        cohesion, spacing = self.truth.values.get("cohesion", 0.0), self.numerics.spacing
+        return World(self.name, self.truth.measurement, self.angle, self.start(spacing), spacing, cohesion=cohesion)
 
-    def truth(self, kept: Kept) -> Truth:
-        """As our benchmarks take it."""
-        return Truth(self.measurement, kept.particles, kept.spacing**3, dict(self.values), self.effects)
-
-    def heights(self, kept: Kept) -> FloatArray:
-        """(frames, ny, nx) m, at the frames that are compared."""
-        return surfaces(self.measurement, kept.particles, kept.spacing)
-
-
-@dataclass(frozen=True)
-class Kept:
-    """A world that the independent solver made.
-
-    Attributes:
-        particles: (n, 3) in m by frame, from 0 on.
-        spacing: edge of the cube of soil that a particle stands for, m.
-        force: (f, 3) N, of the soil on the tool: mean over the time that leads to frames 1, 2, …, f.
-    """
-
-    particles: dict[int, FloatArray]
-    spacing: float
-    force: FloatArray
-
-    def save(self, file: Path, about: Mapping[str, Any]) -> None:
-        """Positions as ``fNNN`` (n, 3) uint16: times ``scale`` plus ``origin`` they are metres; with ``spacing``,
-        ``force`` and, as JSON, what the world is."""
-        origin = np.floor(100.0 * np.min([x.min(axis=0) for x in self.particles.values()], axis=0)) / 100.0
-        reach = max(float((x - origin).max()) for x in self.particles.values())
-        scale = SCALE * max(1.0, np.ceil(reach / (SCALE * np.iinfo(np.uint16).max)))
-        stored = {f"f{f:03d}": np.round((x - origin) / scale).astype(np.uint16) for f, x in self.particles.items()}
-        _archive(
-            file,
-            scale=scale,
-            origin=origin,
-            spacing=self.spacing,
-            force=self.force.astype(np.float32),
-            about=json.dumps(plain(about)),
-            **stored,
-        )
-
-    @classmethod
-    def load(cls, file: Path, about: Mapping[str, Any]) -> Kept:
-        """What `save` wrote; ParameterError where the file holds another world."""
-        check_about(file, about)
-        return cls(*read_particles(file), read_npz(file, ["force"])["force"].astype(np.float64))
-
-
-def read_particles(file: Path) -> tuple[dict[int, FloatArray], float]:
-    """Positions (n, 3) in m by frame and the particles' spacing in m, as `Kept.save` and sets store them."""
-    with np.load(file) as stored:
-        scale, origin = float(stored["scale"]), stored["origin"]
-        particles = {int(k[1:]): stored[k] * scale + origin for k in stored.files if k[1:].isdigit()}
-        return particles, float(stored["spacing"])
-
-
-def surfaces(measurement: Measurement, particles: dict[int, FloatArray], spacing: float) -> FloatArray:
-    """Heights (frames, ny, nx) in m at the frames after 0, of particles (n, 3) by frame."""
-    truth = Truth(measurement, particles, spacing**3, {}, ())
-    return np.array([truth.heights(particles[f], truth.volume) for f in sorted(particles) if f > 0])
-
-
-def _archive(file: Path, **arrays: Any) -> None:
-    """Write arrays whole or not at all, compressed."""
-    stream = io.BytesIO()
-    np.savez_compressed(stream, **arrays)
-    write_bytes(file, stream.getvalue())
-
-
-def check_about(file: Path, about: Mapping[str, Any]) -> dict[str, Any]:
-    """What a file tells of its world, with what it took; ParameterError unless it is the one that is asked for."""
-    told = json.loads(str(read_npz(file, ["about"])["about"]))
-    if {key: told.get(key) for key in about} != json.loads(json.dumps(plain(about))):
-        raise ParameterError(f"{file}: holds another scene or other numerics; choose another --out")
-    return dict(told)
+    def kept(self, out: Path) -> Truth:
+        """With the independent solver's particles and force; ParameterError where the file is of another case."""
+        return self.truth if self.made else Truth.saved(out / f"{self.name}.npz", self.about, self.truth)
 
 
 def plough_missing(
-    cases: Sequence[Case],
-    out: Path,
-    device: str,
-    side_by_side: int,
-    say: Callable[[str], None],
-    *,
-    fine: bool = False,
+    cases: Sequence[Case], out: Path, device: str, side_by_side: int, say: Callable[[str], None]
 ) -> None:
-    """Make the worlds that the folder doesn't have, so many at a time; of fine ones keep heights, not particles."""
-    missing = []
-    for case in cases:
-        if place(out, case, fine).is_file():
-            check_about(place(out, case, fine), told(case))
-        elif fine or case.made is None:
-            missing.append(case)
-    for group in _groups(missing, side_by_side):
-        began = time.perf_counter()
-        worlds = [case.world() for case in group]
-        names = ", ".join(case.name for case in group)
-        say(f"{names}: {sum(len(w.particles) for w in worlds)} particles")
-
-        def progress(frame: int, last: int, names: str = names) -> None:
-            if frame in (1, 2, 5) or frame % 25 == 0:
-                say(f"{names}: frame {frame} of {last}")
-
-        runs = plough(worlds, group[0].numerics, group[0].frames, device, progress=progress)
-        seconds = time.perf_counter() - began
-        more = {"newton": load_newton().__version__, "device": device.split(":")[0], "seconds": seconds}
-        for case, world, run in zip(group, worlds, runs, strict=True):
-            _keep(place(out, case, fine), case, world, run, {**told(case), **more, "beside": len(group)}, fine)
-        say(f"{names}: done in {seconds:.0f} s")
-
-
-def _groups(cases: Sequence[Case], most: int) -> list[list[Case]]:
-    """Those that can be ploughed side by side together, ``most`` at a time, in their order."""
+    """Simulate the cases that the folder does not have by the independent solver, so many at a time."""
     alike: dict[Any, list[Case]] = {}
     for case in cases:
-        bed = case.measurement.bed
-        floor = (float(bed.lower[2]), bed.floor_friction)
-        alike.setdefault((case.numerics, case.frames, case.measurement.frame_rate, floor), []).append(case)
-    return [group[k : k + most] for group in alike.values() for k in range(0, len(group), most)]
+        if (out / f"{case.name}.npz").is_file():
+            case.kept(out)  # another case of this name is refused now, not at the end
+        elif not case.made:
+            bed = case.truth.measurement.bed
+            floor = (float(bed.lower[2]), bed.floor_friction)
+            alike.setdefault((case.numerics, case.frames, case.truth.measurement.frame_rate, floor), []).append(case)
+    for group in (g[k : k + side_by_side] for g in alike.values() for k in range(0, len(g), side_by_side)):
+        worlds, names = [case.world() for case in group], ", ".join(case.name for case in group)
+        say(f"{names}: {sum(len(w.particles) for w in worlds)} particles")
+        runs = plough(worlds, group[0].numerics, group[0].frames, device)
+        for case, world, run in zip(group, worlds, runs, strict=True):
+            made = replace(case.truth, particles={0: world.particles, **run.particles}, volume=world.spacing**3)
+            replace(made, force=run.force).save(out / f"{case.name}.npz", case.about)
+        say(f"{names}: done")
 
 
-def told(case: Case) -> dict[str, Any]:
-    """What a file tells of the world in it."""
-    return {"scene": dict(case.about), "numerics": asdict(case.numerics)}
+@dataclass(frozen=True)
+class Scan:
+    """Our solver over friction angles.
+
+    Attributes:
+        angles: (n,) in degrees, increasing.
+        begun: (ny, nx) heights at frame 0 in m, averaged over seeds as all that follows.
+        heights: (n, frames, ny, nx) in m.
+        force: (n, f, 3) of the soil on the tool at frames 1, 2, …, f, N.
+        scatter: of the heights between seeds, m; None for one seed.
+    """
+
+    angles: FloatArray
+    begun: FloatArray
+    heights: FloatArray
+    force: FloatArray
+    scatter: float | None = None
+
+    def at(self, angle: float) -> int:
+        """Index of the angle nearest to one."""
+        return int(np.argmin(np.abs(self.angles - angle)))
+
+    def best(self, other: FloatArray) -> float:
+        """Angle whose heights lie nearest to ``other`` (frames, ny, nx) in patches."""
+        fine, loss = self._loss(other)
+        return float(fine[np.argmin(loss)])
+
+    def residual(self, other: FloatArray) -> float:
+        """Difference in patches, m, that no angle takes away."""
+        return float(np.sqrt(max(self._loss(other)[1].min(), 0.0)))
+
+    def _loss(self, other: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Mean square difference by angle, interpolated by a cubic spline."""
+        smooth = gaussian_filter(self.heights - other, (0, 0, PATCH, PATCH))
+        fine = np.linspace(self.angles[0], self.angles[-1], 2001)
+        return fine, CubicSpline(self.angles, np.mean(smooth**2, axis=(1, 2, 3)))(fine)
 
 
-def place(out: Path, case: Case, fine: bool = False) -> Path:
-    """A world's file."""
-    return out / f"{case.name}{'.fine' if fine else ''}.npz"
-
-
-def _keep(file: Path, case: Case, world: World, run: Run, about: Mapping[str, Any], fine: bool) -> None:
-    kept = Kept({0: world.particles, **run.particles}, world.spacing, run.force)
-    if not fine:
-        kept.save(file, about)
-        return
-    _archive(
-        file,
-        heights=case.heights(kept).astype(np.float32),
-        force=kept.force.astype(np.float32),
-        about=json.dumps(plain(about)),
-    )
-
-
-def in_patches(difference: FloatArray) -> float:
-    """Root mean square of a difference of heights (…, ny, nx), smoothed to patches larger than chance."""
-    width = (0.0,) * (difference.ndim - 2) + (PATCH, PATCH)
-    return float(np.sqrt(np.mean(gaussian_filter(difference, width) ** 2)))
-
-
-def cut_and_heaped(before: FloatArray, after: FloatArray) -> FloatArray:
-    """Soil that is missing and soil that was added, (frames, 2) in cm³.
+def scan(truth: Truth, resolution: Resolution, offsets: Sequence[float], seeds: Sequence[int], device: str) -> Scan:
+    """Simulate the true angle and others by their offsets for all seeds, on a GPU as one batch.
 
     Args:
-        before: heights (ny, nx) in m.
-        after: heights (frames, ny, nx) in m.
+        truth: where particles begin, and the frames at which heights are taken.
+        resolution: of our solver.
+        offsets: degrees.
+        seeds: of the particles.
+        device: where to compute.
     """
-    change = gaussian_filter(after - before, (0.0, PATCH, PATCH))
-    change = np.where(np.abs(change) > SETTLED, change, 0.0)
-    parts = [np.clip(sign * change, 0.0, None).sum(axis=(1, 2)) for sign in (-1.0, 1.0)]
-    return np.stack(parts, axis=1) * CELL**2 * 1.0e6
-
-
-def stage_forces(measurement: Measurement, force: FloatArray) -> dict[str, tuple[float, float]]:
-    """Mean force along the tool's way forward and upwards, N, over all frames of each stage, by the stages' names.
-
-    Args:
-        measurement: bed, tool and motion.
-        force: (f, 3) N at frames 1, 2, …, f.
-    """
-    stages = np.array(stages_of(measurement, [float(frame) for frame in range(1, len(force) + 1)]))
-    heading = heading_of(measurement)
-    parts = np.stack([force[:, :2] @ heading, force[:, 2]], axis=1)
-    return {
-        str(name): (float(mean[0]), float(mean[1]))
-        for name in dict.fromkeys(stages)
-        for mean in [parts[stages == name].mean(axis=0)]
-    }
-
-
-def compare_forces(measurement: Measurement, ours: FloatArray, theirs: FloatArray) -> dict[str, dict[str, Any]]:
-    """By stage: both means, their ratios and how far they are apart as a share of theirs.
-
-    A ratio is None where the component is a small part of the stage's force.
-    """
-    last = min(len(ours), len(theirs))
-    own, other = stage_forces(measurement, ours[:last]), stage_forces(measurement, theirs[:last])
-    found = {}
-    for name, there in other.items():
-        size = float(np.hypot(*there))
-        apart = float(np.hypot(*np.subtract(own[name], there)))
-        found[name] = {
-            "ours": own[name],
-            "newton": there,
-            "ratio": [a / b if abs(b) > LEAST * size else None for a, b in zip(own[name], there, strict=True)],
-            "off": apart / size if size > 0.0 else None,
-        }
-    return found
-
-
-def judge(
-    case: Case, kept: Kept, preset: str, offsets: Sequence[float], seeds: Sequence[int], device: str
-) -> dict[str, Any]:
-    """Our solver beside a world, JSON-able."""
-    began = time.perf_counter()
-    truth = case.truth(kept)
-    resolution = Resolution.derive(case.measurement, preset)
     low, high = FRICTION_ANGLE.limits or (FRICTION_ANGLE.lower, FRICTION_ANGLE.upper)
-    angles = sorted({case.angle + o for o in (*offsets, 0.0) if low <= case.angle + o <= high})
-    at = angles.index(case.angle)
-    begun, heights, forces, volumes = [], [], [], []
+    true = truth.values["friction_angle"]
+    angles = sorted({true + o for o in (*offsets, 0.0) if low <= true + o <= high})
+    batch = [{**truth.values, "friction_angle": a} for a in angles]
+    law, volume = Law(find_effects(truth.effects)), resolution.spacing**3
+    begun, heights, forces = [], [], []
     for seed in seeds:
         x = truth.start(resolution.spacing, seed)
-        runs = _ours(case, x, angles, resolution, device)
-        volume = resolution.spacing**3
+        runs = [
+            run
+            for group in ([[values] for values in batch] if device == "cpu" else [batch])
+            for run in simulate(
+                truth.measurement, x, group, law=law, resolution=resolution, frames=truth.frames, device=device
+            )
+        ]
         begun.append(truth.heights(x, volume))
         heights.append([[truth.heights(p, volume) for p in run.positions] for run in runs])
         forces.append([run.force for run in runs])
-        volumes.append(volume_range(begun[-1], np.array(heights[-1][at])))
-    every, force = np.array(heights), np.mean(forces, axis=0)
-    mean, theirs = every.mean(axis=0), case.heights(kept)
-    scatter = float(np.sqrt(every.var(axis=0, ddof=1).mean())) if len(seeds) > 1 else None
-    pushes = np.array([pushing(case.measurement, of_angle) for of_angle in force])
-    scanned = Scan(np.array(angles), mean, scatter or 0.0, volumes[0], pushes) if len(angles) > 2 else None
-    first = truth.heights(kept.particles[0], truth.volume)
+    scatter = float(np.sqrt(np.var(heights, axis=0, ddof=1).mean())) if len(seeds) > 1 else None
+    start, height, force = (np.mean(found, axis=0) for found in (begun, heights, forces))
+    return Scan(np.array(angles), start, height, force, scatter)
+
+
+def compare_stages(truth: Truth, ours: FloatArray, other: FloatArray) -> dict[str, dict[str, Any]]:
+    """By stage: both mean forces along the way and upwards in N, and how far they are apart over the other's size."""
+    last = min(len(ours), len(other))
+    own, reference = (stage_forces(truth.measurement, force[:last]) for force in (ours, other))
     return {
-        "angle": case.angle,
-        "angles": angles,
-        "best_angle": scanned.best(theirs) if scanned else None,
-        "best_angle_by_slopes": scanned.best(theirs, slopes=True) if scanned else None,
-        "heights_mm": 1e3 * in_patches(mean[at] - theirs),
-        "heights_mm_by_frame": {
-            str(f): 1e3 * in_patches(a - b) for f, a, b in zip(case.frames, mean[at], theirs, strict=True)
-        },
-        "heights_mm_at_best": 1e3 * scanned.residual(theirs) if scanned else None,
-        "chance_mm": None if scatter is None else 1e3 * scatter,
-        "volume": np.mean(volumes, axis=0),
-        "newton_volume": volume_range(first, theirs),
-        "cut_and_heaped_cm3": cut_and_heaped(np.mean(begun, axis=0), mean[at]),
-        "newton_cut_and_heaped_cm3": cut_and_heaped(first, theirs),
-        "stages": compare_forces(case.measurement, force[at], kept.force),
-        "resolution": asdict(resolution),
-        "particles": len(x),
-        "seconds": time.perf_counter() - began,
+        name: {"ours": own[name], "other": there, "off": float(np.hypot(*np.subtract(own[name], there)) / size)}
+        for name, there in reference.items()
+        if (size := float(np.hypot(*there))) > 0.0
     }
 
 
-def _ours(case: Case, x: FloatArray, angles: Sequence[float], resolution: Resolution, device: str) -> list[Any]:
-    """Runs at all angles; on a GPU as one batch."""
-    law = Law(find_effects(case.effects))
-    batch = [{**case.values, "friction_angle": float(a)} for a in angles]
-    groups = [[values] for values in batch] if device == "cpu" else [batch]
-    return [
-        run
-        for group in groups
-        for run in simulate(
-            case.measurement, x, group, law=law, resolution=resolution, frames=case.frames, device=device
-        )
-    ]
-
-
-def refinement(case: Case, kept: Kept, out: Path) -> dict[str, Any] | None:
-    """What voxels of three quarters change in a world; None where that wasn't tried."""
-    file = place(out, case, fine=True)
-    if not file.is_file():
-        return None
-    check_about(file, told(case.finer()))
-    fine = read_npz(file, ["heights", "force"])
-    return moved(
-        case.measurement, (case.heights(kept), kept.force), (fine["heights"], fine["force"].astype(np.float64))
-    )
-
-
-def moved(
-    measurement: Measurement, coarse: tuple[FloatArray, FloatArray], fine: tuple[FloatArray, FloatArray]
-) -> dict[str, Any]:
-    """How far apart two runs' heights (frames, ny, nx) and forces (f, 3) are, and whether the first has converged."""
-    height = in_patches(coarse[0] - fine[0])
-    stages = compare_forces(measurement, coarse[1], fine[1])
+def agreement(truth: Truth, found: Scan) -> dict[str, Any]:
+    """A scan beside the independent solver's particles and force, JSON-able."""
+    at, theirs, several = found.at(truth.values["friction_angle"]), truth.surfaces(), len(found.angles) > 2
+    first = truth.heights(truth.particles[0], truth.volume)
+    assert truth.force is not None
     return {
-        "heights_mm": 1e3 * height,
-        "stages": {name: {"coarse": s["ours"], "fine": s["newton"], "off": s["off"]} for name, s in stages.items()},
-        "converged": bool(height <= HEIGHTS_CLOSE and stages["pushing"]["off"] <= FORCE_CLOSE),
+        "angle": truth.values["friction_angle"],
+        "angles": found.angles,
+        "best_angle": found.best(theirs) if several else None,
+        "heights_mm": 1e3 * in_patches(found.heights[at] - theirs),
+        "heights_mm_at_best": 1e3 * found.residual(theirs) if several else None,
+        "scatter_mm": None if found.scatter is None else 1e3 * found.scatter,
+        "volume": volume_range(found.begun, found.heights[at]),
+        "cut_and_heaped_cm3": cut_and_heaped(found.begun, found.heights[at][-1]),
+        "their_cut_and_heaped_cm3": cut_and_heaped(first, theirs[-1]),
+        "stages": compare_stages(truth, found.force[at], truth.force),
     }
 
 
-def refinement_table(checked: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """What `moved` said of worlds by name, as lines of Markdown."""
-    lines = ["| world | voxels of 3/4: heights, mm | force while pushed | converged |", "|---|---|---|---|"]
-    for name, found in checked.items():
-        pushed = 100.0 * found["stages"]["pushing"]["off"]
-        lines.append(
-            f"| {name} | {found['heights_mm']:.2f} | {pushed:.1f} % | {'yes' if found['converged'] else 'no'} |"
-        )
-    return lines
+def changed(base: Resolution) -> dict[str, Resolution]:
+    """The solver with one of its numbers changed."""
+    return {
+        "half the particles' step": replace(base, steps=2 * base.steps),
+        "half the grid's substep": replace(base, courant=base.courant / 2.0),
+        "Young's modulus × 3": replace(base, bulk=3.0 * base.bulk, shear=3.0 * base.shear),
+        "27 instead of 8 particles a cell": replace(base, spacing=base.spacing / 1.5),
+        "hourglass modes damped twice as fast": replace(base, relaxation=2.0 * base.relaxation),
+        "hourglass modes damped half as fast": replace(base, relaxation=0.5 * base.relaxation),
+        "faces of thin plates without skin": replace(base, skin=0.0),
+    }
+
+
+def sensitivity(truth: Truth, base: Resolution, found: Scan, seeds: Sequence[int], device: str) -> list[dict[str, Any]]:
+    """By how much each of the solver's numbers shifts the angle that the scan reads, in degrees, and the push force."""
+    at = found.at(truth.values["friction_angle"])
+    angle, force = found.best(found.heights[at]), _push(truth, found.force[at])
+    rows = []
+    for name, resolution in changed(base).items():
+        other = scan(truth, resolution, (), seeds, device)
+        shifted = found.best(other.heights[0]) - angle
+        rows.append({"change": name, "angle": shifted, "force": _push(truth, other.force[0]) / force - 1.0})
+    return rows
+
+
+def convergence(
+    truth: Truth, preset: str, cells: Sequence[float], offsets: Sequence[float], seeds: Sequence[int], device: str
+) -> list[dict[str, float]]:
+    """One row for each number of cells across the tool, the coarsest first, compared with the finest one's heights."""
+    true, rows = truth.values["friction_angle"], []
+    grids = [Resolution.derive(truth.measurement, replace(PRESETS[preset], cells_across_tool=c)) for c in sorted(cells)]
+    finest = scan(truth, grids[-1], (), seeds, device)
+    for grid in grids:
+        found = finest if grid is grids[-1] else scan(truth, grid, offsets, seeds, device)
+        at = found.at(true)
+        low, high = volume_range(found.begun, found.heights[at])
+        rows.append({"cell_mm": 1e3 * grid.cell, "force": _push(truth, found.force[at]), "lost": low, "gained": high})
+        if found is not finest:
+            rows[-1]["heights_mm"] = 1e3 * in_patches(found.heights[at] - finest.heights[0])
+            rows[-1]["angle_off"] = found.best(finest.heights[0]) - true
+    return rows
+
+
+def _push(truth: Truth, force: FloatArray) -> float:
+    """Mean force along the tool's way while it is pushed, N."""
+    return abs(stage_forces(truth.measurement, force)["pushing"][0])
 
 
 def table(result: Mapping[str, Any]) -> str:
     """The result as Markdown."""
-    lines = []
-    names = list(result["worlds"])
+    cases = result["cases"]
+    lines = [f"{result['seeds']} particle seeds, {result['made_by']['device']}."]
     for preset in result["presets"]:
-        rows = {n: w["presets"][preset] for n, w in result["worlds"].items() if preset in w["presets"]}
-        if not rows:
-            continue
-        stages = list(dict.fromkeys(s for row in rows.values() for s in row["stages"]))
-        lines += [
-            f"Preset `{preset}`, {result['seeds']} particle seeds, {result['made_by']['device']}. Heights in patches, "
-            "all frames that are kept; soil cut and heaped in the end, ours / Newton's; force, ours / Newton's in N: "
-            "along the way, upwards (apart in all).",
-            "",
-            "| world | cell, mm | φ | best φ | heights at the truth, mm | at the best φ, mm | volume | cut, cm³ "
-            "| heaped, cm³ | " + " | ".join(stages) + " | s |",
-            "|---" * (10 + len(stages)) + "|",
-        ]
-        for name, row in rows.items():
-            best = "–" if row["best_angle"] is None else f"{_at_end(row)}{row['best_angle']:.1f}°"
-            left = "–" if row["heights_mm_at_best"] is None else f"{row['heights_mm_at_best']:.2f}"
-            volume = f"{100 * row['volume'][0]:+.2f} to {100 * row['volume'][1]:+.2f} %"
-            last = zip(row["cut_and_heaped_cm3"][-1], row["newton_cut_and_heaped_cm3"][-1], strict=True)
-            cells = [f"{own:.0f} / {other:.0f}" for own, other in last]
-            cells += [_forces(row["stages"][s]) if s in row["stages"] else "–" for s in stages]
-            lines.append(
-                f"| {name} | {1e3 * row['resolution']['cell']:.1f} | {row['angle']:.1f}° | {best} "
-                f"| {row['heights_mm']:.2f} | {left} | {volume} | " + " | ".join(cells) + f" | {row['seconds']:.0f} |"
-            )
-        lines += ["", *_summary(rows, stages), ""]
-    checked = {n: result["worlds"][n]["refinement"] for n in names if result["worlds"][n].get("refinement")}
-    if checked:
-        lines += refinement_table(checked)
-    absent = [n for n in names if not result["worlds"][n]["presets"]]
-    if absent:
-        lines += ["", f"Not judged: {', '.join(absent)}."]
+        rows = {n: c["agreement"][preset] for n, c in cases.items() if preset in c.get("agreement", {})}
+        if rows:
+            lines += ["", *_agreement_table(preset, rows), "", *_summary(rows)]
+    for name, case in cases.items():
+        if case.get("convergence"):
+            lines += [
+                "",
+                f"| {name}: cell, mm | angle off | heights off, mm | push force, N | volume |",
+                "|---" * 5 + "|",
+            ]
+        for row in case.get("convergence", ()):
+            off = f"{row['angle_off']:+.1f}° | {row['heights_mm']:.1f}" if "angle_off" in row else "– | –"
+            volume = f"{100 * row['lost']:+.2f} to {100 * row['gained']:+.2f} %"
+            lines.append(f"| {row['cell_mm']:.1f} | {off} | {row['force']:.0f} | {volume} |")
+        if case.get("changes"):
+            lines += ["", f"| {name}: change | shift of the angle | of the push force |", "|---" * 3 + "|"]
+        for row in case.get("changes", ()):
+            lines.append(f"| {row['change']} | {row['angle']:+.1f}° | {100 * row['force']:+.0f} % |")
+    refined = {name: case["refined"] for name, case in cases.items() if "refined" in case}
+    if refined:
+        lines += ["", "| Newton on voxels of 3/4 | heights off, mm | force while pushed |", "|---" * 3 + "|"]
+        lines += [f"| {n} | {f['heights_mm']:.2f} | {100 * f['pushing']:.1f} % |" for n, f in refined.items()]
     return "\n".join(lines)
 
 
-def _at_end(row: Mapping[str, Any]) -> str:
-    """An estimate at the scan's end is only a bound."""
-    low, high = row["angles"][0], row["angles"][-1]
-    return "≤ " if row["best_angle"] <= low else "≥ " if row["best_angle"] >= high else ""
-
-
-def _forces(stage: Mapping[str, Any]) -> str:
-    pairs = ", ".join(f"{a:.0f} / {b:.0f}" for a, b in zip(stage["ours"], stage["newton"], strict=True))
-    return pairs if stage["off"] is None else f"{pairs} ({100 * stage['off']:.0f} %)"
-
-
-def _summary(rows: Mapping[str, Mapping[str, Any]], stages: Sequence[str]) -> list[str]:
-    """What all worlds come to."""
-
-    def spread(values: Sequence[float]) -> str:
-        return f"{np.sqrt(np.mean(np.square(values))):.2f} root mean square, {np.max(np.abs(values)):.2f} at most"
-
-    lines = [f"- heights at the truth, mm: {spread([row['heights_mm'] for row in rows.values()])}"]
-    off = [row["best_angle"] - row["angle"] for row in rows.values() if row["best_angle"] is not None]
-    if off:
-        lines.append(f"- best angle less the true one, degrees: mean {np.mean(off):+.2f}, {spread(off)}")
-    for k, what in enumerate(("cut", "heaped")):
-        shares = [
-            row["cut_and_heaped_cm3"][-1][k] / row["newton_cut_and_heaped_cm3"][-1][k]
-            for row in rows.values()
-            if row["newton_cut_and_heaped_cm3"][-1][k] > 0.0
-        ]
-        if shares:
-            lines.append(f"- soil {what} in the end, ours over Newton's: {_range(shares)}")
-    for name in stages:
-        for k, what in enumerate(("along the way", "upwards")):
-            ratios = [row["stages"][name]["ratio"][k] for row in rows.values() if name in row["stages"]]
-            if known := [ratio for ratio in ratios if ratio is not None]:
-                lines.append(f"- force, {name}, {what}, ours over Newton's: {_range(known)}")
-        apart = [row["stages"][name]["off"] for row in rows.values() if name in row["stages"]]
-        if known := [100.0 * value for value in apart if value is not None]:
-            lines.append(f"- force, {name}, apart in %: {spread(known)}")
+def _agreement_table(preset: str, rows: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    stages = list(dict.fromkeys(s for row in rows.values() for s in row["stages"]))
+    lines = [
+        f"Preset `{preset}`: ours / Newton's; forces along the way, upwards in N.",
+        "",
+        "| case | true φ | best φ | heights at the truth, mm | at the best φ, mm | cut, cm³ | heaped, cm³ | "
+        + " | ".join(stages)
+        + " |",
+        "|---" * (7 + len(stages)) + "|",
+    ]
+    for name, row in rows.items():
+        best = "–" if row["best_angle"] is None else f"{row['best_angle']:.1f}°"
+        best += " (end of the scan)" if row["best_angle"] in (row["angles"][0], row["angles"][-1]) else ""
+        least = "–" if row["heights_mm_at_best"] is None else f"{row['heights_mm_at_best']:.2f}"
+        cells = [name, f"{row['angle']:.1f}°", best, f"{row['heights_mm']:.2f}", least]
+        soil = zip(row["cut_and_heaped_cm3"], row["their_cut_and_heaped_cm3"], strict=True)
+        cells += [f"{own:.0f} / {other:.0f}" for own, other in soil]
+        for stage in (row["stages"].get(s) for s in stages):
+            pairs = zip(stage["ours"], stage["other"], strict=True) if stage else ()
+            cells.append(", ".join(f"{own:.0f} / {other:.0f}" for own, other in pairs) or "–")
+        lines.append("| " + " | ".join(cells) + " |")
     return lines
 
 
-def _range(values: Sequence[float]) -> str:
-    return f"mean {np.mean(values):.2f}, {np.min(values):.2f} to {np.max(values):.2f}"
+def _summary(rows: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """What all cases come to."""
+
+    def spread(what: str, values: Sequence[float], digits: int) -> str:
+        rms, most = np.sqrt(np.mean(np.square(values))), np.max(np.abs(values))
+        mean = np.mean(values)
+        return f"- {what}: mean {mean:+.{digits}f}, root mean square {rms:.{digits}f}, {most:.{digits}f} at most"
+
+    lines = [spread("heights at the truth, mm", [row["heights_mm"] for row in rows.values()], 2)]
+    off = [row["best_angle"] - row["angle"] for row in rows.values() if row["best_angle"] is not None]
+    lines += [spread("best angle less the true one, degrees", off, 2)] if off else []
+    for name in dict.fromkeys(s for row in rows.values() for s in row["stages"]):
+        apart = [100.0 * row["stages"][name]["off"] for row in rows.values() if name in row["stages"]]
+        lines.append(spread(f"force, {name}, difference in %", apart, 0))
+    return lines
 
 
-def asked(options: argparse.Namespace, numerics: Numerics) -> list[Case]:
-    """The worlds that the command line names."""
-    drawn = islice(scenes(options.seed), options.count)
-    cases = [Case.drawn(f"scene-{options.seed}-{k}", scene, numerics) for k, scene in enumerate(drawn)]
-    if options.pairs:
-        for scene in pair(options.seed):
-            cases.append(Case.drawn(f"pair-{options.seed}-friction-{scene.tool_friction:g}", scene, numerics))
-    return cases + [Case.of_set(folder, numerics) for folder in options.sets]
-
-
-class Judgement:
-    """The result of one call, written after every world.
-
-    Args:
-        cases: all worlds that are asked for.
-        options: the command line.
-    """
-
-    def __init__(self, cases: Sequence[Case], options: argparse.Namespace) -> None:
-        self.cases, self.options = cases, options
-        self.result: dict[str, Any] = {
-            "made_by": stamp(options.device),
-            "seeds": options.seeds,
-            "presets": options.presets,
-            "worlds": {c.name: {**told(c), "kind": c.kind, "presets": {}} for c in cases},
-        }
-
-    def kept(self, case: Case) -> Kept | None:
-        """The world, where there is one."""
-        file = place(self.options.out, case)
-        return Kept.load(file, told(case)) if file.is_file() else case.made
-
-    @cached_property
-    def worlds(self) -> list[tuple[Case, Kept]]:
-        """Those that are there."""
-        return [(case, kept) for case in self.cases for kept in [self.kept(case)] if kept is not None]
-
-    def score(self, say: Callable[[str], None]) -> None:
-        """Judge all worlds that are there with all presets."""
-        o = self.options
-        for case, kept in self.worlds:
-            entry = self.result["worlds"][case.name]
-            entry["refinement"] = refinement(case, kept, o.out)
-            for preset in o.presets:
-                entry["presets"][preset] = judge(case, kept, preset, o.offsets, range(o.seeds), o.device)
-                say(f"{case.name}, {preset}: judged in {entry['presets'][preset]['seconds']:.0f} s")
-                self.write()
-
-    def write(self) -> None:
-        """Result and table."""
-        write_result(self.options.out, plain(self.result), table(self.result), {})
+def measure(case: Case, options: argparse.Namespace, say: Callable[[str], None]) -> dict[str, Any]:
+    """All that the command line asks for of a case."""
+    seeds, device, offsets = range(options.seeds), options.device, options.offsets
+    truth, found = case.kept(options.out), dict[str, Any](case.about)
+    found["agreement"] = {}
+    for preset in options.presets:
+        base = Resolution.derive(truth.measurement, preset)
+        scanned = scan(truth, base, offsets, seeds, device)
+        found["agreement"][preset] = agreement(truth, scanned)
+        if options.changes and preset == options.presets[0]:
+            found["changes"] = sensitivity(truth, base, scanned, seeds, device)
+        say(f"{case.name}, {preset}: compared")
+    if options.cells:
+        found["convergence"] = convergence(truth, options.presets[0], options.cells, offsets, seeds, device)
+    if (options.out / f"{case.name}.fine.npz").is_file():
+        fine = case.refined().kept(options.out)
+        assert truth.force is not None and fine.force is not None
+        pushing = compare_stages(truth, truth.force, fine.force)["pushing"]["off"]
+        found["refined"] = {"heights_mm": 1e3 * in_patches(truth.surfaces() - fine.surfaces()), "pushing": pushing}
+    return found
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Command line; exit code 0 when every world was judged."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    """Command line; exit code 0."""
+    parser = parser_of(__doc__)
     parser.add_argument("--count", type=at_least(0), help="scenes that are drawn; 6, or with --sets none")
     parser.add_argument("--seed", type=int, default=1, help="of the scenes")
     parser.add_argument("--pairs", action="store_true", help="also one scene with tool friction 0.3 and 0.9")
     parser.add_argument("--sets", type=Path, nargs="+", default=[], metavar="DIR", help="measurement sets with truths")
-    parser.add_argument("--only", nargs="+", metavar="NAME", help="of these worlds, by name")
-    parser.add_argument("--out", type=Path, default=Path("runs/solvers"), help="worlds, result.json and table.md")
-    parser.add_argument("--device", type=here, default="cpu")
-    parser.add_argument("--side-by-side", type=at_least(1), default=4, help="worlds that Newton ploughs at a time")
-    parser.add_argument("--no-plough", action="store_true", help="judge the worlds that are there; needs no Newton")
-    parser.add_argument("--worlds-only", action="store_true", help="make the worlds and stop")
-    parser.add_argument(
-        "--refine", nargs="*", metavar="NAME", help="plough these with finer voxels too; one of each kind"
-    )
-    parser.add_argument("--presets", nargs="+", default=["small"], help="of our solver")
-    parser.add_argument(
-        "--offsets", nargs="*", type=float, default=list(OFFSETS), help="of our angles, degrees; none: the truth alone"
-    )
+    parser.add_argument("--out", type=Path, default=Path("runs/solvers"), help="folder of scenes and results")
+    parser.add_argument("--presets", nargs="+", default=["small"], choices=sorted(PRESETS), help="of our solver")
+    parser.add_argument("--cells", nargs="+", type=float, default=[], help="across the tool: ours on these grids")
+    parser.add_argument("--changes", action="store_true", help="change each number of our solver")
+    parser.add_argument("--offsets", nargs="*", type=float, default=list(OFFSETS), help="of our angles, degrees")
     parser.add_argument("--seeds", type=at_least(1), default=2, help="particle seeds that ours are averaged over")
-    parser.add_argument(
-        "--voxel", type=float, default=Numerics.voxel, help="edge of Newton's cells, m; less for sets of narrow tools"
-    )
+    parser.add_argument("--side-by-side", type=at_least(1), default=4, help="scenes that Newton ploughs at a time")
+    parser.add_argument("--refine", action="store_true", help="Newton on finer voxels, too")
+    parser.add_argument("--voxel", type=float, default=Numerics.voxel, help="edge of Newton's cells, m")
     parser.add_argument("--substeps", type=at_least(1), default=Numerics.substeps, help="of Newton in a frame")
     parser.add_argument("--iterations", type=at_least(1), default=Numerics.iterations, help="most in a substep")
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of tables")
     options = parser.parse_args(arguments)
     if not options.voxel > 0.0:
         raise ParameterError("--voxel must be positive")
-    if options.count is None:
-        options.count = 0 if options.sets else 6
-    hush()
-    began = time.perf_counter()
-
-    def say(what: str) -> None:
-        print(f"{time.perf_counter() - began:6.0f} s  {what}", file=sys.stderr, flush=True)
-
+    if (options.changes or options.cells) and len({0.0, *options.offsets}) < 3:
+        raise ParameterError("--changes and --cells read angles off a scan: give two or more --offsets")
+    count = options.count if options.count is not None else 0 if options.sets else 6
     numerics = Numerics(options.voxel, options.substeps, options.iterations)
-    cases = asked(options, numerics)
-    names = [case.name for case in cases]
-    unknown = [n for n in [*(options.only or ()), *(options.refine or ())] if n not in names]
-    if unknown or not cases:
-        raise ParameterError(f"{', '.join(unknown) or 'no world'}: asked for are {', '.join(names) or 'none'}")
-    cases = [case for case in cases if not options.only or case.name in options.only]
-    if not options.no_plough:
-        plough_missing(cases, options.out, options.device, options.side_by_side, say)
-        if options.refine is not None:
-            first = {case.kind: case.name for case in reversed(cases)}.values()
-            finer = [case.finer() for case in cases if case.name in (options.refine or first)]
-            plough_missing(finer, options.out, options.device, options.side_by_side, say, fine=True)
-    if options.worlds_only:
-        return 0
-    judgement = Judgement(cases, options)
-    judgement.score(say)
-    judgement.write()
-    print(table(judgement.result))
-    return 0 if len(judgement.worlds) == len(cases) else 1
+    drawn = [(f"scene-{options.seed}-{k}", scene) for k, scene in enumerate(islice(scenes(options.seed), count))]
+    if options.pairs:
+        drawn += [(f"pair-{options.seed}-friction-{s.tool_friction:g}", s) for s in pair(options.seed)]
+    cases = [Case.drawn(name, scene, numerics) for name, scene in drawn]
+    cases += [Case.of_set(folder, numerics) for folder in options.sets]
+    if not cases:
+        raise ParameterError("there is nothing to compare: give --count or --sets")
+    hush()
+    say = Clock()
+    finer = [case.refined() for case in cases] if options.refine else []
+    plough_missing([*cases, *finer], options.out, options.device, options.side_by_side, say)
+    result = {"made_by": stamp(options.device), "seeds": options.seeds, "presets": options.presets, "cases": {}}
+    for case in cases:
+        result["cases"][case.name] = measure(case, options, say)
+        write_result(options.out, result, table(result), {})
+    print(json.dumps(plain(result), indent=1) if options.json else table(result))
+    return 0
 
 
 if __name__ == "__main__":

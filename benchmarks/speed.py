@@ -1,199 +1,349 @@
-"""How fast? Solver, rasteriser, reconstruction and whole inversion beside others of their kind: docs/performance.md."""
+"""How fast? Simulation, drawing, reconstruction and the whole path, each beside something else in the same run.
+
+``splatsoil benchmark speed --page docs/performance.md`` writes the CPU's section, with ``--device cuda:0`` the GPU's.
+Times of one thread are CPU times, which other programs disturb less than the clock's; all others are the clock's.
+Newton (extra ``independent``) is measured where it is installed.
+"""
 
 from __future__ import annotations
 
-import argparse
+import statistics
+import subprocess
 import sys
 import tempfile
 import time
-import traceback
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property, partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from splatsoil.benchmarks._common import at_least, here
-from splatsoil.benchmarks._speed import (
-    against_newton,
-    against_taichi,
-    kernels,
-    machine,
-    mpm,
-    page,
-    pictures,
-    run_to_run,
-    whole,
-)
-from splatsoil.benchmarks._speed.rows import Group, missing, text
-from splatsoil.benchmarks._speed.scenes import paper_scene, plough
+import numpy as np
+import torch
+import warp as wp
+from splatsoil.benchmarks._common import at_least, parser_of, sources, stamp
+from splatsoil.benchmarks._newton import Numerics, World, plough
+from splatsoil.benchmarks._parts import part_options, run_parts
+from splatsoil.benchmarks._truth import FloatArray, Truth
+from splatsoil.benchmarks._validation.page import Row, Section
+from splatsoil.benchmarks.effects import acting, strong
 
-from splatsoil.commands._output import only_json, print_json
-from splatsoil.errors import RunError, SplatsoilError
-from splatsoil.files import check_folder, plain, read_json, write_json, write_text
-from splatsoil.mpm import PRESETS
+from splatsoil.errors import RunError
+from splatsoil.measurement import Camera, Measurement
+from splatsoil.mpm import PRESETS, Resolution, Solver, simulate
+from splatsoil.mpm.simulate import base_settings, step_poses
 from splatsoil.quiet import hush
+from splatsoil.reconstruction import Reconstruction, fill, reconstruct
+from splatsoil.soil.law import Law
+from splatsoil.soil.library import find_effects
+from splatsoil.splats import Gaussians, rasterise, reference
+from splatsoil.synthetic import paper
+from splatsoil.threads import at_most
 
-FORMAT = "splatsoil-speed/1"
+BATCH = 16
+"""Parameter sets of one batch on a GPU."""
+LEAVES = ("means", "scales", "quaternions", "opacities", "colours")
+SHARE = 50
+"""The slow reference draws one Gaussian of so many."""
+WINDOWS, FRAMES = (0, 50, 150), 3
+"""Frames at which pieces of Newton's run begin (soil at rest, pushed, tool drawn back), and how many of each count."""
+ROUNDS = 15
+"""Steps of each law, taken in turns."""
+
+
+@dataclass(frozen=True)
+class Times:
+    """Repetitions of one measurement, in s."""
+
+    values: tuple[float, ...]
+
+    @property
+    def median(self) -> float:
+        """Of the repetitions, s."""
+        return statistics.median(self.values)
+
+    def __str__(self) -> str:
+        factor, unit = (1e3, "ms") if self.median < 0.1 else (1.0, "s")
+        spread = 0.5 * factor * (max(self.values) - min(self.values))
+        digits = f" ± {spread:.2g}" if len(self.values) > 1 else ""
+        return f"{factor * self.median:.3g}{digits} {unit}"
+
+    def over(self, other: Times, name: str) -> str:
+        """This time, the other's, and how many times as fast this is."""
+        ratio = other.median / self.median
+        return f"{self}; {name} {other}: {f'{ratio:.0f}' if ratio >= 100 else f'{ratio:.3g}'} × as fast"
+
+
+def timed(task: Callable[[], object], repeats: int, device: str, *, warm: int = 1, wall: bool = False) -> Times:
+    """Times after ``warm`` calls that do not count: of this thread on a CPU, unless ``wall``; else the clock's."""
+    clock = time.thread_time if device == "cpu" and not wall else time.perf_counter
+
+    def once() -> float:
+        _synchronise(device)
+        began = clock()
+        task()
+        _synchronise(device)
+        return clock() - began
+
+    for _ in range(warm):
+        task()
+    return Times(tuple(once() for _ in range(repeats)))
+
+
+def _synchronise(device: str) -> None:
+    """Wait until a GPU has done what it was given, by Warp and by torch."""
+    if device != "cpu":
+        wp.synchronize_device(device)
+        torch.cuda.synchronize(device)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A bed that our solver ploughs.
+
+    Attributes:
+        measurement: bed, tool and motion.
+        resolution: of the solver.
+        x: particles (n, 3) in m.
+        values: parameters by name.
+        last: the run ends with this frame.
+    """
+
+    measurement: Measurement
+    resolution: Resolution
+    x: FloatArray
+    values: Mapping[str, float]
+    last: int
+
+    @property
+    def particle_steps(self) -> float:
+        """Particles times substeps of the grid in the whole run."""
+        r = self.resolution
+        return float(len(self.x)) * self.last * r.steps * r.substeps(r.steps)
+
+    def run(self, device: str, batch: int = 1) -> None:
+        """The whole run; the sets of a batch differ by their friction angles."""
+        angle = self.values["friction_angle"]
+        values = [{**self.values, "friction_angle": angle + 0.5 * k} for k in range(batch)]
+        simulate(self.measurement, self.x, values, resolution=self.resolution, frames=(self.last,), device=device)
+
+    def solver(self, law: Law, values: Mapping[str, float]) -> Solver:
+        """The solver at frame 0, on the CPU."""
+        bed, mesh, x = self.measurement.bed, self.measurement.tool.mesh, self.x[None].astype(np.float32)
+        settings = base_settings(self.measurement)
+        return Solver(x, bed.lower, bed.upper, mesh, self.resolution, law, settings, [{**self.values, **values}], "cpu")
 
 
 @dataclass(frozen=True)
 class Task:
-    """What parts are made with.
-
-    Attributes:
-        folder: of the measurement set.
-        preset: of solver and reconstruction.
-        device: where to compute.
-        repeats: of what takes seconds; what takes milliseconds is repeated more often.
-        work: folder for run folders, empty at the start.
-    """
+    """What parts are made with: a measurement set with true particles, a preset, a device, and repetitions."""
 
     folder: Path
     preset: str
     device: str
     repeats: int
-    work: Path
+
+    @cached_property
+    def truth(self) -> Truth:
+        """The set's."""
+        return Truth.load(self.folder)
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The set with its true angle."""
+        truth = self.truth
+        resolution = Resolution.derive(truth.measurement, self.preset)
+        values = {"friction_angle": truth.values["friction_angle"]}
+        return Scene(truth.measurement, resolution, truth.start(resolution.spacing, 0), values, max(truth.particles))
 
 
-def cpu_parts(task: Task) -> dict[str, Callable[[], Group]]:
-    """Parts that a machine without a GPU can measure, by name, in the page's order."""
-    folder, preset, repeats = task.folder, task.preset, task.repeats
-    return {
-        "solver": lambda: mpm.cpu(plough(folder, preset), repeats),
-        "taichi": lambda: against_taichi.compare(plough(folder, preset), repeats),
-        "newton": lambda: against_newton.compare(plough(folder, preset), repeats),
-        "rasteriser": lambda: pictures.rasteriser(repeats),
-        "reconstruction": lambda: pictures.training(folder, preset, "cpu"),
-        "kernels": lambda: kernels.profile(plough(folder, preset), "cpu"),
-    }
+def published_scene() -> Scene:
+    """The scene of the published table on cells of its size; its plate's thickness and frictions are the example's."""
+    setup = paper()
+    measurement = setup.experiment()
+    resolution = Resolution.derive(measurement, "paper")
+    x = fill(setup.surface, setup.bed, resolution.spacing, seed=0)
+    return Scene(measurement, resolution, x, {"friction_angle": 35.0}, max(setup.frames))
 
 
-def gpu_parts(task: Task) -> dict[str, Callable[[], Group]]:
-    """Parts that are measured on a GPU."""
-    folder, preset, device, repeats = task.folder, task.preset, task.device, task.repeats
-    return {
-        "solver": lambda: mpm.gpu(plough(folder, preset), device, repeats),
-        "large": lambda: mpm.large(plough(folder, preset), device, repeats),
-        "kernels": lambda: kernels.profile(paper_scene(), device),
-        "kernels-large": lambda: kernels.profile(plough(folder, preset).refined(1_000_000), device),
-        "reconstruction": lambda: pictures.training(folder, preset, device),
-        "inversion": lambda: whole.inversion(folder, preset, device, task.work),
-        "diagnosis": lambda: whole.diagnosis(folder, preset, device, task.work),
-        "gsplat": lambda: pictures.against_gsplat(device, repeats),
-        "run-to-run": lambda: run_to_run.compare(folder, preset, device, repeats),
-    }
+def simulation(task: Task) -> Section:
+    """Whole runs: one alone, and several at a time."""
+    scene, device, rows = task.scene, task.device, []
+    cases = {scene.measurement.name: scene}
+    if device != "cpu":
+        cases["the published scene"] = published_scene()
+    for name, one in cases.items():
+        alone = timed(lambda one=one: one.run(device), task.repeats, device)  # type: ignore[misc]
+        what = f"{name}: {len(one.x)} particles, {one.last} frames"
+        rows.append(Row(what, f"{alone}; {1e-6 * one.particle_steps / alone.median:.3g} M particle-steps/s"))
+        if device != "cpu":
+            batch = timed(lambda one=one: one.run(device, BATCH), task.repeats, device)  # type: ignore[misc]
+            each = Times(tuple(BATCH * t for t in alone.values))
+            rows.append(Row(f"{name}: {BATCH} parameter sets as one batch", batch.over(each, "one after the other")))
+    if device == "cpu":
+        with ThreadPoolExecutor(2) as pool:
+            pair = timed(lambda: list(pool.map(scene.run, ["cpu"] * 2)), task.repeats, "cpu", wall=True)
+        each = timed(lambda: scene.run("cpu"), task.repeats, "cpu", warm=0, wall=True)
+        twice = Times(tuple(2.0 * t for t in each.values))
+        rows.append(Row("two runs side by side on two cores", pair.over(twice, "one after the other")))
+    words = "A particle-step is a particle times a substep of the grid."
+    return Section("Simulation", words, tuple(rows))
 
 
-def parts(task: Task) -> dict[str, Callable[[], Group]]:
-    """All parts for the task's device."""
-    return cpu_parts(task) if task.device == "cpu" else gpu_parts(task)
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure the parts that are asked for, print their table, and write it into its section of the page.
-
-    Returns:
-        0; 1 where a part broke down in a way that isn't the machine's fault.
-    """
-    parser = argparse.ArgumentParser(prog="splatsoil benchmark speed", description=__doc__)
-    parser.add_argument(
-        "--set", type=Path, default=Path("examples/plow-dry"), help="measurement set with true particles"
+def newton(task: Task) -> Section:
+    """The whole run with ours, and in Newton's implicit MPM by pieces of it."""
+    scene, truth = task.scene, task.truth
+    numerics = Numerics(voxel=scene.resolution.cell, substeps=2, iterations=120, tolerance=1e-4)
+    rng, seconds = np.random.default_rng(0), []
+    for start in (w for w in WINDOWS if w in truth.particles):
+        # as many particles as ours, which stand for as much soil
+        x = rng.permutation(truth.particles[start])[: len(scene.x)]
+        world = World("speed", truth.measurement, scene.values["friction_angle"], x, scene.resolution.spacing)
+        ends: list[float] = []
+        plough(
+            [world], numerics, (start + 1 + FRAMES,), task.device, begin=start,
+            progress=lambda *_, ends=ends: ends.append(time.perf_counter()),
+        )  # fmt: skip
+        seconds.append(np.diff(ends))  # the first frame compiles, and lets stress build up
+    whole = Times(tuple(scene.last * float(s) for s in np.mean(seconds, axis=0)))
+    ours = timed(lambda: scene.run(task.device), task.repeats, task.device, wall=True)
+    ratio = whole.median / ours.median
+    row = Row(f"{scene.measurement.name}, {scene.last} frames", ours.over(whole, "Newton"), "≥ 20 ×", ratio >= 20.0)
+    return Section(
+        "Against Newton's implicit MPM",
+        f"{len(scene.x)} particles and cells of {1e3 * numerics.voxel:.3g} mm in both; Newton: {numerics.substeps} "
+        f"substeps a frame, at most {numerics.iterations} iterations to {numerics.tolerance:g}; {FRAMES} frames from "
+        f"each of the frames {', '.join(map(str, WINDOWS))} with the true particles there, times {scene.last}.",
+        (row,),
     )
-    parser.add_argument("--device", type=here, default="cpu", help="cpu or cuda:0; they have parts of their own")
-    parser.add_argument("--only", nargs="+", metavar="PART", help="parts to measure; all of the device by default")
+
+
+def effects(task: Task) -> Section:
+    """A step with all effects on strength that act together, over the base law's."""
+    names = strong()
+    acts = find_effects(names)
+    values = {key: value for effect in acts for key, value in acting(effect).items()}
+    scene, spent = task.scene, ([], [])  # type: ignore[var-annotated]
+    runs = scene.solver(Law(), {}), scene.solver(Law(acts), values)
+    r = scene.resolution
+    for frame in range(ROUNDS):
+        poses = step_poses(scene.measurement.tool.motion, frame * r.frame_time, r.frame_time, r.steps)
+        for run, own in zip(runs, spent, strict=True):
+            own += timed(lambda run=run, poses=poses: run.advance(poses), 1, "cpu", warm=0).values  # type: ignore[misc]
+    base, whole = (min(own[1:]) for own in spent)
+    found, words = whole / base, f"On: {', '.join(names)}; least times of {ROUNDS - 1} frames, on the CPU."
+    row = Row(
+        f"a frame with {len(names)} effects on strength, over the base law's", f"{found:.2f}", "≤ 2", found <= 2.0
+    )
+    return Section("What effects cost", words, (row,))
+
+
+def random_gaussians(count: int, size: int, device: str, pixels: float = 3.0) -> tuple[Gaussians, Camera]:
+    """Leaves of about ``pixels`` px spread over an image of ``size``² px."""
+    g = torch.Generator().manual_seed(0)
+    z = 1 + torch.rand(count, generator=g)
+    xy = (torch.rand(count, 2, generator=g) - 0.5) * z[:, None]
+    drawn = Gaussians(
+        means=torch.cat([xy, z[:, None]], dim=1),
+        scales=(pixels / size * z)[:, None] * torch.exp(0.3 * torch.randn(count, 3, generator=g)),
+        quaternions=torch.randn(count, 4, generator=g),
+        opacities=torch.rand(count, generator=g) * 0.8 + 0.1,
+        colours=torch.rand(count, 3, generator=g),
+    )
+    leaves = Gaussians(*(getattr(drawn, name).to(device).requires_grad_() for name in LEAVES))
+    pose = np.diag([1.0, -1.0, -1.0, 1.0])
+    return leaves, Camera(width=size, height=size, fx=size, fy=size, cx=size / 2, cy=size / 2, camera_to_world=pose)
+
+
+def rasteriser(task: Task, count: int = 20_000, size: int = 256) -> Section:
+    """Forward, and forward with gradients, beside the slow reference on one core of the CPU."""
+    leaves, camera = random_gaussians(count, size, task.device)
+    few = random_gaussians(count, size, "cpu")[0][: max(count // SHARE, 1)]
+
+    def ours() -> list[torch.Tensor]:
+        drawn = rasterise(leaves, camera, normals=False)
+        return [drawn.colour, drawn.depth]
+
+    def slowly() -> list[torch.Tensor]:
+        covariances = few.covariances()
+        return [reference.rasterise_features(few.means, covariances, few.opacities, few.colours, camera)[0]]
+
+    def backward(draw: Callable[[], list[torch.Tensor]]) -> Callable[[], object]:
+        return lambda: torch.autograd.backward([out.sum() for out in draw()])
+
+    with at_most(1):
+        off = float((rasterise(few.to(task.device), camera).colour.cpu() - slowly()[0]).abs().max().detach())
+        rows = [Row("largest difference from the reference's picture", f"{off:.1e}", "≤ 1e-3", off <= 1e-3)]
+        for what, way in (("forward", torch.no_grad()), ("forward + backward", backward)):
+            mine, slow = timed(way(ours), 5 * task.repeats, task.device, warm=3), timed(way(slowly), 1, "cpu", warm=0)
+            slow = Times((slow.median * count / len(few),))
+            rows.append(Row(f"{count} Gaussians at {size}², {what}", mine.over(slow, "reference")))
+    words = f"Gaussians of 3 px; colour, alpha and depth. The reference draws one of {SHARE}."
+    return Section("Rasteriser", words, tuple(rows))
+
+
+def reconstruction(task: Task) -> Section:
+    """From photographs to Gaussians; on a GPU beside one core of the CPU."""
+    measurement = task.truth.measurement
+
+    def made(device: str) -> tuple[Times, Reconstruction]:
+        found: list[Reconstruction] = []
+
+        def once() -> None:
+            found.append(reconstruct(measurement, preset=task.preset, device=device))
+
+        return timed(once, 1, device, warm=int(device != "cpu")), found[-1]
+
+    where = [task.device] if task.device == "cpu" else [task.device, "cpu"]
+    (seconds, result), *slow = (made(device) for device in where)
+    text = seconds.over(slow[0][0], "one core of the CPU") if slow else f"{seconds} on one core"
+    dB = ", ".join(f"{r.psnr:.2f} dB" for r in (result, *(r for _, r in slow)))
+    row = Row(f"{measurement.name}, {len(result.gaussians)} Gaussians", f"{text}; {dB} on photographs set aside")
+    return Section("Reconstruction", f"Preset `{task.preset}`.", (row,))
+
+
+def whole_path(task: Task) -> Section:
+    """``splatsoil fit`` of a set, reconstruction included, and ``splatsoil diagnose`` of its run."""
+    rows = []
+    with tempfile.TemporaryDirectory() as work:
+        run = str(Path(work) / "run")
+        given = [str(task.folder), "--run", run, "--preset", task.preset]
+        for words in (["fit", *given], ["diagnose", run]):
+            command = [sys.executable, "-m", "splatsoil", *words, "--device", task.device]
+            began = time.perf_counter()
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            if done.returncode not in (0, 3):  # 3: the data give no answer, which takes as long
+                raise RunError(f"splatsoil {words[0]}: {' '.join(done.stderr.split())[-300:]}")
+            seconds = time.perf_counter() - began
+            rows.append(Row(f"`splatsoil {words[0]}`, {task.truth.measurement.name}", f"{seconds:.0f} s"))
+    text = f"Preset `{task.preset}`; each a process of its own; the first one reconstructs the bed, too."
+    return Section("Whole path", text, tuple(rows))
+
+
+PARTS = (simulation, newton, effects, rasteriser, reconstruction, whole_path)
+"""In the page's order."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Measure the parts that are asked for, print their tables, and write the device's section of a page."""
+    parser = parser_of(__doc__)
+    parser.add_argument("--set", type=Path, default=Path("examples/plow-dry"), help="with true particles")
     parser.add_argument("--preset", default="small", choices=sorted(PRESETS), help="of solver and reconstruction")
     parser.add_argument("--repeats", type=at_least(1), default=3, help="of what takes seconds")
-    parser.add_argument("--out", type=Path, default=Path("runs/speed"), help="results, one file a part")
-    parser.add_argument("--page", type=Path, help="write the device's section of this page (.md)")
-    parser.add_argument("--render", action="store_true", help="measure nothing: write the page from --out")
-    parser.add_argument("--json", action="store_true", help="print one JSON object instead of tables")
+    part_options(parser, "runs/speed")
     options = parser.parse_args(arguments)
     hush()
-    try:
-        with tempfile.TemporaryDirectory() as work, only_json() if options.json else nullcontext():
-            task = Task(options.set, options.preset, options.device, options.repeats, Path(work))
-            return _run(parser, options, task)
-    except SplatsoilError as error:
-        parser.error(" ".join(str(error).split()))
-
-
-def _run(parser: argparse.ArgumentParser, options: argparse.Namespace, task: Task) -> int:
-    todo = parts(task)
-    unknown = sorted(set(options.only or ()) - set(todo))
-    if unknown:
-        parser.error(f"part {unknown[0]!r} is not among {', '.join(todo)}, those of {task.device}")
-    if options.page:
-        page.current(options.page)
-        check_folder(options.page.parent)
-    kind = task.device.split(":")[0]
-    out = options.out / kind
-    check_folder(out)
-    # a set that can't be read fails here, not in every part
-    scene = plough(task.folder, task.preset)
-    here = machine.describe(task.device)
-    wanted = [] if options.render else [name for name in todo if not options.only or name in options.only]
-    broken = False
-    for name in wanted:
-        began = time.monotonic()
-        group, fault = measured(name, todo[name])
-        broken |= fault
-        seconds = time.monotonic() - began
-        entry = {
-            "format": FORMAT,
-            "machine": here,
-            "measurement": {"name": scene.measurement.name, "hash": scene.measurement.hash},
-            "preset": task.preset,
-            "repeats": task.repeats,
-            "seconds": seconds,
-            "group": group.data(),
-        }
-        write_json(out / f"{name}.json", entry)
-        print(f"{name}: {seconds:.0f} s", file=sys.stderr, flush=True)
-        if not options.json:
-            print(f"\n{text([group])}", flush=True)
-        # after every part, so that a run that is cut short leaves what it has
-        if options.page:
-            write_page(options.page, task.device, out, list(todo), here)
-    if options.page and not wanted:
-        write_page(options.page, task.device, out, list(todo), here)
-    if options.json:
-        found = {name: read_json(out / f"{name}.json") for name in wanted}
-        print_json({"ok": not broken, "machine": here, "parts": plain(found)})
-    return int(broken)
-
-
-def measured(name: str, part: Callable[[], Group]) -> tuple[Group, bool]:
-    """A part's rows; one that can't be measured here becomes a row that says why, and whether it's a fault to mend."""
-    try:
-        return part(), False
-    except SplatsoilError as error:
-        return Group(name, (missing(name, " ".join(str(error).split())),)), False
-    except Exception as error:  # the other parts must not suffer
-        traceback.print_exc(file=sys.stderr)
-        why = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
-        return Group(name, (missing(name, why),)), True
-
-
-def write_page(file: Path, device: str, out: Path, names: Sequence[str], here: Mapping[str, str]) -> None:
-    """The device's section, from all parts on disk that this code measured on this machine.
-
-    Raises:
-        RunError: there is none.
-    """
-    groups, seconds = [], 0.0
-    latest: dict[str, Any] = {"made": ""}
-    for name in names:
-        stored = read_json(out / f"{name}.json") if (out / f"{name}.json").is_file() else {}
-        if stored.get("format") == FORMAT and machine.same(stored["machine"], here):
-            groups.append(Group.restored(stored["group"]))
-            seconds += stored["seconds"]
-            latest = max(latest, stored["machine"], key=lambda told: str(told["made"]))
-    if not groups:
-        raise RunError(f"{out}: holds nothing that this code measured on this machine; leave --render out")
-    kind = device.split(":")[0]
-    command = f"splatsoil benchmark speed{'' if kind == 'cpu' else f' --device {device}'} --page {file}"
-    write_text(file, page.replaced(page.current(file), kind, page.section(groups, latest, command, seconds)))
+    task = Task(options.set, options.preset, options.device, options.repeats)
+    made = stamp(options.device)
+    key: dict[str, Any] = {name: made.get(name) for name in ("processor", "cores", "gpu")}
+    key |= {"code": sources([Path(__file__)]), "set": task.truth.measurement.hash}
+    key |= {"preset": task.preset, "repeats": task.repeats}
+    options.out = options.out / made["device"]
+    measured = [part for part in PARTS if part is not newton or find_spec("newton")]
+    parts = {part.__name__.replace("_", "-"): partial(part, task) for part in measured}
+    return run_parts(options, parts, lambda _: key, f"speed {made['device']}")
 
 
 if __name__ == "__main__":

@@ -1,76 +1,47 @@
-"""From photographs to a friction angle: each stage against its aim, and the table in docs/measurements.md.
+"""From photographs to a friction angle: each stage against its target, and the table in docs/measurements.md.
 
 ``splatsoil benchmark whole-path --page docs/measurements.md`` takes the best part of an hour on two cores: the example
-sets are reconstructed, drawn from their true particles, simulated from them with one piece of the numerics changed at a
-time, and fitted as a user does. Parts are kept in the folder as they end, fits with all their evaluations, and a second
-call goes on from there; a part that is asked for by name is measured again.
+sets are reconstructed, drawn from their true particles, and fitted as a user does. Parts are kept in the folder as they
+end, fits with all their evaluations, and a second call continues from there.
 """
 
 from __future__ import annotations
 
-import argparse
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import nullcontext
-from dataclasses import asdict, dataclass
-from functools import cache
-from multiprocessing import get_context
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from splatsoil.benchmarks import numerics
-from splatsoil.benchmarks._common import at_least, here
-from splatsoil.benchmarks._speed import machine
-from splatsoil.benchmarks._speed.clock import repeated
-from splatsoil.benchmarks._speed.page import between
-from splatsoil.benchmarks._speed.scenes import plough
-from splatsoil.benchmarks.landscape import floor
-from splatsoil.benchmarks.numerics import Truth
-from splatsoil.benchmarks.reconstruction import score
+import numpy as np
+from scipy.ndimage import gaussian_filter, map_coordinates
+from splatsoil.benchmarks._common import parser_of, sources
+from splatsoil.benchmarks._parts import part_options, run_parts
+from splatsoil.benchmarks._truth import Truth
+from splatsoil.benchmarks._validation.page import Row, Section
 
-from splatsoil.commands._output import only_json, print_json
-from splatsoil.comparison import Comparator
-from splatsoil.errors import RunError, SplatsoilError
-from splatsoil.files import check_folder, plain, read_json, write_json, write_text
+from splatsoil.comparison import Comparator, Comparison
+from splatsoil.errors import RunError
+from splatsoil.files import read_json
 from splatsoil.measurement import Measurement
 from splatsoil.model import Model
 from splatsoil.mpm import PRESETS
 from splatsoil.quiet import hush
-from splatsoil.reconstruction import Reconstruction, reconstruct
+from splatsoil.reconstruction import HeightField, Reconstruction, reconstruct
+from splatsoil.scene import build_scene
 
-FORMAT = "splatsoil-whole-path/1"
-BEGIN = "<!-- whole path: written by `splatsoil benchmark whole-path`, what stands here is overwritten -->"
-END = "<!-- whole path: end -->"
 AWAY = 5.0
-"""Degrees by which the simulations beside the renderer's floor are wrong."""
+"""Degrees by which the simulations beside the true particles are wrong."""
 FIT_SEEDS = (0, 1, 2)
 EFFECT = "cohesion"
-"""What the damp set has and the base model hasn't."""
-
-
-@dataclass(frozen=True)
-class Row:
-    """One line of the table.
-
-    Attributes:
-        what: was measured.
-        measured: with units.
-        aim: in words.
-        met: whether it was reached; None: there is nothing to reach.
-    """
-
-    what: str
-    measured: str
-    aim: str = ""
-    met: bool | None = None
-
-    def line(self) -> str:
-        """In Markdown; what misses its aim is bold."""
-        measured = self.measured.replace("-", "−")
-        return f"| {self.what} | {f'**{measured}**' if self.met is False else measured} | {self.aim} |"
+"""What the damp set has and the base model has not."""
+LEVEL = 0.45
+"""Share of the bulk density at which the sets' pictures show the surface."""
+FINENESS, PADDING = 4, 3
+"""Grid cells per particle spacing, and spacings of empty space around the bed, so that the blur ends in nothing."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +52,6 @@ class Task:
         dry: a measurement set with true particles that the base model can explain.
         damp: one whose soil is cohesive.
         preset: of reconstruction and solver.
-        seeds: of the particles, for heights and shifts.
         device: where to compute.
         out: folder for parts and runs.
     """
@@ -89,166 +59,132 @@ class Task:
     dry: Path
     damp: Path
     preset: str
-    seeds: int
     device: str
     out: Path
 
 
-def parts(task: Task) -> dict[str, Callable[[], list[Row]]]:
-    """All parts by name, in the table's order."""
-    return {
-        "reconstruction": lambda: reconstruction(task),
-        "renderer": lambda: renderer(task),
-        "solver": lambda: solver(task),
-        "simulation": lambda: simulation(task),
-        "angle": lambda: angle(task),
-        "missing-effect": lambda: missing_effect(task),
-    }
+def true_surface(truth: Truth, cells: HeightField) -> HeightField:
+    """The surface of the true particles at frame 0 at the given cells, found without any part of the reconstruction.
+
+    It is where a Gaussian blur of one spacing of the particles' volume falls to `LEVEL`, from above: so the sets'
+    pictures were made, on a coarser grid. Other grids move it by up to 0.2 mm on average and 0.7 mm in a cell.
+    """
+    bed, spacing = truth.measurement.bed, truth.spacing
+    step = spacing / FINENESS
+    lower = bed.lower - PADDING * spacing
+    shape = np.ceil((bed.upper + PADDING * spacing - lower) / step).astype(int)
+    ranges = list(zip(lower, lower + shape * step, strict=True))
+    bulk, _ = np.histogramdd(truth.particles[0], bins=shape.tolist(), range=ranges)
+    bulk = gaussian_filter(bulk * (spacing / step) ** 3, FINENESS)
+    level = np.arange(shape[2])
+    where = [
+        np.repeat(((a - lower[k]) / step - 0.5)[..., None], len(level), axis=2)
+        for k, a in enumerate(np.meshgrid(cells.x, cells.y))
+    ]
+    columns = map_coordinates(bulk, [*where, np.broadcast_to(level, where[0].shape)], order=1)
+    filled = columns >= LEVEL
+    top = len(level) - 1 - np.argmax(filled[..., ::-1], axis=2)
+    under = np.take_along_axis(columns, top[..., None], axis=2)[..., 0]
+    over = np.take_along_axis(columns, np.minimum(top + 1, len(level) - 1)[..., None], axis=2)[..., 0]
+    height = lower[2] + (top + 0.5 + (under - LEVEL) / np.maximum(under - over, 1e-12)) * step
+    return HeightField(cells.x, cells.y, np.where(filled.any(axis=2), height, np.nan))
 
 
-def reconstruction(task: Task) -> list[Row]:
+def floor(truth: Truth, reconstruction: Reconstruction, device: str) -> tuple[tuple[int, ...], Comparison]:
+    """Frames that the truth has, and the comparison of its true particles, drawn, with the photographs."""
+    measurement, frames = truth.measurement, (0, *truth.frames)
+    scene = build_scene(reconstruction, measurement, truth.particles[0], truth.spacing, device=device)
+    images = {}
+    for frame in frames:
+        posed = scene.pose(truth.particles[frame], None, measurement.tool.motion.pose(frame / measurement.frame_rate))
+        for name, camera in measurement.cameras.items():
+            images[name, frame] = scene.picture(posed, camera.undistorted())
+    return frames, Comparator(measurement, surface=reconstruction.surface, frames=frames).compare(images)
+
+
+def reconstruction(task: Task) -> Section:
     """Time, likeness to photographs that were set aside, and the surface against the true one."""
-    measurement = Measurement.load(task.dry)
-    found = score(task.dry, _reconstructed(task.dry, task.preset, task.device), measurement)
-    assert found.rmse is not None and found.bias is not None
-    name, rmse, bias = measurement.name, 1e3 * found.rmse, 1e3 * found.bias
-    return [
+    truth, made = Truth.load(task.dry), _reconstructed(task.dry, task.preset, task.device)
+    exact = true_surface(truth, made.surface)
+    rmse, bias = 1e3 * made.surface.rmse(exact), 1e3 * made.surface.bias(exact)
+    name, good = truth.measurement.name, made.seconds <= 180.0 and made.psnr >= 30.0
+    rows = (
+        Row(f"{name}; photographs set aside", f"{made.seconds:.0f} s; {made.psnr:.1f} dB", "180 s; 30 dB", good),
         Row(
-            f"reconstruction of `{name}`; photographs set aside",
-            f"{found.seconds:.0f} s; {found.psnr:.1f} dB",
-            "180 s; 30 dB",
-            found.seconds <= 180.0 and found.psnr >= 30.0,
-        ),
-        Row(
-            "its surface against the truth inside the bin: root mean square, mean",
+            "surface against the truth inside the bin: root mean square, mean",
             f"{rmse:.1f} mm, {bias:+.1f} mm",
             "4 mm, 1 mm",
             rmse <= 4.0 and abs(bias) <= 1.0,
         ),
-    ]
+    )
+    return Section("Reconstruction", "", rows)
 
 
-def renderer(task: Task) -> list[Row]:
+def renderer(task: Task) -> Section:
     """The error of true particles drawn through the whole scene path, beside that of wrong simulations."""
-    truth = Truth.load(task.dry)
-    made = _reconstructed(task.dry, task.preset, task.device)
+    truth, made = Truth.load(task.dry), _reconstructed(task.dry, task.preset, task.device)
     frames, least = floor(truth, made, task.device)
     model = Model(truth.measurement, made, preset=task.preset, device=task.device)
     comparator = Comparator(truth.measurement, surface=made.surface, frames=frames)
-    off = []
-    for by in (-AWAY, AWAY):
-        images = model.predict({"friction_angle": truth.values["friction_angle"] + by}, 0).images
-        off.append(comparator.compare(images))
-    shown = ", ".join(map(str, frames[1:]))
-    halves = [least.loss / wrong.loss for wrong in off]
-    return [
+    weak, strong = (
+        comparator.compare(model.predict({"friction_angle": truth.values["friction_angle"] + by}, 0).images)
+        for by in (-AWAY, AWAY)
+    )
+    rows = (
         Row(
-            f"true particles drawn, frames {shown}, against simulations {AWAY:g}° too weak and too strong: loss",
-            f"{least.loss:.3f} against {off[0].loss:.3f} and {off[1].loss:.3f}",
+            "loss of the true particles; of simulations",
+            f"{least.loss:.3f}; {weak.loss:.3f} and {strong.loss:.3f}",
             "less than half",
-            max(halves) < 0.5,
+            least.loss < 0.5 * min(weak.loss, strong.loss),
         ),
-        Row(
-            "the same, raw colour error",
-            f"{1e5 * least.rgb:.0f} against {1e5 * off[0].rgb:.0f} and {1e5 * off[1].rgb:.0f} · 10⁻⁵",
-        ),
-    ]
+        Row("raw colour error", f"{1e5 * least.rgb:.0f}; {1e5 * weak.rgb:.0f} and {1e5 * strong.rgb:.0f} · 10⁻⁵"),
+    )
+    words = (
+        f"True particles, and simulations {AWAY:g}° too weak and too strong, frames {', '.join(map(str, frames[1:]))}."
+    )
+    return Section("Renderer", words, rows)
 
 
-def solver(task: Task) -> list[Row]:
-    """Heights and best angle against an independent solver, and how far numerics shift the angle."""
-    arguments = [([folder], task.preset, task.seeds, task.device) for folder in (task.dry, task.damp)]
-    with ProcessPoolExecutor(2, get_context("spawn"), hush) as pool:
-        jobs = [pool.submit(numerics.run, *each) for each in arguments]
-        found = {name: entry for job in jobs for name, entry in job.result()["sets"].items()}
-    return of_solver(found, task.preset)
-
-
-def of_solver(found: Mapping[str, Any], preset: str) -> list[Row]:
-    """Rows of what `splatsoil.benchmarks.numerics` found, by set."""
-    rows = []
-    for name, entry in found.items():
-        errors, true = entry["rmse_mm"].values(), entry["true_angle"]
-        gain = 100.0 * entry["volume"][1]
-        rows.append(
-            Row(
-                f"from the true particles of `{name}`: heights; best angle of a scan (true {true:g}°); volume gained",
-                f"{min(errors):.1f} to {max(errors):.1f} mm; {entry['best_angle']:.1f}°; {gain:+.2f} %",
-                "4 mm; within 2°; 0.5 %",
-                max(errors) <= 4.0 and abs(entry["best_angle"] - true) <= 2.0 and gain <= 0.5,
-            )
-        )
-    for name, entry in found.items():
-        shifts = entry["shifts"]
-        rows.append(
-            Row(
-                f"shift of the angle by {', '.join(shifts)} (`{name}`, preset `{preset}`)",
-                ", ".join(f"{by:+.1f}°" for by in shifts.values()),
-                "1° each",
-                all(abs(by) <= 1.0 for by in shifts.values()),
-            )
-        )
-    return rows
-
-
-def simulation(task: Task) -> list[Row]:
-    """Seconds of one run."""
-    scene = plough(task.dry, task.preset)
-    took = repeated(lambda: scene.run(task.device), 2, task.device)
-    where = "one core" if task.device == "cpu" else task.device
-    return [Row(f"one simulation, {where}", f"{took.median:.1f} s", "20 s", took.median <= 20.0)]
-
-
-def angle(task: Task) -> list[Row]:
+def angle(task: Task) -> Section:
     """The commands that a user gives, for three seeds."""
     true = Truth.load(task.dry).values["friction_angle"]
-    # only a run that hasn't begun can be timed
+    # only a run that has not begun can be timed
     fresh = not (task.out / "runs" / f"{task.dry.name}-0").exists()
     options = ("run", "--stop-at-floor", "--seed")
     runs = [_fitted(task, task.dry, f"{task.dry.name}-{seed}", *options, str(seed)) for seed in FIT_SEEDS]
-    seconds, memory = runs[0].seconds, runs[0].memory
     angles = [run.fit["parameters"]["friction_angle"] for run in runs]
-    stds = sorted(found["std"] for found in angles)
-    estimates = ", ".join(f"{found['estimate']:.1f}" for found in angles)
+    stds, estimates = sorted(a["std"] for a in angles), ", ".join(f"{a['estimate']:.1f}" for a in angles)
     rows = [
         Row(
-            f"friction angle of `{task.dry.name}` from photographs and force (true {true:g}°), seeds "
-            f"{', '.join(map(str, FIT_SEEDS))}",
+            f"{task.dry.name} (true {true:g}°), seeds {', '.join(map(str, FIT_SEEDS))}",
             f"{estimates} ± {stds[0]:.1f} to {stds[-1]:.1f}°",
             "within 2°",
             all(abs(found["estimate"] - true) <= 2.0 for found in angles),
         )
     ]
     if fresh:
-        rows.append(
-            Row(
-                "all of it by `splatsoil run`, as `make demo` does after the set-up; its largest process",
-                f"{seconds / 60.0:.1f} min; {memory / 2**30:.1f} GiB",
-                "8 min; 2 GiB",
-                seconds <= 480.0 and memory <= 2**31,
-            )
-        )
-    return rows
+        seconds, memory = runs[0].seconds, runs[0].memory
+        what, met = "all of it by `splatsoil run`; its largest process", seconds <= 480.0 and memory <= 2**31
+        rows.append(Row(what, f"{seconds / 60.0:.1f} min; {memory / 2**30:.1f} GiB", "8 min; 2 GiB", met))
+    return Section("Friction angle", "From photographs and force.", tuple(rows))
 
 
-def missing_effect(task: Task) -> list[Row]:
-    """The damp set under the base model and with what it lacks, beside the renderer's floor."""
+def missing_effect(task: Task) -> Section:
+    """The damp set under the base model and with what it lacks, beside its true particles, drawn."""
     name = task.damp.name
     base = _fitted(task, task.damp, f"{name}-base", "fit").fit["loss"]
     added = _fitted(task, task.damp, f"{name}-{EFFECT}", "fit", "--with", EFFECT).fit["loss"]
-    truth = Truth.load(task.damp)
-    least = floor(truth, _reconstructed(task.damp, task.preset, task.device), task.device)[1].loss
-    return [
-        Row(
-            f"loss of `{name}`: base model, with {EFFECT}, true particles drawn",
-            f"{base:.3f}, {added:.3f}, {least:.3f}",
-            f"falls with {EFFECT}, towards the last",
-            added < base and base > 1.5 * least,
-        )
-    ]
+    least = floor(Truth.load(task.damp), _reconstructed(task.damp, task.preset, task.device), task.device)[1].loss
+    row = Row(
+        f"loss of {name}: base model, with {EFFECT}, true particles drawn",
+        f"{base:.3f}, {added:.3f}, {least:.3f}",
+        f"falls with {EFFECT}, towards the last",
+        added < base and base > 1.5 * least,
+    )
+    return Section("Missing effect", "", (row,))
 
 
-# A process is said to be as large as the one that it began as a copy of, so a small one begins the command.
+# A process is reported to be as large as the one that it began as a copy of, so a small one begins the command.
 _COUNTED = """
 import resource, subprocess, sys
 code = subprocess.run(sys.argv[1:], stdout=subprocess.DEVNULL).returncode
@@ -278,7 +214,7 @@ class Run:
 
 
 def _fitted(task: Task, folder: Path, name: str, command: str, *options: str) -> Run:
-    """A command in a process of its own; evaluations of a run that began before aren't repeated.
+    """A command in a process of its own; evaluations of a run that began before are not repeated.
 
     Raises:
         RunError: the command failed.
@@ -295,88 +231,24 @@ def _fitted(task: Task, folder: Path, name: str, command: str, *options: str) ->
     return Run(read_json(run / "fit.json"), time.monotonic() - began, memory)
 
 
-def table(rows: Sequence[Row]) -> str:
-    """Markdown."""
-    return "\n".join(["| | measured | aim |", "|---|---|---|", *(row.line() for row in rows)])
+PARTS = (reconstruction, renderer, angle, missing_effect)
+"""In the page's order."""
 
 
-def written(page: str, rows: Sequence[Row], made: Mapping[str, str]) -> str:
-    """A page with the table between its two lines.
-
-    Raises:
-        RunError: the page has no such lines.
-    """
-    told = f"On {str(made['made'])[:10]}: {machine.sentence(dict(made))}"
-    return between(page, BEGIN, END, f"{table(rows)}\n\n{told}")
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure the parts that are asked for, print the table, and write it into a page."""
-    parser = argparse.ArgumentParser(prog="splatsoil benchmark whole-path", description=__doc__)
+def main(arguments: list[str] | None = None) -> int:
+    """Measure the parts that are asked for, print their tables, and write them into a page."""
+    parser = parser_of(__doc__)
     parser.add_argument("--dry", type=Path, default=Path("examples/plow-dry"), help="set that the base model explains")
     parser.add_argument("--damp", type=Path, default=Path("examples/plow-damp"), help="set with cohesive soil")
     parser.add_argument("--preset", default="small", choices=sorted(PRESETS))
-    parser.add_argument("--seeds", type=at_least(1), default=2, help="of the particles, for heights and shifts")
-    parser.add_argument("--device", type=here, default="cpu")
-    parser.add_argument("--only", nargs="+", metavar="PART", help="parts to measure, again if need be; all by default")
-    parser.add_argument("--out", type=Path, default=Path("runs/whole-path"))
-    parser.add_argument("--page", type=Path, help="write the table into this page")
-    parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+    part_options(parser, "runs/whole-path")
     options = parser.parse_args(arguments)
     hush()
-    task = Task(options.dry, options.damp, options.preset, options.seeds, options.device, options.out)
-    known = parts(task)
-    unknown = sorted(set(options.only or ()) - set(known))
-    if unknown:
-        parser.error(f"part {unknown[0]!r} is not among {', '.join(known)}")
-    try:
-        with only_json() if options.json else nullcontext():
-            return _run(options, task)
-    except SplatsoilError as error:
-        parser.error(" ".join(str(error).split()))
-
-
-def _run(options: argparse.Namespace, task: Task) -> int:
-    check_folder(task.out)
-    here = machine.describe(task.device)
-    if options.page:
-        written(_page(options.page), (), here)  # a page without a place for the table fails now, not at the end
-    todo = parts(task)
-    kept = _kept(task, here, todo)
-    for name in options.only or [name for name in todo if name not in kept]:
-        began = time.monotonic()
-        rows = todo[name]()
-        entry = {"format": FORMAT, "machine": here, "preset": task.preset, "seeds": task.seeds}
-        seconds = time.monotonic() - began
-        write_json(task.out / f"{name}.json", {**entry, "seconds": seconds, "rows": [asdict(row) for row in rows]})
-        print(f"{name}: {seconds:.0f} s", file=sys.stderr, flush=True)
-    rows = [row for found in _kept(task, here, todo).values() for row in found]
-    if options.page:
-        write_text(options.page, written(_page(options.page), rows, here))
-    if options.json:
-        print_json({"ok": True, "machine": here, "rows": plain([asdict(row) for row in rows])})
-    else:
-        print(table(rows))
-    return 0
-
-
-def _page(file: Path) -> str:
-    try:
-        return file.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise RunError(f"{file}: cannot be read as text ({error})") from error
-
-
-def _kept(task: Task, here: Mapping[str, str], names: Iterable[str]) -> dict[str, list[Row]]:
-    """Rows by part of what this code measured on this machine, with these options."""
-    found = {}
-    for name in names:
-        file = task.out / f"{name}.json"
-        stored = read_json(file) if file.is_file() else {}
-        same = stored.get("format") == FORMAT and machine.same(stored["machine"], here)
-        if same and (stored["preset"], stored["seeds"]) == (task.preset, task.seeds):
-            found[name] = [Row(**row) for row in stored["rows"]]
-    return found
+    task = Task(options.dry, options.damp, options.preset, options.device, options.out)
+    sets = {name: Measurement.load(folder).hash for name, folder in (("dry", task.dry), ("damp", task.damp))}
+    key = {"code": sources([Path(__file__)]), "preset": task.preset, **sets}
+    parts = {part.__name__.replace("_", "-"): partial(part, task) for part in PARTS}
+    return run_parts(options, parts, lambda _: key, "whole path")
 
 
 if __name__ == "__main__":

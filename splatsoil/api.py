@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     import arviz
     import numpy as np
     import numpy.typing as npt
+    import xarray
 
     from splatsoil.measurement import Measurement, Remark
     from splatsoil.reconstruction import Reconstruction
@@ -118,6 +119,57 @@ class Run:
         import arviz
 
         return arviz.from_netcdf(str(file), engine="h5netcdf")
+
+    @property
+    def evaluations(self) -> xarray.Dataset:
+        """Simulations of the latest fit over ``step``: its parameters in their units, ``loss`` (NaN where one
+        failed), ``seed`` of the particles, and ``level`` of resolution ("full" or "coarse")."""
+        import xarray
+
+        fit = self.data.fit
+        records = fit["history"]
+        columns: dict[str, Any] = {name: [r["parameters"][name] for r in records] for name in fit["parameters"]}
+        columns["loss"] = _numbers(r["loss"] for r in records)
+        columns |= {key: [r[key] for r in records] for key in ("seed", "level")}
+        out = xarray.Dataset({n: ("step", v) for n, v in columns.items()}, {"step": [r["step"] for r in records]})
+        for name, parameter in fit["parameters"].items():
+            out[name].attrs["units"] = parameter["unit"]
+        return out
+
+    @property
+    def force(self) -> xarray.Dataset:
+        """Force on the tool around each compared frame: ``measured`` and ``predicted`` (channel, frame) in N, NaN where
+        it was not measured.
+
+        Raises:
+            RunError: the run has not been compared, or too little force was measured.
+        """
+        import xarray
+
+        comparison = self.data.comparison
+        record = None if comparison is None else comparison["force"]
+        if record is None:
+            raise RunError(f"{self.path}: there is no comparison with a measured force; compare() makes it")
+        coordinates = {"channel": [c["channel"] for c in record["channels"]], "frame": record["frames"]}
+        sides = ("measured", "predicted")
+        table = {k: (("channel", "frame"), [_numbers(c[k]) for c in record["channels"]]) for k in sides}
+        return xarray.Dataset(table, coordinates, {"units": record["unit"]})
+
+    @property
+    def surface(self) -> xarray.DataArray:
+        """Height (y, x) in m of the reconstructed soil surface before anything moves; coordinates in m.
+
+        Raises:
+            RunError: the folder holds no reconstruction.
+        """
+        import xarray
+
+        surface = self.data.surface
+        if surface is None:
+            raise RunError(f"{self.path}: holds no reconstruction; fit() makes one")
+        return xarray.DataArray(
+            surface.height, {"y": surface.y, "x": surface.x}, ("y", "x"), name="height", attrs={"units": "m"}
+        )
 
     def picture(
         self, camera: str, frame: int, kind: Literal["observed", "predicted", "difference"]
@@ -366,6 +418,10 @@ def _run(
 def _of(command: str, run: Run | PathLike, **options: Any) -> Run:
     _command(command, run=_path(run), **options)
     return Run(_path(run))
+
+
+def _numbers(column: Iterable[float | None]) -> list[float]:
+    return [float("nan") if value is None else value for value in column]
 
 
 def _path(run: Run | PathLike) -> Path:

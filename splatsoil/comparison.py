@@ -49,6 +49,9 @@ MARGIN = 0.02
 RISE = 0.5
 """How far heaps stand out from a crest behind which nothing of the bed is seen, as a share of the tool's width."""
 
+GAIN = 4.0
+"""Differences are shown this many times as strong as they are."""
+
 _FEWEST = 12
 """Pixels a block needs."""
 
@@ -243,6 +246,13 @@ class Comparator:
                 total = np.sum(frames, axis=0)
                 mask = self.interior[camera] & ~self.silhouettes[camera, self.reference]
                 yield camera, ([f - (total - f) / (len(frames) - 1) for f in frames], [mask] * len(frames))
+
+    def pictures(self, images: Mapping[Key, Image], camera: str, frame: int) -> dict[str, Image]:
+        """(h, w, 3) observed, predicted and their difference by these names; the difference is grey where equal, and
+        `GAIN` times as strong as it is."""
+        observed, predicted = self.observed[camera, frame], images[camera, frame]
+        difference = np.clip(0.5 + GAIN * (observed - predicted), 0.0, 1.0)
+        return {"observed": observed, "predicted": predicted, "difference": difference.astype(np.float32)}
 
     def outlines(self, camera: str) -> FloatArray:
         """(blocks, 4, 2) corners of each block on the undisturbed surface, in the undistorted picture of a camera, as

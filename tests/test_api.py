@@ -97,6 +97,42 @@ def test_a_run_is_what_its_files_say(tmp_path: Path) -> None:
     assert run.probabilities == {"": 0.9, "tilt": 0.1}
 
 
+def test_tables_are_xarray(tmp_path: Path) -> None:
+    fitted(tmp_path)
+    made = json.loads((tmp_path / "fit.json").read_text())
+    tried = [(34.0, 0.5, "full"), (36.0, None, "coarse")]
+    made["history"] = [
+        {
+            "step": k,
+            "parameters": {"friction_angle": angle},
+            "loss": loss,
+            "seed": 7 + k,
+            "level": level,
+            "status": "ok",
+        }
+        for k, (angle, loss, level) in enumerate(tried)
+    ]
+    write_json(tmp_path / "fit.json", made)
+    run = ss.open_run(tmp_path)
+    table = run.evaluations
+    assert table["friction_angle"].attrs == {"units": "deg"} and list(table["level"].values) == ["full", "coarse"]
+    assert float(table["loss"].sel(step=0)) == 0.5 and np.isnan(table["loss"].sel(step=1))
+    with pytest.raises(RunError, match=r"compare\(\)"):
+        _ = run.force
+    with pytest.raises(RunError, match=r"fit\(\)"):
+        _ = run.surface
+    channels = [{"channel": "push", "measured": [1.0, None], "predicted": [2.0, 3.0]}]
+    force = {"unit": "N", "frames": [10, 20], "channels": channels}
+    told = {"format": "splatsoil-comparison/1", "fit": "base", "parameters": {"friction_angle": 35.0}, "force": force}
+    write_json(tmp_path / "comparison" / "comparison.json", told)
+    pushed = run.force.sel(channel="push")
+    assert float(pushed["predicted"].sel(frame=20)) == 3.0 and np.isnan(pushed["measured"].sel(frame=20))
+    (tmp_path / "reconstruction").mkdir()
+    height = np.arange(6.0).reshape(2, 3)
+    np.savez(tmp_path / "reconstruction" / "surface.npz", x=[0.1, 0.2, 0.3], y=[0.5, 0.6], height=height)
+    assert float(run.surface.sel(x=0.2, y=0.6)) == 4.0
+
+
 def test_mistakes_are_one_sentence(tmp_path: Path, plow_dry: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(RunError, match=r"run\.json"):

@@ -134,6 +134,14 @@ def test_walls_and_ground_are_left_out(comparator, seen):
     assert comparator.compare(outside).rgb == 0.0
 
 
+def test_a_difference_is_grey_where_pictures_are_equal(comparator, seen):
+    shown = comparator.pictures(seen, "left", 100)
+    assert [picture.shape for picture in shown.values()] == [(240, 320, 3)] * 3
+    assert np.allclose(shown["difference"], 0.5)
+    brighter = comparator.pictures({key: image + 0.01 for key, image in seen.items()}, "left", 100)
+    assert np.allclose(brighter["difference"], 0.46, atol=1e-6)
+
+
 def test_the_same_pictures_give_the_same_bits(comparator, seen):
     images = {key: np.roll(image, 3, axis=1) for key, image in seen.items()}
     first, second = comparator.compare(images), comparator.compare(images)

@@ -1,16 +1,10 @@
-"""What a part of the validation reports, and the page made of all parts."""
+"""What a part of a benchmark reports, and the page of several parts."""
 
 from __future__ import annotations
 
-import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
-import warp as wp
-
-from splatsoil import __version__
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -21,15 +15,15 @@ class Row:
     """One comparison.
 
     Attributes:
-        case: what was computed.
-        found: the solver's number, with its unit.
-        expected: the reference's, and how near the two must be.
+        case: what was computed or measured.
+        found: the number, with its unit.
+        expected: the reference or the target, and how near the two must be.
         held: whether they are; None for a number that is only reported.
     """
 
     case: str
     found: str
-    expected: str
+    expected: str = ""
     held: bool | None = None
 
     @property
@@ -67,44 +61,23 @@ class Section:
         return cls(data["title"], data["before"], rows, data["after"])
 
 
-INTRODUCTION = """# Is the soil right?
-
-The soil law and the solver against exact answers, laboratories and real sand. A row *holds* when its number lies within
-what its third column allows: what was asked for where there is an exact answer and for the plates, our own estimate of
-a source's scatter, or of what a grid does, where there is a fit to experiments or a bound (columns, cuts, blades,
-incline). Negative controls show that each of these estimates can be missed. Rows that fail stay on the page, with the
-reason as far as it is known. A dash marks a number that is reported and not judged.
-"""
-
-
 def percent(found: float, expected: float) -> str:
     """Relative deviation, signed."""
     deviation = 100.0 * (found / expected - 1.0)
     return f"{deviation:+.2f} %" if abs(deviation) < 1.0 else f"{deviation:+.1f} %"
 
 
-def page(parts: Mapping[str, tuple[Section, bool]], command: str, device: str) -> str:
-    """Markdown of the whole page; each part with whether it has a picture ``validation-NAME.png``."""
-    sections = [section for section, _ in parts.values()]
-    judged = [row for section in sections for row in section.rows if row.held is not None]
-    failed = [(section, row) for section in sections for row in section.rows if row.held is False]
-    text = [INTRODUCTION]
-    text.append(
-        f"Made with `{command}` by splatsoil {__version__} (NumPy {np.__version__}, Warp {wp.__version__}, "
-        f"{platform.machine()}, {device}). {len(judged) - len(failed)} of {len(judged)} comparisons hold."
-    )
-    if failed:
-        text.append(
-            "What fails:\n\n" + "\n".join(f"- {s.title}: {r.case}: {r.found} ({r.expected})" for s, r in failed)
-        )
-    for name, (section, picture) in parts.items():
-        text.append(f"## {section.title}\n\n{section.before}")
-        text.append(table(section.rows))
-        if picture:
-            text.append(f"![{section.title}](validation-{name}.png)")
-        if section.after:
-            text.append(section.after)
-    return "\n\n".join(part.strip() for part in text) + "\n"
+def text(sections: Iterable[tuple[Section, str]]) -> str:
+    """Markdown of sections, each with its picture's file name or none: how many rows hold, which fail, tables."""
+    parts = list(sections)
+    judged = [(s, row) for s, _ in parts for row in s.rows if row.held is not None]
+    failed = [f"- {s.title}: {row.case}: {row.found} ({row.expected})" for s, row in judged if not row.held]
+    found = [f"{len(judged) - len(failed)} of {len(judged)} comparisons hold." + (" What fails:" if failed else "")]
+    found += ["\n".join(failed)]
+    for section, picture in parts:
+        found += [f"### {section.title}", section.before, table(section.rows)]
+        found += [f"![{section.title}]({picture})" if picture else "", section.after]
+    return "\n\n".join(part.strip() for part in found if part)
 
 
 def table(rows: Sequence[Row]) -> str:

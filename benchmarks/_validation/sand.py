@@ -1,160 +1,96 @@
-"""Part ``sand``: drained triaxial tests on Karlsruhe fine sand, loose and dense."""
+"""Part ``sand``: one sand through its triaxial tests, from some of them to the others, and what diagnoses say."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import csv
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
-from scipy.optimize import least_squares
 from splatsoil.benchmarks._validation.page import Row, Section
 from splatsoil.benchmarks._validation.scene import FloatArray
+from splatsoil.inverse.criticism.simulations import Simulations
 
-from splatsoil.errors import SimulationError
-from splatsoil.experiment.triaxial import Curve, TriaxialExperiment, read_triaxial
+from splatsoil.errors import MeasurementError
+from splatsoil.experiment.triaxial import Curve, TriaxialExperiment
+from splatsoil.laboratory.answer import diagnosed, search
+from splatsoil.laboratory.folder import read_curve, together
+from splatsoil.report.text import probability, verdict
+from splatsoil.soil.packing import at_void_ratio, of_limits
 
 CRITICAL = 33.1
-"""Published critical friction angle, degrees (Wichtmann & Triantafyllidis 2016)."""
-TESTS = {"loose (TMD2)": ("TMD2", 0.9753), "dense (TMD22)": ("TMD22", 0.7351)}
-MODELS: tuple[tuple[str, ...], ...] = ((), ("dilatancy",), ("dilatancy", "softening"))
-FAILED = 0.03
-"""Nominal axial strain from which on the sand flows."""
-LARGEST = 1.0
-"""Mean square of a channel's residuals, in spreads between specimens of one density, that a right model keeps to."""
+"""Published critical friction angle of Karlsruhe fine sand, degrees (Wichtmann & Triantafyllidis 2016)."""
+LIMITS = (0.677, 1.054)
+"""Its void ratios in index tests, densest and loosest, as published."""
+VOID_RATIOS = {"TMD2": 0.9753, "TMD22": 0.7351}
+CULLINAN = {"TX13": ("CD400", 4e5, 0.7734), "TX16": ("CD50", 5e4, 0.6757), "TX17": ("CD100", 1e5, 0.7018)}
+"""File, confining pressure in Pa and void ratio of the drained tests on Cullinan sand."""
+LADDER: tuple[tuple[str, ...], ...] = (
+    (),
+    ("critical_state",),
+    ("critical_state", "hardening"),
+    ("critical_state", "hardening", "pressure_dependence"),
+)
+"""Models, each with an effect more."""
+HUNDRED = {"pressure_reference": 1e5}
+"""The friction angle of a curved envelope is that at 100 kPa, Pa."""
 
 
-@dataclass(frozen=True)
-class Fit:
-    """Best parameters of a model, and mean squares of its residuals.
+def karlsruhe(folder: Path) -> dict[str, Curve]:
+    """The loose and the dense test, by name.
 
-    Attributes:
-        values: parameters by name.
-        strength: of q/p.
-        failed: of q/p from an axial strain of ``FAILED`` on.
-        volume: of volume strain.
-        predicted: features (t, 2).
+    Raises:
+        MeasurementError: the file is missing.
     """
+    file = folder / "karlsruhe_triaxial" / "tmd2_loose_tmd22_dense_subset.csv"
+    try:
+        with file.open(newline="", encoding="utf-8") as stream:
+            rows = list(csv.DictReader(stream))
+    except OSError as error:
+        raise MeasurementError(f"cannot be read ({error.strerror})", file=file) from error
+    out = {}
+    for name, void_ratio in VOID_RATIOS.items():
+        columns = ("eps_a[%]", "eps_v[%]", "sigma_r[kPa]", "sigma_v[kPa]")
+        table = np.array([[float(row[c]) for c in columns] for row in rows if row["test_id"] == name])[1:]
+        radial, axial = 1e3 * table[:, 2], 1e3 * table[:, 3]
+        ratio = (axial - radial) / ((axial + 2.0 * radial) / 3.0)
+        out[name] = Curve(name, table[:, 0] / 100.0, table[:, 1] / 100.0, ratio, 1e5, void_ratio=void_ratio)
+    return out
 
-    values: Mapping[str, float]
-    strength: float
-    failed: float
-    volume: float
-    predicted: FloatArray
 
+def cullinan(folder: Path) -> dict[str, Curve]:
+    """The drained tests, by name.
 
-def fit(experiment: TriaxialExperiment, since: float = 0.0) -> Fit:
-    """Least squares over all free parameters; stiffness is fitted on a logarithmic scale.
-
-    Args:
-        experiment: the test and the model.
-        since: nominal axial strain from which on readings count, also in the mean squares.
+    Raises:
+        MeasurementError: a file is missing or damaged.
     """
-    parameters = experiment.parameters
-    low = np.array([np.log(p.lower) if p.log else p.lower for p in parameters])
-    high = np.array([np.log(p.upper) if p.log else p.upper for p in parameters])
-
-    def values(unit: FloatArray) -> dict[str, float]:
-        theta = low + (high - low) * unit
-        return {p.name: float(np.exp(v) if p.log else v) for p, v in zip(parameters, theta, strict=True)}
-
-    counted = experiment.curve.strain >= since
-
-    def residuals(unit: FloatArray) -> FloatArray:
-        try:
-            return (experiment.predict(values(unit)) - experiment.observed)[counted].ravel()
-        except SimulationError:
-            return np.full(experiment.observed[counted].size, 1e3)
-
-    # several starts: softening and stiffness trade against each other
-    starts = [np.full(len(parameters), s) for s in (0.25, 0.4, 0.55)]
-    found = [least_squares(residuals, s, bounds=(0.0, 1.0), diff_step=1e-3) for s in starts]
-    best = min(found, key=lambda f: float(f.cost))
-    predicted = experiment.predict(values(best.x))
-    square = np.mean((predicted - experiment.observed)[counted] ** 2, axis=0)
-    late = experiment.curve.strain >= max(FAILED, since)
-    failed = float(np.mean((predicted - experiment.observed)[late, 0] ** 2))
-    return Fit(values(best.x), float(square[0]), failed, float(square[1]), predicted)
+    curves = [
+        read_curve(folder / "cullinan_sand" / f"triaxial_{name}_{what}.csv", pressure, void_ratio)
+        for name, (what, pressure, void_ratio) in CULLINAN.items()
+    ]
+    return dict(zip(CULLINAN, together(curves), strict=True))
 
 
-def validate(folder: Path) -> Section:
-    """Fit every model to both tests."""
-    curves = read_triaxial(folder / "karlsruhe_triaxial" / "tmd2_loose_tmd22_dense_subset.csv")
-    rows: list[Row] = []
-    figure = Figure(figsize=(11, 3.2), layout="constrained")
-    panels = figure.subplots(1, 4)
-    for k, (name, (test, void_ratio)) in enumerate(TESTS.items()):
-        fits = {}
-        for effects in MODELS:
-            experiment = TriaxialExperiment(curves[test], effects, void_ratio=void_ratio)
-            fits[effects] = fit(experiment)
-            rows += _rows(name, effects, fits[effects])
-            strain = 100.0 * curves[test].strain
-            for c, title in enumerate(("q/p, spreads", "volume strain, spreads")):
-                axes = panels[2 * k + c]
-                if not effects:
-                    axes.plot(strain, experiment.observed[:, c], "k.", markersize=4, label="measured")
-                    axes.set(title=f"{name}: {title}", xlabel="axial strain, %")
-                    axes.title.set_fontsize(7)
-                axes.plot(strain, fits[effects].predicted[:, c], label=" + ".join(("base", *effects)))
-        best = fits[MODELS[-1] if "dense" in name else ()]
-        rows.append(
-            Row(
-                f"{name}: q/p of the right model, whole curve; strains ≥ 3 %",
-                f"{best.strength:.2f}; {best.failed:.2f}",
-                "each ≤ 1",
-                max(best.strength, best.failed) <= LARGEST,
-            )
-        )
-        base, full = fits[MODELS[0]], fits[MODELS[-1]]
-        if "dense" in name:
-            # where the base law fails must be the volume, and each effect must earn its place
-            where = base.volume / (base.volume + base.strength)
-            rows.append(
-                Row(
-                    f"{name}: where the base law is rejected",
-                    f"{100 * where:.0f} % of its misfit is volume change",
-                    "> 50 %, and volume misfit > 1",
-                    where > 0.5 and base.volume > LARGEST,
-                )
-            )
-            errors = [fits[m].strength + fits[m].volume for m in MODELS]
-            rows.append(
-                Row(
-                    f"{name}: misfit, base → dilatancy → softening too",
-                    " → ".join(f"{e:.2f}" for e in errors),
-                    "falls each time",
-                    bool(np.all(np.diff(errors) < 0.0)),
-                )
-            )
-            rows += _softened(name, curves[test], void_ratio, full)
-            # the law's dilation decays from its start, the published angle is the largest secant
-            psi = fits[MODELS[1]].values["dilatancy_angle"]
-            rows.append(
-                Row(f"{name}: ψ at the start", f"{psi:.1f}°", "16.7° largest measured ± 5°", abs(psi - 16.7) <= 5.0)
-            )
-        else:
-            rows.append(_critical(f"{name}: φ of the base law", base.values["friction_angle"]))
-    panels[0].legend(fontsize=6)
-    return Section(
-        "Real sand: triaxial tests",
-        "Drained tests at 100 kPa on Karlsruhe fine sand (Wichtmann & Triantafyllidis 2016; compiled by H. Wang, "
-        "4TU.ResearchData, CC BY 4.0): loose (relative density 21 %) and dense (85 %). Misfits are mean squares "
-        "in units of "
-        "what specimens of one density differ by (q/p: 0.04, volume strain: 0.005); 1 is as good as another "
-        "specimen. The "
-        "elastic stiffness is fitted too.",
-        tuple(rows),
-        "The base law is right for the loose specimen's volume and its angle, and is rejected by the dense one "
-        "where it must be: in volume. Dilatancy takes that misfit away, softening the fall after the peak. q/p fails "
-        "over the whole curve in every model, because stiffness is constant here and falls with strain in sand, and no "
-        f"effect of the library hardens: the loose sand mobilises {_mobilised(curves['TMD2'])}. "
-        "The angle that softening leaves in the dense sand fails for the same reason: over the whole curve the fit "
-        "trades the rise before the peak for the fall after it. From the peak on, where softening has its meaning, "
-        "model and sand agree. Under a tool, where strains are large, the rise is short.",
-        figure,
-    )
+def calibrated(
+    curves: Sequence[Curve], effects: tuple[str, ...], known: Mapping[str, float] | None = None
+) -> dict[str, float]:
+    """All parameters of a model, those of least squares and those known, at the first curve's void ratio."""
+    experiment = TriaxialExperiment(curves, effects, candidates=(), known=known)
+    values, _ = search(experiment, Simulations(experiment), 0, lambda what, share: None)
+    return experiment.values(values)
+
+
+def predicted(curve: Curve, effects: tuple[str, ...], values: Mapping[str, float], before: float) -> FloatArray:
+    """(t, 2) q/p and volume strain in spreads between specimens, by parameters at another void ratio."""
+    experiment = TriaxialExperiment(curve, effects, candidates=())
+    return experiment.predict(at_void_ratio(values, before, curve.void_ratio))
+
+
+def misfit(curve: Curve, table: FloatArray) -> FloatArray:
+    """(2,) root mean squares of q/p and volume strain, in spreads between specimens."""
+    observed = TriaxialExperiment(curve, candidates=()).observed
+    return np.asarray(np.sqrt(np.mean((table - observed) ** 2, axis=0)))
 
 
 def mobilised(curve: Curve) -> FloatArray:
@@ -162,43 +98,93 @@ def mobilised(curve: Curve) -> FloatArray:
     return np.degrees(np.arcsin(3.0 * curve.ratio / (6.0 + curve.ratio)))
 
 
-def _mobilised(curve: Curve) -> str:
-    """Angles on the way, in words."""
-    strains = (0.02, 0.05, 0.10, float(curve.strain[-1]))
-    angles = np.interp(strains, curve.strain, mobilised(curve))
-    return ", ".join(f"{a:.1f}° at {100 * s:.0f} %" for a, s in zip(angles, strains, strict=True))
+def from_one_to_another(
+    name: str,
+    curves: Mapping[str, Curve],
+    fit: Sequence[str],
+    ladder: Sequence[tuple[str, ...]],
+    known: Mapping[str, float],
+) -> tuple[list[Row], dict[tuple[str, str], FloatArray]]:
+    """Rows of a ladder of models, fitted on some tests and held against the others; predictions by model and test."""
+    rows, tables, errors = [], {}, []
+    first = curves[fit[0]]
+    others = [test for test in curves if test not in fit]
+    for effects in ladder:
+        values = calibrated([curves[test] for test in fit], effects, known)
+        model = " + ".join(("base", *effects))
+        found = {}
+        for test in others:
+            tables[model, test] = predicted(curves[test], effects, values, first.void_ratio)
+            found[test] = misfit(curves[test], tables[model, test])
+        errors.append(float(np.mean([np.sum(f**2) for f in found.values()])))
+        text = "; ".join(f"{test} q/p {f[0]:.1f}, volume {f[1]:.1f}" for test, f in found.items())
+        better = None if len(errors) == 1 else errors[-1] < errors[-2]
+        told = "reported" if better is None else "less than without the last effect"
+        rows.append(Row(f"{name}: {model}; φ = {values['friction_angle']:.1f}°", text, told, better))
+    return rows, tables
 
 
-def _softened(name: str, curve: Curve, void_ratio: float, whole: Fit) -> list[Row]:
-    """Peak and residual angle of the model with softening: of the whole curve, and of what comes after the peak."""
-    measured = mobilised(curve)
-    peak, since = float(measured.max()), float(curve.strain[np.argmax(measured)])
-    after = fit(TriaxialExperiment(curve, MODELS[-1], void_ratio=void_ratio), since)
-    found = whole.values["friction_angle"] + whole.values["softening_angle"]
-    wanted = f"{peak:.1f}° (measured peak) ± 2°"
-    where = f"{name}, readings from the peak (strain {100 * since:.0f} %) on"
-    return [
-        Row(f"{name}: φ before softening", f"{found:.1f}°", wanted, abs(found - peak) <= 2.0),
-        _critical(f"{name}: φ that softening leaves, whole curve", whole.values["friction_angle"]),
-        Row(
-            f"{where}: q/p; volume",
-            f"{after.strength:.2f}; {after.volume:.2f}",
-            "each ≤ 1",
-            max(after.strength, after.volume) <= LARGEST,
-        ),
-        _critical(f"{where}: φ that softening leaves", after.values["friction_angle"]),
-    ]
-
-
-def _critical(case: str, angle: float) -> Row:
-    return Row(case, f"{angle:.1f}°", f"{CRITICAL}° ± 2° (critical, published)", abs(angle - CRITICAL) <= 2.0)
-
-
-def _rows(name: str, effects: tuple[str, ...], found: Fit) -> list[Row]:
+def told(name: str, curves: Curve | Sequence[Curve], effects: tuple[str, ...]) -> Row:
+    """What a diagnosis says of a model."""
+    experiment = TriaxialExperiment(curves, effects)
+    found = diagnosed(experiment, None, 0, lambda what, share: None)
+    likely = [m for m in found["models"] if m["name"] and m["kind"] != "discrepancy"][:2]
+    shares = ", ".join(f"{m['name']} {probability(m['probability'])}" for m in likely)
+    angle = found["estimates"]["friction_angle"]
     model = " + ".join(("base", *effects))
-    values = ", ".join(f"{n} {v:.3g}" for n, v in found.values.items())
-    expected = f"volume ≤ {LARGEST:g}" if effects or "loose" in name else f"volume > {LARGEST:g}: rejected"
-    fits = found.volume <= LARGEST
-    held = fits if effects or "loose" in name else not fits
-    text = f"q/p {found.strength:.2f}, volume {found.volume:.2f}; {values}"
-    return [Row(f"{name}: {model}", text, expected, held)]
+    text = f"{verdict(found)} Most probable: {shares}. φ = {angle['value']:.1f} ± {angle['std']:.1f}°"
+    return Row(f"{name}: diagnosis of {model}", text, "reported")
+
+
+def validate(folder: Path) -> Section:
+    """Every way from some tests to others."""
+    sand, other = karlsruhe(folder), cullinan(folder)
+    rows: list[Row] = []
+    shown: dict[tuple[str, str], FloatArray] = {}
+    for way, test in (("loose → dense", "TMD2"), ("dense → loose", "TMD22")):
+        known = of_limits(sand[test].void_ratio, *LIMITS)
+        more, tables = from_one_to_another(f"Karlsruhe, {way}", sand, [test], LADDER[:3], known)
+        rows += more
+        shown |= tables
+    for test in other:
+        fit = [name for name in other if name != test]
+        more, tables = from_one_to_another(f"Cullinan, {' and '.join(fit)} → {test}", other, fit, LADDER, HUNDRED)
+        rows += more
+        shown |= tables
+    for effects in LADDER[:3]:
+        rows.append(told("Karlsruhe, dense", sand["TMD22"], effects))
+    for effects in LADDER:
+        rows.append(told("Cullinan, all three", list(other.values()), effects))
+    try:
+        read_curve(folder / "cullinan_sand" / "triaxial_TX4_CU100.csv", 1e5)
+    except MeasurementError as error:
+        rows.append(Row("Cullinan, TX4", str(error).split(": ", 1)[-1], "undrained: refused", True))
+    return Section(
+        "Triaxial tests",
+        "Misfits are root mean squares in units of what specimens of one density differ by (q/p: 0.04, volume strain: "
+        "0.005); 1 is as good as another specimen. Karlsruhe fine sand (Wichtmann & Triantafyllidis 2016; compiled by "
+        "H. Wang, 4TU.ResearchData, CC BY 4.0): TMD2 loose, TMD22 dense, 100 kPa; its relative density follows from "
+        "published void ratio limits, and its published critical angle is 33.1°. Cullinan sand (Kruger, Els & "
+        "Hamersma 2023, CC BY 4.0): TX13 loose at 400 kPa, TX16 and TX17 dense at 50 and 100 kPa; its limits are not "
+        "told, so relative density and volume range are fitted. Tests right of an arrow are predicted.",
+        tuple(rows),
+        figure=_figure(sand | other, shown),
+    )
+
+
+def _figure(curves: Mapping[str, Curve], shown: Mapping[tuple[str, str], FloatArray]) -> Figure:
+    tests = list(dict.fromkeys(test for _, test in shown))
+    figure = Figure(figsize=(2.6 * len(tests), 4.6), layout="constrained")
+    panels = figure.subplots(2, len(tests))
+    for k, test in enumerate(tests):
+        observed = TriaxialExperiment(curves[test], candidates=()).observed
+        strain = 100.0 * curves[test].strain
+        for c, title in enumerate(("q/p", "volume strain")):
+            axes = panels[c, k]
+            axes.plot(strain, observed[:, c], "k.", markersize=4, label="measured")
+            for (model, name), table in shown.items():
+                if name == test:
+                    axes.plot(strain, table[:, c], label=model)
+            axes.set_title(f"{test}: {title}, spreads", fontsize=7)
+    panels[0, 0].legend(fontsize=5)
+    return figure

@@ -70,7 +70,7 @@ def needs(measurement: Measurement, preset: str, device: str, simulations: int, 
     from splatsoil.reconstruction.presets import preset_named
 
     resolution = Resolution.derive(measurement, preset)
-    count = particles or int(measurement.bed.extents.prod() / resolution.spacing**3)
+    count = particles or int(measurement.bed.domain.extents.prod() / resolution.spacing**3)
     side = preset_named(preset).longest_side
     views = [_pixels(f.camera.width, f.camera.height, side) for f in measurement.views]
     video = sum(f.camera.width * f.camera.height for f in measurement.video)

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
 #: Share of a fit's time that is its search.
 SEARCH = 0.5
-#: Differences are shown this many times as strong as they are.
-GAIN = 4.0
 #: Evaluations of a fit that are chosen and simulated together: as many cores as a small laptop has.
 TOGETHER = 2
 
@@ -180,7 +178,7 @@ def run_fit(
 def draw_comparison(run: RunFolder, model: Model, report: Report) -> dict[str, Any]:
     """Simulate at the latest fit's estimate, and keep pictures and losses of every frame in ``comparison/``."""
     from splatsoil import __version__
-    from splatsoil.comparison import Comparator
+    from splatsoil.comparison import GAIN, Comparator
     from splatsoil.envs.measured import LOSS
     from splatsoil.experiment.forces import force_record
     from splatsoil.files import write_json
@@ -197,8 +195,7 @@ def draw_comparison(run: RunFolder, model: Model, report: Report) -> dict[str, A
         report("writing pictures", 0.95)
         frames = []
         for camera, frame in comparator.keys:
-            observed, predicted = comparator.observed[camera, frame], prediction.images[camera, frame]
-            pictures = {"observed": observed, "predicted": predicted, "difference": 0.5 + GAIN * (observed - predicted)}
+            pictures = comparator.pictures(prediction.images, camera, frame)
             names = {kind: f"{camera}_{frame:04d}_{kind}.jpg" for kind in pictures}
             for kind, picture in pictures.items():
                 write_jpeg(run.comparison / names[kind], picture)

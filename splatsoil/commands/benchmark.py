@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
-import runpy
 import sys
 from dataclasses import dataclass
 
@@ -50,19 +49,15 @@ def run(config: Config) -> int:
 
 
 def _execute(name: str, module: str, arguments: tuple[str, ...]) -> int:
-    """A module's ``main`` (or all of it, as ``python -m`` would) with these arguments; its exit code."""
+    """A module's ``main`` with these arguments; its exit code."""
     before = sys.argv
     sys.argv = [f"splatsoil benchmark {name}", *arguments]
     try:
-        main = getattr(importlib.import_module(module), "main", None)
-        if main is not None:
-            return int(main(list(arguments)))
-        runpy.run_module(module, run_name="__main__")
+        return int(importlib.import_module(module).main(list(arguments)))
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else int(end.code is not None)
     finally:
         sys.argv = before
-    return 0
 
 
 def _title(module: str) -> str:

@@ -8,6 +8,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from splatsoil.commands import _laboratory
 from splatsoil.commands._options import SET
 from splatsoil.commands._output import print_json, print_table, print_text
 from splatsoil.options import JSON, argument, option
@@ -30,6 +31,8 @@ def run(config: Config) -> int:
     """Print the table or the object; MeasurementError when the set breaks the format's rules."""
     from splatsoil.measurement import Measurement, remarks
 
+    if _laboratory.is_test(config.set):
+        return _laboratory.check(config.set, quiet=config.json)
     measurement = Measurement.load(config.set)
     found = remarks(measurement)
     if config.json:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from splatsoil.commands import _folder, _model, _stages
+from splatsoil.commands import _folder, _laboratory, _model, _stages
 from splatsoil.commands._options import DEVICE, RunOptions
 from splatsoil.commands._output import print_json, print_notes, print_table, print_text
 from splatsoil.errors import NoAnswer
@@ -36,6 +36,8 @@ def run(config: Config) -> int:
     from splatsoil.files import plain
     from splatsoil.soil.library import find_effects
 
+    if _laboratory.is_run(config.run) or _laboratory.is_test(config.run):
+        return _laboratory.diagnose(config.run, config.effects, config.device, config.set, quiet=config.json)
     folder = _folder.opened(config)
     fit = _folder.latest_fit(folder)
     none = _folder.no_answer(fit)

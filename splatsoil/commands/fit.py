@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from splatsoil.commands import _folder, _model, _stages
+from splatsoil.commands import _folder, _laboratory, _model, _stages
 from splatsoil.commands._options import FitOptions, command_line
 from splatsoil.commands._output import print_json, print_notes, print_table, print_text, stages
 
@@ -27,6 +27,8 @@ def run(config: Config) -> int:
     from splatsoil.envs.devices import resolve_device
     from splatsoil.quiet import hush
 
+    if _laboratory.is_test(config.set):
+        return _laboratory.fit(config)
     hush()
     measurement, folder = _stages.prepare(config)
     device = resolve_device(config.device)

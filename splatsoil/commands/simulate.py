@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from splatsoil.commands import _laboratory
 from splatsoil.commands._options import Preset
 from splatsoil.commands._output import print_json, print_table
 from splatsoil.errors import ParameterError
@@ -32,13 +33,17 @@ class Config:
     friction_angle: float = option(35.0, "Of the sand, degrees.")
     effects: tuple[str, ...] = option((), ACTING, name="with", metavar="EFFECT")
     values: tuple[str, ...] = option((), VALUES, name="set", metavar="NAME=VALUE")
-    scene: Literal["plow", "paper"] = option(
+    scene: Literal["plow", "paper", "triaxial", "shear_box", "plate", "repose", "column"] = option(
         "plow",
-        "plow: a plate of 12 cm in a bed of 0.8 x 0.5 m; paper: Hsiao and Kumar's cube of 1 m, pictures of 1280 x 720.",
+        "plow: a plate of 12 cm in a bed of 0.8 x 0.5 m; paper: Hsiao and Kumar's cube of 1 m, pictures of 1280 x 720; "
+        "the others: a laboratory's test, without cameras.",
         expert=True,
     )
     like: Path | None = option(
         None, "Take bed, tool, motion and cameras from this set instead of a scene.", expert=True
+    )
+    container: Literal["bin", "transparent", "open", "heap"] | None = option(
+        None, "What holds the soil of the scene plow; a bin of opaque walls if not given.", expert=True
     )
     depth: float | None = option(
         None, "Mean depth of the soil in metres (not for the paper's scene, whose surface is a formula).", expert=True
@@ -62,6 +67,12 @@ def run(config: Config) -> int:
     from splatsoil.synthetic.world import check_place
 
     values = parse_values(config.values)
+    if config.scene not in ("plow", "paper"):
+        known = {"friction_angle": config.friction_angle, **values}
+        preset = config.preset or "small"
+        return _laboratory.simulate(
+            config.scene, config.out, known, config.effects, preset, config.seed, quiet=config.json
+        )
     hush()
     check_place(config.out)
     setup = choose_setup(config)
@@ -108,7 +119,7 @@ def parse_values(words: Sequence[str]) -> dict[str, float]:
 
 def choose_setup(config: Config) -> Setup:
     """The scene that the options describe."""
-    from splatsoil.measurement import Measurement
+    from splatsoil.measurement import BIN, Measurement
     from splatsoil.synthetic import like, paper, plow
     from splatsoil.synthetic.setups import VIEWS
 
@@ -118,13 +129,15 @@ def choose_setup(config: Config) -> Setup:
         raise ParameterError(f"--seed {config.seed}: seeds are whole numbers from 0 on")
     if config.scene == "paper" and (config.like is not None or config.depth is not None):
         raise ParameterError("--scene paper is a scene of its own; leave --like and --depth out")
+    if config.container is not None and (config.scene == "paper" or config.like is not None):
+        raise ParameterError("--container is for the scene plow; leave --scene paper and --like out")
     views = config.views or VIEWS
     if config.like is not None:
         setup = like(Measurement.load(config.like), config.seed, views=config.views, depth=config.depth)
     elif config.scene == "paper":
         setup = paper(views=views)
     else:
-        setup = plow(config.seed, views=views, depth=config.depth)
+        setup = plow(config.seed, views=views, depth=config.depth, container=config.container or BIN)
     return setup if config.picture_scale == 1.0 else setup.resized(config.picture_scale)
 
 

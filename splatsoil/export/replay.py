@@ -82,7 +82,7 @@ def replay(
         ParameterError: unknown names or values out of bounds.
     """
     measurement, resolution = model.measurement, model.resolution
-    bed, motion = measurement.bed, measurement.tool.motion
+    bed, motion = measurement.bed.domain, measurement.tool.motion
     start = model.particles(seed).astype(np.float32)
     settings = base_settings(measurement)
     solver = Solver(
@@ -113,7 +113,7 @@ def replay(
 
 
 def _moment(model: Model, solver: Solver, frame: int, start: Floats) -> Moment:
-    bed, time = model.measurement.bed, frame * model.resolution.frame_time
+    bed, time = model.measurement.bed.domain, frame * model.resolution.frame_time
     positions = solver.positions()[0]
     strains = solver.plastic_strains()
     # Soil's surface is seen, not simulated: the processor does.

@@ -7,15 +7,20 @@ from splatsoil.measurement.blender import read_blender
 from splatsoil.measurement.camera import CAMERA_MODELS, Camera
 from splatsoil.measurement.colmap import read_colmap
 from splatsoil.measurement.frames import Frame
-from splatsoil.measurement.measurement import FORMAT, Bed, Measurement
+from splatsoil.measurement.measurement import BIN, CONTAINERS, FORMAT, HEAP, OPEN, TRANSPARENT, Bed, Measurement
 from splatsoil.measurement.motion import ToolMotion
 from splatsoil.measurement.remarks import Remark, remarks
 from splatsoil.measurement.tool import Tool
 from splatsoil.measurement.writer import Picture, write_measurement
 
 __all__ = [
+    "BIN",
     "CAMERA_MODELS",
+    "CONTAINERS",
     "FORMAT",
+    "HEAP",
+    "OPEN",
+    "TRANSPARENT",
     "Bed",
     "Camera",
     "Frame",

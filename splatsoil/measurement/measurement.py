@@ -24,7 +24,9 @@ FloatArray = npt.NDArray[np.float64]
 FORMAT = "splatsoil-measurement/1"
 EXPERIMENT = "experiment.json"
 FIELDS = ("format", "name", "up", "gravity", "frame_rate", "bed", "tool", "views", "video")
-BED_FIELDS = ("lower", "upper", "density", "wall_friction", "floor_friction")
+BED_FIELDS = ("lower", "upper", "density", "container", "wall_friction", "floor_friction")
+BIN, TRANSPARENT, OPEN, HEAP = "bin", "transparent", "open", "heap"
+CONTAINERS = (BIN, TRANSPARENT, OPEN, HEAP)
 TOOL_FIELDS = ("mesh", "motion", "force", "friction")
 
 # What a laboratory or a field could hold; beyond it a unit is wrong (millimetres, g/cm³).
@@ -34,6 +36,7 @@ _DENSITIES = (100.0, 20_000.0)
 _GRAVITIES = (1e-3, 300.0)
 _FAR_CAMERA = 100.0  # in diagonals of the bed
 _OTHER_UNIT = math.sqrt(1000.0)  # half-way between metres and millimetres
+_AROUND = 0.2  # of the bed's narrower side: how much beyond it is simulated where nothing stands at its sides
 _SLACK = 0.1  # of the bed: what its floor and walls, which the tool can't pass, may be off by
 _SMALL_TOOL = 1e5  # cubes of the tool's width in the bed; cells are a fraction of it, and no memory holds as many
 _FASTEST_TOOL = 100.0  # m/s, the speed of sound in loose soil: nothing is pushed through it faster
@@ -49,6 +52,9 @@ class Bed:
         density: bulk density in kg/m³.
         wall_friction: Coulomb coefficient at the box's sides.
         floor_friction: Coulomb coefficient at its floor.
+        container: what holds the soil, one of ``CONTAINERS``: a bin of opaque walls, transparent walls, nothing because
+            soil goes on beyond the box (``open``), or nothing because it lies on a floor as a heap. None if it is not
+            said: a bin, unless photographs show soil at its sides.
     """
 
     lower: FloatArray
@@ -56,6 +62,7 @@ class Bed:
     density: float
     wall_friction: float = 0.0
     floor_friction: float = 0.6
+    container: str | None = None
 
     def __post_init__(self) -> None:
         for name in ("lower", "upper"):
@@ -67,6 +74,15 @@ class Bed:
     def extents(self) -> FloatArray:
         """Lengths (3,) of the box's edges in metres."""
         return self.upper - self.lower
+
+    @property
+    def domain(self) -> Bed:
+        """What of the world is simulated: the box, or where nothing stands at its sides, more around it for soil to go
+        on or to run out to."""
+        if self.container not in (OPEN, HEAP):
+            return self
+        margin = _AROUND * float(self.extents[:2].min()) * np.array([1.0, 1.0, 0.0])
+        return replace(self, lower=self.lower - margin, upper=self.upper + margin)
 
     @property
     def corners(self) -> FloatArray:
@@ -216,7 +232,17 @@ def _read_bed(fields: Fields, assumed: dict[str, float]) -> Bed:
         density=fields.number("density", *_DENSITIES, hint="it is the bulk density in kg/m³"),
         wall_friction=_read_friction(fields, "wall_friction", 0.0, assumed),
         floor_friction=_read_friction(fields, "floor_friction", 0.6, assumed),
+        container=_read_container(fields),
     )
+
+
+def _read_container(fields: Fields) -> str | None:
+    if not fields.has("container"):
+        return None
+    container = fields.text("container")
+    if container not in CONTAINERS:
+        fields.fail("container", f"{container[:40]!r} is unknown; known are {', '.join(CONTAINERS)}")
+    return container
 
 
 def _read_friction(fields: Fields, key: str, default: float, assumed: dict[str, float]) -> float:

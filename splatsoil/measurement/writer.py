@@ -97,6 +97,7 @@ def write_measurement(
                 "density": bed.density,
                 "wall_friction": bed.wall_friction,
                 "floor_friction": bed.floor_friction,
+                **({} if bed.container is None else {"container": bed.container}),
             },
             "tool": {
                 "mesh": "tool.stl",

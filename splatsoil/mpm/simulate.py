@@ -143,7 +143,7 @@ def simulate(
         x = np.broadcast_to(x, (len(batch), *x.shape))
     resolution = resolution or Resolution.derive(measurement, preset)
     law = law or Law()
-    bed = measurement.bed
+    bed = measurement.bed.domain
     solver = Solver(
         x, bed.lower, bed.upper, measurement.tool.mesh, resolution, law, base_settings(measurement), batch, device
     )

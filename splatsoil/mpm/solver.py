@@ -186,7 +186,7 @@ class Solver:
         c = Cells()
         c.slot, c.node, c.count = ints(count), ints(most), ints(1)
         c.volume, c.elastic, c.opening = floats(most), floats(most), floats(most)
-        c.normal, c.shear, c.middle, c.spread = (vectors(most) for _ in range(4))
+        c.normal, c.shear = (vectors(most) for _ in range(2))
         c.gradient = vectors(8 * most)
         kept = most if self.law.history else 0
         c.history, c.depth = wp.zeros(kept, dtype=wp.vec2, device=device), floats(kept)
@@ -280,7 +280,12 @@ class Solver:
         cells = self._size(c.count, cell_count)
         wp.launch(number_cells, dim=cells, inputs=[c], device=device)
         wp.launch(particles_to_grid, dim=n, inputs=[p, c, g, grid], device=device)
-        wp.launch(average_cells, dim=cells, inputs=[c, g, grid, INERTIA_MARGIN * modulus * dt * dt], device=device)
+        wp.launch(
+            average_cells,
+            dim=cells,
+            inputs=[p, c, g, grid, r.density, INERTIA_MARGIN * modulus * dt * dt],
+            device=device,
+        )
         wp.launch(momentum_to_velocity, dim=node_count, inputs=[g], device=device)
         nodes = self._size(g.count, node_count)
         viscosity = BULK_VISCOSITY * r.density * r.wave_speed * r.cell

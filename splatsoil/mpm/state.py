@@ -32,7 +32,7 @@ class Particles:
             it isn't loaded, where the tool started in the soil.
         grip: tangential displacement that the contact's friction holds, m.
         per_simulation: particles of one simulation.
-        volume: initial volume of a particle, m^3.
+        volume: of a particle, m^3.
         mass: kg, of a particle of nominal density.
     """
 
@@ -91,9 +91,7 @@ class Cells:
         slot: entry among the active cells for every cell of the batch, -1 where empty (indexed by lowest node).
         node: lowest node of each active cell.
         count: how many are active.
-        volume: soil in the cell, m^3; of a cell that counts as full its own.
-        middle: of its soil, in local coordinates; times ``volume`` until all of it is counted, like ``spread``.
-        spread: mean products yz, xz and xy of these.
+        volume: soil in the cell, m^3; the number of its particles until all are counted.
         gradient: mean gradient of the eight corners' weights over the cell's soil, 1/m; entry 8 * cell + corner.
         normal: deviatoric stress, diagonal, Pa.
         shear: deviatoric stress, off-diagonal, Pa.
@@ -107,8 +105,6 @@ class Cells:
     node: wp.array(dtype=int)
     count: wp.array(dtype=int)
     volume: wp.array(dtype=float)
-    middle: wp.array(dtype=wp.vec3)
-    spread: wp.array(dtype=wp.vec3)
     gradient: wp.array(dtype=wp.vec3)
     normal: wp.array(dtype=wp.vec3)
     shear: wp.array(dtype=wp.vec3)

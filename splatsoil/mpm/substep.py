@@ -68,6 +68,12 @@ def make_stress_kernel(update: Any, history: bool) -> Any:
                 stress.dilated = cells.history[entry][1]
                 stress.depth = cells.depth[entry]
             stress = update(stress, gradient, stiffness * bulk, stiffness * shear, dt, values, row)
+            if cells.volume[entry] == 0.0:
+                # loose grains bear nothing, and must close up before they do
+                stress.normal = wp.vec3()
+                stress.shear = wp.vec3()
+                stress.opening = wp.max(stress.opening + stress.elastic, 0.0)
+                stress.elastic = 0.0
             if wp.static(history):
                 cells.history[entry] = wp.vec2(stress.plastic_strain, stress.dilated)
             cells.normal[entry] = stress.normal

@@ -21,16 +21,15 @@ from splatsoil.mpm.tool import FAR, Tool, distance_normal, signed_distance, tool
 
 wp.set_module_options(OPTIONS)
 
+vec8 = wp.types.vector(length=8, dtype=float)
+
 RUNAWAY = wp.constant(1.0e3)
 """Most that the visual deformation's norm comes to between two frames."""
 AFFINE_SHARE = 7.0 / 16.0
 """Of a bilinear mode, what affine fields of eight particles in a cell carry over an exchange."""
 HOURGLASS_DAMPING = (1.0 - AFFINE_SHARE) / (1.0 + AFFINE_SHARE)
-HOLLOW = wp.constant(0.7)
-"""Of a cell's volume: with so little soil and less it counts as it is. One in twenty of the cells within soil that a
-blade has sheared holds less."""
-FULL = wp.constant(0.9)
-"""Of a cell's volume: with so much soil and more it counts as full."""
+SUBCELLS = wp.constant(4)
+"""Along a cell's edge: pieces of which each counts as soil by its middle."""
 
 
 def hourglass_share(exchanges: float) -> float:
@@ -76,13 +75,11 @@ def number_cells(cells: Cells) -> None:
         if entry < cells.history.shape[0]:
             cells.history[entry] = wp.vec2(0.0)
             cells.depth[entry] = 0.0
-        cells.middle[entry] = wp.vec3(0.0)
-        cells.spread[entry] = wp.vec3(0.0)
 
 
 @wp.kernel(enable_backward=False)
 def particles_to_grid(particles: Particles, cells: Cells, nodes: Nodes, grid: Grid) -> None:
-    """Add each particle's mass and momentum to nodes, its stress and shape to its cell.
+    """Add each particle's mass and momentum to nodes, its stress to its cell.
 
     A particle carries the whole trilinear field of velocity around it, not the affine part alone (APIC, Jiang et al.
     2015; PolyPIC, Fu et al. 2017): what it takes from the nodes it gives back to them, and an exchange loses nothing
@@ -94,17 +91,14 @@ def particles_to_grid(particles: Particles, cells: Cells, nodes: Nodes, grid: Gr
     base = particles.cell[p]
     entry = cells.slot[base]
     particles.cell[p] = entry
-    volume = particles.volume
-    wp.atomic_add(cells.volume, entry, volume)
-    wp.atomic_add(cells.normal, entry, volume * particles.normal[p])
-    wp.atomic_add(cells.shear, entry, volume * particles.shear[p])
-    wp.atomic_add(cells.elastic, entry, volume * particles.elastic[p])
-    wp.atomic_add(cells.opening, entry, volume * particles.opening[p])
+    wp.atomic_add(cells.volume, entry, 1.0)
+    wp.atomic_add(cells.normal, entry, particles.normal[p])
+    wp.atomic_add(cells.shear, entry, particles.shear[p])
+    wp.atomic_add(cells.elastic, entry, particles.elastic[p])
+    wp.atomic_add(cells.opening, entry, particles.opening[p])
     if p < particles.history.shape[0]:
-        wp.atomic_add(cells.history, entry, volume * particles.history[p])
-        wp.atomic_add(cells.depth, entry, volume * particles.depth[p])
-    wp.atomic_add(cells.middle, entry, volume * f)
-    wp.atomic_add(cells.spread, entry, volume * wp.vec3(f[1] * f[2], f[0] * f[2], f[0] * f[1]))
+        wp.atomic_add(cells.history, entry, particles.history[p])
+        wp.atomic_add(cells.depth, entry, particles.depth[p])
     affine = particles.affine[p]
     bilinear = particles.bilinear[p]
     field = Field()
@@ -135,8 +129,14 @@ def mean_gradient(middle: wp.vec3, spread: wp.vec3, corner: int, inverse: wp.vec
         mean_weight(middle[0], middle[2], spread[1], x, z),
         mean_weight(middle[0], middle[1], spread[2], x, y),
     )
-    side = wp.vec3(2.0 * float(x) - 1.0, 2.0 * float(y) - 1.0, 2.0 * float(z) - 1.0)
-    return wp.cw_mul(wp.cw_mul(side, inverse), gradient)
+    return wp.cw_mul(wp.cw_mul(side_of(corner), inverse), gradient)
+
+
+@wp.func
+def side_of(corner: int) -> wp.vec3:
+    """-1 or 1 along each axis."""
+    x, y, z = corner >> 2, (corner >> 1) & 1, corner & 1
+    return wp.vec3(2.0 * float(x) - 1.0, 2.0 * float(y) - 1.0, 2.0 * float(z) - 1.0)
 
 
 @wp.func
@@ -148,21 +148,41 @@ def mean_weight(a: float, b: float, both: float, upper_a: int, upper_b: int) -> 
     return wp.where(upper_b == 1, above, whole - above)
 
 
-@wp.kernel(enable_backward=False)
-def average_cells(cells: Cells, nodes: Nodes, grid: Grid, stiffness: float) -> None:
-    """Sums to means; ``stiffness`` = c (K + 4G/3) dt^2 turns a node's share of stiffness into the least stable inertia.
+@wp.func
+def packing(nodes: Nodes, grid: Grid, node: int, full: float) -> float:
+    """Density at a node over that of the bulk, whose cells hold the mass ``full`` (kg); walls and floor mirror it."""
+    local = node % grid.nodes
+    iz = local % grid.shape[2]
+    iy = (local / grid.shape[2]) % grid.shape[1]
+    ix = local / (grid.shape[2] * grid.shape[1])
+    mass = nodes.mass[node]
+    if iz == 0:
+        mass *= 2.0
+    if ix == 0 or ix == grid.shape[0] - 1:
+        mass *= 2.0
+    if iy == 0 or iy == grid.shape[1] - 1:
+        mass *= 2.0
+    return mass / full
 
-    Counted by its particles, a cell holds an eighth more or less soil whenever one of eight crosses its face: stresses
-    around it no longer balance, and soil that shears is shaken and yields too early. So cells within the soil count as
-    full, by one point in their middle (Beuth, Wieckowski & Vermeer 2011), the emptier ones by their particles.
+
+@wp.kernel(enable_backward=False)
+def average_cells(
+    particles: Particles, cells: Cells, nodes: Nodes, grid: Grid, density: float, stiffness: float
+) -> None:
+    """Sums to means, and the part of each cell that is soil; ``stiffness`` = c (K + 4G/3) dt^2 turns a node's share of
+    stiffness into the least stable inertia.
+
+    Soil is where the nodes' density (trilinear) is above half of the bulk's, ``density`` (kg/m^3): where the surface of
+    level ground lies. So a cell within the soil is full and has its mean gradient in its middle, however its particles
+    lie; counted by these, it would hold an eighth more or less whenever one of eight crosses its face, and flow would
+    lose volume.
 
     Trilinear weights vanish at a cell's faces but their gradients do not, so a node reached only by the edge of a
     particle would be flung away by stress. The inertia bound is the central-difference limit node by node.
     """
     entry = wp.tid()
     if entry < cells.count[0]:
-        volume = cells.volume[entry]
-        share = 1.0 / volume
+        share = 1.0 / cells.volume[entry]
         cells.normal[entry] = share * cells.normal[entry]
         cells.shear[entry] = share * cells.shear[entry]
         cells.elastic[entry] = share * cells.elastic[entry]
@@ -171,16 +191,38 @@ def average_cells(cells: Cells, nodes: Nodes, grid: Grid, stiffness: float) -> N
             cells.history[entry] = share * cells.history[entry]
             cells.depth[entry] = share * cells.depth[entry]
         capacity = grid.cell[0] * grid.cell[1] * grid.cell[2]
-        full = wp.clamp((volume / capacity - HOLLOW) / (FULL - HOLLOW), 0.0, 1.0)
-        volume = wp.lerp(volume, capacity, full)
-        cells.volume[entry] = volume
-        middle = wp.lerp(share * cells.middle[entry], wp.vec3(0.5), full)
-        spread = wp.lerp(share * cells.spread[entry], wp.vec3(0.25), full)
+        base = cells.node[entry]
+        above = vec8()
+        slope = wp.vec3()
+        for corner in range(8):
+            above[corner] = packing(nodes, grid, base + corner_offset(grid, corner), density * capacity) - 0.5
+            slope += 0.25 * above[corner] * side_of(corner)
+        # by how much the density changes across a piece, and so the share of it that a plane cuts off
+        change = (wp.abs(slope[0]) + wp.abs(slope[1]) + wp.abs(slope[2])) / float(SUBCELLS) + 1.0e-6
+        volume, middle, spread = wp.float32(1.0), wp.vec3(0.5), wp.vec3(0.25)
+        if wp.min(above) < 0.5 * change:
+            volume, middle, spread = wp.float32(0.0), wp.vec3(), wp.vec3()
+            for piece in range(SUBCELLS * SUBCELLS * SUBCELLS):
+                index = wp.vec3(
+                    float(piece / (SUBCELLS * SUBCELLS)), float((piece / SUBCELLS) % SUBCELLS), float(piece % SUBCELLS)
+                )
+                f = (index + wp.vec3(0.5)) / float(SUBCELLS)
+                value = wp.float32(0.0)
+                for corner in range(8):
+                    value += corner_weight(f, corner) * above[corner]
+                part = wp.clamp(0.5 + value / change, 0.0, 1.0) / float(SUBCELLS * SUBCELLS * SUBCELLS)
+                volume += part
+                middle += part * f
+                spread += part * wp.vec3(f[1] * f[2], f[0] * f[2], f[0] * f[1])
+            middle /= wp.max(volume, 1.0e-6)
+            spread /= wp.max(volume, 1.0e-6)
+        cells.volume[entry] = volume * capacity
+        # loose grains bear nothing, but the tool may strike them
+        stiff = stiffness * wp.max(cells.volume[entry], particles.volume / share)
         for corner in range(8):
             gradient = mean_gradient(middle, spread, corner, grid.inverse)
             cells.gradient[8 * entry + corner] = gradient
-            node = cells.node[entry] + corner_offset(grid, corner)
-            wp.atomic_add(nodes.inertia, node, stiffness * volume * wp.length_sq(gradient))
+            wp.atomic_add(nodes.inertia, base + corner_offset(grid, corner), stiff * wp.length_sq(gradient))
 
 
 @wp.kernel(enable_backward=False)

@@ -17,6 +17,8 @@ _SAMPLES = 4  # heights sampled along each side of a column
 def fill(surface: HeightField, bed: Bed, spacing: float, seed: int = 0, jitter: float = 0.5) -> Array:
     """Particles that fill the bed from its floor to the surface, each standing for `spacing`³ of soil.
 
+    Where nothing stands at the bed's sides, its whole `Bed.domain` is filled, the surface's border carried on.
+
     The bed is cut into square columns about `spacing` wide. A column of height H holds the whole number of particles
     nearest to its volume, and the rounding errors are carried on from column to column, so that the sum is right to
     within one particle. They are spread evenly over H: the top layer lies half a particle below the surface everywhere,
@@ -36,6 +38,8 @@ def fill(surface: HeightField, bed: Bed, spacing: float, seed: int = 0, jitter: 
     Raises:
         ParameterError: spacing or jitter make no sense for this bed.
     """
+    bed = bed.domain
+    surface = surface.widened(bed.lower, bed.upper)
     size = bed.upper - bed.lower
     if not 0.0 < spacing <= 0.5 * float(size.min()):
         raise ParameterError(

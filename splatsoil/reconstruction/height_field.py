@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -97,6 +98,24 @@ class HeightField:
             out = np.flatnonzero(beyond[:, axis])
             value[out] += spline.ev(inside[out, 1], inside[out, 0], **order_of) * beyond[out, axis]
         return value
+
+    def widened(self, lower: Array, upper: Array) -> HeightField:
+        """This field out to a rectangle (2,) or (3,) around it, m, its outermost heights carried on level: by as many
+        whole cells as cover it."""
+        count = [
+            [max(0, math.ceil((gap - 0.5 * cell) / cell - 1e-6)) for gap in gaps]
+            for cell, gaps in (
+                (self.cell[0], (self.x[0] - lower[0], upper[0] - self.x[-1])),
+                (self.cell[1], (self.y[0] - lower[1], upper[1] - self.y[-1])),
+            )
+        ]
+        x, y = (
+            axis[0] + (axis[1] - axis[0]) * np.arange(-before, len(axis) + after)
+            for axis, (before, after) in zip((self.x, self.y), count, strict=True)
+        )
+        around = (tuple(count[1]), tuple(count[0]))
+        deviation = None if self.deviation is None else np.pad(self.deviation, around, mode="edge")
+        return HeightField(x, y, np.pad(self.height, around, mode="edge"), deviation)
 
     def difference(self, other: HeightField) -> Array:
         """(ny, nx) this height minus the other's at this field's cells; NaN where either is unknown."""

@@ -33,7 +33,7 @@ _REACH = 2.8
 
 
 def reaching_into_soil(gaussians: Gaussians, surface: HeightField, floor: float) -> Tensor:
-    """Which of n Gaussians (n,) reach into the soil, visibly if it weren't there.
+    """Which of n Gaussians (n,) reach into the soil, visibly if it weren't there; where there is none, none does.
 
     Args:
         gaussians: of anything but soil.
@@ -60,7 +60,7 @@ def reaching_into_soil(gaussians: Gaussians, surface: HeightField, floor: float)
     square = _nearest_square(metric, low - means[near], highest[near] - means[near])
     densest = gaussians.opacities.detach().cpu().numpy()[near] * np.exp(-0.5 * square)
     out = np.zeros(len(means), dtype=bool)
-    out[near] = densest > _VISIBLE
+    out[near] = (densest > _VISIBLE) & ~(heights[near] <= floor)
     return torch.from_numpy(out).to(gaussians.means.device)
 
 

@@ -20,7 +20,7 @@ from splatsoil.splats import Gaussians
 
 Array = NDArray[np.float64]
 
-SURROUNDINGS, SOIL, TOOL = 0, 1, 2
+SURROUNDINGS, SOIL, TOOL, SIDE = 0, 1, 2, 3
 
 FLATNESS = 0.15  # a disc's thickness over its radius
 OVERLAP = 0.6  # a disc's standard deviation over the distance to the next disc
@@ -37,7 +37,7 @@ class Seeds:
         points: (n, 3) centres, metres.
         normals: (n, 3) unit.
         spacing: (n,) distance to the neighbours, metres.
-        label: (n,) SURROUNDINGS, SOIL or TOOL.
+        label: (n,) SURROUNDINGS, SOIL (its surface), TOOL or SIDE (of the soil).
     """
 
     points: Array
@@ -92,19 +92,30 @@ def seed_rim(relief: Relief, bed: Bed, spacing: float) -> Seeds:
     parts = []
     lower, upper = bed.lower[:2], bed.upper[:2]
     for inset in np.arange(0.5 * spacing, relief.rim, spacing):
-        xy, _ = _around(lower - inset, upper + inset, spacing)
+        xy, _ = around(lower - inset, upper + inset, spacing)
         top = np.column_stack([xy, relief.surface.sample(xy)])
         parts.append(Seeds.of(top, np.tile([0.0, 0.0, 1.0], (len(top), 1)), spacing, SURROUNDINGS))
-    xy, outward = _around(lower - relief.rim, upper + relief.rim, spacing)
+    return Seeds.join([*parts, _upright(relief, bed, relief.rim, relief.ground, spacing, SURROUNDINGS)])
+
+
+def seed_sides(relief: Relief, bed: Bed, spacing: float) -> Seeds:
+    """Discs on the sides of the bed's box, from its floor to the soil's surface."""
+    return _upright(relief, bed, 0.0, float(bed.lower[2]), spacing, SIDE)
+
+
+def _upright(relief: Relief, bed: Bed, inset: float, floor: float, spacing: float, label: int) -> Seeds:
+    """Discs on the sides of a box that is larger than the bed's by ``inset``, as high as the soil beside them."""
+    xy, outward = around(bed.lower[:2] - inset, bed.upper[:2] + inset, spacing)
     height = relief.surface.sample(xy)
-    for level in np.arange(relief.ground + 0.5 * spacing, float(height.max()), spacing):
+    parts = [Seeds.of(np.zeros((0, 3)), np.zeros((0, 3)), spacing, label)]
+    for level in np.arange(floor + 0.5 * spacing, float(height.max()), spacing):
         kept = height > level
         side = np.column_stack([xy[kept], np.full(int(kept.sum()), level)])
-        parts.append(Seeds.of(side, outward[kept], spacing, SURROUNDINGS))
+        parts.append(Seeds.of(side, outward[kept], spacing, label))
     return Seeds.join(parts)
 
 
-def _around(lower: Array, upper: Array, spacing: float) -> tuple[Array, Array]:
+def around(lower: Array, upper: Array, spacing: float) -> tuple[Array, Array]:
     """Points (n, 2) on a rectangle's border, and outward normals (n, 3)."""
     points, normals = [], []
     for axis in (0, 1):
@@ -176,7 +187,7 @@ def _thinned(points: Array, spacing: Array, allowed: NDArray[np.bool_]) -> NDArr
 def colours_seen(views: Views, relief: Relief, seeds: Seeds, *, batch: int = 8192) -> Array:
     """(n, 3) median colour of each disc over the photographs that see it.
 
-    Discs that none sees get the colour of the nearest one that is seen.
+    Discs that none sees get the colour of the nearest one that is seen; the soil's sides that of the sides.
     """
     n, device = len(seeds.points), views.images.device
     colour, count = np.zeros((n, 3)), np.zeros(n)
@@ -198,12 +209,14 @@ def colours_seen(views: Views, relief: Relief, seeds: Seeds, *, batch: int = 819
         known = torch.where((weight > 0)[:, None], colours, torch.nan)
         colour[part] = torch.nanmedian(known, dim=0).values.T.cpu().numpy()
         count[part] = (weight > 0).sum(0).cpu().numpy()
-    blind = count == 0
-    if blind.all():
-        colour[:] = 0.5
-    elif blind.any():
-        _, nearest = cKDTree(seeds.points[~blind]).query(seeds.points[blind])
-        colour[blind] = colour[~blind][nearest]
+    side = seeds.label == SIDE
+    for alike in (side, ~side):  # the foot of soil's sides is nearest to the ground
+        blind, known = alike & (count == 0), alike & (count > 0)
+        if not known.any():
+            colour[blind] = 0.5
+        elif blind.any():
+            _, nearest = cKDTree(seeds.points[known]).query(seeds.points[blind])
+            colour[blind] = colour[known][nearest]
     return colour
 
 
@@ -222,7 +235,7 @@ def discs(seeds: Seeds, colours: Array, opacity: float) -> Gaussians:
 
 
 def first_gaussians(
-    views: Views, bed: Bed, tool: trimesh.Trimesh, relief: Relief, spacing: float
+    views: Views, bed: Bed, tool: trimesh.Trimesh, relief: Relief, spacing: float, *, sides: bool = False
 ) -> tuple[Gaussians, torch.Tensor]:
     """All Gaussians before training, and their labels (n,) int8.
 
@@ -232,11 +245,12 @@ def first_gaussians(
         tool: mesh in world coordinates.
         relief: what stereo found.
         spacing: distance between the soil's discs, metres.
+        sides: whether the soil's sides are seen.
     """
     parts = [
         seed_soil(relief.surface, bed, spacing),
         seed_tool(tool, spacing, most=3000),
-        seed_rim(relief, bed, 1.3 * spacing),
+        seed_sides(relief, bed, spacing) if sides else seed_rim(relief, bed, 1.3 * spacing),
         seed_far(views, bed, relief),
     ]
     seeds = Seeds.join(parts)

@@ -15,13 +15,14 @@ from scipy.spatial import cKDTree
 from splatsoil import __version__
 from splatsoil.errors import MeasurementError, ParameterError
 from splatsoil.files import RECONSTRUCTING, code_digest
-from splatsoil.measurement import Bed, Measurement
+from splatsoil.measurement import BIN, HEAP, TRANSPARENT, Bed, Measurement
 from splatsoil.reconstruction.height_field import HeightField
 from splatsoil.reconstruction.hidden import reaching_into_soil
-from splatsoil.reconstruction.initial import TOOL, first_gaussians
+from splatsoil.reconstruction.initial import SIDE, TOOL, first_gaussians
 from splatsoil.reconstruction.likeness import Likeness, likeness
 from splatsoil.reconstruction.presets import preset_named
 from splatsoil.reconstruction.result import HeldOut, Reconstruction
+from splatsoil.reconstruction.sides import sides_seen
 from splatsoil.reconstruction.surface import find_relief, soil_mesh, surface_through
 from splatsoil.reconstruction.training import train
 from splatsoil.reconstruction.views import Views, load_views, silhouettes, still_video, surface_points
@@ -79,7 +80,15 @@ def reconstruct(
     tool = measurement.tool.mesh.copy()
     tool.apply_transform(measurement.tool.motion.matrix(float(measurement.tool.motion.times[0])))
     report("finding the tool", 0.0)
-    relief = find_relief(views.to(device), bed, silhouettes(views, tool), chosen, report)
+    hidden = silhouettes(views, tool)
+    container, remarks = bed.container or BIN, []
+    relief = find_relief(views.to(device), bed, hidden, chosen, report, container=container)
+    if bed.container is None and sides_seen(views.to(device), bed, relief):
+        container = TRANSPARENT
+        relief = find_relief(views.to(device), bed, hidden, chosen, report, container=container)
+        remarks.append(
+            "bed: bed.container is not given; photographs show soil at the bed's sides, so transparent walls are taken."
+        )
     spacing = chosen.soil_spacing * max(relief.surface.cell)
     report("placing Gaussians", 0.0)
     cameras: list[str] = []
@@ -89,7 +98,8 @@ def reconstruct(
         cameras = [camera.name for camera in still.cameras]
         views = views.joined(still)
         relief = replace(relief, trust=(views.valid * (1.0 - silhouettes(views, tool))).to(device))
-    first, label = first_gaussians(views.to(device), bed, tool, relief, spacing)
+    sides = container == TRANSPARENT
+    first, label = first_gaussians(views.to(device), bed, tool, relief, spacing, sides=sides)
     if cameras:
         # Before training, which bends the scene to what it is shown.
         level = float(np.median(relief.surface.height))
@@ -105,19 +115,24 @@ def reconstruct(
         first, label, views, relief.surface, float(bed.lower[2]),
         iterations=chosen.iterations, growth=chosen.growth, seed=seed, device=device, report=report,
     )  # fmt: skip
-    soil, on_tool = segments(trained.gaussians, trained.label, relief.surface, bed, tool)
-    surface = surface_through(trained.gaussians[soil], relief.surface)
+    on_top, on_tool = segments(trained.gaussians, trained.label, relief.surface, bed, tool)
+    if container == HEAP:
+        on_top &= torch.from_numpy(relief.surface.sample(trained.gaussians.means.numpy()[:, :2]) > bed.lower[2])
+    surface = surface_through(trained.gaussians[on_top], relief.surface)
+    if container == HEAP:
+        bare = relief.surface.height <= bed.lower[2]
+        surface = replace(surface, height=np.where(bare, bed.lower[2], np.maximum(surface.height, bed.lower[2])))
+    soil = on_top | (at_sides(trained.gaussians, trained.label, surface, bed) & ~on_tool) if sides else on_top
     around = torch.nonzero(~soil & ~on_tool)[:, 0]
     kept = torch.ones(len(soil), dtype=torch.bool)
     kept[around] = ~reaching_into_soil(trained.gaussians[around], surface, float(bed.lower[2]))
     gaussians, soil, on_tool = trained.gaussians[kept], soil[kept], on_tool[kept]
     scene = gaussians.to(device)
-    remarks = []
     if cameras:
         report("comparing with the video", 0.0)
         level = float(np.median(surface.height))
         alike = likeness(scene, views, relief.trust, bed, level, trained.background)
-        remarks = [
+        remarks += [
             f"video: The bed that {camera} sees differs from that in the views; are their poses and lenses of one world"
             " and scale, and is the bed the same?"
             for camera in unlike_cameras(alike, cameras, alike.unlike(len(cameras)))
@@ -140,6 +155,7 @@ def reconstruct(
             "seed": seed,
             "device": device,
             "holdout": holdout,
+            "container": container,
             "ground": relief.ground,
             "first_loss": float(np.mean(trained.losses[: len(views)])),
             "last_loss": float(np.mean(trained.losses[-len(views) :])),
@@ -164,7 +180,7 @@ def unlike_cameras(alike: Likeness, cameras: Sequence[str], which: NDArray[np.bo
 def segments(
     gaussians: Gaussians, label: torch.Tensor, surface: HeightField, bed: Bed, tool: trimesh.Trimesh
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Which Gaussians are soil and which are tool, each (n,) bool.
+    """Which Gaussians are the soil's surface and which are tool, each (n,) bool.
 
     By place, not by where they began: the tool's lie within their own size of its mesh; the soil's inside the bed's box
     within a few cells of the surface.
@@ -179,8 +195,22 @@ def segments(
     above = place[:, 2] - surface.sample(place[:, :2])
     at_surface = np.abs(above) < 3.0 * cell
     on_tool = (distance < cell + np.where(began, reach, 0.0)) & (began | ~(inside & at_surface))
-    soil = inside & at_surface & ~on_tool
+    soil = inside & at_surface & ~on_tool & (label.numpy() != SIDE)
     return torch.from_numpy(soil), torch.from_numpy(on_tool)
+
+
+def at_sides(gaussians: Gaussians, label: torch.Tensor, surface: HeightField, bed: Bed) -> torch.Tensor:
+    """Which Gaussians (n,) are the soil's sides: within a few cells of the box's, between its floor and the surface.
+
+    Outside of the box only those that began there: beside it is something else.
+    """
+    place = gaussians.means.numpy().astype(np.float64)
+    cell = max(surface.cell)
+    depth = np.minimum(place[:, :2] - bed.lower[:2], bed.upper[:2] - place[:, :2]).min(axis=1)
+    began = label.numpy() == SIDE
+    near = (depth < 3.0 * cell) & (depth > np.where(began, -3.0 * cell, 0.0))
+    high = (place[:, 2] > bed.lower[2]) & (place[:, 2] < surface.sample(place[:, :2]) + cell)
+    return torch.from_numpy(near & high)
 
 
 def judged(gaussians: Gaussians, views: Views, background: tuple[float, float, float]) -> tuple[HeldOut, ...]:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from splatsoil.errors import RunError, SetWarning
 from splatsoil.files import check_unpacked, read_json, write_bytes, write_json
+from splatsoil.measurement import BIN
 from splatsoil.reconstruction.height_field import HeightField
 from splatsoil.run_files import RECONSTRUCTION_FORMAT
 from splatsoil.splats import Gaussians, save_ply
@@ -45,7 +46,7 @@ class Reconstruction:
     Attributes:
         gaussians: everything that was seen, float32 on the CPU, world frame in metres, colours in sRGB as seen;
             trained with ``antialias=True``, and to be drawn so.
-        soil: (n,) bool, the Gaussians on the soil's surface.
+        soil: (n,) bool, the Gaussians on the soil's surface, and on its sides where these are seen.
         tool: (n,) bool, those on the tool at its first pose.
         surface: the soil's surface over the bed's box.
         mesh: the soil as a watertight solid between the box's sides, floor and surface.
@@ -69,6 +70,11 @@ class Reconstruction:
     def surroundings(self) -> torch.Tensor:
         """(n,) bool, the Gaussians that belong neither to the soil nor to the tool."""
         return ~(self.soil | self.tool)
+
+    @property
+    def container(self) -> str:
+        """What holds the soil, see `measurement.Bed`; where the set doesn't say, what photographs show."""
+        return str(self.metadata.get("container", BIN))
 
     @property
     def psnr(self) -> float:

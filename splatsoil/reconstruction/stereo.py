@@ -117,6 +117,7 @@ def disagreement(
     sigma: float,
     *,
     levels: bool = False,
+    normalised: bool = False,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """How much each photograph differs from the others' mean around each cell.
 
@@ -127,6 +128,9 @@ def disagreement(
         trust: (v, h, w) pixels that may be used.
         weight: (v, ny, nx) what each photograph counts at each cell.
         sigma: the window's standard deviation in cells.
+        levels: whether mean colours count, too.
+        normalised: whether to divide by what the two vary by, as in normalised cross-correlation: plain ground then
+            agrees with nothing, where else it agrees with itself at any height.
 
     Returns:
         (v, ny, nx) windowed mean square difference summed over the channels, and (v, ny, nx) the weights that remain
@@ -141,6 +145,9 @@ def disagreement(
     mean = (colours * weight).sum(0) / weight.sum(0).clamp_min(1e-6)
     square = ((colours - mean) ** 2).sum(1, keepdim=True)
     error = _blur(square * weight, near) / _blur(weight, near).clamp_min(1e-6)
+    if normalised:
+        both = (colours**2 + mean**2).sum(1, keepdim=True)
+        error = error / (_blur(both * weight, near) / _blur(weight, near).clamp_min(1e-6)).clamp_min(1e-6)
     return error[:, 0], weight[:, 0]
 
 
@@ -188,6 +195,7 @@ def sweep(
     heights: Array,
     *,
     sigma: float = 2.5,
+    normalised: bool = False,
 ) -> Array:
     """(ny, nx) the best of the given heights in each cell under a smoothness term; good to about a step.
 
@@ -198,14 +206,16 @@ def sweep(
         weight: (v, ny, nx) what each photograph counts at each cell.
         heights: (k,) evenly spaced candidates, metres.
         sigma: the window's standard deviation in cells.
+        normalised: see `disagreement`.
     """
     scale = (3.0 * views.noise) ** 2 * 3.0
     costs = []
     counts = []
     for z in heights:
         level = torch.full_like(cells.mask, float(z))
-        error, left = disagreement(views, cells, level, trust, weight, sigma)
-        costs.append((left * torch.log1p(error / scale)).sum(0))
+        error, left = disagreement(views, cells, level, trust, weight, sigma, normalised=normalised)
+        # What is normalised is bounded, and needs no robust form.
+        costs.append((left * (error if normalised else torch.log1p(error / scale))).sum(0))
         counts.append(left.sum(0))
     total, count = (torch.stack(parts).cpu().numpy().astype(float) for parts in (costs, counts))
     # Two photographs agree by chance more easily than twenty: shrink towards what disagreement is usual.
@@ -238,6 +248,7 @@ def refine(
     sigma: float = 1.5,
     reach: float,
     length: float,
+    normalised: bool = False,
 ) -> tuple[Array, Array]:
     """Gauss-Newton from a good start.
 
@@ -251,6 +262,7 @@ def refine(
         sigma: the last window's standard deviation in cells; the first is twice as wide.
         reach: distance of the first trial heights above and below, metres; it shrinks to a third.
         length: the bed's longest side, metres, which scales the curvature prior.
+        normalised: see `disagreement`.
 
     Returns:
         (ny, nx) heights and (ny, nx) their standard deviations, metres.
@@ -272,12 +284,12 @@ def refine(
         trials = []
         for offset in (-delta, 0.0, delta):
             level = torch.tensor(current + offset, dtype=torch.float32, device=cells.mask.device)
-            trials.append(disagreement(views, cells, level, trust, weight, width))
+            trials.append(disagreement(views, cells, level, trust, weight, width, normalised=normalised))
         error, left = trials[1]
         known = torch.where(left > 0, error, torch.nan)
         middle = torch.nan_to_num(torch.nanmedian(known, dim=0).values, nan=0.0)
         typical = float(middle[cells.mask > 0].median())
-        variance = max(typical, (views.noise**2) * 3.0 / 4.0)
+        variance = typical if normalised else max(typical, (views.noise**2) * 3.0 / 4.0)
         spread = middle.clamp_min(variance)
         robust = left / (1.0 + error / (4.0 * spread)) ** 2
         below, here, above = [((robust * e).sum(0) / spread).cpu().numpy().astype(np.float64) for e, _ in trials]

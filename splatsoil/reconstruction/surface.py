@@ -13,7 +13,7 @@ from scipy.ndimage import binary_propagation, distance_transform_edt
 from scipy.spatial import cKDTree
 
 from splatsoil.errors import MeasurementError
-from splatsoil.measurement import Bed
+from splatsoil.measurement import BIN, HEAP, TRANSPARENT, Bed
 from splatsoil.reconstruction.height_field import HeightField
 from splatsoil.reconstruction.presets import Preset
 from splatsoil.reconstruction.stereo import Cells, disagreement, refine, sweep, visibility
@@ -61,7 +61,9 @@ def footprint(views: Views, bed: Bed) -> float:
     return float(np.median([np.linalg.norm(c.position - centre) / np.sqrt(c.fx * c.fy) for c in views.cameras]))
 
 
-def find_relief(views: Views, bed: Bed, tool_silhouettes: torch.Tensor, preset: Preset, report: Report) -> Relief:
+def find_relief(
+    views: Views, bed: Bed, tool_silhouettes: torch.Tensor, preset: Preset, report: Report, *, container: str = BIN
+) -> Relief:
     """Heights of the soil over the bed's box.
 
     Args:
@@ -70,11 +72,14 @@ def find_relief(views: Views, bed: Bed, tool_silhouettes: torch.Tensor, preset: 
         tool_silhouettes: (v, h, w) 1 where the tool hides what is behind it.
         preset: how much work.
         report: called with what is being done and how much of it is done.
+        container: what holds the soil, see `measurement.Bed`. Where no wall is seen around it, photographs look past
+            its edge at the ground behind.
 
     Raises:
         MeasurementError: the photographs are too far away, or tell no height in half of the bed or more.
     """
     length, device = scale_of(bed), views.images.device
+    bare = container in (TRANSPARENT, HEAP)
     cell = max(length / preset.cells**0.5, 1.2 * footprint(views, bed))
     trust = views.valid * (1.0 - tool_silhouettes.to(device))
     step = float(bed.upper[2] - bed.lower[2]) / (preset.candidates - 1)
@@ -88,17 +93,18 @@ def find_relief(views: Views, bed: Bed, tool_silhouettes: torch.Tensor, preset: 
     cells = Cells.of(coarse, device=device)
     everything = torch.ones(len(views), *cells.mask.shape, device=device)
     report("sweeping the bed's height", 0.0)
-    height = sweep(
-        views, cells, trust, everything, np.linspace(bed.lower[2], bed.upper[2], preset.candidates), sigma=1.5
-    )
+    levels = np.linspace(bed.lower[2], bed.upper[2], preset.candidates)
+    height = sweep(views, cells, trust, everything, levels, sigma=1.5, normalised=bare)
     report("refining heights", 0.4)
-    height, deviation = refine(views, cells, trust, everything, height, sigma=1.0, reach=step, length=length)
+    height, deviation = refine(
+        views, cells, trust, everything, height, sigma=1.0, reach=step, length=length, normalised=bare
+    )
     height, _ = without_backdrop(height, deviation, length)
 
     fine = HeightField.over(bed.lower, bed.upper, cell)
     where = fine.points[..., :2].reshape(-1, 2)
     height = HeightField(coarse.x, coarse.y, height).smooth(where).reshape(fine.height.shape)
-    rim = RIM * length
+    rim = 0.0 if bare else RIM * length
     for last in (False, True):
         report("refining heights", 0.6 + 0.2 * last)
         now = HeightField(fine.x, fine.y, height)
@@ -115,9 +121,12 @@ def find_relief(views: Views, bed: Bed, tool_silhouettes: torch.Tensor, preset: 
             reach=0.5 * step,
             length=length,
             iterations=6 if last else 3,
+            normalised=bare,
         )
         height, deviation = without_backdrop(height, deviation, length)
-    surface = HeightField(fine.x, fine.y, np.clip(height, bed.lower[2], None), deviation)
+    # Around a heap the floor is bare: what is less high than a cell is wide is not told from it.
+    least = bed.lower[2] + (0.5 * cell if container == HEAP else 0.0)
+    surface = HeightField(fine.x, fine.y, np.where(height > least, height, bed.lower[2]), deviation)
     occluder = with_rim(surface, bed, rim)
     return Relief(surface, occluder, ground_level(views, bed, surface, occluder, rim), trust, rim)
 

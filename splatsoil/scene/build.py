@@ -5,11 +5,13 @@ from __future__ import annotations
 from typing import Any, Protocol
 
 import numpy as np
+import numpy.typing as npt
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from splatsoil.errors import ParameterError
-from splatsoil.measurement import Bed, Frame, Measurement
+from splatsoil.measurement import TRANSPARENT, Bed, Frame, Measurement
 from splatsoil.scene import albedo as albedos
 from splatsoil.scene.binding import bind
 from splatsoil.scene.estimate import estimate_light, still_frames
@@ -17,16 +19,21 @@ from splatsoil.scene.intrinsic import Intrinsic
 from splatsoil.scene.layers import Posed
 from splatsoil.scene.light import Light, encoded, linear
 from splatsoil.scene.lit import LitRelief, light_relief
-from splatsoil.scene.relief import relief_of_particles
-from splatsoil.scene.render import Scene
+from splatsoil.scene.relief import Relief, relief_of_particles
+from splatsoil.scene.render import Scene, nearer_side, to_sides
 from splatsoil.scene.tool import ToolBody
 from splatsoil.splats import Gaussians
+
+FloatArray = npt.NDArray[np.float64]
 
 ROUNDS = 2
 """Rounds of `albedo.refined`; more follow the noise of the photographs."""
 
 _FOOTPRINT = 0.002
 """Half width of the patch of surface that a Gaussian's colour was seen on, m, for shadows' edges."""
+
+_NEAREST = 9
+"""Gaussians of a side whose median a particle behind it is like: a few that no photograph shows have any colour."""
 
 _EDGE = 3
 """Pixels around the tool that are not used: lenses, blur and JPEG blocks mix colours there."""
@@ -43,6 +50,8 @@ class Reconstructed(Protocol):
     def tool(self) -> Any: ...
     @property
     def background(self) -> tuple[float, float, float]: ...
+    @property
+    def container(self) -> str: ...
 
 
 def build_scene(
@@ -82,7 +91,8 @@ def build_scene(
     if len(soil) == 0:
         raise ParameterError("the reconstruction has no soil")
     body = ToolBody(measurement.tool.mesh, device)
-    relief = relief_of_particles(x, spacing, measurement.bed.lower, measurement.bed.upper)
+    bed = measurement.bed.domain
+    relief = relief_of_particles(x, spacing, bed.lower, bed.upper)
     if intrinsic is not None:
         light = intrinsic.light
     elif light is None:
@@ -99,9 +109,10 @@ def build_scene(
         light=light,
         tool=body,
         tool_albedo=np.ones(3),
-        bed=measurement.bed,
+        bed=bed,
         spacing=spacing,
         background=np.asarray(reconstruction.background, dtype=np.float64),
+        side_light=_side_light(soil, relief, light, bed) if reconstruction.container == TRANSPARENT else None,
     )
     if intrinsic is not None:
         return intrinsic.coloured(scene)
@@ -110,16 +121,42 @@ def build_scene(
         posed = scene.pose(x, None, start)
         scene = scene.replace(tool_albedo=albedos.tool_albedo(frames, lambda camera: scene.layers(posed, camera).tool))
         lit = light_relief(relief, light, body.at(*start), scene.tool_albedo)
-        scene = scene.replace(**_albedo(soil, lit, x, spacing, measurement.bed))
+        scene = scene.replace(**_albedo(soil, lit, scene))
         return _refined(scene, scene.pose(x, None, start), frames, rounds) if rounds > 0 else scene
 
 
-def _albedo(soil: Gaussians, lit: LitRelief, grains: Tensor, spacing: float, bed: Bed) -> dict[str, Tensor]:
+def _side_light(soil: Gaussians, relief: Relief, light: Light, bed: Bed) -> FloatArray:
+    """Light (4, 3) on the soil's sides, see `Scene`: their soil is on the mean that of the surface, so it is what their
+    mean colour is brighter than level ground's."""
+    side = nearer_side(soil.means, relief, bed)
+    colours = linear(soil.colours)
+    seen = [colours[side == k].mean(dim=0) for k in range(4) if (side == k).any()]
+    usual = torch.stack(seen).mean(dim=0) if seen else colours.mean(dim=0)
+    means = [colours[side == k].mean(dim=0) if (side == k).any() else usual for k in range(4)]
+    return torch.stack(means).cpu().numpy().astype(np.float64) / light.level
+
+
+def _albedo(soil: Gaussians, lit: LitRelief, scene: Scene) -> dict[str, Tensor]:
     """First albedo of soil and grains: the reconstruction's colours with the light on them taken out."""
-    light = lit.irradiance(soil.means.contiguous(), _FOOTPRINT).clamp_min(0.05)
-    albedo = (linear(soil.colours) / light).clamp(0.0, albedos.BRIGHTEST)
-    surface = albedos.SurfaceAlbedo(soil.means, albedo, spacing, bed.lower, bed.upper)
+    grains, bed = scene.soil.particles, scene.bed
+    light = lit.irradiance(soil.means.contiguous(), _FOOTPRINT)
+    on_top = torch.ones(len(soil), dtype=torch.bool, device=light.device)
+    if scene.side_light is not None:
+        side = nearer_side(soil.means, lit.relief, bed)
+        on_top = side < 0
+        light[~on_top] = torch.from_numpy(scene.side_light).to(light)[side[~on_top]]
+    albedo = (linear(soil.colours) / light.clamp_min(0.05)).clamp(0.0, albedos.BRIGHTEST)
+    surface = albedos.SurfaceAlbedo(soil.means[on_top], albedo[on_top], scene.spacing, bed.lower, bed.upper)
     beneath = surface.beneath(grains, lit.relief.depth_below(grains))
+    if not on_top.all():
+        # The layer behind a side that is seen has its colours.
+        behind = nearer_side(grains, lit.relief, bed) >= 0
+        behind &= to_sides(grains, bed)[0] < scene.spacing
+        k = min(_NEAREST, int((~on_top).sum()))
+        _, nearest = cKDTree(soil.means[~on_top].cpu().numpy()).query(
+            grains[behind].cpu().numpy(), k=[*range(1, k + 1)]
+        )
+        beneath[behind] = albedo[~on_top][torch.from_numpy(nearest).to(albedo.device)].median(dim=1).values
     return {"soil_albedo": encoded(albedo), "grain_albedo": encoded(beneath)}
 
 
@@ -140,6 +177,8 @@ def _refined(scene: Scene, posed: Posed, frames: list[Frame], rounds: int) -> Sc
     parts = (posed.centres[:count], posed.covariances[:count], posed.opacities[:count])
     found = albedos.refined(*parts, posed.features[:count, :3], targets, rounds=rounds)
     soil, grains = scene.soil_albedo.clone(), scene.grain_albedo.clone()
-    soil[shown] = found[: int(shown.sum())]
-    grains[near] = found[int(shown.sum()) :]
+    on_top = posed.features[:count, 3:] > 0.0  # not at a side, whose colour is not in the light that was taken out
+    first = int(shown.sum())
+    soil[shown] = torch.where(on_top[:first], found[:first], soil[shown])
+    grains[near] = torch.where(on_top[first:], found[first:], grains[near])
     return scene.replace(soil_albedo=soil, grain_albedo=grains)

@@ -69,6 +69,8 @@ class Scene:
         spacing: of the particles, m.
         background: (3,) sRGB where nothing is.
         smoothing: of the surface; see `relief_of_particles`.
+        side_light: (4, 3) light on the soil's sides at the least x, the largest x, the least y and the largest y, in
+            units of level ground's, where walls let them be seen; None where they hide them. It stays as it is.
     """
 
     soil: Binding
@@ -84,6 +86,7 @@ class Scene:
     spacing: float
     background: FloatArray
     smoothing: float = SMOOTHING
+    side_light: FloatArray | None = None
 
     @property
     def device(self) -> torch.device:
@@ -94,6 +97,10 @@ class Scene:
     def surface_albedo(self) -> SurfaceAlbedo:
         """What photographs show of the soil's albedo, as a map."""
         rest, albedo = self.soil.rest, linear(self.soil_albedo)
+        if self.side_light is not None:
+            relief = relief_of_particles(self.soil.particles, self.spacing, self.bed.lower, self.bed.upper)
+            on_top = nearer_side(rest, relief, self.bed) < 0
+            rest, albedo = rest[on_top], albedo[on_top]
         return SurfaceAlbedo(rest, albedo, self.spacing, self.bed.lower, self.bed.upper)
 
     def with_particles(self, particles: Any) -> Scene:
@@ -118,13 +125,28 @@ class Scene:
         )
         return self.replace(grain_albedo=encoded(others.clamp(0.0, BRIGHTEST)))
 
+    @cached_property
+    def _sides(self) -> Tensor:
+        """Sides that are seen, as the kernels take them: outward x and y, distance from the origin along these, light
+        (4, 6); none (0, 6) where walls hide them."""
+        if self.side_light is None:
+            return self.soil_opacity.new_zeros((0, 6))
+        planes = np.zeros((4, 6))
+        planes[[0, 1, 2, 3], [0, 0, 1, 1]] = [-1.0, 1.0, -1.0, 1.0]
+        planes[:, 2] = [-self.bed.lower[0], self.bed.upper[0], -self.bed.lower[1], self.bed.upper[1]]
+        planes[:, 3:] = self.side_light
+        return upload(planes, self.device)
+
     def replace(self, **changes: Any) -> Scene:
         """A copy with some parts replaced."""
         return replace(self, **changes)
 
     def shown(self, relief: Relief, centres: Tensor, particles: Tensor) -> tuple[Tensor, Tensor]:
         """Which soil Gaussians and which particles lie near enough to the surface to be drawn: masks (s,) and (p,)."""
-        near = relief.within(_HIDDEN * self.spacing, torch.cat([centres, particles]))
+        points = torch.cat([centres, particles])
+        near = relief.within(_HIDDEN * self.spacing, points)
+        if self.side_light is not None:
+            near |= to_sides(points, self.bed)[0] < _HIDDEN * self.spacing
         return near[: len(centres)], near[len(centres) :]
 
     def pose(self, positions: Any, deformations: Any, tool: Pose | None) -> Posed:
@@ -158,8 +180,9 @@ class Scene:
         visible = tuple(x.new_empty((sum(counts), *shape)) for shape in ((3,), (3, 3), (), (4,)))
         soil, grains, rest = zip(*(part.split(counts) for part in visible), strict=True)
         carried = (centres, covariances, self.soil.thickness, self.soil_opacity, self.soil_albedo)
-        _settle(relief, chosen[0], carried, soil)
-        _draw_grains(relief, chosen[1], (x, self.grain_albedo), self.spacing, grains)
+        sides = self._sides
+        _settle(relief, chosen[0], carried, sides, soil)
+        _draw_grains(relief, chosen[1], (x, self.grain_albedo), sides, self.spacing, grains)
         still = (around.means, self.surrounding_shapes, around.opacities, functional.pad(around.colours, (0, 1)))
         for part, of_rest in zip(rest, still, strict=True):
             part.copy_(of_rest)
@@ -173,7 +196,11 @@ class Scene:
     def recoloured(self, posed: Posed) -> Posed:
         """What was posed of the same soil with other colours beneath its surface, in this scene's."""
         features = posed.features.clone()
-        features[posed.grains, :3] = self.grain_albedo[posed.grain_numbers]
+        # Photographs show the sides' grains, and how they are lit is in what stands here.
+        hidden = features[posed.grains, 3:] > 0.0
+        features[posed.grains, :3] = torch.where(
+            hidden, self.grain_albedo[posed.grain_numbers], features[posed.grains, :3]
+        )
         return replace(posed, features=features)
 
     def layers(self, posed: Posed, camera: Camera) -> Layers:
@@ -210,25 +237,40 @@ class Scene:
         return [out[k] for k in range(len(seen))]
 
 
-def _settle(relief: Relief, chosen: Tensor, carried: Sequence[Tensor], out: Sequence[Tensor]) -> None:
+def to_sides(points: Tensor, bed: Bed) -> tuple[Tensor, Tensor]:
+    """Distance (n,) of points (n, 3) to the nearest of the bed's sides, m, negative outside of the box; and which it
+    is, in the order of `Scene.side_light`."""
+    x, y, low, high = points[:, 0], points[:, 1], bed.lower.tolist(), bed.upper.tolist()
+    nearest = torch.stack([x - low[0], high[0] - x, y - low[1], high[1] - y]).min(dim=0)
+    return nearest.values, nearest.indices
+
+
+def nearer_side(points: Tensor, relief: Relief, bed: Bed) -> Tensor:
+    """Which of the bed's sides points (n, 3) lie nearer to than to the surface: (n,), -1 for none."""
+    distance, which = to_sides(points, bed)
+    return torch.where(distance < relief.depth_below(points), which, -1)
+
+
+def _settle(relief: Relief, chosen: Tensor, carried: Sequence[Tensor], sides: Tensor, out: Sequence[Tensor]) -> None:
     """Write soil's Gaussians, none of which reaches out of the surface.
 
     Args:
         relief: the surface.
         chosen: (n,) which of them.
         carried: their centres, covariances, standard deviations across at rest, opacities and albedo.
+        sides: those that are seen, in the kernels' form.
         out: n centres, covariances, opacities and features.
     """
     arrays = [as_warp(t, d) for t, d in zip(carried, (wp.vec3, wp.mat33, wp.float32, wp.float32, wp.vec3), strict=True)]
-    inputs = [*surface_of(relief), as_warp(chosen, wp.int32), *arrays, _END, *_arrays(out)]
-    launch(kernels_visible.settle, len(chosen), inputs, relief.height)
+    inputs = [*surface_of(relief), as_warp(chosen, wp.int32), *arrays, as_warp(sides, wp.float32), _END]
+    launch(kernels_visible.settle, len(chosen), [*inputs, *_arrays(out)], relief.height)
 
 
 def _draw_grains(
-    relief: Relief, chosen: Tensor, particles: Sequence[Tensor], spacing: float, out: Sequence[Tensor]
+    relief: Relief, chosen: Tensor, particles: Sequence[Tensor], sides: Tensor, spacing: float, out: Sequence[Tensor]
 ) -> None:
     """Write particles' own Gaussians (positions and albedo): flat along the surface over them, round beneath."""
-    arrays = [as_warp(t, wp.vec3) for t in particles]
+    arrays = [*(as_warp(t, wp.vec3) for t in particles), as_warp(sides, wp.float32)]
     sizes = [size * spacing for size in (PARTICLE_SIZE, PARTICLE_THICKNESS, BURIED_SIZE)]
     inputs = [*surface_of(relief), as_warp(chosen, wp.int32), *arrays, *sizes, _END, PARTICLE_OPACITY, *_arrays(out)]
     launch(kernels_visible.grains, len(chosen), inputs, relief.height)

@@ -78,6 +78,7 @@ def base_strength(state: SoilState, values: wp.array2d(dtype=float), row: int) -
     strength.intercept = 0.0
     strength.intercept_per_cohesion = values[row, INTERCEPT_PER_COHESION]
     strength.dilation = 0.0
+    strength.mobilised = 1.0
     strength.viscosity = 0.0
     strength.crush_pressure = 0.0
     strength.crush_hardening = 0.0
@@ -90,6 +91,19 @@ def _chain(previous: Any, effect: Any, column: int) -> Any:
         return effect(previous(state, values, row), state, values, row, wp.static(column))
 
     return strength
+
+
+@wp.func
+def _lode(normal: wp.vec3, shear: wp.vec3) -> float:
+    """Cosine of three times the Lode angle of a deviator (tension positive), 1 in triaxial compression."""
+    j2 = 0.5 * wp.dot(normal, normal) + wp.dot(shear, shear)
+    j3 = (
+        2.0 * shear[0] * shear[1] * shear[2]
+        + normal[0] * (normal[1] * normal[2] - shear[2] * shear[2])
+        - normal[1] * shear[1] * shear[1]
+        - normal[2] * shear[0] * shear[0]
+    )
+    return wp.clamp(wp.static(-1.5 * 3.0**0.5) * j3 / wp.max(j2 * wp.sqrt(j2), 1.0e-12), -1.0, 1.0)
 
 
 def _stress_update(strength_of: Any, history: bool) -> Any:
@@ -144,6 +158,7 @@ def _stress_update(strength_of: Any, history: bool) -> Any:
             state.plastic_strain = stress.plastic_strain
             state.dilated = stress.dilated
             state.depth = stress.depth
+            state.lode = _lode(normal, tangent)
         strength = strength_of(state, values, row)
         apex = -strength.intercept / wp.max(strength.slope, 1.0e-6)
         if pressure < apex:
@@ -151,7 +166,10 @@ def _stress_update(strength_of: Any, history: bool) -> Any:
             elastic = -apex / bulk
             pressure = apex
         result = Stress()
-        limit = wp.max(strength.intercept + strength.slope * pressure, 0.0)
+        slope = strength.slope
+        if wp.static(history):
+            slope = strength.mobilised * slope
+        limit = wp.max(strength.intercept + slope * pressure, 0.0)
         measure = wp.sqrt(0.5 * wp.dot(normal, normal) + wp.dot(tangent, tangent))
         kept = 1.0
         if wp.static(history):
@@ -162,22 +180,23 @@ def _stress_update(strength_of: Any, history: bool) -> Any:
                 dilated = dilated - lost
                 elastic = elastic + lost
                 pressure = -bulk * elastic
-                limit = strength.intercept + strength.slope * pressure
+                limit = strength.intercept + slope * pressure
             slip = 0.0
             if measure > limit:
                 gain = 0.0
                 if opening <= 0.0:
                     # soil that has come apart is looser than any dilation makes it
-                    least = LEAST_DILATION * shear / (bulk * wp.max(strength.slope, 1.0e-6))
-                    gain = wp.max(strength.dilation, least)
-                slip = (measure - limit) / (shear + strength.viscosity / dt + strength.slope * gain * bulk)
+                    least = LEAST_DILATION * shear / (bulk * wp.max(slope, 1.0e-6))
+                    idle = (strength.slope - slope) / (1.0 + wp.static(3.0**-0.5) * strength.slope)
+                    gain = wp.max(strength.dilation - idle, least)
+                slip = (measure - limit) / (shear + strength.viscosity / dt + slope * gain * bulk)
                 slip = wp.min(slip, measure / shear)
                 dilated = dilated + gain * slip
                 elastic = elastic - gain * slip
                 if -bulk * elastic < apex:
                     opening = opening + elastic + apex / bulk
                     elastic = -apex / bulk
-                limit = wp.max(limit + (strength.viscosity / dt + strength.slope * gain * bulk) * slip, 0.0)
+                limit = wp.max(limit + (strength.viscosity / dt + slope * gain * bulk) * slip, 0.0)
                 kept = limit / wp.max(measure, 1.0e-12)
             result.plastic_strain = stress.plastic_strain + slip
             result.dilated = dilated

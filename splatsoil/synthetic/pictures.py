@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
-from splatsoil.measurement import Camera, Picture
+from splatsoil.measurement import HEAP, OPEN, TRANSPARENT, Camera, Picture
 from splatsoil.mpm import Trajectory
 from splatsoil.observation import Observation
 from splatsoil.synthetic.appearance import Appearance
@@ -31,6 +31,8 @@ WALL = 0.03
 """Thickness of the bin's walls and floor, as a share of the bed's narrower side."""
 RIM = 0.006
 """How far the bin's walls stand over the soil along them, m."""
+FIELD = 5.0
+"""How far open ground goes on, in lengths of the bed."""
 GRAIN = 0.1
 """Contrast of the fine pattern of bin and ground."""
 
@@ -104,7 +106,8 @@ class Photographer:
     def soil(self, frame: int, seen: Observation, colours: FloatArray) -> Body:
         """Of one frame of the video; particle albedo (n, 3), linear."""
         particles, _ = self.trajectory.at(self._moment(frame, seen))
-        return soil_surface(particles, colours, self.trajectory.spacing, self.setup.bed, sides=not self.setup.walls)
+        bed, sides = self.setup.bed.domain, self.setup.bed.container in (TRANSPARENT, HEAP)
+        return soil_surface(particles, colours, self.trajectory.spacing, bed, sides=sides)
 
     def stage(self, frame: int, seen: Observation, soil: Body) -> Renderer:
         """Soil, tool, bin and ground of one frame of the video."""
@@ -118,9 +121,10 @@ class Photographer:
         rotation, position = seen.tool(setup.tool.motion.pose(self._moment(frame, seen) / setup.frame_rate))
         tool = setup.tool.mesh
         placed = trimesh.Trimesh(tool.vertices @ rotation.T + position, tool.faces, process=False)
-        walls, ground = bin_of(setup)
+        walls, ground = surroundings_of(setup)
+        colour = look.sand if setup.bed.container == OPEN else look.bin
         return self.renderer(
-            [soil, Body.flat(placed, look.tool), *(Body.flat(wall, look.bin, GRAIN) for wall in walls)],
+            [soil, Body.flat(placed, look.tool), *(Body.flat(wall, colour, GRAIN) for wall in walls)],
             look.light,
             ground=ground,
             ground_colour=look.ground,
@@ -160,12 +164,16 @@ def _one_ahead(work: Callable[[T], R], items: Sequence[T]) -> Iterator[R]:
         yield coming.result()
 
 
-def bin_of(setup: Setup) -> tuple[list[trimesh.Trimesh], float]:
-    """Floor and walls around the soil, and the height in m of the ground that they stand on."""
-    bed, height = setup.bed, setup.surface.height
+def surroundings_of(setup: Setup) -> tuple[list[trimesh.Trimesh], float]:
+    """Floor and walls around the soil, or the soil that it goes on into; and the height in m of the ground."""
+    bed, height = setup.bed.domain, setup.surface.height
     thick = WALL * float(bed.extents[:2].min())
     edges = np.concatenate([height[0], height[-1], height[:, 0], height[:, -1]])
     top = float(edges.max()) + RIM
+    if setup.bed.container == HEAP:
+        return [], float(bed.lower[2])
+    if setup.bed.container == OPEN:
+        thick, top = FIELD * float(bed.extents[:2].max()), float(np.median(edges))
     (x0, y0, z0), (x1, y1) = bed.lower.tolist(), bed.upper[:2].tolist()
     boxes = (
         ((x0 - thick, y0 - thick, z0 - thick), (x1 + thick, y1 + thick, z0)),
@@ -174,5 +182,5 @@ def bin_of(setup: Setup) -> tuple[list[trimesh.Trimesh], float]:
         ((x0, y0 - thick, z0), (x1, y0, top)),
         ((x0, y1, z0), (x1, y1 + thick, top)),
     )
-    shown = boxes if setup.walls else boxes[:1]
+    shown = boxes[:1] if setup.bed.container == TRANSPARENT else boxes
     return [trimesh.creation.box(bounds=box) for box in shown], z0 - thick

@@ -12,7 +12,7 @@ import numpy.typing as npt
 import trimesh
 
 from splatsoil.errors import ParameterError
-from splatsoil.measurement import Bed, Camera, Frame, Measurement, Tool, ToolMotion
+from splatsoil.measurement import BIN, HEAP, TRANSPARENT, Bed, Camera, Frame, Measurement, Tool, ToolMotion
 from splatsoil.reconstruction.height_field import HeightField
 
 FloatArray = npt.NDArray[np.float64]
@@ -35,6 +35,8 @@ WAVELENGTHS = (0.4, 1.6)
 """Of a wavy surface, as shares of the bed's narrower side."""
 DEPTH_SHARE = 0.45
 """Mean depth of the soil in the bed's box, where nothing else is said."""
+FOOT, FLANK = 0.05, 25.0
+"""Of a heap: what its foot keeps off the bed's sides, of the narrower one, and its slopes in degrees."""
 CLEARANCE = 0.004
 """Between the soil and the tool before it moves, m."""
 
@@ -53,7 +55,6 @@ class Setup:
         video: fixed cameras by name.
         frames: video frames, from 0 on.
         pre_roll: video frames before that, negative.
-        walls: whether the bed's walls can be seen; without them the soil's sides show, as behind glass.
     """
 
     bed: Bed
@@ -65,7 +66,6 @@ class Setup:
     video: Mapping[str, Camera]
     frames: tuple[int, ...]
     pre_roll: tuple[int, ...] = PRE_ROLL
-    walls: bool = True
 
     def experiment(self) -> Measurement:
         """The experiment as the solver takes it; the pictures of its video are yet to be taken."""
@@ -100,9 +100,16 @@ class Setup:
         )
 
 
-def plow(seed: int = 0, *, views: int = VIEWS, depth: float | None = None) -> Setup:
-    """A plate of 12 x 12 cm, tilted by 20°, lowered into a bed of 0.8 x 0.5 m, pushed, paused and drawn back."""
-    bed = Bed(np.zeros(3), np.array([0.8, 0.5, 0.27]), density=1600.0, wall_friction=0.0, floor_friction=0.6)
+def plow(seed: int = 0, *, views: int = VIEWS, depth: float | None = None, container: str = BIN) -> Setup:
+    """A plate of 12 x 12 cm, tilted by 20°, lowered into a bed of 0.8 x 0.5 m, pushed, paused and drawn back.
+
+    Args:
+        seed: of the surface.
+        views: how many.
+        depth: mean depth of the soil in m, of a heap its highest.
+        container: what holds the soil, see `measurement.Bed`.
+    """
+    bed = Bed(np.zeros(3), np.array([0.8, 0.5, 0.27]), 1600.0, 0.0, floor_friction=0.6, container=container)
     motion = staged_motion((0.2, 0.25, 0.21), tilt=20.0, down=0.2, push=0.2, stages=STAGES)
     tool = Tool(plate(), motion, friction=0.3)
     target = (0.4, 0.25, 0.08)
@@ -132,7 +139,8 @@ def paper(*, views: int = VIEWS) -> Setup:
     Their x stays, their y (up) is our z, their z is our 1 - y. The plate's thickness and the frictions of tool and
     floor are not published; 1 cm and the frictions of ``plow`` are taken.
     """
-    bed = Bed(np.zeros(3), np.ones(3), density=1000.0, wall_friction=0.0, floor_friction=0.6)
+    # Their cameras stand so low that walls would hide the furrow.
+    bed = Bed(np.zeros(3), np.ones(3), 1000.0, wall_friction=0.0, floor_friction=0.6, container=TRANSPARENT)
     field = HeightField.over(bed.lower, bed.upper, SURFACE_CELL)
     x, z = field.points[..., 0], 1.0 - field.points[..., 1]
     waves = np.sin(math.pi * x) + 0.5 * np.sin(1.5 * math.pi * z) + 0.05 * np.sin(4.0 * math.pi * x)
@@ -152,7 +160,6 @@ def paper(*, views: int = VIEWS) -> Setup:
         views=tuple(camera(eye) for eye in spiral(target, 1.8, views)),
         video={"left": camera((-0.5, -0.5, 0.5), "left"), "right": camera((-0.5, 1.5, 0.5), "right")},
         frames=video_frames(199),
-        walls=False,  # their cameras stand so low that walls would hide the furrow
     )
 
 
@@ -235,12 +242,14 @@ def staged_motion(
 
 
 def wavy_surface(bed: Bed, depth: float, seed: int, tool: Tool) -> HeightField:
-    """`waves` that are clear of the tool where it starts.
+    """`waves`, of a heap cut down to one, that are clear of the tool where it starts.
 
     Raises:
         ParameterError: a depth that does not fit the bed, or soil that would reach the tool before it moves.
     """
     field = waves(bed, depth, seed)
+    if bed.container == HEAP:
+        field = heaped(field, bed)
     low, high = tool.bounds(0.0)
     reach = highest(field, low, high)
     if reach + CLEARANCE > low[2]:
@@ -275,6 +284,14 @@ def waves(bed: Bed, depth: float, seed: int) -> HeightField:
     slope = np.hypot(*np.gradient(relief, *field.cell[::-1])).max()
     scale = min(RELIEF * depth / relief.std(), math.tan(math.radians(STEEPEST)) / slope)
     return replace(field, height=np.minimum(bed.lower[2] + depth + scale * relief, bed.upper[2]))
+
+
+def heaped(surface: HeightField, bed: Bed) -> HeightField:
+    """A surface cut down to a heap whose foot is clear of the bed's sides, with slopes at which soil rests."""
+    place, foot = surface.points[..., :2], FOOT * float(bed.extents[:2].min())
+    inside = np.minimum(place - bed.lower[:2], bed.upper[:2] - place).min(axis=-1) - foot
+    slope = bed.lower[2] + math.tan(math.radians(FLANK)) * np.maximum(inside, 0.0)
+    return replace(surface, height=np.minimum(surface.height, slope))
 
 
 def plane(bed: Bed, depth: float, slope: float = 0.0, towards: float = 0.0) -> HeightField:

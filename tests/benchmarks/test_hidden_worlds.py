@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from splatsoil.benchmarks import hidden_worlds
-from splatsoil.benchmarks._newton import Numerics, Run, World
-from splatsoil.benchmarks._scenes import ANGLES, BEDS, TOOLS, Scene
-from splatsoil.benchmarks._truths import FIELD, KINDS, NOTHING, OBSERVATION, OUTSIDE, Hidden, draw
-from splatsoil.benchmarks.hidden_worlds import ELSE, main, ploughed_by_us, refine, score, soil_of, table
-from splatsoil.benchmarks.solvers import FRAMES, Kept
+from splatsoil.benchmarks._hidden import FIELD, KINDS, NOTHING, OBSERVATION, OUTSIDE, Hidden, draw
+from splatsoil.benchmarks._scenes import ANGLES, Scene
+from splatsoil.benchmarks.hidden_worlds import ELSE, main, score, soil_of, table
 
-from splatsoil.errors import ParameterError, RunError
-from splatsoil.files import read_json
-from splatsoil.measurement import Measurement
+from splatsoil.errors import ParameterError
 from splatsoil.mpm.simulate import base_settings
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects, library
@@ -42,15 +35,6 @@ def test_a_truth_is_drawn_by_seed_and_is_an_effect_of_the_library(kind: str) -> 
     assert (hidden.observation() != draw(NOTHING, 0, 1).observation()) == (kind in OBSERVATION)
 
 
-def test_truths_come_in_all_beds_tools_and_angles() -> None:
-    scenes = [draw(NOTHING, k, 1).scene for k in range(60)]
-    assert {s.bed for s in scenes} == set(BEDS)
-    assert {(s.tool, s.width, s.tilt) for s in scenes} == set(TOOLS)
-    angles = sorted(s.angle for s in scenes)
-    assert angles[0] < ANGLES[0] + 4.0 and angles[-1] > ANGLES[1] - 4.0
-    assert all(s.tool_friction == 0.3 for s in scenes), "what is noted of the tool"
-
-
 @pytest.mark.parametrize("kind", ["layering", FIELD])
 def test_no_part_of_the_soil_is_outside_of_what_the_model_takes(kind: str) -> None:
     low, high = FRICTION_ANGLE.limits or (FRICTION_ANGLE.lower, FRICTION_ANGLE.upper)
@@ -58,18 +42,6 @@ def test_no_part_of_the_soil_is_outside_of_what_the_model_takes(kind: str) -> No
         hidden = draw(kind, number, 1)
         angles = np.asarray(soil_of(hidden, hidden.scene.setup(), 0.04).angle)
         assert low <= angles.min() < angles.max() <= high
-
-
-def test_a_layer_lies_below_its_depth_and_a_stone_holds_no_sand() -> None:
-    setup = WAVY.setup()
-    layered = soil_of(replace(placed(draw("layering", 0, 1)), soil={"layer": (-8.0, 0.05)}), setup, 0.01)
-    weak = np.asarray(layered.angle) < 33.0 - 7.9
-    top = float(setup.surface.height.max())
-    assert weak[layered.particles[:, 2] < 0.02].all(), "the soil is 8 cm deep and more"
-    assert not weak[layered.particles[:, 2] > top - 0.05].any()
-    stone = draw("buried_obstacle", 0, 1)
-    x, y, z, radius = stone.soil["obstacle"]
-    assert np.linalg.norm(soil_of(stone, setup, 0.01).particles - [x, y, z], axis=1).min() > radius
 
 
 def test_no_photograph_shows_a_stone_and_no_tool_meets_one() -> None:
@@ -118,86 +90,15 @@ def test_both_solvers_are_told_the_same(kind: str) -> None:
         assert told.obstacle == pytest.approx((*place, values["obstacle_radius"]))
 
 
-def test_our_solver_ploughs_a_truth_of_its_own() -> None:
-    setup = WAVY.setup()
-    dry, damp = (
-        ploughed_by_us(placed(draw(kind, 0, 1), seed=2000), setup, [0, 2], "tiny", "cpu")
-        for kind in (NOTHING, "cohesion")
-    )
-    assert dry.frames == damp.frames == (0, 2)
-    assert np.array_equal(dry.positions[0], damp.positions[0])
-    assert not np.array_equal(dry.positions[1], damp.positions[1])
-
-
-@pytest.mark.parametrize("kind", OUTSIDE)
-def test_what_our_library_lacks_our_solver_cannot_plough(kind: str, tmp_path: Path) -> None:
-    with pytest.raises(ParameterError, match=kind):
-        main(["--solver", "small", "--kinds", kind, "--out", str(tmp_path / "worlds")])
-    assert not (tmp_path / "worlds").exists()
-
-
 @pytest.mark.parametrize(
-    "wrong", [["--voxel", "0"], ["--voxel", "-0.02"], ["--iterations", "0"], ["--refine", "--solver", "small"]]
+    ("wrong", "match"),
+    [(["--voxel", "0"], "--voxel"), (["--voxel", "-0.02"], "--voxel")]
+    + [(["--times", low, high], "--times") for low, high in (("0", "2"), ("3", "2"), ("1", "inf"), ("nan", "2"))],
 )
-def test_numerics_that_are_none_are_refused(tmp_path: Path, wrong: list[str]) -> None:
-    with pytest.raises(ParameterError, match=r"--voxel|--refine"):
+def test_numbers_that_make_no_sense_are_refused(tmp_path: Path, wrong: list[str], match: str) -> None:
+    with pytest.raises(ParameterError, match=match):
         main(["--kinds", NOTHING, "--out", str(tmp_path / "worlds"), *wrong])
     assert not (tmp_path / "worlds").exists()
-
-
-def test_the_other_solver_gets_the_numerics_that_are_asked_for(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    asked: list[tuple[Any, ...]] = []
-
-    class Ploughed(Exception):
-        """Far enough."""
-
-    def plough(worlds: Sequence[World], numerics: Numerics, *_: object) -> None:
-        spacings = sorted({world.spacing for world in worlds})
-        asked.append((numerics.voxel, numerics.iterations, *spacings, len(worlds)))
-        raise Ploughed
-
-    monkeypatch.setattr(hidden_worlds, "plough", plough)
-    coarse = ["--voxel", "0.04", "--iterations", "60", "--worlds-side-by-side", "2"]
-    for name, words in (("usual", []), ("coarse", coarse)):
-        with pytest.raises(Ploughed):
-            main(["--kinds", "tilt", NOTHING, "gravity", "--out", str(tmp_path / name), *words])
-    usual = Numerics()
-    assert asked == [(usual.voxel, usual.iterations, usual.spacing, 4), (0.04, 60, 0.02, 2)]
-
-
-def test_the_first_world_of_a_kind_is_checked_with_finer_voxels_once(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """Soil that doesn't move is as high with finer voxels; a force that is a fifth larger then isn't the same."""
-    numerics, asked = Numerics(voxel=0.03), []
-    truths = [draw(kind, k, 1) for kind in (NOTHING, "cohesion", "exposure") for k in (0, 1)]
-    force = np.outer(np.arange(1.0, 200.0), [-1.0, 0.0, 0.5])
-    for hidden in truths:
-        world = soil_of(hidden, hidden.scene.setup(), numerics.spacing)
-        folder = tmp_path / "sets" / hidden.name
-        folder.mkdir(parents=True)
-        still = dict.fromkeys((0, *FRAMES), world.particles)
-        Kept(still, world.spacing, force).save(folder / "truth_particles.npz", {})
-
-    def plough(worlds: Sequence[World], finer: Numerics, *_: object) -> list[Run]:
-        asked.append(([w.label for w in worlds], finer))
-        return [Run(dict.fromkeys(FRAMES, w.particles), (1.2 if w.cohesion else 1.01) * force) for w in worlds]
-
-    def load(folder: Path) -> Measurement:
-        hidden = next(h for h in truths if h.name == folder.name)
-        measurement = hidden.scene.setup().experiment()
-        frames = np.arange(1, 200)
-        table = np.column_stack([frames, frames / 50.0, force])
-        return replace(measurement, folder=folder, tool=replace(measurement.tool, force=table))
-
-    monkeypatch.setattr(hidden_worlds, "plough", plough)
-    monkeypatch.setattr(hidden_worlds.Measurement, "load", load)
-    for _ in range(2):
-        refine(truths, tmp_path, "cpu", lambda _: None, numerics, 4)
-    assert [names for names, _ in asked] == [[f"{NOTHING}-0", "cohesion-0"]], "photographs' effects are no soil"
-    assert asked[0][1] == numerics.refined()
-    done = read_json(tmp_path / "refinement.json")
-    assert {name: found["converged"] for name, found in done.items()} == {"nothing-0": True, "cohesion-0": False}
 
 
 def judged(kind: str, verdict: str, members: list[str], sure: float = 0.95) -> dict[str, Any]:
@@ -268,36 +169,3 @@ def test_probabilities_are_held_against_how_often_they_are_right() -> None:
     assert f"log score of the true model, mean: {np.log([0.97, 0.03, 0.94]).mean():.2f}" in told
     not_compared = judged("cohesion", "missing", ["tilt"])
     assert "mean: -13.82" in table([not_compared]), "as improbable as it counts at most"
-
-
-@pytest.mark.parametrize("wrong", [["0", "2"], ["3", "2"], ["1", "inf"], ["nan", "2"]])
-def test_a_range_of_sizes_that_is_none_is_refused(tmp_path: Path, wrong: list[str]) -> None:
-    with pytest.raises(ParameterError, match="--times"):
-        main(["--kinds", "tilt", "--times", *wrong, "--out", str(tmp_path / "worlds")])
-    assert not (tmp_path / "worlds").exists()
-
-
-def test_sizes_are_drawn_from_the_range_that_is_asked_for(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    made: list[Hidden] = []
-    monkeypatch.setattr(hidden_worlds, "make_worlds", lambda truths, *_: made.extend(truths))
-    assert main(["--kinds", "tilt", "--times", "3", "3", "--worlds-only", "--out", str(tmp_path)]) == 0
-    (candidate,) = (p for p in library()["tilt"].parameters if p.name == "tilt_x")
-    assert abs(made[0].size) == pytest.approx(3.0 * candidate.meaningful)
-
-
-def test_a_missing_renderer_is_said_before_anything_is_made(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setitem(sys.modules, "mitsuba", None)
-    with pytest.raises(RunError, match="independent"):
-        main(["--renderer", "mitsuba", "--kinds", NOTHING, "--out", str(tmp_path / "worlds")])
-    assert not (tmp_path / "worlds").exists()
-
-
-def test_a_folder_keeps_one_renderer_and_one_solver(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Worlds that the path tracer photographed aren't told as Mitsuba's."""
-    monkeypatch.setattr(hidden_worlds, "make_worlds", lambda *_: None)
-    monkeypatch.setattr(hidden_worlds, "load_mitsuba", lambda: None)
-    own = ["--kinds", NOTHING, "--worlds-only", "--out", str(tmp_path)]
-    assert main(own) == 0 and main(own) == 0
-    for other in (["--renderer", "mitsuba"], ["--solver", "small"], ["--voxel", "0.015"], ["--iterations", "240"]):
-        with pytest.raises(ParameterError, match="another --out"):
-            main([*own, *other])

@@ -9,13 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
-from splatsoil.benchmarks.information import precision_of, sigmas, size_of, table, written
+from splatsoil.benchmarks.information import precision_of, sigmas, table
 
 from splatsoil.cli import main as command_line
-from splatsoil.errors import RunError
 from splatsoil.files import read_json
-from splatsoil.parameters import Parameter
-from splatsoil.soil.library import library
 
 PAGE = Path(__file__).parents[2] / "docs" / "information.md"
 
@@ -53,13 +50,6 @@ def test_a_change_like_that_of_the_angle_is_nothing_and_one_orthogonal_to_it_is_
     assert length(apart + 2.0 * angle, covariance, angle) == pytest.approx(length(apart, covariance), rel=1e-6)
 
 
-def test_a_free_angle_leaves_what_generalised_least_squares_leaves(rng: np.random.Generator) -> None:
-    covariance, angle, change = covariance_of(rng, 5), rng.standard_normal(5), rng.standard_normal(5)
-    white = np.linalg.inv(np.linalg.cholesky(covariance))
-    _, left, *_ = np.linalg.lstsq((white @ angle)[:, None], white @ change, rcond=None)
-    assert length(change, covariance, angle) == pytest.approx(np.sqrt(left[0]), rel=1e-6)
-
-
 def test_chance_of_the_simulations_adds_nothing(rng: np.random.Generator) -> None:
     """Lengths of means of three changes, each with as much chance as noise, would be 40 / 3 too long, squared."""
     covariance, change = covariance_of(rng, 40), 4.0 * np.eye(40)[0]
@@ -77,15 +67,8 @@ def test_chance_alone_passes_its_limit_in_one_of_twenty(rng: np.random.Generator
     assert np.mean([value > least for value, least in found]) == pytest.approx(0.05, abs=0.025)
 
 
-def test_an_effect_is_on_at_four_times_what_matters_or_at_its_bound() -> None:
-    cohesion = library()["cohesion"].parameters[0]
-    assert size_of(cohesion) == (4.0 * cohesion.meaningful, 4.0)
-    low = Parameter("p", "1", 0.0, 1.0, 1.0, off=1.0, meaningful=0.5, sign=-1)
-    assert size_of(low) == (0.0, -2.0)
-
-
 def test_a_row_says_how_much_is_lost_and_by_what() -> None:
-    names = ("soil", "drawn", "reconstructed", "angle", "observation", "numerics")
+    names = ("soil", "drawn", "reconstructed", "angle", "observation", "discretisation")
 
     def row(effect: str, sigmas: Sequence[float], loss: float, factors: Sequence[float]) -> dict[str, Any]:
         own = names[-len(sigmas) :]
@@ -108,30 +91,6 @@ def test_a_row_says_how_much_is_lost_and_by_what() -> None:
     ]
 
 
-def test_the_page_has_a_place_and_other_pages_are_left_alone(tmp_path: Path) -> None:
-    assert "new table" in written(PAGE, "tiny", "new table")
-    other = tmp_path / "page.md"
-    other.write_text("mine")
-    with pytest.raises(RunError, match="no lines"):
-        written(other, "tiny", "new table")
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (("--effects", "glue"), "invalid choice: 'glue'"),
-        (("--effects", "stiffness"), "invalid choice: 'stiffness'"),
-        (("--page", "no.md"), "read"),
-    ],
-)
-def test_bad_options_are_told_before_anything_is_made(
-    words: tuple[str, ...], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "out"
-    assert command_line(["benchmark", "information", *words, "--out", str(out)]) == 2
-    assert said in capsys.readouterr().err and not out.exists()
-
-
 @pytest.mark.slow
 def test_all_of_it_with_one_effect_and_a_second_call_simulates_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -144,7 +103,7 @@ def test_all_of_it_with_one_effect_and_a_second_call_simulates_nothing(
     result = read_json(out / "result.json")
     found = result["rows"][0]["sigmas"]
     assert [row["effect"] for row in result["rows"]] == ["gravity"]
-    assert found["soil"] > found["angle"] >= found["observation"] >= found["numerics"] >= 0.0
+    assert found["soil"] > found["angle"] >= found["observation"] >= found["discretisation"] >= 0.0
     assert found["reconstructed"] > found["angle"]
     assert command_line([*words, "--page", str(page)]) == 0
     assert "base" not in capsys.readouterr().err

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
-from splatsoil.benchmarks._newton import WALL, Numerics, Run, World, _model, _shifts, _walls, plough
+from splatsoil.benchmarks._newton import Numerics, Run, World, _model, plough
 from splatsoil.benchmarks._scenes import Scene
-from splatsoil.benchmarks.numerics import Truth
+from splatsoil.benchmarks._truth import Truth
 
-from splatsoil.errors import MeasurementError, RunError
-from splatsoil.measurement import Bed, Measurement
 from splatsoil.reconstruction import fill
 
 SPACING, COARSE = 0.02, Numerics(voxel=0.04, substeps=2, iterations=60)
@@ -29,19 +26,6 @@ def test_the_examples_were_made_with_converged_numerics(plow_dry: Path, plow_dam
     assert Numerics.of(plow_dry) == Numerics.of(plow_damp) == Numerics()
 
 
-def test_a_set_that_does_not_tell_its_numerics_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "truth.json").write_text("{}")
-    with pytest.raises(MeasurementError, match="numerics"):
-        Numerics.of(tmp_path)
-
-
-def test_finer_voxels_get_more_steps_and_iterations() -> None:
-    finer = Numerics().refined()
-    assert finer.voxel == pytest.approx(0.01)
-    assert (finer.substeps, finer.iterations) == (4, 2000)
-    assert finer.spacing == pytest.approx(0.005)
-
-
 def test_a_bed_weighs_what_its_soil_does() -> None:
     """Whatever the spacing: volume x density x gravity."""
     scene = Scene(seed=1, angle=35.0, bed="flat", density=1430.0)
@@ -51,29 +35,6 @@ def test_a_bed_weighs_what_its_soil_does() -> None:
         assert weight == pytest.approx([0.0, 0.0, -0.8 * 0.5 * 0.12 * 1430.0 * 9.81], rel=1e-4)
     tilted = replace(world, gravity=(1.0, 0.0, -2.0))
     assert tilted.weight == pytest.approx(1430.0 * 0.013**3 * np.array([1.0, 0.0, -2.0]))
-
-
-def test_beds_beside_each_other_keep_their_walls_and_their_place_on_the_grid() -> None:
-    sizes = ((0.0, 0.5), (-0.31, 0.4), (0.2, 1.0))
-    base = Scene(seed=1, angle=35.0).setup().experiment()
-    worlds = []
-    for low, high in sizes:
-        bed = Bed(np.array([0.0, low, 0.0]), np.array([0.8, high, 0.27]), density=1600.0)
-        worlds.append(World("bed", replace(base, bed=bed), 35.0, np.zeros((1, 3)), SPACING))
-    shifts = _shifts(worlds, 0.04)
-    assert not shifts[0].any() and not shifts[:, [0, 2]].any()
-    assert shifts[:, 1] / 0.04 == pytest.approx(np.round(shifts[:, 1] / 0.04))
-    outsides = [(low - 2 * WALL + s, high + 2 * WALL + s) for (low, high), s in zip(sizes, shifts[:, 1], strict=True)]
-    for (_, end), (begin, _) in pairwise(outsides):
-        assert -1e-9 <= begin - end < 0.04 + 1e-9, "walls meet, or room is wasted"
-
-
-def test_worlds_on_different_floors_are_not_ploughed_together() -> None:
-    pytest.importorskip("newton")
-    world = soil(Scene(seed=1, angle=35.0))
-    bed = replace(world.measurement.bed, floor_friction=0.2)
-    with pytest.raises(RunError, match="one by one"):
-        plough([world, replace(world, measurement=replace(world.measurement, bed=bed))], COARSE, (1,))
 
 
 def test_cohesion_is_the_whole_strength_without_pressure_and_counted_once(plow_damp: Path) -> None:
@@ -94,15 +55,6 @@ def test_cohesion_is_the_whole_strength_without_pressure_and_counted_once(plow_d
     assert tension[: len(x)] == pytest.approx(300.0 / np.tan(np.radians(33.0)), rel=1e-3)
 
 
-def test_no_gap_is_left_between_two_walls() -> None:
-    lower, upper = np.array([0.0, -0.2, 0.1]), np.array([0.8, 0.3, 0.4])
-    margin = np.array([0.1, 0.1, 0.0])
-    around = np.random.default_rng(0).uniform(lower - margin, upper + margin, (2000, 3))
-    outside = np.any((around < lower) | (around > upper), axis=1)
-    held = [np.all(np.abs(around - centre) <= half, axis=1) for centre, half in _walls(lower, upper)]
-    assert np.array_equal(np.any(held, axis=0), outside)
-
-
 @pytest.mark.slow
 def test_soil_falls_as_its_own_world_pulls() -> None:
     """A lump in the air, under 9.81 and under 4 m/s², and one without weight."""
@@ -119,16 +71,6 @@ def test_soil_falls_as_its_own_world_pulls() -> None:
         assert (lump - run.particles[5])[:, 2].mean() == pytest.approx(fall, rel=0.02, abs=1e-6)
 
 
-@pytest.mark.slow
-def test_soil_too_weak_to_stand_stays_in_the_box(plow_dry: Path) -> None:
-    pytest.importorskip("newton")
-    truth = Truth.load(plow_dry)
-    bed, weak = truth.measurement.bed, World("weak", truth.measurement, 12.0, truth.start(SPACING, 0), SPACING)
-    x = plough([weak], COARSE, (20,))[0].particles[20]
-    # through corners that were open it came out by 57 mm
-    assert np.maximum(bed.lower - x, x - bed.upper).max() < 1e-3
-
-
 @pytest.fixture(scope="module")
 def ploughed() -> tuple[Truth, list[Run]]:
     """Two coarse worlds, ten frames into the push."""
@@ -138,36 +80,6 @@ def ploughed() -> tuple[Truth, list[Run]]:
     short = replace(truth, particles={0: x, 5: x, 35: x}, volume=SPACING**3)
     true = World("true", short.measurement, 33.0, x, SPACING, cohesion=300.0)
     return short, plough([true, replace(true, angle=20.0)], COARSE, (5, 35))
-
-
-@pytest.mark.slow
-def test_before_the_tool_arrives_the_bed_rests(
-    ploughed: tuple[Truth, list[Run]],
-) -> None:
-    truth, runs = ploughed
-    for run in runs:
-        moved = np.linalg.norm(run.particles[5] - truth.particles[0], axis=1)
-        assert np.percentile(moved, 90) < 0.3e-3  # loose grains on top settle by more; free fall would be 49 mm
-
-
-@pytest.mark.slow
-def test_soil_reaches_where_the_plate_was_a_substep_ago_and_no_further(
-    ploughed: tuple[Truth, list[Run]],
-) -> None:
-    truth, runs = ploughed
-    for run in runs:
-        # the solver lets particles a hundredth of a voxel in; the tool's way in a substep is 2 mm
-        assert abs(gap_before(truth.measurement, run.particles[35])) < 0.6e-3
-
-
-def gap_before(measurement: Measurement, x: np.ndarray) -> float:
-    """Between the plate's front, where it was a substep before frame 35, and the soil nearest to it, m."""
-    tool = measurement.tool
-    lower, upper = tool.mesh.bounds
-    rotation, position = tool.motion.pose((35 - 1 / COARSE.substeps) / measurement.frame_rate)
-    local = (x - position) @ rotation
-    before = local[(np.abs(local[:, 1]) < upper[1] - 0.01) & (local[:, 2] > lower[2] + 0.01) & (local[:, 0] > 0.0)]
-    return float(before[:, 0].min() - upper[0])
 
 
 @pytest.mark.slow

@@ -14,11 +14,11 @@ def test_listed_are_the_modules_of_the_folder(repository: Path, capsys: pytest.C
     assert cli.main(["benchmark", "--json"]) == 0
     listed = json.loads(capsys.readouterr().out)["benchmarks"]
     modules = {p.stem.replace("_", "-") for p in (repository / "benchmarks").glob("[!_]*.py")}
-    assert set(listed) == modules and {"bo-vs-mcmc", "calibration", "paper-table"} <= modules
+    assert set(listed) == modules and {"bo-vs-mcmc", "calibration", "paper-table", "solvers"} <= modules
     assert all(listed.values())
 
 
-@pytest.mark.parametrize("name", ["bo-vs-mcmc", "calibration", "paper-table"])
+@pytest.mark.parametrize("name", ["bo-vs-mcmc", "calibration", "paper-table", "speed"])
 def test_options_behind_the_name_are_the_benchmarks_own(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["benchmark", name, "--help"]) == 0
     assert f"usage: splatsoil benchmark {name}" in capsys.readouterr().out
@@ -33,10 +33,11 @@ def test_an_unknown_name_is_told_the_known_ones(capsys: pytest.CaptureFixture[st
 @pytest.mark.parametrize(
     ("words", "says"),
     [
+        ("solvers --sets examples/plow-dry --seeds 0", "--seeds: 0: give 1 or more"),
         ("hidden-worlds --count -2", "--count: -2: give 1 or more"),
         ("hidden-worlds --count few", "--count: invalid number value: 'few'"),
         ("validate --device cuda:99", "there is no device 'cuda:99' here"),
-        ("validate --device gpu", "there is no device 'gpu' here"),
+        ("speed --device gpu", "there is no device 'gpu' here"),
     ],
 )
 def test_options_that_make_no_sense_are_refused_before_the_work(

@@ -3,12 +3,12 @@
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NoReturn
 
 import pytest
 from splatsoil.inverse.criticism.simulations import Simulations
@@ -110,10 +110,8 @@ def test_helpers_begin_with_the_command_and_nothing_outlives_it(helps: bool, fai
 @pytest.mark.usefixtures("three_cores")
 @pytest.mark.parametrize("stage", ["run_diagnosis", "check_adequacy"])
 def test_who_is_not_alone_in_a_folder_has_no_helpers(stage: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    @contextmanager
-    def taken() -> Iterator[None]:
+    def taken() -> NoReturn:
         raise RunError("another process is writing")
-        yield
 
     fit = {"parameters": {}, "setup": {"effects": [], "preset": "tiny"}}
     folder: Any = SimpleNamespace(lock=taken, fit=lambda: fit, description={"seed": 0})

@@ -437,6 +437,8 @@ CASES = [
     Case("frame-rate-zero", edit(SET, "frame_rate", to=0), SET, "frame_rate", "outside"),
     Case("friction-is-an-angle", edit(SET, "tool", "friction", to=17.0), SET, "tool.friction", "not an angle"),
     Case("friction-negative", edit(SET, "bed", "floor_friction", to=-0.1), SET, "bed.floor_friction", "outside"),
+    Case("container-unknown", edit(SET, "bed", "container", to="glas"), SET, "bed.container",
+         "'glas' is unknown; known are bin, transparent, open, heap"),
     Case("name-with-dots", edit(SET, "name", to="../../elsewhere"), SET, "name", "names files"),
     Case("name-of-two-lines", edit(SET, "name", to="a\nb"), SET, "name", "unprintable"),
     Case("name-endless", edit(SET, "name", to="a" * 300), SET, "name", "at most 60"),

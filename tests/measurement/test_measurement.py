@@ -129,6 +129,16 @@ def made_up(**bend: float) -> dict:
     }
 
 
+@pytest.mark.parametrize("container", [None, "bin", "transparent", "open", "heap"])
+def test_the_container_is_kept_and_says_what_is_simulated(container: str | None, tmp_path: Path) -> None:
+    parts = made_up()
+    bed = write_measurement(tmp_path / "set", **parts | {"bed": replace(parts["bed"], container=container)}).bed
+    assert bed.container == container
+    margin = 0.06 if container in ("open", "heap") else 0.0
+    np.testing.assert_allclose(bed.domain.lower, [-margin, -margin, 0.0])
+    np.testing.assert_allclose(bed.domain.upper, [0.4 + margin, 0.3 + margin, 0.2])
+
+
 def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     parts = made_up(k1=-0.1, p2=0.002)
     m = write_measurement(tmp_path / "out" / "set", **parts, suffix=".png", truth={"phi": 36.0})

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.ndimage import gaussian_filter
-from splatsoil.benchmarks.numerics import Truth
+from splatsoil.benchmarks._truth import Truth
 
 from splatsoil.measurement import Measurement
 from splatsoil.mpm import Resolution, Trajectory, simulate

@@ -177,11 +177,12 @@ def test_adhesion_drags_a_sliding_tool_by_its_area() -> None:
     assert drag[1] - drag[0] == pytest.approx(300.0 * 0.08 * 0.08, rel=0.03)
 
 
-EVERY = tuple(n for n in library() if n not in ("compaction", "camera_pose"))
+EVERY = tuple(n for n in library() if n not in ("compaction", "critical_state", "camera_pose"))
 EVERY_VALUE = {
     "dilatancy_angle": 8.0, "rate_gain": 0.5, "viscosity": 5.0, "softening_angle": 4.0, "cohesion": 100.0,
     "pressure_exponent": 0.05, "layer_friction": 2.0, "density_gradient": 0.5, "tool_adhesion": 100.0,
     "tilt_x": 2.0, "gravity_factor": 0.9, "obstacle_radius": 0.03, "stiffness_factor": 1.5,
+    "hardening_strain": 0.01,
 }  # fmt: skip
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from splatsoil.benchmarks.numerics import Truth
+from splatsoil.benchmarks._truth import Truth
 
 from splatsoil.measurement import Measurement
 from splatsoil.mpm import PRESETS, Resolution, Trajectory, simulate

@@ -42,8 +42,8 @@ class Scene:
         grain: size of the texture's features.
         contrast: of the texture, 0 to 1.
         wall: thickness of the bin's walls, which are as high as the soil's mean level; 0 for a bed in a field, where
-        soil and
-            texture go on beyond the box.
+            soil and texture go on beyond the box; None for no walls, so that the soil's sides are seen.
+        heap: whether the soil slopes down to the floor within the box.
         sun: direction to the sun.
         tool_centre: of the box-shaped tool.
         noise: standard deviation of the pixels.
@@ -54,7 +54,8 @@ class Scene:
     wave: float = 0.015
     grain: float = 0.02
     contrast: float = 0.6
-    wall: float = 0.02
+    wall: float | None = 0.02
+    heap: bool = False
     sun: tuple[float, float, float] = (0.4, 0.3, 0.85)
     tool_height: float = 0.12
     noise: float = 0.005
@@ -74,12 +75,16 @@ class Scene:
     def height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """The soil's surface."""
         u, v = x - self.bed.lower[0], y - self.bed.lower[1]
+        if self.heap:
+            inside = np.minimum.reduce([u, v, self.bed.extents[0] - u, self.bed.extents[1] - v]) - 0.05
+            return self.bed.lower[2] + np.minimum(0.5 * np.maximum(inside, 0.0), 0.06)
         return self.level + self.wave * (
             np.sin(2 * np.pi * u / (0.31 * self.stretch)) * np.cos(2 * np.pi * v / (0.27 * self.stretch))
             + 0.4 * np.cos(7 * u / self.stretch)
         )
 
-    def soil_colour(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    def soil_colour(self, x: np.ndarray, y: np.ndarray, z: np.ndarray | float = 0.0) -> np.ndarray:
+        x, y = x + 0.7 * z, y + 1.3 * z  # blotches of sides, too
         noise = 0.6 * value_noise(x, y, self.grain, self.seed) + 0.4 * value_noise(x, y, self.grain / 2, self.seed + 1)
         return (0.55 + self.contrast * (noise - 0.5))[..., None] * np.array([1.0, 0.86, 0.66])
 
@@ -104,7 +109,9 @@ class Scene:
             out = np.maximum.reduce([lower[0] - x, x - upper[0], lower[1] - y, y - upper[1]])
             if thick == 0.0:
                 return self.height(x, y), np.full(x.shape, 2)
-            kind = np.where(out < 0, 2, np.where(out < thick, 1, 0))
+            kind = np.where(out < 0, 2, np.where(out < (thick or 0.0), 1, 0))
+            if self.heap:
+                kind = np.where((kind == 2) & (self.height(x, y) <= lower[2]), 0, kind)
             return np.where(kind == 2, self.height(x, y), np.where(kind == 1, self.level, lower[2])), kind
 
         # March from where a ray enters the slab under `top`, then bisect.
@@ -140,6 +147,15 @@ class Scene:
             for a, b in ((1, 0), (0, 1))
         ]
         normal = np.stack([-slope[0], -slope[1], np.ones(len(ray))], 1)
+        if thick is None and not self.heap:
+            # Met well beneath the surface: an upright side.
+            sunk = (kind == 2) & (point[:, 2] < self.height(point[:, 0], point[:, 1]) - 2e-3)
+            colour[sunk] = self.soil_colour(*point.T)[sunk]
+            out = np.stack(
+                [lower[0] - point[:, 0], point[:, 0] - upper[0], lower[1] - point[:, 1], point[:, 1] - upper[1]]
+            )
+            outward = np.array([[-1.0, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0]])[out.argmax(0)]
+            normal[sunk] = outward[sunk]
         normal[kind < 2] = [0.0, 0.0, 1.0]
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         lit = ~self._meets_tool(point, np.tile(sun, (len(ray), 1)))[0]
@@ -163,14 +179,24 @@ class Scene:
         normal[np.arange(len(ray)), axis] = -np.sign(ray[np.arange(len(ray)), axis])
         return (enter < leave) & (enter > 1e-6), enter, normal
 
-    def cameras(self, count: int, width: int, height: int, *, distance: float = 1.1, **lens: float) -> list[Camera]:
-        """Cameras on a dome that look at the bed's middle; `lens` replaces intrinsics."""
+    def cameras(
+        self,
+        count: int,
+        width: int,
+        height: int,
+        *,
+        distance: float = 1.1,
+        rise: tuple[float, float] = (35.0, 80.0),
+        **lens: float,
+    ) -> list[Camera]:
+        """Cameras on a dome, between two elevations in degrees, that look at the bed's middle; `lens` replaces
+        intrinsics."""
         target = np.array([*(self.bed.lower + self.bed.upper)[:2] / 2, self.level])
         size = float(np.linalg.norm(self.bed.extents[:2]))
         result = []
         for k in range(count):
-            turn, rise = 2.39996 * k, np.radians(35 + 45 * (k + 0.5) / count)
-            away = np.array([np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise)])
+            turn, high = 2.39996 * k, np.radians(rise[0] + (rise[1] - rise[0]) * (k + 0.5) / count)
+            away = np.array([np.cos(high) * np.cos(turn), np.cos(high) * np.sin(turn), np.sin(high)])
             right = np.cross([0.0, 0.0, 1.0], away)
             right /= np.linalg.norm(right)
             pose = np.eye(4)

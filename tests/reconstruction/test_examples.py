@@ -7,26 +7,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from splatsoil.benchmarks.reconstruction import score, true_surface
+from splatsoil.benchmarks._truth import Truth
+from splatsoil.benchmarks.whole_path import true_surface
 
 from splatsoil.measurement import Measurement
-from splatsoil.reconstruction import HeightField, fill, reconstruct
+from splatsoil.reconstruction import HeightField, fill, reconstruct, volume
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["plow-dry", "plow-damp"])
 def test_pictures_and_surface(repository: Path, name: str):
-    folder = repository / "examples" / name
-    measurement = Measurement.load(folder)
+    truth = Truth.load(repository / "examples" / name)
+    measurement = truth.measurement
     result = reconstruct(measurement)
-    numbers = score(folder, result, measurement)
-    assert numbers.psnr >= 30.0
-    assert numbers.rmse is not None and numbers.rmse <= 4e-3
-    assert numbers.bias is not None and abs(numbers.bias) <= 1e-3
-    assert numbers.volume is not None and abs(numbers.volume) <= 0.01
+    exact = true_surface(truth, result.surface)
+    assert result.psnr >= 30.0
+    assert result.surface.rmse(exact) <= 4e-3 and abs(result.surface.bias(exact)) <= 1e-3
+    assert volume(result.surface, measurement.bed) == pytest.approx(len(truth.particles[0]) * truth.volume, rel=0.01)
     # A level bed of the right mean height would not do: the bound on RMSE means something.
-    exact = true_surface(folder, measurement, result.surface)
-    assert exact is not None
     level = HeightField(exact.x, exact.y, np.full_like(exact.height, np.nanmean(exact.height)))
     assert level.rmse(exact) > 4e-3
     particles = fill(result.surface, measurement.bed, 0.01)

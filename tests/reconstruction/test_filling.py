@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -101,3 +102,27 @@ def test_the_solid_is_closed_and_has_the_soils_volume(waves):
     assert solid.volume == pytest.approx(EXACT, rel=2e-3)
     np.testing.assert_allclose(solid.bounds[:, :2], [BED.lower[:2], BED.upper[:2]])
     assert solid.bounds[0, 2] == pytest.approx(BED.lower[2])
+
+
+def test_open_ground_goes_on_beyond_the_box(waves):
+    """Around the box lies soil as high as at its border, as much as a tenth of its narrower side twice over."""
+    bed, spacing = replace(BED, container="open"), 0.01
+    particles = fill(waves, bed, spacing, seed=1)
+    inside = np.all((particles[:, :2] > BED.lower[:2]) & (particles[:, :2] < BED.upper[:2]), axis=1)
+    assert inside.sum() * spacing**3 == pytest.approx(EXACT, rel=5e-3)
+    beyond = particles[~inside]
+    assert beyond[:, 0].min() < -0.29 and beyond[:, 1].max() > 1.59
+    # Beside the box's long sides the waves go on, before and behind it their ends do.
+    ends = 0.1 * (0.8 + 0.2) * 2 * MEAN + 0.1 * 0.5 * (height(-0.2) + height(0.6) - 2 * BED.lower[2])
+    assert len(beyond) * spacing**3 == pytest.approx(ends, rel=0.02)
+
+
+def test_a_heap_is_filled_alone():
+    """A cone of half a radian: its volume, and nothing on the floor around it."""
+    field = HeightField.over(BED.lower, BED.upper, 0.005)
+    x, y = np.meshgrid(field.x, field.y)
+    away = np.hypot(x - 0.2, y - 1.25)
+    cone = HeightField(field.x, field.y, BED.lower[2] + np.maximum(0.1 - 0.5 * away, 0.0))
+    particles = fill(cone, replace(BED, container="heap"), 0.01, seed=1)
+    assert len(particles) * 0.01**3 == pytest.approx(np.pi * 0.2**2 * 0.1 / 3.0, rel=0.01)
+    assert np.hypot(particles[:, 0] - 0.2, particles[:, 1] - 1.25).max() < 0.21

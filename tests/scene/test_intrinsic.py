@@ -37,7 +37,9 @@ def experiment(small_set: Path):
     )
     whole = torch.ones(count, dtype=torch.bool)
     surface = HeightField.over(bed.lower, bed.upper, 0.02, LEVEL)
-    made = SimpleNamespace(gaussians=gaussians, soil=whole, tool=~whole, background=(0.0, 0.0, 0.0), surface=surface)
+    made = SimpleNamespace(
+        gaussians=gaussians, soil=whole, tool=~whole, background=(0.0, 0.0, 0.0), surface=surface, container="bin"
+    )
     return measurement, made
 
 

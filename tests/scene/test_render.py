@@ -94,6 +94,28 @@ def test_level_soil_shows_its_albedo():
     assert np.allclose(image[pixel(view, (0.2, 0.2, 0.1))], encoded(ALBEDO).numpy(), atol=0.01)
 
 
+def test_sides_that_are_seen_are_drawn_in_their_own_light():
+    """A wall's picture from beside it: soil's albedo in the side's light, down to the floor and up to the surface."""
+    bed, view = level_bed(), camera(eye=(0.2, -0.6, 0.12), target=(0.2, 0.0, 0.05))
+    hidden = scene_of(bed)
+    light = np.full((4, 3), 0.9)
+    light[2] = [0.3, 0.4, 0.5]  # the side at the least y
+    image = hidden.replace(side_light=light).render(bed, None, None, view)
+    for height in (0.01, 0.03, 0.05):  # nearer to the side than to the surface, two layers in
+        shown = linear(torch.tensor(image[pixel(view, (0.2, 0.0, height))])).numpy()
+        assert np.allclose(shown, ALBEDO.numpy() * light[2], rtol=0.15)
+    assert np.all(image[pixel(view, (0.2, 0.0, -0.02))] < 0.02)
+    through = linear(torch.tensor(hidden.render(bed, None, None, view)[pixel(view, (0.2, 0.0, 0.03))])).numpy()
+    assert not np.allclose(through, ALBEDO.numpy() * light[2], rtol=0.15)
+    # Soil that sinks at the wall is seen to: the surface's own light falls on what is left of it.
+    sunk = bed.clone()
+    sunk[:, 2] *= 0.5
+    lower = hidden.replace(side_light=light).render(sunk, None, None, view)
+    assert np.allclose(linear(torch.tensor(lower[pixel(view, (0.2, 0.0, 0.02))])), ALBEDO.numpy() * light[2], rtol=0.1)
+    above = linear(torch.tensor(lower[pixel(view, (0.2, 0.0, 0.085))])).numpy()
+    assert not np.allclose(above, ALBEDO.numpy() * light[2], rtol=0.1)
+
+
 def test_soil_in_the_shadow_of_a_box_keeps_the_sky_alone():
     bed, view = level_bed(), camera()
     box = trimesh.creation.box((0.08, 0.08, 0.02))
@@ -203,7 +225,7 @@ def test_no_gaussian_reaches_out_of_the_soil():
     albedo = torch.tensor(generator.random((count, 3)), dtype=torch.float32)
     out = [torch.zeros(count - 20, *shape) for shape in ((3,), (3, 3), (), (4,))]
     chosen = torch.arange(20, count, dtype=torch.int32)
-    render._settle(relief, chosen, (*tensors, albedo), out)
+    render._settle(relief, chosen, (*tensors, albedo), torch.zeros(0, 6), out)
     centres, covariances, opacities, features = (t.double().numpy() for t in out)
     before, left = shapes[20:], depth[20:]
     across = np.sqrt(np.einsum("i,nij,j->n", slope, before, slope))
@@ -220,7 +242,7 @@ def test_no_gaussian_reaches_out_of_the_soil():
     assert np.array_equal(opacities, tensors[3].double().numpy()[20:]) and np.all(features[:, 3] == 1.0)
     assert np.array_equal(features[:, :3], albedo.double().numpy()[20:])
 
-    render._draw_grains(relief, chosen, (tensors[0], albedo), SPACING, out)
+    render._draw_grains(relief, chosen, (tensors[0], albedo), torch.zeros(0, 6), SPACING, out)
     centres, covariances, opacities, _ = (t.double().numpy() for t in out)
     deep = left > 2.0 * render.BURIED_SIZE * SPACING
     assert 5 < deep.sum() < 175 and np.allclose(centres, place[20:], atol=1e-6) and np.allclose(opacities, 0.95)
@@ -267,7 +289,7 @@ def coloured_surface(measurement, particles, spacing, cell=0.004):
     scales = torch.tensor([0.6, 0.6, 0.1]).mul(cell).expand(len(points), 3).contiguous()
     gaussians = Gaussians(points, scales, turn, torch.full((len(points),), 0.9), encoded(colours))
     soil = torch.ones(len(points), dtype=torch.bool)
-    return SimpleNamespace(gaussians=gaussians, soil=soil, tool=~soil, background=(0.0, 0.0, 0.0))
+    return SimpleNamespace(gaussians=gaussians, soil=soil, tool=~soil, background=(0.0, 0.0, 0.0), container="bin")
 
 
 @pytest.mark.parametrize("turned", [0.0, 40.0, 90.0])

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from splatsoil.envs.together import attempt
 
-from splatsoil.errors import ParameterError
+from splatsoil.errors import CombinationError, ParameterError
 from splatsoil.soil.element import ElementTest, isotropic_compression, simple_shear, triaxial
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects, library
-from splatsoil.soil.matching import Matching
+from splatsoil.soil.matching import Matching, cone_slope
+from splatsoil.soil.packing import at_void_ratio
 from splatsoil.soil.settings import Settings
 
 ANGLE, PRESSURE = 33.0, 1.0e4
@@ -163,6 +164,79 @@ def test_friction_grows_with_the_logarithm_of_density() -> None:
     np.testing.assert_allclose(density, [1.0, 1.05, 1.2 * 1.1])
 
 
+@pytest.mark.parametrize(("matching", "degrees"), [(Matching.COMPRESSION, 3.0), (Matching.PLANE_STRAIN, 5.0)])
+def test_friction_and_dilation_follow_boltons_index(matching: Matching, degrees: float) -> None:
+    """Bolton (1986): phi = phi_c + 3 I_R (5 in plane strain), 0.3 I_R of volume per axial strain; I_R = 5 I_D - 1."""
+    effect = library()["critical_state"]
+    for density in (0.0, 0.2, 0.5, 0.8, 1.0):
+        index = 5.0 * density - 1.0
+        _, _, more, less, first, bend = effect.columns(
+            Settings(ANGLE, matching=matching), {"relative_density": density, "volume_range": 0.2}
+        )
+        slope = cone_slope(ANGLE, matching) * (1.0 + more * index / (1.0 + less * index))
+        assert slope == pytest.approx(cone_slope(ANGLE + degrees * index, matching), rel=0.01)
+        gain = 0.3 * index
+        # per shear strain g: g = sqrt(3) (eps_1 - eps_v / 3) in triaxial compression, eps_1 - eps_3 in plane strain
+        sheared = math.sqrt(3.0) * (1.0 + gain / 3.0) if matching is Matching.COMPRESSION else 2.0 + gain
+        assert first * index / (1.0 + bend * index) == pytest.approx(gain / sheared, abs=1e-9)
+
+
+@pytest.mark.parametrize("density", [0.0, 0.1, 0.5, 0.9])
+def test_shear_brings_any_density_to_the_critical_state(density: float) -> None:
+    """At I_R = 0, below 150 kPa at I_D = 0.2, volume stays and friction is the critical one."""
+    values = {"friction_angle": ANGLE, "relative_density": density, "volume_range": 0.2}
+    law = Law(find_effects(["critical_state"]))
+    test = triaxial(law, values, confining=2e4, strains=np.linspace(0.002, 2.0, 100), young=1e8)
+    assert -test.volume_strain[0, -1] == pytest.approx(0.2 * (density - 0.2), abs=2e-3)
+    phi = math.sin(math.radians(ANGLE))
+    assert test.q[0, -1] == pytest.approx(4e4 * phi / (1.0 - phi), rel=0.01)
+    peak = math.sin(math.radians(ANGLE + 3.0 * (5.0 * density - 1.0)))
+    assert test.q[0].max() == pytest.approx(4e4 * max(peak / (1.0 - peak), phi / (1.0 - phi)), rel=0.03)
+
+
+def test_pressure_takes_dilatancy_away() -> None:
+    """I_R = 0 at ln p = Q - R / I_D: above it dense sand contracts."""
+    law = Law(find_effects(["critical_state"]))
+    for pressure, gains in ((5e5, True), (2e7, False)):
+        test = simple_shear(
+            law,
+            {"relative_density": 0.8},
+            confining=pressure,
+            strains=[0.02, 0.04],
+            constant_volume=True,
+            young=100.0 * pressure,
+        )
+        assert (test.p[0, 2] > test.p[0, 1]) == gains
+
+
+def test_hardening_mobilises_friction_by_a_hyperbola() -> None:
+    """g / (0.9 (A + g)) with A for the pressure, all of it from 9 A on; volume lost from Rowe's 9 M / (9 + 3 M) on."""
+    values = {"friction_angle": ANGLE, "hardening_strain": 0.02}
+    law = Law(find_effects(["hardening"]))
+    test = triaxial(law, values, confining=1e5, strains=STRAINS, young=1e8, largest_step=5e-5)
+    plastic, p = test.plastic_strain[0], test.p[0]
+    share = np.minimum(plastic / (0.9 * (0.02 * np.sqrt(p / 1e5) + plastic)), 1.0)
+    slope = cone_slope(ANGLE)
+    np.testing.assert_allclose(test.q[0, 1:] / math.sqrt(3.0) / p[1:], slope * share[1:], rtol=0.01)
+    elastic = (p - 1e5) / (1e8 / 1.8)
+    # Rowe's is per deviatoric strain, q = M p; the shear strain is sqrt(3) times that
+    stress_ratio = math.sqrt(3.0) * slope
+    rowe = 9.0 * stress_ratio / (9.0 + 3.0 * stress_ratio) / math.sqrt(3.0)
+    lost = np.sum(rowe * (1.0 - 0.5 * (share[1:] + share[:-1])) * np.diff(plastic))
+    assert test.volume_strain[0, -1] - elastic[-1] == pytest.approx(lost, rel=0.03)
+
+
+def test_another_packing_changes_density_and_hardening_alone() -> None:
+    values = {"friction_angle": ANGLE, "relative_density": 0.3, "volume_range": 0.2, "hardening_strain": 0.01}
+    dense = at_void_ratio(values, 0.9, 0.75)
+    density = 0.3 + math.log(1.9 / 1.75) / 0.2
+    assert dense == pytest.approx({**values, "relative_density": density, "hardening_strain": 0.003 / density})
+    assert at_void_ratio(dense, 0.75, 0.9) == pytest.approx(values)
+    assert at_void_ratio({"friction_angle": ANGLE}, 0.9, 0.75) == {"friction_angle": ANGLE}
+    with pytest.raises(CombinationError, match=r"void ratio 0.5: a relative density of 0.30 at 0.9 makes 1.48 of it"):
+        at_void_ratio(values, 0.9, 0.5)
+
+
 def test_cohesion_matches_mohr_coulomb_in_extension_too() -> None:
     """q = 6 (c cos phi + p sin phi) / (3 + sin phi) in extension, for a cone matched there."""
     law = Law(find_effects(["cohesion"]))
@@ -209,7 +283,7 @@ def test_off_values_change_nothing(name: str) -> None:
 
 
 def test_all_effects_on_strength_work_together_in_any_order() -> None:
-    names = [n for n in library() if n != "compaction"]
+    names = [n for n in library() if n not in ("compaction", "critical_state")]
     sizes = {"cohesion": 200.0, "dilatancy_angle": 8.0, "rate_gain": 0.5, "viscosity": 5.0, "softening_angle": 4.0}
     values = sizes | {"pressure_exponent": 0.05, "layer_friction": 2.0, "density_gradient": 0.5}
     one, other = Law(find_effects(names)), Law(find_effects(names[::-1]))

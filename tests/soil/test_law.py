@@ -172,7 +172,7 @@ def test_every_built_in_effect_is_complete() -> None:
     named = (
         "cohesion dilatancy rate_dependence viscosity softening pressure_dependence compaction tool_friction "
         "tool_adhesion tilt gravity layering density_gradient buried_obstacle camera_pose exposure time_offset "
-        "tool_pose blur light stiffness"
+        "tool_pose blur light stiffness critical_state hardening"
     )
     assert set(named.split()) == set(library())
     for name, effect in library().items():

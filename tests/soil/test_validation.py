@@ -2,17 +2,31 @@
 
 from __future__ import annotations
 
+import csv
+import math
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 from splatsoil.benchmarks._validation.element import ALLOWED, strength
-from splatsoil.benchmarks._validation.sand import CRITICAL, TESTS, fit, mobilised
+from splatsoil.benchmarks._validation.sand import (
+    CRITICAL,
+    LADDER,
+    LIMITS,
+    from_one_to_another,
+    karlsruhe,
+    mobilised,
+)
 
-from splatsoil.experiment.triaxial import TriaxialExperiment, read_triaxial
+from splatsoil.soil.element import triaxial
+from splatsoil.soil.law import Law
+from splatsoil.soil.library import find_effects
 from splatsoil.soil.matching import Matching
+from splatsoil.soil.packing import at_void_ratio, of_limits
 
 FILE = Path(os.environ.get("SPLATSOIL_MEASURED", "")) / "karlsruhe_triaxial" / "tmd2_loose_tmd22_dense_subset.csv"
+SUMMARY = FILE.with_name("summary_25_drained_tests_derived.csv")
 
 PEAK = 42.14
 """Peak friction angle of TMD22, from the data set's own table of all 25 tests, degrees."""
@@ -26,23 +40,38 @@ def test_strength_is_exact_in_the_test_a_matching_is_named_after(matching: Match
 
 
 @pytest.mark.skipif(not FILE.is_file(), reason="SPLATSOIL_MEASURED names no folder with karlsruhe_triaxial")
-def test_the_base_law_is_rejected_by_dense_sand_in_its_volume_and_effects_mend_it() -> None:
-    curves = read_triaxial(FILE)
-    name, void_ratio = TESTS["loose (TMD2)"]
-    loose = fit(TriaxialExperiment(curves[name], void_ratio=void_ratio))
-    assert loose.volume < 1.0
-    assert loose.values["friction_angle"] == pytest.approx(CRITICAL, abs=2.0)
-    name, void_ratio = TESTS["dense (TMD22)"]
-    fits = [
-        fit(TriaxialExperiment(curves[name], effects, void_ratio=void_ratio))
-        for effects in ((), ("dilatancy",), ("dilatancy", "softening"))
-    ]
-    assert fits[0].volume > 50.0 and fits[0].volume > fits[0].strength
-    assert fits[1].volume < 1.0
-    # the effect's friction angle is the residual one: from the peak on it must be the critical angle
-    after = fit(TriaxialExperiment(curves[name], ("dilatancy", "softening"), void_ratio=void_ratio), since=0.06)
-    assert after.values["friction_angle"] == pytest.approx(CRITICAL, abs=2.0)
-    assert after.strength < 1.0 and after.volume < 1.0
-    assert mobilised(curves[name]).max() == pytest.approx(PEAK, abs=0.1)
-    errors = [f.volume + f.strength for f in fits]
-    assert errors[0] > 5.0 * errors[1] and errors[1] > 1.1 * errors[2]
+@pytest.mark.parametrize(("fit", "other"), [("TMD2", "TMD22"), ("TMD22", "TMD2")])
+def test_each_effect_lowers_the_error_on_a_density_that_was_not_fitted(fit: str, other: str) -> None:
+    curves = karlsruhe(FILE.parents[1])
+    known = of_limits(curves[fit].void_ratio, *LIMITS)
+    rows, tables = from_one_to_another("sand", curves, [fit], LADDER[:3], known)
+    assert [row.held for row in rows] == [None, True, True]
+    assert {test for _, test in tables} == {other}
+    assert mobilised(curves["TMD22"]).max() == pytest.approx(PEAK, abs=0.1)
+
+
+@pytest.mark.skipif(not SUMMARY.is_file(), reason="SPLATSOIL_MEASURED names no folder with karlsruhe_triaxial")
+def test_published_index_numbers_predict_the_peaks_of_25_tests() -> None:
+    """Critical angle and void ratio limits as published, and no fit: densities from 0.15 to 1, 50 to 400 kPa."""
+    law = Law(find_effects(["critical_state", "hardening", "stiffness"]))
+    soil = {
+        "friction_angle": CRITICAL,
+        "relative_density": 0.2,
+        "volume_range": math.log(2.054 / 1.677),
+        "hardening_strain": 0.008,
+        "stiffness_factor": 5.0,
+    }
+    loose = 2.054 * math.exp(-0.2 * soil["volume_range"]) - 1.0
+    strains = np.linspace(0.002, 0.3, 100)
+    off = []
+    with SUMMARY.open(newline="") as stream:
+        for row in csv.DictReader(stream):
+            values = at_void_ratio(soil, loose, float(row["e0"]))
+            test = triaxial(law, values, confining=1e3 * float(row["p0_kPa"]), strains=strains, young=2e7)
+            ratio = (test.q / test.p)[0].max()
+            gained = -np.diff(test.volume_strain[0, 1:]) / np.diff(strains)
+            peak = math.degrees(math.asin(3.0 * ratio / (6.0 + ratio)))
+            dilation = math.degrees(math.asin(np.max(gained / (2.0 + gained))))
+            off.append((peak - float(row["phi_peak_deg"]), dilation - float(row["psi_max_deg"])))
+    assert len(off) == 25
+    assert np.sqrt(np.mean(np.square(off), axis=0)) == pytest.approx([1.0, 1.0], abs=0.5)

@@ -1,1 +1,0 @@
-"""Parts of ``splatsoil benchmark speed``."""

@@ -1,0 +1,118 @@
+"""What tests without cameras have in common: instruments without a place, read over a strain or a depth."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
+from typing import ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from splatsoil.experiment.base import candidates_of
+from splatsoil.experiment.features import Layout, Site
+from splatsoil.parameters import Parameter
+from splatsoil.soil.effect import Effect
+from splatsoil.soil.law import Law
+from splatsoil.soil.library import find_effects, library
+
+FloatArray = npt.NDArray[np.float64]
+
+MEMORY = 0.8
+"""Correlation of neighbouring readings: a specimen, or a bed, that is off stays off."""
+ONE_ANGLE = {"intermediate_share": 1.0}
+"""The friction angle has the same meaning in every test, see `intermediate_stress`; parameters that are not fitted."""
+
+
+class LaboratoryExperiment(ABC):
+    """A test without cameras, and a model of it: an :class:`~splatsoil.experiment.base.Experiment`.
+
+    Attributes:
+        kind: what the test is, as ``experiment.json`` says it.
+        always: effects that are on in every model of such a test.
+        known: parameters that other tests of the soil have told, by name; they are not fitted.
+    """
+
+    kind: ClassVar[str]
+    always: ClassVar[tuple[str, ...]] = ("intermediate_stress",)
+    chance: bool = False
+    sensor_memory: float = MEMORY
+    numerics: tuple[str, ...] = ()
+    redrawn: tuple[str, ...] = ()
+    guesses: tuple[str, ...] = ()
+
+    def __init__(
+        self,
+        name: str,
+        effects: Iterable[str | Effect],
+        candidates: Iterable[str | Effect] | None,
+        known: Mapping[str, float] | None = None,
+    ) -> None:
+        self.name = name
+        chosen = find_effects(effects)
+        on = (*(e for e in find_effects(self.always) if e.name not in {c.name for c in chosen}), *chosen)
+        law = Law(on)
+        self.model = tuple(effect.name for effect in on)
+        names = {p.name for p in law.parameters}
+        self.known = {name: v for name, v in {**ONE_ANGLE, **(known or {})}.items() if name in names}
+        shapes = {shape for effect in on for shape in effect.shapes}
+        self.parameters: tuple[Parameter, ...] = tuple(
+            p
+            for p in law.parameters
+            if (p.off is not None or p.name == "friction_angle" or p.name in shapes) and p.name not in self.known
+        )
+        wanted = tuple(library().values()) if candidates is None else find_effects(candidates)
+        self._known = {effect.name: effect for effect in (*wanted, *on)}
+        self.candidates = candidates_of((e for e in wanted if self.acts(e)), on)
+
+    def acts(self, effect: Effect) -> bool:
+        """Whether an effect can change what such a test measures."""
+        return not (effect.numerical or effect.observes)
+
+    def law(self, effects: Iterable[str]) -> Law:
+        """The model's law with other effects on, too."""
+        return Law(self._known[name] for name in dict.fromkeys((*self.model, *effects)))
+
+    def values(self, values: Mapping[str, float]) -> dict[str, float]:
+        """A model's parameters, those that are not fitted included."""
+        return {**self.known, **values}
+
+    def _read(
+        self,
+        observed: FloatArray,
+        sensor: FloatArray,
+        times: Sequence[float],
+        time_name: str,
+        unit: str,
+        channels: Sequence[str],
+        region: str,
+    ) -> None:
+        """Take features (t, s) and their standard deviations (t, s); stages are the halves of the test."""
+        middle = 0.5 * float(times[-1])
+        self.layout = Layout(
+            times=tuple(float(t) for t in times),
+            sites=tuple(Site(channel) for channel in channels),
+            time_name=time_name,
+            unit=unit,
+            stages=tuple("first half" if t <= middle else "second half" for t in times),
+            regions=np.full((len(times), len(channels)), region),
+        )
+        self.observed, self.sensor = observed, sensor
+        self.seen = np.ones(self.layout.shape, dtype=bool)
+        self.quiet = np.zeros(self.layout.shape, dtype=bool)
+
+    @abstractmethod
+    def readings(
+        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
+    ) -> FloatArray:
+        """(t, s) what the instruments would read, in SI units; arguments as for `predict`."""
+
+    @abstractmethod
+    def features(self, readings: FloatArray) -> FloatArray:
+        """(t, s) features of readings (t, s)."""
+
+    def predict(
+        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
+    ) -> FloatArray:
+        """(t, s) features; see :class:`~splatsoil.experiment.base.Experiment`."""
+        return self.features(self.readings(values, effects=effects, seed=seed, numerics=numerics))

@@ -1,0 +1,173 @@
+"""Direct shear tests, and the angle of repose, as experiments: the law in simple shear at a single point."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from splatsoil.errors import ParameterError
+from splatsoil.experiment.laboratory import FloatArray, LaboratoryExperiment
+from splatsoil.experiment.triaxial import REFERENCE, SLOW, VOLUME_SPREAD, YOUNG
+from splatsoil.soil.effect import Effect
+from splatsoil.soil.element import simple_shear
+from splatsoil.soil.packing import at_void_ratio
+
+RATIO_SPREAD = 0.024
+"""Of shear stress over normal stress between specimens: 1° of friction, as in triaxial tests."""
+
+REPOSE_SPREAD = 1.0
+"""Of an angle of repose between heaps where they are too few to tell, degrees."""
+REPOSE_STRAIN = 1.0
+"""Shear strain that soil has gone through when it comes to rest on a heap."""
+GRAVITY = 9.81
+
+
+@dataclass(frozen=True)
+class Shearing:
+    """One test.
+
+    Attributes:
+        name: of the test.
+        strain: displacement over the specimen's height (n,).
+        ratio: shear stress over normal stress (n,).
+        volume: loss of height over the height (n,).
+        normal: stress in Pa.
+        void_ratio: at the start.
+    """
+
+    name: str
+    strain: FloatArray
+    ratio: FloatArray
+    volume: FloatArray
+    normal: float
+    void_ratio: float = 0.8
+
+
+class ShearBoxExperiment(LaboratoryExperiment):
+    """Shear box tests under constant normal stress; the box is taken to shear evenly.
+
+    Args:
+        tests: of one soil, at the same strains; parameters are those of the first one's void ratio.
+        effects: that are on.
+        candidates: effects to consider; all that act on strength by default.
+        known: parameters that are not fitted, at the first test's void ratio.
+
+    Raises:
+        ParameterError: tests whose strains differ.
+    """
+
+    kind = "shear_box"
+    always = (*LaboratoryExperiment.always, "stiffness")
+
+    def __init__(
+        self,
+        tests: Sequence[Shearing],
+        effects: Iterable[str | Effect] = (),
+        *,
+        candidates: Iterable[str | Effect] | None = None,
+        known: Mapping[str, float] | None = None,
+    ) -> None:
+        self.tests = tuple(tests)
+        if not self.tests or any(not np.array_equal(t.strain, self.tests[0].strain) for t in self.tests):
+            raise ParameterError("shear box tests of one experiment need the same strains; interpolate their curves")
+        super().__init__(", ".join(t.name for t in self.tests), effects, candidates, known)
+        observed = self.features(np.concatenate([np.stack([t.ratio, t.volume], axis=1) for t in self.tests], axis=1))
+        self._read(
+            observed,
+            np.ones_like(observed),
+            100.0 * self.tests[0].strain,
+            "displacement over height, %",
+            "spreads between specimens",
+            [f"{what}, {t.name}" for t in self.tests for what in ("stress ratio", "volume strain")],
+            "specimen",
+        )
+
+    def acts(self, effect: Effect) -> bool:
+        """Whether it acts on strength."""
+        return effect.strength is not None
+
+    def readings(
+        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
+    ) -> FloatArray:
+        """(t, 2 tests) stress ratio and volume strain; nothing about them is chance."""
+        del seed, numerics
+        law, out, first = self.law(effects), [], self.tests[0].void_ratio
+        for test in self.tests:
+            sheared = simple_shear(
+                law,
+                at_void_ratio(self.values(values), first, test.void_ratio),
+                confining=test.normal,
+                strains=test.strain,
+                void_ratio=test.void_ratio,
+                young=YOUNG * float(np.sqrt(test.normal / REFERENCE)),
+                strain_rate=SLOW,
+            )
+            out += [sheared.shear_stress[0, 1:] / test.normal, 1.0 - np.exp(-sheared.volume_strain[0, 1:])]
+        return np.stack(out, axis=1)
+
+    def features(self, readings: FloatArray) -> FloatArray:
+        """In units of spreads."""
+        return readings / np.tile([RATIO_SPREAD, VOLUME_SPREAD], len(self.tests))
+
+
+class ReposeExperiment(LaboratoryExperiment):
+    """The angle of repose of a heap: a layer at the surface of a long slope is in simple shear, at its critical state.
+
+    Args:
+        angles: (trials,) measured, degrees.
+        height: of the heap, m; half of it is the layer that moves.
+        density: bulk density, kg/m³.
+        effects: that are on.
+        candidates: effects to consider; all that act on strength by default.
+
+    Raises:
+        ParameterError: no angles, or lengths without meaning.
+    """
+
+    kind = "repose"
+
+    def __init__(
+        self,
+        angles: npt.ArrayLike,
+        *,
+        height: float = 0.1,
+        density: float = 1600.0,
+        effects: Iterable[str | Effect] = (),
+        candidates: Iterable[str | Effect] | None = None,
+        name: str = "repose",
+    ) -> None:
+        measured = np.asarray(angles, dtype=np.float64).reshape(-1)
+        if not (measured.size and height > 0.0 and density > 0.0):
+            raise ParameterError("a heap needs an angle of repose, a height and a density")
+        super().__init__(name, effects, candidates)
+        self.normal = 0.5 * height * density * GRAVITY
+        spread = float(measured.std(ddof=1)) if len(measured) > 2 else REPOSE_SPREAD
+        self._read(
+            np.array([[measured.mean()]]), np.array([[spread]]), (1.0,), "heap at rest", "deg", ("angle",), "heap"
+        )
+
+    def acts(self, effect: Effect) -> bool:
+        """Whether it acts on strength."""
+        return effect.strength is not None
+
+    def readings(
+        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
+    ) -> FloatArray:
+        """(1, 1) degrees; nothing about them is chance."""
+        del seed, numerics
+        sheared = simple_shear(
+            self.law(effects),
+            self.values(values),
+            confining=self.normal,
+            strains=[REPOSE_STRAIN],
+            young=YOUNG * float(np.sqrt(self.normal / REFERENCE)),
+            strain_rate=SLOW,
+        )
+        return np.array([[np.degrees(np.arctan(sheared.shear_stress[0, -1] / self.normal))]])
+
+    def features(self, readings: FloatArray) -> FloatArray:
+        """Degrees."""
+        return readings

@@ -1,0 +1,121 @@
+"""What a test tells: the parameters of a model, and how probable each model is, by the comparison that pictures get."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from splatsoil.errors import SimulationError
+from splatsoil.experiment.laboratory import FloatArray, LaboratoryExperiment
+from splatsoil.inverse.criticism.design import Prior, Run
+from splatsoil.inverse.criticism.diagnosis import diagnose
+from splatsoil.inverse.criticism.record import record
+from splatsoil.inverse.criticism.simulations import Simulations
+from splatsoil.parameters import ParameterSpace
+
+STARTS = (-0.5, -0.2, 0.1)
+"""Of the search, in halves of the parameters' ranges about their middles; simulations with chance begin at the last."""
+STEP, CHANCE_STEP = 2e-3, 0.1
+"""Of the search's differences, likewise: where simulations have chance, well above it."""
+MOST = 12
+"""Rounds of a search among simulations with chance."""
+FAR = 1e3
+"""Residual, in standard deviations, of a simulation that could not be made."""
+
+Report = Callable[[str, float], None]
+
+
+def fitted(experiment: LaboratoryExperiment, folder: Path | None, seed: int, report: Report) -> dict[str, Any]:
+    """The parameters of the model as it is, with their uncertainty, and whether it leaves more than noise."""
+    return _compared(experiment, folder, seed, report, effects=False)
+
+
+def diagnosed(experiment: LaboratoryExperiment, folder: Path | None, seed: int, report: Report) -> dict[str, Any]:
+    """How probable each model is: the one as it is, and those with an effect more."""
+    return _compared(experiment, folder, seed, report, effects=True)
+
+
+def _compared(
+    experiment: LaboratoryExperiment, folder: Path | None, seed: int, report: Report, *, effects: bool
+) -> dict[str, Any]:
+    simulations = Simulations(experiment, folder, _identity(experiment))
+    values, known = search(experiment, simulations, seed, report)
+    found = diagnose(
+        experiment,
+        values,
+        simulate=simulations,
+        effects=effects,
+        seed=seed,
+        known=known,
+        prior=Prior.of(experiment, values),
+        progress=report,
+    )
+    return {
+        **record(experiment, found, simulations.asked),
+        "fit": "+".join(experiment.model),
+        "values": values,
+        "simulated_now": simulations.made,
+    }
+
+
+def search(
+    experiment: LaboratoryExperiment, simulations: Simulations, seed: int, report: Report
+) -> tuple[dict[str, float], list[Run]]:
+    """Parameters of least squares, and all simulations that were made for them (Levenberg & Marquardt's way within
+    bounds: Branch, Coleman & Li 1999, SIAM J. Sci. Comput. 21(1))."""
+    space = ParameterSpace(experiment.parameters)
+    runs: list[Run] = []
+
+    def residuals(unit: FloatArray) -> FloatArray:
+        values = space.to_dict(space.from_unit(unit))
+        report("search", min(0.9, 0.02 * len(runs)))
+        try:
+            table = simulations(values, seed=seed, purpose="search")
+        except SimulationError:
+            return np.full(experiment.observed.size, FAR)
+        runs.append(Run(values, seed=seed))
+        return ((table - experiment.observed) / experiment.sensor).ravel()
+
+    chance = experiment.chance
+    found = [
+        least_squares(
+            residuals,
+            np.full(len(space), start),
+            bounds=(-1.0, 1.0),
+            diff_step=CHANCE_STEP if chance else STEP,
+            max_nfev=MOST if chance else None,
+        )
+        for start in (STARTS[-1:] if chance else STARTS)
+    ]
+    best = min(found, key=lambda f: float(f.cost))
+    # one run at each place, and few of them: an emulator wants places that differ
+    return space.to_dict(space.from_unit(best.x)), _apart(runs, space, best.x)
+
+
+def _apart(runs: list[Run], space: ParameterSpace, best: FloatArray) -> list[Run]:
+    """The nearest runs to the best one, each at least a step of the search from those before it, about as many as a
+    design has."""
+    unit = space.to_unit(np.array([[r.values[p.name] for p in space] for r in runs]))
+    kept: list[int] = []
+    for index in np.argsort(np.linalg.norm(unit - best, axis=1), kind="stable"):
+        if all(np.linalg.norm(unit[index] - unit[k]) > CHANCE_STEP / 2 for k in kept):
+            kept.append(int(index))
+        if len(kept) >= 5 * (1 + len(space)):
+            break
+    return [runs[k] for k in kept]
+
+
+def _identity(experiment: LaboratoryExperiment) -> Mapping[str, Any]:
+    resolution = getattr(experiment, "resolution", None)
+    return {
+        "kind": experiment.kind,
+        "model": list(experiment.model),
+        "observed": experiment.observed.tolist(),
+        "times": list(experiment.layout.times),
+        "resolution": None if resolution is None else vars(resolution),
+        "always": dict(experiment.values({})),
+    }

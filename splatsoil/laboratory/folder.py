@@ -1,0 +1,375 @@
+"""Folders that hold a test: ``experiment.json`` with its ``kind``, and tables of readings beside it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from splatsoil.errors import MeasurementError
+from splatsoil.experiment.column import ColumnExperiment
+from splatsoil.experiment.laboratory import FloatArray, LaboratoryExperiment
+from splatsoil.experiment.plate import PlateExperiment
+from splatsoil.experiment.shear_box import ReposeExperiment, ShearBoxExperiment, Shearing
+from splatsoil.experiment.triaxial import Curve, TriaxialExperiment
+from splatsoil.files import write_text
+from splatsoil.measurement.fields import Fields, read_table, read_text
+from splatsoil.measurement.measurement import EXPERIMENT
+from splatsoil.soil.effect import Effect
+from splatsoil.soil.packing import of_limits
+
+FORMAT = "splatsoil-laboratory/1"
+STRAINS = np.concatenate([np.arange(0.005, 0.0201, 0.005), np.arange(0.03, 0.301, 0.01)])
+"""At which curves are read."""
+FEWEST = 4
+"""Readings of a curve."""
+PORE_PRESSURE = 0.1
+"""Of the confining pressure: a specimen in which it changes by more is not drained."""
+GRAINS = 2650.0
+"""Density of quartz, kg/m³."""
+PLATE_READINGS = 12
+"""Depths at which a plate's force is read, evenly from a twelfth of the largest on."""
+TRIALS_DIFFER = 0.1
+"""Standard deviation of a plate's force between trials, relative, where there are too few to tell: the nine trials of
+Pavlov & Johnson (github.com/robomechanics/3d-terramechanics) differ by 5 to 21 % from least to most."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """How a test is modelled.
+
+    Attributes:
+        effects: that are on.
+        candidates: effects to consider; all that can act if None.
+        preset: resolution of the solver, where there is one.
+        device: Warp device name.
+    """
+
+    effects: tuple[str | Effect, ...] = ()
+    candidates: tuple[str | Effect, ...] | None = None
+    preset: str = "small"
+    device: str = "cpu"
+
+
+def load(folder: Path, options: Options | None = None) -> LaboratoryExperiment:
+    """The test in a folder.
+
+    Raises:
+        MeasurementError: what is wrong with it, by file and field.
+        ParameterError: an effect or preset that is unknown.
+    """
+    fields = Fields.read(folder / EXPERIMENT)
+    kind = fields.text("kind")
+    if kind not in KINDS:
+        fields.fail("kind", f"{kind!r} is no kind of test; known are {', '.join(KINDS)}")
+    if fields.text("format") != FORMAT:
+        fields.fail("format", f"expected {FORMAT!r}")
+    fields.name("name")
+    return KINDS[kind].read(fields, folder, options or Options())
+
+
+def simulate(
+    kind: str, out: Path, values: Mapping[str, float], effects: Sequence[str | Effect], preset: str, seed: int
+) -> LaboratoryExperiment:
+    """Write a test of known soil, without errors of reading.
+
+    Raises:
+        ParameterError: values that the model doesn't take.
+        MeasurementError: the folder is not empty.
+    """
+    if out.exists() and any(out.iterdir()):
+        raise MeasurementError("is not empty; choose another folder", file=out)
+    shape = KINDS[kind].example(out.name or kind, Options(tuple(effects), preset=preset))
+    shape.law(()).require_on({**shape.values(values), **_off(shape, values)})
+    description, tables = KINDS[kind].write(shape, shape.readings(values, seed=seed))
+    write_text(
+        out / EXPERIMENT,
+        json.dumps({"format": FORMAT, "kind": kind, "name": out.name or kind, **description}, indent=1) + "\n",
+    )
+    for name, text in tables.items():
+        write_text(out / name, text)
+    return shape
+
+
+def _off(shape: LaboratoryExperiment, values: Mapping[str, float]) -> dict[str, float]:
+    """A stiffness that nobody asked for, where tests always have one: as if it were asked for."""
+    always = "stiffness" in shape.always and "stiffness_factor" not in values
+    return {"stiffness_factor": 1.0 + 1e-9} if always else {}
+
+
+def _csv(columns: Mapping[str, FloatArray]) -> str:
+    rows = zip(*columns.values(), strict=True)
+    return "\n".join([",".join(columns), *(",".join(f"{v:.6g}" for v in row) for row in rows)]) + "\n"
+
+
+def _header(file: Path) -> str:
+    """The names of a table's columns, in small letters."""
+    lines = [line for line in read_text(file).splitlines() if line.strip()]
+    return lines[0].lower() if lines else ""
+
+
+def _at(kept: FloatArray, strains: FloatArray, *curves: FloatArray) -> list[FloatArray]:
+    """Curves (n,) over strains (n,) at strains (k,)."""
+    order = np.argsort(strains, kind="stable")
+    return [np.interp(kept, strains[order], curve[order]) for curve in curves]
+
+
+def read_curve(file: Path, confining: float, void_ratio: float = 0.8, *, drained: bool = True) -> Curve:
+    """A triaxial test's curve at `STRAINS`, as far as it reaches, from a CSV table.
+
+    Columns are ``axial_strain_percent``, ``q_kPa`` and ``volume_strain_percent`` or ``void_ratio``; ``p_kPa``, the mean
+    effective stress, shows whether the specimen drained.
+
+    Args:
+        file: the table.
+        confining: lateral stress, Pa.
+        void_ratio: at the start.
+        drained: whether it was.
+
+    Raises:
+        MeasurementError: what is wrong with it, or that it is undrained.
+    """
+    header = _header(file)
+    by_ratio = "void_ratio" in header and "volume_strain_percent" not in header
+    volume = "void_ratio" if by_ratio else "volume_strain_percent"
+    table = read_table(file, ("axial_strain_percent", "q_kpa", volume))
+    strain, q = table[:, 0] / 100.0, 1e3 * table[:, 1]
+    if "p_kpa" in header:
+        pore = confining + q / 3.0 - 1e3 * read_table(file, ("p_kpa",))[:, 0]
+        drained = drained and bool(np.abs(pore).max() <= PORE_PRESSURE * confining)
+    if not drained:
+        raise MeasurementError(
+            "is undrained: pore water bears a part of the stress, and the law knows none; give drained tests", file=file
+        )
+    lost = (table[0, 2] - table[:, 2]) / (1.0 + table[0, 2]) if by_ratio else table[:, 2] / 100.0
+    kept = STRAINS[strain.max() * 1.0001 >= STRAINS]
+    if len(kept) < FEWEST:
+        raise MeasurementError(f"ends before a strain of {100 * STRAINS[FEWEST - 1]:g} %", file=file)
+    ratio, lost = _at(kept, strain, q / (confining + q / 3.0), lost)
+    return Curve(file.stem, kept, lost, ratio, confining, void_ratio=void_ratio)
+
+
+def _read_triaxial(fields: Fields, folder: Path, options: Options) -> TriaxialExperiment:
+    curves = [
+        read_curve(
+            test.path("file", folder, folder),
+            test.number("confining", 1e2, 1e8, hint="it is in Pa"),
+            test.number("void_ratio", 0.1, 3.0, default=0.8),
+            drained=not test.has("drained") or test.flag("drained"),
+        )
+        for test in fields.children("tests")
+    ]
+    known = _limits(fields, curves[0].void_ratio)
+    return TriaxialExperiment(together(curves), options.effects, candidates=options.candidates, known=known)
+
+
+def together(curves: Sequence[Curve]) -> list[Curve]:
+    """Curves at the strains that all of them reach."""
+    kept = min((c.strain for c in curves), key=len)
+    n = len(kept)
+    return [replace(c, strain=kept, volume=c.volume[:n], ratio=c.ratio[:n]) for c in curves]
+
+
+def _limits(fields: Fields, void_ratio: float) -> dict[str, float]:
+    """What is known of the density by index tests; nothing without them."""
+    if not fields.has("void_ratio_limits"):
+        return {}
+    least, most = fields.vector("void_ratio_limits", 2)
+    return of_limits(void_ratio, float(least), float(most))
+
+
+def _example_triaxial(name: str, options: Options) -> TriaxialExperiment:
+    del name
+    strains = STRAINS[STRAINS <= 0.2 + 1e-9]
+    nothing = np.zeros(len(strains))
+    return TriaxialExperiment(
+        [Curve(f"{p:.0f}kPa", strains, nothing, nothing, 1e3 * p) for p in (50.0, 100.0, 200.0)], options.effects
+    )
+
+
+def _write_triaxial(shape: TriaxialExperiment, readings: FloatArray) -> tuple[dict[str, object], dict[str, str]]:
+    tests, tables = [], {}
+    for k, curve in enumerate(shape.curves):
+        file = f"{curve.name}.csv"
+        ratio, volume = readings[:, 2 * k], readings[:, 2 * k + 1]
+        q = curve.confining * ratio / (1.0 - ratio / 3.0)
+        tests.append({"file": file, "confining": curve.confining, "void_ratio": curve.void_ratio, "drained": True})
+        tables[file] = _csv(
+            {"axial_strain_percent": 100 * curve.strain, "q_kPa": q / 1e3, "volume_strain_percent": 100 * volume}
+        )
+    return {"tests": tests}, tables
+
+
+def _read_shear_box(fields: Fields, folder: Path, options: Options) -> ShearBoxExperiment:
+    height = fields.number("height", 1e-3, 1.0, hint="it is in m")
+    found = []
+    for test in fields.children("tests"):
+        file = test.path("file", folder, folder)
+        normal = test.number("normal_stress", 1e1, 1e8, hint="it is in Pa")
+        table = read_table(file, ("displacement_mm", "shear_stress_kpa", "vertical_displacement_mm"))
+        strain = 1e-3 * table[:, 0] / height
+        kept = STRAINS[strain.max() * 1.0001 >= STRAINS]
+        if len(kept) < FEWEST:
+            raise MeasurementError(f"ends before {100 * STRAINS[FEWEST - 1]:g} % of the height", file=file)
+        ratio, lost = _at(kept, strain, 1e3 * table[:, 1] / normal, -1e-3 * table[:, 2] / height)
+        void_ratio = test.number("void_ratio", 0.1, 3.0, default=0.8)
+        found.append(Shearing(file.stem, kept, ratio, lost, normal, void_ratio))
+    kept = min((t.strain for t in found), key=len)
+    n = len(kept)
+    tests = [replace(t, strain=kept, ratio=t.ratio[:n], volume=t.volume[:n]) for t in found]
+    known = _limits(fields, tests[0].void_ratio)
+    return ShearBoxExperiment(tests, options.effects, candidates=options.candidates, known=known)
+
+
+HEIGHT = 0.02
+"""Of the example's shear box, m."""
+
+
+def _example_shear_box(name: str, options: Options) -> ShearBoxExperiment:
+    del name
+    strains = STRAINS[STRAINS <= 0.2 + 1e-9]
+    nothing = np.zeros(len(strains))
+    return ShearBoxExperiment(
+        [Shearing(f"{p:.0f}kPa", strains, nothing, nothing, 1e3 * p) for p in (25.0, 50.0, 100.0)], options.effects
+    )
+
+
+def _write_shear_box(shape: ShearBoxExperiment, readings: FloatArray) -> tuple[dict[str, object], dict[str, str]]:
+    tests, tables = [], {}
+    for k, test in enumerate(shape.tests):
+        file = f"{test.name}.csv"
+        tests.append({"file": file, "normal_stress": test.normal, "void_ratio": test.void_ratio})
+        tables[file] = _csv(
+            {
+                "displacement_mm": 1e3 * HEIGHT * test.strain,
+                "shear_stress_kPa": readings[:, 2 * k] * test.normal / 1e3,
+                "vertical_displacement_mm": -1e3 * HEIGHT * readings[:, 2 * k + 1],
+            }
+        )
+    return {"height": HEIGHT, "tests": tests}, tables
+
+
+def _read_plate(fields: Fields, folder: Path, options: Options) -> PlateExperiment:
+    diameter = fields.number("diameter", 1e-3, 10.0, hint="it is in m")
+    area = 0.25 * np.pi * diameter**2
+    curves = []
+    for trial in fields.children("tests"):
+        file = trial.path("file", folder, folder)
+        as_pressure = "pressure_kpa" in _header(file)
+        table = read_table(file, ("sinkage_mm", "pressure_kpa" if as_pressure else "force_n"))
+        # a plate that is lifted in between bears only where it is deeper than before
+        down = np.concatenate([[True], table[1:, 0] > np.maximum.accumulate(table[:-1, 0])])
+        depth = 1e-3 * table[down, 0]
+        curves.append((depth, table[down, 1] * (1e3 * area if as_pressure else 1.0)))
+    deepest = min(float(depth[-1]) for depth, _ in curves)
+    if not deepest > 0.0:
+        fields.fail("tests", "sinkage grows downwards from 0 where the plate touches the soil; one never does")
+    depths = deepest * (np.arange(PLATE_READINGS) + 1.0) / PLATE_READINGS
+    forces = np.array([np.interp(depths, *curve) for curve in curves])
+    density = fields.number("density", 100.0, 20_000.0, hint="it is in kg/m³")
+    grains = fields.number("grain_density", 500.0, 20_000.0, default=GRAINS, hint="it is in kg/m³")
+    mean = forces.mean(axis=0)
+    spread = forces.std(axis=0, ddof=1) if len(forces) > 2 else TRIALS_DIFFER * mean
+    return PlateExperiment(
+        diameter,
+        depths,
+        mean,
+        spread,
+        density=density,
+        known=_limits(fields, grains / density - 1.0),
+        friction=fields.number("friction", 0.0, 2.0, default=0.3),
+        effects=options.effects,
+        candidates=options.candidates,
+        preset=options.preset,
+        device=options.device,
+        name=fields.text("name"),
+    )
+
+
+def _example_plate(name: str, options: Options) -> PlateExperiment:
+    depths = 0.03 * (np.arange(PLATE_READINGS) + 1.0) / PLATE_READINGS
+    return PlateExperiment(
+        0.1, depths, np.ones(len(depths)), 0.1, effects=options.effects, preset=options.preset, name=name
+    )
+
+
+def _write_plate(shape: PlateExperiment, readings: FloatArray) -> tuple[dict[str, object], dict[str, str]]:
+    table = _csv({"sinkage_mm": 1e3 * shape.depths, "force_N": readings[:, 0]})
+    about = {"diameter": shape.diameter, "density": shape.density, "friction": shape.friction}
+    return {**about, "tests": [{"file": "plate.csv"}]}, {"plate.csv": table}
+
+
+def _read_repose(fields: Fields, folder: Path, options: Options) -> ReposeExperiment:
+    del folder
+    return ReposeExperiment(
+        [trial.number("angle", 1.0, 80.0, hint="it is in degrees") for trial in fields.children("trials")],
+        height=fields.number("height", 1e-3, 100.0, default=0.1, hint="it is in m"),
+        density=fields.number("density", 100.0, 20_000.0, default=1600.0, hint="it is in kg/m³"),
+        effects=options.effects,
+        candidates=options.candidates,
+        name=fields.text("name"),
+    )
+
+
+def _read_column(fields: Fields, folder: Path, options: Options) -> ColumnExperiment:
+    del folder
+    metres = "it is in m"
+    return ColumnExperiment(
+        fields.number("radius", 1e-3, 100.0, hint=metres),
+        fields.number("height", 1e-3, 100.0, hint=metres),
+        [
+            [trial.number(key, 1e-4, 1e3, hint=metres) for key in ("final_radius", "final_height")]
+            for trial in fields.children("trials")
+        ],
+        density=fields.number("density", 100.0, 20_000.0, default=1600.0, hint="it is in kg/m³"),
+        floor_friction=fields.number("floor_friction", 0.0, 10.0, default=0.6),
+        effects=options.effects,
+        candidates=options.candidates,
+        preset=options.preset,
+        device=options.device,
+        name=fields.text("name"),
+    )
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of test.
+
+    Attributes:
+        read: the experiment of a folder.
+        example: one of usual size, with nothing measured yet, by its name.
+        write: what describes readings in ``experiment.json``, and the tables beside it by file name.
+    """
+
+    read: Callable[[Fields, Path, Options], LaboratoryExperiment]
+    example: Callable[[str, Options], LaboratoryExperiment]
+    write: Callable[..., tuple[dict[str, object], dict[str, str]]]
+
+
+def _trials(*keys: str) -> Callable[[LaboratoryExperiment, FloatArray], tuple[dict[str, object], dict[str, str]]]:
+    def write(shape: LaboratoryExperiment, readings: FloatArray) -> tuple[dict[str, object], dict[str, str]]:
+        about = {"radius": shape.radius, "height": shape.height} if isinstance(shape, ColumnExperiment) else {}
+        trial = {key: round(float(value), 6) for key, value in zip(keys, readings[0], strict=True)}
+        return {**about, "trials": [trial]}, {}
+
+    return write
+
+
+KINDS: dict[str, Kind] = {
+    "triaxial": Kind(_read_triaxial, _example_triaxial, _write_triaxial),
+    "shear_box": Kind(_read_shear_box, _example_shear_box, _write_shear_box),
+    "plate": Kind(_read_plate, _example_plate, _write_plate),
+    "repose": Kind(
+        _read_repose,
+        lambda name, o: ReposeExperiment([30.0], effects=o.effects, name=name),
+        _trials("angle"),
+    ),
+    "column": Kind(
+        _read_column,
+        lambda name, o: ColumnExperiment(0.1, 0.1, [[0.2, 0.05]], effects=o.effects, preset=o.preset, name=name),
+        _trials("final_radius", "final_height"),
+    ),
+}

@@ -1,0 +1,81 @@
+"""Whether photographs show soil at the sides of the bed's box, as behind glass."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.stats import chi2
+from torch.nn import functional
+
+from splatsoil.colour import linear
+from splatsoil.measurement import Bed
+from splatsoil.reconstruction.height_field import HeightField
+from splatsoil.reconstruction.initial import around
+from splatsoil.reconstruction.stereo import draw, visibility
+from splatsoil.reconstruction.surface import Relief, scale_of, with_rim
+from splatsoil.reconstruction.views import Views
+
+Array = NDArray[np.float64]
+
+_ALIKE = float(chi2.ppf(0.99, 2))
+"""Squared Mahalanobis distance within which 99 % of one kind of colours lie."""
+
+_RING = np.array([0.1, 0.2, 0.3])
+"""Where around the bed the ground's colour is looked at, in square roots of the bed's area."""
+
+
+def sides_seen(views: Views, bed: Bed, relief: Relief) -> bool:
+    """Whether what is seen where the box's sides are, below the soil, has the soil's colour, and the ground around has
+    another.
+
+    Colour without brightness (chromaticity), which shade changes little, is compared with that of the soil's surface:
+    two are of one kind if their medians differ by no more than colours of one kind do. Where soil goes on beyond the
+    box, all around has its colour, and it has no sides to be seen.
+
+    Args:
+        views: the photographs.
+        bed: the box.
+        relief: the soil's surface, found as if walls hid its sides.
+    """
+    surface, floor = relief.surface, float(bed.lower[2])
+    level = float(np.median(surface.height))
+    cell = max(surface.cell)
+    xy, outward = around(bed.lower[:2], bed.upper[:2], cell)
+    # Where photographs look past the soil's edge its height is not known well: stay in the lower half.
+    top = 0.5 * (np.minimum(surface.sample(xy), level) - floor)
+    heights = floor + top[:, None] * np.array([0.25, 0.5, 0.75, 1.0])
+    side = np.concatenate([np.column_stack([xy, z]) for z in heights.T])
+    flat = HeightField(surface.x, surface.y, np.full_like(surface.height, level))
+    seen = _chromaticity(views, side, np.tile(outward, (4, 1)), relief.trust, with_rim(flat, bed, 0.0))
+    soil = _chromaticity(
+        views, surface.points.reshape(-1, 3), surface.normals.reshape(-1, 3), relief.trust, relief.occluder
+    )
+    length = scale_of(bed)
+    ring = np.concatenate([around(bed.lower[:2] - out, bed.upper[:2] + out, cell)[0] for out in _RING * length])
+    ground = np.column_stack([ring, np.full(len(ring), relief.ground)])
+    upward = np.tile([0.0, 0.0, 1.0], (len(ground), 1))
+    beside = _chromaticity(views, ground, upward, relief.trust, with_rim(flat, bed, relief.rim))
+    return _alike(seen, soil) and not _alike(beside, soil)
+
+
+def _alike(some: Array, others: Array) -> bool:
+    """Whether two sets of colours (n, 2) are of one kind, by the distance of their medians in their mean spread."""
+    if min(len(some), len(others)) < 3:
+        return False
+    apart = np.median(some, axis=0) - np.median(others, axis=0)
+    spread = 0.5 * (np.cov(some.T) + np.cov(others.T))
+    return bool(apart @ np.linalg.pinv(spread) @ apart < _ALIKE)
+
+
+def _chromaticity(views: Views, points: Array, normals: Array, trust: torch.Tensor, occluder: HeightField) -> Array:
+    """Red and green (m, 2) of the sum of linear red, green and blue, of those points (n, 3) that are seen: the median
+    over photographs."""
+    place, facing = (torch.tensor(a, dtype=torch.float32, device=views.images.device) for a in (points, normals))
+    drawn, sure = draw(views, functional.pad(place, (0, 1), value=1.0)[None], trust)
+    clearance = 0.1 * max(occluder.cell)
+    open_to = visibility(views, points + clearance * normals, occluder, clearance=clearance)
+    weight = sure[:, 0] * open_to * (((views.positions[:, None] - place) * facing).sum(-1) > 0)
+    median = torch.where((weight > 0)[:, None], drawn[:, :, 0], torch.nan).nanmedian(dim=0).values.T
+    colours = linear(median[torch.isfinite(median).all(dim=1)].cpu().numpy().astype(np.float64))
+    return colours[:, :2] / np.maximum(colours.sum(axis=1, keepdims=True), 1e-6)
