@@ -17,7 +17,7 @@ from splatsoil.envs.together import attempt, evaluate_together
 
 from splatsoil.errors import RunError, SimulationError
 from splatsoil.parameters import Parameter, ParameterSpace
-from splatsoil.report.words import undetermined
+from splatsoil.report.text import undetermined
 from splatsoil.run_files import FIT_FORMAT
 from splatsoil.threads import one_thread
 

@@ -75,7 +75,7 @@ class Run:
     @property
     def estimates(self) -> dict[str, Estimate]:
         """The latest fit's parameters by name: averaged over models where the fit has been compared or diagnosed."""
-        from splatsoil.report.words import averaged
+        from splatsoil.report.text import averaged
 
         data = self.data
         better = averaged(data.fit, data.judged)
@@ -89,7 +89,7 @@ class Run:
     @property
     def adequate(self) -> bool | None:
         """Whether the latest fit's model explains the data; None before `compare` or `diagnose`."""
-        from splatsoil.report.words import called_adequate
+        from splatsoil.report.text import called_adequate
 
         data = self.data
         return called_adequate(data.fit, data.judged)

@@ -49,6 +49,9 @@ MARGIN = 0.02
 RISE = 0.5
 """How far heaps stand out from a crest behind which nothing of the bed is seen, as a share of the tool's width."""
 
+GAIN = 4.0
+"""Differences are shown this many times as strong as they are."""
+
 _FEWEST = 12
 """Pixels a block needs."""
 
@@ -104,10 +107,7 @@ class Comparator:
     Args:
         measurement: video, cameras, bed, tool.
         surface: the undisturbed surface, to know which pixels show the bed.
-        level: a height in m all over, instead of the surface; by default the middle of the bed's box.
-        frames: frames to compare; all from the first on by default. The first one in the video is what changes refer to
-            and has no loss of its own.
-        cameras: names; all by default.
+        frames: frames to compare. The first one in the video is what changes refer to and has no loss of its own.
         patch: side of a block on the bed, m.
 
     Attributes:
@@ -123,30 +123,21 @@ class Comparator:
         noise: the robust loss that the cameras' noise alone leaves; None where it can't be told.
 
     Raises:
-        ParameterError: a frame or camera that is not in the video, or nothing to compare.
+        ParameterError: a frame that is not in the video, or nothing to compare.
     """
 
     def __init__(
-        self,
-        measurement: Measurement,
-        *,
-        surface: HeightField | None = None,
-        level: float | None = None,
-        frames: Iterable[int] | None = None,
-        cameras: Iterable[str] | None = None,
-        patch: float = PATCH,
+        self, measurement: Measurement, *, surface: HeightField, frames: Iterable[int], patch: float = PATCH
     ) -> None:
         self.measurement = measurement
         self.reference = int(measurement.frames[0])
-        self.cameras = tuple(measurement.cameras) if cameras is None else tuple(cameras)
-        chosen = measurement.frames if frames is None else tuple(sorted({int(f) for f in frames}))
-        unknown = [str(f) for f in chosen if f not in measurement.frames]
-        unknown += [c for c in self.cameras if c not in measurement.cameras]
+        self.cameras = tuple(measurement.cameras)
+        self.frames = tuple(sorted({int(f) for f in frames} - {self.reference}))
+        unknown = [str(f) for f in self.frames if f not in measurement.frames]
         if unknown:
-            raise ParameterError(f"the video has no {', '.join(unknown)}")
-        self.frames = tuple(f for f in chosen if f != self.reference)
-        if not self.frames or not self.cameras:
-            raise ParameterError("there is nothing to compare: name a camera and a frame after the first")
+            raise ParameterError(f"the video has no frame {', '.join(unknown)}")
+        if not self.frames:
+            raise ParameterError("there is nothing to compare: name a frame after the first")
         self.keys: tuple[Key, ...] = tuple((c, f) for c in self.cameras for f in self.frames)
         self._views = {c: measurement.cameras[c].undistorted() for c in self.cameras}
         self.observed: dict[Key, Image] = {
@@ -154,7 +145,7 @@ class Comparator:
             for c in self.cameras
             for f in (self.reference, *self.frames)
         }
-        self._relief = relief = _relief(measurement, surface, level)
+        self._relief = relief = _relief(surface)
         self.ground = self._places(relief, RISE * float(np.sort(measurement.tool.mesh.extents)[1]))
         self.bed = {c: np.isfinite(place[..., 0]) for c, place in self._places(relief, -1.0).items()}
         self.interior = {c: np.isfinite(place[..., 0]) for c, place in self.ground.items()}
@@ -239,22 +230,29 @@ class Comparator:
 
         Each is the frame minus the mean of the other still ones; a camera with fewer than two has none.
         """
-        out = {}
+        return {camera: 255.0 * self._block_means(camera, *changed) for camera, changed in self._still_changes()}
+
+    def block_noise(self) -> float:
+        """Standard deviation of a block's change by the cameras' noise alone, in grey levels of 255; 0 if unknown."""
+        # A later frame's own noise, and that of the mean it is compared with, from n still frames.
+        variances = [float(np.mean(c**2)) * (1.0 - 1.0 / len(c) ** 2) for c in self.still_blocks().values()]
+        return float(np.mean(variances)) ** 0.5 if variances else 0.0
+
+    def _still_changes(self) -> Iterator[tuple[str, tuple[list[Image], list[BoolImage]]]]:
+        """Each camera with its (h, w, 3) still frames minus the mean of the others, and pixels (h, w) that count."""
         for camera, still in self._still.items():
             frames = [*still, self.observed[camera, self.reference]]
-            if len(frames) < 2:
-                continue
-            total = np.sum(frames, axis=0)
-            change = [image - (total - image) / (len(frames) - 1) for image in frames]
-            mask = self.interior[camera] & ~self.silhouettes[camera, self.reference]
-            out[camera] = 255.0 * self._block_means(camera, change, [mask] * len(frames))
-        return out
+            if len(frames) > 1:
+                total = np.sum(frames, axis=0)
+                mask = self.interior[camera] & ~self.silhouettes[camera, self.reference]
+                yield camera, ([f - (total - f) / (len(frames) - 1) for f in frames], [mask] * len(frames))
 
-    def picture(self, images: Mapping[Key, Image], camera: str, frame: int, gain: float = 4.0) -> Image:
-        """Observed, predicted and their difference (grey where equal, times ``gain``) side by side: (h, 3w, 3)."""
+    def pictures(self, images: Mapping[Key, Image], camera: str, frame: int) -> dict[str, Image]:
+        """(h, w, 3) observed, predicted and their difference by these names; the difference is grey where equal, and
+        `GAIN` times as strong as it is."""
         observed, predicted = self.observed[camera, frame], images[camera, frame]
-        difference = np.clip(0.5 + gain * (observed - predicted), 0.0, 1.0)
-        return np.concatenate([observed, predicted, difference], axis=1).astype(np.float32)
+        difference = np.clip(0.5 + GAIN * (observed - predicted), 0.0, 1.0)
+        return {"observed": observed, "predicted": predicted, "difference": difference.astype(np.float32)}
 
     def outlines(self, camera: str) -> FloatArray:
         """(blocks, 4, 2) corners of each block on the undisturbed surface, in the undistorted picture of a camera, as
@@ -367,48 +365,20 @@ class Comparator:
             out[camera] = np.maximum(self._scaled_losses(camera, change, masks).mean(axis=0), 1e-12)
         return out
 
-    def block_noise(self) -> float:
-        """Standard deviation of a block's change by the cameras' noise alone, in grey levels of 255, from frames before
-        anything moves; 0 without."""
-        variances = []
-        for camera, still in self._still.items():
-            frames = [*still, self.observed[camera, self.reference]]
-            if len(frames) > 1:
-                masks = [self.interior[camera] & ~self.silhouettes[camera, self.reference]] * len(frames)
-                means = self._block_means(camera, [f - self.before[camera] for f in frames], masks)
-                # A later frame's own noise, and that of the mean it is compared with.
-                variances.append(np.sum(means**2, axis=0).mean() / (len(frames) - 1) * (1.0 + 1.0 / len(frames)))
-        return 255.0 * float(np.mean(variances)) ** 0.5 if variances else 0.0
-
     def _noise(self) -> float | None:
         """The robust loss that the cameras' noise alone leaves, from frames before anything moves; None without."""
-        found = []
-        for camera, still in self._still.items():
-            frames = [*still, self.observed[camera, self.reference]]
-            if len(frames) < 2:
-                continue
-            total = np.sum(frames, axis=0)
-            change = [image - (total - image) / (len(frames) - 1) for image in frames]
-            mask = self.interior[camera] & ~self.silhouettes[camera, self.reference]
-            scaled = self._scaled_losses(camera, change, [mask] * len(frames)) / self._unit[camera]
-            found.append(float(scaled.mean()))
+        found = [
+            float((self._scaled_losses(camera, *changed) / self._unit[camera]).mean())
+            for camera, changed in self._still_changes()
+        ]
         return float(np.mean(found)) if found else None
 
 
-def compare(measurement: Measurement, images: Mapping[Key, Image], **options: object) -> Comparison:
-    """One comparison; `Comparator` saves reading the video again where there are several."""
-    return Comparator(measurement, **options).compare(images)  # type: ignore[arg-type]
-
-
-def _relief(measurement: Measurement, surface: HeightField | None, level: float | None) -> Relief:
-    """The surface; a level one where a level is given or nothing is known."""
-    bed = measurement.bed
-    if surface is None or level is not None:
-        middle = float(np.mean([bed.lower[2], bed.upper[2]]))
-        surface = HeightField.over(bed.lower, bed.upper, PATCH, middle if level is None else level)
+def _relief(surface: HeightField) -> Relief:
+    """The surface; cells that nobody knows are as high as the nearest known one."""
     nearest = distance_transform_edt(~np.isfinite(surface.height), return_distances=False, return_indices=True)
-    height = surface.height[tuple(nearest)]
-    return Relief.of_heights(torch.from_numpy(height), (float(surface.x[0]), float(surface.y[0])), surface.cell)
+    height = torch.from_numpy(surface.height[tuple(nearest)])
+    return Relief.of_heights(height, (float(surface.x[0]), float(surface.y[0])), surface.cell)
 
 
 def _in_order(means: list[FloatArray]) -> FloatArray:

@@ -199,6 +199,8 @@ FORWARD = (
     *("experiment/base.py", "experiment/features.py", "experiment/forces.py", "experiment/plow.py"),
     "experiment/scene_parts.py",
 )
+#: Parts that draw verdicts from features.
+JUDGING = ("inverse/criticism",)
 
 
 def code_digest(parts: Iterable[str] = FORWARD, others: Iterable[str | Path] = ()) -> str:
@@ -225,3 +227,13 @@ def code_digest(parts: Iterable[str] = FORWARD, others: Iterable[str | Path] = (
     except OSError as error:
         raise RunError(f"{error.filename}: cannot be read ({error.strerror})") from error
     return digest.hexdigest()[:16]
+
+
+def code_of(effects: Iterable[str]) -> str:
+    """Digest of the code that decides features, users' own effects in it."""
+    return code_digest(others=own_files(effects))
+
+
+def own_files(effects: Iterable[str]) -> list[str]:
+    """Of effects' names those that are a user's own files."""
+    return [name for name in effects if name.endswith(".py")]

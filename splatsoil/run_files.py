@@ -56,7 +56,12 @@ SHAPES: Mapping[str, Mapping[str, Any]] = {
         "history": [{"parameters": {EACH: NUMBER}, "seed": int, "level": str, "status": str}],
     },
     COMPARISON_FORMAT: {"fit": str, "parameters": dict, "frames": _are_pictures},
-    DIAGNOSIS_FORMAT: {"values": dict, "model": list, "models": [{"name": _is_effect, "probability": NUMBER}]},
+    DIAGNOSIS_FORMAT: {
+        "fit": str,
+        "values": dict,
+        "model": list,
+        "models": [{"name": _is_effect, "probability": NUMBER}],
+    },
     MISFIT_FORMAT: {"fit": str, "values": dict},
     POSTERIOR_FORMAT: {"fit": str, "values": dict},
     HISTORY_FORMAT: {"models": [{"model": _is_name, "effects": [str], "parameters": {EACH: ESTIMATE}}]},

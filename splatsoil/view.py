@@ -82,9 +82,8 @@ class Column:
         trajectory = Trajectory(frames, positions, deformations, force, resolution.spacing, resolution)
         images = self.model.draw(trajectory, values=self.values)
         for camera, frame in images:
-            strip = _bytes(self.comparator.picture(images, camera, frame))
-            for kind, picture in zip(PICTURES, np.split(strip, 3, axis=1), strict=True):
-                self.pictures[kind, camera, frame] = picture
+            for kind, picture in self.comparator.pictures(images, camera, frame).items():
+                self.pictures[kind, camera, frame] = _bytes(picture)
         self._compare(self.comparator.blocks(images))
         self._deformations.clear()
 

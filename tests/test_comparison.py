@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatsoil.comparison import Comparator, compare
+from splatsoil.comparison import PATCH, Comparator
 from splatsoil.errors import ParameterError
 from splatsoil.measurement import Measurement
 from splatsoil.reconstruction import HeightField
@@ -17,8 +17,14 @@ FRAMES = (0, 50, 100)
 
 
 @pytest.fixture(scope="module")
-def comparator():
-    return Comparator(Measurement.load(FOLDER), level=0.12, frames=FRAMES)
+def level():
+    bed = Measurement.load(FOLDER).bed
+    return HeightField.over(bed.lower, bed.upper, PATCH, 0.12)
+
+
+@pytest.fixture(scope="module")
+def comparator(level):
+    return Comparator(Measurement.load(FOLDER), surface=level, frames=FRAMES)
 
 
 @pytest.fixture
@@ -84,8 +90,6 @@ def test_blocks_answer_linearly_and_where_the_change_is(comparator, seen):
         return comparator.compare(images)
 
     one, two = blocks(0.02), blocks(0.04)
-    darker = {key: image - 0.02 for key, image in seen.items()}
-    assert np.array_equal(comparator.blocks(darker), comparator.compare(darker).blocks)
     assert np.allclose(two.blocks, 2.0 * one.blocks, atol=1e-3)
     largest = one.labels[int(np.argmax(np.abs(one.blocks)))]
     assert (largest.camera, largest.frame) == ("left", 100)
@@ -130,29 +134,38 @@ def test_walls_and_ground_are_left_out(comparator, seen):
     assert comparator.compare(outside).rgb == 0.0
 
 
-def test_pictures_side_by_side(comparator, seen):
-    picture = comparator.picture(seen, "left", 100)
-    assert picture.shape == (240, 960, 3)
-    assert np.allclose(picture[:, 640:], 0.5)
+def test_a_difference_is_grey_where_pictures_are_equal(comparator, seen):
+    shown = comparator.pictures(seen, "left", 100)
+    assert [picture.shape for picture in shown.values()] == [(240, 320, 3)] * 3
+    assert np.allclose(shown["difference"], 0.5)
+    brighter = comparator.pictures({key: image + 0.01 for key, image in seen.items()}, "left", 100)
+    assert np.allclose(brighter["difference"], 0.46, atol=1e-6)
 
 
 def test_the_same_pictures_give_the_same_bits(comparator, seen):
     images = {key: np.roll(image, 3, axis=1) for key, image in seen.items()}
     first, second = comparator.compare(images), comparator.compare(images)
     assert first.loss == second.loss
-    assert np.array_equal(first.blocks, second.blocks)
+    assert np.array_equal(first.blocks, second.blocks) and np.array_equal(first.blocks, comparator.blocks(images))
 
 
-def test_what_is_missing_is_named(comparator, seen):
+def test_noise_of_still_frames_is_their_spread(comparator):
+    """A later frame's, and that of the mean of five; each still one is told against the other four."""
+    still = comparator.still_blocks()
+    assert {camera: rows.shape[0] for camera, rows in still.items()} == {"left": 5, "right": 5}
+    variance = [np.var(0.8 * rows, axis=0, ddof=1).mean() * (1.0 + 1.0 / 5.0) for rows in still.values()]
+    assert comparator.block_noise() == pytest.approx(np.sqrt(np.mean(variance)), rel=1e-6)
+    assert 0.01 < comparator.block_noise() < 1.0
+    assert all(np.abs(rows.sum(axis=0)).max() < 1e-3 for rows in still.values())
+
+
+def test_what_is_missing_is_named(comparator, seen, level):
     del seen["right", 50]
     with pytest.raises(ParameterError, match="'right' at frame 50"):
         comparator.compare(seen)
-    with pytest.raises(ParameterError, match="33"):
-        compare(Measurement.load(FOLDER), {}, frames=(0, 33))
-    with pytest.raises(ParameterError, match="top"):
-        compare(Measurement.load(FOLDER), {}, cameras=("top",))
-    with pytest.raises(ParameterError, match="nothing to compare"):
-        compare(Measurement.load(FOLDER), {}, frames=(0,))
+    for frames, says in (((0, 33), "no frame 33"), ((0,), "nothing to compare")):
+        with pytest.raises(ParameterError, match=says):
+            Comparator(comparator.measurement, surface=level, frames=frames)
     seen["right", 50] = np.zeros((10, 10, 3), dtype=np.float32)
     with pytest.raises(ParameterError, match="frame 50"):
         comparator.compare(seen)

@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatsoil.commands._control import JUDGING
 from splatsoil.errors import RunError
-from splatsoil.files import FORWARD, RECONSTRUCTING, code_digest, read_npy, read_npz, write_npz
+from splatsoil.files import FORWARD, JUDGING, RECONSTRUCTING, code_digest, read_npy, read_npz, write_npz
 
 #: Modules that results are made with, and why they don't decide one.
 NEUTRAL = {

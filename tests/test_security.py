@@ -137,7 +137,7 @@ def test_a_comparisons_pictures_are_in_its_folder(run: Path, tmp_path: Path, pla
 def test_a_diagnosis_names_no_program(run: Path) -> None:
     from splatsoil.report.data import load
 
-    data = {"values": {}, "model": [], "models": [{"name": "evil.py", "probability": 1.0}]}
+    data = {"fit": "base", "values": {}, "model": [], "models": [{"name": "evil.py", "probability": 1.0}]}
     write_json(run / "diagnoses" / "base.json", {"format": "splatsoil-diagnosis/2", **data})
     with pytest.raises(RunError, match=r"lacks models\.0\.name"):
         load(run)

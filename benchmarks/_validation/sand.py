@@ -16,7 +16,7 @@ from splatsoil.errors import MeasurementError
 from splatsoil.experiment.triaxial import Curve, TriaxialExperiment
 from splatsoil.laboratory.answer import diagnosed, search
 from splatsoil.laboratory.folder import read_curve, together
-from splatsoil.report.words import probability, verdict
+from splatsoil.report.text import probability, verdict
 from splatsoil.soil.packing import at_void_ratio, of_limits
 
 CRITICAL = 33.1

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from splatsoil.experiment.base import Candidate
-from splatsoil.report.words import amount, listed, probability, title, undetermined
+from splatsoil.report.text import amount, listed, probability, title, undetermined
 
 from .checks import SIGNIFICANT
 from .diagnosis import Diagnosis

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from concurrent.futures import Future
     from pathlib import Path
 
-    from splatsoil.commands._experiments import Chosen
+    from splatsoil.commands._model import ModelSpec
     from splatsoil.experiment.plow import PlowExperiment
     from splatsoil.inverse.criticism.simulations import Simulations
     from splatsoil.inverse.executors import Processes
@@ -38,7 +38,7 @@ class Crew:
     """
 
     def __init__(self, folder: RunFolder, device: str, effects: Iterable[str]) -> None:
-        from splatsoil.commands._limits import memory
+        from splatsoil.commands._resources import memory
         from splatsoil.inverse.executors import Processes
         from splatsoil.threads import cores
 
@@ -64,11 +64,11 @@ class Crew:
             self._workers.kill()
 
     @contextmanager
-    def helping(self, chosen: Chosen, experiment: PlowExperiment, simulate: Simulations) -> Iterator[None]:
+    def helping(self, spec: ModelSpec, experiment: PlowExperiment, simulate: Simulations) -> Iterator[None]:
         """While the block runs, where this process holds the folder's lock, they simulate.
 
         Args:
-            chosen: the model.
+            spec: the model.
             experiment: of it.
             simulate: what is helped.
         """
@@ -84,7 +84,7 @@ class Crew:
 
             def together(jobs: Sequence[Mapping[str, Any]]) -> Future[None]:
                 made = [dict(job) for job in jobs]
-                return workers.submit(_simulate, self._path, device, chosen, self._effects, self.count, made)
+                return workers.submit(_simulate, self._path, device, spec, self._effects, self.count, made)
 
             try:
                 with simulate.helped(Helpers(self.count, together, experiment.together, experiment.prepare)):
@@ -138,7 +138,7 @@ def _threads(device: str, helpers: int) -> int:
     return 1 if device == "cpu" or helpers == 0 else max(1, cores() // (1 + helpers))
 
 
-_known: dict[tuple[Path, str, Chosen, tuple[str, ...]], tuple[PlowExperiment, Simulations]] = {}
+_known: dict[tuple[Path, str, ModelSpec, tuple[str, ...]], tuple[PlowExperiment, Simulations]] = {}
 
 
 def _ready(device: str) -> None:
@@ -150,7 +150,7 @@ def _ready(device: str) -> None:
     def load(here: str) -> None:
         import torch
 
-        from splatsoil.commands import _control, _experiments  # noqa: F401
+        from splatsoil.commands import _model  # noqa: F401
         from splatsoil.experiment import plow  # noqa: F401
 
         torch.zeros(1, device=here)
@@ -159,13 +159,13 @@ def _ready(device: str) -> None:
 
 
 def _simulate(
-    path: Path, device: str, chosen: Chosen, effects: tuple[str, ...], helpers: int, jobs: Sequence[Mapping[str, Any]]
+    path: Path, device: str, spec: ModelSpec, effects: tuple[str, ...], helpers: int, jobs: Sequence[Mapping[str, Any]]
 ) -> None:
     """A helper's work."""
     from splatsoil.errors import SplatsoilError
 
     def make(here: str) -> None:
-        experiment, simulate = _known_here(path, here, chosen, effects)
+        experiment, simulate = _known_here(path, here, spec, effects)
         if len(jobs) > 1:
             experiment.prepare(jobs)
         for job in jobs:
@@ -189,24 +189,24 @@ def _quietly(work: Callable[[str], object], device: str, helpers: int) -> None:
 
 
 def _known_here(
-    path: Path, device: str, chosen: Chosen, effects: tuple[str, ...]
+    path: Path, device: str, spec: ModelSpec, effects: tuple[str, ...]
 ) -> tuple[PlowExperiment, Simulations]:
     """What a helper works with, made once."""
     import signal
     import warnings
 
-    from splatsoil.commands._experiments import experiment_of, model_of
+    from splatsoil.commands._model import experiment_of, model_of
     from splatsoil.errors import SetWarning
     from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.quiet import hush
 
-    key = (path, device, chosen, effects)
+    key = (path, device, spec, effects)
     if key not in _known:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process ends this one
         hush()
         warnings.simplefilter("ignore", SetWarning)  # the first process has said it
         folder = RunFolder.open(path)
         # a reconstruction that isn't kept is the first process's to make
-        model = model_of(folder, device, lambda what, share: None, chosen=chosen, anew=False)
-        _known[key] = experiment_of(folder, model, chosen, effects or None)
+        model = model_of(folder, device, lambda what, share: None, spec=spec, make=False)
+        _known[key] = experiment_of(folder, model, spec, effects or None)
     return _known[key]

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from splatsoil.commands._output import print_json
+from splatsoil.commands._output import print_json, stages
 from splatsoil.errors import RunError
 
 if TYPE_CHECKING:
@@ -143,7 +143,6 @@ def _opened(folder: Path, options: Options, run: Path | None) -> tuple[Laborator
 def _answered(
     experiment: LaboratoryExperiment, run: Path, seed: int, *, with_effects: bool, quiet: bool
 ) -> dict[str, Any]:
-    from splatsoil.commands._progress import stages
     from splatsoil.laboratory.answer import diagnosed, fitted
 
     began = time.perf_counter()
@@ -155,7 +154,7 @@ def _answered(
 
 
 def _told(result: dict[str, Any], run: Path, *, quiet: bool) -> int:
-    from splatsoil.commands._diagnosis_table import show
+    from splatsoil.commands.diagnose import show
     from splatsoil.files import plain
 
     if quiet:

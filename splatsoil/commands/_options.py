@@ -1,69 +1,76 @@
-"""Options that `fit` and `run` share."""
+"""Options of the commands: the parser, the help page, and the command line that says the same again.
+
+All are made from the fields of a dataclass, see `splatsoil.options`.
+"""
 
 from __future__ import annotations
 
+import argparse
+import dataclasses
+import inspect
 import shlex
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+import shutil
+import sys
+import textwrap
+import types
+import typing
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Any, Literal, NoReturn
 
-import tyro
-from tyro.conf import Positional
+from splatsoil.errors import ParameterError, did_you_mean
+from splatsoil.options import JSON, argument, option
 
-from splatsoil.errors import ParameterError
+Preset = Literal["tiny", "small", "paper", "fine"]
 
-Option = tuple[str, object, object]
-"""Name, value and usual value of an option."""
+#: Texts of options that several commands have.
+SET = "Folder of the measurement set."
+PRESET = "Resolution; small suits a laptop without a graphics card."
+DEVICE = "Where to compute: auto, cpu, cuda:0, …"
+SEED = "Of random numbers; one seed gives one result on one processor."
+EFFECTS = "Effects of the model, by name, or files that define some."
+BUDGET = "Evaluations; 10 for each free parameter if not given."
 
 #: Commands as help lists them, by what they are for.
 ORDER = {
     "all at once": ("run",),
     "into a measurement set": ("import", "check", "simulate"),
     "step by step": ("reconstruct", "fit", "compare", "diagnose", "add", "report"),
-    "more of a run": ("posterior", "view", "export"),
+    "more of a run": ("posterior", "design", "export", "view"),
     "by themselves": ("element", "benchmark"),
 }
-
-#: Options that a first run does without.
-EXPERT = frozenset(
-    (
-        *("budget", "search", "coarse", "criticise", "most_effects", "seed", "particle_seed", "holdout", "checks"),
-        *("scene", "like", "depth", "views", "picture_scale", "model", "every", "records", "void_ratio", "young"),
-        *("poisson", "strain_rate", "matching", "known", "points", "robot_to_world", "mesh_to_flange", "video_every"),
-    )
-)
-
 #: Evaluations for each free parameter, unless the user says how many.
 EVALUATIONS = 10
+
+WIDEST = 100
+"""Columns of a help page, at most."""
+KINDS = {int: "N", float: "X", Path: "PATH", str: "NAME"}
+"""What stands for a value of some type in help."""
 
 
 @dataclass(frozen=True)
 class FitOptions:
     """What decides a fit."""
 
-    set: Positional[Path]
-    """Folder of the measurement set."""
-    parameters: tuple[str, ...] = ()
-    """Free parameters; friction angle and those of effects that are on if not given."""
-    effects: Annotated[tuple[str, ...], tyro.conf.arg(name="with", metavar="EFFECT …")] = ()
-    """Effects of the model, by name, or files that define some."""
-    budget: int | None = None
-    """Evaluations; 10 for each free parameter if not given."""
-    search: Literal["usual", "paper"] = "usual"
-    """paper: as Hsiao and Kumar, expected improvement from one random start."""
-    coarse: Literal["tiny", "small", "paper"] | None = None
-    """Search with simulations at this coarser preset, too; --budget counts their cost."""
-    preset: Literal["tiny", "small", "paper", "fine"] = "small"
-    """Resolution; small suits a laptop without a graphics card."""
-    device: str = "auto"
-    """Where to compute: auto, cpu, cuda:0, …"""
-    seed: int = 0
-    """Of random numbers; one seed gives one result on one processor."""
-    run: Path | None = None
-    """Run folder; runs/NAME-PRESET, with the seed if it is not 0, if not given."""
-    json: bool = False
-    """Print one JSON object and nothing else."""
+    set: Path = argument(SET)
+    parameters: tuple[str, ...] = option(
+        (), "Free parameters; friction angle and those of effects that are on if not given."
+    )
+    effects: tuple[str, ...] = option((), EFFECTS, name="with", metavar="EFFECT")
+    budget: int | None = option(None, BUDGET, expert=True)
+    search: Literal["usual", "paper"] = option(
+        "usual", "paper: as Hsiao and Kumar, expected improvement from one random start.", expert=True
+    )
+    coarse: Literal["tiny", "small", "paper"] | None = option(
+        None, "Search with simulations at this coarser preset, too; --budget counts their cost.", expert=True
+    )
+    preset: Preset = option("small", PRESET)
+    device: str = option("auto", DEVICE)
+    seed: int = option(0, SEED, expert=True)
+    run: Path | None = option(None, "Run folder; runs/NAME-PRESET, with the seed if it is not 0, if not given.")
+    json: bool = option(False, JSON)
 
     def folder(self, name: str) -> Path:
         """The run folder for a measurement set of this name."""
@@ -71,60 +78,144 @@ class FitOptions:
             return self.run
         return Path("runs") / (f"{name}-{self.preset}" + (f"-seed{self.seed}" if self.seed else ""))
 
-    def again(self, command: str, *others: Option) -> str:
-        """The command line that means this, and other options besides."""
-        return command_line(
-            command,
-            (self.set,),
-            (
-                ("--parameters", self.parameters, ()),
-                ("--with", self.effects, ()),
-                ("--budget", self.budget, None),
-                ("--search", self.search, "usual"),
-                ("--coarse", self.coarse, None),
-                ("--preset", self.preset, "small"),
-                ("--device", self.device, "auto"),
-                ("--seed", self.seed, 0),
-                ("--run", self.run, None),
-                *others,
-                ("--json", self.json, False),
-            ),
-        )
-
 
 @dataclass(frozen=True)
 class RunOptions:
     """What a command on a run folder takes."""
 
-    run: Positional[Path]
-    """The run folder."""
-    set: Path | None = field(default=None, kw_only=True)
-    """Where the measurement set is now, if it has moved; later commands know it, too."""
-
-    def again(self, command: str, *others: Option, positional: Iterable[object] = ()) -> str:
-        """The command line that means this, with other words and options besides."""
-        return command_line(command, (self.run, *positional), (("--set", self.set, None), *others))
-
-
-def command_line(command: str, positional: Iterable[object], options: Iterable[Option] = ()) -> str:
-    """A command as a shell takes it; options are (name, value, usual value), and usual ones are left out.
-
-    What is True is a flag.
-    """
-    words = ["splatsoil", command, *(str(word) for word in positional)]
-    for name, value, usual in options:
-        if value is True and usual is False:
-            words.append(name)
-        elif value != usual:
-            words += [name, *map(str, value)] if isinstance(value, tuple) else [name, str(value)]
-    return shlex.join(words)
+    run: Path = argument("The run folder.")
+    set: Path | None = option(None, "Where the measurement set is now, if it has moved; later commands know it, too.")
 
 
 def check_evaluations(budget: int | None) -> None:
-    """ParameterError for a fit of too few evaluations.
-
-    Raises:
-        ParameterError: see above.
-    """
+    """ParameterError for a fit of too few evaluations."""
     if budget is not None and budget < 2:
         raise ParameterError(f"--budget: a fit needs at least 2 evaluations, not {budget}")
+
+
+def command_line(command: str, *words: object) -> str:
+    """A command as a shell takes it."""
+    return shlex.join(["splatsoil", command, *map(str, words)])
+
+
+def same_again(command: str, config: Any) -> str:
+    """The command line that means a command's options; what is as usual is left out."""
+    places: list[object] = []
+    options: list[object] = []
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        words = value if isinstance(value, tuple) else (value,)
+        if field.metadata.get("positional"):
+            places += words
+        elif value != field.default:
+            options += [_flag(field), *(() if value is True else words)]
+    return command_line(command, *places, *options)
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        """One line on stderr."""
+        command = self.prog.removeprefix("splatsoil ")
+        print(f"splatsoil: {command}: {message}; {self.prog} --help lists its options", file=sys.stderr)
+        raise SystemExit(2)
+
+
+class _Tuple(argparse.Action):
+    """Several values, each of its own type."""
+
+    def __init__(
+        self, option_strings: Sequence[str], dest: str, *, kinds: Sequence[Callable[[str], Any]], **settings: Any
+    ) -> None:
+        super().__init__(option_strings, dest, nargs=len(kinds), **settings)
+        self.kinds = kinds
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, *_: Any) -> None:
+        try:
+            setattr(namespace, self.dest, tuple(kind(word) for kind, word in zip(self.kinds, values, strict=True)))
+        except ValueError as error:
+            raise argparse.ArgumentError(self, str(error)) from None
+
+
+def parse(command: str, config: type, words: Sequence[str]) -> Any:
+    """A dataclass of options from a command's words; ``--help`` leaves with 0, and usage errors with 2."""
+    parser = parser_of(command, config)
+    found, unknown = parser.parse_known_intermixed_args(list(words))
+    if unknown:
+        hint = did_you_mean(unknown[0], map(_flag, dataclasses.fields(config)))
+        parser.error(f"unrecognized argument: {unknown[0]}{hint}")
+    return config(**{name: tuple(value) if isinstance(value, list) else value for name, value in vars(found).items()})
+
+
+def parser_of(command: str, config: type) -> argparse.ArgumentParser:
+    """What reads a command's words, and prints its help page."""
+    fields, hints = dataclasses.fields(config), typing.get_type_hints(config)
+    places = [_shown(field) for field in fields if field.metadata.get("positional")]
+    parser = _Parser(
+        prog=f"splatsoil {command}",
+        usage=" ".join(["%(prog)s", *places, "[options]"]),
+        description=inspect.cleandoc(config.__doc__ or "").replace("%", "%%"),
+        formatter_class=partial(argparse.HelpFormatter, max_help_position=26, width=_columns()),
+        allow_abbrev=False,
+        argument_default=argparse.SUPPRESS,
+    )
+    expert = parser.add_argument_group("expert")
+    for field in fields:
+        about, required = field.metadata, field.default is dataclasses.MISSING
+        settings = _settings(hints[field.name], about.get("metavar", ""))
+        settings["help"] = (about.get("text", "") + _usual(field.default)).replace("%", "%%")
+        if about.get("positional"):
+            many = ("+" if required else "*") if "nargs" in settings else None if required else "?"
+            parser.add_argument(field.name, **settings | {"metavar": field.name.upper(), "nargs": many})
+        else:
+            group = expert if about.get("expert") else parser
+            group.add_argument(_flag(field), dest=field.name, **settings)
+    return parser
+
+
+def _settings(hint: Any, metavar: str) -> dict[str, Any]:
+    """How argparse reads a value of some type."""
+    inner, origin = typing.get_args(hint), typing.get_origin(hint)
+    if origin in (typing.Union, types.UnionType):
+        return _settings(next(part for part in inner if part is not type(None)), metavar)
+    if origin is Literal:
+        return {"choices": inner}
+    if origin is tuple and Ellipsis in inner:
+        return {**_settings(inner[0], metavar), "nargs": "*"}
+    if origin is tuple:
+        return {"action": _Tuple, "kinds": inner, "metavar": tuple(metavar.split())}
+    return {"action": "store_true"} if hint is bool else {"type": hint, "metavar": metavar or KINDS[hint]}
+
+
+def program_page(configs: Mapping[str, type], description: str) -> str:
+    """All commands, the first to try first."""
+    lines = ["usage: splatsoil COMMAND …", "", description, "Start with: splatsoil run examples/plow-dry --preset tiny"]
+    left = dict(configs)
+    for title, names in (*ORDER.items(), ("others", tuple(configs))):
+        mine = [name for name in names if name in left]
+        lines += ["", title] if mine else []
+        for name in mine:
+            text = f"  {name:<13}{inspect.cleandoc(left.pop(name).__doc__ or '').splitlines()[0]}"
+            lines += textwrap.wrap(text, _columns(), subsequent_indent=" " * 15)
+    return "\n".join([*lines, "", "splatsoil COMMAND --help lists a command's options."])
+
+
+def _columns() -> int:
+    return min(shutil.get_terminal_size().columns, WIDEST)
+
+
+def _flag(field: dataclasses.Field[Any]) -> str:
+    return "--" + (field.metadata.get("name") or field.name.replace("_", "-"))
+
+
+def _shown(field: dataclasses.Field[Any]) -> str:
+    """A positional one in the usage."""
+    name = field.name.upper() + " …" * str(field.type).startswith("tuple")
+    return name if field.default is dataclasses.MISSING else f"[{name}]"
+
+
+def _usual(value: Any) -> str:
+    """The usual value, where it is one."""
+    if value is dataclasses.MISSING or value is None or value is False or value in ((), ""):
+        return ""
+    words = value if isinstance(value, tuple) else (value,)
+    return f" [{' '.join(f'{word:g}' if isinstance(word, float) else str(word) for word in words)}]"

@@ -1,16 +1,21 @@
-"""Where commands print: the result on stdout, everything else on stderr."""
+"""What commands print: the result on stdout, everything else on stderr."""
 
 from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
 from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any, TextIO
 
 if TYPE_CHECKING:
     from splatsoil.measurement import Measurement
+
+Report = Callable[[str, float], None]
+"""Takes what is being done, and the share of its stage that is done, 0 to 1."""
+Stage = Callable[[str], Report]
+"""Begins a stage by its name."""
 
 _stdout: ContextVar[TextIO | None] = ContextVar("stdout", default=None)
 
@@ -35,9 +40,119 @@ def print_json(data: Mapping[str, Any]) -> None:
     print(json.dumps(data, indent=1, allow_nan=False), file=_stdout.get() or sys.stdout, flush=True)
 
 
-def say_remarks(measurement: Measurement) -> None:
+def print_remarks(measurement: Measurement) -> None:
     """Print on stderr what is odd about a set that is about to be worked on."""
     from splatsoil.measurement import remarks
 
     for remark in remarks(measurement):
         print(f"remark {remark.about}: {remark.text}", file=sys.stderr)
+
+
+def print_table(
+    title: str,
+    columns: Sequence[str],
+    rows: Iterable[Sequence[str]],
+    *,
+    left: Collection[str] | None = None,
+    faint: Collection[int] = (),
+) -> None:
+    """Print a table.
+
+    Args:
+        title: above it.
+        columns: headings; none for rows of a name and what it is.
+        rows: texts.
+        left: columns that are aligned left; the first if not given.
+        faint: numbers of rows that matter less.
+    """
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(title=escape(title), title_justify="left", show_header=bool(columns), box=SIMPLE_HEAD)
+    for column in columns:
+        aligned_left = column in (columns[:1] if left is None else left)
+        table.add_column(escape(column), justify="left" if aligned_left else "right", no_wrap=column == columns[0])
+    for number, row in enumerate(rows):
+        table.add_row(*map(escape, row), style="dim" if number in faint else None)
+    Console(highlight=False).print(table)
+
+
+def print_text(*paragraphs: str, style: str = "") -> None:
+    """Print sentences, wrapped at words."""
+    from rich.console import Console
+    from rich.text import Text
+
+    for paragraph in paragraphs:
+        Console(highlight=False).print(Text(paragraph), style=style)
+
+
+def print_notes(notes: Iterable[str]) -> None:
+    """Print what is to be known besides."""
+    from rich.console import Console
+    from rich.text import Text
+
+    for note in notes:
+        Console(highlight=False).print(Text.assemble(("note", "yellow"), f" {note}"))
+
+
+@contextmanager
+def stages(*, quiet: bool = False) -> Iterator[Stage]:
+    """Progress on stderr: one line a stage, with what it is doing, how much is done and how long the rest will take.
+
+    Yields a function that begins a stage; the one before ends then. Where stderr is no terminal (a log), a line is
+    printed when a stage begins and at every tenth of it. ``quiet`` prints nothing.
+    """
+    if quiet:
+        yield lambda name: lambda what, share: None
+        return
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield _logged
+        return
+    columns = (
+        TextColumn("{task.description:<12}"),
+        BarColumn(bar_width=24),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        # Stages have few and unequal steps: the rate over all of the stage is the steadiest guess.
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[what]}"),
+    )
+    with Progress(*columns, console=console, speed_estimate_period=3600.0) as bar:
+        current: list[TaskID] = []
+
+        def finish() -> None:
+            for task in current:
+                bar.update(task, completed=1.0, what="")
+                bar.stop_task(task)
+            current.clear()
+
+        def begin(name: str) -> Report:
+            finish()
+            task = bar.add_task(escape(name), total=1.0, what="")
+            current.append(task)
+            return lambda what, share: bar.update(task, completed=share, what=escape(what))
+
+        yield begin
+        finish()
+
+
+def _logged(name: str) -> Report:
+    """A stage as lines of a log."""
+    print(name, file=sys.stderr, flush=True)
+    tenth = 0
+
+    def report(what: str, share: float) -> None:
+        nonlocal tenth
+        if int(10.0 * share + 1e-9) > tenth:
+            tenth = int(10.0 * share + 1e-9)
+            print(f"{name}: {100.0 * share:.0f} %, {what}", file=sys.stderr, flush=True)
+
+    return report

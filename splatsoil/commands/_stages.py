@@ -1,33 +1,36 @@
-"""The stages that commands are made of: set, run folder, reconstruction, fit, comparison."""
+"""The stages that commands are made of: check, fit, compare, diagnose."""
 
 from __future__ import annotations
 
-import hashlib
+import io
 import sys
-from collections.abc import Iterable
+import time
+from collections.abc import Iterable, Mapping
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from splatsoil.commands._control import code_of
-from splatsoil.commands._options import EVALUATIONS, FitOptions, RunOptions, check_evaluations, command_line
-from splatsoil.commands._output import say_remarks
+from splatsoil.commands._model import ModelSpec, experiment_of, reconstruction_digest
+from splatsoil.commands._options import EVALUATIONS, FitOptions, check_evaluations
+from splatsoil.commands._output import print_remarks
 from splatsoil.errors import MeasurementError, ParameterError, RunError
 
 if TYPE_CHECKING:
-    from splatsoil.commands._progress import Report
+    from splatsoil.commands._crew import Crew
+    from splatsoil.commands._output import Report, Stage
+    from splatsoil.experiment.base import Experiment
+    from splatsoil.inverse.criticism.design import Prior
     from splatsoil.inverse.criticism.diagnosis import Diagnosis
+    from splatsoil.inverse.criticism.simulations import Simulations
     from splatsoil.inverse.evaluations import EvaluationRecord
     from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.measurement import Measurement
     from splatsoil.model import Model
-    from splatsoil.reconstruction import Reconstruction
 
 #: Share of a fit's time that is its search.
 SEARCH = 0.5
-#: Differences are shown this many times as strong as they are.
-GAIN = 4.0
 #: Evaluations of a fit that are chosen and simulated together: as many cores as a small laptop has.
 TOGETHER = 2
 
@@ -39,7 +42,7 @@ def prepare(options: FitOptions) -> tuple[Measurement, RunFolder]:
         MeasurementError, ParameterError, RunError: what is wrong, before any work.
     """
     from splatsoil import __version__
-    from splatsoil.commands._limits import COMPARISON, check_memory, needs
+    from splatsoil.commands._resources import COMPARISON, check_memory, needs
     from splatsoil.envs.devices import resolve_device
     from splatsoil.envs.levels import relative_cost
     from splatsoil.inverse.run_folder import RunFolder
@@ -56,7 +59,7 @@ def prepare(options: FitOptions) -> tuple[Measurement, RunFolder]:
     effects = find_effects(options.effects)
     device = resolve_device(options.device)
     measurement = Measurement.load(options.set)
-    say_remarks(measurement)
+    print_remarks(measurement)
     known = [p.name for p in Law(effect.for_measurement(measurement) for effect in effects).parameters]
     unknown = [name for name in options.parameters if name not in known]
     if unknown:
@@ -85,83 +88,6 @@ def prepare(options: FitOptions) -> tuple[Measurement, RunFolder]:
     return measurement, run
 
 
-def reconstructed(
-    measurement: Measurement, run: RunFolder, device: str, report: Report, *, anew: bool = True
-) -> Reconstruction:
-    """The run's reconstruction: from the folder, or made ``anew`` and kept there.
-
-    Raises:
-        RunError: what is kept is damaged, or nothing is and it may not be made.
-    """
-    from splatsoil import __version__
-    from splatsoil.files import RECONSTRUCTING, code_digest
-    from splatsoil.reconstruction import Reconstruction, reconstruct
-
-    preset, seed = run.description["preset"], run.description["seed"]
-    wanted = {
-        "measurement_hash": measurement.hash,
-        "preset": preset,
-        "seed": seed,
-        "version": __version__,
-        "code": code_digest(RECONSTRUCTING),
-    }
-    if (run.reconstruction / "reconstruction.json").is_file():
-        report("reading", 0.0)
-        try:
-            kept = Reconstruction.load(run.reconstruction)
-        except RunError as error:
-            raise RunError(f"{error}: delete the folder {run.reconstruction} and run the command again") from error
-        if all(kept.metadata.get(key) == value for key, value in wanted.items()):
-            return kept
-    if not anew:
-        raise RunError(f"{run.path}: its reconstruction isn't there")
-    made = reconstruct(measurement, seed=seed, device=device, preset=preset, progress=report)
-    with run.lock():
-        made.save(run.reconstruction)
-    # Read back: float32 on disk is what every later command will start from.
-    return Reconstruction.load(run.reconstruction)
-
-
-def model_on(
-    measurement: Measurement,
-    run: RunFolder,
-    reconstruction: Reconstruction,
-    effects: Iterable[str],
-    preset: str,
-    device: str,
-) -> Model:
-    """A model of a run's set. What photographs say of light and albedo is kept in the run's ``features/``: processes
-    that work side by side, and later commands, find it there."""
-    from splatsoil import __version__
-    from splatsoil.files import FORWARD, code_digest
-    from splatsoil.inverse.evaluations import digest
-    from splatsoil.model import Model
-
-    what = {
-        "measurement": measurement.hash,
-        "reconstruction": digest_of(reconstruction),
-        "device": device.split(":")[0],
-        "version": __version__,
-        "code": code_digest(FORWARD),
-    }
-
-    def file(spacing: float) -> Path:
-        return run.path / "features" / f"intrinsic-{digest({**what, 'spacing': spacing})[:24]}.npz"
-
-    return Model(measurement, reconstruction, effects=effects, preset=preset, device=device, intrinsic=file)
-
-
-def digest_of(reconstruction: Reconstruction) -> str:
-    """SHA-256 of what simulations and pictures start from; the same arrays, the same digest."""
-    digest = hashlib.sha256()
-    g = reconstruction.gaussians
-    tensors = (g.means, g.scales, g.quaternions, g.opacities, g.colours, reconstruction.soil, reconstruction.tool)
-    for tensor in tensors:
-        digest.update(np.ascontiguousarray(tensor.detach().cpu().numpy()).tobytes())
-    digest.update(np.ascontiguousarray(reconstruction.surface.height).tobytes())
-    return digest.hexdigest()
-
-
 def facts(model: Model) -> dict[str, str]:
     """How a model computes, for readers."""
     r = model.resolution
@@ -174,48 +100,47 @@ def facts(model: Model) -> dict[str, str]:
     }
 
 
-def fitted(
+def run_fit(
     options: FitOptions, measurement: Measurement, run: RunFolder, model: Model, report: Report
 ) -> dict[str, Any]:
     """Search, evaluation by evaluation, and compare the model with something else by what was simulated, and more; what
     is in the run folder already isn't simulated again. The paper's search ends with itself.
     """
-    from splatsoil.commands import _criticism as criticism
+    from splatsoil import __version__
     from splatsoil.commands._crew import Crew
-    from splatsoil.commands._experiments import Chosen, experiment_of
-    from splatsoil.commands._limits import check_memory, needs
+    from splatsoil.commands._resources import check_memory, needs
     from splatsoil.envs.levels import is_full
     from splatsoil.envs.measured import LOSS, MeasuredProblem
+    from splatsoil.files import code_of
     from splatsoil.inverse.fitting import FitSetup, fit
 
     space = model.space(options.parameters or None)
     budget = options.budget or EVALUATIONS * len(space)
     need = needs(measurement, options.preset, model.device, budget, particles=len(model.particles(0)))
     check_memory(need, model.device, measurement.folder)
-    version, code = sources(options.effects)
     setup = FitSetup(
         measurement=measurement.hash,
-        reconstruction=digest_of(model.reconstruction),
+        reconstruction=reconstruction_digest(model.reconstruction),
         parameters=space.names,
         effects=options.effects,
         preset=options.preset,
         device=model.device,
         seed=options.seed,
-        version=version,
-        code=code,
+        version=__version__,
+        code=code_of(options.effects),
         loss=LOSS,
         search=options.search,
         coarse=options.coarse,
         at_once=1 if options.coarse is not None or options.search == "paper" else TOGETHER,
     )
     report("reading the video", 0.0)
-    chosen = Chosen(tuple(options.effects), options.preset, space.names)
-    experiment, simulate = experiment_of(run, model, chosen, ())
+    spec = ModelSpec(tuple(options.effects), options.preset, space.names)
+    experiment, simulate = experiment_of(run, model, spec, ())
     problem = MeasuredProblem(experiment)
     units = {p.name: "°" if p.unit == "deg" else f" {p.unit}" for p in space}
     finished, spent = 0, 0.0
 
-    def told(done: int, record: EvaluationRecord) -> None:
+    def evaluated(done: int, record: EvaluationRecord) -> None:
         nonlocal finished, spent
         finished, spent = done, spent + record.extras.get("cost", 1.0)
         if record.status == "ok" and is_full(record.parameters):
@@ -235,8 +160,8 @@ def fitted(
             report(what, SEARCH + (1.0 - SEARCH) * share)
 
         experiment.progress = None
-        with Crew(run, model.device, ()) as crew, crew.helping(chosen, experiment, simulate):
-            return criticism.judged(experiment, simulate, found, comparing, options.seed, with_effects=False)
+        with Crew(run, model.device, ()) as crew, crew.helping(spec, experiment, simulate):
+            return compare_models(experiment, simulate, found, comparing, options.seed, with_effects=False)
 
     experiment.progress = simulating
     return fit(
@@ -246,96 +171,62 @@ def fitted(
         budget=budget,
         facts=facts(model),
         compare=None if options.search == "paper" else compared,
-        after_evaluation=told,
+        after_evaluation=evaluated,
     )
 
 
-def sources(effects: Iterable[str]) -> tuple[str, str]:
-    """Version and digest of the code that a fit with some effects would be made by now."""
-    from splatsoil import __version__
-
-    return __version__, code_of(effects)
-
-
-def note_other_sources(run: RunFolder) -> None:
-    """Say on stderr, in one line, if the latest fit was made by other sources than these."""
-    from splatsoil.commands._anew import anew
-    from splatsoil.run_files import read_fit
-
-    fit = read_fit(run.path)
-    setup = fit["setup"]
-    then = (setup.get("version"), setup.get("code"))
-    try:
-        now = sources(setup["effects"])
-    except RunError as error:
-        print(f"splatsoil: {run.path}: effects that it was fitted with are gone ({error})", file=sys.stderr)
-        return
-    if then != now:
-        print(
-            f"splatsoil: {run.path} was fitted by splatsoil {then[0]}, code {then[1]}, and this is {now[0]}, code "
-            f"{now[1]}; this makes it anew: {anew(run, fit)}",
-            file=sys.stderr,
-        )
-
-
-def compared(run: RunFolder, model: Model, report: Report) -> dict[str, Any]:
+def draw_comparison(run: RunFolder, model: Model, report: Report) -> dict[str, Any]:
     """Simulate at the latest fit's estimate, and keep pictures and losses of every frame in ``comparison/``."""
-    with run.lock():
-        return _compared(run, model, report)
-
-
-def _compared(run: RunFolder, model: Model, report: Report) -> dict[str, Any]:
     from splatsoil import __version__
-    from splatsoil.comparison import Comparator
+    from splatsoil.comparison import GAIN, Comparator
     from splatsoil.envs.measured import LOSS
     from splatsoil.experiment.forces import force_record
     from splatsoil.files import write_json
     from splatsoil.report.data import estimates
     from splatsoil.run_files import COMPARISON_FORMAT
 
-    result = run.fit()
-    values = estimates(result)
-    report("reading the video", 0.0)
-    comparator = Comparator(model.measurement, surface=model.reconstruction.surface, frames=model.frames)
-    prediction = model.predict(values, 0, lambda frame, last: report(f"frame {frame}", 0.9 * frame / last))
-    comparison = comparator.compare(prediction.images)
-    report("writing pictures", 0.95)
-    frames = []
-    for camera, frame in comparator.keys:
-        strip = comparator.picture(prediction.images, camera, frame, GAIN)
-        names = {kind: f"{camera}_{frame:04d}_{kind}.jpg" for kind in ("observed", "predicted", "difference")}
-        for name, picture in zip(names.values(), np.split(strip, 3, axis=1), strict=True):
-            write_jpeg(run.comparison / name, picture)
-        losses = {LOSS: comparison.losses[camera, frame], "rgb": comparison.rgb_mse[camera, frame]}
-        frames.append({"camera": camera, "frame": frame, "losses": losses, **names})
-    data = {
-        "format": COMPARISON_FORMAT,
-        "fit": result["name"],
-        "parameters": values,
-        "seed": prediction.seed,
-        "preset": model.preset,
-        "device": model.device,
-        "version": __version__,
-        "measurement": run.description["measurement"]["hash"],
-        "loss": LOSS,
-        "total": {LOSS: comparison.loss, "rgb": comparison.rgb},
-        "noise": {} if comparator.noise is None else {LOSS: comparator.noise},
-        # The loss is measured in units of what soil at rest would leave.
-        "motionless": {LOSS: 1.0},
-        "gain": GAIN,
-        "cameras": list(comparator.cameras),
-        "frames": frames,
-        "force": force_record(model.measurement, comparator.frames, prediction.trajectory.force),
-        "seconds": sum(prediction.seconds.values()),
-    }
-    write_json(run.comparison / "comparison.json", data)
+    with run.lock():
+        result = run.fit()
+        values = estimates(result)
+        report("reading the video", 0.0)
+        comparator = Comparator(model.measurement, surface=model.reconstruction.surface, frames=model.frames)
+        prediction = model.predict(values, 0, lambda frame, last: report(f"frame {frame}", 0.9 * frame / last))
+        comparison = comparator.compare(prediction.images)
+        report("writing pictures", 0.95)
+        frames = []
+        for camera, frame in comparator.keys:
+            pictures = comparator.pictures(prediction.images, camera, frame)
+            names = {kind: f"{camera}_{frame:04d}_{kind}.jpg" for kind in pictures}
+            for kind, picture in pictures.items():
+                write_jpeg(run.comparison / names[kind], picture)
+            losses = {LOSS: comparison.losses[camera, frame], "rgb": comparison.rgb_mse[camera, frame]}
+            frames.append({"camera": camera, "frame": frame, "losses": losses, **names})
+        data = {
+            "format": COMPARISON_FORMAT,
+            "fit": result["name"],
+            "parameters": values,
+            "seed": prediction.seed,
+            "preset": model.preset,
+            "device": model.device,
+            "version": __version__,
+            "measurement": run.description["measurement"]["hash"],
+            "loss": LOSS,
+            "total": {LOSS: comparison.loss, "rgb": comparison.rgb},
+            "noise": {} if comparator.noise is None else {LOSS: comparator.noise},
+            # The loss is measured in units of what soil at rest would leave.
+            "motionless": {LOSS: 1.0},
+            "gain": GAIN,
+            "cameras": list(comparator.cameras),
+            "frames": frames,
+            "force": force_record(model.measurement, comparator.frames, prediction.trajectory.force),
+            "seconds": sum(prediction.seconds.values()),
+        }
+        write_json(run.comparison / "comparison.json", data)
     return data
 
 
 def write_jpeg(path: Path, picture: np.ndarray) -> None:
-    """A picture (h, w, 3) in [0, 1] as a JPEG file, whole or not at all."""
-    import io
-
+    """A picture (h, w, 3), clipped to [0, 1], as a JPEG file, whole or not at all."""
     from PIL import Image
 
     from splatsoil.files import write_bytes
@@ -346,58 +237,8 @@ def write_jpeg(path: Path, picture: np.ndarray) -> None:
     write_bytes(path, stream.getvalue())
 
 
-def opened(options: RunOptions) -> RunFolder:
-    """The run folder of a command, which knows where its set is now if the command says so.
-
-    Raises:
-        RunError: there is none, or the set is another one.
-        MeasurementError: there is no set.
-    """
-    from splatsoil.inverse.run_folder import RunFolder
-    from splatsoil.measurement import Measurement
-
-    run = RunFolder.open(options.run)
-    if options.set is None:
-        return run
-    measurement = Measurement.load(options.set)
-    if measurement.hash != run.description["measurement"]["hash"]:
-        raise RunError(f"{run.path}: --set {options.set} isn't the set that it was made from, or has changed since")
-    return run.moved(measurement.folder.resolve())
-
-
-def measurement_of(run: RunFolder) -> Measurement:
-    """The set that a run was made from: where it was, or beside the run if both have moved.
-
-    Raises:
-        RunError: it is at none of these places, or has changed since.
-    """
-    from splatsoil.measurement import Measurement
-    from splatsoil.measurement.measurement import EXPERIMENT
-
-    first, *others = run.measurement_places()
-    changed = ""
-    for folder in (first, *others):
-        if not (folder / EXPERIMENT).is_file():
-            continue
-        try:
-            measurement = Measurement.load(folder)
-        except MeasurementError:
-            if folder == first:
-                raise
-            continue
-        if measurement.hash == run.description["measurement"]["hash"]:
-            return measurement
-        changed = changed or f"{run.path}: its measurement set {folder} has changed since; fit again into another --run"
-    note = command_line("report", (run.path,), (("--set", "FOLDER", None),))
-    raise RunError(
-        changed
-        or f"{run.path}: its measurement set {first} isn't there any more, nor beside the run; `{note}` notes "
-        "where it is now"
-    )
-
-
 def kept(options: FitOptions) -> str:
-    """How many evaluations an interrupted fit leaves, for the sentence after Ctrl-C."""
+    """What an interrupted fit leaves, for the sentence after Ctrl-C."""
     from splatsoil.inverse.evaluations import EvaluationStore
     from splatsoil.measurement import Measurement
 
@@ -406,5 +247,137 @@ def kept(options: FitOptions) -> str:
         with EvaluationStore(folder / "evaluations.db", writable=False) as store:
             count = len(store.records())
     except (RunError, MeasurementError):
-        return "no evaluation has been finished"
-    return f"{count} evaluation{'s are' if count != 1 else ' is'} kept in {folder}"
+        return "no evaluation has been finished; go on with"
+    return f"{count} evaluation{'s are' if count != 1 else ' is'} kept in {folder}; go on with"
+
+
+def run_diagnosis(
+    folder: RunFolder,
+    model: Model,
+    begin: Stage,
+    effects: Iterable[str] = (),
+    *,
+    crew: Crew | None = None,
+) -> dict[str, Any]:
+    """Compare the latest fit's model with those that have an effect more; the result is ``diagnosis.json`` and, by
+    model, ``diagnoses/NAME.json``.
+
+    ``crew`` are processes for these effects that are there already.
+    """
+    from splatsoil.files import write_json
+
+    result = _compared_models(folder, model, begin("diagnose"), tuple(effects), crew, with_effects=True)
+    write_json(folder.path / "diagnoses" / f"{result['fit']}.json", result)
+    write_json(folder.path / "diagnosis.json", result)
+    return result
+
+
+def check_adequacy(folder: RunFolder, model: Model, report: Report, *, crew: Crew | None = None) -> dict[str, Any]:
+    """Whether the latest fit's model leaves more than noise, where and when; kept as ``comparison/misfit.json``.
+
+    ``crew`` are processes for no effects that are there already.
+    """
+    from splatsoil.files import plain, write_json
+    from splatsoil.inverse.criticism.record import misfit_of
+
+    result = misfit_of(_compared_models(folder, model, report, (), crew, with_effects=False))
+    write_json(folder.comparison / "misfit.json", result)
+    return dict(plain(result))
+
+
+def _compared_models(
+    folder: RunFolder, model: Model, report: Report, effects: tuple[str, ...], crew: Crew | None, *, with_effects: bool
+) -> dict[str, Any]:
+    from splatsoil import __version__
+    from splatsoil.commands._crew import Crew
+    from splatsoil.files import JUDGING, code_digest, code_of
+    from splatsoil.inverse.criticism.next_stroke import posterior_draws
+    from splatsoil.inverse.criticism.record import record
+    from splatsoil.report.data import estimates
+
+    began = time.perf_counter()
+    fit, seed = folder.fit(), folder.description["seed"]
+    spec = ModelSpec.of(fit)
+    experiment, simulate = experiment_of(folder, model, spec, (effects or None) if with_effects else ())
+    with (
+        folder.lock(),
+        Crew(folder, model.device, effects) if crew is None else nullcontext(crew) as mine,
+        mine.helping(spec, experiment, simulate),
+    ):
+        found = compare_models(experiment, simulate, fit, report, seed, with_effects=with_effects)
+    return {
+        **record(experiment, found, simulate.asked),
+        "draws": posterior_draws(found.evidence, seed),
+        "candidates": list(effects),
+        "fit": fit["name"],
+        "values": estimates(fit),
+        "preset": model.preset,
+        "device": model.device,
+        "version": __version__,
+        "code": code_of((*spec.effects, *effects)),
+        "judged_by": code_digest(JUDGING),
+        "seed": seed,
+        "seconds": round(time.perf_counter() - began, 1),
+        "simulated_now": simulate.made,
+    }
+
+
+def compare_models(
+    experiment: Experiment,
+    simulate: Simulations,
+    fit: Mapping[str, Any],
+    report: Report,
+    seed: int,
+    *,
+    with_effects: bool,
+) -> Diagnosis:
+    """A fit's model against something else, and against models with an effect more; it starts from what the search has
+    found and simulated.
+
+    Args:
+        experiment: of the model.
+        simulate: its simulations.
+        fit: what ``fit.json`` holds, or will hold.
+        report: progress.
+        seed: of the run.
+        with_effects: whether effects that are off are models, too.
+
+    Raises:
+        SimulationError: the model as it is could not be simulated often enough.
+    """
+    from splatsoil.inverse.criticism.design import Run
+    from splatsoil.inverse.criticism.diagnosis import diagnose
+
+    stage, share = "", 0.0
+
+    def progress(what: str, done: float) -> None:
+        nonlocal stage, share
+        stage, share = what, done
+        report(stage, share)
+
+    def starting(purpose: str) -> None:
+        report(f"{stage}, {simulate.made + 1}: {purpose.replace('_', ' ')}", share)
+
+    simulate.told = starting
+    return diagnose(
+        experiment,
+        {name: entry["estimate"] for name, entry in fit["minimum"].items()},
+        simulate=simulate,
+        effects=with_effects,
+        seed=seed,
+        known=[
+            Run(step["parameters"], seed=step["seed"])
+            for step in fit["history"]
+            if step["status"] == "ok" and step["level"] == "full"
+        ],
+        prior=prior_of(experiment, fit),
+        progress=progress,
+    )
+
+
+def prior_of(experiment: Experiment, fit: Mapping[str, Any]) -> Prior:
+    """The prior of the parameters, given what the search for a fit leaves possible."""
+    from splatsoil.inverse.criticism.design import Prior
+
+    low, high = ({name: entry[end] for name, entry in fit["minimum"].items()} for end in ("low", "high"))
+    return Prior.of(experiment, low, high)

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
-import runpy
 import sys
 from dataclasses import dataclass
 
-from tyro.conf import Positional
-
 from splatsoil.commands._output import print_json
 from splatsoil.errors import ParameterError
+from splatsoil.options import argument, option
 
 
 @dataclass(frozen=True)
@@ -21,12 +19,9 @@ class Config:
     splatsoil benchmark NAME --help lists a benchmark's options.
     """
 
-    name: Positional[str] = ""
-    """Of the benchmark; without one they are listed."""
-    arguments: Positional[tuple[str, ...]] = ()
-    """The benchmark's own arguments."""
-    json: bool = False
-    """List as one JSON object; as an argument of a benchmark, it is the benchmark's own."""
+    name: str = argument("Of the benchmark; without one they are listed.", default="")
+    arguments: tuple[str, ...] = argument("The benchmark's own arguments.", default=())
+    json: bool = option(False, "List as one JSON object; as an argument of a benchmark, it is the benchmark's own.")
 
 
 def benchmarks() -> dict[str, str]:
@@ -54,19 +49,15 @@ def run(config: Config) -> int:
 
 
 def _execute(name: str, module: str, arguments: tuple[str, ...]) -> int:
-    """A module's ``main`` (or all of it, as ``python -m`` would) with these arguments; its exit code."""
+    """A module's ``main`` with these arguments; its exit code."""
     before = sys.argv
     sys.argv = [f"splatsoil benchmark {name}", *arguments]
     try:
-        main = getattr(importlib.import_module(module), "main", None)
-        if main is not None:
-            return int(main(list(arguments)))
-        runpy.run_module(module, run_name="__main__")
+        return int(importlib.import_module(module).main(list(arguments)))
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else int(end.code is not None)
     finally:
         sys.argv = before
-    return 0
 
 
 def _title(module: str) -> str:

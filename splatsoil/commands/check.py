@@ -8,47 +8,43 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tyro.conf import Positional
-
-from splatsoil.commands._options import command_line
-from splatsoil.commands._output import print_json
+from splatsoil.commands import _laboratory
+from splatsoil.commands._options import SET
+from splatsoil.commands._output import print_json, print_table, print_text
+from splatsoil.options import JSON, argument, option
 
 if TYPE_CHECKING:
     from splatsoil.measurement import Measurement, Remark
+
+INTERRUPTED = "nothing was written; start again with"
 
 
 @dataclass(frozen=True)
 class Config:
     """List what a measurement set contains and what is wrong with it. Writes nothing."""
 
-    set: Positional[Path]
-    """Folder of the measurement set."""
-    json: bool = False
-    """Print one JSON object instead of a table."""
+    set: Path = argument(SET)
+    json: bool = option(False, JSON)
 
 
 def run(config: Config) -> int:
     """Print the table or the object; MeasurementError when the set breaks the format's rules."""
-    from splatsoil.commands import _laboratory as laboratory
     from splatsoil.measurement import Measurement, remarks
 
-    if laboratory.is_test(config.set):
-        return laboratory.check(config.set, quiet=config.json)
+    if _laboratory.is_test(config.set):
+        return _laboratory.check(config.set, quiet=config.json)
     measurement = Measurement.load(config.set)
-    said = remarks(measurement)
+    found = remarks(measurement)
     if config.json:
-        print_json(_as_json(measurement, said))
+        print_json(_as_json(measurement, found))
     else:
-        _show(measurement, said)
+        print_table(f"{measurement.name} ({measurement.folder})", (), _rows(measurement))
+        print_text(*(f"remark {remark.about}: {remark.text}" for remark in found), style="yellow")
+        print("The set can be used as it is." if found else "The set is complete and consistent.")
     return 0
 
 
-def interrupted(config: Config) -> str:
-    """Checking keeps nothing."""
-    return f"nothing was written; start again with: {command_line('check', (config.set,))}"
-
-
-def _as_json(measurement: Measurement, said: tuple[Remark, ...]) -> dict[str, Any]:
+def _as_json(measurement: Measurement, found: tuple[Remark, ...]) -> dict[str, Any]:
     bed, tool = measurement.bed, measurement.tool
     return {
         "ok": True,
@@ -78,55 +74,28 @@ def _as_json(measurement: Measurement, said: tuple[Remark, ...]) -> dict[str, An
             "frames": list(measurement.frames),
             "pre_roll": sorted({f.frame for f in measurement.pre_roll if f.frame is not None}),
         },
-        "remarks": [{"about": remark.about, "text": remark.text} for remark in said],
+        "remarks": [{"about": remark.about, "text": remark.text} for remark in found],
     }
-
-
-def _show(measurement: Measurement, said: tuple[Remark, ...]) -> None:
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table(title=escape(f"{measurement.name} ({measurement.folder})"), show_header=False, title_justify="left")
-    table.add_column(style="bold")
-    table.add_column()
-    for key, value in _rows(measurement):
-        table.add_row(key, escape(value))
-    console = Console(highlight=False)
-    console.print(table)
-    for remark in said:
-        console.print(f"[yellow]remark[/yellow] {remark.about}: {escape(remark.text)}")
-    console.print("[green]The set is complete and consistent.[/green]" if not said else "The set can be used as it is.")
 
 
 def _rows(measurement: Measurement) -> list[tuple[str, str]]:
     bed, tool, motion = measurement.bed, measurement.tool, measurement.tool.motion
-    first = measurement.views[0].camera
-    sizes = {(f.camera.width, f.camera.height) for f in measurement.views}
+    lens = "with lens distortion" if measurement.views[0].camera.has_distortion else "no lens distortion"
+    sizes = sorted({(f.camera.width, f.camera.height) for f in measurement.views})
+    pixels = ", ".join(f"{width} x {height}" for width, height in sizes)
+    bed_size, tool_size = (" x ".join(f"{v:g}" for v in sides.round(4)) for sides in (bed.extents, tool.mesh.extents))
     pre_roll = {f.frame for f in measurement.pre_roll}
     frames = measurement.frames
     numbers = f"numbers {frames[0]} to {frames[-1]}" if frames else "none"
     way = sum(math.dist(a, b) for a, b in pairwise(motion.positions))
     return [
-        ("bed", f"{_lengths(bed.extents)} m, {bed.density:g} kg/m³, friction {bed.floor_friction:g} on the floor"),
+        ("bed", f"{bed_size} m, {bed.density:g} kg/m³, friction {bed.floor_friction:g} on the floor"),
         ("gravity", ", ".join(f"{g:g}" for g in measurement.gravity) + " m/s²"),
-        ("views", f"{len(measurement.views)} of {_sizes(sizes)} pixels, {_lens(first.has_distortion)}"),
+        ("views", f"{len(measurement.views)} of {pixels} pixels, {lens}"),
         ("video", f"cameras {', '.join(measurement.cameras)}; {len(frames)} frames each at most, {numbers}"),
         ("pre-roll", f"{len(pre_roll)} frames" if pre_roll else "none"),
-        ("tool", f"{_lengths(tool.mesh.extents)} m, {len(tool.mesh.faces)} triangles, friction {tool.friction:g}"),
+        ("tool", f"{tool_size} m, {len(tool.mesh.faces)} triangles, friction {tool.friction:g}"),
         ("motion", f"{len(motion.times)} rows, {motion.times[-1] - motion.times[0]:g} s, {way:.3g} m of way"),
         ("force", "not measured" if tool.force is None else f"{len(tool.force)} rows"),
         ("hash", measurement.hash[:16]),
     ]
-
-
-def _lengths(values: Any) -> str:
-    return " x ".join(f"{v:g}" for v in values.round(4))
-
-
-def _sizes(sizes: set[tuple[int, int]]) -> str:
-    return ", ".join(f"{w} x {h}" for w, h in sorted(sizes))
-
-
-def _lens(distorted: bool) -> str:
-    return "with lens distortion" if distorted else "no lens distortion"

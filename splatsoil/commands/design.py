@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
-from splatsoil.commands._options import RunOptions
-from splatsoil.commands._output import print_json
+from splatsoil.commands import _folder, _model
+from splatsoil.commands._options import DEVICE, Preset, RunOptions, command_line
+from splatsoil.commands._output import print_json, print_notes, print_table, print_text
+from splatsoil.errors import ParameterError, RunError, SimulationError
+from splatsoil.options import JSON, option
 
 if TYPE_CHECKING:
-    from splatsoil.commands._experiments import Chosen
-    from splatsoil.commands._progress import Report, Stage
+    from splatsoil.commands._model import ModelSpec
+    from splatsoil.commands._output import Report
     from splatsoil.experiment.plow import PlowExperiment
     from splatsoil.experiment.strokes import Stroke
     from splatsoil.inverse.criticism.next_stroke import Information
@@ -19,6 +23,8 @@ if TYPE_CHECKING:
     from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.measurement import ToolMotion
     from splatsoil.model import Model
+
+INTERRUPTED = "finished simulations are kept; go on with"
 
 
 @dataclass(frozen=True)
@@ -29,40 +35,31 @@ class Config(RunOptions):
     the tool_motion.csv of a measurement set. Simulations are kept: an interrupted design goes on.
     """
 
-    draws: int = 8
-    """Simulations of each model and motion."""
-    preset: Literal["tiny", "small", "paper", "fine"] = "tiny"
-    """How finely to simulate; differences between models are looked at, for which the coarsest will do."""
-    device: str = "auto"
-    """Where to compute: auto, cpu, cuda:0, …"""
-    json: bool = False
-    """Print one JSON object instead of a table."""
+    draws: int = option(8, "Simulations of each model and motion.")
+    preset: Preset = option(
+        "tiny", "How finely to simulate; differences between models are looked at, for which the coarsest will do."
+    )
+    device: str = option("auto", DEVICE)
+    json: bool = option(False, JSON)
 
 
 def run(config: Config) -> int:
     """Simulate other strokes; the result goes into ``design/`` of the run folder."""
-    from splatsoil.commands import _criticism as criticism
-    from splatsoil.commands import _stages as stage
-    from splatsoil.commands._progress import stages
-    from splatsoil.envs.devices import resolve_device
-    from splatsoil.errors import ParameterError
     from splatsoil.files import check_folder
     from splatsoil.inverse.criticism.next_stroke import FEWEST, KEPT, probable
-    from splatsoil.quiet import hush
 
     if not FEWEST <= config.draws <= KEPT:
         raise ParameterError(f"--draws: between {FEWEST} and {KEPT} simulations, not {config.draws}")
-    folder = stage.opened(config)
-    criticism.need_fit(folder)
+    folder = _folder.opened(config)
+    fit = _folder.latest_fit(folder)
     diagnosis = diagnosis_of(folder)
     probable(diagnosis)  # refused before the rest is loaded
     folder.check_writable()
     check_folder(folder.path / "design")
-    hush()
-    device = resolve_device(config.device)
-    stage.note_other_sources(folder)
-    with stages(quiet=config.json) as begin:
-        result = _designed(config, folder, diagnosis, device, begin)
+    # Other strokes are looked at with the fitted model at a preset of their own.
+    spec = replace(_model.ModelSpec.of(fit), preset=config.preset)
+    with _model.loaded(config, folder, spec) as (model, begin):
+        result = _designed(config, folder, diagnosis, model, spec, begin("design"))
     if config.json:
         print_json({"ok": True, "run": str(folder.path), **result})
     else:
@@ -71,148 +68,107 @@ def run(config: Config) -> int:
     return 0
 
 
-def interrupted(config: Config) -> str:
-    """Simulations are kept one by one."""
-    again = config.again(
-        "design",
-        ("--draws", config.draws, 8),
-        ("--preset", config.preset, "tiny"),
-        ("--device", config.device, "auto"),
-        ("--json", config.json, False),
-    )
-    return f"finished simulations are kept; go on with: {again}"
-
-
 def diagnosis_of(folder: RunFolder) -> dict[str, Any]:
     """The diagnosis of the latest fit.
 
     Raises:
         RunError: there is none, or it is of another fit or by other code.
     """
-    import shlex
-
-    from splatsoil.commands._control import code_of, judged_by
-    from splatsoil.errors import RunError
-    from splatsoil.report.data import estimates
-    from splatsoil.run_files import DIAGNOSIS_FORMAT, read_kept
-
-    fit, path = folder.fit(), folder.path / "diagnosis.json"
-    make = f"make one first: splatsoil diagnose {shlex.quote(str(folder.path))}"
+    path, make = folder.path / "diagnosis.json", f"make one first: {command_line('diagnose', folder.path)}"
     if not path.is_file():
         raise RunError(f"{folder.path}: has no diagnosis; {make}")
-    data = read_kept(path, DIAGNOSIS_FORMAT)
-    same = data["values"] == estimates(fit) and data.get("judged_by") == judged_by() and "draws" in data
-    if not same or data["code"] != code_of((*fit["setup"]["effects"], *data["candidates"])):
+    data = _folder.current_diagnosis(folder, path)
+    if data is None or "draws" not in data:
         raise RunError(f"{folder.path}: its diagnosis is of another fit, or by other code; {make}")
     return data
 
 
-@dataclass(frozen=True)
-class _Design:
-    """What strokes are compared by.
+def _expected(
+    stroke: Stroke,
+    measured: PlowExperiment,
+    kept: Simulations,
+    folder: RunFolder,
+    spec: ModelSpec,
+    diagnosis: Mapping[str, Any],
+    draws: Mapping[str, Sequence[Mapping[str, float]]],
+    report: Report,
+) -> tuple[Information, int]:
+    """What a stroke is expected to tell, and how many new simulations and drawings that took.
 
-    Attributes:
-        folder: the run.
-        model: of the measured stroke.
-        chosen: what makes it.
-        measured: the experiment of that stroke.
+    Args:
+        stroke: another one than was measured.
+        measured: the experiment of the measured one.
         kept: its simulations.
+        folder: the run.
+        spec: of its model.
         diagnosis: what ``diagnosis.json`` holds.
-        probability: of the models to be told apart.
-        draws: parameters of each, and of the model as it is.
+        draws: parameters of the model as it is, and of each that is to be told apart.
+        report: progress.
     """
+    from concurrent.futures import Future
+    from contextlib import nullcontext
 
-    folder: RunFolder
-    model: Model
-    chosen: Chosen
-    measured: PlowExperiment
-    kept: Simulations
-    diagnosis: Mapping[str, Any]
-    probability: Mapping[str, float]
-    draws: Mapping[str, Sequence[Mapping[str, float]]]
+    from splatsoil.experiment.strokes import StrokeExperiment
+    from splatsoil.files import code_digest
+    from splatsoil.inverse.criticism.next_stroke import expected_information, probable, runs_of
+    from splatsoil.inverse.criticism.simulations import Helpers, Simulations
+    from splatsoil.inverse.evaluations import digest
 
-    @classmethod
-    def of(cls, folder: RunFolder, model: Model, chosen: Chosen, diagnosis: Mapping[str, Any], draws: int) -> _Design:
-        from splatsoil.commands._experiments import experiment_of
-        from splatsoil.inverse.criticism.evidence import AS_IT_IS
-        from splatsoil.inverse.criticism.next_stroke import probable
-
-        measured, kept = experiment_of(folder, model, chosen, diagnosis["candidates"] or None)
-        probability = probable(diagnosis)
-        drawn = {name: diagnosis["draws"][name][:draws] for name in dict.fromkeys((AS_IT_IS, *probability))}
-        return cls(folder, model, chosen, measured, kept, diagnosis, probability, drawn)
-
-    def expected(self, stroke: Stroke, report: Report) -> tuple[Information, int]:
-        """What a stroke is expected to tell, and how many new simulations and drawings that took."""
-        from concurrent.futures import Future
-        from contextlib import nullcontext
-
-        from splatsoil.commands._stages import model_on
-        from splatsoil.experiment.strokes import StrokeExperiment
-        from splatsoil.files import code_digest
-        from splatsoil.inverse.criticism.next_stroke import expected_information, runs_of
-        from splatsoil.inverse.criticism.simulations import Helpers, Simulations
-        from splatsoil.inverse.evaluations import digest
-
-        seed, chosen, model = int(self.folder.description["seed"]), self.chosen, self.model
-        measurement = stroke.prepared(self.measured)
-        other = model_on(measurement, self.folder, model.reconstruction, chosen.effects, chosen.preset, model.device)
-        experiment = StrokeExperiment(other, self.measured, self.diagnosis["candidates"] or None)
-        motion = table(stroke.measurement.tool.motion)
-        identity = {
-            **self.kept.identity,
-            "stroke": digest({"motion": motion, "rate": stroke.measurement.frame_rate, "start": stroke.start}),
-            "strokes": code_digest(("experiment/strokes.py",)),
-            "layout": list(experiment.layout.shape),
-        }
-        runs = [run for mine in runs_of(self.draws, seed).values() for run in mine]
-        simulate = Simulations(experiment, self.kept.folder, identity, sources=self.kept.sources)
-        count = len(runs) + len(experiment.guesses) + len(experiment.redrawn)
-        simulate.told = lambda purpose: report(purpose.replace("_", " "), simulate.asked / count)
-        # A GPU makes several at a time, all of them in this process.
-        batch = Helpers(0, lambda jobs: Future(), experiment.together, experiment.prepare)
-        with simulate.helped(batch) if experiment.together > 1 else nullcontext():
-            simulate.ahead(lambda ask: [ask(**run.arguments()) for run in runs])
-            found = expected_information(
-                experiment, self.draws, self.probability, simulate, numerics=self.diagnosis["numerics"], seed=seed
-            )
-        return found, simulate.made
+    seed, model = int(folder.description["seed"]), measured.base
+    measurement, reconstruction = stroke.prepared(measured), model.reconstruction
+    other = _model.model_on(measurement, folder, reconstruction, spec.effects, spec.preset, model.device)
+    experiment = StrokeExperiment(other, measured, diagnosis["candidates"] or None)
+    motion = motion_csv(stroke.measurement.tool.motion)
+    identity = {
+        **kept.identity,
+        "stroke": digest({"motion": motion, "rate": stroke.measurement.frame_rate, "start": stroke.start}),
+        "strokes": code_digest(("experiment/strokes.py",)),
+        "layout": list(experiment.layout.shape),
+    }
+    runs = [run for mine in runs_of(draws, seed).values() for run in mine]
+    simulate = Simulations(experiment, kept.folder, identity, sources=kept.sources)
+    count = len(runs) + len(experiment.guesses) + len(experiment.redrawn)
+    simulate.told = lambda purpose: report(purpose.replace("_", " "), simulate.asked / count)
+    # A GPU makes several at a time, all of them in this process.
+    batch = Helpers(0, lambda jobs: Future(), experiment.together, experiment.prepare)
+    with simulate.helped(batch) if experiment.together > 1 else nullcontext():
+        simulate.ahead(lambda ask: [ask(**run.arguments()) for run in runs])
+        found = expected_information(
+            experiment, draws, probable(diagnosis), simulate, numerics=diagnosis["numerics"], seed=seed
+        )
+    return found, simulate.made
 
 
 def _designed(
-    config: Config, folder: RunFolder, diagnosis: Mapping[str, Any], device: str, begin: Stage
+    config: Config, folder: RunFolder, diagnosis: Mapping[str, Any], model: Model, spec: ModelSpec, report: Report
 ) -> dict[str, Any]:
     """The strokes, the most informative first; kept in ``design/``."""
-    import time
-
     import numpy as np
 
     from splatsoil import __version__
-    from splatsoil.commands import _experiments as experiments
-    from splatsoil.errors import SimulationError
     from splatsoil.experiment.strokes import strokes
     from splatsoil.files import write_json, write_text
-    from splatsoil.inverse.criticism.next_stroke import entropy
+    from splatsoil.inverse.criticism.evidence import AS_IT_IS
+    from splatsoil.inverse.criticism.next_stroke import entropy, probable
     from splatsoil.run_files import DESIGN_FORMAT
 
     began = time.perf_counter()
-    chosen = replace(experiments.Chosen.of(folder.fit()), preset=config.preset)
-    model = experiments.model_of(folder, device, begin("reconstruct"), chosen=chosen)
-    report = begin("design")
     report("light and colours", 0.0)
     model.scene()  # kept: in other strokes the tool may begin elsewhere than photographs show it
-    design = _Design.of(folder, model, chosen, diagnosis, config.draws)
+    measured, kept = _model.experiment_of(folder, model, spec, diagnosis["candidates"] or None)
+    probability = probable(diagnosis)
+    draws = {name: diagnosis["draws"][name][: config.draws] for name in dict.fromkeys((AS_IT_IS, *probability))}
     proposed = {s.name: s for s in strokes(model.measurement, float(np.nanmean(model.reconstruction.surface.height)))}
     found: dict[str, Information] = {}
     notes, made = [], 0
     with folder.lock():
         for number, (name, stroke) in enumerate(proposed.items()):
 
-            def told(what: str, share: float, number: int = number, name: str = name) -> None:
+            def progress(what: str, share: float, number: int = number, name: str = name) -> None:
                 report(f"{name}, {what}", (number + share) / len(proposed))
 
             try:
-                found[name], new = design.expected(stroke, told)
+                found[name], new = _expected(stroke, measured, kept, folder, spec, diagnosis, draws, progress)
                 made += new
             except SimulationError as error:
                 notes.append(f"{name}: {error}")
@@ -223,8 +179,8 @@ def _designed(
         result = {
             "format": DESIGN_FORMAT,
             "fit": diagnosis["fit"],
-            "models": dict(design.probability),
-            "most": entropy(design.probability),
+            "models": dict(probability),
+            "most": entropy(probability),
             "stroke": order[0],
             "strokes": [
                 {
@@ -239,7 +195,7 @@ def _designed(
             ],
             "draws": config.draws,
             "preset": config.preset,
-            "device": device,
+            "device": model.device,
             "version": __version__,
             "seed": folder.description["seed"],
             "notes": notes,
@@ -247,12 +203,12 @@ def _designed(
             "seconds": round(time.perf_counter() - began, 1),
         }
         motion = proposed[order[0]].motion(model.measurement.frame_rate)
-        write_text(folder.path / "design" / "tool_motion.csv", table(motion))
+        write_text(folder.path / "design" / "tool_motion.csv", motion_csv(motion))
         write_json(folder.path / "design" / "design.json", result)
     return result
 
 
-def table(motion: ToolMotion) -> str:
+def motion_csv(motion: ToolMotion) -> str:
     """A motion as a measurement set's ``tool_motion.csv``."""
     import numpy as np
 
@@ -268,40 +224,35 @@ def table(motion: ToolMotion) -> str:
 
 def show(result: Mapping[str, Any]) -> None:
     """The strokes, what each is expected to tell, and which to make."""
-    from rich.box import SIMPLE_HEAD
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
+    from splatsoil.report.text import listed, model_label
 
-    from splatsoil.report.words import listed, model_label
-
-    console = Console(highlight=False)
     models = listed([f"{model_label(name)} ({100.0 * p:.0f} %)" for name, p in result["models"].items()])
-    console.print(f"models: {escape(models)}; to be told at most: {result['most']:.2f} bits")
-    shown = Table(title="the next stroke", title_justify="left", box=SIMPLE_HEAD)
-    for column in ("motion", "expected information", "would tell apart"):
-        shown.add_column(column, justify="right" if column == "expected information" else "left")
-    for stroke in result["strokes"]:
-        pairs = [f"{model_label(a)} from {model_label(b)}" for a, b in stroke["told_apart"]]
-        shown.add_row(
-            escape(stroke["name"]), f"{stroke['bits']:.2f} ± {stroke['std']:.2f} bits", escape("; ".join(pairs) or "–")
-        )
-    console.print(shown)
-    console.print(escape(sentence(result)))
-    for note in result["notes"]:
-        console.print(f"[yellow]note[/yellow] {escape(note)}")
-    console.print(f"{result['simulated_now']} new simulations and drawings, {result['seconds']:.0f} s")
+    print_text(f"models: {models}; to be told at most: {result['most']:.2f} bits")
+    print_table(
+        "the next stroke",
+        ("motion", "expected information", "would tell apart"),
+        (
+            (
+                stroke["name"],
+                f"{stroke['bits']:.2f} ± {stroke['std']:.2f} bits",
+                "; ".join(f"{model_label(a)} from {model_label(b)}" for a, b in stroke["told_apart"]) or "–",
+            )
+            for stroke in result["strokes"]
+        ),
+        left=("motion", "would tell apart"),
+    )
+    print_text(best_sentence(result))
+    print_notes(result["notes"])
+    print(f"{result['simulated_now']} new simulations and drawings, {result['seconds']:.0f} s")
 
 
-def sentence(result: Mapping[str, Any]) -> str:
+def best_sentence(result: Mapping[str, Any]) -> str:
     """Which stroke, and over which others that can be said."""
-    from splatsoil.report.words import listed
+    from splatsoil.report.text import listed
 
     first, *others = result["strokes"]
     alike = [s["name"] for s in others if not s["less_than_best"]]
-    said = f"Most is expected of the stroke {first['name']}: {first['bits']:.2f} ± {first['std']:.2f} bits"
-    if not others:
-        return f"{said}."
-    if not alike:
-        return f"{said}, more than of any other."
-    return f"{said}; by these simulations it is not better than {listed(alike)}."
+    best = f"Most is expected of the stroke {first['name']}: {first['bits']:.2f} ± {first['std']:.2f} bits"
+    if alike:
+        return f"{best}; by these simulations it is not better than {listed(alike)}."
+    return f"{best}, more than of any other." if others else f"{best}."

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from splatsoil.commands._answer import why_none
-from splatsoil.commands._options import RunOptions
-from splatsoil.commands._output import print_json
+from splatsoil.commands import _folder, _laboratory, _model, _stages
+from splatsoil.commands._options import DEVICE, RunOptions
+from splatsoil.commands._output import print_json, print_notes, print_table, print_text
+from splatsoil.errors import NoAnswer
+from splatsoil.options import JSON, option
 
-if TYPE_CHECKING:
-    from splatsoil.commands._crew import Crew
-    from splatsoil.inverse.run_folder import RunFolder
+INTERRUPTED = "finished simulations are kept; go on with"
 
 
 @dataclass(frozen=True)
@@ -22,36 +23,34 @@ class Config(RunOptions):
     diagnosis that was interrupted goes on.
     """
 
-    effects: tuple[str, ...] = ()
-    """Effects to consider, by name, or files that define some; the whole library if not given."""
-    device: str = "auto"
-    """Where to compute: auto, cpu, cuda:0, …"""
-    json: bool = False
-    """Print one JSON object instead of a table."""
+    effects: tuple[str, ...] = option(
+        (), "Effects to consider, by name, or files that define some; the whole library if not given."
+    )
+    device: str = option("auto", DEVICE)
+    json: bool = option(False, JSON)
 
 
 def run(config: Config) -> int:
     """Diagnose; the result goes into the run folder."""
-    from splatsoil.commands import _criticism as criticism
-    from splatsoil.commands import _laboratory as laboratory
-    from splatsoil.commands import _stages as stage
     from splatsoil.commands._crew import Crew
-    from splatsoil.commands._diagnosis_table import show
-    from splatsoil.errors import NoAnswer
+    from splatsoil.files import plain
+    from splatsoil.soil.library import find_effects
 
-    if laboratory.is_run(config.run) or laboratory.is_test(config.run):
-        return laboratory.diagnose(config.run, config.effects, config.device, config.set, quiet=config.json)
-    folder = stage.opened(config)
-    none = why_none(criticism.need_fit(folder))
+    if _laboratory.is_run(config.run) or _laboratory.is_test(config.run):
+        return _laboratory.diagnose(config.run, config.effects, config.device, config.set, quiet=config.json)
+    folder = _folder.opened(config)
+    fit = _folder.latest_fit(folder)
+    none = _folder.no_answer(fit)
     folder.check_writable()
+    # Helpers begin before what takes seconds to load is loaded.
     with Crew(folder, config.device, config.effects) as crew:
-        result = _diagnosed(config, folder, crew)
-    if none:
-        del result["estimates"]
+        _model.off_effects(config.effects, find_effects(fit["setup"]["effects"]))
+        with _model.loaded(config, folder) as (model, begin):
+            result = _stages.run_diagnosis(folder, model, begin, config.effects, crew=crew)
+    result = {key: value for key, value in result.items() if not (none and key == "estimates")}
     if config.json:
-        print_json(
-            {**({"ok": False, "error": none} if none else {"ok": True}), **_finite(result), "run": str(folder.path)}
-        )
+        verdict = {"ok": False, "error": none} if none else {"ok": True}
+        print_json({**verdict, **plain(result), "run": str(folder.path)})
     else:
         if none:
             print(none)
@@ -60,39 +59,25 @@ def run(config: Config) -> int:
     return NoAnswer.code if none else 0
 
 
-def _diagnosed(config: Config, folder: RunFolder, crew: Crew) -> dict[str, Any]:
-    """What takes seconds to load is loaded here: helpers have begun by then."""
-    from splatsoil.commands import _criticism as criticism
-    from splatsoil.commands import _experiments as experiments
-    from splatsoil.commands import _stages as stage
-    from splatsoil.commands._progress import stages
-    from splatsoil.envs.devices import resolve_device
-    from splatsoil.quiet import hush
-    from splatsoil.soil.library import find_effects
+def show(result: Mapping[str, Any]) -> None:
+    """The table of models, the verdict, and why; the parameters where ``result`` has them."""
+    from splatsoil.report.text import LITTLE, averaged_sentence, estimate, model_label, probability, verdict
 
-    # a name that is wrong is refused before the rest is loaded
-    experiments.off_effects(config.effects, find_effects(folder.fit()["setup"]["effects"]))
-
-    hush()
-    device = resolve_device(config.device)
-    stage.note_other_sources(folder)
-    with stages(quiet=config.json) as begin:
-        model = experiments.model_of(folder, device, begin("reconstruct"))
-        return criticism.diagnosed(folder, model, begin, config.effects, crew=crew)
-
-
-def interrupted(config: Config) -> str:
-    """Simulations are kept one by one."""
-    again = config.again(
-        "diagnose",
-        ("--effects", config.effects, ()),
-        ("--device", config.device, "auto"),
-        ("--json", config.json, False),
+    print_table(
+        f"models compared with {result['fit']}",
+        ("model", "probability", "size", "smallest detectable"),
+        (
+            (
+                model_label(model["name"]),
+                probability(model["probability"]),
+                estimate(model["estimate"], model["std"], model["unit"]),
+                estimate(model["detectable"], None, model["unit"]),
+            )
+            for model in result["models"]
+        ),
+        faint=[number for number, model in enumerate(result["models"]) if model["probability"] < LITTLE],
     )
-    return f"finished simulations are kept; go on with: {again}"
-
-
-def _finite(result: dict) -> dict:
-    from splatsoil.files import plain
-
-    return plain(result)
+    print_text(verdict(result), style="bold")
+    print_text(*([averaged_sentence(result["estimates"])] if "estimates" in result else []), *result["sentences"])
+    print_notes(result["notes"])
+    print(f"{result['simulations']} simulations, {result['simulated_now']} of them new, {result['seconds']:.0f} s")

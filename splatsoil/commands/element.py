@@ -4,55 +4,46 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-import tyro
-
-from splatsoil.commands._options import command_line
-from splatsoil.commands._output import print_json
+from splatsoil.commands._output import print_json, print_table
+from splatsoil.commands.simulate import ACTING, VALUES, parse_values
 from splatsoil.errors import ParameterError
+from splatsoil.options import JSON, option
 
 if TYPE_CHECKING:
     from splatsoil.soil.element import ElementTest
     from splatsoil.soil.law import Law
+
+INTERRUPTED = "the plot was not written; start again with"
 
 
 @dataclass(frozen=True)
 class Config:
     """A laboratory test on the soil law, as a table and a plot."""
 
-    test: Literal["triaxial", "extension", "simple-shear", "isotropic"] = "triaxial"
-    """Drained triaxial compression or extension, simple shear, or isotropic compression."""
-    confining: float = 100e3
-    """Stress at the start, and of what is held, in Pa."""
-    friction_angle: float = 35.0
-    """Of the soil, degrees."""
-    effects: Annotated[tuple[str, ...], tyro.conf.arg(name="with", metavar="EFFECT …")] = ()
-    """Effects that act, or files that define some."""
-    values: Annotated[tuple[str, ...], tyro.conf.arg(name="set", metavar="NAME=VALUE …")] = ()
-    """Parameters of the effects."""
-    strain: float = 0.2
-    """Largest logarithmic strain: of the axis, or of shear; at most 10."""
-    pressure: float | None = None
-    """Largest pressure of the isotropic test in Pa; ten times the confining stress unless given."""
-    records: int = 100
-    """Points of the curve, 2 to 100000."""
-    void_ratio: float = 0.8
-    """At the start."""
-    young: float = 5.0e7
-    """Young's modulus in Pa."""
-    poisson: float = 0.2
-    """Poisson's ratio."""
-    strain_rate: float = 1.0e-5
-    """In 1/s; only effects of rate feel it."""
-    depth: float = 0.0
-    """Below the undisturbed surface in metres; only effects of depth feel it."""
-    matching: Literal["compression", "extension", "plane_strain", "simple_shear"] = "compression"
-    """Where the Drucker-Prager cone agrees with Mohr-Coulomb."""
-    plot: Path = Path("element.png")
-    """File for the plot (png, svg or pdf)."""
-    json: bool = False
-    """Print one JSON object with all records instead of a table."""
+    test: Literal["triaxial", "extension", "simple-shear", "isotropic"] = option(
+        "triaxial", "Drained triaxial compression or extension, simple shear, or isotropic compression."
+    )
+    confining: float = option(100e3, "Stress at the start, and of what is held, in Pa.")
+    friction_angle: float = option(35.0, "Of the soil, degrees.")
+    effects: tuple[str, ...] = option((), ACTING, name="with", metavar="EFFECT")
+    values: tuple[str, ...] = option((), VALUES, name="set", metavar="NAME=VALUE")
+    strain: float = option(0.2, "Largest logarithmic strain: of the axis, or of shear; at most 10.")
+    pressure: float | None = option(
+        None, "Largest pressure of the isotropic test in Pa; ten times the confining stress unless given."
+    )
+    records: int = option(100, "Points of the curve, 2 to 100000.", expert=True)
+    void_ratio: float = option(0.8, "At the start.", expert=True)
+    young: float = option(5.0e7, "Young's modulus in Pa.", expert=True)
+    poisson: float = option(0.2, "Poisson's ratio.", expert=True)
+    strain_rate: float = option(1.0e-5, "In 1/s; only effects of rate feel it.", expert=True)
+    depth: float = option(0.0, "Below the undisturbed surface in metres; only effects of depth feel it.", expert=True)
+    matching: Literal["compression", "extension", "plane_strain", "simple_shear"] = option(
+        "compression", "Where the Drucker-Prager cone agrees with Mohr-Coulomb.", expert=True
+    )
+    plot: Path = option(Path("element.png"), "File for the plot (png, svg or pdf).")
+    json: bool = option(False, JSON)
 
 
 #: A specimen strained by more is none any more; a curve of more points says no more.
@@ -65,15 +56,12 @@ LEAST_SPAN, LEAST_STRAIN = 0.02, 1.0e-3
 
 def run(config: Config) -> int:
     """Test, print and plot."""
-    from splatsoil.commands.simulate import parse_values
     from splatsoil.quiet import hush
     from splatsoil.soil.law import Law
     from splatsoil.soil.library import find_effects
 
     hush()
     values = parse_values(config.values)
-    if "friction_angle" in values:
-        raise ParameterError("the friction angle is given by --friction-angle, not by --set")
     if config.records < 2:
         raise ParameterError(f"--records: a curve needs at least 2 points, not {config.records}")
     if config.records > MOST_RECORDS:
@@ -194,43 +182,9 @@ def draw(columns: dict[str, Any], config: Config) -> None:
 def show(columns: dict[str, Any], config: Config) -> None:
     """A dozen lines of the curve."""
     import numpy as np
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
 
-    table = Table(title=f"{config.test} test at {config.confining:g} Pa", title_justify="left")
-    for name in columns:
-        table.add_column(escape(name), justify="right")
     total = len(next(iter(columns.values())))
-    for k in np.unique(np.linspace(0, total - 1, min(ROWS, total)).astype(int)):
-        table.add_row(*(f"{column[k]:.5g}" for column in columns.values()))
-    console = Console(highlight=False)
-    console.print(table)
-    console.print(f"plot: {escape(str(config.plot))}")
-
-
-def interrupted(config: Config) -> str:
-    """A plot is written whole or not at all."""
-    again = command_line(
-        "element",
-        (),
-        (
-            ("--test", config.test, "triaxial"),
-            ("--confining", config.confining, 100e3),
-            ("--friction-angle", config.friction_angle, 35.0),
-            ("--with", config.effects, ()),
-            ("--set", config.values, ()),
-            ("--strain", config.strain, 0.2),
-            ("--pressure", config.pressure, None),
-            ("--records", config.records, 100),
-            ("--void-ratio", config.void_ratio, 0.8),
-            ("--young", config.young, 5.0e7),
-            ("--poisson", config.poisson, 0.2),
-            ("--strain-rate", config.strain_rate, 1.0e-5),
-            ("--depth", config.depth, 0.0),
-            ("--matching", config.matching, "compression"),
-            ("--plot", config.plot, Path("element.png")),
-            ("--json", config.json, False),
-        ),
-    )
-    return f"the plot was not written; start again with: {again}"
+    shown = np.unique(np.linspace(0, total - 1, min(ROWS, total)).astype(int))
+    rows = ([f"{column[k]:.5g}" for column in columns.values()] for k in shown)
+    print_table(f"{config.test} test at {config.confining:g} Pa", tuple(columns), rows, left=())
+    print(f"plot: {config.plot}")

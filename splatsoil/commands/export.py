@@ -9,18 +9,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from tyro.conf import Positional
-
-from splatsoil.commands._options import command_line
+from splatsoil.commands import _model
+from splatsoil.commands._options import DEVICE
 from splatsoil.commands._output import print_json
 from splatsoil.errors import ParameterError, RunError
+from splatsoil.options import JSON, argument, option
 
 if TYPE_CHECKING:
     from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.model import Model
 
+INTERRUPTED = "nothing was written; start again with"
 Format = Literal["vtk", "usd", "csv", "ply"]
-USUAL: tuple[Format, ...] = ("vtk", "usd", "csv", "ply")
 
 
 @dataclass(frozen=True)
@@ -30,20 +30,21 @@ class Config:
     vtk: ParaView; usd: Omniverse, Blender; csv: spreadsheets; ply: viewers of Gaussian splats.
     """
 
-    run: Positional[Path]
-    """The run folder."""
-    to: tuple[Format, ...] = USUAL
-    """Formats; vtk and usd need `pip install 'splatsoil[export]'`."""
-    out: Path | None = None
-    """Folder for them, new or empty; RUN/export, where an older one is replaced, if not given."""
-    model: Literal["fit", "diagnosis"] = "fit"
-    """The latest fit, or the most probable model of its diagnosis."""
-    every: int | None = None
-    """Frames from one that is written to the next; those of the video are written if not given."""
-    device: str = "auto"
-    """Where to compute: auto, cpu, cuda:0, …"""
-    json: bool = False
-    """Print one JSON object instead of sentences."""
+    run: Path = argument("The run folder.")
+    to: tuple[Format, ...] = option(
+        ("vtk", "usd", "csv", "ply"), "Formats; vtk and usd need `pip install 'splatsoil[export]'`."
+    )
+    out: Path | None = option(
+        None, "Folder for them, new or empty; RUN/export, where an older one is replaced, if not given."
+    )
+    model: Literal["fit", "diagnosis"] = option(
+        "fit", "The latest fit, or the most probable model of its diagnosis.", expert=True
+    )
+    every: int | None = option(
+        None, "Frames from one that is written to the next; those of the video are written if not given.", expert=True
+    )
+    device: str = option("auto", DEVICE)
+    json: bool = option(False, JSON)
 
 
 def run(config: Config) -> int:
@@ -72,40 +73,14 @@ def run(config: Config) -> int:
     return 0
 
 
-def interrupted(config: Config) -> str:
-    """An export is written when it is complete."""
-    again = command_line(
-        "export",
-        (config.run,),
-        (
-            ("--to", config.to, USUAL),
-            ("--out", config.out, None),
-            ("--model", config.model, "fit"),
-            ("--every", config.every, None),
-            ("--device", config.device, "auto"),
-            ("--json", config.json, False),
-        ),
-    )
-    return f"nothing was written; start again with: {again}"
-
-
 def _exported(config: Config, folder: RunFolder, formats: tuple[str, ...], target: Path) -> dict[str, Any]:
     """Write into a folder beside the target, then move it there; returns what ``export.json`` says."""
     from splatsoil import __version__
-    from splatsoil.commands import _experiments as experiments
-    from splatsoil.commands import _stages as stage
-    from splatsoil.commands._progress import stages
-    from splatsoil.envs.devices import resolve_device
     from splatsoil.export import make_writers, replay
     from splatsoil.files import plain, write_json
-    from splatsoil.quiet import hush
 
-    hush()
-    device = resolve_device(config.device)
-    stage.note_other_sources(folder)
-    with stages(quiet=config.json) as begin:
-        model = experiments.model_of(folder, device, begin("reconstruct"))
-        model, values = _chosen(config, folder, model)
+    with _model.loaded(config, folder) as (fitted, begin):
+        model, values = _chosen(config, folder, fitted)
         frames = model.frames if config.every is None else tuple(range(0, model.frames[-1] + 1, config.every))
         report = begin("export")
         target.parent.mkdir(parents=True, exist_ok=True)

@@ -6,9 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from splatsoil.commands._answer import need_answer
+from splatsoil.commands import _folder, _model, _stages
 from splatsoil.commands._options import RunOptions, command_line
-from splatsoil.commands._output import print_json
+from splatsoil.commands._output import print_json, print_notes, print_table, print_text, stages
+from splatsoil.errors import ParameterError
+from splatsoil.options import JSON, option
+
+INTERRUPTED = "what was simulated and sampled is kept; go on with"
 
 
 @dataclass(frozen=True)
@@ -18,25 +22,18 @@ class Config(RunOptions):
     It is the posterior that the estimate and ± of the latest fit are of. Sampling that was interrupted goes on.
     """
 
-    checks: int = 3
-    """Simulations at points drawn from the posterior, which test the emulator."""
-    device: str = "auto"
-    """Where to compute: auto (what the fit used), cpu, cuda:0, …"""
-    seed: int = 0
-    """Of chains and checks."""
-    json: bool = False
-    """Print one JSON object instead of a table."""
+    checks: int = option(3, "Simulations at points drawn from the posterior, which test the emulator.", expert=True)
+    device: str = option("auto", "Where to compute: auto (what the fit used), cpu, cuda:0, …")
+    seed: int = option(0, "Of chains and checks.", expert=True)
+    json: bool = option(False, JSON)
 
 
 def run(config: Config) -> int:
     """Compare as the fit did, sample, check; ``posterior.json`` and the folder ``posterior`` are kept."""
-    from splatsoil.commands import _criticism as criticism
-    from splatsoil.commands import _experiments as experiments
-    from splatsoil.commands import _stages as stage
+    from splatsoil import __version__
     from splatsoil.commands._crew import Crew
-    from splatsoil.commands._progress import stages
     from splatsoil.envs.devices import resolve_device
-    from splatsoil.errors import ParameterError
+    from splatsoil.files import code_of
     from splatsoil.inverse.posterior_run import run_posterior
     from splatsoil.quiet import hush
 
@@ -45,9 +42,10 @@ def run(config: Config) -> int:
         if value < 0:
             raise ParameterError(f"--{name}: must be 0 or more, not {value}")
     hush()
-    folder = stage.opened(config)
+    folder = _folder.opened(config)
     fit = folder.fit()
-    need_answer(fit, f"so there is nothing to sample; `{command_line('compare', (folder.path,))}` shows where")
+    compare = command_line("compare", folder.path)
+    _folder.require_answer(fit, f"so there is nothing to sample; `{compare}` shows where")
     setup = fit["setup"]
     wanted = ("cuda:0" if setup["device"] == "cuda" else "cpu") if config.device == "auto" else config.device
     device = resolve_device(wanted)
@@ -56,24 +54,24 @@ def run(config: Config) -> int:
             f"--device {config.device}: the fit in {folder.path} was made on {setup['device']}; give the same or fit "
             "again"
         )
-    if (setup["version"], setup["code"]) != stage.sources(setup["effects"]):
+    if (setup["version"], setup["code"]) != (__version__, code_of(setup["effects"])):
         raise ParameterError(
             f"{folder.path}: the fit was made by other sources of splatsoil; fit again before the posterior"
         )
     folder.check_writable()
-    chosen = experiments.Chosen.of(fit)
+    spec = _model.ModelSpec.of(fit)
     with stages(quiet=config.json) as begin:
-        model = experiments.model_of(folder, device, begin("reconstruct"))
-        experiment, simulate = experiments.experiment_of(folder, model, chosen, ())
-        with folder.lock(), Crew(folder, device, ()) as crew, crew.helping(chosen, experiment, simulate):
+        model = _model.model_of(folder, device, begin("reconstruct"))
+        experiment, simulate = _model.experiment_of(folder, model, spec, ())
+        with folder.lock(), Crew(folder, device, ()) as crew, crew.helping(spec, experiment, simulate):
             seed = folder.description["seed"]
-            found = criticism.judged(experiment, simulate, fit, begin("models"), seed, with_effects=False)
+            found = _stages.compare_models(experiment, simulate, fit, begin("models"), seed, with_effects=False)
             result = run_posterior(
                 folder,
                 experiment,
                 simulate,
                 found.evidence.noise,
-                criticism.prior_of(experiment, fit),
+                _stages.prior_of(experiment, fit),
                 checks=config.checks,
                 seed=config.seed,
                 progress=begin("posterior"),
@@ -85,46 +83,23 @@ def run(config: Config) -> int:
     return 0
 
 
-def interrupted(config: Config) -> str:
-    """What is kept, and the command that goes on."""
-    again = config.again(
-        "posterior",
-        ("--checks", config.checks, 3),
-        ("--device", config.device, "auto"),
-        ("--seed", config.seed, 0),
-        ("--json", config.json, False),
-    )
-    return f"what was simulated and sampled is kept; go on with: {again}"
-
-
 def show(result: Mapping[str, Any], folder: str) -> None:
     """A table of the parameters, and what to know about them."""
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
+    from splatsoil.report.text import amount, duration, interval, model_name
 
-    from splatsoil.report.words import duration, model_name, symbol, with_std
-
-    table = Table(title=f"posterior, {escape(model_name(result['fit']))}", title_justify="left")
-    for column in ("parameter", "mean", "5 to 95 %", "width / prior", ""):
-        table.add_column(column, justify="left" if column in ("parameter", "") else "right")
-    for name, entry in result["parameters"].items():
-        value, std = with_std(entry["mean"], entry["std"])
-        unit = symbol(entry["unit"])
-        table.add_row(
-            escape(name),
-            f"{value} ± {std}{unit}",
-            f"{entry['low']:.4g} to {entry['high']:.4g}{unit}",
-            f"{entry['contraction']:.2f}",
-            entry["verdict"],
-        )
-    console = Console(highlight=False)
-    console.print(table)
-    for note in result["notes"]:
-        console.print(f"[yellow]note[/yellow] {escape(note)}")
-    chains = result["chains"]
-    console.print(
-        f"{result['simulations']} simulations; R-hat {chains['r_hat']:.3f}, acceptance {chains['acceptance']:.2f}, "
-        f"{chains['effective']:.0f} independent samples; {duration(result['seconds'])}"
+    print_table(
+        f"posterior, {model_name(result['fit'])}",
+        ("parameter", "mean", "5 to 95 %", "width / prior", ""),
+        (
+            (name, amount(p["mean"], p["std"], p["unit"]), interval(p), f"{p['contraction']:.2f}", p["verdict"])
+            for name, p in result["parameters"].items()
+        ),
+        left=("parameter", ""),
     )
-    console.print(f"kept in {escape(folder)}: posterior.json, posterior/")
+    print_notes(result["notes"])
+    chains = result["chains"]
+    print_text(
+        f"{result['simulations']} simulations; R-hat {chains['r_hat']:.3f}, acceptance {chains['acceptance']:.2f}, "
+        f"{chains['effective']:.0f} independent samples; {duration(result['seconds'])}",
+        f"kept in {folder}: posterior.json, posterior/",
+    )

@@ -4,35 +4,29 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
-from tyro.conf import Positional
-
-from splatsoil.commands._options import command_line
-from splatsoil.commands._output import print_json, say_remarks
+from splatsoil.commands._options import PRESET, SEED, SET, Preset
+from splatsoil.commands._output import print_json, print_remarks, print_table, print_text
+from splatsoil.options import JSON, argument, option
 
 if TYPE_CHECKING:
     from splatsoil.reconstruction import Reconstruction
+
+INTERRUPTED = "nothing was written; start again with"
 
 
 @dataclass(frozen=True)
 class Config:
     """Photographs to Gaussians, soil surface and mesh."""
 
-    set: Positional[Path]
-    """Folder of the measurement set."""
-    out: Path | None = None
-    """Folder for the result; runs/NAME-reconstruction if not given."""
-    preset: Literal["tiny", "small", "paper", "fine"] = "small"
-    """Resolution; small suits a laptop without a graphics card."""
-    seed: int = 0
-    """Of random numbers; one seed gives one result on one processor."""
-    device: str = "auto"
-    """Where to train: auto, cpu, cuda:0, …"""
-    holdout: int = 8
-    """Every so many views one is set aside to judge by; 0 for none."""
-    json: bool = False
-    """Print one JSON object instead of a table."""
+    set: Path = argument(SET)
+    out: Path | None = option(None, "Folder for the result; runs/NAME-reconstruction if not given.")
+    preset: Preset = option("small", PRESET)
+    seed: int = option(0, SEED, expert=True)
+    device: str = option("auto", "Where to train: auto, cpu, cuda:0, …")
+    holdout: int = option(8, "Every so many views one is set aside to judge by; 0 for none.", expert=True)
+    json: bool = option(False, JSON)
 
 
 def run(config: Config) -> int:
@@ -50,7 +44,7 @@ def run(config: Config) -> int:
     hush()
     device = resolve_device(config.device)
     measurement = Measurement.load(config.set)
-    say_remarks(measurement)
+    print_remarks(measurement)
     out = config.out or Path("runs") / f"{measurement.name}-reconstruction"
     check_folder(out)
     with progress_bar(quiet=config.json) as report:
@@ -65,42 +59,17 @@ def run(config: Config) -> int:
     return 0
 
 
-def interrupted(config: Config) -> str:
-    """A reconstruction is written when it is complete."""
-    again = command_line(
-        "reconstruct",
-        (config.set,),
-        (
-            ("--out", config.out, None),
-            ("--preset", config.preset, "small"),
-            ("--seed", config.seed, 0),
-            ("--device", config.device, "auto"),
-            ("--holdout", config.holdout, 8),
-            ("--json", config.json, False),
-        ),
-    )
-    return f"nothing was written; start again with: {again}"
-
-
 def _show(result: Reconstruction, out: Path) -> None:
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table(title=escape(f"reconstruction of {result.metadata['measurement']}"), title_justify="left")
-    for column in ("photograph set aside", "PSNR in dB", "SSIM"):
-        table.add_column(column, justify="left" if column.startswith("photo") else "right")
-    for view in result.held_out:
-        table.add_row(escape(view.name), f"{view.psnr:.2f}", f"{view.ssim:.3f}")
-    if result.held_out:
-        table.add_section()
-        table.add_row("mean", f"{result.psnr:.2f}", f"{result.ssim:.3f}")
-    console = Console(highlight=False)
-    console.print(table)
+    rows = [(view.name, f"{view.psnr:.2f}", f"{view.ssim:.3f}") for view in result.held_out]
+    if rows:
+        rows.append(("mean", f"{result.psnr:.2f}", f"{result.ssim:.3f}"))
+    print_table(
+        f"reconstruction of {result.metadata['measurement']}", ("photograph set aside", "PSNR in dB", "SSIM"), rows
+    )
     height = result.surface.height
-    console.print(
+    print_text(
         f"{len(result.gaussians)} Gaussians ({int(result.soil.sum())} soil, {int(result.tool.sum())} tool); "
         f"surface {height.min():.3f} to {height.max():.3f} m in cells of {1e3 * max(result.surface.cell):.1f} mm; "
-        f"{result.seconds:.0f} s"
+        f"{result.seconds:.0f} s",
+        f"written to {out}",
     )
-    console.print(f"written to {escape(str(out))}")

@@ -6,16 +6,20 @@ import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from splatsoil.commands._answer import need_answer
-from splatsoil.commands._options import FitOptions, Option, command_line
-from splatsoil.commands._output import print_json
+from splatsoil.commands import _folder, _model, _stages, add, compare, diagnose, fit
+from splatsoil.commands._options import FitOptions, command_line
+from splatsoil.commands._output import print_json, stages
+from splatsoil.errors import ParameterError, SplatsoilError
+from splatsoil.options import option
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from splatsoil.commands._progress import Report
+    from splatsoil.commands._output import Stage
     from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.model import Model
+
+INTERRUPTED = _stages.kept
+#: What --json prints of a diagnosis.
+DIAGNOSIS = ("verdict", "class", "sentences", "models", "checks", "held_out", "estimates", "simulations")
 
 
 @dataclass(frozen=True)
@@ -26,38 +30,18 @@ class Config(FitOptions):
     effect is probable enough, or the limit is reached. A run that was interrupted goes on.
     """
 
-    criticise: bool = False
-    """Diagnose an adequate model, too."""
-    stop_at_floor: bool = False
-    """Only say whether the model is adequate; do not look for missing effects."""
-    most_effects: int = 2
-    """Largest number of effects that are added."""
-
-    def again(self, command: str, *others: Option) -> str:
-        """The command line that means this, and other options besides."""
-        return super().again(
-            command,
-            ("--criticise", self.criticise, False),
-            ("--stop-at-floor", self.stop_at_floor, False),
-            ("--most-effects", self.most_effects, 2),
-            *others,
-        )
+    criticise: bool = option(False, "Diagnose an adequate model, too.", expert=True)
+    stop_at_floor: bool = option(False, "Only say whether the model is adequate; do not look for missing effects.")
+    most_effects: int = option(2, "Largest number of effects that are added.", expert=True)
 
 
 def run(config: Config) -> int:
     """Each stage in turn; what the run folder has already isn't done again."""
-    from splatsoil.commands import _criticism as criticism
-    from splatsoil.commands import _history as histories
-    from splatsoil.commands import _stages as stage
-    from splatsoil.commands import add, compare, fit
-    from splatsoil.commands._diagnosis_table import show
-    from splatsoil.commands._progress import stages
     from splatsoil.envs.devices import resolve_device
-    from splatsoil.errors import ParameterError, SplatsoilError
     from splatsoil.files import plain, read_json
     from splatsoil.quiet import hush
     from splatsoil.report import write_report
-    from splatsoil.report.words import called_adequate
+    from splatsoil.report.text import called_adequate
 
     hush()
     if config.most_effects < 0:
@@ -67,20 +51,20 @@ def run(config: Config) -> int:
     stopped, diagnosis, misfit, unknown = "", None, None, ""
     with stages(quiet=config.json) as begin:
         begin("check")("reading every image", 0.0)
-        measurement, folder = stage.prepare(config)
+        measurement, folder = _stages.prepare(config)
         device = resolve_device(config.device)
-        reconstruction = stage.reconstructed(measurement, folder, device, begin("reconstruct"))
-        model = stage.model_on(measurement, folder, reconstruction, config.effects, config.preset, device)
-        result = stage.fitted(config, measurement, folder, model, begin("fit"))
-        comparison = stage.compared(folder, model, begin("compare"))
+        reconstruction = _model.reconstructed(measurement, folder, device, begin("reconstruct"))
+        model = _model.model_on(measurement, folder, reconstruction, config.effects, config.preset, device)
+        result = _stages.run_fit(config, measurement, folder, model, begin("fit"))
+        comparison = _stages.draw_comparison(folder, model, begin("compare"))
         if not config.criticise:
             try:
-                misfit = criticism.misfit(folder, model, begin("models"))
+                misfit = _stages.check_adequacy(folder, model, begin("models"))
             except SplatsoilError as error:  # the fit stands all the same
                 unknown = f"whether the model is adequate isn't known: {error}"
         if config.criticise or not (config.stop_at_floor or misfit is None or misfit["adequate"]):
             try:
-                diagnosis, stopped = loop(folder, model, config.most_effects, begin)
+                diagnosis, stopped = add_missing(folder, model, config.most_effects, begin)
             except SplatsoilError as error:
                 if config.criticise:
                     raise
@@ -90,58 +74,44 @@ def run(config: Config) -> int:
         page = write_report(folder.path)
     if unknown:
         print(unknown, file=sys.stderr)
-    need_answer(result, f"report: {page}")
+    _folder.require_answer(result, f"report: {page}")
+    entries = [] if diagnosis is None else _folder.history(folder)
     if config.json:
         losses = {key: comparison[key] for key in ("loss", "total", "noise")}
-        extra: dict[str, Any] = {} if misfit is None else {"misfit": {key: misfit[key] for key in compare.TOLD}}
+        extra: dict[str, Any] = {} if misfit is None else {"misfit": {key: misfit[key] for key in compare.MISFIT}}
         if diagnosis is not None:
-            kept = ("verdict", "class", "sentences", "models", "checks", "held_out", "estimates", "simulations")
-            extra = {
-                "diagnosis": plain({key: diagnosis[key] for key in kept}),
-                "models": histories.history(folder),
-                "stopped": stopped,
-            }
+            kept = plain({key: diagnosis[key] for key in DIAGNOSIS})
+            extra = {"diagnosis": kept, "models": entries, "stopped": stopped}
         print_json({"ok": True, "report": str(page), "comparison": losses, **extra, **result, "run": str(folder.path)})
         return 0
     fit.show(result, str(folder.path))
     compare.show(comparison, str(folder.comparison), called_adequate(result, diagnosis or misfit))
-    if diagnosis is None and misfit is not None:
-        compare.show_misfit(misfit, str(folder.path))
     if diagnosis is not None:
-        if entries := histories.history(folder):
+        if entries:
             add.show(entries)
-        show(diagnosis)
+        diagnose.show(diagnosis)
         print(f"Stopped because {stopped}.")
+    elif misfit is not None:
+        compare.show_misfit(misfit, str(folder.path))
     print(f"report: {page}")
     return 0
 
 
-def loop(folder: RunFolder, model: Model, most: int, begin: Callable[[str], Report]) -> tuple[dict[str, Any], str]:
-    """Diagnose and add until there is nothing more to be told; the last diagnosis, and why it stopped."""
-    from splatsoil.commands import _criticism as criticism
-    from splatsoil.commands import add
-
+def add_missing(folder: RunFolder, model: Model, most: int, begin: Stage) -> tuple[dict[str, Any], str]:
+    """Diagnose and add, ``most`` effects at most; the last diagnosis, and why it stopped."""
     count = 0
     while True:
-        diagnosis = criticism.diagnosed(folder, model, begin)
+        diagnosis = _stages.run_diagnosis(folder, model, begin)
         if diagnosis["verdict"] == "adequate":
             return diagnosis, "nothing more is needed to explain the data"
         if diagnosis["verdict"] != "missing":
             hint = ""
             if diagnosis["class"]:
                 nearest = diagnosis["class"][0]
-                tries = command_line("add", (folder.path, nearest))
+                tries = command_line("add", folder.path, nearest)
                 hint = f"; the most probable is {nearest.replace('_', ' ')}: {tries} tries it"
             return diagnosis, f"no single effect is probable enough to be added{hint}"
         if count == most:
             return diagnosis, f"{most} effects have been added, which is the limit (--most-effects)"
-        add.added(folder, model, diagnosis["class"][0], begin)
-        model = model.variant(effects=tuple(folder.fit()["setup"]["effects"]))
+        model = add.add_effect(folder, model, diagnosis["class"][0], begin)
         count += 1
-
-
-def interrupted(config: Config) -> str:
-    """What is kept, and the command that goes on."""
-    from splatsoil.commands._stages import kept
-
-    return f"{kept(config)}; go on with: {config.again('run')}"

@@ -5,17 +5,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-import tyro
-from tyro.conf import Positional
-
-from splatsoil.commands._options import command_line
-from splatsoil.commands._output import print_json
+from splatsoil.commands import _laboratory
+from splatsoil.commands._options import Preset
+from splatsoil.commands._output import print_json, print_table
 from splatsoil.errors import ParameterError
+from splatsoil.options import JSON, argument, option
 
 if TYPE_CHECKING:
     from splatsoil.synthetic import Setup, World
+
+INTERRUPTED = "nothing was written; start again with"
+#: Texts of options that an element test has, too.
+ACTING = "Effects that act, or files that define some."
+VALUES = "Parameters of the effects."
 
 
 @dataclass(frozen=True)
@@ -25,57 +29,50 @@ class Config:
     Simulated sand, photographed by a path tracer; truth.json says the parameters.
     """
 
-    out: Positional[Path]
-    """Folder of the new set; must not exist, or be empty."""
-    friction_angle: float = 35.0
-    """Of the sand, degrees."""
-    effects: Annotated[tuple[str, ...], tyro.conf.arg(name="with", metavar="EFFECT …")] = ()
-    """Effects that act, or files that define some."""
-    values: Annotated[tuple[str, ...], tyro.conf.arg(name="set", metavar="NAME=VALUE …")] = ()
-    """Parameters of the effects."""
-    scene: Literal["plow", "paper", "triaxial", "shear_box", "plate", "repose", "column"] = "plow"
-    """plow: a plate of 12 cm in a bed of 0.8 x 0.5 m; paper: Hsiao and Kumar's cube of 1 m, pictures of 1280 x 720; the
-    others: a laboratory's test, without cameras."""
-    like: Path | None = None
-    """Take bed, tool, motion and cameras from this set instead of a scene."""
-    container: Literal["bin", "transparent", "open", "heap"] | None = None
-    """What holds the soil of the scene plow; a bin of opaque walls if not given."""
-    depth: float | None = None
-    """Mean depth of the soil in metres (not for the paper's scene, whose surface is a formula)."""
-    preset: Literal["tiny", "small", "paper", "fine"] | None = None
-    """Resolution of the solver; small unless given, paper for the paper's scene."""
-    seed: int = 0
-    """Of surface, appearance and noise; one seed gives one set on one processor."""
-    particle_seed: int | None = None
-    """Of the particles' places; drawn by the seed unless given."""
-    device: str = "cpu"
-    """Where to simulate and draw: auto, cpu, cuda:0, …"""
-    views: int | None = None
-    """Photographs before anything moves; 40, or all of the set given by --like."""
-    picture_scale: float = 1.0
-    """Size of the pictures, as a multiple of the scene's."""
-    json: bool = False
-    """Print one JSON object instead of a table."""
+    out: Path = argument("Folder of the new set; must not exist, or be empty.")
+    friction_angle: float = option(35.0, "Of the sand, degrees.")
+    effects: tuple[str, ...] = option((), ACTING, name="with", metavar="EFFECT")
+    values: tuple[str, ...] = option((), VALUES, name="set", metavar="NAME=VALUE")
+    scene: Literal["plow", "paper", "triaxial", "shear_box", "plate", "repose", "column"] = option(
+        "plow",
+        "plow: a plate of 12 cm in a bed of 0.8 x 0.5 m; paper: Hsiao and Kumar's cube of 1 m, pictures of 1280 x 720; "
+        "the others: a laboratory's test, without cameras.",
+        expert=True,
+    )
+    like: Path | None = option(
+        None, "Take bed, tool, motion and cameras from this set instead of a scene.", expert=True
+    )
+    container: Literal["bin", "transparent", "open", "heap"] | None = option(
+        None, "What holds the soil of the scene plow; a bin of opaque walls if not given.", expert=True
+    )
+    depth: float | None = option(
+        None, "Mean depth of the soil in metres (not for the paper's scene, whose surface is a formula).", expert=True
+    )
+    preset: Preset | None = option(None, "Resolution of the solver; small unless given, paper for the paper's scene.")
+    seed: int = option(0, "Of surface, appearance and noise; one seed gives one set on one processor.", expert=True)
+    particle_seed: int | None = option(None, "Of the particles' places; drawn by the seed unless given.", expert=True)
+    device: str = option("cpu", "Where to simulate and draw: auto, cpu, cuda:0, …")
+    views: int | None = option(
+        None, "Photographs before anything moves; 40, or all of the set given by --like.", expert=True
+    )
+    picture_scale: float = option(1.0, "Size of the pictures, as a multiple of the scene's.", expert=True)
+    json: bool = option(False, JSON)
 
 
 def run(config: Config) -> int:
     """Make the set; ParameterError for options that make no sense, before anything is computed."""
-    values = parse_values(config.values)
-    if "friction_angle" in values:
-        raise ParameterError("the friction angle is given by --friction-angle, not by --set")
-    if config.scene not in ("plow", "paper"):
-        from splatsoil.commands import _laboratory as laboratory
-
-        values = {"friction_angle": config.friction_angle, **values}
-        preset = config.preset or "small"
-        return laboratory.simulate(
-            config.scene, config.out, values, config.effects, preset, config.seed, quiet=config.json
-        )
     from splatsoil.quiet import hush
     from splatsoil.reconstruction.progress import progress_bar
     from splatsoil.synthetic import make_set
     from splatsoil.synthetic.world import check_place
 
+    values = parse_values(config.values)
+    if config.scene not in ("plow", "paper"):
+        known = {"friction_angle": config.friction_angle, **values}
+        preset = config.preset or "small"
+        return _laboratory.simulate(
+            config.scene, config.out, known, config.effects, preset, config.seed, quiet=config.json
+        )
     hush()
     check_place(config.out)
     setup = choose_setup(config)
@@ -93,36 +90,12 @@ def run(config: Config) -> int:
             device=config.device,
             progress=report,
         )
+    summary = _summary(world)
     if config.json:
-        print_json({"ok": True, **_summary(world)})
+        print_json({"ok": True, **summary})
     else:
-        _show(world)
+        _show(summary)
     return 0
-
-
-def interrupted(config: Config) -> str:
-    """A set is written when it is complete."""
-    again = command_line(
-        "simulate",
-        (config.out,),
-        (
-            ("--friction-angle", config.friction_angle, 35.0),
-            ("--with", config.effects, ()),
-            ("--set", config.values, ()),
-            ("--scene", config.scene, "plow"),
-            ("--like", config.like, None),
-            ("--container", config.container, None),
-            ("--depth", config.depth, None),
-            ("--preset", config.preset, None),
-            ("--seed", config.seed, 0),
-            ("--particle-seed", config.particle_seed, None),
-            ("--device", config.device, "cpu"),
-            ("--views", config.views, None),
-            ("--picture-scale", config.picture_scale, 1.0),
-            ("--json", config.json, False),
-        ),
-    )
-    return f"nothing was written; start again with: {again}"
 
 
 def parse_values(words: Sequence[str]) -> dict[str, float]:
@@ -138,6 +111,8 @@ def parse_values(words: Sequence[str]) -> dict[str, float]:
             raise ParameterError(f"--set {word}: write NAME=VALUE with a number, for example cohesion=300")
         if name in out:
             raise ParameterError(f"--set {word}: {name} is given twice")
+        if name == "friction_angle":
+            raise ParameterError("the friction angle is given by --friction-angle, not by --set")
         out[name] = number
     return out
 
@@ -180,22 +155,13 @@ def _summary(world: World) -> dict[str, Any]:
     }
 
 
-def _show(world: World) -> None:
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
-
-    summary = _summary(world)
-    table = Table(title=f"synthetic set {escape(summary['name'])}", show_header=False, title_justify="left")
-    table.add_column(style="bold")
-    table.add_column()
-    for name, value in summary["parameters"].items():
-        table.add_row(name, f"{value:g}")
-    table.add_row("effects", escape(", ".join(summary["effects"])) or "none")
-    table.add_row("particles", f"{summary['particles']}, preset {summary['preset']}, seed {summary['seed']}")
-    table.add_row("pictures", f"{summary['views']} views, {summary['video']} of video")
-    spent = ", ".join(f"{what} {seconds:.0f} s" for what, seconds in summary["seconds"].items())
-    table.add_row("time", spent)
-    console = Console(highlight=False)
-    console.print(table)
-    console.print(f"written to {escape(summary['out'])}")
+def _show(summary: dict[str, Any]) -> None:
+    rows = [(name, f"{value:g}") for name, value in summary["parameters"].items()]
+    rows += [
+        ("effects", ", ".join(summary["effects"]) or "none"),
+        ("particles", f"{summary['particles']}, preset {summary['preset']}, seed {summary['seed']}"),
+        ("pictures", f"{summary['views']} views, {summary['video']} of video"),
+        ("time", ", ".join(f"{what} {seconds:.0f} s" for what, seconds in summary["seconds"].items())),
+    ]
+    print_table(f"synthetic set {summary['name']}", (), rows)
+    print(f"written to {summary['out']}")

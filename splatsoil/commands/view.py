@@ -7,17 +7,18 @@ import io
 from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import tyro
-from tyro.conf import Positional
-
-from splatsoil.commands._options import command_line
+from splatsoil.commands import _model
+from splatsoil.commands._options import DEVICE
 from splatsoil.errors import ParameterError, RunError
+from splatsoil.options import argument, option
 
 if TYPE_CHECKING:
     from splatsoil.measurement import Measurement
     from splatsoil.view import Column
+
+INTERRUPTED = "show it again with"
 
 
 @dataclass(frozen=True)
@@ -27,14 +28,10 @@ class Config:
     A run: Gaussians or particles of its latest fit, simulated once, with tool and cameras. A set: tool and cameras.
     """
 
-    folder: Positional[Annotated[Path, tyro.conf.arg(metavar="RUN|SET")]]
-    """A run folder, or a measurement set."""
-    beside: str | None = None
-    """Another fit of the run to show beside the latest, as base beside cohesion."""
-    port: int = 8080
-    """Of 127.0.0.1; the next free one where it is taken."""
-    device: str = "auto"
-    """Where to compute: auto, cpu, cuda:0, …"""
+    folder: Path = argument("A run folder, or a measurement set.")
+    beside: str | None = option(None, "Another fit of the run to show beside the latest, as base beside cohesion.")
+    port: int = option(8080, "Of 127.0.0.1; the next free one where it is taken.")
+    device: str = option("auto", DEVICE)
 
 
 def run(config: Config) -> int:
@@ -61,23 +58,12 @@ def run(config: Config) -> int:
     return 0
 
 
-def interrupted(config: Config) -> str:
-    """How to see it again."""
-    options = (("--beside", config.beside, None), ("--port", config.port, 8080), ("--device", config.device, "auto"))
-    return f"show it again with: {command_line('view', (config.folder,), options)}"
-
-
 def _loaded(config: Config) -> tuple[Measurement, list[Column]]:
     """The set, and predictions of a run's fits, the latest first."""
-    from splatsoil.commands import _experiments as experiments
-    from splatsoil.commands import _stages as stage
-    from splatsoil.commands._progress import stages
     from splatsoil.comparison import Comparator
-    from splatsoil.envs.devices import resolve_device
     from splatsoil.export import replay
     from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.measurement import Measurement
-    from splatsoil.quiet import hush
     from splatsoil.report.data import estimates, load
     from splatsoil.view import Column
 
@@ -85,20 +71,17 @@ def _loaded(config: Config) -> tuple[Measurement, list[Column]]:
         if config.beside is not None:
             raise ParameterError(f"--beside: {config.folder} is no run folder; only a run has fits")
         return Measurement.load(config.folder), []
-    hush()
-    device, folder = resolve_device(config.device), RunFolder.open(config.folder)
+    folder = RunFolder.open(config.folder)
     data = load(folder.path)
     if config.beside is not None and config.beside not in data.fits:
         raise RunError(f"--beside: {folder.path} has no fit {config.beside!r}; it has {', '.join(data.fits)}")
-    stage.note_other_sources(folder)
     columns = []
-    with stages() as begin:
-        model = experiments.model_of(folder, device, begin("reconstruct"))
+    with _model.loaded(config, folder) as (model, begin):
         comparator = Comparator(model.measurement, surface=model.reconstruction.surface, frames=model.frames)
         for fit in (data.fit, *([data.fits[config.beside]] if config.beside else [])):
             values, report = estimates(fit), begin(fit["name"])
             said = (f"{n} {p['estimate']:.4g} ± {p['std']:.3g} {p['unit']}" for n, p in fit["parameters"].items())
-            shown = model.variant(effects=experiments.Chosen.of(fit).effects)
+            shown = model.variant(effects=_model.ModelSpec.of(fit).effects)
             column = Column(f"{fit['name']}: {', '.join(said)}", shown, values, comparator)
             progress = lambda frame, last, say=report: say(f"frame {frame}", frame / last)  # noqa: E731
             replay(shown, values, shown.recorded, [column], progress=progress)

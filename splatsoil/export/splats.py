@@ -18,11 +18,11 @@ from splatsoil.splats import Gaussians, save_ply
 
 
 class SplatWriter:
-    """Writes ``splats_N.ply`` of some frames, in the world's metres, z up."""
+    """Writes ``splats_N.ply`` of the first and the last frame, in the world's metres, z up."""
 
     def __init__(self, folder: Path, model: Model, frames: tuple[int, ...]) -> None:
-        """Args: an empty folder, the model, and which of its frames to write."""
-        self.folder, self.scene, self.frames = folder, model.scene(), frames
+        """Args: an empty folder, the model, and its frames that come; the first and the last are written."""
+        self.folder, self.scene, self.frames = folder, model.scene(), (frames[0], frames[-1])
 
     def add(self, moment: Moment) -> None:
         """Write a frame, if it is one of them."""

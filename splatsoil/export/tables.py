@@ -23,8 +23,8 @@ class CsvWriter:
     """Writes ``force.csv``, and ``surface.csv``: x, y, the height that photographs show before anything moves
     (``reconstructed``), and the simulated one at each frame (``frame_N``), all in m."""
 
-    def __init__(self, folder: Path, model: Model) -> None:
-        """Args: an empty folder, and the model whose frames come."""
+    def __init__(self, folder: Path, model: Model, frames: tuple[int, ...]) -> None:
+        """Args: an empty folder, the model, and its frames that come."""
         self.folder, self.model = folder, model
         self.columns: dict[str, npt.NDArray[np.floating]] = {}
 

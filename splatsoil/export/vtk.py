@@ -21,8 +21,8 @@ from splatsoil.model import Model
 class VtkWriter:
     """Writes ``particles.pvd``, ``tool.pvd`` and ``surface.pvd`` and, beside each, a .vtu file a frame."""
 
-    def __init__(self, folder: Path, model: Model) -> None:
-        """Args: an empty folder, and the model whose frames come."""
+    def __init__(self, folder: Path, model: Model, frames: tuple[int, ...]) -> None:
+        """Args: an empty folder, the model, and its frames that come."""
         self.folder, self.mesh = folder, model.measurement.tool.mesh
         self.first: npt.NDArray[np.float32] | None = None
         self.times: list[tuple[int, float]] = []

@@ -4,46 +4,23 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Callable, Iterable, Mapping
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from splatsoil.errors import ParameterError
 from splatsoil.export.replay import Writer
 from splatsoil.model import Model
 
-
-def _vtk(folder: Path, model: Model, frames: tuple[int, ...]) -> Writer:
-    from splatsoil.export.vtk import VtkWriter
-
-    return VtkWriter(folder, model)
-
-
-def _usd(folder: Path, model: Model, frames: tuple[int, ...]) -> Writer:
-    from splatsoil.export.usd import UsdWriter
-
-    return UsdWriter(folder, model, frames)
-
-
-def _csv(folder: Path, model: Model, frames: tuple[int, ...]) -> Writer:
-    from splatsoil.export.tables import CsvWriter
-
-    return CsvWriter(folder, model)
-
-
-def _ply(folder: Path, model: Model, frames: tuple[int, ...]) -> Writer:
-    from splatsoil.export.splats import SplatWriter
-
-    return SplatWriter(folder, model, (frames[0], frames[-1]))
-
-
-FORMATS: Mapping[str, Callable[[Path, Model, tuple[int, ...]], Writer]] = {
-    "vtk": _vtk,
-    "usd": _usd,
-    "csv": _csv,
-    "ply": _ply,
+FORMATS: Mapping[str, Callable[[], Any]] = {
+    "vtk": lambda: import_module("splatsoil.export.vtk").VtkWriter,
+    "usd": lambda: import_module("splatsoil.export.usd").UsdWriter,
+    "csv": lambda: import_module("splatsoil.export.tables").CsvWriter,
+    "ply": lambda: import_module("splatsoil.export.splats").SplatWriter,
 }
-"""By name, what makes a format's writer of its folder, the model and the frames, which rise."""
+"""By name, what loads a format's writer, which takes an empty folder, the model, and its frames that come."""
 
-_MODULES = {"vtk": "meshio", "usd": "pxr"}
+_PACKAGES = {"vtk": "meshio", "usd": "pxr"}
 
 
 def check_installed(formats: Iterable[str]) -> None:
@@ -52,7 +29,7 @@ def check_installed(formats: Iterable[str]) -> None:
     Raises:
         ParameterError: one of a format isn't.
     """
-    missing = [name for name in formats if name in _MODULES and importlib.util.find_spec(_MODULES[name]) is None]
+    missing = [name for name in formats if name in _PACKAGES and importlib.util.find_spec(_PACKAGES[name]) is None]
     if missing:
         raise ParameterError(
             f"--to {' '.join(missing)}: needs packages that aren't installed; pip install 'splatsoil[export]'"
@@ -60,9 +37,9 @@ def check_installed(formats: Iterable[str]) -> None:
 
 
 def make_writers(folder: Path, formats: Iterable[str], model: Model, frames: tuple[int, ...]) -> list[Writer]:
-    """A writer for each format, into a new folder of its name."""
+    """A writer for each format, into a new folder of its name; frames rise."""
     writers = []
     for name in formats:
         (folder / name).mkdir(parents=True)
-        writers.append(FORMATS[name](folder / name, model, frames))
+        writers.append(FORMATS[name]()(folder / name, model, frames))
     return writers

@@ -90,18 +90,20 @@ def load(folder: str | Path) -> RunData:
     path = Path(folder)
     run, fit = read_description(path), read_fit(path)
     fits = {file.stem: read_kept(file, FIT_FORMAT) for file in sorted((path / "fits").glob("*.json"))}
+    fits = fits or {str(fit["name"]): fit}
+    history = _read(path / "history.json", HISTORY_FORMAT)
     return RunData(
         folder=path,
         run=run,
         fit=fit,
-        fits=fits or {str(fit["name"]): fit},
-        comparison=_comparison(path / "comparison", fit),
-        before=_before(path / "before"),
-        misfit=_misfit(path / "comparison" / "misfit.json", fit),
-        diagnosis=_diagnosis(path / "diagnoses", fits or {str(fit["name"]): fit}, fit),
-        posterior=_posterior(path / "posterior.json", fit),
-        history=_history(path / "history.json"),
-        reconstruction=_reconstruction(path / "reconstruction"),
+        fits=fits,
+        comparison=kept_of(path / "comparison" / "comparison.json", COMPARISON_FORMAT, fit),
+        before=_read(path / "before" / "comparison.json", COMPARISON_FORMAT),
+        misfit=kept_of(path / "comparison" / "misfit.json", MISFIT_FORMAT, fit),
+        diagnosis=_diagnosis(path / "diagnoses", fits, fit),
+        posterior=kept_of(path / "posterior.json", POSTERIOR_FORMAT, fit),
+        history=[] if history is None else history["models"],
+        reconstruction=_read(path / "reconstruction" / "reconstruction.json", RECONSTRUCTION_FORMAT),
         surface=_surface(path / "reconstruction" / "surface.npz"),
         truth=true_values(run["measurement"]["folder"], fit["parameters"]),
     )
@@ -133,59 +135,29 @@ def estimates(fit: Mapping[str, Any]) -> dict[str, float]:
     return {name: float(entry["estimate"]) for name, entry in fit["parameters"].items()}
 
 
-def _comparison(folder: Path, fit: Mapping[str, Any]) -> dict[str, Any] | None:
-    """The comparison, unless it was made at another estimate."""
-    if not (folder / "comparison.json").is_file():
+def _read(path: Path, tag: str) -> dict[str, Any] | None:
+    """A file of a run folder, if it is there."""
+    return read_kept(path, tag) if path.is_file() else None
+
+
+def kept_of(path: Path, tag: str, fit: Mapping[str, Any]) -> dict[str, Any] | None:
+    """A file of a run folder of a format, if it is there and was made at the estimate of this very fit.
+
+    Raises:
+        RunError: it is damaged.
+    """
+    data = _read(path, tag)
+    if data is None or data["fit"] != fit["name"]:
         return None
-    data = read_kept(folder / "comparison.json", COMPARISON_FORMAT)
-    same = data["fit"] == fit["name"] and data["parameters"] == estimates(fit)
-    return data if same else None
-
-
-def _misfit(path: Path, fit: Mapping[str, Any]) -> dict[str, Any] | None:
-    """The latest fit against something else, unless that was another estimate."""
-    if not path.is_file():
-        return None
-    data = read_kept(path, MISFIT_FORMAT)
-    return data if data["fit"] == fit["name"] and data["values"] == estimates(fit) else None
-
-
-def _before(folder: Path) -> dict[str, Any] | None:
-    path = folder / "comparison.json"
-    return read_kept(path, COMPARISON_FORMAT) if path.is_file() else None
+    return data if data["parameters" if tag == COMPARISON_FORMAT else "values"] == estimates(fit) else None
 
 
 def _diagnosis(folder: Path, fits: Mapping[str, Any], fit: Mapping[str, Any]) -> dict[str, Any] | None:
     """The diagnosis of the latest fit or, where it has none, of the model that it was made from."""
-    found = {}
-    for name, other in fits.items():
-        path = folder / f"{name}.json"
-        if path.is_file():
-            data = read_kept(path, DIAGNOSIS_FORMAT)
-            if data["values"] == estimates(other):
-                found[name] = data
-    if fit["name"] in found:
-        return found[str(fit["name"])]
-    mine = set(fit["setup"]["effects"]) if "setup" in fit else set()
-    smaller = [d for d in found.values() if set(d["model"]) < mine]
-    return max(smaller, key=lambda d: len(d["model"]), default=None)
-
-
-def _posterior(path: Path, fit: Mapping[str, Any]) -> dict[str, Any] | None:
-    """The posterior, unless it was sampled for another fit."""
-    if not path.is_file():
-        return None
-    data = read_kept(path, POSTERIOR_FORMAT)
-    return data if data["fit"] == fit["name"] and data["values"] == estimates(fit) else None
-
-
-def _history(path: Path) -> list[dict[str, Any]]:
-    return list(read_kept(path, HISTORY_FORMAT)["models"]) if path.is_file() else []
-
-
-def _reconstruction(folder: Path) -> dict[str, Any] | None:
-    path = folder / "reconstruction.json"
-    return read_kept(path, RECONSTRUCTION_FORMAT) if path.is_file() else None
+    of_fits = {name: kept_of(folder / f"{name}.json", DIAGNOSIS_FORMAT, other) for name, other in fits.items()}
+    found = {name: diagnosis for name, diagnosis in of_fits.items() if diagnosis is not None}
+    smaller = [d for d in found.values() if set(d["model"]) < set(fit["setup"]["effects"])]
+    return found.get(fit["name"]) or max(smaller, key=lambda d: len(d["model"]), default=None)
 
 
 def _surface(path: Path) -> Surface | None:

@@ -13,9 +13,10 @@ from html import escape
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from markupsafe import Markup
 
 from splatsoil.report.data import Surface
-from splatsoil.report.words import BEYOND, SIGNIFICANT, block
+from splatsoil.report.text import BEYOND, SIGNIFICANT, block
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -46,7 +47,7 @@ STYLE = {
 }
 
 
-def _draw(draw: Any, shows: str, size: tuple[float, float] = SIZE) -> str:
+def _draw(draw: Any, shows: str, size: tuple[float, float] = SIZE) -> Markup:
     """SVG of what ``draw(figure, axes)`` draws, and what that ``shows`` in words."""
     import matplotlib as mpl
     from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -68,10 +69,10 @@ def _draw(draw: Any, shows: str, size: tuple[float, float] = SIZE) -> str:
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
     for colour, variable in VARIABLES.items():
         svg = svg.replace(colour, f"var({variable})")
-    return svg
+    return Markup(svg)
 
 
-def surrogate(fit: Mapping[str, Any], name: str) -> str:
+def surrogate(fit: Mapping[str, Any], name: str) -> Markup:
     """The GP over one parameter with its evaluations: the paper's figure."""
     curve, entry = fit["curves"][name], fit["parameters"][name]
     x, mean, std = (np.array(curve[key]) for key in ("x", "mean", "std"))
@@ -97,7 +98,7 @@ def surrogate(fit: Mapping[str, Any], name: str) -> str:
     return _draw(draw, f"loss over the {name.replace('_', ' ')}", (SIZE[0], 2.9))
 
 
-def marginal(entry: Mapping[str, Any]) -> str:
+def marginal(entry: Mapping[str, Any]) -> Markup:
     """What the pictures leave possible of one parameter: its posterior density over its prior's, and both intervals.
 
     The axis is the prior's, on which the prior is flat: a logarithmic one where the parameter is searched on one.
@@ -128,7 +129,7 @@ def marginal(entry: Mapping[str, Any]) -> str:
     return _draw(draw, f"prior and posterior of the {entry['title']}", (SIZE[0], 2.2))
 
 
-def losses(comparison: Mapping[str, Any]) -> str:
+def losses(comparison: Mapping[str, Any]) -> Markup:
     """Loss of each compared frame, for each camera, and the noise level."""
     name = comparison["loss"]
 
@@ -148,7 +149,7 @@ def losses(comparison: Mapping[str, Any]) -> str:
     return _draw(draw, "loss of each frame by camera")
 
 
-def surface_map(surface: Surface) -> str:
+def surface_map(surface: Surface) -> Markup:
     """The reconstructed surface seen from above."""
 
     def draw(figure: Figure, axes: Axes) -> None:
@@ -164,7 +165,7 @@ def surface_map(surface: Surface) -> str:
     return _draw(draw, "height of the bed from above")
 
 
-def history(fits: Mapping[str, Mapping[str, Any]], order: Sequence[str]) -> str:
+def history(fits: Mapping[str, Mapping[str, Any]], order: Sequence[str]) -> Markup:
     """The loss at the estimate of each model that was fitted: does it fall when an effect is added?"""
 
     def draw(_: Figure, axes: Axes) -> None:
@@ -180,7 +181,7 @@ def history(fits: Mapping[str, Mapping[str, Any]], order: Sequence[str]) -> str:
     return _draw(draw, "loss at the estimate of each model", (SIZE[0], 0.8 + 0.36 * len(order)))
 
 
-def falling(errors: Sequence[float], noise: Sequence[float], names: Sequence[str], unit: str) -> str:
+def falling(errors: Sequence[float], noise: Sequence[float], names: Sequence[str], unit: str) -> Markup:
     """The error on data set aside of models in turn, and the noise level."""
 
     def draw(_: Figure, axes: Axes) -> None:
@@ -220,7 +221,7 @@ class Readings:
     predicted: Mapping[str, tuple[np.ndarray, np.ndarray]]
 
 
-def readings(one: Readings, time_name: str) -> str:
+def readings(one: Readings, time_name: str) -> Markup:
     """What an instrument without a place measured, and what models predict."""
 
     def draw(figure: Figure, axes: Axes) -> None:
@@ -238,7 +239,7 @@ def readings(one: Readings, time_name: str) -> str:
     return _draw(draw, f"measured and predicted {one.channel} [{one.unit}]", (SIZE[0], 2.7))
 
 
-def plan_maps(judged: Mapping[str, Any], which: Sequence[tuple[str, str]]) -> list[str]:
+def plan_maps(judged: Mapping[str, Any], which: Sequence[tuple[str, str]]) -> list[Markup]:
     """Residuals over expected noise from above: one row for each stage, one column for each instrument that has places.
 
     Args:
@@ -251,7 +252,7 @@ def plan_maps(judged: Mapping[str, Any], which: Sequence[tuple[str, str]]) -> li
     return [_plan_map(judged, placed, table, limit, title) for table, (title, _) in zip(tables, which, strict=True)]
 
 
-def _plan_map(judged: Mapping[str, Any], placed: Sequence[int], table: np.ndarray, limit: float, title: str) -> str:
+def _plan_map(judged: Mapping[str, Any], placed: Sequence[int], table: np.ndarray, limit: float, title: str) -> Markup:
     sites, stages = [judged["sites"][i] for i in placed], judged["stages"]
     channels = list(dict.fromkeys(site[0] for site in sites))
     names = list(dict.fromkeys(stages))
@@ -304,7 +305,7 @@ def _outline(place: Axes, xs: np.ndarray, ys: np.ndarray, centres: Sequence[Sequ
         place.add_patch(Rectangle(corner, width, height, fill=False, edgecolor=INK, linewidth=0.7))
 
 
-def outlined(check: Mapping[str, Any], judged: Mapping[str, Any], squares: Mapping[int, float]) -> str:
+def outlined(check: Mapping[str, Any], judged: Mapping[str, Any], squares: Mapping[int, float]) -> Markup:
     """Squares of a block that fails, to lie over the picture in which they were seen.
 
     Args:
@@ -318,7 +319,7 @@ def outlined(check: Mapping[str, Any], judged: Mapping[str, Any], squares: Mappi
         for site, value in sorted(squares.items(), key=lambda item: abs(item[1]))
     ]
     shows = f"outlined: {block(check)}"
-    return (
+    return Markup(
         f'<svg viewBox="0 0 1 1" preserveAspectRatio="none" role="img" aria-label="{escape(shows)}">'
         f"{''.join(shapes)}</svg>"
     )

@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 import splatsoil
 from splatsoil.errors import RunError
 from splatsoil.files import write_text
-from splatsoil.report import figures, words
+from splatsoil.report import figures, text
 from splatsoil.report.data import RunData, load
 
 HERE = Path(__file__).parent
@@ -44,23 +45,22 @@ def write_report(folder: str | Path) -> Path:
 def render(data: RunData) -> str:
     """The page as a string."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
-    from markupsafe import Markup
 
     environment = Environment(
         loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     environment.filters.update(
-        duration=words.duration,
-        estimate=words.estimate,
-        label=words.model_label,
-        model=words.model_name,
-        probability=words.probability,
+        duration=text.duration,
+        estimate=text.estimate,
+        label=text.model_label,
+        model=text.model_name,
+        probability=text.probability,
     )
     comparison, diagnosis = data.comparison, data.diagnosis
     judged = data.judged
-    adequate = words.called_adequate(data.fit, judged)
-    ratio = words.ratio_to_noise(comparison)
-    at_the_noise = ratio is not None and ratio <= words.AT_THE_NOISE
+    adequate = text.called_adequate(data.fit, judged)
+    ratio = text.ratio_to_noise(comparison)
+    at_the_noise = ratio is not None and ratio <= text.AT_THE_NOISE
     pictures = None if comparison is None else _pictures(data.folder / "comparison", comparison)
     kinds = list(KINDS)
     if pictures is not None and data.before is not None:
@@ -76,30 +76,30 @@ def render(data: RunData) -> str:
         data=data,
         fit=data.fit,
         coarse=sum(step.get("level") == "coarse" for step in data.fit["history"]),
-        answers=words.answers(data.fit, judged, data.truth),
+        answers=text.answers(data.fit, judged, data.truth),
         adequate=adequate,
-        fitted=words.fitted_sentence(data.fit, judged),
-        residual=words.residual_sentence(comparison, adequate) if judged is None else words.misfit_sentence(judged),
+        fitted=text.fitted_sentence(data.fit, judged),
+        residual=text.residual_sentence(comparison, adequate) if judged is None else text.misfit_sentence(judged),
         calm=at_the_noise if adequate is None else adequate,
         by_comparison=data.fit["estimated_from"] == "comparison",
         forces=_forces(data, judged),
-        surrogates={name: Markup(figures.surrogate(data.fit, name)) for name in data.fit["parameters"]},
-        losses=None if comparison is None else Markup(figures.losses(comparison)),
+        surrogates={name: figures.surrogate(data.fit, name) for name in data.fit["parameters"]},
+        losses=None if comparison is None else figures.losses(comparison),
         pictures=pictures,
         kinds=kinds,
         titles={"predicted": "after"} if "before" in kinds else {},
         findings=_findings(data, judged),
         models=[] if diagnosis is None else diagnosis["models"],
-        little=words.LITTLE,
+        little=text.LITTLE,
         judged=judged,
         failing=None if judged is None else _failing(judged, comparison, data.folder / "comparison"),
-        significant=words.SIGNIFICANT,
-        beyond=words.BEYOND,
+        significant=text.SIGNIFICANT,
+        beyond=text.BEYOND,
         posterior=None if data.posterior is None else _posterior(data.folder, data.posterior),
         falling=_falling(data),
-        surface=None if data.surface is None else Markup(figures.surface_map(data.surface)),
+        surface=None if data.surface is None else figures.surface_map(data.surface),
         order=order,
-        history=Markup(figures.history(data.fits, order)) if len(order) > 1 else None,
+        history=figures.history(data.fits, order) if len(order) > 1 else None,
     )
 
 
@@ -136,13 +136,11 @@ def _join(pictures: list[dict[str, Any]], earlier: list[dict[str, Any]]) -> bool
 
 def _posterior(folder: Path, posterior: Mapping[str, Any]) -> dict[str, Any]:
     """Sentences, one figure for each parameter, and the corner picture where there are several."""
-    from markupsafe import Markup
-
     corner = folder / "posterior" / "corner.png"
     return {
-        "sentences": words.posterior_sentences(posterior),
-        "notes": words.posterior_notes(posterior),
-        "marginals": [Markup(figures.marginal(entry)) for entry in posterior["parameters"].values()],
+        "sentences": text.posterior_sentences(posterior),
+        "notes": text.posterior_notes(posterior),
+        "marginals": [figures.marginal(entry) for entry in posterior["parameters"].values()],
         "corner": data_url(corner) if len(posterior["parameters"]) > 1 and corner.is_file() else None,
         "simulations": posterior["simulations"],
         "chains": posterior["chains"],
@@ -155,25 +153,23 @@ def _findings(data: RunData, judged: Mapping[str, Any] | None) -> list[dict[str,
     if data.diagnosis is not None:
         named = data.diagnosis["class"] if data.diagnosis["verdict"] in ("missing", "one of") else ()
         added, of = set(named) & set(data.fit["name"].split("+")), data.diagnosis["fit"]
-        later = "" if of == data.fit["name"] else "Added." if added else f"({words.model_name(of)})"
+        later = "" if of == data.fit["name"] else "Added." if added else f"({text.model_name(of)})"
         calm = data.diagnosis["verdict"] == "adequate"
         sentences = data.diagnosis["sentences"]
-        out.append({"text": words.verdict(data.diagnosis), "calm": calm, "later": later, "sentences": sentences})
+        out.append({"text": text.verdict(data.diagnosis), "calm": calm, "later": later, "sentences": sentences})
     if judged is not None and judged is data.misfit:
-        said = {"text": words.misfit_verdict(judged), "calm": judged["adequate"], "later": ""}
+        said = {"text": text.misfit_verdict(judged), "calm": judged["adequate"], "later": ""}
         out.append({**said, "sentences": judged["sentences"]})
     return out
 
 
 def _failing(judged: Mapping[str, Any], comparison: Mapping[str, Any] | None, folder: Path) -> dict[str, Any]:
     """Plan views of the residual, of the model as it is and with the best effect, and pictures of what fails."""
-    from markupsafe import Markup
-
     which = [("as it is", "before")]
-    which += [(f"with {words.model_label(n)}", n) for n in judged.get("class", ())[:1] if n in judged["maps"]]
+    which += [(f"with {text.model_label(n)}", n) for n in judged.get("class", ())[:1] if n in judged["maps"]]
     drawn = figures.plan_maps(judged, which)
     return {
-        "maps": [(title, Markup(svg)) for (title, _), svg in zip(which, drawn, strict=True)],
+        "maps": [(title, svg) for (title, _), svg in zip(which, drawn, strict=True)],
         "pictures": [] if comparison is None else _outlined(judged, comparison, folder),
     }
 
@@ -181,24 +177,22 @@ def _failing(judged: Mapping[str, Any], comparison: Mapping[str, Any] | None, fo
 def _outlined(judged: Mapping[str, Any], comparison: Mapping[str, Any], folder: Path) -> list[dict[str, Any]]:
     """The blocks that fail most: each on the photograph nearest to where it fails most, with words on when it
     begins."""
-    from markupsafe import Markup
-
     out: list[dict[str, Any]] = []
     for check in judged["checks"]:
-        if check["p"] >= words.SIGNIFICANT or check["channel"] not in comparison["cameras"] or len(out) == OUTLINED:
+        if check["p"] >= text.SIGNIFICANT or check["channel"] not in comparison["cameras"] or len(out) == OUTLINED:
             continue
-        row, squares = words.worst_row(judged, check)
+        row, squares = text.worst_row(judged, check)
         mine = (entry for entry in comparison["frames"] if entry["camera"] == check["channel"])
         entry = min(mine, key=lambda entry: abs(entry["frame"] - judged["times"][row]))
-        name = words.block(check)
+        name = text.block(check)
         out.append(
             {
                 "title": name[:1].upper() + name[1:],
                 "ratio": check["ratio"],
-                "begins": words.begins(judged, check),
+                "begins": text.begins(judged, check),
                 "frame": entry["frame"],
                 "photograph": data_url(folder / entry["observed"]),
-                "squares": Markup(figures.outlined(check, judged, squares)),
+                "squares": figures.outlined(check, judged, squares),
             }
         )
     return out
@@ -207,8 +201,6 @@ def _outlined(judged: Mapping[str, Any], comparison: Mapping[str, Any], folder: 
 def _forces(data: RunData, judged: Mapping[str, Any] | None) -> dict[str, Any] | None:
     """Force on the tool, measured and predicted: by the comparison at each frame, before and after an addition, and
     what a diagnosis of this fit expects and predicts."""
-    from markupsafe import Markup
-
     own = judged if judged is not None and judged["fit"] == data.fit["name"] else None
     curves = {} if own is None else {curve["channel"]: curve for curve in own["curves"]}
     now, before = ((c or {}).get("force") for c in (data.comparison, data.before))
@@ -229,13 +221,13 @@ def _forces(data: RunData, judged: Mapping[str, Any] | None) -> dict[str, Any] |
             for name in own.get("class", ())[:1] if before is None else ():
                 if name in curve["predicted"]:
                     times, values = _series(own["times"], curve["predicted"][name])
-                    lines[f"with {words.model_label(name)}"] = (times, values)
+                    lines[f"with {text.model_label(name)}"] = (times, values)
         one = figures.Readings(channel["channel"], now["unit"], (frames, measured), expected, lines)
-        drawn.append(Markup(figures.readings(one, "frame")))
+        drawn.append(figures.readings(one, "frame"))
         error, largest = np.sqrt(np.nanmean((predicted - measured) ** 2)), np.nanmax(np.abs(measured))
         sentences.append(
-            f"{channel['channel'].capitalize()}: root mean square error {words.rounded(float(error))} {now['unit']}; "
-            f"largest measured {words.rounded(float(largest))} {now['unit']}."
+            f"{channel['channel'].capitalize()}: root mean square error {text.rounded(float(error))} {now['unit']}; "
+            f"largest measured {text.rounded(float(largest))} {now['unit']}."
         )
     return {"figures": drawn, "sentences": sentences}
 
@@ -247,19 +239,17 @@ def _series(*columns: Sequence[float | None]) -> tuple[np.ndarray, ...]:
 
 def _falling(data: RunData) -> dict[str, Any] | None:
     """The error on data set aside: of the models tried or, where there is only one, of those that were compared."""
-    from markupsafe import Markup
-
     diagnosis = data.diagnosis or {"held_out": [], "aside": "data set aside", "unit": "grey levels"}
     if len(data.history) > 1:
         rows = [(entry["held_out"], entry["floor"]) for entry in data.history]
-        names = words.steps(data.history)
+        names = text.steps(data.history)
     else:
         rows = [(entry["error"], entry["noise"]) for entry in diagnosis["held_out"]]
-        names = [words.model_label(entry["model"]) for entry in diagnosis["held_out"]]
+        names = [text.model_label(entry["model"]) for entry in diagnosis["held_out"]]
     if len(rows) < 2:
         return None
     errors, noise = zip(*rows, strict=True)
-    figure = Markup(figures.falling(errors, noise, names, diagnosis["unit"]))
+    figure = figures.falling(errors, noise, names, diagnosis["unit"])
     return {"figure": figure, "falls": errors[-1] < errors[0], "aside": diagnosis["aside"]}
 
 

@@ -1,23 +1,27 @@
-"""What ``add`` hands on to the fit, with everything that simulates taken out."""
+"""``add``, with everything that simulates taken out: what it hands to the fit, keeps, and goes on from."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+import json
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
+from splatsoil.inverse.run_folder import RunFolder
 
-from splatsoil.commands import _control, _criticism, _history, _stages
+from splatsoil import cli
+from splatsoil.commands import _folder, _model, _stages
 from splatsoil.commands._options import FitOptions
-from splatsoil.commands.add import added
-from splatsoil.errors import RunError
-from splatsoil.files import write_json
+from splatsoil.files import JUDGING, code_digest, code_of, read_json, write_json
+from splatsoil.report.data import estimates
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
 
+FitOf = Callable[..., dict[str, Any]]
+ERRORS = {"base": 9.0, "cohesion": 5.0, "cohesion+tilt": 3.0}
+SIZES = {"cohesion": 300.0, "tilt_x": 2.0, "tilt_y": 1.0}
 OWN = """
 from splatsoil.parameters import Parameter
 from splatsoil.soil.effect import Effect
@@ -33,71 +37,83 @@ class Crust(Effect):
 """
 
 
-def diagnosis(held_out: Sequence[str], notes: Sequence[str] = ()) -> dict[str, Any]:
-    """What is used of a diagnosis.
+class Stages:
+    """Simulating ones, which count what they did and can be interrupted."""
 
-    Args:
-        held_out: effects whose error on what was set aside is told.
-        notes: for people.
-    """
-    told = [{"model": "", "error": 5.0, "noise": 1.0}]
-    told += [{"model": name, "error": 2.0, "noise": 1.5} for name in held_out]
-    return {"held_out": told, "notes": list(notes)}
+    def __init__(self, run: RunFolder, fit_of: FitOf, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.run, self.fit_of, self.done = run, fit_of, list[str]()
+        self.stops_at: tuple[str, int] | None = None
+        self.options = list[FitOptions]()
+        self.simulated = True
+        for place, name in (
+            (_model, "model_of"),
+            (_stages, "run_diagnosis"),
+            (_stages, "run_fit"),
+            (_stages, "draw_comparison"),
+        ):
+            monkeypatch.setattr(place, name, getattr(self, name))
+        monkeypatch.setattr("splatsoil.report.write_report", self.report)
+        self.draw_comparison(run)
+        self.done.clear()
 
+    def passed(self, what: str) -> None:
+        """Something is done, or Ctrl-C is pressed."""
+        self.done.append(what)
+        if self.stops_at == (what, self.done.count(what)):
+            raise KeyboardInterrupt
 
-@dataclass
-class Bench:
-    """A run that has a fit of the friction angle, what is kept of its diagnosis, and what was asked of it."""
+    def model_of(self, folder: RunFolder, *_: object, **__: object) -> Any:
+        return self.model(folder.fit()["setup"]["effects"])
 
-    kept: dict[str, Any] | None = None
-    new: dict[str, Any] = field(default_factory=dict)
-    diagnosed: list[Sequence[str]] = field(default_factory=list)
-    fit_of: dict[str, Any] = field(
-        default_factory=lambda: {
-            "name": "base",
-            "loss": 2.0,
-            "parameters": {"friction_angle": {"estimate": 30.0, "std": 1.0, "unit": "deg", "title": "angle"}},
-            "setup": {"effects": [], "preset": "tiny"},
-        }
-    )
-    options: FitOptions | None = None
-    history: list[dict[str, Any]] = field(default_factory=list)
-
-    def diagnose(self, folder: object, model: object, begin: object, effects: Sequence[str]) -> dict[str, Any]:
-        """A new diagnosis."""
-        self.diagnosed.append(effects)
-        return self.new
-
-    def fitted(self, options: FitOptions, *others: Any) -> dict[str, Any]:
-        """What the fit would keep."""
-        self.options = options
-        shown = {n: {"estimate": 1.0, "std": 0.5, "unit": "1", "title": n} for n in options.parameters}
-        setup = {"effects": list(options.effects), "preset": options.preset}
-        return {"name": "with it", "loss": 1.0, "parameters": shown, "setup": setup}
-
-    def add(self, name: str) -> dict[str, Any]:
-        """One effect."""
-        folder = SimpleNamespace(fit=lambda: self.fit_of, description={"seed": 0}, path=Path("run"))
-        model = SimpleNamespace(
-            measurement=SimpleNamespace(folder=Path("set")),
-            device="cpu",
-            variant=lambda effects: SimpleNamespace(law=Law(find_effects(effects))),
+    def model(self, effects: Sequence[str]) -> Any:
+        measurement = SimpleNamespace(folder=self.run.path)
+        return SimpleNamespace(
+            law=Law(find_effects(effects)), variant=self.model, measurement=measurement, device="cpu"
         )
-        return added(cast(Any, folder), cast(Any, model), name, lambda stage: lambda what, share: None)
+
+    def run_diagnosis(self, folder: RunFolder, model: object, begin: object, effects: Sequence[str]) -> dict[str, Any]:
+        (effect,) = find_effects(effects)
+        self.passed(f"diagnose {effect.name}")
+        return self.diagnosis(effect.name if self.simulated else "")
+
+    def diagnosis(self, *names: str) -> dict[str, Any]:
+        """Of the latest fit, with errors of the model as it is and of the best effect."""
+        before = self.run.fit()
+        after = {name: "+".join(sorted([*before["setup"]["effects"], name])) for name in names if name}
+        told = {"": before["name"], **after}
+        held_out = [{"model": key, "error": ERRORS.get(fit, 4.0), "noise": 1.0} for key, fit in told.items()]
+        return {"held_out": held_out, "notes": ["it could not be simulated (soil left the bin)"]}
+
+    def run_fit(self, options: FitOptions, *_: object) -> dict[str, Any]:
+        self.options.append(options)
+        fit = self.fit_of(options.effects, **{name: SIZES.get(name, 35.0) for name in options.parameters})
+        fit["name"] = fit["name"].replace("/", "|")
+        self.passed("fit")
+        self.run.write_fit(fit["name"], fit)
+        self.passed("fitted")
+        return fit
+
+    def draw_comparison(self, folder: RunFolder, *_: object) -> None:
+        self.passed("compare")
+        fit = folder.fit()
+        data = {"format": "splatsoil-comparison/1", "fit": fit["name"], "parameters": estimates(fit)}
+        write_json(folder.comparison / "comparison.json", data)
+        self.passed("compared")
+
+    def report(self, path: object) -> object:
+        self.passed("report")
+        return path
+
+    def add(self, *effects: str) -> int:
+        return cli.main(["add", str(self.run.path), *effects])
+
+    def history(self) -> dict[str, Any]:
+        return cast(dict[str, Any], read_json(self.run.path / "history.json"))
 
 
 @pytest.fixture
-def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
-    made = Bench()
-    monkeypatch.setattr(_criticism, "latest_diagnosis", lambda folder, effect: made.kept)
-    monkeypatch.setattr(_criticism, "diagnosed", made.diagnose)
-    monkeypatch.setattr(_history, "history", lambda folder: made.history)
-    monkeypatch.setattr(_history, "remember", lambda folder, entries, *_: setattr(made, "history", entries))
-    monkeypatch.setattr(_criticism, "pictured", lambda folder: True)
-    monkeypatch.setattr(_criticism, "keep_pictures", lambda folder: None)
-    monkeypatch.setattr(_stages, "compared", lambda *others: {})
-    monkeypatch.setattr(_stages, "fitted", made.fitted)
-    return made
+def stages(run: RunFolder, fit_of: FitOf, monkeypatch: pytest.MonkeyPatch) -> Stages:
+    return Stages(run, fit_of, monkeypatch)
 
 
 @pytest.mark.parametrize(
@@ -111,66 +127,127 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
     ],
 )
 def test_what_shapes_an_effect_is_fitted_with_it(
-    bench: Bench, tmp_path: Path, effect: str, free: list[str], held: list[str]
+    stages: Stages, tmp_path: Path, effect: str, free: list[str], held: list[str]
 ) -> None:
     if effect.endswith(".py"):
         (tmp_path / effect).write_text(OWN)
         effect = str(tmp_path / effect)
     (known,) = find_effects([effect])
     assert {p.name for p in known.parameters} == {*free, *held}
-    bench.kept = diagnosis([known.name])
-    entry = bench.add(effect)
-    assert bench.options is not None
-    assert bench.options.effects == (effect,)
-    assert bench.options.parameters == ("friction_angle", *free)
-    assert entry == bench.history[-1]
-    assert entry["added"] == known.name
-    assert set(entry["parameters"]) == {"friction_angle", *free}
+    assert stages.add(effect) == 0
+    (options,) = stages.options
+    assert options.effects == (effect,) and options.parameters == ("friction_angle", *free)
+    after = stages.history()["models"][-1]
+    assert after["added"] == known.name and set(after["parameters"]) == {"friction_angle", *free}
 
 
-def test_the_history_holds_errors_on_what_was_set_aside(bench: Bench) -> None:
-    bench.kept = diagnosis(["cohesion"])
-    bench.add("cohesion")
-    assert [(entry["model"], entry["held_out"], entry["floor"]) for entry in bench.history] == [
-        ("base", 5.0, 1.0),
-        ("with it", 2.0, 1.5),
-    ]
+def test_what_a_current_diagnosis_says_is_not_asked_again(stages: Stages, tmp_path: Path) -> None:
+    """One of another estimate, by other code, or without the effect's error, is none."""
+    run = stages.run
+    whole = {
+        "format": "splatsoil-diagnosis/2",
+        "fit": "base",
+        "model": [],
+        "models": [],
+        "values": {"friction_angle": 35.0},
+        "code": code_of(()),
+        "judged_by": code_digest(JUDGING),
+        **stages.diagnosis("cohesion"),
+    }
+    file = run.path / "diagnoses" / "base.json"
+    for change in (
+        {},
+        {"code": "of yesterday"},
+        {"judged_by": "of yesterday"},
+        {"values": {"friction_angle": 31.0}},
+        stages.diagnosis("tilt"),
+    ):
+        stages.done.clear()
+        write_json(file, {**whole, **change})
+        stages.stops_at = ("fit", 1)
+        assert stages.add("cohesion") == 130
+        assert stages.done == [*(["diagnose cohesion"] if change else []), "fit"], change
+    (tmp_path / "own.py").write_text(OWN)
+    assert _folder.current_diagnosis(run, file, (str(tmp_path / "own.py"),)) is None
+
+
+def test_an_effect_that_cannot_be_simulated_is_refused(stages: Stages, capsys: pytest.CaptureFixture[str]) -> None:
+    stages.simulated = False
+    assert stages.add("cohesion") == 2
+    assert "cohesion cannot be added: it could not be simulated (soil left the bin)" in capsys.readouterr().err
+    assert stages.options == [] and not (stages.run.path / "history.json").exists()
+
+
+STOPS = [("diagnose cohesion", 1), ("fit", 1), ("fitted", 1), ("compare", 1), ("compared", 1), ("report", 1)]
 
 
 @pytest.mark.parametrize(
-    ("kept", "asked"),
+    ("effects", "stop"),
     [
-        (diagnosis(["cohesion", "tilt"]), []),
-        (None, [("cohesion",)]),
-        (diagnosis(["tilt"]), [("cohesion",)]),
+        *((["cohesion"], stop) for stop in STOPS),
+        *((["cohesion", "tilt"], stop) for stop in STOPS),
+        *((["cohesion", "tilt"], stop) for stop in [("diagnose tilt", 1), *((what, 2) for what, _ in STOPS[1:-1])]),
     ],
-    ids=["all-known", "no-diagnosis", "error-unknown"],
 )
-def test_what_the_kept_diagnosis_does_not_say_is_asked_of_a_new_one(
-    bench: Bench, kept: dict[str, Any] | None, asked: list[tuple[str, ...]]
+def test_the_same_command_goes_on_to_the_same_end(
+    stages: Stages, capsys: pytest.CaptureFixture[str], effects: list[str], stop: tuple[str, int]
 ) -> None:
-    bench.kept, bench.new = kept, diagnosis(["cohesion"])
-    entry = bench.add("cohesion")
-    assert bench.diagnosed == asked
-    assert entry["held_out"] == 2.0
+    stages.stops_at = stop
+    assert stages.add(*effects) == 130
+    assert f"go on with: splatsoil add '{stages.run.path}' {' '.join(effects)}" in capsys.readouterr().err
+    stages.stops_at = None
+    assert stages.add(*effects) == 0, capsys.readouterr().err
+    assert stages.done.count("fitted") == len(effects), "no fit twice"
+    kept = stages.history()
+    models = kept["models"]
+    assert [entry["model"] for entry in models] == ["base", "cohesion", "cohesion+tilt"][: len(effects) + 1]
+    assert [entry.get("added") for entry in models] == [None, *effects]
+    assert [entry["held_out"] for entry in models] == [ERRORS[entry["model"]] for entry in models]
+    assert [entry["floor"] for entry in models] == [1.0] * len(models)
+    before = read_json(stages.run.path / "before" / "comparison.json")
+    assert before["fit"] == models[-2]["model"] and stages.run.fit()["name"] == models[-1]["model"]
+    assert "adding" not in kept, "nothing is under way any more"
+    assert stages.done[-1] == "report"
+    capsys.readouterr()
+    assert stages.add(*effects) == 2
+    assert "effect cohesion is on already; name one that is off" in capsys.readouterr().err
 
 
-def test_an_effect_that_cannot_be_simulated_is_refused(bench: Bench) -> None:
-    bench.new = diagnosis([], notes=["cohesion: some simulations failed (soil left the bin)"])
-    with pytest.raises(RunError, match=r"cohesion cannot be added: .*soil left the bin"):
-        bench.add("cohesion")
-    assert bench.options is None and bench.history == []
+def test_another_addition_first_ends_the_one_that_was_interrupted(stages: Stages) -> None:
+    stages.stops_at = ("compare", 1)
+    assert stages.add("cohesion") == 130
+    stages.stops_at = None
+    assert stages.add("tilt") == 0
+    assert [entry["model"] for entry in stages.history()["models"]] == ["base", "cohesion", "cohesion+tilt"]
 
 
-def test_a_diagnosis_by_other_code_is_none(tmp_path: Path) -> None:
-    fit = {"name": "base", "setup": {"effects": []}, "parameters": {"friction_angle": {"estimate": 30.0}}}
-    folder = cast(Any, SimpleNamespace(fit=lambda: fit, path=tmp_path))
-    assert _criticism.latest_diagnosis(folder, "cohesion") is None
-    data = {"format": "splatsoil-diagnosis/2", "model": [], "models": [], "values": {"friction_angle": 30.0}}
-    data |= {"code": _control.code_of(()), "judged_by": _control.judged_by()}
-    other = [{key: "of yesterday"} for key in ("code", "judged_by")] + [{"values": {"friction_angle": 31.0}}]
-    for change, known in ({}, True), *((change, False) for change in other):
-        write_json(tmp_path / "diagnoses" / "base.json", {**data, **change})
-        assert (_criticism.latest_diagnosis(folder, "cohesion") is not None) is known
-    (tmp_path / "own.py").write_text(OWN)
-    assert _criticism.latest_diagnosis(folder, str(tmp_path / "own.py")) is None
+def test_what_another_command_put_in_is_on_already(
+    stages: Stages, capsys: pytest.CaptureFixture[str], fit_of: FitOf
+) -> None:
+    """Not only what an interrupted one was about to."""
+    stages.stops_at = ("fit", 1)
+    assert stages.add("cohesion") == 130
+    stages.run.write_fit("cohesion+tilt", fit_of(["cohesion", "tilt"], cohesion=100.0, tilt_x=1.0))
+    capsys.readouterr()
+    assert stages.add("cohesion") == 2
+    assert "effect cohesion is on already" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["add", "cohesion", "cohesion"], "effect named twice: cohesion"),
+        (["add", "cohesion", "--budget", "1"], "--budget: a fit needs at least 2 evaluations, not 1"),
+        (["add", "nonsense"], "effect 'nonsense' is unknown"),
+        (["add", "tilt"], "effect tilt is on already; name one that is off"),
+        (["diagnose", "--effects", "nonsense"], "effect 'nonsense' is unknown"),
+        (["diagnose", "--effects", "tilt"], "effect tilt is on already; name one that is off"),
+    ],
+)
+@pytest.mark.usefixtures("no_work")
+def test_what_makes_no_sense_is_refused_before_any_work(
+    run: RunFolder, capsys: pytest.CaptureFixture[str], fit_of: FitOf, words: list[str], says: str
+) -> None:
+    run.write_fit("tilt", fit_of(["tilt"], tilt_x=1.0))
+    assert cli.main([words[0], str(run.path), *words[1:], "--json"]) == 2
+    assert says in json.loads(capsys.readouterr().out)["error"]

@@ -14,11 +14,11 @@ import pytest
 from splatsoil.inverse.criticism.simulations import Simulations
 from splatsoil.inverse.executors import Processes
 
-from splatsoil.commands import _crew, _criticism
-from splatsoil.commands._experiments import Chosen
+from splatsoil.commands import _crew, _stages
+from splatsoil.commands._model import ModelSpec
 from splatsoil.errors import RunError, SimulationError
 
-BASE = Chosen((), "tiny", ("friction_angle",))
+BASE = ModelSpec((), "tiny", ("friction_angle",))
 
 
 @pytest.mark.parametrize("count", [1, 3])
@@ -108,7 +108,7 @@ def test_helpers_begin_with_the_command_and_nothing_outlives_it(helps: bool, fai
 
 
 @pytest.mark.usefixtures("three_cores")
-@pytest.mark.parametrize("stage", ["diagnosed", "misfit"])
+@pytest.mark.parametrize("stage", ["run_diagnosis", "check_adequacy"])
 def test_who_is_not_alone_in_a_folder_has_no_helpers(stage: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def taken() -> NoReturn:
         raise RunError("another process is writing")
@@ -116,13 +116,13 @@ def test_who_is_not_alone_in_a_folder_has_no_helpers(stage: str, monkeypatch: py
     fit = {"parameters": {}, "setup": {"effects": [], "preset": "tiny"}}
     folder: Any = SimpleNamespace(lock=taken, fit=lambda: fit, description={"seed": 0})
     model: Any = SimpleNamespace(device="cpu")
-    monkeypatch.setattr(_criticism, "experiment_of", lambda *words: (SimpleNamespace(), SimpleNamespace()))
+    monkeypatch.setattr(_stages, "experiment_of", lambda *words: (SimpleNamespace(), SimpleNamespace()))
 
     def told(*words: Any) -> Any:
         return lambda *words: None
 
     with pytest.raises(RunError, match="another process"):
-        getattr(_criticism, stage)(folder, model, told)
+        getattr(_stages, stage)(folder, model, told)
     assert not made
 
 
@@ -160,7 +160,7 @@ EARLY = """
 import sys
 from pathlib import Path
 from types import SimpleNamespace
-from splatsoil.commands import _crew, _criticism, {command}
+from splatsoil.commands import _crew, {command}
 from splatsoil.inverse import executors
 from splatsoil.inverse.run_folder import RunFolder
 

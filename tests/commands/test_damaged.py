@@ -15,12 +15,16 @@ import pytest
 from splatsoil.inverse.run_folder import RunFolder
 
 from splatsoil import cli
-from splatsoil.commands import _criticism, _experiments, _history, _stages
+from splatsoil.commands import _folder, _model, _stages
 from splatsoil.commands._options import FitOptions
 from splatsoil.errors import RunError
 from splatsoil.files import write_json
 
+FitOf = Callable[..., dict[str, Any]]
 ALL = ("compare", "diagnose", "add", "report", "posterior")
+SHOWN = ("add", "report")
+FIT = '{"format": "splatsoil-fit/2", "name": "base"'
+DIAGNOSIS = '{"format": "splatsoil-diagnosis/2", "fit": "base", "values": {}, "model": []'
 
 
 def words(command: str, run: RunFolder) -> list[str]:
@@ -33,38 +37,18 @@ def words(command: str, run: RunFolder) -> list[str]:
     [
         ("fit.json", "{}", "isn't of format splatsoil-fit/2", ALL),
         ("fit.json", "[]", "isn't of format splatsoil-fit/2", ALL),
-        ("fit.json", '{"format": "splatsoil-fit/2", "name": "base"}', "lacks parameters", ALL),
-        (
-            "fit.json",
-            '{"format": "splatsoil-fit/2", "name": "base", "parameters": {"friction_angle": {}}}',
-            "lacks parameters.friction_angle.estimate",
-            ALL,
-        ),
-        (
-            "fit.json",
-            '{"format": "splatsoil-fit/2", "name": "base", "parameters": {}, "setup": {"effects": [3]}}',
-            "lacks setup.effects.0",
-            ALL,
-        ),
+        ("fit.json", FIT + "}", "lacks parameters", ALL),
+        ("fit.json", FIT + ', "parameters": {"a": {}}}', "lacks parameters.a.estimate", ALL),
+        ("fit.json", FIT + ', "parameters": {}, "setup": {"effects": [3]}}', "lacks setup.effects.0", ALL),
         ("run.json", '{"format": "splatsoil-run/1"}', "lacks measurement", ALL),
         ("run.json", '{"format": "splatsoil-run/1", "measurement": {}}', "lacks measurement.name", ALL),
         ("run.json", '{"format": "splatsoil-run/2"}', "isn't of format splatsoil-run/1", ALL),
-        ("history.json", "{}", "isn't of format splatsoil-history/1", ("add", "report")),
-        (
-            "history.json",
-            '{"format": "splatsoil-history/1", "models": [{}]}',
-            "lacks models.0.model",
-            ("add", "report"),
-        ),
-        ("diagnoses/base.json", "{}", "isn't of format splatsoil-diagnosis/2", ("add", "report")),
-        (
-            "diagnoses/base.json",
-            '{"format": "splatsoil-diagnosis/2", "values": {}, "model": [], "models": [{"name": ""}]}',
-            "lacks models.0.probability",
-            ("add", "report"),
-        ),
-        ("comparison/misfit.json", "{}", "isn't of format splatsoil-misfit/2", ("add", "report")),
-        ("comparison/comparison.json", "{}", "isn't of format splatsoil-comparison/1", ("add", "report")),
+        ("history.json", "{}", "isn't of format splatsoil-history/1", SHOWN),
+        ("history.json", '{"format": "splatsoil-history/1", "models": [{}]}', "lacks models.0.model", SHOWN),
+        ("diagnoses/base.json", "{}", "isn't of format splatsoil-diagnosis/2", SHOWN),
+        ("diagnoses/base.json", DIAGNOSIS + ', "models": [{"name": ""}]}', "lacks models.0.probability", SHOWN),
+        ("comparison/misfit.json", "{}", "isn't of format splatsoil-misfit/2", SHOWN),
+        ("comparison/comparison.json", "{}", "isn't of format splatsoil-comparison/1", SHOWN),
     ],
 )
 def test_json_of_another_shape_is_named_before_any_work(
@@ -73,11 +57,9 @@ def test_json_of_another_shape_is_named_before_any_work(
     (run.path / file).parent.mkdir(exist_ok=True)
     (run.path / file).write_text(text)
     for command in commands:
-        assert cli.main(words(command, run)) == 2, command
+        assert cli.main([*words(command, run), "--json"]) == 2, command
         out, err = capsys.readouterr()
-        assert out == "" and err.count("\n") == 1 and file in err and says in err, err
-        assert cli.main([*words(command, run), "--json"]) == 2
-        out, err = capsys.readouterr()
+        assert err.count("\n") == 1 and file in err and says in err, err
         assert json.loads(out) == {"ok": False, "error": err.removeprefix("splatsoil: ").strip()}
 
 
@@ -128,14 +110,14 @@ def test_a_fit_meets_another_process_before_any_work(
 
 def test_pictures_are_written_by_one_process_at_a_time(run: RunFolder) -> None:
     with run.lock(), pytest.raises(RunError, match="another process is writing"):
-        _stages.compared(run, cast(Any, None), lambda what, share: pytest.fail("work has begun"))
+        _stages.draw_comparison(run, cast(Any, None), lambda what, share: pytest.fail("work has begun"))
 
 
 def test_a_damaged_reconstruction_is_to_be_deleted(run: RunFolder) -> None:
     write_json(run.reconstruction / "reconstruction.json", {"format": "splatsoil-reconstruction/1"})
     measurement = cast(Any, SimpleNamespace(hash="a" * 64))
     with pytest.raises(RunError, match=r"delete the folder .*my run/reconstruction and run the command again"):
-        _stages.reconstructed(measurement, run, "cpu", lambda what, share: None)
+        _model.reconstructed(measurement, run, "cpu", lambda what, share: None)
 
 
 @pytest.mark.parametrize("command", ["compare", "diagnose", "add", "report"])
@@ -148,7 +130,7 @@ def test_a_fit_by_other_sources_is_said_to_be_one(
     monkeypatch: pytest.MonkeyPatch,
     command: str,
     change: dict[str, str],
-    fit_of: Callable[..., dict[str, Any]],
+    fit_of: FitOf,
 ) -> None:
     fit = fit_of()
     fit["setup"] |= change
@@ -157,7 +139,7 @@ def test_a_fit_by_other_sources_is_said_to_be_one(
     def goes_on(*_: object, **__: object) -> None:
         raise RunError("has gone on")
 
-    monkeypatch.setattr(_experiments, "model_of", goes_on)
+    monkeypatch.setattr(_model, "model_of", goes_on)
     monkeypatch.setattr("splatsoil.report.write_report", goes_on)
     assert cli.main([*words(command, run), "--json"]) == 2
     out, err = capsys.readouterr()
@@ -170,14 +152,13 @@ def test_a_fit_by_other_sources_is_said_to_be_one(
 
 
 def test_a_model_with_added_effects_is_made_anew_by_adding_them(
-    run: RunFolder, capsys: pytest.CaptureFixture[str], fit_of: Callable[..., dict[str, Any]]
+    run: RunFolder, capsys: pytest.CaptureFixture[str], fit_of: FitOf
 ) -> None:
     fits = [fit_of(), fit_of(["tilt"], tilt_x=1.0), fit_of(["cohesion", "tilt"], tilt_x=1.0, cohesion=100.0)]
-    entries = [_criticism.entry(fit, {"error": 1.0, "noise": 1.0}) for fit in fits]
-    _history.remember(run, entries)
+    _folder.write_history(run, [_folder.history_entry(fit, {"error": 1.0, "noise": 1.0}) for fit in fits])
     fits[-1]["setup"]["code"] = "of yesterday"
     run.write_fit("cohesion+tilt", fits[-1])
-    _stages.note_other_sources(run)
+    _folder.note_other_sources(run)
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and "--with" not in said
     assert said.strip().endswith(f"--run '{run.path}' && splatsoil add '{run.path}' tilt cohesion")

@@ -3,27 +3,22 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from splatsoil.commands import _criticism, _history, _stages, add
-from splatsoil.commands import run as command
-from splatsoil.commands.run import Config, loop
-from splatsoil.errors import ParameterError, SimulationError
+from splatsoil import cli
+from splatsoil.commands import _stages, add, run
+from splatsoil.errors import SimulationError
 
-LAST = {"name": "last", "loss": 0.5, "best": {"loss": 0.5}, "parameters": {}}
+ENOUGH = "nothing more is needed to explain the data"
+NONE = "no single effect is probable enough to be added"
+TRY = f"{NONE}; the most probable is buried obstacle: splatsoil add 'my run' buried_obstacle tries it"
 
 
 def said(verdict: str, *effects: str) -> dict[str, Any]:
     return {"verdict": verdict, "class": list(effects)}
-
-
-ENOUGH = "nothing more is needed to explain the data"
-NONE = "no single effect is probable enough to be added"
-TRY = f"{NONE}; the most probable is buried obstacle: splatsoil add run buried_obstacle tries it"
 
 
 @pytest.mark.parametrize(
@@ -31,13 +26,10 @@ TRY = f"{NONE}; the most probable is buried obstacle: splatsoil add run buried_o
     [
         ([said("adequate")], 2, [], ENOUGH),
         ([said("adequate", "tilt")], 2, [], ENOUGH),
-        ([said("missing", "cohesion"), said("adequate")], 2, ["cohesion"], ENOUGH),
         ([said("missing", "cohesion"), said("missing", "tilt"), said("adequate")], 2, ["cohesion", "tilt"], ENOUGH),
         ([said("missing", "cohesion")] * 2, 1, ["cohesion"], "1 effects have been added, which is the limit"),
         ([said("missing", "cohesion")], 0, [], "0 effects have been added, which is the limit"),
         ([said("something else")], 2, [], NONE),
-        ([said("undecided")], 2, [], NONE),
-        ([said("something else", "buried_obstacle", "tilt")], 2, [], TRY),
         ([said("undecided", "buried_obstacle")], 2, [], TRY),
         ([said("missing", "cohesion"), said("one of", "buried_obstacle", "tilt")], 2, ["cohesion"], TRY),
     ],
@@ -45,88 +37,69 @@ TRY = f"{NONE}; the most probable is buried obstacle: splatsoil add run buried_o
 def test_the_loop_adds_what_is_missing_and_says_why_it_stops(
     monkeypatch: pytest.MonkeyPatch, diagnoses: list[dict[str, Any]], most: int, added: list[str], reason: str
 ) -> None:
-    left, done = list(diagnoses), []
-    monkeypatch.setattr(_criticism, "diagnosed", lambda *_: left.pop(0))
-    monkeypatch.setattr(add, "added", lambda folder, model, name, *_: done.append(name))
-    folder: Any = SimpleNamespace(path="run", fit=lambda: {"setup": {"effects": done}})
-    model: Any = SimpleNamespace(variant=lambda effects: model)
-    last, why = loop(folder, model, most, lambda _: lambda what, share: None)
+    left, done = list(diagnoses), list[str]()
+    monkeypatch.setattr(_stages, "run_diagnosis", lambda *_: left.pop(0))
+    monkeypatch.setattr(add, "add_effect", lambda folder, model, name, *_: done.append(name))
+    folder, model = SimpleNamespace(path="my run"), SimpleNamespace()
+    last, why = run.add_missing(folder, model, most, lambda _: lambda what, share: None)  # type: ignore[arg-type]
     assert done == added and last is diagnoses[len(added)]
     assert why.removesuffix(" (--most-effects)") == reason
 
 
-def stand_in(monkeypatch: pytest.MonkeyPatch, place: Path, adequate: bool) -> None:
-    """All of the stages but the loop."""
-    comparison = {"loss": "robust", "total": {}, "noise": {}}
-    (place / "comparison.json").write_text(json.dumps(comparison))
-    folder = SimpleNamespace(path=place, comparison=place, fit=lambda: LAST)
-    monkeypatch.setattr(_stages, "prepare", lambda config: (None, folder))
-    for name, found in (("reconstructed", None), ("model_on", None), ("fitted", LAST), ("compared", comparison)):
-        monkeypatch.setattr(_stages, name, lambda *_, found=found: found)
-    told = {"adequate": adequate, "probability": 0.9, "estimates": {}, "checks": [], "passes": adequate}
-    monkeypatch.setattr(_criticism, "misfit", lambda *_: told)
-    monkeypatch.setattr(_history, "history", lambda _: [])
-    monkeypatch.setattr("splatsoil.report.write_report", lambda path: path)
+@pytest.fixture
+def missing(results: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """Stages that aren't run, and the search for what is missing."""
+    results["add_missing"] = (dict.fromkeys(run.DIAGNOSIS, ""), "enough")
+
+    def add_missing(*_: object) -> Any:
+        if isinstance(results["add_missing"], Exception):
+            raise results["add_missing"]
+        return results["add_missing"]
+
+    monkeypatch.setattr(run, "add_missing", add_missing)
+    return results
 
 
 @pytest.mark.parametrize(
     ("flags", "adequate", "looks"),
     [
-        ({}, True, False),
-        ({}, False, True),
-        ({"criticise": True}, True, True),
-        ({"criticise": True}, False, True),
-        ({"stop_at_floor": True}, False, False),
+        ([], True, False),
+        ([], False, True),
+        (["--criticise"], True, True),
+        (["--criticise"], False, True),
+        (["--stop-at-floor"], False, False),
     ],
 )
 def test_run_looks_for_what_is_missing_where_the_model_is_not_adequate(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
-    flags: dict[str, bool],
-    adequate: bool,
-    looks: bool,
+    missing: dict[str, Any], capsys: pytest.CaptureFixture[str], flags: list[str], adequate: bool, looks: bool
 ) -> None:
-    stand_in(monkeypatch, tmp_path, adequate)
-    parts = ("verdict", "class", "sentences", "models", "checks", "held_out", "estimates", "simulations")
-    monkeypatch.setattr(command, "loop", lambda *_: (dict.fromkeys(parts, ""), "enough"))
-    assert command.run(Config(set=tmp_path, json=True, **flags)) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert (said.get("stopped") == "enough") is looks and ("diagnosis" in said) is looks
-    assert ("misfit" in said) is not looks
+    missing["check_adequacy"]["adequate"] = adequate
+    assert cli.main(["run", "set", "--json", *flags]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told.get("stopped") == "enough") is looks and ("diagnosis" in told) is looks
+    assert ("misfit" in told) is not looks
 
 
-def test_run_cannot_both_look_and_not_look(tmp_path: Path) -> None:
-    with pytest.raises(ParameterError, match="give one of them"):
-        command.run(Config(set=tmp_path, criticise=True, stop_at_floor=True))
+def test_run_cannot_both_look_and_not_look(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["run", "set", "--criticise", "--stop-at-floor"]) == 2
+    assert "give one of them" in capsys.readouterr().err
 
 
-def test_a_diagnosis_that_fails_costs_no_report_unless_it_was_asked_for(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+@pytest.mark.parametrize(
+    ("fails", "says"),
+    [
+        ("add_missing", "what is missing isn't known"),
+        ("check_adequacy", "whether the model is adequate isn't known"),
+    ],
+)
+def test_what_fails_after_the_fit_costs_no_report_unless_it_was_asked_for(
+    missing: dict[str, Any], capsys: pytest.CaptureFixture[str], fails: str, says: str
 ) -> None:
-    def fails(*_: object) -> None:
-        raise SimulationError("soil left the bin")
-
-    stand_in(monkeypatch, tmp_path, adequate=False)
-    monkeypatch.setattr(command, "loop", fails)
-    assert command.run(Config(set=tmp_path, json=True)) == 0
-    told = capsys.readouterr()
-    assert "what is missing isn't known: soil left the bin" in told.err and json.loads(told.out)["name"] == "last"
-    with pytest.raises(SimulationError):
-        command.run(Config(set=tmp_path, json=True, criticise=True))
-
-
-def test_whether_the_model_is_adequate_may_stay_unknown(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    def fails(*_: object) -> None:
-        raise SimulationError("soil left the bin")
-
-    stand_in(monkeypatch, tmp_path, adequate=False)
-    monkeypatch.setattr(_criticism, "misfit", fails)
-    monkeypatch.setattr(command, "loop", lambda *_: pytest.fail("looks for what is missing"))
-    assert command.run(Config(set=tmp_path, json=True)) == 0
-    told = capsys.readouterr()
-    assert "whether the model is adequate isn't known: soil left the bin" in told.err
-    page = json.loads(told.out)
-    assert page["report"] == str(tmp_path) and "misfit" not in page
+    missing["check_adequacy"]["adequate"] = False
+    missing[fails] = SimulationError("soil left the bin")
+    assert cli.main(["run", "set", "--json"]) == 0
+    out, err = capsys.readouterr()
+    assert f"{says}: soil left the bin" in err and json.loads(out)["name"] == "base"
+    assert ("misfit" in json.loads(out)) is (fails == "add_missing") and "diagnosis" not in json.loads(out)
+    if fails == "add_missing":
+        assert cli.main(["run", "set", "--criticise"]) == 2

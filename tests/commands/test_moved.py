@@ -12,7 +12,7 @@ import pytest
 from splatsoil.inverse.run_folder import RunFolder
 
 from splatsoil import cli
-from splatsoil.commands import _stages
+from splatsoil.commands import _folder, _model, _stages
 from splatsoil.commands._options import FitOptions
 from splatsoil.errors import RunError
 
@@ -25,7 +25,7 @@ def project(small_set: Path, tmp_path: Path, fit_of: Callable[..., dict[str, Any
     place = tmp_path / "project"
     shutil.move(small_set, place / "data" / "set")
     _, run = _stages.prepare(FitOptions(place / "data" / "set", preset="tiny", run=place / "runs" / "run"))
-    run.write_fit("base", {**fit_of(), "setup": {**fit_of()["setup"], "device": "cpu"}})
+    run.write_fit("base", fit_of())
     return place
 
 
@@ -38,7 +38,7 @@ def reaches(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
         found.append(measurement.folder)
         raise RunError("far enough")
 
-    monkeypatch.setattr(_stages, "reconstructed", asked)
+    monkeypatch.setattr(_model, "reconstructed", asked)
     return found
 
 
@@ -78,7 +78,7 @@ def test_a_run_without_its_way_finds_a_set_beside_it(project: Path) -> None:
     del data["way"]
     (run / "run.json").write_text(json.dumps(data))
     shutil.move(project / "data" / "set", project / "runs" / "set")
-    assert _stages.measurement_of(RunFolder.open(run)).folder == project / "runs" / "set"
+    assert _folder.measurement_of(RunFolder.open(run)).folder == project / "runs" / "set"
 
 
 @pytest.mark.usefixtures("reaches")
@@ -87,7 +87,7 @@ def test_a_fit_takes_the_new_place(project: Path, capsys: pytest.CaptureFixture[
     shutil.move(project / "data" / "set", new)
     assert cli.main(["fit", str(new), "--preset", "tiny", "--run", str(run)]) == 2
     assert "far enough" in capsys.readouterr().err
-    assert _stages.measurement_of(RunFolder.open(run)).folder == new
+    assert _folder.measurement_of(RunFolder.open(run)).folder == new
 
 
 @pytest.mark.parametrize("told", [True, False])
@@ -98,10 +98,3 @@ def test_another_set_is_not_taken(project: Path, capsys: pytest.CaptureFixture[s
     assert cli.main(words("compare", run, *(["--set", place] if told else []))) == 2
     assert "has changed since" in capsys.readouterr().err.splitlines()[-1]
     assert (run / "run.json").read_bytes() == before
-
-
-def test_the_command_that_goes_on_says_where_the_set_is(project: Path) -> None:
-    from splatsoil.commands import add, compare, diagnose, posterior, report
-
-    for module, more in ((add, {"effects": ("tilt",)}), (compare, {}), (diagnose, {}), (posterior, {}), (report, {})):
-        assert "--set new" in module.interrupted(module.Config(run=Path("run"), set=Path("new"), **more))

@@ -8,7 +8,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from splatsoil.commands._experiments import off_effects
+from splatsoil.commands._model import off_effects
 from splatsoil.errors import ParameterError, SimulationError
 from splatsoil.experiment.plow import MOST_TOGETHER, PlowExperiment
 from splatsoil.measurement import Measurement

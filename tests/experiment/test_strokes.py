@@ -10,7 +10,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from splatsoil.commands.design import table
+from splatsoil.commands.design import motion_csv
 from splatsoil.experiment.forces import ALONG, SCALE, SENSOR
 from splatsoil.experiment.plow import PlowExperiment
 from splatsoil.experiment.strokes import StrokeExperiment, strokes
@@ -87,7 +87,7 @@ def test_a_second_stroke_begins_after_the_first_and_in_the_air(damp: Measurement
 def test_a_written_motion_reads_as_the_stroke(damp: Measurement, tmp_path: Path) -> None:
     for stroke in strokes(damp, SURFACE):
         motion = stroke.motion(damp.frame_rate)
-        (tmp_path / "tool_motion.csv").write_text(table(motion))
+        (tmp_path / "tool_motion.csv").write_text(motion_csv(motion))
         read = ToolMotion.read(tmp_path / "tool_motion.csv")
         assert np.array_equal(read.frames, np.arange(len(read.frames)))
         assert np.allclose(read.times, read.frames / damp.frame_rate)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatsoil.commands._stages import model_on
+from splatsoil.commands._model import model_on
 from splatsoil.errors import ParameterError, RunError
 from splatsoil.measurement import Measurement
 from splatsoil.model import Model

@@ -11,8 +11,9 @@ import trimesh
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from splatsoil.comparison import Comparator
+from splatsoil.comparison import PATCH, Comparator
 from splatsoil.measurement import Bed, Camera, Measurement
+from splatsoil.reconstruction import HeightField
 from splatsoil.scene import (
     Layers,
     Light,
@@ -353,7 +354,9 @@ def test_true_particles_look_like_the_measured_frames():
     assert abs(scene.light.azimuth - 145.0) < 3.0
     assert abs(scene.light.elevation - 53.0) < 3.0
     level = float(relief_of_particles(start, spacing, measurement.bed.lower, measurement.bed.upper).height.mean())
-    comparator = Comparator(measurement, level=level, frames=frames)
+    bed = measurement.bed
+    surface = HeightField.over(bed.lower, bed.upper, PATCH, level)
+    comparator = Comparator(measurement, surface=surface, frames=frames)
 
     def loss(scene, particles):
         images = {}

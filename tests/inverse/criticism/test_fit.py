@@ -18,7 +18,7 @@ from splatsoil.inverse.posterior import Density
 from splatsoil.inverse.posterior_run import run_posterior
 from splatsoil.inverse.run_folder import RunFolder
 
-from splatsoil.commands._criticism import judged, prior_of
+from splatsoil.commands._stages import compare_models, prior_of
 from splatsoil.errors import SimulationError
 from splatsoil.experiment.emulated import EmulatedExperiment
 from splatsoil.parameters import Parameter, ParameterSpace
@@ -66,7 +66,7 @@ def fitted(experiment: EmulatedExperiment, folder: Path, budget: int = BUDGET) -
         simulate.keep(table, record.parameters, record.seed)
 
     def compared(found: dict[str, Any]) -> Any:
-        return judged(experiment, simulate, found, lambda what, share: None, 3, with_effects=False)
+        return compare_models(experiment, simulate, found, lambda what, share: None, 3, with_effects=False)
 
     result = fit(Searched(experiment), run, setup, budget=budget, compare=compared, after_evaluation=kept)
     return run, result, simulate.made
@@ -83,11 +83,11 @@ def test_nothing_is_simulated_twice_and_all_say_the_same(make: Make, tmp_path: P
     assert run.fit() == result
 
     again = Simulations(experiment, tmp_path / "features")
-    found = judged(experiment, again, run.fit(), lambda what, share: None, 3, with_effects=False)
+    found = compare_models(experiment, again, run.fit(), lambda what, share: None, 3, with_effects=False)
     assert again.made == 0, "a comparison finds every simulation"
     assert found.estimates["friction_angle"] == (angle["estimate"], angle["std"])
     more = Simulations(experiment, tmp_path / "features")
-    found = judged(experiment, more, run.fit(), lambda what, share: None, 3, with_effects=True)
+    found = compare_models(experiment, more, run.fit(), lambda what, share: None, 3, with_effects=True)
     assert set(found.evidence.models) > {"one", "two", "three"}
     assert more.asked - more.made >= BUDGET + made, "so does a diagnosis"
 
@@ -136,7 +136,7 @@ def test_the_chains_sample_what_the_comparison_integrates(make: Make, tmp_path: 
     run, result, _ = fitted(experiment, tmp_path)
     simulate = Simulations(experiment, tmp_path / "features")
     prior = prior_of(experiment, run.fit())
-    found = judged(experiment, simulate, run.fit(), lambda what, share: None, 3, with_effects=False)
+    found = compare_models(experiment, simulate, run.fit(), lambda what, share: None, 3, with_effects=False)
     density = Density.of(found.evidence.noise, prior, 3)
     grid = np.linspace(-1.0, 1.0, 2001)
     log = density(grid[:, None])

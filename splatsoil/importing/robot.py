@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
 from splatsoil.errors import MeasurementError
@@ -39,6 +40,13 @@ class Grid:
         """On the robot's clock: of frames 0, 1, … to the first that isn't before ``last``."""
         count = int(np.ceil((last - self.zero) * self.rate - 1e-6))
         return self.zero + np.arange(max(count, 1) + 1) / self.rate
+
+
+def metres(unit: str, file: Path) -> float:
+    """In a unit of a file's lengths; MeasurementError for one that is unknown."""
+    if unit not in UNITS:
+        raise MeasurementError(f"its unit {unit!r} is none of {', '.join(UNITS)}", file=file)
+    return UNITS[unit]
 
 
 def read_rigid(file: Path | None) -> FloatArray:
@@ -87,7 +95,7 @@ def read_motion(file: Path, unit: str, robot_to_world: FloatArray, mesh_to_flang
         )
     flange = np.tile(np.eye(4), (len(table), 1, 1))
     flange[:, :3, :3] = Rotation.from_quat(table[:, 4:], scalar_first=True).as_matrix()
-    flange[:, :3, 3] = UNITS[unit] * table[:, 1:4]
+    flange[:, :3, 3] = metres(unit, file) * table[:, 1:4]
     poses = robot_to_world @ flange @ mesh_to_flange
     quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat(scalar_first=True)
     return ToolMotion(rows.astype(np.int64), table[:, 0], poses[:, :3, 3], quaternions)
@@ -120,17 +128,8 @@ def read_force(file: Path, robot_to_world: FloatArray, grid: Grid) -> FloatArray
     ends = ends[(ends >= times[0]) & (ends <= times[-1])]
     if len(ends) < 2:
         raise MeasurementError("the force's times cover no frame of the tool's motion; is it on its clock?", file=file)
-    # A frame's mean is the integral's growth: trapezoids between rows are exact for what is linear there.
-    steps = 0.5 * np.diff(times)[:, None] * (table[1:, 1:] + table[:-1, 1:])
-    integral = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-    means = grid.rate * np.diff([_integral(times, table[:, 1:], integral, end) for end in ends], axis=0)
+    # A frame's mean is the growth of the integral of what is linear between rows.
+    integral = make_interp_spline(times, table[:, 1:], k=1).antiderivative()
+    means = grid.rate * np.diff(integral(ends), axis=0)
     frames = np.rint((ends[1:] - grid.zero) * grid.rate)
     return np.column_stack([frames, frames / grid.rate, means @ robot_to_world[:3, :3].T])
-
-
-def _integral(times: FloatArray, values: FloatArray, integral: FloatArray, end: float) -> FloatArray:
-    """Of values (n, 3), linear between times, up to ``end``; ``integral`` (n, 3) is up to each time."""
-    k = int(np.clip(np.searchsorted(times, end, side="right") - 1, 0, len(times) - 2))
-    rest = end - times[k]
-    slope = (values[k + 1] - values[k]) / (times[k + 1] - times[k])
-    return np.asarray(integral[k] + rest * (values[k] + 0.5 * rest * slope))

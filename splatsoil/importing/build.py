@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +13,11 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from splatsoil.errors import MeasurementError
-from splatsoil.measurement.camera import Camera
-from splatsoil.measurement.fields import Fields
-from splatsoil.measurement.frames import Frame, read_transforms
-from splatsoil.measurement.importing.clock import WIDTH, ClockOffset, Footage, clock_offset, moving
-from splatsoil.measurement.importing.robot import UNITS, Grid, read_force, read_motion, read_rigid, resampled
-from splatsoil.measurement.importing.similarity import (
+from splatsoil.errors import MeasurementError, ParameterError
+from splatsoil.importing.clock import WIDTH, ClockOffset, Footage, clock_offset, moving
+from splatsoil.importing.options import ImportOptions
+from splatsoil.importing.robot import Grid, metres, read_force, read_motion, read_rigid, resampled
+from splatsoil.importing.similarity import (
     by_known_points,
     by_scale,
     distance_scale,
@@ -27,9 +25,12 @@ from splatsoil.measurement.importing.similarity import (
     read_marked,
     read_points,
 )
-from splatsoil.measurement.importing.source import Source, find_image, read_source
-from splatsoil.measurement.importing.tags import tag_scale
-from splatsoil.measurement.importing.video import Video
+from splatsoil.importing.source import Source, find_image, read_source
+from splatsoil.importing.tags import tag_scale
+from splatsoil.importing.video import Video
+from splatsoil.measurement.camera import Camera
+from splatsoil.measurement.fields import Fields
+from splatsoil.measurement.frames import Frame, read_transforms
 from splatsoil.measurement.measurement import EXPERIMENT, FORMAT, Measurement
 from splatsoil.measurement.motion import MOTION_COLUMNS, ToolMotion
 from splatsoil.measurement.tool import FORCE_COLUMNS, read_mesh
@@ -42,53 +43,6 @@ PRE_ROLL = 8
 LOOKED_AT = 60
 """Pictures of each video that its clock is told from."""
 QUALITY = 95
-
-
-@dataclass(frozen=True)
-class Alignment:
-    """How the source's world becomes metres with z up; one of `scale`, `distance`, `tags` and `known`.
-
-    Attributes:
-        scale: metres for each of its units.
-        distance: two marked points, and the metres between them.
-        tags: edge of the AprilTags in its photographs, m.
-        known: file of points' places in the new world.
-        points: file of the same points in the source's world, or in its photographs.
-        up: direction in the source's world that points up; with `known` it is told by these.
-    """
-
-    scale: float | None = None
-    distance: tuple[str, str, float] | None = None
-    tags: float | None = None
-    known: Path | None = None
-    points: Path | None = None
-    up: tuple[float, float, float] | None = None
-
-
-@dataclass(frozen=True)
-class Parts:
-    """What is imported besides the views.
-
-    Attributes:
-        tool: mesh and its unit.
-        motion: the robot's record, and the unit of its positions.
-        force: the robot's record.
-        robot_to_world, mesh_to_flange: files of rigid motions, m.
-        video: by camera, the file and the photograph of the source that has the camera's pose.
-        every: frames of a video from one that is kept to the next.
-        clock_offset: what is added to the video's times to get the robot's, s; estimated if None.
-        experiment: an experiment.json with the rest.
-    """
-
-    tool: tuple[Path, str] | None = None
-    motion: tuple[Path, str] | None = None
-    force: Path | None = None
-    robot_to_world: Path | None = None
-    mesh_to_flange: Path | None = None
-    video: dict[str, tuple[Path, str]] = field(default_factory=dict)
-    every: int = 1
-    clock_offset: float | None = None
-    experiment: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -124,43 +78,40 @@ class Imported:
 Report = Callable[[str, float], None]
 
 
-def import_set(
-    source: Path, out: Path, alignment: Alignment, parts: Parts, *, images: Path | None = None, report: Report
-) -> Imported:
-    """Write ``out``: its views, and whatever else of a set is given; with an experiment.json, a whole set, checked.
+def import_set(options: ImportOptions, report: Report) -> Imported:
+    """Write the new folder: views, and whatever else of a set is given; with an experiment.json, a whole set, checked.
 
-    Args:
-        source: see `read_source`.
-        out: a folder, new or empty.
-        alignment: of the source's world.
-        parts: the rest.
-        images: see `read_source`.
-        report: called with what is being done, and the share of it that is done.
+    ``report`` is called with what is being done, and the share of it that is done.
 
     Raises:
         MeasurementError: something is missing or faulty; nothing is written.
-        ParameterError: a package is missing.
+        ParameterError: a package is missing, or an option makes no sense.
     """
+    out = options.out
+    if options.video_every < 1:
+        raise ParameterError(f"--video-every: must be 1 or more, not {options.video_every}")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise MeasurementError("already there and not an empty folder; nothing is overwritten", file=out)
     report("reading the views", 0.0)
-    found = read_source(source, images)
-    similarity, marks, left = _similarity(found, alignment)
-    stills = {name: find_image(found.frames, image) for name, (_, image) in parts.video.items()}
+    found = read_source(options.source, options.images)
+    similarity, marks, left = _similarity(found, options)
+    stills = {name: find_image(found.frames, image) for name, (_, image) in options.cameras.items()}
     aside = {still.path for still in stills.values()}
     views = [moved(frame, similarity) for frame in found.frames if frame.path not in aside]
     if not views:
-        raise MeasurementError("no view is left: all photographs give the video's cameras their poses", file=source)
+        raise MeasurementError(
+            "no view is left: all photographs give the video's cameras their poses", file=options.source
+        )
     cameras = {name: moved(still, similarity).camera for name, still in stills.items()}
-    videos = _opened(parts, cameras)
-    mesh = None if parts.tool is None else _mesh(*parts.tool)
-    to_world, to_flange = read_rigid(parts.robot_to_world), read_rigid(parts.mesh_to_flange)
-    motion = None if parts.motion is None else read_motion(*parts.motion, to_world, to_flange)
-    experiment = {} if parts.experiment is None else dict(Fields.read(parts.experiment).data)
+    videos = {name: _opened(path, image, cameras[name]) for name, (path, image) in options.cameras.items()}
+    mesh = None if options.tool is None else _mesh(*options.tool)
+    to_world, to_flange = read_rigid(options.robot_to_world), read_rigid(options.mesh_to_flange)
+    motion = None if options.motion is None else read_motion(*options.motion, to_world, to_flange)
+    experiment = {} if options.experiment is None else dict(Fields.read(options.experiment).data)
     rate = _rate(videos, experiment, motion)
 
-    clock, offset = None, parts.clock_offset or 0.0
-    if videos and motion is not None and parts.clock_offset is None:
+    clock, offset = None, options.clock_offset or 0.0
+    if options.needs_clock and motion is not None:
         if mesh is None:
             raise MeasurementError("the clock's offset is told from the tool's mesh; give --tool or --clock-offset")
         report("finding the clock's offset", 0.1)
@@ -183,12 +134,13 @@ def import_set(
             table = np.column_stack([steps.frames, steps.times, steps.positions, steps.quaternions])
             write_table(root / "tool_motion.csv", MOTION_COLUMNS, table)
             last = int(steps.frames[-1])
-        if parts.force is not None:
-            write_table(root / "tool_force.csv", FORCE_COLUMNS, read_force(parts.force, to_world, grid))
+        if options.force is not None:
+            write_table(root / "tool_force.csv", FORCE_COLUMNS, read_force(options.force, to_world, grid))
         taken = []
         for k, (name, video) in enumerate(videos.items()):
             report(f"video {name}", 0.4 + 0.5 * k / len(videos))
-            taken += _extracted(video, cameras[name], name, Path(temporary) / "video" / name, zero, last, parts.every)
+            camera, folder = replace(cameras[name], name=name), Path(temporary) / "video" / name
+            taken += _extracted(video, camera, folder, zero, last, options.video_every)
         if taken:
             write_frames(root / "video", taken, video=True, suffix=".jpg", quality=QUALITY)
         report("checking", 0.9)
@@ -200,38 +152,33 @@ def import_set(
     return Imported(found.kind, len(views), similarity, marks, left, count, clock, missing)
 
 
-def _similarity(source: Source, alignment: Alignment) -> tuple[FloatArray, float, float | None]:
+def _similarity(source: Source, options: ImportOptions) -> tuple[FloatArray, float, float | None]:
     """From the source's world to the set's; errors of marks in px, of known points in m."""
-    ways = {
-        "--scale": alignment.scale,
-        "--distance": alignment.distance,
-        "--tags": alignment.tags,
-        "--known": alignment.known,
-    }
+    ways = {f"--{name}": getattr(options, name) for name in ("scale", "distance", "tags", "known")}
     given = [name for name, value in ways.items() if value is not None]
     if len(given) != 1:
         what = f"{' and '.join(given)} contradict each other" if given else "no scale is given"
         raise MeasurementError(f"{what}; give one of --scale, --distance, --tags and --known")
-    if given[0] in ("--distance", "--known") and alignment.points is None:
+    if given[0] in ("--distance", "--known") and options.points is None:
         raise MeasurementError(f"{given[0]}: needs --points, which say where these points are in the source")
-    marked = None if alignment.points is None else read_marked(alignment.points, source.frames)
-    if alignment.known is not None:
-        if alignment.up is not None:
+    marked = None if options.points is None else read_marked(options.points, source.frames)
+    if options.known is not None:
+        if options.up is not None:
             raise MeasurementError("--up: the known points tell it; leave it out")
         assert marked is not None
-        similarity, left = by_known_points(marked.places, read_points(alignment.known))
+        similarity, left = by_known_points(marked.places, read_points(options.known))
         return similarity, marked.error, left
-    if alignment.up is None and not source.has_up:
+    if options.up is None and not source.has_up:
         raise MeasurementError(f"{source.kind} doesn't know which way is up; give --up or --known")
-    if alignment.tags is not None:
-        scale, marked = tag_scale(source.frames, alignment.tags)
-    elif alignment.distance is not None:
+    if options.tags is not None:
+        scale, marked = tag_scale(source.frames, options.tags)
+    elif options.distance is not None:
         assert marked is not None
-        scale = distance_scale(marked.places, *alignment.distance)
+        scale = distance_scale(marked.places, *options.distance)
     else:
-        assert alignment.scale is not None
-        scale = alignment.scale
-    return by_scale(scale, alignment.up or (0.0, 0.0, 1.0)), 0.0 if marked is None else marked.error, None
+        assert options.scale is not None
+        scale = options.scale
+    return by_scale(scale, options.up or (0.0, 0.0, 1.0)), 0.0 if marked is None else marked.error, None
 
 
 def _mesh(file: Path, unit: str) -> Any:
@@ -239,21 +186,17 @@ def _mesh(file: Path, unit: str) -> Any:
     told = mesh.units is not None
     if told and unit != "m":
         raise MeasurementError(f"the file itself tells its unit, and was read in metres; say m, not {unit}", file=file)
-    return mesh if told else mesh.apply_scale(UNITS[unit])
+    return mesh if told else mesh.apply_scale(metres(unit, file))
 
 
-def _opened(parts: Parts, cameras: dict[str, Camera]) -> dict[str, Video]:
-    out = {}
-    for name, (path, image) in parts.video.items():
-        video, camera = Video.open(path), cameras[name]
-        if video.size != (camera.width, camera.height):
-            raise MeasurementError(
-                f"its frames have {video.size[0]} x {video.size[1]} pixels, {image} has {camera.width} x"
-                f" {camera.height}",
-                file=path,
-            )
-        out[name] = video
-    return out
+def _opened(path: Path, image: str, camera: Camera) -> Video:
+    video = Video.open(path)
+    if video.size != (camera.width, camera.height):
+        raise MeasurementError(
+            f"its frames have {video.size[0]} x {video.size[1]} pixels, {image} has {camera.width} x {camera.height}",
+            file=path,
+        )
+    return video
 
 
 def _rate(videos: dict[str, Video], experiment: dict[str, Any], motion: ToolMotion | None) -> float:
@@ -293,9 +236,7 @@ def _without_distortion(picture: npt.NDArray[np.uint8], camera: Camera) -> npt.N
     return picture[rows, columns]
 
 
-def _extracted(
-    video: Video, camera: Camera, name: str, folder: Path, zero: int, last: int | None, every: int
-) -> list[Frame]:
+def _extracted(video: Video, camera: Camera, folder: Path, zero: int, last: int | None, every: int) -> list[Frame]:
     """Frames of a video as files: every so many from ``zero`` on until the tool rests, and those just before."""
     end = video.count if last is None else min(video.count, zero + last + 1)
     wanted = {*range(max(zero, zero % every), end, every), *range(max(zero - PRE_ROLL, 0), min(zero, video.count))}
@@ -303,11 +244,10 @@ def _extracted(
         raise MeasurementError("the video ends before the tool moves, or begins after; is the clock's offset right?")
     folder.mkdir(parents=True)
     out = []
-    named = replace(camera, name=name)
     for number, picture in video.pictures(wanted):
         path = folder / f"{number:06d}.jpg"
         Image.fromarray(picture).save(path, quality=QUALITY, subsampling=0)
-        out.append(Frame(named, path, name, number - zero, (number - zero) / video.rate))
+        out.append(Frame(camera, path, camera.name, number - zero, (number - zero) / video.rate))
     return out
 
 
@@ -332,20 +272,3 @@ def _finish(root: Path, experiment: dict[str, Any], rate: float, out: Path) -> t
     except MeasurementError as error:
         raise MeasurementError(str(error).replace(str(root.absolute()), str(out))) from error
     return tuple(missing)
-
-
-def names_of(videos: Sequence[str]) -> dict[str, tuple[Path, str]]:
-    """``FILE=IMAGE`` words by camera, which is called as its file.
-
-    Raises:
-        MeasurementError: another form, or two files of one name.
-    """
-    out: dict[str, tuple[Path, str]] = {}
-    for word in videos:
-        file, sign, image = word.partition("=")
-        if not sign or not file or not image:
-            raise MeasurementError(f"--video {word}: write FILE=IMAGE, with the photograph of SOURCE it was posed by")
-        if Path(file).stem in out:
-            raise MeasurementError(f"--video {word}: two cameras would be called {Path(file).stem}")
-        out[Path(file).stem] = Path(file), image
-    return out

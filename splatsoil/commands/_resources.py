@@ -48,7 +48,7 @@ class Needs:
 
     def sentence(self, device: str) -> str:
         """The needs in one line, where the soil isn't known yet."""
-        from splatsoil.report.words import duration
+        from splatsoil.report.text import duration
 
         return (
             f"needs up to {self.memory:.2g} of {memory():.2g} GiB of memory and {duration(self.seconds)} a simulation "

@@ -11,7 +11,7 @@ import pytest
 from splatsoil.inverse.run_folder import RunFolder
 
 from splatsoil import cli
-from splatsoil.commands import _limits, _stages
+from splatsoil.commands import _resources, _stages
 from splatsoil.commands._options import FitOptions
 from splatsoil.errors import ParameterError
 from splatsoil.measurement import Measurement
@@ -23,7 +23,7 @@ def test_needs_follow_from_the_set(small_set: Path) -> None:
     import numpy as np
 
     measurement = Measurement.load(small_set)
-    tiny, small = (_limits.needs(measurement, preset, "cpu", 10) for preset in ("tiny", "small"))
+    tiny, small = (_resources.needs(measurement, preset, "cpu", 10) for preset in ("tiny", "small"))
     # A bed that is full to its top is what `fill` fills.
     ends = [np.linspace(a, b, 9) for a, b in zip(measurement.bed.lower[:2], measurement.bed.upper[:2], strict=True)]
     x, y = (0.5 * (end[1:] + end[:-1]) for end in ends)
@@ -32,31 +32,29 @@ def test_needs_follow_from_the_set(small_set: Path) -> None:
     # half the cell: eight times the particles, twice the substeps
     assert small.particles == pytest.approx(8 * tiny.particles, rel=1e-3)
     assert small.seconds == pytest.approx(16 * tiny.seconds, rel=1e-3)
-    assert small.memory > tiny.memory > _limits.PROGRAM
-    more = _limits.needs(measurement, "tiny", "cpu", 10, particles=10 * tiny.particles)
+    assert small.memory > tiny.memory > _resources.PROGRAM
+    more = _resources.needs(measurement, "tiny", "cpu", 10, particles=10 * tiny.particles)
     assert more.simulation == pytest.approx(10 * tiny.simulation) and more.memory > tiny.memory
-    on_gpu = _limits.needs(measurement, "tiny", "cuda:0", 10, particles=10 * tiny.particles)
+    on_gpu = _resources.needs(measurement, "tiny", "cuda:0", 10, particles=10 * tiny.particles)
     assert on_gpu.memory < more.memory and on_gpu.simulation == more.simulation
 
 
-def test_a_fit_says_what_it_needs_before_it_works(
-    small_set: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    _stages.prepare(FitOptions(small_set, preset="tiny", device="cpu", run=tmp_path / "run"))
-    said = capsys.readouterr().err.splitlines()[-1]
-    assert said.startswith("needs up to ") and "(13500 particles, cpu), 30 simulations" in said
-
-
 @pytest.mark.parametrize("preset", ["tiny", "fine"])
-def test_pictures_that_no_memory_holds_are_refused_before_anything_is_written(
+def test_what_a_fit_needs_is_said_and_refused_where_no_memory_holds_it(
     small_set: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], preset: str
 ) -> None:
-    monkeypatch.setattr(_limits, "memory", lambda: 0.5)
-    words = ["fit", str(small_set), "--preset", preset, "--device", "cpu", "--run", str(tmp_path / "run"), "--json"]
+    """Before anything is written."""
+    options = FitOptions(small_set, preset="tiny", device="cpu", run=tmp_path / "run")
+    monkeypatch.setattr(_resources, "memory", lambda: 0.5)
+    words = ["fit", str(small_set), "--preset", preset, "--device", "cpu", "--run", str(options.run), "--json"]
     assert cli.main(words) == 2
     told = capsys.readouterr()
     assert "and this machine has 0.5 GiB; choose a coarser --preset" in json.loads(told.out)["error"]
     assert not (tmp_path / "run").exists()
+    monkeypatch.undo()
+    _stages.prepare(options)
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert said.startswith("needs up to ") and "(13500 particles, cpu), 30 simulations" in said
 
 
 def test_soil_that_no_memory_holds_is_refused_before_it_is_simulated(
@@ -68,7 +66,7 @@ def test_soil_that_no_memory_holds_is_refused_before_it_is_simulated(
     soil = range(10**9)
     model: Any = SimpleNamespace(space=lambda names: ["friction_angle"], device="cpu", particles=lambda seed: soil)
     with pytest.raises(ParameterError, match=r"1000000000 particles, and the pictures, need \d+ GiB of memory"):
-        _stages.fitted(options, measurement, cast(RunFolder, run), model, lambda what, share: None)
+        _stages.run_fit(options, measurement, cast(RunFolder, run), model, lambda what, share: None)
 
 
 def test_a_control_groups_limit_counts(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -77,8 +75,8 @@ def test_a_control_groups_limit_counts(monkeypatch: pytest.MonkeyPatch) -> None:
             return f"{2**30}\n"
         raise FileNotFoundError
 
-    whole = _limits.memory()
+    whole = _resources.memory()
     monkeypatch.setattr(Path, "read_text", read)
-    assert _limits.memory() == 1.0 <= whole
+    assert _resources.memory() == 1.0 <= whole
     monkeypatch.setattr(Path, "read_text", lambda path: "max\n")
-    assert _limits.memory() >= whole
+    assert _resources.memory() >= whole

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from splatsoil.report import words
+from splatsoil.report import text as words
 
 
 @pytest.mark.parametrize(

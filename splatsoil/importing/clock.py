@@ -30,7 +30,7 @@ STEP = 0.25
 """Way of the tool, over its width, from one offset of the coarse search to the next."""
 RESTING = 0.01
 """Of the largest speed: a tool that is no faster rests."""
-TOLD = 0.1
+LEAST_SHARE = 0.1
 """Of what is unknown of a pixel's cover, its colour must tell this share at least (uncertainty coefficient: Theil 1970,
 Am. J. Sociol. 76:103); of noise it tells a few hundredths, as histograms have few entries."""
 
@@ -63,7 +63,7 @@ class ClockOffset:
     by_camera: tuple[float, ...]
 
 
-class _Witness:
+class _ToolInformation:
     """One camera's pictures, cut to where the tool ever is, and their information on it."""
 
     def __init__(self, footage: Footage, mesh: trimesh.Trimesh, motion: ToolMotion) -> None:
@@ -143,21 +143,21 @@ def clock_offset(footage: Sequence[Footage], mesh: trimesh.Trimesh, motion: Tool
     """
     from scipy.optimize import minimize_scalar
 
-    witnesses = [w for w in (_Witness(one, mesh, motion) for one in footage) if w.seen]
-    if not witnesses:
+    cameras = [w for w in (_ToolInformation(one, mesh, motion) for one in footage) if w.seen]
+    if not cameras:
         raise MeasurementError("no camera of the video sees the tool's motion; give --clock-offset in seconds")
 
-    times = np.concatenate([w.times for w in witnesses])
+    times = np.concatenate([w.times for w in cameras])
     begin, end, speed = moving(motion)
     step = STEP * float(np.sort(mesh.extents)[1]) / speed
     offsets = np.arange(begin - times.max(), end - times.min() + step, step)
-    found = np.array([sum(w.information(offset, 1) for w in witnesses) for offset in offsets])
+    found = np.array([sum(w.information(offset, 1) for w in cameras) for offset in offsets])
     best = float(offsets[found.argmax()])
-    information, entropy = np.sum([w.measured(best) for w in witnesses], axis=0)
-    if not information > TOLD * entropy:
+    information, entropy = np.sum([w.measured(best) for w in cameras], axis=0)
+    if not information > LEAST_SHARE * entropy:
         raise MeasurementError("the tool cannot be told from what is behind it; give --clock-offset in seconds")
 
-    def refined(*chosen: _Witness) -> float:
+    def refined(*chosen: _ToolInformation) -> float:
         result = minimize_scalar(
             lambda offset: -sum(w.information(offset) for w in chosen),
             bounds=(best - step, best + step),
@@ -166,4 +166,4 @@ def clock_offset(footage: Sequence[Footage], mesh: trimesh.Trimesh, motion: Tool
         )
         return float(result.x)
 
-    return ClockOffset(refined(*witnesses), tuple(refined(w) for w in witnesses))
+    return ClockOffset(refined(*cameras), tuple(refined(w) for w in cameras))

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from splatsoil.errors import MeasurementError, ParameterError
+from splatsoil.importing.similarity import Marked, Marks, intersected
 from splatsoil.measurement.frames import Frame
-from splatsoil.measurement.importing.similarity import Marked, Marks, intersected
 
 FAMILY = "tag36h11"
 ALIKE = 0.1

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
-import shlex
 import shutil
 import sys
 from collections.abc import Callable
@@ -15,18 +13,16 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-import tyro
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from splatsoil import cli
-from splatsoil.commands import import_
 from splatsoil.errors import MeasurementError
+from splatsoil.importing.clock import Footage, clock_offset
+from splatsoil.importing.robot import Grid, read_force
+from splatsoil.importing.similarity import by_known_points, by_scale, read_marked
+from splatsoil.importing.source import read_source
 from splatsoil.measurement import Camera, Frame, Measurement, ToolMotion
-from splatsoil.measurement.importing.clock import Footage, clock_offset
-from splatsoil.measurement.importing.robot import Grid, read_force
-from splatsoil.measurement.importing.similarity import by_known_points, by_scale, read_marked
-from splatsoil.measurement.importing.source import read_source
 
 RATE = 5.0
 """Frames a second of the videos: a tenth of the sets'."""
@@ -447,13 +443,14 @@ def test_forces_are_means_over_frames_in_world_axes(tmp_path: Path) -> None:
         (["--motion", "robot.csv", "mm", "--robot-to-world", "known.csv"], "four rows of four numbers"),
         (["--motion", "robot.csv", "mm", "--video", "left.mp4=left.jpg"], "give --tool or --clock-offset"),
         (["--tool", "known.csv", "mm"], "known.csv"),
+        (["--motion", "robot.csv", "km"], "its unit 'km' is none of m, cm, mm, in"),
     ],
 )
 def test_mistakes_are_one_sentence_and_nothing_is_written(
     words: list[str], said: str, plow: Recorded, importing: Callable[..., dict[str, Any]], tmp_path: Path
 ) -> None:
     if said.startswith(
-        ("write", "two", "no posed", "cannot", "--video", "a motion", "expected", "four", "give", "known")
+        ("write", "two", "no posed", "cannot", "--video", "a motion", "expected", "four", "give", "known", "its unit")
     ):
         words = [*words, "--scale", "1", "--up", "0", "0", "1"]
     result = importing(plow, *words)
@@ -513,33 +510,3 @@ def test_the_clock_of_a_box_that_crosses_the_picture() -> None:
 def test_no_clock_is_told_from_noise() -> None:
     with pytest.raises(MeasurementError, match="cannot be told from what is behind it"):
         clock_offset(*([one] if isinstance(one, Footage) else one for one in footage(shown=False)))
-
-
-def test_help_fits_a_screen(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "80")
-    with pytest.raises(SystemExit):
-        cli.main(["import", "--help"])
-    assert len(capsys.readouterr().out.splitlines()) <= 40
-
-
-def test_the_commands_of_the_page_parse(repository: Path) -> None:
-    page = (repository / "docs" / "own-photographs.md").read_text()
-    text = "\n".join(re.findall(r"```sh\n(.*?)```", page, re.DOTALL)).replace("\\\n", "")
-    lines = [shlex.split(line) for line in text.splitlines() if line.startswith("splatsoil")]
-    assert [words[1] for words in lines] == ["import", "check", "import", "import"]
-    known = cli.commands()
-    for _, name, *words in lines:
-        tyro.cli(known[name].config, args=words)
-
-
-@pytest.mark.parametrize("how", ["everything", "nothing"])
-def test_the_hint_after_ctrl_c_is_the_command_that_was_given(how: str) -> None:
-    text = (
-        "'a folder' out --images i --scale 2 --distance a b 0.5 --tags 0.1 --known k.csv --points p.csv --up 0 -1 0"
-        " --tool t.stl mm --motion m.csv m --force f.csv --robot-to-world r.txt --mesh-to-flange f.txt"
-        " --video 'a b.mp4=c.jpg' d.mp4=e.png --video-every 3 --clock-offset -0.5 --experiment e.json --json"
-    )
-    config = tyro.cli(import_.Config, args=shlex.split(text)[: None if how == "everything" else 2])
-    hint = import_.interrupted(config)
-    words = shlex.split(hint[hint.index("splatsoil ") :])
-    assert words[:2] == ["splatsoil", "import"] and tyro.cli(import_.Config, args=words[2:]) == config

@@ -312,6 +312,11 @@ def amount(value: float, std: float, unit: str) -> str:
     return (" ± ".join(with_std(value, std)) if 0.0 < std < math.inf else rounded(value)) + symbol(unit)
 
 
+def interval(entry: Mapping[str, Any]) -> str:
+    """The 5 to 95 % of a parameter."""
+    return f"{entry['low']:.4g} to {entry['high']:.4g}{symbol(entry['unit'])}"
+
+
 def title(name: str) -> str:
     """An effect's name at the beginning of a sentence."""
     return name.replace("_", " ").capitalize()

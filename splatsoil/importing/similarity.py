@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
 from splatsoil.errors import MeasurementError
+from splatsoil.importing.source import find_image
 from splatsoil.measurement.fields import read_table, read_text
 from splatsoil.measurement.frames import Frame
-from splatsoil.measurement.importing.source import find_image
-from splatsoil.measurement.rotations import rotation_matrix
 
 FloatArray = npt.NDArray[np.float64]
 Marks = dict[str, list[tuple[Frame, FloatArray]]]
@@ -135,13 +135,8 @@ def by_scale(scale: float, up: npt.ArrayLike = (0.0, 0.0, 1.0)) -> FloatArray:
     length = float(np.linalg.norm(way))
     if not (np.isfinite(length) and length > 0.0):
         raise MeasurementError("up is a direction: three numbers that are not all 0")
-    way = way / length
-    axis = np.cross(way, [0.0, 0.0, 1.0])
-    sine = float(np.linalg.norm(axis))
-    # Of half a turn any horizontal axis will do.
-    unit = axis / sine if sine > 1e-12 else np.array([1.0, 0.0, 0.0])
     out = np.eye(4)
-    out[:3, :3] = scale * rotation_matrix(np.arctan2(sine, way[2]) * unit)
+    out[:3, :3] = scale * Rotation.align_vectors([[0.0, 0.0, 1.0]], [way / length])[0].as_matrix()
     return out
 
 

@@ -1,0 +1,250 @@
+"""A run folder as commands meet it: its set, its latest fit, and what is kept of earlier ones."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Mapping
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from splatsoil.commands._options import EVALUATIONS, FitOptions, RunOptions, command_line, same_again
+from splatsoil.errors import MeasurementError, NoAnswer, RunError
+
+if TYPE_CHECKING:
+    from splatsoil.inverse.run_folder import RunFolder
+    from splatsoil.measurement import Measurement
+
+#: Loss of a prediction in which nothing moves. The loss is measured in units of it, so this is no choice of ours: a
+#: model that comes to it has explained nothing of what was seen, wherever its estimate lies.
+NOTHING_MOVES = 1.0
+
+
+def opened(options: RunOptions) -> RunFolder:
+    """The run folder of a command, which knows where its set is now if the command says so.
+
+    Raises:
+        RunError: there is none, or the set is another one.
+        MeasurementError: there is no set.
+    """
+    from splatsoil.inverse.run_folder import RunFolder
+    from splatsoil.measurement import Measurement
+
+    run = RunFolder.open(options.run)
+    if options.set is None:
+        return run
+    measurement = Measurement.load(options.set)
+    if measurement.hash != run.description["measurement"]["hash"]:
+        raise RunError(f"{run.path}: --set {options.set} isn't the set that it was made from, or has changed since")
+    return run.moved(measurement.folder.resolve())
+
+
+def measurement_of(run: RunFolder) -> Measurement:
+    """The set that a run was made from: where it was, or beside the run if both have moved.
+
+    Raises:
+        RunError: it is at none of these places, or has changed since.
+    """
+    from splatsoil.measurement import Measurement
+    from splatsoil.measurement.measurement import EXPERIMENT
+
+    first, *others = run.measurement_places()
+    changed = ""
+    for folder in (first, *others):
+        if not (folder / EXPERIMENT).is_file():
+            continue
+        try:
+            measurement = Measurement.load(folder)
+        except MeasurementError:
+            if folder == first:
+                raise
+            continue
+        if measurement.hash == run.description["measurement"]["hash"]:
+            return measurement
+        changed = changed or f"{run.path}: its measurement set {folder} has changed since; fit again into another --run"
+    note = command_line("report", run.path, "--set", "FOLDER")
+    raise RunError(
+        changed
+        or f"{run.path}: its measurement set {first} isn't there any more, nor beside the run; `{note}` notes "
+        "where it is now"
+    )
+
+
+def latest_fit(folder: RunFolder) -> dict[str, Any]:
+    """The fit that a diagnosis starts from.
+
+    Raises:
+        RunError: there is none.
+    """
+    try:
+        return folder.fit()
+    except RunError as error:
+        raise RunError(f"{error}; a diagnosis starts from a fit") from error
+
+
+def no_answer(fit: Mapping[str, Any]) -> str:
+    """Why the estimate of ``fit.json`` means nothing, in one sentence; empty where it means something.
+
+    Raises:
+        RunError: the file is damaged.
+    """
+    from splatsoil.files import ANEW
+    from splatsoil.report.text import symbol
+
+    try:
+        least, loss = fit["best"]["loss"], max(fit["loss"], fit["best"]["loss"])
+        if loss >= NOTHING_MOVES:
+            where = "everywhere it was tried" if least >= NOTHING_MOVES else "where pictures and force together put it"
+            return (
+                f"no answer: {where} the model explains the video no better than soil that never moves (loss "
+                f"{loss:.3g}; such soil has {NOTHING_MOVES:g}); photographs, poses, clock or tool are wrong, or the "
+                "soil is another"
+            )
+        for name, entry in fit["parameters"].items():
+            if entry["at_bound"] is None:
+                continue
+            bound = entry["bounds"][0 if entry["at_bound"] == "lower" else 1]
+            # An effect that is off is no bound of knowledge: it isn't there.
+            if bound != entry.get("off"):
+                return (
+                    f"no answer: the {name.replace('_', ' ')} ends at the {entry['at_bound']} bound of its range "
+                    f"({bound:g}{symbol(entry['unit'])}); the best value lies beyond it, or the model lacks an effect"
+                )
+    except (KeyError, TypeError, IndexError, AttributeError, ValueError) as error:
+        raise RunError(
+            f"fit.json: is damaged, it lacks loss, best, or a parameter's bounds ({error!r}); {ANEW}"
+        ) from error
+    return ""
+
+
+def require_answer(fit: Mapping[str, Any], look: str) -> None:
+    """NoAnswer where a fit has none; ``look`` says what to look at then."""
+    if reason := no_answer(fit):
+        raise NoAnswer(f"{reason}: {look}")
+
+
+def note_other_sources(run: RunFolder) -> None:
+    """Say on stderr, in one line, if the latest fit was made by other sources than these."""
+    from splatsoil import __version__
+    from splatsoil.files import code_of
+    from splatsoil.run_files import read_fit
+
+    fit = read_fit(run.path)
+    setup = fit["setup"]
+    then = (setup.get("version"), setup.get("code"))
+    try:
+        now = (__version__, code_of(setup["effects"]))
+    except RunError as error:
+        print(f"splatsoil: {run.path}: effects that it was fitted with are gone ({error})", file=sys.stderr)
+        return
+    if then != now:
+        print(
+            f"splatsoil: {run.path} was fitted by splatsoil {then[0]}, code {then[1]}, and this is {now[0]}, code "
+            f"{now[1]}; this makes it anew: {fit_again(run, fit)}",
+            file=sys.stderr,
+        )
+
+
+def fit_again(run: RunFolder, fit: Mapping[str, Any]) -> str:
+    """The commands that make a run's latest model again: the fit, and the effects that were added to it."""
+    setup, entries = fit["setup"], history(run)
+    parameters, effects, budget = tuple(fit["parameters"]), tuple(setup["effects"]), fit.get("evaluations")
+    if budget == EVALUATIONS * len(parameters) or setup.get("coarse") is not None:
+        budget = None
+    added: list[str] = []
+    if len(entries) > 1 and entries[-1]["model"] == fit["name"]:
+        parameters, effects, budget = tuple(entries[0]["parameters"]), tuple(entries[0]["effects"]), None
+        added = [name for one, other in pairwise(entries) for name in other["effects"] if name not in one["effects"]]
+    options = FitOptions(
+        set=Path(run.description["measurement"]["folder"]),
+        parameters=parameters,
+        effects=effects,
+        budget=budget,
+        search=setup.get("search", "usual"),
+        coarse=setup.get("coarse"),
+        preset=setup["preset"],
+        seed=run.description["seed"],
+        run=run.path,
+    )
+    commands = [same_again("fit", options), *([command_line("add", run.path, *added)] if added else [])]
+    return " && ".join(commands)
+
+
+def history(folder: RunFolder) -> list[dict[str, Any]]:
+    """The models tried so far, the first one first."""
+    return list(_history(folder).get("models", ()))
+
+
+def adding(folder: RunFolder) -> dict[str, Any]:
+    """The addition of an effect that is under way, as `write_history` was given it; empty where none is."""
+    return dict(_history(folder).get("adding", {}))
+
+
+def _history(folder: RunFolder) -> dict[str, Any]:
+    from splatsoil.run_files import HISTORY_FORMAT, read_kept
+
+    path = folder.path / "history.json"
+    return read_kept(path, HISTORY_FORMAT) if path.is_file() else {}
+
+
+def write_history(folder: RunFolder, entries: list[dict[str, Any]], under_way: Mapping[str, Any] | None = None) -> Path:
+    """Keep the models tried, and what is needed to go on with an addition that is under way."""
+    from splatsoil.files import write_json
+    from splatsoil.run_files import HISTORY_FORMAT
+
+    more = {"adding": dict(under_way)} if under_way else {}
+    return write_json(folder.path / "history.json", {"format": HISTORY_FORMAT, "models": entries, **more})
+
+
+def history_entry(fit: Mapping[str, Any], held_out: Mapping[str, Any]) -> dict[str, Any]:
+    """A model's line in the history: its fit, and its error on what was set aside."""
+    return {
+        "model": fit["name"],
+        "effects": list(fit["setup"]["effects"]),
+        "parameters": {
+            name: {key: p[key] for key in ("estimate", "std", "unit", "title")} for name, p in fit["parameters"].items()
+        },
+        "loss": fit["loss"],
+        "held_out": held_out["error"],
+        "floor": held_out["noise"],
+    }
+
+
+def compared_already(folder: RunFolder) -> bool:
+    """Whether there are pictures at the latest fit's estimate."""
+    from splatsoil.report.data import kept_of
+    from splatsoil.run_files import COMPARISON_FORMAT
+
+    return kept_of(folder.comparison / "comparison.json", COMPARISON_FORMAT, folder.fit()) is not None
+
+
+def keep_earlier_comparison(folder: RunFolder) -> None:
+    """Put the comparison of the model before aside, so that before and after can be shown."""
+    if not (folder.comparison / "comparison.json").is_file():
+        return
+    before = folder.path / "before"
+    with folder.lock():
+        shutil.rmtree(before, ignore_errors=True)
+        folder.comparison.rename(before)
+
+
+def current_diagnosis(folder: RunFolder, path: Path, effects: tuple[str, ...] | None = None) -> dict[str, Any] | None:
+    """A diagnosis of the latest fit by the code as it is, or None.
+
+    Args:
+        folder: the run.
+        path: of the file.
+        effects: those whose files count for the code; the diagnosis's own candidates if not given.
+    """
+    from splatsoil.files import JUDGING, code_digest, code_of
+    from splatsoil.report.data import kept_of
+    from splatsoil.run_files import DIAGNOSIS_FORMAT
+
+    fit = folder.fit()
+    data = kept_of(path, DIAGNOSIS_FORMAT, fit)
+    if data is None:
+        return None
+    candidates = data.get("candidates", ()) if effects is None else effects
+    digests = code_of((*fit["setup"]["effects"], *candidates)), code_digest(JUDGING)
+    return data if (data.get("code"), data.get("judged_by")) == digests else None

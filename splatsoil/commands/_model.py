@@ -1,0 +1,218 @@
+"""A run folder as a model and as an experiment: what stages compute with."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from splatsoil.commands._folder import measurement_of, note_other_sources
+from splatsoil.commands._output import print_remarks, stages
+from splatsoil.errors import ParameterError, RunError
+
+if TYPE_CHECKING:
+    from splatsoil.commands._output import Report, Stage
+    from splatsoil.experiment.plow import PlowExperiment
+    from splatsoil.inverse.criticism.simulations import Simulations
+    from splatsoil.inverse.run_folder import RunFolder
+    from splatsoil.measurement import Measurement
+    from splatsoil.model import Model
+    from splatsoil.reconstruction import Reconstruction
+    from splatsoil.soil.effect import Effect
+
+
+@dataclass(frozen=True)
+class ModelSpec:
+    """What makes a run's model, beside its set and reconstruction.
+
+    Attributes:
+        effects: names of those that are on, or files.
+        preset: resolution of the solver.
+        parameters: names of the free ones.
+    """
+
+    effects: tuple[str, ...]
+    preset: str
+    parameters: tuple[str, ...]
+
+    @classmethod
+    def of(cls, fit: Mapping[str, Any]) -> ModelSpec:
+        """What ``fit.json`` is a fit of."""
+        setup = fit["setup"]
+        return cls(tuple(setup["effects"]), setup["preset"], tuple(fit["parameters"]))
+
+
+@contextmanager
+def loaded(options: Any, folder: RunFolder, spec: ModelSpec | None = None) -> Iterator[tuple[Model, Stage]]:
+    """The model of a run, and what begins a stage, while these last; says if other sources made the fit.
+
+    Args:
+        options: of a command; ``device`` is where it computes, with ``json`` nothing is said of progress.
+        folder: the run.
+        spec: of the model; that of the latest fit if not given.
+    """
+    from splatsoil.envs.devices import resolve_device
+    from splatsoil.quiet import hush
+
+    hush()
+    device = resolve_device(options.device)
+    note_other_sources(folder)
+    with stages(quiet=getattr(options, "json", False)) as begin:
+        yield model_of(folder, device, begin("reconstruct"), spec=spec), begin
+
+
+def model_of(
+    folder: RunFolder, device: str, report: Report, *, spec: ModelSpec | None = None, make: bool = True
+) -> Model:
+    """The model that a run's latest fit is of, or a chosen one, on one device.
+
+    Args:
+        folder: the run.
+        device: ``cpu`` or ``cuda:N``.
+        report: progress.
+        spec: of the chosen model.
+        make: whether a reconstruction that isn't kept is made, and remarks on the set are printed.
+
+    Raises:
+        RunError: the reconstruction is damaged, or it isn't there and may not be made.
+    """
+    spec = spec or ModelSpec.of(folder.fit())
+    measurement = measurement_of(folder)
+    if make:
+        print_remarks(measurement)
+    reconstruction = reconstructed(measurement, folder, device, report, make=make)
+    return model_on(measurement, folder, reconstruction, spec.effects, spec.preset, device)
+
+
+def reconstructed(
+    measurement: Measurement, run: RunFolder, device: str, report: Report, *, make: bool = True
+) -> Reconstruction:
+    """The run's reconstruction: from the folder, or made and kept there.
+
+    Raises:
+        RunError: what is kept is damaged, or nothing is and it may not be made.
+    """
+    from splatsoil import __version__
+    from splatsoil.files import RECONSTRUCTING, code_digest
+    from splatsoil.reconstruction import Reconstruction, reconstruct
+
+    preset, seed = run.description["preset"], run.description["seed"]
+    wanted = {
+        "measurement_hash": measurement.hash,
+        "preset": preset,
+        "seed": seed,
+        "version": __version__,
+        "code": code_digest(RECONSTRUCTING),
+    }
+    if (run.reconstruction / "reconstruction.json").is_file():
+        report("reading", 0.0)
+        try:
+            kept = Reconstruction.load(run.reconstruction)
+        except RunError as error:
+            raise RunError(f"{error}: delete the folder {run.reconstruction} and run the command again") from error
+        if all(kept.metadata.get(key) == value for key, value in wanted.items()):
+            return kept
+    if not make:
+        raise RunError(f"{run.path}: its reconstruction isn't there")
+    made = reconstruct(measurement, seed=seed, device=device, preset=preset, progress=report)
+    with run.lock():
+        made.save(run.reconstruction)
+    # Read back: float32 on disk is what every later command will start from.
+    return Reconstruction.load(run.reconstruction)
+
+
+def model_on(
+    measurement: Measurement,
+    run: RunFolder,
+    reconstruction: Reconstruction,
+    effects: Iterable[str],
+    preset: str,
+    device: str,
+) -> Model:
+    """A model of a run's set. What photographs say of light and albedo is kept in the run's ``features/``: processes
+    that work side by side, and later commands, find it there."""
+    from splatsoil import __version__
+    from splatsoil.files import FORWARD, code_digest
+    from splatsoil.inverse.evaluations import digest
+    from splatsoil.model import Model
+
+    what = {
+        "measurement": measurement.hash,
+        "reconstruction": reconstruction_digest(reconstruction),
+        "device": device.split(":")[0],
+        "version": __version__,
+        "code": code_digest(FORWARD),
+    }
+
+    def file(spacing: float) -> Path:
+        return run.path / "features" / f"intrinsic-{digest({**what, 'spacing': spacing})[:24]}.npz"
+
+    return Model(measurement, reconstruction, effects=effects, preset=preset, device=device, intrinsic=file)
+
+
+def reconstruction_digest(reconstruction: Reconstruction) -> str:
+    """SHA-256 of what simulations and pictures start from; the same arrays, the same digest."""
+    digest = hashlib.sha256()
+    g = reconstruction.gaussians
+    tensors = (g.means, g.scales, g.quaternions, g.opacities, g.colours, reconstruction.soil, reconstruction.tool)
+    for tensor in tensors:
+        digest.update(np.ascontiguousarray(tensor.detach().cpu().numpy()).tobytes())
+    digest.update(np.ascontiguousarray(reconstruction.surface.height).tobytes())
+    return digest.hexdigest()
+
+
+def experiment_of(
+    folder: RunFolder, model: Model, spec: ModelSpec, effects: Iterable[str] | None = None
+) -> tuple[PlowExperiment, Simulations]:
+    """The run as an experiment, with some effects as candidates or all, and its simulations, kept in ``features/``.
+
+    Raises:
+        ParameterError: an effect that is unknown or on already.
+    """
+    from splatsoil import __version__
+    from splatsoil.experiment.plow import PlowExperiment
+    from splatsoil.files import code_digest, code_of, own_files
+    from splatsoil.inverse.criticism.simulations import Simulations
+    from splatsoil.soil.library import find_effects
+
+    named = None if effects is None else tuple(effects)
+    wanted = None if named is None else off_effects(named, model.law.effects)
+    experiment = PlowExperiment(model, spec.parameters, candidates=wanted)
+    identity = {
+        "measurement": folder.description["measurement"]["hash"],
+        "reconstruction": reconstruction_digest(model.reconstruction),
+        "model": sorted(experiment.model),
+        "preset": model.preset,
+        "device": model.device.split(":")[0],
+        "version": __version__,
+        "code": code_of(spec.effects),
+        "layout": list(experiment.layout.shape),
+    }
+    # A file counts for what it is on in alone: simulations of the model as it is are there already.
+    own = {e.name: code_digest((), [file]) for file in own_files(named or ()) for e in find_effects([file])}
+    return experiment, Simulations(experiment, folder.path / "features", identity, sources=own)
+
+
+def off_effects(names: Iterable[str], on: Iterable[Effect]) -> tuple[Effect, ...]:
+    """Effects by name, or from files, that are none of those that are on.
+
+    Raises:
+        ParameterError: one is unknown, on already, or no more than discretisation error to a diagnosis.
+    """
+    from splatsoil.soil.library import find_effects
+
+    wanted, taken = find_effects(names), {effect.name for effect in on}
+    for effect in wanted:
+        if effect.name in taken:
+            raise ParameterError(f"effect {effect.name} is on already; name one that is off")
+        if effect.numerical:
+            raise ParameterError(
+                f"effect {effect.name} can't be told from other numerics, which a diagnosis allows for; "
+                f"fit it: splatsoil fit SET --with {effect.name}"
+            )
+    return wanted

@@ -1,0 +1,1 @@
+"""Measurement sets out of what other programs and instruments recorded."""
