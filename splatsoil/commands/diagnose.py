@@ -24,7 +24,7 @@ class Config(RunOptions):
     """
 
     effects: tuple[str, ...] = option(
-        (), "Effects to consider, by name, or files that define some; the whole library if not given."
+        (), "Effects to consider, by name, or files that define some; all that such data tell if not given."
     )
     device: str = option("auto", DEVICE)
     json: bool = option(False, JSON)

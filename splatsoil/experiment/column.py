@@ -16,7 +16,7 @@ from splatsoil.mpm import PRESETS, Resolution, Solver
 from splatsoil.soil.effect import Effect
 from splatsoil.soil.settings import FRICTION_ANGLE, Settings
 
-ACROSS = 0.5
+ACROSS = 1.5
 """Cells along the column's radius, over the preset's along a tool's width."""
 GRAVITY = 9.81
 REACH = 2.5

@@ -70,7 +70,8 @@ class PlowExperiment:
     Args:
         model: the model at hand; candidates are the library's effects that it doesn't have.
         parameters: names of its free parameters.
-        candidates: effects to consider, by name or from a file; all of the library by default.
+        candidates: effects to consider, by name or from a file; by default all of the library but those that only
+            tests of a laboratory tell.
         numerics: names of other numerics to consider.
         progress: called with (frame, last frame) while a simulation runs.
     """
@@ -95,7 +96,8 @@ class PlowExperiment:
         self.numerics = tuple(numerics)
         self.redrawn = tuple(name for name in self.numerics if name == ROUNDING)
         self.progress = progress
-        wanted = tuple(library().values()) if candidates is None else find_effects(candidates)
+        told = (effect for effect in library().values() if not effect.laboratory)
+        wanted = tuple(told) if candidates is None else find_effects(candidates)
         self._wanted: dict[str, Effect] = {effect.name: effect for effect in wanted if not effect.numerical}
         self.candidates: tuple[Candidate, ...] = candidates_of(
             (e.for_measurement(model.measurement) for e in self._wanted.values()), model.law.effects

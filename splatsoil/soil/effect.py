@@ -38,6 +38,8 @@ class Effect:
         source: paper or textbook with equation.
         conflicts: effects that cannot be on at the same time, with the reason.
         numerical: whether it changes what other numerics change: diagnoses allow for these, and can't tell it.
+        laboratory: whether tests of a laboratory are needed to tell it from others: diagnoses of photographs consider
+            it by name only.
     """
 
     name: ClassVar[str]
@@ -48,6 +50,7 @@ class Effect:
     strength: ClassVar[Any | None] = None
     conflicts: ClassVar[Mapping[str, str]] = {}
     numerical: ClassVar[bool] = False
+    laboratory: ClassVar[bool] = False
 
     @property
     def observes(self) -> bool:

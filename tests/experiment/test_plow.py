@@ -70,11 +70,13 @@ def test_an_unknown_way_is_not_taken_for_the_usual_one() -> None:
         PlowExperiment._variant(experiment, ("cohesion",), "finer")
 
 
-def test_what_is_numerics_is_no_candidate(small_set: Path) -> None:
+def test_what_is_numerics_or_takes_a_laboratory_is_no_candidate(small_set: Path) -> None:
     measurement = Measurement.load(small_set)
     surface = HeightField.over(measurement.bed.lower, measurement.bed.upper, 0.02, 0.12)
     model = Model(measurement, cast(Any, SimpleNamespace(surface=surface)), preset="tiny")
-    assert {c.name for c in PlowExperiment(model).candidates} == {n for n in library() if n != "stiffness"}
+    others = {"stiffness", "critical_state", "hardening", "intermediate_stress"}
+    assert {c.name for c in PlowExperiment(model).candidates} == set(library()) - others
+    assert [c.name for c in PlowExperiment(model, candidates=["hardening"]).candidates] == ["hardening"]
     with pytest.raises(ParameterError, match="other numerics"):
         off_effects(["stiffness"], ())
 

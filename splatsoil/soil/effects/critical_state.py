@@ -68,6 +68,7 @@ class CriticalState(Effect):
         "softening": "both say how friction falls from its peak",
         "compaction": "both say how loose soil becomes denser in shear",
     }
+    laboratory = True
     strength = of_density
 
     def columns(self, settings: Settings, values: Mapping[str, float]) -> Sequence[float]:

@@ -56,4 +56,5 @@ class Hardening(Effect):
         "Kondner (1963), J. Soil Mech. Found. Div. 89(1); exponent, failure ratio: Duncan & Chang (1970), "
         "J. Soil Mech. Found. Div. 96(5); volume: Rowe (1962), Proc. R. Soc. A 269"
     )
+    laboratory = True
     strength = mobilised

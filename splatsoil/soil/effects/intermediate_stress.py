@@ -51,4 +51,5 @@ class IntermediateStress(Effect):
         "plate, before a blade, in a shear box. Sand has about one friction angle in all of them."
     )
     source = "Matsuoka & Nakai (1974), Proc. JSCE 232; its root: Panteghini & Lagioia (2014), Géotechnique 64(12)"
+    laboratory = True
     strength = matsuoka_nakai
