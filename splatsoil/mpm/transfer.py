@@ -165,17 +165,57 @@ def packing(nodes: Nodes, grid: Grid, node: int, full: float) -> float:
     return mass / full
 
 
+@wp.struct
+class Soil:
+    """What of a cell is soil: its share, and the means of local coordinates and of their products yz, xz and xy."""
+
+    volume: float
+    middle: wp.vec3
+    spread: wp.vec3
+
+
+@wp.func
+def soil_of_cell(nodes: Nodes, grid: Grid, base: int, full: float) -> Soil:
+    """Soil is where the nodes' density (trilinear) is above half of the bulk's: where the surface of level ground lies.
+
+    So a cell within the soil is full, however its particles lie (Beuth, Wieckowski & Vermeer 2011). Counted by these,
+    it would hold an eighth more or less whenever one of eight crosses its face, and flow would lose volume. A cell
+    that the surface cuts is summed up by pieces, of which a plane may cut off a share.
+    """
+    above = vec8()
+    slope = wp.vec3()
+    for corner in range(8):
+        above[corner] = packing(nodes, grid, base + corner_offset(grid, corner), full) - 0.5
+        slope += 0.25 * above[corner] * side_of(corner)
+    # by how much the density changes across a piece
+    change = (wp.abs(slope[0]) + wp.abs(slope[1]) + wp.abs(slope[2])) / float(SUBCELLS) + 1.0e-6
+    soil = Soil()
+    if wp.min(above) >= 0.5 * change:
+        soil.volume = 1.0
+        soil.middle = wp.vec3(0.5)
+        soil.spread = wp.vec3(0.25)
+    else:
+        for piece in range(SUBCELLS * SUBCELLS * SUBCELLS):
+            x, y, z = piece / (SUBCELLS * SUBCELLS), (piece / SUBCELLS) % SUBCELLS, piece % SUBCELLS
+            f = (wp.vec3(float(x), float(y), float(z)) + wp.vec3(0.5)) / float(SUBCELLS)
+            value = wp.float32(0.0)
+            for corner in range(8):
+                value += corner_weight(f, corner) * above[corner]
+            part = wp.clamp(0.5 + value / change, 0.0, 1.0) / float(SUBCELLS * SUBCELLS * SUBCELLS)
+            soil.volume += part
+            soil.middle += part * f
+            soil.spread += part * wp.vec3(f[1] * f[2], f[0] * f[2], f[0] * f[1])
+        soil.middle = soil.middle / wp.max(soil.volume, 1.0e-6)
+        soil.spread = soil.spread / wp.max(soil.volume, 1.0e-6)
+    return soil
+
+
 @wp.kernel(enable_backward=False)
 def average_cells(
     particles: Particles, cells: Cells, nodes: Nodes, grid: Grid, density: float, stiffness: float
 ) -> None:
     """Sums to means, and the part of each cell that is soil; ``stiffness`` = c (K + 4G/3) dt^2 turns a node's share of
     stiffness into the least stable inertia.
-
-    Soil is where the nodes' density (trilinear) is above half of the bulk's, ``density`` (kg/m^3): where the surface of
-    level ground lies. So a cell within the soil is full and has its mean gradient in its middle, however its particles
-    lie; counted by these, it would hold an eighth more or less whenever one of eight crosses its face, and flow would
-    lose volume.
 
     Trilinear weights vanish at a cell's faces but their gradients do not, so a node reached only by the edge of a
     particle would be flung away by stress. The inertia bound is the central-difference limit node by node.
@@ -192,35 +232,12 @@ def average_cells(
             cells.depth[entry] = share * cells.depth[entry]
         capacity = grid.cell[0] * grid.cell[1] * grid.cell[2]
         base = cells.node[entry]
-        above = vec8()
-        slope = wp.vec3()
-        for corner in range(8):
-            above[corner] = packing(nodes, grid, base + corner_offset(grid, corner), density * capacity) - 0.5
-            slope += 0.25 * above[corner] * side_of(corner)
-        # by how much the density changes across a piece, and so the share of it that a plane cuts off
-        change = (wp.abs(slope[0]) + wp.abs(slope[1]) + wp.abs(slope[2])) / float(SUBCELLS) + 1.0e-6
-        volume, middle, spread = wp.float32(1.0), wp.vec3(0.5), wp.vec3(0.25)
-        if wp.min(above) < 0.5 * change:
-            volume, middle, spread = wp.float32(0.0), wp.vec3(), wp.vec3()
-            for piece in range(SUBCELLS * SUBCELLS * SUBCELLS):
-                index = wp.vec3(
-                    float(piece / (SUBCELLS * SUBCELLS)), float((piece / SUBCELLS) % SUBCELLS), float(piece % SUBCELLS)
-                )
-                f = (index + wp.vec3(0.5)) / float(SUBCELLS)
-                value = wp.float32(0.0)
-                for corner in range(8):
-                    value += corner_weight(f, corner) * above[corner]
-                part = wp.clamp(0.5 + value / change, 0.0, 1.0) / float(SUBCELLS * SUBCELLS * SUBCELLS)
-                volume += part
-                middle += part * f
-                spread += part * wp.vec3(f[1] * f[2], f[0] * f[2], f[0] * f[1])
-            middle /= wp.max(volume, 1.0e-6)
-            spread /= wp.max(volume, 1.0e-6)
-        cells.volume[entry] = volume * capacity
+        soil = soil_of_cell(nodes, grid, base, density * capacity)
+        cells.volume[entry] = soil.volume * capacity
         # loose grains bear nothing, but the tool may strike them
         stiff = stiffness * wp.max(cells.volume[entry], particles.volume / share)
         for corner in range(8):
-            gradient = mean_gradient(middle, spread, corner, grid.inverse)
+            gradient = mean_gradient(soil.middle, soil.spread, corner, grid.inverse)
             cells.gradient[8 * entry + corner] = gradient
             wp.atomic_add(nodes.inertia, base + corner_offset(grid, corner), stiff * wp.length_sq(gradient))
 
