@@ -187,7 +187,7 @@ def _thinned(points: Array, spacing: Array, allowed: NDArray[np.bool_]) -> NDArr
 def colours_seen(views: Views, relief: Relief, seeds: Seeds, *, batch: int = 8192) -> Array:
     """(n, 3) median colour of each disc over the photographs that see it.
 
-    Discs that none sees get the colour of the nearest one that is seen; the soil's sides that of the sides.
+    Discs that none sees get the colour of the nearest one that is seen.
     """
     n, device = len(seeds.points), views.images.device
     colour, count = np.zeros((n, 3)), np.zeros(n)
@@ -209,14 +209,12 @@ def colours_seen(views: Views, relief: Relief, seeds: Seeds, *, batch: int = 819
         known = torch.where((weight > 0)[:, None], colours, torch.nan)
         colour[part] = torch.nanmedian(known, dim=0).values.T.cpu().numpy()
         count[part] = (weight > 0).sum(0).cpu().numpy()
-    side = seeds.label == SIDE
-    for alike in (side, ~side):  # the foot of soil's sides is nearest to the ground
-        blind, known = alike & (count == 0), alike & (count > 0)
-        if not known.any():
-            colour[blind] = 0.5
-        elif blind.any():
-            _, nearest = cKDTree(seeds.points[known]).query(seeds.points[blind])
-            colour[blind] = colour[known][nearest]
+    blind = count == 0
+    if blind.all():
+        colour[:] = 0.5
+    elif blind.any():
+        _, nearest = cKDTree(seeds.points[~blind]).query(seeds.points[blind])
+        colour[blind] = colour[~blind][nearest]
     return colour
 
 
