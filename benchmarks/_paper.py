@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from splatsoil.benchmarks._simulations import FEWEST, density_of
-from splatsoil.inverse.bayesopt import PAPER, BayesianOptimiser, Told
-from splatsoil.inverse.marginal import Marginal
+from splatsoil.inverse.bayesopt import BayesianOptimiser, Told
 
 from splatsoil.comparison import Comparator
 from splatsoil.errors import SimulationError
@@ -40,6 +39,8 @@ SPACE = ParameterSpace([replace(FRICTION_ANGLE, lower=25.0, upper=55.0)])
 #: Ways that spend evaluations of their own.
 SEARCHES = ("published", "ours")
 WAYS = (*SEARCHES, "features")
+#: Seed of the published way's first search: its start is random, and another one than ours.
+FIRST_OF_PUBLISHED = 1000
 
 
 @dataclass(frozen=True)
@@ -195,7 +196,10 @@ class Trial:
 
 def optimiser_of(way: str, seed: int, told: Sequence[Told]) -> BayesianOptimiser:
     """The search of a way, with what it has been told."""
-    optimiser = BayesianOptimiser(1, seed=seed, search=PAPER if way == "published" else None)
+    if way == "published":
+        optimiser = BayesianOptimiser(1, seed=FIRST_OF_PUBLISHED + seed, start=1, acquisition="best")
+    else:
+        optimiser = BayesianOptimiser(1, seed=seed)
     for t in told:
         optimiser.tell(t.action, t.loss)
     return optimiser
@@ -203,7 +207,7 @@ def optimiser_of(way: str, seed: int, told: Sequence[Told]) -> BayesianOptimiser
 
 def propose(way: str, seed: int, told: Sequence[Told]) -> float:
     """The angle to try next."""
-    return float(SPACE.from_unit(optimiser_of(way, seed, told).ask().astype(np.float64))[0])
+    return float(SPACE.from_unit(optimiser_of(way, seed, told).ask()[0].astype(np.float64))[0])
 
 
 def conclude(way: str, seed: int, told: Sequence[Told]) -> dict[str, float]:
@@ -225,7 +229,7 @@ def by_features(
         return None
     points, residuals = space.to_unit(angles[:, None]), blocks[:, seen]
     density = density_of(space, points, -residuals, np.zeros(residuals.shape[1]), sensor, seed)
-    marginal = Marginal.of(next(iter(space)), density.comparison.judge())
+    marginal = density.comparison.judge().marginal(space.names[0])
     low, high = marginal.quantile(0.05), marginal.quantile(0.95)
     return {"estimate": marginal.mean, "std": marginal.std, "low": low, "high": high}
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from splatsoil.benchmarks._paper import WAYS, Images, Look, Say, Sight, by_features, look, threads
-from splatsoil.inverse.surrogate import Surrogate
+from splatsoil.inverse.bayesopt import Surrogate
 
 from splatsoil.comparison import Comparator
 from splatsoil.errors import SimulationError

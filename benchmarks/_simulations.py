@@ -12,18 +12,16 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from splatsoil.envs.levels import is_full
 from splatsoil.envs.measured import LOSS, MeasuredProblem, cache_folder
-from splatsoil.envs.problem import Problem
+from splatsoil.envs.problem import Job, Problem
 from splatsoil.envs.synthetic import SyntheticProblem
 from splatsoil.envs.synthetic_world import World
-from splatsoil.inverse.campaign import Job, run_campaign
+from splatsoil.inverse.bayesopt import sobol
 from splatsoil.inverse.criticism.design import Prior, Run
 from splatsoil.inverse.criticism.diagnosis import BASE
 from splatsoil.inverse.criticism.noise import Tables, noise_of
-from splatsoil.inverse.evaluations import EvaluationRecord, EvaluationStore, digest, writer_lock
+from splatsoil.inverse.evaluations import EvaluationRecord, EvaluationStore, digest, evaluate, writer_lock
 from splatsoil.inverse.posterior import Density
-from splatsoil.inverse.surrogate import sobol
 
 import splatsoil
 from splatsoil.experiment import Layout, Site
@@ -56,8 +54,8 @@ class Data:
 
     @classmethod
     def of(cls, space: ParameterSpace, records: Sequence[EvaluationRecord]) -> Data:
-        """Those that succeeded, at full resolution; blocks hidden in any of them are left out."""
-        good = [r for r in records if r.status == "ok" and is_full(r.parameters)]
+        """Those that succeeded; blocks hidden in any of them are left out."""
+        good = [r for r in records if r.loss is not None]
         blocks = np.array([r.blocks for r in good])
         points = space.to_unit(np.stack([space.to_vector(r.parameters) for r in good]))
         return cls(space, points, blocks[:, np.all(blocks != 0.0, axis=0)])
@@ -141,22 +139,18 @@ def simulations(
     jobs = jobs_at(problem.space, np.concatenate([points, np.zeros((repeats, len(problem.space)))]), seed)
     file = cache_folder() / "simulations" / f"{digest({**model, 'parameters': list(parameters)})[:16]}.db"
     with writer_lock(file.parent), EvaluationStore(file) as store:
-        records = run_campaign(
-            problem,
-            jobs,
-            store,
-            model,
-            {"agent": "simulations", "parameters": list(parameters), "count": count, "seed": seed, "repeats": repeats},
-            executor=executor,
-            after_evaluation=None if progress is None else lambda done, _: progress(done, len(jobs)),
-        )
+        records = []
+        for record in evaluate(problem, jobs, store, model, pool=executor):
+            records.append(record)
+            if progress is not None:
+                progress(len(records), len(jobs))
     return Data.of(problem.space, records), file
 
 
 def jobs_at(space: ParameterSpace, points: FloatArray, seed: int) -> list[Job]:
     """One evaluation at each point (k, n) of [-1, 1]^n, no two with the same particles."""
     seeds = np.random.SeedSequence([seed, 9]).generate_state(len(points)) % 2**31
-    return [Job(space.to_dict(space.from_unit(p)), int(s)) for p, s in zip(points, seeds, strict=True)]
+    return [(space.to_dict(space.from_unit(p)), int(s)) for p, s in zip(points, seeds, strict=True)]
 
 
 def _problem(

@@ -23,6 +23,7 @@ import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol
 
 import emcee
@@ -32,11 +33,10 @@ from splatsoil.benchmarks._common import output_options, simulated, stamp, ticke
 from splatsoil.benchmarks._simulations import FEWEST, density_of
 from splatsoil.envs.synthetic import SyntheticProblem
 from splatsoil.envs.together import attempt
-from splatsoil.inverse.bayesopt import PAPER, BayesianOptimiser, Search
-from splatsoil.inverse.executors import Executor, Serial, executor, in_order
+from splatsoil.inverse.bayesopt import BayesianOptimiser, sobol
+from splatsoil.inverse.executors import Executor, Serial, executor
 from splatsoil.inverse.mcmc import sample
 from splatsoil.inverse.posterior import Density
-from splatsoil.inverse.surrogate import sobol
 
 from splatsoil.errors import ParameterError
 from splatsoil.parameters import ParameterSpace
@@ -125,17 +125,17 @@ class Answer:
     seconds: float
 
 
-def play(world: World, budgets: Sequence[int], seed: int, search: Search | None) -> tuple[dict[int, Answer], Any]:
-    """Bayesian optimisation: an answer at each budget, and the calls (points, features)."""
+def play(world: World, budgets: Sequence[int], seed: int, **options: Any) -> tuple[dict[int, Answer], Any]:
+    """Bayesian optimisation with options of its own: an answer at each budget, and the calls (points, features)."""
     rng = np.random.default_rng([seed, 31])
-    optimiser = BayesianOptimiser(len(world.space), seed=seed, search=search)
+    optimiser = BayesianOptimiser(len(world.space), seed=seed, **options)
     answers: dict[int, Answer] = {}
     points: list[FloatArray] = []
     features: list[FloatArray] = []
     spent = 0.0
     while len(points) < max(budgets):
         began = time.perf_counter()
-        action = optimiser.ask().astype(np.float64)
+        action = optimiser.ask()[0].astype(np.float64)
         spent += time.perf_counter() - began
         loss, residual = world.call(action, rng)
         optimiser.tell(action, loss)
@@ -152,9 +152,9 @@ def play(world: World, budgets: Sequence[int], seed: int, search: Search | None)
 def sample_emulated(space: ParameterSpace, points: FloatArray, features: FloatArray, seed: int) -> Answer:
     """emcee on an emulator of calls (k, n), (k, b); features are residuals, so the observed ones are 0."""
     began = time.perf_counter()
-    ends, count = np.ones(len(space)), features.shape[1]
+    count = features.shape[1]
     density = density_of(space, points, features, np.zeros(count), 0.0, seed)
-    chains = sample(density, -ends, ends, seed=seed, ensembles=2, most_steps=1000)
+    chains = sample(density, len(space), seed=seed, ensembles=2, most_steps=1000)
     low, high = np.quantile(chains.flat, [0.05, 0.95], axis=0)
     return Answer(chains.flat.mean(axis=0), low, high, time.perf_counter() - began)
 
@@ -198,10 +198,10 @@ def trial(
     out: dict[str, dict[int, Answer]] = {}
     calls = None
     if "bo" in ways or "both" in ways:
-        answers, calls = play(world, budgets, seed, None)
+        answers, calls = play(world, budgets, seed)
         out["bo"] = answers
     if "paper" in ways:
-        out["paper"] = play(world, budgets, seed, PAPER)[0]
+        out["paper"] = play(world, budgets, seed, start=1, acquisition="best")[0]
     if "mcmc" in ways:
         noise = np.random.default_rng([seed, 41])
         points = sobol(max(budgets), n, seed)
@@ -229,8 +229,8 @@ def run(
     space = world.space
     rows: dict[tuple[str, int], list[dict[str, Any]]] = {}
     pool = pool or Serial()
-    jobs = [(world, ways, budgets, direct, chance, seed) for seed in range(seeds)]
-    for seed, answers_of in enumerate(in_order(pool, trial, jobs)):
+    job = partial(trial, world, ways, budgets, direct, chance)
+    for seed, answers_of in enumerate(pool.map(job, range(seeds))):
         truth = np.random.default_rng([seed, 29]).uniform(-INNER, INNER, len(space))
         for way, answers in answers_of.items():
             for budget, answer in answers.items():

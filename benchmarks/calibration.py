@@ -24,8 +24,7 @@ import numpy.typing as npt
 from scipy.stats import binom, chisquare
 from splatsoil.benchmarks._common import output_options, simulated, stamp, ticker, world_options, write_result
 from splatsoil.benchmarks._simulations import Data, density_of
-from splatsoil.inverse.executors import Executor, Serial, executor, in_order
-from splatsoil.inverse.marginal import Marginal
+from splatsoil.inverse.executors import Executor, Serial, executor
 
 from splatsoil.parameters import ParameterSpace
 from splatsoil.quiet import hush
@@ -80,7 +79,7 @@ def calibrate(
             train = np.concatenate([np.sort(chosen), train[train >= truths]])
         jobs.append((data, train, test, sensor_std, seed, number))
     out: list[dict[str, Any]] = []
-    for entries in in_order(pool, one_fold, jobs):
+    for entries in pool.map(one_fold, *zip(*jobs, strict=True)):
         out += entries
         if progress is not None:
             progress(len(out), truths)
@@ -103,7 +102,7 @@ def one_fold(
         observed = features[index] + sensor_std * rng.standard_normal(features.shape[1])
         density = density_of(space, data.points[train], features[train], observed, sensor_std, seed)
         evidence = density.comparison.judge()
-        marginals = [Marginal.of(p, evidence) for p in space]
+        marginals = [evidence.marginal(p.name) for p in space]
         weights = marginals[0].weights
         chosen = rng.choice(len(weights), DRAWS, p=weights / weights.sum())
         draws = space.to_unit(np.stack([m.values[chosen] for m in marginals], axis=1))

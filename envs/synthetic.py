@@ -7,7 +7,7 @@ loss is chance and not zero. It is a toy for trying agents on; an answer about r
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -159,23 +159,6 @@ class SyntheticProblem:
         self.observed()
         evaluation = self.judge(self.predict(parameters, seed))
         return replace(evaluation, seconds=time.perf_counter() - began)
-
-    def cheaper(self, preset: str) -> tuple[Callable[[Mapping[str, float], int], Evaluation], float]:
-        """Evaluation by a coarser simulation, against the same observation, and its cost in units of a full one.
-
-        Raises:
-            ParameterError: a preset that is unknown or no cheaper.
-        """
-        from .levels import relative_cost
-
-        world = World(self.effects, preset, self.device)
-
-        def evaluate(parameters: Mapping[str, float], seed: int) -> Evaluation:
-            particles = world.particles(seed)
-            found = world.simulate(particles, parameters)
-            return self.judge(world.pictures(particles, found.positions, found.deformations))
-
-        return evaluate, relative_cost(self.world.resolution, world.resolution)
 
     def judge(self, predicted: Image) -> Evaluation:
         """Predicted pictures (k, h, w, 3) compared with the observed ones."""

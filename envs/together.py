@@ -12,13 +12,11 @@ import numpy as np
 
 from splatsoil.errors import SimulationError
 
-from .problem import Evaluation, Problem
+from .problem import Evaluation, Job, Problem
 
 if TYPE_CHECKING:
     from .measured import MeasuredProblem
     from .synthetic import SyntheticProblem
-
-Job = tuple[Mapping[str, float], int]
 
 
 def attempt(problem: Problem, parameters: Mapping[str, float], seed: int) -> Evaluation:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import os
 import tempfile
 import warnings
 from collections.abc import Sequence
@@ -58,18 +57,12 @@ def inference_data(posterior: Posterior) -> arviz.InferenceData:
 def write_inference_data(posterior: Posterior, path: Path) -> Path:
     """As NetCDF, whole or not at all; ``arviz.from_netcdf`` reads it."""
     data = inference_data(posterior)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    descriptor, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
-    os.close(descriptor)
-    temporary = Path(name)
     try:
-        data.to_netcdf(name, engine="h5netcdf")
-        temporary.replace(path)
+        with tempfile.TemporaryDirectory() as folder:
+            made = Path(data.to_netcdf(str(Path(folder) / path.name), engine="h5netcdf"))
+            return write_bytes(path, made.read_bytes())
     except OSError as error:
-        raise RunError(f"{path}: cannot be written ({error}); free some space and try again") from error
-    finally:
-        temporary.unlink(missing_ok=True)
-    return path
+        raise RunError(f"{path}: cannot be made ({error}); free some space and try again") from error
 
 
 def predictive_scores(posterior: Posterior, count: int, seed: int = 0) -> FloatArray:

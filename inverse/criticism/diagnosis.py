@@ -195,15 +195,13 @@ def diagnose(
         if c.name in evidence.models
         for size in [detectable(comparison, evidence, c, seed)]
     }
-    names = [p.name for p in prior.space]
-    estimates = {name: evidence.averaged(name) for name in names}
-    spread = {p.name: (p.upper - p.lower) / np.sqrt(12.0) for p in prior.space}
+    averaged = {p.name: evidence.marginal(p.name) for p in prior.space}
     return Diagnosis(
         verdict,
         members,
         evidence,
-        estimates,
-        {name: estimates[name][1] < 0.5 * spread[name] for name in names},
+        {name: (marginal.mean, marginal.std) for name, marginal in averaged.items()},
+        {p.name: averaged[p.name].std < 0.5 * (p.upper - p.lower) / np.sqrt(12.0) for p in prior.space},
         power,
         found,
         residuals,

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +21,7 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_t, qmc
 
 from splatsoil.experiment.base import Candidate
+from splatsoil.parameters import Parameter, ParameterSpace
 
 from .design import Prior, Run, effect_points, effect_values, sizes
 from .emulator import BaseEmulator, IncrementEmulator
@@ -41,6 +43,44 @@ PRIOR = 0.5
 """Probability of the base model beforehand; the others share the rest."""
 SLAB = 4.0
 """Standard deviation of an observation effect's sizes, over the smallest meaningful ones: its drawings are linear."""
+NEAR_BOUND, CROWDED = 0.05, 0.10
+"""A bound is reached where this share of the axis near it holds more than twice its share of the posterior."""
+
+
+@dataclass(frozen=True, eq=False)
+class Marginal:
+    """Weighted draws of one parameter.
+
+    Attributes:
+        values: (k,) in its unit.
+        weights: (k,) that sum to 1.
+    """
+
+    values: FloatArray
+    weights: FloatArray
+
+    @property
+    def mean(self) -> float:
+        """Mean."""
+        return float(self.weights @ self.values)
+
+    @property
+    def std(self) -> float:
+        """Standard deviation."""
+        return float(np.sqrt(self.weights @ (self.values - self.mean) ** 2))
+
+    def quantile(self, share: float) -> float:
+        """The value below which a share of the weight lies."""
+        order = np.argsort(self.values)
+        index = np.searchsorted(np.cumsum(self.weights[order]), share * self.weights.sum())
+        return float(self.values[order][min(int(index), len(order) - 1)])
+
+    def bounds_reached(self, parameter: Parameter) -> list[Literal["lower", "upper"]]:
+        """Bounds of the parameter's range that the posterior crowds at."""
+        unit = ParameterSpace([parameter]).to_unit(self.values[:, None])[:, 0]
+        edge = 1.0 - 2.0 * NEAR_BOUND
+        near: dict[Literal["lower", "upper"], npt.NDArray[np.bool_]] = {"lower": unit < -edge, "upper": unit > edge}
+        return [bound for bound, close in near.items() if float(self.weights @ close) > CROWDED]
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,9 +111,8 @@ class Model:
 
     def moments(self, name: str) -> tuple[float, float]:
         """Mean and standard deviation of a parameter."""
-        weights = self.weights.sum(axis=0)
-        mean = float(weights @ self.values[name])
-        return mean, float(np.sqrt(max(weights @ (self.values[name] - mean) ** 2, 0.0)))
+        marginal = Marginal(self.values[name], self.weights.sum(axis=0))
+        return marginal.mean, marginal.std
 
     @property
     def factors(self) -> FloatArray:
@@ -106,12 +145,11 @@ class Evidence:
         """The most probable model."""
         return max(self.probability, key=lambda name: self.probability[name])
 
-    def averaged(self, name: str) -> tuple[float, float]:
-        """Mean and standard deviation of a base parameter over models (Hoeting et al. 1999, Stat. Sci. 14:382)."""
-        known = [(self.probability[m], *model.moments(name)) for m, model in self.models.items()]
-        mean = sum(p * value for p, value, _ in known)
-        variance = sum(p * (std**2 + (value - mean) ** 2) for p, value, std in known)
-        return float(mean), float(np.sqrt(variance))
+    def marginal(self, name: str) -> Marginal:
+        """Posterior of a base parameter, averaged over models (Hoeting et al. 1999, Stat. Sci. 14:382)."""
+        weights = [self.probability[m] * model.weights.sum(axis=0) for m, model in self.models.items()]
+        values = [model.values[name] for model in self.models.values()]
+        return Marginal(np.concatenate(values), np.concatenate(weights))
 
 
 @dataclass(frozen=True)

@@ -75,8 +75,8 @@ def _density(values: Mapping[str, FloatArray], evidence: Evidence) -> FloatArray
     names = list(evidence.models[AS_IT_IS].values)
     z2 = np.zeros(len(next(iter(values.values()))))
     for name in names:
-        middle, std = evidence.averaged(name)
-        z2 = z2 + ((values[name] - middle) / max(std, 1e-12)) ** 2
+        averaged = evidence.marginal(name)
+        z2 = z2 + ((values[name] - averaged.mean) / max(averaged.std, 1e-12)) ** 2
     return np.asarray(np.exp(-0.5 * np.minimum(z2, 60.0)))
 
 

@@ -19,7 +19,7 @@ def anew(run: RunFolder, fit: Mapping[str, Any]) -> str:
 
     setup, entries = fit["setup"], history(run)
     parameters, effects, budget = tuple(fit["parameters"]), tuple(setup["effects"]), fit.get("evaluations")
-    if budget == EVALUATIONS * len(parameters) or setup.get("coarse") is not None:
+    if budget == EVALUATIONS * len(parameters):
         budget = None
     added: list[str] = []
     if len(entries) > 1 and entries[-1]["model"] == fit["name"]:
@@ -30,8 +30,6 @@ def anew(run: RunFolder, fit: Mapping[str, Any]) -> str:
         parameters=parameters,
         effects=effects,
         budget=budget,
-        search=setup.get("search", "usual"),
-        coarse=setup.get("coarse"),
         preset=setup["preset"],
         seed=run.description["seed"],
         run=run.path,

@@ -147,11 +147,7 @@ def judged(
         simulate=simulate,
         effects=with_effects,
         seed=seed,
-        known=[
-            Run(step["parameters"], seed=step["seed"])
-            for step in fit["history"]
-            if step["status"] == "ok" and step["level"] == "full"
-        ],
+        known=[Run(step["parameters"], seed=step["seed"]) for step in fit["history"] if step["status"] == "ok"],
         prior=prior_of(experiment, fit),
         progress=told,
     )

@@ -28,7 +28,7 @@ ORDER = {
 #: Options that a first run does without.
 EXPERT = frozenset(
     (
-        *("budget", "search", "coarse", "criticise", "most_effects", "seed", "particle_seed", "holdout", "checks"),
+        *("budget", "criticise", "most_effects", "seed", "particle_seed", "holdout", "checks"),
         *("scene", "like", "depth", "views", "picture_scale", "model", "every", "records", "void_ratio", "young"),
         *("poisson", "strain_rate", "matching", "known", "points", "robot_to_world", "mesh_to_flange", "video_every"),
     )
@@ -50,10 +50,6 @@ class FitOptions:
     """Effects of the model, by name, or files that define some."""
     budget: int | None = None
     """Evaluations; 10 for each free parameter if not given."""
-    search: Literal["usual", "paper"] = "usual"
-    """paper: as Hsiao and Kumar, expected improvement from one random start."""
-    coarse: Literal["tiny", "small", "paper"] | None = None
-    """Search with simulations at this coarser preset, too; --budget counts their cost."""
     preset: Literal["tiny", "small", "paper", "fine"] = "small"
     """Resolution; small suits a laptop without a graphics card."""
     device: str = "auto"
@@ -80,8 +76,6 @@ class FitOptions:
                 ("--parameters", self.parameters, ()),
                 ("--with", self.effects, ()),
                 ("--budget", self.budget, None),
-                ("--search", self.search, "usual"),
-                ("--coarse", self.coarse, None),
                 ("--preset", self.preset, "small"),
                 ("--device", self.device, "auto"),
                 ("--seed", self.seed, 0),

@@ -15,7 +15,7 @@ from splatsoil.commands._output import print_json
 class Config(RunOptions):
     """Sample the posterior: intervals, correlations, ArviZ file.
 
-    It is the posterior that the estimate and ± of the latest fit are of. Sampling that was interrupted goes on.
+    It is the posterior that the estimate and ± of the latest fit are of.
     """
 
     checks: int = 3
@@ -37,7 +37,7 @@ def run(config: Config) -> int:
     from splatsoil.commands._progress import stages
     from splatsoil.envs.devices import resolve_device
     from splatsoil.errors import ParameterError
-    from splatsoil.inverse.posterior_run import run_posterior
+    from splatsoil.inverse.posterior import Density, run_posterior
     from splatsoil.quiet import hush
 
     for name in ("checks", "seed"):
@@ -72,8 +72,7 @@ def run(config: Config) -> int:
                 folder,
                 experiment,
                 simulate,
-                found.evidence.noise,
-                criticism.prior_of(experiment, fit),
+                Density.of(found.evidence.noise, criticism.prior_of(experiment, fit), seed),
                 checks=config.checks,
                 seed=config.seed,
                 progress=begin("posterior"),
@@ -94,7 +93,7 @@ def interrupted(config: Config) -> str:
         ("--seed", config.seed, 0),
         ("--json", config.json, False),
     )
-    return f"what was simulated and sampled is kept; go on with: {again}"
+    return f"what was simulated is kept; go on with: {again}"
 
 
 def show(result: Mapping[str, Any], folder: str) -> None:

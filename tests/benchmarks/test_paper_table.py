@@ -15,7 +15,7 @@ import torch
 from splatsoil.benchmarks import _paper, _paper_budget, paper_table
 from splatsoil.benchmarks._common import keep_to_one_protocol
 from splatsoil.benchmarks._paper import FRAMES, Look, Protocol, Trial
-from splatsoil.inverse import surrogate
+from splatsoil.inverse import bayesopt
 from splatsoil.inverse.executors import Serial
 
 from splatsoil.comparison import Block
@@ -241,8 +241,8 @@ def test_a_folder_keeps_one_protocol(tmp_path: Path) -> None:
 def test_trials_of_another_search_are_not_gone_on_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     keep_to_one_protocol(tmp_path, paper_table.kept_protocol(Protocol()))
     other = tmp_path / "inverse"
-    shutil.copytree(Path(surrogate.__file__).parent, other)
-    changed = other / "surrogate.py"
+    shutil.copytree(Path(bayesopt.__file__).parent, other)
+    changed = other / "bayesopt.py"
     changed.write_text(changed.read_text() + "\n# another surrogate\n")
     monkeypatch.setattr(importlib.util.find_spec("splatsoil.inverse"), "submodule_search_locations", [str(other)])
     with pytest.raises(ParameterError, match="other sources"):

@@ -19,9 +19,9 @@ GIVEN = {
     "simulate": "out --friction-angle 31.5 --with cohesion tilt --set cohesion=300 tilt_x=-2 --scene plow --depth 0.09 "
     "--preset tiny --seed 4 --particle-seed 5 --views 12 --picture-scale 0.5 --device cuda:0 --like 'a set' --json",
     "posterior": "runs/a --set 'a set' --checks 0 --device cpu --seed 1 --json",
-    "fit": "nowhere --parameters friction_angle --with cohesion --budget 9 --coarse tiny --preset fine --device cpu "
+    "fit": "nowhere --parameters friction_angle --with cohesion --budget 9 --preset fine --device cpu "
     "--seed 2 --run 'a run' --json",
-    "run": "nowhere --parameters friction_angle --with cohesion --budget 9 --coarse tiny --preset fine --device cpu "
+    "run": "nowhere --parameters friction_angle --with cohesion --budget 9 --preset fine --device cpu "
     "--seed 2 --run 'a run' --criticise --most-effects 3 --json",
     "compare": "'a run' --set 'a set' --quick --device cpu --json",
     "diagnose": "'a run' --set 'a set' --effects cohesion 'my effects/crust.py' --device cpu --json",
@@ -43,7 +43,6 @@ def test_the_hint_is_the_command_that_was_given(command: str, how: str) -> None:
     words = shlex.split(GIVEN[command])
     config = parsed(module.Config, words if how == "everything" else words[: POSITIONAL.get(command, 1)])
     assert how == "nothing" or {f.name for f in dataclasses.fields(config) if _usual(config, f)} <= {
-        "search",
         "scene",
         "stop_at_floor",
     }

@@ -192,7 +192,6 @@ def test_a_run_folder_is_for_one_set_preset_and_seed(
         (["--parameters", "phi"], "unknown phi; this model has friction_angle"),
         (["--parameters", "cohesion"], "unknown cohesion"),
         (["--device", "cuda:77"], "cuda:77"),
-        (["--preset", "small", "--coarse", "small"], "no cheaper"),
     ],
 )
 def test_options_that_make_no_sense_write_nothing(

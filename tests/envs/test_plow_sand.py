@@ -168,14 +168,3 @@ def test_particles_are_each_steps_own_or_all_of_an_episodes(analytic: ModuleType
         env.reset(seed=0)
         steps = [env.step(np.zeros(1, dtype=np.float32)) for _ in range(3)]
         assert len({reward for _, reward, *_ in steps}) == kinds == len({info["seed"] for *_, info in steps})
-
-
-def test_what_the_next_steps_will_simulate_is_known_beforehand(env: PlowSandEnv) -> None:
-    env.reset(seed=3)
-    env.step(np.array([0.5], dtype=np.float32))
-    actions = np.array([[-0.4], [0.1], [0.9], [0.3]], dtype=np.float32)
-    ahead = env.ahead(actions)
-    assert len(ahead) == 3, "a budget of 4, of which 1 is spent"
-    for action, (parameters, seed) in zip(actions, ahead, strict=False):
-        info = env.step(action)[-1]
-        assert (info["parameters"], info["seed"]) == (parameters, seed)

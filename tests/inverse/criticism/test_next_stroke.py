@@ -211,7 +211,7 @@ def test_simulations_made_several_at_a_time_tell_the_same(make: Callable[..., Em
     alone = expected_information(experiment, draws, EVEN_NAMES, Simulations(experiment))
     shares: list[Any] = []
     simulate = Simulations(experiment)
-    with simulate.helped(Helpers(0, lambda jobs: Future(), 4, shares.append)):
+    with simulate.helped(Helpers(lambda jobs: Future(), 4, shares.append)):
         simulate.ahead(lambda ask: [ask(**run.arguments()) for runs in runs_of(draws, 0).values() for run in runs])
         together = expected_information(experiment, draws, EVEN_NAMES, simulate)
     assert together.mean == alone.mean and together.std == alone.std

@@ -62,7 +62,7 @@ def helper(experiment: Watched, folder: Path, together: int = 1, mine: Watched |
                 continue
 
     with ThreadPoolExecutor(1) as pool:
-        yield Helpers(1, lambda jobs: pool.submit(work, jobs), together, mine.prepared.append if mine else len)
+        yield Helpers(lambda jobs: pool.submit(work, jobs), together, mine.prepared.append if mine else len)
 
 
 def everything(ask: Callable[..., np.ndarray]) -> list[np.ndarray]:
@@ -126,7 +126,7 @@ def test_a_share_is_made_whole_by_who_takes_it_and_one_failure_in_it_is_no_other
         return Future()
 
     angles = (1.0, 2.0, 3.0)
-    with simulate.helped(Helpers(1, never, 4)):
+    with simulate.helped(Helpers(never, 4)):
         simulate.ahead(lambda ask: [ask({"angle": angle}) for angle in angles])
         assert [len(jobs) for jobs in shares] == [3]
         assert np.array_equal(simulate({"angle": 1.0}), table({"angle": 1.0}))
@@ -146,7 +146,7 @@ def test_all_drawings_of_a_simulation_are_one_share_whatever_is_best_made_at_a_t
         return Future()
 
     simulate = simulations(Watched())
-    with simulate.helped(Helpers(1, never, 2)):
+    with simulate.helped(Helpers(never, 2)):
         simulate.ahead(lambda ask: [ask(AT, numerics=n) for n in ("guess 1", "guess 2", "fine", "rounding", "")])
     assert sorted(sorted(share) for share in shares) == [[""], ["fine"], ["guess 1", "guess 2", "rounding"]]
 
@@ -160,7 +160,7 @@ def test_a_helper_that_fails_or_dies_costs_nothing_but_its_help(tmp_path: Path, 
 
     mine = Watched(lambda values: values["angle"] > 1.0)
     simulate = simulations(mine, tmp_path)
-    with simulate.helped(Helpers(1, dead)):
+    with simulate.helped(Helpers(dead)):
         simulate.ahead(lambda ask: [ask(AT), ask({"angle": 2.0})])
         assert np.array_equal(simulate(AT), table(AT))
         for _ in range(2):
