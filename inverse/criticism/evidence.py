@@ -90,24 +90,21 @@ class Model:
     Attributes:
         name: the effect's; `AS_IT_IS`, `ELSE`.
         values: parameters (q,) by name at the points.
-        mean: (q, p) scores that are predicted there.
-        variance: (q, p) the emulator's doubt of them, in the directions of `whitened` scores.
-        pattern: (k, p) of an effect of observation, else empty.
-        log_likelihood: (f, q) by the numerics' factors.
-        importance: (q,) logarithms of the prior's density over that of the points.
-        weights: (f, q) posterior, summing to 1.
+        weights: (f, q) posterior by the numerics' factors, summing to 1.
         log_evidence: of it.
     """
 
     name: str
     values: Mapping[str, FloatArray]
-    mean: FloatArray
-    variance: FloatArray
-    pattern: FloatArray
-    log_likelihood: FloatArray
-    importance: FloatArray
     weights: FloatArray
     log_evidence: float
+
+    @classmethod
+    def of(cls, name: str, values: Mapping[str, FloatArray], log: FloatArray, factors: FloatArray) -> Model:
+        """From logarithms (f, q) of likelihoods times importance weights, and of the factors' probabilities (f,)."""
+        joint = log + factors[:, None]
+        weights = np.exp(joint - joint.max())
+        return cls(name, values, weights / weights.sum(), float(logsumexp(joint)) - float(np.log(joint.shape[1])))
 
     def moments(self, name: str) -> tuple[float, float]:
         """Mean and standard deviation of a parameter."""
@@ -153,7 +150,7 @@ class Evidence:
 
 
 @dataclass(frozen=True)
-class _Likelihood:
+class Likelihood:
     """Of scores whitened by the expected noise.
 
     Attributes:
@@ -165,7 +162,8 @@ class _Likelihood:
     rotations: Sequence[tuple[FloatArray, FloatArray]]
 
     @classmethod
-    def of(cls, noise: Noise) -> _Likelihood:
+    def of(cls, noise: Noise) -> Likelihood:
+        """With the noise of scores."""
         root = np.linalg.cholesky(noise.covariance(np.ones(2)) + 1e-9 * np.eye(len(noise.fixed)))
         rotations = []
         for factor in FACTORS:
@@ -175,6 +173,7 @@ class _Likelihood:
         return cls(np.asarray(root, dtype=np.float64), rotations)
 
     def white(self, scores: FloatArray) -> FloatArray:
+        """(q, p) whitened scores (q, p)."""
         return np.asarray(solve_triangular(self.root, np.atleast_2d(scores).T, lower=True).T)
 
     def log(self, left: FloatArray, variance: FloatArray, pattern: FloatArray, every: int = 1) -> FloatArray:
@@ -227,7 +226,7 @@ class Comparison:
     """
 
     noise: Noise
-    likelihood: _Likelihood
+    likelihood: Likelihood
     models: Sequence[Emulated] = field(repr=False)
     seed: int = 0
 
@@ -250,7 +249,7 @@ class Comparison:
             simulated: runs and scores (m, p) by effect.
             seed: of sequences and draws.
         """
-        likelihood = _Likelihood.of(noise)
+        likelihood = Likelihood.of(noise)
         n = len(prior.space)
         chance = np.maximum(np.diag(likelihood.white(likelihood.white(noise.chance).T)), 1e-4)
         white = likelihood.white(noise.base)
@@ -293,11 +292,9 @@ class Comparison:
 
     def judge(self) -> Evidence:
         """Every model against the observation."""
-        white, factors = self.likelihood.white(self.noise.observed)[0], self.noise.expected
-        found = {model.name: self._integrated(model, white, factors) for model in self.models}
-        base = found[AS_IT_IS]
-        given = (base.values, base.mean, base.variance, base.pattern, base.log_likelihood, base.importance)
-        found[ELSE] = _model(ELSE, *given, self.noise.beyond)
+        sampled = {model.name: self._sampled(model) for model in self.models}
+        found = {name: Model.of(name, *points, self.noise.expected) for name, points in sampled.items()}
+        found[ELSE] = Model.of(ELSE, *sampled[AS_IT_IS], self.noise.beyond)
         weight = {
             name: model.log_evidence + np.log(PRIOR if name == AS_IT_IS else (1.0 - PRIOR) / (len(found) - 1))
             for name, model in found.items()
@@ -305,18 +302,17 @@ class Comparison:
         total = logsumexp(list(weight.values()))
         return Evidence(self.noise, found, {name: float(np.exp(w - total)) for name, w in weight.items()})
 
-    def _integrated(self, model: Emulated, white: FloatArray, factors: FloatArray) -> Model:
-        """A model's evidence and posterior."""
-        rng = np.random.default_rng([self.seed, 23])
+    def _sampled(self, model: Emulated) -> tuple[Mapping[str, FloatArray], FloatArray]:
+        """Parameters (q,) at points drawn where the posterior is, and logarithms (f, q) of their likelihoods times
+        importance weights."""
+        rng, white = np.random.default_rng([self.seed, 23]), self.likelihood.white(self.noise.observed)[0]
         cube, (values, mean, variance) = model.prior
         importance = np.zeros(len(cube))
-        for number in range(ROUNDS + 1):
-            log = self.likelihood.log(white - mean, variance, model.pattern)
-            if number == ROUNDS:
-                break
-            cube, importance = _drawn(cube, logsumexp(log + factors[:, None], axis=0) + importance, rng)
+        for _ in range(ROUNDS):
+            log = self.likelihood.log(white - mean, variance, model.pattern) + self.noise.expected[:, None]
+            cube, importance = _drawn(cube, logsumexp(log, axis=0) + importance, rng)
             values, mean, variance = model.predict(cube)
-        return _model(model.name, values, mean, variance, model.pattern, log, importance, factors)
+        return values, self.likelihood.log(white - mean, variance, model.pattern) + importance
 
 
 def _drawn(cube: FloatArray, weights: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
@@ -341,19 +337,3 @@ def _drawn(cube: FloatArray, weights: FloatArray, rng: np.random.Generator) -> t
     share = DEFENSIVE / (DEFENSIVE + inside)
     density = share + (1.0 - share) * student.pdf(points).reshape(-1) / inside
     return points, -np.log(density)
-
-
-def _model(
-    name: str,
-    values: Mapping[str, FloatArray],
-    mean: FloatArray,
-    variance: FloatArray,
-    pattern: FloatArray,
-    log: FloatArray,
-    importance: FloatArray,
-    factors: FloatArray,
-) -> Model:
-    joint = log + importance + factors[:, None]
-    evidence = float(logsumexp(joint)) - float(np.log(joint.shape[1]))
-    weights = np.exp(joint - joint.max())
-    return Model(name, values, mean, variance, pattern, log, importance, weights / weights.sum(), evidence)
