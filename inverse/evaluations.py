@@ -15,7 +15,7 @@ import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from datetime import UTC, datetime
 from functools import lru_cache
 from pathlib import Path
@@ -31,7 +31,7 @@ from .executors import Serial
 
 #: Marks the file as ours (SQLite's ``application_id``: ASCII "SoIL") and its layout (``user_version``).
 APPLICATION_ID = 0x536F494C
-SCHEMA_VERSION = 2
+LAYOUT = 2
 
 #: ``model`` is what decides an evaluation beside its parameters and seed, as JSON: measurement, device, version, ...
 SCHEMA = """
@@ -49,7 +49,6 @@ CREATE TABLE evaluations (
   CHECK ((loss IS NULL) = (message <> ''))
 ) STRICT;
 """
-COLUMNS = "key, model, parameters, seed, loss, message, blocks, extras, seconds, created"
 
 
 def digest(description: Mapping[str, Any]) -> str:
@@ -81,7 +80,7 @@ class EvaluationRecord:
     seed: int
     loss: float | None
     message: str = ""
-    blocks: tuple[float, ...] = ()
+    blocks: Sequence[float] = ()
     extras: Mapping[str, float] = field(default_factory=dict)
     seconds: float = 0.0
     created: str = ""
@@ -94,6 +93,10 @@ class EvaluationRecord:
     def status(self) -> str:
         """``ok`` or ``failed``."""
         return "failed" if self.loss is None else "ok"
+
+
+COLUMNS = [column.name for column in fields(EvaluationRecord)]
+JSON = {"model", "parameters", "blocks", "extras"}
 
 
 class EvaluationStore:
@@ -116,8 +119,7 @@ class EvaluationStore:
             # Without tables: new, or of a process killed between making the file and its first commit.
             if writable and self._one("SELECT count(*) FROM sqlite_master") == 0:
                 self._connection.executescript(
-                    f"BEGIN; PRAGMA application_id={APPLICATION_ID}; PRAGMA user_version={SCHEMA_VERSION}; {SCHEMA}"
-                    "COMMIT;"
+                    f"BEGIN; PRAGMA application_id={APPLICATION_ID}; PRAGMA user_version={LAYOUT}; {SCHEMA}COMMIT;"
                 )
             self._verify()
 
@@ -137,10 +139,8 @@ class EvaluationStore:
     def _verify(self) -> None:
         if self._one("PRAGMA application_id") != APPLICATION_ID:
             raise RunError(f"{self.path}: is an SQLite file, but not a run database; choose another run folder")
-        if (version := self._one("PRAGMA user_version")) != SCHEMA_VERSION:
-            raise RunError(
-                f"{self.path}: has layout {version}, this version reads {SCHEMA_VERSION}; choose another run folder"
-            )
+        if (layout := self._one("PRAGMA user_version")) != LAYOUT:
+            raise RunError(f"{self.path}: has layout {layout}, this version reads {LAYOUT}; choose another run folder")
         if (state := self._one("PRAGMA quick_check(1)")) != "ok":
             raise RunError(f"{self.path}: is damaged ({state}); move it away and fit again")
 
@@ -171,12 +171,10 @@ class EvaluationStore:
             RunError: it is already stored, or the disk refuses.
         """
         made = replace(record, created=record.created or datetime.now(UTC).isoformat(timespec="microseconds"))
-        row = [getattr(made, name) for name in COLUMNS.split(", ")]
-        plainly = [v if v is None or isinstance(v, str | int | float) else json.dumps(plain(v)) for v in row]
+        row = [json.dumps(plain(getattr(made, c))) if c in JSON else getattr(made, c) for c in COLUMNS]
+        insert = f"INSERT INTO evaluations ({', '.join(COLUMNS)}) VALUES ({', '.join('?' * len(row))})"
         with self._explained(), self._connection:
-            self._connection.execute(
-                f"INSERT INTO evaluations ({COLUMNS}) VALUES ({', '.join('?' * len(row))})", plainly
-            )
+            self._connection.execute(insert, row)
 
     def find(self, key: str) -> EvaluationRecord | None:
         """The evaluation with this key."""
@@ -188,15 +186,11 @@ class EvaluationStore:
         return self._read("ORDER BY created, rowid")
 
     def _read(self, which: str, *values: str) -> list[EvaluationRecord]:
+        query = f"SELECT {', '.join(COLUMNS)} FROM evaluations {which}"
         with self._explained():
-            rows = self._connection.execute(f"SELECT {COLUMNS} FROM evaluations {which}", values).fetchall()
-        return [
-            EvaluationRecord(
-                key, json.loads(model), json.loads(parameters), seed, loss, message,
-                tuple(json.loads(blocks)), json.loads(extras), seconds, created,
-            )
-            for key, model, parameters, seed, loss, message, blocks, extras, seconds, created in rows
-        ]  # fmt: skip
+            rows = self._connection.execute(query, values).fetchall()
+        named = ({c: json.loads(v) if c in JSON else v for c, v in zip(COLUMNS, row, strict=True)} for row in rows)
+        return [EvaluationRecord(**values) for values in named]
 
     def __enter__(self) -> EvaluationStore:
         return self
@@ -238,12 +232,18 @@ def evaluate(
         for key, (parameters, seed) in zip(keys, jobs, strict=True):
             if key not in known:
                 made = next(new)
-                record = EvaluationRecord(
-                    key, model, dict(parameters), seed, made.loss, made.message,
-                    tuple(float(b) for b in made.blocks), dict(made.extras), made.seconds,
-                )  # fmt: skip
-                store.append(record)
-                known[key] = record
+                known[key] = EvaluationRecord(
+                    key=key,
+                    model=model,
+                    parameters=dict(parameters),
+                    seed=seed,
+                    loss=made.loss,
+                    message=made.message,
+                    blocks=made.blocks.tolist(),
+                    extras=dict(made.extras),
+                    seconds=made.seconds,
+                )
+                store.append(known[key])
             yield known[key]
     except BrokenExecutor as error:
         raise RunError("a worker died; is there enough memory? What is stored is kept: run it again") from error

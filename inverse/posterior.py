@@ -165,7 +165,7 @@ def run_posterior(
     Raises:
         RunError: the folder can't be written.
     """
-    from .posterior_files import write_figures, write_inference_data
+    from .posterior_files import write_corner, write_inference_data
 
     began = time.perf_counter()
     fit, own = run.fit(), list(experiment.parameters)
@@ -185,13 +185,14 @@ def run_posterior(
             "Simulations at points drawn from the posterior lay farther from the emulator than its variance says "
             f"(χ² per score {surprise:.1f} instead of 1): more evaluations would help."
         )
-    write_inference_data(posterior, run.path / "posterior" / "posterior.nc")
+    files = run.path / "posterior"
+    write_inference_data(posterior, files / "posterior.nc")
     result |= {
         "fit": fit["name"],
         "values": {name: entry["estimate"] for name, entry in fit["parameters"].items()},
         "checks": checked,
         "simulations": len(density.noise.base) + len(checked),
-        "figures": write_figures(posterior, own, run.path / "posterior"),
+        "figures": [write_corner(posterior, own, files / "corner.png").name],
         "seconds": round(time.perf_counter() - began, 3),
         "seed": seed,
         **{key: fit[key] for key in ("device", "preset", "version")},

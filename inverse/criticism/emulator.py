@@ -105,7 +105,7 @@ class IncrementEmulator:
 def _regressed(
     inner: FloatArray, cross: FloatArray, alone: FloatArray, signal: FloatArray, noise: FloatArray, values: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Mean and variance (q, p) of Gaussian processes: kernels (m, m), (q, m) and (q,) times signals (p,), through values
+    """Mean and variance (q, p) of Gaussian processes: kernels (m, m), (q, m), (q,) times signals (p,), through values
     (m, p) whose noise has a variance (m, p)."""
     mean, variance = np.zeros((len(cross), len(signal))), np.zeros((len(cross), len(signal)))
     for c in np.flatnonzero(signal):

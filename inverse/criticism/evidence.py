@@ -30,6 +30,8 @@ from .noise import FACTORS, Noise
 FloatArray = npt.NDArray[np.float64]
 Prediction = tuple[Mapping[str, FloatArray], FloatArray, FloatArray]
 """Values by name (q,), mean and variance (q, p) of whitened scores."""
+Predict = Callable[[FloatArray], Prediction]
+"""At points (q, d) of the unit cube."""
 
 POINTS = 2048
 """Of the sequence, and of each later round's draws."""
@@ -179,20 +181,18 @@ class Likelihood:
     def log(self, left: FloatArray, variance: FloatArray, pattern: FloatArray, every: int = 1) -> FloatArray:
         """(f, q) of whitened residuals (q, p) with the emulator's variance (q, p), and free sizes of a pattern (k, p);
         for ``every`` so many factors."""
-        rotations = self.rotations[::every]
-        out = np.empty((len(rotations), len(left)))
-        for i, (size, modes) in enumerate(rotations):
+        out = []
+        for size, modes in self.rotations[::every]:
             turned, spread = left @ modes, size + variance @ modes**2
             if len(pattern):
                 # one doubt for all points: a pattern's sizes are integrated over in closed form
-                common = spread.mean(axis=0)
-                inner = np.diag(common) + SLAB**2 * (pattern @ modes).T @ (pattern @ modes)
+                inner = np.diag(spread.mean(axis=0)) + SLAB**2 * (pattern @ modes).T @ (pattern @ modes)
                 root = np.linalg.cholesky(inner)
                 z = solve_triangular(root, turned.T, lower=True)
-                out[i] = -0.5 * np.sum(z**2, axis=0) - np.log(np.diag(root)).sum()
+                out.append(-0.5 * np.sum(z**2, axis=0) - np.log(np.diag(root)).sum())
             else:
-                out[i] = -0.5 * np.sum(turned**2 / spread + np.log(spread), axis=1)
-        return out
+                out.append(-0.5 * np.sum(turned**2 / spread + np.log(spread), axis=1))
+        return np.array(out)
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,15 +201,13 @@ class Emulated:
 
     Attributes:
         name: the effect's; `AS_IT_IS`.
-        dimension: of the cube.
         predict: values by name, mean and variance (q, p) of whitened scores, at points (q, d) of the cube.
         pattern: (k, p) of an effect of observation, else empty.
         prior: what it predicts at a Sobol sequence.
     """
 
     name: str
-    dimension: int
-    predict: Callable[[FloatArray], Prediction]
+    predict: Predict
     pattern: FloatArray
     prior: tuple[FloatArray, Prediction]
 
@@ -262,7 +260,7 @@ class Comparison:
             mean, variance = base.predict(where)
             return {p.name: physical[:, i] for i, p in enumerate(prior.space)}, mean + middle, variance
 
-        def with_effect(candidate: Candidate, runs: Sequence[Run], scores: FloatArray) -> Callable[..., Prediction]:
+        def with_effect(candidate: Candidate, runs: Sequence[Run], scores: FloatArray) -> Predict:
             k = len(candidate.parameters)
             there, doubt = base.predict(prior.unit(runs))
             points = (prior.unit(runs), *effect_points(candidate, runs))
@@ -276,18 +274,17 @@ class Comparison:
 
             return predict
 
-        nothing = np.zeros((0, white.shape[1]))
-        made: list[tuple[str, int, Callable[[FloatArray], Prediction], FloatArray]] = [(AS_IT_IS, n, as_it_is, nothing)]
+        def emulated(name: str, dimension: int, predict: Predict, *patterns: FloatArray) -> Emulated:
+            cube = qmc.Sobol(dimension, seed=seed).random(POINTS)
+            return Emulated(name, predict, np.reshape(patterns, (-1, white.shape[1])), (cube, predict(cube)))
+
+        models = [emulated(AS_IT_IS, n, as_it_is)]
         for candidate in candidates:
             if candidate.name in noise.patterns:
-                made.append((candidate.name, n, as_it_is, likelihood.white(noise.patterns[candidate.name])))
+                models.append(emulated(candidate.name, n, as_it_is, *likelihood.white(noise.patterns[candidate.name])))
             elif candidate.name in simulated:
                 dimension = n + len(candidate.parameters) + len(candidate.shapes)
-                made.append((candidate.name, dimension, with_effect(candidate, *simulated[candidate.name]), nothing))
-        models = []
-        for name, dimension, predict, pattern in made:
-            cube = qmc.Sobol(dimension, seed=seed).random(POINTS)
-            models.append(Emulated(name, dimension, predict, pattern, (cube, predict(cube))))
+                models.append(emulated(candidate.name, dimension, with_effect(candidate, *simulated[candidate.name])))
         return cls(noise, likelihood, models, seed)
 
     def judge(self) -> Evidence:

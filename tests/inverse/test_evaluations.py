@@ -33,7 +33,7 @@ RECORD = EvaluationRecord(
     parameters={"friction_angle": 36.000000000000014},
     seed=7,
     loss=0.1 + 0.2,
-    blocks=(1.5, -2.0),
+    blocks=[1.5, -2.0],
     extras={"rgb": 1e-5},
     seconds=3.25,
 )
