@@ -7,7 +7,6 @@ may read meanwhile. A failed simulation is a row with a message and no loss, nev
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import pickle
@@ -25,7 +24,7 @@ from splatsoil.envs.problem import Evaluation, Job, Problem
 from splatsoil.envs.together import evaluate_together
 
 from splatsoil.errors import RunError
-from splatsoil.files import plain
+from splatsoil.files import digest, plain
 
 from .executors import Serial
 
@@ -49,12 +48,6 @@ CREATE TABLE evaluations (
   CHECK ((loss IS NULL) = (message <> ''))
 ) STRICT;
 """
-
-
-def digest(description: Mapping[str, Any]) -> str:
-    """SHA-256 (hex) of a description: equal descriptions, equal digests, whatever the order of their keys."""
-    text = json.dumps(plain(dict(description)), sort_keys=True, separators=(",", ":"), allow_nan=False)
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,10 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from splatsoil.inverse.evaluations import digest
 
 from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Experiment
-from splatsoil.files import read_npy, write_bytes
+from splatsoil.files import digest, read_npy, write_bytes
 
 FloatArray = npt.NDArray[np.float64]
 Simulate = Callable[..., FloatArray]

@@ -21,7 +21,7 @@ from types import ModuleType
 from typing import Any
 
 import pytest
-from splatsoil.inverse.evaluations import EvaluationRecord, EvaluationStore, digest, evaluate, writer_lock
+from splatsoil.inverse.evaluations import EvaluationRecord, EvaluationStore, evaluate, writer_lock
 from splatsoil.inverse.executors import executor
 
 from splatsoil.errors import RunError
@@ -78,11 +78,6 @@ def test_readers_read_while_one_writes(tmp_path: Path) -> None:
         assert reader.records() == []
         writer.append(RECORD)
         assert len(reader.records()) == 1
-
-
-def test_digests_know_contents_and_not_order() -> None:
-    assert digest({"a": 1, "b": [1, 2]}) == digest({"b": [1, 2], "a": 1})
-    assert digest({"a": 1.0}) != digest({"a": 1.0 + 2**-52})
 
 
 def _text(path: Path) -> None:

@@ -104,18 +104,6 @@ def test_what_is_kept_is_read_and_not_made_again(tmp_path: Path) -> None:
     assert (again.made, told) == (1, ["another"])
 
 
-def test_order_of_effects_and_nothing_else_is_the_same_simulation() -> None:
-    simulate = simulations(Watched())
-    simulate(AT, effects=("cohesion", "tilt"))
-    simulate(AT, effects=("tilt", "cohesion"), purpose="the same")
-    assert simulate.made == 1
-    simulate(AT, effects=("tilt",))
-    simulate(AT, effects=("tilt",), seed=1)
-    simulate(AT, effects=("tilt",), numerics="fine")
-    simulate({"angle": 0.6}, effects=("tilt",))
-    assert simulate.made == 5
-
-
 def test_a_share_is_made_whole_by_who_takes_it_and_one_failure_in_it_is_no_other_ones(tmp_path: Path) -> None:
     mine = Watched(lambda values: values["angle"] == 2.0)
     simulate = simulations(mine, tmp_path)
@@ -169,13 +157,20 @@ def test_a_helper_that_fails_or_dies_costs_nothing_but_its_help(tmp_path: Path, 
     assert len(mine.calls) == 2 and simulate.asked == 1
 
 
-def test_a_file_that_defines_an_effect_counts_for_what_it_is_on_in(tmp_path: Path) -> None:
-    """Another file of the same name: only what it is on in is made anew."""
-    for digest, made in (("one", 2), ("other", 1), ("one", 0)):
-        simulate = Simulations(Watched(), tmp_path, sources={"own": digest})  # type: ignore[arg-type]
-        simulate(AT)
-        simulate(AT, effects=("own",))
-        assert simulate.made == made
+def test_what_decides_a_simulation_and_nothing_else_makes_it_another(tmp_path: Path) -> None:
+    """Effects in whatever order; another file of the same name: only what it is on in is made anew."""
+    simulate = Simulations(Watched(), tmp_path, sources={"own": "one"})  # type: ignore[arg-type]
+    for effects in (("tilt", "own"), ("own", "tilt"), ("tilt",), ()):
+        simulate(AT, effects=effects, purpose="any")
+    assert simulate.made == 3
+    simulate(AT, effects=("tilt",), seed=1)
+    simulate(AT, effects=("tilt",), numerics="fine")
+    simulate({"angle": 0.6}, effects=("tilt",))
+    assert simulate.made == 6
+    other = Simulations(Watched(), tmp_path, sources={"own": "other"})  # type: ignore[arg-type]
+    for effects in (("tilt", "own"), ("tilt",), ()):
+        other(AT, effects=effects)
+    assert other.made == 1
 
 
 def test_what_was_made_elsewhere_is_kept_and_not_made_again(tmp_path: Path) -> None:
