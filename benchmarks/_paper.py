@@ -212,12 +212,12 @@ def propose(way: str, seed: int, told: Sequence[Told]) -> float:
 
 def conclude(way: str, seed: int, told: Sequence[Told]) -> dict[str, float]:
     """What a search came to."""
-    result = optimiser_of(way, seed, told).result()
+    found = optimiser_of(way, seed, told).result()
     best = min(told, key=lambda t: np.inf if t.loss is None else t.loss).action
-    estimate, low, high, luckiest = (
-        float(SPACE.from_unit(p)[0]) for p in (result.estimate, result.low, result.high, best)
-    )
-    return {"estimate": estimate, "std": float(result.std[0]) * 15.0, "low": low, "high": high, "best": luckiest}
+    estimate, luckiest = (SPACE.from_unit(p) for p in (found.estimate, best))
+    std, low, high = found.interval(SPACE.from_unit)
+    numbers = {"estimate": estimate, "std": std, "low": low, "high": high, "best": luckiest}
+    return {name: float(value[0]) for name, value in numbers.items()}
 
 
 def by_features(

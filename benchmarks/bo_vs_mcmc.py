@@ -145,7 +145,8 @@ def play(world: World, budgets: Sequence[int], seed: int, **options: Any) -> tup
             began = time.perf_counter()
             found = optimiser.result()
             seconds = spent + time.perf_counter() - began
-            answers[len(points)] = Answer(found.estimate, found.low, found.high, seconds)
+            _, low, high = found.interval()
+            answers[len(points)] = Answer(found.estimate, low, high, seconds)
     return answers, (np.array(points), np.array(features))
 
 

@@ -7,7 +7,7 @@ the evaluations of an interrupted one goes on as that one would have.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -49,27 +49,47 @@ class Told(NamedTuple):
     loss: float | None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Minimum:
     """Where the loss is least, by the Gaussian process.
 
     Attributes:
         estimate: (n,) minimiser of the posterior mean, in [-1, 1]^n.
-        std: (n,) distance from the estimate that holds 68.3 % of the minimisers of sample paths.
-        low: (n,) 5 % quantile of those minimisers.
-        high: (n,) 95 % quantile.
-        noise_std: standard deviation of one evaluation's noise.
-        at_bound: for each axis ``lower`` or ``upper`` where the estimate lies on that bound, else None.
-        determined: for each axis, False where the evaluations hardly say where along it the minimum is.
+        minimisers: (k, n) those of sample paths.
+        constant: all losses were alike.
     """
 
     estimate: FloatArray
-    std: FloatArray
-    low: FloatArray
-    high: FloatArray
-    noise_std: float
-    at_bound: tuple[Literal["lower", "upper"] | None, ...]
-    determined: tuple[bool, ...]
+    minimisers: FloatArray
+    constant: bool = False
+
+    @property
+    def at_bound(self) -> tuple[Literal["lower", "upper"] | None, ...]:
+        """For each axis the bound that the estimate lies on, if any."""
+        near = np.abs(self.estimate) > 1.0 - 2.0 * AT_BOUND
+        return tuple(
+            ("upper" if value > 0.0 else "lower") if on else None for on, value in zip(near, self.estimate, strict=True)
+        )
+
+    @property
+    def determined(self) -> tuple[bool, ...]:
+        """For each axis, False where the evaluations hardly say where along it the minimum is."""
+        spread = np.sqrt(np.mean((self.minimisers - self.estimate) ** 2, axis=0))
+        return tuple(bool(s < UNINFORMED * 2.0 / np.sqrt(12.0)) and not self.constant for s in spread)
+
+    def interval(
+        self, to: Callable[[FloatArray], FloatArray] = lambda unit: unit
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Standard deviation, 5 and 95 % quantile (n,) of the minimisers, on the scale that ``to`` leads to.
+
+        The first is the distance from the estimate that holds 68.3 % of them, as a root mean square would be ruled by
+        the few paths that dip in a gap between evaluations; it is the latter for an axis that is not determined.
+        """
+        minimisers = to(self.minimisers)
+        distances = np.abs(minimisers - to(self.estimate))
+        rms = np.sqrt(np.mean(distances**2, axis=0))
+        low, high = np.quantile(minimisers, [0.05, 0.95], axis=0)
+        return np.where(self.determined, np.quantile(distances, 0.683, axis=0), rms), low, high
 
 
 class Surrogate:
@@ -147,21 +167,7 @@ class Surrogate:
             paths = draw_matheron_paths(self._ensemble(), torch.Size([PATHS]))
             best, _ = optimize_posterior_samples(paths, self._bounds, raw_samples=RAW, num_restarts=2)  # type: ignore[arg-type]
         minimisers = 2.0 * best.detach().reshape(-1, self.dimension).numpy() - 1.0
-        # About the estimate: what is quoted as ± belongs to the number in front of it. A root mean square would be
-        # ruled by the few paths that dip in a gap between evaluations.
-        distances = np.abs(minimisers - estimate)
-        spread = np.sqrt(np.mean(distances**2, axis=0))
-        determined = (spread < UNINFORMED * 2.0 / np.sqrt(12.0)) & (not self.constant)
-        low, high = np.quantile(minimisers, [0.05, 0.95], axis=0)
-        return Minimum(
-            estimate=estimate,
-            std=np.where(determined, np.quantile(distances, 0.683, axis=0), spread),
-            low=low,
-            high=high,
-            noise_std=self.noise_std,
-            at_bound=tuple(_bound_of(value) for value in estimate),
-            determined=tuple(bool(d) for d in determined),
-        )
+        return Minimum(estimate, minimisers, self.constant)
 
     def _process(self, *batch: int) -> SingleTaskGP:
         """One, or a batch of them with hyperparameters to be set."""
@@ -301,12 +307,6 @@ def sobol(count: int, dimension: int, seed: int) -> FloatArray:
     """Scrambled Sobol points (count, dimension) in [-1, 1]."""
     engine = torch.quasirandom.SobolEngine(dimension, scramble=True, seed=seed)
     return 2.0 * engine.draw(count, dtype=torch.float64).numpy() - 1.0
-
-
-def _bound_of(value: float) -> Literal["lower", "upper"] | None:
-    if abs(value) < 1.0 - 2.0 * AT_BOUND:
-        return None
-    return "upper" if value > 0.0 else "lower"
 
 
 @contextmanager

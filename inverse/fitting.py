@@ -17,7 +17,7 @@ from splatsoil.report.words import undetermined
 from splatsoil.run_files import FIT_FORMAT
 from splatsoil.threads import one_thread
 
-from .bayesopt import BayesianOptimiser, FloatArray, Minimum, Surrogate
+from .bayesopt import BayesianOptimiser, FloatArray, Surrogate
 from .criticism.diagnosis import Diagnosis
 from .evaluations import EvaluationRecord, evaluate
 from .run_folder import RunFolder
@@ -152,14 +152,27 @@ def summarise(
     minimum = surrogate.minimum()
     losses = [np.inf if record.loss is None else record.loss for record in records]
     best = int(np.argmin(losses))
-    searched = {p.name: _minimiser(p, i, minimum, space) for i, p in enumerate(space)}
+    estimate = space.from_unit(minimum.estimate)
+    std, low, high = minimum.interval(space.from_unit)
+    searched = {
+        p.name: {
+            "estimate": float(estimate[i]),
+            "std": float(std[i]),
+            "low": float(low[i]),
+            "high": float(high[i]),
+            **_about(p),
+            "at_bound": minimum.at_bound[i],
+            "determined": minimum.determined[i],
+        }
+        for i, p in enumerate(space)
+    }
     result: dict[str, Any] = {
         "format": FIT_FORMAT,
         "name": setup.name,
         "parameters": searched,
         "estimated_from": "loss",
         "minimum": {name: {key: entry[key] for key in ("estimate", "low", "high")} for name, entry in searched.items()},
-        "noise_std": minimum.noise_std,
+        "noise_std": surrogate.noise_std,
         "evaluations": len(records),
         "failed": sum(record.loss is None for record in records),
         "best": {"parameters": dict(records[best].parameters), "loss": losses[best], "step": best},
@@ -238,30 +251,6 @@ def _averaged(parameter: Parameter, found: Diagnosis) -> dict[str, Any]:
 def _about(parameter: Parameter) -> dict[str, Any]:
     bounds = [parameter.lower, parameter.upper]
     return {"unit": parameter.unit, "title": parameter.title, "bounds": bounds, "off": parameter.off}
-
-
-def _minimiser(parameter: Parameter, index: int, minimum: Minimum, space: ParameterSpace) -> dict[str, Any]:
-    """A parameter where the loss is least."""
-
-    def physical(unit: float) -> float:
-        point = minimum.estimate.copy()
-        point[index] = unit
-        return float(space.from_unit(point)[index])
-
-    centre = float(minimum.estimate[index])
-    std = float(minimum.std[index])
-    # Half the width of ± one std in physical units: exact on a linear axis, sensible on a logarithmic one. Both
-    # ends are pushed inside the bounds together, so that a bound doesn't halve the std.
-    middle = float(np.clip(centre, -1.0 + min(std, 1.0), 1.0 - min(std, 1.0)))
-    return {
-        "estimate": physical(centre),
-        "std": 0.5 * (physical(middle + std) - physical(middle - std)),
-        "low": physical(float(minimum.low[index])),
-        "high": physical(float(minimum.high[index])),
-        **_about(parameter),
-        "at_bound": minimum.at_bound[index],
-        "determined": minimum.determined[index],
-    }
 
 
 def _curve(index: int, point: FloatArray, surrogate: Surrogate, space: ParameterSpace) -> dict[str, list[float]]:

@@ -93,8 +93,8 @@ def checks(
     order, adjusted = np.argsort(p), np.ones(len(p))
     adjusted[order] = np.minimum(np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1)), 1.0)
     found = [
-        Check(*key, float(ratio), float(chance), len(index))
-        for (key, index), ratio, chance in zip(blocks.items(), np.sqrt(own), adjusted, strict=True)
+        Check(stage, region, channel, float(ratio), float(chance), len(index))
+        for ((stage, region, channel), index), ratio, chance in zip(blocks.items(), np.sqrt(own), adjusted, strict=True)
     ]
     return sorted(found, key=lambda c: (c.p, -c.ratio))
 
