@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import gaussian_filter
 
-from splatsoil.errors import ParameterError
+from splatsoil.errors import ParameterError, SimulationError
 from splatsoil.parameters import ParameterSpace
 
 from .devices import resolve_device
@@ -140,8 +140,10 @@ class SyntheticProblem:
         """Values and seed of the world's own simulation, as long as it hasn't been made."""
         return (self._truth, self._truth_seed) if self._observed is None and self._truth is not None else None
 
-    def record(self, clean: Image) -> None:
+    def record(self, clean: Image | SimulationError) -> None:
         """Take pictures (k, h, w, 3) of the world's own simulation as what the cameras saw, but for their noise."""
+        if isinstance(clean, SimulationError):
+            raise clean
         noise = np.random.default_rng([self._truth_seed, 1]).standard_normal(clean.shape)
         self._observed = np.clip(clean + SENSOR_NOISE * noise, 0.0, 1.0).astype(np.float32)
 
@@ -176,11 +178,15 @@ class SyntheticProblem:
         )
 
     def predict(self, parameters: Mapping[str, float], seed: int) -> Image:
-        """Pictures (k, h, w, 3), camera by camera, of a bed of other particles (by ``seed``) with these parameters."""
-        world = self.world
-        particles = world.particles(seed)
-        trajectory = world.simulate(particles, parameters)
-        return world.pictures(particles, trajectory.positions, trajectory.deformations)
+        """Pictures (k, h, w, 3), camera by camera, of a bed of other particles (by ``seed``) with these parameters.
+
+        Raises:
+            SimulationError: the simulation could not go on.
+        """
+        (made,) = self.world.simulated([(parameters, seed)])
+        if isinstance(made, SimulationError):
+            raise made
+        return made
 
     def share(self, other: SyntheticProblem) -> None:
         """Use another problem's solver and scene, if they are for the same law, preset and device."""
