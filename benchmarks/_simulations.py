@@ -13,18 +13,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from splatsoil.benchmarks._common import parser_of, ticker
-from splatsoil.envs.levels import is_full
 from splatsoil.envs.measured import LOSS, MeasuredProblem, cache_folder
 from splatsoil.envs.problem import Problem
 from splatsoil.envs.synthetic import SyntheticProblem
 from splatsoil.envs.synthetic_world import World
-from splatsoil.inverse.campaign import Job, run_campaign
+from splatsoil.inverse.bayesopt import sobol
 from splatsoil.inverse.criticism.design import Prior, Run
 from splatsoil.inverse.criticism.diagnosis import BASE
 from splatsoil.inverse.criticism.noise import Tables, noise_of
-from splatsoil.inverse.evaluations import EvaluationRecord, EvaluationStore, digest, writer_lock
+from splatsoil.inverse.evaluations import EvaluationRecord, EvaluationStore, digest, evaluate, writer_lock
 from splatsoil.inverse.posterior import Density
-from splatsoil.inverse.surrogate import sobol
 
 import splatsoil
 from splatsoil.experiment import Layout, Site
@@ -57,8 +55,8 @@ class Data:
 
     @classmethod
     def of(cls, space: ParameterSpace, records: Sequence[EvaluationRecord]) -> Data:
-        """Those that succeeded, at full resolution; blocks hidden in any of them are left out."""
-        good = [r for r in records if r.status == "ok" and is_full(r.parameters)]
+        """Those that succeeded; blocks hidden in any of them are left out."""
+        good = [r for r in records if r.loss is not None]
         blocks = np.array([r.blocks for r in good])
         points = space.to_unit(np.stack([space.to_vector(r.parameters) for r in good]))
         return cls(space, points, blocks[:, np.all(blocks != 0.0, axis=0)])
@@ -135,22 +133,17 @@ def simulated(
         "code": code_digest((*FORWARD,), others=[name for name in options.effects if name.endswith(".py")]),
         "loss": LOSS,
     }
-    asked = {"parameters": list(options.parameters), "count": count, "seed": seed, "repeats": repeats}
     points = np.concatenate([sobol(count, len(problem.space), seed), np.zeros((repeats, len(problem.space)))])
     seeds = np.random.SeedSequence([seed, 9]).generate_state(len(points)) % 2**31
-    jobs = [Job(problem.space.to_dict(problem.space.from_unit(p)), int(s)) for p, s in zip(points, seeds, strict=True)]
-    file = cache_folder() / "simulations" / f"{digest({**model, 'parameters': asked['parameters']})[:16]}.db"
+    values = [problem.space.to_dict(problem.space.from_unit(p)) for p in points]
+    jobs = list(zip(values, map(int, seeds), strict=True))
+    file = cache_folder() / "simulations" / f"{digest({**model, 'parameters': list(options.parameters)})[:16]}.db"
     report = ticker("simulations")
     with writer_lock(file.parent), EvaluationStore(file) as store:
-        records = run_campaign(
-            problem,
-            jobs,
-            store,
-            model,
-            {"agent": "simulations", **asked},
-            executor=pool,
-            after_evaluation=lambda done, _: report(done, len(jobs)),
-        )
+        records = []
+        for record in evaluate(problem, jobs, store, model, pool=pool):
+            records.append(record)
+            report(len(records), len(jobs))
     return Data.of(problem.space, records), file
 
 

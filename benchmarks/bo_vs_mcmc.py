@@ -21,6 +21,7 @@ import json
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import emcee
@@ -28,11 +29,10 @@ import numpy as np
 import numpy.typing as npt
 from splatsoil.benchmarks._common import at_least, output_options, stamp, ticker, write_result
 from splatsoil.benchmarks._simulations import FEWEST, density_of, simulated, world_parser
-from splatsoil.inverse.bayesopt import PAPER, BayesianOptimiser, Search
-from splatsoil.inverse.executors import Executor, Serial, executor, in_order
+from splatsoil.inverse.bayesopt import BayesianOptimiser, sobol
+from splatsoil.inverse.executors import Executor, Serial, executor
 from splatsoil.inverse.mcmc import sample
 from splatsoil.inverse.posterior import Density
-from splatsoil.inverse.surrogate import sobol
 
 from splatsoil.files import plain
 from splatsoil.parameters import ParameterSpace
@@ -93,19 +93,17 @@ class Answer:
     seconds: float
 
 
-def play(
-    world: EmulatedWorld, budgets: Sequence[int], seed: int, search: Search | None
-) -> tuple[dict[int, Answer], Any]:
-    """Bayesian optimisation: an answer at each budget, and the calls (points, features)."""
+def play(world: EmulatedWorld, budgets: Sequence[int], seed: int, **options: Any) -> tuple[dict[int, Answer], Any]:
+    """Bayesian optimisation with options of its own: an answer at each budget, and the calls (points, features)."""
     rng = np.random.default_rng([seed, 31])
-    optimiser = BayesianOptimiser(len(world.space), seed=seed, search=search)
+    optimiser = BayesianOptimiser(len(world.space), seed=seed, **options)
     answers: dict[int, Answer] = {}
     points: list[FloatArray] = []
     features: list[FloatArray] = []
     spent = 0.0
     while len(points) < max(budgets):
         began = time.perf_counter()
-        action = optimiser.ask().astype(np.float64)
+        action = optimiser.ask()[0].astype(np.float64)
         spent += time.perf_counter() - began
         loss, residual = world.call(action, rng)
         optimiser.tell(action, loss)
@@ -115,16 +113,17 @@ def play(
             began = time.perf_counter()
             found = optimiser.result()
             seconds = spent + time.perf_counter() - began
-            answers[len(points)] = Answer(found.estimate, found.low, found.high, seconds)
+            _, low, high = found.interval()
+            answers[len(points)] = Answer(found.estimate, low, high, seconds)
     return answers, (np.array(points), np.array(features))
 
 
 def sample_emulated(space: ParameterSpace, points: FloatArray, features: FloatArray, seed: int) -> Answer:
     """emcee on an emulator of calls (k, n), (k, b); features are residuals, so the observed ones are 0."""
     began = time.perf_counter()
-    ends, count = np.ones(len(space)), features.shape[1]
+    count = features.shape[1]
     density = density_of(space, points, features, np.zeros(count), 0.0, seed)
-    chains = sample(density, -ends, ends, seed=seed, ensembles=2, most_steps=1000)
+    chains = sample(density, len(space), seed=seed, ensembles=2, most_steps=1000)
     low, high = np.quantile(chains.flat, [0.05, 0.95], axis=0)
     return Answer(chains.flat.mean(axis=0), low, high, time.perf_counter() - began)
 
@@ -170,10 +169,10 @@ def trial(
     usable = [b for b in budgets if b >= FEWEST]
     out: dict[str, dict[int, Answer]] = {}
     if "bo" in ways or "both" in ways:
-        out["bo"], (points, features) = play(world, budgets, seed, None)
+        out["bo"], (points, features) = play(world, budgets, seed)
         out["both"] = {b: sample_emulated(world.space, points[:b], features[:b], seed) for b in usable}
     if "paper" in ways:
-        out["paper"], _ = play(world, budgets, seed, PAPER)
+        out["paper"], _ = play(world, budgets, seed, start=1, acquisition="best")
     if "mcmc" in ways:
         points = sobol(max(budgets), n, seed)
         features = np.array([world.call(p, rng)[1] for p in points])
@@ -195,8 +194,8 @@ def run(
     """Errors, widths and coverage of all ways over seeds, in physical units."""
     space, report = world.space, ticker("truths")
     rows: dict[tuple[str, int], list[tuple[FloatArray, FloatArray, npt.NDArray[np.bool_], float]]] = {}
-    jobs = [(world, ways, budgets, direct, seed) for seed in range(seeds)]
-    for seed, answers_of in enumerate(in_order(pool or Serial(), trial, jobs)):
+    pool, job = pool or Serial(), partial(trial, world, ways, budgets, direct)
+    for seed, answers_of in enumerate(pool.map(job, range(seeds))):
         truth = truth_of(seed, len(space))
         for way, answers in answers_of.items():
             for budget, answer in answers.items():

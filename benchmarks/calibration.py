@@ -23,8 +23,7 @@ import numpy.typing as npt
 from scipy.stats import binom, chisquare
 from splatsoil.benchmarks._common import at_least, output_options, stamp, ticker, write_result
 from splatsoil.benchmarks._simulations import Data, density_of, simulated, world_parser
-from splatsoil.inverse.executors import Executor, Serial, executor, in_order
-from splatsoil.inverse.marginal import Marginal
+from splatsoil.inverse.executors import Executor, Serial, executor
 
 from splatsoil.files import plain
 from splatsoil.parameters import ParameterSpace
@@ -78,7 +77,7 @@ def calibrate(
         jobs.append((data, train, test, sensor_std, seed, number))
     out: list[dict[str, Any]] = []
     report = ticker("truths")
-    for entries in in_order(pool or Serial(), one_fold, jobs):
+    for entries in (pool or Serial()).map(one_fold, *zip(*jobs, strict=True)):
         out += entries
         report(len(out), truths)
     return out
@@ -95,7 +94,7 @@ def one_fold(
         observed = features[index] + sensor_std * rng.standard_normal(features.shape[1])
         density = density_of(space, data.points[train], features[train], observed, sensor_std, seed)
         evidence = density.comparison.judge()
-        marginals = [Marginal.of(p, evidence) for p in space]
+        marginals = [evidence.marginal(p.name) for p in space]
         weights = marginals[0].weights
         chosen = rng.choice(len(weights), DRAWS, p=weights / weights.sum())
         draws = space.to_unit(np.stack([m.values[chosen] for m in marginals], axis=1))

@@ -42,9 +42,8 @@ from splatsoil.benchmarks._common import (
     write_result,
 )
 from splatsoil.benchmarks._simulations import FEWEST, density_of
-from splatsoil.inverse.bayesopt import PAPER, BayesianOptimiser
+from splatsoil.inverse.bayesopt import BayesianOptimiser
 from splatsoil.inverse.executors import executor
-from splatsoil.inverse.marginal import Marginal
 
 from splatsoil.comparison import Comparator
 from splatsoil.errors import SimulationError
@@ -71,6 +70,8 @@ SPACE = ParameterSpace([replace(FRICTION_ANGLE, lower=25.0, upper=55.0)])
 #: Ways that spend evaluations of their own.
 SEARCHES = ("published", "ours")
 WAYS = (*SEARCHES, "features")
+#: Seed of the published way's first search: its start is random, and another one than ours.
+FIRST_OF_PUBLISHED = 1000
 
 
 @dataclass(frozen=True)
@@ -194,13 +195,17 @@ class Trial:
     calls: list[tuple[float, tuple[float, FloatArray] | None]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.optimiser = BayesianOptimiser(1, seed=self.number, search=PAPER if self.way == "published" else None)
+        if self.way == "published":
+            seed = FIRST_OF_PUBLISHED + self.number
+            self.optimiser = BayesianOptimiser(1, seed=seed, start=1, acquisition="best")
+        else:
+            self.optimiser = BayesianOptimiser(1, seed=self.number)
 
     def ask(self) -> tuple[float, int]:
         """The angle to try next, degrees, and a seed of its particles."""
         sequence = np.random.SeedSequence([self.number, len(self.calls), WAYS.index(self.way)])
         seed = int(sequence.generate_state(1)[0] % 2**31)
-        return float(SPACE.from_unit(self.optimiser.ask().astype(np.float64))[0]), seed
+        return float(SPACE.from_unit(self.optimiser.ask()[0].astype(np.float64))[0]), seed
 
     def tell(self, angle: float, found: tuple[float, FloatArray] | None) -> None:
         """What the angle came to; None: its simulation failed."""
@@ -213,8 +218,9 @@ class Trial:
         told: dict[str, Any] = {"calls": [{"angle": a, "loss": f and f[0]} for a, f in self.calls], self.way: None}
         if good:
             found = self.optimiser.result()
-            estimate, low, high = (float(SPACE.from_unit(p)[0]) for p in (found.estimate, found.low, found.high))
-            told[self.way] = {"estimate": estimate, "low": low, "high": high}
+            _, low, high = found.interval(SPACE.from_unit)
+            numbers = {"estimate": SPACE.from_unit(found.estimate), "low": low, "high": high}
+            told[self.way] = {name: float(value[0]) for name, value in numbers.items()}
         if self.way == "ours":
             angles, blocks = np.array([a for a, _, _ in good]), np.array([b for _, _, b in good])
             told["features"] = by_features(angles, blocks, sensor, self.number)
@@ -228,7 +234,7 @@ def by_features(angles: FloatArray, blocks: FloatArray, sensor: float, seed: int
         return None
     points, residuals = SPACE.to_unit(angles[:, None]), blocks[:, seen]
     density = density_of(SPACE, points, -residuals, np.zeros(residuals.shape[1]), sensor, seed)
-    marginal = Marginal.of(next(iter(SPACE)), density.comparison.judge())
+    marginal = density.comparison.judge().marginal(SPACE.names[0])
     return {"estimate": marginal.mean, "low": marginal.quantile(0.05), "high": marginal.quantile(0.95)}
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -124,24 +124,6 @@ class MeasuredProblem:
         began = time.perf_counter()
         evaluation = self.judge(self.experiment.prediction(parameters, seed=seed))
         return replace(evaluation, seconds=time.perf_counter() - began)
-
-    def cheaper(self, preset: str) -> tuple[Callable[[Mapping[str, float], int], Evaluation], float]:
-        """Evaluation by a coarser simulation of the same reconstruction, and its cost in units of a full one.
-
-        Raises:
-            ParameterError: a preset that is unknown or no cheaper.
-        """
-        from splatsoil.mpm import Resolution
-
-        from .levels import relative_cost
-
-        model = self.model
-        coarse = model.variant(resolution=Resolution.derive(model.measurement, preset))
-
-        def evaluate(parameters: Mapping[str, float], seed: int) -> Evaluation:
-            return self.judge(coarse.predict(parameters, seed, self.experiment.progress))
-
-        return evaluate, relative_cost(model.resolution, coarse.resolution)
 
     def judge(self, prediction: Prediction) -> Evaluation:
         """A prediction compared with what was measured."""

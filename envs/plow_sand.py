@@ -6,7 +6,7 @@ the observed ones and pays minus the loss; the episode ends when the budget of g
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from splatsoil.errors import ParameterError
 
-from .problem import Evaluation, Image, Problem
+from .problem import Evaluation, Image, Job, Problem, simulation_seed
 from .together import attempt
 
 Observation = dict[str, npt.NDArray[np.float32]]
@@ -54,9 +54,6 @@ class PlowSandEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         budget: evaluations in an episode, at least 2.
         device: ``auto``, ``cpu`` or ``cuda:N``.
         reconstruction: folder of a saved reconstruction of the measurement; made (minutes) when there is none.
-        coarse: a coarser preset that the agent may use, too: the action then has one more entry, the fidelity, and
-            where it is negative, the guess is simulated at this preset. ``info["cost"]`` says what that cost in units
-            of a full evaluation; the budget counts steps.
         render_mode: ``rgb_array`` shows observed | predicted | difference.
         same_particles: simulate all of an episode with the same particles, so that two losses differ by their
             parameters and hardly by chance (common random numbers); by default each has its own.
@@ -76,7 +73,6 @@ class PlowSandEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         reconstruction: str | None = None,
         render_mode: str | None = None,
         same_particles: bool = False,
-        coarse: str | None = None,
         problem: Problem | None = None,
     ) -> None:
         if budget < 2:
@@ -86,7 +82,7 @@ class PlowSandEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self.render_mode = render_mode
         self.budget = int(budget)
         self.same_particles = bool(same_particles)
-        self.problem = problem or make_problem(measurement, parameters, effects, preset, device, reconstruction, coarse)
+        self.problem = problem or make_problem(measurement, parameters, effects, preset, device, reconstruction)
         n, b = len(self.problem.space), self.problem.block_count
         box = gym.spaces.Box
         self.action_space = box(-1.0, 1.0, (n,), np.float32)
@@ -109,6 +105,8 @@ class PlowSandEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self._best_loss: float | None = None
         self._last_action = np.zeros(n, dtype=np.float32)
         self.last_evaluation: Evaluation | None = None
+        #: The next step's, where it was simulated in a batch with others.
+        self.ahead: Evaluation | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -135,36 +133,9 @@ class PlowSandEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             gymnasium.error.ResetNeeded: the episode is over or hasn't begun.
             ParameterError: the action isn't n finite numbers; one beyond [-1, 1] is clipped.
         """
-        guess, parameters, seed = self.plan(action)
-        return self.settle(guess, parameters, seed, attempt(self.problem, parameters, seed))
-
-    def plan(self, action: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.float32], dict[str, float], int]:
-        """The first half of a step: the guess (n,) as it counts, its physical values, and the simulation's seed."""
-        if self._left <= 0:
-            raise gym.error.ResetNeeded("the budget of evaluations is spent; call reset() to start another episode")
-        guess = np.array(action, dtype=np.float32).reshape(-1)
-        if guess.shape != self.action_space.shape or not np.all(np.isfinite(guess)):
-            raise ParameterError(f"action: expected {len(self.problem.space)} finite numbers, got {action}")
-        guess = np.clip(guess, -1.0, 1.0)
-        parameters = self.problem.space.to_dict(self.problem.space.from_unit(guess))
-        return guess, parameters, self.simulation_seed(self.budget - self._left)
-
-    def ahead(self, actions: Sequence[npt.ArrayLike]) -> list[tuple[dict[str, float], int]]:
-        """Physical values and simulation seeds of the next steps if they take these actions, as far as the budget goes:
-        for agents that have several evaluated side by side."""
-        left, jobs = self._left, []
-        try:
-            for action in list(actions)[:left]:
-                jobs.append(self.plan(np.asarray(action, dtype=np.float32))[1:])
-                self._left -= 1
-        finally:
-            self._left = left
-        return jobs
-
-    def settle(
-        self, guess: npt.NDArray[np.float32], parameters: Mapping[str, float], seed: int, evaluation: Evaluation
-    ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """The second half of a step: take note of the evaluation of a planned guess, and pay for it."""
+        guess, (parameters, seed) = self.plan(action)
+        evaluation = self.ahead or attempt(self.problem, parameters, seed)
+        self.ahead = None
         self._left -= 1
         self._last_action, self.last_evaluation = guess, evaluation
         if evaluation.loss is not None and (self._best_loss is None or evaluation.loss < self._best_loss):
@@ -182,10 +153,17 @@ class PlowSandEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         reward = -float(self.problem.worst_loss if evaluation.loss is None else evaluation.loss)
         return self._observation(), reward, False, self._left == 0, info
 
-    def simulation_seed(self, step: int) -> int:
-        """Seed of the simulation in this step of this episode."""
-        which = 0 if self.same_particles else step
-        return int(np.random.SeedSequence([self._episode_seed, which]).generate_state(1)[0] % 2**31)
+    def plan(self, action: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.float32], Job]:
+        """What a step will simulate: the guess (n,) as it counts, its physical values and the simulation's seed."""
+        if self._left <= 0:
+            raise gym.error.ResetNeeded("the budget of evaluations is spent; call reset() to start another episode")
+        guess = np.array(action, dtype=np.float32).reshape(-1)
+        if guess.shape != self.action_space.shape or not np.all(np.isfinite(guess)):
+            raise ParameterError(f"action: expected {len(self.problem.space)} finite numbers, got {action}")
+        guess = np.clip(guess, -1.0, 1.0)
+        parameters = self.problem.space.to_dict(self.problem.space.from_unit(guess))
+        step = 0 if self.same_particles else self.budget - self._left
+        return guess, (parameters, simulation_seed(self._episode_seed, step))
 
     def _observation(self) -> Observation:
         worst = self.problem.worst_loss
@@ -223,28 +201,20 @@ def signed_difference(observed: Image, predicted: Image) -> Image:
 
 
 def make_problem(
-    measurement: str | None,
-    parameters: Sequence[str],
-    effects: Sequence[str],
-    preset: str | None,
-    device: str,
-    reconstruction: str | None,
-    coarse: str | None = None,
+    measurement: str | None = None,
+    parameters: Sequence[str] = ("friction_angle",),
+    effects: Sequence[str] = (),
+    preset: str | None = None,
+    device: str = "cpu",
+    reconstruction: str | None = None,
 ) -> Problem:
     """The simulate-and-compare that the environment's options describe."""
-    problem: Problem
     if measurement is None:
         from .synthetic import SyntheticProblem
 
-        problem = SyntheticProblem(parameters, effects, preset=preset or "tiny", device=device)
-    else:
-        from .measured import MeasuredProblem
+        return SyntheticProblem(parameters, effects, preset=preset or "tiny", device=device)
+    from .measured import MeasuredProblem
 
-        problem = MeasuredProblem.load(
-            measurement, parameters, effects, preset=preset or "small", device=device, reconstruction=reconstruction
-        )
-    if coarse is None:
-        return problem
-    from .levels import TwoLevelProblem
-
-    return TwoLevelProblem(problem, coarse)
+    return MeasuredProblem.load(
+        measurement, parameters, effects, preset=preset or "small", device=device, reconstruction=reconstruction
+    )

@@ -13,6 +13,8 @@ from splatsoil.parameters import ParameterSpace
 
 FloatArray = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
+Job = tuple[Mapping[str, float], int]
+"""Parameters by name in physical units, and the simulation's seed."""
 
 
 @dataclass(frozen=True)
@@ -75,48 +77,6 @@ class Problem(Protocol):
         """The hidden parameters of a synthetic experiment, None for a measured one."""
 
 
-class WrappedProblem:
-    """A problem that does what another one does, but for what a subclass changes.
-
-    Args:
-        inner: does the work.
-    """
-
-    def __init__(self, inner: Problem) -> None:
-        self.inner = inner
-
-    @property
-    def space(self) -> ParameterSpace:
-        """The free parameters."""
-        return self.inner.space
-
-    @property
-    def block_count(self) -> int:
-        """Length of the block residuals."""
-        return self.inner.block_count
-
-    @property
-    def worst_loss(self) -> float:
-        """Larger than any loss."""
-        return self.inner.worst_loss
-
-    @property
-    def image_size(self) -> tuple[int, int]:
-        """(height, width) of the pictures."""
-        return self.inner.image_size
-
-    def begin(self, seed: int) -> None:
-        """Start an episode."""
-        self.inner.begin(seed)
-
-    def evaluate(self, parameters: Mapping[str, float], seed: int) -> Evaluation:
-        """Simulate and compare; see :class:`Problem`."""
-        return self.inner.evaluate(parameters, seed)
-
-    def observed_image(self) -> Image:
-        """The observation as pictures show it."""
-        return self.inner.observed_image()
-
-    def truth(self) -> Mapping[str, float] | None:
-        """The hidden parameters of a synthetic experiment."""
-        return self.inner.truth()
+def simulation_seed(seed: int, step: int) -> int:
+    """Seed of the particles in one step of an episode or a fit."""
+    return int(np.random.SeedSequence([seed, step]).generate_state(1)[0] % 2**31)

@@ -7,7 +7,7 @@ loss is chance and not zero. It is a toy for trying agents on; an answer about r
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import gaussian_filter
 
-from splatsoil.errors import ParameterError
+from splatsoil.errors import ParameterError, SimulationError
 from splatsoil.parameters import ParameterSpace
 
 from .devices import resolve_device
@@ -140,8 +140,10 @@ class SyntheticProblem:
         """Values and seed of the world's own simulation, as long as it hasn't been made."""
         return (self._truth, self._truth_seed) if self._observed is None and self._truth is not None else None
 
-    def record(self, clean: Image) -> None:
+    def record(self, clean: Image | SimulationError) -> None:
         """Take pictures (k, h, w, 3) of the world's own simulation as what the cameras saw, but for their noise."""
+        if isinstance(clean, SimulationError):
+            raise clean
         noise = np.random.default_rng([self._truth_seed, 1]).standard_normal(clean.shape)
         self._observed = np.clip(clean + SENSOR_NOISE * noise, 0.0, 1.0).astype(np.float32)
 
@@ -160,23 +162,6 @@ class SyntheticProblem:
         evaluation = self.judge(self.predict(parameters, seed))
         return replace(evaluation, seconds=time.perf_counter() - began)
 
-    def cheaper(self, preset: str) -> tuple[Callable[[Mapping[str, float], int], Evaluation], float]:
-        """Evaluation by a coarser simulation, against the same observation, and its cost in units of a full one.
-
-        Raises:
-            ParameterError: a preset that is unknown or no cheaper.
-        """
-        from .levels import relative_cost
-
-        world = World(self.effects, preset, self.device)
-
-        def evaluate(parameters: Mapping[str, float], seed: int) -> Evaluation:
-            particles = world.particles(seed)
-            found = world.simulate(particles, parameters)
-            return self.judge(world.pictures(particles, found.positions, found.deformations))
-
-        return evaluate, relative_cost(self.world.resolution, world.resolution)
-
     def judge(self, predicted: Image) -> Evaluation:
         """Predicted pictures (k, h, w, 3) compared with the observed ones."""
         observed = self.observed()
@@ -193,11 +178,15 @@ class SyntheticProblem:
         )
 
     def predict(self, parameters: Mapping[str, float], seed: int) -> Image:
-        """Pictures (k, h, w, 3), camera by camera, of a bed of other particles (by ``seed``) with these parameters."""
-        world = self.world
-        particles = world.particles(seed)
-        trajectory = world.simulate(particles, parameters)
-        return world.pictures(particles, trajectory.positions, trajectory.deformations)
+        """Pictures (k, h, w, 3), camera by camera, of a bed of other particles (by ``seed``) with these parameters.
+
+        Raises:
+            SimulationError: the simulation could not go on.
+        """
+        (made,) = self.world.simulated([(parameters, seed)])
+        if isinstance(made, SimulationError):
+            raise made
+        return made
 
     def share(self, other: SyntheticProblem) -> None:
         """Use another problem's solver and scene, if they are for the same law, preset and device."""

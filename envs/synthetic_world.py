@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from .problem import Image
+from splatsoil.errors import SimulationError
+
+from .problem import Image, Job
 
 if TYPE_CHECKING:
     from splatsoil.measurement import Camera, Measurement
-    from splatsoil.mpm import Trajectory
     from splatsoil.scene import Scene
 
 FloatArray = npt.NDArray[np.float64]
@@ -111,19 +112,16 @@ class World:
 
         return fill(self.surface, self.measurement.bed, self.resolution.spacing, seed=seed)
 
-    def simulate(self, particles: FloatArray, parameters: Mapping[str, float]) -> Trajectory:
-        """The compared frames."""
-        from splatsoil.mpm import simulate
+    def simulated(self, jobs: Sequence[Job]) -> list[Image | SimulationError]:
+        """Pictures (k, h, w, 3) of each job, or why it could not go on; all are simulated as one batch."""
+        from splatsoil.mpm import simulate_together
 
-        return simulate(
-            self.measurement,
-            particles,
-            parameters,
-            law=self.law,
-            resolution=self.resolution,
-            frames=COMPARED,
-            device=self.device,
-        )[0]
+        particles = [self.particles(seed) for _, seed in jobs]
+        found = simulate_together(self.measurement, particles, [values for values, _ in jobs], self)
+        return [
+            one if isinstance(one, SimulationError) else self.pictures(x, one.positions, one.deformations)
+            for x, one in zip(particles, found, strict=True)
+        ]
 
     def still(self) -> Image:
         """Pictures (k, h, w, 3) of soil that doesn't move while the blade does."""

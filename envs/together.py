@@ -4,21 +4,19 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from splatsoil.errors import SimulationError
 
-from .problem import Evaluation, Problem
+from .problem import Evaluation, Job, Problem
 
 if TYPE_CHECKING:
     from .measured import MeasuredProblem
     from .synthetic import SyntheticProblem
-
-Job = tuple[Mapping[str, float], int]
 
 
 def attempt(problem: Problem, parameters: Mapping[str, float], seed: int) -> Evaluation:
@@ -55,46 +53,36 @@ def evaluate_together(problems: Sequence[Problem], jobs: Sequence[Job]) -> list[
 
 
 def _synthetic(problems: Sequence[SyntheticProblem], jobs: Sequence[Job]) -> list[Evaluation]:
-    from splatsoil.mpm import simulate_together
-
-    first = problems[0]
+    began, first = time.perf_counter(), problems[0]
     for problem in problems:
         problem.share(first)
-    new = {id(p): p for p in problems if p.unobserved() is not None}
-    truths = [(p, p.unobserved()) for p in new.values()]
-    began = time.perf_counter()
-    everything: list[Job] = [truth for _, truth in truths if truth is not None] + list(jobs)
-    world = first.world
-    particles = [world.particles(seed) for _, seed in everything]
-    found = simulate_together(world.measurement, particles, [v for v, _ in everything], world)
-    for (problem, _), x, trajectory in zip(truths, particles, found, strict=False):
-        if isinstance(trajectory, SimulationError):
-            raise trajectory
-        problem.record(world.pictures(x, trajectory.positions, trajectory.deformations))
-    out = []
-    for problem, x, trajectory in zip(problems, particles[len(truths) :], found[len(truths) :], strict=True):
-        if isinstance(trajectory, SimulationError):
-            out.append(failed(problem, trajectory))
-        else:
-            out.append(problem.judge(world.pictures(x, trajectory.positions, trajectory.deformations)))
-    seconds = (time.perf_counter() - began) / len(out)
-    return [replace(evaluation, seconds=seconds) for evaluation in out]
+    new = {id(p): (p, truth) for p in problems if (truth := p.unobserved()) is not None}
+    made = first.world.simulated([*(truth for _, truth in new.values()), *jobs])
+    for (problem, _), clean in zip(new.values(), made, strict=False):
+        problem.record(clean)
+    return _judged(problems, made[len(new) :], began)
 
 
 def _measured(problem: MeasuredProblem, jobs: Sequence[Job]) -> list[Evaluation]:
     from splatsoil.model import Prediction
     from splatsoil.mpm import simulate_together
 
-    began = time.perf_counter()
-    model = problem.model
+    began, model = time.perf_counter(), problem.model
     particles = [model.particles(seed) for _, seed in jobs]
     found = simulate_together(model.measurement, particles, [v for v, _ in jobs], model, problem.experiment.progress)
-    out = []
-    for (values, seed), trajectory in zip(jobs, found, strict=True):
-        if isinstance(trajectory, SimulationError):
-            out.append(failed(problem, trajectory))
-        else:
-            images = model.draw(trajectory, seed, values)
-            out.append(problem.judge(Prediction(dict(values), seed, images, trajectory, {})))
-    seconds = (time.perf_counter() - began) / len(out)
-    return [replace(evaluation, seconds=seconds) for evaluation in out]
+    made = (
+        trajectory
+        if isinstance(trajectory, SimulationError)
+        else Prediction(dict(values), seed, model.draw(trajectory, seed, values), trajectory, {})
+        for (values, seed), trajectory in zip(jobs, found, strict=True)
+    )
+    return _judged([problem] * len(jobs), made, began)
+
+
+def _judged(problems: Sequence[Any], made: Iterable[Any], began: float) -> list[Evaluation]:
+    """What simulations, or the errors in their place, come to."""
+    out = [
+        failed(problem, one) if isinstance(one, SimulationError) else problem.judge(one)
+        for problem, one in zip(problems, made, strict=True)
+    ]
+    return [replace(evaluation, seconds=(time.perf_counter() - began) / len(out)) for evaluation in out]

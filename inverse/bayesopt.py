@@ -1,261 +1,324 @@
-"""Bayesian optimisation as an agent: it knows a Gymnasium environment and nothing of soil.
+"""Bayesian optimisation with BoTorch: a Gaussian process over the loss, and log expected improvement.
 
-Ask, tell, and a result. What is asked next depends only on the seed and on what was told, so that a run told the
-evaluations of an interrupted one goes on as that one would have.
+The optimiser asks and is told. What it asks next depends only on the seed and on what it was told, so that a run told
+the evaluations of an interrupted one goes on as that one would have.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
+import emcee
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 import torch
+from scipy.stats import norm
 
-from .surrogate import FloatArray, Minimum, Surrogate, quiet, seeded, sobol
+if TYPE_CHECKING:
+    from botorch.models import SingleTaskGP
+
+FloatArray = npt.NDArray[np.float64]
+Acquisition = Literal["noisy", "best"]
 
 #: Space-filling evaluations before the first acquisition: at least, and for each parameter. With fewer, a search in
 #: many dimensions runs into corners and stays there.
 START, START_EACH = 4, 3
-#: Quasi-Monte-Carlo draws, restarts and raw candidates of the acquisition function.
-DRAWS = 128
-RESTARTS = 4
-RAW = 128
-#: A proposal closer than this to an evaluated point (in [-1, 1]^n) adds too little: it is moved away.
-NEAREST = 1e-3
+#: Restarts and raw candidates of every optimisation of BoTorch's.
+RESTARTS, RAW = 4, 128
+#: ln of the noise variance beforehand, of standardised losses: BoTorch's median and twice its width, for a simulator
+#: may have hardly any noise.
+NOISE_MEAN, NOISE_STD = -4.0, 2.0
+#: Draws of the hyperparameters (emcee's walkers after so many steps), and sample paths of each.
+DRAWS, STEPS, PATHS = 64, 200, 2
+#: A minimum this close to a bound, as a part of the axis' length, counts as lying on it.
+AT_BOUND = 0.01
+#: Minimisers whose root mean square distance from the estimate is more than this part of a uniform distribution's
+#: standard deviation do not determine it.
+UNINFORMED = 0.6
 
 
-@dataclass(frozen=True)
-class Search:
-    """How an optimiser searches.
-
-    Attributes:
-        start: space-filling points before the first acquisition.
-        acquisition: ``noisy`` (log noisy expected improvement: what is best so far is itself uncertain) or ``ei`` (log
-            expected improvement over the best mean at an evaluated point).
-        random: the start is drawn uniformly, not from a Sobol sequence.
-    """
-
-    start: int = START
-    acquisition: Literal["noisy", "ei"] = "noisy"
-    random: bool = False
-
-
-#: The settings of Hsiao and Kumar: one random start, expected improvement; with 10 evaluations in [25°, 55°].
-PAPER = Search(start=1, acquisition="ei", random=True)
-
-
-@dataclass(frozen=True)
-class Told:
-    """One evaluation the optimiser knows.
-
-    Attributes:
-        action: (n,) in [-1, 1].
-        loss: None where the evaluation failed.
-    """
+class Told(NamedTuple):
+    """One evaluation: the action (n,) in [-1, 1], and its loss; None where it failed."""
 
     action: FloatArray
     loss: float | None
 
 
+@dataclass(frozen=True, eq=False)
+class Minimum:
+    """Where the loss is least, by the Gaussian process.
+
+    Attributes:
+        estimate: (n,) minimiser of the posterior mean, in [-1, 1]^n.
+        minimisers: (k, n) those of sample paths.
+        constant: all losses were alike.
+    """
+
+    estimate: FloatArray
+    minimisers: FloatArray
+    constant: bool = False
+
+    @property
+    def at_bound(self) -> tuple[Literal["lower", "upper"] | None, ...]:
+        """For each axis the bound that the estimate lies on, if any."""
+        near = np.abs(self.estimate) > 1.0 - 2.0 * AT_BOUND
+        return tuple(
+            ("upper" if value > 0.0 else "lower") if on else None for on, value in zip(near, self.estimate, strict=True)
+        )
+
+    @property
+    def determined(self) -> tuple[bool, ...]:
+        """For each axis, False where the evaluations hardly say where along it the minimum is."""
+        spread = np.sqrt(np.mean((self.minimisers - self.estimate) ** 2, axis=0))
+        return tuple(bool(s < UNINFORMED * 2.0 / np.sqrt(12.0)) and not self.constant for s in spread)
+
+    def interval(
+        self, to: Callable[[FloatArray], FloatArray] = lambda unit: unit
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Standard deviation, 5 and 95 % quantile (n,) of the minimisers, on the scale that ``to`` leads to.
+
+        The first is the distance from the estimate that holds 68.3 % of them, as a root mean square would be ruled by
+        the few paths that dip in a gap between evaluations; it is the latter for an axis that is not determined.
+        """
+        minimisers = to(self.minimisers)
+        distances = np.abs(minimisers - to(self.estimate))
+        rms = np.sqrt(np.mean(distances**2, axis=0))
+        low, high = np.quantile(minimisers, [0.05, 0.95], axis=0)
+        return np.where(self.determined, np.quantile(distances, 0.683, axis=0), rms), low, high
+
+
+class Surrogate:
+    """A Gaussian process over a loss: BoTorch's single-task one.
+
+    Proposals and means are those of the most probable hyperparameters. What the minimum could be is averaged over draws
+    of them: ten losses leave them open, and one best guess takes noise for a valley.
+
+    Args:
+        points: (m, n) in [-1, 1].
+        losses: (m,) finite.
+        seed: of draws.
+
+    Raises:
+        ValueError: no evaluations, or shapes that do not agree.
+    """
+
+    def __init__(self, points: npt.ArrayLike, losses: npt.ArrayLike, *, seed: int = 0) -> None:
+        x, y = np.atleast_2d(np.asarray(points, dtype=np.float64)), np.asarray(losses, dtype=np.float64).reshape(-1)
+        if len(y) == 0 or len(x) != len(y):
+            raise ValueError(f"{len(x)} points and {len(y)} losses make no surrogate")
+        spread = float(np.std(y, ddof=1)) if len(y) > 1 else 0.0
+        self.constant = spread <= 1e-12 * max(1.0, float(np.abs(y).max()))
+        self.shift, self.scale = float(np.mean(y)), 1.0 if self.constant else spread
+        self.dimension, self.seed = x.shape[1], seed
+        # BoTorch maximises, and its priors are meant for the unit cube and standardised outcomes.
+        self.inputs = torch.from_numpy(0.5 * (x + 1.0))
+        self.outcomes = torch.from_numpy((self.shift - y) / self.scale)[:, None]
+        with _torch(seed):
+            from botorch.fit import fit_gpytorch_mll
+            from gpytorch.mlls import ExactMarginalLogLikelihood
+
+            self.model = self._process()
+            fit_gpytorch_mll(ExactMarginalLogLikelihood(self.model.likelihood, self.model))
+
+    @property
+    def noise_std(self) -> float:
+        """Standard deviation of one evaluation's noise, in the loss's unit."""
+        return 0.0 if self.constant else self.scale * self.model.likelihood.noise.item() ** 0.5
+
+    def mean_and_std(self, points: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Posterior mean and standard deviation (m,), (m,) of the noise-free loss at points (m, n) of [-1, 1]^n."""
+        x = torch.from_numpy(0.5 * (np.atleast_2d(np.asarray(points, dtype=np.float64)) + 1.0))
+        with torch.no_grad(), _torch(self.seed):
+            given = self.model.posterior(x)
+        mean, variance = given.mean.numpy()[:, 0], given.variance.clamp_min(0.0).numpy()[:, 0]
+        return self.shift - self.scale * mean, self.scale * np.sqrt(variance)
+
+    def proposals(self, count: int, acquisition: Acquisition = "noisy") -> FloatArray:
+        """(count, n) points of [-1, 1]^n that together are expected to improve most.
+
+        Args:
+            count: of them.
+            acquisition: ``noisy`` (log noisy expected improvement: what is best so far is itself uncertain) or
+                ``best`` (log expected improvement over the best mean at an evaluated point).
+        """
+        with _torch(self.seed):
+            from botorch.acquisition.logei import qLogExpectedImprovement, qLogNoisyExpectedImprovement
+
+            if acquisition == "noisy":
+                improvement: Any = qLogNoisyExpectedImprovement(self.model, self.inputs, prune_baseline=True)
+            else:
+                best = self.model.posterior(self.inputs).mean.max().detach()
+                improvement = qLogExpectedImprovement(self.model, best_f=best)
+            return self._maximised(improvement, count)
+
+    def minimum(self) -> Minimum:
+        """Minimiser of the posterior mean, with the spread that the posterior gives it."""
+        with _torch(self.seed):
+            from botorch.acquisition import PosteriorMean
+            from botorch.sampling.pathwise import draw_matheron_paths
+            from botorch.utils.sampling import optimize_posterior_samples
+
+            estimate = self._maximised(PosteriorMean(self.model), 1)[0]
+            paths = draw_matheron_paths(self._ensemble(), torch.Size([PATHS]))
+            best, _ = optimize_posterior_samples(paths, self._bounds, raw_samples=RAW, num_restarts=2)  # type: ignore[arg-type]
+        minimisers = 2.0 * best.detach().reshape(-1, self.dimension).numpy() - 1.0
+        return Minimum(estimate, minimisers, self.constant)
+
+    def _process(self, *batch: int) -> SingleTaskGP:
+        """One, or a batch of them with hyperparameters to be set."""
+        from botorch.models import SingleTaskGP
+        from gpytorch.constraints import GreaterThan
+        from gpytorch.likelihoods import GaussianLikelihood
+        from gpytorch.priors import LogNormalPrior
+
+        likelihood = GaussianLikelihood(
+            noise_prior=LogNormalPrior(NOISE_MEAN, NOISE_STD),
+            noise_constraint=GreaterThan(1e-6, transform=None, initial_value=np.exp(NOISE_MEAN)),
+            batch_shape=torch.Size(batch),
+        )
+        x, y = (t.expand(*batch, *t.shape) for t in (self.inputs, self.outcomes))
+        return SingleTaskGP(x, y, likelihood=likelihood, outcome_transform=None)
+
+    def _ensemble(self) -> SingleTaskGP:
+        """A batch of processes whose hyperparameters are drawn from their posterior."""
+        n, x, y = self.dimension, self.inputs.numpy(), self.outcomes.numpy()
+        lengths = self.model.covar_module.lengthscale_prior
+        means = np.array([*[float(lengths.loc)] * n, NOISE_MEAN, 0.0])
+        stds = np.array([*[float(lengths.scale)] * n, NOISE_STD, 1.0])
+        squares = ((x[:, None] - x[None]) ** 2).reshape(-1, n).T
+
+        def log_density(points: FloatArray) -> FloatArray:
+            """(w,) of logarithms of lengths and noise variance, and means (w, n + 2)."""
+            correlation = np.exp(-0.5 * np.exp(-2.0 * points[:, :n]) @ squares).reshape(-1, len(x), len(x))
+            noise = np.exp(points[:, n, None, None]) + 1e-6
+            factor = np.linalg.cholesky(correlation + noise * np.eye(len(x)))
+            z = np.linalg.solve(factor, y - points[:, n + 1, None, None])[..., 0]
+            determinant = np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
+            return norm.logpdf(points, means, stds).sum(axis=1) - 0.5 * np.sum(z**2, axis=1) - determinant
+
+        random = np.random.RandomState(self.seed)  # the kind that emcee takes
+        start = emcee.State(means + stds * random.standard_normal((DRAWS, n + 2)), random_state=random.get_state())
+        moves = [(emcee.moves.DEMove(), 0.8), (emcee.moves.StretchMove(), 0.2)]
+        sampler = emcee.EnsembleSampler(DRAWS, n + 2, log_density, vectorize=True, moves=moves)
+        drawn = torch.from_numpy(sampler.run_mcmc(start, STEPS).coords)
+        model = self._process(DRAWS)
+        model.covar_module.lengthscale = drawn[:, None, :n].exp()
+        model.likelihood.noise = drawn[:, n, None].exp() + 1e-6
+        model.mean_module.constant.data = drawn[:, n + 1]
+        return model.requires_grad_(False).eval()
+
+    @property
+    def _bounds(self) -> torch.Tensor:
+        return torch.tensor([[0.0], [1.0]], dtype=torch.float64).expand(2, self.dimension)
+
+    def _maximised(self, acquisition: Any, count: int) -> FloatArray:
+        """(count, n) points of [-1, 1]^n."""
+        from botorch.optim import optimize_acqf
+
+        found, _ = optimize_acqf(
+            acquisition, self._bounds, q=count, num_restarts=RESTARTS, raw_samples=RAW, sequential=count > 1
+        )
+        return np.clip(2.0 * found.detach().numpy() - 1.0, -1.0, 1.0)
+
+
 class BayesianOptimiser:
-    """Expected improvement over a GP, after a space-filling start.
+    """A Sobol sequence first, then expected improvement over a Gaussian process.
 
     Args:
         dimension: number of free parameters; points live in [-1, 1]^dimension.
-        start: least number of space-filling points before the first acquisition, where ``search`` doesn't say.
-        noise_std: standard deviation of one evaluation's noise, where it was measured; inferred otherwise.
         seed: the same seed and evaluations give the same proposals.
-        search: how to search.
+        start: number of space-filling points; 4, or 3 for each parameter if that is more, if not given.
+        acquisition: see :meth:`Surrogate.proposals`.
     """
 
     def __init__(
-        self,
-        dimension: int,
-        *,
-        start: int = START,
-        noise_std: float | None = None,
-        seed: int = 0,
-        search: Search | None = None,
+        self, dimension: int, *, seed: int = 0, start: int | None = None, acquisition: Acquisition = "noisy"
     ) -> None:
-        self.search = search or Search(start=max(start, START_EACH * dimension))
-        if dimension < 1 or start < 1 or self.search.start < 1:
+        self.start = max(START, START_EACH * dimension) if start is None else start
+        if dimension < 1 or self.start < 1:
             raise ValueError("an optimiser needs at least one dimension and one starting point")
-        self.dimension = dimension
-        self.noise_std = noise_std
-        self.seed = seed
+        self.dimension, self.seed, self.acquisition = dimension, seed, acquisition
         self.told: list[Told] = []
 
     def tell(self, action: npt.ArrayLike, loss: float | None) -> None:
         """Learn the loss (None: the evaluation failed) at a point (n,) of [-1, 1]^n."""
-        point = np.array(action, dtype=np.float64).reshape(self.dimension)
         usable = loss is not None and np.isfinite(loss)
-        self.told.append(Told(point, float(loss) if usable and loss is not None else None))
+        self.told.append(Told(np.array(action, dtype=np.float64).reshape(self.dimension), loss if usable else None))
 
-    def ask(self) -> npt.NDArray[np.float32]:
-        """The next point (n,) to evaluate, in float32 as environments take it."""
-        return self.ask_batch(1)[0]
-
-    def ask_batch(self, count: int) -> npt.NDArray[np.float32]:
-        """The next ``count`` points (count, n), chosen to be evaluated side by side: together they are to improve."""
-        done = len(self.told)
-        if done < self.search.start or not self._succeeded():
+    def ask(self, count: int = 1) -> npt.NDArray[np.float32]:
+        """The next points (count, n), in float32 as environments take them; together they are to improve."""
+        done, succeeded = len(self.told), [t.loss for t in self.told if t.loss is not None]
+        if done < self.start or not succeeded:
             # Beyond the start only while nothing has succeeded: keep filling the space.
-            return self._fill(done + count)[done:].astype(np.float32)
-        seed = self._stream(done)
-        return self._apart(self._most_improving(seed, count), seed).astype(np.float32)
-
-    def _fill(self, count: int) -> FloatArray:
-        if self.search.random:
-            return np.random.default_rng(self._stream(2**20)).uniform(-1.0, 1.0, (count, self.dimension))
-        return sobol(count, self.dimension, self.seed)
+            return sobol(done + count, self.dimension, self.seed)[done:].astype(np.float32)
+        # A failed simulation tells where not to go: for the search (not for the result) it counts as the worst seen.
+        losses = [max(succeeded) if t.loss is None else t.loss for t in self.told]
+        surrogate = Surrogate([t.action for t in self.told], losses, seed=self._stream(done))
+        return surrogate.proposals(count, self.acquisition).astype(np.float32)
 
     def surrogate(self) -> Surrogate:
-        """The GP over every evaluation that succeeded.
+        """The Gaussian process over every evaluation that succeeded.
 
         Raises:
             ValueError: none has.
         """
-        good = self._succeeded()
-        return Surrogate(
-            [t.action for t in good],
-            [t.loss for t in good if t.loss is not None],
-            noise_std=self.noise_std,
-            seed=self._stream(0),
-        )
+        good = [(t.action, t.loss) for t in self.told if t.loss is not None]
+        return Surrogate([action for action, _ in good], [loss for _, loss in good], seed=self._stream(0))
 
     def result(self) -> Minimum:
-        """Minimiser of the GP's mean with its posterior spread."""
-        return self.surrogate().minimum(seed=self._stream(1))
-
-    def _succeeded(self) -> list[Told]:
-        return [t for t in self.told if t.loss is not None]
+        """Where the loss is least."""
+        return self.surrogate().minimum()
 
     def _stream(self, index: int) -> int:
         """An independent seed for each use."""
         return int(np.random.SeedSequence([self.seed, index]).generate_state(1)[0])
 
-    def _most_improving(self, seed: int, count: int) -> FloatArray:
-        with quiet():
-            from botorch.acquisition.logei import qLogExpectedImprovement, qLogNoisyExpectedImprovement
-            from botorch.optim import optimize_acqf
-            from botorch.sampling.normal import SobolQMCNormalSampler
 
-        # A failed simulation tells where not to go: for the search (not for the estimate) it counts as the worst seen.
-        worst = max(t.loss for t in self._succeeded() if t.loss is not None)
-        points = np.array([t.action for t in self.told])
-        losses = [worst if t.loss is None else t.loss for t in self.told]
-        surrogate = Surrogate(points, losses, noise_std=self.noise_std, seed=seed)
-        if surrogate.constant:
-            return self._farthest(points, seed, count)
-        bounds = torch.tensor([[0.0] * self.dimension, [1.0] * self.dimension], dtype=torch.float64)
-        cube = torch.from_numpy(0.5 * (points + 1.0))
-        sampler = SobolQMCNormalSampler(torch.Size([DRAWS]), seed=seed % 2**31)
-        model = surrogate.likeliest
-        with seeded(seed), quiet():
-            if self.search.acquisition == "noisy":
-                acquisition: Any = qLogNoisyExpectedImprovement(model, cube, sampler=sampler, prune_baseline=True)
-            else:
-                best_mean = model.posterior(cube).mean.max().detach()
-                acquisition = qLogExpectedImprovement(model, best_f=best_mean, sampler=sampler)
-            best, _ = optimize_acqf(
-                acquisition, bounds, q=count, num_restarts=RESTARTS, raw_samples=RAW, sequential=count > 1
-            )
-        return 2.0 * np.asarray(best.detach().reshape(count, -1).numpy()) - 1.0
-
-    def _apart(self, proposals: FloatArray, seed: int) -> FloatArray:
-        """Proposals (count, n), those moved that come too close to evaluated points or to each other."""
-        points = np.array([t.action for t in self.told])
-        chosen: list[FloatArray] = []
-        for k, proposal in enumerate(proposals):
-            known = np.concatenate([points, *(c[None] for c in chosen)])
-            near = np.min(np.max(np.abs(known - proposal), axis=1)) < NEAREST
-            chosen.append(self._beside(proposal, seed + k) if near else np.clip(proposal, -1.0, 1.0))
-        return np.array(chosen)
-
-    def _farthest(self, points: FloatArray, seed: int, count: int) -> FloatArray:
-        """Sobol points farthest from all evaluated ones: what is left to do when all losses are equal."""
-        candidates = sobol(256, self.dimension, seed % 2**31)
-        known = points
-        for _ in range(count):
-            gaps = np.linalg.norm(candidates[:, None] - known[None], axis=-1).min(axis=1)
-            known = np.concatenate([known, candidates[[np.argmax(gaps)]]])
-        return known[len(points) :]
-
-    def _beside(self, proposal: FloatArray, seed: int) -> FloatArray:
-        """Close to a repeated proposal, but not on it: repetition says less about the slope than a neighbour does."""
-        step = np.random.default_rng(seed).uniform(0.02, 0.05, self.dimension)
-        sign = np.where(proposal > 0.0, -1.0, 1.0)
-        return np.clip(proposal + sign * step, -1.0, 1.0)
-
-
-@dataclass(frozen=True)
-class Episode:
-    """What an agent brought back from one episode.
-
-    Attributes:
-        minimum: the estimate, in [-1, 1]^n.
-        told: every evaluation, in order.
-        optimiser: for the GP behind the estimate.
-    """
-
-    minimum: Minimum
-    told: tuple[Told, ...]
-    optimiser: BayesianOptimiser
-
-
-def optimise(
-    env: gym.Env[Any, Any],
-    *,
-    seed: int = 0,
-    start: int = START,
-    noise_std: float | None = None,
-    search: Search | None = None,
-    replay: Sequence[npt.ArrayLike] = (),
-    at_once: int = 1,
-    before_batch: Callable[[Sequence[npt.ArrayLike]], None] | None = None,
-    after_step: Callable[[int, dict[str, Any]], None] | None = None,
-) -> Episode:
+def optimise(env: gym.Env[Any, Any], *, seed: int = 0) -> BayesianOptimiser:
     """Play one episode of an environment whose reward is minus a loss, until it truncates or terminates.
 
     Args:
         env: action space Box(-1, 1, (n,)); ``info["status"] == "failed"`` marks an evaluation without a loss.
-        seed: of environment and agent.
-        start: Sobol points before the first acquisition.
-        noise_std: standard deviation of one evaluation's noise, if measured.
-        search: how to search, start included; :data:`PAPER` for the paper's way.
-        replay: actions of an interrupted episode, taken again before anything new is asked.
-        at_once: points that are chosen together.
-        before_batch: called with actions chosen together before the first of them is taken, unless all are replayed.
-        after_step: called with the number of steps done and the step's info.
+        seed: of environment and optimiser.
 
     Raises:
-        ValueError: the action space isn't [-1, 1]^n.
-        RuntimeError: every evaluation failed.
+        ValueError: the action space is not [-1, 1]^n.
     """
     space = env.action_space
     if not isinstance(space, gym.spaces.Box) or np.any(space.low != -1.0) or np.any(space.high != 1.0):
         raise ValueError(f"Bayesian optimisation needs actions in [-1, 1]^n, not {space}")
-    optimiser = BayesianOptimiser(int(np.prod(space.shape)), start=start, noise_std=noise_std, seed=seed, search=search)
+    optimiser = BayesianOptimiser(int(np.prod(space.shape)), seed=seed)
     env.reset(seed=seed)
-    over, batch = False, list[npt.ArrayLike]()
+    over = False
     while not over:
-        done = len(optimiser.told)
-        if not batch:
-            known = list(replay[done : done + at_once])
-            batch = [*known, *(optimiser.ask_batch(at_once)[len(known) :] if len(known) < at_once else ())]
-            if before_batch is not None and len(known) < at_once:
-                before_batch(batch)
-        action = np.asarray(batch.pop(0), dtype=np.float32)
+        (action,) = optimiser.ask()
         _, reward, terminated, truncated, info = env.step(action.reshape(space.shape))
-        failed = info.get("status") == "failed"
-        optimiser.tell(action, None if failed else -float(reward))
+        optimiser.tell(action, None if info.get("status") == "failed" else -float(reward))
         over = terminated or truncated
-        if after_step is not None:
-            after_step(done + 1, info)
-    if not any(t.loss is not None for t in optimiser.told):
-        raise RuntimeError("every evaluation of the episode failed")
-    return Episode(optimiser.result(), tuple(optimiser.told), optimiser)
+    return optimiser
+
+
+def sobol(count: int, dimension: int, seed: int) -> FloatArray:
+    """Scrambled Sobol points (count, dimension) in [-1, 1]."""
+    engine = torch.quasirandom.SobolEngine(dimension, scramble=True, seed=seed)
+    return 2.0 * engine.draw(count, dtype=torch.float64).numpy() - 1.0
+
+
+@contextmanager
+def _torch(seed: int) -> Iterator[None]:
+    """Torch's CPU generator seeded inside the block, as it was outside; remarks that say nothing to a user silenced."""
+    with warnings.catch_warnings(), torch.random.fork_rng(devices=[]):
+        warnings.simplefilter("ignore", FutureWarning)  # torch.jit, on BoTorch's import
+        from botorch.exceptions.warnings import BotorchWarning
+        from linear_operator.utils.warnings import NumericalWarning
+
+        warnings.simplefilter("ignore", BotorchWarning)
+        warnings.simplefilter("ignore", NumericalWarning)
+        warnings.filterwarnings("ignore", "Optimization failed", RuntimeWarning)
+        torch.manual_seed(seed)
+        yield

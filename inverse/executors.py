@@ -1,32 +1,24 @@
-"""Where evaluations run: here, in processes of this machine, or on a Dask cluster, all shaped like a
-``concurrent.futures.Executor``.
-
-A worker that dies (killed, out of memory) costs the one evaluation it was at, which is repeated.
-"""
+"""Where simulations run: here, in processes of this machine, or on a Dask cluster, as ``concurrent.futures`` has it."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
-import queue
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from typing import Any
 
-from splatsoil.errors import ParameterError, RunError
+from splatsoil.errors import ParameterError
+from splatsoil.threads import cores
 
-#: A job whose worker dies this often is to blame itself.
-ATTEMPTS = 4
 #: What decides how many threads a worker's libraries start.
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-_ENVIRONMENT = threading.Lock()
 
 
 class Serial(Executor):
-    """Runs each job where it is submitted, at once."""
+    """Runs each job in this process: a submitted one at once, a mapped one when its result is asked for."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Run it; the future returned is done."""
@@ -37,134 +29,49 @@ class Serial(Executor):
             future.set_exception(error)
         return future
 
+    def map(self, fn: Callable[..., Any], *iterables: Any, **_: Any) -> Iterator[Any]:
+        """As the built-in one."""
+        return map(fn, *iterables)
 
-class Processes(Executor):
-    """Worker processes of this machine, each with a pool of its own: the death of one leaves the others at work.
 
-    Args:
-        workers: their number.
+def processes(workers: int) -> ProcessPoolExecutor:
+    """Worker processes of this machine, which share its cores and end with this process.
 
     Raises:
         ParameterError: fewer than one.
     """
-
-    def __init__(self, workers: int) -> None:
-        if workers < 1:
-            raise ParameterError(f"processes:{workers}: at least one worker is needed")
-        # Each worker's libraries would start a thread for every core, and stand in each other's way. What the user has
-        # set stays.
-        share = str(max(1, (os.cpu_count() or 1) // workers))
-        self._limits = {} if any(name in os.environ for name in THREADS) else dict.fromkeys(THREADS, share)
-        self._jobs: queue.SimpleQueue[tuple[Future[Any], Callable[..., Any], tuple[Any, ...], dict[str, Any]] | None]
-        self._jobs = queue.SimpleQueue()
-        self._closed = False
-        pools = [self._started() for _ in range(workers)]
-        self._threads = [threading.Thread(target=self._work, args=(pool,), daemon=True) for pool in pools]
-        for thread in self._threads:
-            thread.start()
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Queue a job; function, arguments and result have to be picklable."""
-        if self._closed:
-            raise RuntimeError("the executor has been shut down")
-        future: Future[Any] = Future()
-        self._jobs.put((future, fn, args, kwargs))
-        return future
-
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Let the workers finish what is queued (or only what they are at), and end them."""
-        self._closed = True
-        if cancel_futures:
-            self._forget()
-        for _ in self._threads:
-            self._jobs.put(None)
-        for thread in self._threads if wait else ():
-            thread.join()
-
-    def dismiss(self, count: int) -> None:
-        """End as many workers as come first to the end of what has been queued."""
-        for _ in range(count):
-            self._jobs.put(None)
-
-    def kill(self) -> None:
-        """End the workers, and with them all other child processes, without waiting for what they are at."""
-        self._closed = True
-        self._forget()
-        for child in multiprocessing.active_children():
-            child.terminate()
-        self.shutdown()
-
-    def _forget(self) -> None:
-        """Cancel what is queued."""
-        while True:
-            try:
-                job = self._jobs.get_nowait()
-            except queue.Empty:
-                return
-            if job is not None:
-                job[0].cancel()
-
-    def _started(self) -> ProcessPoolExecutor:
-        """A worker, on its way. What limits its libraries is in its environment alone: this process may load them
-        later."""
-        # A fresh interpreter: forking a process that has threads or a CUDA context breaks both.
-        context = multiprocessing.get_context("spawn")
-        pool = ProcessPoolExecutor(1, mp_context=context, initializer=_end_with_parent)
-        with _ENVIRONMENT:
-            os.environ.update(self._limits)
-            try:
-                pool.submit(int)
-            finally:
-                for name in self._limits:
-                    del os.environ[name]
-        return pool
-
-    def _work(self, first: ProcessPoolExecutor) -> None:
-        pool: ProcessPoolExecutor | None = first
-        while (job := self._jobs.get()) is not None:
-            future, fn, args, kwargs = job
-            if not future.set_running_or_notify_cancel():
-                continue
-            for attempt in range(1, ATTEMPTS + 1):
-                pool = pool or self._started()
-                try:
-                    future.set_result(pool.submit(fn, *args, **kwargs).result())
-                except BrokenProcessPool:
-                    pool.shutdown(wait=False)
-                    pool = None
-                    if attempt < ATTEMPTS and not self._closed:
-                        continue
-                    future.set_exception(
-                        RunError(f"a worker died {ATTEMPTS} times at the same evaluation; is there enough memory?")
-                    )
-                except Exception as error:
-                    future.set_exception(error)
-                break
-        if pool is not None:
-            pool.shutdown(wait=True)
+    if workers < 1:
+        raise ParameterError(f"processes:{workers}: at least one worker is needed")
+    # A fresh interpreter: forking a process that has threads or a CUDA context breaks both.
+    context = multiprocessing.get_context("spawn")
+    share = str(max(1, cores() // workers))
+    return ProcessPoolExecutor(workers, mp_context=context, initializer=_begin, initargs=(share,))
 
 
-def _end_with_parent() -> None:
-    """In a worker: whatever kills the process that it works for ends it, too; it would go on in a folder that is no
-    longer locked, and keep its memory."""
+def kill(pool: ProcessPoolExecutor) -> None:
+    """End the workers, and with them all other child processes, without waiting for what they are at."""
+    pool.shutdown(wait=False, cancel_futures=True)
+    for child in multiprocessing.active_children():
+        child.terminate()
+    pool.shutdown()
+
+
+def _begin(threads: str) -> None:
+    """In a new worker, before its libraries are loaded: each would start a thread for every core, and stand in the
+    others' way. What the user has set stays.
+
+    Whatever kills the process that it works for ends it, too; it would go on in a folder that is no longer locked.
+    """
+    if not any(name in os.environ for name in THREADS):
+        os.environ.update(dict.fromkeys(THREADS, threads))
     parent = multiprocessing.parent_process()
-    if parent is not None:
+    assert parent is not None
 
-        def watch() -> None:
-            parent.join()
-            os._exit(1)
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
 
-        threading.Thread(target=watch, daemon=True).start()
-
-
-def in_order(pool: Executor, fn: Callable[..., Any], jobs: Iterable[tuple[Any, ...]]) -> Iterator[Any]:
-    """Results of ``fn(*job)`` in the order of the jobs; in this process each is made when it is asked for."""
-    if isinstance(pool, Serial):
-        for job in jobs:
-            yield pool.submit(fn, *job).result()
-    else:
-        for future in [pool.submit(fn, *job) for job in jobs]:
-            yield future.result()
+    threading.Thread(target=watch, daemon=True).start()
 
 
 @contextmanager
@@ -182,14 +89,14 @@ def executor(where: str = "serial") -> Iterator[Executor]:
     if kind == "serial" and not detail:
         yield Serial()
     elif kind == "processes" and detail.isdigit():
-        workers = Processes(int(detail))
+        pool = processes(int(detail))
         try:
-            yield workers
-        finally:
-            workers.shutdown(cancel_futures=True)
-    elif kind == "dask" and detail:
-        with _dask(detail) as pool:
             yield pool
+        finally:
+            pool.shutdown(cancel_futures=True)
+    elif kind == "dask" and detail:
+        with _dask(detail) as cluster:
+            yield cluster
     else:
         raise ParameterError(f"executor {where!r} is unknown; give serial, processes:N or dask:ADDRESS")
 
@@ -206,6 +113,6 @@ def _dask(address: str) -> Iterator[Executor]:
         raise ParameterError(f"no Dask scheduler answers at {address} ({error})") from error
     try:
         # A simulation is no pure function of its arguments to Dask: its own cache is not to answer for the database.
-        yield client.get_executor(pure=False, retries=ATTEMPTS - 1)
+        yield client.get_executor(pure=False)
     finally:
         client.close()

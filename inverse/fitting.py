@@ -1,19 +1,15 @@
-"""A fit: the agent on the environment, each evaluation stored as it ends, and what it all came to."""
+"""A fit: Bayesian optimisation of the loss, each evaluation stored as it ends, and what it all came to."""
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from splatsoil.envs.levels import FIDELITY, TwoLevelProblem, is_full
-from splatsoil.envs.plow_sand import PlowSandEnv
-from splatsoil.envs.problem import Evaluation, Problem, WrappedProblem
-from splatsoil.envs.together import attempt, evaluate_together
+from splatsoil.envs.problem import Job, Problem, simulation_seed
 
 from splatsoil.errors import RunError, SimulationError
 from splatsoil.parameters import Parameter, ParameterSpace
@@ -21,16 +17,14 @@ from splatsoil.report.text import undetermined
 from splatsoil.run_files import FIT_FORMAT
 from splatsoil.threads import one_thread
 
-from .bayesopt import PAPER, START, Episode, optimise
-from .campaign import Job, make_record
+from .bayesopt import BayesianOptimiser, FloatArray, Surrogate
 from .criticism.diagnosis import Diagnosis
-from .evaluations import EvaluationRecord, EvaluationStore, digest
-from .marginal import Marginal
-from .multifidelity import most_steps, optimise_two_levels
+from .evaluations import EvaluationRecord, evaluate
 from .run_folder import RunFolder
-from .surrogate import FloatArray, Minimum, Surrogate
 
-#: Points of the GP's curve kept for the figure.
+#: Evaluations that are chosen and simulated together: as many cores as a small laptop has.
+TOGETHER = 2
+#: Points of the Gaussian process' curve kept for the figure.
 CURVE = 201
 
 
@@ -45,15 +39,10 @@ class FitSetup:
         effects: names of the effects that are on.
         preset: resolution of the solver.
         device: ``cpu`` or ``cuda:N``.
-        seed: of agent and simulations.
+        seed: of search and simulations.
         version: of this package.
         code: digest of its sources and of the effects' own files, see :func:`splatsoil.files.code_digest`.
         loss: name of the loss.
-        noise_std: measured noise of one evaluation, None to infer it.
-        start: Sobol points before the first acquisition.
-        search: ``usual``, or ``paper`` for Hsiao and Kumar's: one random start, expected improvement.
-        coarse: preset of cheap evaluations that the search may use, too; None: it has none.
-        at_once: evaluations that are chosen, and simulated, together.
     """
 
     measurement: str
@@ -66,11 +55,6 @@ class FitSetup:
     version: str
     code: str = ""
     loss: str = ""
-    noise_std: float | None = None
-    start: int = START
-    search: Literal["usual", "paper"] = "usual"
-    coarse: str | None = None
-    at_once: int = 1
 
     @property
     def name(self) -> str:
@@ -94,93 +78,7 @@ class FitSetup:
 
     def description(self) -> dict[str, Any]:
         """What decides the whole fit."""
-        return {
-            **self.model(),
-            "agent": "bayesopt",
-            "parameters": list(self.parameters),
-            "seed": self.seed,
-            "noise_std": self.noise_std,
-            "start": self.start,
-            **({} if self.search == "usual" else {"search": self.search}),
-            **({} if self.coarse is None else {"coarse": self.coarse}),
-            **({} if self.at_once == 1 else {"at_once": self.at_once}),
-        }
-
-
-class StoredProblem(WrappedProblem):
-    """A problem whose evaluations go into the run database, and come from it when they are there.
-
-    Args:
-        problem: does the work.
-        store: open for writing.
-        setup: of the fit.
-    """
-
-    def __init__(self, problem: Problem, store: EvaluationStore, setup: FitSetup) -> None:
-        super().__init__(problem)
-        self.store = store
-        self.setup = setup
-        self.fit = digest(setup.description())
-        self.store.register(self.fit, setup.description())
-        self.stored = self.store.records(self.fit)
-        self._step = 0
-        self._ready: dict[str, Evaluation] = {}
-        self.last: EvaluationRecord | None = None
-
-    def begin(self, seed: int) -> None:
-        """Start an episode, from the fit's first evaluation."""
-        self._step = 0
-        super().begin(seed)
-
-    def evaluate(self, parameters: Mapping[str, float], seed: int) -> Evaluation:
-        """The stored evaluation, or a new one, which is stored before it is returned."""
-        if self._step < len(self.stored):
-            record, evaluation = self._replay(parameters, seed)
-        else:
-            key = self._key(parameters, seed)
-            found = self.store.find(key)
-            if found is None:
-                evaluation = self._ready.pop(key) if key in self._ready else attempt(self.inner, parameters, seed)
-                job = Job(dict(parameters), seed)
-                record = make_record(self.fit, self._step, key, job, evaluation, self.space, self.setup.model())
-            else:
-                evaluation = _from_record(found)
-                record = replace(found, fit=self.fit, step=self._step, created="")
-            self.store.append(record)
-        self._step += 1
-        self.last = record
-        return evaluation
-
-    def prepare(self, jobs: Sequence[tuple[Mapping[str, float], int]]) -> None:
-        """Simulate side by side what the next steps will ask for (parameters and seeds), as far as it isn't stored."""
-        ahead = jobs[max(len(self.stored) - self._step, 0) :]
-        fresh = [job for job in ahead if self.store.find(self._key(*job)) is None]
-        if len(fresh) > 1:
-            done = evaluate_together([self.inner] * len(fresh), fresh)
-            self._ready = {self._key(*job): evaluation for job, evaluation in zip(fresh, done, strict=True)}
-
-    def _key(self, parameters: Mapping[str, float], seed: int) -> str:
-        return digest({**self.setup.model(), "values": dict(parameters), "seed": seed})
-
-    def _replay(self, parameters: Mapping[str, float], seed: int) -> tuple[EvaluationRecord, Evaluation]:
-        """The stored evaluation of this step."""
-        record = self.stored[self._step]
-        asked, known = (self.space.to_unit(self.space.to_vector(v)) for v in (parameters, record.parameters))
-        if record.seed != seed or not np.allclose(asked, known, rtol=0.0, atol=1e-6):
-            raise RunError(
-                f"{self.store.path}: evaluation {self._step} isn't the one this fit would make; choose another --run"
-            )
-        return record, _from_record(record)
-
-
-def _from_record(record: EvaluationRecord) -> Evaluation:
-    return Evaluation(
-        loss=record.loss,
-        blocks=np.array(record.blocks, dtype=np.float64),
-        message=record.message,
-        extras=dict(record.extras),
-        seconds=record.seconds,
-    )
+        return {**self.model(), "agent": "bayesopt", "parameters": list(self.parameters), "seed": self.seed}
 
 
 @one_thread()
@@ -197,10 +95,10 @@ def fit(
     """Fit the free parameters and write ``fit.json``; goes on where an interrupted fit of the same setup stopped.
 
     Args:
-        problem: simulate-and-compare, at the resolution that counts.
+        problem: simulate-and-compare.
         run: the run folder; only this process may write to it meanwhile.
         setup: what is fitted and how.
-        budget: evaluations, those already stored included; with a coarse preset their cost, in full ones.
+        budget: evaluations, those already stored included.
         facts: what the fit should say of how it was computed (time step, spacing, ...).
         compare: compares the model with something else, given what the search came to as ``fit.json`` will hold it; the
             parameters are its. Without it, and where simulations are too few for it, they are the loss' minimum.
@@ -212,75 +110,72 @@ def fit(
     Raises:
         RunError: every evaluation failed, or the run folder can't be written.
     """
-    began = time.perf_counter()
-    levels = None if setup.coarse is None else TwoLevelProblem(problem, setup.coarse)
-    steps = budget if levels is None else most_steps(budget, levels.cost)
+    began, earlier = time.perf_counter(), 0.0
+    optimiser = BayesianOptimiser(len(problem.space), seed=setup.seed)
+    records: list[EvaluationRecord] = []
     with run.lock(), run.evaluations(writable=True) as store:
-        stored = StoredProblem(levels or problem, store, setup)
-        earlier = sum(record.seconds for record in stored.stored[:steps])
-        # Each evaluation has particles of its own: chance that all of them shared would shift the estimate, unseen.
-        env = PlowSandEnv(problem=stored, budget=steps)
-
-        def told(done: int, _: dict[str, Any]) -> None:
-            if after_evaluation is not None and stored.last is not None:
-                after_evaluation(done, stored.last)
-
-        try:
-            shared: dict[str, Any] = {
-                "seed": setup.seed,
-                "noise_std": setup.noise_std,
-                "replay": [record.action for record in stored.stored],
-                "after_step": told,
-            }
-            if levels is None:
-                episode = optimise(
-                    env,
-                    start=setup.start,
-                    search=PAPER if setup.search == "paper" else None,
-                    at_once=setup.at_once,
-                    before_batch=lambda actions: stored.prepare(env.ahead(actions)),
-                    **shared,
-                )
-            else:
-                episode = optimise_two_levels(env, cost=levels.cost, budget=budget, **shared)
-        except RuntimeError as error:
-            records = store.records(stored.fit)
-            if any(record.status == "ok" and is_full(record.parameters) for record in records):
-                raise
-            first = records[0].message if records else str(error)
-            raise RunError(f"{run.path}: all {len(records)} simulations failed; the first said: {first}") from error
-        records = store.records(stored.fit)[: len(episode.told)]
-        result = summarise(episode, problem.space, setup, records, compare)
-    result["seconds"] = round(earlier + time.perf_counter() - began, 3)
-    result["run"] = {"measurement": dict(run.description["measurement"])}
-    result["facts"] = dict(facts or {})
-    run.write_fit(setup.name, result)
+        known = {record.key for record in store.records()}
+        problem.begin(setup.seed)
+        while len(records) < budget:
+            actions = optimiser.ask(TOGETHER)[: budget - len(records)]
+            # Each evaluation has particles of its own: a scatter that all of them shared would shift the estimate,
+            # unseen.
+            jobs: list[Job] = [
+                (problem.space.to_dict(problem.space.from_unit(action)), simulation_seed(setup.seed, len(records) + k))
+                for k, action in enumerate(actions)
+            ]
+            made = evaluate(problem, jobs, store, setup.model(), together=TOGETHER)
+            for action, record in zip(actions, made, strict=True):
+                optimiser.tell(action, record.loss)
+                records.append(record)
+                earlier += record.seconds if record.key in known else 0.0
+                if after_evaluation is not None:
+                    after_evaluation(len(records), record)
+        if all(record.loss is None for record in records):
+            raise RunError(f"{run.path}: all {budget} simulations failed; the first said: {records[0].message}")
+        result = summarise(optimiser.surrogate(), problem.space, setup, records, compare)
+        result["seconds"] = round(earlier + time.perf_counter() - began, 3)
+        result["run"] = {"measurement": dict(run.description["measurement"])}
+        result["facts"] = dict(facts or {})
+        run.write_fit(setup.name, result)
     return result
 
 
 def summarise(
-    episode: Episode,
+    surrogate: Surrogate,
     space: ParameterSpace,
     setup: FitSetup,
-    records: list[EvaluationRecord],
+    records: Sequence[EvaluationRecord],
     compare: Callable[[dict[str, Any]], Diagnosis] | None = None,
 ) -> dict[str, Any]:
     """A fit in plain numbers, physical units and words; see :func:`fit`."""
-    surrogate, minimum = episode.optimiser.surrogate(), episode.minimum
-    good = [record for record in records if record.status == "ok"]
-    done = [record for record in good if is_full(record.parameters)]
-    best = min(done, key=lambda record: record.loss if record.loss is not None else math.inf)
-    searched = {p.name: _minimiser(p, i, minimum, space) for i, p in enumerate(space)}
+    minimum = surrogate.minimum()
+    losses = [np.inf if record.loss is None else record.loss for record in records]
+    best = int(np.argmin(losses))
+    estimate = space.from_unit(minimum.estimate)
+    std, low, high = minimum.interval(space.from_unit)
+    searched = {
+        p.name: {
+            "estimate": float(estimate[i]),
+            "std": float(std[i]),
+            "low": float(low[i]),
+            "high": float(high[i]),
+            **_about(p),
+            "at_bound": minimum.at_bound[i],
+            "determined": minimum.determined[i],
+        }
+        for i, p in enumerate(space)
+    }
     result: dict[str, Any] = {
         "format": FIT_FORMAT,
         "name": setup.name,
         "parameters": searched,
         "estimated_from": "loss",
         "minimum": {name: {key: entry[key] for key in ("estimate", "low", "high")} for name, entry in searched.items()},
-        "noise_std": minimum.noise_std,
+        "noise_std": surrogate.noise_std,
         "evaluations": len(records),
-        "failed": len(records) - len(good),
-        "best": {"parameters": _without_level(best.parameters), "loss": best.loss, "step": best.step},
+        "failed": sum(record.loss is None for record in records),
+        "best": {"parameters": dict(records[best].parameters), "loss": losses[best], "step": best},
         "seed": setup.seed,
         "device": setup.device,
         "preset": setup.preset,
@@ -288,17 +183,11 @@ def summarise(
         "setup": setup.description(),
         "history": [
             {
-                "step": record.step,
-                "parameters": _without_level(record.parameters),
-                "level": "full" if is_full(record.parameters) else "coarse",
-                "seed": record.seed,
-                "loss": record.loss,
-                "status": record.status,
-                "message": record.message,
-                "seconds": record.seconds,
+                "step": step,
+                **{key: getattr(record, key) for key in ("parameters", "seed", "loss", "status", "message", "seconds")},
                 "extras": dict(record.extras),
             }
-            for record in records
+            for step, record in enumerate(records)
         ],
     }
     remarks = []
@@ -319,10 +208,6 @@ def summarise(
         "notes": [*remarks, *notes(result, space)],
         "curves": {p.name: _curve(i, point, surrogate, space) for i, p in enumerate(space)},
     }
-
-
-def _without_level(parameters: Mapping[str, float]) -> dict[str, float]:
-    return {name: value for name, value in parameters.items() if name != FIDELITY.name}
 
 
 def notes(result: Mapping[str, Any], space: ParameterSpace) -> list[str]:
@@ -350,7 +235,7 @@ def notes(result: Mapping[str, Any], space: ParameterSpace) -> list[str]:
 
 def _averaged(parameter: Parameter, found: Diagnosis) -> dict[str, Any]:
     """A parameter, averaged over the models of a comparison."""
-    marginal = Marginal.of(parameter, found.evidence)
+    marginal = found.evidence.marginal(parameter.name)
     determined = bool(found.determined[parameter.name])
     return {
         "estimate": found.estimates[parameter.name][0],
@@ -358,7 +243,7 @@ def _averaged(parameter: Parameter, found: Diagnosis) -> dict[str, Any]:
         "low": marginal.quantile(0.05),
         "high": marginal.quantile(0.95),
         **_about(parameter),
-        "at_bound": next(iter(marginal.at_bounds), None) if determined else None,
+        "at_bound": next(iter(marginal.bounds_reached(parameter)), None) if determined else None,
         "determined": determined,
     }
 
@@ -368,32 +253,8 @@ def _about(parameter: Parameter) -> dict[str, Any]:
     return {"unit": parameter.unit, "title": parameter.title, "bounds": bounds, "off": parameter.off}
 
 
-def _minimiser(parameter: Parameter, index: int, minimum: Minimum, space: ParameterSpace) -> dict[str, Any]:
-    """A parameter where the loss is least."""
-
-    def physical(unit: float) -> float:
-        point = minimum.estimate.copy()
-        point[index] = unit
-        return float(space.from_unit(point)[index])
-
-    centre = float(minimum.estimate[index])
-    std = float(minimum.std[index])
-    # Half the width of ± one std in physical units: exact on a linear axis, sensible on a logarithmic one. Both
-    # ends are pushed inside the bounds together, so that a bound doesn't halve the std.
-    middle = float(np.clip(centre, -1.0 + min(std, 1.0), 1.0 - min(std, 1.0)))
-    return {
-        "estimate": physical(centre),
-        "std": 0.5 * (physical(middle + std) - physical(middle - std)),
-        "low": physical(float(minimum.low[index])),
-        "high": physical(float(minimum.high[index])),
-        **_about(parameter),
-        "at_bound": minimum.at_bound[index],
-        "determined": minimum.determined[index],
-    }
-
-
 def _curve(index: int, point: FloatArray, surrogate: Surrogate, space: ParameterSpace) -> dict[str, list[float]]:
-    """The GP along one parameter, the others at their estimates."""
+    """The Gaussian process along one parameter, the others at their estimates."""
     points = np.repeat(point[None], CURVE, axis=0)
     points[:, index] = np.linspace(-1.0, 1.0, CURVE)
     mean, std = surrogate.mean_and_std(points)

@@ -6,7 +6,9 @@ one model with the mean of both beliefs.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,21 +16,31 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import logsumexp
 
+from splatsoil.errors import SimulationError
+from splatsoil.experiment.base import Experiment
+from splatsoil.files import plain, write_json
 from splatsoil.parameters import Parameter
 from splatsoil.run_files import POSTERIOR_FORMAT
+from splatsoil.threads import one_thread
 
-from .criticism.design import Prior
-from .criticism.evidence import PRIOR, Comparison
+from .criticism.design import Prior, Run
+from .criticism.evidence import PRIOR, Comparison, Marginal
 from .criticism.noise import FACTORS, Noise
-from .marginal import Marginal
-from .mcmc import Chains
+from .criticism.simulations import Simulations
+from .mcmc import Chains, sample
+from .run_folder import RunFolder
 
 FloatArray = npt.NDArray[np.float64]
 
 #: Posterior over prior standard deviation: below the first a parameter is determined, above the second it is not.
 DETERMINED, UNDETERMINED = 0.5, 0.8
+QUANTILES = {"median": 0.5, "low": 0.05, "high": 0.95, "low_50": 0.25, "high_50": 0.75}
 #: Bins of the histograms kept for the report.
 BINS = 60
+#: Seeds of simulations at points drawn from the posterior, above those of a comparison.
+FIRST_SEED = 1_000_000
+#: χ² per score of these from which the emulator is said to have been too sure.
+SURPRISING = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,6 +137,86 @@ class Posterior:
         return self.density.prior.space.from_unit(self.unit)
 
 
+@one_thread()
+def run_posterior(
+    run: RunFolder,
+    experiment: Experiment,
+    simulate: Simulations,
+    density: Density,
+    *,
+    checks: int = 3,
+    seed: int = 0,
+    progress: Callable[[str, float], None] = lambda what, share: None,
+) -> dict[str, Any]:
+    """Sample, check, and write ``posterior.json`` and the folder ``posterior/``.
+
+    Args:
+        run: the latest fit's folder; only this process may write to it meanwhile.
+        experiment: of the fit's model.
+        simulate: its simulations.
+        density: of a comparison of that model.
+        checks: simulations at points drawn from the posterior, which test the emulator.
+        seed: of chains and checks.
+        progress: called with (what, share done).
+
+    Returns:
+        What ``posterior.json`` holds.
+
+    Raises:
+        RunError: the folder can't be written.
+    """
+    from .posterior_files import write_corner, write_inference_data
+
+    began = time.perf_counter()
+    fit, own = run.fit(), list(experiment.parameters)
+
+    def sampling(done: int, most: int) -> None:
+        progress(f"chains, step {done}", 0.5 * done / most)
+
+    posterior = Posterior(density, sample(density, len(density.prior.space), seed=seed, progress=sampling))
+    progress("checks", 0.5)
+    checked = _checked(posterior, simulate, checks, seed)
+    result = summarise(posterior, own)
+    surprise = float(np.mean([c["chi2"] for c in checked])) if checked else 0.0
+    if len(checked) < checks:
+        result["notes"].append(f"{checks - len(checked)} of {checks} checks could not be simulated.")
+    if surprise > SURPRISING:
+        result["notes"].append(
+            "Simulations at points drawn from the posterior lay farther from the emulator than its variance says "
+            f"(χ² per score {surprise:.1f} instead of 1): more evaluations would help."
+        )
+    files = run.path / "posterior"
+    write_inference_data(posterior, files / "posterior.nc")
+    result |= {
+        "fit": fit["name"],
+        "values": {name: entry["estimate"] for name, entry in fit["parameters"].items()},
+        "checks": checked,
+        "simulations": len(density.noise.base) + len(checked),
+        "figures": [write_corner(posterior, own, files / "corner.png").name],
+        "seconds": round(time.perf_counter() - began, 3),
+        "seed": seed,
+        **{key: fit[key] for key in ("device", "preset", "version")},
+    }
+    told: dict[str, Any] = plain(result)
+    write_json(run.path / "posterior.json", told)
+    return told
+
+
+def _checked(posterior: Posterior, simulate: Simulations, count: int, seed: int) -> list[dict[str, Any]]:
+    """Simulations at draws that could be made: where, and how far they lie from what the emulator says."""
+    prior = posterior.density.prior
+    chosen = np.random.default_rng([seed, 7]).choice(len(posterior.unit), count, replace=False)
+    jobs = [Run(v, seed=FIRST_SEED + seed + i) for i, v in enumerate(prior.values(posterior.unit[chosen]))]
+    simulate.ahead(lambda noted: [noted(job.values, seed=job.seed) for job in jobs])
+    out = []
+    for job in jobs:
+        with suppress(SimulationError):
+            table = simulate(job.values, seed=job.seed, purpose="check")
+            chi2 = posterior.density.surprise(table[None], prior.unit([job]))
+            out.append({"parameters": dict(job.values), "chi2": float(chi2[0])})
+    return out
+
+
 def summarise(posterior: Posterior, own: Sequence[Parameter]) -> dict[str, Any]:
     """A posterior in plain numbers, physical units and words.
 
@@ -169,23 +261,18 @@ def verdicts(unit: FloatArray) -> list[str]:
 
 def _marginal(posterior: Posterior, index: int, parameter: Parameter) -> dict[str, Any]:
     values, unit = posterior.values[:, index], posterior.unit[:, index]
-    low, low50, median, high50, high = (float(q) for q in np.quantile(values, [0.05, 0.25, 0.5, 0.75, 0.95]))
     space = posterior.density.prior.space
     # Compared on the axis that the prior is uniform on: the logarithmic one where the parameter is.
     contraction = float(unit.std() * np.sqrt(3.0))
     (verdict,) = verdicts(unit[:, None])
-    bounds = Marginal(parameter, values, np.full(len(values), 1.0 / len(values))).at_bounds
+    bounds = Marginal(values, np.full(len(values), 1.0 / len(values))).bounds_reached(parameter)
     counts, edges = np.histogram(unit, bins=BINS, range=(-1.0, 1.0), density=True)
     ends = np.repeat(np.zeros((1, len(space))), BINS + 1, axis=0)
     ends[:, index] = edges
     return {
         "mean": float(values.mean()),
         "std": float(values.std(ddof=1)),
-        "median": median,
-        "low": low,
-        "high": high,
-        "low_50": low50,
-        "high_50": high50,
+        **dict(zip(QUANTILES, np.quantile(values, list(QUANTILES.values())).tolist(), strict=True)),
         "unit": parameter.unit,
         "title": parameter.title,
         "bounds": [parameter.lower, parameter.upper],

@@ -73,39 +73,29 @@ class RunFolder:
             RunError: the folder belongs to another experiment, isn't a run, or can't be written.
         """
         folder = Path(path)
-        if (folder / "run.json").exists():
-            run = cls.open(folder)
-            run._must_match(measurement["hash"], preset, seed)
-            return run.moved(measurement["folder"])
-        if folder.exists() and (not folder.is_dir() or not all(_is_left(p) for p in folder.iterdir())):
-            raise RunError(f"{folder}: exists and isn't a run folder; choose another --run")
-        description = {
-            "format": RUN_FORMAT,
-            "measurement": dict(measurement),
-            "way": _way(folder, measurement["folder"]),
-            "preset": preset,
-            "seed": seed,
-            "version": version,
-            "created": datetime.now(UTC).isoformat(timespec="seconds"),
-        }
-        write_json(folder / "run.json", description)
-        return cls(folder, description)
-
-    def _must_match(self, measurement_hash: str, preset: str, seed: int) -> None:
-        wanted = {"measurement": measurement_hash, "preset": preset, "seed": seed}
-        found = {
-            "measurement": self.description["measurement"]["hash"],
-            "preset": self.description["preset"],
-            "seed": self.description["seed"],
-        }
-        for name, value in wanted.items():
-            if found[name] != value:
-                what = (
-                    f"another measurement set ({self.description['measurement']['name']}), or the set has changed"
-                    if name == "measurement"
-                    else f"{name} {found[name]}, not {value}"
-                )
-                raise RunError(f"{self.path}: belongs to {what}; choose another --run")
+        if not (folder / "run.json").exists():
+            if folder.exists() and (not folder.is_dir() or not all(_is_left(p) for p in folder.iterdir())):
+                raise RunError(f"{folder}: exists and isn't a run folder; choose another --run")
+            description = {
+                "format": RUN_FORMAT,
+                "measurement": dict(measurement),
+                "way": _way(folder, measurement["folder"]),
+                "preset": preset,
+                "seed": seed,
+                "version": version,
+                "created": datetime.now(UTC).isoformat(timespec="seconds"),
+            }
+            write_json(folder / "run.json", description)
+            return cls(folder, description)
+        run = cls.open(folder)
+        noted = run.description
+        if noted["measurement"]["hash"] != measurement["hash"]:
+            what = f"another measurement set ({noted['measurement']['name']}), or the set has changed"
+            raise RunError(f"{folder}: belongs to {what}; choose another --run")
+        for name, value in (("preset", preset), ("seed", seed)):
+            if noted[name] != value:
+                raise RunError(f"{folder}: belongs to {name} {noted[name]}, not {value}; choose another --run")
+        return run.moved(measurement["folder"])
 
     def moved(self, measurement: str | Path) -> RunFolder:
         """The run, which knows from now on that its measurement set, the same as ever, lies in this folder.

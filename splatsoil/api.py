@@ -123,14 +123,14 @@ class Run:
     @property
     def evaluations(self) -> xarray.Dataset:
         """Simulations of the latest fit over ``step``: its parameters in their units, ``loss`` (NaN where one
-        failed), ``seed`` of the particles, and ``level`` of resolution ("full" or "coarse")."""
+        failed), and ``seed`` of the particles."""
         import xarray
 
         fit = self.data.fit
         records = fit["history"]
         columns: dict[str, Any] = {name: [r["parameters"][name] for r in records] for name in fit["parameters"]}
         columns["loss"] = _numbers(r["loss"] for r in records)
-        columns |= {key: [r[key] for r in records] for key in ("seed", "level")}
+        columns["seed"] = [r["seed"] for r in records]
         out = xarray.Dataset({n: ("step", v) for n, v in columns.items()}, {"step": [r["step"] for r in records]})
         for name, parameter in fit["parameters"].items():
             out[name].attrs["units"] = parameter["unit"]

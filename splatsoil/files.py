@@ -10,7 +10,7 @@ import os
 import re
 import tempfile
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
@@ -171,6 +171,12 @@ def _readable(path: str | Path, remedy: str = ANEW) -> Iterator[None]:
         yield
     except (OSError, ValueError, KeyError, TypeError, EOFError, MemoryError, BadZipFile, zlib.error) as error:
         raise RunError(f"{path}: cannot be read ({error}); {remedy}") from error
+
+
+def digest(description: Mapping[str, Any]) -> str:
+    """SHA-256 (hex) of a description: equal descriptions, equal digests, whatever the order of their keys."""
+    text = json.dumps(plain(dict(description)), sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def plain(data: Any) -> Any:

@@ -53,7 +53,7 @@ SHAPES: Mapping[str, Mapping[str, Any]] = {
         "parameters": {EACH: {**ESTIMATE, "title": str}},
         "setup": {"effects": [str], "preset": str},
         "minimum": {EACH: {"estimate": NUMBER, "low": NUMBER, "high": NUMBER}},
-        "history": [{"parameters": {EACH: NUMBER}, "seed": int, "level": str, "status": str}],
+        "history": [{"parameters": {EACH: NUMBER}, "seed": int, "status": str}],
     },
     COMPARISON_FORMAT: {"fit": str, "parameters": dict, "frames": _are_pictures},
     DIAGNOSIS_FORMAT: {

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import shutil
+import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -39,6 +42,17 @@ def measured_data() -> Path:
     if not folder.is_dir():
         pytest.skip("SPLATSOIL_MEASURED names no folder of measured data")
     return folder
+
+
+@pytest.fixture(scope="session")
+def analytic() -> ModuleType:
+    """A simulate-and-compare with a known answer; as a script it fits one."""
+    spec = importlib.util.spec_from_file_location("analytic", REPOSITORY / "tests" / "inverse" / "analytic.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
 
 
 @pytest.fixture

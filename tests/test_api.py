@@ -100,22 +100,21 @@ def test_a_run_is_what_its_files_say(tmp_path: Path) -> None:
 def test_tables_are_xarray(tmp_path: Path) -> None:
     fitted(tmp_path)
     made = json.loads((tmp_path / "fit.json").read_text())
-    tried = [(34.0, 0.5, "full"), (36.0, None, "coarse")]
+    tried = [(34.0, 0.5), (36.0, None)]
     made["history"] = [
         {
             "step": k,
             "parameters": {"friction_angle": angle},
             "loss": loss,
             "seed": 7 + k,
-            "level": level,
             "status": "ok",
         }
-        for k, (angle, loss, level) in enumerate(tried)
+        for k, (angle, loss) in enumerate(tried)
     ]
     write_json(tmp_path / "fit.json", made)
     run = ss.open_run(tmp_path)
     table = run.evaluations
-    assert table["friction_angle"].attrs == {"units": "deg"} and list(table["level"].values) == ["full", "coarse"]
+    assert table["friction_angle"].attrs == {"units": "deg"} and list(table["seed"].values) == [7, 8]
     assert float(table["loss"].sel(step=0)) == 0.5 and np.isnan(table["loss"].sel(step=1))
     with pytest.raises(RunError, match=r"compare\(\)"):
         _ = run.force

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,7 +11,18 @@ import numpy as np
 import pytest
 
 from splatsoil.errors import RunError
-from splatsoil.files import FORWARD, JUDGING, RECONSTRUCTING, code_digest, read_npy, read_npz, write_npz
+from splatsoil.files import (
+    FORWARD,
+    JUDGING,
+    RECONSTRUCTING,
+    code_digest,
+    digest,
+    read_npy,
+    read_npz,
+    write_bytes,
+    write_json,
+    write_npz,
+)
 
 #: Modules that results are made with, and why they don't decide one.
 NEUTRAL = {
@@ -24,7 +36,6 @@ NEUTRAL = {
     "threads.py": "how many work at once",
     "envs/__init__.py": "the names of environments",
     "envs/devices.py": "the device, which each key has by itself",
-    "envs/levels.py": "which resolution is asked for, which each key has by itself",
     "envs/problem.py": "what an evaluation is",
 }
 
@@ -85,7 +96,7 @@ def reached(repository: Path, start: str) -> set[str]:
         (
             "inverse.criticism.diagnosis",
             (*FORWARD, *JUDGING),
-            {"inverse/evaluations.py": "names what is kept"},
+            {},
         ),
     ],
 )
@@ -148,3 +159,33 @@ def test_what_is_no_array_or_lacks_one_gets_one_sentence(tmp_path: Path) -> None
             read(text)
     with pytest.raises(RunError, match="no single array"):
         read_npy(path)
+
+
+def test_a_write_that_fails_leaves_the_old_file_and_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_json(tmp_path / "a.json", {"old": True})
+
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("splatsoil.files.os.fsync", full)
+    with pytest.raises(RunError, match="No space left"):
+        write_bytes(path, b"new")
+    assert json.loads(path.read_text()) == {"old": True}
+    assert [p.name for p in tmp_path.iterdir()] == ["a.json"]
+
+
+def test_json_is_strict(tmp_path: Path) -> None:
+    path = write_json(
+        tmp_path / "a.json", {"nan": float("nan"), "array": np.arange(2), "path": tmp_path, "n": np.int64(3)}
+    )
+    assert json.loads(path.read_text(), parse_constant=lambda _: pytest.fail("not JSON")) == {
+        "nan": None,
+        "array": [0, 1],
+        "path": str(tmp_path),
+        "n": 3,
+    }
+
+
+def test_digests_know_contents_and_not_order() -> None:
+    assert digest({"a": 1, "b": [1, 2]}) == digest({"b": [1, 2], "a": 1})
+    assert digest({"a": 1.0}) != digest({"a": 1.0 + 2**-52})

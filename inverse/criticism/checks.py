@@ -30,7 +30,7 @@ class Check:
         stage, region, channel: what it is.
         ratio: root mean square of the residual over what is expected.
         p: chance of as much with nothing wrong, in any block.
-        features: how many.
+        n: features in it.
     """
 
     stage: str
@@ -38,7 +38,7 @@ class Check:
     channel: str
     ratio: float
     p: float
-    features: int
+    n: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,13 +76,11 @@ def checks(
 ) -> list[Check]:
     """Every block of a residual (t, s), the most surprising first."""
     layout, rng = experiment.layout, np.random.default_rng([seed, 13])
-    blocks: dict[tuple[str, str, str], npt.NDArray[np.int64]] = {}
     stages = np.broadcast_to(np.array(layout.stages)[:, None], mask.shape)[mask]
     channels = np.broadcast_to(np.array([s.channel for s in layout.sites]), mask.shape)[mask]
-    for key in sorted(set(zip(stages, layout.regions[mask], channels, strict=True))):
-        inside = (stages == key[0]) & (layout.regions[mask] == key[1]) & (channels == key[2])
-        if inside.sum() >= FEWEST:
-            blocks[str(key[0]), str(key[1]), str(key[2])] = np.flatnonzero(inside)
+    labels = np.stack([stages, layout.regions[mask], channels], axis=1)
+    inside = {tuple(map(str, key)): np.flatnonzero(np.all(labels == key, axis=1)) for key in np.unique(labels, axis=0)}
+    blocks = {key: index for key, index in inside.items() if len(index) >= FEWEST}
     variance = expected.variance[mask]
 
     def statistics(table: FloatArray) -> FloatArray:
@@ -92,13 +90,11 @@ def checks(
     own = statistics(residual)
     replicates = np.array([statistics(expected.replicate(rng)) for _ in range(DRAWS)])
     p = (1.0 + np.sum(replicates >= own, axis=0)) / (1.0 + DRAWS)
-    order, adjusted, worst = np.argsort(p), np.ones(len(p)), 0.0
-    for rank, index in enumerate(order):
-        worst = max(worst, float(p[index]) * (len(p) - rank))
-        adjusted[index] = min(worst, 1.0)
+    order, adjusted = np.argsort(p), np.ones(len(p))
+    adjusted[order] = np.minimum(np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1)), 1.0)
     found = [
-        Check(*key, float(np.sqrt(own[i])), float(adjusted[i]), len(index))
-        for i, (key, index) in enumerate(blocks.items())
+        Check(stage, region, channel, float(ratio), float(chance), len(index))
+        for ((stage, region, channel), index), ratio, chance in zip(blocks.items(), np.sqrt(own), adjusted, strict=True)
     ]
     return sorted(found, key=lambda c: (c.p, -c.ratio))
 

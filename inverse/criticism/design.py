@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -32,7 +33,7 @@ class Run:
     seed: int = 0
     numerics: str = ""
 
-    def arguments(self) -> dict[str, object]:
+    def arguments(self) -> dict[str, Any]:
         """By name."""
         return {"values": dict(self.values), "effects": self.effects, "seed": self.seed, "numerics": self.numerics}
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -14,10 +14,10 @@ from splatsoil.experiment.base import Candidate, Experiment
 
 from .checks import Check, Expected, checks, passes
 from .design import Prior, Run, effect_runs
-from .evidence import AS_IT_IS, ELSE, PRIOR, Comparison, Evidence
-from .noise import REMAINING, Noise, Tables, compared, noise_of, trend_of
+from .evidence import AS_IT_IS, ELSE, PRIOR, SLAB, Comparison, Evidence
+from .noise import REMAINING, Tables, compared, noise_of, trend_of
 from .power import NAMED, detectable
-from .simulations import Simulate, Simulations
+from .simulations import Simulations
 
 FloatArray = npt.NDArray[np.float64]
 Verdict = Literal["adequate", "missing", "one of", "something else", "undecided"]
@@ -102,21 +102,75 @@ class Diagnosis:
 
 @dataclass
 class _Study:
-    """Simulations so far, and what failed."""
+    """An experiment, the models that could be true, what is simulated of each, and what failed."""
 
     experiment: Experiment
-    simulate: Simulate
+    simulate: Simulations
     prior: Prior
+    candidates: Sequence[Candidate]
     seed: int
-    base: list[Run] = field(default_factory=list)
+    base: list[Run]
     fine: list[Run] = field(default_factory=list)
     effects: dict[str, list[Run]] = field(default_factory=dict)
+    drawn: Mapping[str, FloatArray] = field(default_factory=dict)
+    reference: FloatArray = field(default_factory=lambda: np.zeros(0))
     failed: dict[str, str] = field(default_factory=dict)
 
-    def tables(self, drawn: Mapping[str, FloatArray], reference: FloatArray) -> Tables:
+    def design(self) -> None:
+        """The first simulations: of the base model, of pairs, and of each effect of physics."""
+        prior, seed = self.prior, self.seed
+        points = _spread(prior, BASE + BASE // 2 * (len(prior.space) - 1), seed)
+        # each simulation that is there stands for the nearest point of the design
+        for there in prior.unit(self.base)[: len(points)]:
+            points = np.delete(points, np.argmin(np.sum((points - there) ** 2, axis=1)), axis=0)
+        self.base += [Run(v, seed=seed + 1 + i) for i, v in enumerate(prior.values(points))]
+        if FINE in self.experiment.numerics:
+            points = 0.7 * _spread(prior, PAIRS, seed + 1)
+            self.fine = [Run(v, seed=seed + 101 + i, numerics=FINE) for i, v in enumerate(prior.values(points))]
+        for number, candidate in enumerate(c for c in self.candidates if c.kind == "physics"):
+            count = SCREENED + len(prior.space) + len(candidate.parameters) + len(candidate.shapes)
+            self.effects[candidate.name] = effect_runs(candidate, prior, count, seed + 201 + 100 * number)
+        self.ask_ahead()
+
+    def refine(self, evidence: Evidence, number: int) -> None:
+        """More simulations where the base model and the most probable effects are most probable."""
+        rng = np.random.default_rng([self.seed, 19, number])
+        first = 10_000 * (1 + number) + self.seed
+        likely = sorted(self.effects, key=lambda name: -evidence.probability.get(name, 0.0))[:REFINED]
+        for name in (n for n in likely if n in evidence.models):
+            drawn = evidence.models[name].drawn(AGAIN, rng)
+            self.effects[name] += [Run(v, (name,), first + i) for i, v in enumerate(drawn)]
+        self.base += [Run(v, seed=first + 100 + i) for i, v in enumerate(evidence.models[AS_IT_IS].drawn(AGAIN, rng))]
+        self.ask_ahead()
+
+    def ask_ahead(self) -> None:
+        """Have others simulate, too."""
+        runs = [*(run for mine in self.effects.values() for run in mine), *self.base, *self.fine]
+        self.simulate.ahead(lambda noted: [noted(**run.arguments()) for run in runs])
+
+    def draw(self, values: Mapping[str, float]) -> None:
+        """One simulation as usual, and reported or drawn otherwise: by guesses, and by effects of observation in their
+        smallest meaningful sizes."""
+        observed = [c for c in self.candidates if c.kind == "observation"]
+        # What needs more frames of it comes first, so that one simulation serves all.
+        observed.sort(key=lambda c: c.name != "time_offset")
+        tables = {}
+        for candidate in observed:
+            for p in candidate.parameters:
+                assert p.off is not None
+                end = float(np.clip(p.off + STEP * p.meaningful, p.lower, p.upper))
+                table = self.simulate({**values, p.name: end}, effects=(candidate.name,), purpose=candidate.name)
+                tables[p.name] = (table, (end - p.off) / p.meaningful)
+        self.reference = self.simulate(values, purpose="as it is")
+        drawn = {name: self.reference + (table - self.reference) / step for name, (table, step) in tables.items()}
+        others = (*self.experiment.guesses, *self.experiment.redrawn)
+        self.drawn = drawn | {name: self.simulate(values, numerics=name, purpose=name) for name in others}
+
+    def tables(self) -> Tables:
+        """All simulations."""
         made = {name: self._made(runs) for name, runs in self.effects.items()}
         enough = {name: found for name, found in made.items() if len(found[0]) > 1}
-        return Tables(self._made(self.base), self._made(self.fine), enough, drawn, reference)
+        return Tables(self._made(self.base), self._made(self.fine), enough, self.drawn, self.reference)
 
     def _made(self, runs: Sequence[Run]) -> tuple[list[Run], FloatArray]:
         """Those that could be made, and their tables."""
@@ -129,6 +183,69 @@ class _Study:
             else:
                 kept.append(run)
         return kept, np.array(found).reshape(len(kept), *self.experiment.layout.shape)
+
+    def compare(self, aside: npt.NDArray[np.bool_] | None = None) -> _Compared:
+        """All models against the observation, without what is set aside."""
+        tables = self.tables()
+        if len(tables.base[0]) < BASE // 2:
+            why = self.failed.get("the model as it is", "")
+            raise SimulationError(f"the model as it is could be simulated {len(tables.base[0])} times only: {why}")
+        noise = noise_of(self.experiment, self.prior, tables, self.candidates, aside)
+        simulated = {name: (runs, noise.scores(found)) for name, (runs, found) in tables.effects.items()}
+        comparison = Comparison.of(noise, self.prior, self.candidates, simulated, self.seed)
+        return _Compared(self, tables, comparison, comparison.judge())
+
+
+@dataclass
+class _Compared:
+    """A study's models against the observation."""
+
+    study: _Study
+    tables: Tables
+    comparison: Comparison
+    evidence: Evidence
+
+    def predicted(self, name: str) -> FloatArray:
+        """(t, s) of a model at its posterior mean, of finer cells: by the base simulations' trend, or a simulation of
+        an effect."""
+        study, noise, model = self.study, self.evidence.noise, self.evidence.models[name]
+        values = {parameter: model.moments(parameter)[0] for parameter in model.values}
+        if name in self.tables.effects:
+            return study.simulate(values, effects=(name,), seed=study.seed, purpose=name) + noise.cell
+        point = study.prior.space.to_unit(study.prior.space.to_vector(values))[None]
+        (trend,) = trend_of(point, noise.points)
+        table = np.tensordot(trend, self.tables.base[1], axes=1)
+        if name in noise.patterns:
+            # at the sizes that explain most of what the base model leaves
+            pattern, precision = noise.patterns[name], np.linalg.inv(noise.covariance(model.factors))
+            left = noise.observed - trend @ noise.base
+            inner = pattern @ precision @ pattern.T + np.eye(len(pattern)) / SLAB**2
+            size = np.linalg.solve(inner, pattern @ precision @ left)
+            candidate = next(c for c in study.candidates if c.name == name)
+            drawn = [self.tables.drawn[p.name] for p in candidate.parameters if p.name in self.tables.drawn]
+            table = table + sum(s * (one - self.tables.reference) for s, one in zip(size, drawn, strict=True))
+        return np.asarray(table + noise.cell)
+
+    def expected(self, factors: FloatArray) -> Expected:
+        """The same parts as in the noise of scores, for each feature, with numerics of factors (2,)."""
+        experiment, noise, tables = self.study.experiment, self.evidence.noise, self.tables
+        placed, base = experiment.layout.placed, tables.base[1]
+
+        def about_trend(runs: Sequence[Run], found: FloatArray) -> FloatArray:
+            hat = trend_of(self.study.prior.unit(runs), noise.points)
+            return np.asarray((found - np.tensordot(hat, base, axes=1)) / np.sqrt(max(len(found), 1)))
+
+        rest = np.tensordot(np.eye(len(base)) - noise.trend, base, axes=1)
+        rest /= np.sqrt(np.maximum(1.0 - np.diag(noise.trend), 1e-9) * len(base))[:, None, None]
+        otherwise = [about_trend(*made) for made in tables.effects.values()]
+        otherwise.append((base - base.mean(axis=0)) / np.sqrt(len(base)))
+        numerics = [
+            factors[0] * noise.share / np.sqrt(len(otherwise)) * np.where(placed, found, 0.0) for found in otherwise
+        ]
+        if len(tables.fine[0]):
+            numerics.append(factors[1] * REMAINING * np.where(placed, 0.0, about_trend(*tables.fine)))
+        chance = rest if experiment.chance else rest[:0]
+        return Expected(np.asarray(experiment.sensor), chance, np.concatenate(numerics, axis=0), noise.factor_std)
 
 
 def diagnose(
@@ -157,53 +274,47 @@ def diagnose(
     Raises:
         SimulationError: the base model could not be simulated.
     """
-    ask = Simulations(experiment) if simulate is None else simulate
-    prior = Prior.of(experiment, values) if prior is None else prior
+    prior = prior or Prior.of(experiment, values)
     candidates = experiment.candidates if effects else ()
-    study = _design(experiment, ask, prior, candidates, seed, known)
-    ask.ahead(lambda noted: _ask_through(study, noted))
+    study = _Study(experiment, simulate or Simulations(experiment), prior, candidates, seed, prior.inside(known))
+    study.design()
     progress("drawings", 0.0)
-    drawn, reference = _drawings(experiment, ask, values, candidates)
+    study.draw(dict(values))
     progress("simulations", 0.1)
-    evidence, comparison, noise, tables = _judged(study, drawn, reference, candidates)
+    now = study.compare()
     for number in range(MOST_ROUNDS if effects else 0):
         progress("simulations where models are most probable", 0.7 + 0.05 * number)
-        before = evidence
-        _refine(study, before, number)
-        ask.ahead(lambda noted: _ask_through(study, noted))
-        evidence, comparison, noise, tables = _judged(study, drawn, reference, candidates)
-        if number + 1 >= FEWEST_ROUNDS and _settled(before, evidence):
+        before = now.evidence
+        study.refine(before, number)
+        now = study.compare()
+        if number + 1 >= FEWEST_ROUNDS and _settled(before, now.evidence):
             break
     progress("checks", 0.9)
-    best = max(
-        (n for n in evidence.probability if n not in (AS_IT_IS, ELSE)),
-        key=lambda n: evidence.probability[n],
-        default="",
+    evidence, noise = now.evidence, now.evidence.noise
+    likely = sorted(
+        (n for n in evidence.probability if n not in (AS_IT_IS, ELSE)), key=lambda n: -evidence.probability[n]
     )
-    predictions = {AS_IT_IS: _predicted(study, tables, evidence, AS_IT_IS, ask)}
-    if best:
-        predictions[best] = _predicted(study, tables, evidence, best, ask)
+    shown = (AS_IT_IS, *likely[:1])
+    predictions = {name: now.predicted(name) for name in shown}
     residuals = {name: experiment.observed - table for name, table in predictions.items()}
-    top = best if best and evidence.probability[best] > evidence.probability[AS_IT_IS] else AS_IT_IS
-    expected = _expected(study, noise, tables, evidence.models[top].factors)
+    top = max(shown, key=lambda name: evidence.probability[name])
+    expected = now.expected(evidence.models[top].factors)
     found = checks(experiment, residuals[top], expected, noise.mask, seed)
+    held_out, aside = _held_out(study, shown) if effects else ([], "")
     verdict, members = judged(evidence.probability, fits=passes(found))
-    held_out, aside = _held_out(study, tables, candidates, tuple(predictions), ask) if effects else ([], "")
     power = {
-        c.name: size if size is None else size * c.measure.meaningful
+        c.name: None if size is None else size * c.measure.meaningful
         for c in candidates
         if c.name in evidence.models
-        for size in [detectable(comparison, evidence, c, seed)]
+        for size in [detectable(now.comparison, evidence, c, seed)]
     }
-    names = [p.name for p in prior.space]
-    estimates = {name: evidence.averaged(name) for name in names}
-    spread = {p.name: (p.upper - p.lower) / np.sqrt(12.0) for p in prior.space}
+    averaged = {p.name: evidence.marginal(p.name) for p in prior.space}
     return Diagnosis(
         verdict,
         members,
         evidence,
-        estimates,
-        {name: estimates[name][1] < 0.5 * spread[name] for name in names},
+        {name: (marginal.mean, marginal.std) for name, marginal in averaged.items()},
+        {p.name: averaged[p.name].std < 0.5 * (p.upper - p.lower) / np.sqrt(12.0) for p in prior.space},
         power,
         found,
         residuals,
@@ -233,42 +344,6 @@ def judged(probability: Mapping[str, float], *, fits: bool) -> tuple[Verdict, tu
     return "undecided", shown
 
 
-def _design(
-    experiment: Experiment,
-    simulate: Simulate,
-    prior: Prior,
-    candidates: Iterable[Candidate],
-    seed: int,
-    known: Sequence[Run] = (),
-) -> _Study:
-    count = BASE + BASE // 2 * (len(prior.space) - 1)
-    study = _Study(experiment, simulate, prior, seed)
-    study.base = prior.inside(known)
-    points = _spread(prior, count, seed)
-    # each simulation that is there stands for the nearest point of the design
-    for there in prior.unit(study.base)[: len(points)]:
-        points = np.delete(points, np.argmin(np.sum((points - there) ** 2, axis=1)), axis=0)
-    study.base += [Run(v, seed=seed + 1 + i) for i, v in enumerate(prior.values(points))]
-    if FINE in experiment.numerics:
-        points = 0.7 * _spread(prior, PAIRS, seed + 1)
-        study.fine = [Run(v, seed=seed + 101 + i, numerics=FINE) for i, v in enumerate(prior.values(points))]
-    for number, candidate in enumerate(c for c in candidates if c.kind == "physics"):
-        free = len(prior.space) + len(candidate.parameters) + len(candidate.shapes)
-        study.effects[candidate.name] = effect_runs(candidate, prior, SCREENED + free, seed + 201 + 100 * number)
-    return study
-
-
-def _refine(study: _Study, evidence: Evidence, number: int) -> None:
-    """More simulations where the base model and the most probable effects are most probable."""
-    rng = np.random.default_rng([study.seed, 19, number])
-    first = 10_000 * (1 + number) + study.seed
-    likely = sorted(study.effects, key=lambda name: -evidence.probability.get(name, 0.0))[:REFINED]
-    for name in (n for n in likely if n in evidence.models):
-        drawn = evidence.models[name].drawn(AGAIN, rng)
-        study.effects[name] += [Run(v, (name,), first + i) for i, v in enumerate(drawn)]
-    study.base += [Run(v, seed=first + 100 + i) for i, v in enumerate(evidence.models[AS_IT_IS].drawn(AGAIN, rng))]
-
-
 def _settled(before: Evidence, now: Evidence) -> bool:
     """Whether the most probable model's parameters have moved by less than their standard deviation."""
     model, old = now.models[now.best], before.models[now.best]
@@ -282,112 +357,7 @@ def _spread(prior: Prior, count: int, seed: int) -> FloatArray:
     return prior.points(1 << (count - 1).bit_length(), seed)[:count]
 
 
-def _ask_through(study: _Study, simulate: Simulate) -> None:
-    """Ask for all that a study needs, through another function."""
-    other = replace(study, simulate=simulate, failed={})
-    other.tables({}, np.zeros(study.experiment.layout.shape))
-
-
-def _drawings(
-    experiment: Experiment, simulate: Simulate, values: Mapping[str, float], candidates: Iterable[Candidate]
-) -> tuple[dict[str, FloatArray], FloatArray]:
-    """One simulation reported or drawn otherwise, by guess or parameter (these for their smallest meaningful size), and
-    as usual."""
-    observed = [c for c in candidates if c.kind == "observation"]
-    # What needs more frames of it comes first, so that one simulation serves all.
-    observed.sort(key=lambda c: c.name != "time_offset")
-    at, tables = dict(values), {}
-    for candidate in observed:
-        for p in candidate.parameters:
-            assert p.off is not None
-            end = float(np.clip(p.off + STEP * p.meaningful, p.lower, p.upper))
-            table = simulate({**at, p.name: end}, effects=(candidate.name,), purpose=candidate.name)
-            tables[p.name] = (table, (end - p.off) / p.meaningful)
-    reference = simulate(at, purpose="as it is")
-    drawn = {name: reference + (table - reference) / step for name, (table, step) in tables.items()}
-    others = {name: simulate(at, numerics=name, purpose=name) for name in (*experiment.guesses, *experiment.redrawn)}
-    return {**drawn, **others}, reference
-
-
-def _judged(
-    study: _Study,
-    drawn: Mapping[str, FloatArray],
-    reference: FloatArray,
-    candidates: Sequence[Candidate],
-) -> tuple[Evidence, Comparison, Noise, Tables]:
-    tables = study.tables(drawn, reference)
-    return (*_compared(study, tables, candidates, None), tables)
-
-
-def _compared(
-    study: _Study, tables: Tables, candidates: Sequence[Candidate], aside: npt.NDArray[np.bool_] | None
-) -> tuple[Evidence, Comparison, Noise]:
-    if len(tables.base[0]) < BASE // 2:
-        why = study.failed.get("the model as it is", "")
-        raise SimulationError(f"the model as it is could be simulated {len(tables.base[0])} times only: {why}")
-    noise = noise_of(study.experiment, study.prior, tables, candidates, aside)
-    simulated = {name: (runs, noise.scores(found)) for name, (runs, found) in tables.effects.items()}
-    comparison = Comparison.of(noise, study.prior, candidates, simulated, study.seed)
-    return comparison.judge(), comparison, noise
-
-
-def _predicted(study: _Study, tables: Tables, evidence: Evidence, name: str, simulate: Simulate) -> FloatArray:
-    """(t, s) of a model at its posterior mean, of finer cells: by the base simulations' trend, or a simulation of an
-    effect."""
-    model = evidence.models[name]
-    values = {parameter: model.moments(parameter)[0] for parameter in model.values}
-    if name in tables.effects:
-        return simulate(values, effects=(name,), seed=study.seed, purpose=name) + evidence.noise.cell
-    point = study.prior.space.to_unit(study.prior.space.to_vector(values))[None]
-    table = np.tensordot(trend_of(point, study.prior.unit(tables.base[0]))[0], tables.base[1], axes=1)
-    if name in evidence.noise.patterns:
-        table = table + _observed_otherwise(study, tables, evidence, name)
-    return np.asarray(table + evidence.noise.cell)
-
-
-def _observed_otherwise(study: _Study, tables: Tables, evidence: Evidence, name: str) -> FloatArray:
-    """(t, s) what an effect of observation adds, at the sizes that explain most of what the base model leaves."""
-    noise = evidence.noise
-    candidate = next(c for c in study.experiment.candidates if c.name == name)
-    pattern = noise.patterns[name]
-    precision = np.linalg.inv(noise.covariance(evidence.models[name].factors))
-    model = evidence.models[name]
-    values = {p: model.moments(p)[0] for p in model.values}
-    point = study.prior.space.to_unit(study.prior.space.to_vector(values))[None]
-    left = noise.observed - trend_of(point, noise.points)[0] @ noise.base
-    size = np.linalg.solve(pattern @ precision @ pattern.T + np.eye(len(pattern)) / 16.0, pattern @ precision @ left)
-    added = [
-        s * (tables.drawn[p.name] - tables.reference)
-        for s, p in zip(size, (p for p in candidate.parameters if p.name in tables.drawn), strict=True)
-    ]
-    return np.asarray(sum(added))
-
-
-def _expected(study: _Study, noise: Noise, tables: Tables, factors: FloatArray) -> Expected:
-    """The same parts as in the noise of scores, for each feature."""
-    experiment, prior = study.experiment, study.prior
-    placed, base = experiment.layout.placed, tables.base[1]
-
-    def about_trend(runs: Sequence[Run], found: FloatArray) -> FloatArray:
-        hat = trend_of(prior.unit(runs), noise.points)
-        return np.asarray((found - np.tensordot(hat, base, axes=1)) / np.sqrt(max(len(found), 1)))
-
-    rest = np.tensordot(np.eye(len(base)) - noise.trend, base, axes=1)
-    rest /= np.sqrt(np.maximum(1.0 - np.diag(noise.trend), 1e-9) * len(base))[:, None, None]
-    otherwise = [about_trend(*made) for made in tables.effects.values()]
-    otherwise.append((base - base.mean(axis=0)) / np.sqrt(len(base)))
-    numerics = [
-        factors[0] * noise.share / np.sqrt(len(otherwise)) * np.where(placed, found, 0.0) for found in otherwise
-    ]
-    if len(tables.fine[0]):
-        numerics.append(factors[1] * REMAINING * np.where(placed, 0.0, about_trend(*tables.fine)))
-    chance = rest if experiment.chance else rest[:0]
-    return Expected(np.asarray(experiment.sensor), chance, np.concatenate(numerics, axis=0), noise.factor_std)
-
-
-def _held_out(
-    study: _Study, tables: Tables, candidates: Sequence[Candidate], names: Sequence[str], simulate: Simulate
-) -> tuple[list[HeldOut], str]:
+def _held_out(study: _Study, names: Sequence[str]) -> tuple[list[HeldOut], str]:
     """Models fitted without one camera and the last stage, and their errors there."""
     experiment = study.experiment
     aside, what = set_aside(experiment)
@@ -395,14 +365,14 @@ def _held_out(
     judged_on = mask & aside & experiment.layout.common[None]
     if not judged_on.any() or not (mask & ~aside).any():
         return [], ""
-    evidence, _, noise = _compared(study, tables, candidates, aside)
-    nothing_wrong = _expected(study, noise, tables, np.ones(2)).variance[judged_on]
+    now = study.compare(aside)
+    noise = float(np.sqrt(now.expected(np.ones(2)).variance[judged_on].mean()))
     out = []
     for name in names:
-        variance = _expected(study, noise, tables, evidence.models[name].factors).variance[judged_on]
-        left = (experiment.observed - _predicted(study, tables, evidence, name, simulate))[judged_on]
+        variance = now.expected(now.evidence.models[name].factors).variance[judged_on]
+        left = (experiment.observed - now.predicted(name))[judged_on]
         score = -0.5 * float(np.mean(left**2 / variance + np.log(2.0 * np.pi * variance)))
-        out.append(HeldOut(name, float(np.sqrt(np.mean(left**2))), float(np.sqrt(nothing_wrong.mean())), score))
+        out.append(HeldOut(name, float(np.sqrt(np.mean(left**2))), noise, score))
     return out, what
 
 

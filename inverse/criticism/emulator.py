@@ -54,15 +54,11 @@ class BaseEmulator:
 
     def predict(self, where: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Mean and variance (q, p) at points (q, n)."""
-        inner, cross = _base_kernel(self.points, self.points), _base_kernel(where, self.points)
-        alone = _base_variance(where)
-        mean, variance = np.empty((len(where), len(self.signal))), np.empty((len(where), len(self.signal)))
-        for c, (signal, chance) in enumerate(zip(self.signal, self.chance, strict=True)):
-            factor = cho_factor(signal * inner + chance * np.eye(len(inner)))
-            mean[:, c] = signal * cross @ cho_solve(factor, self.scores[:, c])
-            gain = cho_solve(factor, cross.T)
-            variance[:, c] = signal * alone - signal**2 * np.einsum("ij,ji->i", cross, gain)
-        return mean, np.maximum(variance, 0.0)
+        square = np.sum(where**2, axis=1)
+        alone = SHARES[0] + SHARES[1] * square + SHARES[2] * square**2 + 1.0
+        kernels = _base_kernel(self.points, self.points), _base_kernel(where, self.points)
+        noise = np.broadcast_to(self.chance, self.scores.shape)
+        return _regressed(*kernels, alone, self.signal, noise, self.scores)
 
 
 @dataclass(frozen=True)
@@ -101,16 +97,23 @@ class IncrementEmulator:
 
     def predict(self, where: Points) -> tuple[FloatArray, FloatArray]:
         """Mean and variance (q, p) of the increment."""
-        inner = _increment_kernel(self.points, self.points, self.lengths)
-        cross = _increment_kernel(where, self.points, self.lengths)
+        inner, cross = (_increment_kernel(x, self.points, self.lengths) for x in (self.points, where))
         alone = np.sum(where[1] ** 2, axis=1) / HALFWAY**2
-        mean, variance = np.zeros((len(cross), len(self.amplitude))), np.zeros((len(cross), len(self.amplitude)))
-        for c in np.flatnonzero(self.amplitude):
-            factor = cho_factor(self.amplitude[c] * inner + np.diag(self.noise[:, c]))
-            mean[:, c] = self.amplitude[c] * cross @ cho_solve(factor, self.increments[:, c])
-            gain = cho_solve(factor, cross.T)
-            variance[:, c] = self.amplitude[c] * alone - self.amplitude[c] ** 2 * np.einsum("ij,ji->i", cross, gain)
-        return mean, np.maximum(variance, 0.0)
+        return _regressed(inner, cross, alone, self.amplitude, self.noise, self.increments)
+
+
+def _regressed(
+    inner: FloatArray, cross: FloatArray, alone: FloatArray, signal: FloatArray, noise: FloatArray, values: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Mean and variance (q, p) of Gaussian processes: kernels (m, m), (q, m), (q,) times signals (p,), through values
+    (m, p) whose noise has a variance (m, p)."""
+    mean, variance = np.zeros((len(cross), len(signal))), np.zeros((len(cross), len(signal)))
+    for c in np.flatnonzero(signal):
+        factor = cho_factor(signal[c] * inner + np.diag(noise[:, c]))
+        mean[:, c] = signal[c] * cross @ cho_solve(factor, values[:, c])
+        gain = cho_solve(factor, cross.T)
+        variance[:, c] = signal[c] * alone - signal[c] ** 2 * np.einsum("ij,ji->i", cross, gain)
+    return mean, np.maximum(variance, 0.0)
 
 
 def _likelihoods(kernel: FloatArray, amplitude: FloatArray, noise: FloatArray, values: FloatArray) -> FloatArray:
@@ -126,11 +129,6 @@ def _base_kernel(a: FloatArray, b: FloatArray) -> FloatArray:
     product_ = a @ b.T
     near = np.exp(-0.5 * np.sum((a[:, None] - b[None]) ** 2, axis=-1) / LENGTH**2)
     return SHARES[0] + SHARES[1] * product_ + SHARES[2] * product_**2 + near
-
-
-def _base_variance(a: FloatArray) -> FloatArray:
-    square = np.sum(a**2, axis=1)
-    return SHARES[0] + SHARES[1] * square + SHARES[2] * square**2 + 1.0
 
 
 def _increment_kernel(a: Points, b: Points, lengths: Sequence[float]) -> FloatArray:

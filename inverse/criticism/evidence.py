@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +21,7 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_t, qmc
 
 from splatsoil.experiment.base import Candidate
+from splatsoil.parameters import Parameter, ParameterSpace
 
 from .design import Prior, Run, effect_points, effect_values, sizes
 from .emulator import BaseEmulator, IncrementEmulator
@@ -28,6 +30,8 @@ from .noise import FACTORS, Noise
 FloatArray = npt.NDArray[np.float64]
 Prediction = tuple[Mapping[str, FloatArray], FloatArray, FloatArray]
 """Values by name (q,), mean and variance (q, p) of whitened scores."""
+Predict = Callable[[FloatArray], Prediction]
+"""At points (q, d) of the unit cube."""
 
 POINTS = 2048
 """Of the sequence, and of each later round's draws."""
@@ -41,6 +45,44 @@ PRIOR = 0.5
 """Probability of the base model beforehand; the others share the rest."""
 SLAB = 4.0
 """Standard deviation of an observation effect's sizes, over the smallest meaningful ones: its drawings are linear."""
+NEAR_BOUND, CROWDED = 0.05, 0.10
+"""A bound is reached where this share of the axis near it holds more than twice its share of the posterior."""
+
+
+@dataclass(frozen=True, eq=False)
+class Marginal:
+    """Weighted draws of one parameter.
+
+    Attributes:
+        values: (k,) in its unit.
+        weights: (k,) that sum to 1.
+    """
+
+    values: FloatArray
+    weights: FloatArray
+
+    @property
+    def mean(self) -> float:
+        """Mean."""
+        return float(self.weights @ self.values)
+
+    @property
+    def std(self) -> float:
+        """Standard deviation."""
+        return float(np.sqrt(self.weights @ (self.values - self.mean) ** 2))
+
+    def quantile(self, share: float) -> float:
+        """The value below which a share of the weight lies."""
+        order = np.argsort(self.values)
+        index = np.searchsorted(np.cumsum(self.weights[order]), share * self.weights.sum())
+        return float(self.values[order][min(int(index), len(order) - 1)])
+
+    def bounds_reached(self, parameter: Parameter) -> list[Literal["lower", "upper"]]:
+        """Bounds of the parameter's range that the posterior crowds at."""
+        unit = ParameterSpace([parameter]).to_unit(self.values[:, None])[:, 0]
+        edge = 1.0 - 2.0 * NEAR_BOUND
+        near: dict[Literal["lower", "upper"], npt.NDArray[np.bool_]] = {"lower": unit < -edge, "upper": unit > edge}
+        return [bound for bound, close in near.items() if float(self.weights @ close) > CROWDED]
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,30 +92,26 @@ class Model:
     Attributes:
         name: the effect's; `AS_IT_IS`, `ELSE`.
         values: parameters (q,) by name at the points.
-        mean: (q, p) scores that are predicted there.
-        variance: (q, p) the emulator's doubt of them, in the directions of `whitened` scores.
-        pattern: (k, p) of an effect of observation, else empty.
-        log_likelihood: (f, q) by the numerics' factors.
-        importance: (q,) logarithms of the prior's density over that of the points.
-        weights: (f, q) posterior, summing to 1.
+        weights: (f, q) posterior by the numerics' factors, summing to 1.
         log_evidence: of it.
     """
 
     name: str
     values: Mapping[str, FloatArray]
-    mean: FloatArray
-    variance: FloatArray
-    pattern: FloatArray
-    log_likelihood: FloatArray
-    importance: FloatArray
     weights: FloatArray
     log_evidence: float
 
+    @classmethod
+    def of(cls, name: str, values: Mapping[str, FloatArray], log: FloatArray, factors: FloatArray) -> Model:
+        """From logarithms (f, q) of likelihoods times importance weights, and of the factors' probabilities (f,)."""
+        joint = log + factors[:, None]
+        weights = np.exp(joint - joint.max())
+        return cls(name, values, weights / weights.sum(), float(logsumexp(joint)) - float(np.log(joint.shape[1])))
+
     def moments(self, name: str) -> tuple[float, float]:
         """Mean and standard deviation of a parameter."""
-        weights = self.weights.sum(axis=0)
-        mean = float(weights @ self.values[name])
-        return mean, float(np.sqrt(max(weights @ (self.values[name] - mean) ** 2, 0.0)))
+        marginal = Marginal(self.values[name], self.weights.sum(axis=0))
+        return marginal.mean, marginal.std
 
     @property
     def factors(self) -> FloatArray:
@@ -106,16 +144,15 @@ class Evidence:
         """The most probable model."""
         return max(self.probability, key=lambda name: self.probability[name])
 
-    def averaged(self, name: str) -> tuple[float, float]:
-        """Mean and standard deviation of a base parameter over models (Hoeting et al. 1999, Stat. Sci. 14:382)."""
-        known = [(self.probability[m], *model.moments(name)) for m, model in self.models.items()]
-        mean = sum(p * value for p, value, _ in known)
-        variance = sum(p * (std**2 + (value - mean) ** 2) for p, value, std in known)
-        return float(mean), float(np.sqrt(variance))
+    def marginal(self, name: str) -> Marginal:
+        """Posterior of a base parameter, averaged over models (Hoeting et al. 1999, Stat. Sci. 14:382)."""
+        weights = [self.probability[m] * model.weights.sum(axis=0) for m, model in self.models.items()]
+        values = [model.values[name] for model in self.models.values()]
+        return Marginal(np.concatenate(values), np.concatenate(weights))
 
 
 @dataclass(frozen=True)
-class _Likelihood:
+class Likelihood:
     """Of scores whitened by the expected noise.
 
     Attributes:
@@ -127,7 +164,8 @@ class _Likelihood:
     rotations: Sequence[tuple[FloatArray, FloatArray]]
 
     @classmethod
-    def of(cls, noise: Noise) -> _Likelihood:
+    def of(cls, noise: Noise) -> Likelihood:
+        """With the noise of scores."""
         root = np.linalg.cholesky(noise.covariance(np.ones(2)) + 1e-9 * np.eye(len(noise.fixed)))
         rotations = []
         for factor in FACTORS:
@@ -137,25 +175,24 @@ class _Likelihood:
         return cls(np.asarray(root, dtype=np.float64), rotations)
 
     def white(self, scores: FloatArray) -> FloatArray:
+        """(q, p) whitened scores (q, p)."""
         return np.asarray(solve_triangular(self.root, np.atleast_2d(scores).T, lower=True).T)
 
     def log(self, left: FloatArray, variance: FloatArray, pattern: FloatArray, every: int = 1) -> FloatArray:
         """(f, q) of whitened residuals (q, p) with the emulator's variance (q, p), and free sizes of a pattern (k, p);
         for ``every`` so many factors."""
-        rotations = self.rotations[::every]
-        out = np.empty((len(rotations), len(left)))
-        for i, (size, modes) in enumerate(rotations):
+        out = []
+        for size, modes in self.rotations[::every]:
             turned, spread = left @ modes, size + variance @ modes**2
             if len(pattern):
                 # one doubt for all points: a pattern's sizes are integrated over in closed form
-                common = spread.mean(axis=0)
-                inner = np.diag(common) + SLAB**2 * (pattern @ modes).T @ (pattern @ modes)
+                inner = np.diag(spread.mean(axis=0)) + SLAB**2 * (pattern @ modes).T @ (pattern @ modes)
                 root = np.linalg.cholesky(inner)
                 z = solve_triangular(root, turned.T, lower=True)
-                out[i] = -0.5 * np.sum(z**2, axis=0) - np.log(np.diag(root)).sum()
+                out.append(-0.5 * np.sum(z**2, axis=0) - np.log(np.diag(root)).sum())
             else:
-                out[i] = -0.5 * np.sum(turned**2 / spread + np.log(spread), axis=1)
-        return out
+                out.append(-0.5 * np.sum(turned**2 / spread + np.log(spread), axis=1))
+        return np.array(out)
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,15 +201,13 @@ class Emulated:
 
     Attributes:
         name: the effect's; `AS_IT_IS`.
-        dimension: of the cube.
         predict: values by name, mean and variance (q, p) of whitened scores, at points (q, d) of the cube.
         pattern: (k, p) of an effect of observation, else empty.
         prior: what it predicts at a Sobol sequence.
     """
 
     name: str
-    dimension: int
-    predict: Callable[[FloatArray], Prediction]
+    predict: Predict
     pattern: FloatArray
     prior: tuple[FloatArray, Prediction]
 
@@ -189,7 +224,7 @@ class Comparison:
     """
 
     noise: Noise
-    likelihood: _Likelihood
+    likelihood: Likelihood
     models: Sequence[Emulated] = field(repr=False)
     seed: int = 0
 
@@ -212,7 +247,7 @@ class Comparison:
             simulated: runs and scores (m, p) by effect.
             seed: of sequences and draws.
         """
-        likelihood = _Likelihood.of(noise)
+        likelihood = Likelihood.of(noise)
         n = len(prior.space)
         chance = np.maximum(np.diag(likelihood.white(likelihood.white(noise.chance).T)), 1e-4)
         white = likelihood.white(noise.base)
@@ -225,7 +260,7 @@ class Comparison:
             mean, variance = base.predict(where)
             return {p.name: physical[:, i] for i, p in enumerate(prior.space)}, mean + middle, variance
 
-        def with_effect(candidate: Candidate, runs: Sequence[Run], scores: FloatArray) -> Callable[..., Prediction]:
+        def with_effect(candidate: Candidate, runs: Sequence[Run], scores: FloatArray) -> Predict:
             k = len(candidate.parameters)
             there, doubt = base.predict(prior.unit(runs))
             points = (prior.unit(runs), *effect_points(candidate, runs))
@@ -239,27 +274,24 @@ class Comparison:
 
             return predict
 
-        nothing = np.zeros((0, white.shape[1]))
-        made: list[tuple[str, int, Callable[[FloatArray], Prediction], FloatArray]] = [(AS_IT_IS, n, as_it_is, nothing)]
+        def emulated(name: str, dimension: int, predict: Predict, *patterns: FloatArray) -> Emulated:
+            cube = qmc.Sobol(dimension, seed=seed).random(POINTS)
+            return Emulated(name, predict, np.reshape(patterns, (-1, white.shape[1])), (cube, predict(cube)))
+
+        models = [emulated(AS_IT_IS, n, as_it_is)]
         for candidate in candidates:
             if candidate.name in noise.patterns:
-                made.append((candidate.name, n, as_it_is, likelihood.white(noise.patterns[candidate.name])))
+                models.append(emulated(candidate.name, n, as_it_is, *likelihood.white(noise.patterns[candidate.name])))
             elif candidate.name in simulated:
                 dimension = n + len(candidate.parameters) + len(candidate.shapes)
-                made.append((candidate.name, dimension, with_effect(candidate, *simulated[candidate.name]), nothing))
-        models = []
-        for name, dimension, predict, pattern in made:
-            cube = qmc.Sobol(dimension, seed=seed).random(POINTS)
-            models.append(Emulated(name, dimension, predict, pattern, (cube, predict(cube))))
+                models.append(emulated(candidate.name, dimension, with_effect(candidate, *simulated[candidate.name])))
         return cls(noise, likelihood, models, seed)
 
     def judge(self) -> Evidence:
         """Every model against the observation."""
-        white, factors = self.likelihood.white(self.noise.observed)[0], self.noise.expected
-        found = {model.name: self._integrated(model, white, factors) for model in self.models}
-        base = found[AS_IT_IS]
-        given = (base.values, base.mean, base.variance, base.pattern, base.log_likelihood, base.importance)
-        found[ELSE] = _model(ELSE, *given, self.noise.beyond)
+        sampled = {model.name: self._sampled(model) for model in self.models}
+        found = {name: Model.of(name, *points, self.noise.expected) for name, points in sampled.items()}
+        found[ELSE] = Model.of(ELSE, *sampled[AS_IT_IS], self.noise.beyond)
         weight = {
             name: model.log_evidence + np.log(PRIOR if name == AS_IT_IS else (1.0 - PRIOR) / (len(found) - 1))
             for name, model in found.items()
@@ -267,18 +299,17 @@ class Comparison:
         total = logsumexp(list(weight.values()))
         return Evidence(self.noise, found, {name: float(np.exp(w - total)) for name, w in weight.items()})
 
-    def _integrated(self, model: Emulated, white: FloatArray, factors: FloatArray) -> Model:
-        """A model's evidence and posterior."""
-        rng = np.random.default_rng([self.seed, 23])
+    def _sampled(self, model: Emulated) -> tuple[Mapping[str, FloatArray], FloatArray]:
+        """Parameters (q,) at points drawn where the posterior is, and logarithms (f, q) of their likelihoods times
+        importance weights."""
+        rng, white = np.random.default_rng([self.seed, 23]), self.likelihood.white(self.noise.observed)[0]
         cube, (values, mean, variance) = model.prior
         importance = np.zeros(len(cube))
-        for number in range(ROUNDS + 1):
-            log = self.likelihood.log(white - mean, variance, model.pattern)
-            if number == ROUNDS:
-                break
-            cube, importance = _drawn(cube, logsumexp(log + factors[:, None], axis=0) + importance, rng)
+        for _ in range(ROUNDS):
+            log = self.likelihood.log(white - mean, variance, model.pattern) + self.noise.expected[:, None]
+            cube, importance = _drawn(cube, logsumexp(log, axis=0) + importance, rng)
             values, mean, variance = model.predict(cube)
-        return _model(model.name, values, mean, variance, model.pattern, log, importance, factors)
+        return values, self.likelihood.log(white - mean, variance, model.pattern) + importance
 
 
 def _drawn(cube: FloatArray, weights: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
@@ -303,19 +334,3 @@ def _drawn(cube: FloatArray, weights: FloatArray, rng: np.random.Generator) -> t
     share = DEFENSIVE / (DEFENSIVE + inside)
     density = share + (1.0 - share) * student.pdf(points).reshape(-1) / inside
     return points, -np.log(density)
-
-
-def _model(
-    name: str,
-    values: Mapping[str, FloatArray],
-    mean: FloatArray,
-    variance: FloatArray,
-    pattern: FloatArray,
-    log: FloatArray,
-    importance: FloatArray,
-    factors: FloatArray,
-) -> Model:
-    joint = log + importance + factors[:, None]
-    evidence = float(logsumexp(joint)) - float(np.log(joint.shape[1]))
-    weights = np.exp(joint - joint.max())
-    return Model(name, values, mean, variance, pattern, log, importance, weights / weights.sum(), evidence)

@@ -149,36 +149,33 @@ def expected_information(
     Raises:
         SimulationError: too few simulations of a model could be made.
     """
-    made: dict[str, list[FloatArray | None]] = {}
     runs = runs_of(draws, seed, pairs=FINE in experiment.numerics)
     # What draws a simulation otherwise comes right after it, while it is at hand.
     first = next((run for run in runs[AS_IT_IS] if _made(simulate, run) is not None), runs[AS_IT_IS][0])
     others = (*experiment.guesses, *experiment.redrawn)
     drawn = {n: simulate(first.values, seed=first.seed, numerics=n, purpose=n) for n in others}
+    there: dict[str, npt.NDArray[np.bool_]] = {}
+    kept: dict[str, tuple[list[Run], FloatArray]] = {FINE: ([], np.zeros((0, *experiment.layout.shape)))}
     for name, mine in runs.items():
-        made[name] = [_made(simulate, run) for run in mine]
-        if name != FINE and sum(t is not None for t in made[name]) < FEWEST:
+        found = [_made(simulate, run) for run in mine]
+        there[name] = np.array([table is not None for table in found])
+        if name != FINE and there[name].sum() < FEWEST:
             raise SimulationError(f"{name.replace('_', ' ') or 'the model as it is'} could hardly be simulated")
-    there = {
-        name: (
-            [run for run, table in zip(runs[name], found, strict=True) if table is not None],
-            np.array([t for t in found if t is not None]).reshape(-1, *experiment.layout.shape),
-        )
-        for name, found in made.items()
-    }
-    base = there[AS_IT_IS]
+        tables = [table for table in found if table is not None]
+        made = [run for run, table in zip(mine, found, strict=True) if table is not None]
+        kept[name] = made, np.array(tables).reshape(-1, *experiment.layout.shape)
+    base, fine = kept[AS_IT_IS], kept[FINE]
     experiment.expect(base[1].mean(axis=0))
-    effects = {name: found for name, found in there.items() if name not in (AS_IT_IS, FINE)}
-    tables = Tables(base, there.get(FINE, ([], base[1][:0])), effects, drawn, base[1][0])
-    noise = noise_of(experiment, _among(experiment, draws[AS_IT_IS]), tables, ())
+    effects = {name: found for name, found in kept.items() if name not in (AS_IT_IS, FINE)}
+    prior = _among(experiment, draws[AS_IT_IS])
+    noise = noise_of(experiment, prior, Tables(base, fine, effects, drawn, base[1][0]), ())
     # One simulation's own chance is in all of them.
     covariance = noise.covariance(numerics) - noise.chance
-    scores = {name: noise.scores(there[name][1]) for name in probability}
-    found = information(scores, probability, covariance, seed)
-    bits = {name: np.full(len(made[name]), np.nan) for name in probability}
-    for name, values in found.bits.items():
-        bits[name][[table is not None for table in made[name]]] = values
-    return replace(found, bits=bits)
+    found_bits = information({name: noise.scores(kept[name][1]) for name in probability}, probability, covariance, seed)
+    bits = {name: np.full(len(there[name]), np.nan) for name in probability}
+    for name, values in found_bits.bits.items():
+        bits[name][there[name]] = values
+    return replace(found_bits, bits=bits)
 
 
 def runs_of(
@@ -215,10 +212,9 @@ def information(
     logs: dict[str, FloatArray] = {}
     for m, name in enumerate(names):
         drawn = rng.standard_normal((len(white[name]), NOISES, len(covariance)))
-        found = np.stack([_densities(white, name, i, noise) for i, noise in enumerate(drawn)])
-        joint = found + prior
+        logs[name] = np.stack([_densities(white, name, i, noise) for i, noise in enumerate(drawn)])
+        joint = logs[name] + prior
         bits[name] = ((joint[..., m] - logsumexp(joint, axis=-1) - prior[m]) / np.log(2.0)).mean(axis=1)
-        logs[name] = found
     pairs = {}
     for (a, first), (b, second) in combinations(enumerate(names), 2):
         right = expit(logs[first][..., a] - logs[first][..., b]).mean()
@@ -243,14 +239,11 @@ def _densities(white: Mapping[str, FloatArray], held: str, index: int, noise: Fl
 def _weighted(bits: Mapping[str, FloatArray], probability: Mapping[str, float]) -> tuple[float, float, float]:
     """Mean over models of the simulations' means, its standard error, and the degrees of freedom of that (Welch 1947,
     Biometrika 34:28)."""
-    mean = variance = spread = 0.0
-    for name, weight in probability.items():
-        found = bits[name][np.isfinite(bits[name])]
-        own = weight**2 * float(found.var(ddof=1)) / len(found)
-        mean += weight * float(found.mean())
-        variance += own
-        spread += own**2 / (len(found) - 1)
-    return mean, float(np.sqrt(variance)), variance**2 / max(spread, 1e-300)
+    found = {name: values[np.isfinite(values)] for name, values in bits.items()}
+    mean = sum(weight * float(found[name].mean()) for name, weight in probability.items())
+    own = [weight**2 * float(found[name].var(ddof=1)) / len(found[name]) for name, weight in probability.items()]
+    spread = sum(v**2 / (len(found[name]) - 1) for name, v in zip(probability, own, strict=True))
+    return mean, float(np.sqrt(sum(own))), sum(own) ** 2 / max(spread, 1e-300)
 
 
 def _made(simulate: Callable[..., FloatArray], run: Run) -> FloatArray | None:

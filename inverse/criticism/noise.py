@@ -162,71 +162,71 @@ def noise_of(
     """
     mask = compared(experiment) if aside is None else compared(experiment) & ~aside
     placed = np.broadcast_to(experiment.layout.placed, mask.shape)[mask]
-    (base_runs, base), (fine_runs, _) = tables.base, tables.fine
+    (base_runs, base), (fine_runs, fine) = tables.base, tables.fine
     points = prior.unit(base_runs)
     varied = np.concatenate([base, *(found for _, found in tables.effects.values())])[:, mask]
     mean = varied.mean(axis=0)
     hat = trend_of(points, points)
     rest = (base[:, mask] - hat @ base[:, mask]) / np.sqrt(np.maximum(1.0 - np.diag(hat), 1e-9))[:, None]
     basis = _modes(varied - mean, rest, placed)
-    scores = {name: (found[:, mask] - mean) @ basis for name, found in _named(tables).items()}
-    own = scores["base"]
-    chance = shrunk(rest @ basis) if experiment.chance else np.zeros((basis.shape[1],) * 2)
+    count = basis.shape[1]
+    in_place = np.arange(count) < count - int((~placed).sum())
+    both = np.outer(in_place, in_place)
 
-    def trend(runs: Sequence[Run]) -> FloatArray:
-        return trend_of(prior.unit(runs), points) @ own
+    def scored(found: FloatArray) -> FloatArray:
+        return np.asarray((found[..., mask] - mean) @ basis)
 
+    def apart(runs: Sequence[Run], found: FloatArray) -> FloatArray:
+        """Scores about the base simulations' trend."""
+        return np.asarray(scored(found) - trend_of(prior.unit(runs), points) @ own)
+
+    own = scored(base)
+    chance = shrunk(rest @ basis) if experiment.chance else np.zeros((count, count))
     # What soil could do otherwise: every effect's simulations about the trend, and the base model's about their mean.
-    varied_by = [scores[name] - trend(runs) for name, (runs, _) in tables.effects.items()] + [own - own.mean(axis=0)]
+    varied_by = [apart(*made) for made in tables.effects.values()] + [own - own.mean(axis=0)]
     otherwise = _positive(sum(e.T @ e / len(e) for e in varied_by) / len(varied_by) - chance)
-    unplaced = np.zeros(basis.shape[1], dtype=bool)
-    unplaced[basis.shape[1] - int((~placed).sum()) :] = True
-    correction, share, factor_std = np.zeros(basis.shape[1]), UNMEASURED, NO_PAIRS
     if len(fine_runs):
-        factor_std = DOUBT
-        apart = scores["fine"] - trend(fine_runs)
-        share = _share(
-            apart[:, ~unplaced], chance[np.ix_(~unplaced, ~unplaced)], otherwise[np.ix_(~unplaced, ~unplaced)]
-        )
-        numerics = np.where(np.outer(~unplaced, ~unplaced), share**2 * otherwise, 0.0)
-        pairs = numerics + chance * (1.0 + 1.0 / len(own)) / len(apart) + 1e-9 * np.eye(len(numerics))
-        correction = np.where(
-            unplaced, 0.0, numerics @ np.linalg.solve(pairs, np.where(unplaced, 0.0, apart.mean(axis=0)))
-        )
-        numerics = REMAINING**2 * (numerics + _of_unplaced(experiment, mask, placed, apart, unplaced))
-        share = REMAINING * share
+        pairs = apart(fine_runs, fine)
+        share = _share(pairs[:, in_place], *(c[np.ix_(in_place, in_place)] for c in (chance, otherwise)))
+        numerics = np.where(both, share**2 * otherwise, 0.0)
+        scatter = numerics + chance * (1.0 + 1.0 / len(own)) / len(pairs) + 1e-9 * np.eye(count)
+        difference = np.where(in_place, pairs.mean(axis=0), 0.0)
+        correction = np.where(in_place, numerics @ np.linalg.solve(scatter, difference), 0.0)
+        numerics = REMAINING**2 * (numerics + _of_unplaced(experiment, mask, pairs, in_place))
+        share, factor_std = REMAINING * share, DOUBT
     else:
+        correction, share, factor_std = np.zeros(count), UNMEASURED, NO_PAIRS
         numerics = share**2 * otherwise
-    reference = (tables.reference[mask] - mean) @ basis
-    drawn = {name: (table[mask] - mean) @ basis - reference for name, table in tables.drawn.items()}
+    drawn = {name: scored(table) - scored(tables.reference) for name, table in tables.drawn.items()}
     guessed = [drawn[name] for name in experiment.guesses if name in drawn]
-    low = [g / np.sqrt(len(guessed)) for g in guessed] + [drawn[name] for name in experiment.redrawn if name in drawn]
     patterns = {
         c.name: np.array([drawn[p.name] for p in c.parameters if p.name in drawn])
         for c in candidates
         if c.kind == "observation" and any(p.name in drawn for p in c.parameters)
     }
-    low += [row for found in patterns.values() for row in found]
     fixed = chance + _instruments(experiment, mask, basis)
-    for row in low:
+    for row in (
+        *(g / np.sqrt(len(guessed)) for g in guessed),
+        *(drawn[name] for name in experiment.redrawn if name in drawn),
+        *(row for found in patterns.values() for row in found),
+    ):
         fixed = fixed + np.outer(row, row)
-    observed = (experiment.observed[mask] - mean) @ basis
     return Noise(
-        mask,
-        mean,
-        basis,
-        observed - correction,
-        correction,
-        own,
-        points,
-        chance,
-        fixed,
-        numerics,
-        ~unplaced,
-        share,
-        factor_std,
-        patterns,
-        hat,
+        mask=mask,
+        mean=mean,
+        basis=basis,
+        observed=scored(experiment.observed) - correction,
+        correction=correction,
+        base=own,
+        points=points,
+        chance=chance,
+        fixed=fixed,
+        numerics=numerics,
+        placed=in_place,
+        share=share,
+        factor_std=factor_std,
+        patterns=patterns,
+        trend=hat,
     )
 
 
@@ -262,14 +262,6 @@ def shrunk(rows: FloatArray) -> FloatArray:
     return np.asarray((1.0 - share) * covariance + share * np.diag(np.diag(covariance)))
 
 
-def _named(tables: Tables) -> dict[str, FloatArray]:
-    return {
-        "base": tables.base[1],
-        "fine": tables.fine[1],
-        **{name: found for name, (_, found) in tables.effects.items()},
-    }
-
-
 def _modes(varied: FloatArray, rest: FloatArray, placed: npt.NDArray[np.bool_]) -> FloatArray:
     """(n, p) leading modes of placed features, beside them the unplaced ones themselves."""
     n, columns = varied.shape[1], []
@@ -302,32 +294,22 @@ def _share(apart: FloatArray, chance: FloatArray, otherwise: FloatArray) -> floa
 
 
 def _of_unplaced(
-    experiment: Experiment,
-    mask: npt.NDArray[np.bool_],
-    placed: npt.NDArray[np.bool_],
-    apart: FloatArray,
-    unplaced: npt.NDArray[np.bool_],
+    experiment: Experiment, mask: npt.NDArray[np.bool_], pairs: FloatArray, in_place: npt.NDArray[np.bool_]
 ) -> FloatArray:
     """(p, p) numerics of instruments without a place, one size for each channel and stage."""
-    out = np.zeros((len(unplaced),) * 2)
-    if not unplaced.any():
-        return out
+    out = np.zeros((len(in_place),) * 2)
     layout = experiment.layout
-    rows, sites = (index[~placed] for index in np.nonzero(mask))
-    stages = np.array(layout.stages)[rows]
-    units = np.array([layout.sites[s].unit for s in sites])
-    channels = np.array([layout.sites[s].channel for s in sites])
-
-    spread = np.empty(len(rows))
-    for stage in np.unique(stages):
-        for channel in np.unique(channels):
-            mine = (stages == stage) & (channels == channel)
-            if mine.any():
-                spread[mine] = np.sqrt(np.mean(apart[:, unplaced][:, mine] ** 2))
+    there = np.argwhere(mask & ~layout.placed)
+    stages = np.array(layout.stages)[there[:, 0]]
+    channels, units = (np.array([(s.channel, s.unit) for s in layout.sites])[there[:, 1]]).T
+    own, spread = pairs[:, ~in_place], np.empty(len(there))
+    for stage, channel in set(zip(stages, channels, strict=True)):
+        mine = (stages == stage) & (channels == channel)
+        spread[mine] = np.sqrt(np.mean(own[:, mine] ** 2))
     alike = np.where(channels[:, None] == channels[None], STAGE, CHANNEL) * (stages[:, None] == stages[None])
     alike *= units[:, None] == units[None]
     np.fill_diagonal(alike, 1.0)
-    out[np.ix_(unplaced, unplaced)] = alike * np.outer(spread, spread)
+    out[np.ix_(~in_place, ~in_place)] = alike * np.outer(spread, spread)
     return out
 
 

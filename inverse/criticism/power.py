@@ -41,42 +41,39 @@ def detectable(comparison: Comparison, evidence: Evidence, candidate: Candidate,
         return None
     rng = np.random.default_rng([seed, 17])
     values, mean, variance, pattern = models[candidate.name]
-    base = models[AS_IT_IS]
-    measure = candidate.measure
+    base, measure = models[AS_IT_IS], candidate.measure
     odds = np.log(PRIOR / ((1.0 - PRIOR) / len(evidence.probability)) * NAMED / (1.0 - NAMED))
-    likely = _density(base[0], evidence)
     for size in SIZES:
         if len(pattern):
             direction = rng.standard_normal((WORLDS, len(pattern)))
             direction *= size / np.linalg.norm(direction, axis=1, keepdims=True)
+            likely = _density(base[0], evidence)
             chosen = rng.choice(len(likely), WORLDS, p=likely / likely.sum())
             truth = base[1][chosen] + direction @ pattern
         else:
             reached = np.abs(values[measure.name] - float(measure.off or 0.0)) / measure.meaningful
             near = np.flatnonzero((reached > size / NEAR) & (reached < size * NEAR))
             weight = _density(values, evidence)[near]
-            if not len(near) or not weight.sum() > 0.0:
+            if not weight.sum() > 0.0:
                 continue
             chosen = rng.choice(near, WORLDS, p=weight / weight.sum())
             truth = mean[chosen] + np.sqrt(variance[chosen]) * rng.standard_normal((WORLDS, mean.shape[1]))
-        noisy = truth + rng.standard_normal(truth.shape)
-        named = 0
-        for world in noisy:
-            with_it = _evidence(comparison, world, mean, variance, pattern)
-            without = _evidence(comparison, world, *base[1:])
-            named += with_it - without > odds
-        if named >= POWER * WORLDS:
+        worlds = truth + rng.standard_normal(truth.shape)
+        gains = [
+            _evidence(comparison, world, mean, variance, pattern) - _evidence(comparison, world, *base[1:])
+            for world in worlds
+        ]
+        if np.sum(np.array(gains) > odds) >= POWER * WORLDS:
             return size
     return None
 
 
 def _density(values: Mapping[str, FloatArray], evidence: Evidence) -> FloatArray:
     """(q,) how well base parameters at an effect's points agree with the averaged posterior."""
-    names = list(evidence.models[AS_IT_IS].values)
-    z2 = np.zeros(len(next(iter(values.values()))))
-    for name in names:
-        middle, std = evidence.averaged(name)
-        z2 = z2 + ((values[name] - middle) / max(std, 1e-12)) ** 2
+    z2 = np.array(0.0)
+    for name in evidence.models[AS_IT_IS].values:
+        averaged = evidence.marginal(name)
+        z2 = z2 + ((values[name] - averaged.mean) / max(averaged.std, 1e-12)) ** 2
     return np.asarray(np.exp(-0.5 * np.minimum(z2, 60.0)))
 
 

@@ -1,4 +1,4 @@
-"""A comparison of models as plain data: what ``diagnosis.json`` and ``misfit.json`` hold."""
+"""A comparison of models as plain data and in plain words: what ``diagnosis.json`` and ``misfit.json`` hold."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 
 from splatsoil.experiment.base import Candidate, Experiment
+from splatsoil.report.text import amount, listed, probability, title, undetermined
 from splatsoil.run_files import DIAGNOSIS_FORMAT, MISFIT_FORMAT
 
+from .checks import SIGNIFICANT
 from .diagnosis import Diagnosis
-from .evidence import AS_IT_IS, ELSE, Model
-from .words import sentences
+from .evidence import AS_IT_IS, ELSE
 
 ABOUT_MISFIT = (
     *("estimates", "sentences", "checks", "passes", "numerics", "unit", "time_name", "times", "stages", "sites"),
@@ -26,7 +27,6 @@ def record(experiment: Experiment, diagnosis: Diagnosis, simulations: int) -> di
     candidates = {c.name: c for c in experiment.candidates}
     evidence = diagnosis.evidence
     order = sorted(evidence.probability, key=lambda name: -evidence.probability[name])
-    names = {AS_IT_IS: "before"}
     return {
         "format": DIAGNOSIS_FORMAT,
         "experiment": experiment.name,
@@ -43,14 +43,9 @@ def record(experiment: Experiment, diagnosis: Diagnosis, simulations: int) -> di
             for p in experiment.parameters
         },
         "models": [_model(diagnosis, name, candidates.get(name)) for name in order],
-        "held_out": [
-            {"model": h.model, "error": h.error, "noise": h.noise, "log_score": h.log_score} for h in diagnosis.held_out
-        ],
+        "held_out": [dict(vars(one)) for one in diagnosis.held_out],
         "aside": diagnosis.aside,
-        "checks": [
-            {"stage": c.stage, "region": c.region, "channel": c.channel, "ratio": c.ratio, "p": c.p, "n": c.features}
-            for c in diagnosis.checks
-        ],
+        "checks": [dict(vars(check)) for check in diagnosis.checks],
         "passes": diagnosis.passes,
         "numerics": float(evidence.models[evidence.best].factors.max()),
         "unit": layout.unit,
@@ -65,7 +60,7 @@ def record(experiment: Experiment, diagnosis: Diagnosis, simulations: int) -> di
         "regions": layout.regions.tolist(),
         "curves": [_curve(experiment, diagnosis, column) for column, there in enumerate(layout.placed) if not there],
         # In units of what each feature is expected to be off; null where nothing is compared.
-        "maps": {names.get(name, name): _map(table, diagnosis) for name, table in diagnosis.residuals.items()},
+        "maps": {name or "before": _map(table, diagnosis) for name, table in diagnosis.residuals.items()},
         "simulations": simulations,
         "notes": list(diagnosis.notes),
     }
@@ -82,24 +77,88 @@ def misfit_of(whole: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _model(diagnosis: Diagnosis, name: str, candidate: Candidate | None) -> dict[str, Any]:
+def sentences(diagnosis: Diagnosis, candidates: Mapping[str, Candidate]) -> list[str]:
+    """What was found, the most important first. Each says no more than the numbers do."""
     evidence = diagnosis.evidence
-    model: Model = evidence.models[name]
+    out = []
+    if diagnosis.verdict == "missing":
+        (name,) = diagnosis.members
+        out.append(
+            f"{title(name)} is missing{_size(diagnosis, candidates[name])}: of all models that were compared, its "
+            f"probability is {probability(evidence.probability[name])}."
+        )
+    elif diagnosis.verdict == "one of":
+        told = [f"{n.replace('_', ' ')} ({probability(evidence.probability[n])})" for n in diagnosis.members]
+        out.append(f"One of these is missing: {listed(told)}. The data do not tell them apart.")
+    elif diagnosis.verdict == "something else":
+        none = ", and no effect of the library explains it" if candidates else ""
+        out.append(f"The residual is larger than noise and discretisation error{none}.")
+    elif diagnosis.verdict == "undecided":
+        shares = [
+            f"{(name or 'the model as it is').replace('_', ' ')} {probability(evidence.probability[name])}"
+            for name in sorted(evidence.probability, key=lambda n: -evidence.probability[n])[:4]
+        ]
+        out.append(f"No model is probable enough to be named: {listed(shares)}.")
+    else:
+        others = "" if not candidates else f" Its probability is {probability(evidence.probability[AS_IT_IS])}."
+        out.append(f"The model as it is explains the data.{others}")
+    out += [undetermined(name) for name, determined in diagnosis.determined.items() if not determined]
+    if len(diagnosis.held_out) > 1:
+        before, after = diagnosis.held_out[:2]
+        out.append(
+            f"On {diagnosis.aside}, which were set aside, the error is {before.error:.2g} without and "
+            f"{after.error:.2g} with {after.model.replace('_', ' ')}; the noise level is {after.noise:.2g}."
+        )
+    worst = next((c for c in diagnosis.checks if c.p < SIGNIFICANT), None)
+    if worst is not None:
+        out.append(
+            f"The most probable model fails most clearly here: {worst.region}, {worst.stage}, {worst.channel}, with "
+            f"{worst.ratio:.1f} times what is expected."
+        )
+    if candidates:
+        out += _power(diagnosis, candidates)
+    return out
+
+
+def _size(diagnosis: Diagnosis, candidate: Candidate) -> str:
+    measure, model = candidate.measure, diagnosis.evidence.models[candidate.name]
+    return f", about {amount(*model.moments(measure.name), measure.unit)}" if measure.name in model.values else ""
+
+
+def _power(diagnosis: Diagnosis, candidates: Mapping[str, Candidate]) -> list[str]:
+    """What would have been seen, and what not."""
+    named = diagnosis.members if diagnosis.verdict == "missing" else ()
+    sizes = {name: size for name, size in diagnosis.detectable.items() if name not in named}
+    seen = [
+        f"{name.replace('_', ' ')} of {amount(size, 0.0, candidates[name].measure.unit)}"
+        for name, size in sizes.items()
+        if size is not None
+    ]
+    blind = [name.replace("_", " ") for name, size in sizes.items() if size is None]
+    out = []
+    if seen and diagnosis.verdict != "missing":
+        out.append(f"These would have been named in 8 of 10 cases: {listed(seen)}.")
+    if blind:
+        out.append(f"These data cannot show {listed(blind)}.")
+    return out
+
+
+def _model(diagnosis: Diagnosis, name: str, candidate: Candidate | None) -> dict[str, Any]:
+    model = diagnosis.evidence.models[name]
     moments = {parameter: model.moments(parameter) for parameter in model.values}
     measure = None if candidate is None else candidate.measure
-    known = measure is not None and measure.name in moments
-    kind = candidate.kind if candidate is not None else "discrepancy" if name == ELSE else "base"
+    size = (None, None) if measure is None else moments.get(measure.name, (None, None))
     return {
         "name": name,
-        "kind": kind,
+        "kind": candidate.kind if candidate is not None else "discrepancy" if name == ELSE else "base",
         "note": "" if candidate is None else candidate.note,
-        "probability": evidence.probability[name],
-        "log_evidence": model.log_evidence - evidence.models[AS_IT_IS].log_evidence,
+        "probability": diagnosis.evidence.probability[name],
+        "log_evidence": model.log_evidence - diagnosis.evidence.models[AS_IT_IS].log_evidence,
         "values": {parameter: value for parameter, (value, _) in moments.items()},
         "stds": {parameter: std for parameter, (_, std) in moments.items()},
         "parameter": None if measure is None else measure.name,
-        "estimate": moments[measure.name][0] if measure is not None and known else None,
-        "std": moments[measure.name][1] if measure is not None and known else None,
+        "estimate": size[0],
+        "std": size[1],
         "unit": "" if measure is None else measure.unit,
         "off": None if measure is None else measure.off,
         "meaningful": None if measure is None else measure.meaningful,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, wait
+from concurrent.futures import BrokenExecutor, Future, wait
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,21 +12,15 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from splatsoil.inverse.evaluations import digest
 
 from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Experiment
-from splatsoil.files import read_npy, write_bytes
+from splatsoil.files import digest, read_npy, write_bytes
 
 FloatArray = npt.NDArray[np.float64]
 Simulate = Callable[..., FloatArray]
-
-POLL = 0.05
-"""Seconds between looks for a table that another process makes."""
-
-
-def _unprepared(jobs: Sequence[Mapping[str, Any]]) -> None:
-    """Nothing is done for all of them at once."""
+Arguments = Mapping[str, Any]
+"""Of a simulation, by name; see :meth:`~splatsoil.experiment.base.Experiment.predict`."""
 
 
 @dataclass(frozen=True)
@@ -34,23 +28,21 @@ class Helpers:
     """Other processes that simulate the same experiment and keep what they make in the same folder.
 
     Attributes:
-        count: of them.
-        submit: simulations' keyword arguments to a future that is done when they are kept, or could not be made.
+        submit: simulations to a future that is done when they are kept, or could not be made.
         together: how many simulations are best made by one at a time.
         prepare: has this process do for simulations what is best done for all of them at once.
     """
 
-    count: int
-    submit: Callable[[Sequence[Mapping[str, Any]]], Future[Any]]
+    submit: Callable[[Sequence[Arguments]], Future[Any]]
     together: int = 1
-    prepare: Callable[[Sequence[Mapping[str, Any]]], object] = _unprepared
+    prepare: Callable[[Sequence[Arguments]], object] = lambda jobs: None
 
 
 @dataclass(frozen=True)
 class _Plan:
-    """Simulations that a helper will make, unless this process is there first, or that this process makes now."""
+    """Simulations by key that a helper will make, unless this process is there first."""
 
-    jobs: Mapping[str, Mapping[str, Any]]
+    jobs: Mapping[str, Arguments]
     future: Future[Any]
 
 
@@ -70,12 +62,11 @@ class Simulations:
         experiment: Experiment,
         folder: Path | None = None,
         identity: Mapping[str, Any] | None = None,
-        told: Callable[[str], None] | None = None,
+        told: Callable[[str], None] = lambda purpose: None,
         sources: Mapping[str, str] | None = None,
     ) -> None:
         self.experiment, self.folder = experiment, folder
-        self.identity, self.told = dict(identity or {}), told
-        self.sources = dict(sources or {})
+        self.identity, self.sources, self.told = dict(identity or {}), dict(sources or {}), told
         self.made = 0
         """Simulations made, not read."""
         self._tables: dict[str, FloatArray | SimulationError] = {}
@@ -106,7 +97,7 @@ class Simulations:
         key = self._key(what)
         if key not in self._tables:
             try:
-                self._tables[key] = self._find(key, what, purpose)
+                self._tables[key] = self._found(key, what, purpose)
             except SimulationError as error:
                 self._tables[key] = error
         table = self._tables[key]
@@ -121,9 +112,7 @@ class Simulations:
             RunError: the folder can't be written to.
         """
         key = self._key({"values": dict(values), "effects": (), "seed": seed, "numerics": ""})
-        if self.folder is None:
-            self._tables.setdefault(key, table)
-        elif self._kept(key) is None:
+        if self._kept(key) is None:
             self._write(key, table)
 
     @contextmanager
@@ -143,19 +132,20 @@ class Simulations:
         """
         if self._helpers is None:
             return
-        asked: list[dict[str, Any]] = []
+        asked: dict[str, Arguments] = {}
 
         def noted(values: Mapping[str, float], *, purpose: str = "", **others: Any) -> FloatArray:
-            asked.append({"values": dict(values), "effects": (), "seed": 0, "numerics": "", **others})
+            what = {"values": dict(values), "effects": (), "seed": 0, "numerics": "", **others}
+            asked.setdefault(self._key(what), what)
             return np.zeros(self.experiment.layout.shape)
 
         work(noted)
         drawings = {*self.experiment.guesses, *self.experiment.redrawn}
-        known = {*self._tables, *self._planned}
-        new = {key: what for what in asked if (key := self._key(what)) not in known and self._kept(key) is None}
-        shares: list[dict[str, dict[str, Any]]] = []
-        latest: dict[object, dict[str, dict[str, Any]]] = {}
-        for key, what in new.items():
+        shares: list[dict[str, Arguments]] = []
+        latest: dict[object, dict[str, Arguments]] = {}
+        for key, what in asked.items():
+            if key in self._tables or key in self._planned or self._kept(key) is not None:
+                continue
             # What only draws a simulation otherwise is left to one process: on a GPU no second one is quite the same.
             drawn = what["numerics"] in drawings
             kind = self._key({**what, "numerics": ""}) if drawn else (*sorted(what["effects"]), what["numerics"])
@@ -163,51 +153,33 @@ class Simulations:
                 latest[kind] = {}
                 shares.append(latest[kind])
             latest[kind][key] = what
-        for jobs in reversed(shares):
-            plan = _Plan(jobs, self._helpers.submit(list(jobs.values())))
-            self._planned |= dict.fromkeys(jobs, plan)
+        with suppress(BrokenExecutor):  # helpers that died cost nothing but their help
+            for jobs in reversed(shares):
+                self._planned |= dict.fromkeys(jobs, _Plan(jobs, self._helpers.submit(list(jobs.values()))))
 
-    def _key(self, what: Mapping[str, Any]) -> str:
+    def _key(self, what: Arguments) -> str:
         effects = sorted(f"{name} {self.sources.get(name, '')}".rstrip() for name in what["effects"])
         return digest({**self.identity, **what, "effects": effects})
 
-    def _path(self, key: str) -> Path | None:
-        return None if self.folder is None else self.folder / f"{key[:32]}.npy"
-
-    def _kept(self, key: str) -> FloatArray | None:
-        path = self._path(key)
-        if path is None or not path.is_file():
-            return None
-        table: FloatArray = read_npy(path)
-        return table if table.shape == self.experiment.layout.shape else None
-
-    def _find(self, key: str, what: Mapping[str, Any], purpose: str) -> FloatArray:
+    def _found(self, key: str, what: Arguments, purpose: str) -> FloatArray:
+        """What is kept, or will be by a helper; else made here, with all that goes with it."""
         plan, kept = self._planned.pop(key, None), self._kept(key)
         if kept is not None and plan is None:
             return kept
-        if self.told is not None:
-            self.told(purpose)
+        self.told(purpose)
         if plan is not None and plan.future.cancel():
             self._planned = {name: other for name, other in self._planned.items() if other is not plan}
             return self._make(key, plan.jobs)
-        # Tables are there one by one, before the whole share is.
-        while plan is not None and kept is None and not plan.future.done():
-            wait([plan.future], timeout=POLL)
-            kept = self._kept(key)
-        kept = self._kept(key) if kept is None else kept
-        if kept is None:
-            # Whatever went wrong there, it will be met here, too, and said.
-            return self._make(key, {key: what})
-        self.made += 1
-        return kept
+        if plan is not None:
+            wait([plan.future])
+            if (kept := self._kept(key)) is not None:
+                self.made += 1
+                return kept
+        # Whatever went wrong there, it will be met here, too, and said.
+        return self._make(key, {key: what})
 
-    def _make(self, key: str, jobs: Mapping[str, Mapping[str, Any]]) -> FloatArray:
-        """New simulations, made here and kept; the one named is returned.
-
-        Args:
-            key: its name.
-            jobs: arguments of ``predict`` by name, its own among them.
-        """
+    def _make(self, key: str, jobs: Mapping[str, Arguments]) -> FloatArray:
+        """New simulations by key, kept; the one with this key is returned."""
         if len(jobs) > 1 and self._helpers is not None:
             self._helpers.prepare(list(jobs.values()))
         made = self._predicted(key, jobs[key])
@@ -218,18 +190,24 @@ class Simulations:
                     self._predicted(other, jobs[other])
         return made
 
-    def _predicted(self, key: str, what: Mapping[str, Any]) -> FloatArray:
-        """A simulation made here and now, and kept."""
-        made = self.experiment.predict(
-            what["values"], effects=tuple(what["effects"]), seed=what["seed"], numerics=what["numerics"]
-        )
+    def _predicted(self, key: str, what: Arguments) -> FloatArray:
+        made = self.experiment.predict(**what)
         self.made += 1
         self._write(key, made)
         return made
 
+    def _kept(self, key: str) -> FloatArray | None:
+        if self.folder is None:
+            table = self._tables.get(key)
+            return None if isinstance(table, SimulationError) else table
+        path = self.folder / f"{key[:32]}.npy"
+        table = read_npy(path) if path.is_file() else None
+        return table if table is not None and table.shape == self.experiment.layout.shape else None
+
     def _write(self, key: str, table: FloatArray) -> None:
-        path = self._path(key)
-        if path is not None:
-            stream = io.BytesIO()
-            np.save(stream, table, allow_pickle=False)
-            write_bytes(path, stream.getvalue())
+        if self.folder is None:
+            self._tables[key] = table
+            return
+        stream = io.BytesIO()
+        np.save(stream, table, allow_pickle=False)
+        write_bytes(self.folder / f"{key[:32]}.npy", stream.getvalue())

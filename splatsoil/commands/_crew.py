@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from concurrent.futures import Future
+    from concurrent.futures import Future, ProcessPoolExecutor
     from pathlib import Path
 
     from splatsoil.commands._model import ModelSpec
     from splatsoil.experiment.plow import PlowExperiment
-    from splatsoil.inverse.criticism.simulations import Simulations
-    from splatsoil.inverse.executors import Processes
+    from splatsoil.inverse.criticism.simulations import Arguments, Simulations
     from splatsoil.inverse.run_folder import RunFolder
 
 MOST_HELPERS = 3
@@ -25,11 +24,10 @@ class Crew:
     """Other processes that simulate, too: one for every other core, as far as there is use for them.
 
     They begin at once, so that they have loaded what takes seconds when the first process has. All keep what they make
-    in ``features/`` and find it there, and one that dies costs nothing but its help. Simulations wait until the first
-    process holds the folder's lock. On a CPU
-    each process keeps to one thread, the first one too: the results are those of one process, bit for bit, and with
-    more they would wait for each other. A GPU is shared: each process makes simulations that are alike as one batch, as
-    one leaves most of it idle, and cores are shared out.
+    in ``features/`` and find it there, and those that die cost nothing but their help. Simulations wait until the first
+    process holds the folder's lock. On a CPU each process keeps to one thread, the first one too: the results are those
+    of one process, bit for bit, and with more they would wait for each other. A GPU is shared: each process makes
+    simulations that are alike as one batch, as one leaves most of it idle, and cores are shared out.
 
     Args:
         folder: the run folder.
@@ -39,29 +37,38 @@ class Crew:
 
     def __init__(self, folder: RunFolder, device: str, effects: Iterable[str]) -> None:
         from splatsoil.commands._resources import memory
-        from splatsoil.inverse.executors import Processes
         from splatsoil.threads import cores
 
         self.count = max(0, int(min(cores(), 1 + MOST_HELPERS, memory() / SHARE["cpu"])) - 1)
         self._path, self._effects = folder.path, tuple(effects)
-        self._workers: Processes | None = None
-        try:
-            with _unheard():
-                self._workers = Processes(self.count) if self.count > 0 else None
-            if self._workers is not None:
-                for _ in range(self.count):
-                    self._workers.submit(_ready, device)
-        except BaseException:
-            self.__exit__()
-            raise
+        self._workers = self._started(device)
 
     def __enter__(self) -> Crew:
         return self
 
     def __exit__(self, *_: object) -> None:
         """End those that never came to help."""
+        from splatsoil.inverse.executors import kill
+
         if self._workers is not None:
-            self._workers.kill()
+            kill(self._workers)
+        self._workers = None
+
+    def _started(self, device: str) -> ProcessPoolExecutor | None:
+        """As many helpers as there are to be, on their way."""
+        from splatsoil.inverse.executors import kill, processes
+
+        if self.count == 0:
+            return None
+        workers = processes(self.count)
+        try:
+            with _unheard():
+                for _ in range(self.count):
+                    workers.submit(_ready, device)
+        except BaseException:
+            kill(workers)
+            raise
+        return workers
 
     @contextmanager
     def helping(self, spec: ModelSpec, experiment: PlowExperiment, simulate: Simulations) -> Iterator[None]:
@@ -76,35 +83,25 @@ class Crew:
         from splatsoil.threads import at_most
 
         device = experiment.base.device
-        workers, self._workers = self._fitting(device), None
+        if self._workers is not None and device != "cpu":
+            count = max(0, min(self.count, int(_free(device) / SHARE["cuda"]) - 1))
+            if count < self.count:  # they began before it was known how much memory is free there
+                self.__exit__()
+                self.count = count
+                self._workers = self._started(device)
         with at_most(_threads(device, self.count)):
-            if workers is None:
+            if self._workers is None:
                 yield
                 return
+            workers, what = self._workers, (self._path, device, spec, self._effects, self.count)
 
-            def together(jobs: Sequence[Mapping[str, Any]]) -> Future[None]:
-                made = [dict(job) for job in jobs]
-                return workers.submit(_simulate, self._path, device, spec, self._effects, self.count, made)
+            def submit(jobs: Sequence[Arguments]) -> Future[None]:
+                return workers.submit(_simulate, *what, jobs)
 
-            try:
-                with simulate.helped(Helpers(self.count, together, experiment.together, experiment.prepare)):
-                    yield
-                workers.shutdown(cancel_futures=True)
-            except BaseException:
-                workers.kill()
-                raise
-
-    def _fitting(self, device: str) -> Processes | None:
-        """The helpers that a device has memory for, if any; the others end."""
-        workers = self._workers
-        if workers is not None and device != "cpu":
-            count = max(0, min(self.count, int(_free(device) / SHARE["cuda"]) - 1))
-            if count > 0:
-                workers.dismiss(self.count - count)
-            else:
-                workers.kill()
-            self.count = count
-        return workers if self.count > 0 else None
+            with simulate.helped(Helpers(submit, experiment.together, experiment.prepare)):
+                yield
+            workers.shutdown(cancel_futures=True)
+            self._workers = None
 
 
 @contextmanager
@@ -159,7 +156,7 @@ def _ready(device: str) -> None:
 
 
 def _simulate(
-    path: Path, device: str, spec: ModelSpec, effects: tuple[str, ...], helpers: int, jobs: Sequence[Mapping[str, Any]]
+    path: Path, device: str, spec: ModelSpec, effects: tuple[str, ...], helpers: int, jobs: Sequence[Arguments]
 ) -> None:
     """A helper's work."""
     from splatsoil.errors import SplatsoilError

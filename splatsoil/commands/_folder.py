@@ -150,7 +150,7 @@ def fit_again(run: RunFolder, fit: Mapping[str, Any]) -> str:
     """The commands that make a run's latest model again: the fit, and the effects that were added to it."""
     setup, entries = fit["setup"], history(run)
     parameters, effects, budget = tuple(fit["parameters"]), tuple(setup["effects"]), fit.get("evaluations")
-    if budget == EVALUATIONS * len(parameters) or setup.get("coarse") is not None:
+    if budget == EVALUATIONS * len(parameters):
         budget = None
     added: list[str] = []
     if len(entries) > 1 and entries[-1]["model"] == fit["name"]:
@@ -161,8 +161,6 @@ def fit_again(run: RunFolder, fit: Mapping[str, Any]) -> str:
         parameters=parameters,
         effects=effects,
         budget=budget,
-        search=setup.get("search", "usual"),
-        coarse=setup.get("coarse"),
         preset=setup["preset"],
         seed=run.description["seed"],
         run=run.path,

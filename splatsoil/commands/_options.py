@@ -60,12 +60,6 @@ class FitOptions:
     )
     effects: tuple[str, ...] = option((), EFFECTS, name="with", metavar="EFFECT")
     budget: int | None = option(None, BUDGET, expert=True)
-    search: Literal["usual", "paper"] = option(
-        "usual", "paper: as Hsiao and Kumar, expected improvement from one random start.", expert=True
-    )
-    coarse: Literal["tiny", "small", "paper"] | None = option(
-        None, "Search with simulations at this coarser preset, too; --budget counts their cost.", expert=True
-    )
     preset: Preset = option("small", PRESET)
     device: str = option("auto", DEVICE)
     seed: int = option(0, SEED, expert=True)

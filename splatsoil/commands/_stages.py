@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
 #: Share of a fit's time that is its search.
 SEARCH = 0.5
-#: Evaluations of a fit that are chosen and simulated together: as many cores as a small laptop has.
-TOGETHER = 2
 
 
 def prepare(options: FitOptions) -> tuple[Measurement, RunFolder]:
@@ -44,16 +42,12 @@ def prepare(options: FitOptions) -> tuple[Measurement, RunFolder]:
     from splatsoil import __version__
     from splatsoil.commands._resources import COMPARISON, check_memory, needs
     from splatsoil.envs.devices import resolve_device
-    from splatsoil.envs.levels import relative_cost
     from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.measurement import Measurement
-    from splatsoil.mpm import Resolution
     from splatsoil.soil.law import Law
     from splatsoil.soil.library import find_effects
 
     check_evaluations(options.budget)
-    if options.coarse is not None and options.search == "paper":
-        raise ParameterError("--search paper knows one resolution; leave --coarse out")
     if not 0 <= options.seed < 2**63:
         raise ParameterError(f"--seed: must be 0 or more and less than 2^63, not {options.seed}")
     effects = find_effects(options.effects)
@@ -64,12 +58,9 @@ def prepare(options: FitOptions) -> tuple[Measurement, RunFolder]:
     unknown = [name for name in options.parameters if name not in known]
     if unknown:
         raise ParameterError(f"--parameters: unknown {', '.join(unknown)}; this model has {', '.join(known)}")
-    if options.coarse is not None:
-        relative_cost(*(Resolution.derive(measurement, preset) for preset in (options.preset, options.coarse)))
     if not measurement.frames:
         raise MeasurementError("has no video frames from 0 on: there is nothing to compare with", file=options.set)
-    simulations = options.budget or EVALUATIONS * max(1, len(options.parameters))
-    simulations += 0 if options.search == "paper" else COMPARISON
+    simulations = (options.budget or EVALUATIONS * max(1, len(options.parameters))) + COMPARISON
     pictures = needs(measurement, options.preset, device, simulations, particles=1)
     check_memory(pictures, device, options.set)  # how much soil there is isn't known yet
     print(needs(measurement, options.preset, device, simulations).sentence(device), file=sys.stderr)
@@ -104,15 +95,14 @@ def run_fit(
     options: FitOptions, measurement: Measurement, run: RunFolder, model: Model, report: Report
 ) -> dict[str, Any]:
     """Search, evaluation by evaluation, and compare the model with something else by what was simulated, and more; what
-    is in the run folder already isn't simulated again. The paper's search ends with itself.
+    is in the run folder already isn't simulated again.
     """
     from splatsoil import __version__
     from splatsoil.commands._crew import Crew
     from splatsoil.commands._resources import check_memory, needs
-    from splatsoil.envs.levels import is_full
     from splatsoil.envs.measured import LOSS, MeasuredProblem
     from splatsoil.files import code_of
-    from splatsoil.inverse.fitting import FitSetup, fit
+    from splatsoil.inverse.fitting import TOGETHER, FitSetup, fit
 
     space = model.space(options.parameters or None)
     budget = options.budget or EVALUATIONS * len(space)
@@ -129,30 +119,25 @@ def run_fit(
         version=__version__,
         code=code_of(options.effects),
         loss=LOSS,
-        search=options.search,
-        coarse=options.coarse,
-        at_once=1 if options.coarse is not None or options.search == "paper" else TOGETHER,
     )
     report("reading the video", 0.0)
     spec = ModelSpec(tuple(options.effects), options.preset, space.names)
     experiment, simulate = experiment_of(run, model, spec, ())
     problem = MeasuredProblem(experiment)
     units = {p.name: "°" if p.unit == "deg" else f" {p.unit}" for p in space}
-    finished, spent = 0, 0.0
+    finished = 0
 
     def evaluated(done: int, record: EvaluationRecord) -> None:
-        nonlocal finished, spent
-        finished, spent = done, spent + record.extras.get("cost", 1.0)
-        if record.status == "ok" and is_full(record.parameters):
-            values = {name: record.parameters[name] for name in space.names}
-            simulate.keep(problem.features(record.blocks), values, record.seed)
+        nonlocal finished
+        finished = done
+        if record.loss is not None:
+            simulate.keep(problem.features(record.blocks), record.parameters, record.seed)
         said = ", ".join(f"{name} {record.parameters[name]:.4g}{unit}" for name, unit in units.items())
         outcome = "failed" if record.loss is None else f"loss {record.loss:.4g}"
-        level = "" if is_full(record.parameters) else ", coarse"
-        report(f"{spent:.3g} of {budget}: {said}, {outcome}{level}", SEARCH * spent / budget)
+        report(f"{done} of {budget}: {said}, {outcome}", SEARCH * done / budget)
 
     def simulating(frame: int, last: int) -> None:
-        share = min((spent + setup.at_once * frame / (last + 1)) / budget, 1.0)
+        share = min((finished + TOGETHER * frame / (last + 1)) / budget, 1.0)
         report(f"simulation {finished + 1}, frame {frame}", SEARCH * share)
 
     def compared(found: dict[str, Any]) -> Diagnosis:
@@ -170,7 +155,7 @@ def run_fit(
         setup,
         budget=budget,
         facts=facts(model),
-        compare=None if options.search == "paper" else compared,
+        compare=compared,
         after_evaluation=evaluated,
     )
 
@@ -365,11 +350,7 @@ def compare_models(
         simulate=simulate,
         effects=with_effects,
         seed=seed,
-        known=[
-            Run(step["parameters"], seed=step["seed"])
-            for step in fit["history"]
-            if step["status"] == "ok" and step["level"] == "full"
-        ],
+        known=[Run(step["parameters"], seed=step["seed"]) for step in fit["history"] if step["status"] == "ok"],
         prior=prior_of(experiment, fit),
         progress=progress,
     )

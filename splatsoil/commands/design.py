@@ -130,7 +130,7 @@ def _expected(
     count = len(runs) + len(experiment.guesses) + len(experiment.redrawn)
     simulate.told = lambda purpose: report(purpose.replace("_", " "), simulate.asked / count)
     # A GPU makes several at a time, all of them in this process.
-    batch = Helpers(0, lambda jobs: Future(), experiment.together, experiment.prepare)
+    batch = Helpers(lambda jobs: Future(), experiment.together, experiment.prepare)
     with simulate.helped(batch) if experiment.together > 1 else nullcontext():
         simulate.ahead(lambda ask: [ask(**run.arguments()) for run in runs])
         found = expected_information(

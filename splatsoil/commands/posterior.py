@@ -12,14 +12,14 @@ from splatsoil.commands._output import print_json, print_notes, print_table, pri
 from splatsoil.errors import ParameterError
 from splatsoil.options import JSON, option
 
-INTERRUPTED = "what was simulated and sampled is kept; go on with"
+INTERRUPTED = "what was simulated is kept; go on with"
 
 
 @dataclass(frozen=True)
 class Config(RunOptions):
     """Sample the posterior: intervals, correlations, ArviZ file.
 
-    It is the posterior that the estimate and ± of the latest fit are of. Sampling that was interrupted goes on.
+    It is the posterior that the estimate and ± of the latest fit are of.
     """
 
     checks: int = option(3, "Simulations at points drawn from the posterior, which test the emulator.", expert=True)
@@ -34,7 +34,7 @@ def run(config: Config) -> int:
     from splatsoil.commands._crew import Crew
     from splatsoil.envs.devices import resolve_device
     from splatsoil.files import code_of
-    from splatsoil.inverse.posterior_run import run_posterior
+    from splatsoil.inverse.posterior import Density, run_posterior
     from splatsoil.quiet import hush
 
     for name in ("checks", "seed"):
@@ -70,8 +70,7 @@ def run(config: Config) -> int:
                 folder,
                 experiment,
                 simulate,
-                found.evidence.noise,
-                _stages.prior_of(experiment, fit),
+                Density.of(found.evidence.noise, _stages.prior_of(experiment, fit), seed),
                 checks=config.checks,
                 seed=config.seed,
                 progress=begin("posterior"),

@@ -76,8 +76,7 @@ def surrogate(fit: Mapping[str, Any], name: str) -> Markup:
     """The GP over one parameter with its evaluations: the paper's figure."""
     curve, entry = fit["curves"][name], fit["parameters"][name]
     x, mean, std = (np.array(curve[key]) for key in ("x", "mean", "std"))
-    # Losses of a coarser simulation are another function's; the GP has them in it, the picture not.
-    done = [s for s in fit["history"] if s["loss"] is not None and s.get("level", "full") == "full"]
+    done = [step for step in fit["history"] if step["loss"] is not None]
     failed = [step for step in fit["history"] if step["loss"] is None]
 
     def draw(figure: Figure, axes: Axes) -> None:

@@ -75,7 +75,6 @@ def render(data: RunData) -> str:
         program=splatsoil.__version__,
         data=data,
         fit=data.fit,
-        coarse=sum(step.get("level") == "coarse" for step in data.fit["history"]),
         answers=text.answers(data.fit, judged, data.truth),
         adequate=adequate,
         fitted=text.fitted_sentence(data.fit, judged),

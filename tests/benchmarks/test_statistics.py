@@ -7,7 +7,7 @@ import pytest
 import torch
 from splatsoil.benchmarks import bo_vs_mcmc, calibration
 from splatsoil.benchmarks._simulations import Data, density_of
-from splatsoil.inverse.surrogate import sobol
+from splatsoil.inverse.bayesopt import sobol
 
 from splatsoil.parameters import Parameter, ParameterSpace
 

@@ -12,7 +12,7 @@ from typing import Any, NoReturn
 
 import pytest
 from splatsoil.inverse.criticism.simulations import Simulations
-from splatsoil.inverse.executors import Processes
+from splatsoil.inverse.executors import processes
 
 from splatsoil.commands import _crew, _stages
 from splatsoil.commands._model import ModelSpec
@@ -53,12 +53,6 @@ class Workers:
         self.words.append(words)
         return Future()
 
-    def dismiss(self, count: int) -> None:
-        self.ended += ["dismissed"] * count
-
-    def kill(self) -> None:
-        self.ended.append("killed")
-
     def shutdown(self, *, cancel_futures: bool) -> None:
         assert cancel_futures
         self.ended.append("let go")
@@ -71,7 +65,8 @@ made: list[Workers] = []
 def three_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     """A machine with as many, whose processes are none."""
     made.clear()
-    monkeypatch.setattr("splatsoil.inverse.executors.Processes", Workers)
+    monkeypatch.setattr("splatsoil.inverse.executors.processes", Workers)
+    monkeypatch.setattr("splatsoil.inverse.executors.kill", lambda workers: workers.ended.append("killed"))
     monkeypatch.setattr("splatsoil.threads.cores", lambda: 3)
 
 
@@ -137,20 +132,21 @@ def test_a_gpu_with_little_memory_keeps_few_helpers(
     experiment = experiment_on("cuda:0")
     simulate = Simulations(experiment)
     with _crew.Crew(folder, "auto", ()) as crew, crew.helping(BASE, experiment, simulate):
-        (workers,) = made
         assert crew.count == left
         simulate.ahead(lambda ask: ask({"angle": 30.0}))
-        assert (_crew._simulate in workers.jobs) is (left > 0)
-    assert workers.ended == (["dismissed"] * (2 - left) + ["let go"] if left else ["killed"])
+    assert [workers.jobs.count(_crew._ready) for workers in made] == ([2] if left == 2 else [2, 1] if left else [2])
+    assert [workers.ended for workers in made] == {2: [["let go"]], 1: [["killed"], ["let go"]], 0: [["killed"]]}[left]
+    assert (_crew._simulate in made[-1].jobs) is (left > 0)
 
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="this system has no masks")
 def test_helpers_never_hear_of_an_interrupt_and_the_first_process_does() -> None:
     """Not even while they load: one would print a traceback beside the sentence of the first."""
-    with _crew._unheard():
-        workers = Processes(1)
+    workers = processes(1)
     try:
-        assert signal.SIGINT in workers.submit(signal.pthread_sigmask, signal.SIG_BLOCK, []).result()
+        with _crew._unheard():
+            masked = workers.submit(signal.pthread_sigmask, signal.SIG_BLOCK, [])
+        assert signal.SIGINT in masked.result()
         assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
     finally:
         workers.shutdown()
@@ -172,12 +168,10 @@ class Helpers:
         if job is _crew._ready:
             sys.exit(1 if {{"torch", "kornia"}} & sys.modules.keys() else 0)
 
-    def kill(self):
-        pass
-
 fit = {{"setup": {{"effects": []}}, "loss": 0.5, "best": {{"loss": 0.5}}, "parameters": {{}}}}
 RunFolder.open = lambda path: SimpleNamespace(path=path, fit=lambda: fit, check_writable=lambda: None)
-executors.Processes = Helpers
+executors.processes = Helpers
+executors.kill = lambda helpers: None
 _crew.MOST_HELPERS = 1
 splatsoil.threads.cores = lambda: 2
 {command}.run({command}.Config(Path("run")))

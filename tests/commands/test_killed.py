@@ -26,7 +26,7 @@ from splatsoil import cli
 
 #: What a clock or an interruption, but nothing else, may change.
 CLOCKS = {"seconds", "created", "simulated_now"}
-QUICK = ("--preset", "tiny", "--budget", "2", "--search", "paper", "--device", "cpu")
+QUICK = ("--preset", "tiny", "--budget", "2", "--device", "cpu")
 WHOLE = ("--preset", "tiny", "--budget", "2", "--stop-at-floor", "--device", "cpu")
 
 #: Runs the program and kills it at a certain one of the moments at which it touches a file of a folder.
@@ -107,8 +107,8 @@ def essence(run: Path) -> dict[str, Any]:
         elif file.suffix in (".npy", ".npz", ".ply", ".jpg", ".png") and not file.name.startswith("."):
             out[name] = file.read_bytes()
     with contextlib.closing(sqlite3.connect(run / "evaluations.db")) as database:
-        columns = "fit, step, key, parameters, action, seed, status, loss, blocks"
-        out["evaluations"] = database.execute(f"SELECT {columns} FROM evaluations ORDER BY fit, step").fetchall()
+        columns = "key, model, parameters, seed, loss, blocks"
+        out["evaluations"] = database.execute(f"SELECT {columns} FROM evaluations ORDER BY key").fetchall()
     return out
 
 

@@ -27,7 +27,7 @@ GIVEN = {
     "dilatancy_angle=9 --strain 0.1 --pressure 1e6 --records 20 --void-ratio 0.7 --young 1e7 --poisson 0.3 "
     "--strain-rate 1e-3 --depth 0.1 --matching extension --plot 'a plot.svg' --json",
     "export": "'a run' --to csv ply --out 'a folder' --model diagnosis --every 5 --device cpu --json",
-    "fit": "nowhere --parameters friction_angle --with cohesion --budget 9 --search paper --coarse tiny --preset fine "
+    "fit": "nowhere --parameters friction_angle --with cohesion --budget 9 --preset fine "
     "--device cpu --seed 2 --run 'a run' --json",
     "import": "'a folder' out --images i --scale 2 --distance a b 0.5 --tags 0.1 --known k.csv --points p.csv "
     "--up 0 -1 0 --tool t.stl mm --motion m.csv m --force f.csv --robot-to-world r.txt --mesh-to-flange f.txt "
@@ -35,7 +35,7 @@ GIVEN = {
     "posterior": "runs/a --set 'a set' --checks 0 --device cpu --seed 1 --json",
     "reconstruct": "'my set' --out a/b --preset tiny --seed 3 --device cpu --holdout 0 --json",
     "report": "'a run' --set 'a set' --json",
-    "run": "nowhere --parameters friction_angle --with cohesion --budget 9 --search paper --coarse tiny --preset fine "
+    "run": "nowhere --parameters friction_angle --with cohesion --budget 9 --preset fine "
     "--device cpu --seed 2 --run 'a run' --criticise --stop-at-floor --most-effects 3 --json",
     "simulate": "out --friction-angle 31.5 --with cohesion tilt --set cohesion=300 tilt_x=-2 --scene paper --depth "
     "0.09 --preset tiny --seed 4 --particle-seed 5 --views 12 --picture-scale 0.5 --device cuda:0 --like 'a set' "

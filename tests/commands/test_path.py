@@ -160,10 +160,12 @@ def test_a_fit_and_its_posterior(place: Path, whole: dict[str, Any], program: Pr
     assert angle["std"] == pytest.approx(fitted["std"], rel=0.15)
     assert 20.0 <= angle["low"] <= angle["median"] <= angle["high"] <= 50.0
     assert angle["verdict"] in ("determined", "weakly determined", "not determined")
-    assert {"corner.png", "trace.png", "scores.png"} == set(told["figures"])
+    assert told["figures"] == ["corner.png"]
     assert (place / "sampled" / "posterior" / "posterior.nc").is_file()
+    kept = {file.name: file.stat().st_mtime_ns for file in (place / "sampled" / "features").glob("*.npy")}
     again = program("posterior", "sampled", "--checks", "1", cwd=place)
-    assert again["parameters"] == told["parameters"] and again["seconds"] < told["seconds"], "simulations were kept"
+    assert again["parameters"] == told["parameters"]
+    assert {file.name: file.stat().st_mtime_ns for file in (place / "sampled" / "features").glob("*.npy")} == kept
     fit = read_json(place / "sampled" / "fit.json")
     fit["setup"]["code"] = "other"
     write_json(place / "sampled" / "fit.json", fit)
@@ -255,7 +257,6 @@ def next_stroke(place: Path, program: Program, source: Path) -> None:
         (["--parameters", "phi"], "unknown phi; this model has friction_angle"),
         (["--parameters", "cohesion"], "unknown cohesion"),
         (["--device", "cuda:77"], "cuda:77"),
-        (["--preset", "small", "--coarse", "small"], "no cheaper"),
     ],
 )
 def test_options_that_make_no_sense_write_nothing(

@@ -1,23 +1,9 @@
-from __future__ import annotations
+"""What tests of ``inverse`` share."""
 
-import importlib.util
-import sys
-from pathlib import Path
-from types import ModuleType
+from __future__ import annotations
 
 import pytest
 import torch
-
-
-@pytest.fixture(scope="session")
-def analytic() -> ModuleType:
-    """The module beside this file, which is also a script."""
-    spec = importlib.util.spec_from_file_location("analytic_problem", Path(__file__).with_name("analytic.py"))
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.fixture(autouse=True)

@@ -1,151 +1,129 @@
+"""The run database, and evaluations that come from it: what a kill, a full disk or a damaged file costs."""
+
 from __future__ import annotations
 
+import contextlib
 import math
+import multiprocessing
 import os
+import random
 import signal
 import sqlite3
 import subprocess
 import sys
 import textwrap
+import time
+from collections.abc import Callable
+from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import pytest
-from splatsoil.inverse.evaluations import EvaluationRecord, EvaluationStore, digest, writer_lock
+from splatsoil.inverse.evaluations import EvaluationRecord, EvaluationStore, evaluate, writer_lock
+from splatsoil.inverse.executors import executor
 
 from splatsoil.errors import RunError
 
+MODEL = {"model": "analytic", "device": "cpu"}
 RECORD = EvaluationRecord(
-    fit="f",
-    step=0,
     key="k0",
+    model=MODEL,
     parameters={"friction_angle": 36.000000000000014},
-    action=(0.1,),
     seed=7,
-    status="ok",
     loss=0.1 + 0.2,
-    blocks=(1.5, -2.0),
+    blocks=[1.5, -2.0],
     extras={"rgb": 1e-5},
     seconds=3.25,
-    preset="tiny",
-    version="1",
-    measurement="m",
 )
 
 
 def filled(path: Path, count: int = 1) -> Path:
     with EvaluationStore(path) as store:
-        store.register("f", {"what": "a test"})
         for step in range(count):
-            store.append(replace(RECORD, step=step, key=f"k{step}"))
+            store.append(replace(RECORD, key=f"k{step}"))
     return path
 
 
 def test_what_goes_in_comes_out_bit_for_bit(tmp_path: Path) -> None:
     path = filled(tmp_path / "e.db")
+    with EvaluationStore(path) as store:
+        store.append(replace(RECORD, key="k1", loss=None, message="a particle left the grid"))
     with EvaluationStore(path, writable=False) as store:
-        (record,) = store.records("f")
-        assert replace(record, created="") == RECORD
-        assert record.created
-        assert store.find("k0") == record
-        assert store.find("k1") is None
-        assert store.descriptions() == {"f": {"what": "a test"}}
+        record, failed = store.records()
+        assert replace(record, created="") == RECORD and record.created
+        assert store.find("k0") == record and store.find("k2") is None
+        assert (failed.status, failed.loss, failed.message) == ("failed", None, "a particle left the grid")
+        with pytest.raises(RunError, match="cannot be written"):
+            store.append(replace(RECORD, key="k2"))
 
 
-def test_a_failure_is_a_row_with_a_message_and_no_loss(tmp_path: Path) -> None:
-    failed = replace(RECORD, status="failed", loss=None, message="a particle left the grid")
-    with EvaluationStore(tmp_path / "e.db") as store:
-        store.register("f", {})
-        store.append(failed)
-        (record,) = store.records()
-    assert (record.status, record.loss, record.message) == ("failed", None, "a particle left the grid")
-    raw = sqlite3.connect(tmp_path / "e.db").execute("SELECT loss, status FROM evaluations").fetchall()
-    assert raw == [(None, "failed")]
-
-
-@pytest.mark.parametrize(("status", "loss"), [("ok", math.nan), ("ok", None), ("ok", math.inf), ("failed", 1.0)])
-def test_a_loss_that_contradicts_its_status_is_refused(status: str, loss: float | None) -> None:
+@pytest.mark.parametrize(("loss", "message"), [(math.nan, ""), (None, ""), (math.inf, ""), (1.0, "failed")])
+def test_a_loss_that_contradicts_its_message_is_refused(loss: float | None, message: str) -> None:
     with pytest.raises(ValueError):
-        replace(RECORD, status=status, loss=loss)
+        replace(RECORD, loss=loss, message=message)
 
 
-def test_the_database_itself_refuses_a_nan(tmp_path: Path) -> None:
+def test_the_database_itself_refuses_a_nan_and_a_second_one_of_the_same(tmp_path: Path) -> None:
     path = filled(tmp_path / "e.db")
-    connection = sqlite3.connect(path)
-    with pytest.raises(sqlite3.IntegrityError):
-        connection.execute("UPDATE evaluations SET loss = ?", (math.nan,))
-
-
-def test_a_step_is_stored_once(tmp_path: Path) -> None:
-    path = filled(tmp_path / "e.db")
+    with contextlib.closing(sqlite3.connect(path)) as database, pytest.raises(sqlite3.IntegrityError):
+        database.execute("UPDATE evaluations SET loss = ?", (math.nan,))
     with EvaluationStore(path) as store, pytest.raises(RunError, match="can't be stored"):
-        store.append(replace(RECORD, key="other"))
+        store.append(RECORD)
 
 
 def test_readers_read_while_one_writes(tmp_path: Path) -> None:
-    path = tmp_path / "e.db"
-    with EvaluationStore(path) as writer:
-        writer.register("f", {})
-        with EvaluationStore(path, writable=False) as reader:
-            assert reader.records() == []
-            writer.append(RECORD)
-            assert len(reader.records()) == 1
+    with EvaluationStore(tmp_path / "e.db") as writer, EvaluationStore(tmp_path / "e.db", writable=False) as reader:
+        assert reader.records() == []
+        writer.append(RECORD)
+        assert len(reader.records()) == 1
 
 
-def test_digests_know_contents_and_not_order() -> None:
-    assert digest({"a": 1, "b": [1, 2]}) == digest({"b": [1, 2], "a": 1})
-    assert digest({"a": 1.0}) != digest({"a": 1.0 + 2**-52})
+def _text(path: Path) -> None:
+    path.write_bytes(b"this is no database, just text that is long enough" * 40)
 
 
-@pytest.mark.parametrize(
-    ("contents", "says"),
-    [(b"this is no database, just text that is long enough" * 40, "damaged or not a run database")],
-)
-def test_a_file_that_is_no_database_gets_one_sentence(tmp_path: Path, contents: bytes, says: str) -> None:
-    path = tmp_path / "e.db"
-    path.write_bytes(contents)
-    for writable in (True, False):
-        with pytest.raises(RunError, match=says):
-            EvaluationStore(path, writable=writable)
-    assert path.read_bytes() == contents
-
-
-def test_a_damaged_database_gets_one_sentence(tmp_path: Path) -> None:
-    path = filled(tmp_path / "e.db", 200)
-    data = bytearray(path.read_bytes())
+def _damaged(path: Path) -> None:
+    data = bytearray(filled(path, 200).read_bytes())
     for start in range(4096, len(data), 4096):
         data[start : start + 512] = b"\xff" * 512
     path.write_bytes(data)
-    with pytest.raises(RunError, match="damaged"):
-        EvaluationStore(path)
 
 
-def test_somebody_elses_database_is_left_alone(tmp_path: Path) -> None:
-    path = tmp_path / "e.db"
+def _theirs(path: Path) -> None:
     with sqlite3.connect(path) as connection:
         connection.execute("CREATE TABLE theirs (x)")
     connection.close()
-    with pytest.raises(RunError, match="not a run database"):
-        EvaluationStore(path)
 
 
-def test_a_later_layout_is_refused(tmp_path: Path) -> None:
-    path = filled(tmp_path / "e.db")
-    with sqlite3.connect(path) as connection:
+def _later(path: Path) -> None:
+    with sqlite3.connect(filled(path)) as connection:
         connection.execute("PRAGMA user_version=99")
     connection.close()
-    with pytest.raises(RunError, match="layout 99"):
-        EvaluationStore(path)
 
 
-def test_reading_what_is_not_there(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (_text, "damaged or not a run database"),
+        (_damaged, "damaged"),
+        (_theirs, "not a run database"),
+        (_later, "layout 99"),
+    ],
+)
+def test_a_file_that_is_not_ours_gets_one_sentence(tmp_path: Path, make: Callable[[Path], None], says: str) -> None:
+    make(tmp_path / "e.db")
+    for writable in (False, True):
+        with pytest.raises(RunError, match=says):
+            EvaluationStore(tmp_path / "e.db", writable=writable)
+
+
+def test_what_is_not_there_or_empty(tmp_path: Path) -> None:
     with pytest.raises(RunError, match="no run database"):
         EvaluationStore(tmp_path / "e.db", writable=False)
     assert not (tmp_path / "e.db").exists()
-
-
-def test_an_empty_file_left_by_a_kill_becomes_a_database(tmp_path: Path) -> None:
-    (tmp_path / "e.db").touch()
+    (tmp_path / "e.db").touch()  # as a kill leaves it
     assert filled(tmp_path / "e.db").stat().st_size > 0
 
 
@@ -159,70 +137,115 @@ def test_writing_where_one_may_not(tmp_path: Path) -> None:
         pass
 
 
-def test_a_database_opened_for_reading_is_not_written(tmp_path: Path) -> None:
-    path = filled(tmp_path / "e.db")
-    with EvaluationStore(path, writable=False) as store, pytest.raises(RunError, match="cannot be written"):
-        store.append(replace(RECORD, step=1, key="k1"))
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="permission bits don't hold root back")
-def test_a_read_only_database_gets_one_sentence(tmp_path: Path) -> None:
-    path = filled(tmp_path / "e.db")
-    path.chmod(0o444)
-    with pytest.raises(RunError, match="cannot be written"):
-        filled(path)
-
-
 def test_a_full_disk_is_said_and_costs_nothing_that_is_stored(tmp_path: Path) -> None:
-    with EvaluationStore(tmp_path / "evaluations.db", writable=True) as store:
-        store.register("f", {})
-        store.append(RECORD)
+    with EvaluationStore(filled(tmp_path / "e.db")) as store:
         # SQLite's own stand-in for a disk without room.
         pages = store._connection.execute("PRAGMA page_count").fetchone()[0]
         store._connection.execute(f"PRAGMA max_page_count={pages}")
         with pytest.raises(RunError, match=r"full.*free some space"):
             for step in range(1, 200):
-                store.append(replace(RECORD, step=step, key=f"k{step}"))
-    with EvaluationStore(tmp_path / "evaluations.db", writable=True) as store:
-        kept = [r.step for r in store.records("f")]
-        assert kept == list(range(len(kept))) and kept
-        store.append(replace(RECORD, step=len(kept), key="last"))
-
-
-def test_one_writer_at_a_time(tmp_path: Path) -> None:
-    with writer_lock(tmp_path), pytest.raises(RunError, match="another process is writing"), writer_lock(tmp_path):
-        pass
-    with writer_lock(tmp_path):
-        pass
+                store.append(replace(RECORD, key=f"k{step}"))
+    with EvaluationStore(tmp_path / "e.db") as store:
+        kept = [r.key for r in store.records()]
+        assert kept == [f"k{step}" for step in range(len(kept))] and kept
+        store.append(replace(RECORD, key="last"))
 
 
 def test_a_killed_writer_leaves_what_it_stored_and_no_lock(tmp_path: Path) -> None:
     script = """
-        import sys, time
-        from dataclasses import replace
+        import sys
         from splatsoil.inverse.evaluations import *
-        record = EvaluationRecord("f", 0, "k", {"a": 1.0}, (0.0,), 1, "ok", 0.5)
         with writer_lock(sys.argv[1]), EvaluationStore(sys.argv[1] + "/e.db") as store:
-            store.register("f", {})
             for step in range(10_000):
-                store.append(replace(record, step=step, key=f"k{step}"))
+                store.append(EvaluationRecord(f"k{step}", {}, {"a": 1.0}, 1, 0.5))
                 print(step, flush=True)
         """
     process = subprocess.Popen(
         [sys.executable, "-c", textwrap.dedent(script), str(tmp_path)], stdout=subprocess.PIPE, text=True
     )
     assert process.stdout is not None
-    seen = -1
     for line in process.stdout:
-        seen = int(line)
-        if seen >= 20:
+        if (seen := int(line)) >= 20:
             break
     with pytest.raises(RunError, match="another process is writing"), writer_lock(tmp_path):
         pass
     process.send_signal(signal.SIGKILL)
-    process.wait()
-    process.stdout.close()
+    process.communicate()
     with writer_lock(tmp_path), EvaluationStore(tmp_path / "e.db") as store:
-        records = store.records("f")
-    assert len(records) >= seen + 1
-    assert [r.step for r in records] == list(range(len(records)))
+        keys = [r.key for r in store.records()]
+    assert len(keys) >= seen + 1 and keys == [f"k{step}" for step in range(len(keys))]
+
+
+def run(problem: Any, count: int, file: Path, pool: Executor | None = None, whole: int = 12) -> list[tuple]:
+    """The first evaluations of a campaign, without their times."""
+    jobs = [({"friction_angle": 20.0 + 30.0 * k / whole}, k) for k in range(whole)][:count]
+    with EvaluationStore(file) as store:
+        records = list(evaluate(problem, jobs, store, MODEL, together=2, pool=pool))
+        assert [(r.parameters, r.seed) for r in records] == jobs
+        assert sorted(r.key for r in store.records()) == sorted(r.key for r in records)
+    return [(r.key, r.loss, r.blocks, r.message) for r in records]
+
+
+def test_what_is_stored_is_not_made_again(analytic: ModuleType, tmp_path: Path) -> None:
+    problem = analytic.AnalyticProblem(fails_below=25.0)
+    first = run(problem, 7, tmp_path / "e.db")
+    assert {message[:13] for *_, message in first} == {"", "nothing holds"}
+    assert run(problem, 12, tmp_path / "e.db")[:7] == first
+    assert problem.calls == 12
+    assert run(problem, 12, tmp_path / "other.db")[:7] == first
+
+
+def _campaign(analytic: ModuleType, file: Path) -> None:
+    run(analytic.AnalyticProblem(delay=0.02), 40, file, whole=40)
+
+
+def test_killed_at_random_moments(analytic: ModuleType, tmp_path: Path) -> None:
+    """No finished evaluation is lost, none is made twice, and the end is that of the uninterrupted campaign."""
+    file, context, moments, kept = tmp_path / "killed.db", multiprocessing.get_context("fork"), random.Random(5), 0
+    for _ in range(12):
+        process = context.Process(target=_campaign, args=(analytic, file))
+        process.start()
+        time.sleep(moments.uniform(0.01, 0.12))
+        assert process.pid is not None
+        os.kill(process.pid, signal.SIGKILL)
+        process.join()
+        with EvaluationStore(file) as store:
+            count = len(store.records())
+        assert count >= kept
+        kept = count
+    assert kept > 0
+    problem = analytic.AnalyticProblem()
+    records = run(problem, 40, file, whole=40)
+    assert problem.calls == 40 - kept
+    assert records == run(analytic.AnalyticProblem(), 40, tmp_path / "whole.db", whole=40)
+
+
+class Dying:
+    """A problem that ends its worker."""
+
+    def evaluate(self, parameters: Any, seed: int) -> None:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_worker_that_dies_is_said(tmp_path: Path) -> None:
+    problem: Any = Dying()
+    with executor("processes:1") as pool, EvaluationStore(tmp_path / "e.db") as store:
+        made = evaluate(problem, [({}, 0)], store, MODEL, pool=pool)
+        with pytest.raises(RunError, match="a worker died"):
+            next(made)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("where", ["processes:2", "dask"])
+def test_other_processes_give_the_same(tmp_path: Path, where: str) -> None:
+    from splatsoil.envs.synthetic import SyntheticProblem
+
+    problem = SyntheticProblem()
+    problem.begin(3)
+    here = run(problem, 4, tmp_path / "here.db")
+    if where == "dask":
+        distributed = pytest.importorskip("distributed")
+        cluster = distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None)
+        where = f"dask:{cluster.scheduler_address}"
+    with executor(where) as pool:
+        assert run(problem, 4, tmp_path / "there.db", pool) == here

@@ -1,13 +1,12 @@
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
 from splatsoil.inverse.run_folder import RunFolder
 
 from splatsoil.errors import RunError
-from splatsoil.files import RECONSTRUCTING, code_digest, read_json, write_bytes, write_json
+from splatsoil.files import read_json
 
 MEASUREMENT = {"name": "plow", "folder": "sets/plow", "hash": "a" * 64}
 
@@ -97,41 +96,3 @@ def test_a_run_that_another_process_writes_into_is_not_writable(tmp_path: Path) 
     (tmp_path / "comparison").write_text("in the way")
     with pytest.raises(RunError, match="comparison"):
         run.check_writable()
-
-
-def test_a_write_that_fails_leaves_the_old_file_and_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = write_json(tmp_path / "a.json", {"old": True})
-
-    def full(_: int) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("splatsoil.files.os.fsync", full)
-    with pytest.raises(RunError, match="No space left"):
-        write_bytes(path, b"new")
-    assert json.loads(path.read_text()) == {"old": True}
-    assert [p.name for p in tmp_path.iterdir()] == ["a.json"]
-
-
-def test_json_is_strict(tmp_path: Path) -> None:
-    import numpy as np
-
-    path = write_json(
-        tmp_path / "a.json", {"nan": float("nan"), "array": np.arange(2), "path": tmp_path, "n": np.int64(3)}
-    )
-    assert json.loads(path.read_text(), parse_constant=lambda _: pytest.fail("not JSON")) == {
-        "nan": None,
-        "array": [0, 1],
-        "path": str(tmp_path),
-        "n": 3,
-    }
-
-
-def test_the_digest_of_the_code_knows_its_parts_and_a_users_file(tmp_path: Path) -> None:
-    effect = tmp_path / "my_effect.py"
-    effect.write_text("a = 1")
-    first = code_digest(others=[effect])
-    assert first == code_digest(others=[effect]) != code_digest() != code_digest(RECONSTRUCTING)
-    effect.write_text("a = 2")
-    assert code_digest(others=[effect]) != first
-    with pytest.raises(RunError, match="nowhere"):
-        code_digest(others=[tmp_path / "nowhere.py"])

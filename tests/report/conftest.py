@@ -140,7 +140,6 @@ def fit(name: str = "base", effects: tuple[str, ...] = (), **changes: Any) -> di
             {
                 "step": step,
                 "seed": 7,
-                "level": "full",
                 "parameters": dict.fromkeys(parameters, value),
                 "loss": loss,
                 "status": status,

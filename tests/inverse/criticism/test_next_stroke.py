@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,9 +19,8 @@ from splatsoil.inverse.criticism.next_stroke import (
     information,
     posterior_draws,
     probable,
-    runs_of,
 )
-from splatsoil.inverse.criticism.simulations import Helpers, Simulations
+from splatsoil.inverse.criticism.simulations import Simulations
 
 from splatsoil.errors import RunError, SimulationError
 from splatsoil.experiment.emulated import EmulatedExperiment
@@ -91,13 +89,6 @@ def test_models_far_apart_tell_all_there_is() -> None:
     assert found.told_apart == [("a", "b"), ("a", "c"), ("b", "c")]
 
 
-def test_only_what_differs_beyond_its_error_is_better() -> None:
-    far, near = (information(scattered(12, d, 0.3), EVEN, np.eye(2)) for d in (3.0, 0.5))
-    again = information(scattered(12, 3.0, 0.3, seed=5), EVEN, np.eye(2))
-    assert far.beyond(near) and not near.beyond(far)
-    assert not far.beyond(again) and not again.beyond(far)
-
-
 def test_few_simulations_must_differ_by_more() -> None:
     """Differences of 1 ± 0.35, from 3 simulations or from 12 (ends of 95 % of Student's t: 4.30 and 2.20)."""
     zero = np.zeros(12)
@@ -110,13 +101,6 @@ def test_few_simulations_must_differ_by_more() -> None:
 
 def scaled(values: np.ndarray) -> np.ndarray:
     return np.asarray((values - values.mean()) / values.std(ddof=1))
-
-
-def test_a_simulation_that_failed_is_left_out_of_both() -> None:
-    bits = {"a": np.array([0.5, np.nan, 0.7]), "b": np.array([0.4, 0.6, 0.5])}
-    found = Information(bits, EVEN, {})
-    assert found.mean == pytest.approx(0.5 * 0.6 + 0.5 * 0.5)
-    assert not found.beyond(found)
 
 
 def diagnosis(**probability: float) -> dict[str, Any]:
@@ -199,24 +183,6 @@ def test_a_simulation_that_cannot_go_on_costs_itself_alone(make: Callable[..., E
     assert np.isfinite(found.mean)
     with pytest.raises(SimulationError, match="one could hardly be simulated"):
         expected_information(experiment, draws, EVEN_NAMES, fails(4))
-
-
-def test_simulations_made_several_at_a_time_tell_the_same(make: Callable[..., EmulatedExperiment]) -> None:
-    """As on a GPU: a share is prepared, then asked for one by one."""
-    experiment = proposed(make({}))
-    draws = {
-        "": [{"friction_angle": 34.0 + 0.25 * i} for i in range(6)],
-        "one": [{"friction_angle": 34.0 + 0.25 * i, "one_size": 3.0} for i in range(6)],
-    }
-    alone = expected_information(experiment, draws, EVEN_NAMES, Simulations(experiment))
-    shares: list[Any] = []
-    simulate = Simulations(experiment)
-    with simulate.helped(Helpers(0, lambda jobs: Future(), 4, shares.append)):
-        simulate.ahead(lambda ask: [ask(**run.arguments()) for runs in runs_of(draws, 0).values() for run in runs])
-        together = expected_information(experiment, draws, EVEN_NAMES, simulate)
-    assert together.mean == alone.mean and together.std == alone.std
-    prepared = [(*job["effects"], job["seed"]) for share in shares for job in share]
-    assert max(map(len, shares)) == 4 and len(set(prepared)) == len(prepared)
 
 
 def test_draws_are_of_the_posterior(make: Callable[..., EmulatedExperiment]) -> None:

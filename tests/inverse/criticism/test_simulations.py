@@ -62,7 +62,7 @@ def helper(experiment: Watched, folder: Path, together: int = 1, mine: Watched |
                 continue
 
     with ThreadPoolExecutor(1) as pool:
-        yield Helpers(1, lambda jobs: pool.submit(work, jobs), together, mine.prepared.append if mine else len)
+        yield Helpers(lambda jobs: pool.submit(work, jobs), together, mine.prepared.append if mine else len)
 
 
 def everything(ask: Callable[..., np.ndarray]) -> list[np.ndarray]:
@@ -104,18 +104,6 @@ def test_what_is_kept_is_read_and_not_made_again(tmp_path: Path) -> None:
     assert (again.made, told) == (1, ["another"])
 
 
-def test_order_of_effects_and_nothing_else_is_the_same_simulation() -> None:
-    simulate = simulations(Watched())
-    simulate(AT, effects=("cohesion", "tilt"))
-    simulate(AT, effects=("tilt", "cohesion"), purpose="the same")
-    assert simulate.made == 1
-    simulate(AT, effects=("tilt",))
-    simulate(AT, effects=("tilt",), seed=1)
-    simulate(AT, effects=("tilt",), numerics="fine")
-    simulate({"angle": 0.6}, effects=("tilt",))
-    assert simulate.made == 5
-
-
 def test_a_share_is_made_whole_by_who_takes_it_and_one_failure_in_it_is_no_other_ones(tmp_path: Path) -> None:
     mine = Watched(lambda values: values["angle"] == 2.0)
     simulate = simulations(mine, tmp_path)
@@ -126,7 +114,7 @@ def test_a_share_is_made_whole_by_who_takes_it_and_one_failure_in_it_is_no_other
         return Future()
 
     angles = (1.0, 2.0, 3.0)
-    with simulate.helped(Helpers(1, never, 4)):
+    with simulate.helped(Helpers(never, 4)):
         simulate.ahead(lambda ask: [ask({"angle": angle}) for angle in angles])
         assert [len(jobs) for jobs in shares] == [3]
         assert np.array_equal(simulate({"angle": 1.0}), table({"angle": 1.0}))
@@ -146,7 +134,7 @@ def test_all_drawings_of_a_simulation_are_one_share_whatever_is_best_made_at_a_t
         return Future()
 
     simulate = simulations(Watched())
-    with simulate.helped(Helpers(1, never, 2)):
+    with simulate.helped(Helpers(never, 2)):
         simulate.ahead(lambda ask: [ask(AT, numerics=n) for n in ("guess 1", "guess 2", "fine", "rounding", "")])
     assert sorted(sorted(share) for share in shares) == [[""], ["fine"], ["guess 1", "guess 2", "rounding"]]
 
@@ -160,7 +148,7 @@ def test_a_helper_that_fails_or_dies_costs_nothing_but_its_help(tmp_path: Path, 
 
     mine = Watched(lambda values: values["angle"] > 1.0)
     simulate = simulations(mine, tmp_path)
-    with simulate.helped(Helpers(1, dead)):
+    with simulate.helped(Helpers(dead)):
         simulate.ahead(lambda ask: [ask(AT), ask({"angle": 2.0})])
         assert np.array_equal(simulate(AT), table(AT))
         for _ in range(2):
@@ -169,13 +157,20 @@ def test_a_helper_that_fails_or_dies_costs_nothing_but_its_help(tmp_path: Path, 
     assert len(mine.calls) == 2 and simulate.asked == 1
 
 
-def test_a_file_that_defines_an_effect_counts_for_what_it_is_on_in(tmp_path: Path) -> None:
-    """Another file of the same name: only what it is on in is made anew."""
-    for digest, made in (("one", 2), ("other", 1), ("one", 0)):
-        simulate = Simulations(Watched(), tmp_path, sources={"own": digest})  # type: ignore[arg-type]
-        simulate(AT)
-        simulate(AT, effects=("own",))
-        assert simulate.made == made
+def test_what_decides_a_simulation_and_nothing_else_makes_it_another(tmp_path: Path) -> None:
+    """Effects in whatever order; another file of the same name: only what it is on in is made anew."""
+    simulate = Simulations(Watched(), tmp_path, sources={"own": "one"})  # type: ignore[arg-type]
+    for effects in (("tilt", "own"), ("own", "tilt"), ("tilt",), ()):
+        simulate(AT, effects=effects, purpose="any")
+    assert simulate.made == 3
+    simulate(AT, effects=("tilt",), seed=1)
+    simulate(AT, effects=("tilt",), numerics="fine")
+    simulate({"angle": 0.6}, effects=("tilt",))
+    assert simulate.made == 6
+    other = Simulations(Watched(), tmp_path, sources={"own": "other"})  # type: ignore[arg-type]
+    for effects in (("tilt", "own"), ("tilt",), ()):
+        other(AT, effects=effects)
+    assert other.made == 1
 
 
 def test_what_was_made_elsewhere_is_kept_and_not_made_again(tmp_path: Path) -> None:
