@@ -81,9 +81,9 @@ def test_heights_agree_with_the_implicit_solver(name: str, values: dict[str, flo
 
 @pytest.mark.parametrize(("name", "values"), [("plow-dry", DRY), ("plow-damp", DAMP)])
 def test_as_much_soil_is_cut_and_none_is_lost(name: str, values: dict[str, float]) -> None:
-    """The tool takes about as much out of the bed as the implicit solver's does (7 % more on these cells, 10 % on those of
-    13.3 mm), and all of it is heaped up; damp soil with gaps between its clods. (The implicit solver's heaps miss a sixth of it:
-    docs/numerics.md.)"""
+    """The tool takes about as much out of the bed as the implicit solver's does, 7 % more on these cells, 10 % on those
+    of 13.3 mm. All of it is heaped up, damp soil with gaps between its clods; the implicit solver's heaps miss a sixth
+    (docs/numerics.md)."""
     measurement, run, x = ploughed(name, values, [50, 100])
     particles, spacing = truth(name)
     start, own = heights(particles[0], measurement, spacing**3), heights(x, measurement, run.spacing**3)
