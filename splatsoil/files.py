@@ -197,10 +197,10 @@ def plain(data: Any) -> Any:
 
 
 #: Parts of the package that decide what a reconstruction is, and what an evaluation comes to.
-RECONSTRUCTING = ("measurement", "splats", "reconstruction")
+RECONSTRUCTING = ("measurement", "splats", "reconstruction", "colour.py")
 FORWARD = (
     *RECONSTRUCTING,
-    *("soil", "mpm", "scene", "parameters.py", "model.py", "observation.py", "colour.py"),
+    *("soil", "mpm", "scene", "parameters.py", "model.py", "observation.py"),
     *("comparison.py", "robust_loss.py", "envs/measured.py"),
     *("experiment/base.py", "experiment/features.py", "experiment/forces.py", "experiment/plow.py"),
     "experiment/scene_parts.py",
