@@ -33,8 +33,10 @@ RESTARTS, RAW = 4, 128
 #: ln of the noise variance beforehand, of standardised losses: BoTorch's median and twice its width, for a simulator
 #: may have hardly any noise.
 NOISE_MEAN, NOISE_STD = -4.0, 2.0
-#: Draws of the hyperparameters (emcee's walkers after so many steps), and sample paths of each.
+#: Draws of the hyperparameters (emcee's walkers after so many steps), and sample paths of each; points of the prior and
+#: about the peak (in its standard deviations), from which the walkers' starts are chosen.
 DRAWS, STEPS, PATHS = 64, 200, 2
+POOL, NEAR_PEAK = 1024, 0.2
 #: A minimum this close to a bound, as a part of the axis' length, counts as lying on it.
 AT_BOUND = 0.01
 #: Minimisers whose root mean square distance from the estimate is more than this part of a uniform distribution's
@@ -202,10 +204,19 @@ class Surrogate:
             return norm.logpdf(points, means, stds).sum(axis=1) - 0.5 * np.sum(z**2, axis=1) - determinant
 
         random = np.random.RandomState(self.seed)  # the kind that emcee takes
-        start = emcee.State(means + stds * random.standard_normal((DRAWS, n + 2)), random_state=random.get_state())
+        # Walkers start at points of the prior and about the most probable one, by their density: in several dimensions
+        # hardly a point of the prior is near the peak.
+        mode = torch.cat([self.model.covar_module.lengthscale[0].log(), self.model.likelihood.noise.log()])
+        peak = np.append(mode.detach().numpy(), self.model.mean_module.constant.item())
+        spread = random.standard_normal((2, POOL, n + 2)) * stds
+        pool = np.concatenate([means + spread[0], peak + NEAR_PEAK * spread[1]])
+        weights = np.exp((logs := log_density(pool)) - logs.max())
+        start = pool[random.choice(len(pool), DRAWS, p=weights / weights.sum())]
+        start = start + 0.05 * stds * random.standard_normal(start.shape)  # twins would never part
         moves = [(emcee.moves.DEMove(), 0.8), (emcee.moves.StretchMove(), 0.2)]
         sampler = emcee.EnsembleSampler(DRAWS, n + 2, log_density, vectorize=True, moves=moves)
-        drawn = torch.from_numpy(sampler.run_mcmc(start, STEPS).coords)
+        state = emcee.State(start, random_state=random.get_state())
+        drawn = torch.from_numpy(sampler.run_mcmc(state, STEPS).coords)
         model = self._process(DRAWS)
         model.covar_module.lengthscale = drawn[:, None, :n].exp()
         model.likelihood.noise = drawn[:, n, None].exp() + 1e-6
