@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatsoil.commands._output import print_json, stages
-from splatsoil.errors import RunError
+from splatsoil.errors import MeasurementError, RunError
 
 if TYPE_CHECKING:
     from splatsoil.commands._options import FitOptions
@@ -23,10 +22,11 @@ ABOUT_FORMAT = "splatsoil-laboratory-run/1"
 
 def is_test(folder: Path) -> bool:
     """Whether a folder holds a test of a laboratory: its ``experiment.json`` names a kind."""
-    file = folder / "experiment.json"
+    from splatsoil.measurement.fields import read_json
+
     try:
-        data = json.loads(file.read_text(encoding="utf-8-sig")) if file.is_file() else None
-    except (OSError, ValueError):
+        data = read_json(folder / "experiment.json")
+    except MeasurementError:  # what is wrong with it is said by whoever reads it as a measurement set
         return False
     return isinstance(data, dict) and "kind" in data
 
