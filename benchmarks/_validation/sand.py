@@ -83,13 +83,13 @@ def calibrated(
 
 def predicted(curve: Curve, effects: tuple[str, ...], values: Mapping[str, float], before: float) -> FloatArray:
     """(t, 2) q/p and volume strain in spreads between specimens, by parameters at another void ratio."""
-    experiment = TriaxialExperiment(curve, effects, candidates=())
+    experiment = TriaxialExperiment([curve], effects, candidates=())
     return experiment.predict(at_void_ratio(values, before, curve.void_ratio))
 
 
 def misfit(curve: Curve, table: FloatArray) -> FloatArray:
     """(2,) root mean squares of q/p and volume strain, in spreads between specimens."""
-    observed = TriaxialExperiment(curve, candidates=()).observed
+    observed = TriaxialExperiment([curve], candidates=()).observed
     return np.asarray(np.sqrt(np.mean((table - observed) ** 2, axis=0)))
 
 
@@ -124,7 +124,7 @@ def from_one_to_another(
     return rows, tables
 
 
-def told(name: str, curves: Curve | Sequence[Curve], effects: tuple[str, ...]) -> Row:
+def told(name: str, curves: Sequence[Curve], effects: tuple[str, ...]) -> Row:
     """What a diagnosis says of a model."""
     experiment = TriaxialExperiment(curves, effects)
     found = diagnosed(experiment, None, 0, lambda what, share: None)
@@ -152,7 +152,7 @@ def validate(folder: Path) -> Section:
         rows += more
         shown |= tables
     for effects in LADDER[:3]:
-        rows.append(told("Karlsruhe, dense", sand["TMD22"], effects))
+        rows.append(told("Karlsruhe, dense", [sand["TMD22"]], effects))
     for effects in LADDER:
         rows.append(told("Cullinan, all three", list(other.values()), effects))
     try:
@@ -177,7 +177,7 @@ def _figure(curves: Mapping[str, Curve], shown: Mapping[tuple[str, str], FloatAr
     figure = Figure(figsize=(2.6 * len(tests), 4.6), layout="constrained")
     panels = figure.subplots(2, len(tests))
     for k, test in enumerate(tests):
-        observed = TriaxialExperiment(curves[test], candidates=()).observed
+        observed = TriaxialExperiment([curves[test]], candidates=()).observed
         strain = 100.0 * curves[test].strain
         for c, title in enumerate(("q/p", "volume strain")):
             axes = panels[c, k]

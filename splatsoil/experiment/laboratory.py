@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
-from typing import ClassVar
+from typing import ClassVar, Generic, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
+from splatsoil.errors import ParameterError
 from splatsoil.experiment.base import candidates_of
 from splatsoil.experiment.features import Layout, Site
 from splatsoil.parameters import Parameter
@@ -117,3 +118,81 @@ class LaboratoryExperiment(ABC):
     ) -> FloatArray:
         """(t, s) features; see :class:`~splatsoil.experiment.base.Experiment`."""
         return self.features(self.readings(values, effects=effects, seed=seed, numerics=numerics))
+
+
+class Specimen(Protocol):
+    """What a test of one specimen measured, over its strain (n,): a stress ratio and the volume strain, (n,) each."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def strain(self) -> FloatArray: ...
+    @property
+    def ratio(self) -> FloatArray: ...
+    @property
+    def volume(self) -> FloatArray: ...
+    @property
+    def void_ratio(self) -> float: ...
+
+
+AnySpecimen = TypeVar("AnySpecimen", bound=Specimen)
+
+
+class SpecimenExperiment(LaboratoryExperiment, Generic[AnySpecimen]):
+    """Tests of specimens of one soil, and a model of it: the law at a single point, no chance.
+
+    Features are the stress ratio and the volume strain, each in units of its spread between specimens. The elastic
+    stiffness is a parameter of the model: a laboratory's sand is not rigid. Parameters are those of the first test's
+    void ratio, see :func:`~splatsoil.soil.packing.at_void_ratio`.
+
+    Args:
+        tests: of one soil, at the same strains.
+        effects: that are on.
+        candidates: effects to consider; all that act on strength by default.
+        known: parameters that are not fitted, at the first test's void ratio.
+
+    Attributes:
+        spreads: of the stress ratio and of the volume strain between specimens.
+        strain_name: what is read along a test, in %.
+
+    Raises:
+        ParameterError: tests whose strains differ.
+    """
+
+    always = (*LaboratoryExperiment.always, "stiffness")
+    spreads: ClassVar[tuple[float, float]]
+    strain_name: ClassVar[str]
+
+    def __init__(
+        self,
+        tests: Sequence[AnySpecimen],
+        effects: Iterable[str | Effect] = (),
+        *,
+        candidates: Iterable[str | Effect] | None = None,
+        known: Mapping[str, float] | None = None,
+    ) -> None:
+        self.tests = tuple(tests)
+        if not self.tests or any(not np.array_equal(t.strain, self.tests[0].strain) for t in self.tests):
+            raise ParameterError(
+                f"{self.kind}: tests of one soil need the same strains; interpolate their curves"
+            )
+        super().__init__(", ".join(t.name for t in self.tests), effects, candidates, known)
+        observed = self.features(np.concatenate([np.stack([t.ratio, t.volume], axis=1) for t in self.tests], axis=1))
+        names = [f", {t.name}" for t in self.tests] if len(self.tests) > 1 else [""]
+        self._read(
+            observed,
+            np.ones_like(observed),
+            100.0 * self.tests[0].strain,
+            self.strain_name,
+            "spreads between specimens",
+            [f"{what}{name}" for name in names for what in ("stress ratio", "volume strain")],
+            "specimen",
+        )
+
+    def acts(self, effect: Effect) -> bool:
+        """Whether it acts on strength."""
+        return effect.strength is not None
+
+    def features(self, readings: FloatArray) -> FloatArray:
+        """In units of spreads."""
+        return readings / np.tile(self.spreads, len(self.tests))

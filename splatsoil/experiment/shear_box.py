@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from splatsoil.errors import ParameterError
-from splatsoil.experiment.laboratory import FloatArray, LaboratoryExperiment
+from splatsoil.experiment.laboratory import FloatArray, LaboratoryExperiment, SpecimenExperiment
 from splatsoil.experiment.triaxial import REFERENCE, SLOW, VOLUME_SPREAD, YOUNG
 from splatsoil.soil.effect import Effect
 from splatsoil.soil.element import simple_shear
@@ -46,48 +46,12 @@ class Shearing:
     void_ratio: float = 0.8
 
 
-class ShearBoxExperiment(LaboratoryExperiment):
-    """Shear box tests under constant normal stress; the box is taken to shear evenly.
-
-    Args:
-        tests: of one soil, at the same strains; parameters are those of the first one's void ratio.
-        effects: that are on.
-        candidates: effects to consider; all that act on strength by default.
-        known: parameters that are not fitted, at the first test's void ratio.
-
-    Raises:
-        ParameterError: tests whose strains differ.
-    """
+class ShearBoxExperiment(SpecimenExperiment[Shearing]):
+    """Shear box tests under constant normal stress; the box is taken to shear evenly."""
 
     kind = "shear_box"
-    always = (*LaboratoryExperiment.always, "stiffness")
-
-    def __init__(
-        self,
-        tests: Sequence[Shearing],
-        effects: Iterable[str | Effect] = (),
-        *,
-        candidates: Iterable[str | Effect] | None = None,
-        known: Mapping[str, float] | None = None,
-    ) -> None:
-        self.tests = tuple(tests)
-        if not self.tests or any(not np.array_equal(t.strain, self.tests[0].strain) for t in self.tests):
-            raise ParameterError("shear box tests of one experiment need the same strains; interpolate their curves")
-        super().__init__(", ".join(t.name for t in self.tests), effects, candidates, known)
-        observed = self.features(np.concatenate([np.stack([t.ratio, t.volume], axis=1) for t in self.tests], axis=1))
-        self._read(
-            observed,
-            np.ones_like(observed),
-            100.0 * self.tests[0].strain,
-            "displacement over height, %",
-            "spreads between specimens",
-            [f"{what}, {t.name}" for t in self.tests for what in ("stress ratio", "volume strain")],
-            "specimen",
-        )
-
-    def acts(self, effect: Effect) -> bool:
-        """Whether it acts on strength."""
-        return effect.strength is not None
+    spreads = (RATIO_SPREAD, VOLUME_SPREAD)
+    strain_name = "displacement over height, %"
 
     def readings(
         self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
@@ -107,10 +71,6 @@ class ShearBoxExperiment(LaboratoryExperiment):
             )
             out += [sheared.shear_stress[0, 1:] / test.normal, 1.0 - np.exp(-sheared.volume_strain[0, 1:])]
         return np.stack(out, axis=1)
-
-    def features(self, readings: FloatArray) -> FloatArray:
-        """In units of spreads."""
-        return readings / np.tile([RATIO_SPREAD, VOLUME_SPREAD], len(self.tests))
 
 
 class ReposeExperiment(LaboratoryExperiment):

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from splatsoil.errors import ParameterError, SimulationError
-from splatsoil.experiment.laboratory import FloatArray, LaboratoryExperiment
-from splatsoil.soil.effect import Effect
+from splatsoil.errors import SimulationError
+from splatsoil.experiment.laboratory import FloatArray, SpecimenExperiment
 from splatsoil.soil.element import triaxial
 from splatsoil.soil.packing import at_void_ratio
 
@@ -47,74 +46,27 @@ class Curve:
     void_ratio: float = 0.8
 
 
-class TriaxialExperiment(LaboratoryExperiment):
-    """One triaxial test, or several of the same soil, and a model of it.
+class TriaxialExperiment(SpecimenExperiment[Curve]):
+    """Drained triaxial tests; stress ratios are q/p.
 
-    Features are q/p and the volume strain, each in units of its spread between specimens. The elastic stiffness is a
-    parameter of the model: a laboratory's sand is not rigid. One test at one pressure cannot tell cohesion from
-    friction, nor rate from either; a series at several pressures and rates can. Parameters are those of the first
-    test's void ratio, see :func:`~splatsoil.soil.packing.at_void_ratio`.
-
-    Args:
-        curves: what was measured; several tests need the same strains.
-        effects: that are on.
-        candidates: effects to consider; all that act on strength by default.
-        known: parameters that are not fitted, at the first test's void ratio.
-
-    Raises:
-        ParameterError: tests whose strains differ.
+    One test at one pressure cannot tell cohesion from friction, nor rate from either; a series at several pressures and
+    rates can.
     """
 
     kind = "triaxial"
-    always = (*LaboratoryExperiment.always, "stiffness")
-
-    def __init__(
-        self,
-        curves: Curve | Sequence[Curve],
-        effects: Iterable[str | Effect] = (),
-        *,
-        candidates: Iterable[str | Effect] | None = None,
-        known: Mapping[str, float] | None = None,
-    ) -> None:
-        self.curves = (curves,) if isinstance(curves, Curve) else tuple(curves)
-        if not self.curves or any(not np.array_equal(c.strain, self.curve.strain) for c in self.curves):
-            raise ParameterError("triaxial tests of one experiment need the same strains; interpolate their curves")
-        super().__init__(", ".join(curve.name for curve in self.curves), effects, candidates, known)
-        several = len(self.curves) > 1
-        observed = self.features(np.concatenate([np.stack([c.ratio, c.volume], axis=1) for c in self.curves], axis=1))
-        self._read(
-            observed,
-            np.ones_like(observed),
-            100.0 * self.curve.strain,
-            "axial strain, %",
-            "spreads between specimens",
-            [
-                f"{what}, {curve.name}" if several else what
-                for curve in self.curves
-                for what in ("stress ratio", "volume strain")
-            ],
-            "specimen",
-        )
-
-    @property
-    def curve(self) -> Curve:
-        """The first test."""
-        return self.curves[0]
-
-    def acts(self, effect: Effect) -> bool:
-        """Whether it acts on strength."""
-        return effect.strength is not None
+    spreads = (RATIO_SPREAD, VOLUME_SPREAD)
+    strain_name = "axial strain, %"
 
     def readings(
         self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
     ) -> FloatArray:
         """(t, 2 tests) q/p and nominal volume strain; nothing about them is chance."""
         del seed, numerics
-        law, out = self.law(effects), []
-        for curve in self.curves:
+        law, out, first = self.law(effects), [], self.tests[0].void_ratio
+        for curve in self.tests:
             test = triaxial(
                 law,
-                at_void_ratio(self.values(values), self.curve.void_ratio, curve.void_ratio),
+                at_void_ratio(self.values(values), first, curve.void_ratio),
                 confining=curve.confining,
                 strains=-np.log(1.0 - curve.strain),
                 void_ratio=curve.void_ratio,
@@ -126,7 +78,3 @@ class TriaxialExperiment(LaboratoryExperiment):
                 raise SimulationError(f"the triaxial test with {dict(values)} came to no finite stress")
             out += [ratio, 1.0 - np.exp(-test.volume_strain[0, 1:])]
         return np.stack(out, axis=1)
-
-    def features(self, readings: FloatArray) -> FloatArray:
-        """In units of spreads."""
-        return readings / np.tile([RATIO_SPREAD, VOLUME_SPREAD], len(self.curves))

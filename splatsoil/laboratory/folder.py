@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -20,6 +21,8 @@ from splatsoil.measurement.fields import Fields, read_table, read_text
 from splatsoil.measurement.measurement import EXPERIMENT
 from splatsoil.soil.effect import Effect
 from splatsoil.soil.packing import of_limits
+
+AnyTest = TypeVar("AnyTest", Curve, Shearing)
 
 FORMAT = "splatsoil-laboratory/1"
 STRAINS = np.concatenate([np.arange(0.005, 0.0201, 0.005), np.arange(0.03, 0.301, 0.01)])
@@ -166,11 +169,11 @@ def _read_triaxial(fields: Fields, folder: Path, options: Options) -> TriaxialEx
     return TriaxialExperiment(together(curves), options.effects, candidates=options.candidates, known=known)
 
 
-def together(curves: Sequence[Curve]) -> list[Curve]:
-    """Curves at the strains that all of them reach."""
-    kept = min((c.strain for c in curves), key=len)
+def together(tests: Sequence[AnyTest]) -> list[AnyTest]:
+    """Tests at the strains that all of them reach."""
+    kept = min((test.strain for test in tests), key=len)
     n = len(kept)
-    return [replace(c, strain=kept, volume=c.volume[:n], ratio=c.ratio[:n]) for c in curves]
+    return [replace(test, strain=kept, volume=test.volume[:n], ratio=test.ratio[:n]) for test in tests]
 
 
 def _limits(fields: Fields, void_ratio: float) -> dict[str, float]:
@@ -192,7 +195,7 @@ def _example_triaxial(name: str, options: Options) -> TriaxialExperiment:
 
 def _write_triaxial(shape: TriaxialExperiment, readings: FloatArray) -> tuple[dict[str, object], dict[str, str]]:
     tests, tables = [], {}
-    for k, curve in enumerate(shape.curves):
+    for k, curve in enumerate(shape.tests):
         file = f"{curve.name}.csv"
         ratio, volume = readings[:, 2 * k], readings[:, 2 * k + 1]
         q = curve.confining * ratio / (1.0 - ratio / 3.0)
@@ -217,11 +220,8 @@ def _read_shear_box(fields: Fields, folder: Path, options: Options) -> ShearBoxE
         ratio, lost = _at(kept, strain, 1e3 * table[:, 1] / normal, -1e-3 * table[:, 2] / height)
         void_ratio = test.number("void_ratio", 0.1, 3.0, default=0.8)
         found.append(Shearing(file.stem, kept, ratio, lost, normal, void_ratio))
-    kept = min((t.strain for t in found), key=len)
-    n = len(kept)
-    tests = [replace(t, strain=kept, ratio=t.ratio[:n], volume=t.volume[:n]) for t in found]
-    known = _limits(fields, tests[0].void_ratio)
-    return ShearBoxExperiment(tests, options.effects, candidates=options.candidates, known=known)
+    known = _limits(fields, found[0].void_ratio)
+    return ShearBoxExperiment(together(found), options.effects, candidates=options.candidates, known=known)
 
 
 HEIGHT = 0.02
