@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from splatsoil.cli import main
+from splatsoil.reconstruction import Reconstruction
 from splatsoil.synthetic import make_set, plow
 
 
@@ -26,7 +28,9 @@ def test_each_container_is_reconstructed_fitted_compared_and_diagnosed(
     told = json.loads(capsys.readouterr().out)
     assert told["ok"] and (run / "diagnosis.json").is_file()
     made = json.loads((run / "reconstruction" / "reconstruction.json").read_text())
-    assert made["container"] == container and made["psnr"] > 28.0
+    assert made["container"] == container
+    off = Reconstruction.load(run / "reconstruction").surface.difference(setup.surface)
+    assert np.sqrt(np.nanmean(off**2)) < 0.005
     fit = json.loads((run / "fit.json").read_text())
     assert abs(fit["parameters"]["friction_angle"]["estimate"] - 33.0) < 8.0
     assert (run / "report.html").is_file()
