@@ -173,9 +173,7 @@ class SpecimenExperiment(LaboratoryExperiment, Generic[AnySpecimen]):
     ) -> None:
         self.tests = tuple(tests)
         if not self.tests or any(not np.array_equal(t.strain, self.tests[0].strain) for t in self.tests):
-            raise ParameterError(
-                f"{self.kind}: tests of one soil need the same strains; interpolate their curves"
-            )
+            raise ParameterError(f"{self.kind}: tests of one soil need the same strains; interpolate their curves")
         super().__init__(", ".join(t.name for t in self.tests), effects, candidates, known)
         observed = self.features(np.concatenate([np.stack([t.ratio, t.volume], axis=1) for t in self.tests], axis=1))
         names = [f", {t.name}" for t in self.tests] if len(self.tests) > 1 else [""]
