@@ -17,7 +17,7 @@ import math
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
@@ -117,10 +117,11 @@ def ploughed_by_us(hidden: Hidden, setup: Setup, frames: Sequence[int], preset: 
     )[0]
 
 
-def make_worlds(truths: Sequence[Hidden], options: argparse.Namespace, say: Callable[[str], None]) -> None:
-    """Simulate and photograph the experiments that the folder does not have, so many at a time."""
+def make_worlds(truths: Sequence[Hidden], options: argparse.Namespace, say: Callable[[str], None]) -> Iterator[Hidden]:
+    """Simulate and photograph the experiments that the folder does not have, so many at a time; each that is there."""
     sets, numerics = options.out / "sets", Numerics(voxel=options.voxel, iterations=options.iterations)
     missing = [h for h in truths if not (sets / h.name / "truth.json").is_file()]
+    yield from (h for h in truths if h not in missing)
     count = options.worlds_side_by_side
     for group in (missing[k : k + count] for k in range(0, len(missing), count)):
         setups, seen = [h.scene.setup() for h in group], [h.observation() for h in group]
@@ -145,6 +146,7 @@ def make_worlds(truths: Sequence[Hidden], options: argparse.Namespace, say: Call
                 device=options.device,
             )
             say(f"{hidden.name} simulated and photographed")
+            yield hidden
 
 
 def criticise(name: str, out: Path, preset: str, device: str, say: Callable[[str], None]) -> None:
@@ -308,13 +310,19 @@ def main(arguments: list[str] | None = None) -> int:
         for k in range((3 if kind == NOTHING else 1) * options.count)
     ]
     say = Clock()
-    make_worlds(truths, options, say)
-    if options.worlds_only:
-        return 0
     threads = max(1, (os.cpu_count() or 1) // options.side_by_side)
     os.environ.setdefault("OMP_NUM_THREADS", str(threads))
+    # an experiment is judged while the next ones are made
     with ThreadPoolExecutor(options.side_by_side) as pool:
-        list(pool.map(lambda h: criticise(h.name, options.out, options.preset, options.device, say), truths))
+        judged = [
+            pool.submit(criticise, hidden.name, options.out, options.preset, options.device, say)
+            for hidden in make_worlds(truths, options, say)
+            if not options.worlds_only
+        ]
+        for one in judged:
+            one.result()
+    if options.worlds_only:
+        return 0
     runs = [(hidden, options.out / "runs" / hidden.name) for hidden in truths]
     rows = [
         score(hidden, read_json(run / "fit.json"), read_json(run / "diagnosis.json"))

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
 import warp as wp
 
+from splatsoil.measurement import Measurement
 from splatsoil.parameters import FloatArray, Parameter
 from splatsoil.soil.effect import Effect
 from splatsoil.soil.settings import Settings
@@ -43,6 +45,20 @@ class Layering(Effect):
     )
     source = "soil profile by definition; Terzaghi, Peck & Mesri (1996), Soil Mechanics in Engineering Practice, ch. 1"
     strength = layered
+
+    def for_measurement(self, measurement: Measurement) -> Effect:
+        """The effect with a layer that begins within the bed."""
+        deepest = float((measurement.bed.upper - measurement.bed.lower)[2])
+
+        class OfMeasurement(Layering):
+            parameters = tuple(
+                replace(p, upper=deepest, default=min(p.default, deepest), limits=(p.lower, p.upper))
+                if p.name == "layer_depth"
+                else p
+                for p in self.parameters
+            )
+
+        return OfMeasurement()
 
     def columns(self, settings: Settings, values: Mapping[str, float]) -> Sequence[float]:
         """Excess of the slope over the upper soil's, depth."""
