@@ -26,11 +26,10 @@ DIAGNOSIS = ("verdict", "class", "sentences", "models", "checks", "held_out", "e
 class Config(FitOptions):
     """From a set to the report: check, reconstruct, fit, compare, and name what the model lacks.
 
-    A model that is not adequate is diagnosed; the missing effect is added and fitted, until the model is adequate, no
-    effect is probable enough, or the limit is reached. A run that was interrupted goes on.
+    The model is compared with all effects that it lacks. A missing one is added and fitted, until the model is
+    adequate, no effect is probable enough, or the limit is reached. A run that was interrupted goes on.
     """
 
-    criticise: bool = option(False, "Diagnose an adequate model, too.", expert=True)
     stop_at_floor: bool = option(False, "Only say whether the model is adequate; do not look for missing effects.")
     most_effects: int = option(2, "Largest number of effects that are added.", expert=True)
 
@@ -46,8 +45,6 @@ def run(config: Config) -> int:
     hush()
     if config.most_effects < 0:
         raise ParameterError(f"--most-effects: must be 0 or more, not {config.most_effects}")
-    if config.criticise and config.stop_at_floor:
-        raise ParameterError("--criticise and --stop-at-floor: give one of them")
     stopped, diagnosis, misfit, unknown = "", None, None, ""
     with stages(quiet=config.json) as begin:
         begin("check")("reading every image", 0.0)
@@ -57,19 +54,14 @@ def run(config: Config) -> int:
         model = _model.model_on(measurement, folder, reconstruction, config.effects, config.preset, device)
         result = _stages.run_fit(config, measurement, folder, model, begin("fit"))
         comparison = _stages.draw_comparison(folder, model, begin("compare"))
-        if not config.criticise:
-            try:
+        try:
+            if config.stop_at_floor:
                 misfit = _stages.check_adequacy(folder, model, begin("models"))
-            except SplatsoilError as error:  # the fit stands all the same
-                unknown = f"whether the model is adequate isn't known: {error}"
-        if config.criticise or not (config.stop_at_floor or misfit is None or misfit["adequate"]):
-            try:
+            else:
                 diagnosis, stopped = add_missing(folder, model, config.most_effects, begin)
-            except SplatsoilError as error:
-                if config.criticise:
-                    raise
-                unknown = f"what is missing isn't known: {error}"
-            result, comparison = folder.fit(), read_json(folder.comparison / "comparison.json")
+                result, comparison = folder.fit(), read_json(folder.comparison / "comparison.json")
+        except SplatsoilError as error:  # the fit stands all the same
+            unknown = f"whether the model is adequate isn't known: {error}"
         begin("report")("drawing figures", 0.0)
         page = write_report(folder.path)
     if unknown:

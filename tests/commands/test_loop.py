@@ -60,46 +60,23 @@ def missing(results: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> dict[st
     return results
 
 
-@pytest.mark.parametrize(
-    ("flags", "adequate", "looks"),
-    [
-        ([], True, False),
-        ([], False, True),
-        (["--criticise"], True, True),
-        (["--criticise"], False, True),
-        (["--stop-at-floor"], False, False),
-    ],
-)
-def test_run_looks_for_what_is_missing_where_the_model_is_not_adequate(
-    missing: dict[str, Any], capsys: pytest.CaptureFixture[str], flags: list[str], adequate: bool, looks: bool
+@pytest.mark.parametrize(("flags", "looks"), [([], True), (["--stop-at-floor"], False)])
+def test_run_compares_all_effects_unless_told_to_stop(
+    missing: dict[str, Any], capsys: pytest.CaptureFixture[str], flags: list[str], looks: bool
 ) -> None:
-    missing["check_adequacy"]["adequate"] = adequate
     assert cli.main(["run", "set", "--json", *flags]) == 0
     told = json.loads(capsys.readouterr().out)
     assert (told.get("stopped") == "enough") is looks and ("diagnosis" in told) is looks
     assert ("misfit" in told) is not looks
 
 
-def test_run_cannot_both_look_and_not_look(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["run", "set", "--criticise", "--stop-at-floor"]) == 2
-    assert "give one of them" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("fails", "says"),
-    [
-        ("add_missing", "what is missing isn't known"),
-        ("check_adequacy", "whether the model is adequate isn't known"),
-    ],
-)
-def test_what_fails_after_the_fit_costs_no_report_unless_it_was_asked_for(
-    missing: dict[str, Any], capsys: pytest.CaptureFixture[str], fails: str, says: str
+@pytest.mark.parametrize(("fails", "flags"), [("add_missing", []), ("check_adequacy", ["--stop-at-floor"])])
+def test_what_fails_after_the_fit_costs_no_report(
+    missing: dict[str, Any], capsys: pytest.CaptureFixture[str], fails: str, flags: list[str]
 ) -> None:
-    missing["check_adequacy"]["adequate"] = False
     missing[fails] = SimulationError("soil left the bin")
-    assert cli.main(["run", "set", "--json"]) == 0
+    assert cli.main(["run", "set", "--json", *flags]) == 0
     out, err = capsys.readouterr()
-    assert f"{says}: soil left the bin" in err and json.loads(out)["name"] == "base"
-    assert ("misfit" in json.loads(out)) is (fails == "add_missing") and "diagnosis" not in json.loads(out)
-    if fails == "add_missing":
-        assert cli.main(["run", "set", "--criticise"]) == 2
+    assert "whether the model is adequate isn't known: soil left the bin" in err
+    told = json.loads(out)
+    assert told["name"] == "base" and "misfit" not in told and "diagnosis" not in told
