@@ -47,26 +47,26 @@ class Expected:
 
     Attributes:
         sensor: (t, s) standard deviation of instruments.
-        chance: (m, t, s) one simulation's own: independent parts, each of a standard normal size.
+        fixed: (m, t, s) chance, guesses and effects of observation: independent parts, each of a standard normal size.
         numerics: (k, t, s) the model's own error, likewise.
         doubt: standard deviation of the logarithm of a factor of that, drawn anew for each replicate.
     """
 
     sensor: FloatArray
-    chance: FloatArray
+    fixed: FloatArray
     numerics: FloatArray
     doubt: float = 0.0
 
     @property
     def variance(self) -> FloatArray:
         """(t, s)."""
-        return np.asarray(self.sensor**2 + np.sum(self.chance**2, axis=0) + np.sum(self.numerics**2, axis=0))
+        return np.asarray(self.sensor**2 + np.sum(self.fixed**2, axis=0) + np.sum(self.numerics**2, axis=0))
 
     def replicate(self, rng: np.random.Generator) -> FloatArray:
         """(t, s) a residual."""
         factor = np.exp(self.doubt * np.abs(rng.standard_normal()))
         out = self.sensor * rng.standard_normal(self.sensor.shape)
-        for parts, size in ((self.chance, 1.0), (self.numerics, factor)):
+        for parts, size in ((self.fixed, 1.0), (self.numerics, factor)):
             out = out + size * np.tensordot(rng.standard_normal(len(parts)), parts, axes=1)
         return np.asarray(out)
 

@@ -15,7 +15,7 @@ from splatsoil.experiment.base import Candidate, Experiment
 from .checks import Check, Expected, checks, passes
 from .design import Prior, Run, effect_runs
 from .evidence import AS_IT_IS, ELSE, PRIOR, SLAB, Comparison, Evidence
-from .noise import REMAINING, Tables, compared, noise_of, trend_of
+from .noise import REMAINING, Tables, compared, drawings, noise_of, trend_of
 from .power import NAMED, detectable
 from .simulations import Simulations
 
@@ -120,9 +120,9 @@ class _Study:
         """The first simulations: of the base model, of pairs, and of each effect of physics."""
         prior, seed = self.prior, self.seed
         points = _spread(prior, BASE + BASE // 2 * (len(prior.space) - 1), seed)
-        # each simulation that is there stands for the nearest point of the design
-        for there in prior.unit(self.base)[: len(points)]:
-            points = np.delete(points, np.argmin(np.sum((points - there) ** 2, axis=1)), axis=0)
+        # simulations that are there stand for the points of the design that they are nearest to
+        apart = np.sum((prior.unit(self.base)[:, None] - points[None]) ** 2, axis=2)
+        points = np.delete(points, apart.argmin(axis=1), axis=0)
         self.base += [Run(v, seed=seed + 1 + i) for i, v in enumerate(prior.values(points))]
         if FINE in self.experiment.numerics:
             points = 0.7 * _spread(prior, PAIRS, seed + 1)
@@ -244,8 +244,9 @@ class _Compared:
         ]
         if len(tables.fine[0]):
             numerics.append(factors[1] * REMAINING * np.where(placed, 0.0, about_trend(*tables.fine)))
-        chance = rest if experiment.chance else rest[:0]
-        return Expected(np.asarray(experiment.sensor), chance, np.concatenate(numerics, axis=0), noise.factor_std)
+        own = [rest] if experiment.chance else []
+        fixed = np.concatenate([*own, drawings(experiment, tables, self.study.candidates)])
+        return Expected(np.asarray(experiment.sensor), fixed, np.concatenate(numerics), noise.factor_std)
 
 
 def diagnose(

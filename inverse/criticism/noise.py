@@ -198,19 +198,13 @@ def noise_of(
         correction, share, factor_std = np.zeros(count), UNMEASURED, NO_PAIRS
         numerics = share**2 * otherwise
     drawn = {name: scored(table) - scored(tables.reference) for name, table in tables.drawn.items()}
-    guessed = [drawn[name] for name in experiment.guesses if name in drawn]
     patterns = {
         c.name: np.array([drawn[p.name] for p in c.parameters if p.name in drawn])
         for c in candidates
         if c.kind == "observation" and any(p.name in drawn for p in c.parameters)
     }
-    fixed = chance + _instruments(experiment, mask, basis)
-    for row in (
-        *(g / np.sqrt(len(guessed)) for g in guessed),
-        *(drawn[name] for name in experiment.redrawn if name in drawn),
-        *(row for found in patterns.values() for row in found),
-    ):
-        fixed = fixed + np.outer(row, row)
+    rows = drawings(experiment, tables, candidates)[:, mask] @ basis
+    fixed = chance + _instruments(experiment, mask, basis) + rows.T @ rows
     return Noise(
         mask=mask,
         mean=mean,
@@ -228,6 +222,16 @@ def noise_of(
         patterns=patterns,
         trend=hat,
     )
+
+
+def drawings(experiment: Experiment, tables: Tables, candidates: Sequence[Candidate]) -> FloatArray:
+    """(k, t, s) what one simulation reported or drawn otherwise differs by: independent parts of the noise."""
+    apart = {name: table - tables.reference for name, table in tables.drawn.items()}
+    guessed = [apart[name] for name in experiment.guesses if name in apart]
+    named = [p.name for c in candidates if c.kind == "observation" for p in c.parameters]
+    rows = [guess / np.sqrt(len(guessed)) for guess in guessed]
+    rows += [apart[name] for name in (*experiment.redrawn, *named) if name in apart]
+    return np.array(rows).reshape(-1, *experiment.layout.shape)
 
 
 def compared(experiment: Experiment) -> npt.NDArray[np.bool_]:
