@@ -123,12 +123,19 @@ def make_worlds(truths: Sequence[Hidden], options: argparse.Namespace, say: Call
     missing = [h for h in truths if not (sets / h.name / "truth.json").is_file()]
     yield from (h for h in truths if h not in missing)
     count = options.worlds_side_by_side
-    for group in (missing[k : k + count] for k in range(0, len(missing), count)):
+    groups = [missing[k : k + count] for k in range(0, len(missing), count)]
+    while groups:
+        group = groups.pop(0)
         setups, seen = [h.scene.setup() for h in group], [h.observation() for h in group]
         rate = setups[0].frame_rate
         frames = sorted({f for o in seen for f in frames_around(setups[0].frames, o.time_offset * rate)})
         if options.solver == NEWTON:
-            trajectories = ploughed_by_newton(group, setups, frames, options.device, numerics)
+            try:
+                trajectories = ploughed_by_newton(group, setups, frames, options.device, numerics)
+            except ValueError as error:  # a particle that flies off asks for a grid of any size
+                say(f"{', '.join(h.name for h in group)}: the other solver failed ({error})")
+                groups += [[hidden] for hidden in group if len(group) > 1]
+                continue
         else:
             ours = zip(group, setups, strict=True)
             trajectories = [ploughed_by_us(h, s, frames, options.solver, options.device) for h, s in ours]
