@@ -17,8 +17,7 @@ from splatsoil.measurement import Frame, Measurement
 from splatsoil.scene import kernels
 from splatsoil.scene.light import linear
 from splatsoil.scene.light_fit import FINEST, LAG, LightEstimate, Passing, fit_light
-from splatsoil.scene.lit import ceiling, march_step
-from splatsoil.scene.relief import Relief, grid_of
+from splatsoil.scene.relief import Relief
 from splatsoil.scene.tool import ToolBody
 from splatsoil.splats.warp_torch import as_warp, launch
 
@@ -72,14 +71,8 @@ def seen_colours(
         camera = frame.camera
         pixels, depth = camera.project(where)
         seen = torch.empty(len(points), dtype=torch.float32, device=points.device)
-        inputs = [
-            as_warp(points, wp.vec3),
-            wp.vec3(*camera.position),
-            as_warp(relief.height, wp.float32),
-            grid_of(relief),
-        ]
-        inputs += [tool, march_step(relief), ceiling(relief), slack, as_warp(seen, wp.float32)]
-        launch(kernels.points_seen, len(points), inputs, points)
+        inputs = [as_warp(points, wp.vec3), wp.vec3(*camera.position), relief.surface, tool, slack]
+        launch(kernels.points_seen, len(points), [*inputs, as_warp(seen, wp.float32)], points)
         inside = (
             (depth > 0) & (pixels > 1.0).all(axis=1) & (pixels < [camera.width - 1.0, camera.height - 1.0]).all(axis=1)
         )

@@ -13,9 +13,8 @@ import warp as wp
 
 from splatsoil.measurement import Camera
 from splatsoil.scene import kernels
-from splatsoil.scene.kernels_maps import Grid, sample
-from splatsoil.scene.lit import march_step
-from splatsoil.scene.relief import Relief, grid_of
+from splatsoil.scene.kernels_maps import Surface, height_at
+from splatsoil.scene.relief import Relief
 from splatsoil.scene.tool import eye_of
 from splatsoil.splats.warp_torch import as_warp, launch
 
@@ -54,16 +53,14 @@ def ground_of_pixels(
     ny, nx = relief.height.shape
     (x0, y0), (dx, dy) = relief.origin, relief.cell
     ends = wp.vec4(x0 - 0.5 * dx, y0 - 0.5 * dy, x0 + (nx - 0.5) * dx, y0 + (ny - 0.5) * dy)
-    floor = float(relief.height.min()) - march_step(relief)
-    inputs = [eye_of(camera), as_warp(relief.height, wp.float32), grid_of(relief), ends, bounds]
-    inputs += [floor, march_step(relief), float(rise), as_warp(place, wp.vec2)]
-    launch(_ground, (camera.height, camera.width), inputs, place)
+    inputs = [eye_of(camera), relief.surface, ends, bounds, relief.range[0] - max(relief.cell), float(rise)]
+    launch(_ground, (camera.height, camera.width), [*inputs, as_warp(place, wp.vec2)], place)
     return place.cpu().numpy().astype(np.float64)
 
 
 @wp.func
-def _height_over(height: wp.array2d(dtype=wp.float32), grid: Grid, origin: wp.vec3, ray: wp.vec3, t: float) -> float:
-    return origin[2] + t * ray[2] - sample(height, grid, origin[0] + t * ray[0], origin[1] + t * ray[1])
+def _gap(surface: Surface, origin: wp.vec3, ray: wp.vec3, t: float) -> float:
+    return origin[2] + t * ray[2] - height_at(surface, origin[0] + t * ray[0], origin[1] + t * ray[1])
 
 
 @wp.func
@@ -76,12 +73,10 @@ def _inside(bounds: wp.vec4, origin: wp.vec3, ray: wp.vec3, t: float) -> bool:
 @wp.kernel(enable_backward=False)
 def _ground(
     eye: kernels.Eye,
-    height: wp.array2d(dtype=wp.float32),
-    grid: Grid,
+    surface: Surface,
     ends: wp.vec4,
     bounds: wp.vec4,
     floor: float,
-    step: float,
     rise: float,
     place: wp.array2d(dtype=wp.vec2),
 ) -> None:
@@ -105,7 +100,7 @@ def _ground(
     if leave <= enter:
         return
     t = enter
-    gap = _height_over(height, grid, eye.position, ray, t)
+    gap = _gap(surface, eye.position, ray, t)
     if gap < 0.0:
         return
     lowest = float(_FAR)
@@ -115,13 +110,13 @@ def _ground(
     closing = 1.0 / wp.max(1.2 * wp.sqrt(ray[0] * ray[0] + ray[1] * ray[1]) - ray[2], 0.1)
     while t < leave:
         before = t
-        longest = wp.where(gap < 2.0 * rise, step, 4.0 * step)
-        t = wp.min(t + wp.clamp(gap * closing, 0.5 * step, longest), leave)
-        gap = _height_over(height, grid, eye.position, ray, t)
+        longest = wp.where(gap < 2.0 * rise, surface.step, 4.0 * surface.step)
+        t = wp.min(t + wp.clamp(gap * closing, 0.5 * surface.step, longest), leave)
+        gap = _gap(surface, eye.position, ray, t)
         if gap < 0.0:
             for _ in range(20):
                 middle = 0.5 * (before + t)
-                if _height_over(height, grid, eye.position, ray, middle) < 0.0:
+                if _gap(surface, eye.position, ray, middle) < 0.0:
                     t = middle
                 else:
                     before = middle

@@ -1,3 +1,5 @@
+# mypy: ignore-errors
+# (Warp reads the annotations of kernels as types of its own)
 """Warp kernels of light and shade; the same source runs on CPU and CUDA.
 
 Every kernel is a gather: each thread writes its own outputs, so results do not depend on the order of threads.
@@ -9,21 +11,47 @@ from __future__ import annotations
 
 import warp as wp
 
-from splatsoil.scene.kernels_maps import Grid, Shade, sample, sample_shade, slope_of_layers
-from splatsoil.scene.kernels_sky import light_around
+from splatsoil.scene.kernels_maps import Surface, cell_centre, height_at, outward, sample
+from splatsoil.scene.kernels_sky import look_around
 
 STEEP, STEEPEST = wp.constant(0.7), wp.constant(0.5)
 """Upward parts of normals (45°, 60°) between which a surface's slope is less and less that of its heights."""
 
+Shade = wp.types.vector(length=8, dtype=wp.float32)
+"""What decides the light on a place: normal, shares of sky and sun, and light from soil and tool (red, green, blue)."""
+
 
 @wp.struct
 class Illumination:
-    """The light's numbers: see ``light.Light``."""
+    """Sun and sky (see ``light.Light``), what level ground and the tool's shaded side send back, and the tool's
+    colour."""
 
     sun: wp.vec3
     ambient: wp.vec3
-    ground: wp.vec3
     softness: float
+    ground: wp.vec3
+    side: wp.vec3
+    tool: wp.vec3
+
+
+@wp.struct
+class Maps:
+    """What reaches the cells of a surface: shades; what they send back; the share of the sky that the tool takes."""
+
+    shades: wp.array2d(dtype=Shade)
+    sent: wp.array2d(dtype=wp.vec3)
+    hidden: wp.array2d(dtype=wp.float32)
+
+
+@wp.struct
+class Pixels:
+    """What splats say of each pixel (depth and share of soil), and what is found for it: light on its soil, and the
+    tool's radiance times its share of the pixel with that share."""
+
+    depth: wp.array2d(dtype=wp.float32)
+    soil: wp.array2d(dtype=wp.float32)
+    light: wp.array2d(dtype=wp.vec3)
+    tool: wp.array2d(dtype=wp.vec4)
 
 
 @wp.struct
@@ -70,71 +98,50 @@ def tool_normal(tool: ToolPose, origin: wp.vec3, direction: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def soil_shadow(
-    height: wp.array2d(dtype=wp.float32), grid: Grid, point: wp.vec3, light: Illumination, step: float, top: float
-) -> float:
+def soil_shadow(surface: Surface, point: wp.vec3, sun: wp.vec3, softness: float) -> float:
     """Share of the sun (0 to 1) that the soil's surface lets through to a point; soft by the sun's width."""
     open_share = float(1.0)
-    flat = wp.sqrt(light.sun[0] * light.sun[0] + light.sun[1] * light.sun[1])
+    flat = wp.sqrt(sun[0] * sun[0] + sun[1] * sun[1])
     if flat < 1.0e-4:
         return open_share
-    rise = light.sun[2] / flat
-    dx = light.sun[0] / flat
-    dy = light.sun[1] / flat
-    r = step
-    z = point[2] + r * rise
-    while z < top and open_share > 0.0:
-        gap = z - sample(height, grid, point[0] + r * dx, point[1] + r * dy)
+    ray = sun / flat
+    r = float(surface.step)
+    z = point[2] + r * ray[2]
+    while z < surface.top and open_share > 0.0:
+        gap = z - height_at(surface, point[0] + r * ray[0], point[1] + r * ray[1])
         # A cell's worth of blur near the blocker, the sun's own width farther out.
-        width = light.softness * r + 0.35 * step
+        width = softness * r + 0.35 * surface.step
         open_share = wp.min(open_share, wp.clamp(0.5 + 0.5 * gap / width, 0.0, 1.0))
-        r += step
-        z = point[2] + r * rise
+        r += surface.step
+        z = point[2] + r * ray[2]
     return open_share
 
 
 @wp.kernel(enable_backward=False)
 def tool_columns(
-    grid: Grid,
-    tool: ToolPose,
-    ceiling: float,
-    floor: float,
-    bottom: wp.array2d(dtype=wp.float32),
-    top: wp.array2d(dtype=wp.float32),
+    surface: Surface, tool: ToolPose, ceiling: float, floor: float, columns: wp.array2d(dtype=wp.vec2)
 ) -> None:
-    """Lowest and highest point of the tool over each cell; bottom > top where there is none."""
+    """Lowest and highest point of the tool over each cell; the former higher where there is none."""
     i, j = wp.tid()
-    x = grid.x0 + float(j) / grid.inverse_x
-    y = grid.y0 + float(i) / grid.inverse_y
-    bottom[i, j] = 1.0e6
-    top[i, j] = -1.0e6
-    reach = ceiling - floor
-    down = tool_hit(tool, wp.vec3(x, y, ceiling), wp.vec3(0.0, 0.0, -1.0), reach)
+    x = cell_centre(surface, i, j)
+    columns[i, j] = wp.vec2(1.0e6, -1.0e6)
+    down = tool_hit(tool, wp.vec3(x[0], x[1], ceiling), wp.vec3(0.0, 0.0, -1.0), ceiling - floor)
     if down >= 0.0:
-        up = tool_hit(tool, wp.vec3(x, y, floor), wp.vec3(0.0, 0.0, 1.0), reach)
-        top[i, j] = ceiling - down
-        bottom[i, j] = wp.where(up >= 0.0, floor + up, floor)
+        up = tool_hit(tool, wp.vec3(x[0], x[1], floor), wp.vec3(0.0, 0.0, 1.0), ceiling - floor)
+        columns[i, j] = wp.vec2(floor + wp.max(up, 0.0), ceiling - down)
 
 
 @wp.kernel(enable_backward=False)
-def sun_visibility(
-    height: wp.array2d(dtype=wp.float32),
-    grid: Grid,
-    light: Illumination,
-    step: float,
-    top: float,
-    visible: wp.array2d(dtype=wp.float32),
-) -> None:
+def sun_visibility(surface: Surface, light: Illumination, visible: wp.array2d(dtype=wp.float32)) -> None:
     """Share of the sun that the soil lets through to each cell."""
     i, j = wp.tid()
-    point = wp.vec3(grid.x0 + float(j) / grid.inverse_x, grid.y0 + float(i) / grid.inverse_y, height[i, j])
-    visible[i, j] = soil_shadow(height, grid, point, light, step, top)
+    visible[i, j] = soil_shadow(surface, cell_centre(surface, i, j), light.sun, light.softness)
 
 
 @wp.func
-def tool_shadow(tool: ToolPose, light: Illumination, point: wp.vec3, spread: float) -> float:
+def tool_shadow(tool: ToolPose, sun: wp.vec3, point: wp.vec3, spread: float) -> float:
     """Share of the sun that the tool lets through to a patch of half width ``spread`` around a point."""
-    if not near_tool(tool, point, light.sun, spread + 1.0e-3):
+    if not near_tool(tool, point, sun, spread + 1.0e-3):
         return 1.0
     lit = float(0.0)
     for k in range(4):
@@ -142,7 +149,7 @@ def tool_shadow(tool: ToolPose, light: Illumination, point: wp.vec3, spread: flo
         sy = wp.where(k < 2, -0.5, 0.5)
         # A turned square covers more distinct edges' positions than an upright one.
         shift = wp.vec3(0.8 * sx - 0.6 * sy, 0.6 * sx + 0.8 * sy, 0.0) * spread
-        if tool_hit(tool, point + shift + light.sun * 1.0e-3, light.sun, 1.0e3) < 0.0:
+        if tool_hit(tool, point + shift + sun * 1.0e-3, sun, 1.0e3) < 0.0:
             lit += 0.25
     return lit
 
@@ -150,24 +157,18 @@ def tool_shadow(tool: ToolPose, light: Illumination, point: wp.vec3, spread: flo
 @wp.kernel(enable_backward=False)
 def suns_on_points(
     points: wp.array(dtype=wp.vec3),
-    height: wp.array2d(dtype=wp.float32),
-    grid: Grid,
+    spread: float,
+    surface: Surface,
     suns: wp.array(dtype=wp.vec3),
     softness: float,
     tool: ToolPose,
-    step: float,
-    top: float,
-    spread: float,
     visible: wp.array2d(dtype=wp.float32),
 ) -> None:
     """Share of each of some suns that soil and tool let through to any points on the soil."""
     k, p = wp.tid()
-    light = Illumination()
-    light.sun = suns[k]
-    light.softness = softness
-    share = tool_shadow(tool, light, points[p], spread)
+    share = tool_shadow(tool, suns[k], points[p], spread)
     if share > 0.0:
-        share *= soil_shadow(height, grid, points[p], light, step, top)
+        share *= soil_shadow(surface, points[p], suns[k], softness)
     visible[k, p] = share
 
 
@@ -175,28 +176,24 @@ def suns_on_points(
 def points_seen(
     points: wp.array(dtype=wp.vec3),
     eye: wp.vec3,
-    height: wp.array2d(dtype=wp.float32),
-    grid: Grid,
+    surface: Surface,
     tool: ToolPose,
-    step: float,
-    top: float,
     slack: float,
     seen: wp.array(dtype=wp.float32),
 ) -> None:
     """1 where neither soil (by more than ``slack``) nor tool stands between a point and the eye, else 0."""
     p = wp.tid()
-    way = eye - points[p]
-    distance = wp.length(way)
-    direction = way / distance
+    distance = wp.length(eye - points[p])
+    direction = wp.normalize(eye - points[p])
     seen[p] = 0.0
     if tool_hit(tool, points[p] + direction * 1.0e-3, direction, distance) >= 0.0:
         return
-    r = step
+    r = float(surface.step)
     q = points[p] + direction * r
-    while r < distance and q[2] < top:
-        if q[2] + slack < sample(height, grid, q[0], q[1]):
+    while r < distance and q[2] < surface.top:
+        if q[2] + slack < height_at(surface, q[0], q[1]):
             return
-        r += step
+        r += surface.step
         q = points[p] + direction * r
     seen[p] = 1.0
 
@@ -220,35 +217,33 @@ def pixel_ray(eye: Eye, u: float, v: float) -> wp.vec3:
 
 
 @wp.func
-def surface_depth(
-    height: wp.array2d(dtype=wp.float32), grid: Grid, origin: wp.vec3, ray: wp.vec3, top: float, step: float, far: float
-) -> float:
+def surface_depth(surface: Surface, origin: wp.vec3, ray: wp.vec3, far: float) -> float:
     """Depth at which a ray from above first falls beneath the surface, or -1 if not before ``far``.
 
     Far above the surface the steps are as long as slopes of 1.2 allow; steeper ones are met a little late.
     """
     if ray[2] >= -1.0e-3:
         return -1.0
-    z = wp.max((top - origin[2]) / ray[2], 0.0)
+    z = wp.max((surface.top - origin[2]) / ray[2], 0.0)
     x = origin + ray * z
-    gap = x[2] - sample(height, grid, x[0], x[1])
+    gap = x[2] - height_at(surface, x[0], x[1])
     if gap < 0.0:
         return -1.0
-    shortest = 0.5 * step / wp.length(ray)
+    shortest = 0.5 * surface.step / wp.length(ray)
     closing = 1.0 / (1.2 * wp.sqrt(ray[0] * ray[0] + ray[1] * ray[1]) - ray[2])
     while z < far:
         stride = wp.max(shortest, gap * closing)
         z += stride
         x = origin + ray * z
         above = gap
-        gap = x[2] - sample(height, grid, x[0], x[1])
+        gap = x[2] - height_at(surface, x[0], x[1])
         if gap < 0.0:
             # Between two points that straddle the surface: regula falsi, with halved weights (Illinois) for walls.
             before = z - stride
             for _ in range(4):
                 stride = (z - before) * above / (above - gap)
                 x = origin + ray * (before + stride)
-                middle = x[2] - sample(height, grid, x[0], x[1])
+                middle = x[2] - height_at(surface, x[0], x[1])
                 if middle < 0.0:
                     z = before + stride
                     gap = middle
@@ -262,15 +257,15 @@ def surface_depth(
 
 
 @wp.func
-def way_out(grid: Grid, rows: int, columns: int, origin: wp.vec3, ray: wp.vec3) -> float:
-    """Depth at which a ray leaves the rectangle that a map of so many cells covers."""
+def way_out(surface: Surface, origin: wp.vec3, ray: wp.vec3) -> float:
+    """Depth at which a ray leaves the rectangle that the surface's cells cover."""
     out = float(1.0e6)
     if wp.abs(ray[0]) > 1.0e-9:
-        end = wp.where(ray[0] > 0.0, float(columns) - 0.5, -0.5)
-        out = wp.min(out, (grid.x0 + end / grid.inverse_x - origin[0]) / ray[0])
+        end = wp.where(ray[0] > 0.0, float(surface.height.shape[1]) - 0.5, -0.5)
+        out = wp.min(out, (surface.grid.x0 + end / surface.grid.inverse_x - origin[0]) / ray[0])
     if wp.abs(ray[1]) > 1.0e-9:
-        end = wp.where(ray[1] > 0.0, float(rows) - 0.5, -0.5)
-        out = wp.min(out, (grid.y0 + end / grid.inverse_y - origin[1]) / ray[1])
+        end = wp.where(ray[1] > 0.0, float(surface.height.shape[0]) - 0.5, -0.5)
+        out = wp.min(out, (surface.grid.y0 + end / surface.grid.inverse_y - origin[1]) / ray[1])
     return out
 
 
@@ -278,25 +273,12 @@ def way_out(grid: Grid, rows: int, columns: int, origin: wp.vec3, ray: wp.vec3) 
 def illuminate(
     first: int,
     eye: Eye,
-    depth: wp.array2d(dtype=wp.float32),
-    soil: wp.array2d(dtype=wp.float32),
-    unhidden: wp.array2d(dtype=wp.float32),
-    height: wp.array2d(dtype=wp.float32),
-    shades: wp.array2d(dtype=Shade),
-    filling: wp.array3d(dtype=wp.float32),
-    layers: wp.vec2,
-    sent: wp.array2d(dtype=wp.vec3),
-    hidden: wp.array2d(dtype=wp.float32),
-    tool_light: wp.vec3,
-    reach: float,
-    grid: Grid,
+    surface: Surface,
+    maps: Maps,
+    no_tool: wp.array2d(dtype=wp.vec2),
     light: Illumination,
     tool: ToolPose,
-    albedo: wp.vec3,
-    step: float,
-    top: float,
-    light_out: wp.array2d(dtype=wp.vec3),
-    tool_out: wp.array2d(dtype=wp.vec4),
+    pixels: Pixels,
 ) -> None:
     """For each pixel: the light on the soil it shows; the tool's radiance times its share of the pixel, and that share.
 
@@ -305,47 +287,43 @@ def illuminate(
     over a trench's floor where what is seen is its far wall. Where heights say that it is steep, and there is any
     density ``filling``, it slopes as that says, and what it sees around it is looked for from there: a wall falls from
     one cell to the next, so that maps don't tell how it stands, nor what it sees.
-
-    Soil hides the tool where both say so: the smooth surface runs on behind a blade that holds soil back, and single
-    blobs stand out from the soil that a blade touches.
     """
     pixel = first + wp.tid()
-    i = pixel // depth.shape[1]
-    j = pixel - i * depth.shape[1]
+    i = pixel // pixels.depth.shape[1]
+    j = pixel - i * pixels.depth.shape[1]
     ray = pixel_ray(eye, float(j) + 0.5, float(i) + 0.5)
-    z = depth[i, j]
-    light_out[i, j] = wp.vec3(1.0, 1.0, 1.0)
-    tool_out[i, j] = wp.vec4(0.0, 0.0, 0.0, 0.0)
-    if soil[i, j] > 0.01 and z > 0.0:
-        out = way_out(grid, height.shape[0], height.shape[1], eye.position, ray)
-        found = surface_depth(height, grid, eye.position, ray, top, step, out)
+    one = wp.vec3(1.0, 1.0, 1.0)
+    z = pixels.depth[i, j]
+    pixels.light[i, j] = one
+    pixels.tool[i, j] = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    if pixels.soil[i, j] > 0.01 and z > 0.0:
+        found = surface_depth(surface, eye.position, ray, way_out(surface, eye.position, ray))
         if found > 0.0:
             z = found
         x = eye.position + ray * z
-        shade = sample_shade(shades, grid, x[0], x[1])
+        shade = sample(maps.shades, surface.grid, x[0], x[1])
         n = wp.normalize(wp.vec3(shade[0], shade[1], shade[2]))
         sky = shade[3]
         back = wp.vec3(shade[5], shade[6], shade[7])
         steep = wp.clamp((STEEP - n[2]) / (STEEP - STEEPEST), 0.0, 1.0)
-        if steep > 0.0 and found > 0.0 and filling.shape[0] > 0:
-            outward = -wp.normalize(slope_of_layers(filling, grid, layers, x))
-            n = wp.normalize(n + steep * (outward - n))
-            seen = light_around(height, sent, grid, x, n, step, reach)
+        if steep > 0.0 and found > 0.0 and surface.filling.shape[0] > 0:
+            n = wp.normalize(n + steep * (outward(surface, x) - n))
+            seen = look_around(surface, maps.sent, no_tool, x, n)
             # The tool takes the share of its sky that it takes of the cell's.
-            taken = sample(hidden, grid, x[0], x[1])
-            by_tool = seen[3] * taken / wp.max(taken + shade[3], 1.0e-3)
-            sky += steep * (seen[3] - by_tool - sky)
-            back += steep * (wp.vec3(seen[0], seen[1], seen[2]) + by_tool * tool_light - back)
+            taken = sample(maps.hidden, surface.grid, x[0], x[1])
+            by_tool = seen.sky * taken / wp.max(taken + shade[3], 1.0e-3)
+            sky += steep * (seen.sky - by_tool - sky)
+            back += steep * (seen.light + by_tool * light.side - back)
         direct = wp.max(wp.dot(n, light.sun), 0.0) / light.sun[2]
         if direct > 0.0:
             sunny = shade[4]
             if sunny > 0.01 and sunny < 0.99:
                 # An edge of a shadow, or a wall too steep for a map: look from the point itself.
-                sunny = soil_shadow(height, grid, x, light, step, top)
+                sunny = soil_shadow(surface, x, light.sun, light.softness)
             direct *= sunny
         if direct > 0.0:
-            direct *= tool_shadow(tool, light, x, 0.5 * z / eye.fx)
-        light_out[i, j] = light.ambient * sky + (wp.vec3(1.0, 1.0, 1.0) - light.ambient) * direct + back
+            direct *= tool_shadow(tool, light.sun, x, 0.5 * z / eye.fx)
+        pixels.light[i, j] = light.ambient * sky + (one - light.ambient) * direct + back
     axis = wp.normalize(ray)
     # A pixel's corner lies less than 1.5 of its width off its axis.
     if not near_tool(tool, eye.position, axis, 1.5 * (wp.length(tool.centre - eye.position) + tool.radius) / eye.fx):
@@ -359,22 +337,19 @@ def illuminate(
         length = wp.length(fine)
         way = fine / length
         t = tool_hit(tool, eye.position, way, 1.0e3)
-        part = float(0.0)
-        if t >= 0.0:
-            part = wp.where(t / length < z or z <= 0.0, 1.0, unhidden[i, j])
-        if part > 0.0:
-            share += 0.25 * part
+        if t >= 0.0 and (t / length < z or z <= 0.0):
+            share += 0.25
             point = eye.position + way * t
             n = tool_normal(tool, eye.position, way)
             sky = 0.5 * (1.0 + n[2])
             direct = wp.max(wp.dot(n, light.sun), 0.0) / light.sun[2]
             if direct > 0.0:
-                direct *= soil_shadow(height, grid, point, light, step, top)
+                direct *= soil_shadow(surface, point, light.sun, light.softness)
                 if tool_hit(tool, point + n * 1.0e-4, light.sun, 1.0e3) >= 0.0:
                     direct = 0.0
-            lit = light.ambient * sky + (wp.vec3(1.0, 1.0, 1.0) - light.ambient) * direct + light.ground * (1.0 - sky)
-            radiance += 0.25 * part * wp.cw_mul(albedo, lit)
-    tool_out[i, j] = wp.vec4(radiance[0], radiance[1], radiance[2], share)
+            lit = light.ambient * sky + (one - light.ambient) * direct + light.ground * (1.0 - sky)
+            radiance += 0.25 * wp.cw_mul(light.tool, lit)
+    pixels.tool[i, j] = wp.vec4(radiance[0], radiance[1], radiance[2], share)
 
 
 @wp.kernel(enable_backward=False)

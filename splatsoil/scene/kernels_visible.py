@@ -4,29 +4,26 @@
 
 import warp as wp
 
-from splatsoil.scene.kernels_relief import place_of
+from splatsoil.scene.kernels_maps import Surface, height_at, sample
+
+
+@wp.struct
+class Visible:
+    """Gaussians that can be seen: centres, covariances, opacities, and features (albedo, and 1 for soil that a
+    picture's light is yet to fall on)."""
+
+    centres: wp.array(dtype=wp.vec3)
+    covariances: wp.array(dtype=wp.mat33)
+    opacities: wp.array(dtype=wp.float32)
+    features: wp.array(dtype=wp.vec4)
 
 
 @wp.func
-def _blended(
-    height: wp.array2d(dtype=wp.float32),
-    normals: wp.array2d(dtype=wp.vec3),
-    origin: wp.vec2,
-    cell: wp.vec2,
-    point: wp.vec3,
-) -> wp.vec4:
-    """Normal, not of unit length, and height over or under a point; constant beyond the outermost cells' centres."""
-    place = place_of(point[0], point[1], origin, cell, height.shape[0], height.shape[1])
-    i = int(place[0])
-    j = int(place[1])
-    u = place[2]
-    v = place[3]
-    low = normals[i, j] * (1.0 - v) + normals[i, j + 1] * v
-    high = normals[i + 1, j] * (1.0 - v) + normals[i + 1, j + 1] * v
-    normal = low * (1.0 - u) + high * u
-    near = height[i, j] * (1.0 - v) + height[i, j + 1] * v
-    far = height[i + 1, j] * (1.0 - v) + height[i + 1, j + 1] * v
-    return wp.vec4(normal[0], normal[1], normal[2], near * (1.0 - u) + far * u)
+def _over(surface: Surface, point: wp.vec3) -> wp.vec4:
+    """The surface's unit normal over a point, and how deep the point lies beneath, measured along it."""
+    normal = sample(surface.normal, surface.grid, point[0], point[1])
+    unit = wp.normalize(normal)
+    return wp.vec4(unit[0], unit[1], unit[2], (height_at(surface, point[0], point[1]) - point[2]) * normal[2])
 
 
 @wp.func
@@ -69,22 +66,14 @@ def _lit(albedo: wp.vec3, sides: wp.array2d(dtype=float), side: int) -> wp.vec4:
 
 @wp.kernel(enable_backward=False)
 def settle(
-    height: wp.array2d(dtype=wp.float32),
-    normals: wp.array2d(dtype=wp.vec3),
-    origin: wp.vec2,
-    cell: wp.vec2,
-    chosen: wp.array(dtype=wp.int32),
-    centres: wp.array(dtype=wp.vec3),
-    covariances: wp.array(dtype=wp.mat33),
-    thickness: wp.array(dtype=wp.float32),
-    opacities: wp.array(dtype=wp.float32),
-    albedo: wp.array(dtype=wp.vec3),
+    surface: Surface,
     sides: wp.array2d(dtype=float),
+    chosen: wp.array(dtype=wp.int32),
+    soil: Visible,
+    albedo: wp.array(dtype=wp.vec3),
+    thickness: wp.array(dtype=wp.float32),
     end: float,
-    centres_out: wp.array(dtype=wp.vec3),
-    covariances_out: wp.array(dtype=wp.mat33),
-    opacities_out: wp.array(dtype=wp.float32),
-    features_out: wp.array(dtype=wp.vec4),
+    out: Visible,
 ) -> None:
     """Soil's Gaussians, laid flat and moved in where one reaches out of the surface by its ``end`` standard deviations.
 
@@ -94,63 +83,54 @@ def settle(
     """
     k = wp.tid()
     i = chosen[k]
-    c = centres[i]
-    shape = covariances[i]
+    c = soil.centres[i]
+    shape = soil.covariances[i]
     thin = thickness[i]
-    here = _blended(height, normals, origin, cell, c)
-    normal = wp.normalize(wp.vec3(here[0], here[1], here[2]))
+    over = _over(surface, c)
+    normal = wp.vec3(over[0], over[1], over[2])
     along = shape * normal
     across = wp.dot(along, normal)
-    depth = (here[3] - c[2]) * here[2]
-    side = _side(sides, c, depth)
-    if side < 0 and depth < end * wp.sqrt(wp.max(across, 0.0)):
+    side = _side(sides, c, over[3])
+    if side < 0 and over[3] < end * wp.sqrt(wp.max(across, 0.0)):
         mixed = wp.outer(normal, along)
         shape = shape - mixed - wp.transpose(mixed) + (across + thin * thin) * wp.outer(normal, normal)
-        c = c - wp.max(end * thin - depth, 0.0) * normal
-    centres_out[k] = c
-    covariances_out[k] = shape
-    opacities_out[k] = opacities[i]
-    features_out[k] = _lit(albedo[i], sides, side)
+        c = c - wp.max(end * thin - over[3], 0.0) * normal
+    out.centres[k] = c
+    out.covariances[k] = shape
+    out.opacities[k] = soil.opacities[i]
+    out.features[k] = _lit(albedo[i], sides, side)
 
 
 @wp.kernel(enable_backward=False)
 def grains(
-    height: wp.array2d(dtype=wp.float32),
-    normals: wp.array2d(dtype=wp.vec3),
-    origin: wp.vec2,
-    cell: wp.vec2,
+    surface: Surface,
+    sides: wp.array2d(dtype=float),
     chosen: wp.array(dtype=wp.int32),
     positions: wp.array(dtype=wp.vec3),
     albedo: wp.array(dtype=wp.vec3),
-    sides: wp.array2d(dtype=float),
-    along: float,
-    across: float,
-    buried: float,
+    sizes: wp.vec3,
     end: float,
     opacity: float,
-    centres_out: wp.array(dtype=wp.vec3),
-    covariances_out: wp.array(dtype=wp.mat33),
-    opacities_out: wp.array(dtype=wp.float32),
-    features_out: wp.array(dtype=wp.vec4),
+    out: Visible,
 ) -> None:
-    """Particles' own Gaussians: flat along the surface over them, by two standard deviations, and round where they lie
-    so deep that a round one of the standard deviation ``buried`` ends, by ``end`` of these, beneath it all the same. At
-    sides that are seen they are flat along these."""
+    """Particles' own Gaussians, of standard deviations ``sizes``: flat along the surface over them, by the first two,
+    and round, by the third, where they lie so deep that this ends, by ``end`` of it, beneath the surface all the same.
+    At sides that are seen they are flat along these."""
     k = wp.tid()
     i = chosen[k]
     x = positions[i]
-    here = _blended(height, normals, origin, cell, x)
-    normal = wp.normalize(wp.vec3(here[0], here[1], here[2]))
+    over = _over(surface, x)
+    normal = wp.vec3(over[0], over[1], over[2])
+    depth = over[3]
     one = wp.identity(n=3, dtype=wp.float32)
-    depth = (here[3] - x[2]) * here[2]
     side = _side(sides, x, depth)
     if side >= 0:
         normal = wp.vec3(sides[side, 0], sides[side, 1], 0.0)
         depth = sides[side, 2] - wp.dot(normal, x)
-    shape = along * along * one - (along * along - across * across) * wp.outer(normal, normal)
-    if depth > end * buried:
-        shape = buried * buried * one
-    centres_out[k] = x
-    covariances_out[k] = shape
-    opacities_out[k] = opacity
-    features_out[k] = _lit(albedo[i], sides, side)
+    shape = sizes[0] * sizes[0] * one - (sizes[0] * sizes[0] - sizes[1] * sizes[1]) * wp.outer(normal, normal)
+    if depth > end * sizes[2]:
+        shape = sizes[2] * sizes[2] * one
+    out.centres[k] = x
+    out.covariances[k] = shape
+    out.opacities[k] = opacity
+    out.features[k] = _lit(albedo[i], sides, side)

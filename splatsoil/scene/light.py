@@ -38,6 +38,9 @@ Photographs without a calibration target do not tell it; the light it decides is
 SUN_SOFTNESS = 0.0047
 """Tangent of the sun's angular radius."""
 
+_TOOL_LIGHT = 0.5
+"""Light on the side of the tool that a shaded point sees, in units of level ground's."""
+
 
 @dataclass(frozen=True)
 class Light:
@@ -102,14 +105,17 @@ class Light:
         """Share of light (3,) that a thing of a linear colour (in sun and sky, as ``level`` is) sends back."""
         return SOIL_REFLECTANCE * np.asarray(colour, dtype=np.float64) / float(self.level.mean())
 
-    def kernel_form(self) -> Any:
-        """The numbers as the kernels take them."""
+    def kernel_form(self, tool: npt.ArrayLike = (0.0, 0.0, 0.0)) -> Any:
+        """The numbers as the kernels take them, with the tool's linear colour (3,)."""
         out = kernels.Illumination()
-        out.sun = wp.vec3(*self.direction)
-        out.ambient = wp.vec3(*self.ambient)
-        out.ground = wp.vec3(*self.reflectance(self.level))
-        out.softness = float(self.softness)
+        out.sun, out.ambient, out.softness = wp.vec3(*self.direction), wp.vec3(*self.ambient), float(self.softness)
+        out.ground, out.side = wp.vec3(*self.reflectance(self.level)), wp.vec3(*self.tool_side(tool))
+        out.tool = wp.vec3(*np.asarray(tool, dtype=np.float64))
         return out
+
+    def tool_side(self, tool: npt.ArrayLike) -> FloatArray:
+        """Light (3,) that a shaded point sees on the side of a tool of this linear colour."""
+        return _TOOL_LIGHT * self.reflectance(tool)
 
 
 def towards(azimuth: float, elevation: float) -> tuple[float, float, float]:

@@ -24,9 +24,9 @@ from scipy.optimize import minimize, minimize_scalar
 from torch import Tensor
 
 from splatsoil.scene.light import SOIL_REFLECTANCE, Light, towards
-from splatsoil.scene.lit import facing, normals, suns_on_points
+from splatsoil.scene.lit import facing, normals, open_sky, suns_on_points
 from splatsoil.scene.relief import Relief
-from splatsoil.scene.sky import sky_openness
+from splatsoil.splats.steps import finished
 from splatsoil.splats.warp_torch import upload
 
 FloatArray = npt.NDArray[np.float64]
@@ -176,7 +176,8 @@ class _Sunlit:
 
     @classmethod
     def of(cls, points: Tensor, relief: Relief, tool: object) -> _Sunlit:
-        openness, hidden = (relief.sample(share, points) for share in sky_openness(relief, tool))
+        rough, _, *shares = finished(open_sky(relief, tool))
+        openness, hidden = (rough.sample(share, points) for share in shares)
         returned = 0.5 * (SOIL_REFLECTANCE * (1.0 - openness - hidden) + _TOOL_REFLECTANCE * hidden)
         return cls(points, relief, tool, normals(relief, points), openness, returned)
 

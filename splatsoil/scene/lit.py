@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -13,23 +13,20 @@ import torch.nn.functional as functional
 import warp as wp
 from torch import Tensor
 
-from splatsoil.scene import kernels
+from splatsoil.scene import kernels, kernels_sky
 from splatsoil.scene.light import SUN_SOFTNESS, Light
-from splatsoil.scene.relief import Relief, grid_of
-from splatsoil.scene.sky import light_from_slopes, sky_openness
+from splatsoil.scene.relief import Relief
 from splatsoil.splats.steps import Steps, stepwise
 from splatsoil.splats.warp_torch import as_warp, launch, upload
 
 FloatArray = npt.NDArray[np.float64]
 
 _COARSE = 2
-"""Cells between which light is sent back and forth, in cells of the relief."""
+"""Cells that look around them, in cells of the relief: what they see changes slowly."""
 
-_BOUNCES = 2
-"""How often light is sent back and forth between the soil's slopes."""
 
-_TOOL_LIGHT = 0.5
-"""Light on the side of the tool that a shaded point sees, in units of level ground's."""
+_REACH = 1.0
+"""Above and below the soil within which the tool is looked for, m."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +42,6 @@ class LitRelief:
         bounced: (ny, nx, 3) light from soil and tool that stand in the sky's way.
         sent: (ny, nx, 3) light that each cell sends back.
         hidden: (ny, nx) share of the sky that the tool takes from each cell.
-        tool_light: (3,) light on the side of the tool that a shaded cell sees.
     """
 
     relief: Relief
@@ -56,19 +52,22 @@ class LitRelief:
     bounced: Tensor
     sent: Tensor
     hidden: Tensor
-    tool_light: FloatArray
 
     @cached_property
-    def shades(self) -> Tensor:
-        """(ny, nx, 8) normals, openness, visibility and bounced light, as a picture is lit by."""
+    def maps(self) -> Any:
+        """What a picture is lit by, in the kernels' form."""
         scalars = self.openness[..., None], self.visible[..., None]
-        return torch.cat([self.relief.normal, *scalars, self.bounced], dim=2)
+        out = kernels.Maps()
+        shades = torch.cat([self.relief.normal, *scalars, self.bounced], dim=2)
+        out.shades = wp.from_torch(shades, dtype=kernels.Shade)
+        out.sent, out.hidden = wp.from_torch(self.sent, dtype=wp.vec3), wp.from_torch(self.hidden)
+        return out
 
     def irradiance(self, points: Tensor, spread: float = 0.0) -> Tensor:
         """Light (n, 3) on points (n, 3) of the surface; a point stands for a patch of half width ``spread`` metres."""
-        sky = self.relief.sample(self.openness, points)[:, None]
-        ambient, direct = _ambient(self.light, points), direct_light(self, points, spread)[:, None]
-        return ambient * sky + (1.0 - ambient) * direct + self.relief.sample(self.bounced, points)
+        sky = self.relief.sample(self.openness, points)
+        direct = direct_light(self.relief, self.light, self.tool, points, spread)
+        return _mixed(self.light, sky, direct) + self.relief.sample(self.bounced, points)
 
 
 @stepwise
@@ -85,50 +84,74 @@ def light_relief(
     """
     yield from relief.ranged()
     visible = torch.empty_like(relief.height)
-    inputs = [as_warp(relief.height, wp.float32), grid_of(relief), light.kernel_form()]
-    inputs += [march_step(relief), ceiling(relief), as_warp(visible, wp.float32)]
+    inputs = [relief.surface, light.kernel_form(), as_warp(visible, wp.float32)]
     launch(kernels.sun_visibility, tuple(visible.shape), inputs, visible)
-    openness, hidden = yield from sky_openness.steps(relief, tool)
-    none = relief.height.new_zeros((*relief.height.shape, 3))
-    side = _TOOL_LIGHT * light.reflectance(tool_colour)
-    dark = LitRelief(relief, light, tool, openness, visible, none, none, hidden, side)
-    bounced, sent = yield from _bounced(dark)
-    return replace(dark, bounced=bounced, sent=sent)
+    rough, columns, openness, hidden = yield from open_sky(relief, tool)
+    direct = direct_light(relief, light, tool, rough.points.reshape(-1, 3), 0.5 * rough.cell[0])
+    first = _mixed(light, openness.reshape(-1), direct).reshape(rough.normal.shape)
+    ground, side = (upload(v, relief.device) for v in (light.reflectance(light.level), light.tool_side(tool_colour)))
+    by_tool = hidden[..., None] * side
+    once = _look_around(rough, ground * (first + by_tool), columns)[0]
+    # It goes on between slopes as within a sphere, each place of which sees the same share of the others.
+    bounced = once / (1.0 - ground * (1.0 - openness - hidden)[..., None]) + by_tool
+    sent = ground * (first + bounced)
+    maps = torch.cat([openness[..., None], hidden[..., None], bounced, sent], dim=-1).permute(2, 0, 1)[None]
+    fine = functional.interpolate(maps, relief.height.shape, mode="bilinear", align_corners=False)[0]
+    bounced, sent = (m.permute(1, 2, 0).contiguous() for m in (fine[2:5], fine[5:]))
+    return LitRelief(relief, light, tool, fine[0].contiguous(), visible, bounced, sent, fine[1].contiguous())
 
 
-def _bounced(lit: LitRelief) -> Steps[tuple[Tensor, Tensor]]:
-    """Light (ny, nx, 3) that comes from the soil around each cell and from the tool, instead of sky; and what each cell
-    sends back."""
-    relief, hidden = lit.relief, lit.hidden
+def open_sky(relief: Relief, tool: Any) -> Steps[tuple[Relief, Tensor, Tensor, Tensor]]:
+    """The relief on fewer cells and the tool over them (see `_tool_columns`), with maps of the shares of the sky's light,
+    weighted by the cosine, that soil and tool leave open (1 on an open plane) and that the tool alone takes."""
     rough = yield from _coarser(relief).ranged()
-    points = rough.points.reshape(-1, 3)
-    first = lit.irradiance(points, 0.5 * rough.cell[0]).T.reshape(3, *rough.height.shape)
-    ground = _row(lit.light.reflectance(lit.light.level), relief)[:, None, None]
-    tool = _row(lit.tool_light, relief)[:, None, None]
-    by_soil = (1.0 - lit.openness - hidden).clamp_min(0.0)
-    share, by_tool = (_resized(m, (rough.height.shape[0], rough.height.shape[1])) for m in (by_soil, hidden))
-    sent = ground * first
-    for _ in range(_BOUNCES - 1):
-        sent = ground * (first + share * light_from_slopes(rough, sent) + by_tool * tool)
-    maps = torch.cat([light_from_slopes(rough, sent), sent])
-    fine = functional.interpolate(maps[None], relief.height.shape, mode="bilinear", align_corners=False)[0]
-    bounced = by_soil * fine[:3] + hidden * tool
-    return bounced.permute(1, 2, 0).contiguous(), fine[3:].permute(1, 2, 0).contiguous()
+    columns = _tool_columns(rough, tool)
+    _, openness, hidden = _look_around(rough, torch.zeros_like(rough.normal), columns)
+    return rough, columns, openness, hidden
 
 
-def _row(values: npt.ArrayLike, relief: Relief) -> Tensor:
-    """Three numbers as a tensor where the relief lives."""
-    return upload(np.asarray(values, dtype=np.float64), relief.device)
+def _look_around(relief: Relief, sent: Tensor, tool: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """What each cell sees around it, by the horizon in a dozen directions.
+
+    Args:
+        relief: the surface.
+        sent: (ny, nx, 3) light sent back by each cell, the same in all directions.
+        tool: see `_tool_columns`.
+
+    Returns:
+        Light from the soil (ny, nx, 3); the share of the sky (ny, nx) that soil and tool leave open, and the share that
+        the tool alone takes.
+    """
+    light, sky = torch.empty_like(sent), sent.new_empty((*sent.shape[:2], 2))
+    maps = [as_warp(m, d) for m, d in ((sent, wp.vec3), (tool, wp.vec2), (light, wp.vec3), (sky, wp.vec2))]
+    launch(kernels_sky.cells_look_around, tuple(relief.height.shape), [relief.surface, *maps], sent)
+    openness, hidden = sky.unbind(dim=-1)
+    return light, openness - hidden, hidden
 
 
-def _ambient(light: Light, like: Tensor) -> Tensor:
-    return upload(light.ambient, like.device)
+def _tool_columns(relief: Relief, tool: Any) -> Tensor:
+    """Lowest and highest point (ny, nx, 2) of the tool over each cell, m, the lowest over the highest where there is
+    none; (0, 0, 2) without a tool."""
+    if tool.mesh == wp.uint64(0):
+        return relief.height.new_empty((0, 0, 2))
+    columns = relief.height.new_empty((*relief.height.shape, 2))
+    low, high = relief.range[0] - _REACH, relief.range[1] + _REACH
+    inputs = [relief.surface, tool, high, low, as_warp(columns, wp.vec2)]
+    launch(kernels.tool_columns, tuple(relief.height.shape), inputs, columns)
+    return columns
 
 
-def direct_light(lit: LitRelief, points: Tensor, spread: float = 0.0) -> Tensor:
+def _mixed(light: Light, sky: Tensor, direct: Tensor) -> Tensor:
+    """(n, 3) of shares of sky and sun (n,)."""
+    ambient = upload(light.ambient, sky.device)
+    return ambient * sky[:, None] + (1.0 - ambient) * direct[:, None]
+
+
+def direct_light(relief: Relief, light: Light, tool: Any, points: Tensor, spread: float = 0.0) -> Tensor:
     """The sun on points (n, 3) of the surface, (n,); 1 on level, open ground."""
-    sun = _row(lit.light.direction, lit.relief)[None]
-    return facing(sun, normals(lit.relief, points))[0] * sun_on_points(lit, points, spread)
+    sun = upload(light.direction[None], relief.device)
+    visible = suns_on_points(relief, tool, sun, points, spread, light.softness)
+    return (facing(sun, normals(relief, points)) * visible)[0]
 
 
 def normals(relief: Relief, points: Tensor) -> Tensor:
@@ -141,46 +164,22 @@ def facing(suns: Tensor, normal: Tensor) -> Tensor:
     return (suns @ normal.T).clamp_min(0.0) / suns[:, 2:]
 
 
+def suns_on_points(
+    relief: Relief, tool: Any, suns: Tensor, points: Tensor, spread: float, softness: float = SUN_SOFTNESS
+) -> Tensor:
+    """Share (k, n) of suns (k, 3) that soil and tool let through to points (n, 3) on the surface, each of which stands
+    for a patch of half width ``spread`` metres."""
+    visible = torch.empty((len(suns), len(points)), dtype=torch.float32, device=points.device)
+    inputs = [as_warp(points, wp.vec3), float(spread), relief.surface, as_warp(suns, wp.vec3), float(softness), tool]
+    launch(kernels.suns_on_points, tuple(visible.shape), [*inputs, as_warp(visible, wp.float32)], visible)
+    return visible
+
+
 def _coarser(relief: Relief) -> Relief:
     """The relief on fewer cells over the same rectangle."""
     ny, nx = relief.height.shape
     size = (max(2, ny // _COARSE), max(2, nx // _COARSE))
     cell = (relief.cell[0] * nx / size[1], relief.cell[1] * ny / size[0])
     origin = (relief.origin[0] + 0.5 * (cell[0] - relief.cell[0]), relief.origin[1] + 0.5 * (cell[1] - relief.cell[1]))
-    return Relief.of_heights(_resized(relief.height, size), origin, cell)
-
-
-def _resized(values: Tensor, size: tuple[int, int]) -> Tensor:
-    """A map on another number of cells over the same rectangle, averaged when there are fewer."""
-    shrinking = size[0] < values.shape[0]
-    resized = torch.nn.functional.interpolate(
-        values[None, None], size=size, mode="bilinear", align_corners=False, antialias=shrinking
-    )
-    return resized[0, 0].contiguous()
-
-
-def sun_on_points(lit: LitRelief, points: Tensor, spread: float = 0.0) -> Tensor:
-    """Share of the sun (n,) that soil and tool let through to points (n, 3) on the surface."""
-    sun = _row(lit.light.direction, lit.relief)[None]
-    return suns_on_points(lit.relief, lit.tool, sun, points, spread, lit.light.softness)[0]
-
-
-def suns_on_points(
-    relief: Relief, tool: Any, suns: Tensor, points: Tensor, spread: float, softness: float = SUN_SOFTNESS
-) -> Tensor:
-    """Share (k, n) of suns (k, 3) that soil and tool let through to points (n, 3) on the surface."""
-    visible = torch.empty((len(suns), len(points)), dtype=torch.float32, device=points.device)
-    inputs = [as_warp(points, wp.vec3), as_warp(relief.height, wp.float32), grid_of(relief), as_warp(suns, wp.vec3)]
-    inputs += [float(softness), tool, march_step(relief), ceiling(relief), float(spread), as_warp(visible, wp.float32)]
-    launch(kernels.suns_on_points, tuple(visible.shape), inputs, visible)
-    return visible
-
-
-def march_step(relief: Relief) -> float:
-    """Horizontal step of rays over the relief, m."""
-    return max(relief.cell)
-
-
-def ceiling(relief: Relief) -> float:
-    """A height that no soil reaches, m."""
-    return relief.range[1] + 1e-3
+    height = functional.interpolate(relief.height[None, None], size, mode="bilinear", antialias=True)[0, 0]
+    return Relief.of_heights(height, origin, cell)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -20,8 +20,7 @@ import warp as wp
 from torch import Tensor
 
 from splatsoil.scene import kernels_relief
-from splatsoil.scene.kernels_maps import Grid
-from splatsoil.scene.kernels_sky import WIDTH
+from splatsoil.scene.kernels_maps import Grid, Surface
 from splatsoil.splats.steps import Steps, finished, stepwise
 from splatsoil.splats.warp_torch import as_warp, launch, upload
 
@@ -30,12 +29,6 @@ FloatArray = npt.NDArray[np.float64]
 SMOOTHING = 1.0
 """Standard deviation of the kernel in particle spacings. Less shows single particles, more rounds off trench and heaps,
 so that soil looks weaker than it is and a fit takes it to be stronger."""
-
-BLOCK = 64
-"""Threads of a GPU's block that work on a map: few, so that it is shared out evenly."""
-
-_LAYERS_BEYOND = 3
-"""Layers of the density that are kept beneath and above the surface."""
 
 _COARSE = 0.8
 """Cell of the density grid in particle spacings; the kernel is wide enough for it."""
@@ -60,16 +53,15 @@ class Relief:
     origin: tuple[float, float]
     cell: tuple[float, float]
     filling: Tensor
-    layers: tuple[float, float]
+    layers: tuple[float, float] = (0.0, 1.0)
 
     @classmethod
     def of_heights(cls, height: Tensor, origin: tuple[float, float], cell: tuple[float, float]) -> Relief:
         """A relief with the normals of its heights (central differences)."""
         height = height.to(torch.float32).contiguous()
-        normal = height.new_empty((*height.shape, 3))
-        inputs = [as_warp(height, wp.float32), float(cell[0]), float(cell[1]), as_warp(normal, wp.vec3)]
-        launch(kernels_relief.normals, tuple(height.shape), inputs, height)
-        return cls(height, normal, origin, cell, height.new_zeros((0, 0, 0)), (0.0, 1.0))
+        along_y, along_x = torch.gradient(height, spacing=(cell[1], cell[0]))
+        normal = functional.normalize(torch.stack([-along_x, -along_y, torch.ones_like(height)], dim=-1), dim=-1)
+        return cls(height, normal, origin, cell, height.new_zeros((0, 0, 0)))
 
     @property
     def device(self) -> torch.device:
@@ -91,10 +83,24 @@ class Relief:
             self.__dict__["range"] = yield from self._range()
         return self
 
-    def with_filling(self, filling: Tensor, layers: tuple[float, float]) -> Relief:
-        """The same surface with the density that it is of; its range, which a GPU is asked for, stays known."""
-        out = replace(self, filling=filling, layers=layers)
-        out.__dict__["range"] = self.range
+    @property
+    def reach(self) -> float:
+        """How far off there is something to look at, m."""
+        low, high = self.range
+        return max(4.0 * (high - low), 0.15)
+
+    @cached_property
+    def surface(self) -> Any:
+        """This in the kernels' form."""
+        wp.init()  # or Warp knows no devices
+        out = Surface()
+        out.height, out.normal = wp.from_torch(self.height), wp.from_torch(self.normal, dtype=wp.vec3)
+        grid = Grid()
+        grid.x0, grid.y0 = self.origin
+        grid.inverse_x, grid.inverse_y = 1.0 / self.cell[0], 1.0 / self.cell[1]
+        out.grid = grid
+        out.filling, out.lowest, out.inverse_z = wp.from_torch(self.filling), self.layers[0], 1.0 / self.layers[1]
+        out.step, out.top, out.reach = max(self.cell), self.range[1] + 1e-3, self.reach
         return out
 
     @property
@@ -116,11 +122,12 @@ class Relief:
         Returns:
             (n,) or (n, k).
         """
-        out = values.new_empty((len(xy), *values.shape[2:]))
-        inputs = [as_warp(m, wp.float32) for m in (values.reshape(*values.shape[:2], -1), xy)]
-        inputs += [wp.vec2(*self.origin), wp.vec2(*self.cell), as_warp(out.reshape(len(xy), -1), wp.float32)]
-        launch(kernels_relief.sample, len(xy), inputs, values)
-        return out
+        ny, nx, *rest = values.shape
+        first, extent = np.array(self.origin), np.array(self.cell) * [nx - 1, ny - 1]
+        places = 2.0 * (xy[:, :2] - upload(first, xy.device)) / upload(extent, xy.device) - 1.0
+        maps = values.reshape(1, ny, nx, -1).movedim(-1, 1)
+        found = functional.grid_sample(maps, places[None, None], padding_mode="border", align_corners=True)
+        return found[0, :, 0].T.reshape(len(xy), *rest).contiguous()
 
     def depth_below(self, points: Tensor) -> Tensor:
         """How far points (n, 3) lie below the surface, measured along its normal, m; negative above it."""
@@ -130,57 +137,15 @@ class Relief:
     def within(self, depth: float, points: Tensor) -> Tensor:
         """Which points (n,) lie above the surface or nearer to it than a depth in m, in whatever direction.
 
-        What lies behind a steep wall is near to it, however far below the rim. The surface is eroded by a ball of that
-        radius; the bed's own walls are no surface.
+        What lies behind a steep wall is near to it, however far below the rim; the bed's own walls are no surface.
         """
-        across, along = (int(depth / self.cell[k]) for k in (0, 1))
-        width = width_of(self.height)
-        wide = padded(self.height, (across, along), width, "constant", math.inf)
-        offsets, drops = _ball(depth, self.cell, wide.shape[1], self.device)
+        x, y = (np.arange(-int(depth / c), int(depth / c) + 1) * c for c in self.cell)
+        ball = depth**2 - y[:, None] ** 2 - x**2
+        drops = upload(np.where(ball >= 0.0, np.sqrt(np.maximum(ball, 0.0)), -np.inf), self.device)
         eroded = torch.empty_like(self.height)
-        inputs = [depth, as_warp(wide, wp.float32), across, along, as_warp(offsets, wp.int32)]
-        inputs += [as_warp(m, wp.float32) for m in (drops, eroded)]
-        launch(kernels_relief.erode, (eroded.shape[0], -(-eroded.shape[1] // width)), inputs, eroded, BLOCK)
+        inputs = [as_warp(m, wp.float32) for m in (self.height, drops, eroded)]
+        launch(kernels_relief.erode, tuple(eroded.shape), inputs, eroded)
         return points[:, 2] > self.sample(eroded, points)
-
-
-@lru_cache(maxsize=16)
-def _ball(radius: float, cell: tuple[float, float], width: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """A ball's lower half on a map of so many columns: offsets (n,) int32 from its middle's cell, and how far it
-    reaches down there (n,), m."""
-    across, along = (int(radius / cell[k]) for k in (0, 1))
-    rows, columns = np.mgrid[-along : along + 1, -across : across + 1]
-    left = radius**2 - (rows * cell[1]) ** 2 - (columns * cell[0]) ** 2
-    offsets = (rows * width + columns)[left >= 0.0]
-    return upload(offsets, device, torch.int32), upload(np.sqrt(left[left >= 0.0]), device)
-
-
-def width_of(like: Tensor) -> int:
-    """Cells of a row that one task of `kernels_sky` does where a tensor lives."""
-    return 1 if like.is_cuda else WIDTH
-
-
-def padded(values: Tensor, margin: tuple[int, int], beyond: int, mode: str, value: float = 0.0) -> Tensor:
-    """Maps (..., ny, nx) with ``margin`` columns and rows more on every side, and ``beyond`` more columns on the
-    right."""
-    wider = (margin[0], margin[0] + beyond, margin[1], margin[1])
-    maps = values.reshape(1, -1, *values.shape[-2:])
-    wide = functional.pad(maps, wider, mode=mode, value=value if mode == "constant" else None)
-    return wide.reshape(*values.shape[:-2], *wide.shape[-2:])
-
-
-def grid_of(relief: Relief) -> Any:
-    """Where the relief's maps lie, in the kernels' form."""
-    grid = Grid()
-    grid.x0, grid.y0 = relief.origin
-    grid.inverse_x, grid.inverse_y = 1.0 / relief.cell[0], 1.0 / relief.cell[1]
-    return grid
-
-
-def surface_of(relief: Relief) -> list[Any]:
-    """Its heights, normals, first cell and cell size, for kernels that look them up at points."""
-    maps = as_warp(relief.height, wp.float32), as_warp(relief.normal, wp.vec3)
-    return [*maps, wp.vec2(*relief.origin), wp.vec2(*relief.cell)]
 
 
 @stepwise
@@ -219,19 +184,14 @@ def relief_of_particles(
     density *= spacing**3 / float(np.prod(cell))
     # The density is smooth, heights aren't: a wall stands where the former says, not somewhere in a coarse cell.
     layers = density.permute(2, 1, 0)[None]
-    fine = functional.interpolate(layers, scale_factor=2, mode="bicubic", align_corners=False)[0]
+    fine = functional.interpolate(layers, scale_factor=2, mode="bicubic", align_corners=False)[0].contiguous()
     height = fine.new_empty(fine.shape[1:])
     inputs = [as_warp(fine, wp.float32), 0.5, float(low[2]), float(cell[2]), as_warp(height, wp.float32)]
     launch(kernels_relief.crossing, tuple(height.shape), inputs, fine)
     half = (float(cell[0]) / 2, float(cell[1]) / 2)
     relief = Relief.of_heights(height, (float(low[0]) + half[0] / 2, float(low[1]) + half[1] / 2), half)
-    relief = yield from relief.ranged()
-    # Layers within reach of the surface, as a copy: a view would keep them all.
-    thick = float(cell[2])
-    first, last = (int((end - float(low[2])) / thick) for end in relief.range)
-    first = max(first - _LAYERS_BEYOND, 0)
-    filling = fine[first : last + 1 + _LAYERS_BEYOND].clone()
-    return relief.with_filling(filling, (float(low[2]) + (first + 0.5) * thick, thick))
+    relief = replace(relief, filling=fine, layers=(float(low[2]) + 0.5 * float(cell[2]), float(cell[2])))
+    return (yield from relief.ranged())
 
 
 def _spread(positions: Tensor, low: FloatArray, cell: FloatArray, count: npt.NDArray[np.int64]) -> Tensor:
@@ -247,9 +207,8 @@ def _blur(grid: Tensor, axis: int, variance: float) -> Tensor:
     if variance <= 0.0:
         return grid
     passes = max(1, math.ceil(variance / 0.5))
-    w = variance / (2.0 * passes)
+    w, count = variance / (2.0 * passes), grid.shape[axis]
     for _ in range(passes):
-        before, grid = grid.contiguous(), torch.empty(grid.shape, device=grid.device)
-        inputs = [axis, w, *(as_warp(g, wp.float32) for g in (before, grid))]
-        launch(kernels_relief.blur, tuple(grid.shape[:2]), inputs, grid)
+        wide = torch.cat([grid.narrow(axis, 0, 1), grid, grid.narrow(axis, count - 1, 1)], dim=axis)
+        grid = (1.0 - 2.0 * w) * grid + w * (wide.narrow(axis, 0, count) + wide.narrow(axis, 2, count))
     return grid

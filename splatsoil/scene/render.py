@@ -21,7 +21,7 @@ from splatsoil.scene.binding import Binding
 from splatsoil.scene.layers import Layers, Posed, layers_of
 from splatsoil.scene.light import Light, encoded, linear
 from splatsoil.scene.lit import light_relief
-from splatsoil.scene.relief import SMOOTHING, Relief, relief_of_particles, surface_of
+from splatsoil.scene.relief import SMOOTHING, Relief, relief_of_particles
 from splatsoil.scene.tool import ToolBody
 from splatsoil.splats import Gaussians
 from splatsoil.splats.steps import Steps, finished, together
@@ -177,21 +177,21 @@ class Scene:
         chosen = yield from _numbers_of(self.shown(relief, centres, x))
         around, counts = self.surroundings, [len(numbers) for numbers in chosen]
         counts.append(len(around.means))
-        visible = tuple(x.new_empty((sum(counts), *shape)) for shape in ((3,), (3, 3), (), (4,)))
-        soil, grains, rest = zip(*(part.split(counts) for part in visible), strict=True)
-        carried = (centres, covariances, self.soil.thickness, self.soil_opacity, self.soil_albedo)
-        sides = self._sides
-        _settle(relief, chosen[0], carried, sides, soil)
-        _draw_grains(relief, chosen[1], (x, self.grain_albedo), sides, self.spacing, grains)
+        drawn = tuple(x.new_empty((sum(counts), *shape)) for shape in ((3,), (3, 3), (), (4,)))
+        soil, grains, rest = zip(*(part.split(counts) for part in drawn), strict=True)
+        inputs = [relief.surface, as_warp(self._sides, wp.float32), as_warp(chosen[0], wp.int32)]
+        inputs += [visible_form(centres, covariances, self.soil_opacity), as_warp(self.soil_albedo, wp.vec3)]
+        inputs += [as_warp(self.soil.thickness, wp.float32), _END, visible_form(*soil)]
+        launch(kernels_visible.settle, counts[0], inputs, x)
+        sizes = wp.vec3(*(size * self.spacing for size in (PARTICLE_SIZE, PARTICLE_THICKNESS, BURIED_SIZE)))
+        inputs = [relief.surface, as_warp(self._sides, wp.float32), as_warp(chosen[1], wp.int32), as_warp(x, wp.vec3)]
+        inputs += [as_warp(self.grain_albedo, wp.vec3), sizes, _END, PARTICLE_OPACITY, visible_form(*grains)]
+        launch(kernels_visible.grains, counts[1], inputs, x)
         still = (around.means, self.surrounding_shapes, around.opacities, functional.pad(around.colours, (0, 1)))
         for part, of_rest in zip(rest, still, strict=True):
             part.copy_(of_rest)
-        discs, box = (x.new_zeros((0, 3)), x.new_zeros((0, 3, 3))), np.zeros((0, 3))
-        if tool is not None:
-            discs, box = self.tool.discs(*tool), self.tool.corners @ np.asarray(tool[0]).T + np.asarray(tool[1])
-        centres, covariances, opacities, features = visible
-        drawn_grains = slice(counts[0], counts[0] + counts[1])
-        return Posed(centres, covariances, opacities, features, drawn_grains, chosen[1], discs, box, lit)
+        discs = (x.new_zeros((0, 3)), x.new_zeros((0, 3, 3))) if tool is None else self.tool.discs(*tool)
+        return Posed(*drawn, slice(counts[0], counts[0] + counts[1]), chosen[1], discs, lit)
 
     def recoloured(self, posed: Posed) -> Posed:
         """What was posed of the same soil with other colours beneath its surface, in this scene's."""
@@ -251,34 +251,15 @@ def nearer_side(points: Tensor, relief: Relief, bed: Bed) -> Tensor:
     return torch.where(distance < relief.depth_below(points), which, -1)
 
 
-def _settle(relief: Relief, chosen: Tensor, carried: Sequence[Tensor], sides: Tensor, out: Sequence[Tensor]) -> None:
-    """Write soil's Gaussians, none of which reaches out of the surface.
-
-    Args:
-        relief: the surface.
-        chosen: (n,) which of them.
-        carried: their centres, covariances, standard deviations across at rest, opacities and albedo.
-        sides: those that are seen, in the kernels' form.
-        out: n centres, covariances, opacities and features.
-    """
-    arrays = [as_warp(t, d) for t, d in zip(carried, (wp.vec3, wp.mat33, wp.float32, wp.float32, wp.vec3), strict=True)]
-    inputs = [*surface_of(relief), as_warp(chosen, wp.int32), *arrays, as_warp(sides, wp.float32), _END]
-    launch(kernels_visible.settle, len(chosen), [*inputs, *_arrays(out)], relief.height)
-
-
-def _draw_grains(
-    relief: Relief, chosen: Tensor, particles: Sequence[Tensor], sides: Tensor, spacing: float, out: Sequence[Tensor]
-) -> None:
-    """Write particles' own Gaussians (positions and albedo): flat along the surface over them, round beneath."""
-    arrays = [*(as_warp(t, wp.vec3) for t in particles), as_warp(sides, wp.float32)]
-    sizes = [size * spacing for size in (PARTICLE_SIZE, PARTICLE_THICKNESS, BURIED_SIZE)]
-    inputs = [*surface_of(relief), as_warp(chosen, wp.int32), *arrays, *sizes, _END, PARTICLE_OPACITY, *_arrays(out)]
-    launch(kernels_visible.grains, len(chosen), inputs, relief.height)
-
-
-def _arrays(out: Sequence[Tensor]) -> list[Any]:
-    """Centres, covariances, opacities and features, for kernels."""
-    return [as_warp(t, d) for t, d in zip(out, (wp.vec3, wp.mat33, wp.float32, wp.vec4), strict=True)]
+def visible_form(centres: Tensor, covariances: Tensor, opacities: Tensor, features: Tensor | None = None) -> Any:
+    """Gaussians in the form of the kernels of `kernels_visible`."""
+    out = kernels_visible.Visible()
+    out.centres = wp.from_torch(centres, dtype=wp.vec3)
+    out.covariances = wp.from_torch(covariances, dtype=wp.mat33)
+    out.opacities = wp.from_torch(opacities)
+    if features is not None:
+        out.features = wp.from_torch(features, dtype=wp.vec4)
+    return out
 
 
 def _numbers_of(masks: Sequence[Tensor]) -> Steps[list[Tensor]]:

@@ -28,14 +28,12 @@ class ToolBody:
     Attributes:
         centres: (k, 3) middles of the discs, tool frame, m.
         covariances: (k, 3, 3), tool frame, m².
-        corners: (8, 3) of the mesh's box, tool frame, m; none without a mesh.
     """
 
     def __init__(self, mesh: trimesh.Trimesh | None, device: torch.device | str = "cpu") -> None:
         """Args: mesh in the tool's frame, metres, or None for no tool; device of the scene's tensors."""
         self._mesh: Any = None
         self._centre, self._radius = np.zeros(3), 0.0
-        self.corners = np.zeros((0, 3))
         self.centres = torch.zeros((0, 3), device=device)
         self.covariances = torch.zeros((0, 3, 3), device=device)
         if mesh is not None:
@@ -49,7 +47,6 @@ class ToolBody:
                 wp.array(vertices, dtype=wp.vec3, device=where), wp.array(faces, dtype=wp.int32, device=where)
             )
             wp.synchronize_device(where)  # rays are cast on torch's stream
-            self.corners = trimesh.bounds.corners(mesh.bounds)
             self._centre = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0)).astype(np.float64)
             self._radius = float(np.linalg.norm(vertices - self._centre, axis=1).max()) + 1e-4
 

@@ -13,7 +13,7 @@ from splatsoil.measurement import Bed, Frame, Measurement, ToolMotion
 from splatsoil.scene import Light, Relief, ToolBody, estimate, estimate_light, light_fit, light_relief
 from splatsoil.scene.estimate import untouched
 from splatsoil.scene.light_fit import Passing, fit_light
-from splatsoil.scene.lit import sun_on_points
+from splatsoil.scene.lit import suns_on_points
 from splatsoil.scene.relief import relief_of_particles
 from splatsoil.synthetic import paper
 from splatsoil.synthetic.setups import staged_motion
@@ -113,7 +113,8 @@ def test_a_shadow_that_comes_later_tells_the_light(azimuth, elevation, ambient):
 def test_a_passing_shadow_known_at_its_edge_only_hardly_counts():
     truth, what, tool = seen(145.0, 53.0, 0.6)
     later = passed(truth, what, tool, (0.25, 0.27, 0.21))
-    share = sun_on_points(light_relief(what[3], truth, later.tool), what[0], 0.001).numpy()
+    sun = torch.tensor(truth.direction[None], dtype=torch.float32)
+    share = suns_on_points(what[3], later.tool, sun, what[0], 0.001)[0].numpy()
     rim = (share > 0.02) & (gaussian_filter(share.reshape(what[2]), 0.8).reshape(-1) < 0.98)
     later.change[~torch.tensor(rim)] = np.nan
     assert rim.sum() >= 30

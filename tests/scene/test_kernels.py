@@ -1,12 +1,12 @@
 """Functions of kernels that pictures hardly show, against brute force."""
 
-from typing import Any
-
 import numpy as np
+import torch
 import warp as wp
 
+from splatsoil.scene import Relief
 from splatsoil.scene.kernels import way_out
-from splatsoil.scene.kernels_maps import Grid
+from splatsoil.scene.kernels_maps import Surface
 
 ROWS, COLUMNS, CELL = 30, 40, 0.02
 FIRST = (-0.1, 0.3)
@@ -14,13 +14,13 @@ FIRST = (-0.1, 0.3)
 
 @wp.kernel(enable_backward=False)
 def ways_out(
-    grid: Grid,
+    surface: Surface,
     origins: wp.array(dtype=wp.vec3),
     rays: wp.array(dtype=wp.vec3),
     out: wp.array(dtype=wp.float32),
 ) -> None:
     i = wp.tid()
-    out[i] = way_out(grid, wp.static(ROWS), wp.static(COLUMNS), origins[i], rays[i])
+    out[i] = way_out(surface, origins[i], rays[i])
 
 
 def test_rays_end_where_the_map_does() -> None:
@@ -33,11 +33,10 @@ def test_rays_end_where_the_map_does() -> None:
     rays = np.column_stack([targets, np.zeros(400)]) - origins
     rays[:2, :2] = [[0.0, 1.0], [-1.0, 0.0]]  # along an axis
     origins[:2, :2] = 0.5 * (lower + upper)
-    grid: Any = Grid()
-    grid.x0, grid.y0, grid.inverse_x, grid.inverse_y = *FIRST, 1.0 / CELL, 1.0 / CELL
+    surface = Relief.of_heights(torch.zeros(ROWS, COLUMNS), FIRST, (CELL, CELL)).surface
     found = wp.zeros(400, dtype=wp.float32, device="cpu")
     given = [wp.array(a.astype(np.float32), dtype=wp.vec3, device="cpu") for a in (origins, rays)]
-    wp.launch(ways_out, dim=400, inputs=[grid, *given], outputs=[found], device="cpu")
+    wp.launch(ways_out, dim=400, inputs=[surface, *given], outputs=[found], device="cpu")
     # The last of many points along the ray that lies on the map.
     depth = np.linspace(0.0, 12.0, 60_001)
     for origin, ray, end in zip(origins, rays, found.numpy(), strict=True):

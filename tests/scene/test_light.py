@@ -10,23 +10,21 @@ import trimesh
 from splatsoil.errors import ParameterError
 from splatsoil.measurement import Camera
 from splatsoil.scene import Light, Relief, ToolBody, encoded, light_relief, linear
-from splatsoil.scene.lit import sun_on_points
-from splatsoil.scene.sky import _Looks, sky_openness
+from splatsoil.scene.lit import suns_on_points
 from splatsoil.synthetic import stage as synthetic
 
 CELL = 0.005
 
 
-def surface(height, size=(120, 160)):
+def surface(height, size=(120, 160), cell=CELL):
     """A relief of height(x, y) around the origin."""
-    y, x = np.meshgrid(
-        (np.arange(size[0]) - size[0] / 2) * CELL, (np.arange(size[1]) - size[1] / 2) * CELL, indexing="ij"
-    )
+    y, x = np.meshgrid(*((np.arange(count) - count / 2) * cell for count in size), indexing="ij")
     values = torch.tensor(np.broadcast_to(height(x, y), x.shape).copy(), dtype=torch.float32)
-    return Relief.of_heights(values, (float(x[0, 0]), float(y[0, 0])), (CELL, CELL))
+    return Relief.of_heights(values, (float(x[0, 0]), float(y[0, 0])), (cell, cell))
 
 
 NONE = ToolBody(None).absent()
+OVERHEAD = Light.from_angles(0.0, 90.0, 0.5)
 
 
 def at(relief, values, x, y):
@@ -56,22 +54,22 @@ def test_plane_is_lit_by_lamberts_law(slope):
 def test_sky_over_ground_before_a_long_wall(distance):
     # View factor of a level patch to an endless strip that ends at elevation t: (1 - cos t) / 2.
     wall = 0.08
-    relief = surface(lambda x, y: np.where(x > 0.0, wall, 0.0), (400, 160))
-    openness, hidden = sky_openness(relief, NONE)
+    relief = surface(lambda x, y: np.where(x > 0.0, wall, 0.0), (800, 320), 0.5 * CELL)
+    lit = light_relief(relief, OVERHEAD, NONE)
     elevation = math.atan2(wall, distance)
     # 12 directions and steps of a fifth cost up to 0.025; no occlusion at all would be off by 0.32, 0.2 and 0.08
-    assert at(relief, openness, -distance, 0.0) == pytest.approx(0.5 * (1 + math.cos(elevation)), abs=0.03)
-    assert float(hidden.max()) == 0.0
+    assert at(relief, lit.openness, -distance, 0.0) == pytest.approx(0.5 * (1 + math.cos(elevation)), abs=0.03)
+    assert float(lit.hidden.max()) == 0.0
 
 
 def test_sky_under_a_plate():
     # View factor of a level patch to a parallel square plate of half side a, straight above at height h.
     a, h = 0.06, 0.05
     plate = ToolBody(trimesh.creation.box((2 * a, 2 * a, 0.004)))
-    _, hidden = sky_openness(surface(lambda x, y: 0.0 * x), plate.at(np.eye(3), (0.0, 0.0, h + 0.002)))
+    relief = surface(lambda x, y: 0.0 * x)
+    hidden = light_relief(relief, OVERHEAD, plate.at(np.eye(3), (0.0, 0.0, h + 0.002))).hidden
     s = a / h
     quarter = 2 * s / math.sqrt(1 + s * s) * math.atan(s / math.sqrt(1 + s * s)) / (2 * math.pi)
-    relief = surface(lambda x, y: 0.0 * x)
     # steps of a fifth lose up to a tenth of the plate's reach
     assert at(relief, hidden, 0.0, 0.0) == pytest.approx(4 * quarter, abs=0.08)
     assert at(relief, hidden, 0.35, 0.0) < 0.02
@@ -90,7 +88,8 @@ def test_shadow_of_a_box_lands_where_geometry_says(azimuth, elevation):
     with np.errstate(divide="ignore", invalid="ignore"):
         crossings = np.stack([(lower - points) / light.direction, (upper - points) / light.direction])
     margin = crossings.max(axis=0).min(axis=1) - crossings.min(axis=0).max(axis=1)
-    shadow = sun_on_points(lit, torch.tensor(points, dtype=torch.float32)).numpy()
+    sun, places = (torch.tensor(v, dtype=torch.float32) for v in (light.direction[None], points))
+    shadow = suns_on_points(lit.relief, lit.tool, sun, places, 0.0)[0].numpy()
     clear = np.abs(margin) > 0.002
     assert (margin > 0.002).sum() > 30
     assert np.array_equal(shadow[clear] < 0.5, margin[clear] > 0)
@@ -173,29 +172,3 @@ def test_impossible_lights_are_refused():
         Light(np.array([1.0, 0.0, 0.0]), np.full(3, 0.5))
     with pytest.raises(ParameterError, match="ambient"):
         Light(np.array([0.0, 0.0, 1.0]), np.full(3, 1.5))
-
-
-def test_sky_against_cell_by_cell():
-    """The kernel against the same horizon found in plain loops, with exact arc tangents; 37 columns are no multiple."""
-    generator = np.random.default_rng(2)
-    waves = generator.normal(0.0, 40.0, (2, 6))
-
-    def rough(x, y):
-        return 0.01 * np.cos(x[..., None] * waves[0] + y[..., None] * waves[1]).sum(axis=-1)
-
-    relief = surface(rough, (23, 37))
-    openness, _ = sky_openness(relief, NONE)
-    z, normal = relief.height.double().numpy(), relief.normal.double().numpy()
-    looks = _Looks.over(relief)
-    for i, j in generator.integers((0, 0), z.shape, (60, 2)):
-        total, up = 0.0, normal[i, j, 2]
-        for a, direction in enumerate(looks.directions):
-            along = normal[i, j, :2] @ direction
-            slope = -along / up
-            for row, column, inverse in zip(looks.rows[a], looks.columns[a], looks.inverses[a], strict=True):
-                there = z[min(max(i + row, 0), z.shape[0] - 1), min(max(j + column, 0), z.shape[1] - 1)]
-                slope = max(slope, (there - z[i, j]) * inverse)
-            e = np.linspace(math.atan(slope), 0.5 * math.pi, 4001)
-            total += np.trapezoid((up * np.sin(e) + along * np.cos(e)) * np.cos(e), e)
-        expected = min(max(2.0 * total / len(looks.directions), 0.0), 1.0)
-        assert float(openness[i, j]) == pytest.approx(expected, abs=3e-5)

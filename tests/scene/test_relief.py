@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial import cKDTree
 
 from splatsoil.measurement import Bed
@@ -147,25 +146,6 @@ def test_what_particles_spread_over_the_walls_comes_back():
     away = [np.abs(images[:, k, None] - middles[k]) / cell[k] for k in range(3)]
     b = [np.where(u < 0.5, 0.75 - u**2, 0.5 * np.clip(1.5 - u, 0.0, None) ** 2) for u in away]
     assert np.allclose(grid, np.einsum("ni,nj,nk->ijk", *b), atol=1e-4)
-
-
-@pytest.mark.parametrize("stride", [1, 3])
-def test_what_is_known_at_every_third_cell_is_linear_in_between(stride):
-    """Against SciPy's, and constant beyond the last."""
-    generator = np.random.default_rng(5)
-    values = generator.random((5, 7)).astype(np.float32)
-    size = (5 * stride - 1, 7 * stride)
-    out = torch.zeros(size)
-    inputs = [torch.from_numpy(values), stride, out]
-    launch(
-        kernels_relief.between,
-        size,
-        [as_warp(i, wp.float32) if isinstance(i, torch.Tensor) else i for i in inputs],
-        out,
-    )
-    known = RegularGridInterpolator((stride * np.arange(5), stride * np.arange(7)), values)
-    rows, columns = np.minimum(np.indices(size), stride * np.array([4, 6])[:, None, None])
-    assert np.allclose(out.numpy(), known(np.stack([rows, columns], axis=-1)), atol=1e-6)
 
 
 def test_the_surface_is_the_uppermost_crossing():

@@ -15,7 +15,6 @@ from splatsoil.comparison import PATCH, Comparator
 from splatsoil.measurement import Bed, Camera, Measurement
 from splatsoil.reconstruction import HeightField
 from splatsoil.scene import (
-    Layers,
     Light,
     Relief,
     Scene,
@@ -24,8 +23,8 @@ from splatsoil.scene import (
     build_scene,
     encoded,
     kernels,
-    kernels_colour,
     kernels_relief,
+    kernels_sky,
     kernels_visible,
     linear,
     relief_of_particles,
@@ -33,9 +32,9 @@ from splatsoil.scene import (
     seen_colours,
     still_frames,
 )
-from splatsoil.scene.kernels_sky import light_of_slopes, sky_kernel
 from splatsoil.splats import Gaussians
 from splatsoil.splats.steps import finished
+from splatsoil.splats.warp_torch import as_warp, launch
 from splatsoil.synthetic.setups import look_at
 
 SPACING = 0.02
@@ -171,22 +170,10 @@ def test_the_same_call_gives_the_same_bits():
     assert np.array_equal(scene.render(bed, None, None, view), scene.render(bed, None, None, view))
 
 
-def test_a_picture_is_its_layers_put_together():
-    generator = torch.Generator().manual_seed(4)
-    colour, light = (scale * torch.rand(7, 5, 3, generator=generator) for scale in (1.1, 2.0))
-    colour[:2] *= 0.03  # the straight part of the curve
-    soil, tool = torch.rand(7, 5, generator=generator), torch.rand(7, 5, 4, generator=generator)
-    tool[:4] = 0.0
-    lit = linear(colour) * (1.0 + soil[..., None] * (light - 1.0))
-    expected = encoded(lit * (1.0 - tool[..., 3:]) + tool[..., :3]).clamp(0.0, 1.0)
-    assert torch.allclose(Layers(colour, soil, soil, light, tool).image, expected, atol=2e-6)
-
-
 def test_kernels_compile_for_cuda(tmp_path):
     """NVRTC comes with Warp, so a compiler error shows without a GPU; sm_90 is an H100 or H200."""
-    ours = kernels.illuminate, kernels_colour.develop, kernels_relief.crossing, kernels_visible.settle
-    for kernel in (*ours, kernels_relief.erode, light_of_slopes, sky_kernel(1, False), sky_kernel(3, True)):
-        (artifact,) = wp.compile_aot_module(kernel.module, arch=90, module_dir=tmp_path, use_ptx=True)
+    for module in (kernels, kernels_relief, kernels_sky, kernels_visible):
+        (artifact,) = wp.compile_aot_module(module, arch=90, module_dir=tmp_path, use_ptx=True)
         assert ".entry" in Path(artifact).read_text()
 
 
@@ -199,7 +186,7 @@ def test_views_that_are_drawn_together_are_those_drawn_alone():
     views = [(moments[0], view), (moments[1], view), (moments[2], view), (moments[1], camera((0.3, -0.3, 0.5)))]
     together = finished(scene._layering(views)).image
     alone = scene.pictures([*views, (moments[0], view.scaled(0.5))])
-    assert torch.equal(together, torch.from_numpy(np.stack(alone[:4])))
+    assert np.allclose(together, np.stack(alone[:4]), atol=1e-6)
     assert alone[4].shape == (view.height // 2, view.width // 2, 3)
     assert np.array_equal(alone[4], scene.picture(moments[0], view.scaled(0.5)))
     assert len({picture.tobytes() for picture in alone[:4]}) == 4
@@ -225,7 +212,10 @@ def test_no_gaussian_reaches_out_of_the_soil():
     albedo = torch.tensor(generator.random((count, 3)), dtype=torch.float32)
     out = [torch.zeros(count - 20, *shape) for shape in ((3,), (3, 3), (), (4,))]
     chosen = torch.arange(20, count, dtype=torch.int32)
-    render._settle(relief, chosen, (*tensors, albedo), torch.zeros(0, 6), out)
+    first = [relief.surface, as_warp(torch.zeros(0, 6), wp.float32), as_warp(chosen, wp.int32)]
+    carried = [render.visible_form(tensors[0], tensors[1], tensors[3]), as_warp(albedo, wp.vec3)]
+    drawn = [2.0, render.visible_form(*out)]
+    launch(kernels_visible.settle, count - 20, [*first, *carried, as_warp(tensors[2], wp.float32), *drawn], albedo)
     centres, covariances, opacities, features = (t.double().numpy() for t in out)
     before, left = shapes[20:], depth[20:]
     across = np.sqrt(np.einsum("i,nij,j->n", slope, before, slope))
@@ -242,7 +232,9 @@ def test_no_gaussian_reaches_out_of_the_soil():
     assert np.array_equal(opacities, tensors[3].double().numpy()[20:]) and np.all(features[:, 3] == 1.0)
     assert np.array_equal(features[:, :3], albedo.double().numpy()[20:])
 
-    render._draw_grains(relief, chosen, (tensors[0], albedo), torch.zeros(0, 6), SPACING, out)
+    sizes = SPACING * np.array([render.PARTICLE_SIZE, render.PARTICLE_THICKNESS, render.BURIED_SIZE])
+    particles = [as_warp(tensors[0], wp.vec3), as_warp(albedo, wp.vec3), wp.vec3(*sizes)]
+    launch(kernels_visible.grains, count - 20, [*first, *particles, 2.0, 0.95, drawn[1]], albedo)
     centres, covariances, opacities, _ = (t.double().numpy() for t in out)
     deep = left > 2.0 * render.BURIED_SIZE * SPACING
     assert 5 < deep.sum() < 175 and np.allclose(centres, place[20:], atol=1e-6) and np.allclose(opacities, 0.95)
