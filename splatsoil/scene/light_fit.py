@@ -13,14 +13,14 @@ dark blotch in the shadow at rest would look like less sky, a pale one like more
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 import torch
 import torch.nn.functional as functional
-from scipy.optimize import minimize, minimize_scalar
+from scipy.optimize import minimize
 from torch import Tensor
 
 from splatsoil.scene.light import SOIL_REFLECTANCE, Light, towards
@@ -30,7 +30,7 @@ from splatsoil.splats.steps import finished
 from splatsoil.splats.warp_torch import upload
 
 FloatArray = npt.NDArray[np.float64]
-Directions = Sequence[tuple[float, float]]
+Directions = Sequence[tuple[float, float]] | Sequence[FloatArray]
 """Azimuths and elevations, degrees."""
 
 FINEST = 0.004
@@ -39,6 +39,9 @@ FINEST = 0.004
 LAG = 3
 """Distance of compared cells: a shadow's edge is blurred over about two."""
 
+_THINNED = 2
+"""Every so many rows and columns of what changes elsewhere are enough: it is known of several moments and cameras."""
+
 _TOOL_REFLECTANCE = 0.2
 """The tool's colour is not known yet; from black to bright metal this moves the sky's share by 0.01."""
 
@@ -46,15 +49,11 @@ _FEWEST_SHADED = 30
 """Cells in the tool's shadow, beside its edge, from which the sky's share can be told."""
 
 _ELEVATIONS, _AZIMUTHS = np.arange(20.0, 81.0, 10.0), np.arange(-180.0, 180.0, 10.0)
-_SHARES = (0.4, 0.6, 0.8)
-_PLACES, _AROUND = 4, (-7.5, -5.0, -2.5, 0.0, 2.5, 5.0, 7.5)
+_PLACES, _AROUND = 4, np.arange(-7.5, 7.6, 2.5)
 """Of the sun's directions tried, the best, and how far around them it is looked for more closely, degrees."""
 
-_THINNED = 2
-"""Every so many rows and columns of what changed elsewhere are enough to find where to search."""
-
-_AT_ONCE = 1 << 20
-"""Numbers that are worked out together for many directions."""
+_SHARES = np.arange(0.02, 0.981, 0.005)
+"""Shares of the sky."""
 
 _LEAST_CHANGE = 0.01
 """Changes of log brightness are not taken for better known than this."""
@@ -111,233 +110,152 @@ def fit_light(
         blur: half width of a shadow's edge in the photographs, in rows and columns.
         passing: what the tool's shadow did elsewhere.
     """
-    telling = [p for p in passing if _tells(p)]
-    # Cameras that look at the same moment share its light.
-    tools = {id(p.tool): p.tool for p in telling}
-    lights = {key: _Sunlit.of(points, relief, there) for key, there in tools.items()}
-    parts = [_Passed.of(lights[id(p.tool)], p.change) for p in telling]
-    problem = _Problem(_Sunlit.of(points, relief, tool), colours.clamp_min(1e-4).log(), shape, parts)
-    first = _start(problem.thinned())
-    simplex = first + np.array([[0, 0, 0], [6.0, 0, 0], [0, 5.0, 0], [0, 0, -0.1]])
+    thin = torch.zeros(shape, dtype=torch.bool, device=points.device)
+    thin[::_THINNED, ::_THINNED] = True
+    thin = thin.reshape(-1)
+    changes = [(p.tool, p.change[thin]) for p in passing if _known(p.change[thin]) >= _FEWEST_SHADED]
+    problem = _Problem(_Bed(points, shape, relief, tool, thin), colours.clamp_min(1e-4).log(), changes)
+    first = _start(problem)
     found = minimize(
-        lambda v: problem.cost(None, *v),
+        lambda v: problem.costs(None, [v[:2]], v[2:]).item(),
         first,
         method="Nelder-Mead",
-        options={"initial_simplex": simplex, "xatol": 0.02, "fatol": 1e-6, "maxfev": 250},
+        bounds=[(None, None), (5.0, 89.9), (_SHARES[0], _SHARES[-1])],
+        options={
+            "initial_simplex": first + np.array([[0, 0, 0], [6.0, 0, 0], [0, 5.0, 0], [0, 0, -0.1]]),
+            "xatol": 0.02,
+            "fatol": 1e-6,
+            "maxfev": 250,
+        },
     )
-    azimuth, elevation = float(found.x[0]), float(np.clip(found.x[1], 5.0, 89.9))
-    beside = problem.beside_edges(azimuth, elevation, blur)
-    ambient = [
-        minimize_scalar(
-            lambda a, c=channel: beside.cost(c, azimuth, elevation, a),
-            bounds=(0.02, 0.98), method="bounded", options={"xatol": 1e-3},
-        ).x
-        for channel in range(3)
-    ]  # fmt: skip
+    at = (float(found.x[0]), float(found.x[1]))
+    beside = problem.beside_edges(at, blur)
+    ambient = [_SHARES[beside.costs(channel, [at], _SHARES)[0].argmin()] for channel in range(3)]
     level = torch.nanmedian(colours, dim=0).values.clamp_min(1e-3).cpu().numpy().astype(np.float64)
-    light = Light.from_angles(azimuth, elevation, np.array(ambient), level=level)
-    shadowed = float(1.0 - problem.still.let_through([(azimuth, elevation)]).mean())
+    light = Light.from_angles(*at, np.array(ambient), level=level)
+    shadowed = 1.0 - float(problem.bed.let_through(tool, [at], points).mean())
     return LightEstimate(light, 1.0 - float(found.fun) / max(problem.nothing(), 1e-12), shadowed)
 
 
 def _start(problem: _Problem) -> FloatArray:
     """Azimuth, elevation and the sky's share to search from: a narrow shadow is felt from a few degrees off at most."""
-    tried = [(azimuth, elevation) for elevation in _ELEVATIONS for azimuth in _AZIMUTHS]
-    costs = problem.costs(None, tried, _SHARES)
-    best = np.argsort(costs.min(axis=1), kind="stable")[:_PLACES]
+    tried, shares = [(azimuth, elevation) for elevation in _ELEVATIONS for azimuth in _AZIMUTHS], (0.4, 0.6, 0.8)
+    costs = problem.costs(None, tried, shares)
     near = []
-    for k in best:
-        (azimuth, elevation), share = tried[k], _SHARES[int(costs[k].argmin())]
-        around = [(azimuth + turn, elevation + rise) for turn in _AROUND for rise in _AROUND]
-        costs_there = problem.costs(None, around, [share])[:, 0]
-        near += [(cost, *at, share) for cost, at in zip(costs_there, around, strict=True)]
+    for k in np.argsort(costs.min(axis=1), kind="stable")[:_PLACES]:
+        share = shares[int(costs[k].argmin())]
+        around = [(tried[k][0] + turn, tried[k][1] + rise) for turn in _AROUND for rise in _AROUND]
+        near += [
+            (cost, *at, share) for cost, at in zip(problem.costs(None, around, [share])[:, 0], around, strict=True)
+        ]
     return np.array(min(near)[1:])
 
 
 @dataclass(frozen=True)
-class _Sunlit:
-    """Light on points of a surface with the tool at one place.
-
-    Attributes:
-        points: (n, 3), m.
-        relief: the surface.
-        tool: its pose in the kernels' form.
-        normal: (n, 3) of the surface.
-        openness: (n,) share of the sky that a point sees.
-        returned: (n,) what soil and tool in the sky's way send back: half of level ground's light.
-    """
+class _Bed:
+    """Points of a grid of rows and columns on a surface, the tool at rest, and the points ``thin`` (n,) among them."""
 
     points: Tensor
+    shape: tuple[int, int]
     relief: Relief
     tool: object
-    normal: Tensor
-    openness: Tensor
-    returned: Tensor
+    thin: Tensor
 
-    @classmethod
-    def of(cls, points: Tensor, relief: Relief, tool: object) -> _Sunlit:
-        rough, _, *shares = finished(open_sky(relief, tool))
-        openness, hidden = (rough.sample(share, points) for share in shares)
-        returned = 0.5 * (SOIL_REFLECTANCE * (1.0 - openness - hidden) + _TOOL_REFLECTANCE * hidden)
-        return cls(points, relief, tool, normals(relief, points), openness, returned)
+    def let_through(self, tool: object, directions: Directions, points: Tensor) -> Tensor:
+        """(d, n) share of the sun that the tool, and soil that stands higher, let through to points."""
+        suns = upload([towards(azimuth, elevation) for azimuth, elevation in directions], points.device)
+        return suns_on_points(self.relief, tool, suns, points, 0.25 * FINEST)
 
-    def at(self, chosen: Tensor) -> _Sunlit:
-        """On some of the points (k,)."""
-        points, normal, openness, returned = (
-            values[chosen].contiguous() for values in (self.points, self.normal, self.openness, self.returned)
-        )
-        return replace(self, points=points, normal=normal, openness=openness, returned=returned)
-
-    def suns(self, directions: Directions) -> Tensor:
-        """(d, n) the sun on the points from directions, 1 on level open ground."""
-        return facing(self._towards(directions), self.normal) * self.let_through(directions)
-
-    def log_light(self, suns: Tensor, ambient: float) -> Tensor:
-        """(d, n) log of the light of suns (d, n) and a sky, 0 on level open ground."""
-        return (ambient * self.openness + (1.0 - ambient) * suns + self.returned).clamp_min(1e-3).log()
-
-    def let_through(self, directions: Directions) -> Tensor:
-        """(d, n) share of the sun that the tool, and soil that stands higher, let through to each point."""
-        suns = self._towards(directions)
-        return suns_on_points(self.relief, self.tool, suns, self.points, 0.25 * FINEST)
-
-    def edge(self, at: tuple[float, float], width: int, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
-        """(rows, columns) points nearer to a shadow's edge than so many rows or columns, and those in full shadow."""
-        sun = self.let_through([at]).reshape(1, 1, *shape)
+    def edge(self, tool: object, at: tuple[float, float], width: int) -> tuple[Tensor, Tensor]:
+        """(n,) points nearer to a shadow's edge than so many rows or columns, and those in full shadow."""
+        sun = self.let_through(tool, [at], self.points).reshape(1, 1, *self.shape)
         highest, lowest = (functional.max_pool2d(sign * sun, 2 * width + 1, 1, width) for sign in (1.0, -1.0))
-        return (highest + lowest > 0.02)[0, 0], (sun < 0.02)[0, 0]
-
-    def _towards(self, directions: Directions) -> Tensor:
-        """(d, 3) unit vectors."""
-        where = [towards(azimuth, elevation) for azimuth, elevation in directions]
-        return upload(where, self.points.device)
+        return (highest + lowest > 0.02).reshape(-1), (sun < 0.02).reshape(-1)
 
 
-@dataclass(frozen=True)
-class _Passed:
-    """A `Passing` and its light.
+class _Lights:
+    """Log of the light on points of a bed, 0 on level open ground, with the tool at one place."""
 
-    Attributes:
-        sunlit: on all points of the grid.
-        change: (n, 3) of them.
-        known: (k,) the points of which it is known.
-        there: the light on these.
-    """
+    def __init__(self, bed: _Bed, tool: object, points: Tensor) -> None:
+        rough, _, *shares = finished(open_sky(bed.relief, tool))
+        self.bed, self.tool, self.points, self.normal = bed, tool, points, normals(bed.relief, points)
+        self.openness, hidden = (rough.sample(share, points) for share in shares)
+        # Soil and tool in the sky's way have half of level ground's light.
+        self.returned = 0.5 * (SOIL_REFLECTANCE * (1.0 - self.openness - hidden) + _TOOL_REFLECTANCE * hidden)
 
-    sunlit: _Sunlit
-    change: Tensor
-    known: Tensor
-    there: _Sunlit
-
-    @classmethod
-    def of(cls, sunlit: _Sunlit, change: Tensor) -> _Passed:
-        known = torch.isfinite(change).all(dim=1).nonzero()[:, 0]
-        return cls(sunlit, change, known, sunlit.at(known))
-
-    def without(self, places: Tensor) -> _Passed:
-        """With nothing known of places (rows, columns)."""
-        return _Passed.of(self.sunlit, _without(places, self.change))
-
-    def seen(self, channel: int | None) -> Tensor:
-        """(k,) change of one colour, or of all, where it is known."""
-        return _channel(self.change[self.known], channel)
+    def of(self, directions: Directions, shares: Sequence[float] | FloatArray) -> Iterator[Tensor]:
+        """(d, n) for suns from these directions, one share of the sky after the other."""
+        suns = upload([towards(azimuth, elevation) for azimuth, elevation in directions], self.points.device)
+        sun = facing(suns, self.normal) * self.bed.let_through(self.tool, directions, self.points)
+        for share in shares:
+            yield (share * self.openness + (1.0 - share) * sun + self.returned).clamp_min(1e-3).log()
 
 
 class _Problem:
     """Robust fit of differences of log brightness: between places of a grid at rest, and between times."""
 
-    def __init__(
-        self,
-        still: _Sunlit,
-        brightness: Tensor,
-        shape: tuple[int, int],
-        passed: Sequence[_Passed] = (),
-        lag: int = LAG,
-    ) -> None:
-        self.still, self.brightness, self.shape, self.passed, self.lag = still, brightness, shape, passed, lag
+    def __init__(self, bed: _Bed, brightness: Tensor, changes: Sequence[tuple[object, Tensor]], lag: int = LAG) -> None:
+        self.bed, self.brightness, self.changes, self.lag = bed, brightness, changes, lag
+        self.still = _Lights(bed, bed.tool, bed.points)
+        # Cameras that look at the same moment share its light.
+        tools = {id(tool): tool for tool, _ in changes}
+        self.later = {key: _Lights(bed, tool, bed.points[bed.thin].contiguous()) for key, tool in tools.items()}
         self.scale = _middle(self.differences(_channel(brightness, None)))
-        self.scales = [max(_middle(_centred(p.seen(None))), _LEAST_CHANGE) for p in passed]
+        self.scales = [max(_middle(_centred(_channel(change, None))), _LEAST_CHANGE) for _, change in changes]
         # A few places known of a moment must not weigh as much as all of the bed.
-        self.shares = [len(p.known) / len(p.change) for p in passed]
-        self._lately: tuple[Directions, list[Tensor]] | None = None
-
-    def thinned(self) -> _Problem:
-        """The same with what changed elsewhere at fewer places, each of which weighs more."""
-        dropped = torch.ones(self.shape, dtype=torch.bool, device=self.brightness.device)
-        dropped[::_THINNED, ::_THINNED] = False
-        fewer = [part.without(dropped) for part in self.passed]
-        kept = [few if len(few.known) >= _FEWEST_SHADED else part for few, part in zip(fewer, self.passed, strict=True)]
-        thin = _Problem(self.still, self.brightness, self.shape, kept, self.lag)
-        thin.scales, thin.shares = self.scales, self.shares
-        return thin
+        self.weights = [_known(change) / len(change) for _, change in changes]
 
     def differences(self, values: Tensor) -> Tensor:
         """Differences (..., m) of values (..., n) over the lag along both axes of the grid."""
-        grid, lag = values.reshape(*values.shape[:-1], *self.shape), self.lag
-        along_y = grid[..., lag:, :] - grid[..., :-lag, :]
-        along_x = grid[..., lag:] - grid[..., :-lag]
+        grid, lag = values.reshape(*values.shape[:-1], *self.bed.shape), self.lag
+        along_y, along_x = grid[..., lag:, :] - grid[..., :-lag, :], grid[..., lag:] - grid[..., :-lag]
         return torch.cat([along_y.flatten(-2), along_x.flatten(-2)], dim=-1)
 
-    def beside_edges(self, azimuth: float, elevation: float, blur: int) -> _Problem:
+    def beside_edges(self, at: tuple[float, float], blur: int) -> _Problem:
         """The same without shadows' edges, their blur taken off both sides, by differences that reach across.
 
         Where all shadows are too narrow for that, less is taken off; nothing where hardly any shadow is left then.
         """
-        widest, at = min(blur, (min(self.shape) // 2 - LAG) // 2), (azimuth, elevation)
-        for width in range(widest, 0, -1):
-            edge, shaded = self.still.edge(at, width, self.shape)
-            enough = _enough(shaded & ~edge, self.brightness)
-            passed = []
-            for part in self.passed:
-                there, then = part.sunlit.edge(at, width, self.shape)
-                enough |= _enough((shaded ^ then) & ~(edge | there), part.change)
-                beside = part.without(edge | there)
-                if len(beside.known) >= _FEWEST_SHADED:
-                    passed.append(beside)
-            clear = _Problem(self.still, _without(edge, self.brightness), self.shape, passed, 2 * width + LAG)
-            if enough and math.isfinite(clear.scale):
-                return clear
+        bed = self.bed
+        for width in range(min(blur, (min(bed.shape) // 2 - LAG) // 2), 0, -1):
+            edge, shaded = bed.edge(bed.tool, at, width)
+            enough = _known(self.brightness[shaded & ~edge]) >= _FEWEST_SHADED
+            changes = []
+            for tool, change in self.changes:
+                there, then = bed.edge(tool, at, width)
+                clear = change.clone()
+                clear[(edge | there)[bed.thin]] = math.nan
+                enough |= _known(clear[(shaded ^ then)[bed.thin]]) >= _FEWEST_SHADED
+                if _known(clear) >= _FEWEST_SHADED:
+                    changes.append((tool, clear))
+            brightness = self.brightness.clone()
+            brightness[edge] = math.nan
+            beside = _Problem(bed, brightness, changes, 2 * width + LAG)
+            if enough and math.isfinite(beside.scale):
+                return beside
         return self
 
-    def cost(self, channel: int | None, azimuth: float, elevation: float, ambient: float) -> float:
-        """Loss of a light in one colour or in grey; the sky's share is held between 0 and 1, the sun above the
-        horizon."""
-        if not 5.0 <= elevation <= 89.9 or not 0.02 <= ambient <= 0.98:
-            return 1e3
-        return float(self.costs(channel, [(azimuth, elevation)], [ambient])[0, 0])
-
-    def costs(self, channel: int | None, directions: Directions, shares: Sequence[float]) -> FloatArray:
-        """(d, s) loss of each of the directions with each of the sky's shares."""
-        still = self.differences(_channel(self.brightness, channel))
-        changes = [part.seen(channel) for part in self.passed]
-        chunk = max(1, _AT_ONCE // len(self.brightness))
-        out = []
-        for start in range(0, len(directions), chunk):
-            suns, *others = self._suns(directions[start : start + chunk])
-            columns = []
-            for share in shares:
-                rest = self.still.log_light(suns, share)
-                total = _spread(still - self.differences(rest), self.scale)
-                for k, part in enumerate(self.passed):
-                    predicted = part.there.log_light(others[k], share) - rest[:, part.known]
-                    total = total + self.shares[k] * _spread(_centred(changes[k] - predicted), self.scales[k])
-                columns.append(total)
-            out.append(torch.stack(columns, dim=1))
-        return torch.cat(out).cpu().numpy().astype(np.float64)
+    def costs(self, channel: int | None, directions: Directions, shares: Sequence[float] | FloatArray) -> FloatArray:
+        """(d, s) loss of each of the directions with each of the sky's shares, in one colour or in grey."""
+        seen = self.differences(_channel(self.brightness, channel))
+        changes = [_channel(change, channel) for _, change in self.changes]
+        lights = [self.still.of(directions, shares), *(later.of(directions, shares) for later in self.later.values())]
+        columns = []
+        for still, *others in zip(*lights, strict=True):
+            later = dict(zip(self.later, others, strict=True))
+            total = _spread(seen - self.differences(still), self.scale)
+            for (tool, _), change, scale, weight in zip(self.changes, changes, self.scales, self.weights, strict=True):
+                predicted = later[id(tool)] - still[:, self.bed.thin]
+                total = total + weight * _spread(_centred(change - predicted), scale)
+            columns.append(total)
+        return torch.stack(columns, dim=1).cpu().numpy().astype(np.float64)
 
     def nothing(self) -> float:
         """Loss of a light that is the same everywhere."""
-        total = _spread(self.differences(_channel(self.brightness, None)), self.scale)
-        for part, scale, share in zip(self.passed, self.scales, self.shares, strict=True):
-            total = total + share * _spread(_centred(part.seen(None)), scale)
-        return float(total)
-
-    def _suns(self, directions: Directions) -> list[Tensor]:
-        """The sun on the bed at rest, and on what is known of each part; the last ones are kept."""
-        if self._lately is None or self._lately[0] != directions:
-            lit = [self.still, *(part.there for part in self.passed)]
-            self._lately = (list(directions), [where.suns(directions) for where in lit])
-        return self._lately[1]
+        total = float(_spread(self.differences(_channel(self.brightness, None)), self.scale))
+        for (_, change), scale, weight in zip(self.changes, self.scales, self.weights, strict=True):
+            total += weight * float(_spread(_centred(_channel(change, None)), scale))
+        return total
 
 
 def _channel(values: Tensor, channel: int | None) -> Tensor:
@@ -353,30 +271,14 @@ def _spread(residual: Tensor, scale: float) -> Tensor:
 
 def _centred(values: Tensor) -> Tensor:
     """Without what changes all of the bed alike: an exposure that drifts. Along the last axis."""
-    return values - values.median(dim=-1, keepdim=True).values
+    return values - values.nanmedian(dim=-1, keepdim=True).values
 
 
 def _middle(values: Tensor) -> float:
     """Standard deviation by the median of those that are known."""
-    return 1.4826 * float(values[torch.isfinite(values)].abs().median())
-
-
-def _enough(chosen: Tensor, values: Tensor) -> bool:
-    """Whether enough of the chosen points (rows, columns) are known."""
-    return _known(_without(~chosen, values)) >= _FEWEST_SHADED
+    return 1.4826 * float(values.abs().nanmedian())
 
 
 def _known(values: Tensor) -> int:
-    """How many places are known."""
+    """How many places (n, 3) are known."""
     return int(torch.isfinite(values).all(dim=1).sum())
-
-
-def _without(edge: Tensor, values: Tensor) -> Tensor:
-    out = values.clone()
-    out[edge.reshape(-1)] = math.nan
-    return out
-
-
-def _tells(passing: Passing) -> bool:
-    """Whether enough is known of it."""
-    return _known(passing.change) >= _FEWEST_SHADED

@@ -102,7 +102,7 @@ def light_relief(
 
 
 def open_sky(relief: Relief, tool: Any) -> Steps[tuple[Relief, Tensor, Tensor, Tensor]]:
-    """The relief on fewer cells and the tool over them (see `_tool_columns`), with maps of the shares of the sky's light,
+    """The relief on fewer cells, the tool over them (see `_tool_columns`), and maps of the shares of the sky's light,
     weighted by the cosine, that soil and tool leave open (1 on an open plane) and that the tool alone takes."""
     rough = yield from _coarser(relief).ranged()
     columns = _tool_columns(rough, tool)

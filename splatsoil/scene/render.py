@@ -191,7 +191,9 @@ class Scene:
         for part, of_rest in zip(rest, still, strict=True):
             part.copy_(of_rest)
         discs = (x.new_zeros((0, 3)), x.new_zeros((0, 3, 3))) if tool is None else self.tool.discs(*tool)
-        return Posed(*drawn, slice(counts[0], counts[0] + counts[1]), chosen[1], discs, lit)
+        centres, covariances, opacities, features = drawn
+        own = slice(counts[0], counts[0] + counts[1])
+        return Posed(centres, covariances, opacities, features, own, chosen[1], discs, lit)
 
     def recoloured(self, posed: Posed) -> Posed:
         """What was posed of the same soil with other colours beneath its surface, in this scene's."""

@@ -10,7 +10,7 @@ import trimesh
 from scipy.ndimage import gaussian_filter
 
 from splatsoil.measurement import Bed, Frame, Measurement, ToolMotion
-from splatsoil.scene import Light, Relief, ToolBody, estimate, estimate_light, light_fit, light_relief
+from splatsoil.scene import Light, Relief, ToolBody, estimate, estimate_light, light_relief
 from splatsoil.scene.estimate import untouched
 from splatsoil.scene.light_fit import Passing, fit_light
 from splatsoil.scene.lit import suns_on_points
@@ -119,20 +119,6 @@ def test_a_passing_shadow_known_at_its_edge_only_hardly_counts():
     later.change[~torch.tensor(rim)] = np.nan
     assert rim.sum() >= 30
     assert np.allclose(fit_light(*what, passing=[later]).light.ambient, truth.ambient, atol=0.05)
-
-
-@pytest.mark.parametrize(("name", "value"), [("_AT_ONCE", 1), ("_THINNED", 1)])
-def test_how_the_search_is_shared_out_changes_no_light(monkeypatch, name, value):
-    # one direction at a time, and all that is known of other moments, against many at once and a quarter
-    truth, what, tool = seen(145.0, 53.0, 0.6)
-    sparse = passed(truth, what, tool, (0.25, 0.27, 0.21))
-    sparse.change[40:] = np.nan  # a quarter of these would be too few
-    later = [passed(truth, what, tool, (0.3, 0.27, 0.19)), sparse]
-    found = fit_light(*what, passing=later).light
-    monkeypatch.setattr(light_fit, name, value)
-    again = fit_light(*what, passing=later).light
-    assert np.degrees(np.arccos(np.clip(found.direction @ again.direction, -1.0, 1.0))) < 0.1
-    assert np.allclose(found.ambient, again.ambient, atol=0.005)
 
 
 @pytest.mark.parametrize(

@@ -110,8 +110,8 @@ def test_a_wall_is_lit_as_it_stands(lean, azimuth):
 @pytest.mark.parametrize("azimuth", [90.0, -90.0])
 def test_a_pit_sends_itself_the_light_that_it_has(azimuth):
     """An upright wall in the shade and the floor before it in the sun, or the other way round. With what maps say
-    between a wall's foot and its rim, and the rim's light for the wall's, they are too bright by up to 13 and 7 %. Paths
-    that are traced end after three surfaces, which leaves out up to 3 %."""
+    between a wall's foot and its rim, and the rim's light for the wall's, they are too bright by up to 13 and 7 %.
+    Paths that are traced end after three surfaces, which leaves out up to 3 %."""
     view = camera((0.2, -0.35, 0.4), (0.2, 0.25, 0.08))
     drawn, traced = both(pit(0.1, 0.32), view, azimuth)
     wall, floor = np.s_[42:54, 60:100], np.s_[70:76, 60:100]
