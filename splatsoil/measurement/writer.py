@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import shutil
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -52,6 +53,7 @@ def write_measurement(
     suffix: str = ".jpg",
     quality: int = 95,
     truth: Mapping[str, Any] | None = None,
+    beside: Callable[[Path], object] | None = None,
 ) -> Measurement:
     """Write a set that ``Measurement.load`` accepts, and load it.
 
@@ -66,17 +68,15 @@ def write_measurement(
         suffix: file type of encoded pictures, ``.jpg`` or ``.png``.
         quality: JPEG quality (no chroma subsampling).
         truth: content of ``truth.json``, for synthetic sets.
+        beside: writes further files into the folder that it is given.
 
     Raises:
-        MeasurementError: the place is taken, or the set breaks the format's rules.
+        MeasurementError: the place is taken or can't be written, or the set breaks the format's rules.
     """
     target = Path(folder)
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise MeasurementError("already there and not an empty folder; nothing is overwritten", file=target)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}-") as temporary:
-        root = Path(temporary) / target.name
-        root.mkdir()
+    with _whole(target) as root:
         tool.mesh.export(root / "tool.stl")
         motion = tool.motion
         table = np.column_stack([motion.frames, motion.times, motion.positions, motion.quaternions])
@@ -111,11 +111,33 @@ def write_measurement(
         write_json(root / EXPERIMENT, experiment)
         if truth is not None:
             write_json(root / "truth.json", dict(truth))
+        if beside is not None:
+            beside(root)
         Measurement.load(root)
-        if target.exists():
-            target.rmdir()
-        shutil.move(root, target)
     return Measurement.load(target)
+
+
+@contextmanager
+def _whole(target: Path) -> Iterator[Path]:
+    """A folder beside ``target`` to fill; in the end it takes its place, or disappears with what was made for it."""
+    new = [p for p in target.absolute().parents if not p.exists()]
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}-") as temporary:
+            root = Path(temporary) / target.name
+            root.mkdir()
+            yield root
+            if target.exists():
+                target.rmdir()
+            root.rename(target)
+    except BaseException as error:
+        for folder in new:
+            with suppress(OSError):
+                folder.rmdir()
+        if not isinstance(error, OSError):
+            raise
+        message = f"cannot be written ({error.strerror}); choose another place"
+        raise MeasurementError(message, file=target) from error
 
 
 def transforms(camera: Camera) -> dict[str, Any]:

@@ -176,41 +176,32 @@ def refined(
     opacities: Tensor,
     albedo: Tensor,
     targets: Sequence[tuple[Camera, Tensor, Tensor]],
-    *,
-    rounds: int,
 ) -> Tensor:
-    """Albedo that makes the drawn Gaussians agree with unlit photographs.
+    """Albedo by which the drawn Gaussians agree better with unlit photographs.
 
-    The drawn colour is linear in the Gaussians' colours. Each round moves every Gaussian by the mean of the residuals
-    of the pixels it shows in, weighted by how much (simultaneous algebraic reconstruction); one that shows nowhere
-    keeps what it has.
+    The drawn colour is linear in the Gaussians' colours. Every Gaussian is moved by the mean of the residuals of the
+    pixels it shows in, weighted by how much (a step of simultaneous algebraic reconstruction; a second one changes
+    pictures by less than cameras' noise); one that shows nowhere keeps what it has.
 
     Args:
         centres: (n, 3) m; covariances: (n, 3, 3) m²; opacities: (n,): every Gaussian that is drawn.
         albedo: (n, 3) sRGB-encoded, the start.
         targets: camera, unlit photograph (h, w, 3) encoded like the albedo, weight (h, w) of its pixels.
-        rounds: how often all photographs are gone through.
     """
-    current = albedo.clone()
-    ceiling = encoded(torch.tensor(BRIGHTEST)).item()
-    for _ in range(rounds):
-        push, weight = torch.zeros_like(current), current.new_zeros(len(current), 1)
-        for camera, target, mask in targets:
-            features = functional.pad(current, (0, 1), value=1.0).requires_grad_()
-            with torch.enable_grad():
-                drawn = rasterise_features(centres, covariances, opacities, features, camera, antialias=True)
-                image = drawn.image
-            covered = drawn.alpha.detach().clamp_min(1e-3)[..., None]
-            residual = (target - image[..., :3].detach() / covered) * mask[..., None]
-            pull = torch.cat([residual, mask[..., None]], dim=2)
-            # of a number: for the gradient of a picture torch would load half a thousand modules
-            with torch.enable_grad():
-                pulled = (image * pull).sum()
-            (gradient,) = torch.autograd.grad(pulled, features)
-            push += gradient[:, :3]
-            weight += gradient[:, 3:]
-        current = (current + push / (weight + 0.5)).clamp(0.0, ceiling)
-    return current
+    push, weight = torch.zeros_like(albedo), albedo.new_zeros(len(albedo), 1)
+    for camera, target, mask in targets:
+        features = functional.pad(albedo, (0, 1), value=1.0).requires_grad_()
+        with torch.enable_grad():
+            drawn = rasterise_features(centres, covariances, opacities, features, camera, antialias=True)
+        covered = drawn.alpha.detach().clamp_min(1e-3)[..., None]
+        residual = (target - drawn.image[..., :3].detach() / covered) * mask[..., None]
+        # of a number: for the gradient of a picture torch would load half a thousand modules
+        with torch.enable_grad():
+            pulled = (drawn.image * torch.cat([residual, mask[..., None]], dim=2)).sum()
+        (gradient,) = torch.autograd.grad(pulled, features)
+        push += gradient[:, :3]
+        weight += gradient[:, 3:]
+    return (albedo + push / (weight + 0.5)).clamp(0.0, encoded(torch.tensor(BRIGHTEST)).item())
 
 
 def tool_albedo(frames: Sequence[Frame], lit_tool: Callable[[Camera], Tensor]) -> FloatArray:

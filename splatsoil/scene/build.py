@@ -26,9 +26,6 @@ from splatsoil.splats import Gaussians
 
 FloatArray = npt.NDArray[np.float64]
 
-ROUNDS = 2
-"""Rounds of `albedo.refined`; more follow the noise of the photographs."""
-
 _FOOTPRINT = 0.002
 """Half width of the patch of surface that a Gaussian's colour was seen on, m, for shadows' edges."""
 
@@ -63,7 +60,6 @@ def build_scene(
     light: Light | None = None,
     intrinsic: Intrinsic | None = None,
     device: torch.device | str = "cpu",
-    rounds: int = ROUNDS,
 ) -> Scene:
     """A scene from photographs of the undisturbed bed: light estimated, albedo taken from colours, Gaussians bound.
 
@@ -75,7 +71,6 @@ def build_scene(
         light: estimated if left out.
         intrinsic: light and albedo that were found before; nothing is estimated then.
         device: where the scene is drawn.
-        rounds: of refining the albedo.
 
     Raises:
         ParameterError: particles of another shape, or a reconstruction without soil.
@@ -122,7 +117,7 @@ def build_scene(
         scene = scene.replace(tool_albedo=albedos.tool_albedo(frames, lambda camera: scene.layers(posed, camera).tool))
         lit = light_relief(relief, light, body.at(*start), scene.tool_albedo)
         scene = scene.replace(**_albedo(soil, lit, scene))
-        return _refined(scene, scene.pose(x, None, start), frames, rounds) if rounds > 0 else scene
+        return _refined(scene, scene.pose(x, None, start), frames)
 
 
 def _side_light(soil: Gaussians, relief: Relief, light: Light, bed: Bed) -> FloatArray:
@@ -160,7 +155,7 @@ def _albedo(soil: Gaussians, lit: LitRelief, scene: Scene) -> dict[str, Tensor]:
     return {"soil_albedo": encoded(albedo), "grain_albedo": encoded(beneath)}
 
 
-def _refined(scene: Scene, posed: Posed, frames: list[Frame], rounds: int) -> Scene:
+def _refined(scene: Scene, posed: Posed, frames: list[Frame]) -> Scene:
     """The scene with its visible albedo made to agree with the photographs, each pixel's light taken out."""
     targets = []
     for frame in frames:
@@ -175,7 +170,7 @@ def _refined(scene: Scene, posed: Posed, frames: list[Frame], rounds: int) -> Sc
     shown, near = scene.shown(posed.lit.relief, scene.soil.rest, scene.soil.particles)
     count = int(shown.sum()) + int(near.sum())
     parts = (posed.centres[:count], posed.covariances[:count], posed.opacities[:count])
-    found = albedos.refined(*parts, posed.features[:count, :3], targets, rounds=rounds)
+    found = albedos.refined(*parts, posed.features[:count, :3], targets)
     soil, grains = scene.soil_albedo.clone(), scene.grain_albedo.clone()
     on_top = posed.features[:count, 3:] > 0.0  # not at a side, whose colour is not in the light that was taken out
     first = int(shown.sum())

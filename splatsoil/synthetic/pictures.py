@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Protocol, TypeVar
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -20,8 +19,6 @@ from splatsoil.synthetic.soil_surface import soil_surface
 from splatsoil.synthetic.stage import Body, FloatImage, Stage, photograph
 
 FloatArray = npt.NDArray[np.float64]
-T = TypeVar("T")
-R = TypeVar("R")
 
 NOISE = 1.5 / 255.0
 """Standard deviation of the sensor's noise, sRGB."""
@@ -76,20 +73,12 @@ class Photographer:
         views: list[Picture] = []
         video: list[Picture] = []
         undisturbed = (setup.frames[0], Observation())
-        filmed = [(frame, self.observation) for frame in setup.frames]
-        moments = [undisturbed, *(moment for moment in filmed if moment != undisturbed)]
-
-        def soil(moment: tuple[int, Observation]) -> Body:
-            return self.soil(*moment, colours)
-
-        # While a GPU traces light the CPU is free.
-        soils = map(soil, moments) if self.device == "cpu" else _one_ahead(soil, moments)
-        stage = self.stage(*undisturbed, next(soils))
+        stage = self.stage(*undisturbed, colours)
         for i, camera in enumerate(setup.views):
             views.append(Picture(camera, self._expose(self._light(stage, camera, 0, i), 0, i)))
-        for frame, observation in filmed:
-            if (frame, observation) != undisturbed:
-                stage = self.stage(frame, observation, next(soils))
+        for frame in setup.frames:
+            if (frame, self.observation) != undisturbed:
+                stage = self.stage(frame, self.observation, colours)
             # Nothing moves in the pre-roll, but it has its own light paths: it measures all of the pictures' noise.
             numbers = (*setup.pre_roll, frame) if frame == setup.frames[0] else (frame,)
             for which, camera in enumerate(setup.video.values(), start=1):
@@ -103,14 +92,8 @@ class Photographer:
         video.sort(key=lambda picture: (picture.frame, order[picture.camera.name]))
         return views, video
 
-    def soil(self, frame: int, seen: Observation, colours: FloatArray) -> Body:
-        """Of one frame of the video; particle albedo (n, 3), linear."""
-        particles, _ = self.trajectory.at(self._moment(frame, seen))
-        bed, sides = self.setup.bed.domain, self.setup.bed.container in (TRANSPARENT, HEAP)
-        return soil_surface(particles, colours, self.trajectory.spacing, bed, sides=sides)
-
-    def stage(self, frame: int, seen: Observation, soil: Body) -> Renderer:
-        """Soil, tool, bin and ground of one frame of the video."""
+    def stage(self, frame: int, seen: Observation, colours: FloatArray) -> Renderer:
+        """Soil, tool, bin and ground of one frame of the video; particle albedo (n, 3), linear."""
         setup = self.setup
         look = replace(
             self.look,
@@ -118,7 +101,11 @@ class Photographer:
             elevation=self.look.elevation + seen.sun_elevation,
             sky_share=self.look.sky_share + seen.sky_share,
         )
-        rotation, position = seen.tool(setup.tool.motion.pose(self._moment(frame, seen) / setup.frame_rate))
+        moment = frame + seen.time_offset * setup.frame_rate
+        particles, _ = self.trajectory.at(moment)
+        sides = setup.bed.container in (TRANSPARENT, HEAP)
+        soil = soil_surface(particles, colours, self.trajectory.spacing, setup.bed.domain, sides=sides)
+        rotation, position = seen.tool(setup.tool.motion.pose(moment / setup.frame_rate))
         tool = setup.tool.mesh
         placed = trimesh.Trimesh(tool.vertices @ rotation.T + position, tool.faces, process=False)
         walls, ground = surroundings_of(setup)
@@ -132,10 +119,6 @@ class Photographer:
             pattern=look.seed,
             device=self.device,
         )
-
-    def _moment(self, frame: int, seen: Observation) -> float:
-        """When a frame is really taken, in frames."""
-        return frame + seen.time_offset * self.setup.frame_rate
 
     def _light(self, stage: Renderer, camera: Camera, which: int, number: int) -> FloatImage:
         paths = self._generator(4, which, number).integers(2**31)
@@ -152,16 +135,6 @@ class Photographer:
     def _generator(self, use: int, which: int, number: int) -> np.random.Generator:
         # Seeds may not be negative, which the pre-roll's numbers are.
         return np.random.default_rng([self.seed, use, which, number % 2**32])
-
-
-def _one_ahead(work: Callable[[T], R], items: Sequence[T]) -> Iterator[R]:
-    """Results of work on each, the next one of which is made while the last one is used."""
-    with ThreadPoolExecutor(1) as beside:
-        coming = beside.submit(work, items[0])
-        for following in items[1:]:
-            made, coming = coming.result(), beside.submit(work, following)
-            yield made
-        yield coming.result()
 
 
 def surroundings_of(setup: Setup) -> tuple[list[trimesh.Trimesh], float]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -75,12 +74,7 @@ class Light:
 
     @classmethod
     def from_angles(
-        cls,
-        azimuth: float,
-        elevation: float,
-        sun: npt.ArrayLike,
-        sky: npt.ArrayLike,
-        softness: float = SUN_RADIUS,
+        cls, azimuth: float, elevation: float, sun: npt.ArrayLike, sky: npt.ArrayLike, softness: float = SUN_RADIUS
     ) -> Light:
         """Angles in degrees; the azimuth counts from +x towards +y.
 
@@ -90,9 +84,7 @@ class Light:
         if not 0.0 < elevation <= 90.0:
             raise ParameterError(f"the sun must stand above the horizon; {elevation:g} deg does not")
         turn, rise = math.radians(azimuth), math.radians(elevation)
-        direction = np.array(
-            [math.cos(rise) * math.cos(turn), math.cos(rise) * math.sin(turn), math.sin(rise)], dtype=np.float64
-        )
+        direction = np.array([math.cos(rise) * math.cos(turn), math.cos(rise) * math.sin(turn), math.sin(rise)])
         sun, sky = (np.broadcast_to(np.asarray(s, dtype=np.float64), (3,)).copy() for s in (sun, sky))
         return cls(direction, sun, sky, softness)
 
@@ -156,9 +148,10 @@ class Stage:
             seed: of the light paths.
             side: each pixel is the mean of side² paths.
         """
-        lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, camera.model)
-        rays = _corner_rays(*lens, camera.distortion) @ camera.camera_to_world[:3, :3].T
-        blind = np.asarray(~np.isfinite(rays).all(axis=2))
+        columns, rows = np.meshgrid(np.arange(camera.width + 1.0), np.arange(camera.height + 1.0))
+        _, rays = camera.rays(np.stack([columns, rows], axis=-1))
+        rays = rays.reshape(camera.height + 1, camera.width + 1, 3)
+        blind = ~np.isfinite(rays).all(axis=2)
         # Between a pixel's corners directions are interpolated: for a pixel of 3 mrad that is exact to a microradian.
         directions = wp.array(np.nan_to_num(rays).astype(np.float32), dtype=wp.vec3, device=self.device)
         count = camera.width * camera.height
@@ -174,27 +167,6 @@ class Stage:
         unseen = blind[:-1, :-1] | blind[1:, :-1] | blind[:-1, 1:] | blind[1:, 1:]
         image[unseen] = 0.0
         return image
-
-
-@lru_cache(maxsize=8)
-def _corner_rays(
-    width: int,
-    height: int,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    model: str,
-    distortion: tuple[float, float, float, float, float, float],
-) -> FloatArray:
-    """Unit directions (height + 1, width + 1, 3) through the pixels' corners in a camera's own axes, NaN where no ray
-    leads: to undo a lens' distortion takes longer than to follow the rays, and many pictures share one."""
-    k1, k2, k3, k4, p1, p2 = distortion
-    camera = Camera(width, height, fx, fy, cx, cy, np.eye(4), k1, k2, k3, k4, p1, p2, model=model)
-    columns, rows = np.meshgrid(np.arange(width + 1.0), np.arange(height + 1.0))
-    _, rays = camera.rays(np.stack([columns.ravel(), rows.ravel()], axis=1))
-    rays.setflags(write=False)
-    return rays.reshape(height + 1, width + 1, 3)
 
 
 def photograph(radiance: FloatImage, noise: float, generator: np.random.Generator) -> npt.NDArray[np.uint8]:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -179,7 +177,8 @@ def photograph_run(
         renderer: makes what pictures are taken of, from `Stage`'s arguments.
 
     Raises:
-        ParameterError: a place that is taken or cannot be written.
+        ParameterError: a place that is taken.
+        MeasurementError: one that cannot be written.
     """
     target = Path(out)
     check_place(target)
@@ -189,21 +188,19 @@ def photograph_run(
     views, video = photographer.take()
     frames = np.arange(1, len(trajectory.force) + 1)
     force = np.column_stack([frames, frames / setup.frame_rate, trajectory.force]) if len(frames) else None
-    with _whole(target) as place:
-        write_measurement(
-            place,
-            name=target.resolve().name,
-            bed=setup.bed,
-            tool=replace(setup.tool, force=force),
-            views=views,
-            video=video,
-            frame_rate=setup.frame_rate,
-            gravity=setup.gravity,
-            quality=QUALITY,
-            truth=truth,
-        )
-        save_particles(place / "truth_particles.npz", trajectory, truth_frames(setup.frames))
-    return Measurement.load(target)
+    return write_measurement(
+        target,
+        name=target.resolve().name,
+        bed=setup.bed,
+        tool=replace(setup.tool, force=force),
+        views=views,
+        video=video,
+        frame_rate=setup.frame_rate,
+        gravity=setup.gravity,
+        quality=QUALITY,
+        truth=truth,
+        beside=lambda place: save_particles(place / "truth_particles.npz", trajectory, truth_frames(setup.frames)),
+    )
 
 
 def check_place(target: Path) -> None:
@@ -246,29 +243,3 @@ def save_particles(path: Path, trajectory: Trajectory, frames: Iterable[int]) ->
         f"f{frame:03d}": np.round((p - origin) / scale).astype(np.uint16) for frame, p in chosen.items()
     }
     np.savez_compressed(path, **arrays, scale=scale, origin=origin, spacing=trajectory.spacing)
-
-
-@contextmanager
-def _whole(target: Path) -> Iterator[Path]:
-    """A folder beside ``target`` to fill; in the end it takes its place, or disappears with what was made for it."""
-    new = [p for p in target.absolute().parents if not p.exists()]
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}-") as temporary:
-            place = Path(temporary) / target.name
-            yield place
-            if target.exists():
-                target.rmdir()
-            place.rename(target)
-    except OSError as error:
-        _forget(new)
-        raise ParameterError(f"{target}: cannot be written ({error.strerror}); choose another place") from error
-    except BaseException:
-        _forget(new)
-        raise
-
-
-def _forget(folders: list[Path]) -> None:
-    for folder in folders:
-        with suppress(OSError):
-            folder.rmdir()

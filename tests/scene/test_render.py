@@ -341,7 +341,7 @@ def test_true_particles_look_like_the_measured_frames():
     true = {f: (stored[f"f{f:03d}"] * float(stored["scale"])).astype(np.float32) for f in frames}
     start, spacing = torch.tensor(true[0]), float(stored["spacing"])
     reconstruction = coloured_surface(measurement, start, spacing)
-    scene = build_scene(reconstruction, measurement, start, spacing, rounds=1)
+    scene = build_scene(reconstruction, measurement, start, spacing)
     # the sun as its shadow shows it in the photographs, measured by hand: azimuth 145, elevation 53 degrees
     assert abs(scene.light.azimuth - 145.0) < 3.0
     assert abs(scene.light.elevation - 53.0) < 3.0

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from splatsoil import cli
-from splatsoil.errors import ParameterError
+from splatsoil.errors import MeasurementError, ParameterError
 from splatsoil.measurement import Measurement, ToolMotion, remarks
 from splatsoil.synthetic import Appearance, Setup, World, like, make_set, paper, plow
 from splatsoil.synthetic.setups import video_frames
@@ -310,7 +310,7 @@ def test_a_fault_while_writing_leaves_nothing(tmp_path: Path, monkeypatch: pytes
     setup = short(views=1)
     setup = replace(setup, tool=replace(setup.tool, motion=cut), frames=(0, 1))
     monkeypatch.setattr("splatsoil.synthetic.world.np.savez_compressed", full)
-    with pytest.raises(ParameterError, match="No space left"):
+    with pytest.raises(MeasurementError, match="No space left"):
         make_set(tmp_path / "deep" / "new", setup, preset="tiny")
     assert list(tmp_path.iterdir()) == []
 
