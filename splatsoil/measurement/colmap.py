@@ -14,13 +14,13 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
 from splatsoil.errors import MeasurementError
 from splatsoil.measurement.camera import LENSES, Camera
 from splatsoil.measurement.fields import inside, read_text
 from splatsoil.measurement.frames import Frame
 from splatsoil.measurement.images import check_image
-from splatsoil.measurement.rotations import quaternion_to_matrix
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -91,7 +91,7 @@ def _camera_to_world(
     norm = float(np.linalg.norm(quaternion))
     if not np.isfinite(translation).all() or not 0.5 < norm < 2.0:
         raise MeasurementError("the pose is no rigid motion", file=file, field=name)
-    rotation = quaternion_to_matrix(quaternion / norm)
+    rotation = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
     out = np.eye(4)
     out[:3, :3] = rotation.T @ np.diag([1.0, -1.0, -1.0])  # OpenCV to OpenGL camera axes
     out[:3, 3] = -rotation.T @ translation
@@ -153,33 +153,25 @@ class _Bytes:
     """Little-endian values from a binary file, with MeasurementError at its end."""
 
     def __init__(self, file: Path) -> None:
-        self.file = file
-        self.data = file.read_bytes()
-        self.at = 0
+        self.file, self.data, self.at = file, file.read_bytes(), 0
 
-    def take(self, form: str) -> tuple[float, ...]:
-        size = struct.calcsize("<" + form)
-        if self.at + size > len(self.data):
-            raise MeasurementError("the file is truncated", file=self.file, field=f"byte {len(self.data)}")
-        values = struct.unpack_from("<" + form, self.data, self.at)
-        self.at += size
-        return values
-
-    def word(self) -> str:
-        end = self.data.find(b"\0", self.at)
-        if end < 0:
-            raise MeasurementError("the file is truncated", file=self.file, field=f"byte {len(self.data)}")
-        raw = self.data[self.at : end]
-        self.at = end + 1
-        try:
-            return raw.decode()
-        except UnicodeDecodeError as error:
-            raise MeasurementError("not a COLMAP file", file=self.file, field=f"byte {end - len(raw)}") from error
-
-    def skip(self, count: int) -> None:
+    def skip(self, count: int) -> int:
+        """Go on by so many bytes, and say from where."""
         if self.at + count > len(self.data):
             raise MeasurementError("the file is truncated", file=self.file, field=f"byte {len(self.data)}")
         self.at += count
+        return self.at - count
+
+    def take(self, form: str) -> tuple[float, ...]:
+        return struct.unpack_from("<" + form, self.data, self.skip(struct.calcsize("<" + form)))
+
+    def word(self) -> str:
+        end = self.data.find(b"\0", self.at)
+        begin = self.skip(end + 1 - self.at if end >= 0 else len(self.data) + 1)
+        try:
+            return self.data[begin:end].decode()
+        except UnicodeDecodeError as error:
+            raise MeasurementError("not a COLMAP file", file=self.file, field=f"byte {begin}") from error
 
 
 def _read_cameras_bin(file: Path) -> dict[int, _Calibration]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import math
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -116,8 +115,7 @@ def read_transforms(file: Path, root: Path, *, video: bool) -> tuple[Frame, ...]
     frames = tuple(_read_frame(item, root, video=video) for item in fields.children("frames"))
     _check_unique(frames, file, video=video)
     if video:
-        _check_fixed(frames, file)
-        _check_times(frames, file)
+        _check_cameras(frames, file)
     told = f"w and h of {file.name}"
     for i, frame in enumerate(frames):
         size = (frame.camera.width, frame.camera.height)
@@ -134,8 +132,6 @@ def read_transforms(file: Path, root: Path, *, video: bool) -> tuple[Frame, ...]
             )
         if frame.depth_path is not None:
             _check_depth(frame.depth_path, size, told, f"frames[{i}].depth_file_path")
-    if not video:
-        _check_contents(frames, file)
     return frames
 
 
@@ -238,69 +234,50 @@ def _read_frame(fields: Fields, root: Path, *, video: bool) -> Frame:
 
 
 def _check_unique(frames: tuple[Frame, ...], file: Path, *, video: bool) -> None:
+    """No image, and no camera's frame, is given twice, nor a photograph, each of which has its own noise, under two
+    names: one of the poses would be wrong."""
     seen: dict[object, int] = {}
     for i, frame in enumerate(frames):
-        keys: list[tuple[object, str, str]] = [(frame.path, f"frames[{i}].file_path", f"the image {frame.path.name}")]
+        image, twice = f"the image {frame.path.name}", "is given twice, first in"
+        keys: list[tuple[object, str, str, str]] = [(frame.path, "file_path", f"{image} {twice}", "")]
         if video:
             what = f"frame {frame.frame} of camera {frame.camera_name!r}"
-            keys.append(((frame.camera_name, frame.frame), f"frames[{i}].frame", what))
-        for key, field, what in keys:
-            if key in seen:
-                raise MeasurementError(f"{what} is given twice, first in frames[{seen[key]}]", file=file, field=field)
-            seen[key] = i
+            keys.append(((frame.camera_name, frame.frame), "frame", f"{what} {twice}", ""))
+        else:
+            content = hashlib.sha256(frame.path.read_bytes()).digest()
+            keys.append((content, "file_path", f"{image} is the same as that of", ", bit by bit"))
+        for key, field, fault, how in keys:
+            first = seen.setdefault(key, i)
+            if first < i:
+                raise MeasurementError(f"{fault} frames[{first}]{how}", file=file, field=f"frames[{i}].{field}")
 
 
-def _check_contents(frames: tuple[Frame, ...], file: Path) -> None:
-    """No two photographs, each with its own noise, are the same to the last bit: one of their poses would be wrong."""
-    seen: dict[bytes, int] = {}
-    for i, frame in enumerate(frames):
-        first = seen.setdefault(hashlib.sha256(frame.path.read_bytes()).digest(), i)
-        if first < i:
-            raise MeasurementError(
-                f"the image {frame.path.name} is the same as that of frames[{first}], bit by bit",
-                file=file,
-                field=f"frames[{i}].file_path",
-            )
-
-
-def _by_camera(frames: tuple[Frame, ...]) -> Iterator[list[tuple[int, Frame]]]:
+def _check_cameras(frames: tuple[Frame, ...], file: Path) -> None:
+    """Each camera of a video stands still, keeps its calibration, and its clock goes on."""
     for name in dict.fromkeys(frame.camera_name for frame in frames):
-        yield [(i, frame) for i, frame in enumerate(frames) if frame.camera_name == name]
-
-
-def _check_fixed(frames: tuple[Frame, ...], file: Path) -> None:
-    for group in _by_camera(frames):
-        first = group[0][1].camera
-        for i, frame in group[1:]:
-            camera = frame.camera
-            if np.abs(camera.camera_to_world - first.camera_to_world).max() > 1e-4:
-                raise MeasurementError(
-                    f"camera {frame.camera_name!r} moves; the video's cameras must stand still",
-                    file=file,
-                    field=f"frames[{i}].transform_matrix",
-                )
-            here = (camera.width, camera.height, *camera.intrinsics.ravel(), *camera.distortion)
-            there = (first.width, first.height, *first.intrinsics.ravel(), *first.distortion)
-            if here != there or camera.model != first.model:
-                raise MeasurementError(
-                    f"camera {frame.camera_name!r} has another calibration than in frames[{group[0][0]}]",
-                    file=file,
-                    field=f"frames[{i}]",
-                )
-
-
-def _check_times(frames: tuple[Frame, ...], file: Path) -> None:
-    for group in _by_camera(frames):
-        ordered = sorted(group, key=lambda pair: pair[1].frame or 0)
-        for (_, before), (i, after) in pairwise(ordered):
+        own = [(i, frame) for i, frame in enumerate(frames) if frame.camera_name == name]
+        start, first = own[0]
+        for i, frame in own:
+            field, fault = f"frames[{i}]", ""
+            if np.abs(frame.camera.camera_to_world - first.camera.camera_to_world).max() > 1e-4:
+                field, fault = f"{field}.transform_matrix", "moves; the video's cameras must stand still"
+            elif _calibration(frame.camera) != _calibration(first.camera):
+                fault = f"has another calibration than in frames[{start}]"
+            if fault:
+                raise MeasurementError(f"camera {name!r} {fault}", file=file, field=field)
+        for (_, before), (i, after) in pairwise(sorted(own, key=lambda pair: pair[1].frame or 0)):
             assert before.time is not None and after.time is not None
             if after.time <= before.time:
                 raise MeasurementError(
-                    f"time runs backwards: camera {after.camera_name!r} has frame {before.frame} at {before.time:g} s, "
+                    f"time runs backwards: camera {name!r} has frame {before.frame} at {before.time:g} s, "
                     f"frame {after.frame} at {after.time:g} s",
                     file=file,
                     field=f"frames[{i}].time",
                 )
+
+
+def _calibration(camera: Camera) -> tuple[object, ...]:
+    return camera.model, camera.width, camera.height, *camera.intrinsics.ravel(), *camera.distortion
 
 
 def _check_depth(path: Path, size: tuple[int, int], told: str, field: str) -> None:

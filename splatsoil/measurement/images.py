@@ -174,16 +174,14 @@ def _opened(path: Path, field: str | None = None) -> Image.Image:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             return Image.open(path, formats=[name for name in FORMATS if name in Image.OPEN])
-    except FileNotFoundError as error:
-        raise MeasurementError("no such image", file=path, field=field) from error
-    except UnidentifiedImageError as error:
-        raise MeasurementError(
-            "not an image of a known kind, or its beginning is damaged", file=path, field=field
-        ) from error
-    except Image.DecompressionBombError as error:
-        raise MeasurementError("the image claims to be larger than any photograph", file=path, field=field) from error
-    except (OSError, ValueError, SyntaxError) as error:
-        raise MeasurementError(f"the image cannot be opened: {error}", file=path, field=field) from error
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        faults = {
+            FileNotFoundError: "no such image",
+            UnidentifiedImageError: "not an image of a known kind, or its beginning is damaged",
+            Image.DecompressionBombError: "the image claims to be larger than any photograph",
+        }
+        fault = faults.get(type(error), f"the image cannot be opened: {error}")
+        raise MeasurementError(fault, file=path, field=field) from error
 
 
 def _decode(image: Image.Image, path: Path, field: str | None = None) -> None:

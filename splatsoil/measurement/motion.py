@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
 from splatsoil.errors import MeasurementError
 from splatsoil.measurement.fields import read_table
-from splatsoil.measurement.rotations import quaternion_to_matrix, rotation_matrix, rotation_vector
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -72,11 +72,11 @@ class ToolMotion:
     def pose(self, time: float) -> tuple[FloatArray, FloatArray]:
         """Rotation (3, 3), tool frame to world, and position (3,) of the tool frame's origin at ``time`` in seconds."""
         i, t = self._segment(time)
+        start = Rotation.from_quat(self.quaternions[i], scalar_first=True)
         if t == 0.0:
-            return quaternion_to_matrix(self.quaternions[i]), self.positions[i].copy()
-        turn = rotation_matrix(t * rotation_vector(self.quaternions[i], self.quaternions[i + 1]))
+            return start.as_matrix(), self.positions[i].copy()
         position = (1.0 - t) * self.positions[i] + t * self.positions[i + 1]
-        return turn @ quaternion_to_matrix(self.quaternions[i]), position
+        return (Rotation.from_rotvec(t * self._turn(i)) * start).as_matrix(), position
 
     def matrix(self, time: float) -> FloatArray:
         """The pose as a (4, 4) matrix, tool frame to world."""
@@ -94,7 +94,12 @@ class ToolMotion:
         i = int(np.searchsorted(self.times, time, side="right")) - 1
         step = self.times[i + 1] - self.times[i]
         linear = (self.positions[i + 1] - self.positions[i]) / step
-        return linear, rotation_vector(self.quaternions[i], self.quaternions[i + 1]) / step
+        return linear, self._turn(i) / step
+
+    def _turn(self, i: int) -> FloatArray:
+        """The shortest rotation vector (3,), in the world, from a row's orientation to the next one's."""
+        start, end = (Rotation.from_quat(self.quaternions[k], scalar_first=True) for k in (i, i + 1))
+        return (end * start.inv()).as_rotvec()
 
     def _segment(self, time: float) -> tuple[int, float]:
         """Row before ``time`` and the fraction of the way to the next."""

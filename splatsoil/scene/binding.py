@@ -70,16 +70,15 @@ class Binding:
         if positions.shape != self.particles.shape:
             raise ValueError(f"{tuple(self.particles.shape)} particles at rest, {tuple(positions.shape)} now")
         centres, covariances = torch.empty_like(self.rest), torch.empty_like(self.covariances)
-        still = deformations is None
-        held = positions.new_zeros((0, 3, 3)) if deformations is None else torch.empty_like(deformations)
-        if deformations is not None:
-            shapes = [as_warp(deformations, wp.mat33), *STRETCH, as_warp(held, wp.mat33)]
-            launch(_hold, len(held), shapes, held)
+        if deformations is None:
+            held = torch.eye(3, device=positions.device).expand(len(positions), 3, 3).contiguous()
+        else:
+            held = torch.empty_like(deformations)
+            launch(_hold, len(held), [as_warp(deformations, wp.mat33), *STRETCH, as_warp(held, wp.mat33)], held)
         inputs = [as_warp(self.rest, wp.vec3), as_warp(self.covariances, wp.mat33), as_warp(self.particles, wp.vec3)]
-        inputs += [as_warp(positions, wp.vec3), as_warp(held, wp.mat33), int(still)]
-        inputs += [as_warp(self.index, wp.int32), as_warp(self.weights, wp.float32), *STRETCH]
-        outputs = [as_warp(centres, wp.vec3), as_warp(covariances, wp.mat33)]
-        launch(_carry, len(self), inputs + outputs, centres)
+        inputs += [as_warp(positions, wp.vec3), as_warp(held, wp.mat33), as_warp(self.index, wp.int32)]
+        inputs += [as_warp(self.weights, wp.float32), *STRETCH, as_warp(centres, wp.vec3)]
+        launch(_carry, len(self), [*inputs, as_warp(covariances, wp.mat33)], centres)
         return centres, covariances
 
 
@@ -156,7 +155,6 @@ def _carry(
     particles: wp.array(dtype=wp.vec3),
     positions: wp.array(dtype=wp.vec3),
     deformations: wp.array(dtype=wp.mat33),
-    still: int,
     index: wp.array2d(dtype=wp.int32),
     weights: wp.array2d(dtype=wp.float32),
     smallest: float,
@@ -170,16 +168,8 @@ def _carry(
     for k in range(index.shape[1]):
         p = index[g, k]
         w = weights[g, k]
-        arm = rest[g] - particles[p]
-        if still == 1:
-            x += w * (positions[p] + arm)
-        else:
-            d = deformations[p]
-            x += w * (positions[p] + d * arm)
-            f += w * d
+        x += w * (positions[p] + deformations[p] * (rest[g] - particles[p]))
+        f += w * deformations[p]
+    f = bounded_deformation(f, smallest, largest)
     centres_out[g] = x
-    if still == 1:
-        covariances_out[g] = covariances[g]
-    else:
-        f = bounded_deformation(f, smallest, largest)
-        covariances_out[g] = f * covariances[g] * wp.transpose(f)
+    covariances_out[g] = f * covariances[g] * wp.transpose(f)

@@ -84,15 +84,6 @@ def test_projection_is_kornias() -> None:
     np.testing.assert_allclose(camera.project(world)[0], bent.numpy(), atol=1e-8)
 
 
-def test_fisheye_is_kornias_kannala_brandt() -> None:
-    camera = Camera(**SIZE, camera_to_world=FLIP, **WIDE)
-    plane = np.random.default_rng(1).uniform(-1.5, 1.5, (100, 2))
-    parameters = torch.tensor([343.0, 350.0, 171.5, 110.25, *camera.distortion[:4]], dtype=torch.float64)
-    expected = kornia.geometry.camera.distort_points_kannala_brandt(torch.from_numpy(plane), parameters)
-    pixels, _ = camera.project(np.concatenate([plane, np.ones((100, 1))], axis=1))
-    np.testing.assert_allclose(pixels, expected.numpy(), atol=1e-9)
-
-
 @pytest.mark.parametrize("options", [{}, BENT, WIDE, {"k1": 0.3, "k4": 0.02}], ids=["pinhole", "bent", "wide", "k4"])
 def test_rays_go_back_through_their_pixels(options: dict) -> None:
     camera = Camera(**SIZE, camera_to_world=pose(), **options)
@@ -103,18 +94,6 @@ def test_rays_go_back_through_their_pixels(options: dict) -> None:
     there, depth = camera.project(origins + 0.7 * directions)
     np.testing.assert_allclose(there, pixels, atol=1e-6)
     assert (depth > 0.0).all()
-
-
-def test_rays_of_bent_lens_are_kornias() -> None:
-    camera = Camera(**SIZE, camera_to_world=FLIP, **BENT)
-    pixels = pixel_grid(camera)[::97]
-    coefficients = torch.tensor([[BENT[c] for c in ("k1", "k2", "p1", "p2", "k3")]], dtype=torch.float64)
-    k = torch.from_numpy(camera.intrinsics)[None]
-    straight = kornia.geometry.calibration.undistort_points(
-        torch.from_numpy(pixels)[None], k, coefficients, num_iters=50
-    )
-    ours, _ = camera.undistorted().project(camera.rays(pixels)[1])
-    np.testing.assert_allclose(ours, straight[0].numpy(), atol=1e-6)
 
 
 def test_looking_down_the_axes() -> None:

@@ -172,15 +172,6 @@ def test_frames_of_another_set_are_copied_bit_by_bit(plow_dry: Path, tmp_path: P
     np.testing.assert_allclose(copy.tool.motion.pose(1.234)[0], m.tool.motion.pose(1.234)[0], atol=1e-12)
 
 
-def test_jpegs_stay_close(tmp_path: Path) -> None:
-    """Smooth pictures through the default file type: within 2 grey levels on average."""
-    parts = made_up()
-    smooth = np.linspace(0, 1, 24 * 32 * 3).reshape(24, 32, 3)
-    m = write_measurement(tmp_path / "set", **parts | {"views": [Picture(parts["views"][0].camera, smooth)]})
-    assert m.views[0].path.suffix == ".jpg"
-    assert np.abs(m.views[0].image() - smooth).mean() < 2.0 / 255.0
-
-
 def test_nothing_is_overwritten_and_faults_leave_nothing(tmp_path: Path) -> None:
     parts = made_up()
     taken = tmp_path / "taken"

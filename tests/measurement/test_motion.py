@@ -9,7 +9,6 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from splatsoil.measurement import ToolMotion
-from splatsoil.measurement.rotations import quaternion_to_matrix, rotation_matrix, rotation_vector
 
 TIMES = np.array([0.0, 0.1, 0.25, 0.3, 1.0])
 
@@ -40,7 +39,8 @@ def test_the_tool_rests_before_and_after(tumbling: tuple[ToolMotion, Slerp]) -> 
     motion, _ = tumbling
     for outside, row in ((-5.0, 0), (7.0, -1)):
         np.testing.assert_array_equal(motion.pose(outside)[1], motion.positions[row])
-        np.testing.assert_allclose(motion.pose(outside)[0], quaternion_to_matrix(motion.quaternions[row]))
+        expected = Rotation.from_quat(motion.quaternions[row], scalar_first=True).as_matrix()
+        np.testing.assert_allclose(motion.pose(outside)[0], expected)
         assert not np.any(motion.twist(outside))
 
 
@@ -67,16 +67,6 @@ def test_turning_about_an_axis_by_hand() -> None:
     np.testing.assert_allclose(angular, [0, 0, np.pi], atol=1e-12)
     np.testing.assert_allclose(motion.twist(0.0)[0], [0.2, 0, 0], err_msg="at a row, what begins there")
     np.testing.assert_array_equal(motion.twist(0.5)[0], 0.0)
-
-
-def test_plow_drys_motion(plow_dry: Path) -> None:
-    """Rows of its CSV, and the plunge's 0.2 m/s between the first two."""
-    motion = ToolMotion.read(plow_dry / "tool_motion.csv")
-    assert len(motion.times) == 201 and motion.frames[-1] == 200
-    rotation, position = motion.pose(0.02)
-    np.testing.assert_allclose(position, [0.2, 0.25, 0.206])
-    np.testing.assert_allclose(rotation, Rotation.from_quat([0, 0.173648, 0, 0.984808]).as_matrix(), atol=1e-9)
-    np.testing.assert_allclose(motion.twist(0.01)[0], [0, 0, -0.2], atol=1e-12)
 
 
 HEADER = ["frame", "time", "x", "y", "z", "qw", "qx", "qy", "qz"]
@@ -125,18 +115,6 @@ def test_one_row_is_a_resting_tool() -> None:
     motion = ToolMotion([0], [0.0], [[1, 2, 3]], [[1, 0, 0, 0]])
     np.testing.assert_array_equal(motion.pose(4.0)[1], [1, 2, 3])
     assert not np.any(motion.twist(0.0))
-
-
-def test_rotation_vectors_are_scipys() -> None:
-    vectors = np.random.default_rng(5).normal(size=(50, 3))
-    vectors[0] = 0.0
-    vectors[1] *= 1e-13
-    for vector in vectors:
-        np.testing.assert_allclose(rotation_matrix(vector), Rotation.from_rotvec(vector).as_matrix(), atol=1e-14)
-        w = Rotation.from_rotvec(vector).as_quat()[[3, 0, 1, 2]]
-        shortest = Rotation.from_rotvec(vector).as_rotvec()
-        np.testing.assert_allclose(rotation_vector([1, 0, 0, 0], w), shortest, atol=1e-13)
-        np.testing.assert_allclose(rotation_vector(w, [1, 0, 0, 0]), -shortest, atol=1e-13)
 
 
 def test_tables_of_uneven_length_are_refused() -> None:
