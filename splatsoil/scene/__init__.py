@@ -7,7 +7,6 @@ from splatsoil.scene.ground import ground_of_pixels
 from splatsoil.scene.intrinsic import Intrinsic
 from splatsoil.scene.layers import Layers, Posed
 from splatsoil.scene.light import Light, encoded, linear
-from splatsoil.scene.light_fit import LightEstimate
 from splatsoil.scene.lit import LitRelief, light_relief
 from splatsoil.scene.relief import Relief, relief_of_particles
 from splatsoil.scene.render import Scene
@@ -18,7 +17,6 @@ __all__ = [
     "Intrinsic",
     "Layers",
     "Light",
-    "LightEstimate",
     "LitRelief",
     "Posed",
     "Relief",

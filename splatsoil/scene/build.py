@@ -91,7 +91,7 @@ def build_scene(
     if intrinsic is not None:
         light = intrinsic.light
     elif light is None:
-        light = estimate_light(measurement, relief, body).light
+        light = estimate_light(measurement, relief, body)
     motion = measurement.tool.motion
     start = motion.pose(float(motion.times[0]))
     scene = Scene(

@@ -9,14 +9,15 @@ import numpy as np
 import numpy.typing as npt
 import torch
 import torch.nn.functional as functional
+import trimesh
 import warp as wp
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 from splatsoil.measurement import Frame, Measurement
 from splatsoil.scene import kernels
-from splatsoil.scene.light import linear
-from splatsoil.scene.light_fit import FINEST, LAG, LightEstimate, Passing, fit_light
+from splatsoil.scene.light import Light, linear
+from splatsoil.scene.light_fit import FINEST, LAG, Passing, fit_light
 from splatsoil.scene.relief import Relief
 from splatsoil.scene.tool import ToolBody
 from splatsoil.splats.warp_torch import as_warp, launch
@@ -73,21 +74,17 @@ def seen_colours(
         seen = torch.empty(len(points), dtype=torch.float32, device=points.device)
         inputs = [as_warp(points, wp.vec3), wp.vec3(*camera.position), relief.surface, tool, slack]
         launch(kernels.points_seen, len(points), [*inputs, as_warp(seen, wp.float32)], points)
-        inside = (
-            (depth > 0) & (pixels > 1.0).all(axis=1) & (pixels < [camera.width - 1.0, camera.height - 1.0]).all(axis=1)
-        )
-        visible = (seen.cpu().numpy() > 0.5) & inside
+        size = np.array([camera.width, camera.height])
+        visible = (seen.cpu().numpy() > 0.5) & (depth > 0) & ((pixels > 1.0) & (pixels < size - 1.0)).all(axis=1)
         image = linear(torch.from_numpy(np.ascontiguousarray(frame.image())))
-        normalised = torch.from_numpy(2.0 * pixels[visible] / [camera.width, camera.height] - 1.0).float()
-        picked = functional.grid_sample(
-            image.permute(2, 0, 1)[None], normalised[None, None], mode="bilinear", align_corners=False
-        )
+        normalised = torch.from_numpy(2.0 * pixels[visible] / size - 1.0).float()
+        picked = functional.grid_sample(image.permute(2, 0, 1)[None], normalised[None, None], align_corners=False)
         samples[k, torch.from_numpy(visible)] = picked[0, :, 0].T
     count = torch.isfinite(samples[:, :, 0]).sum(dim=0)
     return samples.nanmedian(dim=0).values.to(points.device), count.to(points.device)
 
 
-def estimate_light(measurement: Measurement, relief: Relief, body: ToolBody) -> LightEstimate:
+def estimate_light(measurement: Measurement, relief: Relief, body: ToolBody) -> Light:
     """Sun and sky over a measurement set, from its photographs of soil that hasn't moved.
 
     Args:
@@ -113,11 +110,8 @@ def estimate_light(measurement: Measurement, relief: Relief, body: ToolBody) -> 
 def _moments(later: Sequence[int]) -> list[int]:
     """Some of the video's frames after the first, most of them early, when little has moved; of many, none later than
     half way."""
-    places: list[int] = []
-    count = min(_PASSING, len(later))
-    for place in np.geomspace(1.0, max(count, len(later) / 2, 1.0), count):
-        places.append(max(round(place) - 1, places[-1] + 1 if places else 0))
-    return [later[place] for place in places]
+    last = max(len(later) / 2, min(_PASSING, len(later)), 1.0)
+    return sorted({later[round(place) - 1] for place in np.geomspace(1.0, last, _PASSING)}) if later else []
 
 
 def untouched(
@@ -135,33 +129,23 @@ def untouched(
     Returns:
         (n,) by frame, True where nothing has come near.
     """
-    motion, rate, mesh = measurement.tool.motion, measurement.frame_rate, measurement.tool.mesh
-    ends = {frame: frame / rate for frame in sorted(frames)}
-    last = max(ends.values(), default=-math.inf)
-    first = min([float(motion.times[0]), *ends.values()])
-    times = sorted({first, *(float(t) for t in motion.times if t < last), *ends.values()})
-    where, moved = points[:, :2].double().cpu().numpy(), np.zeros(len(points), dtype=bool)
-
-    def corners(time: float) -> FloatArray:
-        rotation, position = motion.pose(time)
-        return np.asarray(mesh.vertices @ np.asarray(rotation).T + position, dtype=np.float64)
-
-    out, at = {}, first
-    for time in times:
-        steps = math.ceil(float(np.linalg.norm(corners(time) - corners(at), axis=1).max()) / _CLEARANCE)
-        # Logs are often denser than anything moves.
-        if steps > 1 or time in ends.values() or time == first:
-            for moment in np.linspace(at, time, max(steps, 1) + 1)[1:]:
-                discs, _ = body.discs(*motion.pose(float(moment)))
-                parts = torch.cat([discs, torch.as_tensor(corners(float(moment))).to(discs)])
-                depth = relief.sample(relief.height, parts) + _CLEARANCE - parts[:, 2]
-                if (depth > 0.0).any():
-                    reach = min(_WEDGE * float(depth.max()), float(max(mesh.extents)))
-                    sunk = cKDTree(parts[depth > 0.0, :2].double().cpu().numpy())
-                    rest = np.flatnonzero(~moved)
-                    moved[rest] = np.isfinite(sunk.query(where[rest], distance_upper_bound=reach)[0])
-            at = time
-        out.update({f: torch.from_numpy(~moved).to(points.device) for f, end in ends.items() if end == time})
+    motion, mesh, ends = measurement.tool.motion, measurement.tool.mesh, np.sort(frames) / measurement.frame_rate
+    # Moments between which the tool moves no farther than the clearance: by the way of its box's corners so far.
+    rows = np.union1d(motion.times, ends)
+    box = trimesh.bounds.corners(mesh.bounds)
+    corners = np.stack([box @ rotation.T + position for rotation, position in map(motion.pose, rows)])
+    way = np.cumsum([0.0, *np.linalg.norm(np.diff(corners, axis=0), axis=2).max(axis=1)])
+    where, moved, at = points[:, :2].double().cpu().numpy(), np.zeros(len(points), dtype=bool), 0.0
+    out = {}
+    for frame, end in zip(sorted(frames), np.interp(ends, rows, way), strict=True):
+        for gone in np.linspace(at, end, math.ceil((end - at) / _CLEARANCE) + 1):
+            discs, _ = body.discs(*motion.pose(float(np.interp(gone, way, rows))))
+            depth = relief.sample(relief.height, discs) + _CLEARANCE - discs[:, 2]
+            if (depth > 0.0).any():
+                reach = min(_WEDGE * float(depth.max()), float(max(mesh.extents)))
+                sunk = cKDTree(discs[depth > 0.0, :2].double().cpu().numpy())
+                moved |= np.isfinite(sunk.query(where, distance_upper_bound=reach)[0])
+        at, out[frame] = end, torch.from_numpy(~moved).to(points.device)
     return out
 
 

@@ -217,8 +217,8 @@ def pixel_ray(eye: Eye, u: float, v: float) -> wp.vec3:
 
 
 @wp.func
-def surface_depth(surface: Surface, origin: wp.vec3, ray: wp.vec3, far: float) -> float:
-    """Depth at which a ray from above first falls beneath the surface, or -1 if not before ``far``.
+def surface_depth(surface: Surface, origin: wp.vec3, ray: wp.vec3) -> float:
+    """Depth at which a ray from above first falls beneath the surface, or -1 where it leaves its map before.
 
     Far above the surface the steps are as long as slopes of 1.2 allow; steeper ones are met a little late.
     """
@@ -231,7 +231,7 @@ def surface_depth(surface: Surface, origin: wp.vec3, ray: wp.vec3, far: float) -
         return -1.0
     shortest = 0.5 * surface.step / wp.length(ray)
     closing = 1.0 / (1.2 * wp.sqrt(ray[0] * ray[0] + ray[1] * ray[1]) - ray[2])
-    while z < far:
+    while gap >= 0.0:
         stride = wp.max(shortest, gap * closing)
         z += stride
         x = origin + ray * z
@@ -252,21 +252,13 @@ def surface_depth(surface: Surface, origin: wp.vec3, ray: wp.vec3, far: float) -
                     before += stride
                     above = middle
                     gap *= 0.5
-            return z
+            # Beyond its map it goes on level.
+            u = (origin[0] + ray[0] * z - surface.grid.x0) * surface.grid.inverse_x + 0.5
+            v = (origin[1] + ray[1] * z - surface.grid.y0) * surface.grid.inverse_y + 0.5
+            rows = float(surface.height.shape[0])
+            inside = u >= 0.0 and v >= 0.0 and u <= float(surface.height.shape[1]) and v <= rows
+            return wp.where(inside, z, -1.0)
     return -1.0
-
-
-@wp.func
-def way_out(surface: Surface, origin: wp.vec3, ray: wp.vec3) -> float:
-    """Depth at which a ray leaves the rectangle that the surface's cells cover."""
-    out = float(1.0e6)
-    if wp.abs(ray[0]) > 1.0e-9:
-        end = wp.where(ray[0] > 0.0, float(surface.height.shape[1]) - 0.5, -0.5)
-        out = wp.min(out, (surface.grid.x0 + end / surface.grid.inverse_x - origin[0]) / ray[0])
-    if wp.abs(ray[1]) > 1.0e-9:
-        end = wp.where(ray[1] > 0.0, float(surface.height.shape[0]) - 0.5, -0.5)
-        out = wp.min(out, (surface.grid.y0 + end / surface.grid.inverse_y - origin[1]) / ray[1])
-    return out
 
 
 @wp.kernel(enable_backward=False)
@@ -297,7 +289,7 @@ def illuminate(
     pixels.light[i, j] = one
     pixels.tool[i, j] = wp.vec4(0.0, 0.0, 0.0, 0.0)
     if pixels.soil[i, j] > 0.01 and z > 0.0:
-        found = surface_depth(surface, eye.position, ray, way_out(surface, eye.position, ray))
+        found = surface_depth(surface, eye.position, ray)
         if found > 0.0:
             z = found
         x = eye.position + ray * z

@@ -60,23 +60,6 @@ _LEAST_CHANGE = 0.01
 
 
 @dataclass(frozen=True)
-class LightEstimate:
-    """A light and how well it explains what was seen.
-
-    Attributes:
-        light: the light.
-        explained: share of the (robust) spread of brightness differences, and of changes by the shadow that passes,
-            that the light explains; near 0 means that the pictures show neither shadow nor slope and the light is a
-            guess.
-        shadowed: share of the bed's area that lies in the shadow of the tool, and of soil that stands higher.
-    """
-
-    light: Light
-    explained: float
-    shadowed: float
-
-
-@dataclass(frozen=True)
 class Passing:
     """The tool somewhere else, its shadow on soil that hasn't moved, as one camera sees it.
 
@@ -98,7 +81,7 @@ def fit_light(
     *,
     blur: int = 1,
     passing: Sequence[Passing] = (),
-) -> LightEstimate:
+) -> Light:
     """The light that explains the colours of a grid of points on a surface.
 
     Args:
@@ -132,9 +115,7 @@ def fit_light(
     beside = problem.beside_edges(at, blur)
     ambient = [_SHARES[beside.costs(channel, [at], _SHARES)[0].argmin()] for channel in range(3)]
     level = torch.nanmedian(colours, dim=0).values.clamp_min(1e-3).cpu().numpy().astype(np.float64)
-    light = Light.from_angles(*at, np.array(ambient), level=level)
-    shadowed = 1.0 - float(problem.bed.let_through(tool, [at], points).mean())
-    return LightEstimate(light, 1.0 - float(found.fun) / max(problem.nothing(), 1e-12), shadowed)
+    return Light.from_angles(*at, np.array(ambient), level=level)
 
 
 def _start(problem: _Problem) -> FloatArray:
@@ -249,13 +230,6 @@ class _Problem:
                 total = total + weight * _spread(_centred(change - predicted), scale)
             columns.append(total)
         return torch.stack(columns, dim=1).cpu().numpy().astype(np.float64)
-
-    def nothing(self) -> float:
-        """Loss of a light that is the same everywhere."""
-        total = float(_spread(self.differences(_channel(self.brightness, None)), self.scale))
-        for (_, change), scale, weight in zip(self.changes, self.scales, self.weights, strict=True):
-            total += weight * float(_spread(_centred(_channel(change, None)), scale))
-        return total
 
 
 def _channel(values: Tensor, channel: int | None) -> Tensor:

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from splatsoil.measurement import Bed
 from splatsoil.reconstruction import HeightField, fill
-from splatsoil.scene import Relief, kernels_relief, relief, relief_of_particles
+from splatsoil.scene import Relief, kernels_relief, relief_of_particles
 from splatsoil.splats.warp_torch import as_warp, launch
 from splatsoil.synthetic.soil_surface import soil_surface
 
@@ -126,26 +126,6 @@ def test_what_lies_behind_a_steep_wall_is_near_the_surface():
     assert np.array_equal(shown[sure], distance[sure] < 0.025)
     behind = (points[:, 0] < 0.12) & (relief.depth_below(torch.tensor(points).float()).numpy() > 0.03) & sure
     assert shown[behind].any(), "some are near a wall though far below the rim"
-
-
-def test_what_particles_spread_over_the_walls_comes_back():
-    """Against the same particles with their mirror images behind all six walls, on a grid that goes on there."""
-    generator = np.random.default_rng(4)
-    particles = generator.uniform(0.0, 1.0, (300, 3)) * [0.4, 0.3, 0.2]
-    particles[:100] *= 0.05
-    cell, count = np.array([0.05, 0.05, 0.05]), np.array([8, 6, 4])
-    grid = relief._spread(torch.tensor(particles, dtype=torch.float32), LOWER, cell, count).double().numpy()
-    assert grid.sum() == pytest.approx(300.0, rel=1e-5)
-    images = particles
-    for axis, wall in enumerate(UPPER):
-        mirrored = [images, images * np.where(np.arange(3) == axis, -1.0, 1.0)]
-        beyond = images.copy()
-        beyond[:, axis] = 2.0 * wall - beyond[:, axis]
-        images = np.concatenate([*mirrored, beyond])
-    middles = [cell[k] * (np.arange(count[k]) + 0.5) for k in range(3)]
-    away = [np.abs(images[:, k, None] - middles[k]) / cell[k] for k in range(3)]
-    b = [np.where(u < 0.5, 0.75 - u**2, 0.5 * np.clip(1.5 - u, 0.0, None) ** 2) for u in away]
-    assert np.allclose(grid, np.einsum("ni,nj,nk->ijk", *b), atol=1e-4)
 
 
 def test_the_surface_is_the_uppermost_crossing():
