@@ -151,7 +151,7 @@ class Stage:
         columns, rows = np.meshgrid(np.arange(camera.width + 1.0), np.arange(camera.height + 1.0))
         _, rays = camera.rays(np.stack([columns, rows], axis=-1))
         rays = rays.reshape(camera.height + 1, camera.width + 1, 3)
-        blind = ~np.isfinite(rays).all(axis=2)
+        blind = np.asarray(~np.isfinite(rays).all(axis=2))
         # Between a pixel's corners directions are interpolated: for a pixel of 3 mrad that is exact to a microradian.
         directions = wp.array(np.nan_to_num(rays).astype(np.float32), dtype=wp.vec3, device=self.device)
         count = camera.width * camera.height
