@@ -290,7 +290,6 @@ LEAVES = "leaves the measurement set"
 MATRIX = "frames[1].transform_matrix"
 VIEWS, VIDEO, SET = "views/transforms.json", "video/transforms.json", "experiment.json"
 POSE = ("frames", 1, "transform_matrix")
-STRETCHED = [[2.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1], [0, 0, 0, 1]]
 DOUBLED = [[2.0, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 1], [0, 0, 0, 1]]
 MIRROR = [[-1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1], [0, 0, 0, 1]]
 SHEARED = [[1.0, 0.1, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1], [0, 0, 0, 1]]
