@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from splatsoil.commands._model import off_effects
+from splatsoil.comparison import PATCH
 from splatsoil.errors import ParameterError, SimulationError
 from splatsoil.experiment.plow import MOST_TOGETHER, PlowExperiment
 from splatsoil.measurement import Measurement
@@ -79,6 +80,27 @@ def test_what_is_numerics_or_takes_a_laboratory_is_no_candidate(small_set: Path)
     assert [c.name for c in PlowExperiment(model, candidates=["hardening"]).candidates] == ["hardening"]
     with pytest.raises(ParameterError, match="other numerics"):
         off_effects(["stiffness"], ())
+
+
+def test_what_one_camera_sees_is_in_its_columns_and_where_it_is(small_set: Path) -> None:
+    """A spot of the bed a little darker in one camera's prediction: columns of that camera, of patches at the spot."""
+    measurement = Measurement.load(small_set)
+    surface = HeightField.over(measurement.bed.lower, measurement.bed.upper, 0.02, 0.12)
+    experiment = PlowExperiment(Model(measurement, cast(Any, SimpleNamespace(surface=surface)), preset="tiny"))
+    comparator, layout, force = experiment.comparator, experiment.layout, np.zeros((10, 3))
+
+    def features(images: dict[tuple[str, int], np.ndarray]) -> np.ndarray:
+        return experiment.features(cast(Any, SimpleNamespace(images=images, trajectory=SimpleNamespace(force=force))))
+
+    for camera, x, y in (("left", 0.5, 0.12), ("right", 0.3, 0.3)):
+        images = dict(comparator.observed)
+        spot = np.linalg.norm(comparator.ground[camera] - [x, y], axis=-1) < 0.06
+        images[camera, 10] = images[camera, 10] - np.float32(0.02) * spot[..., None]
+        (change,) = features(dict(comparator.observed)) - features(images)
+        assert change.max() == pytest.approx(0.02 * 255.0, rel=1e-3)
+        for k in np.flatnonzero(np.abs(change) > 1e-3):
+            assert layout.sites[k].channel == camera
+            assert np.hypot(layout.sites[k].x - x, layout.sites[k].y - y) < 0.06 + PATCH
 
 
 def test_soil_prepared_together_is_that_of_single_simulations(small_set: Path, monkeypatch: pytest.MonkeyPatch) -> None:
