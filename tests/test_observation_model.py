@@ -14,7 +14,7 @@ from splatsoil.measurement import Bed, Camera, Frame, Measurement, Tool, ToolMot
 from splatsoil.model import Model
 from splatsoil.mpm.simulate import Trajectory
 from splatsoil.reconstruction import HeightField
-from splatsoil.scene import Scene, linear
+from splatsoil.scene import linear
 
 SPACING, DEPTH, RATE, FOCAL, SPEED = 0.02, 0.1, 10.0, 150.0, 0.2
 BED = Bed(np.zeros(3), np.array([0.4, 0.4, 0.2]), 1600.0)
@@ -94,35 +94,6 @@ def test_a_pan_shifts_the_picture_of_that_camera_alone(measurement, scene, still
         before["right", 0][middle].mean(axis=2), after["right", 0][middle].mean(axis=2), upsample_factor=20
     )
     assert np.allclose(shift, [0.0, 4.0], atol=0.15)
-
-
-def test_what_cameras_alone_report_looks_at_scenes_that_are_posed_already(measurement, scene, still, monkeypatch):
-    posed = []
-    poses = Scene.poses
-    monkeypatch.setattr(Scene, "poses", lambda self, moments: posed.extend(moments) or poses(self, moments))
-    model = model_of(measurement, scene, "camera_pose", "exposure", "blur", "tool_pose", "light")
-    trajectory, frames = trajectory_of(model, still), len(model.frames)
-    model.draw(trajectory)
-    for values in ({"camera_1_roll": 0.3}, {"exposure_gain": 1.2}, {"blur": 1.0}):
-        shared = model.draw(trajectory, 0, values)
-        assert len(posed) == frames
-        alone = model_of(measurement, scene, "camera_pose", "exposure", "blur", "tool_pose", "light")
-        fresh = alone.draw(trajectory, 0, values)
-        assert all(np.array_equal(shared[key], fresh[key]) for key in fresh)
-        del posed[frames:]
-    others = ({"tool_x": 0.01}, {"sun_elevation_change": 2.0}, {})
-    for count, values in enumerate(others, start=2):
-        model.draw(trajectory, 0, values)
-        assert len(posed) == count * frames
-    for albedo in (1, 2, None):  # colours, too, are another matter than where things are
-        guessed = model.draw(trajectory, albedo=albedo)
-        assert len(posed) == (1 + len(others)) * frames
-        fresh = model_of(measurement, scene if albedo is None else scene.with_other_albedo(albedo)).draw(trajectory)
-        assert all(np.array_equal(guessed[key], fresh[key]) for key in fresh)
-        del posed[(1 + len(others)) * frames :]
-    model.draw(trajectory, rounding=2.0)
-    model.draw(trajectory_of(model, still))
-    assert len(posed) == (3 + len(others)) * frames
 
 
 def test_a_late_video_shows_the_tool_farther_on(measurement, scene, still):

@@ -100,14 +100,6 @@ def test_data_files_are_declared(wheel: Path, repository: Path) -> None:
         assert (name if name.startswith("splatsoil/") else f"splatsoil/{name}") in inside, name
 
 
-def test_every_package_has_an_init(project: dict[str, Any], repository: Path) -> None:
-    """A listed package without __init__.py would be a namespace that anybody could add to."""
-    for package in project["tool"]["setuptools"]["packages"]:
-        parts = package.split(".")
-        folder = Path(*(parts[1:] if len(parts) > 1 and parts[1] in FOLDERS else parts))
-        assert (repository / folder / "__init__.py").is_file(), package
-
-
 def test_imports_come_from_the_wheel(elsewhere: Path) -> None:
     code = (
         "import json, splatsoil, splatsoil.envs, splatsoil.inverse, splatsoil.benchmarks\n"

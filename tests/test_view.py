@@ -104,20 +104,6 @@ def test_the_scene_of_a_run(server: Any, columns: list[Any]) -> None:
     assert np.array_equal(node("/video/left").image, predicted) and not np.array_equal(predicted, observed)
 
 
-def test_misfit_is_where_pictures_differ(columns: list[Any]) -> None:
-    column = columns[0]
-    lower, block = column.model.measurement.bed.lower[:2], column.comparator.block
-    blocks = np.zeros(len(column.comparator.labels))
-    chosen = next(k for k, label in enumerate(column.comparator.labels) if label.frame == 10)
-    blocks[chosen] = -7.0
-    column._compare(blocks)
-    label, found = column.comparator.labels[chosen], column.quantities["misfit"][10]
-    inside = np.all(np.abs(column.positions[10][:, :2] - [label.x, label.y]) < 0.499 * block, axis=1)
-    outside = np.any(np.abs(column.positions[10][:, :2] - [label.x, label.y]) > 0.501 * block, axis=1)
-    assert inside.any() and np.all(found[inside] == 7.0) and not found[outside].any()
-    assert np.all(column.positions[10][inside, :2] >= lower)
-
-
 def test_the_scene_of_a_set(server: Any, small_set: Path) -> None:
     from splatsoil.view import Viewer
 
@@ -150,14 +136,6 @@ def test_mistakes_are_one_sentence(
     assert cli.main(["view", *(word.replace("SET", str(small_set)) for word in words)]) == 2
     said = capsys.readouterr().err
     assert sentence in said and said.count("\n") == 1
-
-
-def test_without_the_extra(
-    small_set: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("splatsoil.commands.view.importlib.util.find_spec", lambda name: None)
-    assert cli.main(["view", str(small_set)]) == 2
-    assert "pip install 'splatsoil[view]'" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,7 +19,6 @@ from splatsoil.benchmarks._truth import Truth
 from splatsoil.benchmarks.solvers import FRAMES, Case, Scan, agreement, compare_stages, main, plough_missing, scan
 
 from splatsoil.errors import ParameterError
-from splatsoil.measurement import Measurement
 from splatsoil.mpm import Resolution, simulate
 from splatsoil.reconstruction import fill
 
@@ -99,25 +97,6 @@ def test_only_missing_scenes_are_ploughed_so_many_at_a_time(groups: list[list[st
     assert kept.frames == FRAMES and kept.spacing == pytest.approx(0.04)
     assert np.abs(kept.particles[50] - world.particles).max() < 1e-4
     assert kept.force == pytest.approx(still(world).force)
-
-
-def test_a_narrower_tool_gets_as_many_voxels_and_is_ploughed_by_itself(
-    groups: list[list[str]], plow_dry: Path, tmp_path: Path
-) -> None:
-    narrow = tmp_path / "narrow"
-    shutil.copytree(plow_dry, narrow)
-    mesh = Measurement.load(plow_dry).tool.mesh.copy()
-    mesh.apply_scale([1.0, 0.5, 1.0])
-    mesh.export(narrow / Measurement.load(plow_dry).tool.mesh_path.name)
-    usual, case = (Case.of_set(folder, Numerics()) for folder in (plow_dry, narrow))
-    assert usual.numerics == Numerics() and usual.made
-    assert not case.made, "the set's own voxels are too coarse for it"
-    assert case.numerics.voxel == pytest.approx(0.06 / 9.0)
-    assert (case.numerics.substeps, case.numerics.iterations) == (6, 3000)
-    coarse = replace(case, numerics=COARSE.across(0.06))
-    scene = Case.drawn("scene", SLOPING, COARSE)
-    plough_missing([scene, coarse, replace(scene, name="other")], tmp_path / "out", "cpu", 4, say)
-    assert groups == [["scene", "other"], [case.name]]
 
 
 def test_soil_between_two_angles_is_estimated_between_them() -> None:

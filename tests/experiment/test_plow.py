@@ -11,64 +11,11 @@ import pytest
 from splatsoil.commands._model import off_effects
 from splatsoil.comparison import PATCH
 from splatsoil.errors import ParameterError, SimulationError
-from splatsoil.experiment.plow import MOST_TOGETHER, PlowExperiment
+from splatsoil.experiment.plow import PlowExperiment
 from splatsoil.measurement import Measurement
 from splatsoil.model import Model
 from splatsoil.reconstruction import HeightField
 from splatsoil.soil.library import library
-
-
-def asked(numerics: str) -> tuple[list[Any], list[Any]]:
-    """How a prediction was simulated (effects and numerics of the model, numerics), and drawn (seed, albedo, rounding)
-    from it."""
-    simulated: list[Any] = []
-    drawn: list[Any] = []
-
-    def draw(trajectory: Any, seed: int, values: Any, *, albedo: int | None, rounding: float) -> None:
-        drawn.append((seed, albedo, rounding))
-
-    model = SimpleNamespace(draw=draw)
-
-    def variant(effects: tuple[str, ...], way: str) -> Any:
-        simulated.append((effects, way))
-        return model
-
-    def trajectory(model: Any, values: Any, seed: int, way: str) -> None:
-        simulated.append(way)
-
-    experiment = SimpleNamespace(
-        model=("cohesion",), guesses=PlowExperiment.guesses, _variant=variant, _trajectory=trajectory
-    )
-    experiment._computed = lambda effects, way: PlowExperiment._computed(cast(Any, experiment), effects, way)
-    PlowExperiment.prediction(cast(Any, experiment), {}, effects=("tilt",), seed=3, numerics=numerics)
-    return simulated, drawn
-
-
-@pytest.mark.parametrize(
-    ("numerics", "way", "drawing"),
-    [
-        ("", "", (None, 1.0)),
-        ("fine", "fine", (None, 1.0)),
-        ("albedo 1", "", (1, 1.0)),
-        ("albedo 6", "", (6, 1.0)),
-        ("rounding", "", (None, 2.0)),
-    ],
-)
-def test_guesses_and_rounding_are_other_drawings_of_the_same_simulation(
-    numerics: str, way: str, drawing: tuple[int | None, float]
-) -> None:
-    simulated, drawn = asked(numerics)
-    assert simulated == [(("cohesion", "tilt"), way), way]
-    assert drawn == [(3, *drawing)]
-
-
-def test_an_unknown_way_is_not_taken_for_the_usual_one() -> None:
-    assert asked("finer")[0] == [(("cohesion", "tilt"), "finer"), "finer"]
-    base = SimpleNamespace(resolution=None, variant=lambda **changes: base)
-    experiment: Any = SimpleNamespace(model=("cohesion",), base=base, _wanted={})
-    assert PlowExperiment._variant(experiment, ("cohesion",), "") is base
-    with pytest.raises(KeyError, match="finer"):
-        PlowExperiment._variant(experiment, ("cohesion",), "finer")
 
 
 def test_what_is_numerics_or_takes_a_laboratory_is_no_candidate(small_set: Path) -> None:
@@ -108,7 +55,13 @@ def test_soil_prepared_together_is_that_of_single_simulations(small_set: Path, m
     bed = measurement.bed
     surface = HeightField.over(bed.lower, bed.upper, 0.02, 0.12)
     model = Model(measurement, cast(Any, SimpleNamespace(surface=surface)), preset="tiny")
-    monkeypatch.setattr(Model, "draw", lambda *_, **__: {})
+    drawn: list[tuple[int, int | None, float]] = []
+
+    def draw(_: Model, trajectory: Any, seed: int, values: Any, *, albedo: int | None, rounding: float) -> dict:
+        drawn.append((seed, albedo, rounding))
+        return {}
+
+    monkeypatch.setattr(Model, "draw", draw)
 
     def experiment() -> PlowExperiment:
         return PlowExperiment(model, candidates=("buried_obstacle", "cohesion", "exposure"))
@@ -127,6 +80,7 @@ def test_soil_prepared_together_is_that_of_single_simulations(small_set: Path, m
     ]
     unseen = job(effects=("buried_obstacle",), obstacle_radius=0.001)
     alone = [experiment().prediction(**each).trajectory.positions for each in jobs]
+    assert drawn[:3] == [(0, None, 1.0), (1, None, 1.0), (0, 2, 1.0)]
     prepared = experiment()
     assert prepared.together == 1, "a CPU makes one at a time, and keeps one"
     prepared.__dict__["together"] = 5
@@ -141,32 +95,8 @@ def test_soil_prepared_together_is_that_of_single_simulations(small_set: Path, m
     assert not any(np.array_equal(a, b) for a, b in combinations(different, 2))
     prepared.prepare([job(2)])
     assert len(prepared._kept) == 5, "what is kept doesn't grow"
-
-
-def test_more_cannot_be_made_together_than_there_is_room_for() -> None:
-    def together(device: str, particles: int, frames: int) -> int:
-        base = SimpleNamespace(device=device, particles=lambda: np.zeros((particles, 3)), recorded=tuple(range(frames)))
-        experiment = SimpleNamespace(base=base)
-        return cast(int, PlowExperiment.together.func(cast(Any, experiment)))
-
-    assert together("cpu", 1000, 10) == 1
-    assert together("cuda:0", 1000, 10) == MOST_TOGETHER
-    assert together("cuda:0", 300_000, 10) == together("cuda:0", 50_000, 200) == 1
-
-
-def test_what_cannot_be_prepared_is_left_to_predictions(monkeypatch: pytest.MonkeyPatch) -> None:
-    def no_memory(*_: Any) -> None:
-        raise RuntimeError("out of memory")
-
-    monkeypatch.setattr("splatsoil.experiment.plow.simulate_together", no_memory)
-    base = SimpleNamespace(
-        law=SimpleNamespace(effects=()),
-        observation_parameters=(),
-        recorded=(0,),
-        particles=lambda seed: None,
-        measurement=None,
-    )
-    experiment: Any = SimpleNamespace(base=base, progress=None, _kept={}, _computed=lambda effects, way: (base, way))
-    jobs = [{"values": {"angle": a}, "effects": (), "seed": 0, "numerics": ""} for a in (1.0, 2.0)]
-    PlowExperiment.prepare(experiment, jobs)
-    assert not experiment._kept
+    drawn.clear()
+    prepared.prediction(**job(2, numerics="rounding"))
+    assert drawn == [(2, None, 2.0)], "another drawing of the same simulation"
+    with pytest.raises(KeyError, match="finer"):
+        prepared.prediction(**job(numerics="finer"))

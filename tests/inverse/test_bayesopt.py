@@ -66,13 +66,6 @@ def test_one_random_start_and_expected_improvement_over_the_best() -> None:
     assert abs(found.estimate[0] - dense_optimum(two_valleys, 1)[0]) < 0.2
 
 
-@pytest.mark.slow
-def test_six_parameters() -> None:
-    weights = np.arange(1.0, 7.0)
-    result = play(lambda a: float(np.sum(weights * (a - 0.3) ** 2)), 6, 48, 0.01, 1).result()
-    assert np.all(np.abs(result.estimate - 0.3) < 0.25) and all(result.determined)
-
-
 def test_ten_noisy_evaluations_find_a_minimum_in_one_dimension() -> None:
     """Over seeds: close to SciPy's optimum, and the quoted std is the size of the error."""
     truth = dense_optimum(two_valleys, 1)
@@ -109,12 +102,6 @@ def test_what_is_asked_hangs_on_the_seed_and_what_was_told_alone() -> None:
     resumed.tell(*whole.told[6])
     assert resumed.result().minimisers.tobytes() == whole.result().minimisers.tobytes()
     assert play(two_valleys, 1, 1, 0.0, 5).told[0].action != whole.told[0].action
-
-
-def test_constant_losses_determine_nothing() -> None:
-    result = play(lambda _: 0.25, 1, 8, 0.0, 0).result()
-    assert result.determined == (False,)
-    assert np.isfinite(result.estimate).all() and np.isfinite(result.minimisers).all()
 
 
 def test_noise_without_a_minimum_is_not_taken_for_one() -> None:

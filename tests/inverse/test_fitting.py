@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -78,25 +74,6 @@ def test_an_interrupted_fit_goes_on_to_the_same_end(
     result = fit(problem, run, analytic.SETUP, budget=BUDGET)
     assert problem.calls == BUDGET - kept
     assert without_times(result) == without_times(uninterrupted)
-
-
-def test_killed_and_started_again(analytic: ModuleType, tmp_path: Path, uninterrupted: dict[str, Any]) -> None:
-    command = [sys.executable, str(analytic.__file__), str(tmp_path / "run"), str(BUDGET), "0.2"]
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
-    assert process.stdout is not None
-    for line in process.stdout:
-        if int(line.split()[0]) == 3:
-            break
-    process.send_signal(signal.SIGKILL)
-    process.communicate()
-    run = analytic.prepare(tmp_path / "run")
-    with run.evaluations() as store:
-        kept = len(store.records())
-    assert 3 <= kept < BUDGET and not (tmp_path / "run" / "fit.json").exists()
-    problem = analytic.AnalyticProblem()
-    assert without_times(fit(problem, run, analytic.SETUP, budget=BUDGET)) == without_times(uninterrupted)
-    assert problem.calls == BUDGET - kept
 
 
 def test_a_search_keeps_to_one_thread_and_gives_them_back(analytic: ModuleType, tmp_path: Path) -> None:

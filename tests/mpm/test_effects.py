@@ -12,7 +12,6 @@ import torch
 import trimesh
 
 from splatsoil.mpm import Resolution, Solver
-from splatsoil.mpm.substep import make_stress_kernel
 from splatsoil.mpm.tool import Pose
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects, library
@@ -47,17 +46,6 @@ def solver(
     batch = np.broadcast_to(x, (len(values), *x.shape))
     law = Law(find_effects(effects))
     return Solver(batch, LOWER, UPPER, mesh, RESOLUTION, law, settings or Settings(friction_angle=35.0), values, device)
-
-
-def test_effects_that_leave_strength_alone_run_the_very_same_kernel() -> None:
-    plain = Law()
-    others = [n for n, e in library().items() if e.strength is None]
-    assert {"tilt", "gravity", "stiffness", "buried_obstacle", "tool_adhesion"} <= set(others)
-    law = Law(find_effects(others))
-    assert make_stress_kernel(law.update, law.history) is make_stress_kernel(plain.update, plain.history)
-    x = block([0.0, 0.0, 0.0], [0.04, 0.04, 0.04])
-    assert solver(x, {})._particles.history.shape[0] == 0
-    assert solver(x, {}, effects=("cohesion",))._particles.history.shape[0] == len(x)
 
 
 def test_sand_on_a_tilted_floor_without_friction_slides_as_galileo_says() -> None:

@@ -14,7 +14,6 @@ import argparse
 import ast
 import compileall
 import copy
-import hashlib
 import json
 import os
 import random
@@ -24,9 +23,9 @@ import signal
 import subprocess
 import sys
 import tempfile
-import time
 import tomllib
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from itertools import islice, zip_longest
 from pathlib import Path
@@ -34,8 +33,6 @@ from py_compile import PycInvalidationMode
 from typing import Any
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-SLOWER, STARTING = 3.0, 60.0
-"""Times as long as without a fault, and seconds beside it, from which tests are stopped."""
 
 COMPARISONS: dict[type[ast.cmpop], type[ast.cmpop]] = {
     ast.Lt: ast.Gt, ast.Gt: ast.Lt, ast.LtE: ast.GtE, ast.GtE: ast.LtE, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
@@ -179,54 +176,43 @@ def tests_of(file: str) -> list[str]:
     return [f.relative_to(REPOSITORY).as_posix() for f in dict.fromkeys((*first, *beside))]
 
 
-def run_tests(files: list[str], view: Path, limit: float | None) -> tuple[int | None, float]:
-    """Exit code of pytest, which stops at the first failure, or None where it took too long; and seconds."""
-    variables = {"PYTHONSAFEPATH": "1", "PYTHONPATH": str(view), "OMP_NUM_THREADS": "1"}
-    words = [sys.executable, "-m", "pytest", "-x", "-q", "-m", "not slow", "-p", "no:cacheprovider", *files]
-    began = time.monotonic()
-    process = subprocess.Popen(
-        words, cwd=REPOSITORY, env=os.environ | variables, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-        start_new_session=True,
-    )  # fmt: skip
-    try:
-        return process.wait(limit), time.monotonic() - began
-    except subprocess.TimeoutExpired:
-        return None, time.monotonic() - began
-    finally:
-        if process.returncode is None:
-            os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
+def failure(tests: list[str], view: Path, limit: float | None = None) -> str | None:
+    """The first test that fails, empty for none; None where they took longer than ``limit`` seconds."""
+    variables = {"PYTHONSAFEPATH": "1", "PYTHONPATH": f"{view}{os.pathsep}{REPOSITORY}", "OMP_NUM_THREADS": "1"}
+    words = [sys.executable, "-m", "pytest", "-xq", "--tb=no", "-m", "not slow", "-p", "no:cacheprovider", *tests]
+    with subprocess.Popen(
+        words, cwd=REPOSITORY, env=os.environ | variables, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+        text=True, start_new_session=True,
+    ) as process:  # fmt: skip
+        try:
+            told, _ = process.communicate(timeout=limit)
+        except subprocess.TimeoutExpired:
+            return None
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+    named = re.search(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", told, flags=re.MULTILINE)
+    return "" if process.returncode == 0 else named[1] if named else tests[0]
 
 
-def judged(mutants: Iterable[Mutant], view: Path, out: Path) -> Iterator[tuple[Mutant, str]]:
-    """Each mutant and its outcome, which is kept."""
+def judged(mutants: Iterable[Mutant], view: Path, limit: float, out: Path) -> Iterator[tuple[Mutant, str]]:
+    """Each mutant and its outcome, which is kept. A test that fails must pass without the fault."""
     kept = [json.loads(line) for line in out.read_text().splitlines()] if out.exists() else []
-    outcomes = {Mutant(**row["mutant"]): row["outcome"] for row in kept if "mutant" in row}
-    usual = {row["tests"]: row["seconds"] for row in kept if "tests" in row}
+    outcomes = {Mutant(**row["mutant"]): row["outcome"] for row in kept}
     out.parent.mkdir(parents=True, exist_ok=True)
     for mutant in mutants:
-        outcome = outcomes.get(mutant)
-        if outcome is None:
-            files = tests_of(mutant.file)
-            digest = hashlib.sha256(b"".join((REPOSITORY / f).read_bytes() for f in files)).hexdigest()
-            rows = []
-            if digest not in usual:
-                code, usual[digest] = run_tests(files, view, None)
-                if code:
-                    raise SystemExit(f"mutants: tests of {mutant.file} fail without any fault")
-                rows.append({"tests": digest, "seconds": usual[digest]})
+        if mutant not in outcomes:
             path = view / mutant.file
             source = path.read_bytes()
             path.write_bytes(source[: mutant.start] + mutant.after.encode() + source[mutant.end :])
-            try:
-                code, seconds = run_tests(files, view, SLOWER * usual[digest] + STARTING)
-            finally:
-                path.write_bytes(source)
-            outcome = {None: "timed out", 0: "survived"}.get(code, "killed")
-            rows.append({"mutant": asdict(mutant), "outcome": outcome, "seconds": seconds})
+            test = failure(tests_of(mutant.file), view, limit)
+            path.write_bytes(source)
+            if test and failure([test], view):
+                raise SystemExit(f"mutants: {test} fails without any fault")
+            outcomes[mutant] = {None: "timed out", "": "survived"}.get(test, "killed")
             with out.open("a") as file:
-                file.writelines(json.dumps(row) + "\n" for row in rows)
-        yield mutant, outcome
+                file.write(json.dumps({"outcome": outcomes[mutant], "by": test, "mutant": asdict(mutant)}) + "\n")
+        yield mutant, outcomes[mutant]
 
 
 def main() -> None:
@@ -234,6 +220,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=25, help="mutants")
     parser.add_argument("--seed", type=int, default=0, help="of the sample")
     parser.add_argument("--only", nargs="+", default=[], help="folders or files of the source")
+    parser.add_argument("--limit", type=float, default=900.0, help="seconds for the tests of a mutant")
     parser.add_argument("--out", type=Path, default=REPOSITORY / "build" / "mutants.jsonl", help="JSON lines")
     given = parser.parse_args()
     counts = dict.fromkeys(("killed", "survived", "timed out"), 0)
@@ -241,7 +228,7 @@ def main() -> None:
         view = Path(folder)
         package_view(view)
         drawn = islice(sample(view, given.only, given.seed), given.count)
-        for mutant, outcome in judged(drawn, view, given.out):
+        for mutant, outcome in judged(drawn, view, given.limit, given.out):
             counts[outcome] += 1
             before, after = (" ".join(text.split())[:70] for text in (mutant.before, mutant.after))
             print(f"{outcome:9}  {mutant.file}:{mutant.line}  {mutant.kind}: {before} -> {after}", flush=True)

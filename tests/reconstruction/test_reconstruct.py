@@ -179,21 +179,6 @@ def test_views_of_another_world_than_the_video_are_refused(measurement, turn):
         reconstruct(moved(measurement, turn=turn), preset="tiny")
 
 
-def test_the_command_line_says_remarks_once_and_on_stderr(measurement, result, tmp_path, monkeypatch, capsys):
-    odd = replace(result, metadata={**result.metadata, "remarks": ["video: is it so?"]})
-
-    def found(*_, **__):
-        odd.say_remarks()
-        odd.say_remarks()
-        return odd
-
-    monkeypatch.setattr("splatsoil.reconstruction.reconstruct", found)
-    assert main(["reconstruct", str(measurement.folder), "--out", str(tmp_path / "r"), "--json"]) == 0
-    out, err = capsys.readouterr()
-    assert json.loads(out)["remarks"] == ["video: is it so?"]
-    assert err.count("remark video: is it so?\n") == 1 and "Warning" not in err
-
-
 def test_likeness_is_of_the_soil_and_whatever_the_exposure(measurement, result):
     views = load_views(measurement.views[:4], 160)
     level = float(np.median(result.surface.height))
@@ -278,14 +263,3 @@ def test_command_line_and_the_same_seed_gives_the_same_bits(measurement, result,
     for name in ("means", "scales", "quaternions", "opacities", "colours"):
         assert torch.equal(getattr(again.gaussians, name), getattr(result.gaussians, name)), name
     np.testing.assert_array_equal(again.surface.height, result.surface.height)
-
-
-def test_interrupting_leaves_nothing(measurement, tmp_path, monkeypatch, capsys):
-    def interrupt(*_, **__):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("splatsoil.reconstruction.pipeline.find_relief", interrupt)
-    out = tmp_path / "result"
-    assert main(["reconstruct", str(measurement.folder), "--out", str(out), "--preset", "tiny"]) == 130
-    assert not out.exists()
-    assert "start again with" in capsys.readouterr().err

@@ -137,10 +137,3 @@ def test_a_spire_at_a_corner_is_cut_off_and_a_hole_inside_is_left_to_the_prior()
     assert np.abs(found - plane).max() < 0.005
     assert (known[corner] == 0.5).all()
     assert np.array_equal(known[~corner], deviation[~corner])
-
-
-def test_a_bed_known_alike_everywhere_is_left_alone() -> None:
-    height = np.random.default_rng(0).normal(size=(6, 7))
-    found, known = without_backdrop(height, np.full(height.shape, 1e-4), 0.5)
-    assert np.array_equal(found, height)
-    assert (known == 1e-4).all()

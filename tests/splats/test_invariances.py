@@ -11,7 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from splatsoil.measurement import Camera
-from splatsoil.splats import Gaussians, rasterise, rasterise_covariances
+from splatsoil.splats import Gaussians, rasterise
 
 CameraMaker = Callable[..., Camera]
 CloudMaker = Callable[..., Gaussians]
@@ -94,17 +94,6 @@ def test_length_of_quaternions(camera_at: CameraMaker, cloud: CloudMaker) -> Non
     lengths = torch.rand(100, 1, generator=torch.Generator().manual_seed(3)) * 5 + 0.1
     longer = rasterise(g.replace(quaternions=-g.quaternions * lengths), camera_at())
     assert_same_picture(longer.colour, rasterise(g, camera_at()).colour, pixels=2e-3)
-
-
-def test_covariances_draw_the_same_as_scales_and_quaternions(camera_at: CameraMaker, cloud: CloudMaker) -> None:
-    g, camera = cloud(200), camera_at()
-    normals = g.normals(torch.zeros(3))
-    a = rasterise(g, camera, background=(0.1, 0.2, 0.3))
-    b = rasterise_covariances(
-        g.means, g.covariances(), g.opacities, g.colours, normals, camera, background=(0.1, 0.2, 0.3)
-    )
-    for name in ("colour", "alpha", "depth", "normal"):
-        assert_same_picture(getattr(a, name), getattr(b, name), pixels=2e-3)
 
 
 def test_a_subset_and_a_concatenation_keep_every_tensor(cloud: CloudMaker) -> None:

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-import warp as wp
 from scipy.spatial.transform import Rotation
 
 from splatsoil.errors import ParameterError
 from splatsoil.measurement import Camera
-from splatsoil.splats import Gaussians, kernels_cuda, rasterise_features, rasteriser
-from splatsoil.splats.binning import Bins
+from splatsoil.splats import Gaussians, rasterise_features
 from splatsoil.splats.steps import finished
 from splatsoil.splats.views import Seen, at_once, rasterise_views
 
@@ -45,23 +42,6 @@ def test_views_together_are_the_same_as_each_alone(views: list[Seen]) -> None:
     assert alpha[:2].amax(dim=(1, 2)).min() > 0.5 and alpha[2:].max() == 0.0
     one_by_one, alphas = rasterise_views(views, background=BACKGROUND, antialias=True)
     assert torch.equal(one_by_one, image) and torch.equal(alphas, alpha)
-
-
-def test_kernels_of_a_gpu_draw_all_views_in_one_launch(views: list[Seen], monkeypatch: pytest.MonkeyPatch) -> None:
-    """On a CPU: the same as the CPU's own, view by view."""
-    launched: list[int] = []
-
-    def launch_pixels(kernel: Any, bins: Bins, inputs: list[Any], like: torch.Tensor) -> None:
-        launched.append(len(bins.starts) - 1)
-        wp.launch(kernel, dim=launched[-1] * kernels_cuda.THREADS, inputs=[0, *inputs], device="cpu")
-
-    ours = rasterise_views(views, background=BACKGROUND, antialias=True)
-    monkeypatch.setattr(rasteriser, "_kernels", lambda like: kernels_cuda)
-    monkeypatch.setattr(rasteriser, "_launch_tiles", launch_pixels)
-    theirs = finished(at_once(views, BACKGROUND, True))
-    assert launched == [4 * 5 * 4]
-    for here, there in zip(ours, theirs, strict=True):
-        assert torch.allclose(here, there, atol=1e-5)
 
 
 def test_one_that_is_no_gaussian_is_refused(views: list[Seen]) -> None:
