@@ -57,9 +57,9 @@ class StopError(Exception):
     """What ends a fit in the test below."""
 
 
-@pytest.mark.parametrize(("stop_after", "kept"), [(1, 1), (4, 4), (5, 5)])
+@pytest.mark.parametrize("stop_after", [1, 5])
 def test_an_interrupted_fit_goes_on_to_the_same_end(
-    analytic: ModuleType, tmp_path: Path, uninterrupted: dict[str, Any], stop_after: int, kept: int
+    analytic: ModuleType, tmp_path: Path, uninterrupted: dict[str, Any], stop_after: int
 ) -> None:
     """Between two evaluations that were chosen together, too."""
 
@@ -72,7 +72,7 @@ def test_an_interrupted_fit_goes_on_to_the_same_end(
         fit(analytic.AnalyticProblem(), run, analytic.SETUP, budget=BUDGET, after_evaluation=stop)
     problem = analytic.AnalyticProblem()
     result = fit(problem, run, analytic.SETUP, budget=BUDGET)
-    assert problem.calls == BUDGET - kept
+    assert problem.calls == BUDGET - stop_after
     assert without_times(result) == without_times(uninterrupted)
 
 
@@ -109,10 +109,6 @@ def test_what_is_there_is_not_simulated_again(analytic: ModuleType, tmp_path: Pa
     assert sorted(p.name for p in (tmp_path / "fits").iterdir()) == ["base.json", "cohesion.json"]
 
 
-def test_a_fit_is_named_by_its_effects_and_stays_in_the_run_folder(analytic: ModuleType) -> None:
-    assert replace(analytic.SETUP, effects=("/my/suction.py", "cohesion")).name == "cohesion+suction"
-
-
 def test_failed_simulations_are_recorded_as_such_and_said(analytic: ModuleType, tmp_path: Path) -> None:
     run = analytic.prepare(tmp_path / "some")
     result = fit(analytic.AnalyticProblem(fails_below=30.0), run, analytic.SETUP, budget=8)
@@ -135,12 +131,3 @@ def test_a_minimum_at_a_bound_and_a_flat_loss_are_said(analytic: ModuleType, tmp
     assert flat["parameters"]["friction_angle"]["determined"] is False
     assert any("not determined" in note for note in flat["notes"])
     assert flat["parameters"]["friction_angle"]["std"] > 4.0
-
-
-def test_two_parameters(analytic: ModuleType, tmp_path: Path) -> None:
-    problem = analytic.AnalyticProblem((analytic.FRICTION, analytic.COHESION))
-    setup = replace(analytic.SETUP, parameters=("friction_angle", "cohesion"), effects=("cohesion",))
-    result = fit(problem, analytic.prepare(tmp_path), setup, budget=14)
-    angle, cohesion = result["parameters"]["friction_angle"], result["parameters"]["cohesion"]
-    assert angle["estimate"] == pytest.approx(36.0, abs=3.0)
-    assert cohesion["estimate"] == pytest.approx(300.0, abs=150.0) and cohesion["unit"] == "Pa"

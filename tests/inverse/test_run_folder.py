@@ -71,16 +71,9 @@ def test_the_latest_fit_and_the_earlier_ones(tmp_path: Path) -> None:
     run = prepare(tmp_path)
     with pytest.raises(RunError, match="no fit"):
         run.fit()
+    empty = {"format": "splatsoil-fit/2", "parameters": {}, "minimum": {}, "history": []}
     first, second = (
-        {
-            "format": "splatsoil-fit/2",
-            "name": name,
-            "parameters": {},
-            "minimum": {},
-            "history": [],
-            "setup": {"effects": [], "preset": "tiny"},
-        }
-        for name in ("base", "cohesion")
+        {**empty, "name": name, "setup": {"effects": [], "preset": "tiny"}} for name in ("base", "cohesion")
     )
     run.write_fit("base", first)
     run.write_fit("cohesion", second)

@@ -97,14 +97,9 @@ HEAD = "axial_strain_percent,q_kPa,volume_strain_percent\n"
     ("description", "table", "says"),
     [
         ({"kind": "vane"}, "", "'vane' is no kind of test; known are triaxial"),
-        ({**TRIAXIAL, "format": "other"}, "", "expected 'splatsoil-laboratory/1'"),
-        ({"kind": "triaxial", "tests": []}, "", "the list is empty"),
-        ({"kind": "triaxial", "tests": [{"file": "b.csv", "confining": 1e5}]}, "", "no such file"),
         ({"kind": "triaxial", "tests": [{"file": "a.csv", "confining": 1.0}]}, HEAD + "1,1,1\n", "it is in Pa"),
         (TRIAXIAL, "strain,q\n1,2\n", "axial_strain_percent"),
         (TRIAXIAL, HEAD + "0,0,0\n1,100,0.1\n", "ends before a strain of 2 %"),
-        (PLATE | {"density": 1.5}, "sinkage_mm,force_N\n1,2\n", "it is in kg/m³"),
-        ({"kind": "repose", "trials": [{"angle": 95}]}, "", "it is in degrees"),
         ({"kind": "column", "radius": 0.1, "height": 0.1, "trials": [{"final_radius": 0.2}]}, "", "final_height"),
     ],
 )  # fmt: skip

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from splatsoil.cli import main
 from splatsoil.errors import MeasurementError, ParameterError, RunError, SetWarning
@@ -223,24 +221,12 @@ def test_views_that_tell_no_height_are_refused(measurement):
 
 
 def test_without_photographs_to_judge_by_there_is_no_likeness(measurement, tmp_path, capsys):
-    """None set aside, or one of which its mask leaves nothing where it is shrunk."""
     out = tmp_path / "none"
     command = ["reconstruct", str(measurement.folder), "--preset", "tiny", "--json"]
     assert main([*command, "--holdout", "0", "--out", str(out)]) == 0
     said = json.loads(capsys.readouterr().out)
     assert said["psnr"] is None and said["ssim"] is None and said["held_out"] == []
     assert np.isnan(Reconstruction.load(out).psnr)
-
-    mask = np.zeros((96, 128), dtype=np.uint8)
-    mask[0, 0] = 255
-    folder = tmp_path / "set"
-    shutil.copytree(measurement.folder, folder)
-    Image.fromarray(mask).save(folder / "mask.png")
-    masked = Measurement.load(folder)
-    first = replace(masked.views[0], mask_path=folder / "mask.png")
-    made = reconstruct(replace(masked, views=(first, *masked.views[1:])), preset="tiny")
-    assert [view.name for view in made.held_out] == [measurement.views[8].path.name]
-    assert np.isfinite(made.psnr)
 
 
 def test_options_that_make_no_sense(measurement):

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 
 import numpy as np
 import pytest
-from splatsoil.envs.together import attempt
 
 from splatsoil.errors import CombinationError, ParameterError
 from splatsoil.soil.element import ElementTest, drive, isotropic_compression, simple_shear, triaxial
@@ -306,19 +305,3 @@ def test_a_parameter_belongs_to_one_effect() -> None:
 
     with pytest.raises(ParameterError, match=r"two effects have a parameter named cohesion"):
         Law([library()["cohesion"], Twin()])
-
-
-def test_a_search_takes_a_combination_without_meaning_for_a_failed_simulation() -> None:
-    """A fit of dilatancy draws angles of dilation above small friction angles: both lie within their bounds."""
-    law = Law(find_effects(["dilatancy"]))
-
-    class Problem:
-        block_count = 3
-
-        def evaluate(self, parameters: Mapping[str, float], seed: int) -> object:
-            law.table(Settings(ANGLE), [parameters])
-            raise AssertionError("the combination was taken")
-
-    found = attempt(Problem(), {"friction_angle": 21.0, "dilatancy_angle": 24.0}, 0)  # type: ignore[arg-type]
-    assert found.loss is None
-    assert "24 deg exceeds the friction angle of 21 deg" in found.message

@@ -9,7 +9,6 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from splatsoil.errors import ParameterError
 from splatsoil.measurement import Camera
 from splatsoil.splats import Gaussians, rasterise_features
 from splatsoil.splats.steps import finished
@@ -42,14 +41,6 @@ def test_views_together_are_the_same_as_each_alone(views: list[Seen]) -> None:
     assert alpha[:2].amax(dim=(1, 2)).min() > 0.5 and alpha[2:].max() == 0.0
     one_by_one, alphas = rasterise_views(views, background=BACKGROUND, antialias=True)
     assert torch.equal(one_by_one, image) and torch.equal(alphas, alpha)
-
-
-def test_one_that_is_no_gaussian_is_refused(views: list[Seen]) -> None:
-    odd = Seen(
-        views[0].means[:, :2], *(getattr(views[0], n) for n in ("covariances", "opacities", "features", "camera"))
-    )
-    with pytest.raises(ParameterError, match="means have shape"):
-        finished(at_once([views[1], odd], BACKGROUND, False))
 
 
 @pytest.mark.cuda
