@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy.spatial import cKDTree
 
 from splatsoil.measurement import Camera
 from splatsoil.reconstruction import PRESETS, HeightField
+from splatsoil.reconstruction.initial import seed_rim
 from splatsoil.reconstruction.stereo import Smoothness, visibility
 from splatsoil.reconstruction.surface import find_relief, with_rim, without_backdrop
 from splatsoil.reconstruction.views import Views, projection_matrix, silhouettes
@@ -108,6 +110,22 @@ def test_the_rim_is_as_high_as_the_soil_beside_it(scene, relief):
     edge = relief.surface.sample(np.array([[lower[0], lower[1] + 0.2]]))
     assert rim.sample(np.array([[lower[0] - 0.015, lower[1] + 0.2]])) == pytest.approx(edge, abs=5e-3)
     assert rim.height.min() == -1.0
+
+
+def test_discs_cover_the_border_around_the_bed(scene, relief):
+    """As many as fit on its top, and on its outer side down to the ground; none leaves a gap."""
+    spacing, rim, lower, upper = 0.01, relief.rim, scene.bed.lower[:2], scene.bed.upper[:2]
+    seeds = seed_rim(relief, scene.bed, spacing)
+    flat = seeds.normals[:, 2] == 1.0
+    top, side = seeds.points[flat], seeds.points[~flat]
+    grid = np.random.default_rng(0).uniform(lower - rim, upper + rim, (2000, 2))
+    beyond = np.maximum(lower - grid, grid - upper).max(axis=1)
+    assert cKDTree(top[:, :2]).query(grid[beyond > 0.0])[0].max() < spacing
+    area = np.prod(upper - lower + 2.0 * rim) - np.prod(upper - lower)
+    assert len(top) * spacing**2 == pytest.approx(area, rel=0.1)
+    assert np.maximum(lower - side[:, :2], side[:, :2] - upper).max(axis=1) == pytest.approx(rim)
+    height = top[:, 2].mean() - relief.ground
+    assert len(side) * spacing**2 == pytest.approx(2.0 * (upper - lower + 2.0 * rim).sum() * height, rel=0.1)
 
 
 def test_a_plate_bends_no_plane_and_stops_at_the_border():
