@@ -106,6 +106,21 @@ def small_set(plow_dry: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
+def over_level_soil() -> Callable[..., Any]:
+    """Makes a model at the preset tiny: of a measurement, over soil level at a height (m), with some effects."""
+    from types import SimpleNamespace
+
+    from splatsoil.model import Model
+    from splatsoil.reconstruction import HeightField
+
+    def make(measurement: Any, height: float, *effects: str) -> Model:
+        surface = HeightField.over(measurement.bed.lower, measurement.bed.upper, 0.02, height)
+        return Model(measurement, SimpleNamespace(surface=surface), effects=effects, preset="tiny")  # type: ignore[arg-type]
+
+    return make
+
+
+@pytest.fixture(scope="session")
 def spotted() -> Callable[..., Any]:
     """Makes a scene: level soil of given particles with spots every 8 mm, under a steep sun."""
     import numpy as np

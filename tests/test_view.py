@@ -10,7 +10,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,8 +20,6 @@ from splatsoil import cli
 from splatsoil.comparison import Comparator
 from splatsoil.export import replay
 from splatsoil.measurement import Measurement
-from splatsoil.model import Model
-from splatsoil.reconstruction import HeightField
 
 viser = pytest.importorskip("viser")
 
@@ -38,20 +35,18 @@ def server() -> Iterator[Any]:
 
 
 @pytest.fixture
-def columns(small_set: Path, spotted: Callable[..., Any]) -> list[Any]:
+def columns(small_set: Path, over_level_soil: Callable[..., Any], spotted: Callable[..., Any]) -> list[Any]:
     """Level soil under the tool of plow-dry, ten frames long, with and without an effect that keeps plastic strain."""
     from splatsoil.view import Column
 
     measurement = Measurement.load(small_set)
-    bed = measurement.bed
-    surface = HeightField.over(bed.lower, bed.upper, 0.02, DEPTH)
     out = []
     for effects in ((), ("dilatancy",)):
-        model = Model(measurement, SimpleNamespace(surface=surface), effects=effects, preset="tiny")  # type: ignore[arg-type]
+        model = over_level_soil(measurement, DEPTH, *effects)
         particles = model.particles().astype(np.float32)
-        scene = spotted(particles, model.resolution.spacing, bed, 0.004, measurement.tool.mesh)
+        scene = spotted(particles, model.resolution.spacing, measurement.bed, 0.004, measurement.tool.mesh)
         model._scene = lambda seed, scene=scene: scene  # type: ignore[assignment]
-        comparator = Comparator(measurement, surface=surface, frames=model.frames)
+        comparator = Comparator(measurement, surface=model.reconstruction.surface, frames=model.frames)
         out.append(Column(" ".join(effects) or "base", model, VALUES, comparator))
         replay(model, VALUES, model.recorded, out[-1:])
     return out

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Sequence
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from splatsoil.benchmarks import solvers
-from splatsoil.benchmarks._newton import Numerics, Run, World
+from splatsoil.benchmarks._newton import Numerics
 from splatsoil.benchmarks._scenes import ANGLES, BEDS, RADIUS, TOOLS, Scene, scenes
 from splatsoil.benchmarks._truth import Truth
-from splatsoil.benchmarks.solvers import FRAMES, Case, Scan, agreement, compare_stages, main, plough_missing, scan
+from splatsoil.benchmarks.solvers import FRAMES, Scan, agreement, compare_stages, main, scan
 
 from splatsoil.errors import ParameterError
 from splatsoil.mpm import Resolution, simulate
@@ -67,36 +65,6 @@ def test_a_drum_that_rolls_stands_still_where_it_touches() -> None:
         assert at_rest == pytest.approx([slip * 0.2, 0.0, 0.0], abs=1e-9)
         assert tool.mesh.is_watertight
         assert tool.mesh.extents == pytest.approx([2 * RADIUS, 0.12, 2 * RADIUS])
-
-
-def still(world: World) -> Run:
-    """Soil that nothing moves, and a force that grows."""
-    return Run(dict.fromkeys(FRAMES, world.particles), np.outer(np.arange(1.0, 200.0), [-1.0, 0.0, 0.5]))
-
-
-@pytest.fixture
-def groups(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
-    """Names of the scenes that were ploughed together; nothing moves in them."""
-    found: list[list[str]] = []
-
-    def plough(worlds: Sequence[World], *_: Any, **__: Any) -> list[Run]:
-        found.append([world.label for world in worlds])
-        return [still(world) for world in worlds]
-
-    monkeypatch.setattr(solvers, "plough", plough)
-    return found
-
-
-def test_only_missing_scenes_are_ploughed_so_many_at_a_time(groups: list[list[str]], tmp_path: Path) -> None:
-    cases = [Case.drawn(f"scene-{k}", scene, COARSE) for k, scene in enumerate(islice(scenes(1), 5))]
-    plough_missing(cases[:1], tmp_path, "cpu", 4, say)
-    for _ in range(2):
-        plough_missing(cases, tmp_path, "cpu", 3, say)
-    assert groups == [["scene-0"], ["scene-1", "scene-2", "scene-3"], ["scene-4"]]
-    kept, world = cases[0].kept(tmp_path), cases[0].world()
-    assert kept.frames == FRAMES and kept.spacing == pytest.approx(0.04)
-    assert np.abs(kept.particles[50] - world.particles).max() < 1e-4
-    assert kept.force == pytest.approx(still(world).force)
 
 
 def test_soil_between_two_angles_is_estimated_between_them() -> None:

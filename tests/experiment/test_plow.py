@@ -1,5 +1,6 @@
 """What a plow experiment draws without simulating anew."""
 
+from collections.abc import Callable
 from itertools import combinations
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,14 +15,15 @@ from splatsoil.errors import ParameterError, SimulationError
 from splatsoil.experiment.plow import PlowExperiment
 from splatsoil.measurement import Measurement
 from splatsoil.model import Model
-from splatsoil.reconstruction import HeightField
 from splatsoil.soil.library import library
 
 
-def test_what_is_numerics_or_takes_a_laboratory_is_no_candidate(small_set: Path) -> None:
-    measurement = Measurement.load(small_set)
-    surface = HeightField.over(measurement.bed.lower, measurement.bed.upper, 0.02, 0.12)
-    model = Model(measurement, cast(Any, SimpleNamespace(surface=surface)), preset="tiny")
+@pytest.fixture
+def model(small_set: Path, over_level_soil: Callable[..., Model]) -> Model:
+    return over_level_soil(Measurement.load(small_set), 0.12)
+
+
+def test_what_is_numerics_or_takes_a_laboratory_is_no_candidate(model: Model) -> None:
     others = {"stiffness", "critical_state", "hardening", "intermediate_stress"}
     assert {c.name for c in PlowExperiment(model).candidates} == set(library()) - others
     assert [c.name for c in PlowExperiment(model, candidates=["hardening"]).candidates] == ["hardening"]
@@ -29,11 +31,9 @@ def test_what_is_numerics_or_takes_a_laboratory_is_no_candidate(small_set: Path)
         off_effects(["stiffness"], ())
 
 
-def test_what_one_camera_sees_is_in_its_columns_and_where_it_is(small_set: Path) -> None:
+def test_what_one_camera_sees_is_in_its_columns_and_where_it_is(model: Model) -> None:
     """A spot of the bed a little darker in one camera's prediction: columns of that camera, of patches at the spot."""
-    measurement = Measurement.load(small_set)
-    surface = HeightField.over(measurement.bed.lower, measurement.bed.upper, 0.02, 0.12)
-    experiment = PlowExperiment(Model(measurement, cast(Any, SimpleNamespace(surface=surface)), preset="tiny"))
+    experiment = PlowExperiment(model)
     comparator, layout, force = experiment.comparator, experiment.layout, np.zeros((10, 3))
 
     def features(images: dict[tuple[str, int], np.ndarray]) -> np.ndarray:
@@ -50,11 +50,7 @@ def test_what_one_camera_sees_is_in_its_columns_and_where_it_is(small_set: Path)
             assert np.hypot(layout.sites[k].x - x, layout.sites[k].y - y) < 0.06 + PATCH
 
 
-def test_soil_prepared_together_is_that_of_single_simulations(small_set: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    measurement = Measurement.load(small_set)
-    bed = measurement.bed
-    surface = HeightField.over(bed.lower, bed.upper, 0.02, 0.12)
-    model = Model(measurement, cast(Any, SimpleNamespace(surface=surface)), preset="tiny")
+def test_soil_prepared_together_is_that_of_single_simulations(model: Model, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: list[tuple[int, int | None, float]] = []
 
     def draw(_: Model, trajectory: Any, seed: int, values: Any, *, albedo: int | None, rounding: float) -> dict:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.optimize import brute, fmin
-from splatsoil.inverse.bayesopt import START_EACH, BayesianOptimiser, Minimum, Surrogate, optimise
+from splatsoil.inverse.bayesopt import BayesianOptimiser, Minimum, Surrogate, optimise
 
 Loss = Callable[[np.ndarray], float]
 
@@ -136,18 +136,6 @@ def test_failed_evaluations_are_avoided_and_left_out() -> None:
     assert any(t.loss is None for t in optimiser.told), "the start covers the range where evaluations fail"
     assert sum(t.loss is None for t in optimiser.told[4:]) <= 2
     assert optimiser.result().estimate[0] == pytest.approx(0.3, abs=0.05)
-
-
-def test_while_nothing_has_succeeded_the_space_is_filled() -> None:
-    optimiser = BayesianOptimiser(2)
-    for action in optimiser.ask(START_EACH * 2 + 2):
-        optimiser.tell(action, np.nan)
-    again = BayesianOptimiser(2)
-    for told in optimiser.told:
-        assert np.array_equal(again.ask()[0], told.action.astype(np.float32))
-        again.tell(told.action, None)
-    with pytest.raises(ValueError):
-        optimiser.result()
 
 
 def test_the_gaussian_process_agrees_with_scikit_learn() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from functools import partial
 
@@ -43,16 +42,6 @@ def solver(
     batch = np.broadcast_to(x, (len(values), *x.shape))
     law = Law(find_effects(effects))
     return Solver(batch, LOWER, UPPER, mesh, RESOLUTION, law, settings or Settings(friction_angle=35.0), values, device)
-
-
-def test_sand_on_a_tilted_floor_without_friction_slides_as_galileo_says() -> None:
-    x = block([0.04, 0.02, 0.0], [0.12, 0.10, 0.04])
-    settings = Settings(friction_angle=45.0, floor_friction=0.0)
-    run = solver(x, {"tilt_x": 10.0, "cohesion": 1500.0}, effects=("tilt", "cohesion"), settings=settings)
-    for _ in range(8):
-        run.advance([FAR_AWAY, FAR_AWAY])
-    way = (run.positions()[0] - x)[:, 0].mean()
-    assert way == pytest.approx(0.5 * 9.81 * math.sin(math.radians(10.0)) * 0.16**2, rel=0.03)
 
 
 def test_a_bed_of_growing_density_rests_and_weighs_its_integral() -> None:
