@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -127,20 +125,6 @@ def test_a_change_of_nothing_shifts_nothing_and_each_change_is_of_one_thing(
     scanned = scan(ours, base, (-6.0, 6.0), (0,), "cpu")
     (row,) = solvers.sensitivity(ours, base, scanned, (0,), "cpu")
     assert row == {"change": "nothing", "angle": 0.0, "force": 0.0}
-
-
-def test_a_set_that_these_numerics_made_needs_no_other_solver(
-    plow_dry: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setitem(sys.modules, "newton", None)
-    words = ["--sets", str(plow_dry), "--presets", "tiny", "--seeds", "1", "--offsets", "--out", str(tmp_path)]
-    assert main(words) == 0
-    found = json.loads((tmp_path / "result.json").read_text())["cases"]["plow-dry"]["agreement"]["tiny"]
-    force = np.loadtxt(plow_dry / "tool_force.csv", delimiter=",", skiprows=1)
-    pushing = force[(force[:, 0] > 25) & (force[:, 0] <= 100)][:, [2, 4]].mean(axis=0)
-    assert found["stages"]["pushing"]["other"] == pytest.approx(pushing)
-    told = capsys.readouterr().out
-    assert f"/ {pushing[0]:.0f}, " in told and "| plow-dry | 36.0° | – |" in told
 
 
 @pytest.mark.parametrize(

@@ -47,10 +47,6 @@ def test_a_folder_with_other_things_is_left_alone(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]
 
 
-def test_an_empty_folder_is_taken(tmp_path: Path) -> None:
-    assert prepare(tmp_path).path == tmp_path
-
-
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"format": "other/1"}', '{"format": "splatsoil-run/1"}'])
 def test_a_broken_description_gets_one_sentence(tmp_path: Path, text: str) -> None:
     (tmp_path / "run.json").write_text(text)

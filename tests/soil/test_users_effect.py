@@ -77,15 +77,6 @@ def test_a_model_with_the_example_fits_and_simulates_it(suction: str) -> None:
     assert np.abs(held - dry).max() > 1e-3
 
 
-def test_the_same_file_gives_the_same_kernels_until_it_changes(suction: str, tmp_path: Path) -> None:
-    assert Law(find_effects([suction])).update is Law(find_effects([suction])).update
-    copy = tmp_path / "suction.py"
-    copy.write_text(Path(suction).read_text())
-    first = find_effects([str(copy)])[0]
-    copy.write_text(Path(suction).read_text().replace("0.0, 5e4", "0.0, 6e4"))
-    assert (first.parameters[0].upper, find_effects([str(copy)])[0].parameters[0].upper) == (5e4, 6e4)
-
-
 def test_the_command_finds_the_effect_of_an_installed_package(suction: str, tmp_path: Path) -> None:
     """A package as pip leaves it: a module, and the metadata that docs/effects.md tells to write."""
     (tmp_path / "my_package").mkdir()
