@@ -35,6 +35,9 @@ def test_what_one_camera_sees_is_in_its_columns_and_where_it_is(model: Model) ->
     """A spot of the bed a little darker in one camera's prediction: columns of that camera, of patches at the spot."""
     experiment = PlowExperiment(model)
     comparator, layout, force = experiment.comparator, experiment.layout, np.zeros((10, 3))
+    still = comparator.still_blocks()
+    for site, noise in zip(layout.sites, experiment.sensor[0], strict=True):
+        assert noise == pytest.approx(np.sqrt(np.mean(still[site.channel] ** 2))), "of three frames before it moves"
 
     def features(images: dict[tuple[str, int], np.ndarray]) -> np.ndarray:
         return experiment.features(cast(Any, SimpleNamespace(images=images, trajectory=SimpleNamespace(force=force))))

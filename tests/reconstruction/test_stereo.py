@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from splatsoil.measurement import Camera
 from splatsoil.reconstruction import PRESETS, HeightField
-from splatsoil.reconstruction.initial import seed_rim
+from splatsoil.reconstruction.initial import seed_far, seed_rim
 from splatsoil.reconstruction.stereo import Smoothness, visibility
 from splatsoil.reconstruction.surface import find_relief, with_rim, without_backdrop
 from splatsoil.reconstruction.views import Views, projection_matrix, silhouettes
@@ -126,6 +126,19 @@ def test_discs_cover_the_border_around_the_bed(scene, relief):
     assert np.maximum(lower - side[:, :2], side[:, :2] - upper).max(axis=1) == pytest.approx(rim)
     height = top[:, 2].mean() - relief.ground
     assert len(side) * spacing**2 == pytest.approx(2.0 * (upper - lower + 2.0 * rim).sum() * height, rel=0.1)
+
+
+def test_first_discs_far_away_lie_on_the_ground_and_on_a_sphere_around_all_cameras(scene, views, relief):
+    """Six times as far from the bed as the farthest camera; nothing within the bed and its border."""
+    seeds = seed_far(views, scene.bed, relief)
+    centre = np.array([*(scene.bed.lower + scene.bed.upper)[:2] / 2, relief.ground])
+    radius = 6.0 * max(np.linalg.norm(camera.position - centre) for camera in views.cameras)
+    up = seeds.normals[:, 2] == 1.0
+    assert up.any() and np.allclose(seeds.points[up, 2], relief.ground)
+    away = np.linalg.norm(seeds.points - centre, axis=1)
+    assert (away[up] < radius).all() and away[~up] == pytest.approx(radius)
+    lower, upper = scene.bed.lower[:2] - relief.rim, scene.bed.upper[:2] + relief.rim
+    assert not np.all((seeds.points[:, :2] > lower) & (seeds.points[:, :2] < upper), axis=1).any()
 
 
 def test_a_plate_bends_no_plane_and_stops_at_the_border():
