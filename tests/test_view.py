@@ -178,3 +178,11 @@ def test_a_browser_draws_it(server: Any, columns: list[Any], tmp_path: Path) -> 
     sand = (gaussians[..., 0] > gaussians[..., 2] + 20.0) & (gaussians.min(axis=2) < 230)
     assert blue.mean() > 0.05, "soil at rest has the colours' lower end"
     assert sand.mean() > 0.05
+
+
+def test_without_the_extra(
+    small_set: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("splatsoil.commands.view.importlib.util.find_spec", lambda name: None)
+    assert cli.main(["view", str(small_set)]) == 2
+    assert "pip install 'splatsoil[view]'" in capsys.readouterr().err

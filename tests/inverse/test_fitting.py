@@ -131,3 +131,7 @@ def test_a_minimum_at_a_bound_and_a_flat_loss_are_said(analytic: ModuleType, tmp
     assert flat["parameters"]["friction_angle"]["determined"] is False
     assert any("not determined" in note for note in flat["notes"])
     assert flat["parameters"]["friction_angle"]["std"] > 4.0
+
+
+def test_a_fit_is_named_by_its_effects_and_stays_in_the_run_folder(analytic: ModuleType) -> None:
+    assert replace(analytic.SETUP, effects=("/my/suction.py", "cohesion")).name == "cohesion+suction"

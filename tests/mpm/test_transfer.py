@@ -258,3 +258,21 @@ def test_friction_on_a_tool_is_coulombs(steps: int, speed: float) -> None:
     sideways = -float(np.mean(slide(run, speed, steps, 40)[-20:, 0]))
     weight = len(x) * spacing**3 * RESOLUTION.density * 9.81
     assert sideways == pytest.approx(friction * weight, rel=0.02)
+
+
+@pytest.mark.parametrize("above", [0.002, 0.006])
+def test_contact_acts_by_what_the_tool_covers(above: float) -> None:
+    """A particle before an upright plate whose lower edge lies in the middle of a cell: of the way down to the nodes
+    below the edge the plate covers ``above`` of ``above`` and half a cell; of that up to the nodes above it, all."""
+    cell = RESOLUTION.cell
+    edge = 4.5 * cell
+    plate = trimesh.creation.box([0.012, 0.4, 0.1])
+    x = np.array([[0.1 + 1e-4, 5.0 * cell + 1e-6, edge + above]])
+    run = solver(x, np.full(3, 0.2), plate, skin=0.0)
+    pose = Pose(np.array([0.094, 0.1, edge + 0.05]), UPRIGHT, np.zeros(3), np.zeros(3))
+    run._pose.assign(pose.row().astype(np.float32))
+    run._contact(1e-4, 1.0)
+    weight = run._near_weight.numpy()[:8].reshape(2, 2, 2).sum(axis=(0, 1))
+    high = 0.5 + above / cell
+    low = (1.0 - high) * above / (above + 0.5 * cell)
+    np.testing.assert_allclose(weight, np.array([low, high]) / (low + high), atol=0.06)

@@ -249,3 +249,18 @@ def test_command_line_and_the_same_seed_gives_the_same_bits(measurement, result,
     for name in ("means", "scales", "quaternions", "opacities", "colours"):
         assert torch.equal(getattr(again.gaussians, name), getattr(result.gaussians, name)), name
     np.testing.assert_array_equal(again.surface.height, result.surface.height)
+
+
+def test_the_command_line_says_remarks_once_and_on_stderr(measurement, result, tmp_path, monkeypatch, capsys):
+    odd = replace(result, metadata={**result.metadata, "remarks": ["video: is it so?"]})
+
+    def found(*_, **__):
+        odd.say_remarks()
+        odd.say_remarks()
+        return odd
+
+    monkeypatch.setattr("splatsoil.reconstruction.reconstruct", found)
+    assert main(["reconstruct", str(measurement.folder), "--out", str(tmp_path / "r"), "--json"]) == 0
+    out, err = capsys.readouterr()
+    assert json.loads(out)["remarks"] == ["video: is it so?"]
+    assert err.count("remark video: is it so?\n") == 1 and "Warning" not in err

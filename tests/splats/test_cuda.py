@@ -132,6 +132,27 @@ def test_cuda_kernels_on_the_cpu(
             assert_agree(draw(g, camera, antialias), expected)
 
 
+def test_what_no_pixel_shows_has_no_gradient_in_the_order_of_cuda(
+    monkeypatch: pytest.MonkeyPatch, camera_at: CameraMaker, cloud: CloudMaker
+) -> None:
+    """That order has the invisible ones, too; their opacity in the picture is 0, by which gradients are divided."""
+    monkeypatch.setattr(binning, "_depth_order", binning._depth_order_torch)
+    for _, g, camera, antialias in scenes(camera_at, cloud):
+        shifted = torch.cat([g.means, g.means + 100.0])
+        both = Gaussians(
+            shifted, *(torch.cat([getattr(g, n)] * 2) for n in ("scales", "quaternions", "opacities", "colours"))
+        )
+        both = Gaussians(*(getattr(both, n).detach().requires_grad_() for n in NAMES))
+        picture = rasterise(both, camera, antialias=antialias)
+        picture.projection.strengths.retain_grad()
+        (picture.colour.sum() + picture.alpha.sum()).backward()
+        gradient = picture.projection.strengths.grad
+        assert gradient is not None
+        hidden = ~picture.projection.visible
+        assert hidden.sum() >= len(g)
+        assert torch.isfinite(gradient).all() and not gradient[hidden].any() and gradient.any()
+
+
 @pytest.mark.parametrize("channels", [1, 8])
 def test_cuda_kernels_compile(channels: int, tmp_path: Path) -> None:
     """NVRTC comes with Warp, so a CUDA compiler error shows without a GPU; sm_90 is an H100 or H200."""

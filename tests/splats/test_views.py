@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+import warp as wp
 from scipy.spatial.transform import Rotation
 
 from splatsoil.measurement import Camera
-from splatsoil.splats import Gaussians, rasterise_features
+from splatsoil.splats import Gaussians, kernels_cuda, rasterise_features, rasteriser
+from splatsoil.splats.binning import Bins
 from splatsoil.splats.steps import finished
 from splatsoil.splats.views import Seen, at_once, rasterise_views
 
@@ -51,3 +54,20 @@ def test_a_gpu_draws_them_as_a_cpu_does(views: list[Seen]) -> None:
     theirs = rasterise_views(there, background=BACKGROUND.cuda(), antialias=True)
     for here, on_gpu in zip(ours, theirs, strict=True):
         assert torch.allclose(here, on_gpu.cpu(), atol=2e-4)
+
+
+def test_kernels_of_a_gpu_draw_all_views_in_one_launch(views: list[Seen], monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a CPU: the same as the CPU's own, view by view."""
+    launched: list[int] = []
+
+    def launch_pixels(kernel: Any, bins: Bins, inputs: list[Any], like: torch.Tensor) -> None:
+        launched.append(len(bins.starts) - 1)
+        wp.launch(kernel, dim=launched[-1] * kernels_cuda.THREADS, inputs=[0, *inputs], device="cpu")
+
+    ours = rasterise_views(views, background=BACKGROUND, antialias=True)
+    monkeypatch.setattr(rasteriser, "_kernels", lambda like: kernels_cuda)
+    monkeypatch.setattr(rasteriser, "_launch_tiles", launch_pixels)
+    theirs = finished(at_once(views, BACKGROUND, True))
+    assert launched == [4 * 5 * 4]
+    for here, there in zip(ours, theirs, strict=True):
+        assert torch.allclose(here, there, atol=1e-5)
