@@ -128,13 +128,15 @@ def test_discs_cover_the_border_around_the_bed(scene, relief):
     assert len(side) * spacing**2 == pytest.approx(2.0 * (upper - lower + 2.0 * rim).sum() * height, rel=0.1)
 
 
-def test_first_discs_far_away_lie_on_the_ground_and_on_a_sphere_around_all_cameras(scene, views, relief):
+def test_first_discs_far_away_lie_on_the_ground_and_on_a_sphere_around_all_cameras(scene, relief):
     """Six times as far from the bed as the farthest camera; nothing within the bed and its border."""
+    cameras = scene.cameras(6, 64, 48, rise=(5.0, 40.0))
+    views = as_views(cameras, [np.zeros((48, 64, 3), np.float32)] * 6)
     seeds = seed_far(views, scene.bed, relief)
     centre = np.array([*(scene.bed.lower + scene.bed.upper)[:2] / 2, relief.ground])
     radius = 6.0 * max(np.linalg.norm(camera.position - centre) for camera in views.cameras)
     up = seeds.normals[:, 2] == 1.0
-    assert up.any() and np.allclose(seeds.points[up, 2], relief.ground)
+    assert up.any() and not up.all() and np.allclose(seeds.points[up, 2], relief.ground)
     away = np.linalg.norm(seeds.points - centre, axis=1)
     assert (away[up] < radius).all() and away[~up] == pytest.approx(radius)
     lower, upper = scene.bed.lower[:2] - relief.rim, scene.bed.upper[:2] + relief.rim
