@@ -3,6 +3,7 @@
 #   make demo     the whole path on examples/plow-dry, ending in runs/demo/report.html
 #   make test     the tests
 #   make test-slow  the tests that take minutes: whole reconstructions and simulations of the example sets
+#   make mutants  small faults in the source, one at a time, and which of them no test sees; an hour
 #   make lint     formatting, lint, unused code and types
 #   make readme   docs/readme.webp, the README's picture, from the run of make demo
 #   make docs     the documentation as a site, build/site/index.html
@@ -12,18 +13,20 @@
 # VENV          where it goes
 # TORCH_INDEX   package index to take torch from first; without a GPU https://download.pytorch.org/whl/cpu saves 4 GB
 # PYTEST_ARGS   arguments for pytest
+# MUTANTS_ARGS  arguments for tests/mutants/run.py
 
 PYTHON ?= python3
 VENV ?= .venv
 TORCH_INDEX ?=
 PYTEST_ARGS ?= -n 2 --dist loadfile -m "not slow"
+MUTANTS_ARGS ?= --count 25 --seed 0
 
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 PACKAGES := splatsoil envs inverse benchmarks
 SOURCES := $(shell find $(PACKAGES) -type f -not -path '*/__pycache__/*')
 
-.PHONY: demo test test-slow lint readme docs clean
+.PHONY: demo test test-slow mutants lint readme docs clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.use
@@ -35,6 +38,9 @@ test: $(VENV)/.develop
 
 test-slow: $(VENV)/.develop
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m slow
+
+mutants: $(VENV)/.develop
+	$(BIN)/python tests/mutants/run.py $(MUTANTS_ARGS)
 
 # Static checkers cannot see that envs/, inverse/ and benchmarks/ install as splatsoil.*, so mypy gets the built package.
 lint: $(VENV)/.develop build/installed/.stamp

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import ast
 import importlib.util
 import json
 import os
 import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -46,13 +47,39 @@ def measured_data() -> Path:
 
 @pytest.fixture(scope="session")
 def analytic() -> ModuleType:
-    """A simulate-and-compare with a known answer; as a script it fits one."""
+    """A simulate-and-compare with a known answer."""
     spec = importlib.util.spec_from_file_location("analytic", REPOSITORY / "tests" / "inverse" / "analytic.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture(scope="session")
+def imports() -> dict[str, set[str]]:
+    """The package's modules by name, and those that each imports anywhere, for types alone aside."""
+    files: dict[str, Path] = {}
+    for package in ("splatsoil", "splatsoil.envs", "splatsoil.inverse", "splatsoil.benchmarks"):
+        (root,) = importlib.util.find_spec(package).submodule_search_locations  # type: ignore[union-attr,misc]
+        for file in Path(root).rglob("*.py"):
+            parts = (package, *file.relative_to(root).with_suffix("").parts)
+            files[".".join(parts).removesuffix(".__init__")] = file
+
+    def imported(name: str, file: Path) -> Iterator[str]:
+        nodes: list[ast.AST] = [ast.parse(file.read_text())]
+        while nodes:
+            node = nodes.pop()
+            if isinstance(node, ast.Import):
+                yield from (alias.name for alias in node.names)
+            elif isinstance(node, ast.ImportFrom):
+                package = name.split(".")[: -node.level if file.stem != "__init__" else 1 - node.level or None]
+                base = ".".join((*(package if node.level else ()), *([node.module] if node.module else ())))
+                yield from (base, *(f"{base}.{alias.name}" for alias in node.names))
+            elif not (isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"):
+                nodes += ast.iter_child_nodes(node)
+
+    return {name: files.keys() & set(imported(name, file)) for name, file in files.items()}
 
 
 @pytest.fixture
@@ -76,6 +103,21 @@ def small_set(plow_dry: Path, tmp_path: Path) -> Path:
             shutil.copy(plow_dry / kind / frame["file_path"], target)
         (folder / kind / "transforms.json").write_text(json.dumps(data))
     return folder
+
+
+@pytest.fixture(scope="session")
+def over_level_soil() -> Callable[..., Any]:
+    """Makes a model at the preset tiny: of a measurement, over soil level at a height (m), with some effects."""
+    from types import SimpleNamespace
+
+    from splatsoil.model import Model
+    from splatsoil.reconstruction import HeightField
+
+    def make(measurement: Any, height: float, *effects: str) -> Model:
+        surface = HeightField.over(measurement.bed.lower, measurement.bed.upper, 0.02, height)
+        return Model(measurement, SimpleNamespace(surface=surface), effects=effects, preset="tiny")  # type: ignore[arg-type]
+
+    return make
 
 
 @pytest.fixture(scope="session")

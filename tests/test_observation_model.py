@@ -1,7 +1,6 @@
 """A model's pictures under observation effects: drawn anew from one trajectory, never simulated anew."""
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,10 +10,8 @@ from skimage.registration import phase_cross_correlation
 
 from splatsoil.errors import ParameterError
 from splatsoil.measurement import Bed, Camera, Frame, Measurement, Tool, ToolMotion
-from splatsoil.model import Model
 from splatsoil.mpm.simulate import Trajectory
-from splatsoil.reconstruction import HeightField
-from splatsoil.scene import Scene, linear
+from splatsoil.scene import linear
 
 SPACING, DEPTH, RATE, FOCAL, SPEED = 0.02, 0.1, 10.0, 150.0, 0.2
 BED = Bed(np.zeros(3), np.array([0.4, 0.4, 0.2]), 1600.0)
@@ -54,11 +51,14 @@ def scene(measurement, still, spotted):
     return spotted(still, SPACING, BED, 0.002, measurement.tool.mesh)
 
 
-def model_of(measurement, scene, *effects):
-    surface = HeightField.over(BED.lower, BED.upper, 0.02, DEPTH)
-    model = Model(measurement, SimpleNamespace(surface=surface), effects=effects, preset="tiny")
-    model._scene = lambda seed: scene
-    return model
+@pytest.fixture(scope="module")
+def model_of(measurement, scene, over_level_soil):
+    def make(*effects):
+        model = over_level_soil(measurement, DEPTH, *effects)
+        model._scene = lambda seed: scene
+        return model
+
+    return make
 
 
 def trajectory_of(model, still, drift=(0.0, 0.0, 0.0)):
@@ -74,8 +74,8 @@ def tool_column(image):
     return float((blue.sum(axis=0) * (np.arange(image.shape[1]) + 0.5)).sum() / blue.sum())
 
 
-def test_each_camera_of_the_set_has_its_own_six_numbers(measurement, scene):
-    model = model_of(measurement, scene, "camera_pose", "cohesion")
+def test_each_camera_of_the_set_has_its_own_six_numbers(model_of):
+    model = model_of("camera_pose", "cohesion")
     free = [p.name for p in model.observation_parameters]
     kinds = ("pan", "tilt", "roll", "right", "up", "forward")
     assert free == [f"camera_{k}_{name}" for k in (1, 2) for name in kinds]
@@ -83,8 +83,8 @@ def test_each_camera_of_the_set_has_its_own_six_numbers(measurement, scene):
     assert "camera right" in next(p.label for p in model.parameters if p.name == "camera_2_pan")
 
 
-def test_a_pan_shifts_the_picture_of_that_camera_alone(measurement, scene, still):
-    model = model_of(measurement, scene, "camera_pose")
+def test_a_pan_shifts_the_picture_of_that_camera_alone(model_of, still):
+    model = model_of("camera_pose")
     trajectory = trajectory_of(model, still)
     angle = float(np.degrees(np.arctan(4.0 / FOCAL)))
     before, after = model.draw(trajectory), model.draw(trajectory, 0, {"camera_2_pan": angle})
@@ -96,37 +96,8 @@ def test_a_pan_shifts_the_picture_of_that_camera_alone(measurement, scene, still
     assert np.allclose(shift, [0.0, 4.0], atol=0.15)
 
 
-def test_what_cameras_alone_report_looks_at_scenes_that_are_posed_already(measurement, scene, still, monkeypatch):
-    posed = []
-    poses = Scene.poses
-    monkeypatch.setattr(Scene, "poses", lambda self, moments: posed.extend(moments) or poses(self, moments))
-    model = model_of(measurement, scene, "camera_pose", "exposure", "blur", "tool_pose", "light")
-    trajectory, frames = trajectory_of(model, still), len(model.frames)
-    model.draw(trajectory)
-    for values in ({"camera_1_roll": 0.3}, {"exposure_gain": 1.2}, {"blur": 1.0}):
-        shared = model.draw(trajectory, 0, values)
-        assert len(posed) == frames
-        alone = model_of(measurement, scene, "camera_pose", "exposure", "blur", "tool_pose", "light")
-        fresh = alone.draw(trajectory, 0, values)
-        assert all(np.array_equal(shared[key], fresh[key]) for key in fresh)
-        del posed[frames:]
-    others = ({"tool_x": 0.01}, {"sun_elevation_change": 2.0}, {})
-    for count, values in enumerate(others, start=2):
-        model.draw(trajectory, 0, values)
-        assert len(posed) == count * frames
-    for albedo in (1, 2, None):  # colours, too, are another matter than where things are
-        guessed = model.draw(trajectory, albedo=albedo)
-        assert len(posed) == (1 + len(others)) * frames
-        fresh = model_of(measurement, scene if albedo is None else scene.with_other_albedo(albedo)).draw(trajectory)
-        assert all(np.array_equal(guessed[key], fresh[key]) for key in fresh)
-        del posed[(1 + len(others)) * frames :]
-    model.draw(trajectory, rounding=2.0)
-    model.draw(trajectory_of(model, still))
-    assert len(posed) == (3 + len(others)) * frames
-
-
-def test_a_late_video_shows_the_tool_farther_on(measurement, scene, still):
-    model = model_of(measurement, scene, "time_offset")
+def test_a_late_video_shows_the_tool_farther_on(model_of, still):
+    model = model_of("time_offset")
     trajectory = trajectory_of(model, still)
     late = model.draw(trajectory, 0, {"time_offset": 0.037})
     moved = tool_column(late["left", 4]) - tool_column(model.draw(trajectory)["left", 4])
@@ -134,8 +105,8 @@ def test_a_late_video_shows_the_tool_farther_on(measurement, scene, still):
     assert moved == pytest.approx(FOCAL * SPEED * 0.037 / 0.48, abs=0.3)
 
 
-def test_between_frames_soil_is_interpolated(measurement, scene, still):
-    model = model_of(measurement, scene, "time_offset")
+def test_between_frames_soil_is_interpolated(model_of, still):
+    model = model_of("time_offset")
     assert model.recorded == (0, 1, 3, 4, 5, 7, 8, 9)
     drift = (0.003, 0.0, -0.001)
     trajectory = trajectory_of(model, still, drift)
@@ -144,14 +115,14 @@ def test_between_frames_soil_is_interpolated(measurement, scene, still):
         assert np.allclose(x, still + moment * np.array(drift), atol=1e-6)
         assert np.allclose(f, np.eye(3))
     assert np.array_equal(trajectory.at(-0.4)[0], still)
-    plain = model_of(measurement, scene)
+    plain = model_of()
     assert plain.recorded == plain.frames == (0, 4, 8)
     with pytest.raises(ParameterError, match="frame 1"):
         model.draw(trajectory_of(plain, still), 0, {"time_offset": 0.02})
 
 
-def test_the_drawn_tool_moves_and_the_soil_does_not(measurement, scene, still):
-    model = model_of(measurement, scene, "tool_pose")
+def test_the_drawn_tool_moves_and_the_soil_does_not(model_of, still):
+    model = model_of("tool_pose")
     trajectory = trajectory_of(model, still)
     before, after = model.draw(trajectory), model.draw(trajectory, 0, {"tool_x": 0.02})
     moved = tool_column(after["left", 4]) - tool_column(before["left", 4])
@@ -159,8 +130,8 @@ def test_the_drawn_tool_moves_and_the_soil_does_not(measurement, scene, still):
     assert np.abs(after["left", 4][:15] - before["left", 4][:15]).max() < 5e-3  # what the tool sends back
 
 
-def test_a_lower_sun_lengthens_the_shadow(measurement, scene, still):
-    model = model_of(measurement, scene, "light")
+def test_a_lower_sun_lengthens_the_shadow(model_of, still):
+    model = model_of("light")
     trajectory = trajectory_of(model, still)
 
     def shadow_end(values):
@@ -178,8 +149,8 @@ def test_a_lower_sun_lengthens_the_shadow(measurement, scene, still):
     assert shares == {"sun_azimuth_change", "sun_elevation_change", "sky_share_change"}
 
 
-def test_exposure_and_blur_reach_the_pictures(measurement, scene, still):
-    model = model_of(measurement, scene, "exposure", "blur")
+def test_exposure_and_blur_reach_the_pictures(model_of, still):
+    model = model_of("exposure", "blur")
     trajectory = trajectory_of(model, still)
     plain = model.draw(trajectory)
     brighter = model.draw(trajectory, 0, {"exposure_gain": 1.2})
@@ -192,8 +163,8 @@ def test_exposure_and_blur_reach_the_pictures(measurement, scene, still):
         model.draw(trajectory, 0, {"blur": 99.0})
 
 
-def test_another_guess_of_buried_colours_shows_where_soil_was_turned_over(measurement, scene, still):
-    model = model_of(measurement, scene)
+def test_another_guess_of_buried_colours_shows_where_soil_was_turned_over(model_of, still):
+    model = model_of()
     turned = still.copy()
     turned[:, 2] = np.where(still[:, 0] > 0.2, DEPTH - still[:, 2], still[:, 2])
     eye = np.tile(np.eye(3, dtype=np.float32), (3, len(still), 1, 1))
@@ -208,8 +179,8 @@ def test_another_guess_of_buried_colours_shows_where_soil_was_turned_over(measur
     assert np.abs(other["left", 8] - again["left", 8])[right].mean() > 0.5 * changes[8][right].mean()
 
 
-def test_rounding_takes_shade_from_a_furrow_and_nothing_from_level_soil(measurement, scene, still):
-    model = model_of(measurement, scene)
+def test_rounding_takes_shade_from_a_furrow_and_nothing_from_level_soil(model_of, still):
+    model = model_of()
     furrowed = still.copy()
     furrowed[:, 2] -= 0.03 * np.exp(-(((furrowed[:, 0] - 0.28) / 0.04) ** 2)) * (furrowed[:, 2] / DEPTH)
     level, once, twice = (

@@ -78,34 +78,13 @@ def test_one_name_in_site_packages(elsewhere: Path) -> None:
     assert any(name.endswith(".dist-info") for name in names)
 
 
-def test_the_wheel_holds_every_module(wheel: Path, repository: Path) -> None:
-    """All modules of all folders, the marker of types, the licence; nothing else but data files that are declared."""
-    inside = set(zipfile.ZipFile(wheel).namelist())
-    wanted = {"splatsoil/py.typed"}
-    for folder in FOLDERS:
-        prefix = "" if folder == "splatsoil" else "splatsoil/"
-        wanted |= {prefix + p.relative_to(repository).as_posix() for p in (repository / folder).rglob("*.py")}
-    assert wanted <= inside, sorted(wanted - inside)
-    modules = {name for name in inside if name.endswith(".py")}
-    assert modules <= wanted, sorted(modules - wanted)
-    assert any(name.endswith("LICENSE") for name in inside)
-
-
-def test_data_files_are_declared(wheel: Path, repository: Path) -> None:
-    """Templates, styles and tables beside the modules are in the wheel, too."""
-    inside = set(zipfile.ZipFile(wheel).namelist())
-    data = {p for f in FOLDERS for p in (repository / f).rglob("*") if p.is_file() and p.suffix not in (".py", ".pyc")}
-    for path in data:
-        name = path.relative_to(repository).as_posix()
-        assert (name if name.startswith("splatsoil/") else f"splatsoil/{name}") in inside, name
-
-
-def test_every_package_has_an_init(project: dict[str, Any], repository: Path) -> None:
-    """A listed package without __init__.py would be a namespace that anybody could add to."""
-    for package in project["tool"]["setuptools"]["packages"]:
-        parts = package.split(".")
-        folder = Path(*(parts[1:] if len(parts) > 1 and parts[1] in FOLDERS else parts))
-        assert (repository / folder / "__init__.py").is_file(), package
+def test_the_wheel_holds_every_file_of_the_package_and_no_other(wheel: Path, repository: Path) -> None:
+    """Modules, the marker of types, templates, styles and tables; beside them only what describes the wheel."""
+    inside = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
+    files = {p for f in FOLDERS for p in (repository / f).rglob("*") if p.is_file() and p.suffix != ".pyc"}
+    names = {f"splatsoil/{p.relative_to(repository).as_posix().removeprefix('splatsoil/')}" for p in files}
+    assert inside == names and "splatsoil/py.typed" in names
+    assert any(name.endswith("LICENSE") for name in zipfile.ZipFile(wheel).namelist())
 
 
 def test_imports_come_from_the_wheel(elsewhere: Path) -> None:

@@ -40,12 +40,6 @@ def test_points_outside_the_cube_are_clipped_to_it() -> None:
     assert SPACE.to_dict(upper) == {"friction_angle": 50.0, "cohesion": 10_000.0, "ratio": 1.0}, "no rounding outside"
 
 
-def test_the_input_is_left_alone() -> None:
-    vector = np.array([30.0, 10.0, 0.0])
-    SPACE.to_unit(vector)
-    np.testing.assert_array_equal(vector, [30, 10, 0])
-
-
 def test_dictionaries() -> None:
     assert SPACE.names == ("friction_angle", "cohesion", "ratio") and len(SPACE) == 3
     assert [p.name for p in SPACE] == list(SPACE.names)
@@ -83,9 +77,3 @@ def test_parameters_that_make_no_sense_are_refused() -> None:
         ParameterSpace([])
     with pytest.raises(ParameterError, match="repeat"):
         ParameterSpace([ANGLE, ANGLE])
-
-
-def test_titles() -> None:
-    assert ANGLE.title == "friction angle [°]"
-    assert COHESION.title == "cohesion [Pa]"
-    assert RATIO.title == "some ratio"

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
-from splatsoil.benchmarks.information import precision_of, sigmas, table
+from splatsoil.benchmarks.information import precision_of, sigmas
 
 from splatsoil.cli import main as command_line
 from splatsoil.files import read_json
@@ -65,30 +63,6 @@ def test_chance_alone_passes_its_limit_in_one_of_twenty(rng: np.random.Generator
     drawn = rng.multivariate_normal(np.zeros(40), chance, size=(2000, 3))
     found = [sigmas(own, precision_of(noise), chance) for own in drawn]
     assert np.mean([value > least for value, least in found]) == pytest.approx(0.05, abs=0.025)
-
-
-def test_a_row_says_how_much_is_lost_and_by_what() -> None:
-    names = ("soil", "drawn", "reconstructed", "angle", "observation", "discretisation")
-
-    def row(effect: str, sigmas: Sequence[float], loss: float, factors: Sequence[float]) -> dict[str, Any]:
-        own = names[-len(sigmas) :]
-        said = {"effect": effect, "value": 4.0, "unit": "deg", "least": dict.fromkeys(own, 1.0), "loss": loss}
-        return {
-            **said,
-            "sigmas": dict(zip(own, sigmas, strict=True)),
-            "factors": dict(zip(own[1:], factors, strict=True)),
-        }
-
-    rows = [
-        row("tilt", (40.0, 20.0, 20.0, 4.0, 4.0, 2.0), 20.0, (2.0, 1.0, 5.0, 1.0, 2.0)),
-        row("light", (8.0, 8.0, 2.0, 2.0, 0.3), 8.0, (1.0, 4.0, 1.0, 2.0)),
-        row("gravity", (0.0, 3.0, 3.0, 3.0, 3.0, 3.0), 0.3, (0.3, 1.0, 1.0, 1.0, 1.0)),
-    ]
-    assert table(rows).splitlines()[2:] == [
-        "| tilt, 4 ° | 40.0 σ | 20.0 σ | 20.0 σ | 2.0 σ | 20.0 | angle: 5.0 |",
-        "| gravity, 4 ° | < 1.0 σ | 3.0 σ | 3.0 σ | 3.0 σ | – | – |",
-        "| light, 4 ° | – | 8.0 σ | 8.0 σ | < 1.0 σ | ≥ 8.0 | angle: 4.0 |",
-    ]
 
 
 @pytest.mark.slow

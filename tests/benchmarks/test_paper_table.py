@@ -11,10 +11,8 @@ import numpy as np
 import pytest
 import torch
 from splatsoil.benchmarks import paper_table
-from splatsoil.benchmarks._common import keep_to_one_protocol
 from splatsoil.benchmarks.paper_table import FRAMES, SPACE, Protocol, published_loss, search
 
-from splatsoil.errors import ParameterError
 from splatsoil.files import read_json, write_json
 from splatsoil.mpm import Resolution
 from splatsoil.synthetic import paper
@@ -126,10 +124,3 @@ def test_errors_are_counted(tmp_path: Path) -> None:
     assert "| 35° | 1.24 ± 0.96° | 1.50 ± 0.71° |" in paper_table.table(result)
     one = paper_table.collect(Protocol(angles=(35.0,), trials=1), tmp_path)
     assert "| 35° | 1.24 ± 0.96° | 1.00° |" in paper_table.table(one), "one trial has no spread"
-
-
-def test_a_folder_keeps_one_protocol(tmp_path: Path) -> None:
-    keep_to_one_protocol(tmp_path, Protocol().kept())
-    keep_to_one_protocol(tmp_path, Protocol(trials=3, angles=(30.0,)).kept())
-    with pytest.raises(ParameterError, match="another protocol"):
-        keep_to_one_protocol(tmp_path, Protocol(views=8).kept())

@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-import json
-import shutil
-import sys
-from collections.abc import Sequence
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from splatsoil.benchmarks import solvers
-from splatsoil.benchmarks._newton import Numerics, Run, World
+from splatsoil.benchmarks._newton import Numerics
 from splatsoil.benchmarks._scenes import ANGLES, BEDS, RADIUS, TOOLS, Scene, scenes
 from splatsoil.benchmarks._truth import Truth
-from splatsoil.benchmarks.solvers import FRAMES, Case, Scan, agreement, compare_stages, main, plough_missing, scan
+from splatsoil.benchmarks.solvers import FRAMES, Scan, agreement, compare_stages, main, scan
 
 from splatsoil.errors import ParameterError
-from splatsoil.measurement import Measurement
 from splatsoil.mpm import Resolution, simulate
 from splatsoil.reconstruction import fill
 
@@ -69,55 +63,6 @@ def test_a_drum_that_rolls_stands_still_where_it_touches() -> None:
         assert at_rest == pytest.approx([slip * 0.2, 0.0, 0.0], abs=1e-9)
         assert tool.mesh.is_watertight
         assert tool.mesh.extents == pytest.approx([2 * RADIUS, 0.12, 2 * RADIUS])
-
-
-def still(world: World) -> Run:
-    """Soil that nothing moves, and a force that grows."""
-    return Run(dict.fromkeys(FRAMES, world.particles), np.outer(np.arange(1.0, 200.0), [-1.0, 0.0, 0.5]))
-
-
-@pytest.fixture
-def groups(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
-    """Names of the scenes that were ploughed together; nothing moves in them."""
-    found: list[list[str]] = []
-
-    def plough(worlds: Sequence[World], *_: Any, **__: Any) -> list[Run]:
-        found.append([world.label for world in worlds])
-        return [still(world) for world in worlds]
-
-    monkeypatch.setattr(solvers, "plough", plough)
-    return found
-
-
-def test_only_missing_scenes_are_ploughed_so_many_at_a_time(groups: list[list[str]], tmp_path: Path) -> None:
-    cases = [Case.drawn(f"scene-{k}", scene, COARSE) for k, scene in enumerate(islice(scenes(1), 5))]
-    plough_missing(cases[:1], tmp_path, "cpu", 4, say)
-    for _ in range(2):
-        plough_missing(cases, tmp_path, "cpu", 3, say)
-    assert groups == [["scene-0"], ["scene-1", "scene-2", "scene-3"], ["scene-4"]]
-    kept, world = cases[0].kept(tmp_path), cases[0].world()
-    assert kept.frames == FRAMES and kept.spacing == pytest.approx(0.04)
-    assert np.abs(kept.particles[50] - world.particles).max() < 1e-4
-    assert kept.force == pytest.approx(still(world).force)
-
-
-def test_a_narrower_tool_gets_as_many_voxels_and_is_ploughed_by_itself(
-    groups: list[list[str]], plow_dry: Path, tmp_path: Path
-) -> None:
-    narrow = tmp_path / "narrow"
-    shutil.copytree(plow_dry, narrow)
-    mesh = Measurement.load(plow_dry).tool.mesh.copy()
-    mesh.apply_scale([1.0, 0.5, 1.0])
-    mesh.export(narrow / Measurement.load(plow_dry).tool.mesh_path.name)
-    usual, case = (Case.of_set(folder, Numerics()) for folder in (plow_dry, narrow))
-    assert usual.numerics == Numerics() and usual.made
-    assert not case.made, "the set's own voxels are too coarse for it"
-    assert case.numerics.voxel == pytest.approx(0.06 / 9.0)
-    assert (case.numerics.substeps, case.numerics.iterations) == (6, 3000)
-    coarse = replace(case, numerics=COARSE.across(0.06))
-    scene = Case.drawn("scene", SLOPING, COARSE)
-    plough_missing([scene, coarse, replace(scene, name="other")], tmp_path / "out", "cpu", 4, say)
-    assert groups == [["scene", "other"], [case.name]]
 
 
 def test_soil_between_two_angles_is_estimated_between_them() -> None:
@@ -180,20 +125,6 @@ def test_a_change_of_nothing_shifts_nothing_and_each_change_is_of_one_thing(
     scanned = scan(ours, base, (-6.0, 6.0), (0,), "cpu")
     (row,) = solvers.sensitivity(ours, base, scanned, (0,), "cpu")
     assert row == {"change": "nothing", "angle": 0.0, "force": 0.0}
-
-
-def test_a_set_that_these_numerics_made_needs_no_other_solver(
-    plow_dry: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setitem(sys.modules, "newton", None)
-    words = ["--sets", str(plow_dry), "--presets", "tiny", "--seeds", "1", "--offsets", "--out", str(tmp_path)]
-    assert main(words) == 0
-    found = json.loads((tmp_path / "result.json").read_text())["cases"]["plow-dry"]["agreement"]["tiny"]
-    force = np.loadtxt(plow_dry / "tool_force.csv", delimiter=",", skiprows=1)
-    pushing = force[(force[:, 0] > 25) & (force[:, 0] <= 100)][:, [2, 4]].mean(axis=0)
-    assert found["stages"]["pushing"]["other"] == pytest.approx(pushing)
-    told = capsys.readouterr().out
-    assert f"/ {pushing[0]:.0f}, " in told and "| plow-dry | 36.0° | – |" in told
 
 
 @pytest.mark.parametrize(

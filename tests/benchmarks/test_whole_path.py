@@ -11,29 +11,12 @@ from splatsoil.benchmarks import whole_path
 from splatsoil.benchmarks._truth import Truth
 from splatsoil.benchmarks.whole_path import Task, true_surface
 
-from splatsoil.errors import RunError
 from splatsoil.reconstruction import HeightField
 
 
 @pytest.fixture
 def task(plow_dry: Path, plow_damp: Path, tmp_path: Path) -> Task:
     return Task(plow_dry, plow_damp, "tiny", "cpu", tmp_path)
-
-
-def test_what_fits_miss_is_seen(task: Task, monkeypatch: pytest.MonkeyPatch) -> None:
-    def held(estimates: tuple[float, ...], seconds: float, memory: int) -> list[bool | None]:
-        found = iter({"parameters": {"friction_angle": {"estimate": e, "std": 0.5}}} for e in estimates)
-        monkeypatch.setattr(whole_path, "_fitted", lambda *words: whole_path.Run(next(found), seconds, memory))
-        return [row.held for row in whole_path.angle(task).rows]
-
-    assert held((34.1, 36.0, 37.9), 479.0, 2**31) == [True, True]
-    assert held((34.1, 36.0, 38.1), 481.0, 2**30) == [False, False]
-    assert held((33.9, 36.0, 36.0), 1.0, 2**31 + 1) == [False, False]
-
-
-def test_a_command_that_fails_is_told(task: Task) -> None:
-    with pytest.raises(RunError, match="budget"):
-        whole_path._fitted(task, task.dry, "run", "fit", "--budget", "0")
 
 
 def test_the_surface_of_a_level_bed_is_level(plow_dry: Path) -> None:

@@ -12,17 +12,11 @@ from splatsoil.experiment.plate import PlateExperiment
 DEPTHS = np.array([0.004, 0.006, 0.008, 0.010, 0.013, 0.016])
 
 
-def plate(forces: np.ndarray | list[float], preset: str = "tiny") -> PlateExperiment:
-    return PlateExperiment(0.1, DEPTHS, forces, 0.05 * np.abs(forces) + 0.2, preset=preset)
+def plate(forces: np.ndarray) -> PlateExperiment:
+    return PlateExperiment(0.1, DEPTHS, forces, 0.05 * np.abs(forces) + 0.2, preset="tiny")
 
 
-def test_force_grows_with_depth_and_with_friction_and_repeats_itself() -> None:
-    experiment = plate(np.ones(6), "small")
-    weak, strong = (experiment.readings({"friction_angle": angle})[:, 0] for angle in (28.0, 42.0))
-    assert weak[-1] > weak[0] > 0.0
-    # a footing's bearing capacity grows ninefold from 28 to 42 degrees (Vesic 1973), what its depth adds fivefold; soil
-    # that gives way bears 1.45 times as much, which no depth would change
-    assert strong.mean() > 2.5 * weak.mean()
+def test_a_seed_repeats_itself_and_another_one_differs() -> None:
     coarse = plate(np.ones(6))
     again = [coarse.readings({"friction_angle": 42.0}, seed=seed) for seed in (0, 0, 1)]
     assert np.array_equal(again[0], again[1])

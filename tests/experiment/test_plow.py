@@ -1,5 +1,6 @@
 """What a plow experiment draws without simulating anew."""
 
+from collections.abc import Callable
 from itertools import combinations
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,71 +10,20 @@ import numpy as np
 import pytest
 
 from splatsoil.commands._model import off_effects
+from splatsoil.comparison import PATCH
 from splatsoil.errors import ParameterError, SimulationError
-from splatsoil.experiment.plow import MOST_TOGETHER, PlowExperiment
+from splatsoil.experiment.plow import PlowExperiment
 from splatsoil.measurement import Measurement
 from splatsoil.model import Model
-from splatsoil.reconstruction import HeightField
 from splatsoil.soil.library import library
 
 
-def asked(numerics: str) -> tuple[list[Any], list[Any]]:
-    """How a prediction was simulated (effects and numerics of the model, numerics), and drawn (seed, albedo, rounding)
-    from it."""
-    simulated: list[Any] = []
-    drawn: list[Any] = []
-
-    def draw(trajectory: Any, seed: int, values: Any, *, albedo: int | None, rounding: float) -> None:
-        drawn.append((seed, albedo, rounding))
-
-    model = SimpleNamespace(draw=draw)
-
-    def variant(effects: tuple[str, ...], way: str) -> Any:
-        simulated.append((effects, way))
-        return model
-
-    def trajectory(model: Any, values: Any, seed: int, way: str) -> None:
-        simulated.append(way)
-
-    experiment = SimpleNamespace(
-        model=("cohesion",), guesses=PlowExperiment.guesses, _variant=variant, _trajectory=trajectory
-    )
-    experiment._computed = lambda effects, way: PlowExperiment._computed(cast(Any, experiment), effects, way)
-    PlowExperiment.prediction(cast(Any, experiment), {}, effects=("tilt",), seed=3, numerics=numerics)
-    return simulated, drawn
+@pytest.fixture
+def model(small_set: Path, over_level_soil: Callable[..., Model]) -> Model:
+    return over_level_soil(Measurement.load(small_set), 0.12)
 
 
-@pytest.mark.parametrize(
-    ("numerics", "way", "drawing"),
-    [
-        ("", "", (None, 1.0)),
-        ("fine", "fine", (None, 1.0)),
-        ("albedo 1", "", (1, 1.0)),
-        ("albedo 6", "", (6, 1.0)),
-        ("rounding", "", (None, 2.0)),
-    ],
-)
-def test_guesses_and_rounding_are_other_drawings_of_the_same_simulation(
-    numerics: str, way: str, drawing: tuple[int | None, float]
-) -> None:
-    simulated, drawn = asked(numerics)
-    assert simulated == [(("cohesion", "tilt"), way), way]
-    assert drawn == [(3, *drawing)]
-
-
-def test_an_unknown_way_is_not_taken_for_the_usual_one() -> None:
-    assert asked("finer")[0] == [(("cohesion", "tilt"), "finer"), "finer"]
-    base = SimpleNamespace(resolution=None, variant=lambda **changes: base)
-    experiment: Any = SimpleNamespace(model=("cohesion",), base=base, _wanted={})
-    assert PlowExperiment._variant(experiment, ("cohesion",), "") is base
-    with pytest.raises(KeyError, match="finer"):
-        PlowExperiment._variant(experiment, ("cohesion",), "finer")
-
-
-def test_what_is_numerics_or_takes_a_laboratory_is_no_candidate(small_set: Path) -> None:
-    measurement = Measurement.load(small_set)
-    surface = HeightField.over(measurement.bed.lower, measurement.bed.upper, 0.02, 0.12)
-    model = Model(measurement, cast(Any, SimpleNamespace(surface=surface)), preset="tiny")
+def test_what_is_numerics_or_takes_a_laboratory_is_no_candidate(model: Model) -> None:
     others = {"stiffness", "critical_state", "hardening", "intermediate_stress"}
     assert {c.name for c in PlowExperiment(model).candidates} == set(library()) - others
     assert [c.name for c in PlowExperiment(model, candidates=["hardening"]).candidates] == ["hardening"]
@@ -81,12 +31,36 @@ def test_what_is_numerics_or_takes_a_laboratory_is_no_candidate(small_set: Path)
         off_effects(["stiffness"], ())
 
 
-def test_soil_prepared_together_is_that_of_single_simulations(small_set: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    measurement = Measurement.load(small_set)
-    bed = measurement.bed
-    surface = HeightField.over(bed.lower, bed.upper, 0.02, 0.12)
-    model = Model(measurement, cast(Any, SimpleNamespace(surface=surface)), preset="tiny")
-    monkeypatch.setattr(Model, "draw", lambda *_, **__: {})
+def test_what_one_camera_sees_is_in_its_columns_and_where_it_is(model: Model) -> None:
+    """A spot of the bed a little darker in one camera's prediction: columns of that camera, of patches at the spot."""
+    experiment = PlowExperiment(model)
+    comparator, layout, force = experiment.comparator, experiment.layout, np.zeros((10, 3))
+    still = comparator.still_blocks()
+    for site, noise in zip(layout.sites, experiment.sensor[0], strict=True):
+        assert noise == pytest.approx(np.sqrt(np.mean(still[site.channel] ** 2))), "of three frames before it moves"
+
+    def features(images: dict[tuple[str, int], np.ndarray]) -> np.ndarray:
+        return experiment.features(cast(Any, SimpleNamespace(images=images, trajectory=SimpleNamespace(force=force))))
+
+    for camera, x, y in (("left", 0.5, 0.12), ("right", 0.3, 0.3)):
+        images = dict(comparator.observed)
+        spot = np.linalg.norm(comparator.ground[camera] - [x, y], axis=-1) < 0.06
+        images[camera, 10] = images[camera, 10] - np.float32(0.02) * spot[..., None]
+        (change,) = features(dict(comparator.observed)) - features(images)
+        assert change.max() == pytest.approx(0.02 * 255.0, rel=1e-3)
+        for k in np.flatnonzero(np.abs(change) > 1e-3):
+            assert layout.sites[k].channel == camera
+            assert np.hypot(layout.sites[k].x - x, layout.sites[k].y - y) < 0.06 + PATCH
+
+
+def test_soil_prepared_together_is_that_of_single_simulations(model: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[tuple[int, int | None, float]] = []
+
+    def draw(_: Model, trajectory: Any, seed: int, values: Any, *, albedo: int | None, rounding: float) -> dict:
+        drawn.append((seed, albedo, rounding))
+        return {}
+
+    monkeypatch.setattr(Model, "draw", draw)
 
     def experiment() -> PlowExperiment:
         return PlowExperiment(model, candidates=("buried_obstacle", "cohesion", "exposure"))
@@ -105,6 +79,7 @@ def test_soil_prepared_together_is_that_of_single_simulations(small_set: Path, m
     ]
     unseen = job(effects=("buried_obstacle",), obstacle_radius=0.001)
     alone = [experiment().prediction(**each).trajectory.positions for each in jobs]
+    assert drawn[:3] == [(0, None, 1.0), (1, None, 1.0), (0, 2, 1.0)]
     prepared = experiment()
     assert prepared.together == 1, "a CPU makes one at a time, and keeps one"
     prepared.__dict__["together"] = 5
@@ -119,32 +94,8 @@ def test_soil_prepared_together_is_that_of_single_simulations(small_set: Path, m
     assert not any(np.array_equal(a, b) for a, b in combinations(different, 2))
     prepared.prepare([job(2)])
     assert len(prepared._kept) == 5, "what is kept doesn't grow"
-
-
-def test_more_cannot_be_made_together_than_there_is_room_for() -> None:
-    def together(device: str, particles: int, frames: int) -> int:
-        base = SimpleNamespace(device=device, particles=lambda: np.zeros((particles, 3)), recorded=tuple(range(frames)))
-        experiment = SimpleNamespace(base=base)
-        return cast(int, PlowExperiment.together.func(cast(Any, experiment)))
-
-    assert together("cpu", 1000, 10) == 1
-    assert together("cuda:0", 1000, 10) == MOST_TOGETHER
-    assert together("cuda:0", 300_000, 10) == together("cuda:0", 50_000, 200) == 1
-
-
-def test_what_cannot_be_prepared_is_left_to_predictions(monkeypatch: pytest.MonkeyPatch) -> None:
-    def no_memory(*_: Any) -> None:
-        raise RuntimeError("out of memory")
-
-    monkeypatch.setattr("splatsoil.experiment.plow.simulate_together", no_memory)
-    base = SimpleNamespace(
-        law=SimpleNamespace(effects=()),
-        observation_parameters=(),
-        recorded=(0,),
-        particles=lambda seed: None,
-        measurement=None,
-    )
-    experiment: Any = SimpleNamespace(base=base, progress=None, _kept={}, _computed=lambda effects, way: (base, way))
-    jobs = [{"values": {"angle": a}, "effects": (), "seed": 0, "numerics": ""} for a in (1.0, 2.0)]
-    PlowExperiment.prepare(experiment, jobs)
-    assert not experiment._kept
+    drawn.clear()
+    prepared.prediction(**job(2, numerics="rounding"))
+    assert drawn == [(2, None, 2.0)], "another drawing of the same simulation"
+    with pytest.raises(KeyError, match="finer"):
+        prepared.prediction(**job(numerics="finer"))

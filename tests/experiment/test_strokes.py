@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from splatsoil.commands.design import motion_csv
 from splatsoil.experiment.forces import ALONG, SCALE, SENSOR
-from splatsoil.experiment.plow import PlowExperiment
+from splatsoil.experiment.plow import MOST_FEATURES, PlowExperiment
 from splatsoil.experiment.strokes import StrokeExperiment, strokes
 from splatsoil.measurement import Measurement, ToolMotion
 from splatsoil.model import Model
-from splatsoil.reconstruction import HeightField
 
 SURFACE = 0.13
 
@@ -97,14 +95,15 @@ def test_a_written_motion_reads_as_the_stroke(damp: Measurement, tmp_path: Path)
             assert np.allclose(read.matrix(time), wanted, atol=2e-3)
 
 
-def test_what_models_differ_by_is_told_without_a_photograph(damp: Measurement) -> None:
+def test_what_models_differ_by_is_told_without_a_photograph(
+    damp: Measurement, over_level_soil: Callable[..., Model]
+) -> None:
     """Pictures that are darker by 10 grey levels, and twice the force, are told as that; the force's noise is that of
     the size that is expected."""
-    surface = HeightField.over(damp.bed.lower, damp.bed.upper, 0.02, SURFACE)
-    parts = cast(Any, SimpleNamespace(surface=surface))
-    measured = PlowExperiment(Model(damp, parts, preset="tiny"))
+    measured = PlowExperiment(over_level_soil(damp, SURFACE))
+    assert 0.8 * MOST_FEATURES < measured.layout.placed.sum() * measured.layout.shape[0] < 1.1 * MOST_FEATURES
     second = strokes(damp, SURFACE)[-1]
-    experiment = StrokeExperiment(Model(second.prepared(measured), parts, preset="tiny"), measured)
+    experiment = StrokeExperiment(over_level_soil(second.prepared(measured), SURFACE), measured)
     assert experiment.layout.times[-1] == measured.layout.times[-1] + second.start
     assert experiment.layout.channels == measured.layout.channels
     last = experiment.base.frames[-1]

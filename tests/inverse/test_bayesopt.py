@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.optimize import brute, fmin
-from splatsoil.inverse.bayesopt import START_EACH, BayesianOptimiser, Minimum, Surrogate, optimise
+from splatsoil.inverse.bayesopt import BayesianOptimiser, Minimum, Surrogate, optimise
 
 Loss = Callable[[np.ndarray], float]
 
@@ -66,13 +66,6 @@ def test_one_random_start_and_expected_improvement_over_the_best() -> None:
     assert abs(found.estimate[0] - dense_optimum(two_valleys, 1)[0]) < 0.2
 
 
-@pytest.mark.slow
-def test_six_parameters() -> None:
-    weights = np.arange(1.0, 7.0)
-    result = play(lambda a: float(np.sum(weights * (a - 0.3) ** 2)), 6, 48, 0.01, 1).result()
-    assert np.all(np.abs(result.estimate - 0.3) < 0.25) and all(result.determined)
-
-
 def test_ten_noisy_evaluations_find_a_minimum_in_one_dimension() -> None:
     """Over seeds: close to SciPy's optimum, and the quoted std is the size of the error."""
     truth = dense_optimum(two_valleys, 1)
@@ -111,12 +104,6 @@ def test_what_is_asked_hangs_on_the_seed_and_what_was_told_alone() -> None:
     assert play(two_valleys, 1, 1, 0.0, 5).told[0].action != whole.told[0].action
 
 
-def test_constant_losses_determine_nothing() -> None:
-    result = play(lambda _: 0.25, 1, 8, 0.0, 0).result()
-    assert result.determined == (False,)
-    assert np.isfinite(result.estimate).all() and np.isfinite(result.minimisers).all()
-
-
 def test_noise_without_a_minimum_is_not_taken_for_one() -> None:
     """The most probable hyperparameters call the lowest of ten random numbers a valley, with a std of 0.03."""
     points = np.linspace(-1.0, 1.0, 10)[:, None]
@@ -149,18 +136,6 @@ def test_failed_evaluations_are_avoided_and_left_out() -> None:
     assert any(t.loss is None for t in optimiser.told), "the start covers the range where evaluations fail"
     assert sum(t.loss is None for t in optimiser.told[4:]) <= 2
     assert optimiser.result().estimate[0] == pytest.approx(0.3, abs=0.05)
-
-
-def test_while_nothing_has_succeeded_the_space_is_filled() -> None:
-    optimiser = BayesianOptimiser(2)
-    for action in optimiser.ask(START_EACH * 2 + 2):
-        optimiser.tell(action, np.nan)
-    again = BayesianOptimiser(2)
-    for told in optimiser.told:
-        assert np.array_equal(again.ask()[0], told.action.astype(np.float32))
-        again.tell(told.action, None)
-    with pytest.raises(ValueError):
-        optimiser.result()
 
 
 def test_the_gaussian_process_agrees_with_scikit_learn() -> None:

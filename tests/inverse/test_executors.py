@@ -79,13 +79,6 @@ def test_workers_share_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
         assert pool.submit(threads_of_worker).result() == min(2, os.cpu_count() or 1), "what the user has set stays"
 
 
-def test_what_is_mapped_here_is_made_when_it_is_asked_for() -> None:
-    made: list[int] = []
-    with executor() as pool:
-        results = pool.map(made.append, [1, 2])
-        assert not made and next(results) is None and made == [1]
-
-
 @pytest.mark.parametrize("name", ["", "threads", "processes:", "processes:two", "dask:", "serial:1", "processes:0"])
 def test_executors_that_do_not_exist(name: str) -> None:
     with pytest.raises(ParameterError, match=r"executor|at least one"), executor(name):

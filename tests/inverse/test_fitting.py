@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -61,9 +57,9 @@ class StopError(Exception):
     """What ends a fit in the test below."""
 
 
-@pytest.mark.parametrize(("stop_after", "kept"), [(1, 1), (4, 4), (5, 5)])
+@pytest.mark.parametrize("stop_after", [1, 5])
 def test_an_interrupted_fit_goes_on_to_the_same_end(
-    analytic: ModuleType, tmp_path: Path, uninterrupted: dict[str, Any], stop_after: int, kept: int
+    analytic: ModuleType, tmp_path: Path, uninterrupted: dict[str, Any], stop_after: int
 ) -> None:
     """Between two evaluations that were chosen together, too."""
 
@@ -76,27 +72,8 @@ def test_an_interrupted_fit_goes_on_to_the_same_end(
         fit(analytic.AnalyticProblem(), run, analytic.SETUP, budget=BUDGET, after_evaluation=stop)
     problem = analytic.AnalyticProblem()
     result = fit(problem, run, analytic.SETUP, budget=BUDGET)
-    assert problem.calls == BUDGET - kept
+    assert problem.calls == BUDGET - stop_after
     assert without_times(result) == without_times(uninterrupted)
-
-
-def test_killed_and_started_again(analytic: ModuleType, tmp_path: Path, uninterrupted: dict[str, Any]) -> None:
-    command = [sys.executable, str(analytic.__file__), str(tmp_path / "run"), str(BUDGET), "0.2"]
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
-    assert process.stdout is not None
-    for line in process.stdout:
-        if int(line.split()[0]) == 3:
-            break
-    process.send_signal(signal.SIGKILL)
-    process.communicate()
-    run = analytic.prepare(tmp_path / "run")
-    with run.evaluations() as store:
-        kept = len(store.records())
-    assert 3 <= kept < BUDGET and not (tmp_path / "run" / "fit.json").exists()
-    problem = analytic.AnalyticProblem()
-    assert without_times(fit(problem, run, analytic.SETUP, budget=BUDGET)) == without_times(uninterrupted)
-    assert problem.calls == BUDGET - kept
 
 
 def test_a_search_keeps_to_one_thread_and_gives_them_back(analytic: ModuleType, tmp_path: Path) -> None:
@@ -132,10 +109,6 @@ def test_what_is_there_is_not_simulated_again(analytic: ModuleType, tmp_path: Pa
     assert sorted(p.name for p in (tmp_path / "fits").iterdir()) == ["base.json", "cohesion.json"]
 
 
-def test_a_fit_is_named_by_its_effects_and_stays_in_the_run_folder(analytic: ModuleType) -> None:
-    assert replace(analytic.SETUP, effects=("/my/suction.py", "cohesion")).name == "cohesion+suction"
-
-
 def test_failed_simulations_are_recorded_as_such_and_said(analytic: ModuleType, tmp_path: Path) -> None:
     run = analytic.prepare(tmp_path / "some")
     result = fit(analytic.AnalyticProblem(fails_below=30.0), run, analytic.SETUP, budget=8)
@@ -160,10 +133,5 @@ def test_a_minimum_at_a_bound_and_a_flat_loss_are_said(analytic: ModuleType, tmp
     assert flat["parameters"]["friction_angle"]["std"] > 4.0
 
 
-def test_two_parameters(analytic: ModuleType, tmp_path: Path) -> None:
-    problem = analytic.AnalyticProblem((analytic.FRICTION, analytic.COHESION))
-    setup = replace(analytic.SETUP, parameters=("friction_angle", "cohesion"), effects=("cohesion",))
-    result = fit(problem, analytic.prepare(tmp_path), setup, budget=14)
-    angle, cohesion = result["parameters"]["friction_angle"], result["parameters"]["cohesion"]
-    assert angle["estimate"] == pytest.approx(36.0, abs=3.0)
-    assert cohesion["estimate"] == pytest.approx(300.0, abs=150.0) and cohesion["unit"] == "Pa"
+def test_a_fit_is_named_by_its_effects_and_stays_in_the_run_folder(analytic: ModuleType) -> None:
+    assert replace(analytic.SETUP, effects=("/my/suction.py", "cohesion")).name == "cohesion+suction"

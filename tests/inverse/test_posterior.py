@@ -65,22 +65,3 @@ def test_a_posterior_that_crowds_at_a_bound_says_so() -> None:
     told = summarise(Posterior(density, sample(density, 2)), list(SPACE))
     assert told["parameters"]["friction_angle"]["at_bound"] == ["upper"]
     assert any("crowds at its upper bound" in note for note in told["notes"])
-
-
-@pytest.mark.slow
-def test_intervals_of_a_known_model_hold_what_they_promise() -> None:
-    """Truths drawn from the prior, observations with chance: 90 % intervals hold 90 % of them."""
-    rng = np.random.default_rng(12)
-    points, slopes = sobol(64, 2, 0), np.array([SLOPE, 5.0])
-    directions = np.linalg.qr(rng.normal(size=(30, 2)))[0].T
-    held = []
-    for index in range(24):
-        features = (slopes * points + NOISE * rng.normal(size=points.shape)) @ directions
-        truth = rng.uniform(-1.0, 1.0, 2)
-        observed = (slopes * truth + NOISE * rng.normal(size=2)) @ directions
-        density = density_of(SPACE, points, features, observed, 0.0)
-        chains = sample(density, 2, seed=index, ensembles=2, most_steps=400)
-        low, high = np.quantile(chains.flat, [0.05, 0.95], axis=0)
-        held.append((low <= truth) & (truth <= high))
-    # 48 intervals: below 80 % is less likely than 2 % when 90 % is right.
-    assert np.mean(held) >= 0.8

@@ -47,10 +47,6 @@ def test_a_folder_with_other_things_is_left_alone(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]
 
 
-def test_an_empty_folder_is_taken(tmp_path: Path) -> None:
-    assert prepare(tmp_path).path == tmp_path
-
-
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"format": "other/1"}', '{"format": "splatsoil-run/1"}'])
 def test_a_broken_description_gets_one_sentence(tmp_path: Path, text: str) -> None:
     (tmp_path / "run.json").write_text(text)
@@ -71,16 +67,9 @@ def test_the_latest_fit_and_the_earlier_ones(tmp_path: Path) -> None:
     run = prepare(tmp_path)
     with pytest.raises(RunError, match="no fit"):
         run.fit()
+    empty = {"format": "splatsoil-fit/2", "parameters": {}, "minimum": {}, "history": []}
     first, second = (
-        {
-            "format": "splatsoil-fit/2",
-            "name": name,
-            "parameters": {},
-            "minimum": {},
-            "history": [],
-            "setup": {"effects": [], "preset": "tiny"},
-        }
-        for name in ("base", "cohesion")
+        {**empty, "name": name, "setup": {"effects": [], "preset": "tiny"}} for name in ("base", "cohesion")
     )
     run.write_fit("base", first)
     run.write_fit("cohesion", second)

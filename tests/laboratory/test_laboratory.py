@@ -11,7 +11,7 @@ import pytest
 from splatsoil.benchmarks._validation.plates import meyerhof, vesic
 
 from splatsoil.cli import main
-from splatsoil.errors import MeasurementError
+from splatsoil.errors import MeasurementError, ParameterError
 from splatsoil.experiment.column import ColumnExperiment
 from splatsoil.experiment.plate import PlateExperiment
 from splatsoil.experiment.shear_box import ReposeExperiment, ShearBoxExperiment, Shearing
@@ -30,6 +30,12 @@ def test_a_simulated_test_is_read_as_it_was_simulated(kind: str, tmp_path: Path)
     read = load(tmp_path / "set", Options(preset="tiny"))
     assert (read.kind, read.layout.shape) == (kind, made.layout.shape)
     np.testing.assert_allclose(read.observed, read.features(made.readings(values)), rtol=1e-3, atol=2e-2)
+
+
+def test_an_effect_without_a_size_makes_no_folder(tmp_path: Path) -> None:
+    with pytest.raises(ParameterError, match="'dilatancy' is on but all its parameters are at their off values"):
+        simulate("repose", tmp_path / "set", {"friction_angle": 36.0}, ("dilatancy",), "tiny", 0)
+    assert not (tmp_path / "set").exists()
 
 
 @pytest.mark.parametrize("kind", ["triaxial", "shear_box"])
@@ -97,14 +103,9 @@ HEAD = "axial_strain_percent,q_kPa,volume_strain_percent\n"
     ("description", "table", "says"),
     [
         ({"kind": "vane"}, "", "'vane' is no kind of test; known are triaxial"),
-        ({**TRIAXIAL, "format": "other"}, "", "expected 'splatsoil-laboratory/1'"),
-        ({"kind": "triaxial", "tests": []}, "", "the list is empty"),
-        ({"kind": "triaxial", "tests": [{"file": "b.csv", "confining": 1e5}]}, "", "no such file"),
         ({"kind": "triaxial", "tests": [{"file": "a.csv", "confining": 1.0}]}, HEAD + "1,1,1\n", "it is in Pa"),
         (TRIAXIAL, "strain,q\n1,2\n", "axial_strain_percent"),
         (TRIAXIAL, HEAD + "0,0,0\n1,100,0.1\n", "ends before a strain of 2 %"),
-        (PLATE | {"density": 1.5}, "sinkage_mm,force_N\n1,2\n", "it is in kg/m³"),
-        ({"kind": "repose", "trials": [{"angle": 95}]}, "", "it is in degrees"),
         ({"kind": "column", "radius": 0.1, "height": 0.1, "trials": [{"final_radius": 0.2}]}, "", "final_height"),
     ],
 )  # fmt: skip
@@ -136,6 +137,18 @@ def test_a_plate_that_was_lifted_in_between_and_one_in_kilopascals_are_read(tmp_
     np.testing.assert_allclose(read.layout.times, np.arange(1, 13))
     found = np.sinh(read.observed[:, 0] / 10.0)
     np.testing.assert_allclose(found / found[-1], np.arange(1, 13) / 12.0, rtol=1e-6)
+
+
+def test_a_shear_box_is_read_in_shares_of_its_height_and_stress(tmp_path: Path) -> None:
+    """Stress grows by 10 kPa, and the lid rises by 0.1 mm, with each millimetre of a box of 20 mm under 100 kPa."""
+    rows = "displacement_mm,shear_stress_kPa,vertical_displacement_mm\n" + "".join(
+        f"{d},{10 * d},{0.1 * d}\n" for d in (0.0, 1.0, 4.0)
+    )
+    box = {"kind": "shear_box", "height": 0.02, "tests": [{"file": "a.csv", "normal_stress": 1e5}]}
+    (test,) = load(write(tmp_path / "set", box, rows)).tests
+    assert test.strain[-1] == pytest.approx(0.2) and test.void_ratio == 0.8, "the usual one"
+    np.testing.assert_allclose(test.ratio, 10e3 * 20.0 * test.strain / 1e5)
+    np.testing.assert_allclose(test.volume, -0.1 * test.strain)
 
 
 def test_index_tests_fix_the_density(tmp_path: Path) -> None:

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 import torch
 import trimesh
+from splatsoil.benchmarks._validation.scene import STILL, lattice
 
 from splatsoil.mpm import Resolution, Solver
-from splatsoil.mpm.substep import make_stress_kernel
 from splatsoil.mpm.tool import Pose
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects, library
@@ -24,15 +24,10 @@ RESOLUTION = Resolution(
 )
 LOWER, UPPER = np.zeros(3), np.array([0.24, 0.12, 0.16])
 PLATE = trimesh.creation.box(extents=[0.012, 0.08, 0.08])
-STILL = np.array([0.0, 0.0, 0.0, 1.0])
 FAR_AWAY = Pose(np.array([9.0, 9.0, 9.0]), STILL, np.zeros(3), np.zeros(3))
 
 
-def block(lower: npt.ArrayLike, upper: npt.ArrayLike, spacing: float = 0.01) -> npt.NDArray[np.float64]:
-    axes = [np.arange(a + spacing / 2, b, spacing) for a, b in zip(np.asarray(lower), np.asarray(upper), strict=True)]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-
-
+block = partial(lattice, spacing=0.01, jitter=0.0)
 BED = block(LOWER, [0.24, 0.12, 0.08])
 
 
@@ -47,27 +42,6 @@ def solver(
     batch = np.broadcast_to(x, (len(values), *x.shape))
     law = Law(find_effects(effects))
     return Solver(batch, LOWER, UPPER, mesh, RESOLUTION, law, settings or Settings(friction_angle=35.0), values, device)
-
-
-def test_effects_that_leave_strength_alone_run_the_very_same_kernel() -> None:
-    plain = Law()
-    others = [n for n, e in library().items() if e.strength is None]
-    assert {"tilt", "gravity", "stiffness", "buried_obstacle", "tool_adhesion"} <= set(others)
-    law = Law(find_effects(others))
-    assert make_stress_kernel(law.update, law.history) is make_stress_kernel(plain.update, plain.history)
-    x = block([0.0, 0.0, 0.0], [0.04, 0.04, 0.04])
-    assert solver(x, {})._particles.history.shape[0] == 0
-    assert solver(x, {}, effects=("cohesion",))._particles.history.shape[0] == len(x)
-
-
-def test_sand_on_a_tilted_floor_without_friction_slides_as_galileo_says() -> None:
-    x = block([0.04, 0.02, 0.0], [0.12, 0.10, 0.04])
-    settings = Settings(friction_angle=45.0, floor_friction=0.0)
-    run = solver(x, {"tilt_x": 10.0, "cohesion": 1500.0}, effects=("tilt", "cohesion"), settings=settings)
-    for _ in range(8):
-        run.advance([FAR_AWAY, FAR_AWAY])
-    way = (run.positions()[0] - x)[:, 0].mean()
-    assert way == pytest.approx(0.5 * 9.81 * math.sin(math.radians(10.0)) * 0.16**2, rel=0.03)
 
 
 def test_a_bed_of_growing_density_rests_and_weighs_its_integral() -> None:
@@ -105,13 +79,19 @@ def test_stiffer_soil_under_its_weight_settles_less_and_takes_more_steps() -> No
     assert sunk[0] / sunk[1] == pytest.approx(4.0, rel=0.15)
 
 
+def slide(run: Solver, start: npt.NDArray[np.float64], speed: float, frames: int) -> npt.NDArray[np.float64]:
+    """Force (frames, simulations, 3) on a tool that moves along x."""
+    velocity, force = np.array([speed, 0.0, 0.0]), []
+    for frame in range(frames):
+        times = [(frame + step / 2) * RESOLUTION.frame_time for step in range(2)]
+        force.append(run.advance([Pose(start + t * velocity, STILL, velocity, np.zeros(3)) for t in times]))
+    return np.array(force)
+
+
 def ploughed(effects: tuple[str, ...], *values: Mapping[str, float], frames: int = 8, device: str = "cpu") -> Solver:
     """A plate goes 5 cm through the bed."""
     run = solver(BED, *values, effects=effects, device=device)
-    speed = np.array([0.3, 0.0, 0.0])
-    for frame in range(frames):
-        times = [(frame + step / 2) * RESOLUTION.frame_time for step in range(2)]
-        run.advance([Pose(np.array([0.06, 0.06, 0.06]) + t * speed, STILL, speed, np.zeros(3)) for t in times])
+    slide(run, np.array([0.06, 0.06, 0.06]), 0.3, frames)
     return run
 
 
@@ -166,14 +146,8 @@ def test_adhesion_drags_a_sliding_tool_by_its_area() -> None:
     names = ("tool_adhesion", "cohesion")
     values = [{"tool_adhesion": a, "cohesion": 1500.0} for a in (0.0, 300.0)]
     run = solver(BED, *values, effects=names, settings=settings, mesh=plate)
-    speed = np.array([0.1, 0.0, 0.0])
-    forces = []
-    for frame in range(6):
-        times = [(frame + step / 2) * RESOLUTION.frame_time for step in range(2)]
-        # the lower face half a millimetre below the surface
-        start = np.array([0.1, 0.06, 0.09 - 0.0005])
-        forces.append(run.advance([Pose(start + t * speed, STILL, speed, np.zeros(3)) for t in times]))
-    drag = -np.mean(forces[2:], axis=0)[:, 0]
+    # the lower face half a millimetre below the surface
+    drag = -slide(run, np.array([0.1, 0.06, 0.09 - 0.0005]), 0.1, 6)[2:, :, 0].mean(axis=0)
     assert drag[1] - drag[0] == pytest.approx(300.0 * 0.08 * 0.08, rel=0.03)
 
 

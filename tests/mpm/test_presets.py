@@ -1,4 +1,4 @@
-"""What a preset makes of a measurement set."""
+"""What a preset makes of a measurement set, and simulations of it."""
 
 from __future__ import annotations
 
@@ -55,3 +55,21 @@ def test_dry_soil_is_the_same_under_any_gravity(plow_dry: Path) -> None:
         np.testing.assert_array_equal(found.positions, expected.positions)
         np.testing.assert_array_equal(found.force, 0.25 * expected.force)
     assert np.abs(expected.force[40:]).max() > 20.0
+
+
+def test_the_tool_is_in_each_frame_where_the_set_has_it(plow_dry: Path) -> None:
+    """Above the soil up to frame 10 and in it from frame 11 on: the soil bears and moves in frame 11 for the first
+    time, and so does what is recorded."""
+    truth = Truth.load(plow_dry)
+    tool, resolution = truth.measurement.tool, Resolution.derive(truth.measurement, "tiny")
+    x, (low, high) = truth.start(resolution.spacing, 0), tool.bounds(0.0)
+    under = np.all((x[:, :2] > low[:2]) & (x[:, :2] < high[:2]), axis=1)
+    positions = np.repeat(tool.motion.positions[:1], len(tool.motion.positions), axis=0)
+    positions[:, 2] += x[under, 2].max() - low[2] + np.where(tool.motion.frames > 10, -0.02, 0.04)
+    measurement = replace(truth.measurement, tool=replace(tool, motion=replace(tool.motion, positions=positions)))
+    resolution = Resolution.derive(measurement, "tiny")
+    (run,) = simulate(measurement, x, {"friction_angle": 36.0}, resolution=resolution, frames=[0, 10, 11, 12])
+    size = np.linalg.norm(run.force, axis=1)
+    assert size[:10].max() == 0.0 and size[10] > 1.0
+    moved = np.linalg.norm(np.diff(run.positions[:, under], axis=0), axis=2).max(axis=1)
+    assert moved[0] < 2e-3 and moved[1] > 5e-3

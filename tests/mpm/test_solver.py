@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ import numpy.typing as npt
 import pytest
 import trimesh
 import warp as wp
+from splatsoil.benchmarks._validation.scene import STILL, lattice
 
 from splatsoil.errors import SimulationError
 from splatsoil.mpm import Resolution, Solver
@@ -26,14 +28,8 @@ RESOLUTION = Resolution(
 )
 LOWER, UPPER = np.zeros(3), np.array([0.4, 0.2, 0.2])
 PLATE = trimesh.creation.box(extents=[0.012, 0.08, 0.08])
-FAR_AWAY = Pose(np.array([9.0, 9.0, 9.0]), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), np.zeros(3))
-
-
-def block(lower: npt.ArrayLike, upper: npt.ArrayLike, spacing: float = 0.01) -> npt.NDArray[np.float64]:
-    """Particles at the centres of a regular lattice of cubes, jittered a little."""
-    axes = [np.arange(a + spacing / 2, b, spacing) for a, b in zip(np.asarray(lower), np.asarray(upper), strict=True)]
-    lattice = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    return lattice + np.random.default_rng(0).uniform(-0.2, 0.2, lattice.shape) * spacing
+FAR_AWAY = Pose(np.array([9.0, 9.0, 9.0]), STILL, np.zeros(3), np.zeros(3))
+block = partial(lattice, spacing=0.01, jitter=0.4)
 
 
 def solver(
@@ -47,6 +43,12 @@ def solver(
     law = Law(find_effects(effects))
     given = {"friction_angle": settings.friction_angle, **(values or {})}
     return Solver(x[None], LOWER, UPPER, PLATE, resolution, law, settings, [given])
+
+
+def poses(start: npt.NDArray[np.float64], speed: npt.NDArray[np.float64], frame: int) -> list[Pose]:
+    """Both steps of a frame."""
+    times = [(frame + step / 2) * RESOLUTION.frame_time for step in range(2)]
+    return [Pose(start + t * speed, STILL, speed, np.zeros(3)) for t in times]
 
 
 def test_a_bed_at_rest_stays_at_rest() -> None:
@@ -102,13 +104,7 @@ def test_what_the_soil_gains_the_tool_gives() -> None:
     impulse = np.zeros(3)
     speed = np.array([0.3, 0.0, 0.05])
     for frame in range(10):
-        poses = []
-        for step in range(2):
-            time = (frame + step / 2) * RESOLUTION.frame_time
-            poses.append(
-                Pose(np.array([0.14, 0.1, 0.1]) + time * speed, np.array([0.0, 0.0, 0.0, 1.0]), speed, np.zeros(3))
-            )
-        impulse -= run.advance(poses)[0] * RESOLUTION.frame_time
+        impulse -= run.advance(poses(np.array([0.14, 0.1, 0.1]), speed, frame))[0] * RESOLUTION.frame_time
     gained = run.momentum()[0]
     assert gained[0] > 0.1 * len(x) * DENSITY * 1e-6
     np.testing.assert_allclose(gained, impulse, atol=1e-3 * np.linalg.norm(gained))
@@ -123,11 +119,7 @@ def test_a_thin_plate_keeps_soil_on_both_its_sides() -> None:
     middle = (np.abs(x[:, 1] - 0.1) < 0.03) & (np.abs(x[:, 2] - 0.06) < 0.02)
     ahead = middle & (x[:, 0] > start[0] + 0.008) & (x[:, 0] < start[0] + 0.03)
     for frame in range(15):
-        poses = [
-            Pose(start + (frame + k / 2) * RESOLUTION.frame_time * speed, np.array([0, 0, 0, 1.0]), speed, np.zeros(3))
-            for k in range(2)
-        ]
-        run.advance(poses)
+        run.advance(poses(start, speed, frame))
     plate = start[0] + 15 * RESOLUTION.frame_time * speed[0]
     assert (run.positions()[0][ahead, 0] > plate).all()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,18 +22,27 @@ RESOLUTION = Resolution(
 )
 AMPLITUDE = 1e-3
 """m/s; nothing moves by more than a thousandth of a cell."""
+UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
 STILL = Settings(friction_angle=35.0, gravity=(0.0, 0.0, 0.0))
+
+
+def solver(x: np.ndarray, size: np.ndarray, mesh: Any = None, settings: Settings = STILL, **changes: float) -> Solver:
+    """Of particles (n, 3) in a box that begins at zero."""
+    values = [{"friction_angle": settings.friction_angle}]
+    return Solver(x[None], np.zeros(3), size, mesh, replace(RESOLUTION, **changes), Law(), settings, values)  # type: ignore[arg-type]
+
+
+def cube(**changes: float) -> tuple[Solver, np.ndarray]:
+    """A lump that touches no wall: eight particles in each of 4 x 4 x 4 cells."""
+    axis = np.arange(0.045, 0.12, 0.01)
+    x = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    return solver(x, np.full(3, 0.16), **changes), x
 
 
 def amplitude_after_a_frame(steps: int, relaxation: float) -> float:
     """What is left, after 0.02 s without weight, of velocities along x of ± 1 mm/s that alternate from node to node
     in y and z: a field no cell's mean gradient sees, so that no stress resists it."""
-    # a lump that touches no wall: eight particles in each of 4 x 4 x 4 cells
-    upper = np.full(3, 0.16)
-    axis = np.arange(0.045, 0.12, 0.01)
-    x = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-    resolution = replace(RESOLUTION, steps=steps, relaxation=relaxation)
-    run = Solver(x[None], np.zeros(3), upper, None, resolution, Law(), STILL, [{"friction_angle": 35.0}])
+    run, x = cube(steps=steps, relaxation=relaxation)
     cell = np.floor(x / CELL).astype(int)
     f = x / CELL - cell
     sign = AMPLITUDE * (1.0 - 2.0 * ((cell[:, 1] + cell[:, 2]) % 2))
@@ -50,17 +60,28 @@ def amplitude_after_a_frame(steps: int, relaxation: float) -> float:
     return float(pattern @ run.velocities()[0][:, 0] / (pattern @ pattern))
 
 
-@pytest.mark.parametrize("steps", [1, 4, 16])
-def test_an_exchange_loses_nothing_by_itself(steps: int) -> None:
-    assert amplitude_after_a_frame(steps, relaxation=1e-6) == pytest.approx(1.0, abs=2e-3)
+@pytest.mark.parametrize(
+    ("steps", "relaxation", "left"),
+    [
+        # an exchange loses nothing by itself
+        *((steps, 1e-6, 1.0) for steps in (1, 4, 16)),
+        # by the second, not by the step: 25 plain exchanges of the damping 2 * 9/23; the last step's own is undamped
+        *((steps, 25.0, math.exp(-2 * 9 / 23 * 25.0 * 0.02 * (steps - 1) / steps)) for steps in (4, 16)),
+        # steps as long as several exchanges: the trapezoidal rule with 9/23, below the 7/16 of affine particles
+        *((2, share / 0.01, (23.0 - 9.0 * share) / (23.0 + 9.0 * share)) for share in (1.5, 2.5)),
+        # without a rate, as affine particles at 1/4 and 3/4 of a cell
+        *((steps, 0.0, (7.0 / 16.0) ** (steps - 1)) for steps in (2, 3)),
+    ],
+)
+def test_hourglass_modes_are_damped_by_the_rate_that_is_asked_for(steps: int, relaxation: float, left: float) -> None:
+    assert amplitude_after_a_frame(steps, relaxation) == pytest.approx(left, rel=0.01, abs=0.002)
 
 
 def lump(seed: int, count: int = 400) -> tuple[Solver, np.ndarray]:
     """Soil at (n, 3) random places with random velocities, and a frame in which it neither moves nor is stressed."""
     rng = np.random.default_rng(seed)
     x = rng.uniform(0.045, 0.115, (count, 3))
-    instant = replace(RESOLUTION, steps=1, frame_time=1e-9, relaxation=1e-6)
-    run = Solver(x[None], np.zeros(3), np.full(3, 0.16), None, instant, Law(), STILL, [{"friction_angle": 35.0}])
+    run = solver(x, np.full(3, 0.16), steps=1, frame_time=1e-9, relaxation=1e-6)
     run._particles.velocity.assign(rng.uniform(-1.0, 1.0, x.shape).astype(np.float32))
     return run, x
 
@@ -119,9 +140,8 @@ def test_a_level_bed_ends_where_its_soil_does(beyond: float) -> None:
     high = (3.0 + beyond) * CELL
     spacing = 0.25 * CELL
     across, up = (np.arange(0.5 * spacing, size, spacing) for size in (4.0 * CELL, high))
-    x = np.stack(np.meshgrid(across, across, up, indexing="ij"), axis=-1).reshape(1, -1, 3)
-    fine = replace(RESOLUTION, spacing=spacing, steps=1, frame_time=1e-9)
-    run = Solver(x, np.zeros(3), np.array([4.0, 4.0, 6.0]) * CELL, None, fine, Law(), STILL, [{"friction_angle": 35.0}])
+    x = np.stack(np.meshgrid(across, across, up, indexing="ij"), axis=-1).reshape(-1, 3)
+    run = solver(x, np.array([4.0, 4.0, 6.0]) * CELL, spacing=spacing, steps=1, frame_time=1e-9)
     run.advance(1)
     _, filled, _ = cells_of(run)
     assert filled.sum() / 16.0 == pytest.approx(3.0 + beyond, abs=0.1)
@@ -158,36 +178,9 @@ def test_soil_shows_no_more_stretch_than_allowed() -> None:
     np.testing.assert_allclose(run.deformations()[0], expected, atol=5e-3)
 
 
-@pytest.mark.parametrize("steps", [4, 8, 16])
-def test_hourglass_modes_are_damped_by_the_second_and_not_by_the_step(steps: int) -> None:
-    """As by 25 plain exchanges a second, each of the damping 2 * 9/23; the last step's own velocity is yet undamped."""
-    time = 0.02 * (steps - 1) / steps
-    assert amplitude_after_a_frame(steps, relaxation=25.0) == pytest.approx(
-        math.exp(-2 * 9 / 23 * 25.0 * time), rel=0.01
-    )
-
-
-@pytest.mark.parametrize("exchanges", [1.5, 2.5])
-def test_a_step_damps_them_as_several_exchanges_where_it_is_as_long(exchanges: float) -> None:
-    """By the trapezoidal rule with 9/23 an exchange, which is below the 7/16 of affine particles."""
-    left = amplitude_after_a_frame(2, relaxation=exchanges / 0.01)
-    assert left == pytest.approx((23.0 - 9.0 * exchanges) / (23.0 + 9.0 * exchanges), abs=0.005)
-
-
-@pytest.mark.parametrize("steps", [2, 3])
-def test_without_a_rate_they_are_damped_as_by_affine_particles(steps: int) -> None:
-    """Affine particles at 1/4 and 3/4 of a cell leave 7/16 of a bilinear mode, but for the last step's own velocity."""
-    left = amplitude_after_a_frame(steps, relaxation=0.0)
-    assert left == pytest.approx((7.0 / 16.0) ** (steps - 1), rel=0.01)
-
-
 def test_a_step_turns_a_lump_without_swelling_it() -> None:
     """By 0.1 rad: where the step's displacement starts it would grow by 0.1^2 / 2 (explicit Euler)."""
-    upper = np.full(3, 0.16)
-    axis = np.arange(0.045, 0.12, 0.01)
-    x = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-    resolution = replace(RESOLUTION, steps=1, relaxation=1e-6)
-    run = Solver(x[None], np.zeros(3), upper, None, resolution, Law(), STILL, [{"friction_angle": 35.0}])
+    run, x = cube(steps=1, relaxation=1e-6)
     spin = np.zeros((3, 3))
     spin[0, 1], spin[1, 0] = -5.0, 5.0
     middle = np.full(3, 0.08)
@@ -208,9 +201,8 @@ def test_soil_sunk_into_a_tool_comes_out_by_the_second(steps: int) -> None:
     plate = trimesh.creation.box([0.04, 0.2, 0.2])
     depths = np.array([1.0e-3, 2.0e-3, 6.0e-3])
     x = np.array([[0.10 - d, 0.05 + 0.04 * k, 0.09] for k, d in enumerate(depths)])
-    resolution = replace(RESOLUTION, steps=steps, relaxation=25.0, bulk=1.0, shear=0.5, skin=0.0)
-    run = Solver(x[None], np.zeros(3), np.full(3, 0.2), plate, resolution, Law(), STILL, [{"friction_angle": 35.0}])
-    held = Pose(np.array([0.08, 0.1, 0.1]), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), np.zeros(3))
+    run = solver(x, np.full(3, 0.2), plate, steps=steps, relaxation=25.0, bulk=1.0, shear=0.5, skin=0.0)
+    held = Pose(np.array([0.08, 0.1, 0.1]), UPRIGHT, np.zeros(3), np.zeros(3))
     run.advance([held] * steps)
     left = 0.10 - run.positions()[0][:, 0]
     share = np.exp(-2.0 * 25.0 * 0.02)
@@ -227,9 +219,17 @@ def bed_on_a_plate(height: float) -> tuple[np.ndarray, np.ndarray]:
     return np.stack(grid, axis=-1).reshape(-1, 3), np.array([0.12, 0.12, 0.2])
 
 
-@pytest.mark.parametrize("stiffer", [1.0, 3.0])
-@pytest.mark.parametrize("steps", [1, 8])
-@pytest.mark.parametrize("slid", [0.0, 0.004])
+def slide(run: Solver, speed: float, steps: int, frames: int) -> np.ndarray:
+    """Force (frames, 3) on a plate whose upper face touches the lowest particles, and which moves along x."""
+    force, velocity = [], np.array([speed, 0.0, 0.0])
+    for frame in range(frames):
+        times = (frame + np.arange(steps) / steps) * RESOLUTION.frame_time
+        places = [np.array([0.06, 0.06, 0.045]) + t * velocity for t in times]
+        force.append(run.advance([Pose(place, UPRIGHT, velocity, np.zeros(3)) for place in places])[0])
+    return np.array(force)
+
+
+@pytest.mark.parametrize(("steps", "stiffer", "slid"), [(1, 1.0, 0.0), (8, 3.0, 0.0), (8, 1.0, 0.004), (1, 3.0, 0.004)])
 def test_a_tool_bears_a_bed_for_good(steps: int, stiffer: float, slid: float) -> None:
     """The contact bears the bed's weight, whose pressure p its springs balance at a depth of p * spacing / bulk, and
     the bed sinks no further, by any steps and stiffness, whether the tool stands or slides along."""
@@ -238,15 +238,8 @@ def test_a_tool_bears_a_bed_for_good(steps: int, stiffer: float, slid: float) ->
     plate = trimesh.creation.box([0.2, 0.2, 0.04])
     smooth = Settings(friction_angle=35.0, wall_friction=0.0, tool_friction=0.0)
     bulk, shear = stiffer * RESOLUTION.bulk, stiffer * RESOLUTION.shear
-    resolution = replace(RESOLUTION, steps=steps, relaxation=100.0, bulk=bulk, shear=shear, skin=0.0)
-    run = Solver(x[None], np.zeros(3), upper, plate, resolution, Law(), smooth, [{"friction_angle": 35.0}])
-    # its upper face touches the lowest particles
-    start, speed = np.array([0.06, 0.06, 0.045]), np.array([slid, 0.0, 0.0]) / (frames * RESOLUTION.frame_time)
-    force = []
-    for frame in range(frames):
-        times = (frame + np.arange(steps) / steps) * RESOLUTION.frame_time
-        poses = [Pose(start + t * speed, np.array([0.0, 0.0, 0.0, 1.0]), speed, np.zeros(3)) for t in times]
-        force.append(run.advance(poses)[0, 2])
+    run = solver(x, upper, plate, smooth, steps=steps, relaxation=100.0, bulk=bulk, shear=shear, skin=0.0)
+    force = slide(run, slid / (frames * RESOLUTION.frame_time), steps, frames)[:, 2]
     weight = len(x) * spacing**3 * RESOLUTION.density * 9.81
     assert np.mean(force[-5:]) == pytest.approx(-weight, rel=1e-3)
     sunk = float(np.mean((x - run.positions()[0])[x[:, 2] > 0.13, 2]))
@@ -261,18 +254,9 @@ def test_friction_on_a_tool_is_coulombs(steps: int, speed: float) -> None:
     x, upper = bed_on_a_plate(0.08)
     plate = trimesh.creation.box([0.6, 0.6, 0.04])
     held = Settings(friction_angle=45.0, wall_friction=0.0, tool_friction=friction)
-    resolution = replace(RESOLUTION, steps=steps, relaxation=100.0, skin=0.0)
-    run = Solver(x[None], np.zeros(3), upper, plate, resolution, Law(), held, [{"friction_angle": 45.0}])
-    force = []
-    for frame in range(40):
-        times = (frame + np.arange(steps) / steps) * resolution.frame_time
-        places = [np.array([0.06 + t * speed, 0.06, 0.045]) for t in times]
-        moving = np.array([speed, 0.0, 0.0])
-        force.append(
-            run.advance([Pose(place, np.array([0.0, 0.0, 0.0, 1.0]), moving, np.zeros(3)) for place in places])
-        )
-    sideways = -float(np.mean([f[0, 0] for f in force[-20:]]))
-    weight = len(x) * spacing**3 * resolution.density * 9.81
+    run = solver(x, upper, plate, held, steps=steps, relaxation=100.0, skin=0.0)
+    sideways = -float(np.mean(slide(run, speed, steps, 40)[-20:, 0]))
+    weight = len(x) * spacing**3 * RESOLUTION.density * 9.81
     assert sideways == pytest.approx(friction * weight, rel=0.02)
 
 
@@ -284,17 +268,8 @@ def test_contact_acts_by_what_the_tool_covers(above: float) -> None:
     edge = 4.5 * cell
     plate = trimesh.creation.box([0.012, 0.4, 0.1])
     x = np.array([[0.1 + 1e-4, 5.0 * cell + 1e-6, edge + above]])
-    run = Solver(
-        x[None],
-        np.zeros(3),
-        np.full(3, 0.2),
-        plate,
-        replace(RESOLUTION, skin=0.0),
-        Law(),
-        Settings(friction_angle=35.0),
-        [{"friction_angle": 35.0}],
-    )
-    pose = Pose(np.array([0.094, 0.1, edge + 0.05]), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), np.zeros(3))
+    run = solver(x, np.full(3, 0.2), plate, skin=0.0)
+    pose = Pose(np.array([0.094, 0.1, edge + 0.05]), UPRIGHT, np.zeros(3), np.zeros(3))
     run._pose.assign(pose.row().astype(np.float32))
     run._contact(1e-4, 1.0)
     weight = run._near_weight.numpy()[:8].reshape(2, 2, 2).sum(axis=(0, 1))

@@ -80,16 +80,6 @@ def test_seeds_repeat_and_differ(waves):
     assert one.shape != other.shape or not np.array_equal(one, other)
 
 
-def test_columns_without_soil_stay_empty():
-    field = HeightField.over(BED.lower, BED.upper, 0.01)
-    x = np.meshgrid(field.x, field.y)[0]
-    step = HeightField(field.x, field.y, np.where(x < 0.2, BED.lower[2] + 0.1, BED.lower[2]))
-    particles = fill(step, BED, 0.01, jitter=0.0)
-    # The spline rings for a few cells beside a step this steep.
-    assert (particles[:, 0] > 0.24).sum() < 0.01 * len(particles)
-    assert len(particles) * 1e-6 == pytest.approx(0.4 * 0.5 * 0.1, rel=0.02)
-
-
 @pytest.mark.parametrize(("spacing", "jitter"), [(0.0, 0.5), (-1.0, 0.5), (0.5, 0.5), (float("nan"), 0.5), (0.01, 1.5)])
 def test_senseless_numbers_are_refused(waves, spacing, jitter):
     with pytest.raises(ParameterError):

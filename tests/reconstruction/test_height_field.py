@@ -58,12 +58,3 @@ def test_normals_of_a_slope():
     np.testing.assert_allclose(
         slope.normals, np.broadcast_to(np.array([-0.5, 0, 1]) / 1.25**0.5, (9, 12, 3)), atol=1e-9
     )
-
-
-@pytest.mark.parametrize(
-    ("x", "y", "shape"),
-    [([0, 1], [0, 1], (3, 2)), ([0, 1, 3], [0, 1], (2, 3)), ([1, 0], [0, 1], (2, 2)), ([0], [0, 1], (2, 1))],
-)
-def test_senseless_grids_are_refused(x, y, shape):
-    with pytest.raises(ValueError):
-        HeightField(np.array(x, float), np.array(y, float), np.zeros(shape))

@@ -50,7 +50,3 @@ def test_a_turned_one_reaches_where_it_points() -> None:
     half = float(np.sqrt(0.5))
     along = along.replace(quaternions=torch.tensor([[half, 0.0, -half, 0.0]]))  # x turned to z
     assert reaching_into_soil(along, SURFACE, 0.0).all() and not reaching_into_soil(across, SURFACE, 0.0).any()
-
-
-def test_no_gaussians_no_answer() -> None:
-    assert reaching_into_soil(gaussians([[0.3, 0.2, -0.05]], [[0.1, 0.1, 0.05]])[:0], SURFACE, 0.0).shape == (0,)

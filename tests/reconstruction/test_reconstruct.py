@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from splatsoil.cli import main
 from splatsoil.errors import MeasurementError, ParameterError, RunError, SetWarning
@@ -179,21 +177,6 @@ def test_views_of_another_world_than_the_video_are_refused(measurement, turn):
         reconstruct(moved(measurement, turn=turn), preset="tiny")
 
 
-def test_the_command_line_says_remarks_once_and_on_stderr(measurement, result, tmp_path, monkeypatch, capsys):
-    odd = replace(result, metadata={**result.metadata, "remarks": ["video: is it so?"]})
-
-    def found(*_, **__):
-        odd.say_remarks()
-        odd.say_remarks()
-        return odd
-
-    monkeypatch.setattr("splatsoil.reconstruction.reconstruct", found)
-    assert main(["reconstruct", str(measurement.folder), "--out", str(tmp_path / "r"), "--json"]) == 0
-    out, err = capsys.readouterr()
-    assert json.loads(out)["remarks"] == ["video: is it so?"]
-    assert err.count("remark video: is it so?\n") == 1 and "Warning" not in err
-
-
 def test_likeness_is_of_the_soil_and_whatever_the_exposure(measurement, result):
     views = load_views(measurement.views[:4], 160)
     level = float(np.median(result.surface.height))
@@ -238,24 +221,12 @@ def test_views_that_tell_no_height_are_refused(measurement):
 
 
 def test_without_photographs_to_judge_by_there_is_no_likeness(measurement, tmp_path, capsys):
-    """None set aside, or one of which its mask leaves nothing where it is shrunk."""
     out = tmp_path / "none"
     command = ["reconstruct", str(measurement.folder), "--preset", "tiny", "--json"]
     assert main([*command, "--holdout", "0", "--out", str(out)]) == 0
     said = json.loads(capsys.readouterr().out)
     assert said["psnr"] is None and said["ssim"] is None and said["held_out"] == []
     assert np.isnan(Reconstruction.load(out).psnr)
-
-    mask = np.zeros((96, 128), dtype=np.uint8)
-    mask[0, 0] = 255
-    folder = tmp_path / "set"
-    shutil.copytree(measurement.folder, folder)
-    Image.fromarray(mask).save(folder / "mask.png")
-    masked = Measurement.load(folder)
-    first = replace(masked.views[0], mask_path=folder / "mask.png")
-    made = reconstruct(replace(masked, views=(first, *masked.views[1:])), preset="tiny")
-    assert [view.name for view in made.held_out] == [measurement.views[8].path.name]
-    assert np.isfinite(made.psnr)
 
 
 def test_options_that_make_no_sense(measurement):
@@ -280,12 +251,16 @@ def test_command_line_and_the_same_seed_gives_the_same_bits(measurement, result,
     np.testing.assert_array_equal(again.surface.height, result.surface.height)
 
 
-def test_interrupting_leaves_nothing(measurement, tmp_path, monkeypatch, capsys):
-    def interrupt(*_, **__):
-        raise KeyboardInterrupt
+def test_the_command_line_says_remarks_once_and_on_stderr(measurement, result, tmp_path, monkeypatch, capsys):
+    odd = replace(result, metadata={**result.metadata, "remarks": ["video: is it so?"]})
 
-    monkeypatch.setattr("splatsoil.reconstruction.pipeline.find_relief", interrupt)
-    out = tmp_path / "result"
-    assert main(["reconstruct", str(measurement.folder), "--out", str(out), "--preset", "tiny"]) == 130
-    assert not out.exists()
-    assert "start again with" in capsys.readouterr().err
+    def found(*_, **__):
+        odd.say_remarks()
+        odd.say_remarks()
+        return odd
+
+    monkeypatch.setattr("splatsoil.reconstruction.reconstruct", found)
+    assert main(["reconstruct", str(measurement.folder), "--out", str(tmp_path / "r"), "--json"]) == 0
+    out, err = capsys.readouterr()
+    assert json.loads(out)["remarks"] == ["video: is it so?"]
+    assert err.count("remark video: is it so?\n") == 1 and "Warning" not in err

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy.spatial import cKDTree
 
 from splatsoil.measurement import Camera
 from splatsoil.reconstruction import PRESETS, HeightField
+from splatsoil.reconstruction.initial import seed_far, seed_rim
 from splatsoil.reconstruction.stereo import Smoothness, visibility
 from splatsoil.reconstruction.surface import find_relief, with_rim, without_backdrop
 from splatsoil.reconstruction.views import Views, projection_matrix, silhouettes
@@ -110,6 +112,37 @@ def test_the_rim_is_as_high_as_the_soil_beside_it(scene, relief):
     assert rim.height.min() == -1.0
 
 
+def test_discs_cover_the_border_around_the_bed(scene, relief):
+    """As many as fit on its top, and on its outer side down to the ground; none leaves a gap."""
+    spacing, rim, lower, upper = 0.01, relief.rim, scene.bed.lower[:2], scene.bed.upper[:2]
+    seeds = seed_rim(relief, scene.bed, spacing)
+    flat = seeds.normals[:, 2] == 1.0
+    top, side = seeds.points[flat], seeds.points[~flat]
+    grid = np.random.default_rng(0).uniform(lower - rim, upper + rim, (2000, 2))
+    beyond = np.maximum(lower - grid, grid - upper).max(axis=1)
+    assert cKDTree(top[:, :2]).query(grid[beyond > 0.0])[0].max() < spacing
+    area = np.prod(upper - lower + 2.0 * rim) - np.prod(upper - lower)
+    assert len(top) * spacing**2 == pytest.approx(area, rel=0.1)
+    assert np.maximum(lower - side[:, :2], side[:, :2] - upper).max(axis=1) == pytest.approx(rim)
+    height = top[:, 2].mean() - relief.ground
+    assert len(side) * spacing**2 == pytest.approx(2.0 * (upper - lower + 2.0 * rim).sum() * height, rel=0.1)
+
+
+def test_first_discs_far_away_lie_on_the_ground_and_on_a_sphere_around_all_cameras(scene, relief):
+    """Six times as far from the bed as the farthest camera; nothing within the bed and its border."""
+    cameras = scene.cameras(6, 64, 48, rise=(5.0, 40.0))
+    views = as_views(cameras, [np.zeros((48, 64, 3), np.float32)] * 6)
+    seeds = seed_far(views, scene.bed, relief)
+    centre = np.array([*(scene.bed.lower + scene.bed.upper)[:2] / 2, relief.ground])
+    radius = 6.0 * max(np.linalg.norm(camera.position - centre) for camera in views.cameras)
+    up = seeds.normals[:, 2] == 1.0
+    assert up.any() and not up.all() and np.allclose(seeds.points[up, 2], relief.ground)
+    away = np.linalg.norm(seeds.points - centre, axis=1)
+    assert (away[up] < radius).all() and away[~up] == pytest.approx(radius)
+    lower, upper = scene.bed.lower[:2] - relief.rim, scene.bed.upper[:2] + relief.rim
+    assert not np.all((seeds.points[:, :2] > lower) & (seeds.points[:, :2] < upper), axis=1).any()
+
+
 def test_a_plate_bends_no_plane_and_stops_at_the_border():
     x, y = np.meshgrid(np.arange(20.0), np.arange(14.0))
     plane = 0.2 * x - 0.1 * y
@@ -137,10 +170,3 @@ def test_a_spire_at_a_corner_is_cut_off_and_a_hole_inside_is_left_to_the_prior()
     assert np.abs(found - plane).max() < 0.005
     assert (known[corner] == 0.5).all()
     assert np.array_equal(known[~corner], deviation[~corner])
-
-
-def test_a_bed_known_alike_everywhere_is_left_alone() -> None:
-    height = np.random.default_rng(0).normal(size=(6, 7))
-    found, known = without_backdrop(height, np.full(height.shape, 1e-4), 0.5)
-    assert np.array_equal(found, height)
-    assert (known == 1e-4).all()

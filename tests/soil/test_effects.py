@@ -7,7 +7,6 @@ from collections.abc import Mapping
 
 import numpy as np
 import pytest
-from splatsoil.envs.together import attempt
 
 from splatsoil.errors import CombinationError, ParameterError
 from splatsoil.soil.element import ElementTest, drive, isotropic_compression, simple_shear, triaxial
@@ -252,15 +251,6 @@ def test_another_packing_changes_density_and_hardening_alone() -> None:
         at_void_ratio(values, 0.9, 0.5)
 
 
-def test_cohesion_matches_mohr_coulomb_in_extension_too() -> None:
-    """q = 6 (c cos phi + p sin phi) / (3 + sin phi) in extension, for a cone matched there."""
-    law = Law(find_effects(["cohesion"]))
-    values = {"friction_angle": ANGLE, "cohesion": 500.0}
-    test = triaxial(law, values, confining=PRESSURE, strains=[-0.02], matching=Matching.EXTENSION)
-    sine, cosine = math.sin(math.radians(ANGLE)), math.cos(math.radians(ANGLE))
-    assert -test.q[0, -1] == pytest.approx(6.0 * (500.0 * cosine + test.p[0, -1] * sine) / (3.0 + sine), rel=1e-3)
-
-
 def test_stiffness_multiplies_the_moduli() -> None:
     law = Law(find_effects(["stiffness"]))
     test = isotropic_compression(
@@ -297,19 +287,6 @@ def test_off_values_change_nothing(name: str) -> None:
         np.testing.assert_allclose(off.stress, plain.stress, rtol=2e-5)
 
 
-def test_all_effects_on_strength_work_together_in_any_order() -> None:
-    names = [n for n in library() if n not in ("compaction", "critical_state")]
-    sizes = {"cohesion": 200.0, "dilatancy_angle": 8.0, "rate_gain": 0.5, "viscosity": 5.0, "softening_angle": 4.0}
-    values = sizes | {"pressure_exponent": 0.05, "layer_friction": 2.0, "density_gradient": 0.5}
-    one, other = Law(find_effects(names)), Law(find_effects(names[::-1]))
-    assert one.update is other.update
-    np.testing.assert_array_equal(
-        np.sort(one.table(Settings(ANGLE), [values])), np.sort(other.table(Settings(ANGLE), [values]))
-    )
-    test = triaxial(one, values, confining=PRESSURE, strains=[0.1])
-    assert np.isfinite(test.q).all() and test.q[0, -1] > 0.0
-
-
 def test_combinations_without_meaning_are_refused() -> None:
     with pytest.raises(ParameterError, match=r"compaction and dilatancy cannot both be on: soil is either"):
         Law(find_effects(["dilatancy", "compaction"]))
@@ -328,19 +305,3 @@ def test_a_parameter_belongs_to_one_effect() -> None:
 
     with pytest.raises(ParameterError, match=r"two effects have a parameter named cohesion"):
         Law([library()["cohesion"], Twin()])
-
-
-def test_a_search_takes_a_combination_without_meaning_for_a_failed_simulation() -> None:
-    """A fit of dilatancy draws angles of dilation above small friction angles: both lie within their bounds."""
-    law = Law(find_effects(["dilatancy"]))
-
-    class Problem:
-        block_count = 3
-
-        def evaluate(self, parameters: Mapping[str, float], seed: int) -> object:
-            law.table(Settings(ANGLE), [parameters])
-            raise AssertionError("the combination was taken")
-
-    found = attempt(Problem(), {"friction_angle": 21.0, "dilatancy_angle": 24.0}, 0)  # type: ignore[arg-type]
-    assert found.loss is None
-    assert "24 deg exceeds the friction angle of 21 deg" in found.message

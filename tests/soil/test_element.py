@@ -11,7 +11,6 @@ from splatsoil.errors import ParameterError, SimulationError
 from splatsoil.soil.element import drive, isotropic_compression, simple_shear, triaxial
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects, library
-from splatsoil.soil.matching import Matching
 
 ANGLES = (25.0, 30.0, 35.0, 40.0, 45.0)
 
@@ -26,22 +25,6 @@ def test_triaxial_compression_strength_to_a_thousandth(cohesion: float) -> None:
     expected = 1e4 * (flow - 1.0) + 2.0 * cohesion * np.sqrt(flow)
     np.testing.assert_allclose(test.q[:, -1], expected, rtol=1e-4)
     np.testing.assert_allclose(test.stress[..., :2], 1e4, rtol=1e-4)
-
-
-@pytest.mark.parametrize("matching", list(Matching))
-def test_every_matching_meets_its_own_closed_form(matching: Matching) -> None:
-    """sqrt(J2) / p in the test that the matching is named after (plane strain: the published value sin phi)."""
-    sine = np.sin(np.radians(ANGLES))
-    sets = [{"friction_angle": a} for a in ANGLES]
-    if matching in (Matching.COMPRESSION, Matching.EXTENSION):
-        sign = 1.0 if matching is Matching.COMPRESSION else -1.0
-        test = triaxial(Law(), sets, confining=1e4, strains=[sign * 0.05], matching=matching, young=2e7)
-        major, minor = test.stress[:, -1].max(axis=1), test.stress[:, -1].min(axis=1)
-        np.testing.assert_allclose((major - minor) / (major + minor), sine, rtol=1e-3)
-    else:
-        test = simple_shear(Law(), sets, confining=1e4, strains=[0.3], matching=matching, young=2e7)
-        wanted = sine if matching is Matching.PLANE_STRAIN else np.tan(np.radians(ANGLES))
-        np.testing.assert_allclose(test.shear_stress[:, -1] / test.p[:, -1], wanted, rtol=1e-3)
 
 
 def test_before_failure_the_sample_is_elastic() -> None:

@@ -33,18 +33,6 @@ def batch(s: Scene, effects: tuple[str, ...], *values: Mapping[str, float]) -> S
     return Solver(x, np.zeros(3), s.upper, s.mesh, s.resolution, law, s.settings, values)
 
 
-def test_soil_falls_under_the_gravity_of_its_world() -> None:
-    """x = f g t^2 / 2, for the earth, the moon and twice the earth."""
-    x = lattice([0.08, 0.04, 0.26], [0.16, 0.08, 0.34], 0.5 * CELL)
-    factors = (1.0, 0.165, 2.0)
-    run = batch(scene(x), ("gravity",), *({"gravity_factor": f} for f in factors))
-    for _ in range(6):
-        run.advance(1)
-    seconds = 6 * RESOLUTION.frame_time
-    fallen = (x - run.positions())[..., 2].mean(axis=1)
-    np.testing.assert_allclose(fallen, 0.5 * 9.81 * np.array(factors) * seconds**2, rtol=0.03)
-
-
 def test_a_plate_feels_the_changed_friction() -> None:
     """A plate pressed on coherent soil and dragged: drag over normal force grows by the change of the coefficient.
     Pressed lightly: a substep's friction takes no more than a particle's momentum, 1 kPa here."""

@@ -23,7 +23,6 @@ from splatsoil.splats import (
     kernels_cuda,
     kernels_projection,
     rasterise,
-    rasterise_features,
     rasteriser,
     reference,
     ssim,
@@ -204,30 +203,6 @@ def test_values_and_gradients_on_cuda(index: int, camera_at: CameraMaker, cloud:
 
 
 @on_gpu
-@pytest.mark.parametrize("channels", [1, 3, 8])
-def test_features_on_cuda(channels: int, camera_at: CameraMaker, cloud: CloudMaker) -> None:
-    g, camera = cloud(2000, sigma=1.5), camera_at(width=130, height=97)
-    features = torch.randn(len(g), channels, generator=torch.Generator().manual_seed(1))
-    results = []
-
-    def fast(*arguments: Any) -> tuple[Tensor, Tensor]:
-        out = rasterise_features(*arguments)
-        return out.image, out.alpha
-
-    for draw_features, device, dtype in (
-        (fast, "cuda", torch.float32),
-        (reference.rasterise_features, "cpu", torch.float64),
-    ):
-        inputs = [t.to(device, dtype).requires_grad_() for t in (g.means, g.covariances(), g.opacities, features)]
-        image, alpha = draw_features(*inputs, camera)
-        gradients = torch.autograd.grad(image.square().sum() + alpha.square().sum(), inputs)
-        gradients = [0.5 * (v + v.mT) if v.ndim == 3 else v for v in gradients]  # by a symmetric matrix
-        named = zip(("by means", "by covariances", "by opacities", "by features"), gradients, strict=True)
-        results.append({k: v.detach().float().cpu() for k, v in (("image", image), ("alpha", alpha), *named)})
-    assert_agree(*results)
-
-
-@on_gpu
 def test_a_large_scene_on_cuda(camera_at: CameraMaker, cloud: CloudMaker) -> None:
     """Too large for the reference: a crop, on another grid of tiles, must be the crop of the picture."""
     camera = camera_at(width=512, height=400, f=600.0)
@@ -238,12 +213,6 @@ def test_a_large_scene_on_cuda(camera_at: CameraMaker, cloud: CloudMaker) -> Non
         assert float((difference > 2e-5).double().mean()) < 2e-3, name
         assert float(difference.max()) < 0.02
     assert float(whole.alpha.max()) > 0.999
-
-
-@on_gpu
-def test_an_empty_scene_on_cuda(camera_at: CameraMaker, cloud: CloudMaker) -> None:
-    picture = rasterise(cloud(5)[:0].to("cuda"), camera_at(width=21, height=9), background=(0.1, 0.2, 0.3))
-    assert torch.allclose(picture.colour.cpu(), torch.tensor([0.1, 0.2, 0.3]).expand(9, 21, 3))
 
 
 @on_gpu

@@ -11,7 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from splatsoil.measurement import Camera
-from splatsoil.splats import Gaussians, rasterise, rasterise_covariances
+from splatsoil.splats import Gaussians, rasterise
 
 CameraMaker = Callable[..., Camera]
 CloudMaker = Callable[..., Gaussians]
@@ -70,41 +70,11 @@ def test_rigid_motion_of_scene_and_camera(camera_at: CameraMaker, cloud: CloudMa
     assert_same_picture(after.normal, turned, pixels=2e-3)
 
 
-def test_joint_scaling_of_scene_and_camera(camera_at: CameraMaker, cloud: CloudMaker) -> None:
-    g = cloud(200)
-    big = g.replace(means=g.means * 7.0, scales=g.scales * 7.0)
-    before, after = rasterise(g, camera_at()), rasterise(big, camera_at())
-    assert_same_picture(after.colour, before.colour, pixels=2e-3)
-    assert_same_picture(after.depth / 7, before.depth, pixels=2e-3)
-
-
-def test_linear_in_colour_and_background(camera_at: CameraMaker, cloud: CloudMaker) -> None:
-    g, other, camera = cloud(200), cloud(200, seed=5), camera_at()
-    b1, b2 = torch.tensor([0.2, 0.5, 0.1]), torch.tensor([0.9, -0.3, 0.4])
-    mixed = rasterise(
-        g.replace(colours=2 * g.colours - 0.5 * other.colours), camera, background=2 * b1 - 0.5 * b2
-    ).colour
-    first = rasterise(g, camera, background=b1).colour
-    second = rasterise(g.replace(colours=other.colours), camera, background=b2).colour
-    torch.testing.assert_close(mixed, 2 * first - 0.5 * second, rtol=0, atol=5e-6)
-
-
 def test_length_of_quaternions(camera_at: CameraMaker, cloud: CloudMaker) -> None:
     g = cloud(100)
     lengths = torch.rand(100, 1, generator=torch.Generator().manual_seed(3)) * 5 + 0.1
     longer = rasterise(g.replace(quaternions=-g.quaternions * lengths), camera_at())
     assert_same_picture(longer.colour, rasterise(g, camera_at()).colour, pixels=2e-3)
-
-
-def test_covariances_draw_the_same_as_scales_and_quaternions(camera_at: CameraMaker, cloud: CloudMaker) -> None:
-    g, camera = cloud(200), camera_at()
-    normals = g.normals(torch.zeros(3))
-    a = rasterise(g, camera, background=(0.1, 0.2, 0.3))
-    b = rasterise_covariances(
-        g.means, g.covariances(), g.opacities, g.colours, normals, camera, background=(0.1, 0.2, 0.3)
-    )
-    for name in ("colour", "alpha", "depth", "normal"):
-        assert_same_picture(getattr(a, name), getattr(b, name), pixels=2e-3)
 
 
 def test_a_subset_and_a_concatenation_keep_every_tensor(cloud: CloudMaker) -> None:

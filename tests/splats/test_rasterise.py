@@ -18,7 +18,6 @@ from splatsoil.splats import (
     rasterise,
     rasterise_covariances,
     rasterise_features,
-    reference,
 )
 
 CameraMaker = Callable[..., Camera]
@@ -93,21 +92,6 @@ def test_clamped_opacity_has_no_gradient_and_a_second_one_is_dropped(camera_at: 
     torch.testing.assert_close(picture.colour, torch.ones(8, 8, 3))
     (gradient,) = torch.autograd.grad(picture.alpha.sum(), opacities)
     assert gradient.tolist() == [0.0, 0.0]
-
-
-def test_shape_gradients_in_closed_form(camera_at: CameraMaker) -> None:
-    # α = o·exp(−½A dx² − B dx dy − ½C dy²): by A −½dx²α, by B −dx·dy·α, by C −½dy²α, by the centre α·(A dx + B dy)
-    g = ball()
-    means = g.means.clone().requires_grad_()
-    opacities = g.opacities.clone().requires_grad_()
-    picture = rasterise_covariances(means, g.covariances(), opacities, g.colours, None, camera_at())
-    p = picture.projection
-    outputs = (p.conics, p.centres, opacities)
-    v_conic, v_centre, v_opacity = torch.autograd.grad(picture.alpha[35, 30], outputs)
-    dx, dy, alpha = 30.5 - 32, 35.5 - 32, picture.alpha[35, 30].item()
-    assert v_conic[0].tolist() == pytest.approx([-0.5 * dx * dx * alpha, -dx * dy * alpha, -0.5 * dy * dy * alpha])
-    assert v_centre[0].tolist() == pytest.approx([alpha * dx / 25.3, alpha * dy / 25.3])
-    assert v_opacity[0].item() == pytest.approx(alpha / 0.8)
 
 
 def test_depth_and_normal_of_a_tilted_disc(camera_at: CameraMaker) -> None:
@@ -230,17 +214,6 @@ def test_broken_gaussians_are_not_drawn(camera_at: CameraMaker, cloud: CloudMake
     assert torch.equal(both.colour, rasterise(good, camera).colour)
     huge = rasterise(bad[3:].replace(means=means[3:], scales=scales[3:]), camera)
     assert torch.isfinite(huge.colour).all()
-
-
-@pytest.mark.parametrize(("width", "height"), [(1, 1), (16, 16), (17, 15), (33, 5)])
-def test_image_sizes(width: int, height: int, camera_at: CameraMaker, cloud: CloudMaker) -> None:
-    camera = camera_at(width=width, height=height, f=40.0)
-    g = cloud(40, f=40.0)
-    picture = rasterise(g, camera)
-    expected, alpha = reference.rasterise_features(g.means, g.covariances(), g.opacities, g.colours, camera)
-    assert picture.colour.shape == (height, width, 3)
-    torch.testing.assert_close(picture.colour, expected, rtol=1e-4, atol=1e-5)
-    torch.testing.assert_close(picture.alpha, alpha, rtol=1e-4, atol=1e-5)
 
 
 def test_bad_arguments_are_explained(camera_at: CameraMaker, cloud: CloudMaker) -> None:

@@ -106,6 +106,31 @@ def test_what_is_set_aside_is_the_last_camera_and_the_last_stage(make: Make) -> 
     assert aside[:, right].all() and aside[4:].all() and not aside[:4, ~right].any()
 
 
+def test_what_is_set_aside_has_no_say_in_the_models_that_it_judges(make: Make) -> None:
+    """The angle is 8 degrees higher there alone: of that, models fitted to the rest miss all."""
+    experiment = make(numerics=0.0)
+    aside, _ = set_aside(experiment)
+    shift = np.where(aside, 8.0 * experiment.slopes["friction_angle"], 0.0)
+    found = diagnose(replace(experiment, observed=experiment.observed + shift, candidates=()), START)
+    judged_on = aside & found.mask & experiment.layout.common[None]
+    (held_out,) = found.held_out
+    assert held_out.error == pytest.approx(np.sqrt(np.mean(shift[judged_on] ** 2)), rel=0.2)
+    assert held_out.noise == pytest.approx(np.hypot(1.0, 0.5), rel=0.25), "of chance and of the sensor"
+
+
+def test_the_noise_holds_what_seeds_scatter_by(make: Make) -> None:
+    """Of chance of unit size in every feature and of sensors of half of it, in scores of unit directions."""
+    ratios = []
+    for seed in WORLDS:
+        experiment = make(numerics=0.0, seed=seed)
+        found = diagnose(experiment, START, effects=False, seed=seed)
+        noise = found.evidence.noise
+        drawn = noise.scores(np.array([experiment.predict(START, seed=k) for k in range(5000, 5200)]))
+        ratios.append(np.median((drawn.var(axis=0) + 0.25) / np.diag(noise.fixed)))
+        assert np.sqrt(found.expected[found.mask].mean()) == pytest.approx(np.hypot(1.0, 0.5), rel=0.25)
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.2)
+
+
 @pytest.mark.parametrize(
     ("probability", "fits", "verdict", "members"),
     [
