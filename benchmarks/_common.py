@@ -54,9 +54,17 @@ def at_least(least: int) -> Callable[[str], int]:
     return number
 
 
+class Formatter(argparse.RawDescriptionHelpFormatter):
+    """Shows texts as they are, and defaults."""
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        unsaid = action.default in (None, False, argparse.SUPPRESS, "", [])
+        return action.help if unsaid else f"{action.help} (default: %(default)s)"
+
+
 def parser_of(module_doc: str | None) -> argparse.ArgumentParser:
-    """An argument parser that shows a module's text as it is, with the option ``--device``."""
-    parser = argparse.ArgumentParser(description=module_doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    """An argument parser that shows a module's text as it is and defaults, with the option ``--device``."""
+    parser = argparse.ArgumentParser(description=module_doc, formatter_class=Formatter)
     parser.add_argument("--device", type=here, default="cpu", help="cpu or cuda:0")
     return parser
 

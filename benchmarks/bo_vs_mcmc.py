@@ -1,294 +1,429 @@
-"""Bayesian optimisation against Markov chains: the same budgets of simulator calls, what each makes of them.
+"""Bayesian optimisation, Markov chains and other agents: what each makes of the same episodes of PlowSand.
 
     splatsoil benchmark bo-vs-mcmc --out runs/bo-vs-mcmc
+    splatsoil benchmark bo-vs-mcmc --env PlowSandFast-v0 --budgets 10 --agent my_module:my_agent
 
-| way | what it does with N calls |
-|---|---|
-| `bo` | the search of `splatsoil fit`: log noisy expected improvement of the loss, and where that is least |
-| `paper` | the same with Hsiao and Kumar's settings: one random start, expected improvement |
-| `mcmc` | emcee on a comparison's posterior, by an emulator of the features trained on N space-filling calls |
-| `both` | the same, trained on the N calls that `bo` chose: what `splatsoil fit` says |
-| `direct` | emcee on the calls themselves: N calls are N steps of walkers |
+| agent | on | what it does |
+|---|---|---|
+| `random` | all | actions at random |
+| `bo` | guesses | the search of `splatsoil fit`: log noisy expected improvement of the loss, and where that is least |
+| `paper` | guesses | the same with Hsiao and Kumar's settings: one random start, expected improvement |
+| `tpe` | guesses | Optuna's tree-structured Parzen estimator |
+| `cma-es` | guesses, two parameters or more | covariance matrix adaptation |
+| `mcmc` | guesses | emcee on a comparison's posterior, by an emulator of the features trained on space-filling calls |
+| `both` | guesses | the same, trained on the calls that `bo` chose: what `splatsoil fit` says |
+| `direct` | emulated guesses | emcee on the calls themselves: each is a step of a walker |
+| `sac` | guesses, design | soft actor-critic of Stable-Baselines3, trained on other episodes |
+| `uniform` | naming | all effects alike |
+| `lda` | naming | linear discriminant analysis, trained on other episodes |
+| `greedy` | design | the stroke of most expected information, of 25 |
 
-The calls go to an emulator of real simulations, made once and kept; each call has a draw of the measured seed-to-seed
-scatter. So a thousand calls take a second, and every way meets the same landscape; what the emulator does not show of
-the simulator is not tested.
+An agent of one's own is a function (env, seed) that resets the environment with the seed and plays one whole episode;
+of guesses it may return its estimate, values by name: otherwise its best guess counts.
 """
 
 from __future__ import annotations
 
+import importlib
+import importlib.util
 import json
+import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import TYPE_CHECKING, Any
+from functools import cache
+from pathlib import Path
+from typing import Any
 
 import emcee
+import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
-from splatsoil.benchmarks._common import at_least, output_options, stamp, ticker, write_result
-from splatsoil.benchmarks._simulations import FEWEST, density_of, simulated, world_parser
+from splatsoil.benchmarks._common import at_least, output_options, parser_of, stamp, ticker, write_result
+from splatsoil.benchmarks._simulations import FEWEST, density_of
+from splatsoil.envs.plow_sand import PlowSandEnv
+from splatsoil.envs.recording import EpisodeRecorder
+from splatsoil.envs.strokes import DesignEnv, NamingEnv
 from splatsoil.inverse.bayesopt import BayesianOptimiser, sobol
-from splatsoil.inverse.executors import Executor, Serial, executor
 from splatsoil.inverse.mcmc import sample
-from splatsoil.inverse.posterior import Density
 
+from splatsoil.errors import ParameterError
 from splatsoil.files import plain
-from splatsoil.parameters import ParameterSpace
 from splatsoil.quiet import hush
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 FloatArray = npt.NDArray[np.float64]
 
-BUDGETS = (6, 10, 20)
-DIRECT_BUDGETS = (20, 100, 1000)
-WAYS = ("bo", "paper", "mcmc", "both", "direct")
-#: Truths are drawn from this part of the prior's width, in its middle.
-INNER = 0.8
-COLOURS = {"bo": "#c44e52", "paper": "#dd8452", "mcmc": "#4c72b0", "both": "#8172b3", "direct": "#55a868"}
-
-
-class EmulatedWorld:
-    """Calls answered by an emulator of many real simulations, with seed-to-seed scatter of its measured covariance.
-
-    Features are a comparison's scores; the loss is their mean square residual over what the prior's middle would leave
-    on average.
-    """
-
-    def __init__(self, density: Density) -> None:
-        self.space, self.density = density.prior.space, density
-        self.count = len(density.noise.chance)
-        self.factor = np.linalg.cholesky(density.noise.chance + 1e-12 * np.eye(self.count))
-        spread = self._emulated(sobol(256, len(self.space), 0))
-        self.unit = float(np.mean(np.sum((spread - spread.mean(axis=0)) ** 2, axis=1)))
-        self.observed = np.zeros(self.count)
-
-    def observe(self, truth: FloatArray, rng: np.random.Generator) -> None:
-        """Make an observation of a truth (n,) in [-1, 1]^n."""
-        self.observed = self._simulate(truth, rng)
-
-    def call(self, point: FloatArray, rng: np.random.Generator) -> tuple[float, FloatArray]:
-        """Simulate a point (n,): loss, and predicted minus observed features (b,)."""
-        residual = self._simulate(point, rng) - self.observed
-        return float(np.sum(residual**2)) / self.unit, residual
-
-    def _emulated(self, points: FloatArray) -> FloatArray:
-        """(q, p) mean scores at points (q, n)."""
-        return self.density.predict(points)[0] @ self.density.comparison.likelihood.root.T
-
-    def _simulate(self, point: FloatArray, rng: np.random.Generator) -> FloatArray:
-        return self._emulated(point[None])[0] + self.factor @ rng.standard_normal(self.count)
+ENVS = ("PlowSandFast-v0", "PlowSandSeveralFast-v0", "PlowSandNamingFast-v0", "PlowSandDesignFast-v0")
+#: Episodes and steps that agents learn from, and the first seed of these.
+NAMING_EPISODES, SAC_STEPS, TRAINING = 4000, 20000, 10**6
+#: Simulated outcomes of a stroke that its expected information is averaged over.
+OUTCOMES = 32
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What a way says after some calls: estimate (n,), 90 % interval (n,) each, and seconds of its own thinking."""
+    """What an agent says: estimate (n,) and 90 % interval (n,) each, in [-1, 1]^n."""
 
     estimate: FloatArray
     low: FloatArray
     high: FloatArray
-    seconds: float
 
 
-def play(world: EmulatedWorld, budgets: Sequence[int], seed: int, **options: Any) -> tuple[dict[int, Answer], Any]:
-    """Bayesian optimisation with options of its own: an answer at each budget, and the calls (points, features)."""
-    rng = np.random.default_rng([seed, 31])
-    optimiser = BayesianOptimiser(len(world.space), seed=seed, **options)
-    answers: dict[int, Answer] = {}
-    points: list[FloatArray] = []
-    features: list[FloatArray] = []
-    spent = 0.0
-    while len(points) < max(budgets):
-        began = time.perf_counter()
-        action = optimiser.ask()[0].astype(np.float64)
-        spent += time.perf_counter() - began
-        loss, residual = world.call(action, rng)
-        optimiser.tell(action, loss)
-        points.append(action)
-        features.append(residual)
-        if len(points) in budgets:
-            began = time.perf_counter()
-            found = optimiser.result()
-            seconds = spent + time.perf_counter() - began
-            _, low, high = found.interval()
-            answers[len(points)] = Answer(found.estimate, low, high, seconds)
-    return answers, (np.array(points), np.array(features))
+Agent = Callable[[gym.Env[Any, Any], int], Answer | Mapping[str, float] | None]
 
 
-def sample_emulated(space: ParameterSpace, points: FloatArray, features: FloatArray, seed: int) -> Answer:
-    """emcee on an emulator of calls (k, n), (k, b); features are residuals, so the observed ones are 0."""
-    began = time.perf_counter()
-    count = features.shape[1]
-    density = density_of(space, points, features, np.zeros(count), 0.0, seed)
+class Counted(gym.Wrapper[Any, Any, Any, Any]):
+    """Counts steps and rewards of the one episode that an agent may play, and the CPU's seconds that they take."""
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        super().__init__(env)
+        self.resets, self.steps, self.total, self.seconds, self.over = 0, 0, 0.0, 0.0, False
+        self.last: dict[str, Any] = {}
+
+    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+        began = time.process_time()
+        found = self.env.reset(**options)
+        self.resets += 1
+        self.seconds += time.process_time() - began
+        return found
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        began = time.process_time()
+        found = self.env.step(action)
+        self.steps, self.total, self.last = self.steps + 1, self.total + float(found[1]), found[4]
+        self.over = found[2] or found[3]
+        self.seconds += time.process_time() - began
+        return found
+
+
+def at_random(env: gym.Env[Any, Any], seed: int) -> None:
+    """Actions drawn from the action space."""
+    env.reset(seed=seed)
+    env.action_space.seed(seed)
+    over = False
+    while not over:
+        _, _, terminated, truncated, _ = env.step(env.action_space.sample())
+        over = terminated or truncated
+
+
+def told(env: gym.Env[Any, Any], seed: int, optimiser: BayesianOptimiser) -> tuple[FloatArray, FloatArray]:
+    """Let an optimiser play an episode: its guesses (k, n) and their features (k, b), predicted minus observed."""
+    env.reset(seed=seed)
+    points, features, over = [], [], False
+    while not over:
+        (action,) = optimiser.ask()
+        observation, reward, _, over, info = env.step(action)
+        failed = info["status"] == "failed"
+        optimiser.tell(action, None if failed else -float(reward))
+        if not failed:
+            points.append(action)
+            features.append(-observation["block_residuals"])
+    return np.array(points, dtype=np.float64), np.array(features, dtype=np.float64)
+
+
+def by_optimiser(env: gym.Env[Any, Any], seed: int, **options: Any) -> Answer:
+    """Bayesian optimisation with options of its own."""
+    optimiser = BayesianOptimiser(env.action_space.shape[0], seed=seed, **options)  # type: ignore[index]
+    told(env, seed, optimiser)
+    found = optimiser.result()
+    return Answer(found.estimate, *found.interval()[1:])
+
+
+def by_chains(env: gym.Env[Any, Any], seed: int, *, search: bool) -> Answer:
+    """emcee on an emulator of the features of an episode's guesses, which a search chose or a Sobol sequence."""
+    space, budget = env.unwrapped.problem.space, env.unwrapped.budget  # type: ignore[attr-defined]
+    if budget < FEWEST:
+        raise ParameterError(f"agents mcmc and both need budgets of {FEWEST} or more, not {budget}")
+    start = {} if search else {"start": budget}
+    points, features = told(env, seed, BayesianOptimiser(len(space), seed=seed, **start))
+    density = density_of(space, points, features, np.zeros(features.shape[1]), 0.0, seed)
     chains = sample(density, len(space), seed=seed, ensembles=2, most_steps=1000)
-    low, high = np.quantile(chains.flat, [0.05, 0.95], axis=0)
-    return Answer(chains.flat.mean(axis=0), low, high, time.perf_counter() - began)
+    return Answer(chains.flat.mean(axis=0), *np.quantile(chains.flat, [0.05, 0.95], axis=0))
 
 
-def sample_directly(world: EmulatedWorld, budgets: Sequence[int], seed: int) -> dict[int, Answer]:
-    """emcee on the calls: each density is one. A call's seed-to-seed scatter adds to the observation's."""
-    rng, n = np.random.default_rng([seed, 37]), len(world.space)
-    inverse = np.linalg.pinv(2.0 * world.density.noise.chance)
+def directly(env: gym.Env[Any, Any], seed: int) -> Answer:
+    """emcee on the calls: each density is one. Chance is that of the response surface, in call and observation."""
+    surface, n, budget = env.unwrapped.problem.surface, env.action_space.shape[0], env.unwrapped.budget  # type: ignore
+    inverse = np.linalg.pinv(surface.patches @ surface.factor)
+    env.reset(seed=seed)
 
     def density(point: FloatArray) -> float:
-        if np.any(np.abs(point) > 1.0):
-            return -np.inf
-        _, residual = world.call(point, rng)
-        return -0.5 * float(residual @ inverse @ residual)
+        # A point outside has density 0 whatever the call says; it is a call nonetheless.
+        observation, *_ = env.step(point.astype(np.float32))
+        scale = float(surface.scale(point[None])[0])
+        off = inverse @ observation["block_residuals"] / scale
+        return -0.25 * float(off @ off) - len(off) * np.log(scale) if np.all(np.abs(point) <= 1.0) else -np.inf
 
     walkers = max(4, 2 * n + 2)
+    if budget < 2 * walkers:
+        raise ParameterError(f"agent direct needs a budget of {2 * walkers} or more, not {budget}")
     sampler = emcee.EnsembleSampler(walkers, n, density)
     start = emcee.State(sobol(walkers, n, seed), random_state=np.random.RandomState(seed).get_state())
-    steps = max(budgets) // walkers
-    began = time.perf_counter()
+    steps = budget // walkers - 1  # walkers' starts are calls, too
     sampler.run_mcmc(start, steps, skip_initial_state_check=True)
-    seconds = time.perf_counter() - began
-    answers = {}
-    for budget in budgets:
-        kept = max(budget // walkers, 1)
-        chain = sampler.get_chain()[kept // 4 : kept].reshape(-1, n)
-        low, high = np.quantile(chain, [0.05, 0.95], axis=0)
-        answers[budget] = Answer(chain.mean(axis=0), low, high, seconds * kept / steps)
-    return answers
+    chain = sampler.get_chain()[steps // 4 :].reshape(-1, n)
+    for _ in range(budget % walkers):
+        env.step(chain.mean(axis=0).astype(np.float32))
+    return Answer(chain.mean(axis=0), *np.quantile(chain, [0.05, 0.95], axis=0))
 
 
-def truth_of(seed: int, n: int) -> FloatArray:
-    """A truth (n,) in the middle of [-1, 1]^n."""
-    return np.random.default_rng([seed, 29]).uniform(-INNER, INNER, n)
+def by_tpe(env: gym.Env[Any, Any], seed: int) -> None:
+    """Optuna's sampler, asked and told."""
+    import optuna
+
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    study, over = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=seed, n_startup_trials=4)), False
+    env.reset(seed=seed)
+    while not over:
+        trial = study.ask()
+        guess = [trial.suggest_float(f"action{k}", -1.0, 1.0) for k in range(env.action_space.shape[0])]  # type: ignore
+        _, reward, _, over, _ = env.step(np.array(guess, dtype=np.float32))
+        study.tell(trial, -float(reward))
 
 
-def trial(
-    world: EmulatedWorld, ways: Sequence[str], budgets: Sequence[int], direct: Sequence[int], seed: int
-) -> dict[str, dict[int, Answer]]:
-    """All ways on one truth, drawn by the seed."""
-    n, rng = len(world.space), np.random.default_rng([seed, 41])
-    world.observe(truth_of(seed, n), rng)
-    usable = [b for b in budgets if b >= FEWEST]
-    out: dict[str, dict[int, Answer]] = {}
-    if "bo" in ways or "both" in ways:
-        out["bo"], (points, features) = play(world, budgets, seed)
-        out["both"] = {b: sample_emulated(world.space, points[:b], features[:b], seed) for b in usable}
-    if "paper" in ways:
-        out["paper"], _ = play(world, budgets, seed, start=1, acquisition="best")
-    if "mcmc" in ways:
-        points = sobol(max(budgets), n, seed)
-        features = np.array([world.call(p, rng)[1] for p in points])
-        out["mcmc"] = {b: sample_emulated(world.space, points[:b], features[:b], seed) for b in usable}
-    if "direct" in ways:
-        out["direct"] = sample_directly(world, direct, seed)
-    return {way: answers for way, answers in out.items() if way in ways}
+def by_cma_es(env: gym.Env[Any, Any], seed: int) -> None:
+    """The package ``cmaes``, from the middle."""
+    from cmaes import CMA
+
+    n, over = env.action_space.shape[0], False  # type: ignore[index]
+    search = CMA(mean=np.zeros(n), sigma=0.5, bounds=np.tile([-1.0, 1.0], (n, 1)), seed=seed)
+    env.reset(seed=seed)
+    while not over:
+        generation = []
+        while not over and len(generation) < search.population_size:
+            guess = search.ask()
+            _, reward, _, over, _ = env.step(guess.astype(np.float32))
+            generation.append((guess, -float(reward)))
+        if not over:
+            search.tell(generation)
+
+
+@cache
+def _actor(env_id: str, budget: int) -> Any:
+    """A soft actor-critic that has learnt from other episodes."""
+    from stable_baselines3 import SAC
+
+    env = gym.make(env_id, budget=budget)
+    agent = SAC("MultiInputPolicy", env, gamma=1.0, train_freq=8, gradient_steps=4, seed=TRAINING, device="cpu")
+    return agent.learn(SAC_STEPS)
+
+
+def by_actor(env: gym.Env[Any, Any], seed: int) -> None:
+    """Stable-Baselines3's soft actor-critic, without its noise."""
+    assert env.spec is not None
+    agent = _actor(env.spec.id, env.unwrapped.budget)  # type: ignore[attr-defined]
+    (observation, _), over = env.reset(seed=seed), False
+    while not over:
+        observation, _, _, over, _ = env.step(agent.predict(observation, deterministic=True)[0])
+
+
+def all_alike(env: gym.Env[Any, Any], seed: int) -> None:
+    """Equal logits."""
+    env.reset(seed=seed)
+    env.step(np.zeros(env.action_space.shape, dtype=np.float32))
+
+
+@cache
+def _classes(env_id: str) -> tuple[FloatArray, FloatArray]:
+    """Means (e, b) of each effect's evidence, and the inverse (b, b) of the covariance about them."""
+    env: Any = gym.make(env_id)
+    seen: dict[str, list[FloatArray]] = {effect: [] for effect in env.unwrapped.soil.effects}
+    for k in range(NAMING_EPISODES):
+        evidence, _ = env.reset(seed=TRAINING + k)
+        seen[env.unwrapped.soil.effect].append(evidence)
+    means = np.array([np.mean(rows, axis=0) for rows in seen.values()])
+    off = np.concatenate([np.array(rows) - mean for rows, mean in zip(seen.values(), means, strict=True)])
+    return means, np.linalg.pinv(off.T @ off / len(off), rcond=1e-6, hermitian=True)
+
+
+def by_discriminant(env: gym.Env[Any, Any], seed: int) -> None:
+    """Log densities of normal distributions of equal covariance (Fisher 1936), as logits."""
+    assert env.spec is not None
+    means, inverse = _classes(env.spec.id)
+    evidence, _ = env.reset(seed=seed)
+    logs = np.array([-0.5 * (evidence - mean) @ inverse @ (evidence - mean) for mean in means])
+    env.step((logs - logs.max() + 5.0).astype(np.float32))
+
+
+def greedily(env: gym.Env[Any, Any], seed: int) -> None:
+    """The stroke whose outcomes, drawn from the posterior, leave the most information on average."""
+    inner, rng, over = env.unwrapped, np.random.default_rng([seed, 43]), False
+    assert isinstance(inner, DesignEnv)
+    strokes = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 5)] * 2), axis=-1).reshape(-1, 2)
+    env.reset(seed=seed)
+    while not over:
+        expected = [inner.expected_information(stroke, OUTCOMES, rng) for stroke in strokes]
+        _, _, _, over, _ = env.step(strokes[int(np.argmax(expected))].astype(np.float32))
+
+
+AGENTS: dict[str, tuple[Agent, tuple[type, ...], str]] = {
+    "random": (at_random, (PlowSandEnv, NamingEnv, DesignEnv), ""),
+    "tpe": (by_tpe, (PlowSandEnv,), "optuna"),
+    "cma-es": (by_cma_es, (PlowSandEnv,), "cmaes"),
+    "sac": (by_actor, (PlowSandEnv, DesignEnv), "stable_baselines3"),
+    "paper": (lambda env, seed: by_optimiser(env, seed, start=1, acquisition="best"), (PlowSandEnv,), ""),
+    "bo": (by_optimiser, (PlowSandEnv,), ""),
+    "mcmc": (lambda env, seed: by_chains(env, seed, search=False), (PlowSandEnv,), ""),
+    "both": (lambda env, seed: by_chains(env, seed, search=True), (PlowSandEnv,), ""),
+    "direct": (directly, (PlowSandEnv,), ""),
+    "uniform": (all_alike, (NamingEnv,), ""),
+    "lda": (by_discriminant, (NamingEnv,), ""),
+    "greedy": (greedily, (DesignEnv,), ""),
+}
+
+
+def own_agent(name: str) -> Agent:
+    """The function that MODULE:FUNCTION names, modules of the working folder included.
+
+    Raises:
+        ParameterError: there is none.
+    """
+    module, _, function = name.partition(":")
+    sys.path.insert(0, str(Path.cwd()))
+    try:
+        found = getattr(importlib.import_module(module), function)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ParameterError(f"agent {name}: give MODULE:FUNCTION ({error})") from error
+    finally:
+        sys.path.pop(0)
+    if not callable(found):
+        raise ParameterError(f"agent {name}: is not a function")
+    return found  # type: ignore[no-any-return]
+
+
+def chosen_agents(names: Sequence[str], env: gym.Env[Any, Any]) -> dict[str, Agent]:
+    """Those of the named agents that play such an environment; one whose library is not installed is left out."""
+    out = {}
+    for name in names:
+        agent, kinds, library = AGENTS[name]
+        fits = isinstance(env.unwrapped, kinds)
+        if name == "direct":
+            fits = fits and hasattr(env.unwrapped.problem, "surface")  # type: ignore[attr-defined]
+        if name == "cma-es":
+            fits = fits and env.action_space.shape != (1,)
+        if fits and library and importlib.util.find_spec(library) is None:
+            print(f"{name} is left out: needs the extra: pip install 'splatsoil[agents]'", file=sys.stderr)
+        elif fits:
+            out[name] = agent
+    return out
+
+
+def play(env: gym.Env[Any, Any], name: str, agent: Agent, seed: int) -> dict[str, Any]:
+    """An agent's episode: total reward, its own seconds of the CPU, and of guesses the regret, errors and intervals.
+
+    Raises:
+        ParameterError: the agent has not played one whole episode.
+    """
+    counted, began = Counted(env), time.process_time()
+    answer = agent(counted, seed)
+    seconds = time.process_time() - began - counted.seconds
+    if counted.resets != 1 or not counted.over:
+        raise ParameterError(
+            f"agent {name}: has to play one whole episode; it made {counted.steps} steps in {counted.resets} episodes"
+        )
+    found: dict[str, Any] = {"return": counted.total, "steps": counted.steps, "seconds": seconds}
+    if not isinstance(env.unwrapped, PlowSandEnv):
+        return found
+    space, truth = env.unwrapped.problem.space, counted.last["truth"]
+    if isinstance(answer, Answer):
+        low, high = space.from_unit(answer.low), space.from_unit(answer.high)
+        values = space.to_vector(truth)
+        found |= {"width": high - low, "inside": (low <= values) & (values <= high)}
+        answer = space.to_dict(space.from_unit(answer.estimate))
+    if isinstance(answer, Mapping):
+        error = {name: answer[name] - truth[name] for name in space.names}
+    else:
+        error = counted.last["error"]
+    return found | {"regret": counted.last.get("regret", np.nan), "error": np.array([error[n] for n in space.names])}
+
+
+def summary(agent: str, episodes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Means over an agent's episodes, and the standard deviations of what is called a score."""
+    column = {key: np.array([e[key] for e in episodes], dtype=np.float64) for key in episodes[0]}
+    spread = 1 if len(episodes) > 1 else 0
+    entry: dict[str, Any] = {"agent": agent, "steps": int(column["steps"][0]), "seconds": column["seconds"].mean()}
+    entry |= {"return": column["return"].mean(), "return_std": column["return"].std(ddof=spread)}
+    if "error" in column:
+        size = np.abs(column["error"])
+        entry |= {"mae": size.mean(axis=0), "mae_std": size.std(axis=0, ddof=spread), "errors": column["error"]}
+        entry["regret"] = np.nanmean(column["regret"])
+    if "inside" in column:
+        entry |= {"width_90": column["width"].mean(axis=0), "coverage_90": column["inside"].mean(axis=0)}
+    return entry
 
 
 def run(
-    world: EmulatedWorld,
-    *,
-    ways: Sequence[str] = WAYS,
-    budgets: Sequence[int] = BUDGETS,
-    direct: Sequence[int] = DIRECT_BUDGETS,
-    seeds: int = 12,
-    pool: Executor | None = None,
+    env_id: str, budgets: Sequence[int | None], names: Sequence[str], own: Sequence[str], seeds: int, data_set: str = ""
 ) -> dict[str, Any]:
-    """Errors, widths and coverage of all ways over seeds, in physical units."""
-    space, report = world.space, ticker("truths")
-    rows: dict[tuple[str, int], list[tuple[FloatArray, FloatArray, npt.NDArray[np.bool_], float]]] = {}
-    pool, job = pool or Serial(), partial(trial, world, ways, budgets, direct)
-    for seed, answers_of in enumerate(pool.map(job, range(seeds))):
-        truth = truth_of(seed, len(space))
-        for way, answers in answers_of.items():
-            for budget, answer in answers.items():
-                error = space.from_unit(answer.estimate) - space.from_unit(truth)
-                width = space.from_unit(answer.high) - space.from_unit(answer.low)
-                inside = (answer.low <= truth) & (truth <= answer.high)
-                rows.setdefault((way, budget), []).append((error, width, inside, answer.seconds))
-        report(seed + 1, seeds)
+    """All agents on one environment, at each budget; the episodes are kept as a Minari data set where one is named."""
     entries = []
-    for (way, budget), found in sorted(rows.items(), key=lambda row: (WAYS.index(row[0][0]), row[0][1])):
-        error, width, inside, seconds = (np.array(column) for column in zip(*found, strict=True))
-        spread = np.abs(error).std(axis=0, ddof=1) if len(found) > 1 else np.zeros(len(space))
-        entry = {"way": way, "calls": budget, "mae": np.abs(error).mean(axis=0), "mae_std": spread}
-        entry |= {"width_90": width.mean(axis=0), "coverage_90": inside.mean(axis=0), "seconds": float(seconds.mean())}
-        entries.append(plain({**entry, "errors": error}))
-    return {"parameters": [{"name": p.name, "unit": p.unit} for p in space], "seeds": seeds, "entries": entries}
+    for budget in budgets:
+        env = gym.make(env_id, **({} if budget is None else {"budget": budget}))
+        agents = chosen_agents(names, env) | {name: own_agent(name) for name in own}
+        if data_set:
+            env = EpisodeRecorder(env)
+        report = ticker(f"{env_id}, episodes")
+        for done, (name, agent) in enumerate(agents.items()):
+            entries.append(summary(name, [play(env, name, agent, seed) for seed in range(seeds)]))
+            report(done + 1, len(agents))
+        if isinstance(env, EpisodeRecorder):
+            env.write(data_set, algorithm=", ".join(agents), description=f"{seeds} episodes of each agent on {env_id}")
+    problem = getattr(env.unwrapped, "problem", None)
+    units = [] if problem is None else [{"name": p.name, "unit": p.unit} for p in problem.space]
+    return {"env": env_id, "parameters": units, "seeds": seeds, "entries": plain(entries)}
 
 
-def table(result: dict[str, Any]) -> str:
-    """The result as Markdown."""
-    lines = [f"{result['landscape']}. {result['seeds']} truths and seeds; error and width in the parameter's unit."]
-    for i, parameter in enumerate(result["parameters"]):
-        unit = "°" if parameter["unit"] == "deg" else f" {parameter['unit']}"
-        lines += [
-            "",
-            f"**{parameter['name']}**",
-            "",
-            "| way | calls | mean abs. error ± its spread | 90 % interval's width | contains the truth | own time |",
-            "|---|---|---|---|---|---|",
-        ]
-        for e in result["entries"]:
-            lines.append(
-                f"| {e['way']} | {e['calls']} | {e['mae'][i]:.3g} ± {e['mae_std'][i]:.2g}{unit} | "
-                f"{e['width_90'][i]:.3g}{unit} | {100.0 * e['coverage_90'][i]:.0f} % | {e['seconds']:.1f} s |"
-            )
-    return "\n".join(lines)
-
-
-def figure(result: dict[str, Any]) -> Figure:
-    """Error and interval width against calls, for each parameter."""
-    from matplotlib.figure import Figure
-
-    count = len(result["parameters"])
-    drawn = Figure(figsize=(8.4, 2.8 * count), layout="constrained")
-    for i, (row, parameter) in enumerate(
-        zip(drawn.subplots(count, 2, squeeze=False), result["parameters"], strict=True)
-    ):
-        for way in WAYS:
-            found = [e for e in result["entries"] if e["way"] == way]
-            calls = [e["calls"] for e in found]
-            standard = [e["mae_std"][i] / result["seeds"] ** 0.5 for e in found]
-            row[0].errorbar(calls, [e["mae"][i] for e in found], standard, color=COLOURS[way], marker="o", label=way)
-            row[1].plot(calls, [e["width_90"][i] for e in found], color=COLOURS[way], marker="o", label=way)
-        for axis, what in zip(row, ("mean absolute error", "90 % interval's width"), strict=True):
-            axis.set(xscale="log", yscale="log", xlabel="simulator calls")
-            axis.set_title(f"{parameter['name'].replace('_', ' ')}: {what} [{parameter['unit']}]", fontsize=9)
-        row[0].legend(fontsize=7)
-    return drawn
+def table(found: Mapping[str, Any]) -> str:
+    """One environment's results as Markdown."""
+    head, rows = ["agent", "steps"], []
+    if found["parameters"]:
+        head += [f"error, {p['name']} [{'°' if p['unit'] == 'deg' else p['unit']}]" for p in found["parameters"]]
+        head += ["regret", "90 % interval", "holds the truth"]
+    else:
+        head.append("return [nats]")
+    for e in found["entries"]:
+        row = [e["agent"], str(e["steps"])]
+        if found["parameters"]:
+            row += [f"{mean:.3g} ± {std:.2g}" for mean, std in zip(e["mae"], e["mae_std"], strict=True)]
+            row.append(f"{e['regret']:.3f}")
+            row.append(" / ".join(f"{w:.3g}" for w in e.get("width_90", [])) or "–")
+            row.append(" / ".join(f"{100.0 * c:.0f} %" for c in e.get("coverage_90", [])) or "–")
+        else:
+            row.append(f"{e['return']:.2f} ± {e['return_std']:.2f}")
+        rows.append([*row, f"{e['seconds']:.2g} s"])
+    lines = [[*head, "own CPU time"], ["---"] * (len(head) + 1), *rows]
+    return "\n".join([f"**{found['env']}**", "", *("| " + " | ".join(line) + " |" for line in lines)])
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Command line; exit code 0."""
-    parser = world_parser(__doc__)
-    parser.add_argument("--seeds", type=at_least(1), default=12, help="truths, each with its own scatter")
-    parser.add_argument("--budgets", type=int, nargs="+", default=list(BUDGETS))
+    parser = parser_of(__doc__)
+    parser.add_argument("--env", nargs="+", default=list(ENVS), help="ids of environments whose truth is hidden")
+    parser.add_argument("--budgets", type=at_least(1), nargs="+", help="steps in an episode; by default the id's own")
+    parser.add_argument("--seeds", type=at_least(1), default=10, help="episodes, each with a truth of its own")
     parser.add_argument(
-        "--direct-budgets", type=int, nargs="+", default=list(DIRECT_BUDGETS), help="calls of emcee on the simulator"
+        "--agents", nargs="*", choices=AGENTS, default=list(AGENTS), help="built-in ones, where they fit"
     )
-    parser.add_argument("--ways", nargs="+", choices=WAYS, default=list(WAYS))
-    parser.add_argument("--simulations", type=at_least(1), default=64, help="behind the emulated landscape")
+    parser.add_argument("--agent", action="append", default=[], metavar="MODULE:FUNCTION", help="one of your own")
+    parser.add_argument("--minari", default="", metavar="ID", help="keep the episodes of guesses as a Minari data set")
     output_options(parser)
     options = parser.parse_args(arguments)
+    if options.minari and (len(options.env) > 1 or len(options.budgets or [0]) > 1):
+        raise ParameterError("--minari: a data set is of one environment and one budget; give one of each")
     hush()
     began = time.perf_counter()
-    with executor(options.executor) as pool:
-        data, file = simulated(options, options.simulations, pool)
-        density = density_of(data.space, data.points, -data.residuals, np.zeros(data.residuals.shape[1]), 0.0)
-        chosen = {"ways": options.ways, "budgets": options.budgets, "direct": options.direct_budgets}
-        found = run(EmulatedWorld(density), **chosen, seeds=options.seeds, pool=pool)
-    source = "the synthetic set" if options.set is None else str(options.set)
-    count = len(density.noise.chance)
-    landscape = f"{count} scores of {len(data.points)} simulations of {source}, preset `{options.preset}`, emulated"
-    result = {
-        "benchmark": "bo-vs-mcmc",
-        "landscape": landscape,
-        **found,
-        "simulations": str(file),
-        **stamp(options.device),
-        "seconds": time.perf_counter() - began,
-    }
+    found = [
+        run(env, options.budgets or [None], options.agents, options.agent, options.seeds, options.minari)
+        for env in options.env
+    ]
+    seconds = time.perf_counter() - began
+    result = {"benchmark": "bo-vs-mcmc", "environments": found, **stamp(options.device), "seconds": seconds}
+    text = "\n\n".join(
+        [f"{options.seeds} episodes of each agent: mean ± standard deviation over them.", *map(table, found)]
+    )
     if options.out is not None:
-        write_result(options.out, result, table(result), {"bo-vs-mcmc.svg": figure(result)})
-    print(json.dumps(result, indent=1) if options.json else table(result))
+        write_result(options.out, result, text, {})
+    print(json.dumps(result, indent=1) if options.json else text)
     return 0
 
 

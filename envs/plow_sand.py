@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from splatsoil.errors import ParameterError
 
+from .episode import Array, EpisodeEnv
 from .problem import Evaluation, Image, Job, Problem, simulation_seed
 from .together import attempt
 
@@ -24,7 +25,7 @@ Observation = dict[str, npt.NDArray[np.float32]]
 BLOCK_LIMIT = 1e3
 
 
-class PlowSandEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
+class PlowSandEnv(EpisodeEnv[Observation]):
     """Simulate-and-compare as a Gymnasium environment.
 
     **Action**: Box(-1, 1, (n,)), one number for each free parameter, from its lower to its upper bound (logarithmic
@@ -43,7 +44,8 @@ class PlowSandEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
 
     **Reward**: minus the loss. A simulation that fails pays minus the worst loss; ``info["status"]`` tells.
 
-    **End**: truncated when the budget is spent. A guess is never terminal.
+    **End**: truncated when the budget is spent. A guess is never terminal. The truth is simulated once more then, with
+    the last step's particles, for the regret.
 
     Args:
         measurement: folder of a measurement set. None: a small synthetic experiment with a hidden friction angle,
@@ -57,6 +59,7 @@ class PlowSandEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         render_mode: ``rgb_array`` shows observed | predicted | difference.
         same_particles: simulate all of an episode with the same particles, so that two losses differ by their
             parameters and hardly by chance (common random numbers); by default each has its own.
+        fast: the synthetic experiment emulated, for the parameters and effects that there is an emulator of.
         problem: a simulate-and-compare of one's own instead of all of the above but the budget.
     """
 
@@ -73,16 +76,15 @@ class PlowSandEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         reconstruction: str | None = None,
         render_mode: str | None = None,
         same_particles: bool = False,
+        fast: bool = False,
         problem: Problem | None = None,
     ) -> None:
-        if budget < 2:
-            raise ParameterError(f"budget: an episode needs at least 2 evaluations, not {budget}")
+        super().__init__(budget, least=2)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ParameterError(f"render_mode: must be rgb_array or None, not {render_mode}")
         self.render_mode = render_mode
-        self.budget = int(budget)
         self.same_particles = bool(same_particles)
-        self.problem = problem or make_problem(measurement, parameters, effects, preset, device, reconstruction)
+        self.problem = problem or make_problem(measurement, parameters, effects, preset, device, reconstruction, fast)
         n, b = len(self.problem.space), self.problem.block_count
         box = gym.spaces.Box
         self.action_space = box(-1.0, 1.0, (n,), np.float32)
@@ -96,74 +98,77 @@ class PlowSandEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
                 "evaluations_left": box(0.0, float(self.budget), (1,), np.float32),
             }
         )
-        self._left = 0
         self._clear()
 
     def _clear(self) -> None:
         n = len(self.problem.space)
         self._best_action = np.zeros(n, dtype=np.float32)
         self._best_loss: float | None = None
+        self._of_truth: Evaluation | None = None
         self._last_action = np.zeros(n, dtype=np.float32)
         self.last_evaluation: Evaluation | None = None
-        #: The next step's, where it was simulated in a batch with others.
-        self.ahead: Evaluation | None = None
+        #: The next step's, where they were simulated in a batch with others.
+        self.ahead: Sequence[Evaluation] = ()
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode; the seed decides the hidden truth (synthetic) and every simulation's particles."""
-        super().reset(seed=seed)
-        self._episode_seed = int(self.np_random.integers(2**31))
-        self.problem.begin(self._episode_seed)
-        self._left = self.budget
+    def _begin(self, seed: int) -> dict[str, Any]:
+        self.problem.begin(seed)
         self._clear()
         space = self.problem.space
-        info: dict[str, Any] = {
+        return {
             "parameter_names": list(space.names),
             "parameter_units": [p.unit for p in space],
             "lower": [p.lower for p in space],
             "upper": [p.upper for p in space],
         }
-        return self._observation(), info
 
-    def step(self, action: npt.NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Simulate a guess and compare it with the observation.
-
-        Raises:
-            gymnasium.error.ResetNeeded: the episode is over or hasn't begun.
-            ParameterError: the action isn't n finite numbers; one beyond [-1, 1] is clipped.
-        """
-        guess, (parameters, seed) = self.plan(action)
-        evaluation = self.ahead or attempt(self.problem, parameters, seed)
-        self.ahead = None
-        self._left -= 1
-        self._last_action, self.last_evaluation = guess, evaluation
+    def _act(self, action: Array) -> tuple[float, dict[str, Any]]:
+        """Simulate a guess and compare it with the observation."""
+        jobs = self.plan(action)
+        parameters, self._last_seed = jobs[0]
+        evaluation, *of_truth = self.ahead or [attempt(self.problem, *job) for job in jobs]
+        self.ahead = ()
+        self._of_truth = of_truth[0] if of_truth else None
+        self._last_action, self.last_evaluation = action, evaluation
         if evaluation.loss is not None and (self._best_loss is None or evaluation.loss < self._best_loss):
-            self._best_action, self._best_loss = guess, evaluation.loss
+            self._best_action, self._best_loss = action, evaluation.loss
         info: dict[str, Any] = {
             "parameters": dict(parameters),
             "status": "ok" if evaluation.loss is not None else "failed",
             "message": evaluation.message,
-            "seed": seed,
+            "seed": self._last_seed,
             **{name: float(value) for name, value in evaluation.extras.items()},
         }
-        truth = self.problem.truth()
-        if self._left == 0 and truth is not None:
-            info["truth"] = dict(truth)
-        reward = -float(self.problem.worst_loss if evaluation.loss is None else evaluation.loss)
-        return self._observation(), reward, False, self._left == 0, info
+        return -float(self.problem.worst_loss if evaluation.loss is None else evaluation.loss), info
 
-    def plan(self, action: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.float32], Job]:
-        """What a step will simulate: the guess (n,) as it counts, its physical values and the simulation's seed."""
-        if self._left <= 0:
-            raise gym.error.ResetNeeded("the budget of evaluations is spent; call reset() to start another episode")
-        guess = np.array(action, dtype=np.float32).reshape(-1)
-        if guess.shape != self.action_space.shape or not np.all(np.isfinite(guess)):
-            raise ParameterError(f"action: expected {len(self.problem.space)} finite numbers, got {action}")
-        guess = np.clip(guess, -1.0, 1.0)
-        parameters = self.problem.space.to_dict(self.problem.space.from_unit(guess))
+    def plan(self, action: Array) -> list[Job]:
+        """What a step will simulate, for a guess (n,) as it counts; in an episode's last step the truth, too."""
         step = 0 if self.same_particles else self.budget - self._left
-        return guess, (parameters, simulation_seed(self._episode_seed, step))
+        seed = simulation_seed(self._episode_seed, step)
+        truth = self.problem.truth() if self._left == 1 else None
+        return [(self.values(action), seed), *([] if truth is None else [(truth, seed)])]
+
+    def values(self, action: Array) -> dict[str, float]:
+        """Physical values by name of an action (n,)."""
+        return self.problem.space.to_dict(self.problem.space.from_unit(action))
+
+    def outcome(self) -> dict[str, Any]:
+        """Truth, error and regret of the best guess so far; nothing where nobody knows the truth.
+
+        ``error`` is guess minus truth for each parameter, ``regret`` the best loss minus that of the truth, simulated
+        with other particles than the observation.
+        """
+        truth = self.problem.truth()
+        if truth is None:
+            return {}
+        told: dict[str, Any] = {"truth": dict(truth)}
+        if self._best_loss is not None:
+            best = self.values(self._best_action)
+            told["error"] = {name: best[name] - value for name, value in truth.items() if name in best}
+            if self._of_truth is None:
+                self._of_truth = attempt(self.problem, truth, self._last_seed)
+            if self._of_truth.loss is not None:
+                told["regret"] = self._best_loss - self._of_truth.loss
+        return told
 
     def _observation(self) -> Observation:
         worst = self.problem.worst_loss
@@ -207,8 +212,15 @@ def make_problem(
     preset: str | None = None,
     device: str = "cpu",
     reconstruction: str | None = None,
+    fast: bool = False,
 ) -> Problem:
     """The simulate-and-compare that the environment's options describe."""
+    if fast:
+        from .emulated import EmulatedProblem
+
+        if any(option is not None for option in (measurement, preset, reconstruction)):
+            raise ParameterError("fast: the emulated world takes no measurement, preset or reconstruction")
+        return EmulatedProblem(parameters, effects)
     if measurement is None:
         from .synthetic import SyntheticProblem
 

@@ -35,6 +35,19 @@ BLUR = 1.5
 BLOCKS = (3, 4)
 
 
+def blurred(pictures: Image) -> FloatArray:
+    """Pictures (k, h, w, 3) as they are compared."""
+    return gaussian_filter(pictures.astype(np.float64), (0.0, BLUR, BLUR, 0.0))
+
+
+def patches(pictures: FloatArray) -> FloatArray:
+    """Mean of each patch (k · 3 · 4,) of pictures (k, h, w, 3), in grey levels of 255."""
+    count, height, width = pictures.shape[:3]
+    rows, columns = BLOCKS
+    parts = pictures.reshape(count, rows, height // rows, columns, width // columns, 3)
+    return 255.0 * parts.mean(axis=(2, 4, 5)).reshape(-1)
+
+
 def compare(observed: Image, predicted: Image, still: Image) -> tuple[float, FloatArray]:
     """Loss and block residuals of stacks of pictures (k, h, w, 3), all blurred first.
 
@@ -47,25 +60,18 @@ def compare(observed: Image, predicted: Image, still: Image) -> tuple[float, Flo
         The mean square of the residual over that of ``still``'s: 1 is as good as no model at all. And the mean
         residual of each patch (k · 3 · 4,) in grey levels of 255.
     """
-    blurred = [
-        gaussian_filter(stack.astype(np.float64), (0.0, BLUR, BLUR, 0.0)) for stack in (observed, predicted, still)
-    ]
-    residual = blurred[0] - blurred[1]
-    loss = float(np.mean(residual**2) / np.mean((blurred[0] - blurred[2]) ** 2))
-    count, height, width = residual.shape[:3]
-    rows, columns = BLOCKS
-    patches = residual.reshape(count, rows, height // rows, columns, width // columns, 3)
-    return loss, 255.0 * patches.mean(axis=(2, 4, 5)).reshape(-1)
+    seen = blurred(observed)
+    residual = seen - blurred(predicted)
+    loss = float(np.mean(residual**2) / np.mean((seen - blurred(still)) ** 2))
+    return loss, patches(residual)
 
 
-class SyntheticProblem:
-    """Simulate-and-compare against a hidden truth.
+class HiddenTruth:
+    """Parameters of a made-up world, some of them free and hidden.
 
     Args:
         parameters: names of the free parameters, whose hidden values are drawn at ``begin``; the rest have defaults.
         effects: names of effects that are on, in the world and in the model.
-        preset: resolution of the solver.
-        device: ``auto``, ``cpu`` or ``cuda:N``.
 
     Raises:
         ParameterError: unknown names.
@@ -76,20 +82,10 @@ class SyntheticProblem:
     image_size = (HEIGHT, WIDTH)
     block_count = 2 * len(COMPARED) * BLOCKS[0] * BLOCKS[1]
 
-    def __init__(
-        self,
-        parameters: Sequence[str] = ("friction_angle",),
-        effects: Sequence[str] = (),
-        *,
-        preset: str = "tiny",
-        device: str = "cpu",
-    ) -> None:
-        from splatsoil.mpm import PRESETS
+    def __init__(self, parameters: Sequence[str] = ("friction_angle",), effects: Sequence[str] = ()) -> None:
         from splatsoil.soil.law import Law
         from splatsoil.soil.library import find_effects
 
-        if preset not in PRESETS:
-            raise ParameterError(f"preset {preset!r} is unknown; known are {', '.join(PRESETS)}")
         law = Law(find_effects(effects))
         seen = [effect.name for effect in law.effects if effect.observes]
         if seen:
@@ -100,22 +96,15 @@ class SyntheticProblem:
             raise ParameterError(f"unknown parameter {', '.join(unknown)}; this model has {', '.join(known)}")
         self.space = ParameterSpace(known[name] for name in parameters)
         self.effects = tuple(effects)
-        self.preset = preset
-        self.device = resolve_device(device)
         self._truth: dict[str, float] | None = None
         self._truth_seed = 0
-        self._observed: Image | None = None
-        self._still: Image | None = None
+        self._observed: Any = None
 
     def begin(self, seed: int) -> None:
         """Draw another hidden truth; it is simulated when it is first needed."""
         if self._truth is not None and seed == self._truth_seed:
             return
-        generator = np.random.default_rng(seed)
-        unit = 2.0 * generator.uniform(*HIDDEN_RANGE, len(self.space)) - 1.0
-        self._truth = self.space.to_dict(self.space.from_unit(unit))
-        self._truth_seed = seed
-        self._observed = None
+        self.place(self.space.to_dict(self.space.from_unit(hidden(seed, len(self.space)))), seed)
 
     def place(self, truth: Mapping[str, float], seed: int) -> None:
         """Hide this truth instead of a drawn one; the seed decides its particles and noise."""
@@ -127,14 +116,48 @@ class SyntheticProblem:
         """The hidden values."""
         return self._truth
 
+
+def hidden(seed: int, count: int) -> FloatArray:
+    """A hidden point (count,) of [-1, 1]^count."""
+    return 2.0 * np.random.default_rng(seed).uniform(*HIDDEN_RANGE, count) - 1.0
+
+
+class SyntheticProblem(HiddenTruth):
+    """Simulate-and-compare against a hidden truth.
+
+    Args:
+        parameters, effects: see :class:`HiddenTruth`.
+        preset: resolution of the solver.
+        device: ``auto``, ``cpu`` or ``cuda:N``.
+
+    Raises:
+        ParameterError: unknown names.
+    """
+
+    def __init__(
+        self,
+        parameters: Sequence[str] = ("friction_angle",),
+        effects: Sequence[str] = (),
+        *,
+        preset: str = "tiny",
+        device: str = "cpu",
+    ) -> None:
+        from splatsoil.mpm import PRESETS
+
+        if preset not in PRESETS:
+            raise ParameterError(f"preset {preset!r} is unknown; known are {', '.join(PRESETS)}")
+        super().__init__(parameters, effects)
+        self.preset = preset
+        self.device = resolve_device(device)
+        self._still: Image | None = None
+
     def observed(self) -> Image:
         """(k, h, w, 3): the world as the cameras recorded it, sensor noise and all."""
         if self._truth is None:
             raise RuntimeError("begin() has to be called before anything is observed")
         if self._observed is None:
-            self.record(self.predict(self._truth, self._truth_seed))
-        assert self._observed is not None
-        return self._observed
+            self.record(self.world.surely(self._truth, self._truth_seed))
+        return np.asarray(self._observed)
 
     def unobserved(self) -> tuple[Mapping[str, float], int] | None:
         """Values and seed of the world's own simulation, as long as it hasn't been made."""
@@ -143,7 +166,8 @@ class SyntheticProblem:
     def record(self, clean: Image | SimulationError) -> None:
         """Take pictures (k, h, w, 3) of the world's own simulation as what the cameras saw, but for their noise."""
         if isinstance(clean, SimulationError):
-            raise clean
+            assert self._truth is not None
+            clean = self.world.surely(self._truth, self._truth_seed)
         noise = np.random.default_rng([self._truth_seed, 1]).standard_normal(clean.shape)
         self._observed = np.clip(clean + SENSOR_NOISE * noise, 0.0, 1.0).astype(np.float32)
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,7 @@ import numpy.typing as npt
 
 from splatsoil.errors import SimulationError
 
-from .problem import Image, Job
+from .problem import Image, Job, simulation_seed
 
 if TYPE_CHECKING:
     from splatsoil.measurement import Camera, Measurement
@@ -22,36 +23,54 @@ FloatArray = npt.NDArray[np.float64]
 #: The bed's box and the soil's depth, m.
 BED = (0.36, 0.24, 0.16)
 DEPTH = 0.06
-#: The blade: thickness, width, height, m; how far its edge dips and how far it pushes.
+#: The blade: thickness, width, height, m; how far it pushes.
 BLADE = (0.012, 0.12, 0.08)
-DIP, PUSH = 0.035, 0.16
+PUSH = 0.16
 #: Frames a second; the blade dips for the first frames and pushes for the rest.
 FRAME_RATE = 10
 DIP_FRAMES, PUSH_FRAMES = 3, 7
 COMPARED = (4, 7, 10)
+#: Simulations of a hidden truth before it is given up.
+TRIES = 4
 #: Pictures.
 WIDTH, HEIGHT = 96, 72
 
 
-def blade_motion() -> tuple[FloatArray, FloatArray]:
+@dataclass(frozen=True)
+class Stroke:
+    """How the blade is led.
+
+    Attributes:
+        depth: of its edge, m.
+        rake: its tilt, degrees; above 0 its top leans forwards.
+    """
+
+    depth: float = 0.035
+    rake: float = 0.0
+
+
+def blade_motion(stroke: Stroke) -> tuple[FloatArray, FloatArray]:
     """Times (n,) and positions (n, 3) of the blade's centre."""
     frames = np.arange(DIP_FRAMES + PUSH_FRAMES + 1)
     dip = np.clip(frames / DIP_FRAMES, 0.0, 1.0)
     push = np.clip((frames - DIP_FRAMES) / PUSH_FRAMES, 0.0, 1.0)
-    above = DEPTH + 0.5 * BLADE[2] + 0.004
+    tilt = np.radians(stroke.rake)
+    above = DEPTH + 0.5 * (BLADE[2] * np.cos(tilt) + BLADE[0] * abs(np.sin(tilt))) + 0.004
     x = 0.1 + PUSH * push
-    z = above - (DIP + 0.004) * dip
+    z = above - (stroke.depth + 0.004) * dip
     return frames / FRAME_RATE, np.stack([x, np.full(len(frames), 0.5 * BED[1]), z], axis=1)
 
 
-def experiment() -> Measurement:
+def experiment(stroke: Stroke) -> Measurement:
     """Bed, blade and motion; there are no photographs."""
     import trimesh
 
     from splatsoil.measurement import Bed, Measurement, Tool, ToolMotion
 
-    times, positions = blade_motion()
-    motion = ToolMotion(np.arange(len(times)), times, positions, np.tile([1.0, 0.0, 0.0, 0.0], (len(times), 1)))
+    times, positions = blade_motion(stroke)
+    half = 0.5 * np.radians(stroke.rake)
+    turned = np.tile([np.cos(half), 0.0, np.sin(half), 0.0], (len(times), 1))
+    motion = ToolMotion(np.arange(len(times)), times, positions, turned)
     return Measurement(
         folder=Path(),
         name="synthetic",
@@ -89,14 +108,14 @@ def pattern(points: FloatArray) -> FloatArray:
 class World:
     """The unchanging part: bed, blade, cameras, surface, light."""
 
-    def __init__(self, effects: Sequence[str], preset: str, device: str) -> None:
+    def __init__(self, effects: Sequence[str], preset: str, device: str, stroke: Stroke | None = None) -> None:
         from splatsoil.mpm import Resolution
         from splatsoil.reconstruction import HeightField
         from splatsoil.scene import Light
         from splatsoil.soil.law import Law
         from splatsoil.soil.library import find_effects
 
-        self.measurement = experiment()
+        self.measurement = experiment(stroke or Stroke())
         self.cameras = cameras()
         self.law = Law(find_effects(effects))
         self.resolution = Resolution.derive(self.measurement, preset)
@@ -122,6 +141,18 @@ class World:
             one if isinstance(one, SimulationError) else self.pictures(x, one.positions, one.deformations)
             for x, one in zip(particles, found, strict=True)
         ]
+
+    def surely(self, parameters: Mapping[str, float], seed: int) -> Image:
+        """Pictures (k, h, w, 3) of a simulation; one that fails is made again with other particles.
+
+        Raises:
+            SimulationError: the last of TRIES could not go on either.
+        """
+        for k in range(TRIES):
+            (made,) = self.simulated([(parameters, simulation_seed(seed, k) if k else seed)])
+            if not isinstance(made, SimulationError):
+                return made
+        raise made
 
     def still(self) -> Image:
         """Pictures (k, h, w, 3) of soil that doesn't move while the blade does."""

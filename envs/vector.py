@@ -53,7 +53,9 @@ class PlowSandVectorEnv(SyncVectorEnv):
         if actions.shape != self.action_space.shape:
             raise ParameterError(f"actions: expected an array of shape {self.action_space.shape}, got {actions.shape}")
         envs: Sequence[Any] = self.envs
-        jobs = [env.plan(action)[1] for env, action in zip(envs, actions, strict=True)]
-        for env, evaluation in zip(envs, evaluate_together([env.problem for env in envs], jobs), strict=True):
-            env.ahead = evaluation
+        plans = [env.plan(env.accepted(action)) for env, action in zip(envs, actions, strict=True)]
+        problems = [env.problem for env, plan in zip(envs, plans, strict=True) for _ in plan]
+        found = iter(evaluate_together(problems, [job for plan in plans for job in plan]))
+        for env, plan in zip(envs, plans, strict=True):
+            env.ahead = [next(found) for _ in plan]
         return super().step(actions)
