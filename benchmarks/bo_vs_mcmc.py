@@ -43,7 +43,7 @@ from splatsoil.benchmarks._common import at_least, output_options, parser_of, st
 from splatsoil.benchmarks._simulations import FEWEST, density_of
 from splatsoil.envs.plow_sand import PlowSandEnv
 from splatsoil.envs.recording import EpisodeRecorder
-from splatsoil.envs.strokes import DesignEnv, NamingEnv
+from splatsoil.envs.strokes import LOGITS, DesignEnv, NamingEnv
 from splatsoil.inverse.bayesopt import BayesianOptimiser, sobol
 from splatsoil.inverse.mcmc import sample
 
@@ -189,7 +189,7 @@ def by_cma_es(env: gym.Env[Any, Any], seed: int) -> None:
     search = CMA(mean=np.zeros(n), sigma=0.5, bounds=np.tile([-1.0, 1.0], (n, 1)), seed=seed)
     env.reset(seed=seed)
     while not over:
-        generation = []
+        generation: list[tuple[FloatArray, float]] = []
         while not over and len(generation) < search.population_size:
             guess = search.ask()
             _, reward, _, over, _ = env.step(guess.astype(np.float32))
@@ -218,7 +218,7 @@ def by_actor(env: gym.Env[Any, Any], seed: int) -> None:
 
 
 def all_alike(env: gym.Env[Any, Any], seed: int) -> None:
-    """Equal logits."""
+    """Equal probabilities."""
     env.reset(seed=seed)
     env.step(np.zeros(env.action_space.shape, dtype=np.float32))
 
@@ -242,7 +242,7 @@ def by_discriminant(env: gym.Env[Any, Any], seed: int) -> None:
     means, inverse = _classes(env.spec.id)
     evidence, _ = env.reset(seed=seed)
     logs = np.array([-0.5 * (evidence - mean) @ inverse @ (evidence - mean) for mean in means])
-    env.step((logs - logs.max() + 5.0).astype(np.float32))
+    env.step(((logs - logs.max()) / LOGITS + 1.0).astype(np.float32))
 
 
 def greedily(env: gym.Env[Any, Any], seed: int) -> None:
@@ -288,7 +288,7 @@ def own_agent(name: str) -> Agent:
         sys.path.pop(0)
     if not callable(found):
         raise ParameterError(f"agent {name}: is not a function")
-    return found  # type: ignore[no-any-return]
+    return found
 
 
 def chosen_agents(names: Sequence[str], env: gym.Env[Any, Any]) -> dict[str, Agent]:
@@ -358,7 +358,8 @@ def run(
     """All agents on one environment, at each budget; the episodes are kept as a Minari data set where one is named."""
     entries = []
     for budget in budgets:
-        env = gym.make(env_id, **({} if budget is None else {"budget": budget}))
+        chosen: dict[str, Any] = {} if budget is None else {"budget": budget}
+        env = gym.make(env_id, **chosen)
         agents = chosen_agents(names, env) | {name: own_agent(name) for name in own}
         if data_set:
             env = EpisodeRecorder(env)

@@ -105,7 +105,7 @@ class Surface:
         covariance = (residual @ basis).T @ (residual @ basis) / freedom
         return cls(
             degree=degree,
-            coefficients=np.linalg.lstsq(terms, scores, rcond=None)[0],
+            coefficients=np.asarray(np.linalg.lstsq(terms, scores, rcond=None)[0], dtype=np.float64),
             factor=np.linalg.cholesky(covariance),
             growth=growth,
             patches=shown,

@@ -21,6 +21,8 @@ from .synthetic_world import World
 LIMIT = 255.0
 #: The strokes that the naming environment shows, in [-1, 1]: upright at two depths, and with the top forwards.
 SHOWN = ((-0.5, 0.0), (0.6, 0.0), (0.6, 0.8))
+#: Logit of an action of 1.
+LOGITS = 5.0
 #: Particles of the design environment's posterior.
 PARTICLES = 1024
 
@@ -74,7 +76,7 @@ class NamingEnv(EpisodeEnv[Array]):
     """Which effect is in the soil? One step, scored by log probability.
 
     **Observation**: Box(-255, 255, (216,)), how much brighter each of three strokes makes 72 patches of the pictures.
-    **Action**: Box(-5, 5, (e,)), logits of the effects, in the order of ``info["effects"]``.
+    **Action**: Box(-1, 1, (e,)), a fifth of each effect's logit, in the order of ``info["effects"]``.
     **Reward**: ln of the probability given to the true effect (the logarithmic score; 0 is the best, -ln e for knowing
     nothing). The step is terminal.
 
@@ -87,7 +89,7 @@ class NamingEnv(EpisodeEnv[Array]):
     def __init__(self, effects: Sequence[str] = tuple(STRENGTHS), fast: bool = False, device: str = "cpu") -> None:
         super().__init__(budget=1, least=1)
         self.soil = HiddenSoil(effects, fast, device)
-        self.action_space = gym.spaces.Box(-5.0, 5.0, (len(self.soil.effects),), np.float32)
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (len(self.soil.effects),), np.float32)
         self.observation_space = gym.spaces.Box(-LIMIT, LIMIT, (72 * len(SHOWN),), np.float32)
         self._seen = np.zeros(self.observation_space.shape, dtype=np.float32)
 
@@ -108,7 +110,7 @@ class NamingEnv(EpisodeEnv[Array]):
         return {"effects": list(self.soil.effects)}
 
     def _act(self, action: Array) -> tuple[float, dict[str, Any]]:
-        logits = action.astype(np.float64)
+        logits = LOGITS * action.astype(np.float64)
         logs = logits - np.logaddexp.reduce(logits)
         named = dict(zip(self.soil.effects, np.exp(logs).tolist(), strict=True))
         return float(logs[self.soil.effects.index(self.soil.effect)]), {"probabilities": named}

@@ -148,11 +148,13 @@ class World:
         Raises:
             SimulationError: the last of TRIES could not go on either.
         """
-        for k in range(TRIES):
-            (made,) = self.simulated([(parameters, simulation_seed(seed, k) if k else seed)])
-            if not isinstance(made, SimulationError):
-                return made
-        raise made
+        (made,) = self.simulated([(parameters, seed)])
+        for k in range(1, TRIES):
+            if isinstance(made, SimulationError):
+                (made,) = self.simulated([(parameters, simulation_seed(seed, k))])
+        if isinstance(made, SimulationError):
+            raise made
+        return made
 
     def still(self) -> Image:
         """Pictures (k, h, w, 3) of soil that doesn't move while the blade does."""

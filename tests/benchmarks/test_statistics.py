@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import sys
+
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
 from splatsoil.benchmarks import bo_vs_mcmc, calibration
-from splatsoil.benchmarks._simulations import Data, density_of
+from splatsoil.benchmarks._simulations import Data
 from splatsoil.inverse.bayesopt import sobol
 
+from splatsoil.errors import ParameterError
 from splatsoil.parameters import Parameter, ParameterSpace
 
 SPACE = ParameterSpace([Parameter("friction_angle", "deg", 20.0, 50.0, 35.0)])
@@ -55,19 +59,43 @@ def test_a_known_world_is_calibrated() -> None:
     assert len(entries) == 16 and held >= 11 / 16  # less has a chance of 0.2 % when 90 % is right
 
 
-def test_ways_meet_the_same_world_and_more_calls_do_not_hurt() -> None:
-    data = made_up(24)
-    density = density_of(SPACE, data.points, -data.residuals, np.zeros(data.residuals.shape[1]), 0.0)
-    found = bo_vs_mcmc.run(
-        bo_vs_mcmc.EmulatedWorld(density),
-        ways=("mcmc", "direct"),
-        budgets=(6, 16),
-        direct=(20, 400),
-        seeds=2,
-    )
-    by = {(e["way"], e["calls"]): e for e in found["entries"]}
-    assert set(by) == {("mcmc", 6), ("mcmc", 16), ("direct", 20), ("direct", 400)}
-    # Chance of 0.5 on a slope of 5 per half range of 15 degrees: 1.5 degrees, and observation and call have it both.
-    assert by["mcmc", 16]["mae"][0] < 5.0 and by["direct", 400]["mae"][0] < 5.0
-    assert "| mcmc | 16 |" in bo_vs_mcmc.table({**found, "landscape": "A test"})
-    assert bo_vs_mcmc.figure({**found, "landscape": ""}).axes
+def stops_early(env: gym.Env, seed: int) -> None:
+    env.reset(seed=seed)
+    env.step(env.action_space.sample())
+
+
+def in_the_middle(env: gym.Env, seed: int) -> dict[str, float]:
+    """Guesses 35 degrees, and says 20."""
+    env.reset(seed=seed)
+    while not env.step(np.zeros(1, np.float32))[3]:
+        pass
+    return {"friction_angle": 20.0}
+
+
+def test_agents_play_the_same_episodes_and_their_errors_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "my_agents", sys.modules[__name__])
+    own = f"my_agents:{in_the_middle.__name__}"
+    found = bo_vs_mcmc.run("PlowSandFast-v0", [40, 400], ["random", "direct", "lda"], [own], 8)
+    by = {(e["agent"], e["steps"]): e for e in found["entries"]}
+    assert set(by) == {(name, steps) for name in ("random", "direct", own) for steps in (40, 400)}
+    env = gym.make("PlowSandFast-v0", budget=2)
+    truths = []
+    for seed in range(8):
+        env.reset(seed=seed)
+        truths.append(env.unwrapped.problem.truth()["friction_angle"])  # type: ignore[attr-defined]
+    assert by[own, 40]["mae"][0] == pytest.approx(np.mean(np.array(truths) - 20.0))
+    # A chain of 100 steps by 4 walkers finds the posterior; errors of guesses that know nothing are 5 degrees.
+    assert by["direct", 400]["mae"][0] < 3.0 and by["direct", 400]["coverage_90"][0] >= 0.5
+    assert f"| {own} | 40 |" in bo_vs_mcmc.table(found)
+    with pytest.raises(ParameterError, match=r"one whole episode; it made 1 steps"):
+        bo_vs_mcmc.run("PlowSandFast-v0", [3], [], [f"my_agents:{stops_early.__name__}"], 1)
+    for name in ("nowhere:agent", "my_agents:nobody", "my_agents"):
+        with pytest.raises(ParameterError, match="give MODULE:FUNCTION"):
+            bo_vs_mcmc.run("PlowSandFast-v0", [3], [], [name], 1)
+
+
+def test_agents_of_strokes_beat_chance() -> None:
+    naming = bo_vs_mcmc.run("PlowSandNamingFast-v0", [None], ["uniform", "lda"], [], 60)["entries"]
+    assert naming[0]["return"] == pytest.approx(-np.log(5.0)) and naming[1]["return"] > -1.3
+    design = bo_vs_mcmc.run("PlowSandDesignFast-v0", [2], ["random", "greedy"], [], 6)["entries"]
+    assert design[1]["return"] > design[0]["return"]

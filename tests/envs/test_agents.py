@@ -32,15 +32,15 @@ def test_searches_spend_their_budget_and_come_near(repository: Path, analytic: M
     problem = analytic.AnalyticProblem(noise=0.0)
     env = gym.make("PlowSand-v0", problem=problem, budget=SEARCHES[name])
     parameters, loss = script(repository, name).search(env)
-    assert problem.calls == SEARCHES[name]
+    assert problem.calls == SEARCHES[name] + 1  # the truth, for the regret
     # The loss is 0.1 + ((angle - 36) / 10)^2: what is reported belongs together.
     assert loss == pytest.approx(0.1 + ((parameters["friction_angle"] - 36.0) / 10.0) ** 2, rel=1e-5)
     assert abs(parameters["friction_angle"] - 36.0) < 5.0
 
 
-def test_stable_baselines_checks_and_learns(repository: Path, analytic: ModuleType) -> None:
+def test_stable_baselines_checks_and_learns(repository: Path) -> None:
     module = script(repository, "stable_baselines")
-    env = gym.make("PlowSand-v0", problem=analytic.AnalyticProblem(noise=0.0), budget=4)
+    env = gym.make("PlowSandFast-v0", budget=4)
     with warnings.catch_warnings():
         # Any complaint of its checker about the environment fails the test.
         warnings.simplefilter("error", UserWarning)

@@ -58,6 +58,22 @@ def test_the_budget_is_the_episode_and_only_its_end_reveals_the_truth(env: PlowS
     assert other == begun and "truth" not in begun
 
 
+def test_the_end_tells_error_and_regret_and_a_time_limit_does_not_hide_them(analytic: ModuleType) -> None:
+    env = PlowSandEnv(problem=analytic.AnalyticProblem(noise=0.0), budget=3)
+    env.reset(seed=0)
+    for angle in (0.2, 0.9, -1.0):
+        *_, info = env.step(act(angle))
+    # The best guess is 38 degrees: its loss is 0.2^2 more than that of the truth.
+    assert info["error"] == {"friction_angle": pytest.approx(2.0, abs=1e-5)}
+    assert info["regret"] == pytest.approx(0.04, rel=1e-4) and info["truth"] == {"friction_angle": 36.0}
+    limited = gym.wrappers.TimeLimit(env, 1)
+    limited.reset(seed=0)
+    assert env.outcome() == {"truth": {"friction_angle": 36.0}}
+    *_, truncated, info = limited.step(act(0.0))
+    assert truncated and "truth" not in info
+    assert limited.get_wrapper_attr("outcome")()["regret"] == pytest.approx(0.01, rel=1e-4)
+
+
 def test_the_observation_remembers_the_best_and_the_last(env: PlowSandEnv, analytic: ModuleType) -> None:
     first, _ = env.reset(seed=0)
     assert first["best_loss"] == first["last_loss"] == env.problem.worst_loss

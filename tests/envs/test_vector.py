@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+from pathlib import Path
 from types import ModuleType
 
 import gymnasium as gym
@@ -36,11 +39,38 @@ def test_episodes_begin_anew_in_the_step_that_ends_them_and_fail_alone(analytic:
     observations, rewards, terminated, truncated, infos = batch.step(np.full((2, 1), 0.5, np.float32))
     assert truncated.all() and not terminated.any() and np.all(rewards > -10.0)
     assert list(infos["final_info"]["truth"]["friction_angle"]) == [30.0, 40.0]
+    # 42.5 degrees both times: ((42.5 - 30) / 10)^2 and, as 35 failed, ((42.5 - 40) / 10)^2 but for noise of 0.02.
+    assert list(infos["final_info"]["error"]["friction_angle"]) == pytest.approx([5.0, 2.5], abs=1e-4)
+    assert list(infos["final_info"]["regret"]) == pytest.approx([0.25, 0.0625], abs=0.12)
     assert all(last["evaluations_left"] == 0 for last in infos["final_obs"])
     assert np.all(observations["evaluations_left"] == 2)
     batch.step(np.zeros((2, 1), np.float32))
     with pytest.raises(ParameterError, match="shape"):
         batch.step(np.zeros(2, np.float32))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("context", ["fork", "spawn", "forkserver"])
+def test_processes_work_after_their_parent_has_stepped(context: str, tmp_path: Path) -> None:
+    script = tmp_path / "play.py"
+    script.write_text(
+        f"""import gymnasium as gym, numpy as np, splatsoil, torch
+if __name__ == "__main__":
+    torch.set_num_threads(2)
+    torch.randn(400, 400, 400).sum()
+    single = gym.make("PlowSand-v0", budget=2)
+    single.reset(seed=0)
+    one = single.step(np.zeros(1, np.float32))[1]
+    options = {{"context": {context!r}}}
+    batch = gym.make_vec("PlowSand-v0", num_envs=2, budget=2, vectorization_mode="async", vector_kwargs=options)
+    batch.reset(seed=0)
+    rewards = batch.step(np.zeros((2, 1), np.float32))[1]
+    batch.close()
+    print("same" if rewards[0] == one != rewards[1] else (rewards, one))
+"""
+    )
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=300, check=True)
+    assert done.stdout.splitlines()[-1] == "same"
 
 
 @pytest.mark.parametrize("options", [{"num_envs": 0}, {"num_envs": 2, "problems": []}])
