@@ -55,7 +55,7 @@ FloatArray = npt.NDArray[np.float64]
 
 ENVS = ("PlowSandFast-v0", "PlowSandSeveralFast-v0", "PlowSandNamingFast-v0", "PlowSandDesignFast-v0")
 #: Episodes and steps that agents learn from, and the first seed of these.
-NAMING_EPISODES, SAC_STEPS, TRAINING = 4000, 20000, 10**6
+NAMING_EPISODES, SAC_STEPS, TRAINING = 4000, 10000, 10**6
 #: Simulated outcomes of a stroke that its expected information is averaged over.
 OUTCOMES = 32
 
