@@ -1,31 +1,26 @@
 """Bayesian optimisation, Markov chains and other agents: what each makes of the same episodes of PlowSand.
 
     splatsoil benchmark bo-vs-mcmc --out runs/bo-vs-mcmc
-    splatsoil benchmark bo-vs-mcmc --env PlowSandFast-v0 --budgets 10 --agent my_module:my_agent
+    splatsoil benchmark bo-vs-mcmc --env PlowSandFast-v0 --agent examples.agents.optuna_tpe:search
 
 | agent | on | what it does |
 |---|---|---|
 | `random` | all | actions at random |
 | `bo` | guesses | the search of `splatsoil fit`: log noisy expected improvement of the loss, and where that is least |
 | `paper` | guesses | the same with Hsiao and Kumar's settings: one random start, expected improvement |
-| `tpe` | guesses | Optuna's tree-structured Parzen estimator |
-| `cma-es` | guesses, two parameters or more | covariance matrix adaptation |
 | `mcmc` | guesses | emcee on a comparison's posterior, by an emulator of the features trained on space-filling calls |
 | `both` | guesses | the same, trained on the calls that `bo` chose: what `splatsoil fit` says |
 | `direct` | emulated guesses | emcee on the calls themselves: each is a step of a walker |
-| `sac` | guesses, design | soft actor-critic of Stable-Baselines3, trained on other episodes |
-| `uniform` | naming | all effects alike |
 | `lda` | naming | linear discriminant analysis, trained on other episodes |
 | `greedy` | design | the stroke of most expected information, of 25 |
 
 An agent of one's own is a function (env, seed) that resets the environment with the seed and plays one whole episode;
-of guesses it may return its estimate, values by name: otherwise its best guess counts.
+of guesses it may return an Answer: otherwise its best guess counts.
 """
 
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import json
 import sys
 import time
@@ -41,6 +36,7 @@ import numpy as np
 import numpy.typing as npt
 from splatsoil.benchmarks._common import at_least, output_options, parser_of, stamp, ticker, write_result
 from splatsoil.benchmarks._simulations import FEWEST, density_of
+from splatsoil.envs.emulated import EmulatedProblem
 from splatsoil.envs.plow_sand import PlowSandEnv
 from splatsoil.envs.recording import EpisodeRecorder
 from splatsoil.envs.strokes import LOGITS, DesignEnv, NamingEnv
@@ -54,8 +50,8 @@ from splatsoil.quiet import hush
 FloatArray = npt.NDArray[np.float64]
 
 ENVS = ("PlowSandFast-v0", "PlowSandSeveralFast-v0", "PlowSandNamingFast-v0", "PlowSandDesignFast-v0")
-#: Episodes and steps that agents learn from, and the first seed of these.
-NAMING_EPISODES, SAC_STEPS, TRAINING = 4000, 10000, 10**6
+#: Episodes that an agent learns from, and the first one's seed.
+NAMING_EPISODES, TRAINING = 4000, 10**6
 #: Simulated outcomes of a stroke that its expected information is averaged over.
 OUTCOMES = 32
 
@@ -69,7 +65,7 @@ class Answer:
     high: FloatArray
 
 
-Agent = Callable[[gym.Env[Any, Any], int], Answer | Mapping[str, float] | None]
+Agent = Callable[[gym.Env[Any, Any], int], Any]
 
 
 class Counted(gym.Wrapper[Any, Any, Any, Any]):
@@ -167,62 +163,6 @@ def directly(env: gym.Env[Any, Any], seed: int) -> Answer:
     return Answer(chain.mean(axis=0), *np.quantile(chain, [0.05, 0.95], axis=0))
 
 
-def by_tpe(env: gym.Env[Any, Any], seed: int) -> None:
-    """Optuna's sampler, asked and told."""
-    import optuna
-
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
-    study, over = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=seed, n_startup_trials=4)), False
-    env.reset(seed=seed)
-    while not over:
-        trial = study.ask()
-        guess = [trial.suggest_float(f"action{k}", -1.0, 1.0) for k in range(env.action_space.shape[0])]  # type: ignore
-        _, reward, _, over, _ = env.step(np.array(guess, dtype=np.float32))
-        study.tell(trial, -float(reward))
-
-
-def by_cma_es(env: gym.Env[Any, Any], seed: int) -> None:
-    """The package ``cmaes``, from the middle."""
-    from cmaes import CMA
-
-    n, over = env.action_space.shape[0], False  # type: ignore[index]
-    search = CMA(mean=np.zeros(n), sigma=0.5, bounds=np.tile([-1.0, 1.0], (n, 1)), seed=seed)
-    env.reset(seed=seed)
-    while not over:
-        generation: list[tuple[FloatArray, float]] = []
-        while not over and len(generation) < search.population_size:
-            guess = search.ask()
-            _, reward, _, over, _ = env.step(guess.astype(np.float32))
-            generation.append((guess, -float(reward)))
-        if not over:
-            search.tell(generation)
-
-
-@cache
-def _actor(env_id: str, budget: int) -> Any:
-    """A soft actor-critic that has learnt from other episodes."""
-    from stable_baselines3 import SAC
-
-    env = gym.make(env_id, budget=budget)
-    agent = SAC("MultiInputPolicy", env, gamma=1.0, train_freq=8, gradient_steps=4, seed=TRAINING, device="cpu")
-    return agent.learn(SAC_STEPS)
-
-
-def by_actor(env: gym.Env[Any, Any], seed: int) -> None:
-    """Stable-Baselines3's soft actor-critic, without its noise."""
-    assert env.spec is not None
-    agent = _actor(env.spec.id, env.unwrapped.budget)  # type: ignore[attr-defined]
-    (observation, _), over = env.reset(seed=seed), False
-    while not over:
-        observation, _, _, over, _ = env.step(agent.predict(observation, deterministic=True)[0])
-
-
-def all_alike(env: gym.Env[Any, Any], seed: int) -> None:
-    """Equal probabilities."""
-    env.reset(seed=seed)
-    env.step(np.zeros(env.action_space.shape, dtype=np.float32))
-
-
 @cache
 def _classes(env_id: str) -> tuple[FloatArray, FloatArray]:
     """Means (e, b) of each effect's evidence, and the inverse (b, b) of the covariance about them."""
@@ -256,19 +196,15 @@ def greedily(env: gym.Env[Any, Any], seed: int) -> None:
         _, _, _, over, _ = env.step(strokes[int(np.argmax(expected))].astype(np.float32))
 
 
-AGENTS: dict[str, tuple[Agent, tuple[type, ...], str]] = {
-    "random": (at_random, (PlowSandEnv, NamingEnv, DesignEnv), ""),
-    "tpe": (by_tpe, (PlowSandEnv,), "optuna"),
-    "cma-es": (by_cma_es, (PlowSandEnv,), "cmaes"),
-    "sac": (by_actor, (PlowSandEnv, DesignEnv), "stable_baselines3"),
-    "paper": (lambda env, seed: by_optimiser(env, seed, start=1, acquisition="best"), (PlowSandEnv,), ""),
-    "bo": (by_optimiser, (PlowSandEnv,), ""),
-    "mcmc": (lambda env, seed: by_chains(env, seed, search=False), (PlowSandEnv,), ""),
-    "both": (lambda env, seed: by_chains(env, seed, search=True), (PlowSandEnv,), ""),
-    "direct": (directly, (PlowSandEnv,), ""),
-    "uniform": (all_alike, (NamingEnv,), ""),
-    "lda": (by_discriminant, (NamingEnv,), ""),
-    "greedy": (greedily, (DesignEnv,), ""),
+AGENTS: dict[str, tuple[Agent, tuple[type, ...]]] = {
+    "random": (at_random, (PlowSandEnv, NamingEnv, DesignEnv)),
+    "paper": (lambda env, seed: by_optimiser(env, seed, start=1, acquisition="best"), (PlowSandEnv,)),
+    "bo": (by_optimiser, (PlowSandEnv,)),
+    "mcmc": (lambda env, seed: by_chains(env, seed, search=False), (PlowSandEnv,)),
+    "both": (lambda env, seed: by_chains(env, seed, search=True), (PlowSandEnv,)),
+    "direct": (directly, (PlowSandEnv,)),
+    "lda": (by_discriminant, (NamingEnv,)),
+    "greedy": (greedily, (DesignEnv,)),
 }
 
 
@@ -292,20 +228,12 @@ def own_agent(name: str) -> Agent:
 
 
 def chosen_agents(names: Sequence[str], env: gym.Env[Any, Any]) -> dict[str, Agent]:
-    """Those of the named agents that play such an environment; one whose library is not installed is left out."""
-    out = {}
-    for name in names:
-        agent, kinds, library = AGENTS[name]
-        fits = isinstance(env.unwrapped, kinds)
-        if name == "direct":
-            fits = fits and hasattr(env.unwrapped.problem, "surface")  # type: ignore[attr-defined]
-        if name == "cma-es":
-            fits = fits and env.action_space.shape != (1,)
-        if fits and library and importlib.util.find_spec(library) is None:
-            print(f"{name} is left out: needs the extra: pip install 'splatsoil[agents]'", file=sys.stderr)
-        elif fits:
-            out[name] = agent
-    return out
+    """Those of the named agents that play such an environment."""
+    inner: Any = env.unwrapped
+    emulated = isinstance(inner, PlowSandEnv) and isinstance(inner.problem, EmulatedProblem)
+    return {
+        name: AGENTS[name][0] for name in names if isinstance(inner, AGENTS[name][1]) and (name != "direct" or emulated)
+    }
 
 
 def play(env: gym.Env[Any, Any], name: str, agent: Agent, seed: int) -> dict[str, Any]:
@@ -329,12 +257,10 @@ def play(env: gym.Env[Any, Any], name: str, agent: Agent, seed: int) -> dict[str
         low, high = space.from_unit(answer.low), space.from_unit(answer.high)
         values = space.to_vector(truth)
         found |= {"width": high - low, "inside": (low <= values) & (values <= high)}
-        answer = space.to_dict(space.from_unit(answer.estimate))
-    if isinstance(answer, Mapping):
-        error = {name: answer[name] - truth[name] for name in space.names}
+        error = space.from_unit(answer.estimate) - values
     else:
-        error = counted.last["error"]
-    return found | {"regret": counted.last.get("regret", np.nan), "error": np.array([error[n] for n in space.names])}
+        error = np.array([counted.last["error"][name] for name in space.names])
+    return found | {"regret": counted.last.get("regret", np.nan), "error": error}
 
 
 def summary(agent: str, episodes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

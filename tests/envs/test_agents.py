@@ -12,8 +12,8 @@ from types import ModuleType
 import gymnasium as gym
 import pytest
 
-SEARCHES = {"random_search": 12, "differential_evolution": 20, "optuna_tpe": 12}
-LIBRARIES = {"optuna_tpe": "optuna", "stable_baselines": "stable_baselines3"}
+SEARCHES = {"random_search": 12, "cma_es": 20, "optuna_tpe": 12}
+LIBRARIES = {"cma_es": "cmaes", "optuna_tpe": "optuna", "stable_baselines": "stable_baselines3"}
 
 
 def script(repository: Path, name: str) -> ModuleType:
@@ -40,12 +40,12 @@ def test_searches_spend_their_budget_and_come_near(repository: Path, analytic: M
 
 def test_stable_baselines_checks_and_learns(repository: Path) -> None:
     module = script(repository, "stable_baselines")
-    env = gym.make("PlowSandFast-v0", budget=4)
     with warnings.catch_warnings():
         # Any complaint of its checker about the environment fails the test.
         warnings.simplefilter("error", UserWarning)
-        agent = module.train(env, steps=32)
-    assert agent.num_timesteps == 32
+        agent = module.train("PlowSandFast-v0", 4, steps=128)
+    assert agent.num_timesteps == 128
+    env = gym.make("PlowSandFast-v0", budget=4)
     action, _ = agent.predict(env.reset(seed=1)[0])
     assert env.action_space.contains(action)
 
