@@ -13,14 +13,12 @@ from splatsoil.errors import ParameterError
 from .devices import resolve_device
 from .emulator import STRENGTHS, STROKES, FloatArray, evidence, sobol, soil_of, stroke_at, surfaces
 from .episode import Array, EpisodeEnv
-from .problem import simulation_seed
-from .synthetic import HIDDEN_RANGE, hidden
 from .synthetic_world import World
 
 #: Patches' changes are clipped to this many grey levels.
 LIMIT = 255.0
-#: The strokes that the naming environment shows, in [-1, 1]: upright at two depths, and with the top forwards.
-SHOWN = ((-0.5, 0.0), (0.6, 0.0), (0.6, 0.8))
+#: Half-widths of what friction angle and strength are drawn from, in [-1, 1].
+SPREAD = (0.6, 1.0)
 #: Logit of an action of 1.
 LOGITS = 5.0
 #: Particles of the design environment's posterior.
@@ -49,8 +47,9 @@ class HiddenSoil:
 
     def begin(self, seed: int) -> None:
         """Hide another effect and other values."""
-        self.effect = self.effects[int(np.random.default_rng([seed, 1]).integers(len(self.effects)))]
-        self.point = hidden(seed, len(self.spaces[self.effect]))
+        rng = np.random.default_rng(seed)
+        self.effect = self.effects[int(rng.integers(len(self.effects)))]
+        self.point = (np.array(SPREAD) * rng.uniform(-1.0, 1.0, len(SPREAD)))[: len(self.spaces[self.effect])]
 
     def truth(self) -> dict[str, float]:
         """The hidden values by name."""
@@ -75,7 +74,7 @@ class HiddenSoil:
 class NamingEnv(EpisodeEnv[Array]):
     """Which effect is in the soil? One step, scored by log probability.
 
-    **Observation**: Box(-255, 255, (216,)), how much brighter each of three strokes makes 72 patches of the pictures.
+    **Observation**: Box(-255, 255, (72,)), how much brighter a stroke makes each patch of the pictures.
     **Action**: Box(-1, 1, (e,)), a fifth of each effect's logit, in the order of ``info["effects"]``.
     **Reward**: ln of the probability given to the true effect (the logarithmic score; 0 is the best, -ln e for knowing
     nothing). The step is terminal.
@@ -90,7 +89,7 @@ class NamingEnv(EpisodeEnv[Array]):
         super().__init__(budget=1, least=1)
         self.soil = HiddenSoil(effects, fast, device)
         self.action_space = gym.spaces.Box(-1.0, 1.0, (len(self.soil.effects),), np.float32)
-        self.observation_space = gym.spaces.Box(-LIMIT, LIMIT, (72 * len(SHOWN),), np.float32)
+        self.observation_space = gym.spaces.Box(-LIMIT, LIMIT, (72,), np.float32)
         self._seen = np.zeros(self.observation_space.shape, dtype=np.float32)
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
@@ -104,9 +103,8 @@ class NamingEnv(EpisodeEnv[Array]):
 
     def _begin(self, seed: int) -> dict[str, Any]:
         self.soil.begin(seed)
-        strokes = enumerate(np.array(SHOWN))
-        seen = [self.soil.plowed(stroke, simulation_seed(seed, k)) for k, stroke in strokes]
-        self._seen = np.concatenate(seen).astype(np.float32)
+        usual = STROKES.to_unit([p.default for p in STROKES])
+        self._seen = self.soil.plowed(usual, self.step_seed()).astype(np.float32)
         return {"effects": list(self.soil.effects)}
 
     def _act(self, action: Array) -> tuple[float, dict[str, Any]]:
@@ -144,8 +142,7 @@ class DesignEnv(EpisodeEnv[dict[str, Array]]):
         (self.space,) = self.soil.spaces.values()
         self._surface = surfaces()[f"stroke/{effect}"]
         self._whitening = np.linalg.inv(self._surface.factor).T
-        low, high = (2.0 * end - 1.0 for end in HIDDEN_RANGE)
-        self._particles = 0.5 * (low + high) + 0.5 * (high - low) * sobol(PARTICLES, len(self.space))
+        self._particles = np.array(SPREAD[: len(self.space)]) * sobol(PARTICLES, len(self.space))
         box, n = gym.spaces.Box, len(self.space)
         self.action_space = box(-1.0, 1.0, (len(STROKES),), np.float32)
         self.observation_space = gym.spaces.Dict(  # type: ignore[assignment]

@@ -104,7 +104,8 @@ class HiddenTruth:
         """Draw another hidden truth; it is simulated when it is first needed."""
         if self._truth is not None and seed == self._truth_seed:
             return
-        self.place(self.space.to_dict(self.space.from_unit(hidden(seed, len(self.space)))), seed)
+        unit = 2.0 * np.random.default_rng(seed).uniform(*HIDDEN_RANGE, len(self.space)) - 1.0
+        self.place(self.space.to_dict(self.space.from_unit(unit)), seed)
 
     def place(self, truth: Mapping[str, float], seed: int) -> None:
         """Hide this truth instead of a drawn one; the seed decides its particles and noise."""
@@ -115,11 +116,6 @@ class HiddenTruth:
     def truth(self) -> Mapping[str, float] | None:
         """The hidden values."""
         return self._truth
-
-
-def hidden(seed: int, count: int) -> FloatArray:
-    """A hidden point (count,) of [-1, 1]^count."""
-    return 2.0 * np.random.default_rng(seed).uniform(*HIDDEN_RANGE, count) - 1.0
 
 
 class SyntheticProblem(HiddenTruth):

@@ -27,7 +27,7 @@ def test_the_reward_is_the_logarithmic_score_and_the_answer_ends_the_episode() -
         seen.add(info["truth"]["effect"])
     assert seen == set(STRENGTHS)
     with pytest.raises(gym.error.ResetNeeded):
-        env.step(evidence[:5])
+        env.step(evidence[:5] / 255.0)
 
 
 def test_the_posterior_is_that_of_bayes_and_the_reward_its_information() -> None:
