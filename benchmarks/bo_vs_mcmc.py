@@ -279,13 +279,27 @@ def summary(agent: str, episodes: Sequence[Mapping[str, Any]]) -> dict[str, Any]
 
 
 def run(
-    env_id: str, budgets: Sequence[int | None], names: Sequence[str], own: Sequence[str], seeds: int, data_set: str = ""
+    env_id: str,
+    budgets: Sequence[int | None],
+    names: Sequence[str],
+    own: Sequence[str],
+    seeds: int,
+    *,
+    device: str = "cpu",
+    data_set: str = "",
 ) -> dict[str, Any]:
-    """All agents on one environment, at each budget; the episodes are kept as a Minari data set where one is named."""
+    """All agents on one environment, at each budget; the episodes are kept as a Minari data set where one is named.
+
+    Raises:
+        ParameterError: there is no such environment, or it has no budget to choose.
+    """
     entries = []
     for budget in budgets:
         chosen: dict[str, Any] = {} if budget is None else {"budget": budget}
-        env = gym.make(env_id, **chosen)
+        try:
+            env = gym.make(env_id, device=device, **chosen)
+        except (gym.error.Error, TypeError) as error:
+            raise ParameterError(f"--env {env_id}: cannot be made ({error})") from error
         agents = chosen_agents(names, env) | {name: own_agent(name) for name in own}
         if data_set:
             env = EpisodeRecorder(env)
@@ -340,7 +354,15 @@ def main(arguments: list[str] | None = None) -> int:
     hush()
     began = time.perf_counter()
     found = [
-        run(env, options.budgets or [None], options.agents, options.agent, options.seeds, options.minari)
+        run(
+            env,
+            options.budgets or [None],
+            options.agents,
+            options.agent,
+            options.seeds,
+            device=options.device,
+            data_set=options.minari,
+        )
         for env in options.env
     ]
     seconds = time.perf_counter() - began

@@ -22,7 +22,7 @@ SPREAD = (0.6, 1.0)
 #: Logit of an action of 1.
 LOGITS = 5.0
 #: Particles of the design environment's posterior.
-PARTICLES = 1024
+PARTICLES = 512
 
 
 class HiddenSoil:
@@ -172,12 +172,12 @@ class DesignEnv(EpisodeEnv[dict[str, Array]]):
         return float(np.mean([_information(self._updated(means, scales, one)) for one in seen]))
 
     def _predicted(self, stroke: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Means (1024, k) of what each particle shows, where chance has covariance 1, and factors (1024,) of chance."""
+        """Means (512, k) of what each particle shows, where chance has covariance 1, and factors (512,) of chance."""
         points = np.column_stack([self._particles, np.tile(stroke, (PARTICLES, 1))])
         return self._surface.mean(points) @ self._whitening, self._surface.scale(points)
 
     def _updated(self, means: FloatArray, scales: FloatArray, seen: FloatArray) -> FloatArray:
-        """(1024,) logarithms of the particles' weights once (k,) has been seen."""
+        """(512,) logarithms of the particles' weights once (k,) has been seen."""
         squares = np.sum((seen - means) ** 2, axis=1) / scales**2
         logs = self._logs - 0.5 * squares - len(seen) * np.log(scales)
         return np.asarray(logs - np.logaddexp.reduce(logs))

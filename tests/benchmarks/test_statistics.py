@@ -90,6 +90,9 @@ def test_agents_play_the_same_episodes_and_their_errors_are_counted(monkeypatch:
     assert f"| {own} | 40 |" in bo_vs_mcmc.table(found)
     with pytest.raises(ParameterError, match=r"one whole episode; it made 1 steps"):
         bo_vs_mcmc.run("PlowSandFast-v0", [3], [], [f"my_agents:{stops_early.__name__}"], 1)
+    for env_id, budget in (("Nonsense-v0", None), ("PlowSandNamingFast-v0", 3)):
+        with pytest.raises(ParameterError, match=f"--env {env_id}: cannot be made"):
+            bo_vs_mcmc.run(env_id, [budget], ["random"], [], 1)
     for name in ("nowhere:agent", "my_agents:nobody", "my_agents"):
         with pytest.raises(ParameterError, match="give MODULE:FUNCTION"):
             bo_vs_mcmc.run("PlowSandFast-v0", [3], [], [name], 1)
