@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import pickle
-import warnings
 from types import ModuleType
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 from splatsoil.envs.plow_sand import BLOCK_LIMIT, PlowSandEnv
 
 from splatsoil.errors import ParameterError
@@ -22,13 +20,6 @@ def env(analytic: ModuleType) -> PlowSandEnv:
 
 def act(*values: float) -> np.ndarray:
     return np.array(values, dtype=np.float32)
-
-
-def test_check_env_is_clean(analytic: ModuleType) -> None:
-    made = gym.make("PlowSand-v0", problem=analytic.AnalyticProblem(), budget=4, render_mode="rgb_array")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        check_env(made.unwrapped)
 
 
 def test_the_reward_is_minus_the_loss_of_the_physical_value(analytic: ModuleType) -> None:

@@ -17,9 +17,9 @@ from gymnasium.utils.env_checker import check_env
 from splatsoil.envs import register
 from splatsoil.envs.plow_sand import PlowSandEnv
 from splatsoil.envs.synthetic import BLOCKS, SyntheticProblem, compare
-from splatsoil.envs.synthetic_world import HEIGHT, WIDTH, pattern
+from splatsoil.envs.synthetic_world import HEIGHT, WIDTH, World, pattern
 
-from splatsoil.errors import ParameterError
+from splatsoil.errors import ParameterError, SimulationError
 
 
 @pytest.fixture(autouse=True)
@@ -97,6 +97,20 @@ def test_near_the_truth_the_loss_is_smaller_than_far_from_it() -> None:
 def test_unknown_names_are_refused_when_the_environment_is_made(options: dict, says: str) -> None:
     with pytest.raises(ParameterError, match=says):
         gym.make("PlowSand-v0", **options)
+
+
+def test_a_hidden_truth_that_fails_is_simulated_with_other_particles(monkeypatch: pytest.MonkeyPatch) -> None:
+    world, picture = World([], "tiny", "cpu"), np.zeros((1, 2, 2, 3), np.float32)
+    seeds: list[int] = []
+
+    def simulated(jobs: list) -> list:
+        seeds.append(jobs[0][1])
+        return [picture if len(seeds) == 3 else SimulationError("it flies")]
+
+    monkeypatch.setattr(world, "simulated", simulated)
+    assert world.surely({}, 5) is picture and len(set(seeds)) == 3 and seeds[0] == 5
+    with pytest.raises(SimulationError, match="it flies"):
+        world.surely({}, 5)
 
 
 def test_the_comparison_by_hand() -> None:
