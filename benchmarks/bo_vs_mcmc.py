@@ -259,7 +259,8 @@ def play(env: gym.Env[Any, Any], name: str, agent: Agent, seed: int) -> dict[str
         found |= {"width": high - low, "inside": (low <= values) & (values <= high)}
         error = space.from_unit(answer.estimate) - values
     else:
-        error = np.array([counted.last["error"][name] for name in space.names])
+        best = counted.last.get("error", {})  # none where every simulation failed
+        error = np.array([best.get(name, np.nan) for name in space.names])
     return found | {"regret": counted.last.get("regret", np.nan), "error": error}
 
 
