@@ -15,6 +15,7 @@ from gymnasium.utils.env_checker import check_env
 from splatsoil.envs import VARIANTS, emulator
 from splatsoil.envs.emulated import EmulatedProblem
 from splatsoil.envs.synthetic import SyntheticProblem
+from splatsoil.envs.together import attempt
 
 from splatsoil.errors import ParameterError
 
@@ -90,12 +91,12 @@ def test_emulated_losses_are_those_of_simulations() -> None:
     guesses, off = (23.0, 31.0, 38.0, 46.0), []
     for truth in (25.0, 32.0, 39.0):
         simulated.place({"friction_angle": truth}, 900)
-        real = [simulated.evaluate({"friction_angle": g}, k).loss for k, g in enumerate(guesses)]
-        drawn = []
-        for seed in range(300):
-            emulated.place({"friction_angle": truth}, seed)
-            drawn.append(
-                [emulated.evaluate({"friction_angle": g}, 1000 * k + seed).loss for k, g in enumerate(guesses)]
-            )
-        off.append((np.array(real, dtype=np.float64) - np.mean(drawn, axis=0)) / np.std(drawn, axis=0))
-    assert np.abs(off).max() < 4.0 and np.sqrt(np.mean(np.square(off))) < 2.0
+        for k, guess in enumerate(guesses):
+            real = attempt(simulated, {"friction_angle": guess}, k).loss
+            drawn = []
+            for seed in range(300):
+                emulated.place({"friction_angle": truth}, seed)
+                drawn.append(emulated.evaluate({"friction_angle": guess}, 1000 + seed).loss)
+            if real is not None:  # a simulation may fail
+                off.append((real - np.mean(drawn)) / np.std(drawn))  # type: ignore[arg-type]
+    assert len(off) >= 8 and np.abs(off).max() < 4.0 and np.sqrt(np.mean(np.square(off))) < 2.0
