@@ -57,7 +57,8 @@ class RunError(SplatsoilError):
 
 
 class SetWarning(UserWarning):
-    """Something odd about a measurement set, which can be used all the same; the command line prints it as a remark."""
+    """Something odd about a measurement set or the machine, which can be used all the same; the command line prints it as
+    a remark."""
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
