@@ -177,15 +177,17 @@ class Run:
         """(h, w, 3) sRGB of a compared frame.
 
         Raises:
-            RunError: there is no such picture.
+            RunError: there is no such picture, or it is damaged.
         """
         import numpy as np
         from PIL import Image
 
+        from splatsoil.report.data import read_picture
+
         file = self.path / "comparison" / f"{camera}_{frame:04d}_{kind}.jpg"
         if self.data.comparison is None or not file.is_file():
             raise RunError(f"{file}: there is no such picture; compare() draws those of all compared frames")
-        return np.asarray(Image.open(file).convert("RGB"))
+        return np.asarray(Image.open(io.BytesIO(read_picture(file)[0])).convert("RGB"))
 
     def compare(self, **options: Any) -> Run:
         """`compare` of this run."""

@@ -16,11 +16,6 @@ if TYPE_CHECKING:
     from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.measurement import Measurement
 
-#: Loss of a prediction in which nothing moves. The loss is measured in units of it, so this is no choice of ours: a
-#: model that comes to it has explained nothing of what was seen, wherever its estimate lies.
-NOTHING_MOVES = 1.0
-
-
 def opened(options: RunOptions) -> RunFolder:
     """The run folder of a command, which knows where its set is now if the command says so.
 
@@ -83,43 +78,10 @@ def latest_fit(folder: RunFolder) -> dict[str, Any]:
         raise RunError(f"{error}; a diagnosis starts from a fit") from error
 
 
-def no_answer(fit: Mapping[str, Any]) -> str:
-    """Why the estimate of ``fit.json`` means nothing, in one sentence; empty where it means something.
-
-    Raises:
-        RunError: the file is damaged.
-    """
-    from splatsoil.files import ANEW
-    from splatsoil.report.text import symbol
-
-    try:
-        least, loss = fit["best"]["loss"], max(fit["loss"], fit["best"]["loss"])
-        if loss >= NOTHING_MOVES:
-            where = "everywhere it was tried" if least >= NOTHING_MOVES else "where pictures and force together put it"
-            return (
-                f"no answer: {where} the model explains the video no better than soil that never moves (loss "
-                f"{loss:.3g}; such soil has {NOTHING_MOVES:g}); photographs, poses, clock or tool are wrong, or the "
-                "soil is another"
-            )
-        for name, entry in fit["parameters"].items():
-            if entry["at_bound"] is None:
-                continue
-            bound = entry["bounds"][0 if entry["at_bound"] == "lower" else 1]
-            # An effect that is off is no bound of knowledge: it isn't there.
-            if bound != entry.get("off"):
-                return (
-                    f"no answer: the {name.replace('_', ' ')} ends at the {entry['at_bound']} bound of its range "
-                    f"({bound:g}{symbol(entry['unit'])}); the best value lies beyond it, or the model lacks an effect"
-                )
-    except (KeyError, TypeError, IndexError, AttributeError, ValueError) as error:
-        raise RunError(
-            f"fit.json: is damaged, it lacks loss, best, or a parameter's bounds ({error!r}); {ANEW}"
-        ) from error
-    return ""
-
-
 def require_answer(fit: Mapping[str, Any], look: str) -> None:
     """NoAnswer where a fit has none; ``look`` says what to look at then."""
+    from splatsoil.report.text import no_answer
+
     if reason := no_answer(fit):
         raise NoAnswer(f"{reason}: {look}")
 

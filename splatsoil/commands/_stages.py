@@ -177,6 +177,7 @@ def draw_comparison(run: RunFolder, model: Model, report: Report) -> dict[str, A
         comparator = Comparator(model.measurement, surface=model.reconstruction.surface, frames=model.frames)
         prediction = model.predict(values, 0, lambda frame, last: report(f"frame {frame}", 0.9 * frame / last))
         comparison = comparator.compare(prediction.images)
+        noise = 0.0 if without_noise(model.measurement) else comparator.noise
         report("writing pictures", 0.95)
         frames = []
         for camera, frame in comparator.keys:
@@ -197,7 +198,7 @@ def draw_comparison(run: RunFolder, model: Model, report: Report) -> dict[str, A
             "measurement": run.description["measurement"]["hash"],
             "loss": LOSS,
             "total": {LOSS: comparison.loss, "rgb": comparison.rgb},
-            "noise": {} if comparator.noise is None else {LOSS: comparator.noise},
+            "noise": {} if noise is None else {LOSS: noise},
             # The loss is measured in units of what soil at rest would leave.
             "motionless": {LOSS: 1.0},
             "gain": GAIN,
@@ -208,6 +209,14 @@ def draw_comparison(run: RunFolder, model: Model, report: Report) -> dict[str, A
         }
         write_json(run.comparison / "comparison.json", data)
     return data
+
+
+def without_noise(measurement: Measurement) -> bool:
+    """Whether frames before the tool moves are the same to the last bit, and so are each camera's: no camera's are, but
+    a renderer's."""
+    still = measurement.pre_roll
+    first = {name: measurement.video_frame(name, measurement.frames[0]).image() for name in measurement.cameras}
+    return bool(still) and all(np.array_equal(f.image(), first[f.camera_name]) for f in still)
 
 
 def write_jpeg(path: Path, picture: np.ndarray) -> None:

@@ -36,9 +36,10 @@ class Config(RunOptions):
 def run(config: Config) -> int:
     """Simulate, draw, compare; pictures, losses and the misfit by block go into the run folder."""
     from splatsoil.commands._crew import Crew
+    from splatsoil.report.text import no_answer
 
     folder = _folder.opened(config)
-    none = _folder.no_answer(folder.fit())
+    none = no_answer(folder.fit())
     folder.check_writable()
     # Helpers begin before what takes seconds to load is loaded.
     with (

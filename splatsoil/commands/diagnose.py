@@ -34,13 +34,14 @@ def run(config: Config) -> int:
     """Diagnose; the result goes into the run folder."""
     from splatsoil.commands._crew import Crew
     from splatsoil.files import plain
+    from splatsoil.report.text import no_answer
     from splatsoil.soil.library import find_effects
 
     if _laboratory.is_run(config.run) or _laboratory.is_test(config.run):
         return _laboratory.diagnose(config.run, config.effects, config.device, config.set, quiet=config.json)
     folder = _folder.opened(config)
     fit = _folder.latest_fit(folder)
-    none = _folder.no_answer(fit)
+    none = no_answer(fit)
     folder.check_writable()
     # Helpers begin before what takes seconds to load is loaded.
     with Crew(folder, config.device, config.effects) as crew:

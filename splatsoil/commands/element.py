@@ -172,7 +172,9 @@ def draw(columns: dict[str, Any], config: Config) -> None:
     on = ", ".join(Path(name).stem for name in config.effects) or "base law"
     with_values = " ".join((on, *config.values))
     figure.suptitle(
-        f"{config.test}, {config.confining:g} Pa, φ = {config.friction_angle:g}°, {with_values}", fontsize=10
+        f"{config.test}, {config.confining:g} Pa, φ = {config.friction_angle:g}°, {with_values}",
+        fontsize=10,
+        parse_math=False,
     )
     stream = io.BytesIO()
     figure.savefig(stream, format=config.plot.suffix[1:], dpi=150)

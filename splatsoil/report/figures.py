@@ -34,6 +34,7 @@ STYLE = {
     "svg.hashsalt": "splatsoil",
     "font.size": 9.0,
     "text.color": INK,
+    "text.parse_math": False,  # names may hold a $
     "axes.edgecolor": FAINT,
     "axes.labelcolor": INK,
     "axes.facecolor": "none",

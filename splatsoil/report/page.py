@@ -14,7 +14,7 @@ import splatsoil
 from splatsoil.errors import RunError
 from splatsoil.files import write_text
 from splatsoil.report import figures, text
-from splatsoil.report.data import RunData, load
+from splatsoil.report.data import RunData, load, read_picture
 
 HERE = Path(__file__).parent
 KINDS = ("observed", "predicted", "difference")
@@ -57,7 +57,7 @@ def render(data: RunData) -> str:
         probability=text.probability,
     )
     comparison, diagnosis = data.comparison, data.diagnosis
-    judged = data.judged
+    judged, no_answer = data.judged, text.no_answer(data.fit)
     adequate = text.called_adequate(data.fit, judged)
     ratio = text.ratio_to_noise(comparison)
     at_the_noise = ratio is not None and ratio <= text.AT_THE_NOISE
@@ -75,7 +75,8 @@ def render(data: RunData) -> str:
         program=splatsoil.__version__,
         data=data,
         fit=data.fit,
-        answers=text.answers(data.fit, judged, data.truth),
+        no_answer=no_answer,
+        answers=[] if no_answer else text.answers(data.fit, judged, data.truth),
         adequate=adequate,
         fitted=text.fitted_sentence(data.fit, judged),
         residual=text.residual_sentence(comparison, adequate) if judged is None else text.misfit_sentence(judged),
@@ -140,7 +141,7 @@ def _posterior(folder: Path, posterior: Mapping[str, Any]) -> dict[str, Any]:
         "sentences": text.posterior_sentences(posterior),
         "notes": text.posterior_notes(posterior),
         "marginals": [figures.marginal(entry) for entry in posterior["parameters"].values()],
-        "corner": data_url(corner) if len(posterior["parameters"]) > 1 and corner.is_file() else None,
+        "corner": data_url(corner, "posterior") if len(posterior["parameters"]) > 1 and corner.is_file() else None,
         "simulations": posterior["simulations"],
         "chains": posterior["chains"],
     }
@@ -252,20 +253,7 @@ def _falling(data: RunData) -> dict[str, Any] | None:
     return {"figure": figure, "falls": errors[-1] < errors[0], "aside": diagnosis["aside"]}
 
 
-def data_url(path: Path) -> str:
-    """A picture as a ``data:`` URL.
-
-    Raises:
-        RunError: it is missing or neither JPEG nor PNG.
-    """
-    try:
-        contents = path.read_bytes()
-    except OSError as error:
-        raise RunError(f"{path}: cannot be read ({error.strerror}); run `splatsoil compare` again") from error
-    if contents.startswith(b"\x89PNG\r\n\x1a\n"):
-        kind = "png"
-    elif contents.startswith(b"\xff\xd8\xff"):
-        kind = "jpeg"
-    else:
-        raise RunError(f"{path}: is neither PNG nor JPEG; run `splatsoil compare` again")
+def data_url(path: Path, made_by: str = "compare") -> str:
+    """A picture as a ``data:`` URL; see `read_picture`."""
+    contents, kind = read_picture(path, made_by)
     return f"data:image/{kind};base64,{base64.b64encode(contents).decode()}"

@@ -10,8 +10,9 @@ import pytest
 from splatsoil.inverse.run_folder import RunFolder
 
 from splatsoil import cli
-from splatsoil.commands import _folder, add
+from splatsoil.commands import add
 from splatsoil.errors import NoAnswer, RunError
+from splatsoil.report.text import no_answer
 
 FitOf = Callable[..., dict[str, Any]]
 
@@ -53,18 +54,18 @@ def test_no_command_tells_an_estimate_that_means_nothing(
 
 def test_what_is_an_answer(fit_of: FitOf) -> None:
     fit = fit_of(["cohesion"], cohesion=0.0)
-    assert _folder.no_answer(fit) == ""
-    assert _folder.no_answer(fit | {"loss": 0.99}) == "" and _folder.no_answer(fit | {"loss": 1.0}) != ""
+    assert no_answer(fit) == ""
+    assert no_answer(fit | {"loss": 0.99}) == "" and no_answer(fit | {"loss": 1.0}) != ""
     # of an effect off is where it isn't there, and its other bound is one
     fit["parameters"]["cohesion"] |= {"bounds": [0.0, 1500.0], "off": 0.0, "at_bound": "lower", "unit": "Pa"}
-    assert _folder.no_answer(fit) == ""
+    assert no_answer(fit) == ""
     fit["parameters"]["cohesion"]["at_bound"] = "upper"
-    assert "the cohesion ends at the upper bound of its range (1500 Pa)" in _folder.no_answer(fit)
+    assert "the cohesion ends at the upper bound of its range (1500 Pa)" in no_answer(fit)
     # where forces lead away from what the pictures say
-    assert "where pictures and force together put it" in _folder.no_answer(fit | {"loss": 1.2, "best": {"loss": 0.9}})
+    assert "where pictures and force together put it" in no_answer(fit | {"loss": 1.2, "best": {"loss": 0.9}})
     del fit["best"]
     with pytest.raises(RunError, match="damaged"):
-        _folder.no_answer(fit)
+        no_answer(fit)
 
 
 @pytest.mark.parametrize("command", ["fit", "run"])
