@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import io
+import logging
 from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,6 +47,7 @@ def run(config: Config) -> int:
 
     from splatsoil.view import Viewer
 
+    logging.getLogger("websockets").setLevel(logging.CRITICAL)  # a browser that leaves is no fault
     with redirect_stdout(io.StringIO()):  # viser's banner
         # This machine alone: there is no password.
         server = viser.ViserServer("127.0.0.1", config.port, verbose=False)
