@@ -113,14 +113,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     trust(getattr(config, "effects", ()))
     wants_json = bool(getattr(config, "json", False))
     with only_json() if wants_json else nullcontext(), _printing_remarks():
+        places: dict[str, str] = {}
         try:
             return command.run(config)
+        except NoAnswer as error:  # a result
+            message, code, places = str(error), error.code, error.places
+            print(message)
         except SplatsoilError as error:
             message, code = " ".join(str(error).split()), error.code
-            if isinstance(error, NoAnswer):  # a result
-                print(message)
-            else:
-                print(f"splatsoil: {message}", file=sys.stderr)
+            print(f"splatsoil: {message}", file=sys.stderr)
         except RuntimeError as error:
             if not memory_is_full(error):
                 raise
@@ -130,5 +131,5 @@ def main(arguments: Sequence[str] | None = None) -> int:
             message, code = f"interrupted; {after_interrupt(name, command, config)}", 130
             print(f"\nsplatsoil: {message}", file=sys.stderr)
         if wants_json:
-            print_json({"ok": False, "error": message})
+            print_json({"ok": False, "error": message, **places})
         return code

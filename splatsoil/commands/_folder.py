@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.measurement import Measurement
 
+
 def opened(options: RunOptions) -> RunFolder:
     """The run folder of a command, which knows where its set is now if the command says so.
 
@@ -59,11 +60,13 @@ def measurement_of(run: RunFolder) -> Measurement:
             return measurement
         changed = changed or f"{run.path}: its measurement set {folder} has changed since; fit again into another --run"
     note = command_line("report", run.path, "--set", "FOLDER")
-    raise RunError(
-        changed
-        or f"{run.path}: its measurement set {first} isn't there any more, nor beside the run; `{note}` notes "
-        "where it is now"
-    )
+    gone = f"{run.path}: its measurement set {first} isn't there any more, nor beside the run; `{note}` notes where it"
+    raise RunError(changed or f"{gone} is now")
+
+
+def places(run: RunFolder) -> dict[str, str]:
+    """The run folder and its set, as commands' JSON objects have them."""
+    return {"run": str(run.path), "set": str(run.description["measurement"]["folder"])}
 
 
 def latest_fit(folder: RunFolder) -> dict[str, Any]:
@@ -78,12 +81,12 @@ def latest_fit(folder: RunFolder) -> dict[str, Any]:
         raise RunError(f"{error}; a diagnosis starts from a fit") from error
 
 
-def require_answer(fit: Mapping[str, Any], look: str) -> None:
-    """NoAnswer where a fit has none; ``look`` says what to look at then."""
+def require_answer(run: RunFolder, fit: Mapping[str, Any], look: str) -> None:
+    """NoAnswer where a run's fit has none; ``look`` says what to look at then."""
     from splatsoil.report.text import no_answer
 
     if reason := no_answer(fit):
-        raise NoAnswer(f"{reason}: {look}")
+        raise NoAnswer(f"{reason}: {look}", places(run))
 
 
 def note_other_sources(run: RunFolder) -> None:

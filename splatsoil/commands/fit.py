@@ -8,7 +8,7 @@ from typing import Any
 
 from splatsoil.commands import _folder, _laboratory, _model, _stages
 from splatsoil.commands._options import FitOptions, command_line
-from splatsoil.commands._output import print_json, print_notes, print_table, print_text, stages
+from splatsoil.commands._output import print_table, print_text, stages, tell
 
 INTERRUPTED = _stages.kept
 
@@ -37,13 +37,13 @@ def run(config: Config) -> int:
         model = _model.model_on(measurement, folder, reconstruction, config.effects, config.preset, device)
         result = _stages.run_fit(config, measurement, folder, model, begin("fit"))
     compare = command_line("compare", folder.path)
-    _folder.require_answer(result, f"`{compare}` shows where")
-    if config.json:
-        print_json({"ok": True, **result, "run": str(folder.path)})
-    else:
+    _folder.require_answer(folder, result, f"`{compare}` shows where")
+
+    def show_all() -> None:
         show(result, str(folder.path))
         print("Does the model leave more than noise, and where?", compare)
-    return 0
+
+    return tell(config, {**result, **_folder.places(folder)}, show_all)
 
 
 def show(result: Mapping[str, Any], folder: str) -> None:
@@ -55,7 +55,7 @@ def show(result: Mapping[str, Any], folder: str) -> None:
         ("parameter", "estimate", "5 to 95 %"),
         ((name, amount(p["estimate"], p["std"], p["unit"]), interval(p)) for name, p in result["parameters"].items()),
     )
-    print_notes(result["notes"])
+    print_text(notes=result["notes"])
     print_text(
         f"loss {result['loss']:.4g} ± {result['loss_std']:.2g} at the estimate; {result['evaluations']} evaluations "
         f"in {duration(result['seconds'])}",

@@ -8,7 +8,7 @@ from typing import Any
 
 from splatsoil.commands import _folder, _model, _stages
 from splatsoil.commands._options import RunOptions, command_line
-from splatsoil.commands._output import print_json, print_notes, print_table, print_text, stages
+from splatsoil.commands._output import print_table, print_text, stages, tell
 from splatsoil.errors import ParameterError
 from splatsoil.options import JSON, option
 
@@ -45,7 +45,7 @@ def run(config: Config) -> int:
     folder = _folder.opened(config)
     fit = folder.fit()
     compare = command_line("compare", folder.path)
-    _folder.require_answer(fit, f"so there is nothing to sample; `{compare}` shows where")
+    _folder.require_answer(folder, fit, f"so there is nothing to sample; `{compare}` shows where")
     setup = fit["setup"]
     wanted = ("cuda:0" if setup["device"] == "cuda" else "cpu") if config.device == "auto" else config.device
     device = resolve_device(wanted)
@@ -75,11 +75,7 @@ def run(config: Config) -> int:
                 seed=config.seed,
                 progress=begin("posterior"),
             )
-    if config.json:
-        print_json({"ok": True, **result, "run": str(folder.path)})
-    else:
-        show(result, str(folder.path))
-    return 0
+    return tell(config, {**result, **_folder.places(folder)}, lambda: show(result, str(folder.path)))
 
 
 def show(result: Mapping[str, Any], folder: str) -> None:
@@ -95,7 +91,7 @@ def show(result: Mapping[str, Any], folder: str) -> None:
         ),
         left=("parameter", ""),
     )
-    print_notes(result["notes"])
+    print_text(notes=result["notes"])
     chains = result["chains"]
     print_text(
         f"{result['simulations']} simulations; R-hat {chains['r_hat']:.3f}, acceptance {chains['acceptance']:.2f}, "

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from splatsoil.commands._options import PRESET, SEED, SET, Preset
-from splatsoil.commands._output import print_json, print_remarks, print_table, print_text
+from splatsoil.commands._output import print_remarks, print_table, print_text, stages, tell
 from splatsoil.options import JSON, argument, option
 
 if TYPE_CHECKING:
@@ -37,7 +37,6 @@ def run(config: Config) -> int:
     from splatsoil.measurement import Measurement
     from splatsoil.quiet import hush
     from splatsoil.reconstruction import reconstruct
-    from splatsoil.reconstruction.progress import progress_bar
 
     if not 0 <= config.seed < 2**63:
         raise ParameterError(f"--seed: must be 0 or more and less than 2^63, not {config.seed}")
@@ -47,16 +46,12 @@ def run(config: Config) -> int:
     print_remarks(measurement)
     out = config.out or Path("runs") / f"{measurement.name}-reconstruction"
     check_folder(out)
-    with progress_bar(quiet=config.json) as report:
-        result = reconstruct(
-            measurement, seed=config.seed, device=device, preset=config.preset, holdout=config.holdout, progress=report
-        )
+    with stages(quiet=config.json) as begin:
+        how = {"seed": config.seed, "device": device, "preset": config.preset, "holdout": config.holdout}
+        result = reconstruct(measurement, progress=begin("reconstruct"), **how)
     result.save(out)
-    if config.json:
-        print_json({"ok": True, "out": str(out), **result.summary()})
-    else:
-        _show(result, out)
-    return 0
+    told = {"set": str(measurement.folder), "out": str(out), **result.summary()}
+    return tell(config, told, lambda: _show(result, out))
 
 
 def _show(result: Reconstruction, out: Path) -> None:

@@ -66,7 +66,7 @@ def run(config: Config) -> int:
         page = write_report(folder.path)
     if unknown:
         print(unknown, file=sys.stderr)
-    _folder.require_answer(result, f"report: {page}")
+    _folder.require_answer(folder, result, f"report: {page}")
     entries = [] if diagnosis is None else _folder.history(folder)
     if config.json:
         losses = {key: comparison[key] for key in ("loss", "total", "noise")}
@@ -74,7 +74,8 @@ def run(config: Config) -> int:
         if diagnosis is not None:
             kept = plain({key: diagnosis[key] for key in DIAGNOSIS})
             extra = {"diagnosis": kept, "models": entries, "stopped": stopped}
-        print_json({"ok": True, "report": str(page), "comparison": losses, **extra, **result, "run": str(folder.path)})
+        told = {"report": str(page), "comparison": losses, **extra, **result, **_folder.places(folder)}
+        print_json({"ok": True, **told})
         return 0
     fit.show(result, str(folder.path))
     compare.show(comparison, str(folder.comparison), called_adequate(result, diagnosis or misfit))
