@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -68,11 +69,26 @@ def test_what_is_an_answer(fit_of: FitOf) -> None:
         no_answer(fit)
 
 
-@pytest.mark.parametrize("command", ["fit", "run"])
-def test_json_has_the_run_folder_under_run(
-    run: RunFolder, results: dict[str, Any], capsys: pytest.CaptureFixture[str], command: str
+@pytest.mark.parametrize("answer", [True, False])
+@pytest.mark.parametrize("command", ["fit", "run", "compare", "diagnose", "add", "report"])
+def test_json_names_run_and_set(
+    run: RunFolder,
+    results: dict[str, Any],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    command: str,
+    answer: bool,
 ) -> None:
-    """Not the set, which ``fit.json`` has there."""
-    results["run_fit"]["run"] = {"measurement": {"name": "plow"}}
-    assert cli.main([command, "set", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["run"] == str(run.path)
+    """Their folders, also where there is no answer; ``fit.json`` has something else under "run"."""
+    results["run_fit"] |= {"run": {"measurement": {"name": "plow"}}, **({} if answer else {"loss": 1.2})}
+    run.write_fit("base", results["run_fit"])
+    monkeypatch.setattr(add, "add_effect", lambda *_, **__: None)
+    words = [command, str(run.path), *(["cohesion"] if command == "add" else [])]
+    assert cli.main([*words, "--json"]) == (0 if answer else 3)
+    told = json.loads(capsys.readouterr().out)
+    assert (told["run"], told["set"]) == (str(run.path), run.description["measurement"]["folder"])
+
+
+def test_json_names_the_set(small_set: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["check", str(small_set), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["set"] == str(small_set)

@@ -91,7 +91,9 @@ def test_the_verdict_follows_the_ratio_to_the_noise() -> None:
     assert "nothing more to explain" in words.residual_sentence(comparison(0.011, 0.01))
     far = words.residual_sentence(comparison(0.038, 0.01))
     assert "3.8 ×" in far and "not been estimated yet" in far
-    assert "unknown" in words.residual_sentence(comparison(0.038, None))
+    assert "unknown: the set has no pre-roll" in words.residual_sentence(comparison(0.038, None))
+    none = words.residual_sentence(comparison(0.038, 0.0))
+    assert "unknown: the frames before the tool moves are equal to the last bit" in none and "0.05 grey levels" in none
     assert "160 ×" in words.residual_sentence(comparison(1.6, 0.01))
     with_unit = comparison(0.073, 0.01) | {"motionless": {"robust": 1.0}}
     assert "7.3 % of that of soil at rest, 7.3 × the camera noise" in words.residual_sentence(with_unit)
