@@ -5,11 +5,10 @@ from __future__ import annotations
 import shutil
 import sys
 from collections.abc import Mapping
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from splatsoil.commands._options import EVALUATIONS, FitOptions, RunOptions, command_line, same_again
+from splatsoil.commands._options import FitOptions, RunOptions, command_line, same_again
 from splatsoil.errors import MeasurementError, NoAnswer, RunError
 
 if TYPE_CHECKING:
@@ -70,11 +69,7 @@ def places(run: RunFolder) -> dict[str, str]:
 
 
 def latest_fit(folder: RunFolder) -> dict[str, Any]:
-    """The fit that a diagnosis starts from.
-
-    Raises:
-        RunError: there is none.
-    """
+    """The fit that a diagnosis starts from; RunError where there is none."""
     try:
         return folder.fit()
     except RunError as error:
@@ -103,35 +98,22 @@ def note_other_sources(run: RunFolder) -> None:
     except RunError as error:
         print(f"splatsoil: {run.path}: effects that it was fitted with are gone ({error})", file=sys.stderr)
         return
-    if then != now:
-        print(
-            f"splatsoil: {run.path} was fitted by splatsoil {then[0]}, code {then[1]}, and this is {now[0]}, code "
-            f"{now[1]}; this makes it anew: {fit_again(run, fit)}",
-            file=sys.stderr,
-        )
-
-
-def fit_again(run: RunFolder, fit: Mapping[str, Any]) -> str:
-    """The commands that make a run's latest model again: the fit, and the effects that were added to it."""
-    setup, entries = fit["setup"], history(run)
-    parameters, effects, budget = tuple(fit["parameters"]), tuple(setup["effects"]), fit.get("evaluations")
-    if budget == EVALUATIONS * len(parameters):
-        budget = None
-    added: list[str] = []
-    if len(entries) > 1 and entries[-1]["model"] == fit["name"]:
-        parameters, effects, budget = tuple(entries[0]["parameters"]), tuple(entries[0]["effects"]), None
-        added = [name for one, other in pairwise(entries) for name in other["effects"] if name not in one["effects"]]
+    if then == now:
+        return
+    described = run.description
     options = FitOptions(
-        set=Path(run.description["measurement"]["folder"]),
-        parameters=parameters,
-        effects=effects,
-        budget=budget,
+        set=Path(described["measurement"]["folder"]),
+        parameters=tuple(fit["parameters"]),
+        effects=tuple(setup["effects"]),
         preset=setup["preset"],
-        seed=run.description["seed"],
+        seed=described["seed"],
         run=run.path,
     )
-    commands = [same_again("fit", options), *([command_line("add", run.path, *added)] if added else [])]
-    return " && ".join(commands)
+    print(
+        f"splatsoil: {run.path} was fitted by splatsoil {then[0]}, code {then[1]}, and this is {now[0]}, code "
+        f"{now[1]}; this makes it anew: {same_again('fit', options)}",
+        file=sys.stderr,
+    )
 
 
 def history(folder: RunFolder) -> list[dict[str, Any]]:
@@ -162,12 +144,11 @@ def write_history(folder: RunFolder, entries: list[dict[str, Any]], under_way: M
 
 def history_entry(fit: Mapping[str, Any], held_out: Mapping[str, Any]) -> dict[str, Any]:
     """A model's line in the history: its fit, and its error on what was set aside."""
+    kept = ("estimate", "std", "unit", "title")
     return {
         "model": fit["name"],
         "effects": list(fit["setup"]["effects"]),
-        "parameters": {
-            name: {key: p[key] for key in ("estimate", "std", "unit", "title")} for name, p in fit["parameters"].items()
-        },
+        "parameters": {name: {key: p[key] for key in kept} for name, p in fit["parameters"].items()},
         "loss": fit["loss"],
         "held_out": held_out["error"],
         "floor": held_out["noise"],
@@ -184,21 +165,16 @@ def compared_already(folder: RunFolder) -> bool:
 
 def keep_earlier_comparison(folder: RunFolder) -> None:
     """Put the comparison of the model before aside, so that before and after can be shown."""
-    if not (folder.comparison / "comparison.json").is_file():
-        return
-    before = folder.path / "before"
-    with folder.lock():
-        shutil.rmtree(before, ignore_errors=True)
-        folder.comparison.rename(before)
+    if (folder.comparison / "comparison.json").is_file():
+        with folder.lock():
+            shutil.rmtree(folder.path / "before", ignore_errors=True)
+            folder.comparison.rename(folder.path / "before")
 
 
 def current_diagnosis(folder: RunFolder, path: Path, effects: tuple[str, ...] | None = None) -> dict[str, Any] | None:
-    """A diagnosis of the latest fit by the code as it is, or None.
+    """A diagnosis (its file is ``path``) of the latest fit by the code as it is, or None.
 
-    Args:
-        folder: the run.
-        path: of the file.
-        effects: those whose files count for the code; the diagnosis's own candidates if not given.
+    Code is also that of the files of ``effects``, or of the diagnosis's own candidates if not given.
     """
     from splatsoil.files import JUDGING, code_digest, code_of
     from splatsoil.report.data import kept_of

@@ -31,15 +31,14 @@ class Config:
 
 def run(config: Config) -> int:
     """Reconstruct, save, print; an error before any work when set, options or the folder for the result are no good."""
+    from splatsoil.commands._stages import check_seed
     from splatsoil.envs.devices import resolve_device
-    from splatsoil.errors import ParameterError
     from splatsoil.files import check_folder
     from splatsoil.measurement import Measurement
     from splatsoil.quiet import hush
     from splatsoil.reconstruction import reconstruct
 
-    if not 0 <= config.seed < 2**63:
-        raise ParameterError(f"--seed: must be 0 or more and less than 2^63, not {config.seed}")
+    check_seed(config.seed)
     hush()
     device = resolve_device(config.device)
     measurement = Measurement.load(config.set)

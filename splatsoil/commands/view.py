@@ -67,6 +67,7 @@ def _loaded(config: Config) -> tuple[Measurement, list[Column]]:
     from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.measurement import Measurement
     from splatsoil.report.data import estimates, load
+    from splatsoil.report.text import amount
     from splatsoil.view import Column
 
     if not (config.folder / "run.json").is_file():
@@ -82,7 +83,7 @@ def _loaded(config: Config) -> tuple[Measurement, list[Column]]:
         comparator = Comparator(model.measurement, surface=model.reconstruction.surface, frames=model.frames)
         for fit in (data.fit, *([data.fits[config.beside]] if config.beside else [])):
             values, report = estimates(fit), begin(fit["name"])
-            said = (f"{n} {p['estimate']:.4g} ± {p['std']:.3g} {p['unit']}" for n, p in fit["parameters"].items())
+            said = (f"{n} {amount(p['estimate'], p['std'], p['unit'])}" for n, p in fit["parameters"].items())
             shown = model.variant(effects=_model.ModelSpec.of(fit).effects)
             column = Column(f"{fit['name']}: {', '.join(said)}", shown, values, comparator)
             progress = lambda frame, last, say=report: say(f"frame {frame}", frame / last)  # noqa: E731

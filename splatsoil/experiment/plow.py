@@ -246,9 +246,7 @@ class PlowExperiment:
                 if isinstance(trajectory, Trajectory):
                     self._keep(asked, trajectory)
 
-    def _together(
-        self, group: Sequence[tuple[Model, dict[str, float], int]]
-    ) -> Sequence[Trajectory | SimulationError]:
+    def _together(self, group: Sequence[tuple[Model, dict[str, float], int]]) -> Sequence[Trajectory | SimulationError]:
         """Simulations of models that are alike, as one batch."""
         models, values, seeds = zip(*group, strict=True)
         particles = [models[0].particles(seed) for seed in seeds]

@@ -10,6 +10,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
+from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -134,7 +135,9 @@ def losses(comparison: Mapping[str, Any]) -> Markup:
     name = comparison["loss"]
 
     def draw(_: Figure, axes: Axes) -> None:
-        for camera, colour, marker in zip(comparison["cameras"], _cycle(), "os^Dv<>" * 10, strict=False):
+        for camera, colour, marker in zip(
+            comparison["cameras"], cycle((ACCENT, SECOND, INK, FAINT)), cycle("os^Dv<>"), strict=False
+        ):
             steps = sorted((f for f in comparison["frames"] if f["camera"] == camera), key=lambda f: f["frame"])
             frames = [f["frame"] for f in steps]
             axes.plot(frames, [f["losses"][name] for f in steps], color=colour, marker=marker, ms=3.5, label=camera)
@@ -323,7 +326,3 @@ def outlined(check: Mapping[str, Any], judged: Mapping[str, Any], squares: Mappi
         f'<svg viewBox="0 0 1 1" preserveAspectRatio="none" role="img" aria-label="{escape(shows)}">'
         f"{''.join(shapes)}</svg>"
     )
-
-
-def _cycle() -> list[str]:
-    return [ACCENT, SECOND, INK, FAINT] * 20

@@ -31,18 +31,14 @@ class Answer:
 
     Attributes:
         name: "friction angle".
-        value: "35.6".
-        std: "0.8".
-        unit: "°".
+        number: "35.6 ± 0.8°".
         state: ``determined``, ``bound`` or ``open``.
         remark: one sentence when the state isn't ``determined``.
         truth: "36.0°" where the set is simulated and says it, else empty.
     """
 
     name: str
-    value: str
-    std: str
-    unit: str
+    number: str
     state: str
     remark: str
     truth: str = ""
@@ -89,26 +85,22 @@ def answers(
     out, better = [], averaged(fit, judged)
     for name, entry in fit["parameters"].items():
         plain, state, remark = name.replace("_", " "), "determined", ""
-        if name in better:
-            value, std = with_std(better[name]["value"], better[name]["std"])
-            determined, why = better[name]["determined"], undetermined(name)
-        else:
-            value, std = with_std(entry["estimate"], entry["std"])
-            determined, why = entry["determined"], undetermined(name)
-            if fit["estimated_from"] == "loss":
-                why = f"These evaluations do not determine the {plain}: they hardly say where the loss is least."
-        if not determined:
-            state, remark = "open", why
+        told = better.get(name) or {**entry, "value": entry["estimate"]}
+        if not told["determined"]:
+            state, remark = "open", undetermined(name)
+            if fit["estimated_from"] == "loss" and name not in better:
+                remark = f"These evaluations do not determine the {plain}: they hardly say where the loss is least."
         elif entry["at_bound"] is not None:
             state = "bound"
             remark = (
                 f"The {plain} lies on the {entry['at_bound']} bound of its range: "
                 "the best value may lie beyond it, or the model may lack an effect."
             )
-        true, unit = "", symbol(entry["unit"])
-        if truth and name in truth:
-            true = f"{truth[name]:.{len(value.partition('.')[2])}f}{unit}"
-        out.append(Answer(plain, value, std, unit, state, remark, true))
+        value, std = with_std(told["value"], told["std"])
+        unit, true = symbol(entry["unit"]), (truth or {}).get(name)
+        decimals = len(value.partition(".")[2])
+        said = "" if true is None else f"{true:.{decimals}f}{unit}"
+        out.append(Answer(plain, f"{value} ± {std}{unit}", state, remark, said))
     return out
 
 

@@ -288,7 +288,11 @@ def test_maps_before_and_after_have_colours_of_one_scale(diagnosis: dict[str, An
         ("fit.json", "{", "fit.json"),
         ("comparison/left_0_observed.jpg", None, "left_0_observed.jpg"),
         ("comparison/left_0_observed.jpg", "<svg>", r"left_0_observed\.jpg: is no whole JPEG or PNG image"),
-        ("comparison/left_50_difference.jpg", -300, r"left_50_difference\.jpg: is no whole .*; run `splatsoil compare`"),
+        (
+            "comparison/left_50_difference.jpg",
+            -300,
+            r"left_50_difference\.jpg: is no whole .*; run `splatsoil compare`",
+        ),
         ("reconstruction/surface.npz", "x", r"surface\.npz"),
         ("reconstruction/surface.npz", -100, r"surface\.npz.*; delete the folder .*reconstruction;"),
         ("reconstruction/reconstruction.json", "[]", "reconstruction.json: isn't of format"),

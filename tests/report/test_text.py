@@ -144,7 +144,7 @@ def test_the_answer_is_averaged_over_models_whatever_the_verdict(judged: dict) -
     fit = {"name": "base", "estimated_from": "loss", "parameters": {"friction_angle": entry}}
     judged = {**judged, "estimates": AVERAGED}
     (answer,) = words.answers(fit, judged)
-    assert (answer.value, answer.std, answer.state, answer.remark) == ("37", "3", "determined", "")
+    assert (answer.number, answer.state, answer.remark) == ("37 ± 3°", "determined", "")
     assert "averaged over models" in words.fitted_sentence(fit, judged)
     adequate = judged.get("adequate", judged.get("verdict") == "adequate")
     assert words.called_adequate(fit, judged) is adequate
@@ -158,7 +158,7 @@ def test_the_answer_is_averaged_over_models_whatever_the_verdict(judged: dict) -
 def test_without_a_judgement_of_this_fit_the_answer_is_its_own(judged: dict | None, source: str, said: str) -> None:
     fit = {"name": "base", "estimated_from": source, "evaluations": 10, "parameters": {"friction_angle": ENTRY}}
     (answer,) = words.answers(fit, judged)
-    assert (answer.value, answer.std) == ("36.0", "0.5")
+    assert answer.number == "36.0 ± 0.5°"
     assert said in words.fitted_sentence(fit, judged) and words.called_adequate(fit, judged) is None
 
 
