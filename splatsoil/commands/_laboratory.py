@@ -50,7 +50,8 @@ def diagnose(config: Any) -> int:
     ``diagnosis.json`` in the run folder."""
     from splatsoil.run_files import read_kept
 
-    about, kept = {"set": str(config.run), "effects": [], "preset": "small", "seed": 0}, None
+    about: Mapping[str, Any] = {"set": str(config.run), "effects": [], "preset": "small", "seed": 0}
+    kept = None
     if is_run(config.run):
         about, kept = read_kept(config.run / ABOUT, ABOUT_FORMAT), config.run
     folder = config.set or Path(about["set"])

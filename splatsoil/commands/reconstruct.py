@@ -46,8 +46,14 @@ def run(config: Config) -> int:
     out = config.out or Path("runs") / f"{measurement.name}-reconstruction"
     check_folder(out)
     with stages(quiet=config.json) as begin:
-        how = {"seed": config.seed, "device": device, "preset": config.preset, "holdout": config.holdout}
-        result = reconstruct(measurement, progress=begin("reconstruct"), **how)
+        result = reconstruct(
+            measurement,
+            seed=config.seed,
+            device=device,
+            preset=config.preset,
+            holdout=config.holdout,
+            progress=begin("reconstruct"),
+        )
     result.save(out)
     told = {"set": str(measurement.folder), "out": str(out), **result.summary()}
     return tell(config, told, lambda: _show(result, out))
