@@ -34,7 +34,7 @@ def write_report(folder: str | Path) -> Path:
 
     try:
         page = render(load(folder))
-    except (KeyError, TypeError, IndexError, UndefinedError) as error:
+    except (TypeError, ValueError, LookupError, AttributeError, UndefinedError) as error:
         raise RunError(
             f"{folder}: a file in it lacks what the page needs ({error!r}); it is damaged or made by another "
             "version: fit and compare again"

@@ -7,9 +7,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from splatsoil.errors import RunError
-from splatsoil.files import ANEW
-
 #: Loss of a prediction in which nothing moves. The loss is measured in units of it, so this is no choice of ours: a
 #: model that comes to it has explained nothing of what was seen, wherever its estimate lies.
 NOTHING_MOVES = 1.0
@@ -85,7 +82,7 @@ def answers(
     out, better = [], averaged(fit, judged)
     for name, entry in fit["parameters"].items():
         plain, state, remark = name.replace("_", " "), "determined", ""
-        told = better.get(name) or {**entry, "value": entry["estimate"]}
+        told, key = (better[name], "value") if name in better else (entry, "estimate")
         if not told["determined"]:
             state, remark = "open", undetermined(name)
             if fit["estimated_from"] == "loss" and name not in better:
@@ -96,7 +93,7 @@ def answers(
                 f"The {plain} lies on the {entry['at_bound']} bound of its range: "
                 "the best value may lie beyond it, or the model may lack an effect."
             )
-        value, std = with_std(told["value"], told["std"])
+        value, std = with_std(told[key], told["std"])
         unit, true = symbol(entry["unit"]), (truth or {}).get(name)
         decimals = len(value.partition(".")[2])
         said = "" if true is None else f"{true:.{decimals}f}{unit}"
@@ -105,34 +102,24 @@ def answers(
 
 
 def no_answer(fit: Mapping[str, Any]) -> str:
-    """Why the estimate of ``fit.json`` means nothing, in one sentence; empty where it means something.
-
-    Raises:
-        RunError: the file is damaged.
-    """
-    try:
-        least, loss = fit["best"]["loss"], max(fit["loss"], fit["best"]["loss"])
-        if loss >= NOTHING_MOVES:
-            where = "everywhere it was tried" if least >= NOTHING_MOVES else "where pictures and force together put it"
+    """Why the estimate of ``fit.json`` means nothing, in one sentence; empty where it means something."""
+    least, loss = fit["best"]["loss"], max(fit["loss"], fit["best"]["loss"])
+    if loss >= NOTHING_MOVES:
+        where = "everywhere it was tried" if least >= NOTHING_MOVES else "where pictures and force together put it"
+        return (
+            f"no answer: {where} the model explains the video no better than soil that never moves (loss {loss:.3g}; "
+            f"such soil has {NOTHING_MOVES:g}); photographs, poses, clock or tool are wrong, or the soil is another"
+        )
+    for name, entry in fit["parameters"].items():
+        if entry["at_bound"] is None:
+            continue
+        bound = entry["bounds"][0 if entry["at_bound"] == "lower" else 1]
+        # An effect that is off is no bound of knowledge: it isn't there.
+        if bound != entry.get("off"):
             return (
-                f"no answer: {where} the model explains the video no better than soil that never moves (loss "
-                f"{loss:.3g}; such soil has {NOTHING_MOVES:g}); photographs, poses, clock or tool are wrong, or the "
-                "soil is another"
+                f"no answer: the {name.replace('_', ' ')} ends at the {entry['at_bound']} bound of its range "
+                f"({bound:g}{symbol(entry['unit'])}); the best value lies beyond it, or the model lacks an effect"
             )
-        for name, entry in fit["parameters"].items():
-            if entry["at_bound"] is None:
-                continue
-            bound = entry["bounds"][0 if entry["at_bound"] == "lower" else 1]
-            # An effect that is off is no bound of knowledge: it isn't there.
-            if bound != entry.get("off"):
-                return (
-                    f"no answer: the {name.replace('_', ' ')} ends at the {entry['at_bound']} bound of its range "
-                    f"({bound:g}{symbol(entry['unit'])}); the best value lies beyond it, or the model lacks an effect"
-                )
-    except (KeyError, TypeError, IndexError, AttributeError, ValueError) as error:
-        raise RunError(
-            f"fit.json: is damaged, it lacks loss, best, or a parameter's bounds ({error!r}); {ANEW}"
-        ) from error
     return ""
 
 

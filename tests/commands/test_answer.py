@@ -12,7 +12,7 @@ from splatsoil.inverse.run_folder import RunFolder
 
 from splatsoil import cli
 from splatsoil.commands import add
-from splatsoil.errors import NoAnswer, RunError
+from splatsoil.errors import NoAnswer
 from splatsoil.report.text import no_answer
 
 FitOf = Callable[..., dict[str, Any]]
@@ -64,9 +64,6 @@ def test_what_is_an_answer(fit_of: FitOf) -> None:
     assert "the cohesion ends at the upper bound of its range (1500 Pa)" in no_answer(fit)
     # where forces lead away from what the pictures say
     assert "where pictures and force together put it" in no_answer(fit | {"loss": 1.2, "best": {"loss": 0.9}})
-    del fit["best"]
-    with pytest.raises(RunError, match="damaged"):
-        no_answer(fit)
 
 
 @pytest.mark.parametrize("answer", [True, False])

@@ -67,7 +67,7 @@ def test_a_page_that_lacks_something_says_so(run: RunFolder, capsys: pytest.Capt
     """A fit without its number of evaluations, say: what makes it one is there."""
     assert cli.main(["report", str(run.path)]) == 2
     out, err = capsys.readouterr()
-    assert out == "" and err.count("\n") == 1 and "lacks what the page needs" in err
+    assert out == "" and err.count("\n") == 1 and "fit.json: is damaged, it lacks" in err
 
 
 def test_a_fit_into_a_run_that_does_not_say_what_it_is_for_is_refused(
