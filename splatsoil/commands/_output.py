@@ -95,6 +95,31 @@ def print_table(
     Console(highlight=False).print(table)
 
 
+def print_parameters(
+    title: str, result: Mapping[str, Any], value: str, more: Mapping[str, Callable[[Mapping[str, Any]], str]]
+) -> None:
+    """Print a table of a result's parameters with their ± and interval, and its notes.
+
+    Args:
+        title: above it.
+        result: with ``parameters`` by name, and ``notes``.
+        value: key of what the ± is of.
+        more: further columns.
+    """
+    from splatsoil.report.text import amount, interval
+
+    print_table(
+        title,
+        ("parameter", value, "5 to 95 %", *more),
+        (
+            (name, amount(p[value], p["std"], p["unit"]), interval(p), *(column(p) for column in more.values()))
+            for name, p in result["parameters"].items()
+        ),
+        left=("parameter", ""),
+    )
+    print_text(notes=result["notes"])
+
+
 def print_text(*paragraphs: str, style: str = "", notes: Iterable[str] = ()) -> None:
     """Print sentences, wrapped at words, and then what is to be known besides."""
     from rich.console import Console

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from splatsoil.commands import _model
 from splatsoil.commands._model import ModelSpec, experiment_of, reconstruction_digest
 from splatsoil.commands._options import EVALUATIONS, FitOptions, check_evaluations
 from splatsoil.commands._output import print_remarks
@@ -78,6 +79,24 @@ def check_seed(seed: int) -> None:
     """ParameterError for one that random numbers can't begin with."""
     if not 0 <= seed < 2**63:
         raise ParameterError(f"--seed: must be 0 or more and less than 2^63, not {seed}")
+
+
+def fitted(options: FitOptions, begin: Stage) -> tuple[RunFolder, Model, dict[str, Any]]:
+    """From a set to its fit: run folder, model, and what ``fit.json`` holds. Whatever the folder has isn't made again.
+
+    Raises:
+        MeasurementError, ParameterError, RunError: see `prepare`.
+    """
+    from splatsoil.envs.devices import resolve_device
+    from splatsoil.quiet import hush
+
+    hush()
+    begin("check")("reading every image", 0.0)
+    measurement, folder = prepare(options)
+    device = resolve_device(options.device)
+    reconstruction = _model.reconstructed(measurement, folder, device, begin("reconstruct"))
+    model = _model.model_on(measurement, folder, reconstruction, options.effects, options.preset, device)
+    return folder, model, run_fit(options, measurement, folder, model, begin("fit"))
 
 
 def facts(model: Model) -> dict[str, str]:

@@ -8,7 +8,7 @@ from typing import Any
 
 from splatsoil.commands import _folder, _model, _stages
 from splatsoil.commands._options import RunOptions, command_line
-from splatsoil.commands._output import print_table, print_text, stages, tell
+from splatsoil.commands._output import print_parameters, print_text, stages, tell
 from splatsoil.errors import ParameterError
 from splatsoil.options import JSON, option
 
@@ -80,18 +80,10 @@ def run(config: Config) -> int:
 
 def show(result: Mapping[str, Any], folder: str) -> None:
     """A table of the parameters, and what to know about them."""
-    from splatsoil.report.text import amount, duration, interval, model_name
+    from splatsoil.report.text import duration, model_name
 
-    print_table(
-        f"posterior, {model_name(result['fit'])}",
-        ("parameter", "mean", "5 to 95 %", "width / prior", ""),
-        (
-            (name, amount(p["mean"], p["std"], p["unit"]), interval(p), f"{p['contraction']:.2f}", p["verdict"])
-            for name, p in result["parameters"].items()
-        ),
-        left=("parameter", ""),
-    )
-    print_text(notes=result["notes"])
+    more = {"width / prior": lambda p: f"{p['contraction']:.2f}", "": lambda p: str(p["verdict"])}
+    print_parameters(f"posterior, {model_name(result['fit'])}", result, "mean", more)
     chains = result["chains"]
     print_text(
         f"{result['simulations']} simulations; R-hat {chains['r_hat']:.3f}, acceptance {chains['acceptance']:.2f}, "

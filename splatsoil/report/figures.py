@@ -168,22 +168,6 @@ def surface_map(surface: Surface) -> Markup:
     return _draw(draw, "height of the bed from above")
 
 
-def history(fits: Mapping[str, Mapping[str, Any]], order: Sequence[str]) -> Markup:
-    """The loss at the estimate of each model that was fitted: does it fall when an effect is added?"""
-
-    def draw(_: Figure, axes: Axes) -> None:
-        rows = np.arange(len(order))[::-1]
-        values = [fits[name]["loss"] for name in order]
-        spread = [2.0 * fits[name]["loss_std"] for name in order]
-        axes.barh(rows, values, color=ACCENT, alpha=0.75, height=0.55)
-        axes.errorbar(values, rows, xerr=spread, fmt="none", ecolor=INK, capsize=3)
-        axes.set_yticks(rows, [name.replace("_", " ") for name in order])
-        axes.set_xlabel("loss at the estimate (± 2 std)")
-        axes.set_xlim(left=0.0)
-
-    return _draw(draw, "loss at the estimate of each model", (SIZE[0], 0.8 + 0.36 * len(order)))
-
-
 def falling(errors: Sequence[float], noise: Sequence[float], names: Sequence[str], unit: str) -> Markup:
     """The error on data set aside of models in turn, and the noise level."""
 

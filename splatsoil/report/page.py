@@ -99,7 +99,6 @@ def render(data: RunData) -> str:
         falling=_falling(data),
         surface=None if data.surface is None else figures.surface_map(data.surface),
         order=order,
-        history=figures.history(data.fits, order) if len(order) > 1 else None,
     )
 
 
