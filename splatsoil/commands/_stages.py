@@ -14,7 +14,7 @@ import numpy as np
 
 from splatsoil.commands import _model
 from splatsoil.commands._model import ModelSpec, experiment_of, reconstruction_digest
-from splatsoil.commands._options import EVALUATIONS, FitOptions, check_evaluations
+from splatsoil.commands._options import EVALUATIONS, FitOptions, check_evaluations, check_seed
 from splatsoil.commands._output import print_remarks
 from splatsoil.errors import MeasurementError, ParameterError, RunError
 
@@ -73,12 +73,6 @@ def prepare(options: FitOptions) -> tuple[Measurement, RunFolder]:
     )
     run.check_writable()
     return measurement, run
-
-
-def check_seed(seed: int) -> None:
-    """ParameterError for one that random numbers can't begin with."""
-    if not 0 <= seed < 2**63:
-        raise ParameterError(f"--seed: must be 0 or more and less than 2^63, not {seed}")
 
 
 def fitted(options: FitOptions, begin: Stage) -> tuple[RunFolder, Model, dict[str, Any]]:

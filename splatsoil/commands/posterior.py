@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from splatsoil.commands import _folder, _model, _stages
-from splatsoil.commands._options import RunOptions, command_line
+from splatsoil.commands._options import RunOptions, check_seed, command_line
 from splatsoil.commands._output import print_parameters, print_text, stages, tell
 from splatsoil.errors import ParameterError
 from splatsoil.options import JSON, option
@@ -37,10 +37,9 @@ def run(config: Config) -> int:
     from splatsoil.inverse.posterior import Density, run_posterior
     from splatsoil.quiet import hush
 
-    for name in ("checks", "seed"):
-        value = getattr(config, name)
-        if value < 0:
-            raise ParameterError(f"--{name}: must be 0 or more, not {value}")
+    check_seed(config.seed)
+    if config.checks < 0:
+        raise ParameterError(f"--checks: must be 0 or more, not {config.checks}")
     hush()
     folder = _folder.opened(config)
     fit = folder.fit()

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from splatsoil.commands._options import PRESET, SEED, SET, Preset
+from splatsoil.commands._options import PRESET, SEED, SET, Preset, check_seed
 from splatsoil.commands._output import print_remarks, print_table, print_text, stages, tell
 from splatsoil.options import JSON, argument, option
 
@@ -31,7 +31,6 @@ class Config:
 
 def run(config: Config) -> int:
     """Reconstruct, save, print; an error before any work when set, options or the folder for the result are no good."""
-    from splatsoil.commands._stages import check_seed
     from splatsoil.envs.devices import resolve_device
     from splatsoil.files import check_folder
     from splatsoil.measurement import Measurement

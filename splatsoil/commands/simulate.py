@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from splatsoil.commands import _laboratory
-from splatsoil.commands._options import Preset
+from splatsoil.commands._options import Preset, check_seed
 from splatsoil.commands._output import print_table, stages, tell
 from splatsoil.errors import ParameterError
 from splatsoil.options import JSON, argument, option
@@ -116,8 +116,7 @@ def choose_setup(config: Config) -> Setup:
 
     if config.views is not None and config.views < 1:
         raise ParameterError(f"--views {config.views}: a set needs at least one photograph")
-    if config.seed < 0:
-        raise ParameterError(f"--seed {config.seed}: seeds are whole numbers from 0 on")
+    check_seed(config.seed)
     if config.scene == "paper" and (config.like is not None or config.depth is not None):
         raise ParameterError("--scene paper is a scene of its own; leave --like and --depth out")
     if config.container is not None and (config.scene == "paper" or config.like is not None):

@@ -47,10 +47,15 @@ def test_every_command_says_what_is_odd_and_refuses_what_shows_nothing(
     assert "EXIF rotation" in said and "002.jpg" in said
     assert ("work would begin here" in said) == (command != "check")
 
-    Image.new("RGB", (320, 240)).save(small_set / "views/images/002.jpg")
-    assert main([command, str(small_set)]) == 2
-    out, err = capsys.readouterr()
-    assert "one even grey" in err and "work would begin" not in err and out == ""
+    whole = (small_set / "views/images/002.jpg").read_bytes()
+    for says in ("one even grey", "damaged or truncated"):
+        if says == "one even grey":
+            Image.new("RGB", (320, 240)).save(small_set / "views/images/002.jpg")
+        else:
+            (small_set / "views/images/002.jpg").write_bytes(whole[: len(whole) // 2])
+        assert main([command, str(small_set)]) == 2
+        out, err = capsys.readouterr()
+        assert says in err and "002.jpg" in err and "work would begin" not in err and out == ""
 
 
 @pytest.mark.parametrize("command", [("compare", "--quick"), ("add", "cohesion")], ids=lambda c: c[0])
