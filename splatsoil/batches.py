@@ -1,4 +1,4 @@
-"""Work in batches, in smaller ones once a GPU's memory has been full."""
+"""Work in batches, in smaller ones once memory has been full."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ _most: dict[str, int] = {}
 """Largest batch by kind, of those that didn't fit as a whole."""
 
 
-def memory_is_full(error: BaseException) -> bool:
-    """Whether an error is torch's or Warp's, that a GPU has no memory left."""
-    kind = type(error).__name__ == "OutOfMemoryError"
-    return isinstance(error, RuntimeError) and (kind or "Failed to allocate" in str(error))
+def full_memory(error: RuntimeError) -> str:
+    """Which memory an error of torch or Warp says is full; empty for any other error."""
+    if type(error).__name__ != "OutOfMemoryError" and "Failed to allocate" not in str(error):
+        return ""
+    return "memory" if "device 'cpu'" in str(error) else "GPU memory"
 
 
 def in_batches(work: Callable[[Sequence[Item]], Sequence[Result]], items: Sequence[Item], kind: str) -> list[Result]:
-    """What ``work`` makes of all items at once or, where a GPU's memory is full, of half as many at a time.
+    """What ``work`` makes of all items at once or, where memory is full, of half as many at a time.
 
     Args:
         work: items to as many results.
@@ -38,12 +39,12 @@ def in_batches(work: Callable[[Sequence[Item]], Sequence[Result]], items: Sequen
         try:
             done += work(batch)
         except RuntimeError as error:
-            if len(batch) == 1 or not memory_is_full(error):
+            memory = full_memory(error)
+            if len(batch) == 1 or not memory:
                 raise
             _most[kind] = len(batch) // 2
-            warnings.warn(
-                f"GPU memory is full: {_most[kind]} instead of {len(batch)} {kind} at a time", SetWarning, stacklevel=2
-            )
+            text = f"{memory} is full: {_most[kind]} instead of {len(batch)} {kind} at a time"
+            warnings.warn(text, SetWarning, stacklevel=2)
         else:
             continue
         # Only here: while the error is known, so are the arrays of the functions that it came through.

@@ -23,7 +23,7 @@ from typing import Any
 
 import splatsoil.commands
 from splatsoil import __version__
-from splatsoil.batches import memory_is_full
+from splatsoil.batches import full_memory
 from splatsoil.commands._options import parse, program_page, same_again
 from splatsoil.commands._output import only_json, print_json
 from splatsoil.errors import NoAnswer, SetWarning, SplatsoilError, did_you_mean
@@ -123,9 +123,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             message, code = " ".join(str(error).split()), error.code
             print(f"splatsoil: {message}", file=sys.stderr)
         except RuntimeError as error:
-            if not memory_is_full(error):
+            if not (memory := full_memory(error)):
                 raise
-            message, code = "GPU memory is full; choose a coarser --preset, or --device cpu", SplatsoilError.code
+            message, code = f"{memory} is full; choose a coarser --preset, or another --device", SplatsoilError.code
             print(f"splatsoil: {message}", file=sys.stderr)
         except KeyboardInterrupt:
             message, code = f"interrupted; {after_interrupt(name, command, config)}", 130

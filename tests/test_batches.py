@@ -25,6 +25,7 @@ from splatsoil.scene import Scene
 ERRORS = [
     RuntimeError("Failed to allocate 5368709120 bytes on device 'cuda:0'"),
     torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 5.00 GiB."),
+    RuntimeError("Failed to allocate 5368709120 bytes on device 'cpu'"),
 ]
 
 
@@ -52,13 +53,19 @@ def full() -> Callable[..., Any]:
     return make
 
 
-@pytest.mark.parametrize("error", ERRORS, ids=lambda error: type(error).__name__)
-def test_a_full_memory_halves_the_batch_and_is_told_once(full: Callable[..., Any], error: Exception) -> None:
+@pytest.mark.parametrize(
+    ("error", "memory"),
+    list(zip(ERRORS, ("GPU memory", "GPU memory", "memory"), strict=True)),
+    ids=("warp", "torch", "cpu"),
+)
+def test_a_full_memory_halves_the_batch_and_is_told_once(
+    full: Callable[..., Any], error: Exception, memory: str
+) -> None:
     work, asked = full(4, error, lambda item: 10 * item)
     with pytest.warns(SetWarning) as said:
         assert in_batches(work, range(8), "simulations") == [10 * k for k in range(8)]
         assert in_batches(work, range(5), "simulations") == [10 * k for k in range(5)]
-    assert [str(w.message) for w in said] == ["GPU memory is full: 4 instead of 8 simulations at a time"]
+    assert [str(w.message) for w in said] == [f"{memory} is full: 4 instead of 8 simulations at a time"]
     assert asked == [8, 4, 4, 4, 1]
 
 
