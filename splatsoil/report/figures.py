@@ -8,7 +8,6 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from html import escape
 from itertools import cycle
 from typing import TYPE_CHECKING, Any
@@ -188,42 +187,38 @@ def falling(errors: Sequence[float], noise: Sequence[float], names: Sequence[str
     return _draw(draw, f"error of models on data set aside, {unit}; {'; '.join(rows)}")
 
 
-@dataclass(frozen=True)
-class Readings:
-    """One instrument without a place.
+def readings(
+    channel: str,
+    unit: str,
+    measured: Sequence[np.ndarray],
+    predicted: Mapping[str, Sequence[np.ndarray]],
+    expected: Sequence[np.ndarray] | None,
+    time_name: str,
+) -> Markup:
+    """What an instrument without a place measured, and what models predict.
 
-    Attributes:
+    Args:
         channel: its name.
         unit: of what it reads.
         measured: times and readings (n,), NaN where there is none.
-        expected: times, and readings one expected standard deviation below and above what was measured; None where
-            that has not been estimated.
         predicted: times and readings by model.
+        expected: times, and readings one expected standard deviation below and above what was measured; None where that
+            has not been estimated.
+        time_name: what the times are.
     """
 
-    channel: str
-    unit: str
-    measured: tuple[np.ndarray, np.ndarray]
-    expected: tuple[np.ndarray, np.ndarray, np.ndarray] | None
-    predicted: Mapping[str, tuple[np.ndarray, np.ndarray]]
-
-
-def readings(one: Readings, time_name: str) -> Markup:
-    """What an instrument without a place measured, and what models predict."""
-
     def draw(figure: Figure, axes: Axes) -> None:
-        if one.expected is not None:
-            axes.fill_between(*one.expected, color=FAINT, alpha=0.3, linewidth=0, label="± expected std")
-        axes.plot(*one.measured, "o", markersize=3.5, color=INK, label="measured")
-        lines = zip(one.predicted.items(), (ACCENT, SECOND), ("-", "--"), strict=False)
-        for (title, line), colour, style in lines:
+        if expected is not None:
+            axes.fill_between(*expected, color=FAINT, alpha=0.3, linewidth=0, label="± expected std")
+        axes.plot(*measured, "o", markersize=3.5, color=INK, label="measured")
+        for (title, line), colour, style in zip(predicted.items(), (ACCENT, SECOND), ("-", "--"), strict=False):
             axes.plot(*line, color=colour, linestyle=style, label=title)
         axes.axhline(0.0, color=FAINT, linewidth=0.6)
-        axes.set_ylabel(f"{one.channel} [{one.unit}]")
+        axes.set_ylabel(f"{channel} [{unit}]")
         axes.set_xlabel(time_name)
         figure.legend(fontsize=8, loc="outside upper center", ncols=2, columnspacing=1.0)
 
-    return _draw(draw, f"measured and predicted {one.channel} [{one.unit}]", (SIZE[0], 2.7))
+    return _draw(draw, f"measured and predicted {channel} [{unit}]", (SIZE[0], 2.7))
 
 
 def plan_maps(judged: Mapping[str, Any], which: Sequence[tuple[str, str]]) -> list[Markup]:

@@ -205,28 +205,24 @@ def _forces(data: RunData, judged: Mapping[str, Any] | None) -> dict[str, Any] |
     now, before = ((c or {}).get("force") for c in (data.comparison, data.before))
     if now is None:
         return None
-    drawn, sentences = [], []
+    drawn, sentences, unit = [], [], now["unit"]
     for number, channel in enumerate(now["channels"]):
+        name = channel["channel"]
         frames, measured, predicted = _series(now["frames"], channel["measured"], channel["predicted"])
-        lines = {"predicted": (frames, predicted)}
+        lines, expected, curve = {"predicted": (frames, predicted)}, None, curves.get(name)
         if before is not None:
-            was = before["channels"][number]
-            earlier, _, old = _series(before["frames"], was["measured"], was["predicted"])
-            lines = {"before": (earlier, old), "after": (frames, predicted)}
-        expected, curve = None, curves.get(channel["channel"])
+            earlier = _series(before["frames"], before["channels"][number]["predicted"])
+            lines = {"before": earlier, "after": (frames, predicted)}
         if own is not None and curve is not None:
-            times, low, high = _series(own["times"], curve["low"], curve["high"])
-            expected = (times, low, high)
-            for name in own.get("class", ())[:1] if before is None else ():
-                if name in curve["predicted"]:
-                    times, values = _series(own["times"], curve["predicted"][name])
-                    lines[f"with {text.model_label(name)}"] = (times, values)
-        one = figures.Readings(channel["channel"], now["unit"], (frames, measured), expected, lines)
-        drawn.append(figures.readings(one, "frame"))
+            expected = _series(own["times"], curve["low"], curve["high"])
+            for model in own.get("class", ())[:1] if before is None else ():
+                if model in curve["predicted"]:
+                    lines[f"with {text.model_label(model)}"] = _series(own["times"], curve["predicted"][model])
+        drawn.append(figures.readings(name, unit, (frames, measured), lines, expected, "frame"))
         error, largest = np.sqrt(np.nanmean((predicted - measured) ** 2)), np.nanmax(np.abs(measured))
         sentences.append(
-            f"{channel['channel'].capitalize()}: root mean square error {text.rounded(float(error))} {now['unit']}; "
-            f"largest measured {text.rounded(float(largest))} {now['unit']}."
+            f"{name.capitalize()}: root mean square error {text.rounded(float(error))} {unit}; "
+            f"largest measured {text.rounded(float(largest))} {unit}."
         )
     return {"figures": drawn, "sentences": sentences}
 
