@@ -179,6 +179,11 @@ def stages(*, quiet: bool = False) -> Iterator[Stage]:
         finish()
 
 
+def by_frame(report: Report, share: float = 1.0) -> Callable[[int, int], None]:
+    """Takes the frame that a simulation has come to, and its last, which together are a share of a stage."""
+    return lambda frame, last: report(f"frame {frame}", share * frame / max(last, 1))
+
+
 def _logged(name: str) -> Report:
     """A stage as lines of a log."""
     print(name, file=sys.stderr, flush=True)

@@ -15,7 +15,7 @@ import numpy as np
 from splatsoil.commands import _model
 from splatsoil.commands._model import ModelSpec, experiment_of, reconstruction_digest
 from splatsoil.commands._options import EVALUATIONS, FitOptions, check_evaluations, check_seed
-from splatsoil.commands._output import print_remarks
+from splatsoil.commands._output import by_frame, print_remarks
 from splatsoil.errors import MeasurementError, ParameterError, RunError
 
 if TYPE_CHECKING:
@@ -181,7 +181,7 @@ def draw_comparison(run: RunFolder, model: Model, report: Report) -> dict[str, A
         values = estimates(result)
         report("reading the video", 0.0)
         comparator = Comparator(model.measurement, surface=model.reconstruction.surface, frames=model.frames)
-        prediction = model.predict(values, 0, lambda frame, last: report(f"frame {frame}", 0.9 * frame / last))
+        prediction = model.predict(values, 0, by_frame(report, 0.9))
         comparison = comparator.compare(prediction.images)
         noise = 0.0 if without_noise(model.measurement) else comparator.noise
         report("writing pictures", 0.95)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from splatsoil.commands import _folder, _model
 from splatsoil.commands._options import DEVICE, RunOptions
-from splatsoil.commands._output import tell
+from splatsoil.commands._output import by_frame, tell
 from splatsoil.errors import ParameterError, RunError
 from splatsoil.options import JSON, option
 
@@ -76,18 +76,11 @@ def _exported(config: Config, folder: RunFolder, formats: tuple[str, ...], targe
     with _model.loaded(config, folder) as (fitted, begin):
         model, values = _chosen(config, folder, fitted)
         frames = model.frames if config.every is None else tuple(range(0, model.frames[-1] + 1, config.every))
-        report = begin("export")
         target.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}-") as temporary:
             made = Path(temporary) / target.name
             writers = make_writers(made, formats, model, frames)
-            replay(
-                model,
-                values,
-                frames,
-                writers,
-                progress=lambda frame, last: report(f"frame {frame}", frame / (last or 1)),
-            )
+            replay(model, values, frames, writers, progress=by_frame(begin("export")))
             about = {
                 "run": str(folder.path),
                 "measurement": folder.description["measurement"]["name"],

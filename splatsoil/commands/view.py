@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from splatsoil.commands import _model
 from splatsoil.commands._options import DEVICE
+from splatsoil.commands._output import by_frame
 from splatsoil.errors import ParameterError, RunError
 from splatsoil.options import argument, option
 
@@ -86,7 +87,6 @@ def _loaded(config: Config) -> tuple[Measurement, list[Column]]:
             said = (f"{n} {amount(p['estimate'], p['std'], p['unit'])}" for n, p in fit["parameters"].items())
             shown = model.variant(effects=_model.ModelSpec.of(fit).effects)
             column = Column(f"{fit['name']}: {', '.join(said)}", shown, values, comparator)
-            progress = lambda frame, last, say=report: say(f"frame {frame}", frame / last)  # noqa: E731
-            replay(shown, values, shown.recorded, [column], progress=progress)
+            replay(shown, values, shown.recorded, [column], progress=by_frame(report))
             columns.append(column)
     return model.measurement, columns

@@ -36,8 +36,8 @@ def write_report(folder: str | Path) -> Path:
         page = render(load(folder))
     except (TypeError, ValueError, LookupError, AttributeError, UndefinedError) as error:
         raise RunError(
-            f"{folder}: a file in it lacks what the page needs ({error!r}); it is damaged or made by another "
-            "version: fit and compare again"
+            f"{folder}: fit.json, posterior.json, or one in comparison/ or diagnoses/ isn't what the page needs "
+            f"({error!r}); it is damaged or made by another version: fit and compare again"
         ) from error
     return write_text(Path(folder) / "report.html", page)
 
