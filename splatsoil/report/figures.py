@@ -209,7 +209,8 @@ def readings(
 
     def draw(figure: Figure, axes: Axes) -> None:
         if expected is not None:
-            axes.fill_between(*expected, color=FAINT, alpha=0.3, linewidth=0, label="± expected std")
+            times, low, high = expected
+            axes.fill_between(times, low, high, color=FAINT, alpha=0.3, linewidth=0, label="± expected std")
         axes.plot(*measured, "o", markersize=3.5, color=INK, label="measured")
         for (title, line), colour, style in zip(predicted.items(), (ACCENT, SECOND), ("-", "--"), strict=False):
             axes.plot(*line, color=colour, linestyle=style, label=title)

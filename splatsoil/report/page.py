@@ -209,7 +209,8 @@ def _forces(data: RunData, judged: Mapping[str, Any] | None) -> dict[str, Any] |
     for number, channel in enumerate(now["channels"]):
         name = channel["channel"]
         frames, measured, predicted = _series(now["frames"], channel["measured"], channel["predicted"])
-        lines, expected, curve = {"predicted": (frames, predicted)}, None, curves.get(name)
+        lines: dict[str, tuple[np.ndarray, ...]] = {"predicted": (frames, predicted)}
+        expected, curve = None, curves.get(name)
         if before is not None:
             earlier = _series(before["frames"], before["channels"][number]["predicted"])
             lines = {"before": earlier, "after": (frames, predicted)}
