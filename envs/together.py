@@ -10,11 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from splatsoil.batches import in_batches
 from splatsoil.errors import SimulationError
 
 from .problem import Evaluation, Job, Problem
 
 if TYPE_CHECKING:
+    from splatsoil.mpm import Trajectory
+
     from .measured import MeasuredProblem
     from .synthetic import SyntheticProblem
 
@@ -68,8 +71,13 @@ def _measured(problem: MeasuredProblem, jobs: Sequence[Job]) -> list[Evaluation]
     from splatsoil.mpm import simulate_together
 
     began, model = time.perf_counter(), problem.model
-    particles = [model.particles(seed) for _, seed in jobs]
-    found = simulate_together(model.measurement, particles, [v for v, _ in jobs], model, problem.experiment.progress)
+
+    def simulated(some: Sequence[Job]) -> Sequence[Trajectory | SimulationError]:
+        particles = [model.particles(seed) for _, seed in some]
+        told = problem.experiment.progress
+        return simulate_together(model.measurement, particles, [v for v, _ in some], model, told)
+
+    found = in_batches(simulated, jobs, "simulations")
     made = (
         trajectory
         if isinstance(trajectory, SimulationError)

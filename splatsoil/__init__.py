@@ -13,11 +13,11 @@ and show a run. They are loaded when they are first used. Importing the package 
 that ``import gymnasium, splatsoil`` is all that ``gymnasium.make("PlowSand-v0")`` needs.
 """
 
-from typing import TYPE_CHECKING, Any
-
 from splatsoil import starting as _starting
 
-_starting.heed_interrupts()  # before what takes its time
+_starting.heed_interrupts()  # before anything that takes its time
+
+from typing import TYPE_CHECKING, Any  # noqa: E402
 
 from splatsoil import deterministic as _deterministic  # noqa: E402
 from splatsoil._version import __version__  # noqa: E402

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import signal
 import sys
@@ -34,9 +35,15 @@ def main() -> int:
         from splatsoil.cli import main as run
 
         try:
-            return run()
+            code = run()
         finally:
             sys.stdout.flush()
+        if code == 130:
+            # At its end Python would wait for threads, of those that serve a browser as long as it is open.
+            atexit._run_exitfuncs()
+            sys.stderr.flush()
+            os._exit(code)
+        return code
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0

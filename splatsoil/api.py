@@ -1,8 +1,9 @@
 """What the command line does, in Python: ``import splatsoil as ss``.
 
 Each function is the command of the same name, with its options as keywords, and keeps what it finds in the same files.
-Results are read from these. Errors are `splatsoil.errors.SplatsoilError`, one sentence each. docs/api.md has a quick
-start.
+Results are read from these. What is wrong, missing or damaged is a `splatsoil.errors.SplatsoilError`, one sentence
+each: MeasurementError of a set, ParameterError of an option, RunError of a run folder, SimulationError, and NoAnswer
+where all is kept and means nothing. docs/api.md has a quick start.
 """
 
 from __future__ import annotations
@@ -63,11 +64,7 @@ class Run:
 
     @property
     def data(self) -> RunData:
-        """Everything that the folder's files say; read anew each time.
-
-        Raises:
-            RunError: a file is missing or damaged.
-        """
+        """Everything that the folder's files say; read anew each time."""
         from splatsoil.report.data import load
 
         return load(self.path)
@@ -96,11 +93,8 @@ class Run:
 
     @property
     def probabilities(self) -> dict[str, float]:
-        """Probability of each model that the latest diagnosis compared: "" as it is, an effect more, "something else".
-
-        Raises:
-            RunError: there is no diagnosis.
-        """
+        """Probability of each model that the latest diagnosis compared: "" as it is, an effect more, "something
+        else"."""
         diagnosis = self.data.diagnosis
         if diagnosis is None:
             raise RunError(f"{self.path}: there is no diagnosis of its model yet; diagnose() makes one")
@@ -108,11 +102,7 @@ class Run:
 
     @property
     def posterior(self) -> arviz.InferenceData:
-        """Samples of the latest fit's posterior.
-
-        Raises:
-            RunError: it has not been sampled yet.
-        """
+        """Samples of the latest fit's posterior, once it was sampled."""
         file = self.path / "posterior" / "posterior.nc"
         if self.data.posterior is None or not file.is_file():
             raise RunError(f"{self.path}: the posterior of its latest fit has not been sampled yet; sample() does")
@@ -139,11 +129,7 @@ class Run:
     @property
     def force(self) -> xarray.Dataset:
         """Force on the tool around each compared frame: ``measured`` and ``predicted`` (channel, frame) in N, NaN where
-        it was not measured.
-
-        Raises:
-            RunError: the run has not been compared, or too little force was measured.
-        """
+        it was not measured; once the run was compared."""
         import xarray
 
         comparison = self.data.comparison
@@ -157,11 +143,7 @@ class Run:
 
     @property
     def surface(self) -> xarray.DataArray:
-        """Height (y, x) in m of the reconstructed soil surface before anything moves; coordinates in m.
-
-        Raises:
-            RunError: the folder holds no reconstruction.
-        """
+        """Height (y, x) in m of the reconstructed soil surface before anything moves; coordinates in m."""
         import xarray
 
         surface = self.data.surface
@@ -174,18 +156,16 @@ class Run:
     def picture(
         self, camera: str, frame: int, kind: Literal["observed", "predicted", "difference"]
     ) -> npt.NDArray[np.uint8]:
-        """(h, w, 3) sRGB of a compared frame.
-
-        Raises:
-            RunError: there is no such picture.
-        """
+        """(h, w, 3) sRGB of a compared frame."""
         import numpy as np
         from PIL import Image
+
+        from splatsoil.report.data import read_picture
 
         file = self.path / "comparison" / f"{camera}_{frame:04d}_{kind}.jpg"
         if self.data.comparison is None or not file.is_file():
             raise RunError(f"{file}: there is no such picture; compare() draws those of all compared frames")
-        return np.asarray(Image.open(file).convert("RGB"))
+        return np.asarray(Image.open(io.BytesIO(read_picture(file)[0])).convert("RGB"))
 
     def compare(self, **options: Any) -> Run:
         """`compare` of this run."""
@@ -213,22 +193,14 @@ class Run:
 
 
 def load(folder: PathLike) -> Measurement:
-    """Read and validate a measurement set.
-
-    Raises:
-        MeasurementError: what is wrong with it, with file and field.
-    """
+    """Read and validate a measurement set; MeasurementError says what is wrong with it, with file and field."""
     from splatsoil.measurement import Measurement
 
     return Measurement.load(folder)
 
 
 def check(folder: PathLike) -> tuple[Remark, ...]:
-    """What is odd about a measurement set; nothing where it is consistent.
-
-    Raises:
-        MeasurementError: it cannot be used.
-    """
+    """What is odd about a measurement set; nothing where it is consistent. MeasurementError where it can't be used."""
     from splatsoil.measurement import remarks
 
     return remarks(load(folder))
@@ -246,7 +218,7 @@ def simulate(
     views: int | None = None,
     picture_scale: float = 1.0,
 ) -> Measurement:
-    """Make a synthetic measurement set of known soil; its ``truth.json`` says the parameters.
+    """Make a synthetic measurement set of known soil in a new folder; its ``truth.json`` says the parameters.
 
     Args:
         out: the new folder.
@@ -258,10 +230,6 @@ def simulate(
         device: "cpu", "cuda:0", …
         views: photographs; 40 if not given.
         picture_scale: size of pictures, as a multiple of 320 x 240 pixels.
-
-    Raises:
-        ParameterError: unknown or meaningless options, or a folder that is not empty.
-        SimulationError: the simulation could not go on.
     """
     pairs = tuple(f"{name}={float(value)!r}" for name, value in (values or {}).items())
     options = {"friction_angle": friction_angle, "effects": tuple(effects), "values": pairs, "preset": preset}
@@ -273,17 +241,11 @@ def simulate(
 def reconstruct(
     folder: PathLike, out: PathLike | None = None, *, preset: Preset = "small", seed: int = 0, device: str = "auto"
 ) -> Reconstruction:
-    """Photographs to Gaussians, soil surface and mesh, written to ``out`` (runs/NAME-reconstruction if not given).
-
-    Raises:
-        MeasurementError, ParameterError: the set or an option is no good.
-    """
+    """Photographs to Gaussians, soil surface and mesh, written to ``out`` (runs/NAME-reconstruction if not given)."""
     from splatsoil.reconstruction import Reconstruction
 
-    place = None if out is None else Path(out)
-    return Reconstruction.load(
-        _command("reconstruct", set=Path(folder), out=place, preset=preset, seed=seed, device=device)["out"]
-    )
+    options = {"out": None if out is None else Path(out), "preset": preset, "seed": seed, "device": device}
+    return Reconstruction.load(_command("reconstruct", set=Path(folder), **options)["out"])
 
 
 def fit(
@@ -308,9 +270,6 @@ def fit(
         seed: of random numbers.
         budget: evaluations; 10 for each free parameter if not given.
         run: folder of the run; runs/NAME-PRESET if not given.
-
-    Raises:
-        MeasurementError, ParameterError, RunError, SimulationError: one sentence on what is wrong.
     """
     return _run("fit", folder, parameters, effects, run, preset=preset, device=device, seed=seed, budget=budget)
 
@@ -329,18 +288,14 @@ def run(
 ) -> Run:
     """From a set to the report: check, reconstruct, fit, compare, and name and add what the model lacks.
 
-    Args and errors as for `fit`; ``most_effects`` is the largest number of effects that are added.
+    As for `fit`; ``most_effects`` is the largest number of effects that are added.
     """
     options = {"preset": preset, "device": device, "seed": seed, "budget": budget, "most_effects": most_effects}
     return _run("run", folder, parameters, effects, run, **options)
 
 
 def open_run(folder: PathLike) -> Run:
-    """A run folder that is there already.
-
-    Raises:
-        RunError: it is none.
-    """
+    """A run folder that is there already; RunError where it is none."""
     from splatsoil.run_files import read_description
 
     read_description(Path(folder))
@@ -348,50 +303,28 @@ def open_run(folder: PathLike) -> Run:
 
 
 def compare(run: Run | PathLike, *, quick: bool = False, device: str = "auto") -> Run:
-    """Test whether the fitted model is adequate, and where and when it fails; ``quick`` only draws and measures losses.
-
-    Raises:
-        RunError: the run has no fit, or its set has changed.
-        SimulationError: the model could not be simulated.
-    """
+    """Test whether the fitted model is adequate, and where and when it fails; ``quick`` only draws and measures
+    losses."""
     return _of("compare", run, quick=quick, device=device)
 
 
 def diagnose(run: Run | PathLike, effects: Iterable[str] = (), *, device: str = "auto") -> Run:
-    """Name the effect that the model lacks, with its probability; ``effects`` are those to consider, all by default.
-
-    Raises:
-        ParameterError: an effect is unknown or on already.
-        RunError, SimulationError: as for `compare`.
-    """
+    """Name the effect that the model lacks, with its probability; ``effects`` are those to consider, all by default."""
     return _of("diagnose", run, effects=tuple(effects), device=device)
 
 
 def add(run: Run | PathLike, *effects: str, budget: int | None = None, device: str = "auto") -> Run:
-    """Add effects to the model, and fit again.
-
-    Raises:
-        ParameterError, RunError, SimulationError: as for `diagnose`.
-    """
+    """Add effects to the model, and fit again."""
     return _of("add", run, effects=effects, budget=budget, device=device)
 
 
 def sample(run: Run | PathLike, *, checks: int = 3, seed: int = 0, device: str = "auto") -> Run:
-    """Sample the posterior, for `Run.posterior`; ``checks`` simulations test the emulator.
-
-    Raises:
-        ParameterError: the fit was made on another device, or by other code.
-        RunError, SimulationError: as for `compare`.
-    """
+    """Sample the posterior, for `Run.posterior`; ``checks`` simulations test the emulator."""
     return _of("posterior", run, checks=checks, seed=seed, device=device)
 
 
 def write_report(run: Run | PathLike) -> Path:
-    """Write the page ``report.html`` of a run, and return its path.
-
-    Raises:
-        RunError: the run has no fit, or a file in it is damaged.
-    """
+    """Write the page ``report.html`` of a run, and return its path."""
     from splatsoil.report import write_report as write
 
     return write(_path(run))
@@ -405,14 +338,8 @@ def _run(
     run: PathLike | None,
     **options: Any,
 ) -> Run:
-    from splatsoil.commands._options import FitOptions
-
-    place = None if run is None else Path(run)
-    wanted = FitOptions(Path(folder), preset=options["preset"], seed=options["seed"], run=place)
-    made = wanted.folder(load(folder).name)
-    given = {"parameters": tuple(parameters), "effects": tuple(effects), "run": made}
-    _command(command, set=Path(folder), **given, **options)
-    return Run(made)
+    given = {"parameters": tuple(parameters), "effects": tuple(effects), "run": None if run is None else Path(run)}
+    return Run(Path(_command(command, set=Path(folder), **given, **options)["run"]))
 
 
 def _of(command: str, run: Run | PathLike, **options: Any) -> Run:

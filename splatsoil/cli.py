@@ -23,6 +23,7 @@ from typing import Any
 
 import splatsoil.commands
 from splatsoil import __version__
+from splatsoil.batches import full_memory
 from splatsoil.commands._options import parse, program_page, same_again
 from splatsoil.commands._output import only_json, print_json
 from splatsoil.errors import NoAnswer, SetWarning, SplatsoilError, did_you_mean
@@ -112,17 +113,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     trust(getattr(config, "effects", ()))
     wants_json = bool(getattr(config, "json", False))
     with only_json() if wants_json else nullcontext(), _printing_remarks():
+        places: dict[str, str] = {}
         try:
             return command.run(config)
+        except NoAnswer as error:  # a result
+            message, code, places = str(error), error.code, error.places
+            print(message)
         except SplatsoilError as error:
             message, code = " ".join(str(error).split()), error.code
-            if isinstance(error, NoAnswer):  # a result
-                print(message)
-            else:
-                print(f"splatsoil: {message}", file=sys.stderr)
+            print(f"splatsoil: {message}", file=sys.stderr)
+        except RuntimeError as error:
+            if not (memory := full_memory(error)):
+                raise
+            message, code = f"{memory} is full; choose a coarser --preset, or another --device", SplatsoilError.code
+            print(f"splatsoil: {message}", file=sys.stderr)
         except KeyboardInterrupt:
             message, code = f"interrupted; {after_interrupt(name, command, config)}", 130
             print(f"\nsplatsoil: {message}", file=sys.stderr)
         if wants_json:
-            print_json({"ok": False, "error": message})
+            print_json({"ok": False, "error": message, **places})
         return code

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 
@@ -47,9 +47,18 @@ class CombinationError(ParameterError, SimulationError):
 
 
 class NoAnswer(SplatsoilError):
-    """All was computed and is kept, but the data give no estimate that means anything."""
+    """All was computed and is kept, but the data give no estimate that means anything.
+
+    Args:
+        message: why, and what to look at.
+        places: folders by ``run`` and ``set``.
+    """
 
     code = 3
+
+    def __init__(self, message: str, places: Mapping[str, str]) -> None:
+        super().__init__(message)
+        self.places = dict(places)
 
 
 class RunError(SplatsoilError):
@@ -57,7 +66,8 @@ class RunError(SplatsoilError):
 
 
 class SetWarning(UserWarning):
-    """Something odd about a measurement set, which can be used all the same; the command line prints it as a remark."""
+    """Something odd about a measurement set, or a machine, that can be used all the same; the command line prints it as
+    a remark."""
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

@@ -13,7 +13,7 @@ import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, NoReturn
 from zipfile import BadZipFile, ZipFile
 
 import numpy as np
@@ -93,15 +93,28 @@ def write_npz(path: str | Path, **arrays: Any) -> Path:
     return write_bytes(path, stream.getvalue())
 
 
+class _Kept(dict[str, Any]):
+    """An object of a JSON file, which names the file where it lacks a key."""
+
+    def __init__(self, data: Mapping[str, Any], file: Path, remedy: str) -> None:
+        super().__init__(data)
+        self.fault = f"{file}: is damaged, it lacks", remedy
+
+    def __missing__(self, key: str) -> NoReturn:
+        raise RunError(f"{self.fault[0]} {key}; {self.fault[1]}")
+
+
 def read_json(path: str | Path, *, remedy: str = ANEW) -> Any:
-    """Read a JSON file of a run folder; the remedy is for where that can't be done.
+    """Read a JSON file of a run folder; the remedy is for where that can't be done, or a key is asked for that one of
+    its objects lacks.
 
     Raises:
         RunError: the file is missing, unreadable or not JSON.
     """
     source = Path(path)
     try:
-        data = json.loads(source.read_text(encoding="utf-8"))
+        text = source.read_text(encoding="utf-8")
+        data = json.loads(text, object_hook=lambda found: _Kept(found, source, remedy))
     except FileNotFoundError as error:
         raise RunError(f"{source}: there is no such file") from error
     except OSError as error:

@@ -91,6 +91,10 @@ def test_a_run_is_what_its_files_say(tmp_path: Path) -> None:
     write_json(tmp_path / "comparison" / "comparison.json", told)
     Image.new("RGB", (8, 6), (10, 20, 30)).save(tmp_path / "comparison" / "left_0050_observed.jpg")
     assert np.allclose(run.picture("left", 50, "observed"), (10, 20, 30), atol=3)
+    picture = tmp_path / "comparison" / "left_0050_observed.jpg"
+    picture.write_bytes(picture.read_bytes()[:-40])
+    with pytest.raises(RunError, match=r"left_0050_observed\.jpg: is no whole"):
+        run.picture("left", 50, "observed")
     models = [{"name": "", "probability": 0.9}, {"name": "tilt", "probability": 0.1}]
     found = {"format": "splatsoil-diagnosis/2", "fit": "base", "values": {"friction_angle": 35.0}, "model": []}
     write_json(tmp_path / "diagnoses" / "base.json", {**found, "models": models})

@@ -177,9 +177,10 @@ def test_ctrl_c_while_the_program_loads_leaves_no_traceback(tmp_path: Path) -> N
     assert done.stderr.strip() == "splatsoil: interrupted; start the command again"
 
 
-def test_ctrl_c_while_the_package_loads_leaves_no_traceback(tmp_path: Path) -> None:
-    """Before the command line is there, and though the module that is being loaded would swallow it."""
-    (tmp_path / "gymnasium.py").write_text(
+@pytest.mark.parametrize("module", ["typing", "gymnasium"])
+def test_ctrl_c_while_the_package_loads_leaves_no_traceback(tmp_path: Path, module: str) -> None:
+    """From the first module on that the package needs, and though the module that is being loaded would swallow it."""
+    (tmp_path / f"{module}.py").write_text(
         "import os, signal, time\n"
         "try:\n    os.kill(os.getpid(), signal.SIGINT)\n    time.sleep(9)\n"
         "except BaseException:\n    pass\n"
@@ -198,7 +199,23 @@ def test_ctrl_c_while_the_package_loads_leaves_no_traceback(tmp_path: Path) -> N
     assert (done.returncode, done.stdout) == (130, "")
     assert done.stderr.strip() == "splatsoil: interrupted; start the command again"
     # of other programs that import the package the signal is theirs
-    assert "has gone on" in heard("-c", "import splatsoil").stdout
+    assert module == "typing" or "has gone on" in heard("-c", "import splatsoil").stdout
+
+
+def test_ctrl_c_ends_the_program_whatever_threads_go_on(tmp_path: Path) -> None:
+    """As those of a server do to which a browser is connected."""
+    program = (
+        "import sys, threading, time\n"
+        "from splatsoil import __main__, cli\n"
+        "def serve():\n"
+        "    threading.Thread(target=time.sleep, args=(60,)).start()\n"
+        "    print('served', flush=True)\n"
+        "    return 130\n"
+        "cli.main = serve\n"
+        "sys.exit(__main__.main())\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=40, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "served\n", "")
 
 
 def test_a_new_command_is_one_new_file(

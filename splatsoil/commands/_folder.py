@@ -5,20 +5,15 @@ from __future__ import annotations
 import shutil
 import sys
 from collections.abc import Mapping
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from splatsoil.commands._options import EVALUATIONS, FitOptions, RunOptions, command_line, same_again
+from splatsoil.commands._options import FitOptions, RunOptions, command_line, same_again
 from splatsoil.errors import MeasurementError, NoAnswer, RunError
 
 if TYPE_CHECKING:
     from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.measurement import Measurement
-
-#: Loss of a prediction in which nothing moves. The loss is measured in units of it, so this is no choice of ours: a
-#: model that comes to it has explained nothing of what was seen, wherever its estimate lies.
-NOTHING_MOVES = 1.0
 
 
 def opened(options: RunOptions) -> RunFolder:
@@ -64,64 +59,29 @@ def measurement_of(run: RunFolder) -> Measurement:
             return measurement
         changed = changed or f"{run.path}: its measurement set {folder} has changed since; fit again into another --run"
     note = command_line("report", run.path, "--set", "FOLDER")
-    raise RunError(
-        changed
-        or f"{run.path}: its measurement set {first} isn't there any more, nor beside the run; `{note}` notes "
-        "where it is now"
-    )
+    gone = f"{run.path}: its measurement set {first} isn't there any more, nor beside the run; `{note}` notes where it"
+    raise RunError(changed or f"{gone} is now")
+
+
+def places(run: RunFolder) -> dict[str, str]:
+    """The run folder and its set, as commands' JSON objects have them."""
+    return {"run": str(run.path), "set": str(run.description["measurement"]["folder"])}
 
 
 def latest_fit(folder: RunFolder) -> dict[str, Any]:
-    """The fit that a diagnosis starts from.
-
-    Raises:
-        RunError: there is none.
-    """
+    """The fit that a diagnosis starts from; RunError where there is none."""
     try:
         return folder.fit()
     except RunError as error:
         raise RunError(f"{error}; a diagnosis starts from a fit") from error
 
 
-def no_answer(fit: Mapping[str, Any]) -> str:
-    """Why the estimate of ``fit.json`` means nothing, in one sentence; empty where it means something.
+def require_answer(run: RunFolder, fit: Mapping[str, Any], look: str) -> None:
+    """NoAnswer where a run's fit has none; ``look`` says what to look at then."""
+    from splatsoil.report.text import no_answer
 
-    Raises:
-        RunError: the file is damaged.
-    """
-    from splatsoil.files import ANEW
-    from splatsoil.report.text import symbol
-
-    try:
-        least, loss = fit["best"]["loss"], max(fit["loss"], fit["best"]["loss"])
-        if loss >= NOTHING_MOVES:
-            where = "everywhere it was tried" if least >= NOTHING_MOVES else "where pictures and force together put it"
-            return (
-                f"no answer: {where} the model explains the video no better than soil that never moves (loss "
-                f"{loss:.3g}; such soil has {NOTHING_MOVES:g}); photographs, poses, clock or tool are wrong, or the "
-                "soil is another"
-            )
-        for name, entry in fit["parameters"].items():
-            if entry["at_bound"] is None:
-                continue
-            bound = entry["bounds"][0 if entry["at_bound"] == "lower" else 1]
-            # An effect that is off is no bound of knowledge: it isn't there.
-            if bound != entry.get("off"):
-                return (
-                    f"no answer: the {name.replace('_', ' ')} ends at the {entry['at_bound']} bound of its range "
-                    f"({bound:g}{symbol(entry['unit'])}); the best value lies beyond it, or the model lacks an effect"
-                )
-    except (KeyError, TypeError, IndexError, AttributeError, ValueError) as error:
-        raise RunError(
-            f"fit.json: is damaged, it lacks loss, best, or a parameter's bounds ({error!r}); {ANEW}"
-        ) from error
-    return ""
-
-
-def require_answer(fit: Mapping[str, Any], look: str) -> None:
-    """NoAnswer where a fit has none; ``look`` says what to look at then."""
     if reason := no_answer(fit):
-        raise NoAnswer(f"{reason}: {look}")
+        raise NoAnswer(f"{reason}: {look}", places(run))
 
 
 def note_other_sources(run: RunFolder) -> None:
@@ -138,35 +98,22 @@ def note_other_sources(run: RunFolder) -> None:
     except RunError as error:
         print(f"splatsoil: {run.path}: effects that it was fitted with are gone ({error})", file=sys.stderr)
         return
-    if then != now:
-        print(
-            f"splatsoil: {run.path} was fitted by splatsoil {then[0]}, code {then[1]}, and this is {now[0]}, code "
-            f"{now[1]}; this makes it anew: {fit_again(run, fit)}",
-            file=sys.stderr,
-        )
-
-
-def fit_again(run: RunFolder, fit: Mapping[str, Any]) -> str:
-    """The commands that make a run's latest model again: the fit, and the effects that were added to it."""
-    setup, entries = fit["setup"], history(run)
-    parameters, effects, budget = tuple(fit["parameters"]), tuple(setup["effects"]), fit.get("evaluations")
-    if budget == EVALUATIONS * len(parameters):
-        budget = None
-    added: list[str] = []
-    if len(entries) > 1 and entries[-1]["model"] == fit["name"]:
-        parameters, effects, budget = tuple(entries[0]["parameters"]), tuple(entries[0]["effects"]), None
-        added = [name for one, other in pairwise(entries) for name in other["effects"] if name not in one["effects"]]
+    if then == now:
+        return
+    described = run.description
     options = FitOptions(
-        set=Path(run.description["measurement"]["folder"]),
-        parameters=parameters,
-        effects=effects,
-        budget=budget,
+        set=Path(described["measurement"]["folder"]),
+        parameters=tuple(fit["parameters"]),
+        effects=tuple(setup["effects"]),
         preset=setup["preset"],
-        seed=run.description["seed"],
+        seed=described["seed"],
         run=run.path,
     )
-    commands = [same_again("fit", options), *([command_line("add", run.path, *added)] if added else [])]
-    return " && ".join(commands)
+    print(
+        f"splatsoil: {run.path} was fitted by splatsoil {then[0]}, code {then[1]}, and this is {now[0]}, code "
+        f"{now[1]}; this makes it anew: {same_again('fit', options)}",
+        file=sys.stderr,
+    )
 
 
 def history(folder: RunFolder) -> list[dict[str, Any]]:
@@ -197,12 +144,11 @@ def write_history(folder: RunFolder, entries: list[dict[str, Any]], under_way: M
 
 def history_entry(fit: Mapping[str, Any], held_out: Mapping[str, Any]) -> dict[str, Any]:
     """A model's line in the history: its fit, and its error on what was set aside."""
+    kept = ("estimate", "std", "unit", "title")
     return {
         "model": fit["name"],
         "effects": list(fit["setup"]["effects"]),
-        "parameters": {
-            name: {key: p[key] for key in ("estimate", "std", "unit", "title")} for name, p in fit["parameters"].items()
-        },
+        "parameters": {name: {key: p[key] for key in kept} for name, p in fit["parameters"].items()},
         "loss": fit["loss"],
         "held_out": held_out["error"],
         "floor": held_out["noise"],
@@ -219,21 +165,16 @@ def compared_already(folder: RunFolder) -> bool:
 
 def keep_earlier_comparison(folder: RunFolder) -> None:
     """Put the comparison of the model before aside, so that before and after can be shown."""
-    if not (folder.comparison / "comparison.json").is_file():
-        return
-    before = folder.path / "before"
-    with folder.lock():
-        shutil.rmtree(before, ignore_errors=True)
-        folder.comparison.rename(before)
+    if (folder.comparison / "comparison.json").is_file():
+        with folder.lock():
+            shutil.rmtree(folder.path / "before", ignore_errors=True)
+            folder.comparison.rename(folder.path / "before")
 
 
 def current_diagnosis(folder: RunFolder, path: Path, effects: tuple[str, ...] | None = None) -> dict[str, Any] | None:
-    """A diagnosis of the latest fit by the code as it is, or None.
+    """A diagnosis (its file is ``path``) of the latest fit by the code as it is, or None.
 
-    Args:
-        folder: the run.
-        path: of the file.
-        effects: those whose files count for the code; the diagnosis's own candidates if not given.
+    Code is also that of the files of ``effects``, or of the diagnosis's own candidates if not given.
     """
     from splatsoil.files import JUDGING, code_digest, code_of
     from splatsoil.report.data import kept_of

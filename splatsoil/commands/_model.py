@@ -43,18 +43,14 @@ class ModelSpec:
     @classmethod
     def of(cls, fit: Mapping[str, Any]) -> ModelSpec:
         """What ``fit.json`` is a fit of."""
-        setup = fit["setup"]
-        return cls(tuple(setup["effects"]), setup["preset"], tuple(fit["parameters"]))
+        return cls(tuple(fit["setup"]["effects"]), fit["setup"]["preset"], tuple(fit["parameters"]))
 
 
 @contextmanager
 def loaded(options: Any, folder: RunFolder, spec: ModelSpec | None = None) -> Iterator[tuple[Model, Stage]]:
-    """The model of a run, and what begins a stage, while these last; says if other sources made the fit.
+    """The model of a run, that of its latest fit if not given, and what begins a stage, while these last.
 
-    Args:
-        options: of a command; ``device`` is where it computes, with ``json`` nothing is said of progress.
-        folder: the run.
-        spec: of the model; that of the latest fit if not given.
+    ``options`` are a command's. Says if other sources made the fit.
     """
     from splatsoil.envs.devices import resolve_device
     from splatsoil.quiet import hush
@@ -71,12 +67,7 @@ def model_of(
 ) -> Model:
     """The model that a run's latest fit is of, or a chosen one, on one device.
 
-    Args:
-        folder: the run.
-        device: ``cpu`` or ``cuda:N``.
-        report: progress.
-        spec: of the chosen model.
-        make: whether a reconstruction that isn't kept is made, and remarks on the set are printed.
+    ``make`` is whether a reconstruction that isn't kept is made, and remarks on the set are printed.
 
     Raises:
         RunError: the reconstruction is damaged, or it isn't there and may not be made.
@@ -101,14 +92,9 @@ def reconstructed(
     from splatsoil.files import RECONSTRUCTING, code_digest
     from splatsoil.reconstruction import Reconstruction, reconstruct
 
-    preset, seed = run.description["preset"], run.description["seed"]
-    wanted = {
-        "measurement_hash": measurement.hash,
-        "preset": preset,
-        "seed": seed,
-        "version": __version__,
-        "code": code_digest(RECONSTRUCTING),
-    }
+    made_of = {"preset": run.description["preset"], "seed": run.description["seed"]}
+    code = code_digest(RECONSTRUCTING)
+    wanted = {"measurement_hash": measurement.hash, "version": __version__, "code": code, **made_of}
     if (run.reconstruction / "reconstruction.json").is_file():
         report("reading", 0.0)
         try:
@@ -119,7 +105,7 @@ def reconstructed(
             return kept
     if not make:
         raise RunError(f"{run.path}: its reconstruction isn't there")
-    made = reconstruct(measurement, seed=seed, device=device, preset=preset, progress=report)
+    made = reconstruct(measurement, device=device, progress=report, **made_of)
     with run.lock():
         made.save(run.reconstruction)
     # Read back: float32 on disk is what every later command will start from.
@@ -171,8 +157,7 @@ def experiment_of(
 ) -> tuple[PlowExperiment, Simulations]:
     """The run as an experiment, with some effects as candidates or all, and its simulations, kept in ``features/``.
 
-    Raises:
-        ParameterError: an effect that is unknown or on already.
+    ParameterError for an effect that is unknown or on already.
     """
     from splatsoil import __version__
     from splatsoil.experiment.plow import PlowExperiment

@@ -87,6 +87,12 @@ def check_evaluations(budget: int | None) -> None:
         raise ParameterError(f"--budget: a fit needs at least 2 evaluations, not {budget}")
 
 
+def check_seed(seed: int) -> None:
+    """ParameterError for one that random numbers can't begin with."""
+    if not 0 <= seed < 2**63:
+        raise ParameterError(f"--seed: must be 0 or more and less than 2^63, not {seed}")
+
+
 def command_line(command: str, *words: object) -> str:
     """A command as a shell takes it."""
     return shlex.join(["splatsoil", command, *map(str, words)])

@@ -9,6 +9,8 @@ from contextlib import contextmanager, redirect_stdout
 from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any, TextIO
 
+from splatsoil.errors import NoAnswer
+
 if TYPE_CHECKING:
     from splatsoil.measurement import Measurement
 
@@ -38,6 +40,20 @@ def print_json(data: Mapping[str, Any]) -> None:
         ValueError: the data holds NaN or infinity, which JSON cannot.
     """
     print(json.dumps(data, indent=1, allow_nan=False), file=_stdout.get() or sys.stdout, flush=True)
+
+
+def tell(config: Any, data: Mapping[str, Any], show: Callable[[], object], *, none: str = "") -> int:
+    """Say a command's result: the data as one JSON object, or what ``show`` prints; returns the exit code.
+
+    ``none`` is why there is no answer, and is said first.
+    """
+    if config.json:
+        print_json({"ok": not none, **({"error": none} if none else {}), **data})
+        return NoAnswer.code if none else 0
+    if none:
+        print(none)
+    show()
+    return NoAnswer.code if none else 0
 
 
 def print_remarks(measurement: Measurement) -> None:
@@ -79,22 +95,41 @@ def print_table(
     Console(highlight=False).print(table)
 
 
-def print_text(*paragraphs: str, style: str = "") -> None:
-    """Print sentences, wrapped at words."""
+def print_parameters(
+    title: str, result: Mapping[str, Any], value: str, more: Mapping[str, Callable[[Mapping[str, Any]], str]]
+) -> None:
+    """Print a table of a result's parameters with their ± and interval, and its notes.
+
+    Args:
+        title: above it.
+        result: with ``parameters`` by name, and ``notes``.
+        value: key of what the ± is of.
+        more: further columns.
+    """
+    from splatsoil.report.text import amount, interval
+
+    print_table(
+        title,
+        ("parameter", value, "5 to 95 %", *more),
+        (
+            (name, amount(p[value], p["std"], p["unit"]), interval(p), *(column(p) for column in more.values()))
+            for name, p in result["parameters"].items()
+        ),
+        left=("parameter", ""),
+    )
+    print_text(notes=result["notes"])
+
+
+def print_text(*paragraphs: str, style: str = "", notes: Iterable[str] = ()) -> None:
+    """Print sentences, wrapped at words, and then what is to be known besides."""
     from rich.console import Console
     from rich.text import Text
 
+    console = Console(highlight=False)
     for paragraph in paragraphs:
-        Console(highlight=False).print(Text(paragraph), style=style)
-
-
-def print_notes(notes: Iterable[str]) -> None:
-    """Print what is to be known besides."""
-    from rich.console import Console
-    from rich.text import Text
-
+        console.print(Text(paragraph), style=style)
     for note in notes:
-        Console(highlight=False).print(Text.assemble(("note", "yellow"), f" {note}"))
+        console.print(Text.assemble(("note", "yellow"), f" {note}"))
 
 
 @contextmanager
@@ -142,6 +177,11 @@ def stages(*, quiet: bool = False) -> Iterator[Stage]:
 
         yield begin
         finish()
+
+
+def by_frame(report: Report, share: float = 1.0) -> Callable[[int, int], None]:
+    """Takes the frame that a simulation has come to, and its last, which together are a share of a stage."""
+    return lambda frame, last: report(f"frame {frame}", share * frame / max(last, 1))
 
 
 def _logged(name: str) -> Report:

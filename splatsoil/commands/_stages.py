@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from splatsoil.commands import _model
 from splatsoil.commands._model import ModelSpec, experiment_of, reconstruction_digest
-from splatsoil.commands._options import EVALUATIONS, FitOptions, check_evaluations
-from splatsoil.commands._output import print_remarks
+from splatsoil.commands._options import EVALUATIONS, FitOptions, check_evaluations, check_seed
+from splatsoil.commands._output import by_frame, print_remarks
 from splatsoil.errors import MeasurementError, ParameterError, RunError
 
 if TYPE_CHECKING:
@@ -48,8 +49,7 @@ def prepare(options: FitOptions) -> tuple[Measurement, RunFolder]:
     from splatsoil.soil.library import find_effects
 
     check_evaluations(options.budget)
-    if not 0 <= options.seed < 2**63:
-        raise ParameterError(f"--seed: must be 0 or more and less than 2^63, not {options.seed}")
+    check_seed(options.seed)
     effects = find_effects(options.effects)
     device = resolve_device(options.device)
     measurement = Measurement.load(options.set)
@@ -66,11 +66,7 @@ def prepare(options: FitOptions) -> tuple[Measurement, RunFolder]:
     print(needs(measurement, options.preset, device, simulations).sentence(device), file=sys.stderr)
     run = RunFolder.prepare(
         options.folder(measurement.name),
-        measurement={
-            "name": measurement.name,
-            "folder": str(measurement.folder.resolve()),
-            "hash": measurement.hash,
-        },
+        measurement={"name": measurement.name, "folder": str(measurement.folder.resolve()), "hash": measurement.hash},
         preset=options.preset,
         seed=options.seed,
         version=__version__,
@@ -79,14 +75,31 @@ def prepare(options: FitOptions) -> tuple[Measurement, RunFolder]:
     return measurement, run
 
 
+def fitted(options: FitOptions, begin: Stage) -> tuple[RunFolder, Model, dict[str, Any]]:
+    """From a set to its fit: run folder, model, and what ``fit.json`` holds. Whatever the folder has isn't made again.
+
+    Raises:
+        MeasurementError, ParameterError, RunError: see `prepare`.
+    """
+    from splatsoil.envs.devices import resolve_device
+    from splatsoil.quiet import hush
+
+    hush()
+    begin("check")("reading every image", 0.0)
+    measurement, folder = prepare(options)
+    device = resolve_device(options.device)
+    reconstruction = _model.reconstructed(measurement, folder, device, begin("reconstruct"))
+    model = _model.model_on(measurement, folder, reconstruction, options.effects, options.preset, device)
+    return folder, model, run_fit(options, measurement, folder, model, begin("fit"))
+
+
 def facts(model: Model) -> dict[str, str]:
     """How a model computes, for readers."""
     r = model.resolution
-    step = r.frame_time / r.steps
     return {
         "cell": f"{1e3 * r.cell:.3g} mm",
         "particles": f"{len(model.particles(0))}, {1e3 * r.spacing:.3g} mm apart",
-        "time step": f"{1e3 * step:.3g} ms, in {r.substeps(r.steps)} substeps",
+        "time step": f"{1e3 * r.frame_time / r.steps:.3g} ms, in {r.substeps(r.steps)} substeps",
         "compared frames": f"{len(model.frames) - 1} of each of {len(model.measurement.cameras)} cameras",
     }
 
@@ -103,6 +116,7 @@ def run_fit(
     from splatsoil.envs.measured import LOSS, MeasuredProblem
     from splatsoil.files import code_of
     from splatsoil.inverse.fitting import TOGETHER, FitSetup, fit
+    from splatsoil.report.text import symbol
 
     space = model.space(options.parameters or None)
     budget = options.budget or EVALUATIONS * len(space)
@@ -124,7 +138,6 @@ def run_fit(
     spec = ModelSpec(tuple(options.effects), options.preset, space.names)
     experiment, simulate = experiment_of(run, model, spec, ())
     problem = MeasuredProblem(experiment)
-    units = {p.name: "°" if p.unit == "deg" else f" {p.unit}" for p in space}
     finished = 0
 
     def evaluated(done: int, record: EvaluationRecord) -> None:
@@ -132,7 +145,7 @@ def run_fit(
         finished = done
         if record.loss is not None:
             simulate.keep(problem.features(record.blocks), record.parameters, record.seed)
-        said = ", ".join(f"{name} {record.parameters[name]:.4g}{unit}" for name, unit in units.items())
+        said = ", ".join(f"{p.name} {record.parameters[p.name]:.4g}{symbol(p.unit)}" for p in space)
         outcome = "failed" if record.loss is None else f"loss {record.loss:.4g}"
         report(f"{done} of {budget}: {said}, {outcome}", SEARCH * done / budget)
 
@@ -140,24 +153,16 @@ def run_fit(
         share = min((finished + TOGETHER * frame / (last + 1)) / budget, 1.0)
         report(f"simulation {finished + 1}, frame {frame}", SEARCH * share)
 
-    def compared(found: dict[str, Any]) -> Diagnosis:
-        def comparing(what: str, share: float) -> None:
-            report(what, SEARCH + (1.0 - SEARCH) * share)
+    def comparing(what: str, share: float) -> None:
+        report(what, SEARCH + (1.0 - SEARCH) * share)
 
+    def compared(found: dict[str, Any]) -> Diagnosis:
         experiment.progress = None
         with Crew(run, model.device, ()) as crew, crew.helping(spec, experiment, simulate):
             return compare_models(experiment, simulate, found, comparing, options.seed, with_effects=False)
 
     experiment.progress = simulating
-    return fit(
-        problem,
-        run,
-        setup,
-        budget=budget,
-        facts=facts(model),
-        compare=compared,
-        after_evaluation=evaluated,
-    )
+    return fit(problem, run, setup, budget=budget, facts=facts(model), compare=compared, after_evaluation=evaluated)
 
 
 def draw_comparison(run: RunFolder, model: Model, report: Report) -> dict[str, Any]:
@@ -168,6 +173,7 @@ def draw_comparison(run: RunFolder, model: Model, report: Report) -> dict[str, A
     from splatsoil.experiment.forces import force_record
     from splatsoil.files import write_json
     from splatsoil.report.data import estimates
+    from splatsoil.report.text import NOTHING_MOVES
     from splatsoil.run_files import COMPARISON_FORMAT
 
     with run.lock():
@@ -175,8 +181,9 @@ def draw_comparison(run: RunFolder, model: Model, report: Report) -> dict[str, A
         values = estimates(result)
         report("reading the video", 0.0)
         comparator = Comparator(model.measurement, surface=model.reconstruction.surface, frames=model.frames)
-        prediction = model.predict(values, 0, lambda frame, last: report(f"frame {frame}", 0.9 * frame / last))
+        prediction = model.predict(values, 0, by_frame(report, 0.9))
         comparison = comparator.compare(prediction.images)
+        noise = 0.0 if without_noise(model.measurement) else comparator.noise
         report("writing pictures", 0.95)
         frames = []
         for camera, frame in comparator.keys:
@@ -197,9 +204,8 @@ def draw_comparison(run: RunFolder, model: Model, report: Report) -> dict[str, A
             "measurement": run.description["measurement"]["hash"],
             "loss": LOSS,
             "total": {LOSS: comparison.loss, "rgb": comparison.rgb},
-            "noise": {} if comparator.noise is None else {LOSS: comparator.noise},
-            # The loss is measured in units of what soil at rest would leave.
-            "motionless": {LOSS: 1.0},
+            "noise": {} if noise is None else {LOSS: noise},
+            "motionless": {LOSS: NOTHING_MOVES},
             "gain": GAIN,
             "cameras": list(comparator.cameras),
             "frames": frames,
@@ -208,6 +214,13 @@ def draw_comparison(run: RunFolder, model: Model, report: Report) -> dict[str, A
         }
         write_json(run.comparison / "comparison.json", data)
     return data
+
+
+def without_noise(measurement: Measurement) -> bool:
+    """Whether frames before the tool moves are the same to the last bit: no camera's are, but a renderer's."""
+    still = measurement.pre_roll
+    first = {name: measurement.video_frame(name, measurement.frames[0]).image() for name in measurement.cameras}
+    return bool(still) and all(np.array_equal(f.image(), first[f.camera_name]) for f in still)
 
 
 def write_jpeg(path: Path, picture: np.ndarray) -> None:
@@ -237,18 +250,10 @@ def kept(options: FitOptions) -> str:
 
 
 def run_diagnosis(
-    folder: RunFolder,
-    model: Model,
-    begin: Stage,
-    effects: Iterable[str] = (),
-    *,
-    crew: Crew | None = None,
+    folder: RunFolder, model: Model, begin: Stage, effects: Iterable[str] = (), *, crew: Crew | None = None
 ) -> dict[str, Any]:
     """Compare the latest fit's model with those that have an effect more; the result is ``diagnosis.json`` and, by
-    model, ``diagnoses/NAME.json``.
-
-    ``crew`` are processes for these effects that are there already.
-    """
+    model, ``diagnoses/NAME.json``. ``crew`` are processes for these effects that are there already."""
     from splatsoil.files import write_json
 
     result = _compared_models(folder, model, begin("diagnose"), tuple(effects), crew, with_effects=True)
@@ -259,9 +264,7 @@ def run_diagnosis(
 
 def check_adequacy(folder: RunFolder, model: Model, report: Report, *, crew: Crew | None = None) -> dict[str, Any]:
     """Whether the latest fit's model leaves more than noise, where and when; kept as ``comparison/misfit.json``.
-
-    ``crew`` are processes for no effects that are there already.
-    """
+    ``crew`` are processes for no effects that are there already."""
     from splatsoil.files import plain, write_json
     from splatsoil.inverse.criticism.record import misfit_of
 
@@ -316,16 +319,8 @@ def compare_models(
     *,
     with_effects: bool,
 ) -> Diagnosis:
-    """A fit's model against something else, and against models with an effect more; it starts from what the search has
-    found and simulated.
-
-    Args:
-        experiment: of the model.
-        simulate: its simulations.
-        fit: what ``fit.json`` holds, or will hold.
-        report: progress.
-        seed: of the run.
-        with_effects: whether effects that are off are models, too.
+    """A fit's model against something else and, ``with_effects``, against models with an effect more; it starts from
+    what the search has found (``fit`` is what ``fit.json`` holds, or will hold) and simulated.
 
     Raises:
         SimulationError: the model as it is could not be simulated often enough.
@@ -340,10 +335,7 @@ def compare_models(
         stage, share = what, done
         report(stage, share)
 
-    def starting(purpose: str) -> None:
-        report(f"{stage}, {simulate.made + 1}: {purpose.replace('_', ' ')}", share)
-
-    simulate.told = starting
+    simulate.told = lambda purpose: report(f"{stage}, {simulate.made + 1}: {purpose.replace('_', ' ')}", share)
     return diagnose(
         experiment,
         {name: entry["estimate"] for name, entry in fit["minimum"].items()},

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from splatsoil.commands import _folder, _model, _stages
 from splatsoil.commands._options import BUDGET, DEVICE, FitOptions, RunOptions, check_evaluations
-from splatsoil.commands._output import print_json, print_table
+from splatsoil.commands._output import print_table, tell
 from splatsoil.errors import ParameterError, RunError
 from splatsoil.options import JSON, argument, option
 
@@ -65,13 +65,13 @@ def run(config: Config) -> int:
         page = write_report(folder.path)
     entries = _folder.history(folder)
     _folder.write_history(folder, entries)
-    _folder.require_answer(folder.fit(), f"report: {page}")
-    if config.json:
-        print_json({"ok": True, "run": str(folder.path), "report": str(page), "models": entries})
-    else:
+    _folder.require_answer(folder, folder.fit(), f"report: {page}")
+
+    def show_all() -> None:
         show(entries)
         print(f"report: {page}")
-    return 0
+
+    return tell(config, {**_folder.places(folder), "report": str(page), "models": entries}, show_all)
 
 
 def remaining(effects: Sequence[str], on: Sequence[str], before: Mapping[str, Any], *, half_done: bool) -> list[str]:

@@ -7,7 +7,7 @@ import pkgutil
 import sys
 from dataclasses import dataclass
 
-from splatsoil.commands._output import print_json
+from splatsoil.commands._output import tell
 from splatsoil.errors import ParameterError
 from splatsoil.options import argument, option
 
@@ -40,12 +40,8 @@ def run(config: Config) -> int:
     if config.name:
         raise ParameterError(f"benchmark {config.name!r} is unknown; there are {', '.join(known)}")
     titles = {name: _title(module) for name, module in known.items()}
-    if config.json:
-        print_json({"ok": True, "benchmarks": titles})
-    else:
-        for name, title in titles.items():
-            print(f"{name:<16}{title}")
-    return 0
+    lines = [f"{name:<16}{title}" for name, title in titles.items()]
+    return tell(config, {"benchmarks": titles}, lambda: print(*lines, sep="\n"))
 
 
 def _execute(name: str, module: str, arguments: tuple[str, ...]) -> int:

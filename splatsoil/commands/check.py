@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatsoil.commands import _laboratory
 from splatsoil.commands._options import SET
-from splatsoil.commands._output import print_json, print_table, print_text
+from splatsoil.commands._output import print_table, print_text, tell
 from splatsoil.options import JSON, argument, option
 
 if TYPE_CHECKING:
@@ -32,50 +32,47 @@ def run(config: Config) -> int:
     from splatsoil.measurement import Measurement, remarks
 
     if _laboratory.is_test(config.set):
-        return _laboratory.check(config.set, quiet=config.json)
+        return _laboratory.check(config)
     measurement = Measurement.load(config.set)
     found = remarks(measurement)
-    if config.json:
-        print_json(_as_json(measurement, found))
-    else:
+
+    def show() -> None:
         print_table(f"{measurement.name} ({measurement.folder})", (), _rows(measurement))
         print_text(*(f"remark {remark.about}: {remark.text}" for remark in found), style="yellow")
         print("The set can be used as it is." if found else "The set is complete and consistent.")
-    return 0
+
+    return tell(config, _as_json(measurement, found), show)
 
 
 def _as_json(measurement: Measurement, found: tuple[Remark, ...]) -> dict[str, Any]:
-    bed, tool = measurement.bed, measurement.tool
-    return {
-        "ok": True,
-        "folder": str(measurement.folder),
-        "name": measurement.name,
-        "hash": measurement.hash,
-        "gravity": measurement.gravity.tolist(),
-        "frame_rate": measurement.frame_rate,
-        "bed": {
-            "lower": bed.lower.tolist(),
-            "upper": bed.upper.tolist(),
-            "density": bed.density,
-            "wall_friction": bed.wall_friction,
-            "floor_friction": bed.floor_friction,
-        },
-        "tool": {
-            "extents": tool.mesh.extents.tolist(),
-            "volume": float(tool.mesh.volume),
-            "friction": tool.friction,
-            "rows": len(tool.motion.times),
-            "seconds": float(tool.motion.times[-1] - tool.motion.times[0]),
-            "force_rows": 0 if tool.force is None else len(tool.force),
-        },
-        "views": len(measurement.views),
-        "video": {
-            "cameras": list(measurement.cameras),
-            "frames": list(measurement.frames),
-            "pre_roll": sorted({f.frame for f in measurement.pre_roll if f.frame is not None}),
-        },
-        "remarks": [{"about": remark.about, "text": remark.text} for remark in found],
-    }
+    from splatsoil.files import plain
+
+    bed, tool, motion = measurement.bed, measurement.tool, measurement.tool.motion
+    kept = {key: getattr(measurement, key) for key in ("name", "hash", "gravity", "frame_rate")}
+    about_bed = ("lower", "upper", "density", "wall_friction", "floor_friction")
+    data: dict[str, Any] = plain(
+        {
+            "set": measurement.folder,
+            **kept,
+            "bed": {key: getattr(bed, key) for key in about_bed},
+            "tool": {
+                "extents": tool.mesh.extents,
+                "volume": float(tool.mesh.volume),
+                "friction": tool.friction,
+                "rows": len(motion.times),
+                "seconds": motion.times[-1] - motion.times[0],
+                "force_rows": 0 if tool.force is None else len(tool.force),
+            },
+            "views": len(measurement.views),
+            "video": {
+                "cameras": list(measurement.cameras),
+                "frames": measurement.frames,
+                "pre_roll": sorted({f.frame for f in measurement.pre_roll if f.frame is not None}),
+            },
+            "remarks": [asdict(remark) for remark in found],
+        }
+    )
+    return data
 
 
 def _rows(measurement: Measurement) -> list[tuple[str, str]]:

@@ -9,8 +9,7 @@ from typing import Any
 
 from splatsoil.commands import _folder, _model, _stages
 from splatsoil.commands._options import DEVICE, RunOptions, command_line
-from splatsoil.commands._output import print_json, print_table, print_text
-from splatsoil.errors import NoAnswer
+from splatsoil.commands._output import print_table, print_text, tell
 from splatsoil.options import JSON, option
 
 INTERRUPTED = "the comparison was not finished; start again with"
@@ -36,9 +35,10 @@ class Config(RunOptions):
 def run(config: Config) -> int:
     """Simulate, draw, compare; pictures, losses and the misfit by block go into the run folder."""
     from splatsoil.commands._crew import Crew
+    from splatsoil.report.text import no_answer
 
     folder = _folder.opened(config)
-    none = _folder.no_answer(folder.fit())
+    none = no_answer(folder.fit())
     folder.check_writable()
     # Helpers begin before what takes seconds to load is loaded.
     with (
@@ -49,17 +49,14 @@ def run(config: Config) -> int:
         misfit = None if crew is None else _stages.check_adequacy(folder, model, begin("models"), crew=crew)
     if misfit is not None:
         misfit = {key: value for key, value in misfit.items() if not (none and key == "estimates")}
-    if config.json:
-        extra = {} if misfit is None else {"misfit": {key: misfit[key] for key in MISFIT if key in misfit}}
-        verdict = {"ok": False, "error": none} if none else {"ok": True}
-        print_json({**verdict, "run": str(folder.path), **result, **extra})
-    else:
-        if none:
-            print(none)
+    extra = {} if misfit is None else {"misfit": {key: misfit[key] for key in MISFIT if key in misfit}}
+
+    def show_all() -> None:
         show(result, str(folder.comparison), None if misfit is None else bool(misfit["adequate"]))
         if misfit is not None:
             show_misfit(misfit, str(folder.path))
-    return NoAnswer.code if none else 0
+
+    return tell(config, {**result, **extra, **_folder.places(folder)}, show_all, none=none)
 
 
 def show(result: Mapping[str, Any], folder: str, adequate: bool | None = None) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from splatsoil.commands import _folder, _model
 from splatsoil.commands._options import DEVICE, Preset, RunOptions, command_line
-from splatsoil.commands._output import print_json, print_notes, print_table, print_text
+from splatsoil.commands._output import print_table, print_text, tell
 from splatsoil.errors import ParameterError, RunError, SimulationError
 from splatsoil.options import JSON, option
 
@@ -60,12 +60,12 @@ def run(config: Config) -> int:
     spec = replace(_model.ModelSpec.of(fit), preset=config.preset)
     with _model.loaded(config, folder, spec) as (model, begin):
         result = _designed(config, folder, diagnosis, model, spec, begin("design"))
-    if config.json:
-        print_json({"ok": True, "run": str(folder.path), **result})
-    else:
+
+    def show_all() -> None:
         show(result)
         print(f"kept in {folder.path / 'design'}")
-    return 0
+
+    return tell(config, {**result, **_folder.places(folder)}, show_all)
 
 
 def diagnosis_of(folder: RunFolder) -> dict[str, Any]:
@@ -241,8 +241,7 @@ def show(result: Mapping[str, Any]) -> None:
         ),
         left=("motion", "would tell apart"),
     )
-    print_text(best_sentence(result))
-    print_notes(result["notes"])
+    print_text(best_sentence(result), notes=result["notes"])
     print(f"{result['simulated_now']} new simulations and drawings, {result['seconds']:.0f} s")
 
 

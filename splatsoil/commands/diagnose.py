@@ -8,8 +8,7 @@ from typing import Any
 
 from splatsoil.commands import _folder, _laboratory, _model, _stages
 from splatsoil.commands._options import DEVICE, RunOptions
-from splatsoil.commands._output import print_json, print_notes, print_table, print_text
-from splatsoil.errors import NoAnswer
+from splatsoil.commands._output import print_table, print_text, tell
 from splatsoil.options import JSON, option
 
 INTERRUPTED = "finished simulations are kept; go on with"
@@ -34,13 +33,14 @@ def run(config: Config) -> int:
     """Diagnose; the result goes into the run folder."""
     from splatsoil.commands._crew import Crew
     from splatsoil.files import plain
+    from splatsoil.report.text import no_answer
     from splatsoil.soil.library import find_effects
 
     if _laboratory.is_run(config.run) or _laboratory.is_test(config.run):
-        return _laboratory.diagnose(config.run, config.effects, config.device, config.set, quiet=config.json)
+        return _laboratory.diagnose(config)
     folder = _folder.opened(config)
     fit = _folder.latest_fit(folder)
-    none = _folder.no_answer(fit)
+    none = no_answer(fit)
     folder.check_writable()
     # Helpers begin before what takes seconds to load is loaded.
     with Crew(folder, config.device, config.effects) as crew:
@@ -48,15 +48,12 @@ def run(config: Config) -> int:
         with _model.loaded(config, folder) as (model, begin):
             result = _stages.run_diagnosis(folder, model, begin, config.effects, crew=crew)
     result = {key: value for key, value in result.items() if not (none and key == "estimates")}
-    if config.json:
-        verdict = {"ok": False, "error": none} if none else {"ok": True}
-        print_json({**verdict, **plain(result), "run": str(folder.path)})
-    else:
-        if none:
-            print(none)
+
+    def show_all() -> None:
         show(result)
         print(f"kept in {folder.path / 'diagnosis.json'}")
-    return NoAnswer.code if none else 0
+
+    return tell(config, {**plain(result), **_folder.places(folder)}, show_all, none=none)
 
 
 def show(result: Mapping[str, Any]) -> None:
@@ -78,6 +75,6 @@ def show(result: Mapping[str, Any]) -> None:
         faint=[number for number, model in enumerate(result["models"]) if model["probability"] < LITTLE],
     )
     print_text(verdict(result), style="bold")
-    print_text(*([averaged_sentence(result["estimates"])] if "estimates" in result else []), *result["sentences"])
-    print_notes(result["notes"])
+    averaged = [averaged_sentence(result["estimates"])] if "estimates" in result else []
+    print_text(*averaged, *result["sentences"], notes=result["notes"])
     print(f"{result['simulations']} simulations, {result['simulated_now']} of them new, {result['seconds']:.0f} s")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from splatsoil.commands._output import print_json, print_table
+from splatsoil.commands._output import print_table, tell
 from splatsoil.commands.simulate import ACTING, VALUES, parse_values
 from splatsoil.errors import ParameterError
 from splatsoil.options import JSON, option
@@ -62,10 +62,8 @@ def run(config: Config) -> int:
 
     hush()
     values = parse_values(config.values)
-    if config.records < 2:
-        raise ParameterError(f"--records: a curve needs at least 2 points, not {config.records}")
-    if config.records > MOST_RECORDS:
-        raise ParameterError(f"--records: a curve may have {MOST_RECORDS} points at most, not {config.records}")
+    if not 2 <= config.records <= MOST_RECORDS:
+        raise ParameterError(f"--records: a curve has 2 to {MOST_RECORDS} points, not {config.records}")
     if config.plot.suffix not in (".png", ".svg", ".pdf"):
         raise ParameterError(f"--plot {config.plot}: give a file that ends in .png, .svg or .pdf")
     law = Law(find_effects(config.effects))
@@ -74,20 +72,14 @@ def run(config: Config) -> int:
     result = perform(law, full, config)
     columns = curve(result, config)
     draw(columns, config)
-    if config.json:
-        print_json(
-            {
-                "ok": True,
-                "test": config.test,
-                "parameters": dict(result.values[0]),
-                "effects": [effect.name for effect in law.effects],
-                "plot": str(config.plot),
-                "records": {name: [float(v) for v in column] for name, column in columns.items()},
-            }
-        )
-    else:
-        show(columns, config)
-    return 0
+    told = {
+        "test": config.test,
+        "parameters": dict(result.values[0]),
+        "effects": [effect.name for effect in law.effects],
+        "plot": str(config.plot),
+        "records": {name: [float(v) for v in column] for name, column in columns.items()},
+    }
+    return tell(config, told, lambda: show(columns, config))
 
 
 def refuse_idle(law: Law, values: dict[str, float]) -> None:
@@ -172,7 +164,9 @@ def draw(columns: dict[str, Any], config: Config) -> None:
     on = ", ".join(Path(name).stem for name in config.effects) or "base law"
     with_values = " ".join((on, *config.values))
     figure.suptitle(
-        f"{config.test}, {config.confining:g} Pa, φ = {config.friction_angle:g}°, {with_values}", fontsize=10
+        f"{config.test}, {config.confining:g} Pa, φ = {config.friction_angle:g}°, {with_values}",
+        fontsize=10,
+        parse_math=False,
     )
     stream = io.BytesIO()
     figure.savefig(stream, format=config.plot.suffix[1:], dpi=150)

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from splatsoil.commands import _model
-from splatsoil.commands._options import DEVICE
-from splatsoil.commands._output import print_json
+from splatsoil.commands import _folder, _model
+from splatsoil.commands._options import DEVICE, RunOptions
+from splatsoil.commands._output import by_frame, tell
 from splatsoil.errors import ParameterError, RunError
-from splatsoil.options import JSON, argument, option
+from splatsoil.options import JSON, option
 
 if TYPE_CHECKING:
     from splatsoil.inverse.run_folder import RunFolder
@@ -24,13 +24,12 @@ Format = Literal["vtk", "usd", "csv", "ply"]
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(RunOptions):
     """The prediction for ParaView, Omniverse, spreadsheets, splat viewers.
 
     vtk: ParaView; usd: Omniverse, Blender; csv: spreadsheets; ply: viewers of Gaussian splats.
     """
 
-    run: Path = argument("The run folder.")
     to: tuple[Format, ...] = option(
         ("vtk", "usd", "csv", "ply"), "Formats; vtk and usd need `pip install 'splatsoil[export]'`."
     )
@@ -51,7 +50,6 @@ def run(config: Config) -> int:
     """Simulate and write; all of it or nothing."""
     from splatsoil.export.writers import check_installed
     from splatsoil.files import check_folder
-    from splatsoil.inverse.run_folder import RunFolder
 
     if not config.to:
         raise ParameterError("--to: name a format: vtk, usd, csv or ply")
@@ -59,18 +57,14 @@ def run(config: Config) -> int:
         raise ParameterError(f"--every: must be 1 or more, not {config.every}")
     formats = tuple(dict.fromkeys(config.to))
     check_installed(formats)
-    folder = RunFolder.open(config.run)
+    folder = _folder.opened(config)
     folder.fit()
     target = folder.path / "export" if config.out is None else config.out
     if config.out is not None and target.is_dir() and any(target.iterdir()):
         raise ParameterError(f"--out: {target} is not empty; nothing is overwritten")
     check_folder(target)
     about = _exported(config, folder, formats, target)
-    if config.json:
-        print_json({"ok": True, **about})
-    else:
-        _show(about)
-    return 0
+    return tell(config, {**about, **_folder.places(folder)}, lambda: _show(about))
 
 
 def _exported(config: Config, folder: RunFolder, formats: tuple[str, ...], target: Path) -> dict[str, Any]:
@@ -82,18 +76,11 @@ def _exported(config: Config, folder: RunFolder, formats: tuple[str, ...], targe
     with _model.loaded(config, folder) as (fitted, begin):
         model, values = _chosen(config, folder, fitted)
         frames = model.frames if config.every is None else tuple(range(0, model.frames[-1] + 1, config.every))
-        report = begin("export")
         target.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}-") as temporary:
             made = Path(temporary) / target.name
             writers = make_writers(made, formats, model, frames)
-            replay(
-                model,
-                values,
-                frames,
-                writers,
-                progress=lambda frame, last: report(f"frame {frame}", frame / (last or 1)),
-            )
+            replay(model, values, frames, writers, progress=by_frame(begin("export")))
             about = {
                 "run": str(folder.path),
                 "measurement": folder.description["measurement"]["name"],

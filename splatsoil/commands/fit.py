@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from splatsoil.commands import _folder, _laboratory, _model, _stages
+from splatsoil.commands import _folder, _laboratory, _stages
 from splatsoil.commands._options import FitOptions, command_line
-from splatsoil.commands._output import print_json, print_notes, print_table, print_text, stages
+from splatsoil.commands._output import print_parameters, print_text, stages, tell
 
 INTERRUPTED = _stages.kept
 
@@ -24,38 +24,25 @@ class Config(FitOptions):
 
 def run(config: Config) -> int:
     """Reconstruct (unless the run folder has it), fit, print; everything is kept in the run folder."""
-    from splatsoil.envs.devices import resolve_device
-    from splatsoil.quiet import hush
-
     if _laboratory.is_test(config.set):
         return _laboratory.fit(config)
-    hush()
-    measurement, folder = _stages.prepare(config)
-    device = resolve_device(config.device)
     with stages(quiet=config.json) as begin:
-        reconstruction = _model.reconstructed(measurement, folder, device, begin("reconstruct"))
-        model = _model.model_on(measurement, folder, reconstruction, config.effects, config.preset, device)
-        result = _stages.run_fit(config, measurement, folder, model, begin("fit"))
+        folder, _, result = _stages.fitted(config, begin)
     compare = command_line("compare", folder.path)
-    _folder.require_answer(result, f"`{compare}` shows where")
-    if config.json:
-        print_json({"ok": True, **result, "run": str(folder.path)})
-    else:
+    _folder.require_answer(folder, result, f"`{compare}` shows where")
+
+    def show_all() -> None:
         show(result, str(folder.path))
         print("Does the model leave more than noise, and where?", compare)
-    return 0
+
+    return tell(config, {**result, **_folder.places(folder)}, show_all)
 
 
 def show(result: Mapping[str, Any], folder: str) -> None:
     """A table of the parameters, and what to know about them."""
-    from splatsoil.report.text import amount, duration, interval, model_name
+    from splatsoil.report.text import duration, model_name
 
-    print_table(
-        model_name(result["name"]),
-        ("parameter", "estimate", "5 to 95 %"),
-        ((name, amount(p["estimate"], p["std"], p["unit"]), interval(p)) for name, p in result["parameters"].items()),
-    )
-    print_notes(result["notes"])
+    print_parameters(model_name(result["name"]), result, "estimate", {})
     print_text(
         f"loss {result['loss']:.4g} ± {result['loss_std']:.2g} at the estimate; {result['evaluations']} evaluations "
         f"in {duration(result['seconds'])}",

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from splatsoil.commands._options import command_line
-from splatsoil.commands._output import print_json, stages
+from splatsoil.commands._output import stages, tell
 from splatsoil.importing.options import ImportOptions
 from splatsoil.options import JSON, option
 
@@ -32,11 +32,7 @@ def run(config: Config) -> int:
         hush()
     with stages(quiet=config.json) as begin:
         made = import_set(config, begin("import"))
-    if config.json:
-        print_json({"ok": True, **_as_json(config, made)})
-    else:
-        _show(config, made)
-    return 0
+    return tell(config, _as_json(config, made), lambda: _show(config, made))
 
 
 def _as_json(config: Config, made: Imported) -> dict[str, Any]:
@@ -45,7 +41,7 @@ def _as_json(config: Config, made: Imported) -> dict[str, Any]:
     clock = None if made.clock is None else {"seconds": made.clock.seconds, "by_camera": made.clock.by_camera}
     return plain(
         {
-            "out": config.out,
+            "set": config.out,
             "source": made.kind,
             "views": made.views,
             "scale": made.scale,

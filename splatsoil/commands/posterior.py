@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from splatsoil.commands import _folder, _model, _stages
-from splatsoil.commands._options import RunOptions, command_line
-from splatsoil.commands._output import print_json, print_notes, print_table, print_text, stages
+from splatsoil.commands._options import RunOptions, check_seed, command_line
+from splatsoil.commands._output import print_parameters, print_text, stages, tell
 from splatsoil.errors import ParameterError
 from splatsoil.options import JSON, option
 
@@ -37,15 +37,14 @@ def run(config: Config) -> int:
     from splatsoil.inverse.posterior import Density, run_posterior
     from splatsoil.quiet import hush
 
-    for name in ("checks", "seed"):
-        value = getattr(config, name)
-        if value < 0:
-            raise ParameterError(f"--{name}: must be 0 or more, not {value}")
+    check_seed(config.seed)
+    if config.checks < 0:
+        raise ParameterError(f"--checks: must be 0 or more, not {config.checks}")
     hush()
     folder = _folder.opened(config)
     fit = folder.fit()
     compare = command_line("compare", folder.path)
-    _folder.require_answer(fit, f"so there is nothing to sample; `{compare}` shows where")
+    _folder.require_answer(folder, fit, f"so there is nothing to sample; `{compare}` shows where")
     setup = fit["setup"]
     wanted = ("cuda:0" if setup["device"] == "cuda" else "cpu") if config.device == "auto" else config.device
     device = resolve_device(wanted)
@@ -75,27 +74,15 @@ def run(config: Config) -> int:
                 seed=config.seed,
                 progress=begin("posterior"),
             )
-    if config.json:
-        print_json({"ok": True, **result, "run": str(folder.path)})
-    else:
-        show(result, str(folder.path))
-    return 0
+    return tell(config, {**result, **_folder.places(folder)}, lambda: show(result, str(folder.path)))
 
 
 def show(result: Mapping[str, Any], folder: str) -> None:
     """A table of the parameters, and what to know about them."""
-    from splatsoil.report.text import amount, duration, interval, model_name
+    from splatsoil.report.text import duration, model_name
 
-    print_table(
-        f"posterior, {model_name(result['fit'])}",
-        ("parameter", "mean", "5 to 95 %", "width / prior", ""),
-        (
-            (name, amount(p["mean"], p["std"], p["unit"]), interval(p), f"{p['contraction']:.2f}", p["verdict"])
-            for name, p in result["parameters"].items()
-        ),
-        left=("parameter", ""),
-    )
-    print_notes(result["notes"])
+    more = {"width / prior": lambda p: f"{p['contraction']:.2f}", "": lambda p: str(p["verdict"])}
+    print_parameters(f"posterior, {model_name(result['fit'])}", result, "mean", more)
     chains = result["chains"]
     print_text(
         f"{result['simulations']} simulations; R-hat {chains['r_hat']:.3f}, acceptance {chains['acceptance']:.2f}, "

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from splatsoil.commands._options import PRESET, SEED, SET, Preset
-from splatsoil.commands._output import print_json, print_remarks, print_table, print_text
+from splatsoil.commands._options import PRESET, SEED, SET, Preset, check_seed
+from splatsoil.commands._output import print_remarks, print_table, print_text, stages, tell
 from splatsoil.options import JSON, argument, option
 
 if TYPE_CHECKING:
@@ -32,31 +32,30 @@ class Config:
 def run(config: Config) -> int:
     """Reconstruct, save, print; an error before any work when set, options or the folder for the result are no good."""
     from splatsoil.envs.devices import resolve_device
-    from splatsoil.errors import ParameterError
     from splatsoil.files import check_folder
     from splatsoil.measurement import Measurement
     from splatsoil.quiet import hush
     from splatsoil.reconstruction import reconstruct
-    from splatsoil.reconstruction.progress import progress_bar
 
-    if not 0 <= config.seed < 2**63:
-        raise ParameterError(f"--seed: must be 0 or more and less than 2^63, not {config.seed}")
+    check_seed(config.seed)
     hush()
     device = resolve_device(config.device)
     measurement = Measurement.load(config.set)
     print_remarks(measurement)
     out = config.out or Path("runs") / f"{measurement.name}-reconstruction"
     check_folder(out)
-    with progress_bar(quiet=config.json) as report:
+    with stages(quiet=config.json) as begin:
         result = reconstruct(
-            measurement, seed=config.seed, device=device, preset=config.preset, holdout=config.holdout, progress=report
+            measurement,
+            seed=config.seed,
+            device=device,
+            preset=config.preset,
+            holdout=config.holdout,
+            progress=begin("reconstruct"),
         )
     result.save(out)
-    if config.json:
-        print_json({"ok": True, "out": str(out), **result.summary()})
-    else:
-        _show(result, out)
-    return 0
+    told = {"set": str(measurement.folder), "out": str(out), **result.summary()}
+    return tell(config, told, lambda: _show(result, out))
 
 
 def _show(result: Reconstruction, out: Path) -> None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from splatsoil.commands import _folder
 from splatsoil.commands._options import RunOptions
-from splatsoil.commands._output import print_json
+from splatsoil.commands._output import tell
 from splatsoil.options import JSON, option
 
 INTERRUPTED = "the page was not written; start again with"
@@ -27,9 +27,5 @@ def run(config: Config) -> int:
     folder = _folder.opened(config)
     _folder.note_other_sources(folder)
     path = write_report(folder.path)
-    _folder.require_answer(read_fit(folder.path), f"report: {path}")
-    if config.json:
-        print_json({"ok": True, "report": str(path)})
-    else:
-        print(f"report: {path}")
-    return 0
+    _folder.require_answer(folder, read_fit(folder.path), f"report: {path}")
+    return tell(config, {**_folder.places(folder), "report": str(path)}, lambda: print(f"report: {path}"))

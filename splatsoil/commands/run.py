@@ -6,7 +6,7 @@ import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from splatsoil.commands import _folder, _model, _stages, add, compare, diagnose, fit
+from splatsoil.commands import _folder, _stages, add, compare, diagnose, fit
 from splatsoil.commands._options import FitOptions, command_line
 from splatsoil.commands._output import print_json, stages
 from splatsoil.errors import ParameterError, SplatsoilError
@@ -36,23 +36,15 @@ class Config(FitOptions):
 
 def run(config: Config) -> int:
     """Each stage in turn; what the run folder has already isn't done again."""
-    from splatsoil.envs.devices import resolve_device
     from splatsoil.files import plain, read_json
-    from splatsoil.quiet import hush
     from splatsoil.report import write_report
     from splatsoil.report.text import called_adequate
 
-    hush()
     if config.most_effects < 0:
         raise ParameterError(f"--most-effects: must be 0 or more, not {config.most_effects}")
     stopped, diagnosis, misfit, unknown = "", None, None, ""
     with stages(quiet=config.json) as begin:
-        begin("check")("reading every image", 0.0)
-        measurement, folder = _stages.prepare(config)
-        device = resolve_device(config.device)
-        reconstruction = _model.reconstructed(measurement, folder, device, begin("reconstruct"))
-        model = _model.model_on(measurement, folder, reconstruction, config.effects, config.preset, device)
-        result = _stages.run_fit(config, measurement, folder, model, begin("fit"))
+        folder, model, result = _stages.fitted(config, begin)
         comparison = _stages.draw_comparison(folder, model, begin("compare"))
         try:
             if config.stop_at_floor:
@@ -66,7 +58,7 @@ def run(config: Config) -> int:
         page = write_report(folder.path)
     if unknown:
         print(unknown, file=sys.stderr)
-    _folder.require_answer(result, f"report: {page}")
+    _folder.require_answer(folder, result, f"report: {page}")
     entries = [] if diagnosis is None else _folder.history(folder)
     if config.json:
         losses = {key: comparison[key] for key in ("loss", "total", "noise")}
@@ -74,7 +66,8 @@ def run(config: Config) -> int:
         if diagnosis is not None:
             kept = plain({key: diagnosis[key] for key in DIAGNOSIS})
             extra = {"diagnosis": kept, "models": entries, "stopped": stopped}
-        print_json({"ok": True, "report": str(page), "comparison": losses, **extra, **result, "run": str(folder.path)})
+        told = {"report": str(page), "comparison": losses, **extra, **result, **_folder.places(folder)}
+        print_json({"ok": True, **told})
         return 0
     fit.show(result, str(folder.path))
     compare.show(comparison, str(folder.comparison), called_adequate(result, diagnosis or misfit))

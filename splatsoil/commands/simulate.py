@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from splatsoil.commands import _laboratory
-from splatsoil.commands._options import Preset
-from splatsoil.commands._output import print_json, print_table
+from splatsoil.commands._options import Preset, check_seed
+from splatsoil.commands._output import print_table, stages, tell
 from splatsoil.errors import ParameterError
 from splatsoil.options import JSON, argument, option
 
@@ -62,22 +62,17 @@ class Config:
 def run(config: Config) -> int:
     """Make the set; ParameterError for options that make no sense, before anything is computed."""
     from splatsoil.quiet import hush
-    from splatsoil.reconstruction.progress import progress_bar
     from splatsoil.synthetic import make_set
     from splatsoil.synthetic.world import check_place
 
     values = parse_values(config.values)
     if config.scene not in ("plow", "paper"):
-        known = {"friction_angle": config.friction_angle, **values}
-        preset = config.preset or "small"
-        return _laboratory.simulate(
-            config.scene, config.out, known, config.effects, preset, config.seed, quiet=config.json
-        )
+        return _laboratory.simulate(config, {"friction_angle": config.friction_angle, **values})
     hush()
     check_place(config.out)
     setup = choose_setup(config)
     preset = config.preset or ("paper" if config.scene == "paper" and config.like is None else "small")
-    with progress_bar(quiet=config.json) as report:
+    with stages(quiet=config.json) as begin:
         world = make_set(
             config.out,
             setup,
@@ -88,14 +83,10 @@ def run(config: Config) -> int:
             seed=config.seed,
             particle_seed=config.particle_seed,
             device=config.device,
-            progress=report,
+            progress=begin("simulate"),
         )
     summary = _summary(world)
-    if config.json:
-        print_json({"ok": True, **summary})
-    else:
-        _show(summary)
-    return 0
+    return tell(config, summary, lambda: _show(summary))
 
 
 def parse_values(words: Sequence[str]) -> dict[str, float]:
@@ -125,8 +116,7 @@ def choose_setup(config: Config) -> Setup:
 
     if config.views is not None and config.views < 1:
         raise ParameterError(f"--views {config.views}: a set needs at least one photograph")
-    if config.seed < 0:
-        raise ParameterError(f"--seed {config.seed}: seeds are whole numbers from 0 on")
+    check_seed(config.seed)
     if config.scene == "paper" and (config.like is not None or config.depth is not None):
         raise ParameterError("--scene paper is a scene of its own; leave --like and --depth out")
     if config.container is not None and (config.scene == "paper" or config.like is not None):
@@ -144,7 +134,7 @@ def choose_setup(config: Config) -> Setup:
 def _summary(world: World) -> dict[str, Any]:
     measurement = world.measurement
     return {
-        "out": str(measurement.folder),
+        "set": str(measurement.folder),
         "name": measurement.name,
         "hash": measurement.hash,
         **{key: world.truth[key] for key in ("parameters", "effects", "preset", "seed", "particle_seed")},
@@ -164,4 +154,4 @@ def _show(summary: dict[str, Any]) -> None:
         ("time", ", ".join(f"{what} {seconds:.0f} s" for what, seconds in summary["seconds"].items())),
     ]
     print_table(f"synthetic set {summary['name']}", (), rows)
-    print(f"written to {summary['out']}")
+    print(f"written to {summary['set']}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import io
+import logging
 from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from splatsoil.commands import _model
 from splatsoil.commands._options import DEVICE
+from splatsoil.commands._output import by_frame
 from splatsoil.errors import ParameterError, RunError
 from splatsoil.options import argument, option
 
@@ -46,6 +48,7 @@ def run(config: Config) -> int:
 
     from splatsoil.view import Viewer
 
+    logging.getLogger("websockets").setLevel(logging.CRITICAL)  # a browser that leaves is no fault
     with redirect_stdout(io.StringIO()):  # viser's banner
         # This machine alone: there is no password.
         server = viser.ViserServer("127.0.0.1", config.port, verbose=False)
@@ -65,6 +68,7 @@ def _loaded(config: Config) -> tuple[Measurement, list[Column]]:
     from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.measurement import Measurement
     from splatsoil.report.data import estimates, load
+    from splatsoil.report.text import amount
     from splatsoil.view import Column
 
     if not (config.folder / "run.json").is_file():
@@ -80,10 +84,9 @@ def _loaded(config: Config) -> tuple[Measurement, list[Column]]:
         comparator = Comparator(model.measurement, surface=model.reconstruction.surface, frames=model.frames)
         for fit in (data.fit, *([data.fits[config.beside]] if config.beside else [])):
             values, report = estimates(fit), begin(fit["name"])
-            said = (f"{n} {p['estimate']:.4g} ± {p['std']:.3g} {p['unit']}" for n, p in fit["parameters"].items())
+            said = (f"{n} {amount(p['estimate'], p['std'], p['unit'])}" for n, p in fit["parameters"].items())
             shown = model.variant(effects=_model.ModelSpec.of(fit).effects)
             column = Column(f"{fit['name']}: {', '.join(said)}", shown, values, comparator)
-            progress = lambda frame, last, say=report: say(f"frame {frame}", frame / last)  # noqa: E731
-            replay(shown, values, shown.recorded, [column], progress=progress)
+            replay(shown, values, shown.recorded, [column], progress=by_frame(report))
             columns.append(column)
     return model.measurement, columns

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from splatsoil.batches import in_batches
 from splatsoil.comparison import PATCH, Block, Comparator
-from splatsoil.errors import SplatsoilError
+from splatsoil.errors import SimulationError, SplatsoilError
 from splatsoil.experiment.base import Candidate, candidates_of
 from splatsoil.experiment.features import Layout, Site
 from splatsoil.experiment.forces import REGION, UNIT, ToolForces, compressed
@@ -237,15 +238,19 @@ class PlowExperiment:
             if key not in self._kept:
                 groups.setdefault((moving, way, model.recorded), {})[key] = (model, physics, job["seed"])
         for group in groups.values():
-            models, values, seeds = zip(*group.values(), strict=True)
-            particles = [models[0].particles(seed) for seed in seeds]
             try:
-                found = simulate_together(self.base.measurement, particles, values, models[0], self.progress)
-            except (SplatsoilError, RuntimeError):  # no memory for all of them, or values that one of them doesn't know
+                found = in_batches(self._together, list(group.values()), "simulations")
+            except (SplatsoilError, RuntimeError):  # `predict` meets it, too, and says which one it is of
                 continue
             for asked, trajectory in zip(group, found, strict=True):
                 if isinstance(trajectory, Trajectory):
                     self._keep(asked, trajectory)
+
+    def _together(self, group: Sequence[tuple[Model, dict[str, float], int]]) -> Sequence[Trajectory | SimulationError]:
+        """Simulations of models that are alike, as one batch."""
+        models, values, seeds = zip(*group, strict=True)
+        particles = [models[0].particles(seed) for seed in seeds]
+        return simulate_together(self.base.measurement, particles, values, models[0], self.progress)
 
     def _computed(self, effects: Iterable[str], numerics: str) -> tuple[Model, str]:
         """The model with candidates on, computed in one of the numerics; what only draws otherwise is none of them."""

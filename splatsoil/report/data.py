@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -133,6 +134,28 @@ def true_values(folder: str | Path, names: Iterable[str]) -> dict[str, float]:
 def estimates(fit: Mapping[str, Any]) -> dict[str, float]:
     """The fitted values by name."""
     return {name: float(entry["estimate"]) for name, entry in fit["parameters"].items()}
+
+
+def read_picture(path: Path, made_by: str = "compare") -> tuple[bytes, str]:
+    """A picture's bytes, and which of ``jpeg`` and ``png`` it is.
+
+    Args:
+        path: the file.
+        made_by: command that draws it.
+
+    Raises:
+        RunError: it is missing, damaged, or neither JPEG nor PNG.
+    """
+    from PIL import Image
+
+    try:
+        contents = path.read_bytes()
+        with Image.open(io.BytesIO(contents), formats=("JPEG", "PNG")) as image:
+            image.load()
+            return contents, str(image.format).lower()
+    except (OSError, ValueError, SyntaxError, EOFError, MemoryError, Image.DecompressionBombError) as error:
+        fault = "there is no such picture" if isinstance(error, FileNotFoundError) else "is no whole JPEG or PNG image"
+        raise RunError(f"{path}: {fault}; run `splatsoil {made_by}` again") from error
 
 
 def _read(path: Path, tag: str) -> dict[str, Any] | None:

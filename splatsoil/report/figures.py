@@ -8,8 +8,8 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from html import escape
+from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,6 +34,7 @@ STYLE = {
     "svg.hashsalt": "splatsoil",
     "font.size": 9.0,
     "text.color": INK,
+    "text.parse_math": False,  # names may hold a $
     "axes.edgecolor": FAINT,
     "axes.labelcolor": INK,
     "axes.facecolor": "none",
@@ -133,7 +134,9 @@ def losses(comparison: Mapping[str, Any]) -> Markup:
     name = comparison["loss"]
 
     def draw(_: Figure, axes: Axes) -> None:
-        for camera, colour, marker in zip(comparison["cameras"], _cycle(), "os^Dv<>" * 10, strict=False):
+        for camera, colour, marker in zip(
+            comparison["cameras"], cycle((ACCENT, SECOND, INK, FAINT)), cycle("os^Dv<>"), strict=False
+        ):
             steps = sorted((f for f in comparison["frames"] if f["camera"] == camera), key=lambda f: f["frame"])
             frames = [f["frame"] for f in steps]
             axes.plot(frames, [f["losses"][name] for f in steps], color=colour, marker=marker, ms=3.5, label=camera)
@@ -164,22 +167,6 @@ def surface_map(surface: Surface) -> Markup:
     return _draw(draw, "height of the bed from above")
 
 
-def history(fits: Mapping[str, Mapping[str, Any]], order: Sequence[str]) -> Markup:
-    """The loss at the estimate of each model that was fitted: does it fall when an effect is added?"""
-
-    def draw(_: Figure, axes: Axes) -> None:
-        rows = np.arange(len(order))[::-1]
-        values = [fits[name]["loss"] for name in order]
-        spread = [2.0 * fits[name]["loss_std"] for name in order]
-        axes.barh(rows, values, color=ACCENT, alpha=0.75, height=0.55)
-        axes.errorbar(values, rows, xerr=spread, fmt="none", ecolor=INK, capsize=3)
-        axes.set_yticks(rows, [name.replace("_", " ") for name in order])
-        axes.set_xlabel("loss at the estimate (± 2 std)")
-        axes.set_xlim(left=0.0)
-
-    return _draw(draw, "loss at the estimate of each model", (SIZE[0], 0.8 + 0.36 * len(order)))
-
-
 def falling(errors: Sequence[float], noise: Sequence[float], names: Sequence[str], unit: str) -> Markup:
     """The error on data set aside of models in turn, and the noise level."""
 
@@ -200,42 +187,39 @@ def falling(errors: Sequence[float], noise: Sequence[float], names: Sequence[str
     return _draw(draw, f"error of models on data set aside, {unit}; {'; '.join(rows)}")
 
 
-@dataclass(frozen=True)
-class Readings:
-    """One instrument without a place.
+def readings(
+    channel: str,
+    unit: str,
+    measured: Sequence[np.ndarray],
+    predicted: Mapping[str, Sequence[np.ndarray]],
+    expected: Sequence[np.ndarray] | None,
+    time_name: str,
+) -> Markup:
+    """What an instrument without a place measured, and what models predict.
 
-    Attributes:
+    Args:
         channel: its name.
         unit: of what it reads.
         measured: times and readings (n,), NaN where there is none.
-        expected: times, and readings one expected standard deviation below and above what was measured; None where
-            that has not been estimated.
         predicted: times and readings by model.
+        expected: times, and readings one expected standard deviation below and above what was measured; None where that
+            has not been estimated.
+        time_name: what the times are.
     """
 
-    channel: str
-    unit: str
-    measured: tuple[np.ndarray, np.ndarray]
-    expected: tuple[np.ndarray, np.ndarray, np.ndarray] | None
-    predicted: Mapping[str, tuple[np.ndarray, np.ndarray]]
-
-
-def readings(one: Readings, time_name: str) -> Markup:
-    """What an instrument without a place measured, and what models predict."""
-
     def draw(figure: Figure, axes: Axes) -> None:
-        if one.expected is not None:
-            axes.fill_between(*one.expected, color=FAINT, alpha=0.3, linewidth=0, label="± expected std")
-        axes.plot(*one.measured, "o", markersize=3.5, color=INK, label="measured")
-        lines = zip(one.predicted.items(), (ACCENT, SECOND), ("-", "--"), strict=False)
-        for (title, line), colour, style in lines:
+        if expected is not None:
+            times, low, high = expected
+            axes.fill_between(times, low, high, color=FAINT, alpha=0.3, linewidth=0, label="± expected std")
+        axes.plot(*measured, "o", markersize=3.5, color=INK, label="measured")
+        for (title, line), colour, style in zip(predicted.items(), (ACCENT, SECOND), ("-", "--"), strict=False):
             axes.plot(*line, color=colour, linestyle=style, label=title)
         axes.axhline(0.0, color=FAINT, linewidth=0.6)
-        axes.set_ylabel(f"{one.channel} [{one.unit}]")
+        axes.set_ylabel(f"{channel} [{unit}]")
         axes.set_xlabel(time_name)
         figure.legend(fontsize=8, loc="outside upper center", ncols=2, columnspacing=1.0)
 
-    return _draw(draw, f"measured and predicted {one.channel} [{one.unit}]", (SIZE[0], 2.7))
+    return _draw(draw, f"measured and predicted {channel} [{unit}]", (SIZE[0], 2.7))
 
 
 def plan_maps(judged: Mapping[str, Any], which: Sequence[tuple[str, str]]) -> list[Markup]:
@@ -322,7 +306,3 @@ def outlined(check: Mapping[str, Any], judged: Mapping[str, Any], squares: Mappi
         f'<svg viewBox="0 0 1 1" preserveAspectRatio="none" role="img" aria-label="{escape(shows)}">'
         f"{''.join(shapes)}</svg>"
     )
-
-
-def _cycle() -> list[str]:
-    return [ACCENT, SECOND, INK, FAINT] * 20

@@ -14,7 +14,7 @@ import splatsoil
 from splatsoil.errors import RunError
 from splatsoil.files import write_text
 from splatsoil.report import figures, text
-from splatsoil.report.data import RunData, load
+from splatsoil.report.data import RunData, load, read_picture
 
 HERE = Path(__file__).parent
 KINDS = ("observed", "predicted", "difference")
@@ -34,10 +34,10 @@ def write_report(folder: str | Path) -> Path:
 
     try:
         page = render(load(folder))
-    except (KeyError, TypeError, IndexError, UndefinedError) as error:
+    except (TypeError, ValueError, LookupError, AttributeError, UndefinedError) as error:
         raise RunError(
-            f"{folder}: a file in it lacks what the page needs ({error!r}); it is damaged or made by another "
-            "version: fit and compare again"
+            f"{folder}: fit.json, posterior.json, or one in comparison/ or diagnoses/ isn't what the page needs "
+            f"({error!r}); it is damaged or made by another version: fit and compare again"
         ) from error
     return write_text(Path(folder) / "report.html", page)
 
@@ -57,7 +57,7 @@ def render(data: RunData) -> str:
         probability=text.probability,
     )
     comparison, diagnosis = data.comparison, data.diagnosis
-    judged = data.judged
+    judged, no_answer = data.judged, text.no_answer(data.fit)
     adequate = text.called_adequate(data.fit, judged)
     ratio = text.ratio_to_noise(comparison)
     at_the_noise = ratio is not None and ratio <= text.AT_THE_NOISE
@@ -75,7 +75,8 @@ def render(data: RunData) -> str:
         program=splatsoil.__version__,
         data=data,
         fit=data.fit,
-        answers=text.answers(data.fit, judged, data.truth),
+        no_answer=no_answer,
+        answers=[] if no_answer else text.answers(data.fit, judged, data.truth),
         adequate=adequate,
         fitted=text.fitted_sentence(data.fit, judged),
         residual=text.residual_sentence(comparison, adequate) if judged is None else text.misfit_sentence(judged),
@@ -98,7 +99,6 @@ def render(data: RunData) -> str:
         falling=_falling(data),
         surface=None if data.surface is None else figures.surface_map(data.surface),
         order=order,
-        history=figures.history(data.fits, order) if len(order) > 1 else None,
     )
 
 
@@ -140,7 +140,7 @@ def _posterior(folder: Path, posterior: Mapping[str, Any]) -> dict[str, Any]:
         "sentences": text.posterior_sentences(posterior),
         "notes": text.posterior_notes(posterior),
         "marginals": [figures.marginal(entry) for entry in posterior["parameters"].values()],
-        "corner": data_url(corner) if len(posterior["parameters"]) > 1 and corner.is_file() else None,
+        "corner": data_url(corner, "posterior") if len(posterior["parameters"]) > 1 and corner.is_file() else None,
         "simulations": posterior["simulations"],
         "chains": posterior["chains"],
     }
@@ -205,28 +205,25 @@ def _forces(data: RunData, judged: Mapping[str, Any] | None) -> dict[str, Any] |
     now, before = ((c or {}).get("force") for c in (data.comparison, data.before))
     if now is None:
         return None
-    drawn, sentences = [], []
+    drawn, sentences, unit = [], [], now["unit"]
     for number, channel in enumerate(now["channels"]):
+        name = channel["channel"]
         frames, measured, predicted = _series(now["frames"], channel["measured"], channel["predicted"])
-        lines = {"predicted": (frames, predicted)}
+        lines: dict[str, tuple[np.ndarray, ...]] = {"predicted": (frames, predicted)}
+        expected, curve = None, curves.get(name)
         if before is not None:
-            was = before["channels"][number]
-            earlier, _, old = _series(before["frames"], was["measured"], was["predicted"])
-            lines = {"before": (earlier, old), "after": (frames, predicted)}
-        expected, curve = None, curves.get(channel["channel"])
+            earlier = _series(before["frames"], before["channels"][number]["predicted"])
+            lines = {"before": earlier, "after": (frames, predicted)}
         if own is not None and curve is not None:
-            times, low, high = _series(own["times"], curve["low"], curve["high"])
-            expected = (times, low, high)
-            for name in own.get("class", ())[:1] if before is None else ():
-                if name in curve["predicted"]:
-                    times, values = _series(own["times"], curve["predicted"][name])
-                    lines[f"with {text.model_label(name)}"] = (times, values)
-        one = figures.Readings(channel["channel"], now["unit"], (frames, measured), expected, lines)
-        drawn.append(figures.readings(one, "frame"))
+            expected = _series(own["times"], curve["low"], curve["high"])
+            for model in own.get("class", ())[:1] if before is None else ():
+                if model in curve["predicted"]:
+                    lines[f"with {text.model_label(model)}"] = _series(own["times"], curve["predicted"][model])
+        drawn.append(figures.readings(name, unit, (frames, measured), lines, expected, "frame"))
         error, largest = np.sqrt(np.nanmean((predicted - measured) ** 2)), np.nanmax(np.abs(measured))
         sentences.append(
-            f"{channel['channel'].capitalize()}: root mean square error {text.rounded(float(error))} {now['unit']}; "
-            f"largest measured {text.rounded(float(largest))} {now['unit']}."
+            f"{name.capitalize()}: root mean square error {text.rounded(float(error))} {unit}; "
+            f"largest measured {text.rounded(float(largest))} {unit}."
         )
     return {"figures": drawn, "sentences": sentences}
 
@@ -252,20 +249,7 @@ def _falling(data: RunData) -> dict[str, Any] | None:
     return {"figure": figure, "falls": errors[-1] < errors[0], "aside": diagnosis["aside"]}
 
 
-def data_url(path: Path) -> str:
-    """A picture as a ``data:`` URL.
-
-    Raises:
-        RunError: it is missing or neither JPEG nor PNG.
-    """
-    try:
-        contents = path.read_bytes()
-    except OSError as error:
-        raise RunError(f"{path}: cannot be read ({error.strerror}); run `splatsoil compare` again") from error
-    if contents.startswith(b"\x89PNG\r\n\x1a\n"):
-        kind = "png"
-    elif contents.startswith(b"\xff\xd8\xff"):
-        kind = "jpeg"
-    else:
-        raise RunError(f"{path}: is neither PNG nor JPEG; run `splatsoil compare` again")
+def data_url(path: Path, made_by: str = "compare") -> str:
+    """A picture as a ``data:`` URL; see `read_picture`."""
+    contents, kind = read_picture(path, made_by)
     return f"data:image/{kind};base64,{base64.b64encode(contents).decode()}"

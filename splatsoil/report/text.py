@@ -7,6 +7,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+#: Loss of a prediction in which nothing moves. The loss is measured in units of it, so this is no choice of ours: a
+#: model that comes to it has explained nothing of what was seen, wherever its estimate lies.
+NOTHING_MOVES = 1.0
 #: A residual up to this many times the noise is called noise: the noise itself is only known to about this.
 AT_THE_NOISE = 1.5
 #: A check fails below this p.
@@ -25,18 +28,14 @@ class Answer:
 
     Attributes:
         name: "friction angle".
-        value: "35.6".
-        std: "0.8".
-        unit: "°".
+        number: "35.6 ± 0.8°".
         state: ``determined``, ``bound`` or ``open``.
         remark: one sentence when the state isn't ``determined``.
         truth: "36.0°" where the set is simulated and says it, else empty.
     """
 
     name: str
-    value: str
-    std: str
-    unit: str
+    number: str
     state: str
     remark: str
     truth: str = ""
@@ -83,27 +82,45 @@ def answers(
     out, better = [], averaged(fit, judged)
     for name, entry in fit["parameters"].items():
         plain, state, remark = name.replace("_", " "), "determined", ""
-        if name in better:
-            value, std = with_std(better[name]["value"], better[name]["std"])
-            determined, why = better[name]["determined"], undetermined(name)
-        else:
-            value, std = with_std(entry["estimate"], entry["std"])
-            determined, why = entry["determined"], undetermined(name)
-            if fit["estimated_from"] == "loss":
-                why = f"These evaluations do not determine the {plain}: they hardly say where the loss is least."
-        if not determined:
-            state, remark = "open", why
+        told, key = (better[name], "value") if name in better else (entry, "estimate")
+        if not told["determined"]:
+            state, remark = "open", undetermined(name)
+            if fit["estimated_from"] == "loss" and name not in better:
+                remark = f"These evaluations do not determine the {plain}: they hardly say where the loss is least."
         elif entry["at_bound"] is not None:
             state = "bound"
             remark = (
                 f"The {plain} lies on the {entry['at_bound']} bound of its range: "
                 "the best value may lie beyond it, or the model may lack an effect."
             )
-        true, unit = "", symbol(entry["unit"])
-        if truth and name in truth:
-            true = f"{truth[name]:.{len(value.partition('.')[2])}f}{unit}"
-        out.append(Answer(plain, value, std, unit, state, remark, true))
+        value, std = with_std(told[key], told["std"])
+        unit, true = symbol(entry["unit"]), (truth or {}).get(name)
+        decimals = len(value.partition(".")[2])
+        said = "" if true is None else f"{true:.{decimals}f}{unit}"
+        out.append(Answer(plain, f"{value} ± {std}{unit}", state, remark, said))
     return out
+
+
+def no_answer(fit: Mapping[str, Any]) -> str:
+    """Why the estimate of ``fit.json`` means nothing, in one sentence; empty where it means something."""
+    least, loss = fit["best"]["loss"], max(fit["loss"], fit["best"]["loss"])
+    if loss >= NOTHING_MOVES:
+        where = "everywhere it was tried" if least >= NOTHING_MOVES else "where pictures and force together put it"
+        return (
+            f"no answer: {where} the model explains the video no better than soil that never moves (loss {loss:.3g}; "
+            f"such soil has {NOTHING_MOVES:g}); photographs, poses, clock or tool are wrong, or the soil is another"
+        )
+    for name, entry in fit["parameters"].items():
+        if entry["at_bound"] is None:
+            continue
+        bound = entry["bounds"][0 if entry["at_bound"] == "lower" else 1]
+        # An effect that is off is no bound of knowledge: it isn't there.
+        if bound != entry.get("off"):
+            return (
+                f"no answer: the {name.replace('_', ' ')} ends at the {entry['at_bound']} bound of its range "
+                f"({bound:g}{symbol(entry['unit'])}); the best value lies beyond it, or the model lacks an effect"
+            )
+    return ""
 
 
 def averaged_sentence(estimates: Mapping[str, Mapping[str, Any]]) -> str:
@@ -134,7 +151,7 @@ def fitted_sentence(fit: Mapping[str, Any], judged: Mapping[str, Any] | None) ->
 
 
 def ratio_to_noise(comparison: Mapping[str, Any] | None) -> float | None:
-    """The loss over that of camera noise alone; None where that isn't known."""
+    """The loss over that of camera noise alone; None where that isn't known, or there is none."""
     if comparison is None:
         return None
     name = comparison["loss"]
@@ -156,7 +173,7 @@ def residual_sentence(comparison: Mapping[str, Any] | None, adequate: bool | Non
     left = f"The misfit is {percent(total / rest)} of that of soil at rest" if rest else ""
     ratio = ratio_to_noise(comparison)
     if ratio is None:
-        unknown = "Its ratio to the camera noise is unknown: the set has no pre-roll frames to measure the noise on."
+        unknown = f"Its ratio to the camera noise is unknown: {_no_noise(comparison)}."
         return f"{left}. {unknown}" if left else unknown
     if ratio <= AT_THE_NOISE and adequate is not False:
         return f"The misfit is {ratio:.1f} × the camera noise: nothing more to explain here."
@@ -169,6 +186,18 @@ def residual_sentence(comparison: Mapping[str, Any] | None, adequate: bool | Non
     return (
         f"{said} Part of the rest is seed-to-seed scatter. Whether the other part is the model's, the reconstruction's "
         "or the light's, has not been estimated yet."
+    )
+
+
+def _no_noise(comparison: Mapping[str, Any]) -> str:
+    """Why a comparison has no noise to be measured by."""
+    if comparison.get("noise", {}).get(comparison["loss"]) is None:
+        return "the set has no pre-roll frames to measure the noise on"
+    from splatsoil.experiment.plow import LEAST_NOISE
+
+    return (
+        "the frames before the tool moves are equal to the last bit, so they show no noise; a standard deviation of "
+        f"{LEAST_NOISE:g} grey levels is assumed"
     )
 
 

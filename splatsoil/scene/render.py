@@ -14,6 +14,7 @@ import torch.nn.functional as functional
 import warp as wp
 from torch import Tensor
 
+from splatsoil.batches import in_batches
 from splatsoil.measurement import Bed, Camera
 from splatsoil.scene import kernels_visible
 from splatsoil.scene.albedo import BRIGHTEST, SurfaceAlbedo, other_grain_albedo
@@ -161,7 +162,7 @@ class Scene:
 
     def poses(self, moments: Iterable[tuple[Any, Any, Pose | None]]) -> list[Posed]:
         """Everything moved, hidden and lit for several moments, by arguments of `pose`."""
-        return together([self._posing(*moment) for moment in moments])
+        return in_batches(lambda some: together([self._posing(*m) for m in some]), list(moments), "moments")
 
     def _posing(self, positions: Any, deformations: Any, tool: Pose | None) -> Steps[Posed]:
         """Steps of `pose`."""
@@ -234,9 +235,13 @@ class Scene:
             for alike in sizes.values():
                 for first in range(0, len(alike), most):
                     some = alike[first : first + most]
-                    images = finished(self._layering([seen[k] for k in some])).image.cpu().numpy()
-                    out |= zip(some, images.astype(np.float32), strict=True)
+                    images = in_batches(lambda ks: self._images([seen[k] for k in ks]), some, "pictures")
+                    out |= zip(some, images, strict=True)
         return [out[k] for k in range(len(seen))]
+
+    def _images(self, views: Sequence[tuple[Posed, Camera]]) -> list[FloatImage]:
+        """Pictures of one size, drawn beside each other."""
+        return list(finished(self._layering(views)).image.cpu().numpy().astype(np.float32))
 
 
 def to_sides(points: Tensor, bed: Bed) -> tuple[Tensor, Tensor]:

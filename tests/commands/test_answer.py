@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
 from splatsoil.inverse.run_folder import RunFolder
 
 from splatsoil import cli
-from splatsoil.commands import _folder, add
-from splatsoil.errors import NoAnswer, RunError
+from splatsoil.commands import add
+from splatsoil.errors import NoAnswer
+from splatsoil.report.text import no_answer
 
 FitOf = Callable[..., dict[str, Any]]
 
@@ -53,25 +55,37 @@ def test_no_command_tells_an_estimate_that_means_nothing(
 
 def test_what_is_an_answer(fit_of: FitOf) -> None:
     fit = fit_of(["cohesion"], cohesion=0.0)
-    assert _folder.no_answer(fit) == ""
-    assert _folder.no_answer(fit | {"loss": 0.99}) == "" and _folder.no_answer(fit | {"loss": 1.0}) != ""
+    assert no_answer(fit) == ""
+    assert no_answer(fit | {"loss": 0.99}) == "" and no_answer(fit | {"loss": 1.0}) != ""
     # of an effect off is where it isn't there, and its other bound is one
     fit["parameters"]["cohesion"] |= {"bounds": [0.0, 1500.0], "off": 0.0, "at_bound": "lower", "unit": "Pa"}
-    assert _folder.no_answer(fit) == ""
+    assert no_answer(fit) == ""
     fit["parameters"]["cohesion"]["at_bound"] = "upper"
-    assert "the cohesion ends at the upper bound of its range (1500 Pa)" in _folder.no_answer(fit)
+    assert "the cohesion ends at the upper bound of its range (1500 Pa)" in no_answer(fit)
     # where forces lead away from what the pictures say
-    assert "where pictures and force together put it" in _folder.no_answer(fit | {"loss": 1.2, "best": {"loss": 0.9}})
-    del fit["best"]
-    with pytest.raises(RunError, match="damaged"):
-        _folder.no_answer(fit)
+    assert "where pictures and force together put it" in no_answer(fit | {"loss": 1.2, "best": {"loss": 0.9}})
 
 
-@pytest.mark.parametrize("command", ["fit", "run"])
-def test_json_has_the_run_folder_under_run(
-    run: RunFolder, results: dict[str, Any], capsys: pytest.CaptureFixture[str], command: str
+@pytest.mark.parametrize("answer", [True, False])
+@pytest.mark.parametrize("command", ["fit", "run", "compare", "diagnose", "add", "report"])
+def test_json_names_run_and_set(
+    run: RunFolder,
+    results: dict[str, Any],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    command: str,
+    answer: bool,
 ) -> None:
-    """Not the set, which ``fit.json`` has there."""
-    results["run_fit"]["run"] = {"measurement": {"name": "plow"}}
-    assert cli.main([command, "set", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["run"] == str(run.path)
+    """Their folders, also where there is no answer; ``fit.json`` has something else under "run"."""
+    results["run_fit"] |= {"run": {"measurement": {"name": "plow"}}, **({} if answer else {"loss": 1.2})}
+    run.write_fit("base", results["run_fit"])
+    monkeypatch.setattr(add, "add_effect", lambda *_, **__: None)
+    words = [command, str(run.path), *(["cohesion"] if command == "add" else [])]
+    assert cli.main([*words, "--json"]) == (0 if answer else 3)
+    told = json.loads(capsys.readouterr().out)
+    assert (told["run"], told["set"]) == (str(run.path), run.description["measurement"]["folder"])
+
+
+def test_json_names_the_set(small_set: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["check", str(small_set), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["set"] == str(small_set)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -9,6 +11,7 @@ from PIL import Image
 from splatsoil.inverse.run_folder import RunFolder
 
 from splatsoil.cli import main
+from splatsoil.commands._stages import without_noise
 from splatsoil.errors import RunError
 from splatsoil.measurement import Measurement
 
@@ -44,10 +47,15 @@ def test_every_command_says_what_is_odd_and_refuses_what_shows_nothing(
     assert "EXIF rotation" in said and "002.jpg" in said
     assert ("work would begin here" in said) == (command != "check")
 
-    Image.new("RGB", (320, 240)).save(small_set / "views/images/002.jpg")
-    assert main([command, str(small_set)]) == 2
-    out, err = capsys.readouterr()
-    assert "one even grey" in err and "work would begin" not in err and out == ""
+    whole = (small_set / "views/images/002.jpg").read_bytes()
+    for says in ("one even grey", "damaged or truncated"):
+        if says == "one even grey":
+            Image.new("RGB", (320, 240)).save(small_set / "views/images/002.jpg")
+        else:
+            (small_set / "views/images/002.jpg").write_bytes(whole[: len(whole) // 2])
+        assert main([command, str(small_set)]) == 2
+        out, err = capsys.readouterr()
+        assert says in err and "002.jpg" in err and "work would begin" not in err and out == ""
 
 
 @pytest.mark.parametrize("command", [("compare", "--quick"), ("add", "cohesion")], ids=lambda c: c[0])
@@ -62,3 +70,16 @@ def test_commands_on_a_run_say_it_too(
     assert main([command[0], str(other.path), command[1]]) == 2
     err = " ".join(capsys.readouterr().err.split())
     assert err.count("EXIF rotation") == 1 and "work would begin here" in err
+
+
+def test_frames_without_noise_are_told_from_a_cameras(small_set: Path) -> None:
+    """As a renderer makes them: all that is seen before the tool moves is the same to the last bit."""
+    assert not without_noise(Measurement.load(small_set))
+    for camera in ("left", "right"):
+        for frame in json.loads((small_set / "video/transforms.json").read_text())["frames"]:
+            if frame["camera"] == camera and frame["frame"] == 0:
+                still = small_set / "video" / frame["file_path"]
+        for frame in json.loads((small_set / "video/transforms.json").read_text())["frames"]:
+            if frame["camera"] == camera and frame["frame"] < 0:
+                shutil.copy(still, small_set / "video" / frame["file_path"])
+    assert without_noise(Measurement.load(small_set))

@@ -67,7 +67,7 @@ def test_a_page_that_lacks_something_says_so(run: RunFolder, capsys: pytest.Capt
     """A fit without its number of evaluations, say: what makes it one is there."""
     assert cli.main(["report", str(run.path)]) == 2
     out, err = capsys.readouterr()
-    assert out == "" and err.count("\n") == 1 and "lacks what the page needs" in err
+    assert out == "" and err.count("\n") == 1 and "fit.json: is damaged, it lacks" in err
 
 
 def test_a_fit_into_a_run_that_does_not_say_what_it_is_for_is_refused(
@@ -151,14 +151,13 @@ def test_a_fit_by_other_sources_is_said_to_be_one(
         assert said.endswith(f"--preset tiny --run '{run.path}'")
 
 
-def test_a_model_with_added_effects_is_made_anew_by_adding_them(
+def test_a_model_with_effects_is_made_anew_with_them(
     run: RunFolder, capsys: pytest.CaptureFixture[str], fit_of: FitOf
 ) -> None:
-    fits = [fit_of(), fit_of(["tilt"], tilt_x=1.0), fit_of(["cohesion", "tilt"], tilt_x=1.0, cohesion=100.0)]
-    _folder.write_history(run, [_folder.history_entry(fit, {"error": 1.0, "noise": 1.0}) for fit in fits])
-    fits[-1]["setup"]["code"] = "of yesterday"
-    run.write_fit("cohesion+tilt", fits[-1])
+    fit = fit_of(["cohesion", "tilt"], tilt_x=1.0, cohesion=100.0)
+    fit["setup"]["code"] = "of yesterday"
+    run.write_fit("cohesion+tilt", fit)
     _folder.note_other_sources(run)
     said = capsys.readouterr().err
-    assert said.count("\n") == 1 and "--with" not in said
-    assert said.strip().endswith(f"--run '{run.path}' && splatsoil add '{run.path}' tilt cohesion")
+    assert said.count("\n") == 1
+    assert said.strip().endswith(f"--with cohesion tilt --preset tiny --run '{run.path}'")

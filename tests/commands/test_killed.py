@@ -9,6 +9,7 @@ import contextlib
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import sqlite3
@@ -220,6 +221,36 @@ def test_files_cut_short_are_made_anew_or_named(
                 assert timeless(json.loads(Path("cut/fit.json").read_text())) == timeless(
                     json.loads((whole / "fit.json").read_text())
                 ), name
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [int(os.environ.get("SPLATSOIL_FLIP_SEED", "0"))])
+def test_flipped_bits_are_named_or_do_no_harm(
+    place: Path, whole: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], seed: int
+) -> None:
+    """One bit of each kind of file; one of the letters of a key where it holds any, so that it can still be read."""
+    monkeypatch.chdir(place)
+    monkeypatch.setattr("splatsoil.threads.cores", lambda: 1)
+    chance = random.Random(seed)
+    for name in kinds(whole):
+        contents = bytearray((whole / name).read_bytes())
+        keys = [found.start(1) for found in re.finditer(rb'"([a-z_]+)":', contents)] if name.suffix == ".json" else []
+        for places in (range(len(contents)), keys):
+            if not places:
+                continue
+            flipped = contents.copy()
+            flipped[chance.choice(places)] ^= 1 << chance.randrange(8 if places is not keys else 3)
+            shutil.rmtree("flipped", ignore_errors=True)
+            shutil.copytree(whole, "flipped")
+            (Path("flipped") / name).write_bytes(flipped)
+            read_by_fits = name.parts[0] in ("features", "evaluations.db", "fit.json")
+            for command in ("report", "compare --quick", "export --to csv", *["posterior --checks 0"] * read_by_fits):
+                first, *options = command.split()
+                code = cli.main([first, "flipped", *options])
+                said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("splatsoil: ")]
+                said = [line for line in said if "was fitted by splatsoil" not in line]
+                assert code in (0, 2, 3) and len(said) == (code == 2), (name, command, code, said)
+                assert code != 2 or "flipped" in said[0], (name, command, said)
 
 
 def test_two_commands_on_one_run_folder(place: Path, run_elsewhere: Callable[[], Path]) -> None:

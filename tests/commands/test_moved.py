@@ -16,7 +16,7 @@ from splatsoil.commands import _folder, _model, _stages
 from splatsoil.commands._options import FitOptions
 from splatsoil.errors import RunError
 
-COMMANDS = ("compare", "diagnose", "add", "posterior")
+COMMANDS = ("compare", "diagnose", "add", "posterior", "export")
 
 
 @pytest.fixture
@@ -43,7 +43,8 @@ def reaches(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
 
 
 def words(command: str, run: Path, *more: object) -> list[str]:
-    return [command, str(run), *(["cohesion"] if command == "add" else []), *map(str, more)]
+    own = {"add": ["cohesion"], "export": ["--to", "csv"]}.get(command, [])
+    return [command, str(run), *own, *map(str, more)]
 
 
 @pytest.mark.parametrize("command", COMMANDS)

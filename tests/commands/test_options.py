@@ -26,7 +26,7 @@ GIVEN = {
     "element": "--test isotropic --confining 5e4 --friction-angle 30 --with dilatancy 'my effects/crust.py' --set "
     "dilatancy_angle=9 --strain 0.1 --pressure 1e6 --records 20 --void-ratio 0.7 --young 1e7 --poisson 0.3 "
     "--strain-rate 1e-3 --depth 0.1 --matching extension --plot 'a plot.svg' --json",
-    "export": "'a run' --to csv ply --out 'a folder' --model diagnosis --every 5 --device cpu --json",
+    "export": "'a run' --set 'a set' --to csv ply --out 'a folder' --model diagnosis --every 5 --device cpu --json",
     "fit": "nowhere --parameters friction_angle --with cohesion --budget 9 --preset fine "
     "--device cpu --seed 2 --run 'a run' --json",
     "import": "'a folder' out --images i --scale 2 --distance a b 0.5 --tags 0.1 --known k.csv --points p.csv "

@@ -91,7 +91,8 @@ def test_the_hint_after_a_fit_can_be_pasted(
     parameters["friction_angle"] |= {"at_bound": None}
     result = {"name": "base", "loss": 0.5, "loss_std": 0.1, "best": {"loss": 0.5}, "parameters": parameters}
     result |= {"notes": ["[red]one[/red]"], "evaluations": 3, "seconds": 83.0}
-    monkeypatch.setattr(_stages, "prepare", lambda config: (None, SimpleNamespace(path="runs/of the year")))
+    folder = SimpleNamespace(path="runs/of the year", description={"measurement": {"folder": "set"}})
+    monkeypatch.setattr(_stages, "prepare", lambda config: (None, folder))
     for place, stage in ((_model, "reconstructed"), (_model, "model_on"), (_stages, "run_fit")):
         monkeypatch.setattr(place, stage, lambda *_: result)
     assert fit.run(fit.Config(Path("set"))) == 0

@@ -121,6 +121,7 @@ def fit(name: str = "base", effects: tuple[str, ...] = (), **changes: Any) -> di
         "name": name,
         "parameters": parameters,
         "loss": 0.123,
+        "best": {"loss": 0.12},
         "estimated_from": "loss",
         "minimum": {key: {"estimate": p["estimate"], "low": 34.0, "high": 37.1} for key, p in parameters.items()},
         "loss_std": 0.01,

@@ -91,7 +91,9 @@ def test_the_verdict_follows_the_ratio_to_the_noise() -> None:
     assert "nothing more to explain" in words.residual_sentence(comparison(0.011, 0.01))
     far = words.residual_sentence(comparison(0.038, 0.01))
     assert "3.8 ×" in far and "not been estimated yet" in far
-    assert "unknown" in words.residual_sentence(comparison(0.038, None))
+    assert "unknown: the set has no pre-roll" in words.residual_sentence(comparison(0.038, None))
+    none = words.residual_sentence(comparison(0.038, 0.0))
+    assert "unknown: the frames before the tool moves are equal to the last bit" in none and "0.05 grey levels" in none
     assert "160 ×" in words.residual_sentence(comparison(1.6, 0.01))
     with_unit = comparison(0.073, 0.01) | {"motionless": {"robust": 1.0}}
     assert "7.3 % of that of soil at rest, 7.3 × the camera noise" in words.residual_sentence(with_unit)
@@ -142,7 +144,7 @@ def test_the_answer_is_averaged_over_models_whatever_the_verdict(judged: dict) -
     fit = {"name": "base", "estimated_from": "loss", "parameters": {"friction_angle": entry}}
     judged = {**judged, "estimates": AVERAGED}
     (answer,) = words.answers(fit, judged)
-    assert (answer.value, answer.std, answer.state, answer.remark) == ("37", "3", "determined", "")
+    assert (answer.number, answer.state, answer.remark) == ("37 ± 3°", "determined", "")
     assert "averaged over models" in words.fitted_sentence(fit, judged)
     adequate = judged.get("adequate", judged.get("verdict") == "adequate")
     assert words.called_adequate(fit, judged) is adequate
@@ -156,7 +158,7 @@ def test_the_answer_is_averaged_over_models_whatever_the_verdict(judged: dict) -
 def test_without_a_judgement_of_this_fit_the_answer_is_its_own(judged: dict | None, source: str, said: str) -> None:
     fit = {"name": "base", "estimated_from": source, "evaluations": 10, "parameters": {"friction_angle": ENTRY}}
     (answer,) = words.answers(fit, judged)
-    assert (answer.value, answer.std) == ("36.0", "0.5")
+    assert answer.number == "36.0 ± 0.5°"
     assert said in words.fitted_sentence(fit, judged) and words.called_adequate(fit, judged) is None
 
 
