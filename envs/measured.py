@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 #: Name of the loss that is fitted, part of what identifies an evaluation.
 LOSS = "robust"
+NO_PICTURE: Image = np.full((8, 8, 3), 0.5, dtype=np.float32)
 
 
 class MeasuredProblem:
@@ -41,7 +42,7 @@ class MeasuredProblem:
         self.model = experiment.base
         self.space = ParameterSpace(experiment.parameters)
         self.comparator = experiment.comparator
-        self._shown = (self.comparator.cameras[0], self.comparator.frames[-1])
+        self._shown = next(((camera, self.comparator.frames[-1]) for camera in self.comparator.cameras), None)
         self._recipe: dict[str, Any] | None = None
 
     @classmethod
@@ -112,8 +113,8 @@ class MeasuredProblem:
         return None
 
     def observed_image(self) -> Image:
-        """The first camera's last frame."""
-        return self.comparator.observed[self._shown]
+        """The first camera's last frame; grey where there are no cameras."""
+        return NO_PICTURE if self._shown is None else self.comparator.observed[self._shown]
 
     def evaluate(self, parameters: Mapping[str, float], seed: int) -> Evaluation:
         """Simulate, draw, compare.
@@ -129,13 +130,13 @@ class MeasuredProblem:
         """A prediction compared with what was measured."""
         experiment = self.experiment
         comparison = self.comparator.compare(prediction.images)
-        features = experiment.features_of(comparison.blocks, prediction.trajectory.force)
+        features = experiment.features_of(comparison.blocks, prediction)
         return Evaluation(
-            loss=min(comparison.loss, self.worst_loss),
+            loss=min(experiment.loss_of(comparison, prediction), self.worst_loss),
             blocks=np.where(experiment.seen, experiment.observed - features, 0.0).reshape(-1),
-            extras={"rgb": comparison.rgb},
+            extras={} if self._shown is None else {"rgb": comparison.rgb},
             observed=self.observed_image(),
-            predicted=prediction.images[self._shown],
+            predicted=NO_PICTURE if self._shown is None else prediction.images[self._shown],
         )
 
     def features(self, blocks: Sequence[float]) -> FloatArray:

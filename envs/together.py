@@ -81,7 +81,9 @@ def _measured(problem: MeasuredProblem, jobs: Sequence[Job]) -> list[Evaluation]
     made = (
         trajectory
         if isinstance(trajectory, SimulationError)
-        else Prediction(dict(values), seed, model.draw(trajectory, seed, values), trajectory, {})
+        else Prediction(
+            dict(values), seed, model.draw(trajectory, seed, values), trajectory, {}, model.surfaces(trajectory, values)
+        )
         for (values, seed), trajectory in zip(jobs, found, strict=True)
     )
     return _judged([problem] * len(jobs), made, began)

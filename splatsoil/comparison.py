@@ -19,6 +19,7 @@ are compared as they are.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from copy import copy
 from dataclasses import dataclass
@@ -81,7 +82,8 @@ class Comparison:
     """How a prediction differs from what was seen.
 
     Attributes:
-        loss: the robust loss, all cameras and frames; 0 is perfect, 1 is as good as predicting no motion.
+        loss: the robust loss, all cameras and frames; 0 is perfect, 1 is as good as predicting no motion, NaN without
+            cameras.
         losses: the robust loss by camera and frame; their mean is ``loss``.
         rgb_mse: mean square colour difference (sRGB in [0, 1]) in the bed and over its crests by camera and frame.
         blocks: (b,) mean change observed minus mean change predicted of each block, in grey levels of 255; 0 where a
@@ -179,7 +181,8 @@ class Comparator:
             scaled = self._scaled_losses(camera, change, masks) / self._unit[camera]
             losses.update({(camera, f): float(v) for f, v in zip(self.frames, scaled.mean(axis=1), strict=True)})
             means.append(self._block_means(camera, change, masks))
-        return Comparison(float(np.mean(list(losses.values()))), losses, squares, _in_order(means), self.labels)
+        loss = float(np.mean(list(losses.values()))) if losses else math.nan
+        return Comparison(loss, losses, squares, _in_order(means), self.labels)
 
     def blocks(self, images: Mapping[Key, Image]) -> FloatArray:
         """(b,) `Comparison.blocks` alone, in half the time; raises what ``compare`` does."""
@@ -223,7 +226,7 @@ class Comparator:
             for frame in self.frames:
                 free = known & ~self.silhouettes[camera, frame]
                 out.append(np.bincount(patch[free], minlength=blocks) / np.maximum(pixels, 1))
-        return np.concatenate(out)
+        return np.concatenate([np.zeros(0), *out])
 
     def still_blocks(self) -> dict[str, FloatArray]:
         """(frames, blocks) changes between frames before anything moves, in grey levels, for each camera: noise alone.
@@ -383,7 +386,7 @@ def _relief(surface: HeightField) -> Relief:
 
 def _in_order(means: list[FloatArray]) -> FloatArray:
     """(b,) mean residuals (frames, blocks) of all cameras, in grey levels, in the order of labels."""
-    return np.asarray(255.0 * np.concatenate([m.reshape(-1) for m in means]))
+    return np.asarray(255.0 * np.concatenate([np.zeros(0), *(m.reshape(-1) for m in means)]))
 
 
 def _log_ratios(image: Image) -> FloatArray:

@@ -215,8 +215,8 @@ FORWARD = (
     *RECONSTRUCTING,
     *("soil", "mpm", "scene", "parameters.py", "model.py", "observation.py"),
     *("comparison.py", "robust_loss.py", "envs/measured.py"),
-    *("experiment/base.py", "experiment/features.py", "experiment/forces.py", "experiment/plow.py"),
-    "experiment/scene_parts.py",
+    *("experiment/base.py", "experiment/features.py", "experiment/forces.py", "experiment/heights.py"),
+    *("experiment/plow.py", "experiment/scene_parts.py"),
 )
 #: Parts that draw verdicts from features.
 JUDGING = ("inverse/criticism",)

@@ -6,12 +6,13 @@ import math
 import time
 import weakref
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+import torch
 
 from splatsoil.errors import ParameterError
 from splatsoil.measurement import Measurement
@@ -19,7 +20,8 @@ from splatsoil.mpm import Resolution, Trajectory, frames_around, simulate
 from splatsoil.observation import Observation
 from splatsoil.parameters import Parameter, ParameterSpace
 from splatsoil.reconstruction import Reconstruction, fill
-from splatsoil.scene import Intrinsic, Posed, Scene, build_scene
+from splatsoil.scene import Intrinsic, Posed, Relief, Scene, build_scene, relief_of_particles
+from splatsoil.scene.relief import SMOOTHING
 from splatsoil.soil.effect import Effect
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
@@ -40,6 +42,7 @@ class Prediction:
         images: (h, w, 3) sRGB in [0, 1] by (camera, frame), free of lens distortion.
         trajectory: the simulation behind them.
         seconds: time spent on simulation and on drawing.
+        surfaces: the soil's, by frame, where the set has heights.
     """
 
     values: Mapping[str, float]
@@ -47,6 +50,7 @@ class Prediction:
     images: Mapping[tuple[str, int], Image]
     trajectory: Trajectory
     seconds: Mapping[str, float]
+    surfaces: Mapping[int, Relief] = field(default_factory=dict)
 
 
 class _Poses:
@@ -237,6 +241,8 @@ class Model:
         Raises:
             ParameterError: values out of bounds, or a trajectory without the frames that a time offset needs.
         """
+        if not self.measurement.cameras:
+            return {}
         observation = self.observation(values)
         scene = self.scene(seed)
         if rounding != 1.0:
@@ -265,6 +271,28 @@ class Model:
             for (name, frame), picture in zip(keys, pictures, strict=True)
         }
 
+    def surfaces(
+        self, trajectory: Trajectory, values: Mapping[str, float] | None = None, *, rounding: float = 1.0
+    ) -> dict[int, Relief]:
+        """The soil's surface by frame, as instruments that measure heights report it; none if the set has no heights.
+
+        Takes and raises what :meth:`draw` does.
+        """
+        if not self.measurement.height_frames:
+            return {}
+        late = self.observation(values).time_offset * self.measurement.frame_rate
+        bed, width = self.measurement.bed.domain, SMOOTHING * math.sqrt(rounding)
+        return {
+            frame: relief_of_particles(
+                torch.from_numpy(trajectory.at(frame + late)[0]).to(self.device),
+                trajectory.spacing,
+                bed.lower,
+                bed.upper,
+                smoothing=width,
+            )
+            for frame in self.frames
+        }
+
     def predict(
         self,
         values: Mapping[str, float],
@@ -286,6 +314,7 @@ class Model:
             images=images,
             trajectory=trajectory,
             seconds={"simulation": simulated - started, "drawing": time.perf_counter() - simulated},
+            surfaces=self.surfaces(trajectory, values),
         )
 
     def _recorded_frames(self) -> tuple[int, ...]:

@@ -171,6 +171,7 @@ def draw_comparison(run: RunFolder, model: Model, report: Report) -> dict[str, A
     from splatsoil.comparison import GAIN, Comparator
     from splatsoil.envs.measured import LOSS
     from splatsoil.experiment.forces import force_record
+    from splatsoil.experiment.heights import CHANNEL, Heights
     from splatsoil.files import write_json
     from splatsoil.report.data import estimates
     from splatsoil.report.text import NOTHING_MOVES
@@ -185,14 +186,24 @@ def draw_comparison(run: RunFolder, model: Model, report: Report) -> dict[str, A
         comparison = comparator.compare(prediction.images)
         noise = 0.0 if without_noise(model.measurement) else comparator.noise
         report("writing pictures", 0.95)
-        frames = []
-        for camera, frame in comparator.keys:
-            pictures = comparator.pictures(prediction.images, camera, frame)
+        shown = [
+            (*key, comparator.pictures(prediction.images, *key), comparison.losses[key]) for key in comparator.keys
+        ]
+        heights = Heights.of(model.measurement, comparator, [[i] for i in range(len(comparator.frames))])
+        if heights is not None:
+            left = heights.losses(prediction.surfaces)
+            shown += [(CHANNEL, f, heights.pictures(prediction.surfaces, f), loss) for f, loss in left.items()]
+        frames: list[dict[str, Any]] = []
+        for camera, frame, pictures, loss in shown:
             names = {kind: f"{camera}_{frame:04d}_{kind}.jpg" for kind in pictures}
             for kind, picture in pictures.items():
                 write_jpeg(run.comparison / names[kind], picture)
-            losses = {LOSS: comparison.losses[camera, frame], "rgb": comparison.rgb_mse[camera, frame]}
+            rgb = float(np.mean((pictures["observed"] - pictures["predicted"]) ** 2))
+            losses = {LOSS: loss, "rgb": comparison.rgb_mse.get((camera, frame), rgb)}
             frames.append({"camera": camera, "frame": frame, "losses": losses, **names})
+        # Heights count where there are no pictures.
+        told = [f for f in frames if f["camera"] in (comparator.cameras or (CHANNEL,))]
+        noise = comparator.noise if comparator.cameras or heights is None else heights.noise_loss
         data = {
             "format": COMPARISON_FORMAT,
             "fit": result["name"],
@@ -203,11 +214,11 @@ def draw_comparison(run: RunFolder, model: Model, report: Report) -> dict[str, A
             "version": __version__,
             "measurement": run.description["measurement"]["hash"],
             "loss": LOSS,
-            "total": {LOSS: comparison.loss, "rgb": comparison.rgb},
+            "total": {key: float(np.mean([f["losses"][key] for f in told])) for key in (LOSS, "rgb")},
             "noise": {} if noise is None else {LOSS: noise},
             "motionless": {LOSS: NOTHING_MOVES},
             "gain": GAIN,
-            "cameras": list(comparator.cameras),
+            "cameras": list(dict.fromkeys(f["camera"] for f in frames)),
             "frames": frames,
             "force": force_record(model.measurement, comparator.frames, prediction.trajectory.force),
             "seconds": sum(prediction.seconds.values()),

@@ -69,6 +69,7 @@ def _as_json(measurement: Measurement, found: tuple[Remark, ...]) -> dict[str, A
                 "frames": measurement.frames,
                 "pre_roll": sorted({f.frame for f in measurement.pre_roll if f.frame is not None}),
             },
+            "heights": measurement.height_frames,
             "remarks": [asdict(remark) for remark in found],
         }
     )
@@ -77,19 +78,23 @@ def _as_json(measurement: Measurement, found: tuple[Remark, ...]) -> dict[str, A
 
 def _rows(measurement: Measurement) -> list[tuple[str, str]]:
     bed, tool, motion = measurement.bed, measurement.tool, measurement.tool.motion
-    lens = "with lens distortion" if measurement.views[0].camera.has_distortion else "no lens distortion"
+    bent = any(f.camera.has_distortion for f in measurement.views)
+    lens = "with lens distortion" if bent else "no lens distortion"
     sizes = sorted({(f.camera.width, f.camera.height) for f in measurement.views})
     pixels = ", ".join(f"{width} x {height}" for width, height in sizes)
     bed_size, tool_size = (" x ".join(f"{v:g}" for v in sides.round(4)) for sides in (bed.extents, tool.mesh.extents))
     pre_roll = {f.frame for f in measurement.pre_roll}
     frames = measurement.frames
     numbers = f"numbers {frames[0]} to {frames[-1]}" if frames else "none"
+    cameras = ", ".join(measurement.cameras)
+    source = "depth maps" if measurement.heights is None else "grids"
     way = sum(math.dist(a, b) for a, b in pairwise(motion.positions))
     return [
         ("bed", f"{bed_size} m, {bed.density:g} kg/m³, friction {bed.floor_friction:g} on the floor"),
         ("gravity", ", ".join(f"{g:g}" for g in measurement.gravity) + " m/s²"),
-        ("views", f"{len(measurement.views)} of {pixels} pixels, {lens}"),
-        ("video", f"cameras {', '.join(measurement.cameras)}; {len(frames)} frames each at most, {numbers}"),
+        ("views", f"{len(measurement.views)} of {pixels} pixels, {lens}" if measurement.views else "none"),
+        ("video", f"cameras {cameras}; {len(frames)} frames each at most, {numbers}" if cameras else "none"),
+        ("heights", f"{source} of {len(measurement.height_frames)} frames" if measurement.height_frames else "none"),
         ("pre-roll", f"{len(pre_roll)} frames" if pre_roll else "none"),
         ("tool", f"{tool_size} m, {len(tool.mesh.faces)} triangles, friction {tool.friction:g}"),
         ("motion", f"{len(motion.times)} rows, {motion.times[-1] - motion.times[0]:g} s, {way:.3g} m of way"),

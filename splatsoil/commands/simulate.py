@@ -56,6 +56,8 @@ class Config:
         None, "Photographs before anything moves; 40, or all of the set given by --like.", expert=True
     )
     picture_scale: float = option(1.0, "Size of the pictures, as a multiple of the scene's.", expert=True)
+    heights: bool = option(False, "Measure grids of heights, too, as a scanner above the bed does.", expert=True)
+    depth_maps: bool = option(False, "Let the fixed cameras measure depths, too.", expert=True)
     json: bool = option(False, JSON)
 
 
@@ -83,6 +85,8 @@ def run(config: Config) -> int:
             seed=config.seed,
             particle_seed=config.particle_seed,
             device=config.device,
+            heights=config.heights,
+            depth_maps=config.depth_maps,
             progress=begin("simulate"),
         )
     summary = _summary(world)

@@ -13,11 +13,13 @@ import numpy as np
 import numpy.typing as npt
 
 from splatsoil.batches import in_batches
-from splatsoil.comparison import PATCH, Block, Comparator
+from splatsoil.comparison import PATCH, Block, Comparator, Comparison
 from splatsoil.errors import SimulationError, SplatsoilError
 from splatsoil.experiment.base import Candidate, candidates_of
 from splatsoil.experiment.features import Layout, Site
 from splatsoil.experiment.forces import REGION, UNIT, ToolForces, compressed
+from splatsoil.experiment.heights import UNIT as MILLIMETRES
+from splatsoil.experiment.heights import Heights
 from splatsoil.experiment.scene_parts import QUIET, bins_of, regions_of, stages_of
 from splatsoil.model import Model, Prediction
 from splatsoil.mpm import Resolution, Trajectory, simulate_together
@@ -65,8 +67,9 @@ class PlowExperiment:
     """A measurement set and a model of it.
 
     Features are grey levels (of 255): the change of a square of the bed, as one camera sees it, since the first frame,
-    averaged over neighbouring frames of one stage. Where the force on the tool was measured, it makes further columns;
-    see :class:`~splatsoil.experiment.forces.ToolForces`.
+    averaged over neighbouring frames of one stage. Where heights or the force on the tool were measured, they make
+    further columns; see :class:`~splatsoil.experiment.heights.Heights` and
+    :class:`~splatsoil.experiment.forces.ToolForces`.
 
     Args:
         model: the model at hand; candidates are the library's effects that it doesn't have.
@@ -105,7 +108,8 @@ class PlowExperiment:
         )
         bed = model.measurement.bed
         rows = min(MOST_ROWS, len(model.frames) - 1)
-        area = float(np.prod((bed.upper - bed.lower)[:2])) * len(model.measurement.cameras) * rows
+        instruments = len(model.measurement.cameras) + bool(model.measurement.height_frames)
+        area = float(np.prod((bed.upper - bed.lower)[:2])) * instruments * rows
         self.comparator = Comparator(
             model.measurement,
             surface=model.reconstruction.surface,
@@ -116,6 +120,7 @@ class PlowExperiment:
         self._bins = bins_of(model.measurement, self.comparator.frames, MOST_ROWS)
         rows_of_frames = [[self.comparator.frames[i] for i in group] for group in self._bins]
         self.forces = ToolForces.of(model.measurement, rows_of_frames)
+        self.heights = Heights.of(model.measurement, self.comparator, self._bins)
 
     @cached_property
     def layout(self) -> Layout:
@@ -128,12 +133,14 @@ class PlowExperiment:
             channels = self.forces.channels
             sites += tuple(Site(channel, unit=UNIT, reading=self.forces.newtons) for channel in channels)
             regions = np.concatenate([regions, np.full((len(frames), len(channels)), REGION)], axis=1)
-        return Layout(frames, sites, "frame", "grey levels", stages_of(measurement, frames), regions)
+        unit = "grey levels" if self.comparator.cameras else MILLIMETRES
+        return Layout(frames, sites, "frame", unit, stages_of(measurement, frames), regions)
 
     @cached_property
     def observed(self) -> FloatArray:
         """(t, s) measured changes, and forces."""
-        return self._beside(self._pictured, None if self.forces is None else self.forces.features)
+        heights = None if self.heights is None else self.heights.observed
+        return side_by_side(heights, self._pictured, None if self.forces is None else self.forces.features)
 
     @cached_property
     def _pictured(self) -> FloatArray:
@@ -142,11 +149,6 @@ class PlowExperiment:
         frames = (self.comparator.reference, *self.comparator.frames)
         return self._table(self.comparator.blocks({(c, f): still[c] for c in still for f in frames}))
 
-    @staticmethod
-    def _beside(pictured: FloatArray, forces: FloatArray | None) -> FloatArray:
-        """Columns of cameras, and of forces (t, c) where there are any."""
-        return pictured if forces is None else np.concatenate([pictured, forces], axis=1)
-
     @cached_property
     def quiet(self) -> npt.NDArray[np.bool_]:
         """(t, s) patches far from wherever the tool has been in the soil: nothing but light changes there."""
@@ -154,14 +156,15 @@ class PlowExperiment:
 
     @cached_property
     def seen(self) -> npt.NDArray[np.bool_]:
-        """(t, s) False where the tool hides most of a patch, or no force was measured."""
+        """(t, s) False where the tool hides most of a patch, or neither height nor force was measured."""
+        heights = None if self.heights is None else self.heights.seen
         shares = self._table(self.comparator.open_shares())
-        return self._beside(shares, None if self.forces is None else self.forces.measured.astype(float)) > 0.5
+        return side_by_side(heights, shares, None if self.forces is None else self.forces.measured) > 0.5
 
     @cached_property
     def _sites(self) -> tuple[Site, ...]:
-        """Columns of cameras."""
-        return tuple(
+        """Columns that have a place: heights, then those of cameras."""
+        return (() if self.heights is None else self.heights.sites) + tuple(
             Site(camera, label.x, label.y, outline=tuple(map(tuple, corners)))
             for camera in self.comparator.cameras
             for label, corners in zip(self._labels(camera), self.comparator.outlines(camera), strict=True)
@@ -170,7 +173,7 @@ class PlowExperiment:
     @cached_property
     def sensor(self) -> FloatArray:
         """(t, s) standard deviation of a patch's change by the cameras' noise, from frames before anything moves; and
-        of the measured force.
+        of heights and the measured force.
         """
         still = self.comparator.still_blocks()
         per_site = []
@@ -179,8 +182,9 @@ class PlowExperiment:
             level = np.sqrt(np.mean(still[camera] ** 2)) if camera in still else UNKNOWN_NOISE
             per_site.append(np.full(count, max(float(level), LEAST_NOISE)))
         frames = np.array([len(group) for group in self._bins], dtype=np.float64)
-        pictured = np.concatenate(per_site)[None] / np.sqrt(frames)[:, None]
-        return self._beside(pictured, None if self.forces is None else self.forces.noise)
+        pictured = np.concatenate([np.zeros(0), *per_site])[None] / np.sqrt(frames)[:, None]
+        heights = None if self.heights is None else self.heights.noise
+        return side_by_side(heights, pictured, None if self.forces is None else self.forces.noise)
 
     def predict(
         self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
@@ -190,17 +194,24 @@ class PlowExperiment:
 
     def features(self, prediction: Prediction) -> FloatArray:
         """(t, s) predicted changes, and forces."""
-        return self.features_of(self.comparator.blocks(prediction.images), prediction.trajectory.force)
+        return self.features_of(self.comparator.blocks(prediction.images), prediction)
 
-    def features_of(self, blocks: FloatArray, force: FloatArray) -> FloatArray:
-        """(t, s) predicted features, from what a comparison of pictures leaves of each block and frame (b,), and the
-        force (f, 3) on the tool in frames 1, 2, ….
+    def features_of(self, blocks: FloatArray, prediction: Prediction) -> FloatArray:
+        """(t, s) predicted features, given what a comparison of pictures leaves of each block and frame (b,).
 
         Changes are the measured ones minus the difference, because both sides must leave out the same pixels: those in
         which either shows the tool.
         """
         pictured = self._pictured - self._table(blocks)
-        return self._beside(pictured, None if self.forces is None else compressed(self.forces.predicted(force)))
+        heights = None if self.heights is None else self.heights.predicted(prediction.surfaces)
+        force = None if self.forces is None else self.forces.predicted(prediction.trajectory.force)
+        return side_by_side(heights, pictured, None if force is None else compressed(force))
+
+    def loss_of(self, comparison: Comparison, prediction: Prediction) -> float:
+        """What a search for parameters minimises: the loss of pictures, or of heights where there are no pictures."""
+        if self.comparator.cameras or self.heights is None:
+            return comparison.loss
+        return float(np.mean(list(self.heights.losses(prediction.surfaces).values())))
 
     def prediction(
         self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
@@ -214,7 +225,8 @@ class PlowExperiment:
         simulated = time.perf_counter()
         images = model.draw(trajectory, seed, values, albedo=guess, rounding=rounding)
         seconds = {"simulation": simulated - began, "drawing": time.perf_counter() - simulated}
-        return Prediction(dict(values), seed, images, trajectory, seconds)
+        surfaces = model.surfaces(trajectory, values, rounding=rounding)
+        return Prediction(dict(values), seed, images, trajectory, seconds, surfaces)
 
     @cached_property
     def together(self) -> int:
@@ -294,7 +306,12 @@ class PlowExperiment:
             mine = values[start : start + frames * count].reshape(frames, count)
             columns.append(np.stack([mine[group].mean(axis=0) for group in self._bins]))
             start += frames * count
-        return np.concatenate(columns, axis=1)
+        return np.concatenate([np.zeros((len(self._bins), 0)), *columns], axis=1)
+
+
+def side_by_side(*columns: npt.NDArray[Any] | None) -> FloatArray:
+    """Columns (t, …) of heights, cameras and forces, those that there are."""
+    return np.concatenate([c for c in columns if c is not None], axis=1).astype(np.float64)
 
 
 def _without_reports(model: Model, values: Mapping[str, float]) -> tuple[tuple[str, ...], dict[str, float]]:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from splatsoil.experiment.forces import SCALE
-from splatsoil.experiment.plow import PlowExperiment
+from splatsoil.experiment.plow import PlowExperiment, side_by_side
 from splatsoil.experiment.scene_parts import heading_of
 from splatsoil.measurement import Measurement, ToolMotion
 from splatsoil.model import Model
@@ -56,7 +56,12 @@ class Stroke:
             against = -measured.forces.largest * np.append(heading_of(given), 0.0)
             times = frames / self.measurement.frame_rate
             force = np.column_stack([frames, times, np.tile(against, (len(frames), 1))])
-        return replace(self.measurement, video=video, tool=replace(self.measurement.tool, force=force))
+        heights = given.heights
+        if heights is not None:
+            grids = {n + first if n >= 0 else n: grid for n, grid in heights.grids.items()}
+            heights = replace(heights, grids=grids)
+        tool = replace(self.measurement.tool, force=force)
+        return replace(self.measurement, video=video, heights=heights, tool=tool)
 
     def motion(self, frame_rate: float) -> ToolMotion:
         """The stroke from its own frame 0 on, one row for each frame of a rate in 1/s."""
@@ -124,8 +129,9 @@ def strokes(measurement: Measurement, surface: float) -> list[Stroke]:
 class StrokeExperiment(PlowExperiment):
     """What the cameras, and the force sensor where there is one, would see of a stroke that has not been made.
 
-    Cameras have the noise that still frames show; forces are in % of the measured stroke's largest. Pictures are held
-    against the photograph at rest, which cancels. Nothing is observed until :meth:`expect` says what to expect.
+    Cameras, and heights, have the noise that still frames show; forces are in % of the measured stroke's largest.
+    Pictures are held against the photograph at rest, which cancels; heights are seen where they were measured.
+    Nothing is observed until :meth:`expect` says what to expect.
 
     Args:
         model: of :meth:`Stroke.prepared`.
@@ -145,8 +151,8 @@ class StrokeExperiment(PlowExperiment):
             for site, std in zip(measured.layout.sites, measured.sensor[0], strict=True)
         }
         frames = np.array([[len(group)] for group in self._bins], dtype=np.float64)
-        self._pictures_noise = np.array([level[site.channel] for site in self._sites]) / np.sqrt(frames)
-        self.sensor = self._beside(self._pictures_noise, None if self.forces is None else self.forces.noise)
+        self._placed_noise = np.array([level[site.channel] for site in self._sites]) / np.sqrt(frames)
+        self.sensor = side_by_side(self._placed_noise, None if self.forces is None else self.forces.noise)
         seen = self.comparator.observed
         self.comparator = self.comparator.against({(c, f): seen[c, self.comparator.reference] for c, f in seen})
 
@@ -156,7 +162,7 @@ class StrokeExperiment(PlowExperiment):
         if self.forces is not None:
             forces = SCALE * np.sinh(table[:, len(self._sites) :] / SCALE)
             self.forces = replace(self.forces, observed=forces)
-            self.sensor = self._beside(self._pictures_noise, self.forces.noise)
+            self.sensor = side_by_side(self._placed_noise, self.forces.noise)
 
 
 def _with(measurement: Measurement, motion: ToolMotion) -> Measurement:

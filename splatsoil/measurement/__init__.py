@@ -7,6 +7,7 @@ from splatsoil.measurement.blender import read_blender
 from splatsoil.measurement.camera import CAMERA_MODELS, Camera
 from splatsoil.measurement.colmap import read_colmap
 from splatsoil.measurement.frames import Frame
+from splatsoil.measurement.heights import HeightMaps
 from splatsoil.measurement.measurement import BIN, CONTAINERS, FORMAT, HEAP, OPEN, TRANSPARENT, Bed, Measurement
 from splatsoil.measurement.motion import ToolMotion
 from splatsoil.measurement.remarks import Remark, remarks
@@ -24,6 +25,7 @@ __all__ = [
     "Bed",
     "Camera",
     "Frame",
+    "HeightMaps",
     "Measurement",
     "Picture",
     "Remark",

@@ -27,7 +27,7 @@ LENS_FIELDS = (
     *("camera_model", "is_fisheye", "w", "h", "fl_x", "fl_y", "cx", "cy", *_COEFFICIENTS),
     *("camera_angle_x", "camera_angle_y"),
 )
-FRAME_FIELDS = (*LENS_FIELDS, "file_path", "transform_matrix", "mask_path", "depth_file_path")
+FRAME_FIELDS = (*LENS_FIELDS, "file_path", "transform_matrix", "mask_path", "depth_file_path", "integer_depth_scale")
 VIDEO_FIELDS = ("camera", "frame", "time")
 _LENS_KEY = re.compile(r"[kps]\d|skew|distortion_params")  # what bends an image in any of the formats alike
 _FOCAL_SLACK = 0.01  # further apart than digits that were cut off explain
@@ -45,6 +45,7 @@ class Frame:
         time: seconds on that clock, None for views.
         mask_path: image that is dark where pixels are to be ignored, or None.
         depth_path: image or .npy of the depth along the camera's axis, as ``read_depth`` takes it, or None.
+        depth_scale: what one of a depth's whole numbers means, m.
     """
 
     camera: Camera
@@ -54,6 +55,7 @@ class Frame:
     time: float | None = None
     mask_path: Path | None = None
     depth_path: Path | None = None
+    depth_scale: float = 1e-3
 
     def image(self) -> FloatImage:
         """The image as stored: (height, width, 3) float32, sRGB in [0, 1]."""
@@ -67,7 +69,7 @@ class Frame:
 
     def depth(self) -> FloatImage | None:
         """Depth along the camera's axis, (height, width) float32 metres, 0 where unknown; None if there is none."""
-        return None if self.depth_path is None else read_depth(self.depth_path)
+        return None if self.depth_path is None else read_depth(self.depth_path, scale=self.depth_scale)
 
     def undistorted_image(self) -> FloatImage:
         """The image that ``camera.undistorted()`` would have taken; black where this lens did not see."""
@@ -230,6 +232,7 @@ def _read_frame(fields: Fields, root: Path, *, video: bool) -> Frame:
         time=time,
         mask_path=optional["mask_path"],
         depth_path=optional["depth_file_path"],
+        depth_scale=fields.number("integer_depth_scale", 1e-7, 1.0, default=1e-3, hint="it is in metres"),
     )
 
 

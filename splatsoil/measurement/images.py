@@ -123,14 +123,32 @@ def read_alpha(path: Path) -> npt.NDArray[np.bool_] | None:
         return np.asarray(image.convert("RGBA").getchannel("A")) >= _OPAQUE
 
 
-def read_depth(path: Path, field: str | None = None) -> FloatImage:
+def read_depth(path: Path, field: str | None = None, *, scale: float = 1e-3) -> FloatImage:
     """Depths of an image or a .npy file: (height, width) float32 metres, 0 where unknown.
 
-    Whole numbers are millimetres, as in nerfstudio's 16-bit images; floating-point ones are metres. What is not
-    positive, or not finite, is unknown.
+    Whole numbers are millimetres, as in nerfstudio's 16-bit images, or what ``scale`` in m says; floating-point ones
+    are metres. What is not positive, or not finite, is unknown.
 
     Raises:
         MeasurementError: it can't be read, or has 8 bits.
+    """
+    values = read_numbers(path, field)
+    if values.dtype.itemsize == 1:
+        raise MeasurementError(
+            "a depth is of 16-bit millimetres or floating-point metres, this one of 8 bits, which have no unit",
+            file=path,
+            field=field,
+        )
+    with np.errstate(invalid="ignore"):
+        metres = values.astype(np.float64) * (1.0 if values.dtype.kind == "f" else scale)
+        return np.where(np.isfinite(metres) & (metres > 0.0), metres, 0.0).astype(np.float32)
+
+
+def read_numbers(path: Path, field: str | None = None) -> npt.NDArray[np.generic]:
+    """What an image or a .npy file stores.
+
+    Raises:
+        MeasurementError: it can't be read, or stores something else than one array of numbers.
     """
     if path.suffix == ".npy":
         try:
@@ -141,16 +159,9 @@ def read_depth(path: Path, field: str | None = None) -> FloatImage:
         with _opened(path, field) as image:
             _decode(image, path, field)
             values = np.asarray(image)
-    if not isinstance(values, np.ndarray) or values.dtype.kind not in "uif" or values.dtype.itemsize == 1:
-        raise MeasurementError(
-            "a depth is of 16-bit millimetres or floating-point metres, this one of "
-            + ("8 bits, which have no unit" if isinstance(values, np.ndarray) else "several arrays"),
-            file=path,
-            field=field,
-        )
-    with np.errstate(invalid="ignore"):
-        metres = values.astype(np.float64) * (1.0 if values.dtype.kind == "f" else 1e-3)
-        return np.where(np.isfinite(metres) & (metres > 0.0), metres, 0.0).astype(np.float32)
+    if not isinstance(values, np.ndarray) or values.dtype.kind not in "uif":
+        raise MeasurementError("not one array of numbers", file=path, field=field)
+    return values
 
 
 def _values(image: Image.Image, path: Path, field: str | None = None) -> FloatImage:

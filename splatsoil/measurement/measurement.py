@@ -16,6 +16,7 @@ from splatsoil.errors import MeasurementError
 from splatsoil.measurement.camera import Camera
 from splatsoil.measurement.fields import Fields, inside
 from splatsoil.measurement.frames import Frame, read_transforms
+from splatsoil.measurement.heights import HeightMaps, depth_points
 from splatsoil.measurement.motion import ToolMotion
 from splatsoil.measurement.tool import DEFAULT_FRICTION, Tool, read_force, read_mesh
 
@@ -23,7 +24,7 @@ FloatArray = npt.NDArray[np.float64]
 
 FORMAT = "splatsoil-measurement/1"
 EXPERIMENT = "experiment.json"
-FIELDS = ("format", "name", "up", "gravity", "frame_rate", "bed", "tool", "views", "video")
+FIELDS = ("format", "name", "up", "gravity", "frame_rate", "bed", "tool", "views", "video", "heights")
 BED_FIELDS = ("lower", "upper", "density", "container", "wall_friction", "floor_friction")
 BIN, TRANSPARENT, OPEN, HEAP = "bin", "transparent", "open", "heap"
 CONTAINERS = (BIN, TRANSPARENT, OPEN, HEAP)
@@ -105,6 +106,8 @@ class Measurement:
         views: photographs before anything moves, by their names.
         video: the fixed cameras' frames, pre-roll included, by number and camera.
         assumed: fields that ``experiment.json`` leaves out, and the values taken for them.
+        sources: the set's own files; ``experiment.json`` stands for a list of pictures that isn't there.
+        heights: grids of heights; None if there are none.
     """
 
     folder: Path
@@ -117,6 +120,7 @@ class Measurement:
     video: tuple[Frame, ...]
     assumed: dict[str, float] = field(default_factory=dict)
     sources: tuple[Path, ...] = ()
+    heights: HeightMaps | None = None
 
     @classmethod
     def load(cls, folder: str | Path) -> Measurement:
@@ -144,7 +148,14 @@ class Measurement:
         bed = _read_bed(fields.child("bed"), assumed)
         tool_fields = fields.child("tool")
         tool = _read_tool(tool_fields, root, assumed)
-        transforms = {key: fields.path(key, root, root) for key in ("views", "video")}
+        heights = HeightMaps.read(fields.path("heights", root, root), root) if fields.has("heights") else None
+        # Heights stand in for a video, and their first grid for views where no pictures are to be drawn.
+        absent = {key for key in ("views", "video") if heights and not (fields.has(key) or fields.has("video"))}
+        transforms = {key: file if key in absent else fields.path(key, root, root) for key in ("views", "video")}
+        views, video = (
+            () if key in absent else read_transforms(transforms[key], root, video=key == "video")
+            for key in ("views", "video")
+        )
         measurement = cls(
             folder=root,
             name=fields.name("name") if fields.has("name") else root.resolve().name,
@@ -152,15 +163,17 @@ class Measurement:
             frame_rate=fields.number("frame_rate", 1e-3, 1e6, hint="it is in frames a second"),
             bed=bed,
             tool=tool,
-            views=read_transforms(transforms["views"], root, video=False),
-            video=read_transforms(transforms["video"], root, video=True),
+            views=views,
+            video=video,
             assumed=assumed,
             sources=(file, *transforms.values(), tool_fields.path("motion", root, root)),
+            heights=heights,
         )
         _check_clocks(measurement)
         _check_tool(measurement)
         _check_force(measurement)
         _check_cameras(measurement)
+        _check_heights(measurement)
         # Sums are taken in the frames' order: it must not be that in which a file happens to list them.
         return replace(
             measurement,
@@ -188,8 +201,22 @@ class Measurement:
 
     @cached_property
     def frames(self) -> tuple[int, ...]:
-        """Frame numbers of the video from 0 on, sorted."""
-        return tuple(sorted({f.frame for f in self.video if f.frame is not None and f.frame >= 0}))
+        """Frame numbers of the video, or without one of the heights, from 0 on, sorted."""
+        numbers = {f.frame for f in self.video} if self.video else set(self.height_frames)
+        return tuple(sorted(n for n in numbers if n is not None and n >= 0))
+
+    @cached_property
+    def height_frames(self) -> tuple[int, ...]:
+        """Frame numbers, sorted, at which grids of heights, or else depth maps of the fixed cameras, show the soil."""
+        if self.heights is not None:
+            return tuple(self.heights.grids)
+        return tuple(sorted({f.frame for f in self.video if f.frame is not None and f.depth_path is not None}))
+
+    def surface_points(self, frame: int) -> FloatArray:
+        """(n, 3) points in m that these show at a frame of ``height_frames``: soil, tool and all."""
+        if self.heights is not None:
+            return self.heights.points(frame)
+        return np.concatenate([depth_points(f) for f in self.video if f.frame == frame])
 
     @cached_property
     def pre_roll(self) -> tuple[Frame, ...]:
@@ -207,6 +234,7 @@ class Measurement:
     def _files(self) -> Iterator[Path]:
         yield from self.sources
         yield from (p for p in (self.tool.mesh_path, self.tool.force_path) if p is not None)
+        yield from () if self.heights is None else self.heights.paths
         for frame in (*self.views, *self.video):
             yield from (p for p in (frame.path, frame.mask_path, frame.depth_path) if p is not None)
 
@@ -290,6 +318,8 @@ def _check_clocks(measurement: Measurement) -> None:
         (video, [(f"frames[{i}].time", f.frame or 0, f.time or 0.0) for i, f in enumerate(measurement.video)]),
     )
     for file, rows in clocks:
+        if not rows:
+            continue
         field, number, time = max(rows, key=lambda row: abs(row[2] - row[1] / rate))
         if abs(time - number / rate) > 1.001 / rate:
             there = f"frame {number} is at {time:.10g} s in {file.name}"
@@ -414,13 +444,25 @@ def _check_cameras(measurement: Measurement) -> None:
                     file=frame.depth_path,
                     field=f"frames[{i}].depth_file_path",
                 )
-        if not any(sees(frame, bed) for frame in frames):
+        if frames and not any(sees(frame, bed) for frame in frames):
             raise MeasurementError(
                 "no camera looks at the soil's box; matrices are camera to world, cameras look down their -z axis, and"
                 " masks are black where pixels are ignored",
                 file=file,
                 field="frames[0].transform_matrix",
             )
+
+
+def _check_heights(measurement: Measurement) -> None:
+    """Whether grids of heights show the bed, also before anything has moved."""
+    heights, frames = measurement.heights, measurement.frames
+    if heights is None:
+        return
+    heights.check(measurement.bed.lower, measurement.bed.upper)
+    if frames and frames[0] not in heights.grids:
+        raise MeasurementError(
+            f"there is no grid of frame {frames[0]}, since which changes are compared", file=heights.paths[0]
+        )
 
 
 def sees(frame: Frame, bed: Bed) -> bool:

@@ -43,7 +43,7 @@ def remarks(measurement: Measurement) -> tuple[Remark, ...]:
 
 def _on_views(measurement: Measurement) -> Iterator[str]:
     views, bed, n = measurement.views, measurement.bed, len(measurement.views)
-    if n < _FEW_VIEWS:
+    if 0 < n < _FEW_VIEWS:
         yield f"There are only {n} views; the soil's surface gets reliable from about {_FEW_VIEWS} on."
     if blind := [f.path.name for f in views if not sees(f, bed)]:
         yield f"{len(blind)} of {n} views do not show the soil's box: {_some(blind)}."
@@ -51,7 +51,7 @@ def _on_views(measurement: Measurement) -> Iterator[str]:
         yield f"{len(below)} of {n} views are taken from below the bed's floor: {_some(below)}."
     if turned := [f.path.name for f in (*views, *measurement.video) if _turned(f)]:
         yield f"{len(turned)} images carry an EXIF rotation, which is not applied: {_some(turned)}."
-    for name, camera in {"": views[0].camera, **measurement.cameras}.items():
+    for name, camera in (*(("", f.camera) for f in views[:1]), *measurement.cameras.items()):
         corners = [[x, y] for x in (0.5, camera.width - 0.5) for y in (0.5, camera.height - 0.5)]
         if np.isnan(camera.rays(corners)[1]).any():
             who = f"camera {name!r}" if name else "the views' camera"
@@ -62,7 +62,7 @@ def _on_video(measurement: Measurement) -> Iterator[str]:
     frames, motion, rate = measurement.frames, measurement.tool.motion, measurement.frame_rate
     if not frames:
         yield "All video frames are pre-roll (negative numbers); there is nothing to compare with."
-    if not measurement.pre_roll:
+    if measurement.video and not measurement.pre_roll:
         yield "There is no pre-roll (frames with negative numbers), so the noise cannot be measured."
     for name in measurement.cameras:
         own = [f for f in measurement.video if f.camera_name == name]
@@ -70,6 +70,8 @@ def _on_video(measurement: Measurement) -> Iterator[str]:
             yield f"Camera {name!r} lacks {len(missing)} frames that others have: {_some(missing)}."
         if not any(sees(f, measurement.bed) for f in own):
             yield f"Camera {name!r} does not show the soil's box."
+    if beside := [n for n in measurement.height_frames if n >= 0 and n not in frames]:
+        yield f"The video lacks {len(beside)} frames that have heights, which are not used: {_some(beside)}."
     if lost := _lost(frames):
         yield f"The video lacks {len(lost)} frames in an otherwise even row: {_some(lost)}."
     if late := [n for n in frames if not motion.frames[0] <= n <= motion.frames[-1]]:

@@ -18,6 +18,7 @@ from PIL import Image
 from splatsoil.errors import MeasurementError
 from splatsoil.measurement.camera import Camera
 from splatsoil.measurement.frames import Frame
+from splatsoil.measurement.heights import HeightMaps
 from splatsoil.measurement.measurement import EXPERIMENT, FORMAT, Bed, Measurement
 from splatsoil.measurement.motion import MOTION_COLUMNS
 from splatsoil.measurement.tool import FORCE_COLUMNS, Tool
@@ -32,12 +33,14 @@ class Picture:
         image: (height, width, 3) sRGB, float in [0, 1] or uint8.
         frame: number on the tool motion's clock, for video.
         time: seconds on that clock, for video.
+        depth: (height, width) depth along the camera's axis in m, 0 where unknown; or None.
     """
 
     camera: Camera
     image: npt.NDArray[Any]
     frame: int | None = None
     time: float | None = None
+    depth: npt.NDArray[np.floating] | None = None
 
 
 def write_measurement(
@@ -54,6 +57,7 @@ def write_measurement(
     quality: int = 95,
     truth: Mapping[str, Any] | None = None,
     beside: Callable[[Path], object] | None = None,
+    heights: HeightMaps | None = None,
 ) -> Measurement:
     """Write a set that ``Measurement.load`` accepts, and load it.
 
@@ -69,6 +73,7 @@ def write_measurement(
         quality: JPEG quality (no chroma subsampling).
         truth: content of ``truth.json``, for synthetic sets.
         beside: writes further files into the folder that it is given.
+        heights: grids of heights; beside them views and video may be empty, and are left out then.
 
     Raises:
         MeasurementError: the place is taken or can't be written, or the set breaks the format's rules.
@@ -83,8 +88,11 @@ def write_measurement(
         write_table(root / "tool_motion.csv", MOTION_COLUMNS, table)
         if tool.force is not None:
             write_table(root / "tool_force.csv", FORCE_COLUMNS, tool.force)
-        for kind, frames in (("views", views), ("video", video)):
+        pictures = {kind: frames for kind, frames in (("views", views), ("video", video)) if frames or heights is None}
+        for kind, frames in pictures.items():
             write_frames(root / kind, frames, video=kind == "video", suffix=suffix, quality=quality)
+        if heights is not None:
+            write_heights(root / "heights", heights)
         experiment = {
             "format": FORMAT,
             "name": name,
@@ -105,8 +113,8 @@ def write_measurement(
                 "friction": tool.friction,
                 **({} if tool.force is None else {"force": "tool_force.csv"}),
             },
-            "views": "views/transforms.json",
-            "video": "video/transforms.json",
+            **{kind: f"{kind}/transforms.json" for kind in pictures},
+            **({} if heights is None else {"heights": "heights/heights.json"}),
         }
         write_json(root / EXPERIMENT, experiment)
         if truth is not None:
@@ -179,14 +187,33 @@ def write_frames(folder: Path, frames: Sequence[Picture | Frame], *, video: bool
                 entry["mask_path"] = _copy(frame.mask_path, folder, f"masks/{place}/{stem}")
             if frame.depth_path is not None:
                 entry["depth_file_path"] = _copy(frame.depth_path, folder, f"depth/{place}/{stem}")
+                entry["integer_depth_scale"] = frame.depth_scale
         else:
             entry["file_path"] = f"{place}/{stem}{suffix}"
             _encode(frame, folder / entry["file_path"], quality)
+            if frame.depth is not None:
+                entry["depth_file_path"] = f"depth/{place}/{stem}.npy"
+                _save(folder / entry["depth_file_path"], frame.depth)
         if video:
             entry |= {"camera": place, "frame": frame.frame, "time": frame.time}
         entries.append(entry | transforms(camera))
     folder.mkdir(exist_ok=True)
     write_json(folder / "transforms.json", {"frames": entries})
+
+
+def write_heights(folder: Path, heights: HeightMaps) -> None:
+    """``heights.json`` and its grids."""
+    entries = [{"file_path": f"{number:+05d}.npy", "frame": number} for number in heights.grids]
+    for entry, grid in zip(entries, heights.grids.values(), strict=True):
+        _save(folder / str(entry["file_path"]), grid)
+    noise = {} if heights.noise is None else {"noise": heights.noise}
+    about = {"corner": np.asarray(heights.corner).tolist(), "cell": heights.cell, **noise}
+    write_json(folder / "heights.json", {**about, "frames": entries})
+
+
+def _save(path: Path, values: npt.NDArray[np.floating]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.save(path, values.astype(np.float32), allow_pickle=False)
 
 
 def _encode(picture: Picture, path: Path, quality: int) -> None:

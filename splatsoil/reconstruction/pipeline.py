@@ -17,13 +17,14 @@ from splatsoil.errors import MeasurementError, ParameterError
 from splatsoil.files import RECONSTRUCTING, code_digest
 from splatsoil.measurement import BIN, HEAP, TRANSPARENT, Bed, Measurement
 from splatsoil.reconstruction.height_field import HeightField
+from splatsoil.reconstruction.heights import first_surface
 from splatsoil.reconstruction.hidden import reaching_into_soil
 from splatsoil.reconstruction.initial import SIDE, TOOL, first_gaussians
 from splatsoil.reconstruction.likeness import Likeness, likeness
 from splatsoil.reconstruction.presets import preset_named
 from splatsoil.reconstruction.result import HeldOut, Reconstruction
 from splatsoil.reconstruction.sides import sides_seen
-from splatsoil.reconstruction.surface import find_relief, soil_mesh, surface_through
+from splatsoil.reconstruction.surface import find_relief, scale_of, soil_mesh, surface_through
 from splatsoil.reconstruction.training import train
 from splatsoil.reconstruction.views import Views, load_views, silhouettes, still_video, surface_points
 from splatsoil.splats import Gaussians, psnr, rasterise, ssim
@@ -47,6 +48,8 @@ def reconstruct(
 ) -> Reconstruction:
     """Gaussians, surface and solid of the scene before anything moves, from a set's views.
 
+    Of a set without views the first heights give the surface, and there are no Gaussians.
+
     Args:
         measurement: the set; its `views` show the bed and the tool at the first pose of its motion.
         seed: the same seed on the CPU gives the same bits.
@@ -66,6 +69,23 @@ def reconstruct(
         raise ParameterError(f"holdout sets every so many views aside: 0 for none, or 2 and more, not {holdout}")
     if device != "cpu" and not torch.cuda.is_available():
         raise ParameterError(f"there is no device {device!r} here; choose cpu")
+    about = {
+        "measurement": measurement.name,
+        "measurement_hash": measurement.hash,
+        "version": __version__,
+        "code": code_digest(RECONSTRUCTING),
+        "preset": preset,
+        "seed": seed,
+        "device": device,
+        "holdout": holdout,
+    }
+    if not measurement.views:
+        surface = first_surface(measurement, scale_of(measurement.bed) / chosen.cells**0.5)
+        solid, none = soil_mesh(surface, measurement.bed), torch.zeros(0, dtype=torch.bool)
+        about |= {"container": measurement.bed.container or BIN, "remarks": []}
+        return Reconstruction(
+            no_gaussians(), none, none, surface, solid, NO_BACKGROUND, (), about, time.monotonic() - started
+        )
     report("reading photographs", 0.0)
     every = load_views(measurement.views, chosen.longest_side)
     aside = list(range(0, len(every), holdout)) if holdout else []
@@ -147,14 +167,7 @@ def reconstruct(
         background=trained.background,
         held_out=held_out,
         metadata={
-            "measurement": measurement.name,
-            "measurement_hash": measurement.hash,
-            "version": __version__,
-            "code": code_digest(RECONSTRUCTING),
-            "preset": preset,
-            "seed": seed,
-            "device": device,
-            "holdout": holdout,
+            **about,
             "container": container,
             "ground": relief.ground,
             "first_loss": float(np.mean(trained.losses[: len(views)])),
@@ -165,6 +178,11 @@ def reconstruct(
     )
     made.say_remarks()
     return made
+
+
+def no_gaussians() -> Gaussians:
+    """None at all."""
+    return Gaussians(*(torch.zeros(0, *shape) for shape in ((3,), (3,), (4,), (), (3,))))
 
 
 def unlike_cameras(alike: Likeness, cameras: Sequence[str], which: NDArray[np.bool_]) -> list[str]:

@@ -246,7 +246,7 @@ def block(check: Mapping[str, Any]) -> str:
     """A check's block: "berm while pushing, left camera"."""
     stage, channel = str(check["stage"]), str(check["channel"])
     when = f"while {stage}" if stage.endswith("ing") else f"during {stage}"
-    return f"{check['region']} {when}, {channel if channel.startswith('force') else f'{channel} camera'}"
+    return f"{check['region']} {when}, {channel if channel.startswith(('force', 'heights')) else f'{channel} camera'}"
 
 
 def begins(judged: Mapping[str, Any], check: Mapping[str, Any]) -> str:

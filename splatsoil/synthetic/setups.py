@@ -68,14 +68,20 @@ class Setup:
     pre_roll: tuple[int, ...] = PRE_ROLL
 
     def experiment(self) -> Measurement:
-        """The experiment as the solver takes it; the pictures of its video are yet to be taken."""
+        """The experiment as the solver takes it; the pictures of its video are yet to be taken.
+
+        The tool is the one that the set will hold, in STL's single precision: of a bed of 12.5 cells a rounded width
+        makes 12 or 13, and a model of the set must have as many.
+        """
+        mesh = self.tool.mesh.copy()
+        mesh.vertices = mesh.vertices.astype(np.float32)
         return Measurement(
             folder=Path(),
             name="synthetic",
             gravity=self.gravity,
             frame_rate=self.frame_rate,
             bed=self.bed,
-            tool=self.tool,
+            tool=replace(self.tool, mesh=mesh),
             views=(),
             video=tuple(
                 Frame(camera, Path(), name, frame, frame / self.frame_rate)

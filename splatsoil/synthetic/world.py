@@ -26,6 +26,7 @@ from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
 from splatsoil.synthetic.appearance import Appearance
 from splatsoil.synthetic.pictures import NOISE, Photographer, Renderer
+from splatsoil.synthetic.scanning import DEPTH_NOISE, GRID_NOISE, Scanner
 from splatsoil.synthetic.setups import Setup
 from splatsoil.synthetic.stage import Stage
 
@@ -65,6 +66,8 @@ def make_set(
     particle_seed: int | None = None,
     device: str = "cpu",
     appearance: Appearance | None = None,
+    heights: bool = False,
+    depth_maps: bool = False,
     progress: Report | None = None,
 ) -> World:
     """Make a synthetic measurement set with ``truth.json`` and ``truth_particles.npz``.
@@ -83,6 +86,8 @@ def make_set(
             of them, so that no fit starts from the very particles of the world.
         device: ``auto``, ``cpu`` or ``cuda:N``.
         appearance: looks; drawn by seed by default.
+        heights: whether grids of heights are measured, too.
+        depth_maps: whether the fixed cameras measure depths, too.
         progress: called with (what, share done).
 
     Raises:
@@ -133,6 +138,8 @@ def make_set(
         "device": device,
         "appearance": asdict(look),
         "sensor_noise": NOISE,
+        **({"height_noise": GRID_NOISE} if heights else {}),
+        **({"depth_noise": DEPTH_NOISE} if depth_maps else {}),
     }
     measurement = photograph_run(
         target,
@@ -143,6 +150,8 @@ def make_set(
         observation=observation,
         seed=seed,
         device=device,
+        heights=heights,
+        depth_maps=depth_maps,
         progress=lambda share: report("pictures", share),
     )
     seconds = {"simulation": simulated - began, "pictures": time.perf_counter() - simulated}
@@ -159,6 +168,8 @@ def photograph_run(
     observation: Observation | None = None,
     seed: int = 0,
     device: str = "cpu",
+    heights: bool = False,
+    depth_maps: bool = False,
     progress: Callable[[float], None] = lambda share: None,
     renderer: Callable[..., Renderer] = Stage,
 ) -> Measurement:
@@ -173,6 +184,8 @@ def photograph_run(
         observation: how the cameras err; not at all by default.
         seed: of light paths and noise.
         device: Warp device name.
+        heights: whether grids of heights are measured, too.
+        depth_maps: whether the fixed cameras measure depths, too.
         progress: called with the share of the pictures that is done.
         renderer: makes what pictures are taken of, from `Stage`'s arguments.
 
@@ -182,10 +195,11 @@ def photograph_run(
     """
     target = Path(out)
     check_place(target)
-    photographer = Photographer(
-        setup, trajectory, appearance, seed, device, progress, observation or Observation(), renderer
-    )
+    observation = observation or Observation()
+    photographer = Photographer(setup, trajectory, appearance, seed, device, progress, observation, renderer)
     views, video = photographer.take()
+    scanner = Scanner(setup, trajectory, seed, device, observation)
+    video = scanner.with_depth(video) if depth_maps else video
     frames = np.arange(1, len(trajectory.force) + 1)
     force = np.column_stack([frames, frames / setup.frame_rate, trajectory.force]) if len(frames) else None
     return write_measurement(
@@ -199,6 +213,7 @@ def photograph_run(
         gravity=setup.gravity,
         quality=QUALITY,
         truth=truth,
+        heights=scanner.heights() if heights else None,
         beside=lambda place: save_particles(place / "truth_particles.npz", trajectory, truth_frames(setup.frames)),
     )
 

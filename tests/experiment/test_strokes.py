@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from splatsoil.commands.design import motion_csv
 from splatsoil.experiment.forces import ALONG, SCALE, SENSOR
 from splatsoil.experiment.plow import MOST_FEATURES, PlowExperiment
 from splatsoil.experiment.strokes import StrokeExperiment, strokes
-from splatsoil.measurement import Measurement, ToolMotion
+from splatsoil.measurement import HeightMaps, Measurement, ToolMotion
 from splatsoil.model import Model
 
 SURFACE = 0.13
@@ -115,7 +117,8 @@ def test_what_models_differ_by_is_told_without_a_photograph(
             for key, picture in experiment.comparator.observed.items()
         }
         newtons = np.tile([-force, 0.0, 0.0], (last, 1))
-        return experiment.features_of(experiment.comparator.blocks(images), newtons)
+        prediction = SimpleNamespace(trajectory=SimpleNamespace(force=newtons), surfaces={})
+        return experiment.features_of(experiment.comparator.blocks(images), cast(Any, prediction))
 
     assert measured.forces is not None
     largest = measured.forces.largest
@@ -131,3 +134,23 @@ def test_what_models_differ_by_is_told_without_a_photograph(
     assert np.array_equal(experiment.observed, other)
     moves = np.array(experiment.layout.stages) != "pause"
     assert np.allclose(experiment.sensor[moves, along], SENSOR / np.sqrt(1.0 + (20.0 / SCALE) ** 2))
+
+
+def test_heights_of_another_stroke_are_seen_where_they_were_measured_but_for_the_tool(
+    damp: Measurement, over_level_soil: Callable[..., Model]
+) -> None:
+    shape = tuple(round(float(v) / 0.01) for v in damp.bed.extents[1::-1])
+    level = {f: np.full(shape, SURFACE) for f in damp.frames}
+    scanned = replace(damp, heights=HeightMaps(damp.bed.lower[:2], 0.01, level, 0.002))
+    measured = PlowExperiment(over_level_soil(scanned, SURFACE))
+    second = strokes(scanned, SURFACE)[-1]
+    model = over_level_soil(second.prepared(measured), SURFACE)
+    experiment = StrokeExperiment(model, measured)
+    assert experiment.layout.channels == measured.layout.channels and measured.layout.channels[0] == "heights"
+    heights = np.array([site.channel == "heights" for site in experiment.layout.sites])
+    seen, place = experiment.seen[:, heights], np.array([(s.x, s.y) for s in experiment.layout.sites])[heights]
+    # two frames a row
+    assert seen.mean() > 0.8 and experiment.sensor[:, heights].max() == pytest.approx(2.0 / np.sqrt(2.0))
+    row, frame = next((i, t) for i, t in enumerate(experiment.layout.times) if not seen[i].all())
+    low, high = model.measurement.tool.bounds(frame / model.measurement.frame_rate)
+    assert (np.abs(place[~seen[row]] - 0.5 * (low + high)[:2]) < 0.5 * (high - low)[:2] + 0.08).all()

@@ -14,6 +14,9 @@ import pytest
 from splatsoil import cli
 from splatsoil.errors import MeasurementError, ParameterError
 from splatsoil.measurement import Measurement, ToolMotion, remarks
+from splatsoil.mpm import Resolution, simulate
+from splatsoil.reconstruction import fill
+from splatsoil.soil.law import Law
 from splatsoil.synthetic import Appearance, Setup, World, like, make_set, paper, plow
 from splatsoil.synthetic.setups import video_frames
 from splatsoil.synthetic.world import truth_frames
@@ -75,6 +78,18 @@ def test_particles_fill_the_bed_and_keep_their_number(world: World) -> None:
         assert x[:, 2].min() >= bed.lower[2] - 0.1 * spacing
     area = float(np.prod(bed.extents[:2]))
     assert world.particles * spacing**3 / area == pytest.approx(0.12, rel=0.005)
+
+
+def test_a_model_of_the_set_that_starts_from_its_particles_makes_it_again(world: World) -> None:
+    """The set's tool is of single precision; half of a cell more or less across the bed would be another solver."""
+    measurement, truth = world.measurement, world.truth
+    resolution = Resolution.derive(measurement, "tiny")
+    start = fill(short().surface, measurement.bed, resolution.spacing, seed=truth["particle_seed"])
+    values = {"friction_angle": truth["parameters"]["friction_angle"]}
+    again = simulate(measurement, start, values, law=Law(()), resolution=resolution, frames=(LAST,))[0]
+    np.testing.assert_allclose(again.at(LAST)[0], particles(measurement.folder, LAST), atol=2e-5)
+    assert measurement.tool.force is not None
+    np.testing.assert_allclose(again.force, measurement.tool.force[:LAST, 2:], rtol=1e-4, atol=1e-3)
 
 
 def test_the_soil_pushes_back(world: World) -> None:

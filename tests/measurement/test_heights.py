@@ -1,0 +1,154 @@
+"""Grids of heights and depth maps, written by other libraries and read back; and what is wrong with a set's."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import skimage.io
+import tifffile
+
+from splatsoil.cli import main
+from splatsoil.measurement import Camera, Frame, HeightMaps, Measurement, Picture, write_measurement
+from splatsoil.measurement.heights import depth_points, read_heights
+
+RAMP = np.linspace(0.1, 0.14, 16 * 10).reshape(10, 16).astype(np.float32)
+"""Heights of a grid of 5 cm over a bed of 0.8 x 0.5 m, the first row at the lowest y."""
+
+
+def with_heights(folder: Path, grids: dict[int, np.ndarray], **about: object) -> Path:
+    """A set beside whose pictures lie grids of heights."""
+    (folder / "heights").mkdir()
+    entries = []
+    for number, grid in grids.items():
+        np.save(folder / "heights" / f"{number}.npy", grid)
+        entries.append({"file_path": f"{number}.npy", "frame": number})
+    told = {"corner": [0.0, 0.0], "cell": 0.05, **about, "frames": entries}
+    told = {key: value for key, value in told.items() if value is not None}
+    (folder / "heights" / "heights.json").write_text(json.dumps(told))
+    experiment = json.loads((folder / "experiment.json").read_text())
+    (folder / "experiment.json").write_text(json.dumps({**experiment, "heights": "heights/heights.json"}))
+    return folder
+
+
+def test_a_map_has_north_above_and_an_array_its_first_row_at_the_corner(tmp_path: Path) -> None:
+    holed = np.where(RAMP > 0.13, np.nan, RAMP)
+    np.save(tmp_path / "a.npy", holed)
+    tifffile.imwrite(
+        tmp_path / "a.tif",
+        np.nan_to_num(holed, nan=-9999.0)[::-1],
+        extratags=[(42113, "s", 0, "-9999", True)],
+    )
+    tifffile.imwrite(tmp_path / "b.tiff", holed[::-1], compression="zlib", tile=(16, 16))
+    for name in ("a.npy", "a.tif", "b.tiff"):
+        np.testing.assert_allclose(read_heights(tmp_path / name), holed, rtol=1e-6)
+
+
+def test_points_are_the_centres_of_cells(small_set: Path) -> None:
+    holed = RAMP.copy()
+    holed[0, 0] = np.nan
+    heights = Measurement.load(with_heights(small_set, {0: holed, 10: RAMP}, noise=0.002)).heights
+    assert heights is not None and heights.noise == 0.002 and list(heights.grids) == [0, 10]
+    points = heights.points(0)
+    assert len(points) == RAMP.size - 1
+    np.testing.assert_allclose(points[0], [0.075, 0.025, RAMP[0, 1]], rtol=1e-6)
+    np.testing.assert_allclose(points[-1], [0.775, 0.475, RAMP[-1, -1]], rtol=1e-6)
+
+
+def test_a_depth_map_shows_the_points_that_its_pixels_are_of(plow_dry: Path, tmp_path: Path) -> None:
+    camera = replace(Measurement.load(plow_dry).cameras["left"], k1=-0.2, k2=0.03, p1=0.002)
+    rows, columns = np.mgrid[: camera.height, : camera.width]
+    depth = 0.7 + 0.001 * rows + 0.0005 * columns
+    depth[:5] = 0.0
+    skimage.io.imsave(tmp_path / "d.png", np.round(depth / 2e-5).astype(np.uint16), check_contrast=False)
+    tifffile.imwrite(tmp_path / "d.tif", depth.astype(np.float32))
+    skimage.io.imsave(tmp_path / "p.png", np.zeros((camera.height, camera.width, 3), np.uint8), check_contrast=False)
+    for name, scale in (("d.png", 2e-5), ("d.tif", 1e-3)):
+        frame = Frame(camera, tmp_path / "p.png", depth_path=tmp_path / name, depth_scale=scale)
+        points = depth_points(frame)
+        assert len(points) == (camera.height - 5) * camera.width
+        pixels, along = camera.project(points)
+        np.testing.assert_allclose(pixels, np.stack([columns, rows], -1)[5:].reshape(-1, 2) + 0.5, atol=1e-3)
+        np.testing.assert_allclose(along, depth[5:].reshape(-1), atol=2e-5)
+
+
+def test_a_set_of_heights_and_depths_is_what_was_written(small_set: Path, tmp_path: Path) -> None:
+    given = Measurement.load(small_set)
+    camera: Camera = given.cameras["left"]
+    depth = np.full((camera.height, camera.width), 0.9)
+    noise = np.random.default_rng(0).uniform(size=(camera.height, camera.width, 3))
+    heights = HeightMaps(np.zeros(2), 0.05, {0: RAMP.astype(np.float64)}, 0.001)
+    made = write_measurement(
+        tmp_path / "made",
+        name="made",
+        bed=given.bed,
+        tool=given.tool,
+        views=given.views,
+        video=[Picture(camera, noise, 0, 0.0, depth)],
+        frame_rate=given.frame_rate,
+        heights=heights,
+    )
+    assert made.heights is not None and made.heights.noise == 0.001
+    np.testing.assert_array_equal(made.surface_points(0), heights.points(0))
+    np.testing.assert_allclose(replace(made, heights=None).surface_points(0), depth_points(made.video[0]))
+    bare = write_measurement(
+        tmp_path / "bare",
+        name="bare",
+        bed=given.bed,
+        tool=given.tool,
+        views=[],
+        video=[],
+        frame_rate=given.frame_rate,
+        heights=heights,
+    )
+    assert bare.frames == (0,) and not bare.cameras and not bare.views
+    before = bare.hash
+    np.save(bare.folder / "heights" / "+0000.npy", RAMP + np.float32(0.001))
+    assert Measurement.load(bare.folder).hash != before
+
+
+BAD: dict[str, tuple[Callable[[Path], object], str]] = {
+    "another shape": (lambda s: with_heights(s, {0: RAMP, 10: RAMP[:-1]}), "9 x 16 cells where that of frames"),
+    "no corner": (lambda s: with_heights(s, {0: RAMP}, corner=None), "corner"),
+    "no cell": (lambda s: with_heights(s, {0: RAMP}, cell=None), "cell"),
+    "millimetres": (lambda s: with_heights(s, {0: 1000.0 * RAMP}), "heights are in metres"),
+    "all unknown": (lambda s: with_heights(s, {0: np.nan * RAMP}), "no height is known"),
+    "whole numbers": (lambda s: with_heights(s, {0: np.ones((4, 4), int)}), "floating-point metres"),
+    "elsewhere": (lambda s: with_heights(s, {0: RAMP}, corner=[10.0, 0.0]), "no known height lies over the soil's box"),
+    "not before": (lambda s: with_heights(s, {10: RAMP}), "no grid of frame 0"),
+    "no file": (lambda s: (with_heights(s, {0: RAMP}) / "heights" / "0.npy").unlink(), "no such file"),
+    "no frames": (lambda s: with_heights(s, {}), "the list is empty"),
+}
+
+
+@pytest.mark.parametrize("what", BAD)
+def test_bad_heights_are_refused_by_one_sentence(
+    what: str, small_set: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    spoil, said = BAD[what]
+    spoil(small_set)
+    assert main(["check", str(small_set)]) == 2
+    told = capsys.readouterr()
+    assert said in told.err and "heights" in told.err and len(told.err.splitlines()) == 1 and not told.out
+
+
+def test_without_a_video_there_must_be_heights_and_without_views_no_video(
+    small_set: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    experiment = json.loads((small_set / "experiment.json").read_text())
+    del experiment["video"]
+    (small_set / "experiment.json").write_text(json.dumps(experiment))
+    assert main(["check", str(small_set)]) == 2 and "video" in capsys.readouterr().err
+    with_heights(small_set, {0: RAMP, 10: RAMP})
+    assert main(["check", str(small_set), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["heights"] == [0, 10] and told["video"]["cameras"] == []
+    experiment = json.loads((small_set / "experiment.json").read_text())
+    experiment["video"] = "video/transforms.json"
+    del experiment["views"]
+    (small_set / "experiment.json").write_text(json.dumps(experiment))
+    assert main(["check", str(small_set)]) == 2 and "views" in capsys.readouterr().err
