@@ -72,7 +72,7 @@ def test_the_observation_remembers_the_best_and_the_last(env: PlowSandEnv, analy
     observation, reward, *_ = env.step(act(-0.9))
     assert observation["best_parameters"] == np.float32(0.1) and observation["last_action"] == np.float32(-0.9)
     assert observation["last_loss"] == pytest.approx(-reward) and observation["best_loss"] < observation["last_loss"]
-    expected = np.array([21.5 - 36.0, 0.0, 1.0]) @ analytic.DIRECTIONS
+    expected = np.array([21.5 - 36.0, 1.0]) @ analytic.DIRECTIONS
     np.testing.assert_allclose(observation["block_residuals"], expected, atol=1e-5)
 
 

@@ -8,6 +8,7 @@ from types import ModuleType
 import gymnasium as gym
 import numpy as np
 import pytest
+from splatsoil.benchmarks import bo_vs_mcmc
 from splatsoil.envs.recording import EpisodeRecorder
 
 from splatsoil.errors import ParameterError, RunError
@@ -66,6 +67,12 @@ def test_the_world_is_made_again_from_the_data_set() -> None:
     assert again.spec.kwargs == {"budget": 2}
     again.reset(seed=3)
     assert again.step(np.array([0.3], np.float32))[1] == reward
+
+
+def test_the_benchmark_keeps_the_episodes_of_its_agents() -> None:
+    bo_vs_mcmc.run("PlowSandFast-v0", [3], ["random"], [], 2, data_set="plow-sand/agents-v0")
+    dataset = minari.load_dataset("plow-sand/agents-v0")
+    assert (dataset.total_episodes, dataset.total_steps) == (2, 6)
 
 
 def test_nothing_recorded(analytic: ModuleType) -> None:

@@ -49,6 +49,16 @@ def test_episodes_begin_anew_in_the_step_that_ends_them_and_fail_alone(analytic:
         batch.step(np.zeros(2, np.float32))
 
 
+def test_emulated_episodes_side_by_side_are_the_single_ones() -> None:
+    batch = gym.make_vec("PlowSandSeveralFast-v0", num_envs=2)
+    batch.reset(seed=4)
+    _, rewards, *_ = batch.step(np.zeros((2, 3), np.float32))
+    for k, reward in enumerate(rewards):
+        single = gym.make("PlowSandSeveralFast-v0")
+        single.reset(seed=4 + k)
+        assert single.step(np.zeros(3, np.float32))[1] == reward
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("context", ["fork", "spawn", "forkserver"])
 def test_processes_work_after_their_parent_has_stepped(context: str, tmp_path: Path) -> None:
