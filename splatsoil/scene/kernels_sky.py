@@ -44,7 +44,8 @@ def look_around(
     """What a place of a unit normal sees, by its horizon in a dozen directions, in steps each a fifth longer than the
     last (horizon-based indirect light, after Bavoil and Sainz, 2009).
 
-    ``sent`` is what each cell sends back, ``tool`` the lowest and highest point of the tool over each cell, if any.
+    ``sent`` is what each cell sends back, ``tool`` the lowest and highest point of the tool over each cell; both may be
+    left empty.
     """
     out = Around()
     rows = surface.height.shape[0]
@@ -80,8 +81,9 @@ def look_around(
                     upto = _wedge(slope, up, along)
                     # Soil between two looks sends their mean, but for a wall: none of the light on its top is on it.
                     upper = wp.where(climb <= step, 0.5, wp.max(1.0 - 0.5 * climb / step, 0.0))
-                    before = sent[last // columns, last % columns]
-                    out.light += (upto - seen) * (before + upper * (sent[i, j] - before))
+                    if sent.shape[0] > 0:
+                        before = sent[last // columns, last % columns]
+                        out.light += (upto - seen) * (before + upper * (sent[i, j] - before))
                     seen = upto
                 if tool.shape[0] > 0:
                     low = wp.min(low, (tool[i, j][0] - place[2]) / r)

@@ -26,7 +26,6 @@ from torch import Tensor
 from splatsoil.scene.light import SOIL_REFLECTANCE, Light, towards
 from splatsoil.scene.lit import facing, normals, open_sky, suns_on_points
 from splatsoil.scene.relief import Relief
-from splatsoil.splats.steps import finished
 from splatsoil.splats.warp_torch import upload
 
 FloatArray = npt.NDArray[np.float64]
@@ -158,9 +157,8 @@ class _Lights:
     """Log of the light on points of a bed, 0 on level open ground, with the tool at one place."""
 
     def __init__(self, bed: _Bed, tool: object, points: Tensor) -> None:
-        rough, _, *shares = finished(open_sky(bed.relief, tool))
         self.bed, self.tool, self.points, self.normal = bed, tool, points, normals(bed.relief, points)
-        self.openness, hidden = (rough.sample(share, points) for share in shares)
+        self.openness, hidden = (bed.relief.sample(share, points) for share in open_sky(bed.relief, tool))
         # Soil and tool in the sky's way have half of level ground's light.
         self.returned = 0.5 * (SOIL_REFLECTANCE * (1.0 - self.openness - hidden) + _TOOL_REFLECTANCE * hidden)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -22,7 +23,7 @@ from splatsoil.splats.warp_torch import as_warp, launch, upload
 FloatArray = npt.NDArray[np.float64]
 
 _COARSE = 2
-"""Cells that look around them, in cells of the relief: what they see changes slowly."""
+"""Cells between which light is sent back and forth, in cells of the relief."""
 
 
 _REACH = 1.0
@@ -86,47 +87,48 @@ def light_relief(
     visible = torch.empty_like(relief.height)
     inputs = [relief.surface, light.kernel_form(), as_warp(visible, wp.float32)]
     launch(kernels.sun_visibility, tuple(visible.shape), inputs, visible)
-    rough, columns, openness, hidden = yield from open_sky(relief, tool)
-    direct = direct_light(relief, light, tool, rough.points.reshape(-1, 3), 0.5 * rough.cell[0])
-    first = _mixed(light, openness.reshape(-1), direct).reshape(rough.normal.shape)
+    openness, hidden = open_sky(relief, tool)
     ground, side = (upload(v, relief.device) for v in (light.reflectance(light.level), light.tool_side(tool_colour)))
-    by_tool = hidden[..., None] * side
-    once = _look_around(rough, ground * (first + by_tool), columns)[0]
-    # It goes on between slopes as within a sphere, each place of which sees the same share of the others.
-    bounced = once / (1.0 - ground * (1.0 - openness - hidden)[..., None]) + by_tool
-    sent = ground * (first + bounced)
-    maps = torch.cat([openness[..., None], hidden[..., None], bounced, sent], dim=-1).permute(2, 0, 1)[None]
-    fine = functional.interpolate(maps, relief.height.shape, mode="bilinear", align_corners=False)[0]
-    bounced, sent = (m.permute(1, 2, 0).contiguous() for m in (fine[2:5], fine[5:]))
-    return LitRelief(relief, light, tool, fine[0].contiguous(), visible, bounced, sent, fine[1].contiguous())
-
-
-def open_sky(relief: Relief, tool: Any) -> Steps[tuple[Relief, Tensor, Tensor, Tensor]]:
-    """The relief on fewer cells, the tool over them (see `_tool_columns`), and maps of the shares of the sky's light,
-    weighted by the cosine, that soil and tool leave open (1 on an open plane) and that the tool alone takes."""
     rough = yield from _coarser(relief).ranged()
-    columns = _tool_columns(rough, tool)
-    _, openness, hidden = _look_around(rough, torch.zeros_like(rough.normal), columns)
-    return rough, columns, openness, hidden
+    sky, tools = (_resized(m[None], rough.height.shape)[0] for m in (openness, hidden))
+    direct = direct_light(relief, light, tool, rough.points.reshape(-1, 3), 0.5 * rough.cell[0])
+    first = _mixed(light, sky.reshape(-1), direct).reshape(rough.normal.shape)
+    by_tool = tools[..., None] * side
+    once = _look_around(rough, ground * (first + by_tool), None)[0]
+    # It goes on between slopes as within a sphere, each place of which sees the same share of the others.
+    by_soil = once / (1.0 - ground * (1.0 - sky - tools)[..., None])
+    maps = torch.cat([by_soil, ground * (first + by_soil + by_tool)], dim=-1).permute(2, 0, 1)
+    fine = _resized(maps, relief.height.shape).permute(1, 2, 0)
+    bounced, sent = fine[..., :3] + hidden[..., None] * side, fine[..., 3:].contiguous()
+    return LitRelief(relief, light, tool, openness, visible, bounced, sent, hidden)
 
 
-def _look_around(relief: Relief, sent: Tensor, tool: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def open_sky(relief: Relief, tool: Any) -> tuple[Tensor, Tensor]:
+    """Shares (ny, nx) of the sky's light, weighted by the cosine, that soil and tool leave open to each cell (1 on an
+    open plane), and that the tool alone takes."""
+    return _look_around(relief, None, tool)[1:]
+
+
+def _look_around(relief: Relief, sent: Tensor | None, tool: Any | None) -> tuple[Tensor, Tensor, Tensor]:
     """What each cell sees around it, by the horizon in a dozen directions.
 
     Args:
         relief: the surface.
-        sent: (ny, nx, 3) light sent back by each cell, the same in all directions.
-        tool: see `_tool_columns`.
+        sent: (ny, nx, 3) light sent back by each cell, the same in all directions; None for none.
+        tool: a pose from `ToolBody.at` or `ToolBody.absent`; None where it doesn't matter.
 
     Returns:
         Light from the soil (ny, nx, 3); the share of the sky (ny, nx) that soil and tool leave open, and the share that
         the tool alone takes.
     """
-    light, sky = torch.empty_like(sent), sent.new_empty((*sent.shape[:2], 2))
-    maps = [as_warp(m, d) for m, d in ((sent, wp.vec3), (tool, wp.vec2), (light, wp.vec3), (sky, wp.vec2))]
-    launch(kernels_sky.cells_look_around, tuple(relief.height.shape), [relief.surface, *maps], sent)
+    like = relief.normal
+    light, sky = torch.empty_like(like), like.new_empty((*like.shape[:2], 2))
+    given = like.new_empty((0, 0, 3)) if sent is None else sent
+    columns = like.new_empty((0, 0, 2)) if tool is None else _tool_columns(relief, tool)
+    maps = [as_warp(m, d) for m, d in ((given, wp.vec3), (columns, wp.vec2), (light, wp.vec3), (sky, wp.vec2))]
+    launch(kernels_sky.cells_look_around, tuple(relief.height.shape), [relief.surface, *maps], like)
     openness, hidden = sky.unbind(dim=-1)
-    return light, openness - hidden, hidden
+    return light, openness - hidden, hidden.contiguous()
 
 
 def _tool_columns(relief: Relief, tool: Any) -> Tensor:
@@ -181,5 +183,10 @@ def _coarser(relief: Relief) -> Relief:
     size = (max(2, ny // _COARSE), max(2, nx // _COARSE))
     cell = (relief.cell[0] * nx / size[1], relief.cell[1] * ny / size[0])
     origin = (relief.origin[0] + 0.5 * (cell[0] - relief.cell[0]), relief.origin[1] + 0.5 * (cell[1] - relief.cell[1]))
-    height = functional.interpolate(relief.height[None, None], size, mode="bilinear", antialias=True)[0, 0]
-    return Relief.of_heights(height, origin, cell)
+    return Relief.of_heights(_resized(relief.height[None], size)[0], origin, cell)
+
+
+def _resized(maps: Tensor, size: Sequence[int]) -> Tensor:
+    """Maps (k, ny, nx) on another number of cells over the same rectangle, averaged where there are fewer."""
+    shrinking = size[0] < maps.shape[1]
+    return functional.interpolate(maps[None], tuple(size), mode="bilinear", antialias=shrinking)[0]

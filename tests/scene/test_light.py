@@ -16,11 +16,11 @@ from splatsoil.synthetic import stage as synthetic
 CELL = 0.005
 
 
-def surface(height, size=(120, 160), cell=CELL):
+def surface(height, size=(120, 160)):
     """A relief of height(x, y) around the origin."""
-    y, x = np.meshgrid(*((np.arange(count) - count / 2) * cell for count in size), indexing="ij")
+    y, x = np.meshgrid(*((np.arange(count) - count / 2) * CELL for count in size), indexing="ij")
     values = torch.tensor(np.broadcast_to(height(x, y), x.shape).copy(), dtype=torch.float32)
-    return Relief.of_heights(values, (float(x[0, 0]), float(y[0, 0])), (cell, cell))
+    return Relief.of_heights(values, (float(x[0, 0]), float(y[0, 0])), (CELL, CELL))
 
 
 NONE = ToolBody(None).absent()
@@ -54,7 +54,7 @@ def test_plane_is_lit_by_lamberts_law(slope):
 def test_sky_over_ground_before_a_long_wall(distance):
     # View factor of a level patch to an endless strip that ends at elevation t: (1 - cos t) / 2.
     wall = 0.08
-    relief = surface(lambda x, y: np.where(x > 0.0, wall, 0.0), (800, 320), 0.5 * CELL)
+    relief = surface(lambda x, y: np.where(x > 0.0, wall, 0.0), (400, 160))
     lit = light_relief(relief, OVERHEAD, NONE)
     elevation = math.atan2(wall, distance)
     # 12 directions and steps of a fifth cost up to 0.025; no occlusion at all would be off by 0.32, 0.2 and 0.08
