@@ -101,7 +101,7 @@ def ours() -> Truth:
 def test_our_own_run_is_found_to_be_one(ours: Truth) -> None:
     """By other particles, whose scatter is large with so few; an angle stated 6 degrees too low is found out."""
     tiny = Resolution.derive(ours.measurement, "tiny")
-    scanned = scan(ours, tiny, (-6.0, 6.0), (0, 1), "cpu")
+    scanned = scan(ours, tiny, (-6.0, 6.0), range(6), "cpu")
     found = agreement(ours, scanned)
     assert found["best_angle"] == pytest.approx(36.0, abs=3.0)
     assert found["heights_mm"] < 1.3 * found["scatter_mm"]
