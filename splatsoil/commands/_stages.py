@@ -203,7 +203,8 @@ def draw_comparison(run: RunFolder, model: Model, report: Report) -> dict[str, A
             frames.append({"camera": camera, "frame": frame, "losses": losses, **names})
         # Heights count where there are no pictures.
         told = [f for f in frames if f["camera"] in (comparator.cameras or (CHANNEL,))]
-        noise = comparator.noise if comparator.cameras or heights is None else heights.noise_loss
+        if heights is not None and not comparator.cameras:
+            noise = heights.noise_loss
         data = {
             "format": COMPARISON_FORMAT,
             "fit": result["name"],
