@@ -120,9 +120,9 @@ class _Study:
         """The first simulations: of the base model, of pairs, and of each effect of physics."""
         prior, seed = self.prior, self.seed
         points = _spread(prior, BASE + BASE // 2 * (len(prior.space) - 1), seed)
-        # simulations that are there stand for the points of the design that they are nearest to
-        apart = np.sum((prior.unit(self.base)[:, None] - points[None]) ** 2, axis=2)
-        points = np.delete(points, apart.argmin(axis=1), axis=0)
+        # each simulation that is there stands for the nearest point of the design
+        for there in prior.unit(self.base)[: len(points)]:
+            points = np.delete(points, np.argmin(np.sum((points - there) ** 2, axis=1)), axis=0)
         self.base += [Run(v, seed=seed + 1 + i) for i, v in enumerate(prior.values(points))]
         if FINE in self.experiment.numerics:
             points = 0.7 * _spread(prior, PAIRS, seed + 1)
@@ -237,15 +237,16 @@ class _Compared:
 
         rest = np.tensordot(np.eye(len(base)) - noise.trend, base, axes=1)
         rest /= np.sqrt(np.maximum(1.0 - np.diag(noise.trend), 1e-9) * len(base))[:, None, None]
-        otherwise = [about_trend(*made) for made in tables.effects.values()]
-        otherwise.append((base - base.mean(axis=0)) / np.sqrt(len(base)))
-        numerics = [
-            factors[0] * noise.share / np.sqrt(len(otherwise)) * np.where(placed, found, 0.0) for found in otherwise
-        ]
-        if len(tables.fine[0]):
-            numerics.append(factors[1] * REMAINING * np.where(placed, 0.0, about_trend(*tables.fine)))
         own = [rest] if experiment.chance else []
         fixed = np.concatenate([*own, drawings(experiment, tables, self.study.candidates)])
+        if len(tables.fine[0]):
+            numerics = [factors[0] * noise.share * np.where(placed, fixed, 0.0)]
+            numerics.append(factors[1] * REMAINING * np.where(placed, 0.0, about_trend(*tables.fine)))
+        else:
+            otherwise = [*(about_trend(*made) for made in tables.effects.values())]
+            otherwise.append((base - base.mean(axis=0)) / np.sqrt(len(base)))
+            size = factors[0] * noise.share / np.sqrt(len(otherwise))
+            numerics = [size * np.where(placed, found, 0.0) for found in otherwise]
         return Expected(np.asarray(experiment.sensor), fixed, np.concatenate(numerics), noise.factor_std)
 
 

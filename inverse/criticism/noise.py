@@ -9,8 +9,9 @@ chance      what base simulations with particles of their own scatter by about t
             (Ledoit & Wolf 2004, J. Multivariate Anal. 88:365)
 guesses     colours that no photograph shows, other drawings of the same simulation
 nuisances   effects of observation in their smallest meaningful sizes
-numerics    the model's own error: as large as pairs of coarse and fine runs say, along what soil could do otherwise
-            (all simulations); its factors, one for pictures and one for forces, are unknown and integrated over
+numerics    the model's own error: so many times all of the above as pairs of coarse and fine runs say; for instruments
+            without a place a size for each stage. Its factors, one for pictures and one for forces, are unknown and
+            integrated over. Without pairs it lies along what soil could do otherwise (all simulations)
 ========== ============================================================================================================
 
 Fine runs also correct coarse ones (Kennedy & O'Hagan 2000, Biometrika 87:1): their mean difference, as far as it stands
@@ -25,6 +26,7 @@ from itertools import product
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import solve_triangular
 from scipy.special import logsumexp
 
 from splatsoil.experiment.base import Candidate, Experiment
@@ -42,7 +44,8 @@ in the cell and cells of 1 and 1.5, 0.8 for second order (Roache 1994); the geom
 DOUBT = 0.5
 """Standard deviation of the logarithm of that factor, which holds both orders."""
 UNMEASURED, NO_PAIRS = 0.2, 1.0
-"""Numerics, over what soil could do otherwise, and the deviation of its logarithm, where there are no pairs."""
+"""Numerics, over what soil could do otherwise (every effect's simulations about the trend, and the base model's about
+their mean), and the deviation of its logarithm, where there are no pairs."""
 STEPS = np.array(list(product(range(6), range(6))))
 """(f, 2) standard deviations by which the logarithms of both factors of the numerics, of placed instruments and of
 others, exceed what is expected. None is less: that most features agree is no proof that the one which counts does."""
@@ -89,7 +92,7 @@ class Noise:
         fixed: (p, p) covariance of all parts but numerics.
         numerics: (p, p) that of numerics of factors 1.
         placed: (p,) scores of instruments that have a place.
-        share: of what soil could do otherwise, that numerics of factor 1 is for these.
+        share: numerics of factor 1 over the other parts, for these; without pairs, over what soil could do otherwise.
         factor_std: standard deviation of the logarithm of the numerics' factor.
         patterns: (k, p) what each observation effect does in its smallest meaningful sizes, by name.
         trend: (m, m) projector on the base simulations' trend.
@@ -182,21 +185,6 @@ def noise_of(
 
     own = scored(base)
     chance = shrunk(rest @ basis) if experiment.chance else np.zeros((count, count))
-    # What soil could do otherwise: every effect's simulations about the trend, and the base model's about their mean.
-    varied_by = [apart(*made) for made in tables.effects.values()] + [own - own.mean(axis=0)]
-    otherwise = _positive(sum(e.T @ e / len(e) for e in varied_by) / len(varied_by) - chance)
-    if len(fine_runs):
-        pairs = apart(fine_runs, fine)
-        share = _share(pairs[:, in_place], *(c[np.ix_(in_place, in_place)] for c in (chance, otherwise)))
-        numerics = np.where(both, share**2 * otherwise, 0.0)
-        scatter = numerics + chance * (1.0 + 1.0 / len(own)) / len(pairs) + 1e-9 * np.eye(count)
-        difference = np.where(in_place, pairs.mean(axis=0), 0.0)
-        correction = np.where(in_place, numerics @ np.linalg.solve(scatter, difference), 0.0)
-        numerics = REMAINING**2 * (numerics + _of_unplaced(experiment, mask, pairs, in_place))
-        share, factor_std = REMAINING * share, DOUBT
-    else:
-        correction, share, factor_std = np.zeros(count), UNMEASURED, NO_PAIRS
-        numerics = share**2 * otherwise
     drawn = {name: scored(table) - scored(tables.reference) for name, table in tables.drawn.items()}
     patterns = {
         c.name: np.array([drawn[p.name] for p in c.parameters if p.name in drawn])
@@ -205,6 +193,24 @@ def noise_of(
     }
     rows = drawings(experiment, tables, candidates)[:, mask] @ basis
     fixed = chance + _instruments(experiment, mask, basis) + rows.T @ rows
+    if len(fine_runs):
+        pairs = apart(fine_runs, fine)
+        # of a fine run, and of the trend there; its covariance is estimated: the mean of an F-distribution
+        free = len(own) - np.trace(hat)
+        scatter = chance * (1.0 + np.sum(trend_of(prior.unit(fine_runs), points) ** 2) / len(pairs))
+        scatter *= free / max(free - 2.0, 1.0)
+        share = _share(pairs[:, in_place], *(c[np.ix_(in_place, in_place)] for c in (fixed, scatter)))
+        numerics = np.where(both, share**2 * fixed, 0.0)
+        difference = np.where(in_place, pairs.mean(axis=0), 0.0)
+        of_mean = numerics + scatter / len(pairs) + 1e-9 * np.eye(count)
+        correction = np.where(in_place, numerics @ np.linalg.solve(of_mean, difference), 0.0)
+        numerics = REMAINING**2 * (numerics + _of_unplaced(experiment, mask, pairs, in_place))
+        share, factor_std = REMAINING * share, DOUBT
+    else:
+        varied_by = [apart(*made) for made in tables.effects.values()] + [own - own.mean(axis=0)]
+        otherwise = _positive(sum(e.T @ e / len(e) for e in varied_by) / len(varied_by) - chance)
+        correction, share, factor_std = np.zeros(count), UNMEASURED, NO_PAIRS
+        numerics = share**2 * otherwise
     return Noise(
         mask=mask,
         mean=mean,
@@ -283,18 +289,14 @@ def _modes(varied: FloatArray, rest: FloatArray, placed: npt.NDArray[np.bool_]) 
     return np.concatenate(columns, axis=1)
 
 
-def _share(apart: FloatArray, chance: FloatArray, otherwise: FloatArray) -> float:
-    """Most likely size of differences (m, p) of fine and coarse runs over what soil could do otherwise."""
+def _share(apart: FloatArray, noise: FloatArray, scatter: FloatArray) -> float:
+    """Size of what fine and coarse runs (m, p) differ by beyond their scatter, over noise, both covariances (p, p)."""
     if not apart.shape[1]:
         return 0.0
-    best, found = -np.inf, 0.0
-    for share in np.geomspace(0.05, 2.0, 20):
-        covariance = 1.25 * chance + share**2 * otherwise + 1e-9 * np.eye(len(chance))
-        _, size = np.linalg.slogdet(covariance)
-        likelihood = -0.5 * (len(apart) * size + float(np.sum(apart * np.linalg.solve(covariance, apart.T).T)))
-        if likelihood > best:
-            best, found = likelihood, float(share)
-    return found
+    root = np.linalg.cholesky(noise + 1e-9 * np.eye(len(noise)))
+    white = solve_triangular(root, apart.T, lower=True)
+    by_chance = np.trace(solve_triangular(root, solve_triangular(root, scatter, lower=True).T, lower=True))
+    return float(np.sqrt(max(np.mean(white**2) - by_chance / len(root), 0.0)))
 
 
 def _of_unplaced(

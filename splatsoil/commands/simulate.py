@@ -45,19 +45,15 @@ class Config:
     container: Literal["bin", "transparent", "open", "heap"] | None = option(
         None, "What holds the soil of the scene plow; a bin of opaque walls if not given.", expert=True
     )
-    depth: float | None = option(
-        None, "Mean depth of the soil in metres (not for the paper's scene, whose surface is a formula).", expert=True
-    )
+    depth: float | None = option(None, "Mean depth of the soil in metres; not of the paper's scene.", expert=True)
     preset: Preset | None = option(None, "Resolution of the solver; small unless given, paper for the paper's scene.")
     seed: int = option(0, "Of surface, appearance and noise; one seed gives one set on one processor.", expert=True)
-    particle_seed: int | None = option(None, "Of the particles' places; drawn by the seed unless given.", expert=True)
+    particle_seed: int | None = option(None, "Of the particles' places; by --seed if not given.", expert=True)
     device: str = option("cpu", "Where to simulate and draw: auto, cpu, cuda:0, …")
-    views: int | None = option(
-        None, "Photographs before anything moves; 40, or all of the set given by --like.", expert=True
-    )
+    views: int | None = option(None, "Photographs beforehand; 40, or those of --like.", expert=True)
     picture_scale: float = option(1.0, "Size of the pictures, as a multiple of the scene's.", expert=True)
-    heights: bool = option(False, "Measure grids of heights, too, as a scanner above the bed does.", expert=True)
-    depth_maps: bool = option(False, "Let the fixed cameras measure depths, too.", expert=True)
+    heights: bool = option(False, "Measure grids of heights, too.", expert=True)
+    depth_maps: bool = option(False, "Measure depths by the fixed cameras, too.", expert=True)
     json: bool = option(False, JSON)
 
 

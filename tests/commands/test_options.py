@@ -39,7 +39,7 @@ GIVEN = {
     "--device cpu --seed 2 --run 'a run' --stop-at-floor --most-effects 3 --json",
     "simulate": "out --friction-angle 31.5 --with cohesion tilt --set cohesion=300 tilt_x=-2 --scene paper --depth "
     "0.09 --preset tiny --seed 4 --particle-seed 5 --views 12 --picture-scale 0.5 --device cuda:0 --like 'a set' "
-    "--container heap --json",
+    "--container heap --heights --depth-maps --json",
     "view": "'a run' --beside base --port 8081 --device cpu",
 }
 

@@ -120,14 +120,16 @@ def test_what_is_set_aside_has_no_say_in_the_models_that_it_judges(make: Make) -
 
 def test_the_noise_holds_what_seeds_scatter_by(make: Make) -> None:
     """Of chance of unit size in every feature and of sensors of half of it, in scores of unit directions."""
-    ratios = []
+    ratios, sizes = [], []
     for seed in WORLDS:
         experiment = make(numerics=0.0, seed=seed)
         found = diagnose(experiment, START, effects=False, seed=seed)
         noise = found.evidence.noise
         drawn = noise.scores(np.array([experiment.predict(START, seed=k) for k in range(5000, 5200)]))
         ratios.append(np.median((drawn.var(axis=0) + 0.25) / np.diag(noise.fixed)))
-        assert np.sqrt(found.expected[found.mask].mean()) == pytest.approx(np.hypot(1.0, 0.5), rel=0.25)
+        sizes.append(np.sqrt(found.expected[found.mask].mean()))
+    # three pairs along two directions: what they differ by scatters
+    assert np.median(sizes) == pytest.approx(np.hypot(1.0, 0.5), rel=0.1)
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.2)
 
 
