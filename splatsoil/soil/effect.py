@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -94,3 +95,20 @@ class Effect:
         """The effect as a measurement set needs it, where its parameters depend on that; itself by default."""
         del measurement
         return self
+
+    def bounded(self, bounds: Mapping[str, tuple[float, float]]) -> Effect:
+        """The effect with other bounds of search and prior for some parameters; what it takes at all stays."""
+
+        def parameter(p: Parameter) -> Parameter:
+            if p.name not in bounds:
+                return p
+            lower, upper = bounds[p.name]
+            default = min(max(p.default, lower), upper)
+            return replace(p, lower=lower, upper=upper, default=default, limits=p.limits or (p.lower, p.upper))
+
+        own: dict[str, Any] = {
+            "__module__": type(self).__module__,
+            "parameters": tuple(map(parameter, self.parameters)),
+        }
+        made: Effect = type(type(self).__name__, (type(self),), own)()
+        return made

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from splatsoil.benchmarks import hidden_worlds
 from splatsoil.benchmarks._hidden import FIELD, KINDS, NOTHING, OBSERVATION, OUTSIDE, Hidden, draw
 from splatsoil.benchmarks._scenes import ANGLES, Scene
 from splatsoil.benchmarks.hidden_worlds import ELSE, main, score, soil_of, table
@@ -99,6 +100,28 @@ def test_numbers_that_make_no_sense_are_refused(tmp_path: Path, wrong: list[str]
     with pytest.raises(ParameterError, match=match):
         main(["--kinds", NOTHING, "--out", str(tmp_path / "worlds"), *wrong])
     assert not (tmp_path / "worlds").exists()
+
+
+def test_a_world_that_newton_fails_on_costs_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Worlds of its group are made alone."""
+    asked, done = [], []
+
+    def plough(group: Any, *_: Any) -> list[None]:
+        asked.append([hidden.name for hidden in group])
+        if "tilt-0" in asked[-1]:
+            raise ValueError("array shapes")
+        return [None] * len(group)
+
+    def judge(name: str, *_: Any) -> None:
+        done.append(name)
+
+    monkeypatch.setattr(hidden_worlds, "ploughed_by_newton", plough)
+    monkeypatch.setattr(hidden_worlds, "photograph_run", lambda *_, **__: None)
+    monkeypatch.setattr(hidden_worlds, "criticise", judge)
+    kinds = ("gravity", "tilt", "cohesion", "viscosity")
+    assert main(["--kinds", *kinds, "--worlds-side-by-side", "3", "--out", str(tmp_path / "worlds")]) == 1
+    assert asked == [["gravity-0", "tilt-0", "cohesion-0"], ["viscosity-0"], ["gravity-0"], ["tilt-0"], ["cohesion-0"]]
+    assert sorted(done) == ["cohesion-0", "gravity-0", "viscosity-0"]
 
 
 def judged(kind: str, verdict: str, members: list[str], sure: float = 0.95) -> dict[str, Any]:

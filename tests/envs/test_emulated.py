@@ -76,6 +76,24 @@ def test_surfaces_are_read_as_they_were_written(tmp_path: Path, monkeypatch: pyt
     assert emulator.main([]) == 2
 
 
+@pytest.mark.slow
+def test_the_file_is_made_by_its_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a few simulations; its pictures change with the friction angle as those of the shipped one do."""
+    torch.set_num_threads(1)
+    monkeypatch.setattr(emulator, "GUESSED", {"one": (("friction_angle",), (), 8)})
+    monkeypatch.setattr(emulator, "STRENGTHS", {"none": None})
+    monkeypatch.setattr(emulator, "STROKE_SIMULATIONS", 12)
+    monkeypatch.setattr(emulator, "PATCH_COMPONENTS", 2)
+    assert emulator.main([str(tmp_path / "made.npz")]) == 0
+    shipped = emulator.surfaces()["one"]
+    monkeypatch.setattr(emulator, "FILE", tmp_path / "made.npz")
+    made = emulator.surfaces.__wrapped__()
+    assert set(made) == {"one", "stroke/none"}
+    points = np.linspace(-0.8, 0.8, 5)[:, None]
+    ours, theirs = (s.mean(points) @ s.patches.T for s in (made["one"], shipped))
+    assert np.corrcoef(ours.ravel(), theirs.ravel())[0, 1] > 0.9
+
+
 def test_what_nothing_emulates_is_refused() -> None:
     with pytest.raises(ParameterError, match="only friction_angle with effects none"):
         gym.make("PlowSandFast-v0", parameters=["friction_angle", "cohesion"], effects=["cohesion"])

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from splatsoil.errors import CombinationError, ParameterError
+from splatsoil.measurement import Measurement
 from splatsoil.soil.element import ElementTest, drive, isotropic_compression, simple_shear, triaxial
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects, library
@@ -305,3 +307,15 @@ def test_a_parameter_belongs_to_one_effect() -> None:
 
     with pytest.raises(ParameterError, match=r"two effects have a parameter named cohesion"):
         Law([library()["cohesion"], Twin()])
+
+
+def test_a_stone_and_a_layer_are_looked_for_within_the_bed() -> None:
+    """A bed of 0.8 x 0.5 x 0.27 m; what the model takes at all stays as it is."""
+    measurement = Measurement.load(Path(__file__).parents[2] / "examples" / "plow-dry")
+    bounds = {"obstacle_x": (-0.4, 0.4), "obstacle_y": (-0.25, 0.25), "layer_depth": (0.005, 0.27)}
+    for name in ("buried_obstacle", "layering"):
+        told = {p.name: p for p in library()[name].parameters}
+        for p in library()[name].for_measurement(measurement).parameters:
+            expected = bounds.get(p.name, (told[p.name].lower, told[p.name].upper))
+            assert (p.lower, p.upper) == pytest.approx(expected)
+            assert p.check(told[p.name].upper) == told[p.name].upper

@@ -33,17 +33,8 @@ class BuriedObstacle(Effect):
 
     def for_measurement(self, measurement: Measurement) -> Effect:
         """The effect with a place that lies within the bed."""
-        half = dict(zip(self.shapes, 0.5 * (measurement.bed.upper - measurement.bed.lower)[:2], strict=True))
-
-        class OfMeasurement(BuriedObstacle):
-            parameters = tuple(
-                replace(p, lower=-float(half[p.name]), upper=float(half[p.name]), limits=(p.lower, p.upper))
-                if p.name in half
-                else p
-                for p in self.parameters
-            )
-
-        return OfMeasurement()
+        half = (0.5 * measurement.bed.extents[:2]).tolist()
+        return self.bounded({name: (-h, h) for name, h in zip(self.shapes, half, strict=True)})
 
     def settings(self, settings: Settings, values: Mapping[str, float]) -> Settings:
         """Place the sphere."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -48,17 +47,7 @@ class Layering(Effect):
 
     def for_measurement(self, measurement: Measurement) -> Effect:
         """The effect with a layer that begins within the bed."""
-        deepest = float((measurement.bed.upper - measurement.bed.lower)[2])
-
-        class OfMeasurement(Layering):
-            parameters = tuple(
-                replace(p, upper=deepest, default=min(p.default, deepest), limits=(p.lower, p.upper))
-                if p.name == "layer_depth"
-                else p
-                for p in self.parameters
-            )
-
-        return OfMeasurement()
+        return self.bounded({"layer_depth": (self.parameters[1].lower, float(measurement.bed.extents[2]))})
 
     def columns(self, settings: Settings, values: Mapping[str, float]) -> Sequence[float]:
         """Excess of the slope over the upper soil's, depth."""

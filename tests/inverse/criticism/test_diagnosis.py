@@ -133,6 +133,16 @@ def test_the_noise_holds_what_seeds_scatter_by(make: Make) -> None:
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.2)
 
 
+def test_checks_expect_what_nobody_knows_of_the_soil(make: Make) -> None:
+    """A guess as far off as 3 grey levels, one of two, adds half of its square to what is expected."""
+    experiment = make(numerics=0.0)
+    guessed = {**experiment.guessed, "guess 1": 10.0 * experiment.guessed["guess 1"]}
+    before, after = (diagnose(e, START, effects=False) for e in (experiment, replace(experiment, guessed=guessed)))
+    added = 0.5 * (guessed["guess 1"] ** 2 - experiment.guessed["guess 1"] ** 2)
+    pictures = before.mask & experiment.layout.placed
+    np.testing.assert_allclose((after.expected - before.expected)[pictures], added[pictures], atol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("probability", "fits", "verdict", "members"),
     [
