@@ -10,8 +10,9 @@ chance      what base simulations with particles of their own scatter by about t
 guesses     colours that no photograph shows, other drawings of the same simulation
 nuisances   effects of observation in their smallest meaningful sizes
 numerics    the model's own error: so many times all of the above as pairs of coarse and fine runs say; for instruments
-            without a place a size for each stage. Its factors, one for pictures and one for forces, are unknown and
-            integrated over. Without pairs it lies along what soil could do otherwise (all simulations)
+            without a place a size for each stage, moderated by the others' (Smyth 2004). Its factors, one for pictures
+            and one for forces, are unknown and integrated over. Without pairs it lies along what soil could do
+            otherwise (all simulations)
 ========== ============================================================================================================
 
 Fine runs also correct coarse ones (Kennedy & O'Hagan 2000, Biometrika 87:1): their mean difference, as far as it stands
@@ -27,7 +28,8 @@ from itertools import product
 import numpy as np
 import numpy.typing as npt
 from scipy.linalg import solve_triangular
-from scipy.special import logsumexp
+from scipy.optimize import brentq
+from scipy.special import digamma, logsumexp, polygamma
 
 from splatsoil.experiment.base import Candidate, Experiment
 
@@ -272,6 +274,19 @@ def shrunk(rows: FloatArray) -> FloatArray:
     return np.asarray((1.0 - share) * covariance + share * np.diag(np.diag(covariance)))
 
 
+def moderated(variances: FloatArray, freedom: int) -> FloatArray:
+    """(k,) sample variances of so many degrees of freedom each, drawn towards what they have in common as far as chance
+    alone explains that they differ (empirical Bayes: Smyth 2004, Stat. Appl. Genet. Mol. Biol. 3:3, section 6.2)."""
+    half = 0.5 * freedom
+    logs = np.log(np.maximum(variances, 1e-12)) - digamma(half) + np.log(half)
+    beyond = float(np.var(logs, ddof=1) - polygamma(1, half)) if len(logs) > 1 else 0.0
+    if beyond <= 0.0:
+        return np.full(len(logs), np.exp(logs.mean()))
+    prior = float(brentq(lambda x: polygamma(1, x) - beyond, 1e-6, 1e6))
+    common = np.exp(logs.mean() + digamma(prior) - np.log(prior))
+    return np.asarray((prior * common + half * variances) / (prior + half))
+
+
 def _modes(varied: FloatArray, rest: FloatArray, placed: npt.NDArray[np.bool_]) -> FloatArray:
     """(n, p) leading modes of placed features, beside them the unplaced ones themselves."""
     n, columns = varied.shape[1], []
@@ -302,16 +317,21 @@ def _share(apart: FloatArray, noise: FloatArray, scatter: FloatArray) -> float:
 def _of_unplaced(
     experiment: Experiment, mask: npt.NDArray[np.bool_], pairs: FloatArray, in_place: npt.NDArray[np.bool_]
 ) -> FloatArray:
-    """(p, p) numerics of instruments without a place, one size for each channel and stage."""
+    """(p, p) numerics of instruments without a place, one size for each channel and stage.
+
+    Few pairs say little of a size: that they agree in one stage is often luck. So sizes are moderated by each other.
+    """
     out = np.zeros((len(in_place),) * 2)
     layout = experiment.layout
     there = np.argwhere(mask & ~layout.placed)
+    if not len(there):
+        return out
     stages = np.array(layout.stages)[there[:, 0]]
     channels, units = (np.array([(s.channel, s.unit) for s in layout.sites])[there[:, 1]]).T
-    own, spread = pairs[:, ~in_place], np.empty(len(there))
-    for stage, channel in set(zip(stages, channels, strict=True)):
-        mine = (stages == stage) & (channels == channel)
-        spread[mine] = np.sqrt(np.mean(own[:, mine] ** 2))
+    own = pairs[:, ~in_place]
+    blocks = [(stages == s) & (channels == c) for s, c in sorted(set(zip(stages, channels, strict=True)))]
+    sizes = moderated(np.array([np.mean(own[:, block] ** 2) for block in blocks]), len(pairs))
+    spread = np.sqrt(np.sum(sizes[:, None] * blocks, axis=0))
     alike = np.where(channels[:, None] == channels[None], STAGE, CHANNEL) * (stages[:, None] == stages[None])
     alike *= units[:, None] == units[None]
     np.fill_diagonal(alike, 1.0)

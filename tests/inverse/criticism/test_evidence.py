@@ -12,7 +12,7 @@ from splatsoil.inverse.criticism.design import LARGEST, Prior, Run, effect_runs,
 from splatsoil.inverse.criticism.diagnosis import diagnose
 from splatsoil.inverse.criticism.emulator import BaseEmulator, IncrementEmulator
 from splatsoil.inverse.criticism.evidence import Comparison
-from splatsoil.inverse.criticism.noise import FACTORS, Noise, shrunk, trend_of
+from splatsoil.inverse.criticism.noise import FACTORS, Noise, moderated, shrunk, trend_of
 
 from splatsoil.experiment.base import Candidate
 from splatsoil.experiment.emulated import EmulatedExperiment
@@ -123,6 +123,24 @@ def test_shrinkage_lowers_the_error_of_a_covariance_from_few_samples() -> None:
         raw += float(np.sum((rows.T @ rows / 8 - truth) ** 2))
         better += float(np.sum((shrunk(rows) - truth) ** 2))
     assert better < 0.7 * raw
+
+
+@pytest.mark.parametrize(("prior", "share"), [(4.0, 0.6), (np.inf, 0.3)])
+def test_moderated_variances_are_nearer_to_those_they_were_drawn_from(prior: float, share: float) -> None:
+    """Variances drawn as Smyth's (2004) hierarchical model has them, then samples of three of each."""
+    rng = np.random.default_rng(0)
+    raw, better = 0.0, 0.0
+    for _ in range(200):
+        truth = 2.0 * (prior / rng.chisquare(prior, 8) if np.isfinite(prior) else np.ones(8))
+        sample = truth * rng.chisquare(3, 8) / 3
+        raw += float(np.sum(np.log(sample / truth) ** 2))
+        better += float(np.sum(np.log(moderated(sample, 3) / truth) ** 2))
+    assert better < share * raw
+
+
+def test_variances_far_apart_stay_as_they_are() -> None:
+    sizes = np.array([1e-6, 1.0, 1e6])
+    np.testing.assert_allclose(moderated(sizes, 3), sizes, rtol=0.3, atol=0.1)
 
 
 def test_sizes_are_log_uniform_from_the_meaningful_one_on_both_sides(candidate: Callable[..., Candidate]) -> None:
