@@ -18,9 +18,10 @@ Flags = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Likeness:
-    """How like what is drawn pictures are where they show soil, by correlation.
+    """How like what is drawn pictures are where they show soil, by robust correlation.
 
-    Exposure and white balance, which cameras need not have in common, do not count.
+    Exposure and white balance, which cameras need not have in common, do not count. Nor do a few pixels, as where a
+    wall of the bin hides soil.
 
     Attributes:
         upright: (v,) correlation of each picture with what is drawn; NaN where it shows no soil.
@@ -31,14 +32,10 @@ class Likeness:
     upside_down: Array
 
     def unlike(self, fixed: int) -> Flags:
-        """Which of the last ``fixed`` pictures differ from the scene by more than it differs from the others.
-
-        Of a picture's variance 1 - ρ² is left unexplained. As much as in the median of the others is the scene's own
-        error. Where a picture leaves more than twice that, most of its error is its own.
-        """
-        left = 1.0 - self.upright**2
-        others = left[:-fixed][np.isfinite(left[:-fixed])]
-        return left[-fixed:] > 2.0 * np.median(others) if len(others) else np.zeros(fixed, dtype=bool)
+        """Which of the last ``fixed`` pictures are less like the scene than any other: a rank test, by which one of
+        v + 1 is said to differ that does not."""
+        others = self.upright[:-fixed][np.isfinite(self.upright[:-fixed])]
+        return self.upright[-fixed:] < np.min(others, initial=1.0) if len(others) else np.zeros(fixed, dtype=bool)
 
     def unrelated(self, fixed: int) -> Flags:
         """Which of the last ``fixed`` pictures are no more like the scene than any picture is upside down.
@@ -87,8 +84,19 @@ def likeness(
 
 
 def _correlation(one: NDArray[np.float32], other: NDArray[np.float32], where: Flags) -> float:
-    """Pearson's, NaN where there are no two values to compare."""
-    a, b = one[where], other[where]
-    if a.size < 2 or np.ptp(a) == 0.0 or np.ptp(b) == 0.0:
+    """By the median absolute deviations of sum and difference (Gnanadesikan & Kettenring 1972, Biometrics 28:81), NaN
+    where there is nothing to compare."""
+
+    def scaled(values: Array) -> Array:
+        away = values - np.median(values)
+        return np.asarray(away / np.median(np.abs(away)))
+
+    def squared(values: Array) -> float:
+        return float(np.median(np.abs(values - np.median(values)))) ** 2
+
+    if np.count_nonzero(where) < 2:
         return float("nan")
-    return float(np.corrcoef(a, b)[0, 1])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        a, b = (scaled(image[where].astype(np.float64)) for image in (one, other))
+        alike, apart = squared(a + b), squared(a - b)
+    return (alike - apart) / (alike + apart) if np.isfinite(alike) else float("nan")
