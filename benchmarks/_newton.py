@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import warp as wp
-from splatsoil.benchmarks._truth import FloatArray
+from splatsoil.benchmarks._common import FloatArray
 
 from splatsoil.errors import MeasurementError, RunError, SimulationError
 from splatsoil.measurement import Measurement
@@ -54,14 +54,12 @@ class Numerics:
         """Edge of the cube of soil that a particle stands for, m: two along a voxel."""
         return 0.5 * self.voxel
 
-    def refined(self, share: float = 0.75) -> Numerics:
-        """Voxels of a share, with steps and iterations in proportion."""
+    def across(self, width: float) -> Numerics:
+        """As these resolve a tool 120 mm wide, one of ``width`` m: nine voxels of the defaults' or more across it, with
+        steps and iterations in proportion."""
+        share = min(1.0, round(width, 4) / WIDTH)
         steps, most = math.ceil(self.substeps / share), math.ceil(self.iterations / share)
         return replace(self, voxel=share * self.voxel, substeps=steps, iterations=most)
-
-    def across(self, width: float) -> Numerics:
-        """As these resolve a tool 120 mm wide, one of ``width`` m: nine voxels of the defaults' or more across it."""
-        return self.refined(min(1.0, round(width, 4) / WIDTH))
 
     @classmethod
     def of(cls, folder: Path) -> Numerics:
@@ -80,7 +78,6 @@ class World:
     """Soil to plough.
 
     Attributes:
-        label: what it is called in the table.
         measurement: its bed, tool and motion.
         angle: friction angle, degrees; one, or (n,) one a particle.
         particles: (n, 3) at frame 0, m.
@@ -95,7 +92,6 @@ class World:
         gravity: (3,) m/s^2; None for the measurement's.
     """
 
-    label: str
     measurement: Measurement = field(repr=False)
     angle: float | FloatArray
     particles: FloatArray = field(repr=False)

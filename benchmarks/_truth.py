@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from scipy.ndimage import gaussian_filter
+from splatsoil.benchmarks._common import FloatArray
 
 from splatsoil.errors import MeasurementError, ParameterError
 from splatsoil.experiment.scene_parts import heading_of, stages_of
@@ -19,8 +20,6 @@ from splatsoil.files import plain, read_npz, write_npz
 from splatsoil.measurement import Measurement
 from splatsoil.reconstruction import HeightField, fill
 from splatsoil.scene import relief_of_particles
-
-FloatArray = npt.NDArray[np.float64]
 
 CELL = 0.01
 """Edge of the cells in which heights are compared, m."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from splatsoil.benchmarks import hidden_worlds
-from splatsoil.benchmarks._hidden import FIELD, KINDS, NOTHING, OBSERVATION, OUTSIDE, Hidden, draw
+from splatsoil.benchmarks._hidden import FIELD, KINDS, NOTHING, OUTSIDE, Hidden, draw
 from splatsoil.benchmarks._scenes import ANGLES, Scene
 from splatsoil.benchmarks.hidden_worlds import ELSE, main, score, soil_of, table
 
@@ -33,7 +33,14 @@ def test_a_truth_is_drawn_by_seed_and_is_an_effect_of_the_library(kind: str) -> 
     assert hidden == again and hidden.angle != other.angle
     assert ANGLES[0] <= hidden.angle <= ANGLES[1]
     assert kind in library() or kind in (NOTHING, *OUTSIDE)
-    assert (hidden.observation() != draw(NOTHING, 0, 1).observation()) == (kind in OBSERVATION)
+    assert (hidden.observation() != draw(NOTHING, 0, 1).observation()) == (kind in ("exposure", "time_offset"))
+
+
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in (NOTHING, *OUTSIDE)])
+def test_sizes_that_the_model_does_not_take_are_not_drawn(kind: str) -> None:
+    law = Law(find_effects([kind]))
+    for number in range(5):
+        law.require_on(draw(kind, number, 1, (15.0, 16.0)).values)
 
 
 @pytest.mark.parametrize("kind", ["layering", FIELD])
@@ -92,13 +99,15 @@ def test_both_solvers_are_told_the_same(kind: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "match"),
-    [(["--voxel", "0"], "--voxel"), (["--voxel", "-0.02"], "--voxel")]
-    + [(["--times", low, high], "--times") for low, high in (("0", "2"), ("3", "2"), ("1", "inf"), ("nan", "2"))],
+    ("words", "says"),
+    [
+        *((["--times", *pair], "--times") for pair in (("0", "2"), ("3", "2"), ("1", "inf"), ("nan", "2"))),
+        (["--solver", "tiny", "--kinds", FIELD], "friction_field: outside of our library"),
+    ],
 )
-def test_numbers_that_make_no_sense_are_refused(tmp_path: Path, wrong: list[str], match: str) -> None:
-    with pytest.raises(ParameterError, match=match):
-        main(["--kinds", NOTHING, "--out", str(tmp_path / "worlds"), *wrong])
+def test_what_makes_no_sense_is_refused(tmp_path: Path, words: list[str], says: str) -> None:
+    with pytest.raises(ParameterError, match=says):
+        main(["--kinds", NOTHING, "--out", str(tmp_path / "worlds"), *words])
     assert not (tmp_path / "worlds").exists()
 
 
@@ -112,12 +121,9 @@ def test_a_world_that_newton_fails_on_costs_no_other(tmp_path: Path, monkeypatch
             raise ValueError("array shapes")
         return [None] * len(group)
 
-    def judge(name: str, *_: Any) -> None:
-        done.append(name)
-
     monkeypatch.setattr(hidden_worlds, "ploughed_by_newton", plough)
     monkeypatch.setattr(hidden_worlds, "photograph_run", lambda *_, **__: None)
-    monkeypatch.setattr(hidden_worlds, "criticise", judge)
+    monkeypatch.setattr(hidden_worlds.Study, "judge", lambda _, hidden: done.append(hidden.name))
     kinds = ("gravity", "tilt", "cohesion", "viscosity")
     assert main(["--kinds", *kinds, "--worlds-side-by-side", "3", "--out", str(tmp_path / "worlds")]) == 1
     assert asked == [["gravity-0", "tilt-0", "cohesion-0"], ["viscosity-0"], ["gravity-0"], ["tilt-0"], ["cohesion-0"]]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from splatsoil.benchmarks import paper_table
-from splatsoil.benchmarks.paper_table import FRAMES, SPACE, Protocol, published_loss, search
+from splatsoil.benchmarks.paper_table import CELLS, FRAMES, SPACE, collect, preset, published_loss, search, table
 
 from splatsoil.files import read_json, write_json
 from splatsoil.mpm import Resolution
@@ -46,7 +46,7 @@ class KnownSight:
 
 
 def trials(sight: Any, out: Path, evaluations: int = 6) -> dict[str, Any]:
-    search(sight, TRUTH, [0, 1], evaluations, out)
+    search(sight, TRUTH, 2, evaluations, out)
     return {f.name: read_json(f) for f in sorted((out / "trials").glob("*.json"))}
 
 
@@ -99,13 +99,11 @@ def test_the_published_loss_is_the_mean_square_over_four_frames() -> None:
 
 
 def test_the_protocol_is_the_papers() -> None:
-    protocol, scene = Protocol(), paper()
-    assert (protocol.angles, protocol.trials, protocol.evaluations) == ((25.0, 30.0, 35.0, 45.0), 10, 10)
+    scene = paper()
     assert len(scene.views) == 40 and {(c.width, c.height) for c in scene.video.values()} == {(1280, 720)}
     assert {p.lower for p in SPACE} == {25.0} and {p.upper for p in SPACE} == {55.0}
     experiment = scene.experiment()
-    cells = (protocol.published_cells, protocol.cells, protocol.truth_cells)
-    theirs, ours, truth = (Resolution.derive(experiment, protocol.preset("some", c)) for c in cells)
+    theirs, ours, truth = (Resolution.derive(experiment, preset(which)) for which in CELLS)
     assert [r.cell for r in (theirs, ours, truth)] == pytest.approx([1.0 / 32.0, 1.0 / 64.0, 1.0 / 87.0])
     for model in (theirs, ours):  # no node of the one is a node of the other inside the bed
         nodes = [np.arange(1, round(1.0 / r.cell)) * r.cell for r in (model, truth)]
@@ -117,10 +115,9 @@ def test_errors_are_counted(tmp_path: Path) -> None:
         for way in ("published", "ours"):
             told = {"estimate": 35.0 + error, "low": 34.5, "high": 36.5}
             write_json(tmp_path / "trials" / f"35-{trial}-{way}.json", {way: told, "features": None})
-    result = paper_table.collect(Protocol(angles=(35.0,), trials=2), tmp_path)
-    (first, _) = result["entries"]
+    entries = collect([35.0], 2, tmp_path)
+    first = entries[0]
     assert (first["mae"], first["bias"], first["width_90"], first["coverage_90"]) == (1.5, -0.5, 2.0, 1.0)
     assert first["std"] == pytest.approx(0.5**0.5) and first["scatter"] == pytest.approx(4.5**0.5)
-    assert "| 35° | 1.24 ± 0.96° | 1.50 ± 0.71° |" in paper_table.table(result)
-    one = paper_table.collect(Protocol(angles=(35.0,), trials=1), tmp_path)
-    assert "| 35° | 1.24 ± 0.96° | 1.00° |" in paper_table.table(one), "one trial has no spread"
+    assert len(entries) == 2 and "| 35° | 1.24 ± 0.96° | 1.50 ± 0.71° |" in table(entries)
+    assert "| 35° | 1.24 ± 0.96° | 1.00° |" in table(collect([35.0], 1, tmp_path)), "one trial has no spread"
