@@ -2,8 +2,8 @@
 
 The independent solver is Newton's implicit MPM (``newton`` on PyPI; extra ``independent``), run until it converges, on
 scenes that are drawn by seed: flat, wavy and sloping beds of loose and dense sand, blades of two widths and rakes, a
-drum that turns, friction angles from 22 to 48 degrees; or on measurement sets with true particles. What it simulates is
-kept, a file a scene, and a second call continues from there.
+drum that turns, friction angles from 22 to 48 degrees; or what measurement sets with true particles have of it. What it
+simulates is kept, a file a scene, and a second call continues from there.
 
 Our solver starts from particles that fill the same surface and runs at the true angle and at others. Compared are
 heights in patches wider than seed-to-seed scatter, the angle whose heights lie nearest, soil cut and heaped up, and
@@ -13,7 +13,7 @@ on finer cells and with one of its numbers changed at a time; neither needs the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -42,85 +42,43 @@ OFFSETS = (-6.0, -3.0, 3.0, 6.0)
 """Of the angles of our runs from the true one, degrees."""
 
 
-@dataclass(frozen=True)
-class Case:
-    """Soil that both solvers plough.
+def world_of(scene: Scene) -> World:
+    """As Newton takes it."""
+    setup, spacing = scene.setup(), Numerics().spacing
+    x = fill(setup.surface, setup.bed, spacing, seed=scene.seed)
+    return World(setup.experiment(), scene.angle, x, spacing)
 
-    Attributes:
-        name: of its file.
-        truth: bed, tool, motion and true parameters; its particles are used only if ``made``.
-        numerics: of the independent solver.
-        frames: at which solvers are compared, from 1 on.
-        about: what its file must state, JSON-able.
-        start: (n, 3) particles at frame 0 by their spacing, m.
-        made: whether the truth comes with particles that these numerics made.
+
+def ploughed(cases: Mapping[str, Scene], out: Path, device: str, side_by_side: int, say: Clock) -> dict[str, Truth]:
+    """Scenes by their names with the independent solver's particles and force; those that the folder does not have are
+    simulated, so many at a time.
+
+    Raises:
+        ParameterError: the folder has another scene of a name, or one of other numerics.
     """
-
-    name: str
-    truth: Truth
-    numerics: Numerics
-    frames: tuple[int, ...]
-    about: Mapping[str, Any]
-    start: Callable[[float], FloatArray]
-    made: bool = False
-
-    @classmethod
-    def drawn(cls, name: str, scene: Scene) -> Case:
-        """Of a scene."""
-        setup, numerics = scene.setup(), Numerics()
-        return cls(
-            name,
-            Truth(setup.experiment(), {}, 0.0, {"friction_angle": scene.angle}, ()),
-            numerics,
-            FRAMES,
-            {"scene": asdict(scene), "numerics": asdict(numerics)},
-            lambda spacing: fill(setup.surface, setup.bed, spacing, seed=scene.seed),
-        )
-
-    @classmethod
-    def of_set(cls, folder: Path) -> Case:
-        """Of a measurement set; made already if its particles are of converged numerics, scaled to its tool's width.
-
-        A tool's width is its second longest edge, as for our own solver.
-        """
-        truth = Truth.load(folder)
-        name, extents = truth.measurement.name, truth.measurement.tool.mesh.extents
-        numerics = Numerics().across(float(np.sort(extents)[1]))
-        try:
-            made = Numerics.of(folder) == numerics and truth.force is not None
-        except MeasurementError:
-            made = False
-        about = {"set": name, **truth.values, "numerics": asdict(numerics)}
-        return cls(name, truth, numerics, truth.frames, about, lambda spacing: truth.start(spacing, 0), made)
-
-    def world(self) -> World:
-        """As Newton takes it."""
-        values, spacing = self.truth.values, self.numerics.spacing
-        angle, cohesion = values["friction_angle"], values.get("cohesion", 0.0)
-        return World(self.truth.measurement, angle, self.start(spacing), spacing, cohesion=cohesion)
-
-    def kept(self, out: Path) -> Truth:
-        """With the independent solver's particles and force; ParameterError where the file is of another case."""
-        return self.truth if self.made else Truth.saved(out / f"{self.name}.npz", self.about, self.truth)
+    numerics = Numerics()
+    about = {name: {"scene": asdict(scene), "numerics": asdict(numerics)} for name, scene in cases.items()}
+    blank = {
+        name: Truth(scene.setup().experiment(), {}, 0.0, {"friction_angle": scene.angle}, ())
+        for name, scene in cases.items()
+    }
+    missing = [name for name in cases if not (out / f"{name}.npz").is_file()]
+    for group in (missing[k : k + side_by_side] for k in range(0, len(missing), side_by_side)):
+        say(f"{', '.join(group)}: begun")
+        worlds = [world_of(cases[name]) for name in group]
+        for name, world, run in zip(group, worlds, plough(worlds, numerics, FRAMES, device), strict=True):
+            particles = {0: world.particles, **run.particles}
+            made = replace(blank[name], particles=particles, volume=world.spacing**3, force=run.force)
+            made.save(out / f"{name}.npz", about[name])
+    return {name: Truth.saved(out / f"{name}.npz", about[name], truth) for name, truth in blank.items()}
 
 
-def plough_missing(cases: Sequence[Case], out: Path, device: str, side_by_side: int, say: Clock) -> None:
-    """Simulate the cases that the folder does not have by the independent solver, so many at a time."""
-    alike: dict[Any, list[Case]] = {}
-    for case in cases:
-        if (out / f"{case.name}.npz").is_file():
-            case.kept(out)  # another case of this name is refused now, not at the end
-        elif not case.made:
-            bed = case.truth.measurement.bed
-            floor = (float(bed.lower[2]), bed.floor_friction)
-            alike.setdefault((case.numerics, case.frames, case.truth.measurement.frame_rate, floor), []).append(case)
-    for group in (g[k : k + side_by_side] for g in alike.values() for k in range(0, len(g), side_by_side)):
-        worlds, names = [case.world() for case in group], ", ".join(case.name for case in group)
-        say(f"{names}: {sum(len(w.particles) for w in worlds)} particles")
-        runs = plough(worlds, group[0].numerics, group[0].frames, device)
-        for case, world, run in zip(group, worlds, runs, strict=True):
-            made = replace(case.truth, particles={0: world.particles, **run.particles}, volume=world.spacing**3)
-            replace(made, force=run.force).save(out / f"{case.name}.npz", case.about)
+def of_set(folder: Path) -> Truth:
+    """A measurement set with true particles; MeasurementError where it lacks them, or the force."""
+    truth = Truth.load(folder)
+    if truth.force is None:
+        raise MeasurementError("the benchmark needs the true force", file=folder)
+    return truth
 
 
 @dataclass(frozen=True)
@@ -327,25 +285,27 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--side-by-side", type=at_least(1), default=4, help="scenes that Newton ploughs at a time")
     options = parser.parse_args(arguments)
     count = options.count if options.count is not None else 0 if options.sets else 6
-    cases = [Case.drawn(f"scene-{options.seed}-{k}", s) for k, s in enumerate(islice(scenes(options.seed), count))]
-    cases += [Case.of_set(folder) for folder in options.sets]
-    if not cases:
+    drawn = {f"scene-{options.seed}-{k}": scene for k, scene in enumerate(islice(scenes(options.seed), count))}
+    truths = {truth.measurement.name: truth for truth in map(of_set, options.sets)}
+    if not drawn and not truths:
         raise ParameterError("there is nothing to compare: give --count or --sets")
     hush()
     say, preset = Clock(), options.preset
-    plough_missing(cases, options.out, options.device, options.side_by_side, say)
+    truths |= ploughed(drawn, options.out, options.device, options.side_by_side, say)
     result: dict[str, Any] = {"made_by": stamp(options.device), "seeds": options.seeds, "preset": preset, "cases": {}}
-    for case in cases:
-        scan = Scanner(case.kept(options.out), range(options.seeds), options.device)
-        base = Resolution.derive(scan.truth.measurement, preset)
+    for name, truth in truths.items():
+        scan = Scanner(truth, range(options.seeds), options.device)
+        base = Resolution.derive(truth.measurement, preset)
         scanned = scan(base, OFFSETS)
-        found = {**case.about, "agreement": agreement(scan.truth, scanned)}
+        found: dict[str, Any] = {"agreement": agreement(truth, scanned)}
+        if name in drawn:
+            found["scene"] = asdict(drawn[name])
         if options.changes:
             found["changes"] = sensitivity(scan, base, scanned)
         if options.cells:
             found["convergence"] = convergence(scan, preset, options.cells)
-        result["cases"][case.name] = found
+        result["cases"][name] = found
         write_json(options.out / "result.json", result)
-        say(f"{case.name}: compared")
+        say(f"{name}: compared")
     tell(options, result, table(result))
     return 0

@@ -32,13 +32,7 @@ def lattice(
 
 
 def resolution(
-    cell: float,
-    fastest: float,
-    *,
-    density: float,
-    young: float,
-    transport: float = 0.1,
-    way: float | None = None,
+    cell: float, fastest: float, *, density: float, young: float, transport: float = 0.1, way: float | None = None
 ) -> Resolution:
     """Two particles along a cell's edge, one step a frame; soil at ``fastest`` m/s goes ``transport`` cells in it.
 

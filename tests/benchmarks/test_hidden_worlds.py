@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from splatsoil.benchmarks import hidden_worlds
-from splatsoil.benchmarks._hidden import FIELD, KINDS, NOTHING, OUTSIDE, Hidden, draw
+from splatsoil.benchmarks._hidden import FIELD, KINDS, NOTHING, OUTSIDE, draw
 from splatsoil.benchmarks._scenes import ANGLES, Scene
 from splatsoil.benchmarks.hidden_worlds import ELSE, main, score, soil_of, table
 
@@ -18,13 +18,6 @@ from splatsoil.mpm.simulate import base_settings
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects, library
 from splatsoil.soil.settings import FRICTION_ANGLE
-
-WAVY = Scene(seed=3, angle=33.0)
-
-
-def placed(hidden: Hidden, **scene: Any) -> Hidden:
-    """The same hidden in another scene."""
-    return replace(hidden, scene=replace(WAVY, **scene))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -144,18 +137,24 @@ def judged(kind: str, verdict: str, members: list[str], sure: float = 0.95) -> d
         "estimates": {"friction_angle": {"value": 31.0, "std": 1.25}},
         "seconds": 60.0,
     }
-    hidden = placed(draw(kind, 0, 1), angle=32.0)
+    hidden = replace(draw(kind, 0, 1), scene=Scene(seed=3, angle=32.0))
     return score(replace(hidden, values={"tilt_x": 4.0} if kind == "tilt" else {}), {"seconds": 30.0}, told)
 
 
-def test_right_is_what_claims_the_truth() -> None:
-    assert judged(NOTHING, "adequate", [])["right"]
-    assert not judged(NOTHING, "missing", ["tilt"])["right"]
-    assert judged("tilt", "one of", ["gravity", "tilt"])["right"]
-    assert not judged("tilt", "undecided", ["tilt"])["right"], "what may be missing is not named"
-    assert not judged("tilt", "adequate", [])["right"]
-    assert all(judged(kind, ELSE, ["tilt"])["right"] for kind in OUTSIDE)
-    assert not any(judged(kind, "missing", ["tilt"])["right"] for kind in OUTSIDE)
+@pytest.mark.parametrize(
+    ("kind", "verdict", "members", "right"),
+    [
+        (NOTHING, "adequate", [], True),
+        (NOTHING, "missing", ["tilt"], False),
+        ("tilt", "one of", ["gravity", "tilt"], True),
+        ("tilt", "undecided", ["tilt"], False),  # what may be missing is not named
+        ("tilt", "adequate", [], False),
+        *((kind, ELSE, ["tilt"], True) for kind in OUTSIDE),
+        *((kind, "missing", ["tilt"], False) for kind in OUTSIDE),
+    ],
+)
+def test_right_is_what_claims_the_truth(kind: str, verdict: str, members: list[str], right: bool) -> None:
+    assert judged(kind, verdict, members)["right"] is right
 
 
 def test_names_are_counted_against_what_is_hidden() -> None:

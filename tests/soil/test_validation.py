@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from splatsoil.benchmarks._validation.element import ALLOWED, strength
+from splatsoil.benchmarks._validation.element import ALLOWED, inertia, strength
 from splatsoil.benchmarks._validation.sand import LADDER, LIMITS, from_one_to_another, karlsruhe
 
 from splatsoil.soil.element import triaxial
@@ -31,6 +31,13 @@ CRITICAL = 33.1
 @pytest.mark.parametrize("cohesion", [0.0, 300.0])
 def test_strength_is_exact_in_the_test_a_matching_is_named_after(matching: Matching, cohesion: float) -> None:
     found, exact = strength(matching, cohesion)
+    assert found == pytest.approx(exact, rel=ALLOWED)
+
+
+@pytest.mark.parametrize("inertial_number", [0.01, 0.279, 3.0])
+def test_friction_follows_the_inertial_number(inertial_number: float) -> None:
+    """mu(I) of glass beads (Jop et al. 2006)."""
+    found, exact = inertia(inertial_number)
     assert found == pytest.approx(exact, rel=ALLOWED)
 
 
