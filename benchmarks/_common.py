@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
+from splatsoil.envs.devices import resolve_device
 
 from splatsoil import __version__
 from splatsoil.errors import ParameterError, RunError
@@ -35,16 +36,6 @@ BESIDE = ("splatsoil.envs", "splatsoil.inverse")
 """All that a benchmark's numbers may depend on: parts of the package, and packages beside it."""
 PACKAGES = ("numpy", "torch", "warp-lang", "newton")
 """Packages whose versions are stated."""
-
-
-def here(name: str) -> str:
-    """A device that is here, for an argument parser."""
-    from splatsoil.envs.devices import resolve_device
-
-    try:
-        return resolve_device(name)
-    except ParameterError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def at_least(least: int) -> Callable[[str], int]:
@@ -70,7 +61,7 @@ class Formatter(argparse.RawDescriptionHelpFormatter):
 def parser_of(module_doc: str | None, out: str = "") -> argparse.ArgumentParser:
     """An argument parser with the option ``--device``, and where results have a folder ``--out`` and ``--json``."""
     parser = argparse.ArgumentParser(description=module_doc, formatter_class=Formatter)
-    parser.add_argument("--device", type=here, default="cpu", help="cpu or cuda:0")
+    parser.add_argument("--device", type=resolve_device, default="cpu", help="cpu or cuda:0")
     if out:
         parser.add_argument("--out", type=Path, default=Path(out), help="folder of results, to continue from")
         parser.add_argument("--json", action="store_true", help="print one JSON object instead of tables")
@@ -132,7 +123,7 @@ def keep_to_one_protocol(out: Path, described: Mapping[str, Any]) -> None:
     Raises:
         ParameterError: the folder contains results of another protocol.
     """
-    file, protocol = out / "protocol.json", json.loads(json.dumps(dict(described)))
+    file, protocol = out / "protocol.json", plain(dict(described))
     if file.is_file() and read_json(file) != protocol:
         raise ParameterError(f"{out}: holds results of another protocol or other sources; choose another --out")
     write_json(file, protocol)

@@ -27,13 +27,10 @@ def test_a_truth_is_drawn_by_seed_and_is_an_effect_of_the_library(kind: str) -> 
     assert ANGLES[0] <= hidden.angle <= ANGLES[1]
     assert kind in library() or kind in (NOTHING, *OUTSIDE)
     assert (hidden.observation() != draw(NOTHING, 0, 1).observation()) == (kind in ("exposure", "time_offset"))
-
-
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in (NOTHING, *OUTSIDE)])
-def test_sizes_that_the_model_does_not_take_are_not_drawn(kind: str) -> None:
-    law = Law(find_effects([kind]))
-    for number in range(5):
-        law.require_on(draw(kind, number, 1, (15.0, 16.0)).values)
+    if kind in library():
+        law = Law(find_effects([kind]))
+        for number in range(5):
+            law.require_on(draw(kind, number, 1, (15.0, 16.0)).values)  # refuses what the model does not take
 
 
 @pytest.mark.parametrize("kind", ["layering", FIELD])
@@ -51,9 +48,7 @@ def test_no_photograph_shows_a_stone_and_no_tool_meets_one() -> None:
     for number in range(16):
         hidden = draw("buried_obstacle", number, 3)
         x, y, z, radius = hidden.soil["obstacle"]
-        over = np.array(
-            [[x + radius * a, y + radius * b] for a in np.linspace(-1, 1, 9) for b in np.linspace(-1, 1, 9)]
-        )
+        over = [x, y] + radius * np.stack(np.meshgrid(*[np.linspace(-1, 1, 9)] * 2), axis=-1).reshape(-1, 2)
         setup = hidden.scene.setup()
         assert setup.surface.sample(over).min() - (z + radius) > 0.014
         lowest = min(setup.tool.bounds(time)[0][2] for time in np.arange(0.0, 4.0, 0.1))
