@@ -32,7 +32,7 @@ from splatsoil.benchmarks._common import (
     tell,
     with_section,
 )
-from splatsoil.benchmarks._truth import CELL, Truth
+from splatsoil.benchmarks._truth import CELL, Truth, reconstructed
 from splatsoil.inverse.criticism.design import Prior, Run
 from splatsoil.inverse.criticism.diagnosis import BASE, FINE, PAIRS, STEP
 from splatsoil.inverse.criticism.noise import Noise, Tables, noise_of, trend_of
@@ -48,7 +48,6 @@ from splatsoil.model import Model
 from splatsoil.mpm import PRESETS
 from splatsoil.parameters import Parameter
 from splatsoil.quiet import hush
-from splatsoil.reconstruction import Reconstruction, reconstruct
 from splatsoil.soil.library import library
 from splatsoil.synthetic import make_set, plow
 
@@ -244,13 +243,11 @@ def table(rows: Iterable[Mapping[str, Any]]) -> str:
 
 def measure(effects: Sequence[str], preset: str, seeds: int, device: str, out: Path) -> list[dict[str, Any]]:
     """`left` of the effects of these names, or of all; what is not in the folder is made."""
-    place, made, say = out / "set", out / "reconstruction", Clock()
+    place, say = out / "set", Clock()
     if not (place / "truth.json").is_file():
         make_set(place, plow(WORLD), friction_angle=ANGLE, preset=preset, seed=WORLD, device=device)
     measurement = Measurement.load(place)
-    if not (made / "reconstruction.json").is_file():
-        reconstruct(measurement, preset=preset, device=device).save(made)
-    reconstruction = Reconstruction.load(made)
+    reconstruction = reconstructed(measurement, out / "reconstruction", preset, device)
     known = replace(reconstruction, surface=plow(WORLD).surface)
     prepared: list[Any] = []
     for kind, start in ((TrueSoil, known), (PlowExperiment, reconstruction)):

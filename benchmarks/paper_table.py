@@ -37,6 +37,7 @@ from splatsoil.benchmarks._common import (
     tell,
 )
 from splatsoil.benchmarks._simulations import FEWEST, density_of
+from splatsoil.benchmarks._truth import reconstructed
 from splatsoil.inverse.bayesopt import BayesianOptimiser
 
 from splatsoil.comparison import Comparator
@@ -47,7 +48,7 @@ from splatsoil.model import Model
 from splatsoil.mpm import PRESETS, Preset, Resolution, simulate_together
 from splatsoil.parameters import ParameterSpace
 from splatsoil.quiet import hush
-from splatsoil.reconstruction import Reconstruction, reconstruct
+from splatsoil.reconstruction import Reconstruction
 from splatsoil.soil.settings import FRICTION_ANGLE
 from splatsoil.synthetic import make_set, paper
 
@@ -119,15 +120,13 @@ def published_loss(comparator: Comparator, images: Images) -> float:
 
 def world(angle: float, picture_scale: float, device: str, out: Path) -> tuple[Measurement, Reconstruction]:
     """An experiment and its reconstruction, from the folder or made and kept there."""
-    folder, kept = out / "worlds" / f"{angle:g}", out / "reconstructions" / f"{angle:g}"
+    folder = out / "worlds" / f"{angle:g}"
     if not (folder / "truth.json").is_file():
         setup = paper() if picture_scale == 1.0 else paper().resized(picture_scale)
         other = 1_000_003 + round(10 * angle)
         make_set(folder, setup, friction_angle=angle, preset=preset("truth"), particle_seed=other, device=device)
     measurement = Measurement.load(folder)
-    if not (kept / "reconstruction.json").is_file():
-        reconstruct(measurement, preset="small", device=device).save(kept)
-    return measurement, Reconstruction.load(kept)
+    return measurement, reconstructed(measurement, out / "reconstructions" / folder.name, "small", device)
 
 
 class Trial:
