@@ -1,4 +1,4 @@
-"""What benchmarks share: options, progress, where results go, and what they were made with."""
+"""What benchmarks share: options, progress, tables, and what a result was made with."""
 
 from __future__ import annotations
 
@@ -9,12 +9,16 @@ import os
 import platform
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from splatsoil.envs.devices import resolve_device
 
 from splatsoil import __version__
 from splatsoil.errors import ParameterError, RunError
@@ -24,22 +28,14 @@ from splatsoil.threads import cores
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: All that a benchmark's numbers may depend on: parts of the package, and packages beside it.
+FloatArray = npt.NDArray[np.float64]
+
 PARTS = ("measurement", "splats", "reconstruction", "soil", "mpm", "scene", "experiment", "synthetic")
 FILES = ("parameters.py", "model.py", "comparison.py", "robust_loss.py")
 BESIDE = ("splatsoil.envs", "splatsoil.inverse")
-#: Packages whose versions are stated.
+"""All that a benchmark's numbers may depend on: parts of the package, and packages beside it."""
 PACKAGES = ("numpy", "torch", "warp-lang", "newton")
-
-
-def here(name: str) -> str:
-    """A device that is here, for an argument parser."""
-    from splatsoil.envs.devices import resolve_device
-
-    try:
-        return resolve_device(name)
-    except ParameterError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
+"""Packages whose versions are stated."""
 
 
 def at_least(least: int) -> Callable[[str], int]:
@@ -62,17 +58,56 @@ class Formatter(argparse.RawDescriptionHelpFormatter):
         return action.help if unsaid else f"{action.help} (default: %(default)s)"
 
 
-def parser_of(module_doc: str | None) -> argparse.ArgumentParser:
-    """An argument parser that shows a module's text as it is and defaults, with the option ``--device``."""
+def parser_of(module_doc: str | None, out: str = "") -> argparse.ArgumentParser:
+    """An argument parser with the option ``--device``, and where results have a folder ``--out`` and ``--json``."""
     parser = argparse.ArgumentParser(description=module_doc, formatter_class=Formatter)
-    parser.add_argument("--device", type=here, default="cpu", help="cpu or cuda:0")
+    parser.add_argument("--device", type=resolve_device, default="cpu", help="cpu or cuda:0")
+    if out:
+        parser.add_argument("--out", type=Path, default=Path(out), help="folder of results, to continue from")
+        parser.add_argument("--json", action="store_true", help="print one JSON object instead of tables")
     return parser
 
 
-def output_options(parser: argparse.ArgumentParser) -> None:
-    """Options that say where results go."""
-    parser.add_argument("--out", type=Path, help="folder for result.json, table.md and figures")
-    parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+def tell(
+    options: argparse.Namespace, result: Mapping[str, Any], text: str, figures: Mapping[str, Figure] | None = None
+) -> None:
+    """Keep a result, its text and its figures by file name in ``options.out``, and print the one or the other."""
+    write_json(options.out / "result.json", dict(result))
+    write_text(options.out / "table.md", text + "\n")
+    for name, figure in (figures or {}).items():
+        write_figure(options.out / name, figure)
+    print(json.dumps(plain(dict(result)), indent=1) if options.json else text)
+
+
+def write_figure(file: Path, figure: Figure) -> None:
+    """A figure in the format of the file's name."""
+    stream = io.BytesIO()
+    figure.savefig(stream, format=file.suffix[1:] or "png", dpi=110, bbox_inches="tight")
+    write_bytes(file, stream.getvalue())
+
+
+def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table."""
+    lines = [f"| {' | '.join(cells)} |" for cells in (head, *rows)]
+    return "\n".join([lines[0], "|---" * len(head) + "|", *lines[1:]])
+
+
+def with_section(page: Path, name: str, text: str) -> str:
+    """A page's text with what stands between its two lines ``<!-- NAME: … -->`` and ``<!-- NAME: end -->`` replaced.
+
+    Raises:
+        RunError: the page cannot be read, or does not have each of the lines once.
+    """
+    first, last = f"<!-- {name}: written by the command, what stands here is overwritten -->", f"<!-- {name}: end -->"
+    try:
+        old = page.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise RunError(f"{page}: cannot be read as text ({error}); choose another page") from error
+    before, begin, rest = old.partition(f"{first}\n")
+    _, end, after = rest.partition(last)
+    if not begin or not end or old.count(first) + old.count(last) > 2:
+        raise RunError(f"{page}: has no lines {first!r} and {last!r}, once each, to write between")
+    return f"{before}{begin}{text}\n{end}{after}"
 
 
 def sources(others: Iterable[Path] = ()) -> str:
@@ -88,7 +123,7 @@ def keep_to_one_protocol(out: Path, described: Mapping[str, Any]) -> None:
     Raises:
         ParameterError: the folder contains results of another protocol.
     """
-    file, protocol = out / "protocol.json", json.loads(json.dumps(dict(described)))
+    file, protocol = out / "protocol.json", plain(dict(described))
     if file.is_file() and read_json(file) != protocol:
         raise ParameterError(f"{out}: holds results of another protocol or other sources; choose another --out")
     write_json(file, protocol)
@@ -136,58 +171,11 @@ def _processor() -> str:
     return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "unknown processor")
 
 
-def write_result(out: Path, result: Mapping[str, Any], table: str, figures: Mapping[str, Figure]) -> None:
-    """A benchmark's folder, each file whole or not there."""
-    write_json(out / "result.json", plain(dict(result)))
-    write_text(out / "table.md", table + "\n")
-    for name, figure in figures.items():
-        write_figure(out / name, figure)
-
-
-def write_figure(file: Path, figure: Figure) -> None:
-    """A figure in the format of the file's name."""
-    stream = io.BytesIO()
-    figure.savefig(stream, format=file.suffix[1:] or "png", dpi=110, bbox_inches="tight")
-    write_bytes(file, stream.getvalue())
-
-
-def with_section(page: Path, name: str, text: str) -> str:
-    """A page's text with what stands between its two lines ``<!-- NAME: … -->`` and ``<!-- NAME: end -->`` replaced.
-
-    Raises:
-        RunError: the page cannot be read, or does not have each of the lines once.
-    """
-    first, last = f"<!-- {name}: written by the command, what stands here is overwritten -->", f"<!-- {name}: end -->"
-    try:
-        old = page.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise RunError(f"{page}: cannot be read as text ({error}); choose another page") from error
-    before, begin, rest = old.partition(f"{first}\n")
-    _, end, after = rest.partition(last)
-    if not begin or not end or old.count(first) + old.count(last) > 2:
-        raise RunError(f"{page}: has no lines {first!r} and {last!r}, once each, to write between")
-    return f"{before}{begin}{text}\n{end}{after}"
-
-
-def ticker(what: str) -> Callable[[int, int], None]:
-    """Progress as lines on stderr, one each tenth."""
-    last = -1
-
-    def report(done: int, total: int) -> None:
-        nonlocal last
-        tenth = 10 * done // max(total, 1)
-        if tenth != last:
-            last = tenth
-            print(f"{what}: {done} of {total}", file=sys.stderr, flush=True)
-
-    return report
-
-
 class Clock:
-    """Says on stderr what goes on, and how long after the start; several processes may share one."""
+    """Says on stderr what goes on, and how long after the start."""
 
     def __init__(self) -> None:
-        self.began = time.time()
+        self.began = time.monotonic()
 
     def __call__(self, what: str) -> None:
-        print(f"{time.time() - self.began:7.0f} s  {what}", file=sys.stderr, flush=True)
+        print(f"{time.monotonic() - self.began:7.0f} s  {what}", file=sys.stderr, flush=True)

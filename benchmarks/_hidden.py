@@ -42,7 +42,6 @@ class Hidden:
         values: the effect's parameters; none of the kinds without.
         soil: what differs from plain sand, as Newton takes it.
         gravity: (3,) m/s^2, likewise; None for what the set says.
-        times: range of an effect's size, over the smallest meaningful one.
     """
 
     kind: str
@@ -52,7 +51,6 @@ class Hidden:
     values: Mapping[str, float] = field(default_factory=dict)
     soil: Mapping[str, Any] = field(default_factory=dict)
     gravity: tuple[float, float, float] | None = None
-    times: tuple[float, float] = TIMES
 
     @property
     def name(self) -> str:
@@ -69,11 +67,6 @@ class Hidden:
         """Of surface, looks, particles and noise."""
         return self.scene.seed
 
-    def within(self, rng: np.random.Generator, least: float, most: float) -> Hidden:
-        """The same with an angle between these, and within the range of all, so that no soil leaves it."""
-        angle = float(rng.uniform(max(least, ANGLES[0]), min(most, ANGLES[1])))
-        return replace(self, scene=replace(self.scene, angle=angle))
-
     def observation(self) -> Observation:
         """How the cameras err."""
         if not self.values:
@@ -82,117 +75,121 @@ class Hidden:
         return law.observation(law.require_on(self.values))
 
 
-def _same(name: str) -> Callable[[np.random.Generator, Hidden], Hidden]:
-    """An effect whose parameter Newton takes by the same name and in the same unit."""
+@dataclass(frozen=True)
+class Stream:
+    """Random numbers, and the range of effects' sizes over the smallest meaningful one."""
 
-    def hide(rng: np.random.Generator, hidden: Hidden) -> Hidden:
-        size = _size(rng, hidden, name)
-        return replace(hidden, size=size, values={name: size}, soil={name: size})
+    rng: np.random.Generator
+    times: tuple[float, float]
+
+    def value(self, name: str) -> float:
+        """Of an effect's parameter: log-uniform in the range of sizes, on either side of off where it has two, and at
+        most what the model takes."""
+        candidate = candidate_of(library()[name])
+        assert candidate is not None
+        p = candidate.measure
+        size = p.meaningful * float(np.exp(self.rng.uniform(*np.log(self.times))))
+        return float(np.clip((p.off or 0.0) + size * self.sign(p.sign), p.lower, p.upper))
+
+    def sign(self, given: int = 0) -> float:
+        """One of a side, either where none is given."""
+        return float(given or self.rng.choice([-1.0, 1.0]))
+
+    def within(self, hidden: Hidden, least: float, most: float) -> Hidden:
+        """The same with an angle between these, and within the range of all, so that no soil leaves it."""
+        angle = float(self.rng.uniform(max(least, ANGLES[0]), min(most, ANGLES[1])))
+        return replace(hidden, scene=replace(hidden.scene, angle=angle))
+
+
+def _effect(name: str, parameter: str = "", *, of_soil: bool = True) -> Callable[[Stream, Hidden], Hidden]:
+    """An effect of one parameter, which Newton takes by the same name and in the same unit where it is of the soil."""
+
+    def hide(stream: Stream, hidden: Hidden) -> Hidden:
+        size = stream.value(name)
+        return replace(hidden, size=size, values={parameter or name: size}, soil={name: size} if of_soil else {})
 
     return hide
 
 
-def _dilatancy(rng: np.random.Generator, hidden: Hidden) -> Hidden:
+def _dilatancy(stream: Stream, hidden: Hidden) -> Hidden:
     # associated flow is the most that any soil has
-    size = min(_size(rng, hidden, "dilatancy"), hidden.angle)
+    size = min(stream.value("dilatancy"), hidden.angle)
     return replace(hidden, size=size, values={"dilatancy_angle": size}, soil={"dilatancy": size / hidden.angle})
 
 
-def _tool_friction(rng: np.random.Generator, hidden: Hidden) -> Hidden:
-    change = max(_size(rng, hidden, "tool_friction"), -NOTED)
+def _tool_friction(stream: Stream, hidden: Hidden) -> Hidden:
+    change = stream.value("tool_friction")
     size = NOTED + change
     return replace(hidden, size=size, values={"tool_friction_change": change}, soil={"tool_friction": size})
 
 
-def _tilt(rng: np.random.Generator, hidden: Hidden) -> Hidden:
-    size = _size(rng, hidden, "tilt")
+def _tilt(stream: Stream, hidden: Hidden) -> Hidden:
+    size = stream.value("tilt")
     lean = np.radians(size)
     gravity = (9.81 * np.sin(lean), 0.0, -9.81 * np.cos(lean))
     return replace(hidden, size=size, values={"tilt_x": size}, gravity=gravity)
 
 
-def _gravity(rng: np.random.Generator, hidden: Hidden) -> Hidden:
-    size = max(1.0 + _size(rng, hidden, "gravity"), 1.0 / 6.0)
+def _gravity(stream: Stream, hidden: Hidden) -> Hidden:
+    size = max(stream.value("gravity"), 1.0 / 6.0)
     return replace(hidden, size=size, values={"gravity_factor": size}, gravity=(0.0, 0.0, -9.81 * size))
 
 
-def _layering(rng: np.random.Generator, hidden: Hidden) -> Hidden:
-    size = _size(rng, hidden, "layering")
-    depth = rng.uniform(0.02, 0.06)
+def _layering(stream: Stream, hidden: Hidden) -> Hidden:
+    size = stream.value("layering")
+    depth = stream.rng.uniform(0.02, 0.06)
     return replace(
-        hidden.within(rng, ANGLES[0] - min(size, 0.0), ANGLES[1] - max(size, 0.0)),
+        stream.within(hidden, ANGLES[0] - min(size, 0.0), ANGLES[1] - max(size, 0.0)),
         size=size,
         values={"layer_friction": size, "layer_depth": depth},
         soil={"layer": (size, depth)},
     )
 
 
-def _buried_obstacle(rng: np.random.Generator, hidden: Hidden) -> Hidden:
-    size = min(_size(rng, hidden, "buried_obstacle"), STONE)
+def _buried_obstacle(stream: Stream, hidden: Hidden) -> Hidden:
+    size, rng = min(stream.value("buried_obstacle"), STONE), stream.rng
     # beside the tool's way, or under it: it must not touch the tool
     beside = bool(rng.integers(2))
-    y = rng.choice([-1.0, 1.0]) * (0.5 * hidden.scene.width + BESIDE + size) if beside else rng.uniform(-0.03, 0.03)
+    y = stream.sign() * (0.5 * hidden.scene.width + BESIDE + size) if beside else rng.uniform(-0.03, 0.03)
     x = rng.uniform(0.32, 0.45)
     over = np.array([[x + s * size, MIDDLE[1] + y + t * size] for s in (-1, 0, 1) for t in (-1, 0, 1)])
-    surface = hidden.scene.setup().surface.sample(over)
     cover = COVER if beside else hidden.scene.depth + BESIDE
-    z = min(0.06, float(surface.min()) - cover - size)
+    z = min(0.06, float(hidden.scene.setup().surface.sample(over).min()) - cover - size)
     values = {"obstacle_radius": size, "obstacle_x": x - MIDDLE[0], "obstacle_y": y, "obstacle_height": z}
     return replace(hidden, size=size, values=values, soil={"obstacle": (x, MIDDLE[1] + y, z, size)})
 
 
-def _exposure(rng: np.random.Generator, hidden: Hidden) -> Hidden:
-    size = 1.0 + _size(rng, hidden, "exposure")
-    return replace(hidden, size=size, values={"exposure_gain": size})
-
-
-def _time_offset(rng: np.random.Generator, hidden: Hidden) -> Hidden:
-    size = _size(rng, hidden, "time_offset")
-    return replace(hidden, size=size, values={"time_offset": size})
-
-
-def _friction_field(rng: np.random.Generator, hidden: Hidden) -> Hidden:
-    size = rng.uniform(6.0, 10.0) * rng.choice([-1.0, 1.0])
-    hidden = hidden.within(rng, ANGLES[0] + abs(size), ANGLES[1] - abs(size))
+def _friction_field(stream: Stream, hidden: Hidden) -> Hidden:
+    size = stream.rng.uniform(6.0, 10.0) * stream.sign()
+    hidden = stream.within(hidden, ANGLES[0] + abs(size), ANGLES[1] - abs(size))
     return replace(hidden, size=size, soil={"across": size})
 
 
-def _crust(rng: np.random.Generator, hidden: Hidden) -> Hidden:
-    size = rng.uniform(500.0, 1500.0)
-    return replace(hidden, size=size, soil={"crust": (size, rng.uniform(0.01, 0.02))})
+def _crust(stream: Stream, hidden: Hidden) -> Hidden:
+    size = stream.rng.uniform(500.0, 1500.0)
+    return replace(hidden, size=size, soil={"crust": (size, stream.rng.uniform(0.01, 0.02))})
 
 
-def _size(rng: np.random.Generator, hidden: Hidden, name: str) -> float:
-    """What an effect's parameter is away from off, drawn log-uniformly between ``hidden.times`` its smallest meaningful
-    size; on either side where it has two."""
-    candidate = candidate_of(library()[name])
-    assert candidate is not None
-    least, most = np.log(hidden.times)
-    size = candidate.measure.meaningful * float(np.exp(rng.uniform(least, most)))
-    return size * float(candidate.measure.sign or rng.choice([-1.0, 1.0]))
-
-
-KINDS: dict[str, Callable[[np.random.Generator, Hidden], Hidden]] = {
-    NOTHING: lambda rng, hidden: hidden,
-    "cohesion": _same("cohesion"),
+KINDS: dict[str, Callable[[Stream, Hidden], Hidden]] = {
+    NOTHING: lambda stream, hidden: hidden,
+    "cohesion": _effect("cohesion"),
     "dilatancy": _dilatancy,
-    "viscosity": _same("viscosity"),
+    "viscosity": _effect("viscosity"),
     "tool_friction": _tool_friction,
-    "tool_adhesion": _same("tool_adhesion"),
+    "tool_adhesion": _effect("tool_adhesion"),
     "tilt": _tilt,
     "gravity": _gravity,
     "layering": _layering,
     "buried_obstacle": _buried_obstacle,
-    "exposure": _exposure,
-    "time_offset": _time_offset,
+    "exposure": _effect("exposure", "exposure_gain", of_soil=False),
+    "time_offset": _effect("time_offset", of_soil=False),
     FIELD: _friction_field,
     CRUST: _crust,
 }
-OBSERVATION = ("exposure", "time_offset")
 
 
 def draw(kind: str, number: int, seed: int, times: tuple[float, float] = TIMES) -> Hidden:
     """A sealed truth; effects have sizes of so many ``times`` the smallest meaningful one."""
     rng = np.random.default_rng([seed, list(KINDS).index(kind), number])
     bed, tool = BEDS[int(rng.integers(len(BEDS)))], TOOLS[int(rng.integers(len(TOOLS)))]
-    return KINDS[kind](rng, Hidden(kind, number, _scenes.draw(rng, bed, tool), times=times))
+    return KINDS[kind](Stream(rng, times), Hidden(kind, number, _scenes.draw(rng, bed, tool)))

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import importlib
-import json
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
-from splatsoil.benchmarks._truth import FloatArray
+from splatsoil.benchmarks._common import FloatArray
 
-from splatsoil.errors import MeasurementError, RunError, SimulationError
+from splatsoil.errors import RunError, SimulationError
 from splatsoil.measurement import Measurement
 from splatsoil.mpm.simulate import step_poses
 from splatsoil.soil.matching import cone_intercept, cone_slope
@@ -24,8 +22,6 @@ YIELD_PRESSURE = 1.0e8
 """Pa; high enough never to be met, low enough that single precision still resolves the cohesion's share of it."""
 ROUGH = 1.0
 """Friction of an obstacle: soil sticks to it and shears within itself."""
-WIDTH = 0.12
-"""Of the blade by which `Numerics` are stated, m."""
 WALL = 0.1
 """Half the thickness of a wall, m."""
 
@@ -54,33 +50,12 @@ class Numerics:
         """Edge of the cube of soil that a particle stands for, m: two along a voxel."""
         return 0.5 * self.voxel
 
-    def refined(self, share: float = 0.75) -> Numerics:
-        """Voxels of a share, with steps and iterations in proportion."""
-        steps, most = math.ceil(self.substeps / share), math.ceil(self.iterations / share)
-        return replace(self, voxel=share * self.voxel, substeps=steps, iterations=most)
-
-    def across(self, width: float) -> Numerics:
-        """As these resolve a tool 120 mm wide, one of ``width`` m: nine voxels of the defaults' or more across it."""
-        return self.refined(min(1.0, round(width, 4) / WIDTH))
-
-    @classmethod
-    def of(cls, folder: Path) -> Numerics:
-        """Those that made the measurement set; MeasurementError when ``truth.json`` does not state them."""
-        file = folder / "truth.json"
-        truth = json.loads(file.read_text())
-        try:
-            return cls(float(truth["voxel"]), int(truth["sub"]), int(truth["iterations"]))
-        except KeyError as error:
-            text = "the benchmark needs the numerics that the set was made with"
-            raise MeasurementError(text, file=file, field=str(error)) from error
-
 
 @dataclass(frozen=True)
 class World:
     """Soil to plough.
 
     Attributes:
-        label: what it is called in the table.
         measurement: its bed, tool and motion.
         angle: friction angle, degrees; one, or (n,) one a particle.
         particles: (n, 3) at frame 0, m.
@@ -95,7 +70,6 @@ class World:
         gravity: (3,) m/s^2; None for the measurement's.
     """
 
-    label: str
     measurement: Measurement = field(repr=False)
     angle: float | FloatArray
     particles: FloatArray = field(repr=False)

@@ -7,24 +7,104 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from splatsoil.benchmarks._common import sentence, stamp, with_section, write_figure
-from splatsoil.benchmarks._validation.page import Section, table, text
+from splatsoil.benchmarks._common import FloatArray, markdown, parser_of, sentence, stamp, with_section, write_figure
 
 from splatsoil.commands._output import only_json, print_json
 from splatsoil.errors import ParameterError, SplatsoilError
 from splatsoil.files import check_folder, plain, read_json, write_bytes, write_json, write_text
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
-def part_options(parser: argparse.ArgumentParser, out: str) -> None:
-    """Options that choose parts, and say where results go."""
+
+@dataclass(frozen=True)
+class Row:
+    """One comparison.
+
+    Attributes:
+        case: what was computed or measured.
+        found: the number, with its unit.
+        expected: the reference or the target, and how near the two must be.
+        held: whether they are; None for a number that is only reported.
+    """
+
+    case: str
+    found: str
+    expected: str = ""
+    held: bool | None = None
+
+    @classmethod
+    def near(
+        cls, case: str, found: float, expected: float, share: float, form: str = "{:.2f}", *, inside: bool = True
+    ) -> Row:
+        """A number that must lie within a share of what is expected; outside of it in a control."""
+        wanted = f"{'' if inside else 'outside '}{form.format(expected)} ± {100.0 * share:g} %"
+        held = (abs(found / expected - 1.0) <= share) is inside
+        return cls(case, f"{form.format(found)} ({percent(found, expected)})", wanted, held)
+
+    @property
+    def cells(self) -> tuple[str, str, str, str]:
+        """For people, with the verdict."""
+        verdict = "–" if self.held is None else "holds" if self.held else "**fails**"
+        return self.case, self.found, self.expected, verdict
+
+
+@dataclass(frozen=True)
+class Section:
+    """One part of the page.
+
+    Attributes:
+        title: of the part.
+        before: what is compared and with what, markdown.
+        rows: the comparisons.
+        after: how to read them, markdown.
+        figure: its picture; None when it has none.
+    """
+
+    title: str
+    before: str
+    rows: tuple[Row, ...]
+    after: str = ""
+    figure: Figure | None = field(default=None, compare=False)
+
+    def text(self, picture: str) -> str:
+        """Markdown, with the picture's file name."""
+        table = markdown(("case", "found", "expected", "verdict"), [row.cells for row in self.rows])
+        link = f"![{self.title}]({picture})" if self.figure is not None else ""
+        return "\n\n".join(part for part in (f"### {self.title}", self.before, table, link, self.after) if part)
+
+
+def percent(found: float, expected: float) -> str:
+    """Relative deviation, signed."""
+    deviation = 100.0 * (found / expected - 1.0)
+    return f"{deviation:+.2f} %" if abs(deviation) < 1.0 else f"{deviation:+.1f} %"
+
+
+def curves_of(curves: Mapping[str, tuple[FloatArray, FloatArray]], xlabel: str, ylabel: str) -> tuple[Figure, Axes]:
+    """A figure of curves (x, y) by their names, and its axes."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 3.5), layout="constrained")
+    axes = figure.subplots()
+    for name, (x, y) in curves.items():
+        axes.plot(x, y, label=name, linewidth=1)
+    axes.set(xlabel=xlabel, ylabel=ylabel)
+    axes.legend(fontsize=7, ncols=3)
+    return figure, axes
+
+
+def parts_parser(module_doc: str | None, out: str) -> argparse.ArgumentParser:
+    """An argument parser with options that choose parts, and say where results go."""
+    parser = parser_of(module_doc, out)
     parser.add_argument("--only", nargs="+", metavar="PART", help="parts to measure; all by default")
     parser.add_argument("--again", action="store_true", help="measure parts again that are in the folder")
-    parser.add_argument("--out", type=Path, default=Path(out), help="folder of the parts, to continue from")
     parser.add_argument("--page", type=Path, help="write the parts into their place on this page (.md)")
-    parser.add_argument("--json", action="store_true", help="print one JSON object instead of tables")
+    return parser
 
 
 def run_parts(
@@ -36,7 +116,7 @@ def run_parts(
     """Measure the parts that are asked for and not in the folder, print them, and write all that are there to a page.
 
     Args:
-        options: of :func:`part_options`, with ``device``.
+        options: of :func:`parts_parser`.
         parts: by name, in the page's order.
         key: what a part's result depends on, JSON-able; a kept part with another key is measured again.
         mark: name of the place on the page, and the beginning of the names of its pictures.
@@ -65,36 +145,48 @@ def run_parts(
                     stored = {"key": known, "made_by": made_by, **_measured(name, measure, options.out, mark)}
                     write_json(file, stored)
                 if not options.json:
-                    print(f"\n{stored['section']['title']}\n\n{table(Section.restored(stored['section']).rows)}")
+                    print(f"\n{stored['text']}")
             if stored.get("key") == known:
                 kept[name] = stored
         if options.page and kept:
-            _write_page(options.page, options.out, kept, mark)
+            _write_page(options.page, options.out, list(kept.values()), mark)
         if options.json:
-            print_json({"ok": True, "made_by": made_by, "parts": {n: kept[n]["section"] for n in options.only or kept}})
+            told = {name: {k: kept[name][k] for k in ("title", "rows")} for name in options.only or kept}
+            print_json({"ok": True, "made_by": made_by, "parts": told})
     return 0
 
 
 def _measured(name: str, measure: Callable[[], Section], out: Path, mark: str) -> dict[str, Any]:
-    began = time.monotonic()
+    began, picture = time.monotonic(), f"{mark}-{name}.png".replace(" ", "-")
     try:
         section = measure()
     except SplatsoilError as error:
         raise type(error)(f"part {name}: {error}") from error
     if section.figure is not None:
-        write_figure(out / f"{mark}-{name}.png", section.figure)
+        write_figure(out / picture, section.figure)
     seconds = time.monotonic() - began
     print(f"{name}: {seconds:.0f} s", file=sys.stderr, flush=True)
-    return {"section": plain(section.data()), "seconds": seconds}
+    return {
+        "title": section.title,
+        "rows": [asdict(row) for row in section.rows],
+        "text": section.text(picture),
+        "picture": picture if section.figure is not None else "",
+        "seconds": seconds,
+    }
 
 
-def _write_page(page: Path, out: Path, kept: Mapping[str, Mapping[str, Any]], mark: str) -> None:
-    made = max((entry["made_by"] for entry in kept.values()), key=lambda made: str(made["made"]))
-    sections = []
-    for name, entry in kept.items():
-        picture = f"{mark}-{name}.png" if entry["section"]["figure"] else ""
-        if picture:
-            write_bytes(page.parent / picture, (out / picture).read_bytes())
-        sections.append((Section.restored(entry["section"]), picture))
-    minutes = sum(entry["seconds"] for entry in kept.values()) / 60.0
-    write_text(page, with_section(page, mark, f"{text(sections)}\n\nMeasured in {minutes:.0f} min, {sentence(made)}."))
+def _write_page(page: Path, out: Path, kept: list[Mapping[str, Any]], mark: str) -> None:
+    """How many rows hold, which fail, and all sections."""
+    judged = [(part["title"], Row(**row)) for part in kept for row in part["rows"] if row["held"] is not None]
+    failed = [f"- {title}: {row.case}: {row.found} ({row.expected})" for title, row in judged if not row.held]
+    count = f"{len(judged) - len(failed)} of {len(judged)} comparisons hold."
+    minutes = sum(part["seconds"] for part in kept) / 60.0
+    made = max((part["made_by"] for part in kept), key=lambda made: str(made["made"]))
+    told = [
+        f"{count} What fails:\n\n" + "\n".join(failed) if failed else count,
+        *(part["text"] for part in kept),
+        f"Measured in {minutes:.0f} min, {sentence(made)}.",
+    ]
+    for picture in filter(None, (part["picture"] for part in kept)):
+        write_bytes(page.parent / picture, (out / picture).read_bytes())
+    write_text(page, with_section(page, mark, "\n\n".join(told)))

@@ -7,15 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from splatsoil.measurement import Bed, Tool
+from splatsoil.measurement import Tool
 from splatsoil.reconstruction import HeightField
 from splatsoil.synthetic import Setup, plow
 from splatsoil.synthetic.setups import FRAME_RATE, STAGES, drum, highest, plane, plate, staged_motion, waves
 
 ANGLES = (22.0, 48.0)
 """Range of friction angles, degrees; estimates search 20 to 50."""
-COMMON = (34.0, 42.0)
-"""Of common sand, degrees."""
 DENSITIES = (1400.0, 1700.0)
 """Bulk density of loose and of dense sand, kg/m³."""
 BEDS = ("flat", "wavy", "sloping")
@@ -73,7 +71,8 @@ class Scene:
         """Bed, surface, tool and motion, before the cameras of `splatsoil.synthetic.plow`."""
         usual = plow()
         bed = replace(usual.bed, density=self.density)
-        surface = self._surface(bed)
+        wavy = self.bed == "wavy"
+        surface = waves(bed, SOIL, self.seed) if wavy else plane(bed, SOIL, self.slope, self.towards)
         mesh = plate(self.width) if self.tool == "blade" else drum(self.width, RADIUS)
         roll = self.rolling / RADIUS
 
@@ -86,39 +85,21 @@ class Scene:
         down = (begin - self._level(surface) + self.depth) * FRAME_RATE / STAGES[0]
         return replace(usual, bed=bed, surface=surface, tool=motion(begin - float(low[2]), down))
 
-    def _surface(self, bed: Bed) -> HeightField:
-        if self.bed == "wavy":
-            return waves(bed, SOIL, self.seed)
-        return plane(bed, SOIL, self.slope, self.towards)
-
     def _level(self, surface: HeightField) -> float:
         """Mean height of the surface along the tool's way, m."""
-        x, y = np.meshgrid(
-            np.linspace(START[0], START[0] + WAY, 31), START[1] + self.width * np.linspace(-0.5, 0.5, 13)
-        )
-        return float(surface.sample(np.stack([x.ravel(), y.ravel()], axis=1)).mean())
+        x, y = np.linspace(START[0], START[0] + WAY, 31), START[1] + self.width * np.linspace(-0.5, 0.5, 13)
+        return float(surface.sample(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)).mean())
 
 
 def draw(rng: np.random.Generator, bed: str, tool: tuple[str, float, float]) -> Scene:
     """A scene with the bed and the tool that are given; everything else by chance."""
     kind, width, tilt = tool
-    angle, density = rng.uniform(*ANGLES), rng.uniform(*DENSITIES)
-    slope, towards, depth = rng.uniform(*SLOPES), rng.uniform(0.0, 360.0), rng.uniform(*DEPTHS[kind])
-    rolling, seed = rng.uniform(*ROLLING), int(rng.integers(1000, 2**20))
-    sloping = bed == "sloping"
-    return Scene(
-        seed=seed,
-        angle=float(angle),
-        bed=bed,
-        slope=float(slope) if sloping else 0.0,
-        towards=float(towards) if sloping else 0.0,
-        density=float(density),
-        tool=kind,
-        width=width,
-        tilt=tilt,
-        depth=float(depth),
-        rolling=float(rolling) if kind == "drum" else 0.0,
-    )
+    ranges = (ANGLES, DENSITIES, SLOPES, (0.0, 360.0), DEPTHS[kind], ROLLING)
+    angle, density, slope, towards, depth, rolling = (float(rng.uniform(*limits)) for limits in ranges)
+    seed = int(rng.integers(1000, 2**20))
+    slope, towards = (slope, towards) if bed == "sloping" else (0.0, 0.0)
+    rolling = rolling if kind == "drum" else 0.0
+    return Scene(seed, angle, bed, slope, towards, density, kind, width, tilt, depth, rolling)
 
 
 def scenes(seed: int) -> Iterator[Scene]:
@@ -130,10 +111,3 @@ def scenes(seed: int) -> Iterator[Scene]:
         beds = beds or list(rng.permutation(BEDS))
         tools = tools or list(rng.permutation(len(TOOLS)))
         yield draw(rng, str(beds.pop()), TOOLS[int(tools.pop())])
-
-
-def pair(seed: int) -> tuple[Scene, Scene]:
-    """One scene of common sand with a smooth and with a rough tool."""
-    rng = np.random.default_rng([seed, 1])
-    scene = replace(draw(rng, "wavy", TOOLS[0]), angle=float(rng.uniform(*COMMON)))
-    return replace(scene, tool_friction=0.3), replace(scene, tool_friction=0.9)

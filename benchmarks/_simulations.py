@@ -5,14 +5,14 @@ from __future__ import annotations
 import argparse
 import inspect
 from collections.abc import Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
-from splatsoil.benchmarks._common import parser_of, ticker
+from rich.console import Console
+from rich.progress import track
+from splatsoil.benchmarks._common import FloatArray, parser_of
 from splatsoil.envs.measured import LOSS, MeasuredProblem, cache_folder
 from splatsoil.envs.problem import Problem
 from splatsoil.envs.synthetic import SyntheticProblem
@@ -27,16 +27,14 @@ from splatsoil.inverse.posterior import Density
 import splatsoil
 from splatsoil.experiment import Layout, Site
 from splatsoil.experiment.emulated import EmulatedExperiment
-from splatsoil.files import FORWARD, code_digest
+from splatsoil.files import FORWARD, code_digest, own_files
+from splatsoil.mpm import PRESETS
 from splatsoil.parameters import ParameterSpace
 
-FloatArray = npt.NDArray[np.float64]
-
-#: Simulations that a comparison needs.
 FEWEST = BASE // 2
-
-#: Seed of the synthetic set's own truth, which cancels in all that is made from its simulations.
+"""Simulations that a comparison needs."""
 WORLD = 1
+"""Seed of the synthetic set's own truth, which cancels in all that is made from its simulations."""
 
 
 @dataclass(frozen=True)
@@ -76,10 +74,9 @@ def density_of(
         seed: of sequences.
     """
     b = features.shape[1]
-    layout = Layout((0.0,), tuple(Site("all", float(k), 0.0) for k in range(b)), "", "", ("",), np.full((1, b), ""))
     nothing = np.zeros((1, b))
     experiment = EmulatedExperiment(
-        layout=layout,
+        layout=Layout((0.0,), tuple(Site("all", float(k), 0.0) for k in range(b)), "", "", ("",), np.full((1, b), "")),
         middle=nothing,
         home={},
         slopes={},
@@ -96,28 +93,22 @@ def density_of(
     return Density.of(replace(noise, numerics=np.zeros_like(noise.numerics)), prior, seed)
 
 
-def world_parser(module_doc: str | None) -> argparse.ArgumentParser:
+def world_parser(module_doc: str | None, out: str) -> argparse.ArgumentParser:
     """An argument parser with options that choose what is simulated."""
-    parser = parser_of(module_doc)
+    parser = parser_of(module_doc, out)
     parser.add_argument("set", type=Path, nargs="?", help="measurement set; none: the synthetic one of PlowSand-v0")
-    parser.add_argument("--reconstruction", type=Path, help="of the set, if there is one already")
     parser.add_argument("--parameters", nargs="+", default=["friction_angle"])
     parser.add_argument("--with", dest="effects", nargs="*", default=[], metavar="EFFECT")
-    parser.add_argument("--preset", default="tiny")
-    parser.add_argument("--executor", default="serial", help="serial, processes:N or dask:ADDRESS")
+    parser.add_argument("--preset", default="tiny", choices=sorted(PRESETS))
     return parser
 
 
-def simulated(
-    options: argparse.Namespace, count: int, pool: Executor | None = None, *, seed: int = 0, repeats: int = 8
-) -> tuple[Data, Path]:
+def simulated(options: argparse.Namespace, count: int, repeats: int = 8) -> tuple[Data, Path]:
     """Simulations at Sobol points of the prior, each with particles of its own, and some repeated in the middle.
 
     Args:
         options: of :func:`world_parser`.
         count: points; their number is best a power of two.
-        pool: where; in this process by default.
-        seed: of points and particles.
         repeats: simulations in the middle of the prior that differ in their particles only, after the others.
 
     Returns:
@@ -130,20 +121,17 @@ def simulated(
         "preset": options.preset,
         "device": options.device.split(":")[0],
         "version": splatsoil.__version__,
-        "code": code_digest((*FORWARD,), others=[name for name in options.effects if name.endswith(".py")]),
+        "code": code_digest(FORWARD, others=own_files(options.effects)),
         "loss": LOSS,
     }
-    points = np.concatenate([sobol(count, len(problem.space), seed), np.zeros((repeats, len(problem.space)))])
-    seeds = np.random.SeedSequence([seed, 9]).generate_state(len(points)) % 2**31
+    points = np.concatenate([sobol(count, len(problem.space), 0), np.zeros((repeats, len(problem.space)))])
+    seeds = np.random.SeedSequence([0, 9]).generate_state(len(points)) % 2**31
     values = [problem.space.to_dict(problem.space.from_unit(p)) for p in points]
     jobs = list(zip(values, map(int, seeds), strict=True))
     file = cache_folder() / "simulations" / f"{digest({**model, 'parameters': list(options.parameters)})[:16]}.db"
-    report = ticker("simulations")
     with writer_lock(file.parent), EvaluationStore(file) as store:
-        records = []
-        for record in evaluate(problem, jobs, store, model, pool=pool):
-            records.append(record)
-            report(len(records), len(jobs))
+        made = evaluate(problem, jobs, store, model)
+        records = list(track(made, "simulations", len(jobs), console=Console(stderr=True)))
     return Data.of(problem.space, records), file
 
 
@@ -154,6 +142,5 @@ def _problem(options: argparse.Namespace) -> tuple[Problem, dict[str, Any]]:
         world.begin(WORLD)
         sources = [inspect.getfile(part) for part in (SyntheticProblem, World)]
         return world, {"world": "synthetic", "seed": WORLD, "source": code_digest((), sources)}
-    made = options.reconstruction
-    problem = MeasuredProblem.load(options.set, options.parameters, options.effects, reconstruction=made, **chosen)
-    return problem, {"measurement": problem.model.measurement.hash, "reconstruction": str(made)}
+    problem = MeasuredProblem.load(options.set, options.parameters, options.effects, **chosen)
+    return problem, {"measurement": problem.model.measurement.hash}

@@ -12,15 +12,14 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from scipy.ndimage import gaussian_filter
+from splatsoil.benchmarks._common import FloatArray
 
 from splatsoil.errors import MeasurementError, ParameterError
 from splatsoil.experiment.scene_parts import heading_of, stages_of
 from splatsoil.files import plain, read_npz, write_npz
 from splatsoil.measurement import Measurement
-from splatsoil.reconstruction import HeightField, fill
+from splatsoil.reconstruction import HeightField, Reconstruction, fill, reconstruct
 from splatsoil.scene import relief_of_particles
-
-FloatArray = npt.NDArray[np.float64]
 
 CELL = 0.01
 """Edge of the cells in which heights are compared, m."""
@@ -143,6 +142,13 @@ def _read(file: Path) -> tuple[dict[int, FloatArray], float]:
         scale = float(stored["scale"])
         particles = {int(k[1:]): stored[k] * scale + low for k in stored.files if k[1:].isdigit()}
         return particles, float(stored["spacing"])
+
+
+def reconstructed(measurement: Measurement, folder: Path, preset: str, device: str) -> Reconstruction:
+    """A measurement set's reconstruction, from the folder or made and kept there."""
+    if not (folder / "reconstruction.json").is_file():
+        reconstruct(measurement, preset=preset, device=device).save(folder)
+    return Reconstruction.load(folder)
 
 
 def in_patches(difference: FloatArray) -> float:

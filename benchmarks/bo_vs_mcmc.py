@@ -20,21 +20,20 @@ of guesses it may return an Answer: otherwise its best guess counts.
 
 from __future__ import annotations
 
+import argparse
 import importlib
-import json
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import emcee
 import gymnasium as gym
 import numpy as np
-import numpy.typing as npt
-from splatsoil.benchmarks._common import at_least, output_options, parser_of, stamp, ticker, write_result
+from splatsoil.benchmarks._common import Clock, FloatArray, at_least, markdown, parser_of, stamp, tell
 from splatsoil.benchmarks._simulations import FEWEST, density_of
 from splatsoil.envs.emulated import EmulatedProblem
 from splatsoil.envs.plow_sand import PlowSandEnv
@@ -47,13 +46,11 @@ from splatsoil.errors import ParameterError
 from splatsoil.files import plain
 from splatsoil.quiet import hush
 
-FloatArray = npt.NDArray[np.float64]
-
 ENVS = ("PlowSandFast-v0", "PlowSandSeveralFast-v0", "PlowSandNamingFast-v0", "PlowSandDesignFast-v0")
-#: Episodes that an agent learns from, and the first one's seed.
 NAMING_EPISODES, TRAINING = 4000, 10**6
-#: Simulated outcomes of a stroke that its expected information is averaged over.
+"""Episodes that an agent learns from, and the first one's seed."""
 OUTCOMES = 32
+"""Simulated outcomes of a stroke that its expected information is averaged over."""
 
 
 @dataclass(frozen=True)
@@ -63,9 +60,6 @@ class Answer:
     estimate: FloatArray
     low: FloatArray
     high: FloatArray
-
-
-Agent = Callable[[gym.Env[Any, Any], int], Any]
 
 
 class Counted(gym.Wrapper[Any, Any, Any, Any]):
@@ -92,23 +86,21 @@ class Counted(gym.Wrapper[Any, Any, Any, Any]):
         return found
 
 
-def at_random(env: gym.Env[Any, Any], seed: int) -> None:
+def at_random(env: Counted, seed: int) -> None:
     """Actions drawn from the action space."""
     env.reset(seed=seed)
     env.action_space.seed(seed)
-    over = False
-    while not over:
-        _, _, terminated, truncated, _ = env.step(env.action_space.sample())
-        over = terminated or truncated
+    while not env.over:
+        env.step(env.action_space.sample())
 
 
-def told(env: gym.Env[Any, Any], seed: int, optimiser: BayesianOptimiser) -> tuple[FloatArray, FloatArray]:
+def told(env: Counted, seed: int, optimiser: BayesianOptimiser) -> tuple[FloatArray, FloatArray]:
     """Let an optimiser play an episode: its guesses (k, n) and their features (k, b), predicted minus observed."""
     env.reset(seed=seed)
-    points, features, over = [], [], False
-    while not over:
+    points, features = [], []
+    while not env.over:
         (action,) = optimiser.ask()
-        observation, reward, _, over, info = env.step(action)
+        observation, reward, _, _, info = env.step(action)
         failed = info["status"] == "failed"
         optimiser.tell(action, None if failed else -float(reward))
         if not failed:
@@ -117,7 +109,7 @@ def told(env: gym.Env[Any, Any], seed: int, optimiser: BayesianOptimiser) -> tup
     return np.array(points, dtype=np.float64), np.array(features, dtype=np.float64)
 
 
-def by_optimiser(env: gym.Env[Any, Any], seed: int, **options: Any) -> Answer:
+def by_optimiser(env: Counted, seed: int, **options: Any) -> Answer:
     """Bayesian optimisation with options of its own."""
     optimiser = BayesianOptimiser(env.action_space.shape[0], seed=seed, **options)  # type: ignore[index]
     told(env, seed, optimiser)
@@ -125,7 +117,7 @@ def by_optimiser(env: gym.Env[Any, Any], seed: int, **options: Any) -> Answer:
     return Answer(found.estimate, *found.interval()[1:])
 
 
-def by_chains(env: gym.Env[Any, Any], seed: int, *, search: bool) -> Answer:
+def by_chains(env: Counted, seed: int, *, search: bool) -> Answer:
     """emcee on an emulator of the features of an episode's guesses, which a search chose or a Sobol sequence."""
     space, budget = env.unwrapped.problem.space, env.unwrapped.budget  # type: ignore[attr-defined]
     if budget < FEWEST:
@@ -137,7 +129,7 @@ def by_chains(env: gym.Env[Any, Any], seed: int, *, search: bool) -> Answer:
     return Answer(chains.flat.mean(axis=0), *np.quantile(chains.flat, [0.05, 0.95], axis=0))
 
 
-def directly(env: gym.Env[Any, Any], seed: int) -> Answer:
+def directly(env: Counted, seed: int) -> Answer:
     """emcee on the calls: each density is one. Chance is that of the response surface, in call and observation."""
     surface, n, budget = env.unwrapped.problem.surface, env.action_space.shape[0], env.unwrapped.budget  # type: ignore
     inverse = np.linalg.pinv(surface.patches @ surface.factor)
@@ -176,36 +168,39 @@ def _classes(env_id: str) -> tuple[FloatArray, FloatArray]:
     return means, np.linalg.pinv(off.T @ off / len(off), rcond=1e-6, hermitian=True)
 
 
-def by_discriminant(env: gym.Env[Any, Any], seed: int) -> None:
+def by_discriminant(env: Counted, seed: int) -> None:
     """Log densities of normal distributions of equal covariance (Fisher 1936), as logits."""
     assert env.spec is not None
     means, inverse = _classes(env.spec.id)
     evidence, _ = env.reset(seed=seed)
-    logs = np.array([-0.5 * (evidence - mean) @ inverse @ (evidence - mean) for mean in means])
+    off = evidence - means
+    logs = -0.5 * np.einsum("eb,bc,ec->e", off, inverse, off)
     env.step(((logs - logs.max()) / LOGITS + 1.0).astype(np.float32))
 
 
-def greedily(env: gym.Env[Any, Any], seed: int) -> None:
+def greedily(env: Counted, seed: int) -> None:
     """The stroke whose outcomes, drawn from the posterior, leave the most information on average."""
-    inner, rng, over = env.unwrapped, np.random.default_rng([seed, 43]), False
+    inner, rng = env.unwrapped, np.random.default_rng([seed, 43])
     assert isinstance(inner, DesignEnv)
     strokes = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 5)] * 2), axis=-1).reshape(-1, 2)
     env.reset(seed=seed)
-    while not over:
+    while not env.over:
         expected = [inner.expected_information(stroke, OUTCOMES, rng) for stroke in strokes]
-        _, _, _, over, _ = env.step(strokes[int(np.argmax(expected))].astype(np.float32))
+        env.step(strokes[int(np.argmax(expected))].astype(np.float32))
 
 
-AGENTS: dict[str, tuple[Agent, tuple[type, ...]]] = {
+Agent = Callable[[Counted, int], Any]
+AGENTS: dict[str, tuple[Agent, type | tuple[type, ...]]] = {
     "random": (at_random, (PlowSandEnv, NamingEnv, DesignEnv)),
-    "paper": (lambda env, seed: by_optimiser(env, seed, start=1, acquisition="best"), (PlowSandEnv,)),
-    "bo": (by_optimiser, (PlowSandEnv,)),
-    "mcmc": (lambda env, seed: by_chains(env, seed, search=False), (PlowSandEnv,)),
-    "both": (lambda env, seed: by_chains(env, seed, search=True), (PlowSandEnv,)),
-    "direct": (directly, (PlowSandEnv,)),
-    "lda": (by_discriminant, (NamingEnv,)),
-    "greedy": (greedily, (DesignEnv,)),
+    "paper": (partial(by_optimiser, start=1, acquisition="best"), PlowSandEnv),
+    "bo": (by_optimiser, PlowSandEnv),
+    "mcmc": (partial(by_chains, search=False), PlowSandEnv),
+    "both": (partial(by_chains, search=True), PlowSandEnv),
+    "direct": (directly, PlowSandEnv),
+    "lda": (by_discriminant, NamingEnv),
+    "greedy": (greedily, DesignEnv),
 }
+"""And the environments that they play; `direct` needs emulated guesses."""
 
 
 def own_agent(name: str) -> Agent:
@@ -279,40 +274,40 @@ def summary(agent: str, episodes: Sequence[Mapping[str, Any]]) -> dict[str, Any]
     return entry
 
 
-def run(
-    env_id: str,
-    budgets: Sequence[int | None],
-    names: Sequence[str],
-    own: Sequence[str],
-    seeds: int,
-    *,
-    device: str = "cpu",
-    data_set: str = "",
-) -> dict[str, Any]:
-    """All agents on one environment, at each budget; the episodes are kept as a Minari data set where one is named.
+def environment(env_id: str, budget: int | None, device: str) -> gym.Env[Any, Any]:
+    """An environment by its id; ParameterError where there is none, or it has no budget to choose."""
+    chosen: dict[str, Any] = {} if budget is None else {"budget": budget}
+    try:
+        return gym.make(env_id, device=device, **chosen)
+    except (gym.error.Error, TypeError) as error:
+        raise ParameterError(f"--env {env_id}: cannot be made ({error})") from error
 
-    Raises:
-        ParameterError: there is no such environment, or it has no budget to choose.
-    """
-    entries = []
-    for budget in budgets:
-        chosen: dict[str, Any] = {} if budget is None else {"budget": budget}
-        try:
-            env = gym.make(env_id, device=device, **chosen)
-        except (gym.error.Error, TypeError) as error:
-            raise ParameterError(f"--env {env_id}: cannot be made ({error})") from error
-        agents = chosen_agents(names, env) | {name: own_agent(name) for name in own}
-        if data_set:
-            env = EpisodeRecorder(env)
-        report = ticker(f"{env_id}, episodes")
-        for done, (name, agent) in enumerate(agents.items()):
-            entries.append(summary(name, [play(env, name, agent, seed) for seed in range(seeds)]))
-            report(done + 1, len(agents))
-        if isinstance(env, EpisodeRecorder):
-            env.write(data_set, algorithm=", ".join(agents), description=f"{seeds} episodes of each agent on {env_id}")
+
+def run(env: gym.Env[Any, Any], agents: Mapping[str, Agent], seeds: int, data_set: str = "") -> list[dict[str, Any]]:
+    """What agents come to; the episodes are kept as a Minari data set where one is named."""
+    assert env.spec is not None
+    name, recorder = env.spec.id, EpisodeRecorder(env) if data_set else None
+    found, say = [], Clock()
+    for agent in agents:
+        episodes = [play(recorder or env, agent, agents[agent], seed) for seed in range(seeds)]
+        found.append(summary(agent, episodes))
+        say(f"{name}: {agent}, {found[-1]['steps']} steps")
+    if recorder:
+        words = f"{seeds} episodes of each agent on {name}"
+        recorder.write(data_set, algorithm=", ".join(agents), description=words)
+    return found
+
+
+def compared(env_id: str, options: argparse.Namespace) -> dict[str, Any]:
+    """All agents on one environment, at each budget."""
+    entries: list[dict[str, Any]] = []
+    for budget in options.budgets or [None]:
+        env = environment(env_id, budget, options.device)
+        agents = chosen_agents(options.agents, env) | {name: own_agent(name) for name in options.agent}
+        entries += run(env, agents, options.seeds, options.minari)
     problem = getattr(env.unwrapped, "problem", None)
     units = [] if problem is None else [{"name": p.name, "unit": p.unit} for p in problem.space]
-    return {"env": env_id, "parameters": units, "seeds": seeds, "entries": plain(entries)}
+    return {"env": env_id, "parameters": units, "seeds": options.seeds, "entries": plain(entries)}
 
 
 def table(found: Mapping[str, Any]) -> str:
@@ -333,49 +328,25 @@ def table(found: Mapping[str, Any]) -> str:
         else:
             row.append(f"{e['return']:.2f} ± {e['return_std']:.2f}")
         rows.append([*row, f"{e['seconds']:.2g} s"])
-    lines = [[*head, "own CPU time"], ["---"] * (len(head) + 1), *rows]
-    return "\n".join([f"**{found['env']}**", "", *("| " + " | ".join(line) + " |" for line in lines)])
+    return f"**{found['env']}**\n\n{markdown([*head, 'own CPU time'], rows)}"
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Command line; exit code 0."""
-    parser = parser_of(__doc__)
+    parser = parser_of(__doc__, "runs/bo-vs-mcmc")
     parser.add_argument("--env", nargs="+", default=list(ENVS), help="ids of environments whose truth is hidden")
     parser.add_argument("--budgets", type=at_least(1), nargs="+", help="steps in an episode; by default the id's own")
     parser.add_argument("--seeds", type=at_least(1), default=10, help="episodes, each with a truth of its own")
-    parser.add_argument(
-        "--agents", nargs="*", choices=AGENTS, default=list(AGENTS), help="built-in ones, where they fit"
-    )
+    built_in = "built-in ones, where they fit"
+    parser.add_argument("--agents", nargs="*", choices=AGENTS, default=list(AGENTS), help=built_in)
     parser.add_argument("--agent", action="append", default=[], metavar="MODULE:FUNCTION", help="one of your own")
     parser.add_argument("--minari", default="", metavar="ID", help="keep the episodes of guesses as a Minari data set")
-    output_options(parser)
     options = parser.parse_args(arguments)
     if options.minari and (len(options.env) > 1 or len(options.budgets or [0]) > 1):
         raise ParameterError("--minari: a data set is of one environment and one budget; give one of each")
     hush()
-    began = time.perf_counter()
-    found = [
-        run(
-            env,
-            options.budgets or [None],
-            options.agents,
-            options.agent,
-            options.seeds,
-            device=options.device,
-            data_set=options.minari,
-        )
-        for env in options.env
-    ]
-    seconds = time.perf_counter() - began
-    result = {"benchmark": "bo-vs-mcmc", "environments": found, **stamp(options.device), "seconds": seconds}
-    text = "\n\n".join(
-        [f"{options.seeds} episodes of each agent: mean ± standard deviation over them.", *map(table, found)]
-    )
-    if options.out is not None:
-        write_result(options.out, result, text, {})
-    print(json.dumps(result, indent=1) if options.json else text)
+    found = [compared(env, options) for env in options.env]
+    words = f"{options.seeds} episodes of each agent: mean ± standard deviation over them."
+    text = "\n\n".join([words, *map(table, found)])
+    tell(options, {"made_by": stamp(options.device), "environments": found}, text)
     return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

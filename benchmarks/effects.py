@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from splatsoil.benchmarks._common import at_least, parser_of, write_figure
-from splatsoil.benchmarks._truth import FloatArray, Truth
+from splatsoil.benchmarks._common import FloatArray, markdown, parser_of, write_figure
+from splatsoil.benchmarks._truth import Truth
 
 from splatsoil.errors import SimulationError
 from splatsoil.measurement import Measurement
 from splatsoil.model import Model
-from splatsoil.mpm import Resolution, simulate
+from splatsoil.mpm import PRESETS, Resolution, simulate
 from splatsoil.parameters import Parameter
 from splatsoil.quiet import hush
 from splatsoil.reconstruction import reconstruct
@@ -30,15 +30,20 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 TIMES_MEANINGFUL = 5.0
+ANGLE = 35.0
+"""Of the soil in pictures, degrees."""
+SEEDS = range(3)
+"""Of the particles, that pictures average over."""
 
 
 def table() -> str:
     """Markdown table of the whole library."""
-    lines = ["| effect | what it is | parameters: default; bounds; smallest meaningful | source |", "|---|---|---|---|"]
-    for name, effect in library().items():
-        parameters = "<br>".join(_described(p) for p in effect.parameters)
-        lines.append(f"| `{name}` | {effect.note} | {parameters} | {effect.source} |")
-    return "\n".join(lines)
+    head = ("effect", "what it is", "parameters: default; bounds; smallest meaningful", "source")
+    rows = [
+        (f"`{name}`", effect.note, "<br>".join(map(_described, effect.parameters)), effect.source)
+        for name, effect in library().items()
+    ]
+    return markdown(head, rows)
 
 
 def _described(p: Parameter) -> str:
@@ -66,36 +71,34 @@ def strong() -> list[str]:
     return chosen
 
 
-def heights(
-    truth: Truth, preset: str, angle: float, device: str, seeds: int
-) -> tuple[FloatArray, float, dict[str, FloatArray]]:
-    """Heights (ny, nx), m, of the last frame by the base law, their scatter between seeds, what each effect changes."""
+def heights(truth: Truth, preset: str, device: str) -> tuple[FloatArray, dict[str, FloatArray]]:
+    """Heights (ny, nx), m, of the last frame by the base law, and what each effect changes; scatter is printed."""
     measurement = truth.measurement
     resolution = Resolution.derive(measurement, preset)
 
     def height(law: Law, values: Mapping[str, float], seed: int) -> FloatArray:
-        x, given = truth.start(resolution.spacing, seed), {"friction_angle": angle, **values}
+        x, given = truth.start(resolution.spacing, seed), {"friction_angle": ANGLE, **values}
         frames = [max(truth.particles)]
         run = simulate(measurement, x, given, law=law, resolution=resolution, frames=frames, device=device)[0]
         return truth.heights(run.positions[-1], resolution.spacing**3)
 
-    base = np.array([height(Law(), {}, seed) for seed in range(seeds)])
-    scatter = float(np.sqrt(base.var(axis=0, ddof=1).mean()))
+    base = np.array([height(Law(), {}, seed) for seed in SEEDS])
+    print(f"seed-to-seed scatter: {1e3 * np.sqrt(base.var(axis=0, ddof=1).mean()):.1f} mm", flush=True)
     changes = {}
     for name, effect in library().items():
         if not effect.observes:
             law, values = Law([effect.for_measurement(measurement)]), acting(effect)
             try:
-                found = [height(law, values, seed) - base[seed] for seed in range(seeds)]
+                found = [height(law, values, seed) for seed in SEEDS]
             except SimulationError as error:  # a coarse grid does not bear every size
                 print(f"{name}: left out: {error}", file=sys.stderr)
                 continue
-            changes[name] = np.mean(found, axis=0)
+            changes[name] = np.mean(found - base, axis=0)
             print(f"{name}: {1e3 * np.sqrt(np.mean(changes[name] ** 2)):.1f} mm", flush=True)
-    return base.mean(axis=0), scatter, changes
+    return base.mean(axis=0), changes
 
 
-def reported(measurement: Measurement, angle: float, device: str) -> tuple[FloatArray, dict[str, FloatArray]]:
+def reported(measurement: Measurement, device: str) -> tuple[FloatArray, dict[str, FloatArray]]:
     """Picture (h, w, 3) of the first camera while the tool is fast, in grey levels: as is, and what effects change."""
     motion = measurement.tool.motion
     speed = np.linalg.norm(np.gradient(motion.positions, motion.times, axis=0), axis=1)
@@ -105,7 +108,7 @@ def reported(measurement: Measurement, angle: float, device: str) -> tuple[Float
     scene = reconstruct(measurement, preset="tiny", device=device)
     names = [name for name, effect in library().items() if effect.observes]
     model = Model(measurement, scene, effects=names, preset="tiny", device=device, frames=[frame])
-    trajectory = model.simulate({"friction_angle": angle})
+    trajectory = model.simulate({"friction_angle": ANGLE})
 
     def seen(values: Mapping[str, float]) -> FloatArray:
         return 255.0 * np.asarray(model.draw(trajectory, 0, values)[camera, frame], dtype=np.float64)
@@ -143,27 +146,19 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--table", action="store_true", help="print the table of all effects")
     parser.add_argument("--pictures", type=Path, metavar="FILE", help="draw what every effect does to the bed")
     parser.add_argument("--video", type=Path, metavar="FILE", help="draw what observation effects do to a frame")
-    parser.add_argument("--preset", default="tiny")
-    parser.add_argument("--angle", type=float, default=35.0, help="friction angle of the pictures, degrees")
-    parser.add_argument("--seeds", type=at_least(2), default=3, help="particle seeds that the pictures average over")
+    parser.add_argument("--preset", default="tiny", choices=sorted(PRESETS), help="of the bed's simulations")
     options = parser.parse_args(arguments)
+    if (options.video or options.pictures) and options.set is None:
+        parser.error("--video and --pictures need a measurement set")
     hush()
     if options.table:
         print(table())
-    if (options.video or options.pictures) and options.set is None:
-        parser.error("--video and --pictures need a measurement set")
     if options.video:
-        base, changes = reported(Measurement.load(options.set), options.angle, options.device)
+        base, changes = reported(Measurement.load(options.set), options.device)
         grey = {name: change.mean(axis=2) for name, change in changes.items()}
         write_figure(options.video, figure(np.clip(base / 255.0, 0.0, 1.0), "as it is", grey, 25.0, "grey levels"))
     if options.pictures:
-        truth = Truth.load(options.set)
-        bed, scatter, changes = heights(truth, options.preset, options.angle, options.device, options.seeds)
-        print(f"seed-to-seed scatter: {1e3 * scatter:.1f} mm")
+        bed, changes = heights(Truth.load(options.set), options.preset, options.device)
         mm = {name: 1e3 * change for name, change in changes.items()}
         write_figure(options.pictures, figure(1e3 * bed, "base law", mm, 15.0, "mm"))
     return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

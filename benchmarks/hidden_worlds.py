@@ -11,15 +11,13 @@ error is the model discrepancy, and which the photographs' or the estimates' fau
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,17 +25,17 @@ import numpy as np
 from scipy.stats import binomtest
 from splatsoil.benchmarks._common import (
     Clock,
+    FloatArray,
     at_least,
     keep_to_one_protocol,
-    output_options,
+    markdown,
     parser_of,
     sources,
     stamp,
-    write_result,
+    tell,
 )
 from splatsoil.benchmarks._hidden import KINDS, NOTHING, OUTSIDE, TIMES, Hidden, draw
 from splatsoil.benchmarks._newton import Numerics, World, plough
-from splatsoil.benchmarks._truth import FloatArray
 
 from splatsoil.errors import ParameterError
 from splatsoil.files import plain, read_json
@@ -76,17 +74,17 @@ def soil_of(hidden: Hidden, setup: Setup, spacing: float) -> World:
     if "obstacle" in told:
         keep = np.linalg.norm(x - np.array(told["obstacle"][:3]), axis=1) > told["obstacle"][3]
         x = x[keep]
-    return World(hidden.name, setup.experiment(), angle, x, spacing, gravity=hidden.gravity, **told)
+    return World(setup.experiment(), angle, x, spacing, gravity=hidden.gravity, **told)
 
 
 def ploughed_by_newton(
-    group: Sequence[Hidden], setups: Sequence[Setup], frames: Sequence[int], device: str, numerics: Numerics
+    group: Sequence[Hidden], setups: Sequence[Setup], frames: Sequence[int], device: str
 ) -> list[Trajectory]:
     """Worlds side by side."""
-    soils = [soil_of(h, s, numerics.spacing) for h, s in zip(group, setups, strict=True)]
-    runs = plough(soils, numerics, frames, device)
+    numerics = Numerics()
+    soils = [soil_of(hidden, setup, numerics.spacing) for hidden, setup in zip(group, setups, strict=True)]
     found = []
-    for setup, soil, run in zip(setups, soils, runs, strict=True):
+    for setup, soil, run in zip(setups, soils, plough(soils, numerics, frames, device), strict=True):
         positions = np.stack([soil.particles, *(run.particles[f] for f in frames if f > 0)]).astype(np.float32)
         found.append(
             Trajectory(
@@ -106,72 +104,87 @@ def ploughed_by_us(hidden: Hidden, setup: Setup, frames: Sequence[int], preset: 
     experiment = setup.experiment()
     law = Law(effect.for_measurement(experiment) for effect in find_effects([hidden.kind] if hidden.values else []))
     resolution = Resolution.derive(experiment, preset)
-    return simulate(
-        experiment,
-        fill(setup.surface, setup.bed, resolution.spacing, seed=hidden.seed),
-        law.require_on({**hidden.values, "friction_angle": hidden.angle}),
-        law=law,
-        resolution=resolution,
-        frames=frames,
-        device=device,
-    )[0]
+    x = fill(setup.surface, setup.bed, resolution.spacing, seed=hidden.seed)
+    values = law.require_on({**hidden.values, "friction_angle": hidden.angle})
+    return simulate(experiment, x, values, law=law, resolution=resolution, frames=frames, device=device)[0]
 
 
-def make_worlds(truths: Sequence[Hidden], options: argparse.Namespace, say: Callable[[str], None]) -> Iterator[Hidden]:
-    """Simulate and photograph the experiments that the folder does not have, so many at a time; each that is there."""
-    sets, numerics = options.out / "sets", Numerics(voxel=options.voxel, iterations=options.iterations)
-    missing = [h for h in truths if not (sets / h.name / "truth.json").is_file()]
-    yield from (h for h in truths if h not in missing)
-    count = options.worlds_side_by_side
-    groups = [missing[k : k + count] for k in range(0, len(missing), count)]
-    while groups:
-        group = groups.pop(0)
-        setups, seen = [h.scene.setup() for h in group], [h.observation() for h in group]
-        rate = setups[0].frame_rate
-        frames = sorted({f for o in seen for f in frames_around(setups[0].frames, o.time_offset * rate)})
-        if options.solver == NEWTON:
+@dataclass(frozen=True)
+class Study:
+    """How experiments are made and judged: folder, solver that ploughs, preset of the fits, device, and progress."""
+
+    out: Path
+    solver: str
+    preset: str
+    device: str
+    say: Clock
+
+    def worlds(self, truths: Sequence[Hidden], side_by_side: int) -> Iterator[Hidden]:
+        """Simulate and photograph the experiments that the folder lacks, so many at a time; each that is there."""
+        missing = [h for h in truths if not (self.out / "sets" / h.name / "truth.json").is_file()]
+        yield from (h for h in truths if h not in missing)
+        groups = [missing[k : k + side_by_side] for k in range(0, len(missing), side_by_side)]
+        while groups:
+            group = groups.pop(0)
+            setups, seen = [h.scene.setup() for h in group], [h.observation() for h in group]
+            rate = setups[0].frame_rate
+            frames = sorted({f for o in seen for f in frames_around(setups[0].frames, o.time_offset * rate)})
             try:
-                trajectories = ploughed_by_newton(group, setups, frames, options.device, numerics)
-            except ValueError as error:  # a particle that flies off asks for a grid of any size
-                say(f"{', '.join(h.name for h in group)}: the other solver failed ({error})")
+                if self.solver == NEWTON:
+                    runs = ploughed_by_newton(group, setups, frames, self.device)
+                else:
+                    ours = zip(group, setups, strict=True)
+                    runs = [ploughed_by_us(h, setup, frames, self.solver, self.device) for h, setup in ours]
+            except ValueError as error:  # a particle that flies off asks Newton for a grid of any size
+                self.say(f"{', '.join(h.name for h in group)}: the solver failed ({error})")
                 groups += [[hidden] for hidden in group if len(group) > 1]
                 continue
-        else:
-            ours = zip(group, setups, strict=True)
-            trajectories = [ploughed_by_us(h, s, frames, options.solver, options.device) for h, s in ours]
-        solver = asdict(numerics) if options.solver == NEWTON else options.solver
-        for hidden, setup, trajectory, observation in zip(group, setups, trajectories, seen, strict=True):
-            truth = {"hidden": hidden.kind, "size": hidden.size, "values": hidden.values, "solver": solver}
-            photograph_run(
-                sets / hidden.name,
-                setup,
-                trajectory,
-                plain({**truth, "scene": asdict(hidden.scene)}),
-                appearance=Appearance.drawn(hidden.seed),
-                observation=observation,
-                seed=hidden.seed,
-                device=options.device,
-            )
-            say(f"{hidden.name} simulated and photographed")
-            yield hidden
+            for each in zip(group, setups, runs, strict=True):
+                self.photograph(*each)
+                yield each[0]
 
+    def photograph(self, hidden: Hidden, setup: Setup, run: Trajectory) -> None:
+        """Make the measurement set, with its truth."""
+        solver = asdict(Numerics()) if self.solver == NEWTON else self.solver
+        truth = {"hidden": hidden.kind, "size": hidden.size, "values": hidden.values, "solver": solver}
+        photograph_run(
+            self.out / "sets" / hidden.name,
+            setup,
+            run,
+            plain({**truth, "scene": asdict(hidden.scene)}),
+            appearance=Appearance.drawn(hidden.seed),
+            observation=hidden.observation(),
+            seed=hidden.seed,
+            device=self.device,
+        )
+        self.say(f"{hidden.name} simulated and photographed")
 
-def criticise(name: str, out: Path, preset: str, device: str, say: Callable[[str], None]) -> None:
-    """Fit and diagnose by the command line, unless that is done; what it says is kept beside its run."""
-    run = out / "runs" / name
-    if (run / "diagnosis.json").is_file():
-        return
-    run.mkdir(parents=True, exist_ok=True)
-    commands = (
-        ["fit", str(out / "sets" / name), "--run", str(run), "--preset", preset, "--device", device],
-        ["diagnose", str(run), "--device", device],
-    )
-    with (out / "runs" / f"{name}.log").open("a") as log:
-        codes = [
-            subprocess.run([sys.executable, "-m", "splatsoil", *words], stdout=log, stderr=log, check=False).returncode
-            for words in commands
-        ]
-    say(f"{name}: {'done' if not any(codes) else f'exit codes {codes}'}")
+    def run(self, hidden: Hidden) -> Path:
+        """The run folder."""
+        return self.out / "runs" / hidden.name
+
+    def judge(self, hidden: Hidden) -> None:
+        """Fit and diagnose by the command line, unless that is done; what it says is kept beside its run."""
+        run = self.run(hidden)
+        if (run / "diagnosis.json").is_file():
+            return
+        run.mkdir(parents=True, exist_ok=True)
+        commands = (
+            ["fit", str(self.out / "sets" / hidden.name), "--run", str(run), "--preset", self.preset],
+            ["diagnose", str(run)],
+        )
+        with run.with_suffix(".log").open("a") as log:
+            command = [sys.executable, "-m", "splatsoil"]
+            codes = [
+                subprocess.run([*command, *words, "--device", self.device], stdout=log, stderr=log).returncode
+                for words in commands
+            ]
+        self.say(f"{hidden.name}: {'done' if not any(codes) else f'exit codes {codes}'}")
+
+    def rows(self, truths: Iterable[Hidden]) -> list[dict[str, Any]]:
+        """Scores of those that were judged."""
+        there = [h for h in truths if (self.run(h) / "diagnosis.json").is_file()]
+        return [score(h, read_json(self.run(h) / "fit.json"), read_json(self.run(h) / "diagnosis.json")) for h in there]
 
 
 def score(hidden: Hidden, fit: Mapping[str, Any], told: Mapping[str, Any]) -> dict[str, Any]:
@@ -211,54 +224,58 @@ def score(hidden: Hidden, fit: Mapping[str, Any], told: Mapping[str, Any]) -> di
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """All worlds, those whose truth was not told first, and what they come to, as Markdown."""
-    lines = [
-        "| hidden | size (over the smallest meaningful) | verdict | class | probability: truth, base law | "
-        "angle: true; found (error over ±) | size found | fit, diagnosis |",
-        "|---" * 8 + "|",
-    ]
+    head = ["hidden", "size (over the smallest meaningful)", "verdict", "class", "probability: truth, base law"]
+    head += ["angle: true; found (error over ±)", "size found", "fit, diagnosis"]
+    lines = []
     for r in sorted(rows, key=lambda r: (r["right"], r["hidden"])):
         size = f"{r['size']:.3g}" + (f" ({r['times']:.1f})" if "times" in r else "") if r["truth"] else "–"
         chances = f"{_chance(r, [r['truth']]):.2f}, {_chance(r, ['']):.2f}"
         angle = f"{r['angle']:.1f}°; {r['angle_found'][0]:.1f} ± {r['angle_found'][1]:.1f}° ({r['z']:+.1f})"
         found = "{:.3g} ± {:.2g}".format(*r["size_found"]) if "size_found" in r else "–"
         seconds = "{:.0f}, {:.0f} s".format(*r["seconds"])
-        cells = (r["hidden"], size, r["verdict"], ", ".join(r["class"]) or "–", chances, angle, found, seconds)
-        lines.append("| " + " | ".join(cells) + " |")
-    lines.append("")
+        lines.append([r["hidden"], size, r["verdict"], ", ".join(r["class"]) or "–", chances, angle, found, seconds])
+    return markdown(head, lines) + "\n\n" + "\n".join(f"- {line}" for line in _counts(rows))
 
-    def share(what: str, hits: Sequence[bool]) -> None:
-        if hits:
-            low, high = binomtest(sum(hits), len(hits)).proportion_ci(method="wilson")
-            lines.append(f"- {what}: {sum(hits)} of {len(hits)} ({100 * low:.0f}–{100 * high:.0f} %)")
 
-    def rms(what: str, values: Sequence[float]) -> None:
-        if values:
-            lines.append(f"- {what}, root mean square of {len(values)}: {np.sqrt(np.mean(np.square(values))):.2f}")
-
+def _counts(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     dry = [r for r in rows if r["hidden"] == NOTHING]
     outside = [r for r in rows if r["hidden"] in OUTSIDE]
     library = [r for r in rows if r["hidden"] not in (NOTHING, *OUTSIDE)]
     large = [r for r in library if r.get("detectable") and r["times"] >= r["detectable"]]
-    share("nothing hidden: some effect named", [bool(r["named"]) for r in dry])
-    share("an effect hidden: it alone named", [r["named"] == [r["truth"]] for r in library])
-    share("the same, of what is at least as large as told detectable", [r["named"] == [r["truth"]] for r in large])
-    share("an effect hidden: named, or in the set", [r["right"] for r in library])
-    share("hidden outside the library: something else, or undecided", [r["verdict"] in OPEN for r in outside])
-    share(
-        "named wrongly, of all with something hidden", [bool(r["named"]) and not r["right"] for r in library + outside]
-    )
+    yield from _share("nothing hidden: some effect named", [bool(r["named"]) for r in dry])
+    yield from _share("an effect hidden: it alone named", [r["named"] == [r["truth"]] for r in library])
+    same = "the same, of what is at least as large as told detectable"
+    yield from _share(same, [r["named"] == [r["truth"]] for r in large])
+    yield from _share("an effect hidden: named, or in the set", [r["right"] for r in library])
+    others = "hidden outside the library: something else, or undecided"
+    yield from _share(others, [r["verdict"] in OPEN for r in outside])
+    wrong = [bool(r["named"]) and not r["right"] for r in library + outside]
+    yield from _share("named wrongly, of all with something hidden", wrong)
     for what, some in (("nothing hidden", dry), ("an effect hidden", library), ("outside the library", outside)):
-        rms(f"{what}: error of the angle, degrees", [r["angle_found"][0] - r["angle"] for r in some])
-        rms(f"{what}: error of the angle over its ±", [r["z"] for r in some])
-    rms("relative error of the size", [r["size_error"] for r in rows if "size_error" in r])
+        yield from _rms(f"{what}: error of the angle, degrees", [r["angle_found"][0] - r["angle"] for r in some])
+        yield from _rms(f"{what}: error of the angle over its ±", [r["z"] for r in some])
+    yield from _rms("relative error of the size", [r["size_error"] for r in rows if "size_error" in r])
     for what, told in (
         ("effects named", [(r, r["named"]) for r in rows if r["named"]]),
         ("the most probable model", [(r, [r["best"]]) for r in rows]),
     ):
         mean = np.mean([_chance(*each) for each in told]) if told else math.nan
-        share(f"{what}, of probability {mean:.2f} on average: right", [r["truth"] in names for r, names in told])
-    scores = [math.log(max(_chance(r, [r["truth"]]), LEAST)) for r in rows]
-    return "\n".join([*lines, f"- log score of the true model, mean: {np.mean(scores):.2f}"] if rows else lines)
+        right = [r["truth"] in names for r, names in told]
+        yield from _share(f"{what}, of probability {mean:.2f} on average: right", right)
+    if rows:
+        scores = [math.log(max(_chance(r, [r["truth"]]), LEAST)) for r in rows]
+        yield f"log score of the true model, mean: {np.mean(scores):.2f}"
+
+
+def _share(what: str, hits: Sequence[bool]) -> Iterator[str]:
+    if hits:
+        low, high = binomtest(sum(hits), len(hits)).proportion_ci(method="wilson")
+        yield f"{what}: {sum(hits)} of {len(hits)} ({100 * low:.0f}–{100 * high:.0f} %)"
+
+
+def _rms(what: str, values: Sequence[float]) -> Iterator[str]:
+    if values:
+        yield f"{what}, root mean square of {len(values)}: {np.sqrt(np.mean(np.square(values))):.2f}"
 
 
 def _chance(row: Mapping[str, Any], names: Iterable[str]) -> float:
@@ -268,36 +285,21 @@ def _chance(row: Mapping[str, Any], names: Iterable[str]) -> float:
 
 def main(arguments: list[str] | None = None) -> int:
     """Command line; exit code 0 when every experiment was judged."""
-    parser = parser_of(__doc__)
+    parser = parser_of(__doc__, "runs/hidden-worlds")
     parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=list(KINDS), metavar="KIND")
     parser.add_argument(
         "--count", type=at_least(1), default=1, help="experiments of each kind; three times as many with nothing hidden"
     )
     parser.add_argument("--seed", type=int, default=1, help="of the truths")
-    parser.add_argument(
-        "--times",
-        nargs=2,
-        type=float,
-        default=list(TIMES),
-        metavar=("LOW", "HIGH"),
-        help="range of the effects' sizes over the smallest meaningful ones",
-    )
-    parser.add_argument("--preset", default="small")
+    sizes = "range of the effects' sizes over the smallest meaningful ones"
+    parser.add_argument("--times", nargs=2, type=float, default=list(TIMES), metavar=("LOW", "HIGH"), help=sizes)
+    parser.add_argument("--preset", default="small", choices=sorted(PRESETS), help="of the fits")
     parser.add_argument("--side-by-side", type=at_least(1), default=1, help="fits and diagnoses at a time")
-    parser.add_argument(
-        "--solver",
-        choices=[NEWTON, *PRESETS],
-        default=NEWTON,
-        help="newton needs the package, the others are ours by preset (not friction_field, crust)",
-    )
-    parser.add_argument("--voxel", type=float, default=Numerics.voxel, help="edge of the other solver's cells, m")
-    parser.add_argument("--iterations", type=at_least(1), default=Numerics.iterations, help="most in its substep")
+    solvers = "newton needs the package, the others are ours by preset (not friction_field, crust)"
+    parser.add_argument("--solver", choices=[NEWTON, *PRESETS], default=NEWTON, help=solvers)
     parser.add_argument("--worlds-side-by-side", type=at_least(1), default=4, help="simulated at a time by Newton")
     parser.add_argument("--worlds-only", action="store_true", help="make the sets and stop")
-    output_options(parser)
     options = parser.parse_args(arguments)
-    hush()
-    options.out = options.out or Path("runs/hidden-worlds")
     foreign = [kind for kind in options.kinds if kind in OUTSIDE]
     if options.solver != NEWTON and foreign:
         raise ParameterError(
@@ -305,10 +307,9 @@ def main(arguments: list[str] | None = None) -> int:
         )
     if not 0.0 < options.times[0] <= options.times[1] < math.inf:
         raise ParameterError("--times: give two positive numbers, the smaller one first")
-    if not options.voxel > 0.0:
-        raise ParameterError("--voxel must be positive")
-    named = ("seed", "times", "preset", "solver", "voxel", "iterations")
-    decides = {name: getattr(options, name) for name in named}
+    hush()
+    numerics = {"voxel": Numerics.voxel, "iterations": Numerics.iterations}
+    decides = {name: getattr(options, name) for name in ("seed", "times", "preset", "solver")} | numerics
     decides["code"] = sources([Path(__file__).with_name(f"{name}.py") for name in OWN])
     keep_to_one_protocol(options.out, decides)
     truths = [
@@ -316,31 +317,16 @@ def main(arguments: list[str] | None = None) -> int:
         for kind in options.kinds
         for k in range((3 if kind == NOTHING else 1) * options.count)
     ]
-    say = Clock()
-    threads = max(1, (os.cpu_count() or 1) // options.side_by_side)
-    os.environ.setdefault("OMP_NUM_THREADS", str(threads))
+    study = Study(options.out, options.solver, options.preset, options.device, Clock())
+    os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // options.side_by_side)))
     # an experiment is judged while the next ones are made
     with ThreadPoolExecutor(options.side_by_side) as pool:
-        judged = [
-            pool.submit(criticise, hidden.name, options.out, options.preset, options.device, say)
-            for hidden in make_worlds(truths, options, say)
-            if not options.worlds_only
-        ]
+        worlds = study.worlds(truths, options.worlds_side_by_side)
+        judged = [pool.submit(study.judge, hidden) for hidden in worlds if not options.worlds_only]
         for one in judged:
             one.result()
     if options.worlds_only:
         return 0
-    runs = [(hidden, options.out / "runs" / hidden.name) for hidden in truths]
-    rows = [
-        score(hidden, read_json(run / "fit.json"), read_json(run / "diagnosis.json"))
-        for hidden, run in runs
-        if (run / "diagnosis.json").is_file()
-    ]
-    result = {"made_by": stamp(options.device), **decides, "rows": rows}
-    write_result(options.out, result, table(rows), {})
-    print(json.dumps(plain(result), indent=1) if options.json else table(rows))
+    rows = study.rows(truths)
+    tell(options, {"made_by": stamp(options.device), **decides, "rows": rows}, table(rows))
     return 0 if len(rows) == len(truths) else 1
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -21,21 +21,23 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from splatsoil.benchmarks._common import (
+    Clock,
+    FloatArray,
     at_least,
     keep_to_one_protocol,
+    markdown,
     parser_of,
     sources,
     stamp,
+    tell,
     with_section,
-    write_result,
 )
-from splatsoil.benchmarks._truth import CELL, Truth
+from splatsoil.benchmarks._truth import CELL, Truth, reconstructed
 from splatsoil.inverse.criticism.design import Prior, Run
 from splatsoil.inverse.criticism.diagnosis import BASE, FINE, PAIRS, STEP
 from splatsoil.inverse.criticism.noise import Noise, Tables, noise_of, trend_of
 from splatsoil.inverse.criticism.simulations import Simulations
 
-from splatsoil.commands._output import only_json, print_json
 from splatsoil.errors import SimulationError
 from splatsoil.experiment import Candidate, Layout, Site
 from splatsoil.experiment.plow import MOST_ROWS, PlowExperiment
@@ -46,11 +48,8 @@ from splatsoil.model import Model
 from splatsoil.mpm import PRESETS
 from splatsoil.parameters import Parameter
 from splatsoil.quiet import hush
-from splatsoil.reconstruction import Reconstruction, reconstruct
 from splatsoil.soil.library import library
 from splatsoil.synthetic import make_set, plow
-
-FloatArray = npt.NDArray[np.float64]
 
 ANGLE, WORLD = 35.0, 1
 """Of the soil, degrees, and the seed of its surface, its looks and the cameras' noise."""
@@ -228,36 +227,33 @@ def left(
 
 def table(rows: Iterable[Mapping[str, Any]]) -> str:
     """Markdown: physics, then observation, what loses most first; what scatter alone could reach is a limit."""
-    lines = [
-        "| effect | (a) heights, force | (b) drawn | (c) reconstructed | (d) after nuisances | loss | most by |",
-        "|---" * 7 + "|",
-    ]
+    head = ("effect", "(a) heights, force", "(b) drawn", "(c) reconstructed", "(d) after nuisances", "loss", "most by")
+    lines = []
     for row in sorted(rows, key=lambda row: ("soil" not in row["sigmas"], -row["loss"])):
         hidden = {name: value < row["least"][name] for name, value in row["sigmas"].items()}
         told = {n: f"< {row['least'][n]:.1f} σ" if hidden[n] else f"{v:.1f} σ" for n, v in row["sigmas"].items()}
         loss, most = f"{'≥ ' * hidden['discretisation']}{row['loss']:.1f}", max(row["factors"], key=row["factors"].get)
         unit = "" if row["unit"] == "1" else " " + row["unit"].replace("deg", "°")
-        cells = [told.get(name, "–") for name in ("soil", "drawn", "reconstructed", "discretisation")]
+        cells = [f"{row['effect'].replace('_', ' ')}, {row['value']:g}{unit}"]
+        cells += [told.get(name, "–") for name in ("soil", "drawn", "reconstructed", "discretisation")]
         cells += ["–", "–"] if next(iter(hidden.values())) else [loss, f"{most}: {row['factors'][most]:.1f}"]
-        lines.append("| " + " | ".join([f"{row['effect'].replace('_', ' ')}, {row['value']:g}{unit}", *cells]) + " |")
-    return "\n".join(lines)
+        lines.append(cells)
+    return markdown(head, lines)
 
 
 def measure(effects: Sequence[str], preset: str, seeds: int, device: str, out: Path) -> list[dict[str, Any]]:
     """`left` of the effects of these names, or of all; what is not in the folder is made."""
-    place, made = out / "set", out / "reconstruction"
+    place, say = out / "set", Clock()
     if not (place / "truth.json").is_file():
         make_set(place, plow(WORLD), friction_angle=ANGLE, preset=preset, seed=WORLD, device=device)
     measurement = Measurement.load(place)
-    if not (made / "reconstruction.json").is_file():
-        reconstruct(measurement, preset=preset, device=device).save(made)
-    reconstruction = Reconstruction.load(made)
+    reconstruction = reconstructed(measurement, out / "reconstruction", preset, device)
     known = replace(reconstruction, surface=plow(WORLD).surface)
     prepared: list[Any] = []
     for kind, start in ((TrueSoil, known), (PlowExperiment, reconstruction)):
         experiment = kind(Model(measurement, start, preset=preset, device=device), TRUTH)
         wanted = [c for c in experiment.candidates if not effects or c.name in effects]
-        ask = Simulations(experiment, out / "features", {"experiment": kind.__name__}, partial(print, file=sys.stderr))
+        ask = Simulations(experiment, out / "features", {"experiment": kind.__name__}, say)
         prior = Prior.of(experiment, TRUTH)
         prepared.append((experiment, simulated(experiment, ask, prior, wanted, seeds, kind is PlowExperiment)))
     return left(prepared[0], prepared[1], prior, wanted)
@@ -265,14 +261,12 @@ def measure(effects: Sequence[str], preset: str, seeds: int, device: str, out: P
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure, print the table, and write it into a page; exit code 0."""
-    parser = parser_of(__doc__)
+    parser = parser_of(__doc__, "runs/information")
     known = [name for name, effect in library().items() if not effect.numerical]
     parser.add_argument("--effects", nargs="+", default=[], choices=known, metavar="EFFECT", help="all by default")
     parser.add_argument("--preset", default="tiny", choices=sorted(PRESETS))
     parser.add_argument("--seeds", type=at_least(2), default=3, help="of the particles, with each effect")
-    parser.add_argument("--out", type=Path, default=Path("runs/information"))
     parser.add_argument("--page", type=Path, help="write the table into this page")
-    parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
     options = parser.parse_args(arguments)
     hush()
     mark = f"information {options.preset}"
@@ -280,16 +274,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with_section(options.page, mark, "")  # a page without a place for the table fails now, not at the end
     device, own = options.device.split(":")[0], sources([Path(__file__)])
     keep_to_one_protocol(options.out, {"preset": options.preset, "device": device, "code": own})
-    with only_json() if options.json else nullcontext():
-        rows = measure(options.effects, options.preset, options.seeds, options.device, options.out)
-        told = {"made_by": stamp(options.device), "preset": options.preset, "seeds": options.seeds, **TRUTH}
-        shown = f"Preset `{options.preset}`, {options.seeds} seeds. {COMPUTED}\n\n{table(rows)}"
-        write_result(options.out, {**told, "computed": COMPUTED, "rows": rows}, shown, {})
-        if options.page:
-            write_text(options.page, with_section(options.page, mark, shown))
-        print_json({"ok": True, **told, "rows": rows}) if options.json else print(shown)
+    rows = measure(options.effects, options.preset, options.seeds, options.device, options.out)
+    result = {"made_by": stamp(options.device), "preset": options.preset, "seeds": options.seeds, **TRUTH, "rows": rows}
+    shown = f"Preset `{options.preset}`, {options.seeds} seeds. {COMPUTED}\n\n{table(rows)}"
+    if options.page:
+        write_text(options.page, with_section(options.page, mark, shown))
+    tell(options, result, shown)
     return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

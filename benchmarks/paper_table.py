@@ -2,9 +2,9 @@
 
     splatsoil benchmark paper-table --device cuda:0 --picture-scale 0.5 --out runs/paper-table
 
-For each angle, synthetic experiments are simulated with other particles and a finer grid, whose nodes meet the model's
-at the walls only, and photographed by the path tracer. Each is reconstructed from its views, and each trial spends 10
-evaluations on one:
+For each angle, a synthetic experiment is simulated with other particles and a finer grid, whose nodes meet the model's
+at the walls only, and photographed by the path tracer. It is reconstructed from its views, and each trial spends 10
+evaluations on it:
 
 | way | cells | loss | search |
 |---|---|---|---|
@@ -14,17 +14,12 @@ evaluations on one:
 
 The angle is searched in [25°, 55°]. All trials of an experiment go on side by side: one batch of simulations for each
 step. Experiments, reconstructions and trials are kept in the folder, and an interrupted benchmark continues.
-``--devices cuda:0 cuda:1 --executor processes:4`` shares the experiments out over processes and devices.
 """
 
 from __future__ import annotations
 
-import json
-import time
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Executor
-from dataclasses import dataclass, field, replace
-from itertools import cycle
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,18 +27,18 @@ import numpy as np
 import numpy.typing as npt
 from splatsoil.benchmarks._common import (
     Clock,
+    FloatArray,
     at_least,
-    here,
     keep_to_one_protocol,
-    output_options,
+    markdown,
     parser_of,
     sources,
     stamp,
-    write_result,
+    tell,
 )
 from splatsoil.benchmarks._simulations import FEWEST, density_of
+from splatsoil.benchmarks._truth import reconstructed
 from splatsoil.inverse.bayesopt import BayesianOptimiser
-from splatsoil.inverse.executors import executor
 
 from splatsoil.comparison import Comparator
 from splatsoil.errors import SimulationError
@@ -53,86 +48,51 @@ from splatsoil.model import Model
 from splatsoil.mpm import PRESETS, Preset, Resolution, simulate_together
 from splatsoil.parameters import ParameterSpace
 from splatsoil.quiet import hush
-from splatsoil.reconstruction import Reconstruction, reconstruct
+from splatsoil.reconstruction import Reconstruction
 from splatsoil.soil.settings import FRICTION_ANGLE
 from splatsoil.synthetic import make_set, paper
 
-FloatArray = npt.NDArray[np.float64]
 Images = Mapping[tuple[str, int], npt.NDArray[np.float32]]
 
-#: Mean absolute error and its standard deviation over ten trials, degrees (Hsiao and Kumar).
 PUBLISHED = {25.0: (0.64, 1.01), 30.0: (1.07, 0.71), 35.0: (1.24, 0.96), 45.0: (1.38, 1.36)}
-#: What this project aims at for all four, degrees.
+"""Mean absolute error and its standard deviation over ten trials, degrees, by true angle (Hsiao and Kumar)."""
 TARGET = (0.3, 0.3)
-#: Frames that the published loss compares.
+"""What this project aims at for all four, degrees."""
 FRAMES = (50, 100, 150, 199)
+"""That the published loss compares."""
 SPACE = ParameterSpace([replace(FRICTION_ANGLE, lower=25.0, upper=55.0)])
-#: Ways that spend evaluations of their own.
 SEARCHES = ("published", "ours")
+"""Ways that spend evaluations of their own."""
 WAYS = (*SEARCHES, "features")
-#: Seed of the published way's first search: its start is random, and another one than ours.
+CELLS = {"published": 3.2, "ours": 6.4, "truth": 8.7}
+"""Across the tool. With 8.7 a bed of 1 m has 87 cells, which share no factor with 64 and 32."""
 FIRST_OF_PUBLISHED = 1000
+"""Seed of the published way's first search: its start is random, and another one than ours."""
+
+Found = tuple[float, FloatArray] | None
+"""Loss and block residuals (b,) of an evaluation; None where the simulation failed."""
 
 
-@dataclass(frozen=True)
-class Protocol:
-    """How the table is made.
-
-    Attributes:
-        angles: true friction angles, degrees.
-        trials: for each angle.
-        worlds: experiments for each angle, which trials take in turn.
-        evaluations: in a trial.
-        cells: of our model, across the tool.
-        published_cells: of the model in the published way.
-        truth_cells: of the experiments. With 8.7 a bed of 1 m has 87 cells, which share no factor with 64 and 32.
-        views: photographs before anything moves.
-        picture_scale: size of the pictures over 1280 x 720.
-        device: of everything.
-        reconstruction: preset of the reconstruction.
-    """
-
-    angles: tuple[float, ...] = tuple(PUBLISHED)
-    trials: int = 10
-    worlds: int = 1
-    evaluations: int = 10
-    cells: float = 6.4
-    published_cells: float = 3.2
-    truth_cells: float = 8.7
-    views: int = 40
-    picture_scale: float = 1.0
-    device: str = "cpu"
-    reconstruction: str = "small"
-
-    def preset(self, name: str, cells: float) -> Preset:
-        """The paper's preset with another number of cells across the tool."""
-        return replace(PRESETS["paper"], name=name, cells_across_tool=cells)
-
-    def kept(self) -> dict[str, Any]:
-        """What a folder keeps; trials and angles may grow, nothing else may change."""
-        free = ("angles", "trials", "device")
-        return {k: v for k, v in vars(self).items() if k not in free} | {"code": sources([Path(__file__)])}
+def preset(which: str) -> Preset:
+    """The paper's preset with the number of cells of a way, or of the truth."""
+    return replace(PRESETS["paper"], name=which, cells_across_tool=CELLS[which])
 
 
 class Sight:
     """One experiment as a model sees it: reconstruction, simulator, and both losses."""
 
-    def __init__(self, measurement: Measurement, reconstruction: Reconstruction, protocol: Protocol) -> None:
-        resolution = Resolution.derive(measurement, protocol.preset("model", protocol.cells))
-        self.model = Model(measurement, reconstruction, preset="paper", device=protocol.device)
-        self.model.resolution = resolution
-        coarser = Resolution.derive(measurement, protocol.preset("published", protocol.published_cells))
+    def __init__(self, measurement: Measurement, reconstruction: Reconstruction, device: str) -> None:
+        ours, coarser = (Resolution.derive(measurement, preset(way)) for way in ("ours", "published"))
+        self.model = Model(measurement, reconstruction, preset="paper", device=device)
+        self.model.resolution = ours
         # the published loss compares four frames: no others are drawn for it
         self.few = self.model.variant(frames=(0, *FRAMES), resolution=coarser)
-        patch = 2.0 * resolution.cell  # what is smaller differs from seed to seed
+        # what is smaller than the patch differs from seed to seed
         surface, frames = reconstruction.surface, self.model.frames
-        self.comparator = Comparator(measurement, surface=surface, frames=frames, patch=patch)
+        self.comparator = Comparator(measurement, surface=surface, frames=frames, patch=2.0 * ours.cell)
 
-    def evaluate(self, way: str, jobs: Sequence[tuple[float, int]]) -> list[tuple[float, FloatArray] | None]:
-        """Loss and block residuals (b,) of each angle and particle seed; None where the simulation failed.
-
-        The simulations run as one batch.
-        """
+    def evaluate(self, way: str, jobs: Sequence[tuple[float, int]]) -> list[Found]:
+        """What each angle and particle seed comes to; the simulations run as one batch."""
         model = self.few if way == "published" else self.model
         runs = simulate_together(
             model.measurement,
@@ -140,7 +100,7 @@ class Sight:
             [{"friction_angle": angle} for angle, _ in jobs],
             model,
         )
-        found: list[tuple[float, FloatArray] | None] = []
+        found: list[Found] = []
         for run, (_, seed) in zip(runs, jobs, strict=True):
             if isinstance(run, SimulationError):
                 found.append(None)
@@ -158,48 +118,27 @@ def published_loss(comparator: Comparator, images: Images) -> float:
     return float(np.mean([np.mean(np.square(comparator.observed[k] - images[k])) for k in keys]))
 
 
-def world(protocol: Protocol, angle: float, number: int, out: Path) -> tuple[Measurement, Reconstruction]:
+def world(angle: float, picture_scale: float, device: str, out: Path) -> tuple[Measurement, Reconstruction]:
     """An experiment and its reconstruction, from the folder or made and kept there."""
-    folder = out / "worlds" / f"{angle:g}-{number}"
+    folder = out / "worlds" / f"{angle:g}"
     if not (folder / "truth.json").is_file():
-        setup = paper(views=protocol.views)
-        make_set(
-            folder,
-            setup if protocol.picture_scale == 1.0 else setup.resized(protocol.picture_scale),
-            friction_angle=angle,
-            preset=protocol.preset("truth", protocol.truth_cells),
-            seed=number,
-            particle_seed=1_000_003 * (number + 1) + round(10 * angle),
-            device=protocol.device,
-        )
+        setup = paper() if picture_scale == 1.0 else paper().resized(picture_scale)
+        other = 1_000_003 + round(10 * angle)
+        make_set(folder, setup, friction_angle=angle, preset=preset("truth"), particle_seed=other, device=device)
     measurement = Measurement.load(folder)
-    kept = out / "reconstructions" / folder.name
-    if not (kept / "reconstruction.json").is_file():
-        reconstruct(measurement, preset=protocol.reconstruction, device=protocol.device).save(kept)
-    return measurement, Reconstruction.load(kept)
+    return measurement, reconstructed(measurement, out / "reconstructions" / folder.name, "small", device)
 
 
-@dataclass
 class Trial:
-    """A search going on.
+    """A search going on, by its number, which is its seed, and its way."""
 
-    Attributes:
-        number: of the trial, and the seed of its search.
-        way: of the search.
-        optimiser: that chooses angles.
-        calls: angle, and loss and block residuals (b,) or None, of each evaluation.
-    """
-
-    number: int
-    way: str
-    calls: list[tuple[float, tuple[float, FloatArray] | None]] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        if self.way == "published":
-            seed = FIRST_OF_PUBLISHED + self.number
-            self.optimiser = BayesianOptimiser(1, seed=seed, start=1, acquisition="best")
+    def __init__(self, number: int, way: str) -> None:
+        self.number, self.way = number, way
+        self.calls: list[tuple[float, Found]] = []
+        if way == "published":
+            self.optimiser = BayesianOptimiser(1, seed=FIRST_OF_PUBLISHED + number, start=1, acquisition="best")
         else:
-            self.optimiser = BayesianOptimiser(1, seed=self.number)
+            self.optimiser = BayesianOptimiser(1, seed=number)
 
     def ask(self) -> tuple[float, int]:
         """The angle to try next, degrees, and a seed of its particles."""
@@ -207,8 +146,8 @@ class Trial:
         seed = int(sequence.generate_state(1)[0] % 2**31)
         return float(SPACE.from_unit(self.optimiser.ask()[0].astype(np.float64))[0]), seed
 
-    def tell(self, angle: float, found: tuple[float, FloatArray] | None) -> None:
-        """What the angle came to; None: its simulation failed."""
+    def tell(self, angle: float, found: Found) -> None:
+        """What the angle came to."""
         self.calls.append((angle, found))
         self.optimiser.tell(SPACE.to_unit(np.array([[angle]]))[0], None if found is None else found[0])
 
@@ -238,134 +177,91 @@ def by_features(angles: FloatArray, blocks: FloatArray, sensor: float, seed: int
     return {"estimate": marginal.mean, "low": marginal.quantile(0.05), "high": marginal.quantile(0.95)}
 
 
-def search(sight: Sight, angle: float, numbers: Sequence[int], evaluations: int, out: Path) -> None:
+def trial_files(angle: float, trials: int, out: Path) -> dict[tuple[int, str], Path]:
+    """Where trials are kept, by their number and way."""
+    return {(n, way): out / "trials" / f"{angle:g}-{n}-{way}.json" for n in range(trials) for way in SEARCHES}
+
+
+def search(sight: Sight, angle: float, trials: int, evaluations: int, out: Path) -> None:
     """Trials of one experiment, step by step, side by side; those that are in the folder are not made again."""
-    files = {(n, way): out / "trials" / f"{angle:g}-{n}-{way}.json" for n in numbers for way in SEARCHES}
-    trials = [Trial(n, way) for (n, way), file in files.items() if not file.is_file()]
+    files = trial_files(angle, trials, out)
+    missing = [Trial(*key) for key, file in files.items() if not file.is_file()]
     for _ in range(evaluations):
         for way in SEARCHES:
-            mine = [t for t in trials if t.way == way]
+            mine = [t for t in missing if t.way == way]
             asked = [t.ask() for t in mine]
             for trial, (tried, _), found in zip(mine, asked, sight.evaluate(way, asked) if mine else [], strict=True):
                 trial.tell(tried, found)
-    for trial in trials:
+    for trial in missing:
         write_json(files[trial.number, trial.way], trial.result(sight.comparator.block_noise()))
 
 
-def one_world(protocol: Protocol, angle: float, number: int, out: Path, say: Clock) -> None:
-    """A worker's job: an experiment, its reconstruction, and its trials."""
-    sight = Sight(*world(protocol, angle, number, out), protocol)
-    say(f"{angle:g}°, experiment {number}: reconstructed")
-    search(sight, angle, range(number, protocol.trials, protocol.worlds), protocol.evaluations, out)
-    say(f"{angle:g}°, experiment {number}: done")
-
-
-def run(protocol: Protocol, out: Path, pool: Executor, devices: Sequence[str] = ()) -> dict[str, Any]:
-    """All trials, those in the folder already not again; errors of each way at each angle.
-
-    Args:
-        protocol: what to do.
-        out: folder of experiments, trials and results.
-        pool: where experiments are worked on.
-        devices: that they take in turn; the protocol's by default.
-    """
-    keep_to_one_protocol(out, protocol.kept())
-    turns = cycle([replace(protocol, device=device) for device in devices] or [protocol])
-    jobs = [
-        (next(turns), angle, number, out, Clock()) for angle in protocol.angles for number in range(protocol.worlds)
-    ]
-    for future in [pool.submit(one_world, *job) for job in jobs]:
-        future.result()
-    return collect(protocol, out)
-
-
-def collect(protocol: Protocol, out: Path) -> dict[str, Any]:
-    """Errors of the trials in the folder."""
+def collect(angles: Sequence[float], trials: int, out: Path) -> list[dict[str, Any]]:
+    """Errors of each way at each angle, of the trials in the folder."""
     entries = []
-    for angle in protocol.angles:
-        files = [out / "trials" / f"{angle:g}-{n}-{way}.json" for n in range(protocol.trials) for way in SEARCHES]
-        kept = [read_json(file) for file in files]
+    for angle in angles:
+        kept = [read_json(file) for file in trial_files(angle, trials, out).values()]
         for way in WAYS:
-            trials = [entry[way] for entry in kept if entry.get(way) is not None]
-            if not trials:
+            found = [entry[way] for entry in kept if entry.get(way) is not None]
+            if not found:
                 continue
-            errors = np.array([t["estimate"] for t in trials]) - angle
-            spread = {"std": np.abs(errors).std(ddof=1), "scatter": errors.std(ddof=1)} if len(trials) > 1 else {}
+            errors = np.array([t["estimate"] for t in found]) - angle
+            spread = {"std": np.abs(errors).std(ddof=1), "scatter": errors.std(ddof=1)} if len(found) > 1 else {}
             entry = {"angle": angle, "way": way, "mae": np.abs(errors).mean(), "bias": errors.mean(), **spread}
-            entry["width_90"] = np.mean([t["high"] - t["low"] for t in trials])
-            entry["coverage_90"] = np.mean([t["low"] <= angle <= t["high"] for t in trials])
+            entry["width_90"] = np.mean([t["high"] - t["low"] for t in found])
+            entry["coverage_90"] = np.mean([t["low"] <= angle <= t["high"] for t in found])
             entries.append(plain(entry))
-    return {"benchmark": "paper-table", "protocol": vars(protocol), "published": PUBLISHED, "entries": entries}
+    return entries
 
 
-def table(result: Mapping[str, Any]) -> str:
-    """The result as Markdown."""
-    p = result["protocol"]
-    lines = [
-        f"{p['trials']} trials of {p['evaluations']} evaluations, {p['worlds']} experiments an angle, pictures "
-        f"{p['picture_scale']:g} of 1280 x 720, {p['views']} views, {p['cells']:g} cells across the tool "
-        f"(published: {p['published_cells']:g}, experiments: {p['truth_cells']:g}).",
-        "",
-        "| true angle | in print | " + " | ".join(WAYS) + " | target |",
-        "|---" * (len(WAYS) + 3) + "|",
-    ]
-    for angle in p["angles"]:
-        found = {e["way"]: e for e in result["entries"] if e["angle"] == angle}
-        cells = [_error(found[way]) if way in found else "–" for way in WAYS]
+def table(entries: Sequence[Mapping[str, Any]]) -> str:
+    """Errors as Markdown."""
+
+    def error(entry: Mapping[str, Any] | None) -> str:
+        if entry is None:
+            return "–"
+        return f"{entry['mae']:.2f} ± {entry['std']:.2f}°" if "std" in entry else f"{entry['mae']:.2f}°"
+
+    rows = []
+    for angle in dict.fromkeys(e["angle"] for e in entries):
+        found = {e["way"]: e for e in entries if e["angle"] == angle}
         printed = "{:.2f} ± {:.2f}°".format(*PUBLISHED[angle]) if angle in PUBLISHED else "–"
-        lines.append(f"| {angle:g}° | {printed} | {' | '.join(cells)} | {TARGET[0]:g} ± {TARGET[1]:g}° |")
-    lines += [
-        "",
-        "| true angle | way | bias | scatter | 90 % interval's width | contains the truth |",
-        "|---" * 6 + "|",
+        aim = "{:g} ± {:g}°".format(*TARGET)
+        rows.append([f"{angle:g}°", printed, *(error(found.get(way)) for way in WAYS), aim])
+    more = [
+        [
+            f"{e['angle']:g}°",
+            e["way"],
+            f"{e['bias']:+.2f}°",
+            f"{e['scatter']:.2f}°" if "scatter" in e else "–",
+            f"{e['width_90']:.2f}°",
+            f"{100.0 * e['coverage_90']:.0f} %",
+        ]
+        for e in entries
     ]
-    for e in result["entries"]:
-        scatter = f"{e['scatter']:.2f}°" if "scatter" in e else "–"
-        lines.append(
-            f"| {e['angle']:g}° | {e['way']} | {e['bias']:+.2f}° | {scatter} | {e['width_90']:.2f}° | "
-            f"{100.0 * e['coverage_90']:.0f} % |"
-        )
-    return "\n".join(lines)
-
-
-def _error(entry: Mapping[str, Any]) -> str:
-    """Mean absolute error, and its spread over several trials."""
-    return f"{entry['mae']:.2f} ± {entry['std']:.2f}°" if "std" in entry else f"{entry['mae']:.2f}°"
+    first = markdown(("true angle", "in print", *WAYS, "target"), rows)
+    head = ("true angle", "way", "bias", "scatter", "90 % interval's width", "contains the truth")
+    return f"{first}\n\n{markdown(head, more)}"
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Command line; exit code 0."""
-    usual, parser = Protocol(), parser_of(__doc__)
-    parser.add_argument("--devices", nargs="+", type=here, help="several, which experiments take in turn")
-    parser.add_argument("--executor", default="serial", help="serial, processes:N or dask:ADDRESS")
-    parser.add_argument("--angles", type=float, nargs="+", default=list(usual.angles))
-    for name, kind, text in (
-        ("trials", at_least(1), "for each angle"),
-        ("worlds", at_least(1), "experiments for each angle, which trials take in turn"),
-        ("evaluations", at_least(1), "in a trial"),
-        ("cells", float, "of our model, across the tool"),
-        ("published_cells", float, "in the published way"),
-        ("truth_cells", float, "of the experiments"),
-        ("views", at_least(1), "photographs before anything moves"),
-        ("picture_scale", float, "size of the pictures over 1280 x 720"),
-        ("reconstruction", str, "preset of the reconstruction"),
-    ):
-        parser.add_argument(f"--{name.replace('_', '-')}", type=kind, default=getattr(usual, name), help=text)
-    output_options(parser)
+    parser = parser_of(__doc__, "runs/paper-table")
+    parser.add_argument("--angles", type=float, nargs="+", default=list(PUBLISHED))
+    parser.add_argument("--trials", type=at_least(1), default=10, help="for each angle")
+    parser.add_argument("--evaluations", type=at_least(1), default=10, help="in a trial")
+    parser.add_argument("--picture-scale", type=float, default=1.0, help="size of the pictures over 1280 x 720")
     options = parser.parse_args(arguments)
     hush()
-    devices = options.devices or [options.device]
-    chosen = {name: getattr(options, name) for name in vars(usual)}
-    chosen |= {"angles": tuple(options.angles), "worlds": min(options.worlds, options.trials), "device": devices[0]}
-    out = options.out or Path("runs/paper-table")
-    began = time.time()
-    with executor(options.executor) as pool:
-        result = run(Protocol(**chosen), out, pool, devices)
-    result |= {**stamp(devices[0]), "seconds": time.time() - began}
-    write_result(out, result, table(result), {})
-    print(json.dumps(result, indent=1) if options.json else table(result))
+    say, out, scale = Clock(), options.out, options.picture_scale
+    decides = {"evaluations": options.evaluations, "picture_scale": scale, "code": sources([Path(__file__)])}
+    keep_to_one_protocol(out, decides)
+    for angle in options.angles:
+        sight = Sight(*world(angle, scale, options.device, out), options.device)
+        say(f"{angle:g}°: reconstructed")
+        search(sight, angle, options.trials, options.evaluations, out)
+        say(f"{angle:g}°: done")
+    entries = collect(options.angles, options.trials, out)
+    result = {"made_by": stamp(options.device), "trials": options.trials, **decides, "entries": entries}
+    tell(options, result, table(entries))
     return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -56,7 +56,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
     first, *others = strips(open_run(options.run), options.camera)
     first.save(options.out, save_all=True, append_images=others, duration=PACE, loop=0, quality=70)
     return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

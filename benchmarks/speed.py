@@ -1,4 +1,4 @@
-"""How fast? Simulation, drawing, reconstruction and the whole path, each beside something else in the same run.
+"""How fast is simulation, beside something else in the same run? For reconstruction and fits see `whole-path`.
 
 ``splatsoil benchmark speed --page docs/performance.md`` writes the CPU's section, with ``--device cuda:0`` the GPU's.
 Times of one thread are CPU times, which other programs disturb less than the clock's; all others are the clock's.
@@ -8,9 +8,6 @@ Newton (extra ``independent``) is measured where it is installed.
 from __future__ import annotations
 
 import statistics
-import subprocess
-import sys
-import tempfile
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -23,30 +20,23 @@ from typing import Any
 import numpy as np
 import torch
 import warp as wp
-from splatsoil.benchmarks._common import at_least, parser_of, sources, stamp
+from splatsoil.benchmarks._common import FloatArray, at_least, sources, stamp
 from splatsoil.benchmarks._newton import Numerics, World, plough
-from splatsoil.benchmarks._parts import part_options, run_parts
-from splatsoil.benchmarks._truth import FloatArray, Truth
-from splatsoil.benchmarks._validation.page import Row, Section
+from splatsoil.benchmarks._parts import Row, Section, parts_parser, run_parts
+from splatsoil.benchmarks._truth import Truth
 from splatsoil.benchmarks.effects import acting, strong
 
-from splatsoil.errors import RunError
-from splatsoil.measurement import Camera, Measurement
+from splatsoil.measurement import Measurement
 from splatsoil.mpm import PRESETS, Resolution, Solver, simulate
 from splatsoil.mpm.simulate import base_settings, step_poses
 from splatsoil.quiet import hush
-from splatsoil.reconstruction import Reconstruction, fill, reconstruct
+from splatsoil.reconstruction import fill
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
-from splatsoil.splats import Gaussians, rasterise, reference
 from splatsoil.synthetic import paper
-from splatsoil.threads import at_most
 
 BATCH = 16
 """Parameter sets of one batch on a GPU."""
-LEAVES = ("means", "scales", "quaternions", "opacities", "colours")
-SHARE = 50
-"""The slow reference draws one Gaussian of so many."""
 WINDOWS, FRAMES = (0, 50, 150), 3
 """Frames at which pieces of Newton's run begin (soil at rest, pushed, tool drawn back), and how many of each count."""
 ROUNDS = 15
@@ -69,6 +59,10 @@ class Times:
         spread = 0.5 * factor * (max(self.values) - min(self.values))
         digits = f" ± {spread:.2g}" if len(self.values) > 1 else ""
         return f"{factor * self.median:.3g}{digits} {unit}"
+
+    def times(self, count: float) -> Times:
+        """So many of it, one after the other."""
+        return Times(tuple(count * value for value in self.values))
 
     def over(self, other: Times, name: str) -> str:
         """This time, the other's, and how many times as fast this is."""
@@ -153,16 +147,14 @@ class Task:
     @cached_property
     def scene(self) -> Scene:
         """The set with its true angle."""
-        truth = self.truth
-        resolution = Resolution.derive(truth.measurement, self.preset)
-        values = {"friction_angle": truth.values["friction_angle"]}
-        return Scene(truth.measurement, resolution, truth.start(resolution.spacing, 0), values, max(truth.particles))
+        truth, resolution = self.truth, Resolution.derive(self.truth.measurement, self.preset)
+        x, angle = truth.start(resolution.spacing, 0), {"friction_angle": truth.values["friction_angle"]}
+        return Scene(truth.measurement, resolution, x, angle, max(truth.particles))
 
 
 def published_scene() -> Scene:
     """The scene of the published table on cells of its size; its plate's thickness and frictions are the example's."""
-    setup = paper()
-    measurement = setup.experiment()
+    setup, measurement = paper(), paper().experiment()
     resolution = Resolution.derive(measurement, "paper")
     x = fill(setup.surface, setup.bed, resolution.spacing, seed=0)
     return Scene(measurement, resolution, x, {"friction_angle": 35.0}, max(setup.frames))
@@ -175,21 +167,19 @@ def simulation(task: Task) -> Section:
     if device != "cpu":
         cases["the published scene"] = published_scene()
     for name, one in cases.items():
-        alone = timed(lambda one=one: one.run(device), task.repeats, device)  # type: ignore[misc]
+        alone = timed(partial(one.run, device), task.repeats, device)
         what = f"{name}: {len(one.x)} particles, {one.last} frames"
         rows.append(Row(what, f"{alone}; {1e-6 * one.particle_steps / alone.median:.3g} M particle-steps/s"))
         if device != "cpu":
-            batch = timed(lambda one=one: one.run(device, BATCH), task.repeats, device)  # type: ignore[misc]
-            each = Times(tuple(BATCH * t for t in alone.values))
-            rows.append(Row(f"{name}: {BATCH} parameter sets as one batch", batch.over(each, "one after the other")))
+            batch = timed(partial(one.run, device, BATCH), task.repeats, device)
+            each = batch.over(alone.times(BATCH), "one after the other")
+            rows.append(Row(f"{name}: {BATCH} parameter sets as one batch", each))
     if device == "cpu":
         with ThreadPoolExecutor(2) as pool:
             pair = timed(lambda: list(pool.map(scene.run, ["cpu"] * 2)), task.repeats, "cpu", wall=True)
-        each = timed(lambda: scene.run("cpu"), task.repeats, "cpu", warm=0, wall=True)
-        twice = Times(tuple(2.0 * t for t in each.values))
-        rows.append(Row("two runs side by side on two cores", pair.over(twice, "one after the other")))
-    words = "A particle-step is a particle times a substep of the grid."
-    return Section("Simulation", words, tuple(rows))
+        alone = timed(partial(scene.run, "cpu"), task.repeats, "cpu", warm=0, wall=True)
+        rows.append(Row("two runs side by side on two cores", pair.over(alone.times(2), "one after the other")))
+    return Section("Simulation", "A particle-step is a particle times a substep of the grid.", tuple(rows))
 
 
 def newton(task: Task) -> Section:
@@ -200,15 +190,15 @@ def newton(task: Task) -> Section:
     for start in (w for w in WINDOWS if w in truth.particles):
         # as many particles as ours, which stand for as much soil
         x = rng.permutation(truth.particles[start])[: len(scene.x)]
-        world = World("speed", truth.measurement, scene.values["friction_angle"], x, scene.resolution.spacing)
+        world = World(truth.measurement, scene.values["friction_angle"], x, scene.resolution.spacing)
         ends: list[float] = []
         plough(
             [world], numerics, (start + 1 + FRAMES,), task.device, begin=start,
             progress=lambda *_, ends=ends: ends.append(time.perf_counter()),
         )  # fmt: skip
         seconds.append(np.diff(ends))  # the first frame compiles, and lets stress build up
-    whole = Times(tuple(scene.last * float(s) for s in np.mean(seconds, axis=0)))
-    ours = timed(lambda: scene.run(task.device), task.repeats, task.device, wall=True)
+    whole = Times(tuple(np.mean(seconds, axis=0).tolist())).times(scene.last)
+    ours = timed(partial(scene.run, task.device), task.repeats, task.device, wall=True)
     ratio = whole.median / ours.median
     row = Row(f"{scene.measurement.name}, {scene.last} frames", ours.over(whole, "Newton"), "≥ 20 ×", ratio >= 20.0)
     return Section(
@@ -231,7 +221,7 @@ def effects(task: Task) -> Section:
     for frame in range(ROUNDS):
         poses = step_poses(scene.measurement.tool.motion, frame * r.frame_time, r.frame_time, r.steps)
         for run, own in zip(runs, spent, strict=True):
-            own += timed(lambda run=run, poses=poses: run.advance(poses), 1, "cpu", warm=0).values  # type: ignore[misc]
+            own += timed(partial(run.advance, poses), 1, "cpu", warm=0).values
     base, whole = (min(own[1:]) for own in spent)
     found, words = whole / base, f"On: {', '.join(names)}; least times of {ROUNDS - 1} frames, on the CPU."
     row = Row(
@@ -240,99 +230,16 @@ def effects(task: Task) -> Section:
     return Section("What effects cost", words, (row,))
 
 
-def random_gaussians(count: int, size: int, device: str, pixels: float = 3.0) -> tuple[Gaussians, Camera]:
-    """Leaves of about ``pixels`` px spread over an image of ``size``² px."""
-    g = torch.Generator().manual_seed(0)
-    z = 1 + torch.rand(count, generator=g)
-    xy = (torch.rand(count, 2, generator=g) - 0.5) * z[:, None]
-    drawn = Gaussians(
-        means=torch.cat([xy, z[:, None]], dim=1),
-        scales=(pixels / size * z)[:, None] * torch.exp(0.3 * torch.randn(count, 3, generator=g)),
-        quaternions=torch.randn(count, 4, generator=g),
-        opacities=torch.rand(count, generator=g) * 0.8 + 0.1,
-        colours=torch.rand(count, 3, generator=g),
-    )
-    leaves = Gaussians(*(getattr(drawn, name).to(device).requires_grad_() for name in LEAVES))
-    pose = np.diag([1.0, -1.0, -1.0, 1.0])
-    return leaves, Camera(width=size, height=size, fx=size, fy=size, cx=size / 2, cy=size / 2, camera_to_world=pose)
-
-
-def rasteriser(task: Task, count: int = 20_000, size: int = 256) -> Section:
-    """Forward, and forward with gradients, beside the slow reference on one core of the CPU."""
-    leaves, camera = random_gaussians(count, size, task.device)
-    few = random_gaussians(count, size, "cpu")[0][: max(count // SHARE, 1)]
-
-    def ours() -> list[torch.Tensor]:
-        drawn = rasterise(leaves, camera, normals=False)
-        return [drawn.colour, drawn.depth]
-
-    def slowly() -> list[torch.Tensor]:
-        covariances = few.covariances()
-        return [reference.rasterise_features(few.means, covariances, few.opacities, few.colours, camera)[0]]
-
-    def backward(draw: Callable[[], list[torch.Tensor]]) -> Callable[[], object]:
-        return lambda: torch.autograd.backward([out.sum() for out in draw()])
-
-    with at_most(1):
-        off = float((rasterise(few.to(task.device), camera).colour.cpu() - slowly()[0]).abs().max().detach())
-        rows = [Row("largest difference from the reference's picture", f"{off:.1e}", "≤ 1e-3", off <= 1e-3)]
-        for what, way in (("forward", torch.no_grad()), ("forward + backward", backward)):
-            mine, slow = timed(way(ours), 5 * task.repeats, task.device, warm=3), timed(way(slowly), 1, "cpu", warm=0)
-            slow = Times((slow.median * count / len(few),))
-            rows.append(Row(f"{count} Gaussians at {size}², {what}", mine.over(slow, "reference")))
-    words = f"Gaussians of 3 px; colour, alpha and depth. The reference draws one of {SHARE}."
-    return Section("Rasteriser", words, tuple(rows))
-
-
-def reconstruction(task: Task) -> Section:
-    """From photographs to Gaussians; on a GPU beside one core of the CPU."""
-    measurement = task.truth.measurement
-
-    def made(device: str) -> tuple[Times, Reconstruction]:
-        found: list[Reconstruction] = []
-
-        def once() -> None:
-            found.append(reconstruct(measurement, preset=task.preset, device=device))
-
-        return timed(once, 1, device, warm=int(device != "cpu")), found[-1]
-
-    where = [task.device] if task.device == "cpu" else [task.device, "cpu"]
-    (seconds, result), *slow = (made(device) for device in where)
-    text = seconds.over(slow[0][0], "one core of the CPU") if slow else f"{seconds} on one core"
-    dB = ", ".join(f"{r.psnr:.2f} dB" for r in (result, *(r for _, r in slow)))
-    row = Row(f"{measurement.name}, {len(result.gaussians)} Gaussians", f"{text}; {dB} on photographs set aside")
-    return Section("Reconstruction", f"Preset `{task.preset}`.", (row,))
-
-
-def whole_path(task: Task) -> Section:
-    """``splatsoil fit`` of a set, reconstruction included, and ``splatsoil diagnose`` of its run."""
-    rows = []
-    with tempfile.TemporaryDirectory() as work:
-        run = str(Path(work) / "run")
-        given = [str(task.folder), "--run", run, "--preset", task.preset]
-        for words in (["fit", *given], ["diagnose", run]):
-            command = [sys.executable, "-m", "splatsoil", *words, "--device", task.device]
-            began = time.perf_counter()
-            done = subprocess.run(command, capture_output=True, text=True, check=False)
-            if done.returncode not in (0, 3):  # 3: the data give no answer, which takes as long
-                raise RunError(f"splatsoil {words[0]}: {' '.join(done.stderr.split())[-300:]}")
-            seconds = time.perf_counter() - began
-            rows.append(Row(f"`splatsoil {words[0]}`, {task.truth.measurement.name}", f"{seconds:.0f} s"))
-    text = f"Preset `{task.preset}`; each a process of its own; the first one reconstructs the bed, too."
-    return Section("Whole path", text, tuple(rows))
-
-
-PARTS = (simulation, newton, effects, rasteriser, reconstruction, whole_path)
+PARTS = (simulation, newton, effects)
 """In the page's order."""
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Measure the parts that are asked for, print their tables, and write the device's section of a page."""
-    parser = parser_of(__doc__)
+    parser = parts_parser(__doc__, "runs/speed")
     parser.add_argument("--set", type=Path, default=Path("examples/plow-dry"), help="with true particles")
-    parser.add_argument("--preset", default="small", choices=sorted(PRESETS), help="of solver and reconstruction")
+    parser.add_argument("--preset", default="small", choices=sorted(PRESETS), help="of the solver")
     parser.add_argument("--repeats", type=at_least(1), default=3, help="of what takes seconds")
-    part_options(parser, "runs/speed")
     options = parser.parse_args(arguments)
     hush()
     task = Task(options.set, options.preset, options.device, options.repeats)
@@ -344,7 +251,3 @@ def main(arguments: list[str] | None = None) -> int:
     measured = [part for part in PARTS if part is not newton or find_spec("newton")]
     parts = {part.__name__.replace("_", "-"): partial(part, task) for part in measured}
     return run_parts(options, parts, lambda _: key, f"speed {made['device']}")
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

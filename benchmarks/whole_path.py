@@ -18,10 +18,9 @@ from typing import Any
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
-from splatsoil.benchmarks._common import parser_of, sources
-from splatsoil.benchmarks._parts import part_options, run_parts
+from splatsoil.benchmarks._common import sources
+from splatsoil.benchmarks._parts import Row, Section, parts_parser, run_parts
 from splatsoil.benchmarks._truth import Truth
-from splatsoil.benchmarks._validation.page import Row, Section
 
 from splatsoil.comparison import Comparator, Comparison
 from splatsoil.errors import RunError
@@ -75,13 +74,10 @@ def true_surface(truth: Truth, cells: HeightField) -> HeightField:
     shape = np.ceil((bed.upper + PADDING * spacing - lower) / step).astype(int)
     ranges = list(zip(lower, lower + shape * step, strict=True))
     bulk, _ = np.histogramdd(truth.particles[0], bins=shape.tolist(), range=ranges)
-    bulk = gaussian_filter(bulk * (spacing / step) ** 3, FINENESS)
-    level = np.arange(shape[2])
-    where = [
-        np.repeat(((a - lower[k]) / step - 0.5)[..., None], len(level), axis=2)
-        for k, a in enumerate(np.meshgrid(cells.x, cells.y))
-    ]
-    columns = map_coordinates(bulk, [*where, np.broadcast_to(level, where[0].shape)], order=1)
+    bulk, level = gaussian_filter(bulk * FINENESS**3, FINENESS), np.arange(shape[2])
+    y, x = ((a - lower[k]) / step - 0.5 for k, a in ((1, cells.y), (0, cells.x)))
+    y, x, z = np.meshgrid(y, x, level, indexing="ij")
+    columns = map_coordinates(bulk, [x, y, z], order=1)
     filled = columns >= LEVEL
     top = len(level) - 1 - np.argmax(filled[..., ::-1], axis=2)
     under = np.take_along_axis(columns, top[..., None], axis=2)[..., 0]
@@ -152,7 +148,7 @@ def angle(task: Task) -> Section:
     fresh = not (task.out / "runs" / f"{task.dry.name}-0").exists()
     options = ("run", "--stop-at-floor", "--seed")
     runs = [_fitted(task, task.dry, f"{task.dry.name}-{seed}", *options, str(seed)) for seed in FIT_SEEDS]
-    angles = [run.fit["parameters"]["friction_angle"] for run in runs]
+    angles = [fit["parameters"]["friction_angle"] for fit, _ in runs]
     stds, estimates = sorted(a["std"] for a in angles), ", ".join(f"{a['estimate']:.1f}" for a in angles)
     rows = [
         Row(
@@ -163,7 +159,7 @@ def angle(task: Task) -> Section:
         )
     ]
     if fresh:
-        seconds, memory = runs[0].seconds, runs[0].memory
+        seconds, memory = runs[0][1].seconds, runs[0][1].memory
         what, met = "all of it by `splatsoil run`; its largest process", seconds <= 480.0 and memory <= 2**31
         rows.append(Row(what, f"{seconds / 60.0:.1f} min; {memory / 2**30:.1f} GiB", "8 min; 2 GiB", met))
     return Section("Friction angle", "From photographs and force.", tuple(rows))
@@ -172,8 +168,8 @@ def angle(task: Task) -> Section:
 def missing_effect(task: Task) -> Section:
     """The damp set under the base model and with what it lacks, beside its true particles, drawn."""
     name = task.damp.name
-    base = _fitted(task, task.damp, f"{name}-base", "fit").fit["loss"]
-    added = _fitted(task, task.damp, f"{name}-{EFFECT}", "fit", "--with", EFFECT).fit["loss"]
+    base = _fitted(task, task.damp, f"{name}-base", "fit")[0]["loss"]
+    added = _fitted(task, task.damp, f"{name}-{EFFECT}", "fit", "--with", EFFECT)[0]["loss"]
     least = floor(Truth.load(task.damp), _reconstructed(task.damp, task.preset, task.device), task.device)[1].loss
     row = Row(
         f"loss of {name}: base model, with {EFFECT}, true particles drawn",
@@ -182,6 +178,19 @@ def missing_effect(task: Task) -> Section:
         added < base and base > 1.5 * least,
     )
     return Section("Missing effect", "", (row,))
+
+
+@cache
+def _reconstructed(folder: Path, preset: str, device: str) -> Reconstruction:
+    return reconstruct(Measurement.load(folder), preset=preset, device=device)
+
+
+@dataclass(frozen=True)
+class Ran:
+    """What a command took: seconds, and bytes of its largest process."""
+
+    seconds: float
+    memory: int
 
 
 # A process is reported to be as large as the one that it began as a copy of, so a small one begins the command.
@@ -193,42 +202,26 @@ sys.exit(code)
 """
 
 
-@cache
-def _reconstructed(folder: Path, preset: str, device: str) -> Reconstruction:
-    return reconstruct(Measurement.load(folder), preset=preset, device=device)
-
-
-@dataclass(frozen=True)
-class Run:
-    """What a command left.
-
-    Attributes:
-        fit: its ``fit.json``.
-        seconds: of the whole command.
-        memory: of its largest process, bytes.
-    """
-
-    fit: Mapping[str, Any]
-    seconds: float
-    memory: int
-
-
-def _fitted(task: Task, folder: Path, name: str, command: str, *options: str) -> Run:
-    """A command in a process of its own; evaluations of a run that began before are not repeated.
+def command_line(*words: object) -> Ran:
+    """Run ``splatsoil`` with these words, in a process of its own.
 
     Raises:
-        RunError: the command failed.
+        RunError: it failed.
     """
-    run = task.out / "runs" / name
-    words = [command, str(folder), "--run", str(run), "--preset", task.preset, "--device", task.device, *options]
-    began = time.monotonic()
-    counted = [sys.executable, "-c", _COUNTED, sys.executable, "-m", "splatsoil", *words]
+    told, began = [str(word) for word in words], time.monotonic()
+    counted = [sys.executable, "-c", _COUNTED, sys.executable, "-m", "splatsoil", *told]
     done = subprocess.run(counted, capture_output=True, text=True, check=False)
     if done.returncode:
-        raise RunError(f"splatsoil {' '.join(words)}: {' '.join(done.stderr.split())[-300:]}")
+        raise RunError(f"splatsoil {' '.join(told)}: {' '.join(done.stderr.split())[-300:]}")
     # Linux counts in KiB, macOS in bytes
-    memory = int(done.stdout) * (1 if sys.platform == "darwin" else 1024)
-    return Run(read_json(run / "fit.json"), time.monotonic() - began, memory)
+    return Ran(time.monotonic() - began, int(done.stdout) * (1 if sys.platform == "darwin" else 1024))
+
+
+def _fitted(task: Task, folder: Path, name: str, command: str, *options: str) -> tuple[Mapping[str, Any], Ran]:
+    """A command's ``fit.json``, and what it took; evaluations of a run that began before are not repeated."""
+    run = task.out / "runs" / name
+    took = command_line(command, folder, "--run", run, "--preset", task.preset, "--device", task.device, *options)
+    return read_json(run / "fit.json"), took
 
 
 PARTS = (reconstruction, renderer, angle, missing_effect)
@@ -237,11 +230,10 @@ PARTS = (reconstruction, renderer, angle, missing_effect)
 
 def main(arguments: list[str] | None = None) -> int:
     """Measure the parts that are asked for, print their tables, and write them into a page."""
-    parser = parser_of(__doc__)
+    parser = parts_parser(__doc__, "runs/whole-path")
     parser.add_argument("--dry", type=Path, default=Path("examples/plow-dry"), help="set that the base model explains")
     parser.add_argument("--damp", type=Path, default=Path("examples/plow-damp"), help="set with cohesive soil")
     parser.add_argument("--preset", default="small", choices=sorted(PRESETS))
-    part_options(parser, "runs/whole-path")
     options = parser.parse_args(arguments)
     hush()
     task = Task(options.dry, options.damp, options.preset, options.device, options.out)
@@ -249,7 +241,3 @@ def main(arguments: list[str] | None = None) -> int:
     key = {"code": sources([Path(__file__)]), "preset": task.preset, **sets}
     parts = {part.__name__.replace("_", "-"): partial(part, task) for part in PARTS}
     return run_parts(options, parts, lambda _: key, "whole path")
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -135,7 +135,7 @@ def test_the_made_up_world_finds_its_own_source(elsewhere: Path, tmp_path: Path)
     """Its source is part of what a kept simulation is known by; installed, it lies elsewhere than in the repository."""
     code = (
         "from splatsoil.benchmarks._simulations import simulated, world_parser\n"
-        "data, file = simulated(world_parser('').parse_args([]), 4, repeats=2)\n"
+        "data, file = simulated(world_parser('', 'runs').parse_args([]), 4, repeats=2)\n"
         "assert file.is_file() and data.residuals.shape[0] == 6\n"
     )
     done = run(elsewhere / "venv/bin/python", "-c", code, cwd=tmp_path, XDG_CACHE_HOME=str(tmp_path))

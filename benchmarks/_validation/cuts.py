@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from splatsoil.benchmarks._validation.page import Row, Section
-from splatsoil.benchmarks._validation.scene import GRAVITY, Scene, lattice, resolution, rest
+from splatsoil.benchmarks._parts import Row, Section
+from splatsoil.benchmarks._validation.scene import GRAVITY, Scene, lattice, resolution
 
 from splatsoil.soil.matching import Matching
 from splatsoil.soil.settings import Settings
@@ -14,7 +14,6 @@ from splatsoil.soil.settings import Settings
 HEIGHT = 0.08
 """Of the cut, m: a small plough's trench."""
 DENSITY = 1600.0
-YOUNG = 1.0e6
 WAY = 0.1
 """Cells that falling soil goes between two exchanges with the grid, and while hourglass modes are damped."""
 SECONDS = 0.4
@@ -27,6 +26,8 @@ ROUNDS = 6
 """Of halving."""
 EARLY = 0.1
 """Share by which a grid of eight cells may let less do: it hinders slip of less than a cell. Our estimate."""
+CASES = ((25.0, 8), (33.0, 8), (40.0, 8), (33.0, 4), (33.0, 12))
+"""Friction angles in degrees, and cells over the height."""
 
 
 def expected(friction_angle: float) -> float:
@@ -45,12 +46,11 @@ def cut(cohesion: float, friction_angle: float, cells: int, matching: Matching =
     """Soil with a free vertical face between smooth walls, on a floor that it cannot slide on, released at once."""
     cell = HEIGHT / cells
     length, reach = (cell * math.ceil(share * HEIGHT / cell) for share in (1.5, 3.0))
-    x = lattice([0.0, 0.0, 0.0], [length, 2.0 * cell, HEIGHT], 0.5 * cell)
     fastest = 0.5 * math.sqrt(2.0 * GRAVITY * HEIGHT)
     return Scene(
-        np.clip(x, 1e-6, None),
+        np.clip(lattice([0.0, 0.0, 0.0], [length, 2.0 * cell, HEIGHT], 0.5 * cell), 1e-6, None),
         (reach, 2.0 * cell, HEIGHT + 3.0 * cell),
-        resolution(cell, fastest, density=DENSITY, young=YOUNG, transport=WAY, way=WAY),
+        resolution(cell, fastest, density=DENSITY, young=1.0e6, transport=WAY, way=WAY),
         Settings(friction_angle=friction_angle, wall_friction=0.0, floor_friction=10.0, matching=matching),
         ("cohesion",),
         {"cohesion": cohesion},
@@ -61,24 +61,18 @@ def sinks(scene: Scene, device: str) -> float:
     """How far the crest has sunk in the end, in heights of the cut."""
     start, cell = scene.x, scene.resolution.cell
     crest = (start[:, 0] > start[:, 0].max() - cell) & (start[:, 2] > HEIGHT - cell)
-    end = rest(scene, SECONDS, device).positions()[0]
+    end = scene.rest(SECONDS, device).positions()[0]
     return float(np.mean(start[crest, 2] - end[crest, 2])) / HEIGHT
 
 
-def needed(friction_angle: float, cells: int, device: str, matching: Matching = Matching.PLANE_STRAIN) -> float:
+def needed(friction_angle: float, cells: int, device: str, matching: Matching) -> float:
     """Cohesion in Pa at which the cut begins to stand, by halving."""
     low, high = 0.25 * expected(friction_angle), 2.0 * expected(friction_angle)
     for _ in range(ROUNDS):
         middle = math.sqrt(low * high)
-        if sinks(cut(middle, friction_angle, cells, matching), device) > FALLEN:
-            low = middle
-        else:
-            high = middle
+        falls = sinks(cut(middle, friction_angle, cells, matching), device) > FALLEN
+        low, high = (middle, high) if falls else (low, middle)
     return math.sqrt(low * high)
-
-
-CASES = ((25.0, 8), (33.0, 8), (40.0, 8), (33.0, 4), (33.0, 12))
-"""Friction angles in degrees, and cells over the height."""
 
 
 def validate(device: str) -> Section:

@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from matplotlib.figure import Figure
-from splatsoil.benchmarks._validation.page import Row, Section
-from splatsoil.benchmarks._validation.scene import GRAVITY, FloatArray, Scene, lattice, resolution, rest
+from splatsoil.benchmarks._common import FloatArray
+from splatsoil.benchmarks._parts import Row, Section, curves_of
+from splatsoil.benchmarks._validation.scene import GRAVITY, Scene, lattice, resolution
 
 from splatsoil.soil.matching import Matching
 from splatsoil.soil.settings import Settings
@@ -16,7 +16,12 @@ from splatsoil.soil.settings import Settings
 STATIC, FAST, INERTIAL = math.tan(math.radians(20.9)), math.tan(math.radians(32.8)), 0.279
 WAY = 0.2
 """Cells that the fastest soil goes between two exchanges with the grid, and while hourglass modes are damped."""
-GRAIN_DENSITY, SOLID = 2500.0, 0.6
+GRAIN, GRAIN_DENSITY, SOLID = 0.002, 2500.0, 0.6
+HEIGHT = 0.02
+"""Of the layer, m."""
+LOWER = 0.75
+"""Share of the layer's height that is judged; above it particles hop."""
+ALLOWED = 0.15
 
 
 @dataclass(frozen=True)
@@ -24,13 +29,10 @@ class Chute:
     """A layer on a rough incline, released everywhere at once; m, degrees, s."""
 
     slope: float = 24.0
-    height: float = 0.02
-    grain: float = 0.002
     layers: int = 8
     length: float = 0.7
     seconds: float = 0.8
     transport: float = WAY
-    young: float = 1.0e5
     rate: bool = True
 
     @property
@@ -47,14 +49,12 @@ class Chute:
     def expected(self, z: FloatArray) -> FloatArray:
         """Bagnold's steady velocity in m/s at heights ``z`` in m above the base."""
         fall = SOLID * GRAVITY * math.cos(math.radians(self.slope))
-        shape = self.height**1.5 - (self.height - np.clip(z, 0.0, self.height)) ** 1.5
-        return 2.0 * self.inertial_number / (3.0 * self.grain) * math.sqrt(fall) * shape
+        shape = HEIGHT**1.5 - (HEIGHT - np.clip(z, 0.0, HEIGHT)) ** 1.5
+        return 2.0 * self.inertial_number / (3.0 * GRAIN) * math.sqrt(fall) * shape
 
     def measure(self, device: str) -> tuple[FloatArray, FloatArray]:
         """Heights (n,) in m, and mean velocities along the slope (n,) of the middle fifth, m/s."""
-        cell = self.height / self.layers
-        x = lattice([0.0, 0.0, 0.0], [self.length, cell, self.height], 0.5 * cell)
-        turn = math.radians(self.slope)
+        cell, turn = HEIGHT / self.layers, math.radians(self.slope)
         settings = Settings(
             friction_angle=20.9,
             gravity=(GRAVITY * math.sin(turn), 0.0, -GRAVITY * math.cos(turn)),
@@ -62,65 +62,53 @@ class Chute:
             floor_friction=10.0,
             matching=Matching.SIMPLE_SHEAR,
         )
-        fastest = float(self.expected(np.array([self.height]))[0])
-        density = SOLID * GRAIN_DENSITY
-        values = {"rate_gain": FAST / STATIC - 1.0, "rate_grain_size": self.grain}
+        fastest, density = float(self.expected(np.array([HEIGHT]))[0]), SOLID * GRAIN_DENSITY
         scene = Scene(
-            x,
-            (self.length, cell, 3.0 * self.height),
-            resolution(cell, fastest, density=density, young=self.young, transport=self.transport, way=WAY),
+            lattice([0.0, 0.0, 0.0], [self.length, cell, HEIGHT], 0.5 * cell),
+            (self.length, cell, 3.0 * HEIGHT),
+            resolution(cell, fastest, density=density, young=1.0e5, transport=self.transport, way=WAY),
             settings,
             ("rate_dependence",) if self.rate else (),
-            values if self.rate else {},
+            {"rate_gain": FAST / STATIC - 1.0, "rate_grain_size": GRAIN} if self.rate else {},
         )
-        run = rest(scene, self.seconds, device)
+        run = scene.rest(self.seconds, device)
         x, speed = run.positions()[0], run.velocities()[0][:, 0]
-        edges = np.linspace(0.0, self.height, self.layers + 1)
         middle = np.abs(x[:, 0] - 0.6 * self.length) < 0.1 * self.length
-        layer = np.digitize(x[:, 2], edges) - 1
-        means = [
-            speed[middle & (layer == k)].mean() if (middle & (layer == k)).any() else np.nan for k in range(self.layers)
-        ]
-        return 0.5 * (edges[1:] + edges[:-1]), np.array(means)
+        layers = [middle & (np.floor(x[:, 2] / cell) == k) for k in range(self.layers)]
+        means = [speed[layer].mean() if layer.any() else np.nan for layer in layers]
+        return np.linspace(0.5 * cell, HEIGHT - 0.5 * cell, self.layers), np.array(means)
 
+    def ratio(self, device: str) -> float:
+        """Mean of speed over Bagnold's in the lower part of the layer."""
+        return self.over_bagnold(*self.measure(device))
 
-LOWER = 0.75
-"""Share of the layer's height that is judged; above it particles hop."""
-ALLOWED = 0.15
-
-
-def ratio(chute: Chute, device: str) -> tuple[float, FloatArray, FloatArray]:
-    """Mean of speed over Bagnold's in the lower layer, heights over h and speeds in m/s."""
-    z, speed = chute.measure(device)
-    low = z < LOWER * chute.height
-    return float(np.nanmean(speed[low] / chute.expected(z[low]))), z / chute.height, speed
+    def over_bagnold(self, z: FloatArray, speed: FloatArray) -> float:
+        """The same of speeds (n,) in m/s at heights (n,) in m."""
+        low = z < LOWER * HEIGHT
+        return float(np.nanmean(speed[low] / self.expected(z[low])))
 
 
 def validate(device: str) -> Section:
     """Three slopes, one of them with the grid, the step and the layer changed, and what happens without the effect."""
-    rows = []
-    figure = Figure(figsize=(8, 3), layout="constrained")
-    axes = figure.subplots()
-    for k, slope in enumerate((23.0, 24.0, 25.0)):
+    rows, curves = [], dict[str, tuple[FloatArray, FloatArray]]()
+    for slope in (23.0, 24.0, 25.0):
         chute = Chute(slope)
-        found, z, speed = ratio(chute, device)
-        fine = np.linspace(0.0, chute.height, 60)
+        z, speed = chute.measure(device)
+        found, fine = chute.over_bagnold(z, speed), np.linspace(0.0, HEIGHT, 60)
         bagnold = chute.expected(fine)
+        curves |= {f"{slope:g}°, Bagnold": (bagnold, fine / HEIGHT), f"{slope:g}°": (speed, z / HEIGHT)}
         case = f"{slope:g}° (I = {chute.inertial_number:.3f}, surface {bagnold[-1]:.2f} m/s)"
         text = f"u / u_Bagnold = {found:.2f}, as if friction were {100.0 * chute.friction_error(found):+.1f} %"
         rows.append(Row(case, text, f"1 ± {ALLOWED:g}", abs(found - 1.0) <= ALLOWED))
-        axes.plot(bagnold, fine / chute.height, color=f"C{k}", label=f"{slope:g}°, Bagnold")
-        axes.plot(speed, z, "o", color=f"C{k}")
     for case, chute in (
         ("23° on cells of two thirds", Chute(23.0, layers=12)),
         ("23°, half the step of the particles", Chute(23.0, transport=0.1)),
         ("23°, half as long again, layer and time", Chute(23.0, length=1.0, seconds=1.2)),
     ):
-        rows.append(Row(case, f"u / u_Bagnold = {ratio(chute, device)[0]:.2f}", "reported"))
-    found, control = ratio(Chute(rate=False), device)[0], "control: 24° without rate dependence"
-    rows.append(Row(control, f"{found:.2f}", f"outside 1 ± {ALLOWED:g}", abs(found - 1.0) > ALLOWED))
-    axes.set(xlabel="speed along the slope, m/s", ylabel="height / h")
-    axes.legend()
+        rows.append(Row(case, f"u / u_Bagnold = {chute.ratio(device):.2f}", "reported"))
+    control = Chute(rate=False).ratio(device)
+    rows.append(Row.near("control: 24° without rate dependence", control, 1.0, ALLOWED, inside=False))
+    figure, _ = curves_of(curves, "speed along the slope, m/s", "height / h")
     return Section(
         "Flow down an incline",
         "A layer 2 cm thick of grains of 2 mm on a rough incline, released everywhere at once, with μ(I) from "

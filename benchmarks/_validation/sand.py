@@ -7,9 +7,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
-from splatsoil.benchmarks._validation.page import Row, Section
-from splatsoil.benchmarks._validation.scene import FloatArray
+from splatsoil.benchmarks._common import FloatArray
+from splatsoil.benchmarks._parts import Row, Section
 from splatsoil.inverse.criticism.simulations import Simulations
 
 from splatsoil.errors import MeasurementError
@@ -19,10 +18,8 @@ from splatsoil.laboratory.folder import read_curve, together
 from splatsoil.report.text import probability, verdict
 from splatsoil.soil.packing import at_void_ratio, of_limits
 
-CRITICAL = 33.1
-"""Published critical friction angle of Karlsruhe fine sand, degrees (Wichtmann & Triantafyllidis 2016)."""
 LIMITS = (0.677, 1.054)
-"""Its void ratios in index tests, densest and loosest, as published."""
+"""Void ratios of Karlsruhe fine sand in index tests, densest and loosest (Wichtmann & Triantafyllidis 2016)."""
 VOID_RATIOS = {"TMD2": 0.9753, "TMD22": 0.7351}
 CULLINAN = {"TX13": ("CD400", 4e5, 0.7734), "TX16": ("CD50", 5e4, 0.6757), "TX17": ("CD100", 1e5, 0.7018)}
 """File, confining pressure in Pa and void ratio of the drained tests on Cullinan sand."""
@@ -81,21 +78,12 @@ def calibrated(
     return experiment.values(values)
 
 
-def predicted(curve: Curve, effects: tuple[str, ...], values: Mapping[str, float], before: float) -> FloatArray:
-    """(t, 2) q/p and volume strain in spreads between specimens, by parameters at another void ratio."""
+def misfit(curve: Curve, effects: tuple[str, ...], values: Mapping[str, float], before: float) -> FloatArray:
+    """(2,) root mean squares of q/p and volume strain, in spreads between specimens, by parameters at another void
+    ratio."""
     experiment = TriaxialExperiment([curve], effects, candidates=())
-    return experiment.predict(at_void_ratio(values, before, curve.void_ratio))
-
-
-def misfit(curve: Curve, table: FloatArray) -> FloatArray:
-    """(2,) root mean squares of q/p and volume strain, in spreads between specimens."""
-    observed = TriaxialExperiment([curve], candidates=()).observed
-    return np.asarray(np.sqrt(np.mean((table - observed) ** 2, axis=0)))
-
-
-def mobilised(curve: Curve) -> FloatArray:
-    """Friction angle (n,) in degrees that a triaxial test in compression mobilises: sin phi = 3 q/p / (6 + q/p)."""
-    return np.degrees(np.arcsin(3.0 * curve.ratio / (6.0 + curve.ratio)))
+    table = experiment.predict(at_void_ratio(values, before, curve.void_ratio))
+    return np.asarray(np.sqrt(np.mean((table - experiment.observed) ** 2, axis=0)))
 
 
 def from_one_to_another(
@@ -104,24 +92,20 @@ def from_one_to_another(
     fit: Sequence[str],
     ladder: Sequence[tuple[str, ...]],
     known: Mapping[str, float],
-) -> tuple[list[Row], dict[tuple[str, str], FloatArray]]:
-    """Rows of a ladder of models, fitted on some tests and held against the others; predictions by model and test."""
-    rows, tables, errors = [], {}, []
-    first = curves[fit[0]]
-    others = [test for test in curves if test not in fit]
+) -> list[Row]:
+    """A ladder of models, fitted on some tests and held against the others."""
+    rows, errors = [], []
     for effects in ladder:
         values = calibrated([curves[test] for test in fit], effects, known)
-        model = " + ".join(("base", *effects))
-        found = {}
-        for test in others:
-            tables[model, test] = predicted(curves[test], effects, values, first.void_ratio)
-            found[test] = misfit(curves[test], tables[model, test])
+        before = curves[fit[0]].void_ratio
+        found = {test: misfit(curve, effects, values, before) for test, curve in curves.items() if test not in fit}
         errors.append(float(np.mean([np.sum(f**2) for f in found.values()])))
         text = "; ".join(f"{test} q/p {f[0]:.1f}, volume {f[1]:.1f}" for test, f in found.items())
         better = None if len(errors) == 1 else errors[-1] < errors[-2]
         told = "reported" if better is None else "less than without the last effect"
+        model = " + ".join(("base", *effects))
         rows.append(Row(f"{name}: {model}; φ = {values['friction_angle']:.1f}°", text, told, better))
-    return rows, tables
+    return rows
 
 
 def told(name: str, curves: Sequence[Curve], effects: tuple[str, ...]) -> Row:
@@ -136,21 +120,17 @@ def told(name: str, curves: Sequence[Curve], effects: tuple[str, ...]) -> Row:
     return Row(f"{name}: diagnosis of {model}", text, "reported")
 
 
-def validate(folder: Path) -> Section:
+def validate(device: str, folder: Path) -> Section:
     """Every way from some tests to others."""
+    del device
     sand, other = karlsruhe(folder), cullinan(folder)
     rows: list[Row] = []
-    shown: dict[tuple[str, str], FloatArray] = {}
     for way, test in (("loose → dense", "TMD2"), ("dense → loose", "TMD22")):
         known = of_limits(sand[test].void_ratio, *LIMITS)
-        more, tables = from_one_to_another(f"Karlsruhe, {way}", sand, [test], LADDER[:3], known)
-        rows += more
-        shown |= tables
+        rows += from_one_to_another(f"Karlsruhe, {way}", sand, [test], LADDER[:3], known)
     for test in other:
         fit = [name for name in other if name != test]
-        more, tables = from_one_to_another(f"Cullinan, {' and '.join(fit)} → {test}", other, fit, LADDER, HUNDRED)
-        rows += more
-        shown |= tables
+        rows += from_one_to_another(f"Cullinan, {' and '.join(fit)} → {test}", other, fit, LADDER, HUNDRED)
     for effects in LADDER[:3]:
         rows.append(told("Karlsruhe, dense", [sand["TMD22"]], effects))
     for effects in LADDER:
@@ -168,23 +148,4 @@ def validate(folder: Path) -> Section:
         "Hamersma 2023, CC BY 4.0): TX13 loose at 400 kPa, TX16 and TX17 dense at 50 and 100 kPa; its limits are not "
         "told, so relative density and volume range are fitted. Tests right of an arrow are predicted.",
         tuple(rows),
-        figure=_figure(sand | other, shown),
     )
-
-
-def _figure(curves: Mapping[str, Curve], shown: Mapping[tuple[str, str], FloatArray]) -> Figure:
-    tests = list(dict.fromkeys(test for _, test in shown))
-    figure = Figure(figsize=(2.6 * len(tests), 4.6), layout="constrained")
-    panels = figure.subplots(2, len(tests))
-    for k, test in enumerate(tests):
-        observed = TriaxialExperiment([curves[test]], candidates=()).observed
-        strain = 100.0 * curves[test].strain
-        for c, title in enumerate(("q/p", "volume strain")):
-            axes = panels[c, k]
-            axes.plot(strain, observed[:, c], "k.", markersize=4, label="measured")
-            for (model, name), table in shown.items():
-                if name == test:
-                    axes.plot(strain, table[:, c], label=model)
-            axes.set_title(f"{test}: {title}, spreads", fontsize=7)
-    panels[0, 0].legend(fontsize=5)
-    return figure

@@ -9,14 +9,13 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 import trimesh
+from splatsoil.benchmarks._common import FloatArray
 
 from splatsoil.mpm import Resolution, Solver
 from splatsoil.mpm.tool import Pose
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
 from splatsoil.soil.settings import Settings
-
-FloatArray = npt.NDArray[np.float64]
 
 STILL = np.array([0.0, 0.0, 0.0, 1.0])
 GRAVITY = 9.81
@@ -26,37 +25,28 @@ def lattice(
     lower: npt.ArrayLike, upper: npt.ArrayLike, spacing: float, seed: int = 0, jitter: float = 0.3
 ) -> FloatArray:
     """Particles (n, 3) in m at the centres of cubes that fill a box, moved by up to ``jitter`` of half a cube."""
-    axes = [
-        a + spacing * (np.arange(round((b - a) / spacing)) + 0.5)
-        for a, b in zip(np.asarray(lower, dtype=float), np.asarray(upper, dtype=float), strict=True)
-    ]
+    corners = zip(np.asarray(lower, dtype=float), np.asarray(upper, dtype=float), strict=True)
+    axes = [a + spacing * (np.arange(round((b - a) / spacing)) + 0.5) for a, b in corners]
     x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     return x + np.random.default_rng(seed).uniform(-0.5, 0.5, x.shape) * jitter * spacing
 
 
 def resolution(
-    cell: float,
-    fastest: float,
-    *,
-    density: float,
-    young: float,
-    poisson: float = 0.3,
-    transport: float = 0.1,
-    courant: float = 0.5,
-    way: float | None = None,
+    cell: float, fastest: float, *, density: float, young: float, transport: float = 0.1, way: float | None = None
 ) -> Resolution:
     """Two particles along a cell's edge, one step a frame; soil at ``fastest`` m/s goes ``transport`` cells in it.
 
     ``way`` is how many cells it goes while hourglass modes are damped once; as many as in a step by default.
+    Poisson's ratio is 0.3.
     """
     return Resolution(
         cell=cell,
         spacing=0.5 * cell,
         frame_time=transport * cell / fastest,
         steps=1,
-        courant=courant,
-        bulk=young / (3.0 * (1.0 - 2.0 * poisson)),
-        shear=young / (2.0 * (1.0 + poisson)),
+        courant=0.5,
+        bulk=young / 1.2,
+        shear=young / 2.6,
         density=density,
         relaxation=fastest / ((way or transport) * cell),
     )
@@ -92,30 +82,21 @@ class Scene:
             self.x[None], np.zeros(3), self.upper, self.mesh, self.resolution, law, self.settings, [values], device
         )
 
+    def rest(self, seconds: float, device: str) -> Solver:
+        """Run without a tool for a time."""
+        run = self.solver(device)
+        for _ in range(math.ceil(seconds / self.resolution.frame_time)):
+            run.advance(1)
+        return run
 
-def rest(scene: Scene, seconds: float, device: str) -> Solver:
-    """Run without a tool for a time."""
-    run = scene.solver(device)
-    for _ in range(math.ceil(seconds / scene.resolution.frame_time)):
-        run.advance(1)
-    return run
+    def push(self, start: FloatArray, speed: float, travel: float, device: str) -> tuple[FloatArray, FloatArray]:
+        """Move the tool along x at a constant speed, m/s.
 
-
-def push(
-    scene: Scene, start: npt.ArrayLike, velocity: npt.ArrayLike, travel: float, device: str
-) -> tuple[FloatArray, FloatArray, Solver]:
-    """Move the tool at a constant velocity.
-
-    Returns:
-        Ways gone (n,) in m, forces of the soil on the tool (n, 3) in N, each the mean over a step, and the solver.
-    """
-    run, place, speed = (
-        scene.solver(device),
-        np.asarray(start, dtype=np.float64),
-        np.asarray(velocity, dtype=np.float64),
-    )
-    step = scene.resolution.frame_time
-    count = math.ceil(travel / (float(np.linalg.norm(speed)) * step))
-    force = [run.advance([Pose(place + k * step * speed, STILL, speed, np.zeros(3))])[0] for k in range(count)]
-    way = np.asarray(float(np.linalg.norm(speed)) * step * (np.arange(count) + 0.5), dtype=np.float64)
-    return way, np.array(force, dtype=np.float64), run
+        Returns:
+            Ways gone (n,) in m, and forces of the soil on the tool (n, 3) in N, each the mean over a step.
+        """
+        run, step = self.solver(device), speed * self.resolution.frame_time
+        count, along = math.ceil(travel / step), np.array([1.0, 0.0, 0.0])
+        poses = [Pose(start + k * step * along, STILL, speed * along, np.zeros(3)) for k in range(count)]
+        force = [run.advance([pose])[0] for pose in poses]
+        return np.asarray(step * (np.arange(count) + 0.5)), np.array(force, dtype=np.float64)

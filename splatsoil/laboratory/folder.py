@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -31,6 +31,8 @@ FEWEST = 4
 """Readings of a curve."""
 PORE_PRESSURE = 0.1
 """Of the confining pressure: a specimen in which it changes by more is not drained."""
+HEIGHT = 0.02
+"""Of the example's shear box, m."""
 GRAINS = 2650.0
 """Density of quartz, kg/m³."""
 PLATE_READINGS = 12
@@ -55,6 +57,16 @@ class Options:
     candidates: tuple[str | Effect, ...] | None = None
     preset: str = "small"
     device: str = "cpu"
+
+    @property
+    def model(self) -> dict[str, Any]:
+        """What a test at one stress point takes."""
+        return {"effects": self.effects, "candidates": self.candidates}
+
+    @property
+    def simulation(self) -> dict[str, Any]:
+        """What a test that the solver runs takes."""
+        return {**self.model, "preset": self.preset, "device": self.device}
 
 
 def load(folder: Path, options: Options | None = None) -> LaboratoryExperiment:
@@ -114,10 +126,12 @@ def _header(file: Path) -> str:
     return lines[0].lower() if lines else ""
 
 
-def _at(kept: FloatArray, strains: FloatArray, *curves: FloatArray) -> list[FloatArray]:
-    """Curves (n,) over strains (n,) at strains (k,)."""
-    order = np.argsort(strains, kind="stable")
-    return [np.interp(kept, strains[order], curve[order]) for curve in curves]
+def _at_strains(file: Path, what: str, strain: FloatArray, *curves: FloatArray) -> tuple[FloatArray, ...]:
+    """Those of `STRAINS` that are reached, and curves (n,) over strains (n,) there; MeasurementError for too few."""
+    kept, order = STRAINS[strain.max() * 1.0001 >= STRAINS], np.argsort(strain, kind="stable")
+    if len(kept) < FEWEST:
+        raise MeasurementError(f"ends before {what} {100 * STRAINS[FEWEST - 1]:g} %", file=file)
+    return kept, *(np.interp(kept, strain[order], curve[order]) for curve in curves)
 
 
 def read_curve(file: Path, confining: float, void_ratio: float = 0.8, *, drained: bool = True) -> Curve:
@@ -148,10 +162,7 @@ def read_curve(file: Path, confining: float, void_ratio: float = 0.8, *, drained
             "is undrained: pore water bears a part of the stress, and the law knows none; give drained tests", file=file
         )
     lost = (table[0, 2] - table[:, 2]) / (1.0 + table[0, 2]) if by_ratio else table[:, 2] / 100.0
-    kept = STRAINS[strain.max() * 1.0001 >= STRAINS]
-    if len(kept) < FEWEST:
-        raise MeasurementError(f"ends before a strain of {100 * STRAINS[FEWEST - 1]:g} %", file=file)
-    ratio, lost = _at(kept, strain, q / (confining + q / 3.0), lost)
+    kept, lost, ratio = _at_strains(file, "a strain of", strain, lost, q / (confining + q / 3.0))
     return Curve(file.stem, kept, lost, ratio, confining, void_ratio=void_ratio)
 
 
@@ -165,8 +176,7 @@ def _read_triaxial(fields: Fields, folder: Path, options: Options) -> TriaxialEx
         )
         for test in fields.children("tests")
     ]
-    known = _limits(fields, curves[0].void_ratio)
-    return TriaxialExperiment(together(curves), options.effects, candidates=options.candidates, known=known)
+    return TriaxialExperiment(together(curves), known=_limits(fields, curves[0].void_ratio), **options.model)
 
 
 def together(tests: Sequence[AnyTest]) -> list[AnyTest]:
@@ -184,13 +194,11 @@ def _limits(fields: Fields, void_ratio: float) -> dict[str, float]:
     return of_limits(void_ratio, float(least), float(most))
 
 
-def _example_triaxial(name: str, options: Options) -> TriaxialExperiment:
-    del name
+def _untested(kind: type[AnyTest], *stresses: float) -> list[AnyTest]:
+    """Specimens to a strain of 20 % under stresses in kPa, with nothing measured yet."""
     strains = STRAINS[STRAINS <= 0.2 + 1e-9]
     nothing = np.zeros(len(strains))
-    return TriaxialExperiment(
-        [Curve(f"{p:.0f}kPa", strains, nothing, nothing, 1e3 * p) for p in (50.0, 100.0, 200.0)], options.effects
-    )
+    return [kind(f"{stress:g}kPa", strains, nothing, nothing, 1e3 * stress) for stress in stresses]
 
 
 def _write_triaxial(shape: TriaxialExperiment, readings: FloatArray) -> tuple[dict[str, object], dict[str, str]]:
@@ -213,28 +221,11 @@ def _read_shear_box(fields: Fields, folder: Path, options: Options) -> ShearBoxE
         file = test.path("file", folder, folder)
         normal = test.number("normal_stress", 1e1, 1e8, hint="it is in Pa")
         table = read_table(file, ("displacement_mm", "shear_stress_kpa", "vertical_displacement_mm"))
-        strain = 1e-3 * table[:, 0] / height
-        kept = STRAINS[strain.max() * 1.0001 >= STRAINS]
-        if len(kept) < FEWEST:
-            raise MeasurementError(f"ends before {100 * STRAINS[FEWEST - 1]:g} % of the height", file=file)
-        ratio, lost = _at(kept, strain, 1e3 * table[:, 1] / normal, -1e-3 * table[:, 2] / height)
-        void_ratio = test.number("void_ratio", 0.1, 3.0, default=0.8)
-        found.append(Shearing(file.stem, kept, ratio, lost, normal, void_ratio))
-    known = _limits(fields, found[0].void_ratio)
-    return ShearBoxExperiment(together(found), options.effects, candidates=options.candidates, known=known)
-
-
-HEIGHT = 0.02
-"""Of the example's shear box, m."""
-
-
-def _example_shear_box(name: str, options: Options) -> ShearBoxExperiment:
-    del name
-    strains = STRAINS[STRAINS <= 0.2 + 1e-9]
-    nothing = np.zeros(len(strains))
-    return ShearBoxExperiment(
-        [Shearing(f"{p:.0f}kPa", strains, nothing, nothing, 1e3 * p) for p in (25.0, 50.0, 100.0)], options.effects
-    )
+        strain, lost = 1e-3 * table[:, 0] / height, -1e-3 * table[:, 2] / height
+        what = "a displacement over the height of"
+        kept, ratio, lost = _at_strains(file, what, strain, 1e3 * table[:, 1] / normal, lost)
+        found.append(Shearing(file.stem, kept, ratio, lost, normal, test.number("void_ratio", 0.1, 3.0, default=0.8)))
+    return ShearBoxExperiment(together(found), known=_limits(fields, found[0].void_ratio), **options.model)
 
 
 def _write_shear_box(shape: ShearBoxExperiment, readings: FloatArray) -> tuple[dict[str, object], dict[str, str]]:
@@ -281,19 +272,14 @@ def _read_plate(fields: Fields, folder: Path, options: Options) -> PlateExperime
         density=density,
         known=_limits(fields, grains / density - 1.0),
         friction=fields.number("friction", 0.0, 2.0, default=0.3),
-        effects=options.effects,
-        candidates=options.candidates,
-        preset=options.preset,
-        device=options.device,
+        **options.simulation,
         name=fields.text("name"),
     )
 
 
 def _example_plate(name: str, options: Options) -> PlateExperiment:
     depths = 0.03 * (np.arange(PLATE_READINGS) + 1.0) / PLATE_READINGS
-    return PlateExperiment(
-        0.1, depths, np.ones(len(depths)), 0.1, effects=options.effects, preset=options.preset, name=name
-    )
+    return PlateExperiment(0.1, depths, np.ones(len(depths)), 0.1, name=name, **options.simulation)
 
 
 def _write_plate(shape: PlateExperiment, readings: FloatArray) -> tuple[dict[str, object], dict[str, str]]:
@@ -308,8 +294,7 @@ def _read_repose(fields: Fields, folder: Path, options: Options) -> ReposeExperi
         [trial.number("angle", 1.0, 80.0, hint="it is in degrees") for trial in fields.children("trials")],
         height=fields.number("height", 1e-3, 100.0, default=0.1, hint="it is in m"),
         density=fields.number("density", 100.0, 20_000.0, default=1600.0, hint="it is in kg/m³"),
-        effects=options.effects,
-        candidates=options.candidates,
+        **options.model,
         name=fields.text("name"),
     )
 
@@ -326,10 +311,7 @@ def _read_column(fields: Fields, folder: Path, options: Options) -> ColumnExperi
         ],
         density=fields.number("density", 100.0, 20_000.0, default=1600.0, hint="it is in kg/m³"),
         floor_friction=fields.number("floor_friction", 0.0, 10.0, default=0.6),
-        effects=options.effects,
-        candidates=options.candidates,
-        preset=options.preset,
-        device=options.device,
+        **options.simulation,
         name=fields.text("name"),
     )
 
@@ -359,17 +341,21 @@ def _trials(*keys: str) -> Callable[[LaboratoryExperiment, FloatArray], tuple[di
 
 
 KINDS: dict[str, Kind] = {
-    "triaxial": Kind(_read_triaxial, _example_triaxial, _write_triaxial),
-    "shear_box": Kind(_read_shear_box, _example_shear_box, _write_shear_box),
-    "plate": Kind(_read_plate, _example_plate, _write_plate),
-    "repose": Kind(
-        _read_repose,
-        lambda name, o: ReposeExperiment([30.0], effects=o.effects, name=name),
-        _trials("angle"),
+    "triaxial": Kind(
+        _read_triaxial,
+        lambda name, o: TriaxialExperiment(_untested(Curve, 50.0, 100.0, 200.0), **o.model),
+        _write_triaxial,
     ),
+    "shear_box": Kind(
+        _read_shear_box,
+        lambda name, o: ShearBoxExperiment(_untested(Shearing, 25.0, 50.0, 100.0), **o.model),
+        _write_shear_box,
+    ),
+    "plate": Kind(_read_plate, _example_plate, _write_plate),
+    "repose": Kind(_read_repose, lambda name, o: ReposeExperiment([30.0], name=name, **o.model), _trials("angle")),
     "column": Kind(
         _read_column,
-        lambda name, o: ColumnExperiment(0.1, 0.1, [[0.2, 0.05]], effects=o.effects, preset=o.preset, name=name),
+        lambda name, o: ColumnExperiment(0.1, 0.1, [[0.2, 0.05]], name=name, **o.simulation),
         _trials("final_radius", "final_height"),
     ),
 }

@@ -8,9 +8,8 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from splatsoil.benchmarks._common import keep_to_one_protocol, parser_of, with_section
-from splatsoil.benchmarks._parts import part_options, run_parts
-from splatsoil.benchmarks._validation.page import Row, Section
+from splatsoil.benchmarks._common import keep_to_one_protocol, with_section
+from splatsoil.benchmarks._parts import Row, Section, parts_parser, run_parts
 
 from splatsoil.errors import ParameterError, RunError, SimulationError
 
@@ -20,9 +19,7 @@ DOCS = Path(__file__).parents[2] / "docs"
 
 
 def options(*words: str) -> argparse.Namespace:
-    parser = parser_of("")
-    part_options(parser, "runs/parts")
-    return parser.parse_args([*words])
+    return parts_parser("", "runs/parts").parse_args(words)
 
 
 def page(folder: Path) -> Path:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -13,6 +14,7 @@ from splatsoil.benchmarks._simulations import Data
 from splatsoil.inverse.bayesopt import sobol
 
 from splatsoil.errors import ParameterError
+from splatsoil.files import read_json
 from splatsoil.parameters import Parameter, ParameterSpace
 
 SPACE = ParameterSpace([Parameter("friction_angle", "deg", 20.0, 50.0, 35.0)])
@@ -54,7 +56,7 @@ def test_coverage_and_ranks_are_counted() -> None:
 
 @pytest.mark.slow
 def test_a_known_world_is_calibrated() -> None:
-    entries = calibration.calibrate(made_up(16), 16, sensor_std=0.1)
+    entries = calibration.calibrate(made_up(16), 16, sensor=0.1)
     held = np.mean([e["within"]["0.9"][0] for e in entries])
     assert len(entries) == 16 and held >= 11 / 16  # less has a chance of 0.2 % when 90 % is right
 
@@ -72,11 +74,19 @@ def in_the_middle(env: gym.Env, seed: int) -> bo_vs_mcmc.Answer:
     return bo_vs_mcmc.Answer(-np.ones(1), -np.ones(1), np.zeros(1))
 
 
-def test_agents_play_the_same_episodes_and_their_errors_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+def compared(out: Path, *words: str) -> list[dict]:
+    assert bo_vs_mcmc.main([*words, "--out", str(out)]) == 0
+    (found,) = read_json(out / "result.json")["environments"]
+    return list(found["entries"])
+
+
+def test_agents_play_the_same_episodes_and_their_errors_are_counted(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setitem(sys.modules, "my_agents", sys.modules[__name__])
-    own = f"my_agents:{in_the_middle.__name__}"
-    found = bo_vs_mcmc.run("PlowSandFast-v0", [40, 400], ["random", "direct", "lda"], [own], 8)
-    by = {(e["agent"], e["steps"]): e for e in found["entries"]}
+    own, fast = f"my_agents:{in_the_middle.__name__}", ("--env", "PlowSandFast-v0", "--seeds", "8")
+    chosen = ("--budgets", "40", "400", "--agents", "random", "direct", "lda", "--agent", own)
+    by = {(e["agent"], e["steps"]): e for e in compared(tmp_path, *fast, *chosen)}
     assert set(by) == {(name, steps) for name in ("random", "direct", own) for steps in (40, 400)}
     env = gym.make("PlowSandFast-v0", budget=2)
     truths = []
@@ -87,19 +97,30 @@ def test_agents_play_the_same_episodes_and_their_errors_are_counted(monkeypatch:
     assert by[own, 40]["coverage_90"][0] == np.mean(np.array(truths) <= 35.0)
     # A chain of 100 steps by 4 walkers finds the posterior; errors of guesses that know nothing are 5 degrees.
     assert by["direct", 400]["mae"][0] < 3.0 and by["direct", 400]["coverage_90"][0] >= 0.5
-    assert f"| {own} | 40 |" in bo_vs_mcmc.table(found)
-    with pytest.raises(ParameterError, match=r"one whole episode; it made 1 steps"):
-        bo_vs_mcmc.run("PlowSandFast-v0", [3], [], [f"my_agents:{stops_early.__name__}"], 1)
-    for env_id, budget in (("Nonsense-v0", None), ("PlowSandNamingFast-v0", 3)):
-        with pytest.raises(ParameterError, match=f"--env {env_id}: cannot be made"):
-            bo_vs_mcmc.run(env_id, [budget], ["random"], [], 1)
-    for name in ("nowhere:agent", "my_agents:nobody", "my_agents"):
-        with pytest.raises(ParameterError, match="give MODULE:FUNCTION"):
-            bo_vs_mcmc.run("PlowSandFast-v0", [3], [], [name], 1)
+    assert f"| {own} | 40 |" in (tmp_path / "table.md").read_text()
 
 
-def test_agents_of_strokes_beat_chance() -> None:
-    (naming,) = bo_vs_mcmc.run("PlowSandNamingFast-v0", [None], ["lda"], [], 60)["entries"]
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--agent", f"my_agents:{stops_early.__name__}"], r"one whole episode; it made 1 steps"),
+        (["--env", "Nonsense-v0"], "--env Nonsense-v0: cannot be made"),
+        (["--env", "PlowSandNamingFast-v0"], "--env PlowSandNamingFast-v0: cannot be made"),
+        *((["--agent", name], "give MODULE:FUNCTION") for name in ("nowhere:agent", "my_agents:nobody", "my_agents")),
+    ],
+)
+def test_agents_and_environments_that_do_not_fit_are_named(
+    words: list[str], says: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setitem(sys.modules, "my_agents", sys.modules[__name__])
+    usual = ["--env", "PlowSandFast-v0", "--budgets", "3", "--seeds", "1", "--agents", "--out", str(tmp_path)]
+    with pytest.raises(ParameterError, match=says):
+        bo_vs_mcmc.main([*usual, *words])
+
+
+def test_agents_of_strokes_beat_chance(tmp_path: Path) -> None:
+    (naming,) = compared(tmp_path, "--env", "PlowSandNamingFast-v0", "--agents", "lda", "--seeds", "60")
     assert naming["return"] > -1.3 > -np.log(5.0)
-    design = bo_vs_mcmc.run("PlowSandDesignFast-v0", [2], ["random", "greedy"], [], 6)["entries"]
-    assert design[1]["return"] > design[0]["return"]
+    few = ("--env", "PlowSandDesignFast-v0", "--budgets", "2", "--seeds", "6")
+    chance, greedy = compared(tmp_path, *few, "--agents", "random", "greedy")
+    assert greedy["return"] > chance["return"]

@@ -10,14 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from splatsoil.benchmarks._scenes import Scene
-from splatsoil.benchmarks._truth import (
-    SCALE,
-    Truth,
-    cut_and_heaped,
-    in_patches,
-    stage_forces,
-    volume_range,
-)
+from splatsoil.benchmarks._truth import SCALE, Truth, cut_and_heaped, in_patches, stage_forces, volume_range
 
 from splatsoil.errors import MeasurementError, ParameterError
 from splatsoil.measurement import ToolMotion

@@ -70,7 +70,7 @@ def test_the_world_is_made_again_from_the_data_set() -> None:
 
 
 def test_the_benchmark_keeps_the_episodes_of_its_agents() -> None:
-    bo_vs_mcmc.run("PlowSandFast-v0", [3], ["random"], [], 2, data_set="plow-sand/agents-v0")
+    bo_vs_mcmc.run(gym.make("PlowSandFast-v0", budget=3), {"random": bo_vs_mcmc.at_random}, 2, "plow-sand/agents-v0")
     dataset = minari.load_dataset("plow-sand/agents-v0")
     assert (dataset.total_episodes, dataset.total_steps) == (2, 6)
 

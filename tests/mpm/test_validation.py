@@ -23,10 +23,10 @@ MEASURED = Path(os.environ.get("SPLATSOIL_MEASURED", "nowhere"))
 
 def test_a_column_runs_out_as_in_the_laboratory_and_strong_sand_does_not() -> None:
     """Lube et al. (2004): 1.24 a, within 20 %; sand with a stress ratio of 1.30 stays far short of it."""
-    sand = columns.column(1.0, columns.ANGLE, planar=False, matching=Matching.PLANE_STRAIN, particles=2000.0)
-    assert columns.collapse(sand, 1.0, False, "cpu")[0] == pytest.approx(1.24, rel=0.2)
-    strong = columns.column(1.0, 55.0, planar=False, matching=Matching.COMPRESSION, particles=2000.0)
-    assert columns.collapse(strong, 1.0, False, "cpu")[0] < 0.8 * 1.24
+    sand = columns.Column(particles=2000.0)
+    assert sand.run_out("cpu") == pytest.approx(1.24, rel=0.2)
+    strong = replace(sand, friction_angle=55.0, matching=Matching.COMPRESSION)
+    assert strong.run_out("cpu") < 0.8 * 1.24
 
 
 def test_a_vertical_cut_stands_with_the_cohesion_of_limit_analysis() -> None:
@@ -97,7 +97,7 @@ def test_the_flat_foot_of_a_raked_plate_stays() -> None:
 
 
 def test_a_scene_without_a_tool_takes_a_number_of_steps_and_one_with_a_tool_takes_poses() -> None:
-    scene = columns.column(1.0, 31.0, planar=False, matching=Matching.COMPRESSION, particles=300.0)
+    scene = columns.Column(particles=300.0).scene()
     run = scene.solver("cpu")
     np.testing.assert_array_equal(run.advance(2), 0.0)
     for wrong in (0, []):
@@ -107,7 +107,7 @@ def test_a_scene_without_a_tool_takes_a_number_of_steps_and_one_with_a_tool_take
 
 def test_an_obstacle_that_the_grid_cannot_see_is_refused() -> None:
     """A sphere in the middle of a cell reaches its corners when its radius is half the cell's diagonal."""
-    scene = columns.column(1.0, 31.0, planar=False, matching=Matching.COMPRESSION, particles=300.0)
+    scene = columns.Column(particles=300.0).scene()
     cell = scene.resolution.cell
     half = {"obstacle_x": 0.5 * cell, "obstacle_y": 0.5 * cell, "obstacle_height": 0.5 * cell}
     odd = round(scene.upper[0] / cell) % 2
@@ -122,8 +122,7 @@ def test_an_obstacle_that_the_grid_cannot_see_is_refused() -> None:
 
 @pytest.mark.slow
 def test_a_layer_flows_down_an_incline_as_bagnold_says() -> None:
-    found, _, _ = inclines.ratio(inclines.Chute(24.0), "cpu")
-    assert found == pytest.approx(1.0, abs=inclines.ALLOWED)
+    assert inclines.Chute(24.0).ratio("cpu") == pytest.approx(1.0, abs=inclines.ALLOWED)
 
 
 def test_forces_at_equal_depth_over_diameter_grow_with_the_cube() -> None:

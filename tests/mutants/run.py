@@ -27,12 +27,15 @@ import tomllib
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import asdict, dataclass
-from itertools import islice, zip_longest
+from itertools import accumulate, islice, zip_longest
 from pathlib import Path
 from py_compile import PycInvalidationMode
 from typing import Any
 
 REPOSITORY = Path(__file__).resolve().parents[2]
+OUT = REPOSITORY / "build" / "mutants.jsonl"
+LIMIT = 900.0
+"""Seconds for the tests of a mutant."""
 
 COMPARISONS: dict[type[ast.cmpop], type[ast.cmpop]] = {
     ast.Lt: ast.Gt, ast.Gt: ast.Lt, ast.LtE: ast.GtE, ast.GtE: ast.LtE, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
@@ -58,85 +61,71 @@ class Mutant:
     after: str
 
 
-class Finder(ast.NodeVisitor):
-    """All mutants of a module; annotations, decorators, messages of errors and f-strings stay as they are."""
+def replaced(node: ast.AST, **fields: Any) -> str:
+    """The source of a node with other fields."""
+    other = copy.copy(node)
+    for name, value in fields.items():
+        setattr(other, name, value)
+    return f"({ast.unparse(other)})"
 
-    def __init__(self, file: str, source: bytes) -> None:
-        self.file, self.source, self.found = file, source, list[Mutant]()
-        self.lines = [0]
-        for line in source.splitlines(keepends=True):
-            self.lines.append(self.lines[-1] + len(line))
-        self.visit(ast.parse(source))
 
-    def add(self, kind: str, node: ast.expr | ast.stmt, after: str) -> None:
-        assert node.end_lineno is not None and node.end_col_offset is not None
-        start = self.lines[node.lineno - 1] + node.col_offset
-        end = self.lines[node.end_lineno - 1] + node.end_col_offset
-        self.found.append(Mutant(self.file, node.lineno, start, end, kind, self.source[start:end].decode(), after))
+def faults(node: ast.AST) -> Iterator[tuple[str, ast.AST, str]]:
+    """Kind, node and new source of every fault at a node."""
+    match node:
+        case ast.Compare(ops=[op]):
+            yield "comparison", node, replaced(node, ops=[COMPARISONS[type(op)]()])
+        case ast.BinOp(op=op) if type(op) in OPERATORS:
+            yield "operator", node, replaced(node, op=OPERATORS[type(op)]())
+        case ast.Constant(value=float(value)):
+            yield "constant", node, replaced(node, value=1.5 * value or 1.0)
+        case ast.Constant(value=int(value)) if not isinstance(value, bool):
+            yield "constant", node, replaced(node, value=value + 1)
+        case ast.If() | ast.IfExp() | ast.While():
+            yield "condition", node.test, f"(not ({ast.unparse(node.test)}))"
+        case ast.Call():
+            name = getattr(node.func, "attr", getattr(node.func, "id", ""))
+            if name in EXTREMES:
+                field = "attr" if isinstance(node.func, ast.Attribute) else "id"
+                yield "extreme", node.func, replaced(node.func, **{field: EXTREMES[name]})
+            if len(node.args) > 1:
+                yield "argument", node, replaced(node, args=[node.args[1], node.args[0], *node.args[2:]])
+            if node.keywords:
+                yield "argument", node, replaced(node, keywords=node.keywords[:-1])
+        case ast.FunctionDef() | ast.AsyncFunctionDef():
+            for statement in node.body:
+                if isinstance(statement, ast.If | ast.For | ast.While | ast.With):
+                    yield "return", statement, "return"
+                elif isinstance(statement, ast.AugAssign | ast.Expr) and not isinstance(statement.value, ast.Constant):
+                    yield "return", statement, "pass"
 
-    def changed(self, kind: str, node: ast.expr, **fields: Any) -> None:
-        other = copy.copy(node)
-        for name, value in fields.items():
-            setattr(other, name, value)
-        self.add(kind, node, f"({ast.unparse(other)})")
 
-    def generic_visit(self, node: ast.AST) -> None:
-        for name, value in ast.iter_fields(node):
-            if name not in ("annotation", "returns", "decorator_list"):
-                for child in value if isinstance(value, list) else [value]:
-                    if isinstance(child, ast.AST) and not isinstance(child, ast.Raise | ast.JoinedStr):
-                        self.visit(child)
+def changeable(node: ast.AST, index: bool = False) -> Iterator[tuple[ast.AST, bool]]:
+    """A node and all below it, each with whether it stands in an index; annotations, decorators, messages of errors,
+    f-strings and imports for types alone stay as they are."""
+    if isinstance(node, ast.Raise | ast.JoinedStr) or ast.unparse(getattr(node, "test", node)) == "TYPE_CHECKING":
+        return
+    yield node, index
+    for name, value in ast.iter_fields(node):
+        if name not in ("annotation", "returns", "decorator_list"):
+            for child in value if isinstance(value, list) else [value]:
+                if isinstance(child, ast.AST):
+                    yield from changeable(child, index or (isinstance(node, ast.Subscript) and name == "slice"))
 
-    def visit_Compare(self, node: ast.Compare) -> None:
-        if len(node.ops) == 1:
-            self.changed("comparison", node, ops=[COMPARISONS[type(node.ops[0])]()])
-        self.generic_visit(node)
 
-    def visit_BinOp(self, node: ast.BinOp) -> None:
-        if other := OPERATORS.get(type(node.op)):
-            self.changed("operator", node, op=other())
-        self.generic_visit(node)
-
-    def visit_Constant(self, node: ast.Constant, kind: str = "constant") -> None:
-        if type(node.value) is float:
-            self.changed(kind, node, value=1.5 * node.value or 1.0)
-        elif type(node.value) is int:
-            self.changed(kind, node, value=node.value + 1)
-
-    def visit_Subscript(self, node: ast.Subscript) -> None:
-        self.visit(node.value)
-        for part in ast.walk(node.slice):
-            if isinstance(part, ast.Constant):
-                self.visit_Constant(part, "index")
-
-    def visit_test(self, node: ast.If | ast.IfExp | ast.While) -> None:
-        if ast.unparse(node.test) != "TYPE_CHECKING":
-            self.add("condition", node.test, f"(not ({ast.unparse(node.test)}))")
-            self.generic_visit(node)
-
-    visit_If = visit_IfExp = visit_While = visit_test
-
-    def visit_Call(self, node: ast.Call) -> None:
-        name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
-        if name in EXTREMES:
-            other = copy.copy(node.func)
-            setattr(other, "attr" if isinstance(other, ast.Attribute) else "id", EXTREMES[name])
-            self.changed("extreme", node, func=other)
-        if len(node.args) > 1:
-            self.changed("argument", node, args=[node.args[1], node.args[0], *node.args[2:]])
-        if node.keywords:
-            self.changed("argument", node, keywords=node.keywords[:-1])
-        self.generic_visit(node)
-
-    def visit_function(self, node: ast.FunctionDef | ast.AsyncFunctionDef) -> None:
-        for statement in node.body:
-            if isinstance(statement, ast.If | ast.For | ast.While | ast.With):
-                self.add("return", statement, "return")
-            elif isinstance(statement, ast.AugAssign | ast.Expr) and not isinstance(statement.value, ast.Constant):
-                self.add("return", statement, "pass")
-        self.generic_visit(node)
-
-    visit_FunctionDef = visit_AsyncFunctionDef = visit_function
+def mutants_of(file: str, source: bytes) -> Iterator[Mutant]:
+    """All mutants of a module; in an index, constants only."""
+    lines = [0, *accumulate(map(len, source.splitlines(keepends=True)))]
+    for node, index in changeable(ast.parse(source)):
+        if index and not isinstance(node, ast.Constant):
+            continue
+        for kind, changed, after in faults(node):
+            start, end = (
+                lines[line - 1] + column
+                for line, column in ((changed.lineno, changed.col_offset), (changed.end_lineno, changed.end_col_offset))
+            )
+            yield Mutant(
+                file, changed.lineno, start, end, "index" if index else kind, source[start:end].decode(), after
+            )
 
 
 def package_view(folder: Path) -> None:
@@ -155,7 +144,7 @@ def sample(view: Path, only: list[str], seed: int) -> Iterator[Mutant]:
     for path in sorted(view.rglob("*.py")):
         file = path.relative_to(view).as_posix()
         if file.startswith(wanted):
-            for mutant in Finder(file, path.read_bytes()).found:
+            for mutant in mutants_of(file, path.read_bytes()):
                 kinds.setdefault(mutant.kind, []).append(mutant)
     rng = random.Random(seed)
     shuffled = [rng.sample(kinds[kind], len(kinds[kind])) for kind in sorted(kinds)]
@@ -195,22 +184,22 @@ def failure(tests: list[str], view: Path, limit: float | None = None) -> str | N
     return "" if process.returncode == 0 else named[1] if named else tests[0]
 
 
-def judged(mutants: Iterable[Mutant], view: Path, limit: float, out: Path) -> Iterator[tuple[Mutant, str]]:
+def judged(mutants: Iterable[Mutant], view: Path) -> Iterator[tuple[Mutant, str]]:
     """Each mutant and its outcome, which is kept. A test that fails must pass without the fault."""
-    kept = [json.loads(line) for line in out.read_text().splitlines()] if out.exists() else []
+    kept = [json.loads(line) for line in OUT.read_text().splitlines()] if OUT.exists() else []
     outcomes = {Mutant(**row["mutant"]): row["outcome"] for row in kept}
-    out.parent.mkdir(parents=True, exist_ok=True)
+    OUT.parent.mkdir(parents=True, exist_ok=True)
     for mutant in mutants:
         if mutant not in outcomes:
             path = view / mutant.file
             source = path.read_bytes()
             path.write_bytes(source[: mutant.start] + mutant.after.encode() + source[mutant.end :])
-            test = failure(tests_of(mutant.file), view, limit)
+            test = failure(tests_of(mutant.file), view, LIMIT)
             path.write_bytes(source)
             if test and failure([test], view):
                 raise SystemExit(f"mutants: {test} fails without any fault")
             outcomes[mutant] = {None: "timed out", "": "survived"}.get(test, "killed")
-            with out.open("a") as file:
+            with OUT.open("a") as file:
                 file.write(json.dumps({"outcome": outcomes[mutant], "by": test, "mutant": asdict(mutant)}) + "\n")
         yield mutant, outcomes[mutant]
 
@@ -220,15 +209,13 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=25, help="mutants")
     parser.add_argument("--seed", type=int, default=0, help="of the sample")
     parser.add_argument("--only", nargs="+", default=[], help="folders or files of the source")
-    parser.add_argument("--limit", type=float, default=900.0, help="seconds for the tests of a mutant")
-    parser.add_argument("--out", type=Path, default=REPOSITORY / "build" / "mutants.jsonl", help="JSON lines")
     given = parser.parse_args()
     counts = dict.fromkeys(("killed", "survived", "timed out"), 0)
     with tempfile.TemporaryDirectory() as folder:
         view = Path(folder)
         package_view(view)
         drawn = islice(sample(view, given.only, given.seed), given.count)
-        for mutant, outcome in judged(drawn, view, given.limit, given.out):
+        for mutant, outcome in judged(drawn, view):
             counts[outcome] += 1
             before, after = (" ".join(text.split())[:70] for text in (mutant.before, mutant.after))
             print(f"{outcome:9}  {mutant.file}:{mutant.line}  {mutant.kind}: {before} -> {after}", flush=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,20 +12,6 @@ from splatsoil.errors import ParameterError, SimulationError
 from splatsoil.soil.element import drive, isotropic_compression, simple_shear, triaxial
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects, library
-
-ANGLES = (25.0, 30.0, 35.0, 40.0, 45.0)
-
-
-@pytest.mark.parametrize("cohesion", [0.0, 300.0])
-def test_triaxial_compression_strength_to_a_thousandth(cohesion: float) -> None:
-    """sigma_1 = sigma_3 N + 2 c sqrt(N), N = tan^2(45 + phi / 2), Mohr-Coulomb; 26.90 kPa at 35 deg and 10 kPa."""
-    law = Law(find_effects(["cohesion"]))
-    sets = [{"friction_angle": a, "cohesion": cohesion} for a in ANGLES]
-    test = triaxial(law, sets, confining=1e4, strains=np.linspace(0.005, 0.05, 10), young=2e7)
-    flow = np.tan(np.radians(45.0 + np.array(ANGLES) / 2.0)) ** 2
-    expected = 1e4 * (flow - 1.0) + 2.0 * cohesion * np.sqrt(flow)
-    np.testing.assert_allclose(test.q[:, -1], expected, rtol=1e-4)
-    np.testing.assert_allclose(test.stress[..., :2], 1e4, rtol=1e-4)
 
 
 def test_before_failure_the_sample_is_elastic() -> None:
@@ -57,15 +44,6 @@ def test_records_do_not_hang_on_the_size_of_steps() -> None:
     np.testing.assert_allclose(coarse.volume_strain, fine.volume_strain, atol=2e-4)
 
 
-@pytest.mark.filterwarnings("error")
-def test_a_path_that_would_never_end_is_refused() -> None:
-    """Its steps are more than a 32-bit number holds, too."""
-    with pytest.raises(ParameterError, match=r"5e\+12 steps .* 10000000 are the most"):
-        triaxial(Law(), {}, confining=1e5, strains=[1e9])
-    with pytest.raises(ParameterError, match="steps"):
-        simple_shear(Law(), {}, confining=1e5, strains=[0.1], largest_step=1e-12)
-
-
 def test_a_stress_that_the_soil_cannot_bear_is_an_error() -> None:
     """At 35 deg and 10 kPa the strength is 36.90 kPa: under stress control, 36 kPa are reached and 38 kPa are not."""
 
@@ -79,17 +57,23 @@ def test_a_stress_that_the_soil_cannot_bear_is_an_error() -> None:
         loaded(3.8e4)
 
 
-def test_meaningless_tests_are_refused() -> None:
-    with pytest.raises(ParameterError, match=r"confining: -1.0 is not a positive number"):
-        triaxial(Law(), {}, confining=-1.0, strains=[0.1])
-    with pytest.raises(ParameterError, match=r"strains: give at least one finite number"):
-        triaxial(Law(), {}, confining=1e4, strains=[math.nan])
-    with pytest.raises(ParameterError, match=r"poisson: 0.5"):
-        triaxial(Law(), {}, confining=1e4, strains=[0.1], poisson=0.5)
-    with pytest.raises(ParameterError, match=r"unknown parameter cohesion"):
-        triaxial(Law(), {"cohesion": 10.0}, confining=1e4, strains=[0.1])
-    with pytest.raises(ParameterError, match=r"at least one set"):
-        triaxial(Law(), [], confining=1e4, strains=[0.1])
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    ("values", "wrong", "says"),
+    [
+        ({}, {"confining": -1.0}, r"confining: -1.0 is not a positive number"),
+        ({}, {"strains": [math.nan]}, r"strains: give at least one finite number"),
+        ({}, {"poisson": 0.5}, r"poisson: 0.5"),
+        ({"cohesion": 10.0}, {}, r"unknown parameter cohesion"),
+        ([], {}, r"at least one set"),
+        # more steps than a 32-bit number holds
+        ({}, {"strains": [1e9]}, r"5e\+12 steps .* 10000000 are the most"),
+        ({}, {"largest_step": 1e-12}, "steps"),
+    ],
+)
+def test_meaningless_and_endless_tests_are_refused(values: Any, wrong: dict[str, Any], says: str) -> None:
+    with pytest.raises(ParameterError, match=says):
+        triaxial(Law(), values, **{"confining": 1e4, "strains": [0.1], **wrong})
 
 
 @pytest.mark.parametrize(

@@ -53,6 +53,3 @@ def test_values_and_order_are_no_part_of_the_kernel() -> None:
     assert module(["softening", "cohesion"]) == module(["cohesion", "softening"])
     one, other = (Law(find_effects(names)) for names in (["softening", "cohesion"], ["cohesion", "softening"]))
     assert make_stress_kernel(one.update, one.history) is make_stress_kernel(other.update, other.history)
-
-
-#: Simulates with the effects that are named, in this order, and prints how many modules Warp has compiled since.

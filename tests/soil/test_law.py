@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ import warp as wp
 from splatsoil.errors import ParameterError
 from splatsoil.soil.law import Law, Stress
 from splatsoil.soil.library import find_effects, library
+from splatsoil.soil.matching import Matching, cone_slope
 from splatsoil.soil.settings import Settings
 
 BULK, SHEAR = 2.0e7, 1.0e7
@@ -96,17 +97,28 @@ def test_an_effect_that_is_off_costs_nothing() -> None:
     assert Law(find_effects(["cohesion"])).update is not Law().update
 
 
-def test_unknown_and_absurd_parameters_are_named() -> None:
-    with pytest.raises(ParameterError, match=r"cohesion.*effect is on"):
-        Law().settings(BASE, {"cohesion": 100.0})
-    with pytest.raises(ParameterError, match=r"friction_angle: 80 deg lies outside \[20, 55\]"):
-        Law().settings(BASE, {"friction_angle": 80.0})
-    with pytest.raises(ParameterError, match=r"'cohesiom' is unknown, did you mean cohesion\?"):
-        find_effects(["cohesiom"])
-    with pytest.raises(ParameterError, match=r"'magic' is unknown; known are .*cohesion"):
-        find_effects(["magic"])
-    with pytest.raises(ParameterError, match="twice"):
-        find_effects(["cohesion", "cohesion"])
+@pytest.mark.parametrize(
+    ("matching", "slope"),
+    [("compression", 0.819), ("extension", 0.556), ("plane_strain", 0.574), ("simple_shear", 0.700)],
+)
+def test_slopes_of_the_cone_at_35_degrees(matching: str, slope: float) -> None:
+    assert cone_slope(35.0, Matching(matching)) == pytest.approx(slope, abs=6e-4)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        *((lambda angle=angle: cone_slope(angle), "friction angle") for angle in (-1.0, 90.0, math.nan)),
+        (lambda: Law().settings(BASE, {"cohesion": 100.0}), r"cohesion.*effect is on"),
+        (lambda: Law().settings(BASE, {"friction_angle": 80.0}), r"friction_angle: 80 deg lies outside \[20, 55\]"),
+        (lambda: find_effects(["cohesiom"]), r"'cohesiom' is unknown, did you mean cohesion\?"),
+        (lambda: find_effects(["magic"]), r"'magic' is unknown; known are .*cohesion"),
+        (lambda: find_effects(["cohesion", "cohesion"]), "twice"),
+    ],
+)
+def test_unknown_and_absurd_parameters_are_named(wrong: Callable[[], object], says: str) -> None:
+    with pytest.raises(ParameterError, match=says):
+        wrong()
 
 
 def test_every_built_in_effect_is_complete() -> None:

@@ -7,17 +7,16 @@ import math
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
-import trimesh
+from splatsoil.benchmarks.effects import table
 
 from splatsoil.errors import ParameterError
-from splatsoil.measurement import Bed, Camera, Frame, Measurement, Tool, ToolMotion
-from splatsoil.model import Model
-from splatsoil.reconstruction import HeightField
+from splatsoil.measurement import Measurement
 from splatsoil.soil.element import triaxial
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
@@ -26,23 +25,6 @@ from splatsoil.soil.library import find_effects
 @pytest.fixture
 def suction(repository: Path) -> str:
     return str(repository / "examples" / "effects" / "suction.py")
-
-
-def tiny(effects: list[str]) -> Model:
-    """A box of 4 cm ploughs a bed of 20 x 16 x 6 cm for three frames."""
-    bed = Bed(np.zeros(3), np.array([0.2, 0.16, 0.12]), 1600.0)
-    times = np.arange(4) / 20.0
-    x = 0.06 + 0.3 * times
-    positions = np.stack([x, np.full(4, 0.08), np.full(4, 0.06)], axis=1)
-    motion = ToolMotion(np.arange(4), times, positions, np.tile([1.0, 0.0, 0.0, 0.0], (4, 1)))
-    pose = np.eye(4)
-    pose[2, 3] = 1.0
-    view = Camera(32, 32, 50.0, 50.0, 16.0, 16.0, pose, model="PINHOLE")
-    video = tuple(Frame(view, Path(), "above", f, f / 20.0) for f in (0, 3))
-    tool = Tool(trimesh.creation.box((0.02, 0.04, 0.04)), motion)
-    measurement = Measurement(Path(), "made", np.array([0.0, 0.0, -9.81]), 20.0, bed, tool, (), video)
-    surface = HeightField.over(bed.lower, bed.upper, 0.01, 0.06)
-    return Model(measurement, SimpleNamespace(surface=surface), effects=effects, preset="tiny")  # type: ignore[arg-type]
 
 
 def test_the_example_is_the_effect_it_says_it_is(suction: str) -> None:
@@ -56,24 +38,23 @@ def test_the_example_is_the_effect_it_says_it_is(suction: str) -> None:
         assert test.q[0, -1] == pytest.approx(1e3 * (flow - 1.0) + 2.0 * cohesion * math.sqrt(flow), rel=1e-3)
 
 
-def test_a_variant_of_a_model_keeps_an_effect_from_a_file(suction: str) -> None:
-    """Criticism names effects; those of a user's file are in no library."""
-    model = tiny([suction])
-    more = model.variant(effects=("suction", "cohesion"))
-    assert [effect.name for effect in more.law.effects] == ["suction", "cohesion"]
-    assert [effect.name for effect in model.variant().law.effects] == ["suction"]
-
-
-def test_a_model_with_the_example_fits_and_simulates_it(suction: str) -> None:
-    model, base = tiny([suction]), tiny([])
+def test_a_model_with_the_example_fits_and_simulates_it(
+    suction: str, small_set: Path, over_level_soil: Callable[..., Any]
+) -> None:
+    """Variants keep it: criticism names effects, and those of a user's file are in no library."""
+    measurement = Measurement.load(small_set)
+    base, model = (over_level_soil(measurement, 0.16, *effects) for effects in ((), (suction,)))
     assert model.space().names == ("friction_angle", "suction_gradient")
     assert "suction_angle" in {p.name for p in model.parameters}
+    names = [
+        [effect.name for effect in m.law.effects] for m in (model.variant(), model.variant(effects=("suction", "tilt")))
+    ]
+    assert names == [["suction"], ["suction", "tilt"]]
     dry, off, held = (
         m.simulate({"friction_angle": 30.0, **values}).positions[-1]
         for m, values in ((base, {}), (model, {"suction_gradient": 0.0}), (model, {"suction_gradient": 5e4}))
     )
-    chance = np.abs(off - dry).max()
-    assert chance < 2e-4
+    assert np.abs(off - dry).max() < 2e-4
     assert np.abs(held - dry).max() > 1e-3
 
 
@@ -128,12 +109,6 @@ def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
         find_effects([str(tmp_path / "nothing.py")])
 
 
-def test_the_documents_show_the_example_as_it_is(repository: Path, suction: str) -> None:
+def test_the_documents_show_the_example_and_the_table_of_the_library(repository: Path, suction: str) -> None:
     text = (repository / "docs" / "effects.md").read_text()
-    assert Path(suction).read_text() in text
-
-
-def test_the_documents_have_the_table_of_the_library(repository: Path) -> None:
-    from splatsoil.benchmarks.effects import table
-
-    assert table() in (repository / "docs" / "effects.md").read_text()
+    assert Path(suction).read_text() in text and table() in text

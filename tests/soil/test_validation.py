@@ -9,15 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from splatsoil.benchmarks._validation.element import ALLOWED, strength
-from splatsoil.benchmarks._validation.sand import (
-    CRITICAL,
-    LADDER,
-    LIMITS,
-    from_one_to_another,
-    karlsruhe,
-    mobilised,
-)
+from splatsoil.benchmarks._validation.element import ALLOWED, inertia, strength
+from splatsoil.benchmarks._validation.sand import LADDER, LIMITS, from_one_to_another, karlsruhe
 
 from splatsoil.soil.element import triaxial
 from splatsoil.soil.law import Law
@@ -30,6 +23,8 @@ SUMMARY = FILE.with_name("summary_25_drained_tests_derived.csv")
 
 PEAK = 42.14
 """Peak friction angle of TMD22, from the data set's own table of all 25 tests, degrees."""
+CRITICAL = 33.1
+"""Published critical friction angle, degrees."""
 
 
 @pytest.mark.parametrize("matching", list(Matching))
@@ -39,15 +34,23 @@ def test_strength_is_exact_in_the_test_a_matching_is_named_after(matching: Match
     assert found == pytest.approx(exact, rel=ALLOWED)
 
 
+@pytest.mark.parametrize("inertial_number", [0.01, 0.279, 3.0])
+def test_friction_follows_the_inertial_number(inertial_number: float) -> None:
+    """mu(I) of glass beads (Jop et al. 2006)."""
+    found, exact = inertia(inertial_number)
+    assert found == pytest.approx(exact, rel=ALLOWED)
+
+
 @pytest.mark.skipif(not FILE.is_file(), reason="SPLATSOIL_MEASURED names no folder with karlsruhe_triaxial")
 @pytest.mark.parametrize(("fit", "other"), [("TMD2", "TMD22"), ("TMD22", "TMD2")])
 def test_each_effect_lowers_the_error_on_a_density_that_was_not_fitted(fit: str, other: str) -> None:
     curves = karlsruhe(FILE.parents[1])
     known = of_limits(curves[fit].void_ratio, *LIMITS)
-    rows, tables = from_one_to_another("sand", curves, [fit], LADDER[:3], known)
+    rows = from_one_to_another("sand", curves, [fit], LADDER[:3], known)
     assert [row.held for row in rows] == [None, True, True]
-    assert {test for _, test in tables} == {other}
-    assert mobilised(curves["TMD22"]).max() == pytest.approx(PEAK, abs=0.1)
+    assert all(row.found.startswith(f"{other} q/p") for row in rows)
+    ratio = curves["TMD22"].ratio.max()
+    assert math.degrees(math.asin(3.0 * ratio / (6.0 + ratio))) == pytest.approx(PEAK, abs=0.1)
 
 
 @pytest.mark.skipif(not SUMMARY.is_file(), reason="SPLATSOIL_MEASURED names no folder with karlsruhe_triaxial")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import ClassVar
 
 from splatsoil.observation import Observation
 from splatsoil.parameters import Parameter
@@ -15,9 +14,7 @@ class Blur(Effect):
     """A Gaussian blur of linear colour. Its influence grows with the square of sigma: a derivative at 0 is 0."""
 
     name = "blur"
-    parameters: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("blur", "px", 0.0, 5.0, 0.0, off=0.0, meaningful=0.3, sign=1, label="blur of the video"),
-    )
+    parameters = (Parameter("blur", "px", 0.0, 5.0, 0.0, off=0.0, meaningful=0.3, sign=1, label="blur of the video"),)
     note = "Lens out of focus: Gaussian blur of the video's linear colour by this standard deviation."
     source = "discrete Gaussian kernel: Lindeberg (1990), IEEE PAMI 12(3), sec. III-C"
 

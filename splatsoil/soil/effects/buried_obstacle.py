@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import ClassVar
 
 from splatsoil.measurement import Measurement
 from splatsoil.parameters import Parameter
@@ -16,7 +15,7 @@ class BuriedObstacle(Effect):
     """A fixed, rough sphere in the bed; smaller than a grid cell it is not seen by the solver."""
 
     name = "buried_obstacle"
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    parameters = (
         Parameter(
             "obstacle_radius", "m", 0.0, 0.2, 0.0, off=0.0, meaningful=0.02, sign=1, label="radius of the obstacle"
         ),

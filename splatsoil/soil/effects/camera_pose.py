@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import ClassVar
 
 from splatsoil.measurement import Measurement
 from splatsoil.observation import CameraShift, Observation
@@ -41,7 +40,7 @@ class CameraPose(Effect):
     """
 
     name = "camera_pose"
-    parameters: ClassVar[tuple[Parameter, ...]] = pose_parameters(["1"])
+    parameters = pose_parameters(["1"])
     note = (
         "A video camera stands turned or shifted against its calibration, from before frame 0 to the end; "
         "the simulation does not change. A measurement set with several cameras has these parameters for each."

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import warp as wp
 
 from splatsoil.parameters import Parameter
@@ -25,9 +23,7 @@ class Cohesion(Effect):
     """Mohr-Coulomb cohesion c, matched to Drucker-Prager like the friction angle; the apex is at p = -k/a."""
 
     name = "cohesion"
-    parameters: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("cohesion", "Pa", 0.0, 1500.0, 0.0, off=0.0, meaningful=50.0, sign=1),
-    )
+    parameters = (Parameter("cohesion", "Pa", 0.0, 1500.0, 0.0, off=0.0, meaningful=50.0, sign=1),)
     note = "Strength that remains at zero pressure: damp or cemented soil stands in steep walls and tears in clods."
     source = "Chen & Mizuno (1990), Nonlinear Analysis in Soil Mechanics, eq. 5.27"
     strength = cohesive_strength

@@ -39,7 +39,7 @@ class Compaction(Effect):
     """
 
     name = "compaction"
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    parameters = (
         Parameter(
             "looseness", "1", 0.0, 0.1, 0.0, off=0.0, meaningful=0.01, sign=1, label="volume that loose soil can lose"
         ),

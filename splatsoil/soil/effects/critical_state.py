@@ -51,7 +51,7 @@ class CriticalState(Effect):
     """
 
     name = "critical_state"
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    parameters = (
         Parameter("relative_density", "1", 0.0, 1.0, 0.2, off=0.2, meaningful=0.05, label="relative density"),
         Parameter(
             "volume_range", "1", 0.1, 0.4, 0.2, meaningful=0.03, label="log volume between loosest and densest packing"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import ClassVar
 
 import warp as wp
 
@@ -33,7 +32,7 @@ class DensityGradient(Effect):
     """
 
     name = "density_gradient"
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    parameters = (
         Parameter("density_gradient", "1/m", -0.9, 2.0, 0.0, off=0.0, meaningful=0.1, label="growth of density"),
         Parameter("density_friction", "deg", 0.0, 150.0, 60.0, meaningful=10.0, label="friction per log density"),
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import ClassVar
 
 import warp as wp
 
@@ -30,7 +29,7 @@ class Dilatancy(Effect):
     """
 
     name = "dilatancy"
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    parameters = (
         Parameter("dilatancy_angle", "deg", 0.0, 25.0, 0.0, off=0.0, meaningful=2.0, sign=1, label="angle of dilation"),
         Parameter(
             "dilatancy_strain", "1", 0.02, 20.0, 0.3, meaningful=0.1, log=True, label="strain to the critical state"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import ClassVar
 
 from splatsoil.observation import Observation
 from splatsoil.parameters import Parameter
@@ -15,7 +14,7 @@ class Exposure(Effect):
     """Linear colour times gain · exp(drift · time), plus an offset; the same for all cameras and channels."""
 
     name = "exposure"
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    parameters = (
         Parameter("exposure_gain", "1", 0.5, 2.0, 1.0, off=1.0, meaningful=0.02, log=True, label="exposure gain"),
         Parameter("exposure_drift", "1/s", -0.2, 0.2, 0.0, off=0.0, meaningful=0.005, label="drift of log exposure"),
         Parameter("exposure_offset", "1", -0.05, 0.05, 0.0, off=0.0, meaningful=0.002, label="stray light"),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import ClassVar
 
 from splatsoil.parameters import Parameter
 from splatsoil.soil.effect import Effect
@@ -15,7 +14,7 @@ class Gravity(Effect):
     """Gravity times a factor; the Moon has 0.165, Mars 0.379."""
 
     name = "gravity"
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    parameters = (
         Parameter("gravity_factor", "1", 0.05, 5.0, 1.0, off=1.0, meaningful=0.1, log=True, label="gravity over g"),
     )
     note = (

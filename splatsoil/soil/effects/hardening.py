@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import warp as wp
 
 from splatsoil.parameters import Parameter
@@ -35,7 +33,7 @@ class Hardening(Effect):
     """
 
     name = "hardening"
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    parameters = (
         Parameter(
             "hardening_strain",
             "1",

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import warp as wp
 
 from splatsoil.parameters import Parameter
@@ -41,7 +39,7 @@ class IntermediateStress(Effect):
     """
 
     name = "intermediate_stress"
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    parameters = (
         Parameter(
             "intermediate_share", "1", 0.0, 1.0, 0.0, off=0.0, meaningful=0.25, sign=1, label="share of Matsuoka-Nakai"
         ),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import ClassVar
 
 import numpy as np
 import warp as wp
@@ -28,7 +27,7 @@ class Layering(Effect):
     """Friction angle and density that differ by these amounts in soil that was below a depth at the start."""
 
     name = "layering"
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    parameters = (
         Parameter(
             "layer_friction", "deg", -15.0, 15.0, 0.0, off=0.0, meaningful=1.5, label="friction angle of the layer"
         ),

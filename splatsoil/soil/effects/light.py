@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import ClassVar
 
 from splatsoil.observation import Observation
 from splatsoil.parameters import Parameter
@@ -15,7 +14,7 @@ class LightChange(Effect):
     """Turns the sun and changes the sky's share; level, open ground keeps its brightness, slopes and shadows change."""
 
     name = "light"
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    parameters = (
         Parameter("sun_azimuth_change", "deg", -20.0, 20.0, 0.0, off=0.0, meaningful=1.0, label="turn of the sun"),
         Parameter("sun_elevation_change", "deg", -15.0, 15.0, 0.0, off=0.0, meaningful=1.0, label="rise of the sun"),
         Parameter("sky_share_change", "1", -0.3, 0.3, 0.0, off=0.0, meaningful=0.02, label="change of the sky's share"),

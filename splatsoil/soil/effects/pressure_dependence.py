@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import warp as wp
 
 from splatsoil.parameters import Parameter
@@ -26,7 +24,7 @@ class PressureDependence(Effect):
     """Power law sqrt(J2) = a p0 (p / p0)^(1 - m): the friction angle holds at the pressure p0."""
 
     name = "pressure_dependence"
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    parameters = (
         Parameter("pressure_exponent", "1", 0.0, 0.3, 0.0, off=0.0, meaningful=0.03, sign=1, label="envelope exponent"),
         Parameter(
             "pressure_reference", "Pa", 100.0, 1e6, 1000.0, meaningful=100.0, log=True, label="reference pressure"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import warp as wp
 
 from splatsoil.parameters import Parameter
@@ -29,7 +27,7 @@ class RateDependence(Effect):
     """Friction from mu_s at rest to mu_2 = mu_s (1 + r) in fast flow; glass beads: r = 0.69, I0 = 0.279."""
 
     name = "rate_dependence"
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    parameters = (
         Parameter("rate_gain", "1", 0.0, 2.0, 0.0, off=0.0, meaningful=0.1, sign=1, label="gain of friction by rate"),
         Parameter("rate_inertial_number", "1", 0.01, 1.0, 0.279, meaningful=0.05, log=True, label="inertial number I0"),
         Parameter("rate_grain_size", "m", 1e-5, 2e-2, 1e-3, meaningful=2e-4, log=True, label="grain diameter"),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import ClassVar
 
 import warp as wp
 
@@ -26,7 +25,7 @@ class Softening(Effect):
     """The friction angle is the residual one; undisturbed soil has ``softening_angle`` more."""
 
     name = "softening"
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    parameters = (
         Parameter(
             "softening_angle",
             "deg",

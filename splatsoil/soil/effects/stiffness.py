@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import ClassVar
 
 from splatsoil.parameters import Parameter
 from splatsoil.soil.effect import Effect
@@ -15,7 +14,7 @@ class Stiffness(Effect):
     """Both elastic moduli times a factor; four times the stiffness takes twice the time."""
 
     name = "stiffness"
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    parameters = (
         Parameter("stiffness_factor", "1", 0.1, 20.0, 1.0, off=1.0, meaningful=2.0, log=True, label="stiffness factor"),
     )
     note = (

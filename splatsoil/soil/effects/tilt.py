@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import ClassVar
 
 from scipy.spatial.transform import Rotation
 
@@ -17,7 +16,7 @@ class Tilt(Effect):
     """Ground that falls towards +x (and +y) by these angles: gravity turns about y, then about x."""
 
     name = "tilt"
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    parameters = (
         Parameter("tilt_x", "deg", -15.0, 15.0, 0.0, off=0.0, meaningful=1.0, label="slope falling towards +x"),
         Parameter("tilt_y", "deg", -15.0, 15.0, 0.0, off=0.0, meaningful=1.0, label="slope falling towards +y"),
     )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import ClassVar
 
 from splatsoil.observation import Observation
 from splatsoil.parameters import Parameter
@@ -15,7 +14,7 @@ class TimeOffset(Effect):
     """Pictures show soil and tool a little later (or earlier) than their frame number says."""
 
     name = "time_offset"
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    parameters = (
         Parameter("time_offset", "s", -0.04, 0.04, 0.0, off=0.0, meaningful=0.002, label="time offset of the video"),
     )
     note = (

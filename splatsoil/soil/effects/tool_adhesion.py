@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import ClassVar
 
 from splatsoil.parameters import Parameter
 from splatsoil.soil.effect import Effect
@@ -15,9 +14,7 @@ class ToolAdhesion(Effect):
     """Shear stress c_a between tool and soil in contact, beside Coulomb friction; it does not pull."""
 
     name = "tool_adhesion"
-    parameters: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("tool_adhesion", "Pa", 0.0, 2000.0, 0.0, off=0.0, meaningful=50.0, sign=1),
-    )
+    parameters = (Parameter("tool_adhesion", "Pa", 0.0, 2000.0, 0.0, off=0.0, meaningful=50.0, sign=1),)
     note = (
         "Damp or clayey soil clings to metal: sliding along the tool takes a shear stress even without pressure. It "
         "acts along the surface only; soil that leaves the tool is not held back."

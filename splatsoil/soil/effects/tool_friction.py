@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import ClassVar
 
 from splatsoil.parameters import Parameter
 from splatsoil.soil.effect import Effect
@@ -15,16 +14,9 @@ class ToolFriction(Effect):
     """Replaces the tool's friction coefficient by the noted one plus a change."""
 
     name = "tool_friction"
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    parameters = (
         Parameter(
-            "tool_friction_change",
-            "1",
-            -0.3,
-            0.6,
-            0.0,
-            off=0.0,
-            meaningful=0.1,
-            label="change of tool friction",
+            "tool_friction_change", "1", -0.3, 0.6, 0.0, off=0.0, meaningful=0.1, label="change of tool friction"
         ),
     )
     note = "Coulomb friction between tool and soil, as a change from the coefficient in experiment.json."

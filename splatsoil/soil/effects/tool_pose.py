@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import ClassVar
 
 from splatsoil.observation import Observation
 from splatsoil.parameters import Parameter
@@ -17,7 +16,7 @@ class ToolPose(Effect):
     """Shifts and turns the tool that is drawn, its shadow included; the soil is pushed by the motion as recorded."""
 
     name = "tool_pose"
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    parameters = (
         *(
             Parameter(
                 f"tool_{a}", "m", -0.02, 0.02, 0.0, off=0.0, meaningful=0.001, label=f"shift of the tool along {a}"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import warp as wp
 
 from splatsoil.parameters import Parameter
@@ -23,9 +21,7 @@ class Viscosity(Effect):
     """Bingham's overstress: flowing soil carries sqrt(J2) = yield strength + viscosity * plastic shear rate."""
 
     name = "viscosity"
-    parameters: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("viscosity", "Pa s", 0.0, 500.0, 0.0, off=0.0, meaningful=10.0, sign=1),
-    )
+    parameters = (Parameter("viscosity", "Pa s", 0.0, 500.0, 0.0, off=0.0, meaningful=10.0, sign=1),)
     note = "Wet soil or mud resists shear the more, the faster it is sheared, whatever the pressure."
     source = "Bingham (1922), Fluidity and Plasticity; overstress: Perzyna (1966), Adv. Appl. Mech. 9"
     strength = viscous
