@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
+
+from splatsoil.commands._options import ACTING, VALUES
 from splatsoil.commands._output import print_table, tell
-from splatsoil.commands.simulate import ACTING, VALUES, parse_values
+from splatsoil.commands.simulate import parse_values
 from splatsoil.errors import ParameterError
+from splatsoil.files import write_bytes
 from splatsoil.options import JSON, option
+from splatsoil.quiet import hush
 
 if TYPE_CHECKING:
     from splatsoil.soil.element import ElementTest
@@ -56,7 +62,6 @@ LEAST_SPAN, LEAST_STRAIN = 0.02, 1.0e-3
 
 def run(config: Config) -> int:
     """Test, print and plot."""
-    from splatsoil.quiet import hush
     from splatsoil.soil.law import Law
     from splatsoil.soil.library import find_effects
 
@@ -99,8 +104,6 @@ def refuse_idle(law: Law, values: dict[str, float]) -> None:
 
 def perform(law: Law, values: dict[str, float], config: Config) -> ElementTest:
     """The test that the options describe."""
-    import numpy as np
-
     from splatsoil.soil.element import Options, isotropic_compression, simple_shear, triaxial
     from splatsoil.soil.matching import Matching
 
@@ -138,13 +141,8 @@ def curve(result: ElementTest, config: Config) -> dict[str, Any]:
 
 def draw(columns: dict[str, Any], config: Config) -> None:
     """One panel for each column, over the first; written whole or not at all."""
-    import io
-
-    import numpy as np
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
-
-    from splatsoil.files import write_bytes
 
     (across, x), *others = columns.items()
     figure = Figure(figsize=(3.2 * len(others), 2.8), layout="constrained")
@@ -175,8 +173,6 @@ def draw(columns: dict[str, Any], config: Config) -> None:
 
 def show(columns: dict[str, Any], config: Config) -> None:
     """A dozen lines of the curve."""
-    import numpy as np
-
     total = len(next(iter(columns.values())))
     shown = np.unique(np.linspace(0, total - 1, min(ROWS, total)).astype(int))
     rows = ([f"{column[k]:.5g}" for column in columns.values()] for k in shown)

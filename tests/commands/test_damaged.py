@@ -21,14 +21,11 @@ from splatsoil.errors import RunError
 from splatsoil.files import write_json
 
 FitOf = Callable[..., dict[str, Any]]
+Words = Callable[..., list[str]]
 ALL = ("compare", "diagnose", "add", "report", "posterior")
 SHOWN = ("add", "report")
 FIT = '{"format": "splatsoil-fit/2", "name": "base"'
 DIAGNOSIS = '{"format": "splatsoil-diagnosis/2", "fit": "base", "values": {}, "model": []'
-
-
-def words(command: str, run: RunFolder) -> list[str]:
-    return [command, str(run.path), *(["cohesion"] if command == "add" else [])]
 
 
 @pytest.mark.usefixtures("no_work")
@@ -52,12 +49,12 @@ def words(command: str, run: RunFolder) -> list[str]:
     ],
 )
 def test_json_of_another_shape_is_named_before_any_work(
-    run: RunFolder, capsys: pytest.CaptureFixture[str], file: str, text: str, says: str, commands: tuple[str, ...]
+    run: RunFolder, capsys: pytest.CaptureFixture[str], words: Words, file: str, text: str, says: str, commands: Any
 ) -> None:
     (run.path / file).parent.mkdir(exist_ok=True)
     (run.path / file).write_text(text)
     for command in commands:
-        assert cli.main([*words(command, run), "--json"]) == 2, command
+        assert cli.main(words(command, run, "--json")) == 2, command
         out, err = capsys.readouterr()
         assert err.count("\n") == 1 and file in err and says in err, err
         assert json.loads(out) == {"ok": False, "error": err.removeprefix("splatsoil: ").strip()}
@@ -65,6 +62,9 @@ def test_json_of_another_shape_is_named_before_any_work(
 
 def test_a_page_that_lacks_something_says_so(run: RunFolder, capsys: pytest.CaptureFixture[str]) -> None:
     """A fit without its number of evaluations, say: what makes it one is there."""
+    fit = run.fit()
+    del fit["evaluations"]
+    run.write_fit("base", fit)
     assert cli.main(["report", str(run.path)]) == 2
     out, err = capsys.readouterr()
     assert out == "" and err.count("\n") == 1 and "fit.json: is damaged, it lacks" in err
@@ -81,7 +81,11 @@ def test_a_fit_into_a_run_that_does_not_say_what_it_is_for_is_refused(
 @pytest.mark.usefixtures("no_work")
 @pytest.mark.parametrize("command", ["compare", "diagnose", "add"])
 def test_what_cannot_be_written_to_is_met_before_any_work(
-    run: RunFolder, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, command: str
+    run: RunFolder,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    words: Words,
+    command: str,
 ) -> None:
     with run.lock():
         assert cli.main(words(command, run)) == 2
@@ -128,6 +132,7 @@ def test_a_fit_by_other_sources_is_said_to_be_one(
     run: RunFolder,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
+    words: Words,
     command: str,
     change: dict[str, str],
     fit_of: FitOf,
@@ -141,7 +146,7 @@ def test_a_fit_by_other_sources_is_said_to_be_one(
 
     monkeypatch.setattr(_model, "model_of", goes_on)
     monkeypatch.setattr("splatsoil.report.write_report", goes_on)
-    assert cli.main([*words(command, run), "--json"]) == 2
+    assert cli.main(words(command, run, "--json")) == 2
     out, err = capsys.readouterr()
     said, *last = err.splitlines() if change else ["", *err.splitlines()]
     assert last == ["splatsoil: has gone on"] and json.loads(out)["error"] == "has gone on"

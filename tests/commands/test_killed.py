@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from PIL import Image
 
 from splatsoil import cli
 
@@ -52,28 +51,10 @@ sys.exit(code)
 
 
 @pytest.fixture(scope="module")
-def place(plow_dry: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def place(plow_dry: Path, cut: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a set: five views and four frames of one camera, at half the size."""
     folder = tmp_path_factory.mktemp("killed")
-    made = folder / "set"
-    made.mkdir()
-    for name in ("experiment.json", "tool.stl", "tool_motion.csv", "tool_force.csv"):
-        shutil.copy(plow_dry / name, made)
-    for kind in ("views", "video"):
-        data = json.loads((plow_dry / kind / "transforms.json").read_text())
-        frames = data["frames"]
-        in_video = [f for f in frames if f.get("frame") in (-2, -1, 0, 10) and f.get("camera") == "left"]
-        data["frames"] = frames[::8] if kind == "views" else in_video
-        for entry in (data, *data["frames"]):
-            for key in {"w", "h", "fl_x", "fl_y", "cx", "cy"} & entry.keys():
-                entry[key] = entry[key] // 2 if key in "wh" else entry[key] / 2.0
-        for frame in data["frames"]:
-            target = made / kind / frame["file_path"]
-            target.parent.mkdir(parents=True, exist_ok=True)
-            with Image.open(plow_dry / kind / frame["file_path"]) as image:
-                half = (image.width // 2, image.height // 2)
-                image.resize(half, Image.Resampling.BOX).save(target, quality=95)
-        (made / kind / "transforms.json").write_text(json.dumps(data))
+    cut(plow_dry, folder / "set", 10, every=8, cameras="left", shrunk=2)
     return folder
 
 

@@ -16,6 +16,7 @@ from splatsoil.commands import _folder, _model, _stages
 from splatsoil.commands._options import FitOptions
 from splatsoil.errors import RunError
 
+Words = Callable[..., list[str]]
 COMMANDS = ("compare", "diagnose", "add", "posterior", "export")
 
 
@@ -42,14 +43,9 @@ def reaches(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     return found
 
 
-def words(command: str, run: Path, *more: object) -> list[str]:
-    own = {"add": ["cohesion"], "export": ["--to", "csv"]}.get(command, [])
-    return [command, str(run), *own, *map(str, more)]
-
-
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_set_elsewhere_is_asked_for_and_then_known(
-    project: Path, reaches: list[Path], capsys: pytest.CaptureFixture[str], command: str
+    project: Path, reaches: list[Path], capsys: pytest.CaptureFixture[str], words: Words, command: str
 ) -> None:
     run, new = project / "runs" / "run", project / "elsewhere" / "new"
     shutil.move(project / "data" / "set", new)
@@ -63,7 +59,9 @@ def test_a_set_elsewhere_is_asked_for_and_then_known(
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_a_project_on_another_machine(project: Path, reaches: list[Path], tmp_path: Path, command: str) -> None:
+def test_a_project_on_another_machine(
+    project: Path, reaches: list[Path], tmp_path: Path, words: Words, command: str
+) -> None:
     other = tmp_path / "other" / "machine"
     shutil.move(project, other)
     before = (other / "runs" / "run" / "run.json").read_bytes()
@@ -92,7 +90,7 @@ def test_a_fit_takes_the_new_place(project: Path, capsys: pytest.CaptureFixture[
 
 
 @pytest.mark.parametrize("told", [True, False])
-def test_another_set_is_not_taken(project: Path, capsys: pytest.CaptureFixture[str], told: bool) -> None:
+def test_another_set_is_not_taken(project: Path, capsys: pytest.CaptureFixture[str], words: Words, told: bool) -> None:
     run, place = project / "runs" / "run", project / "data" / "set"
     before = (run / "run.json").read_bytes()
     (place / "experiment.json").write_text((place / "experiment.json").read_text().replace("1600", "1700"))

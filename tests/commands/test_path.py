@@ -276,11 +276,12 @@ def test_a_broken_set_leaves_no_run_folder(small_set: Path, tmp_path: Path, caps
 
 
 @pytest.mark.parametrize("name", ["compare", "report", "diagnose", "add", "posterior", "design", "export"])
-def test_what_is_no_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
-    more = {"add": ["cohesion"], "export": ["--to", "csv"]}.get(name, [])
-    assert cli.main([name, str(tmp_path / "nothing"), *more]) == 2
+def test_what_is_no_run_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: Callable[..., list[str]], name: str
+) -> None:
+    assert cli.main(words(name, tmp_path / "nothing")) == 2
     assert "there is no such run folder" in capsys.readouterr().err
-    assert cli.main([name, str(tmp_path), *more]) == 2
+    assert cli.main(words(name, tmp_path)) == 2
     assert "run.json" in capsys.readouterr().err
 
 
