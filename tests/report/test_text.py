@@ -116,8 +116,8 @@ def test_a_residual_far_above_the_cameras_noise_is_no_fault_of_an_adequate_model
 def test_an_answer_that_is_none_says_so(determined: bool, at_bound: str | None, state: str) -> None:
     entry = {"estimate": 36.0, "std": 1.0, "unit": "deg", "at_bound": at_bound, "determined": determined}
     (answer,) = words.answers({"estimated_from": "loss", "parameters": {"friction_angle": entry}})
-    assert answer.state == state
-    assert bool(answer.remark) == (state != "determined")
+    assert answer["state"] == state
+    assert bool(answer["remark"]) == (state != "determined")
 
 
 @pytest.mark.parametrize(("seconds", "text"), [(48.2, "48 s"), (200.0, "3 min 20 s"), (7500.0, "2 h 5 min")])
@@ -144,13 +144,13 @@ def test_the_answer_is_averaged_over_models_whatever_the_verdict(judged: dict) -
     fit = {"name": "base", "estimated_from": "loss", "parameters": {"friction_angle": entry}}
     judged = {**judged, "estimates": AVERAGED}
     (answer,) = words.answers(fit, judged)
-    assert (answer.number, answer.state, answer.remark) == ("37 ± 3°", "determined", "")
+    assert (answer["number"], answer["state"], answer["remark"]) == ("37 ± 3°", "determined", "")
     assert "averaged over models" in words.fitted_sentence(fit, judged)
     adequate = judged.get("adequate", judged.get("verdict") == "adequate")
     assert words.called_adequate(fit, judged) is adequate
     judged["estimates"] = {"friction_angle": {**AVERAGED["friction_angle"], "determined": False}}
     (wide,) = words.answers(fit, judged)
-    assert wide.state == "open" and "do not determine the friction angle" in wide.remark
+    assert wide["state"] == "open" and "do not determine the friction angle" in wide["remark"]
 
 
 @pytest.mark.parametrize("judged", [None, {"fit": "tilt", "verdict": "adequate", "estimates": AVERAGED}])
@@ -158,7 +158,7 @@ def test_the_answer_is_averaged_over_models_whatever_the_verdict(judged: dict) -
 def test_without_a_judgement_of_this_fit_the_answer_is_its_own(judged: dict | None, source: str, said: str) -> None:
     fit = {"name": "base", "estimated_from": source, "evaluations": 10, "parameters": {"friction_angle": ENTRY}}
     (answer,) = words.answers(fit, judged)
-    assert answer.number == "36.0 ± 0.5°"
+    assert answer["number"] == "36.0 ± 0.5°"
     assert said in words.fitted_sentence(fit, judged) and words.called_adequate(fit, judged) is None
 
 
