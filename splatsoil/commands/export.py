@@ -49,7 +49,7 @@ class Config(ComputingOptions):
 
 def run(config: Config) -> int:
     """Simulate and write; all of it or nothing."""
-    from splatsoil.export.writers import check_installed
+    from splatsoil.export import check_installed
 
     if not config.to:
         raise ParameterError("--to: name a format: vtk, usd, csv or ply")
