@@ -68,33 +68,6 @@ def test_a_mistake_is_one_line_without_traceback(small_set: Path) -> None:
     assert "001.jpg" in done.stderr and "Traceback" not in done.stderr
 
 
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        (("--seed", "-1"), "--seed"),
-        (("--seed", str(2**63)), "--seed"),
-        (("--device", "cuda:99"), "cuda:99"),
-        (("--out", "note.txt"), "note.txt"),
-        (("--out", "note.txt/below"), "note.txt"),
-    ],
-)
-def test_reconstruct_refuses_before_the_work(
-    words: tuple[str, str],
-    expected: str,
-    plow_dry: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    """Not after minutes of training, whose result would be lost."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("splatsoil.reconstruction.reconstruct", lambda *_, **__: pytest.fail("work has begun"))
-    (tmp_path / "note.txt").write_text("mine")
-    assert cli.main(["reconstruct", str(plow_dry), *words]) == 2
-    assert expected in capsys.readouterr().err
-    assert [f.name for f in tmp_path.iterdir()] == ["note.txt"] and (tmp_path / "note.txt").read_text() == "mine"
-
-
 def test_usage_errors_and_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([]) == 2 and "usage: splatsoil COMMAND" in capsys.readouterr().err
     for words in (["check"], ["check", "a", "--nonsense"]):
