@@ -53,7 +53,7 @@ def test_help_leads_to_every_function_and_all_are_typed() -> None:
 
 @pytest.mark.parametrize("name", sorted(set(FUNCTIONS) & set(cli.commands())))
 def test_a_functions_options_are_its_commands_with_the_same_defaults(name: str) -> None:
-    config = cli.commands()[name].config
+    config = cli.commands()[name].Config
     theirs = inspect.signature(config).parameters
     mine = {k: p for k, p in inspect.signature(getattr(ss, name)).parameters.items() if p.default is not p.empty}
     for option, parameter in mine.items():

@@ -11,6 +11,7 @@ import sys
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -118,7 +119,7 @@ def command(monkeypatch: pytest.MonkeyPatch, behaviour: object) -> None:
         return behaviour()  # type: ignore[operator, no-any-return]
 
     known = cli.commands()
-    known["try"] = cli.Command(Config, act, lambda _: "3 of 10 are kept; go on with")
+    known["try"] = SimpleNamespace(Config=Config, run=act, INTERRUPTED=lambda _: "3 of 10 are kept; go on with")
     monkeypatch.setattr(cli, "commands", lambda: known)
 
 

@@ -6,7 +6,6 @@ import signal
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from functools import partial
 from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING
 
@@ -96,10 +95,13 @@ class Crew:
             if self._workers is None:
                 yield
                 return
-            submit = partial(self._workers.submit, _simulate, self._path, device, spec, self._effects, self.count)
-            with simulate.helped(Helpers(submit, experiment.together, experiment.prepare)):
+            workers, what = self._workers, (self._path, device, spec, self._effects, self.count)
+            helpers = Helpers(
+                lambda jobs: workers.submit(_simulate, *what, jobs), experiment.together, experiment.prepare
+            )
+            with simulate.helped(helpers):
                 yield
-            self._workers.shutdown(cancel_futures=True)
+            workers.shutdown(cancel_futures=True)
             self._workers = None
 
 

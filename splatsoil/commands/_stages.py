@@ -91,7 +91,7 @@ def fitted(options: FitOptions, begin: Stage) -> tuple[RunFolder, Model, dict[st
     device = resolve_device(options.device)
     reconstruction = _model.reconstructed(measurement, folder, device, begin("reconstruct"))
     model = _model.model_on(measurement, folder, reconstruction, options.effects, options.preset, device)
-    return folder, model, run_fit(options, measurement, folder, model, begin("fit"))
+    return folder, model, run_fit(options, folder, model, begin("fit"))
 
 
 def facts(model: Model) -> dict[str, str]:
@@ -105,16 +105,14 @@ def facts(model: Model) -> dict[str, str]:
     }
 
 
-def run_fit(
-    options: FitOptions, measurement: Measurement, run: RunFolder, model: Model, report: Report
-) -> dict[str, Any]:
+def run_fit(options: FitOptions, run: RunFolder, model: Model, report: Report) -> dict[str, Any]:
     """Search, evaluation by evaluation, and compare the model with something else by what was simulated, and more; what
     is in the run folder already isn't simulated again.
     """
     from splatsoil.envs.measured import LOSS, MeasuredProblem
     from splatsoil.inverse.fitting import TOGETHER, FitSetup, fit
 
-    space = model.space(options.parameters or None)
+    measurement, space = model.measurement, model.space(options.parameters or None)
     budget = options.budget or EVALUATIONS * len(space)
     need = needs(measurement, options.preset, model.device, budget, particles=len(model.particles(0)))
     check_memory(need, model.device, measurement.folder)

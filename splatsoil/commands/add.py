@@ -155,7 +155,7 @@ def add_effect(
         seed=folder.description["seed"],
         run=folder.path,
     )
-    fit = _stages.run_fit(options, model.measurement, folder, larger, begin(f"fit with {effect.name}"))
+    fit = _stages.run_fit(options, folder, larger, begin(f"fit with {effect.name}"))
     finish(folder, larger, fit, under_way, begin)
     return larger
 

@@ -7,9 +7,10 @@ held in memory.
 from __future__ import annotations
 
 import importlib.util
-import pkgutil
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from splatsoil.errors import ParameterError
 from splatsoil.export.replay import Moment, Writer, replay
@@ -18,11 +19,11 @@ from splatsoil.model import Model
 __all__ = ["Moment", "Writer", "check_installed", "make_writers", "replay"]
 
 #: A format's writer, which takes an empty folder, the model, and its frames that come.
-_WRITERS = {
-    "vtk": "splatsoil.export.vtk:VtkWriter",
-    "usd": "splatsoil.export.usd:UsdWriter",
-    "csv": "splatsoil.export.tables:CsvWriter",
-    "ply": "splatsoil.export.splats:SplatWriter",
+_WRITERS: Mapping[str, Callable[[], Any]] = {
+    "vtk": lambda: import_module("splatsoil.export.vtk").VtkWriter,
+    "usd": lambda: import_module("splatsoil.export.usd").UsdWriter,
+    "csv": lambda: import_module("splatsoil.export.tables").CsvWriter,
+    "ply": lambda: import_module("splatsoil.export.splats").SplatWriter,
 }
 _PACKAGES = {"vtk": "meshio", "usd": "pxr"}
 
@@ -45,5 +46,5 @@ def make_writers(folder: Path, formats: Iterable[str], model: Model, frames: tup
     writers = []
     for name in formats:
         (folder / name).mkdir(parents=True)
-        writers.append(pkgutil.resolve_name(_WRITERS[name])(folder / name, model, frames))
+        writers.append(_WRITERS[name]()(folder / name, model, frames))
     return writers

@@ -18,6 +18,12 @@ from splatsoil.report.data import RunData, load, read_picture
 
 HERE = Path(__file__).parent
 KINDS = ("observed", "predicted", "difference")
+#: What the template asks: words for numbers, and sentences and figures.
+WORDS = (text.duration, text.estimate, text.model_label, text.model_name, text.probability)
+DRAWN = (
+    *(text.fitted_sentence, text.posterior_sentences, text.posterior_notes),
+    *(figures.surrogate, figures.marginal, figures.losses, figures.surface_map),
+)
 OUTLINED = 3
 """Blocks that fail and are drawn on their photographs."""
 
@@ -49,8 +55,8 @@ def render(data: RunData) -> str:
     environment = Environment(
         loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    words = (text.duration, text.estimate, text.model_label, text.model_name, text.probability)
-    environment.filters.update({word.__name__: word for word in words})
+    environment.filters.update({function.__name__: function for function in WORDS})
+    environment.globals.update({function.__name__: function for function in DRAWN})
     comparison, judged, no_answer = data.comparison, data.judged, text.no_answer(data.fit)
     adequate, ratio = text.called_adequate(data.fit, judged), text.ratio_to_noise(comparison)
     pictures = [] if comparison is None else _pictures(data.folder / "comparison", comparison)
@@ -63,7 +69,6 @@ def render(data: RunData) -> str:
         script=Markup((HERE / "page.js").read_text(encoding="utf-8")),
         program=splatsoil.__version__,
         text=text,
-        figures=figures,
         data=data,
         fit=data.fit,
         judged=judged,

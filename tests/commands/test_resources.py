@@ -64,9 +64,11 @@ def test_soil_that_no_memory_holds_is_refused_before_it_is_simulated(
     options = FitOptions(small_set, preset="tiny", device="cpu", run=tmp_path / "run")
     measurement, run = _stages.prepare(options)
     soil = range(10**9)
-    model: Any = SimpleNamespace(space=lambda names: ["friction_angle"], device="cpu", particles=lambda seed: soil)
+    model: Any = SimpleNamespace(
+        measurement=measurement, space=lambda names: ["friction_angle"], device="cpu", particles=lambda seed: soil
+    )
     with pytest.raises(ParameterError, match=r"1000000000 particles, and the pictures, need \d+ GiB of memory"):
-        _stages.run_fit(options, measurement, cast(RunFolder, run), model, lambda what, share: None)
+        _stages.run_fit(options, cast(RunFolder, run), model, lambda what, share: None)
 
 
 def test_a_control_groups_limit_counts(monkeypatch: pytest.MonkeyPatch) -> None:
