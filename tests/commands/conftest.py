@@ -17,6 +17,7 @@ import pytest
 from PIL import Image
 from splatsoil.inverse.run_folder import RunFolder
 
+from splatsoil import cli
 from splatsoil.commands import _crew, _model, _stages, add
 from splatsoil.files import write_json
 
@@ -30,6 +31,21 @@ def words() -> Callable[..., list[str]]:
         return [command, str(getattr(run, "path", run)), *own, *map(str, more)]
 
     return make
+
+
+@pytest.fixture
+def refused(words: Callable[..., list[str]], capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """Gives a command that is to be refused, and returns what it says on stderr: one sentence in the end, the same as
+    the JSON object."""
+
+    def give(command: str, place: Any, *more: object) -> str:
+        capsys.readouterr()
+        assert cli.main([*words(command, place, *more), "--json"]) == 2, command
+        out, err = capsys.readouterr()
+        assert json.loads(out) == {"ok": False, "error": err.splitlines()[-1].removeprefix("splatsoil: ")}
+        return err
+
+    return give
 
 
 @pytest.fixture

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 from splatsoil.inverse.run_folder import RunFolder
 
-from splatsoil import cli
 from splatsoil.commands.design import show
 from splatsoil.files import JUDGING, code_digest, code_of, write_json
 from splatsoil.report.data import estimates
@@ -36,20 +35,16 @@ def diagnose(run: RunFolder, **changes: Any) -> None:
 
 
 @pytest.mark.usefixtures("no_work")
-def test_what_there_is_nothing_to_design_from_is_refused(run: RunFolder, capsys: pytest.CaptureFixture[str]) -> None:
-    def refusal() -> str:
-        assert cli.main(["design", str(run.path), "--json"]) == 2
-        assert not (run.path / "design").exists()
-        return str(json.loads(capsys.readouterr().out)["error"])
-
-    make = f"make one first: splatsoil diagnose '{run.path}'"
-    assert refusal().endswith(f"has no diagnosis; {make}")
+def test_what_there_is_nothing_to_design_from_is_refused(run: RunFolder, refused: Callable[..., str]) -> None:
+    make = f"make one first: splatsoil diagnose '{run.path}'\n"
+    assert refused("design", run).endswith(f"has no diagnosis; {make}")
     for changes in ({"values": {"friction_angle": 1.0}}, {"judged_by": "other code"}, {"code": "other code"}):
         diagnose(run, **changes)
-        assert refusal().endswith(f"its diagnosis is of another fit, or by other code; {make}")
+        assert refused("design", run).endswith(f"its diagnosis is of another fit, or by other code; {make}")
     for probability in ({"": 0.97, "cohesion": 0.03}, {"something else": 0.6, "light": 0.3, "": 0.1}):
         diagnose(run, probability=probability)
-        assert "there are no two that a stroke could tell apart" in refusal()
+        assert "there are no two that a stroke could tell apart" in refused("design", run)
+    assert not (run.path / "design").exists()
 
 
 def result(*alike: str) -> dict[str, Any]:

@@ -138,15 +138,14 @@ def test_compare_and_report_work_on_a_finished_run(
 
 @pytest.mark.slow
 def test_a_run_folder_is_for_one_set_preset_and_seed(
-    place: Path, whole: dict[str, Any], plow_damp: Path, capsys: pytest.CaptureFixture[str]
+    place: Path, whole: dict[str, Any], plow_damp: Path, refused: Callable[..., str]
 ) -> None:
     for words, says in (
         ([str(plow_damp), "--preset", "tiny"], "belongs to another measurement set (plow-dry)"),
         ([str(place / "set"), "--preset", "small"], "belongs to preset tiny, not small"),
         ([str(place / "set"), "--preset", "tiny", "--seed", "1"], "belongs to seed 0, not 1"),
     ):
-        assert cli.main(["fit", *words, "--run", str(place / "whole")]) == 2
-        assert says in capsys.readouterr().err
+        assert says in refused("fit", *words, "--run", place / "whole")
 
 
 @pytest.mark.slow
@@ -247,8 +246,7 @@ def next_stroke(place: Path, program: Program, source: Path) -> None:
     assert Measurement.load(place / "next").tool.motion.times[-1] == motion.times[-1]
 
 
-def test_a_broken_set_leaves_no_run_folder(small_set: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_broken_set_leaves_no_run_folder(small_set: Path, tmp_path: Path, refused: Callable[..., str]) -> None:
     (small_set / "tool.stl").write_bytes(b"")
-    assert cli.main(["run", str(small_set), "--run", str(tmp_path / "run")]) == 2
-    assert "tool.stl" in capsys.readouterr().err
+    assert "tool.stl" in refused("run", small_set, "--run", tmp_path / "run")
     assert not (tmp_path / "run").exists()
