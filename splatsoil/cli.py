@@ -16,9 +16,8 @@ import importlib
 import pkgutil
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
 from typing import Any
 
 import splatsoil.commands
@@ -32,35 +31,15 @@ from splatsoil.trust import trust
 DESCRIPTION = "Soil properties from photographs of a tool moving through it."
 
 
-@dataclass(frozen=True)
-class Command:
-    """A subcommand.
-
-    Attributes:
-        config: the dataclass of its options.
-        run: acts on them and returns the exit code.
-        interrupted: what Ctrl-C leaves and how to go on, before the command line that does.
-    """
-
-    config: type
-    run: Callable[[Any], int]
-    interrupted: str | Callable[[Any], str] = "start again with"
+def commands() -> dict[str, Any]:
+    """The modules of all subcommands by name."""
+    found = [info.name for info in pkgutil.iter_modules(splatsoil.commands.__path__) if not info.name.startswith("_")]
+    return {name.rstrip("_").replace("_", "-"): importlib.import_module(f"splatsoil.commands.{name}") for name in found}
 
 
-def commands() -> dict[str, Command]:
-    """All subcommands by name."""
-    out = {}
-    for info in pkgutil.iter_modules(splatsoil.commands.__path__):
-        if not info.name.startswith("_"):
-            module = importlib.import_module(f"splatsoil.commands.{info.name}")
-            said = getattr(module, "INTERRUPTED", Command.interrupted)
-            out[info.name.rstrip("_").replace("_", "-")] = Command(module.Config, module.run, said)
-    return out
-
-
-def after_interrupt(name: str, command: Command, config: Any) -> str:
+def after_interrupt(name: str, command: Any, config: Any) -> str:
     """What Ctrl-C leaves, and the command line that goes on."""
-    said = command.interrupted
+    said = getattr(command, "INTERRUPTED", "start again with")
     return f"{said if isinstance(said, str) else said(config)}: {same_again(name, config)}"
 
 
@@ -83,10 +62,10 @@ def _printing_remarks() -> Iterator[None]:
         yield
 
 
-def _page_or_hint(name: str, known: dict[str, Command]) -> int:
+def _page_or_hint(name: str, known: dict[str, Any]) -> int:
     """The exit code, where no command is named."""
     if name in ("", "-h", "--help"):
-        page = program_page({name: command.config for name, command in known.items()}, DESCRIPTION)
+        page = program_page({name: command.Config for name, command in known.items()}, DESCRIPTION)
         print(page, file=sys.stdout if name else sys.stderr)
         return 0 if name else 2
     hint = did_you_mean(name, known)
@@ -107,9 +86,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     config: Any
     if name == "benchmark" and words and not words[0].startswith("-"):
         # What follows a benchmark's name is its own, options too.
-        config = command.config(words[0], tuple(words[1:]))
+        config = command.Config(words[0], tuple(words[1:]))
     else:
-        config = parse(name, command.config, words)
+        config = parse(name, command.Config, words)
     trust(getattr(config, "effects", ()))
     wants_json = bool(getattr(config, "json", False))
     with only_json() if wants_json else nullcontext(), _printing_remarks():

@@ -8,7 +8,7 @@ import json
 import os
 import shutil
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -103,6 +103,77 @@ def small_set(plow_dry: Path, tmp_path: Path) -> Path:
             shutil.copy(plow_dry / kind / frame["file_path"], target)
         (folder / kind / "transforms.json").write_text(json.dumps(data))
     return folder
+
+
+@pytest.fixture(scope="session")
+def fit_of() -> Callable[..., dict[str, Any]]:
+    """Makes what ``fit.json`` holds of a model with some effects, by the sources as they are: a friction angle of
+    35 ± 0.8° if no other is given, and other parameters by name."""
+    from splatsoil import __version__
+    from splatsoil.files import code_of
+
+    def make(effects: Sequence[str] = (), friction_angle: float = 35.0, **others: float) -> dict[str, Any]:
+        parameters, values = {}, {"friction_angle": friction_angle, **others}
+        for name, value in values.items():
+            about = {"std": 0.81, "at_bound": None, "off": None, "determined": True, "unit": "1", "title": name}
+            ends = {"low": value - 1.6, "high": value + 1.5, "bounds": [value - 15.0, value + 15.0]}
+            parameters[name] = {"estimate": value, **ends, **about}
+        parameters["friction_angle"] |= {"unit": "deg", "title": "friction angle [°]"}
+        tried = [(30.0, 31.0, ""), (40.0, 20.0, ""), (21.0, None, "particles left the grid")]
+        curve = {"x": [20.0, 35.0, 50.0], "mean": [9.0, 0.1, 8.0], "std": [0.1] * 3}
+        return {
+            "format": "splatsoil-fit/2",
+            "name": "+".join(sorted(effects)) or "base",
+            "parameters": parameters,
+            "minimum": {k: {n: p[n] for n in ("estimate", "low", "high")} for k, p in parameters.items()},
+            "setup": {
+                "effects": sorted(effects),
+                "preset": "tiny",
+                "device": "cpu",
+                "version": __version__,
+                "code": code_of(effects),
+            },
+            "history": [
+                {
+                    "step": step,
+                    "seed": 7,
+                    "parameters": dict.fromkeys(parameters, value),
+                    "loss": loss,
+                    "status": "failed" if message else "ok",
+                    "message": message,
+                    "seconds": 8.0,
+                }
+                for step, (value, loss, message) in enumerate(tried)
+            ],
+            "curves": dict.fromkeys(parameters, curve),
+            "facts": {"cell": "20 mm", "time step": "0.25 ms"},
+            "loss": 0.123,
+            "loss_std": 0.01,
+            "noise_std": 0.02,
+            "best": {"loss": 0.12},
+            "estimated_from": "loss",
+            "evaluations": 3,
+            "failed": 1,
+            "seconds": 83.0,
+            "notes": [],
+            "preset": "small",
+            "device": "cpu",
+            "seed": 5,
+            "version": "0.1.0",
+        }
+
+    return make
+
+
+@pytest.fixture
+def run(tmp_path: Path, fit_of: Callable[..., dict[str, Any]]) -> Any:
+    """A run folder with a finished fit, which nothing was simulated for; a shell would split its name."""
+    from splatsoil.inverse.run_folder import RunFolder
+
+    measurement = {"name": "plow", "folder": str(tmp_path / "my set"), "hash": "a" * 64}
+    made = RunFolder.prepare(tmp_path / "my run", measurement=measurement, preset="tiny", seed=0, version="1")
+    made.write_fit("base", fit_of())
+    return made
 
 
 @pytest.fixture(scope="session")

@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,26 +23,13 @@ from splatsoil.files import write_json
 FUNCTIONS = [name for name in ss.__all__ if name not in ("Run", "Estimate", "__version__")]
 
 
-def fitted(folder: Path) -> Path:
-    """A run whose fit says 35 ± 1° and whose comparison says 36.5 ± 2°, and adequate."""
-    measurement = {"name": "plow", "folder": "nowhere", "hash": "ab" * 32}
-    write_json(
-        folder / "run.json", {"format": "splatsoil-run/1", "measurement": measurement, "preset": "tiny", "seed": 0}
-    )
-    parameter = {"estimate": 35.0, "std": 1.0, "unit": "deg", "title": "friction angle [°]", "determined": True}
-    made = {
-        "format": "splatsoil-fit/2",
-        "name": "base",
-        "parameters": {"friction_angle": parameter},
-        "setup": {"effects": [], "preset": "tiny"},
-        "minimum": {},
-        "history": [],
-    }
-    write_json(folder / "fit.json", made)
+@pytest.fixture
+def fitted(run: Any) -> Path:
+    """A run whose fit says 35 ± 0.8° and whose comparison says 36.5 ± 2°, and adequate."""
     said = {"format": "splatsoil-misfit/2", "fit": "base", "values": {"friction_angle": 35.0}, "adequate": True}
     better = {"friction_angle": {"value": 36.5, "std": 2.0, "determined": True}}
-    write_json(folder / "comparison" / "misfit.json", {**said, "estimates": better})
-    return folder
+    write_json(run.comparison / "misfit.json", {**said, "estimates": better})
+    return Path(run.path)
 
 
 def test_importing_it_loads_nothing_heavy() -> None:
@@ -65,7 +53,7 @@ def test_help_leads_to_every_function_and_all_are_typed() -> None:
 
 @pytest.mark.parametrize("name", sorted(set(FUNCTIONS) & set(cli.commands())))
 def test_a_functions_options_are_its_commands_with_the_same_defaults(name: str) -> None:
-    config = cli.commands()[name].config
+    config = cli.commands()[name].Config
     theirs = inspect.signature(config).parameters
     mine = {k: p for k, p in inspect.signature(getattr(ss, name)).parameters.items() if p.default is not p.empty}
     for option, parameter in mine.items():
@@ -74,8 +62,8 @@ def test_a_functions_options_are_its_commands_with_the_same_defaults(name: str) 
         assert parameter.default == usual or option in ("values",) or (name, option) == ("simulate", "preset"), option
 
 
-def test_a_run_is_what_its_files_say(tmp_path: Path) -> None:
-    run = ss.open_run(fitted(tmp_path))
+def test_a_run_is_what_its_files_say(fitted: Path) -> None:
+    run = ss.open_run(fitted)
     angle = run.estimates["friction_angle"]
     assert (angle.value, angle.std, angle.unit, angle.determined) == (36.5, 2.0, "deg", True)
     assert run.adequate is True
@@ -85,41 +73,27 @@ def test_a_run_is_what_its_files_say(tmp_path: Path) -> None:
         _ = run.posterior
     with pytest.raises(RunError, match=r"compare\(\)"):
         run.picture("left", 50, "observed")
-    (tmp_path / "comparison" / "misfit.json").unlink()
+    (fitted / "comparison" / "misfit.json").unlink()
     assert run.adequate is None and run.estimates["friction_angle"].value == 35.0
     told = {"format": "splatsoil-comparison/1", "fit": "base", "parameters": {"friction_angle": 35.0}}
-    write_json(tmp_path / "comparison" / "comparison.json", told)
-    Image.new("RGB", (8, 6), (10, 20, 30)).save(tmp_path / "comparison" / "left_0050_observed.jpg")
+    write_json(fitted / "comparison" / "comparison.json", told)
+    Image.new("RGB", (8, 6), (10, 20, 30)).save(fitted / "comparison" / "left_0050_observed.jpg")
     assert np.allclose(run.picture("left", 50, "observed"), (10, 20, 30), atol=3)
-    picture = tmp_path / "comparison" / "left_0050_observed.jpg"
+    picture = fitted / "comparison" / "left_0050_observed.jpg"
     picture.write_bytes(picture.read_bytes()[:-40])
     with pytest.raises(RunError, match=r"left_0050_observed\.jpg: is no whole"):
         run.picture("left", 50, "observed")
     models = [{"name": "", "probability": 0.9}, {"name": "tilt", "probability": 0.1}]
     found = {"format": "splatsoil-diagnosis/2", "fit": "base", "values": {"friction_angle": 35.0}, "model": []}
-    write_json(tmp_path / "diagnoses" / "base.json", {**found, "models": models})
+    write_json(fitted / "diagnoses" / "base.json", {**found, "models": models})
     assert run.probabilities == {"": 0.9, "tilt": 0.1}
 
 
-def test_tables_are_xarray(tmp_path: Path) -> None:
-    fitted(tmp_path)
-    made = json.loads((tmp_path / "fit.json").read_text())
-    tried = [(34.0, 0.5), (36.0, None)]
-    made["history"] = [
-        {
-            "step": k,
-            "parameters": {"friction_angle": angle},
-            "loss": loss,
-            "seed": 7 + k,
-            "status": "ok",
-        }
-        for k, (angle, loss) in enumerate(tried)
-    ]
-    write_json(tmp_path / "fit.json", made)
-    run = ss.open_run(tmp_path)
+def test_tables_are_xarray(fitted: Path) -> None:
+    run = ss.open_run(fitted)
     table = run.evaluations
-    assert table["friction_angle"].attrs == {"units": "deg"} and list(table["seed"].values) == [7, 8]
-    assert float(table["loss"].sel(step=0)) == 0.5 and np.isnan(table["loss"].sel(step=1))
+    assert table["friction_angle"].attrs == {"units": "deg"} and list(table["seed"].values) == [7, 7, 7]
+    assert float(table["loss"].sel(step=1)) == 20.0 and np.isnan(table["loss"].sel(step=2))
     with pytest.raises(RunError, match=r"compare\(\)"):
         _ = run.force
     with pytest.raises(RunError, match=r"fit\(\)"):
@@ -127,16 +101,18 @@ def test_tables_are_xarray(tmp_path: Path) -> None:
     channels = [{"channel": "push", "measured": [1.0, None], "predicted": [2.0, 3.0]}]
     force = {"unit": "N", "frames": [10, 20], "channels": channels}
     told = {"format": "splatsoil-comparison/1", "fit": "base", "parameters": {"friction_angle": 35.0}, "force": force}
-    write_json(tmp_path / "comparison" / "comparison.json", told)
+    write_json(fitted / "comparison" / "comparison.json", told)
     pushed = run.force.sel(channel="push")
     assert float(pushed["predicted"].sel(frame=20)) == 3.0 and np.isnan(pushed["measured"].sel(frame=20))
-    (tmp_path / "reconstruction").mkdir()
+    (fitted / "reconstruction").mkdir()
     height = np.arange(6.0).reshape(2, 3)
-    np.savez(tmp_path / "reconstruction" / "surface.npz", x=[0.1, 0.2, 0.3], y=[0.5, 0.6], height=height)
+    np.savez(fitted / "reconstruction" / "surface.npz", x=[0.1, 0.2, 0.3], y=[0.5, 0.6], height=height)
     assert float(run.surface.sel(x=0.2, y=0.6)) == 4.0
 
 
-def test_mistakes_are_one_sentence(tmp_path: Path, plow_dry: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mistakes_are_one_sentence(
+    tmp_path: Path, fitted: Path, plow_dry: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(RunError, match=r"run\.json"):
         ss.open_run(tmp_path)
@@ -145,8 +121,8 @@ def test_mistakes_are_one_sentence(tmp_path: Path, plow_dry: Path, monkeypatch: 
     with pytest.raises(ParameterError, match="did you mean cohesion"):
         ss.fit(plow_dry, effects=["cohesiom"])
     with pytest.raises(TypeError):
-        ss.open_run(fitted(tmp_path / "run")).compare(quik=True)
-    assert {path.name for path in tmp_path.iterdir()} == {"run"}
+        ss.open_run(fitted).compare(quik=True)
+    assert {path.name for path in tmp_path.iterdir()} == {fitted.name}
 
 
 def test_a_set_is_read_and_checked(small_set: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from PIL import Image
 from splatsoil.inverse.run_folder import RunFolder
 
 from splatsoil import cli, trust
@@ -28,6 +27,7 @@ from splatsoil.files import MOST_UNPACKED, read_json, read_npy, read_npz, write_
 from splatsoil.measurement import Measurement
 from splatsoil.measurement.images import read_depth, read_image
 from splatsoil.measurement.tool import read_mesh
+from splatsoil.report.data import load
 from splatsoil.run_files import read_description, read_fit
 
 #: What unpacks to objects, or runs text or other programs.
@@ -67,26 +67,10 @@ def test_the_package_never_runs_or_unpickles_what_it_reads(repository: Path) -> 
 # Run folders.
 
 
-@pytest.fixture
-def run(tmp_path: Path) -> Path:
-    """A run folder with a fit."""
-    folder = tmp_path / "run"
-    measurement = {"name": "plow", "folder": "nowhere", "hash": "a" * 64}
-    RunFolder.prepare(folder, measurement=measurement, preset="tiny", seed=0, version="1").write_fit("base", fit())
-    return folder
-
-
-def fit(**changes: Any) -> dict[str, Any]:
-    return {
-        "format": "splatsoil-fit/2", "name": "base", "loss": 0.5, "best": {"loss": 0.5}, "history": [],
-        "parameters": {}, "minimum": {}, "setup": {"effects": [], "preset": "tiny", "device": "cpu", "version": "1"},
-        **changes,
-    }  # fmt: skip
-
-
 @pytest.mark.parametrize("command", ["compare", "diagnose", "add", "posterior", "export"])
 def test_a_run_folders_program_is_not_run_before_its_user_names_it(
-    run: Path,
+    run: RunFolder,
+    fit_of: Callable[..., dict[str, Any]],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -95,13 +79,12 @@ def test_a_run_folders_program_is_not_run_before_its_user_names_it(
 ) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     monkeypatch.setattr(trust, "_named", set())
-    mark, program = tmp_path / "has run", run / "features" / "my effect.py"
+    mark, program = tmp_path / "has run", run.path / "features" / "my effect.py"
     program.parent.mkdir()
     source = (repository / "examples" / "effects" / "suction.py").read_text()
     program.write_text(f"{source}\nopen({str(mark)!r}, 'w')\n")
-    setup = {**fit()["setup"], "effects": [str(program)], "code": "x"}
-    write_json(run / "fit.json", fit(setup=setup, name="my effect"))
-    words = [command, str(run), *{"add": ["cohesion"], "export": ["--to", "csv"]}.get(command, [])]
+    write_json(run.path / "fit.json", {**fit_of([str(program)]), "name": "my effect"})
+    words = [command, str(run.path), *{"add": ["cohesion"], "export": ["--to", "csv"]}.get(command, [])]
     assert cli.main(words) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and f"splatsoil element --with '{program}'" in said and not mark.exists()
@@ -109,45 +92,46 @@ def test_a_run_folders_program_is_not_run_before_its_user_names_it(
     assert cli.main(["fit", "no set", "--with", str(program)]) == 2
     assert mark.exists()
     monkeypatch.setattr(trust, "_named", set())
-    assert RunFolder.open(run).fit()["name"] == "my effect", "another process knows it"
+    assert RunFolder.open(run.path).fit()["name"] == "my effect", "another process knows it"
     program.write_text(program.read_text() + "# changed")
     with pytest.raises(RunError, match="haven't run before"):
-        RunFolder.open(run).fit()
+        RunFolder.open(run.path).fit()
 
 
 @pytest.mark.parametrize("name", ["../../evil", "/etc/evil", "a/b", "a\\b", "..", ""])
-def test_a_fits_name_leads_nowhere(run: Path, name: str) -> None:
-    write_json(run / "fit.json", fit(name=name))
+def test_a_fits_name_leads_nowhere(run: RunFolder, fit_of: Callable[..., dict[str, Any]], name: str) -> None:
+    write_json(run.path / "fit.json", {**fit_of(), "name": name})
     with pytest.raises(RunError, match=r"fit\.json: is damaged, it lacks name"):
-        read_fit(run)
+        read_fit(run.path)
 
 
-@pytest.mark.parametrize("place", ["../../secret.png", "/secret.png", "a/../../b.png"])
-def test_a_comparisons_pictures_are_in_its_folder(run: Path, tmp_path: Path, place: str) -> None:
-    from splatsoil.report.data import load
-
-    Image.new("RGB", (4, 4)).save(tmp_path / "secret.png")
-    frames = [{"camera": "left", "frame": 0, "observed": place}]
-    comparison = {"format": "splatsoil-comparison/1", "fit": "base", "parameters": {}, "frames": frames}
-    write_json(run / "comparison" / "comparison.json", comparison)
-    with pytest.raises(RunError, match=r"comparison\.json: is damaged, it lacks frames"):
-        load(run)
+COMPARISON = {"format": "splatsoil-comparison/1", "parameters": {}}
+EVIL = [{"name": "evil.py", "probability": 1.0}]
 
 
-def test_a_diagnosis_names_no_program(run: Path) -> None:
-    from splatsoil.report.data import load
-
-    data = {"fit": "base", "values": {}, "model": [], "models": [{"name": "evil.py", "probability": 1.0}]}
-    write_json(run / "diagnoses" / "base.json", {"format": "splatsoil-diagnosis/2", **data})
-    with pytest.raises(RunError, match=r"lacks models\.0\.name"):
-        load(run)
+@pytest.mark.parametrize(
+    ("file", "data", "lacks"),
+    [
+        *(
+            ("comparison/comparison.json", {**COMPARISON, "frames": [{"observed": place}]}, "frames")
+            for place in ("../../secret.png", "/secret.png", "a/../../b.png")
+        ),
+        ("diagnoses/base.json", {"format": "splatsoil-diagnosis/2", "model": [], "models": EVIL}, "models.0.name"),
+    ],
+)
+def test_a_runs_files_name_no_file_outside_and_no_program(
+    run: RunFolder, file: str, data: dict[str, Any], lacks: str
+) -> None:
+    write_json(run.path / file, {"fit": "base", "values": {}, **data})
+    with pytest.raises(RunError, match=rf"{file}: is damaged, it lacks {lacks}"):
+        load(run.path)
 
 
 @pytest.mark.parametrize("link", ["fits", "comparison", "features", "evaluations.db", "writer.lock", "a/b/c.npy"])
-def test_links_out_of_a_run_folder_are_refused(run: Path, tmp_path: Path, link: str) -> None:
+def test_links_out_of_a_run_folder_are_refused(run: RunFolder, tmp_path: Path, link: str) -> None:
     outside = tmp_path / "outside"
     outside.mkdir()
-    place = run / link
+    place = run.path / link
     if place.is_dir():
         (place / "base.json").unlink()
         place.rmdir()
@@ -155,33 +139,33 @@ def test_links_out_of_a_run_folder_are_refused(run: Path, tmp_path: Path, link: 
     place.parent.mkdir(parents=True, exist_ok=True)
     place.symlink_to(outside if link.count(".") == 0 else outside / "file")
     with pytest.raises(RunError, match="a link that leads out of the run folder"):
-        RunFolder.open(run)
+        RunFolder.open(run.path)
     assert list(outside.iterdir()) == []
 
 
-def test_links_inside_a_run_folder_are_followed(run: Path) -> None:
-    (run / "large").mkdir()
-    (run / "features").symlink_to("large")
-    (run / "loop").symlink_to("loop")
-    (run / "loop").unlink()
-    assert RunFolder.open(run).fit()["name"] == "base"
+def test_links_inside_a_run_folder_are_followed(run: RunFolder) -> None:
+    (run.path / "large").mkdir()
+    (run.path / "features").symlink_to("large")
+    (run.path / "loop").symlink_to("loop")
+    (run.path / "loop").unlink()
+    assert RunFolder.open(run.path).fit()["name"] == "base"
 
 
-def test_text_that_acts_on_a_terminal_is_refused(run: Path) -> None:
-    write_json(run / "run.json", {**read_json(run / "run.json"), "preset": "tiny\x1b]0;owned\x07"})
+def test_text_that_acts_on_a_terminal_is_refused(run: RunFolder) -> None:
+    write_json(run.path / "run.json", {**read_json(run.path / "run.json"), "preset": "tiny\x1b]0;owned\x07"})
     with pytest.raises(RunError, match="control characters"):
-        read_description(run)
+        read_description(run.path)
 
 
-def test_commands_that_are_printed_can_be_pasted(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_commands_that_are_printed_can_be_pasted(run: RunFolder, capsys: pytest.CaptureFixture[str]) -> None:
     """A shell takes nothing in a folder's name for a command."""
-    evil = run.rename(run.parent / "run; touch `owned` $(owned) 'x'")
+    evil = run.path.rename(run.path.parent / "run; touch `owned` $(owned) 'x'")
     assert cli.main(["compare", str(evil)]) == 2
     said = capsys.readouterr().err
     printed = said[said.rindex("splatsoil report") : said.index("` notes")]
     script = f"set -f; splatsoil() {{ printf '%s\\n' \"$@\"; }}; {printed}"
-    done = subprocess.run(["sh", "-c", script], cwd=run.parent, capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[1] == str(evil) and not (run.parent / "owned").exists()
+    done = subprocess.run(["sh", "-c", script], cwd=evil.parent, capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[1] == str(evil) and not (evil.parent / "owned").exists()
 
 
 # Measurement sets.

@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from splatsoil import cli
 from splatsoil.comparison import Comparator
 from splatsoil.export import replay
 from splatsoil.measurement import Measurement
@@ -117,22 +116,6 @@ def test_the_scene_of_a_set(server: Any, small_set: Path) -> None:
     assert not server.scene.get_handle_by_name("/photographs/0").visible
 
 
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        (["nowhere"], "no such folder"),
-        (["SET", "--port", "0"], "--port: must be from 1 to 65535"),
-        (["SET", "--beside", "base"], "--beside: "),
-    ],
-)
-def test_mistakes_are_one_sentence(
-    words: list[str], sentence: str, small_set: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert cli.main(["view", *(word.replace("SET", str(small_set)) for word in words)]) == 2
-    said = capsys.readouterr().err
-    assert sentence in said and said.count("\n") == 1
-
-
 @pytest.mark.slow
 def test_ctrl_c_ends_the_command(small_set: Path) -> None:
     words = [sys.executable, "-m", "splatsoil", "view", str(small_set), "--port", "18080"]
@@ -178,11 +161,3 @@ def test_a_browser_draws_it(server: Any, columns: list[Any], tmp_path: Path) -> 
     sand = (gaussians[..., 0] > gaussians[..., 2] + 20.0) & (gaussians.min(axis=2) < 230)
     assert blue.mean() > 0.05, "soil at rest has the colours' lower end"
     assert sand.mean() > 0.05
-
-
-def test_without_the_extra(
-    small_set: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("splatsoil.commands.view.importlib.util.find_spec", lambda name: None)
-    assert cli.main(["view", str(small_set)]) == 2
-    assert "pip install 'splatsoil[view]'" in capsys.readouterr().err

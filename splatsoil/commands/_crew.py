@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+import signal
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING
 
+from splatsoil import threads
+from splatsoil.commands._resources import gpu_memory, memory
+from splatsoil.envs.devices import resolve_device
+from splatsoil.errors import SetWarning, SplatsoilError
+from splatsoil.inverse import executors
+from splatsoil.inverse.run_folder import RunFolder
+from splatsoil.quiet import hush
+
 if TYPE_CHECKING:
-    from concurrent.futures import Future, ProcessPoolExecutor
+    from concurrent.futures import ProcessPoolExecutor
     from pathlib import Path
 
     from splatsoil.commands._model import ModelSpec
     from splatsoil.experiment.plow import PlowExperiment
     from splatsoil.inverse.criticism.simulations import Arguments, Simulations
-    from splatsoil.inverse.run_folder import RunFolder
 
 MOST_HELPERS = 3
 SHARE = {"cpu": 2.0, "cuda": 4.0}
@@ -36,10 +46,7 @@ class Crew:
     """
 
     def __init__(self, folder: RunFolder, device: str, effects: Iterable[str]) -> None:
-        from splatsoil.commands._resources import memory
-        from splatsoil.threads import cores
-
-        self.count = max(0, int(min(cores(), 1 + MOST_HELPERS, memory() / SHARE["cpu"])) - 1)
+        self.count = max(0, int(min(threads.cores(), 1 + MOST_HELPERS, memory() / SHARE["cpu"])) - 1)
         self._path, self._effects = folder.path, tuple(effects)
         self._workers = self._started(device)
 
@@ -48,25 +55,21 @@ class Crew:
 
     def __exit__(self, *_: object) -> None:
         """End those that never came to help."""
-        from splatsoil.inverse.executors import kill
-
         if self._workers is not None:
-            kill(self._workers)
+            executors.kill(self._workers)
         self._workers = None
 
     def _started(self, device: str) -> ProcessPoolExecutor | None:
         """As many helpers as there are to be, on their way."""
-        from splatsoil.inverse.executors import kill, processes
-
         if self.count == 0:
             return None
-        workers = processes(self.count)
+        workers = executors.processes(self.count)
         try:
             with _unheard():
                 for _ in range(self.count):
                     workers.submit(_ready, device)
         except BaseException:
-            kill(workers)
+            executors.kill(workers)
             raise
         return workers
 
@@ -80,25 +83,23 @@ class Crew:
             simulate: what is helped.
         """
         from splatsoil.inverse.criticism.simulations import Helpers
-        from splatsoil.threads import at_most
 
         device = experiment.base.device
         if self._workers is not None and device != "cpu":
-            count = max(0, min(self.count, int(_free(device) / SHARE["cuda"]) - 1))
+            count = max(0, min(self.count, int(gpu_memory(device)[0] / SHARE["cuda"]) - 1))
             if count < self.count:  # they began before it was known how much memory is free there
                 self.__exit__()
                 self.count = count
                 self._workers = self._started(device)
-        with at_most(_threads(device, self.count)):
+        with threads.at_most(_threads(device, self.count)):
             if self._workers is None:
                 yield
                 return
             workers, what = self._workers, (self._path, device, spec, self._effects, self.count)
-
-            def submit(jobs: Sequence[Arguments]) -> Future[None]:
-                return workers.submit(_simulate, *what, jobs)
-
-            with simulate.helped(Helpers(submit, experiment.together, experiment.prepare)):
+            helpers = Helpers(
+                lambda jobs: workers.submit(_simulate, *what, jobs), experiment.together, experiment.prepare
+            )
+            with simulate.helped(helpers):
                 yield
             workers.shutdown(cancel_futures=True)
             self._workers = None
@@ -107,9 +108,6 @@ class Crew:
 @contextmanager
 def _unheard() -> Iterator[None]:
     """Processes that begin meanwhile never hear of Ctrl-C, not even while they load: the first process ends them."""
-    import signal
-    from multiprocessing import resource_tracker
-
     if not hasattr(signal, "pthread_sigmask"):  # not every system has masks
         yield
         return
@@ -121,18 +119,9 @@ def _unheard() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _free(device: str) -> float:
-    """What is free of a GPU's memory, GiB."""
-    import torch
-
-    return float(torch.cuda.mem_get_info(device)[0]) / 2**30
-
-
 def _threads(device: str, helpers: int) -> int:
     """How many each process keeps to."""
-    from splatsoil.threads import cores
-
-    return 1 if device == "cpu" or helpers == 0 else max(1, cores() // (1 + helpers))
+    return 1 if device == "cpu" or helpers == 0 else max(1, threads.cores() // (1 + helpers))
 
 
 _known: dict[tuple[Path, str, ModelSpec, tuple[str, ...]], tuple[PlowExperiment, Simulations]] = {}
@@ -140,14 +129,11 @@ _known: dict[tuple[Path, str, ModelSpec, tuple[str, ...]], tuple[PlowExperiment,
 
 def _ready(device: str) -> None:
     """A helper's work: to load what takes seconds, before it is needed."""
-    import signal
-
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process ends this one
 
     def load(here: str) -> None:
         import torch
 
-        from splatsoil.commands import _model  # noqa: F401
         from splatsoil.experiment import plow  # noqa: F401
 
         torch.zeros(1, device=here)
@@ -159,7 +145,6 @@ def _simulate(
     path: Path, device: str, spec: ModelSpec, effects: tuple[str, ...], helpers: int, jobs: Sequence[Arguments]
 ) -> None:
     """A helper's work."""
-    from splatsoil.errors import SplatsoilError
 
     def make(here: str) -> None:
         experiment, simulate = _known_here(path, here, spec, effects)
@@ -175,13 +160,9 @@ def _simulate(
 
 def _quietly(work: Callable[[str], object], device: str, helpers: int) -> None:
     """Work on a device. Whatever goes wrong, the first process meets it too, and says so."""
-    from splatsoil.envs.devices import resolve_device
-    from splatsoil.errors import SplatsoilError
-    from splatsoil.threads import at_most
-
     with suppress(SplatsoilError, OSError):
         here = resolve_device(device)
-        with at_most(_threads(here, helpers)):
+        with threads.at_most(_threads(here, helpers)):
             work(here)
 
 
@@ -189,13 +170,7 @@ def _known_here(
     path: Path, device: str, spec: ModelSpec, effects: tuple[str, ...]
 ) -> tuple[PlowExperiment, Simulations]:
     """What a helper works with, made once."""
-    import signal
-    import warnings
-
     from splatsoil.commands._model import experiment_of, model_of
-    from splatsoil.errors import SetWarning
-    from splatsoil.inverse.run_folder import RunFolder
-    from splatsoil.quiet import hush
 
     key = (path, device, spec, effects)
     if key not in _known:

@@ -1,18 +1,22 @@
-"""A run folder as commands meet it: its set, its latest fit, and what is kept of earlier ones."""
+"""A run folder as commands meet it: its set, its latest fit, and what is made of that."""
 
 from __future__ import annotations
 
-import shutil
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from splatsoil import __version__
 from splatsoil.commands._options import FitOptions, RunOptions, command_line, same_again
 from splatsoil.errors import MeasurementError, NoAnswer, RunError
+from splatsoil.files import JUDGING, code_digest, code_of
+from splatsoil.inverse.run_folder import RunFolder
+from splatsoil.report.data import kept_of
+from splatsoil.report.text import no_answer
+from splatsoil.run_files import DIAGNOSIS_FORMAT, read_fit
 
 if TYPE_CHECKING:
-    from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.measurement import Measurement
 
 
@@ -23,7 +27,6 @@ def opened(options: RunOptions) -> RunFolder:
         RunError: there is none, or the set is another one.
         MeasurementError: there is no set.
     """
-    from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.measurement import Measurement
 
     run = RunFolder.open(options.run)
@@ -78,18 +81,12 @@ def latest_fit(folder: RunFolder) -> dict[str, Any]:
 
 def require_answer(run: RunFolder, fit: Mapping[str, Any], look: str) -> None:
     """NoAnswer where a run's fit has none; ``look`` says what to look at then."""
-    from splatsoil.report.text import no_answer
-
     if reason := no_answer(fit):
         raise NoAnswer(f"{reason}: {look}", places(run))
 
 
 def note_other_sources(run: RunFolder) -> None:
     """Say on stderr, in one line, if the latest fit was made by other sources than these."""
-    from splatsoil import __version__
-    from splatsoil.files import code_of
-    from splatsoil.run_files import read_fit
-
     fit = read_fit(run.path)
     setup = fit["setup"]
     then = (setup.get("version"), setup.get("code"))
@@ -100,13 +97,12 @@ def note_other_sources(run: RunFolder) -> None:
         return
     if then == now:
         return
-    described = run.description
     options = FitOptions(
-        set=Path(described["measurement"]["folder"]),
+        set=Path(run.description["measurement"]["folder"]),
         parameters=tuple(fit["parameters"]),
         effects=tuple(setup["effects"]),
         preset=setup["preset"],
-        seed=described["seed"],
+        seed=run.description["seed"],
         run=run.path,
     )
     print(
@@ -116,70 +112,11 @@ def note_other_sources(run: RunFolder) -> None:
     )
 
 
-def history(folder: RunFolder) -> list[dict[str, Any]]:
-    """The models tried so far, the first one first."""
-    return list(_history(folder).get("models", ()))
-
-
-def adding(folder: RunFolder) -> dict[str, Any]:
-    """The addition of an effect that is under way, as `write_history` was given it; empty where none is."""
-    return dict(_history(folder).get("adding", {}))
-
-
-def _history(folder: RunFolder) -> dict[str, Any]:
-    from splatsoil.run_files import HISTORY_FORMAT, read_kept
-
-    path = folder.path / "history.json"
-    return read_kept(path, HISTORY_FORMAT) if path.is_file() else {}
-
-
-def write_history(folder: RunFolder, entries: list[dict[str, Any]], under_way: Mapping[str, Any] | None = None) -> Path:
-    """Keep the models tried, and what is needed to go on with an addition that is under way."""
-    from splatsoil.files import write_json
-    from splatsoil.run_files import HISTORY_FORMAT
-
-    more = {"adding": dict(under_way)} if under_way else {}
-    return write_json(folder.path / "history.json", {"format": HISTORY_FORMAT, "models": entries, **more})
-
-
-def history_entry(fit: Mapping[str, Any], held_out: Mapping[str, Any]) -> dict[str, Any]:
-    """A model's line in the history: its fit, and its error on what was set aside."""
-    kept = ("estimate", "std", "unit", "title")
-    return {
-        "model": fit["name"],
-        "effects": list(fit["setup"]["effects"]),
-        "parameters": {name: {key: p[key] for key in kept} for name, p in fit["parameters"].items()},
-        "loss": fit["loss"],
-        "held_out": held_out["error"],
-        "floor": held_out["noise"],
-    }
-
-
-def compared_already(folder: RunFolder) -> bool:
-    """Whether there are pictures at the latest fit's estimate."""
-    from splatsoil.report.data import kept_of
-    from splatsoil.run_files import COMPARISON_FORMAT
-
-    return kept_of(folder.comparison / "comparison.json", COMPARISON_FORMAT, folder.fit()) is not None
-
-
-def keep_earlier_comparison(folder: RunFolder) -> None:
-    """Put the comparison of the model before aside, so that before and after can be shown."""
-    if (folder.comparison / "comparison.json").is_file():
-        with folder.lock():
-            shutil.rmtree(folder.path / "before", ignore_errors=True)
-            folder.comparison.rename(folder.path / "before")
-
-
 def current_diagnosis(folder: RunFolder, path: Path, effects: tuple[str, ...] | None = None) -> dict[str, Any] | None:
     """A diagnosis (its file is ``path``) of the latest fit by the code as it is, or None.
 
     Code is also that of the files of ``effects``, or of the diagnosis's own candidates if not given.
     """
-    from splatsoil.files import JUDGING, code_digest, code_of
-    from splatsoil.report.data import kept_of
-    from splatsoil.run_files import DIAGNOSIS_FORMAT
-
     fit = folder.fit()
     data = kept_of(path, DIAGNOSIS_FORMAT, fit)
     if data is None:

@@ -5,13 +5,15 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from splatsoil.commands._options import FitOptions
 from splatsoil.commands._output import stages, tell
+from splatsoil.envs.devices import resolve_device
 from splatsoil.errors import MeasurementError, RunError
-
-if TYPE_CHECKING:
-    from splatsoil.commands._options import FitOptions
+from splatsoil.files import plain, write_json
+from splatsoil.quiet import hush
+from splatsoil.run_files import read_kept
 
 ABOUT = "laboratory.json"
 """Of a run folder: which test it is of, and with what model."""
@@ -36,20 +38,14 @@ def is_run(folder: Path) -> bool:
 
 def fit(config: FitOptions) -> int:
     """Estimate the parameters of a test's model; the result goes into the run folder as ``fit.json``."""
-    about = {
-        "set": str(config.set.resolve()),
-        "effects": list(config.effects),
-        "preset": config.preset,
-        "seed": config.seed,
-    }
+    made_of = {"effects": list(config.effects), "preset": config.preset, "seed": config.seed}
+    about = {"set": str(config.set.resolve()), **made_of}
     return _answered(config, about, config.set, config.run)
 
 
 def diagnose(config: Any) -> int:
     """Compare the models of a test that was fitted, or the base model of a test's folder; the result is
     ``diagnosis.json`` in the run folder."""
-    from splatsoil.run_files import read_kept
-
     about: Mapping[str, Any] = {"set": str(config.run), "effects": [], "preset": "small", "seed": 0}
     kept = None
     if is_run(config.run):
@@ -71,11 +67,8 @@ def _answered(
 ) -> int:
     """Compute, keep and say an answer from a test in ``folder``; the run folder is named after it if not given."""
     from splatsoil.commands.diagnose import show
-    from splatsoil.envs.devices import resolve_device
-    from splatsoil.files import plain, write_json
     from splatsoil.laboratory.answer import diagnosed, fitted
     from splatsoil.laboratory.folder import Options, load
-    from splatsoil.quiet import hush
 
     device = resolve_device(config.device)
     hush()
@@ -91,12 +84,8 @@ def _answered(
     else:
         write_json(run / ABOUT, {"format": ABOUT_FORMAT, **about})
         write_json(run / "fit.json", result)
-
-    def show_all() -> None:
-        show(result)
-        print(f"kept in {run}")
-
-    return tell(config, {**plain(result), "run": str(run), "set": str(folder)}, show_all)
+    told = {**plain(result), "run": str(run), "set": str(folder)}
+    return tell(config, told, lambda: show(result), last=f"kept in {run}")
 
 
 def check(config: Any) -> int:
@@ -115,22 +104,20 @@ def check(config: Any) -> int:
         "to": layout.times[-1],
         "over": layout.time_name,
     }
-
-    def show() -> None:
-        print(f"{experiment.kind.replace('_', ' ')}: {experiment.name}")
-        print(f"{readings} readings of {', '.join(layout.channels)}")
-        print(f"{layout.time_name}: {layout.times[0]:g} to {layout.times[-1]:g}")
-
-    return tell(config, about, show)
+    said = (
+        f"{experiment.kind.replace('_', ' ')}: {experiment.name}",
+        f"{readings} readings of {', '.join(layout.channels)}",
+        f"{layout.time_name}: {layout.times[0]:g} to {layout.times[-1]:g}",
+    )
+    return tell(config, about, last="\n".join(said))
 
 
 def simulate(config: Any, values: Mapping[str, float]) -> int:
     """Write a test of known soil."""
     from splatsoil.laboratory.folder import simulate as write
-    from splatsoil.quiet import hush
 
     hush()
     shape = write(config.scene, config.out, values, config.effects, config.preset or "small", config.seed)
     told = {"set": str(config.out), "kind": config.scene, "parameters": dict(values), "effects": list(shape.model)}
     said = ", ".join(f"{name} {value:g}" for name, value in values.items())
-    return tell(config, told, lambda: print(f"{config.scene.replace('_', ' ')} with {said}: written to {config.out}"))
+    return tell(config, told, last=f"{config.scene.replace('_', ' ')} with {said}: written to {config.out}")

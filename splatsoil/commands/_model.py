@@ -11,15 +11,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from splatsoil import __version__
 from splatsoil.commands._folder import measurement_of, note_other_sources
-from splatsoil.commands._output import print_remarks, stages
+from splatsoil.commands._output import Report, Stage, print_remarks, stages
+from splatsoil.envs.devices import resolve_device
 from splatsoil.errors import ParameterError, RunError
+from splatsoil.files import FORWARD, RECONSTRUCTING, code_digest, code_of, digest, own_files
+from splatsoil.inverse.run_folder import RunFolder
+from splatsoil.quiet import hush
 
 if TYPE_CHECKING:
-    from splatsoil.commands._output import Report, Stage
     from splatsoil.experiment.plow import PlowExperiment
     from splatsoil.inverse.criticism.simulations import Simulations
-    from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.measurement import Measurement
     from splatsoil.model import Model
     from splatsoil.reconstruction import Reconstruction
@@ -52,9 +55,6 @@ def loaded(options: Any, folder: RunFolder, spec: ModelSpec | None = None) -> It
 
     ``options`` are a command's. Says if other sources made the fit.
     """
-    from splatsoil.envs.devices import resolve_device
-    from splatsoil.quiet import hush
-
     hush()
     device = resolve_device(options.device)
     note_other_sources(folder)
@@ -88,8 +88,6 @@ def reconstructed(
     Raises:
         RunError: what is kept is damaged, or nothing is and it may not be made.
     """
-    from splatsoil import __version__
-    from splatsoil.files import RECONSTRUCTING, code_digest
     from splatsoil.reconstruction import Reconstruction, reconstruct
 
     made_of = {"preset": run.description["preset"], "seed": run.description["seed"]}
@@ -122,9 +120,6 @@ def model_on(
 ) -> Model:
     """A model of a run's set. What photographs say of light and albedo is kept in the run's ``features/``: processes
     that work side by side, and later commands, find it there."""
-    from splatsoil import __version__
-    from splatsoil.files import FORWARD, code_digest
-    from splatsoil.inverse.evaluations import digest
     from splatsoil.model import Model
 
     what = {
@@ -143,13 +138,10 @@ def model_on(
 
 def reconstruction_digest(reconstruction: Reconstruction) -> str:
     """SHA-256 of what simulations and pictures start from; the same arrays, the same digest."""
-    digest = hashlib.sha256()
     g = reconstruction.gaussians
     tensors = (g.means, g.scales, g.quaternions, g.opacities, g.colours, reconstruction.soil, reconstruction.tool)
-    for tensor in tensors:
-        digest.update(np.ascontiguousarray(tensor.detach().cpu().numpy()).tobytes())
-    digest.update(np.ascontiguousarray(reconstruction.surface.height).tobytes())
-    return digest.hexdigest()
+    arrays = [*(tensor.detach().cpu().numpy() for tensor in tensors), reconstruction.surface.height]
+    return hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).hexdigest()
 
 
 def experiment_of(
@@ -159,9 +151,7 @@ def experiment_of(
 
     ParameterError for an effect that is unknown or on already.
     """
-    from splatsoil import __version__
     from splatsoil.experiment.plow import PlowExperiment
-    from splatsoil.files import code_digest, code_of, own_files
     from splatsoil.inverse.criticism.simulations import Simulations
     from splatsoil.soil.library import find_effects
 

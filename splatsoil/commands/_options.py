@@ -30,8 +30,9 @@ SET = "Folder of the measurement set."
 PRESET = "Resolution; small suits a laptop without a graphics card."
 DEVICE = "Where to compute: auto, cpu, cuda:0, …"
 SEED = "Of random numbers; one seed gives one result on one processor."
-EFFECTS = "Effects of the model, by name, or files that define some."
 BUDGET = "Evaluations; 10 for each free parameter if not given."
+ACTING = "Effects that act, or files that define some."
+VALUES = "Parameters of the effects."
 
 #: Commands as help lists them, by what they are for.
 ORDER = {
@@ -41,6 +42,8 @@ ORDER = {
     "more of a run": ("posterior", "design", "export", "view"),
     "by themselves": ("element", "benchmark"),
 }
+#: Options that most commands have, which stand behind a command's own.
+COMMON = {"device": 1, "json": 2}
 #: Evaluations for each free parameter, unless the user says how many.
 EVALUATIONS = 10
 
@@ -58,7 +61,9 @@ class FitOptions:
     parameters: tuple[str, ...] = option(
         (), "Free parameters; friction angle and those of effects that are on if not given."
     )
-    effects: tuple[str, ...] = option((), EFFECTS, name="with", metavar="EFFECT")
+    effects: tuple[str, ...] = option(
+        (), "Effects of the model, by name, or files that define some.", name="with", metavar="EFFECT"
+    )
     budget: int | None = option(None, BUDGET, expert=True)
     preset: Preset = option("small", PRESET)
     device: str = option("auto", DEVICE)
@@ -79,6 +84,14 @@ class RunOptions:
 
     run: Path = argument("The run folder.")
     set: Path | None = option(None, "Where the measurement set is now, if it has moved; later commands know it, too.")
+    json: bool = option(False, JSON)
+
+
+@dataclass(frozen=True)
+class ComputingOptions(RunOptions):
+    """What a command that simulates with the model of a run folder takes."""
+
+    device: str = option("auto", DEVICE)
 
 
 def check_evaluations(budget: int | None) -> None:
@@ -102,7 +115,7 @@ def same_again(command: str, config: Any) -> str:
     """The command line that means a command's options; what is as usual is left out."""
     places: list[object] = []
     options: list[object] = []
-    for field in dataclasses.fields(config):
+    for field in _fields(config):
         value = getattr(config, field.name)
         words = value if isinstance(value, tuple) else (value,)
         if field.metadata.get("positional"):
@@ -141,14 +154,14 @@ def parse(command: str, config: type, words: Sequence[str]) -> Any:
     parser = parser_of(command, config)
     found, unknown = parser.parse_known_intermixed_args(list(words))
     if unknown:
-        hint = did_you_mean(unknown[0], map(_flag, dataclasses.fields(config)))
+        hint = did_you_mean(unknown[0], map(_flag, _fields(config)))
         parser.error(f"unrecognized argument: {unknown[0]}{hint}")
     return config(**{name: tuple(value) if isinstance(value, list) else value for name, value in vars(found).items()})
 
 
 def parser_of(command: str, config: type) -> argparse.ArgumentParser:
     """What reads a command's words, and prints its help page."""
-    fields, hints = dataclasses.fields(config), typing.get_type_hints(config)
+    fields, hints = _fields(config), typing.get_type_hints(config)
     places = [_shown(field) for field in fields if field.metadata.get("positional")]
     parser = _Parser(
         prog=f"splatsoil {command}",
@@ -201,6 +214,11 @@ def program_page(configs: Mapping[str, type], description: str) -> str:
 
 def _columns() -> int:
     return min(shutil.get_terminal_size().columns, WIDEST)
+
+
+def _fields(config: Any) -> list[dataclasses.Field[Any]]:
+    """A command's own options, then those that most commands have."""
+    return sorted(dataclasses.fields(config), key=lambda field: COMMON.get(field.name, 0))
 
 
 def _flag(field: dataclasses.Field[Any]) -> str:

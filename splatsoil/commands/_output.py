@@ -9,9 +9,12 @@ from contextlib import contextmanager, redirect_stdout
 from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any, TextIO
 
+from splatsoil.commands._folder import places
 from splatsoil.errors import NoAnswer
+from splatsoil.report.text import amount, interval
 
 if TYPE_CHECKING:
+    from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.measurement import Measurement
 
 Report = Callable[[str, float], None]
@@ -42,17 +45,33 @@ def print_json(data: Mapping[str, Any]) -> None:
     print(json.dumps(data, indent=1, allow_nan=False), file=_stdout.get() or sys.stdout, flush=True)
 
 
-def tell(config: Any, data: Mapping[str, Any], show: Callable[[], object], *, none: str = "") -> int:
-    """Say a command's result: the data as one JSON object, or what ``show`` prints; returns the exit code.
+def tell(
+    config: Any,
+    data: Mapping[str, Any],
+    show: Callable[[], object] = lambda: None,
+    *,
+    last: str = "",
+    run: RunFolder | None = None,
+    none: str = "",
+) -> int:
+    """Say a command's result, and return the exit code.
 
-    ``none`` is why there is no answer, and is said first.
+    Args:
+        config: the command's options.
+        data: the result as one JSON object.
+        show: prints it.
+        last: the line after that.
+        run: whose folder and set the object names.
+        none: why there is no answer; said first.
     """
     if config.json:
-        print_json({"ok": not none, **({"error": none} if none else {}), **data})
-        return NoAnswer.code if none else 0
-    if none:
-        print(none)
-    show()
+        print_json({"ok": not none, **({"error": none} if none else {}), **data, **(places(run) if run else {})})
+    else:
+        if none:
+            print(none)
+        show()
+        if last:
+            print(last)
     return NoAnswer.code if none else 0
 
 
@@ -96,18 +115,21 @@ def print_table(
 
 
 def print_parameters(
-    title: str, result: Mapping[str, Any], value: str, more: Mapping[str, Callable[[Mapping[str, Any]], str]]
+    title: str,
+    result: Mapping[str, Any],
+    value: str,
+    more: Mapping[str, Callable[[Mapping[str, Any]], str]],
+    *paragraphs: str,
 ) -> None:
-    """Print a table of a result's parameters with their ± and interval, and its notes.
+    """Print a table of a result's parameters with their ± and interval, its notes, and sentences.
 
     Args:
         title: above it.
         result: with ``parameters`` by name, and ``notes``.
         value: key of what the ± is of.
         more: further columns.
+        paragraphs: the sentences.
     """
-    from splatsoil.report.text import amount, interval
-
     print_table(
         title,
         ("parameter", value, "5 to 95 %", *more),
@@ -118,6 +140,7 @@ def print_parameters(
         left=("parameter", ""),
     )
     print_text(notes=result["notes"])
+    print_text(*paragraphs)
 
 
 def print_text(*paragraphs: str, style: str = "", notes: Iterable[str] = ()) -> None:
@@ -144,7 +167,7 @@ def stages(*, quiet: bool = False) -> Iterator[Stage]:
         return
     from rich.console import Console
     from rich.markup import escape
-    from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     console = Console(stderr=True)
     if not console.is_terminal:
@@ -161,18 +184,15 @@ def stages(*, quiet: bool = False) -> Iterator[Stage]:
         TextColumn("{task.fields[what]}"),
     )
     with Progress(*columns, console=console, speed_estimate_period=3600.0) as bar:
-        current: list[TaskID] = []
 
         def finish() -> None:
-            for task in current:
+            for task in bar.task_ids[-1:]:
                 bar.update(task, completed=1.0, what="")
                 bar.stop_task(task)
-            current.clear()
 
         def begin(name: str) -> Report:
             finish()
             task = bar.add_task(escape(name), total=1.0, what="")
-            current.append(task)
             return lambda what, share: bar.update(task, completed=share, what=escape(what))
 
         yield begin

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from splatsoil.errors import ParameterError
+from splatsoil.report.text import duration
 
 if TYPE_CHECKING:
     from splatsoil.measurement import Measurement
@@ -48,8 +49,6 @@ class Needs:
 
     def sentence(self, device: str) -> str:
         """The needs in one line, where the soil isn't known yet."""
-        from splatsoil.report.text import duration
-
         return (
             f"needs up to {self.memory:.2g} of {memory():.2g} GiB of memory and {duration(self.seconds)} a simulation "
             f"({self.particles} particles, {device}), {self.simulations} simulations"
@@ -72,17 +71,16 @@ def needs(measurement: Measurement, preset: str, device: str, simulations: int, 
     resolution = Resolution.derive(measurement, preset)
     count = particles or int(measurement.bed.domain.extents.prod() / resolution.spacing**3)
     side = preset_named(preset).longest_side
-    views = [_pixels(f.camera.width, f.camera.height, side) for f in measurement.views]
+    cameras = [f.camera for f in measurement.views]
+    views = sum(c.width * c.height * min(1.0, side / max(c.width, c.height)) ** 2 for c in cameras)  # shrunk
     video = sum(f.camera.width * f.camera.height for f in measurement.video)
-    pictures = PIXEL * (PICTURES * video + sum(views)) / 2**30
     simulation = count * (PARTICLE + FRAME * len(measurement.frames)) / 2**30
     substeps = resolution.steps * resolution.substeps(resolution.steps)
-    work = count * substeps * max(measurement.frames, default=0)
     return Needs(
         particles=count,
-        memory=PROGRAM + pictures + (simulation if device == "cpu" else 0.0),
+        memory=PROGRAM + PIXEL * (PICTURES * video + views) / 2**30 + (simulation if device == "cpu" else 0.0),
         simulation=simulation,
-        seconds=work / RATE[device.split(":")[0]],
+        seconds=count * substeps * max(measurement.frames, default=0) / RATE[device.split(":")[0]],
         simulations=simulations,
     )
 
@@ -95,19 +93,13 @@ def check_memory(need: Needs, device: str, file: Path) -> None:
     """
     places = [("this machine", need.memory, memory())]
     if device != "cpu":
-        places.append((device, need.simulation, on_device(device)))
+        places.append((device, need.simulation, gpu_memory(device)[1]))
     for where, wanted, there in places:
         if wanted > there:
             raise ParameterError(
                 f"{file}: {need.particles} particles, and the pictures, need {wanted:.3g} GiB of memory, and {where} "
                 f"has {there:.3g} GiB; choose a coarser --preset, fewer frames, or a larger machine"
             )
-
-
-def _pixels(width: int, height: int, side: int) -> float:
-    """Of a photograph that is shrunk to its longest side."""
-    shrunk = min(1.0, side / max(width, height))
-    return width * height * shrunk**2
 
 
 def memory() -> float:
@@ -121,8 +113,9 @@ def memory() -> float:
     return min(there)
 
 
-def on_device(device: str) -> float:
-    """A GPU's memory, GiB."""
+def gpu_memory(device: str) -> tuple[float, float]:
+    """What is free of a GPU's memory, and all of it, GiB."""
     import torch
 
-    return float(torch.cuda.mem_get_info(device)[1]) / 2**30
+    free, whole = torch.cuda.mem_get_info(device)
+    return free / 2**30, whole / 2**30

@@ -12,21 +12,29 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from splatsoil.commands import _model
+from splatsoil import __version__
+from splatsoil.commands import _crew, _model
 from splatsoil.commands._model import ModelSpec, experiment_of, reconstruction_digest
 from splatsoil.commands._options import EVALUATIONS, FitOptions, check_evaluations, check_seed
-from splatsoil.commands._output import by_frame, print_remarks
+from splatsoil.commands._output import Report, Stage, by_frame, print_remarks
+from splatsoil.commands._resources import COMPARISON, check_memory, needs
+from splatsoil.envs.devices import resolve_device
 from splatsoil.errors import MeasurementError, ParameterError, RunError
+from splatsoil.files import JUDGING, code_digest, code_of, plain, write_bytes, write_json
+from splatsoil.inverse.evaluations import EvaluationStore
+from splatsoil.inverse.run_folder import RunFolder
+from splatsoil.quiet import hush
+from splatsoil.report.data import estimates
+from splatsoil.report.text import NOTHING_MOVES, symbol
+from splatsoil.run_files import COMPARISON_FORMAT
 
 if TYPE_CHECKING:
     from splatsoil.commands._crew import Crew
-    from splatsoil.commands._output import Report, Stage
     from splatsoil.experiment.base import Experiment
     from splatsoil.inverse.criticism.design import Prior
     from splatsoil.inverse.criticism.diagnosis import Diagnosis
     from splatsoil.inverse.criticism.simulations import Simulations
     from splatsoil.inverse.evaluations import EvaluationRecord
-    from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.measurement import Measurement
     from splatsoil.model import Model
 
@@ -40,10 +48,6 @@ def prepare(options: FitOptions) -> tuple[Measurement, RunFolder]:
     Raises:
         MeasurementError, ParameterError, RunError: what is wrong, before any work.
     """
-    from splatsoil import __version__
-    from splatsoil.commands._resources import COMPARISON, check_memory, needs
-    from splatsoil.envs.devices import resolve_device
-    from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.measurement import Measurement
     from splatsoil.soil.law import Law
     from splatsoil.soil.library import find_effects
@@ -81,16 +85,13 @@ def fitted(options: FitOptions, begin: Stage) -> tuple[RunFolder, Model, dict[st
     Raises:
         MeasurementError, ParameterError, RunError: see `prepare`.
     """
-    from splatsoil.envs.devices import resolve_device
-    from splatsoil.quiet import hush
-
     hush()
     begin("check")("reading every image", 0.0)
     measurement, folder = prepare(options)
     device = resolve_device(options.device)
     reconstruction = _model.reconstructed(measurement, folder, device, begin("reconstruct"))
     model = _model.model_on(measurement, folder, reconstruction, options.effects, options.preset, device)
-    return folder, model, run_fit(options, measurement, folder, model, begin("fit"))
+    return folder, model, run_fit(options, folder, model, begin("fit"))
 
 
 def facts(model: Model) -> dict[str, str]:
@@ -104,21 +105,14 @@ def facts(model: Model) -> dict[str, str]:
     }
 
 
-def run_fit(
-    options: FitOptions, measurement: Measurement, run: RunFolder, model: Model, report: Report
-) -> dict[str, Any]:
+def run_fit(options: FitOptions, run: RunFolder, model: Model, report: Report) -> dict[str, Any]:
     """Search, evaluation by evaluation, and compare the model with something else by what was simulated, and more; what
     is in the run folder already isn't simulated again.
     """
-    from splatsoil import __version__
-    from splatsoil.commands._crew import Crew
-    from splatsoil.commands._resources import check_memory, needs
     from splatsoil.envs.measured import LOSS, MeasuredProblem
-    from splatsoil.files import code_of
     from splatsoil.inverse.fitting import TOGETHER, FitSetup, fit
-    from splatsoil.report.text import symbol
 
-    space = model.space(options.parameters or None)
+    measurement, space = model.measurement, model.space(options.parameters or None)
     budget = options.budget or EVALUATIONS * len(space)
     need = needs(measurement, options.preset, model.device, budget, particles=len(model.particles(0)))
     check_memory(need, model.device, measurement.folder)
@@ -158,7 +152,7 @@ def run_fit(
 
     def compared(found: dict[str, Any]) -> Diagnosis:
         experiment.progress = None
-        with Crew(run, model.device, ()) as crew, crew.helping(spec, experiment, simulate):
+        with _crew.Crew(run, model.device, ()) as crew, crew.helping(spec, experiment, simulate):
             return compare_models(experiment, simulate, found, comparing, options.seed, with_effects=False)
 
     experiment.progress = simulating
@@ -167,15 +161,10 @@ def run_fit(
 
 def draw_comparison(run: RunFolder, model: Model, report: Report) -> dict[str, Any]:
     """Simulate at the latest fit's estimate, and keep pictures and losses of every frame in ``comparison/``."""
-    from splatsoil import __version__
     from splatsoil.comparison import GAIN, Comparator
     from splatsoil.envs.measured import LOSS
     from splatsoil.experiment.forces import force_record
     from splatsoil.experiment.heights import CHANNEL, Heights
-    from splatsoil.files import write_json
-    from splatsoil.report.data import estimates
-    from splatsoil.report.text import NOTHING_MOVES
-    from splatsoil.run_files import COMPARISON_FORMAT
 
     with run.lock():
         result = run.fit()
@@ -239,8 +228,6 @@ def write_jpeg(path: Path, picture: np.ndarray) -> None:
     """A picture (h, w, 3), clipped to [0, 1], as a JPEG file, whole or not at all."""
     from PIL import Image
 
-    from splatsoil.files import write_bytes
-
     stream = io.BytesIO()
     pixels = np.rint(255.0 * np.clip(picture, 0.0, 1.0)).astype(np.uint8)
     Image.fromarray(pixels).save(stream, format="JPEG", quality=90)
@@ -249,7 +236,6 @@ def write_jpeg(path: Path, picture: np.ndarray) -> None:
 
 def kept(options: FitOptions) -> str:
     """What an interrupted fit leaves, for the sentence after Ctrl-C."""
-    from splatsoil.inverse.evaluations import EvaluationStore
     from splatsoil.measurement import Measurement
 
     try:
@@ -266,8 +252,6 @@ def run_diagnosis(
 ) -> dict[str, Any]:
     """Compare the latest fit's model with those that have an effect more; the result is ``diagnosis.json`` and, by
     model, ``diagnoses/NAME.json``. ``crew`` are processes for these effects that are there already."""
-    from splatsoil.files import write_json
-
     result = _compared_models(folder, model, begin("diagnose"), tuple(effects), crew, with_effects=True)
     write_json(folder.path / "diagnoses" / f"{result['fit']}.json", result)
     write_json(folder.path / "diagnosis.json", result)
@@ -277,7 +261,6 @@ def run_diagnosis(
 def check_adequacy(folder: RunFolder, model: Model, report: Report, *, crew: Crew | None = None) -> dict[str, Any]:
     """Whether the latest fit's model leaves more than noise, where and when; kept as ``comparison/misfit.json``.
     ``crew`` are processes for no effects that are there already."""
-    from splatsoil.files import plain, write_json
     from splatsoil.inverse.criticism.record import misfit_of
 
     result = misfit_of(_compared_models(folder, model, report, (), crew, with_effects=False))
@@ -286,14 +269,16 @@ def check_adequacy(folder: RunFolder, model: Model, report: Report, *, crew: Cre
 
 
 def _compared_models(
-    folder: RunFolder, model: Model, report: Report, effects: tuple[str, ...], crew: Crew | None, *, with_effects: bool
+    folder: RunFolder,
+    model: Model,
+    report: Report,
+    effects: tuple[str, ...],
+    crew: Crew | None,
+    *,
+    with_effects: bool,
 ) -> dict[str, Any]:
-    from splatsoil import __version__
-    from splatsoil.commands._crew import Crew
-    from splatsoil.files import JUDGING, code_digest, code_of
     from splatsoil.inverse.criticism.next_stroke import posterior_draws
     from splatsoil.inverse.criticism.record import record
-    from splatsoil.report.data import estimates
 
     began = time.perf_counter()
     fit, seed = folder.fit(), folder.description["seed"]
@@ -301,7 +286,7 @@ def _compared_models(
     experiment, simulate = experiment_of(folder, model, spec, (effects or None) if with_effects else ())
     with (
         folder.lock(),
-        Crew(folder, model.device, effects) if crew is None else nullcontext(crew) as mine,
+        _crew.Crew(folder, model.device, effects) if crew is None else nullcontext(crew) as mine,
         mine.helping(spec, experiment, simulate),
     ):
         found = compare_models(experiment, simulate, fit, report, seed, with_effects=with_effects)
@@ -340,14 +325,14 @@ def compare_models(
     from splatsoil.inverse.criticism.design import Run
     from splatsoil.inverse.criticism.diagnosis import diagnose
 
-    stage, share = "", 0.0
+    at = "", 0.0
 
-    def progress(what: str, done: float) -> None:
-        nonlocal stage, share
-        stage, share = what, done
-        report(stage, share)
+    def progress(what: str, share: float) -> None:
+        nonlocal at
+        at = what, share
+        report(what, share)
 
-    simulate.told = lambda purpose: report(f"{stage}, {simulate.made + 1}: {purpose.replace('_', ' ')}", share)
+    simulate.told = lambda purpose: report(f"{at[0]}, {simulate.made + 1}: {purpose.replace('_', ' ')}", at[1])
     return diagnose(
         experiment,
         {name: entry["estimate"] for name, entry in fit["minimum"].items()},

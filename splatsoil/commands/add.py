@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from splatsoil import report
 from splatsoil.commands import _folder, _model, _stages
-from splatsoil.commands._options import BUDGET, DEVICE, FitOptions, RunOptions, check_evaluations
-from splatsoil.commands._output import print_table, tell
+from splatsoil.commands._options import BUDGET, ComputingOptions, FitOptions, check_evaluations
+from splatsoil.commands._output import Stage, print_table, tell
 from splatsoil.errors import ParameterError, RunError
-from splatsoil.options import JSON, argument, option
+from splatsoil.files import write_json
+from splatsoil.inverse.run_folder import RunFolder
+from splatsoil.options import argument, option
+from splatsoil.report.data import kept_of, load
+from splatsoil.report.text import amount, model_name
+from splatsoil.run_files import COMPARISON_FORMAT, HISTORY_FORMAT, read_kept
 
 if TYPE_CHECKING:
-    from splatsoil.commands._output import Stage
-    from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.model import Model
 
 INTERRUPTED = "finished simulations are kept; go on with"
 
 
 @dataclass(frozen=True)
-class Config(RunOptions):
+class Config(ComputingOptions):
     """Add effects to the model, and fit again.
 
     Reports the error on data set aside without and with the effect. Earlier fits stay.
@@ -29,14 +34,10 @@ class Config(RunOptions):
 
     effects: tuple[str, ...] = argument("Effects to add, by name, or files that define one each.")
     budget: int | None = option(None, BUDGET, expert=True)
-    device: str = option("auto", DEVICE)
-    json: bool = option(False, JSON)
 
 
 def run(config: Config) -> int:
     """Fit with each effect, keep the history, draw the report."""
-    from splatsoil.report import write_report
-    from splatsoil.report.data import load
     from splatsoil.soil.law import Law
     from splatsoil.soil.library import find_effects
 
@@ -49,50 +50,61 @@ def run(config: Config) -> int:
     for name in config.effects:
         if len(find_effects([name])) != 1:
             raise ParameterError(f"{name} defines several effects; put each that is to be added into a file of its own")
-    # All that the report will show: what is damaged is better known now than after hours.
-    load(folder.path)
-    before = _folder.adding(folder)
-    half_done = before.get("effects") == on
-    left = remaining(config.effects, on, before, half_done=half_done)
+    load(folder.path)  # all that the report will show: what is damaged is better known now than after hours
+    under_way = history(folder)["adding"]
+    half_done = under_way.get("effects") == on
+    # A command that was interrupted, and is given again, goes on: what it has put in is on already.
+    mine = set(under_way["done"] if under_way.get("command") == list(config.effects) else ())
+    mine |= {under_way["effect"]} if half_done else set()
+    left = [name for name in config.effects if not (name in on and name in mine)]
+    _model.off_effects(left, find_effects(on))
     Law(find_effects((*on, *left)))
     folder.check_writable()
     with _model.loaded(config, folder) as (model, begin):
         if half_done:
-            finish(folder, model, fit, before, begin)
+            finish(folder, model, fit, under_way, begin)
         for name in left:
             model = add_effect(folder, model, name, begin, budget=config.budget, command=config.effects)
         begin("report")("drawing figures", 0.0)
-        page = write_report(folder.path)
-    entries = _folder.history(folder)
-    _folder.write_history(folder, entries)
+        page = report.write_report(folder.path)
+    models = history(folder)["models"]
+    write_history(folder, models)
     _folder.require_answer(folder, folder.fit(), f"report: {page}")
-
-    def show_all() -> None:
-        show(entries)
-        print(f"report: {page}")
-
-    return tell(config, {**_folder.places(folder), "report": str(page), "models": entries}, show_all)
+    told = {"report": str(page), "models": models}
+    return tell(config, told, lambda: show(models), last=f"report: {page}", run=folder)
 
 
-def remaining(effects: Sequence[str], on: Sequence[str], before: Mapping[str, Any], *, half_done: bool) -> list[str]:
-    """Effects that are still to be added: a command that was interrupted, and is given again, goes on.
+def history(folder: RunFolder) -> dict[str, Any]:
+    """``models`` tried so far, the first one first, and the addition of an effect that is under way (``adding``), as
+    `write_history` was given it; empty where none is."""
+    path = folder.path / "history.json"
+    return {"models": [], "adding": {}, **(read_kept(path, HISTORY_FORMAT) if path.is_file() else {})}
 
-    Args:
-        effects: of the command.
-        on: of the latest fit.
-        before: the addition that was under way, see `splatsoil.commands._folder.adding`.
-        half_done: whether its fit is the latest.
 
-    Raises:
-        ParameterError: one is on that this command didn't put in.
-    """
-    from splatsoil.soil.library import find_effects
+def write_history(
+    folder: RunFolder, models: Sequence[Mapping[str, Any]], under_way: Mapping[str, Any] | None = None
+) -> None:
+    """Keep the models tried, and what is needed to go on with an addition that is under way."""
+    more = {"adding": under_way} if under_way else {}
+    write_json(folder.path / "history.json", {"format": HISTORY_FORMAT, "models": list(models), **more})
 
-    mine = set(before["done"] if before.get("command") == list(effects) else ())
-    mine |= {before["effect"]} if half_done else set()
-    left = [name for name in effects if not (name in on and name in mine)]
-    _model.off_effects(left, find_effects(on))
-    return left
+
+def _line(fit: Mapping[str, Any], held_out: Mapping[str, Any]) -> dict[str, Any]:
+    """A model in the history: its fit, and its error on what was set aside."""
+    kept = ("estimate", "std", "unit", "title")
+    return {
+        "model": fit["name"],
+        "effects": list(fit["setup"]["effects"]),
+        "parameters": {name: {key: p[key] for key in kept} for name, p in fit["parameters"].items()},
+        "loss": fit["loss"],
+        "held_out": held_out["error"],
+        "floor": held_out["noise"],
+    }
+
+
+def _compared(folder: RunFolder) -> bool:
+    """Whether there are pictures at the latest fit's estimate."""
+    return kept_of(folder.comparison / "comparison.json", COMPARISON_FORMAT, folder.fit()) is not None
 
 
 def add_effect(
@@ -117,11 +129,11 @@ def add_effect(
     scores = {h["model"]: h for h in known["held_out"]}
     if effect.name not in scores:
         raise RunError(f"{effect.name} cannot be added: {'; '.join(known['notes']) or 'it could not be simulated'}")
-    entries = _folder.history(folder)
-    if not entries or entries[-1]["model"] != before["name"]:
-        entries = [_folder.history_entry(before, scores[""])]
-    entries[-1]["held_out"], entries[-1]["floor"] = scores[""]["error"], scores[""]["noise"]
-    if not _folder.compared_already(folder):
+    models = history(folder)["models"]
+    if not models or models[-1]["model"] != before["name"]:
+        models = [_line(before, scores[""])]
+    models[-1] |= {"held_out": scores[""]["error"], "floor": scores[""]["noise"]}
+    if not _compared(folder):
         _stages.draw_comparison(folder, model, begin("compare"))
     under_way = {
         "command": list(command),
@@ -132,7 +144,7 @@ def add_effect(
         "line": {"added": effect.name},
     }
     # Before the fit is the latest one: from then on nothing else knows what it was made from.
-    _folder.write_history(folder, entries, under_way)
+    write_history(folder, models, under_way)
     options = FitOptions(
         set=model.measurement.folder,
         parameters=(*before["parameters"], *free),
@@ -143,27 +155,27 @@ def add_effect(
         seed=folder.description["seed"],
         run=folder.path,
     )
-    fit = _stages.run_fit(options, model.measurement, folder, larger, begin(f"fit with {effect.name}"))
+    fit = _stages.run_fit(options, folder, larger, begin(f"fit with {effect.name}"))
     finish(folder, larger, fit, under_way, begin)
     return larger
 
 
 def finish(folder: RunFolder, model: Model, fit: Mapping[str, Any], under_way: Mapping[str, Any], begin: Stage) -> None:
     """What is left to do once the fit with the new effect is the latest one."""
-    if not _folder.compared_already(folder):
-        _folder.keep_earlier_comparison(folder)
+    if not _compared(folder):
+        if (folder.comparison / "comparison.json").is_file():  # put aside, so that before and after can be shown
+            with folder.lock():
+                shutil.rmtree(folder.path / "before", ignore_errors=True)
+                folder.comparison.rename(folder.path / "before")
         _stages.draw_comparison(folder, model, begin("compare"))
-    entry = {**_folder.history_entry(fit, under_way["held_out"]), **under_way["line"]}
+    line = {**_line(fit, under_way["held_out"]), **under_way["line"]}
     # Until all of the command is done, what it has put in is known to be its own.
     command, done = under_way["command"], [*under_way["done"], under_way["effect"]]
-    rest = {"command": command, "done": done} if command else None
-    _folder.write_history(folder, [*_folder.history(folder), entry], rest)
+    write_history(folder, [*history(folder)["models"], line], {"command": command, "done": done} if command else None)
 
 
-def show(entries: Sequence[Mapping[str, Any]]) -> None:
+def show(models: Sequence[Mapping[str, Any]]) -> None:
     """The falling error, and how the parameters moved."""
-    from splatsoil.report.text import amount, model_name
-
     print_table(
         "error on data that were set aside",
         ("model", "error", "noise alone", "loss, all frames", "parameters"),
@@ -173,7 +185,7 @@ def show(entries: Sequence[Mapping[str, Any]]) -> None:
                 *(f"{entry[key]:.3g}" for key in ("held_out", "floor", "loss")),
                 ", ".join(f"{n} {amount(p['estimate'], p['std'], p['unit'])}" for n, p in entry["parameters"].items()),
             )
-            for entry in entries
+            for entry in models
         ),
         left=("model", "parameters"),
     )

@@ -24,24 +24,20 @@ class Config:
     json: bool = option(False, "List as one JSON object; as an argument of a benchmark, it is the benchmark's own.")
 
 
-def benchmarks() -> dict[str, str]:
-    """Modules of ``splatsoil.benchmarks`` by the names that the command takes."""
+def run(config: Config) -> int:
+    """Run the named module of ``splatsoil.benchmarks`` as a script; ParameterError when there is none of that name."""
     import splatsoil.benchmarks
 
     found = sorted(info.name for info in pkgutil.iter_modules(splatsoil.benchmarks.__path__))
-    return {name.replace("_", "-"): f"splatsoil.benchmarks.{name}" for name in found if not name.startswith("_")}
-
-
-def run(config: Config) -> int:
-    """Run the named benchmark as a script; ParameterError when there is none of that name."""
-    known = benchmarks()
+    known = {name.replace("_", "-"): f"splatsoil.benchmarks.{name}" for name in found if not name.startswith("_")}
     if config.name in known:
         return _execute(config.name, known[config.name], config.arguments)
     if config.name:
         raise ParameterError(f"benchmark {config.name!r} is unknown; there are {', '.join(known)}")
-    titles = {name: _title(module) for name, module in known.items()}
+    texts = {name: importlib.import_module(module).__doc__ or "" for name, module in known.items()}
+    titles = {name: text.strip().splitlines()[0] for name, text in texts.items()}
     lines = [f"{name:<16}{title}" for name, title in titles.items()]
-    return tell(config, {"benchmarks": titles}, lambda: print(*lines, sep="\n"))
+    return tell(config, {"benchmarks": titles}, last="\n".join(lines))
 
 
 def _execute(name: str, module: str, arguments: tuple[str, ...]) -> int:
@@ -54,8 +50,3 @@ def _execute(name: str, module: str, arguments: tuple[str, ...]) -> int:
         return end.code if isinstance(end.code, int) else int(end.code is not None)
     finally:
         sys.argv = before
-
-
-def _title(module: str) -> str:
-    """First line of a module's text."""
-    return (importlib.import_module(module).__doc__ or "").strip().splitlines()[0]

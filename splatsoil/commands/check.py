@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any
 from splatsoil.commands import _laboratory
 from splatsoil.commands._options import SET
 from splatsoil.commands._output import print_table, print_text, tell
+from splatsoil.files import plain
 from splatsoil.options import JSON, argument, option
 
 if TYPE_CHECKING:
-    from splatsoil.measurement import Measurement, Remark
+    from splatsoil.measurement import Measurement
 
 INTERRUPTED = "nothing was written; start again with"
 
@@ -39,22 +40,22 @@ def run(config: Config) -> int:
     def show() -> None:
         print_table(f"{measurement.name} ({measurement.folder})", (), _rows(measurement))
         print_text(*(f"remark {remark.about}: {remark.text}" for remark in found), style="yellow")
-        print("The set can be used as it is." if found else "The set is complete and consistent.")
 
-    return tell(config, _as_json(measurement, found), show)
+    told = {**_as_json(measurement), "remarks": [asdict(remark) for remark in found]}
+    last = "The set can be used as it is." if found else "The set is complete and consistent."
+    return tell(config, told, show, last=last)
 
 
-def _as_json(measurement: Measurement, found: tuple[Remark, ...]) -> dict[str, Any]:
-    from splatsoil.files import plain
-
-    bed, tool, motion = measurement.bed, measurement.tool, measurement.tool.motion
-    kept = {key: getattr(measurement, key) for key in ("name", "hash", "gravity", "frame_rate")}
-    about_bed = ("lower", "upper", "density", "wall_friction", "floor_friction")
+def _as_json(measurement: Measurement) -> dict[str, Any]:
+    tool, motion = measurement.tool, measurement.tool.motion
     data: dict[str, Any] = plain(
         {
             "set": measurement.folder,
-            **kept,
-            "bed": {key: getattr(bed, key) for key in about_bed},
+            **{key: getattr(measurement, key) for key in ("name", "hash", "gravity", "frame_rate")},
+            "bed": {
+                key: getattr(measurement.bed, key)
+                for key in ("lower", "upper", "density", "wall_friction", "floor_friction")
+            },
             "tool": {
                 "extents": tool.mesh.extents,
                 "volume": float(tool.mesh.volume),
@@ -70,7 +71,6 @@ def _as_json(measurement: Measurement, found: tuple[Remark, ...]) -> dict[str, A
                 "pre_roll": sorted({f.frame for f in measurement.pre_roll if f.frame is not None}),
             },
             "heights": measurement.height_frames,
-            "remarks": [asdict(remark) for remark in found],
         }
     )
     return data

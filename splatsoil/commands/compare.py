@@ -7,10 +7,13 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
 
-from splatsoil.commands import _folder, _model, _stages
-from splatsoil.commands._options import DEVICE, RunOptions, command_line
+import numpy as np
+
+from splatsoil.commands import _crew, _folder, _model, _stages
+from splatsoil.commands._options import ComputingOptions, command_line
 from splatsoil.commands._output import print_table, print_text, tell
-from splatsoil.options import JSON, option
+from splatsoil.options import option
+from splatsoil.report.text import SIGNIFICANT, averaged_sentence, no_answer, probability, residual_sentence
 
 INTERRUPTED = "the comparison was not finished; start again with"
 #: Checks shown on the screen.
@@ -20,7 +23,7 @@ MISFIT = ("adequate", "probability", "estimates", "checks", "passes")
 
 
 @dataclass(frozen=True)
-class Config(RunOptions):
+class Config(ComputingOptions):
     """Test whether the fitted model is adequate, and where and when it fails.
 
     Pictures, losses and forces at the latest estimate; residuals over their expected standard deviation, which
@@ -28,44 +31,34 @@ class Config(RunOptions):
     """
 
     quick: bool = option(False, "Only pictures, losses and forces, from one simulation; no test.")
-    device: str = option("auto", DEVICE)
-    json: bool = option(False, JSON)
 
 
 def run(config: Config) -> int:
     """Simulate, draw, compare; pictures, losses and the misfit by block go into the run folder."""
-    from splatsoil.commands._crew import Crew
-    from splatsoil.report.text import no_answer
-
     folder = _folder.opened(config)
     none = no_answer(folder.fit())
     folder.check_writable()
     # Helpers begin before what takes seconds to load is loaded.
     with (
-        nullcontext() if config.quick else Crew(folder, config.device, ()) as crew,
+        nullcontext() if config.quick else _crew.Crew(folder, config.device, ()) as crew,
         _model.loaded(config, folder) as (model, begin),
     ):
         result = _stages.draw_comparison(folder, model, begin("compare"))
-        misfit = None if crew is None else _stages.check_adequacy(folder, model, begin("models"), crew=crew)
-    if misfit is not None:
-        misfit = {key: value for key, value in misfit.items() if not (none and key == "estimates")}
-    extra = {} if misfit is None else {"misfit": {key: misfit[key] for key in MISFIT if key in misfit}}
+        misfit = {} if config.quick else _stages.check_adequacy(folder, model, begin("models"), crew=crew)
+    misfit = {key: value for key, value in misfit.items() if not (none and key == "estimates")}
+    extra = {"misfit": {key: misfit[key] for key in MISFIT if key in misfit}} if misfit else {}
 
     def show_all() -> None:
-        show(result, str(folder.comparison), None if misfit is None else bool(misfit["adequate"]))
-        if misfit is not None:
+        show(result, str(folder.comparison), misfit.get("adequate"))
+        if misfit:
             show_misfit(misfit, str(folder.path))
 
-    return tell(config, {**result, **extra, **_folder.places(folder)}, show_all, none=none)
+    return tell(config, {**result, **extra}, show_all, run=folder, none=none)
 
 
 def show(result: Mapping[str, Any], folder: str, adequate: bool | None = None) -> None:
     """Losses of each camera, and what the whole comes to; ``adequate`` is what a comparison with something else
     says of it."""
-    import numpy as np
-
-    from splatsoil.report.text import residual_sentence
-
     name, rows = result["loss"], []
     for camera in result["cameras"]:
         frames = [entry for entry in result["frames"] if entry["camera"] == camera]
@@ -78,8 +71,6 @@ def show(result: Mapping[str, Any], folder: str, adequate: bool | None = None) -
 
 def show_misfit(misfit: Mapping[str, Any], run: str) -> None:
     """The worst checks, and whether the model is adequate; the parameters where ``misfit`` has them."""
-    from splatsoil.report.text import SIGNIFICANT, averaged_sentence, probability
-
     checks = misfit["checks"]
     failed = {number for number, check in enumerate(checks) if check["p"] < SIGNIFICANT}
     print_table(

@@ -4,23 +4,30 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Future
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from splatsoil import __version__
 from splatsoil.commands import _folder, _model
-from splatsoil.commands._options import DEVICE, Preset, RunOptions, command_line
-from splatsoil.commands._output import print_table, print_text, tell
+from splatsoil.commands._options import ComputingOptions, Preset, command_line
+from splatsoil.commands._output import Report, print_table, print_text, tell
 from splatsoil.errors import ParameterError, RunError, SimulationError
-from splatsoil.options import JSON, option
+from splatsoil.files import check_folder, code_digest, digest, write_json, write_text
+from splatsoil.inverse.run_folder import RunFolder
+from splatsoil.options import option
+from splatsoil.report.text import listed, model_label
+from splatsoil.run_files import DESIGN_FORMAT
 
 if TYPE_CHECKING:
     from splatsoil.commands._model import ModelSpec
-    from splatsoil.commands._output import Report
     from splatsoil.experiment.plow import PlowExperiment
     from splatsoil.experiment.strokes import Stroke
     from splatsoil.inverse.criticism.next_stroke import Information
     from splatsoil.inverse.criticism.simulations import Simulations
-    from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.measurement import ToolMotion
     from splatsoil.model import Model
 
@@ -28,7 +35,7 @@ INTERRUPTED = "finished simulations are kept; go on with"
 
 
 @dataclass(frozen=True)
-class Config(RunOptions):
+class Config(ComputingOptions):
     """Propose the stroke of the tool that is expected to tell most of which model is right.
 
     Starts from a diagnosis. Simulates its probable models under other motions of the tool; the best one is written as
@@ -39,13 +46,10 @@ class Config(RunOptions):
     preset: Preset = option(
         "tiny", "How finely to simulate; differences between models are looked at, for which the coarsest will do."
     )
-    device: str = option("auto", DEVICE)
-    json: bool = option(False, JSON)
 
 
 def run(config: Config) -> int:
     """Simulate other strokes; the result goes into ``design/`` of the run folder."""
-    from splatsoil.files import check_folder
     from splatsoil.inverse.criticism.next_stroke import FEWEST, KEPT, probable
 
     if not FEWEST <= config.draws <= KEPT:
@@ -60,12 +64,7 @@ def run(config: Config) -> int:
     spec = replace(_model.ModelSpec.of(fit), preset=config.preset)
     with _model.loaded(config, folder, spec) as (model, begin):
         result = _designed(config, folder, diagnosis, model, spec, begin("design"))
-
-    def show_all() -> None:
-        show(result)
-        print(f"kept in {folder.path / 'design'}")
-
-    return tell(config, {**result, **_folder.places(folder)}, show_all)
+    return tell(config, result, lambda: show(result), last=f"kept in {folder.path / 'design'}", run=folder)
 
 
 def diagnosis_of(folder: RunFolder) -> dict[str, Any]:
@@ -93,26 +92,14 @@ def _expected(
     draws: Mapping[str, Sequence[Mapping[str, float]]],
     report: Report,
 ) -> tuple[Information, int]:
-    """What a stroke is expected to tell, and how many new simulations and drawings that took.
+    """What another stroke than was measured is expected to tell, and how many new simulations and drawings that took.
 
-    Args:
-        stroke: another one than was measured.
-        measured: the experiment of the measured one.
-        kept: its simulations.
-        folder: the run.
-        spec: of its model.
-        diagnosis: what ``diagnosis.json`` holds.
-        draws: parameters of the model as it is, and of each that is to be told apart.
-        report: progress.
+    ``kept`` are simulations of the measured one; ``draws`` parameters of the model as it is, and of each that is to be
+    told apart.
     """
-    from concurrent.futures import Future
-    from contextlib import nullcontext
-
     from splatsoil.experiment.strokes import StrokeExperiment
-    from splatsoil.files import code_digest
     from splatsoil.inverse.criticism.next_stroke import expected_information, probable, runs_of
     from splatsoil.inverse.criticism.simulations import Helpers, Simulations
-    from splatsoil.inverse.evaluations import digest
 
     seed, model = int(folder.description["seed"]), measured.base
     measurement, reconstruction = stroke.prepared(measured), model.reconstruction
@@ -143,14 +130,9 @@ def _designed(
     config: Config, folder: RunFolder, diagnosis: Mapping[str, Any], model: Model, spec: ModelSpec, report: Report
 ) -> dict[str, Any]:
     """The strokes, the most informative first; kept in ``design/``."""
-    import numpy as np
-
-    from splatsoil import __version__
     from splatsoil.experiment.strokes import strokes
-    from splatsoil.files import write_json, write_text
     from splatsoil.inverse.criticism.evidence import AS_IT_IS
     from splatsoil.inverse.criticism.next_stroke import entropy, probable
-    from splatsoil.run_files import DESIGN_FORMAT
 
     began = time.perf_counter()
     report("light and colours", 0.0)
@@ -210,22 +192,15 @@ def _designed(
 
 def motion_csv(motion: ToolMotion) -> str:
     """A motion as a measurement set's ``tool_motion.csv``."""
-    import numpy as np
-
     from splatsoil.measurement.motion import MOTION_COLUMNS
 
-    rows = np.column_stack([motion.times, motion.positions, motion.quaternions])
-    lines = [
-        ",".join([str(frame), *(repr(float(v)) for v in row)])
-        for frame, row in zip(motion.frames.tolist(), np.round(rows, 9), strict=True)
-    ]
+    rows = np.column_stack([motion.times, motion.positions, motion.quaternions]).round(9).tolist()
+    lines = [",".join([str(frame), *map(repr, row)]) for frame, row in zip(motion.frames.tolist(), rows, strict=True)]
     return "\n".join([",".join(MOTION_COLUMNS), *lines]) + "\n"
 
 
 def show(result: Mapping[str, Any]) -> None:
     """The strokes, what each is expected to tell, and which to make."""
-    from splatsoil.report.text import listed, model_label
-
     models = listed([f"{model_label(name)} ({100.0 * p:.0f} %)" for name, p in result["models"].items()])
     print_text(f"models: {models}; to be told at most: {result['most']:.2f} bits")
     print_table(
@@ -241,17 +216,12 @@ def show(result: Mapping[str, Any]) -> None:
         ),
         left=("motion", "would tell apart"),
     )
-    print_text(best_sentence(result), notes=result["notes"])
-    print(f"{result['simulated_now']} new simulations and drawings, {result['seconds']:.0f} s")
-
-
-def best_sentence(result: Mapping[str, Any]) -> str:
-    """Which stroke, and over which others that can be said."""
-    from splatsoil.report.text import listed
-
     first, *others = result["strokes"]
-    alike = [s["name"] for s in others if not s["less_than_best"]]
     best = f"Most is expected of the stroke {first['name']}: {first['bits']:.2f} ± {first['std']:.2f} bits"
-    if alike:
-        return f"{best}; by these simulations it is not better than {listed(alike)}."
-    return f"{best}, more than of any other." if others else f"{best}."
+    # Better only where that can be said.
+    if alike := [s["name"] for s in others if not s["less_than_best"]]:
+        best += f"; by these simulations it is not better than {listed(alike)}"
+    elif others:
+        best += ", more than of any other"
+    print_text(f"{best}.", notes=result["notes"])
+    print(f"{result['simulated_now']} new simulations and drawings, {result['seconds']:.0f} s")

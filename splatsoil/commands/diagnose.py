@@ -6,16 +6,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from splatsoil.commands import _folder, _laboratory, _model, _stages
-from splatsoil.commands._options import DEVICE, RunOptions
+from splatsoil.commands import _crew, _folder, _laboratory, _model, _stages
+from splatsoil.commands._options import ComputingOptions
 from splatsoil.commands._output import print_table, print_text, tell
-from splatsoil.options import JSON, option
+from splatsoil.files import plain
+from splatsoil.options import option
+from splatsoil.report.text import LITTLE, averaged_sentence, estimate, model_label, no_answer, probability, verdict
 
 INTERRUPTED = "finished simulations are kept; go on with"
 
 
 @dataclass(frozen=True)
-class Config(RunOptions):
+class Config(ComputingOptions):
     """Name the effect that the model lacks, with its probability.
 
     Simulates the model as it is and with each effect that is off, at several sizes; all are compared with all data. A
@@ -25,15 +27,10 @@ class Config(RunOptions):
     effects: tuple[str, ...] = option(
         (), "Effects to consider, by name, or files that define some; all that such data tell if not given."
     )
-    device: str = option("auto", DEVICE)
-    json: bool = option(False, JSON)
 
 
 def run(config: Config) -> int:
     """Diagnose; the result goes into the run folder."""
-    from splatsoil.commands._crew import Crew
-    from splatsoil.files import plain
-    from splatsoil.report.text import no_answer
     from splatsoil.soil.library import find_effects
 
     if _laboratory.is_run(config.run) or _laboratory.is_test(config.run):
@@ -43,23 +40,17 @@ def run(config: Config) -> int:
     none = no_answer(fit)
     folder.check_writable()
     # Helpers begin before what takes seconds to load is loaded.
-    with Crew(folder, config.device, config.effects) as crew:
+    with _crew.Crew(folder, config.device, config.effects) as crew:
         _model.off_effects(config.effects, find_effects(fit["setup"]["effects"]))
         with _model.loaded(config, folder) as (model, begin):
             result = _stages.run_diagnosis(folder, model, begin, config.effects, crew=crew)
     result = {key: value for key, value in result.items() if not (none and key == "estimates")}
-
-    def show_all() -> None:
-        show(result)
-        print(f"kept in {folder.path / 'diagnosis.json'}")
-
-    return tell(config, {**plain(result), **_folder.places(folder)}, show_all, none=none)
+    kept = f"kept in {folder.path / 'diagnosis.json'}"
+    return tell(config, plain(result), lambda: show(result), last=kept, run=folder, none=none)
 
 
 def show(result: Mapping[str, Any]) -> None:
     """The table of models, the verdict, and why; the parameters where ``result`` has them."""
-    from splatsoil.report.text import LITTLE, averaged_sentence, estimate, model_label, probability, verdict
-
     print_table(
         f"models compared with {result['fit']}",
         ("model", "probability", "size", "smallest detectable"),

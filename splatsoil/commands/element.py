@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
+
+from splatsoil.commands._options import ACTING, VALUES
 from splatsoil.commands._output import print_table, tell
-from splatsoil.commands.simulate import ACTING, VALUES, parse_values
+from splatsoil.commands.simulate import parse_values
 from splatsoil.errors import ParameterError
+from splatsoil.files import write_bytes
 from splatsoil.options import JSON, option
+from splatsoil.quiet import hush
 
 if TYPE_CHECKING:
-    from splatsoil.soil.element import ElementTest
     from splatsoil.soil.law import Law
 
 INTERRUPTED = "the plot was not written; start again with"
@@ -56,7 +61,6 @@ LEAST_SPAN, LEAST_STRAIN = 0.02, 1.0e-3
 
 def run(config: Config) -> int:
     """Test, print and plot."""
-    from splatsoil.quiet import hush
     from splatsoil.soil.law import Law
     from splatsoil.soil.library import find_effects
 
@@ -69,12 +73,11 @@ def run(config: Config) -> int:
     law = Law(find_effects(config.effects))
     full = law.require_on({**values, "friction_angle": config.friction_angle})
     refuse_idle(law, full)
-    result = perform(law, full, config)
-    columns = curve(result, config)
+    parameters, columns = perform(law, full, config)
     draw(columns, config)
     told = {
         "test": config.test,
-        "parameters": dict(result.values[0]),
+        "parameters": parameters,
         "effects": [effect.name for effect in law.effects],
         "plot": str(config.plot),
         "records": {name: [float(v) for v in column] for name, column in columns.items()},
@@ -97,10 +100,8 @@ def refuse_idle(law: Law, values: dict[str, float]) -> None:
             raise ParameterError(f"effect {effect.name} does not act on a specimen; leave it out of the element test")
 
 
-def perform(law: Law, values: dict[str, float], config: Config) -> ElementTest:
-    """The test that the options describe."""
-    import numpy as np
-
+def perform(law: Law, values: dict[str, float], config: Config) -> tuple[dict[str, float], dict[str, Any]]:
+    """The parameters, and the curve as columns (records + 1,) each; the first is what the others are plotted over."""
     from splatsoil.soil.element import Options, isotropic_compression, simple_shear, triaxial
     from splatsoil.soil.matching import Matching
 
@@ -114,37 +115,29 @@ def perform(law: Law, values: dict[str, float], config: Config) -> ElementTest:
         depth=config.depth,
         matching=Matching(config.matching),
     )
-    path = np.linspace(0.0, 1.0, config.records + 1)[1:]
+    confining, path = config.confining, np.linspace(0.0, 1.0, config.records + 1)[1:]
+    strains = config.strain * path
     if config.test == "isotropic":
-        top = 10.0 * config.confining if config.pressure is None else config.pressure
-        pressures = config.confining + path * (top - config.confining)
-        return isotropic_compression(law, values, confining=config.confining, pressures=pressures, **options)
-    if config.test == "simple-shear":
-        return simple_shear(law, values, confining=config.confining, strains=config.strain * path, **options)
-    sign = 1.0 if config.test == "triaxial" else -1.0
-    return triaxial(law, values, confining=config.confining, strains=sign * config.strain * path, **options)
-
-
-def curve(result: ElementTest, config: Config) -> dict[str, Any]:
-    """Columns of the one set of parameters, (records + 1,) each; the first is what the others are plotted over."""
-    volume = {"volume strain": result.volume_strain[0], "void ratio": result.void_ratio[0]}
-    if config.test == "isotropic":
-        return {"p [Pa]": result.p[0], **volume}
-    if config.test == "simple-shear":
-        stresses = {"shear stress [Pa]": result.shear_stress[0], "normal stress [Pa]": result.stress[0, :, 2]}
-        return {"shear strain": result.shear_strain[0], **stresses, **volume}
-    return {"axial strain": result.axial_strain[0], "q [Pa]": result.q[0], "p [Pa]": result.p[0], **volume}
+        top = 10.0 * confining if config.pressure is None else config.pressure
+        pressures = confining + path * (top - confining)
+        result = isotropic_compression(law, values, confining=confining, pressures=pressures, **options)
+        columns = {"p [Pa]": result.p[0]}
+    elif config.test == "simple-shear":
+        result = simple_shear(law, values, confining=confining, strains=strains, **options)
+        columns = {"shear strain": result.shear_strain[0], "shear stress [Pa]": result.shear_stress[0]}
+        columns["normal stress [Pa]"] = result.stress[0, :, 2]
+    else:
+        sign = 1.0 if config.test == "triaxial" else -1.0
+        result = triaxial(law, values, confining=confining, strains=sign * strains, **options)
+        columns = {"axial strain": result.axial_strain[0], "q [Pa]": result.q[0], "p [Pa]": result.p[0]}
+    columns |= {"volume strain": result.volume_strain[0], "void ratio": result.void_ratio[0]}
+    return dict(result.values[0]), columns
 
 
 def draw(columns: dict[str, Any], config: Config) -> None:
     """One panel for each column, over the first; written whole or not at all."""
-    import io
-
-    import numpy as np
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
-
-    from splatsoil.files import write_bytes
 
     (across, x), *others = columns.items()
     figure = Figure(figsize=(3.2 * len(others), 2.8), layout="constrained")
@@ -162,12 +155,8 @@ def draw(columns: dict[str, Any], config: Config) -> None:
         axes.set_ylabel("volume strain, + denser" if name == "volume strain" else name)
         axes.grid(alpha=0.3)
     on = ", ".join(Path(name).stem for name in config.effects) or "base law"
-    with_values = " ".join((on, *config.values))
-    figure.suptitle(
-        f"{config.test}, {config.confining:g} Pa, φ = {config.friction_angle:g}°, {with_values}",
-        fontsize=10,
-        parse_math=False,
-    )
+    title = f"{config.test}, {config.confining:g} Pa, φ = {config.friction_angle:g}°, {' '.join((on, *config.values))}"
+    figure.suptitle(title, fontsize=10, parse_math=False)
     stream = io.BytesIO()
     figure.savefig(stream, format=config.plot.suffix[1:], dpi=150)
     write_bytes(config.plot, stream.getvalue())
@@ -175,10 +164,7 @@ def draw(columns: dict[str, Any], config: Config) -> None:
 
 def show(columns: dict[str, Any], config: Config) -> None:
     """A dozen lines of the curve."""
-    import numpy as np
-
-    total = len(next(iter(columns.values())))
-    shown = np.unique(np.linspace(0, total - 1, min(ROWS, total)).astype(int))
+    shown = np.unique(np.linspace(0, config.records, min(ROWS, config.records + 1)).astype(int))
     rows = ([f"{column[k]:.5g}" for column in columns.values()] for k in shown)
     print_table(f"{config.test} test at {config.confining:g} Pa", tuple(columns), rows, left=())
     print(f"plot: {config.plot}")

@@ -9,14 +9,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from splatsoil import __version__
 from splatsoil.commands import _folder, _model
-from splatsoil.commands._options import DEVICE, RunOptions
+from splatsoil.commands._options import ComputingOptions
 from splatsoil.commands._output import by_frame, tell
 from splatsoil.errors import ParameterError, RunError
-from splatsoil.options import JSON, option
+from splatsoil.files import check_folder, plain, write_json
+from splatsoil.inverse.run_folder import RunFolder
+from splatsoil.options import option
+from splatsoil.report.data import estimates, load
 
 if TYPE_CHECKING:
-    from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.model import Model
 
 INTERRUPTED = "nothing was written; start again with"
@@ -24,7 +27,7 @@ Format = Literal["vtk", "usd", "csv", "ply"]
 
 
 @dataclass(frozen=True)
-class Config(RunOptions):
+class Config(ComputingOptions):
     """The prediction for ParaView, Omniverse, spreadsheets, splat viewers.
 
     vtk: ParaView; usd: Omniverse, Blender; csv: spreadsheets; ply: viewers of Gaussian splats.
@@ -42,14 +45,11 @@ class Config(RunOptions):
     every: int | None = option(
         None, "Frames from one that is written to the next; those of the video are written if not given.", expert=True
     )
-    device: str = option("auto", DEVICE)
-    json: bool = option(False, JSON)
 
 
 def run(config: Config) -> int:
     """Simulate and write; all of it or nothing."""
-    from splatsoil.export.writers import check_installed
-    from splatsoil.files import check_folder
+    from splatsoil.export import check_installed
 
     if not config.to:
         raise ParameterError("--to: name a format: vtk, usd, csv or ply")
@@ -64,14 +64,12 @@ def run(config: Config) -> int:
         raise ParameterError(f"--out: {target} is not empty; nothing is overwritten")
     check_folder(target)
     about = _exported(config, folder, formats, target)
-    return tell(config, {**about, **_folder.places(folder)}, lambda: _show(about))
+    return tell(config, about, lambda: _show(about), run=folder)
 
 
 def _exported(config: Config, folder: RunFolder, formats: tuple[str, ...], target: Path) -> dict[str, Any]:
     """Write into a folder beside the target, then move it there; returns what ``export.json`` says."""
-    from splatsoil import __version__
     from splatsoil.export import make_writers, replay
-    from splatsoil.files import plain, write_json
 
     with _model.loaded(config, folder) as (fitted, begin):
         model, values = _chosen(config, folder, fitted)
@@ -104,8 +102,6 @@ def _exported(config: Config, folder: RunFolder, formats: tuple[str, ...], targe
 
 def _chosen(config: Config, folder: RunFolder, model: Model) -> tuple[Model, dict[str, float]]:
     """The model to simulate, and its parameters."""
-    from splatsoil.report.data import estimates, load
-
     if config.model == "fit":
         return model, estimates(folder.fit())
     diagnosis = load(folder.path).diagnosis

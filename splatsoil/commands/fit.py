@@ -8,7 +8,8 @@ from typing import Any
 
 from splatsoil.commands import _folder, _laboratory, _stages
 from splatsoil.commands._options import FitOptions, command_line
-from splatsoil.commands._output import print_parameters, print_text, stages, tell
+from splatsoil.commands._output import print_parameters, stages, tell
+from splatsoil.report.text import duration, model_name
 
 INTERRUPTED = _stages.kept
 
@@ -30,21 +31,12 @@ def run(config: Config) -> int:
         folder, _, result = _stages.fitted(config, begin)
     compare = command_line("compare", folder.path)
     _folder.require_answer(folder, result, f"`{compare}` shows where")
-
-    def show_all() -> None:
-        show(result, str(folder.path))
-        print("Does the model leave more than noise, and where?", compare)
-
-    return tell(config, {**result, **_folder.places(folder)}, show_all)
+    asks = f"Does the model leave more than noise, and where? {compare}"
+    return tell(config, result, lambda: show(result, str(folder.path)), last=asks, run=folder)
 
 
 def show(result: Mapping[str, Any], folder: str) -> None:
     """A table of the parameters, and what to know about them."""
-    from splatsoil.report.text import duration, model_name
-
-    print_parameters(model_name(result["name"]), result, "estimate", {})
-    print_text(
-        f"loss {result['loss']:.4g} ± {result['loss_std']:.2g} at the estimate; {result['evaluations']} evaluations "
-        f"in {duration(result['seconds'])}",
-        f"kept in {folder}",
-    )
+    loss = f"loss {result['loss']:.4g} ± {result['loss_std']:.2g} at the estimate; {result['evaluations']} evaluations"
+    said = (f"{loss} in {duration(result['seconds'])}", f"kept in {folder}")
+    print_parameters(model_name(result["name"]), result, "estimate", {}, *said)

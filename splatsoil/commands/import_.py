@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 from splatsoil.commands._options import command_line
 from splatsoil.commands._output import stages, tell
+from splatsoil.files import plain
 from splatsoil.importing.options import ImportOptions
 from splatsoil.options import JSON, option
+from splatsoil.quiet import hush
 
 if TYPE_CHECKING:
     from splatsoil.importing.build import Imported
@@ -26,7 +28,6 @@ class Config(ImportOptions):
 def run(config: Config) -> int:
     """Import; MeasurementError for whatever is missing or faulty, with nothing written."""
     from splatsoil.importing.build import import_set
-    from splatsoil.quiet import hush
 
     if config.needs_clock:
         hush()
@@ -36,8 +37,6 @@ def run(config: Config) -> int:
 
 
 def _as_json(config: Config, made: Imported) -> dict[str, Any]:
-    from splatsoil.files import plain
-
     clock = None if made.clock is None else {"seconds": made.clock.seconds, "by_camera": made.clock.by_camera}
     return plain(
         {

@@ -6,17 +6,22 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from splatsoil.commands import _folder, _model, _stages
-from splatsoil.commands._options import RunOptions, check_seed, command_line
-from splatsoil.commands._output import print_parameters, print_text, stages, tell
+from splatsoil import __version__
+from splatsoil.commands import _crew, _folder, _model, _stages
+from splatsoil.commands._options import ComputingOptions, check_seed, command_line
+from splatsoil.commands._output import print_parameters, stages, tell
+from splatsoil.envs.devices import resolve_device
 from splatsoil.errors import ParameterError
-from splatsoil.options import JSON, option
+from splatsoil.files import code_of
+from splatsoil.options import option
+from splatsoil.quiet import hush
+from splatsoil.report.text import duration, model_name
 
 INTERRUPTED = "what was simulated is kept; go on with"
 
 
 @dataclass(frozen=True)
-class Config(RunOptions):
+class Config(ComputingOptions):
     """Sample the posterior: intervals, correlations, ArviZ file.
 
     It is the posterior that the estimate and ± of the latest fit are of.
@@ -25,17 +30,11 @@ class Config(RunOptions):
     checks: int = option(3, "Simulations at points drawn from the posterior, which test the emulator.", expert=True)
     device: str = option("auto", "Where to compute: auto (what the fit used), cpu, cuda:0, …")
     seed: int = option(0, "Of chains and checks.", expert=True)
-    json: bool = option(False, JSON)
 
 
 def run(config: Config) -> int:
     """Compare as the fit did, sample, check; ``posterior.json`` and the folder ``posterior`` are kept."""
-    from splatsoil import __version__
-    from splatsoil.commands._crew import Crew
-    from splatsoil.envs.devices import resolve_device
-    from splatsoil.files import code_of
     from splatsoil.inverse.posterior import Density, run_posterior
-    from splatsoil.quiet import hush
 
     check_seed(config.seed)
     if config.checks < 0:
@@ -62,7 +61,7 @@ def run(config: Config) -> int:
     with stages(quiet=config.json) as begin:
         model = _model.model_of(folder, device, begin("reconstruct"))
         experiment, simulate = _model.experiment_of(folder, model, spec, ())
-        with folder.lock(), Crew(folder, device, ()) as crew, crew.helping(spec, experiment, simulate):
+        with folder.lock(), _crew.Crew(folder, device, ()) as crew, crew.helping(spec, experiment, simulate):
             seed = folder.description["seed"]
             found = _stages.compare_models(experiment, simulate, fit, begin("models"), seed, with_effects=False)
             result = run_posterior(
@@ -74,17 +73,18 @@ def run(config: Config) -> int:
                 seed=config.seed,
                 progress=begin("posterior"),
             )
-    return tell(config, {**result, **_folder.places(folder)}, lambda: show(result, str(folder.path)))
+    return tell(config, result, lambda: show(result, str(folder.path)), run=folder)
 
 
 def show(result: Mapping[str, Any], folder: str) -> None:
     """A table of the parameters, and what to know about them."""
-    from splatsoil.report.text import duration, model_name
-
     more = {"width / prior": lambda p: f"{p['contraction']:.2f}", "": lambda p: str(p["verdict"])}
-    print_parameters(f"posterior, {model_name(result['fit'])}", result, "mean", more)
     chains = result["chains"]
-    print_text(
+    print_parameters(
+        f"posterior, {model_name(result['fit'])}",
+        result,
+        "mean",
+        more,
         f"{result['simulations']} simulations; R-hat {chains['r_hat']:.3f}, acceptance {chains['acceptance']:.2f}, "
         f"{chains['effective']:.0f} independent samples; {duration(result['seconds'])}",
         f"kept in {folder}: posterior.json, posterior/",

@@ -8,7 +8,10 @@ from typing import TYPE_CHECKING
 
 from splatsoil.commands._options import PRESET, SEED, SET, Preset, check_seed
 from splatsoil.commands._output import print_remarks, print_table, print_text, stages, tell
+from splatsoil.envs.devices import resolve_device
+from splatsoil.files import check_folder
 from splatsoil.options import JSON, argument, option
+from splatsoil.quiet import hush
 
 if TYPE_CHECKING:
     from splatsoil.reconstruction import Reconstruction
@@ -31,10 +34,7 @@ class Config:
 
 def run(config: Config) -> int:
     """Reconstruct, save, print; an error before any work when set, options or the folder for the result are no good."""
-    from splatsoil.envs.devices import resolve_device
-    from splatsoil.files import check_folder
     from splatsoil.measurement import Measurement
-    from splatsoil.quiet import hush
     from splatsoil.reconstruction import reconstruct
 
     check_seed(config.seed)
@@ -62,9 +62,8 @@ def _show(result: Reconstruction, out: Path) -> None:
     rows = [(view.name, f"{view.psnr:.2f}", f"{view.ssim:.3f}") for view in result.held_out]
     if rows:
         rows.append(("mean", f"{result.psnr:.2f}", f"{result.ssim:.3f}"))
-    print_table(
-        f"reconstruction of {result.metadata['measurement']}", ("photograph set aside", "PSNR in dB", "SSIM"), rows
-    )
+    title = f"reconstruction of {result.metadata['measurement']}"
+    print_table(title, ("photograph set aside", "PSNR in dB", "SSIM"), rows)
     height = result.surface.height
     print_text(
         f"{len(result.gaussians)} Gaussians ({int(result.soil.sum())} soil, {int(result.tool.sum())} tool); "

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from splatsoil import report
 from splatsoil.commands import _folder
 from splatsoil.commands._options import RunOptions
 from splatsoil.commands._output import tell
-from splatsoil.options import JSON, option
+from splatsoil.run_files import read_fit
 
 INTERRUPTED = "the page was not written; start again with"
 
@@ -16,16 +17,11 @@ INTERRUPTED = "the page was not written; start again with"
 class Config(RunOptions):
     """Write the page report.html of a run."""
 
-    json: bool = option(False, JSON)
-
 
 def run(config: Config) -> int:
     """Write the page; RunError when the folder has no finished fit."""
-    from splatsoil.report import write_report
-    from splatsoil.run_files import read_fit
-
     folder = _folder.opened(config)
     _folder.note_other_sources(folder)
-    path = write_report(folder.path)
+    path = report.write_report(folder.path)
     _folder.require_answer(folder, read_fit(folder.path), f"report: {path}")
-    return tell(config, {**_folder.places(folder), "report": str(path)}, lambda: print(f"report: {path}"))
+    return tell(config, {"report": str(path)}, last=f"report: {path}", run=folder)

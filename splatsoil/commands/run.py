@@ -6,15 +6,17 @@ import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from splatsoil import report
 from splatsoil.commands import _folder, _stages, add, compare, diagnose, fit
 from splatsoil.commands._options import FitOptions, command_line
-from splatsoil.commands._output import print_json, stages
+from splatsoil.commands._output import Stage, stages, tell
 from splatsoil.errors import ParameterError, SplatsoilError
+from splatsoil.files import plain, read_json
+from splatsoil.inverse.run_folder import RunFolder
 from splatsoil.options import option
+from splatsoil.report.text import called_adequate
 
 if TYPE_CHECKING:
-    from splatsoil.commands._output import Stage
-    from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.model import Model
 
 INTERRUPTED = _stages.kept
@@ -36,16 +38,13 @@ class Config(FitOptions):
 
 def run(config: Config) -> int:
     """Each stage in turn; what the run folder has already isn't done again."""
-    from splatsoil.files import plain, read_json
-    from splatsoil.report import write_report
-    from splatsoil.report.text import called_adequate
-
     if config.most_effects < 0:
         raise ParameterError(f"--most-effects: must be 0 or more, not {config.most_effects}")
-    stopped, diagnosis, misfit, unknown = "", None, None, ""
+    stopped, diagnosis, misfit = "", None, None
     with stages(quiet=config.json) as begin:
         folder, model, result = _stages.fitted(config, begin)
         comparison = _stages.draw_comparison(folder, model, begin("compare"))
+        unknown = ""
         try:
             if config.stop_at_floor:
                 misfit = _stages.check_adequacy(folder, model, begin("models"))
@@ -55,31 +54,32 @@ def run(config: Config) -> int:
         except SplatsoilError as error:  # the fit stands all the same
             unknown = f"whether the model is adequate isn't known: {error}"
         begin("report")("drawing figures", 0.0)
-        page = write_report(folder.path)
+        page = report.write_report(folder.path)
     if unknown:
         print(unknown, file=sys.stderr)
     _folder.require_answer(folder, result, f"report: {page}")
-    entries = [] if diagnosis is None else _folder.history(folder)
-    if config.json:
-        losses = {key: comparison[key] for key in ("loss", "total", "noise")}
-        extra: dict[str, Any] = {} if misfit is None else {"misfit": {key: misfit[key] for key in compare.MISFIT}}
-        if diagnosis is not None:
-            kept = plain({key: diagnosis[key] for key in DIAGNOSIS})
-            extra = {"diagnosis": kept, "models": entries, "stopped": stopped}
-        told = {"report": str(page), "comparison": losses, **extra, **result, **_folder.places(folder)}
-        print_json({"ok": True, **told})
-        return 0
-    fit.show(result, str(folder.path))
-    compare.show(comparison, str(folder.comparison), called_adequate(result, diagnosis or misfit))
+    told: dict[str, Any] = {
+        "report": str(page),
+        "comparison": {key: comparison[key] for key in ("loss", "total", "noise")},
+    }
+    models = [] if diagnosis is None else add.history(folder)["models"]
+    if misfit is not None:
+        told["misfit"] = {key: misfit[key] for key in compare.MISFIT}
     if diagnosis is not None:
-        if entries:
-            add.show(entries)
-        diagnose.show(diagnosis)
-        print(f"Stopped because {stopped}.")
-    elif misfit is not None:
-        compare.show_misfit(misfit, str(folder.path))
-    print(f"report: {page}")
-    return 0
+        told |= {"diagnosis": plain({key: diagnosis[key] for key in DIAGNOSIS}), "models": models, "stopped": stopped}
+
+    def show() -> None:
+        fit.show(result, str(folder.path))
+        compare.show(comparison, str(folder.comparison), called_adequate(result, diagnosis or misfit))
+        if models:
+            add.show(models)
+        if diagnosis is not None:
+            diagnose.show(diagnosis)
+            print(f"Stopped because {stopped}.")
+        elif misfit is not None:
+            compare.show_misfit(misfit, str(folder.path))
+
+    return tell(config, {**told, **result}, show, last=f"report: {page}", run=folder)
 
 
 def add_missing(folder: RunFolder, model: Model, most: int, begin: Stage) -> tuple[dict[str, Any], str]:

@@ -8,18 +8,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from splatsoil.commands import _laboratory
-from splatsoil.commands._options import Preset, check_seed
+from splatsoil.commands._options import ACTING, VALUES, Preset, check_seed
 from splatsoil.commands._output import print_table, stages, tell
 from splatsoil.errors import ParameterError
 from splatsoil.options import JSON, argument, option
+from splatsoil.quiet import hush
 
 if TYPE_CHECKING:
     from splatsoil.synthetic import Setup, World
 
 INTERRUPTED = "nothing was written; start again with"
-#: Texts of options that an element test has, too.
-ACTING = "Effects that act, or files that define some."
-VALUES = "Parameters of the effects."
 
 
 @dataclass(frozen=True)
@@ -59,7 +57,6 @@ class Config:
 
 def run(config: Config) -> int:
     """Make the set; ParameterError for options that make no sense, before anything is computed."""
-    from splatsoil.quiet import hush
     from splatsoil.synthetic import make_set
     from splatsoil.synthetic.world import check_place
 

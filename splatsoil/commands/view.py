@@ -14,7 +14,10 @@ from splatsoil.commands import _model
 from splatsoil.commands._options import DEVICE
 from splatsoil.commands._output import by_frame
 from splatsoil.errors import ParameterError, RunError
+from splatsoil.inverse.run_folder import RunFolder
 from splatsoil.options import argument, option
+from splatsoil.report.data import estimates, load
+from splatsoil.report.text import amount
 
 if TYPE_CHECKING:
     from splatsoil.measurement import Measurement
@@ -65,10 +68,7 @@ def _loaded(config: Config) -> tuple[Measurement, list[Column]]:
     """The set, and predictions of a run's fits, the latest first."""
     from splatsoil.comparison import Comparator
     from splatsoil.export import replay
-    from splatsoil.inverse.run_folder import RunFolder
     from splatsoil.measurement import Measurement
-    from splatsoil.report.data import estimates, load
-    from splatsoil.report.text import amount
     from splatsoil.view import Column
 
     if not (config.folder / "run.json").is_file():

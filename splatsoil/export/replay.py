@@ -47,6 +47,18 @@ class Moment:
     tool: tuple[FloatArray, FloatArray]
     surface: Relief
 
+    @property
+    def surface_points(self) -> Floats:
+        """The surface's cell centres (ny * nx, 3) in m, row after row."""
+        return np.ascontiguousarray(self.surface.points.reshape(-1, 3).cpu().numpy(), dtype=np.float32)
+
+    @property
+    def surface_quads(self) -> npt.NDArray[np.int32]:
+        """Quadrilaterals (k, 4) between these points, counter-clockwise as seen from above."""
+        ny, nx = self.surface.height.shape
+        corner = np.arange(ny * nx, dtype=np.int32).reshape(ny, nx)[:-1, :-1].reshape(-1, 1)
+        return corner + np.array([0, 1, nx + 1, nx], dtype=np.int32)
+
 
 class Writer(Protocol):
     """Writes moments in one format."""
@@ -82,27 +94,16 @@ def replay(
         ParameterError: unknown names or values out of bounds.
     """
     measurement, resolution = model.measurement, model.resolution
-    bed, motion = measurement.bed.domain, measurement.tool.motion
+    bed, tool = measurement.bed.domain, measurement.tool
     start = model.particles(seed).astype(np.float32)
-    settings = base_settings(measurement)
-    solver = Solver(
-        start[None],
-        bed.lower,
-        bed.upper,
-        measurement.tool.mesh,
-        resolution,
-        model.law,
-        settings,
-        [values],
-        model.device,
-    )
-    wanted = set(frames)
+    soil = (model.law, base_settings(measurement), [values])
+    solver = Solver(start[None], bed.lower, bed.upper, tool.mesh, resolution, *soil, model.device)
+    wanted, force = set(frames), []
     last = max(wanted)
-    force = []
     for frame in range(last + 1):
         if frame > 0:
             began = (frame - 1) * resolution.frame_time
-            force.append(solver.advance(step_poses(motion, began, resolution.frame_time, resolution.steps))[0])
+            force.append(solver.advance(step_poses(tool.motion, began, resolution.frame_time, resolution.steps))[0])
         if frame in wanted:
             moment = _moment(model, solver, frame, start)
             for writer in writers:

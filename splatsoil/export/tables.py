@@ -11,7 +11,6 @@ import numpy as np
 import numpy.typing as npt
 
 from splatsoil.export.replay import Moment
-from splatsoil.export.shapes import surface_points
 from splatsoil.files import write_text
 from splatsoil.model import Model
 
@@ -30,7 +29,7 @@ class CsvWriter:
 
     def add(self, moment: Moment) -> None:
         """Keep one frame's heights."""
-        points = surface_points(moment.surface)
+        points = moment.surface_points
         if not self.columns:
             heights = self.model.reconstruction.surface.sample(points[:, :2].astype(np.float64))
             self.columns = {"x": points[:, 0], "y": points[:, 1], "reconstructed": heights}

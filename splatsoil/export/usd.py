@@ -11,7 +11,6 @@ from pxr import Gf, Usd, UsdGeom, Vt
 
 from splatsoil.colour import linear
 from splatsoil.export.replay import Moment
-from splatsoil.export.shapes import surface_points, surface_quads
 from splatsoil.model import Model
 
 
@@ -60,9 +59,9 @@ class UsdWriter:
         # USD multiplies row vectors.
         self.pose.Set(Gf.Matrix4d(matrix.T.tolist()), code)
 
-        points = surface_points(moment.surface)
+        points = moment.surface_points
         if not self.surface.GetFaceVertexCountsAttr().HasAuthoredValue():
-            _topology(self.surface, surface_quads(moment.surface))
+            _topology(self.surface, moment.surface_quads)
         _vectors(self.surface.CreatePointsAttr(), points, code)
         _vectors(self.surface.CreateExtentAttr(), np.stack([points.min(axis=0), points.max(axis=0)]), code)
 

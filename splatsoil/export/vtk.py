@@ -13,7 +13,6 @@ import numpy as np
 import numpy.typing as npt
 
 from splatsoil.export.replay import Moment
-from splatsoil.export.shapes import surface_points, surface_quads
 from splatsoil.files import write_text
 from splatsoil.model import Model
 
@@ -30,22 +29,18 @@ class VtkWriter:
     def add(self, moment: Moment) -> None:
         """Write one frame."""
         count = len(moment.positions)
-        fields = {
-            "velocity": moment.velocities,
-            "displacement": moment.displacements,
-            "pressure": moment.pressures,
-        }
+        fields = {"velocity": moment.velocities, "displacement": moment.displacements, "pressure": moment.pressures}
         if moment.plastic_strains is not None:
             fields["plastic_strain"] = moment.plastic_strains
         self._write("particles", moment, moment.positions, ("vertex", np.arange(count)[:, None]), fields)
         rotation, position = moment.tool
         corners = self.mesh.vertices @ rotation.T + position
         self._write("tool", moment, corners, ("triangle", np.asarray(self.mesh.faces)), {})
-        points = surface_points(moment.surface)
+        points = moment.surface_points
         if self.first is None:
             self.first = points[:, 2]
         rise = {"height_change": points[:, 2] - self.first}
-        self._write("surface", moment, points, ("quad", surface_quads(moment.surface)), rise)
+        self._write("surface", moment, points, ("quad", moment.surface_quads), rise)
         self.times.append((moment.frame, moment.time))
 
     def finish(self, force: npt.NDArray[np.float64]) -> None:

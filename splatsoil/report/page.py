@@ -18,6 +18,12 @@ from splatsoil.report.data import RunData, load, read_picture
 
 HERE = Path(__file__).parent
 KINDS = ("observed", "predicted", "difference")
+#: What the template asks: words for numbers, and sentences and figures.
+WORDS = (text.duration, text.estimate, text.model_label, text.model_name, text.probability)
+DRAWN = (
+    *(text.fitted_sentence, text.posterior_sentences, text.posterior_notes),
+    *(figures.surrogate, figures.marginal, figures.losses, figures.surface_map),
+)
 OUTLINED = 3
 """Blocks that fail and are drawn on their photographs."""
 
@@ -49,56 +55,37 @@ def render(data: RunData) -> str:
     environment = Environment(
         loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters.update(
-        duration=text.duration,
-        estimate=text.estimate,
-        label=text.model_label,
-        model=text.model_name,
-        probability=text.probability,
-    )
-    comparison, diagnosis = data.comparison, data.diagnosis
-    judged, no_answer = data.judged, text.no_answer(data.fit)
-    adequate = text.called_adequate(data.fit, judged)
-    ratio = text.ratio_to_noise(comparison)
-    at_the_noise = ratio is not None and ratio <= text.AT_THE_NOISE
-    pictures = None if comparison is None else _pictures(data.folder / "comparison", comparison)
+    environment.filters.update({function.__name__: function for function in WORDS})
+    environment.globals.update({function.__name__: function for function in DRAWN})
+    comparison, judged, no_answer = data.comparison, data.judged, text.no_answer(data.fit)
+    adequate, ratio = text.called_adequate(data.fit, judged), text.ratio_to_noise(comparison)
+    pictures = [] if comparison is None else _pictures(data.folder / "comparison", comparison)
     kinds = list(KINDS)
-    if pictures is not None and data.before is not None:
+    if pictures and data.before is not None and _join(pictures, _pictures(data.folder / "before", data.before)):
         # Observed, before, after, difference: what the added effect changed.
-        earlier = _pictures(data.folder / "before", data.before)
-        if _join(pictures, earlier):
-            kinds.insert(1, "before")
-    order = sorted(data.fits, key=lambda name: (name != "base", -data.fits[name]["loss"]))
+        kinds.insert(1, "before")
     return environment.get_template("page.html").render(
         style=Markup((HERE / "page.css").read_text(encoding="utf-8")),
         script=Markup((HERE / "page.js").read_text(encoding="utf-8")),
         program=splatsoil.__version__,
+        text=text,
         data=data,
         fit=data.fit,
+        judged=judged,
         no_answer=no_answer,
         answers=[] if no_answer else text.answers(data.fit, judged, data.truth),
         adequate=adequate,
-        fitted=text.fitted_sentence(data.fit, judged),
         residual=text.residual_sentence(comparison, adequate) if judged is None else text.misfit_sentence(judged),
-        calm=at_the_noise if adequate is None else adequate,
-        by_comparison=data.fit["estimated_from"] == "comparison",
-        forces=_forces(data, judged),
-        surrogates={name: figures.surrogate(data.fit, name) for name in data.fit["parameters"]},
-        losses=None if comparison is None else figures.losses(comparison),
+        calm=(ratio is not None and ratio <= text.AT_THE_NOISE) if adequate is None else adequate,
+        findings=_findings(data, judged),
+        falling=_falling(data),
         pictures=pictures,
         kinds=kinds,
         titles={"predicted": "after"} if "before" in kinds else {},
-        findings=_findings(data, judged),
-        models=[] if diagnosis is None else diagnosis["models"],
-        little=text.LITTLE,
-        judged=judged,
+        forces=_forces(data, judged),
         failing=None if judged is None else _failing(judged, comparison, data.folder / "comparison"),
-        significant=text.SIGNIFICANT,
-        beyond=text.BEYOND,
-        posterior=None if data.posterior is None else _posterior(data.folder, data.posterior),
-        falling=_falling(data),
-        surface=None if data.surface is None else figures.surface_map(data.surface),
-        order=order,
+        corner=_corner(data),
+        order=sorted(data.fits, key=lambda name: (name != "base", -data.fits[name]["loss"])),
     )
 
 
@@ -133,17 +120,11 @@ def _join(pictures: list[dict[str, Any]], earlier: list[dict[str, Any]]) -> bool
     return True
 
 
-def _posterior(folder: Path, posterior: Mapping[str, Any]) -> dict[str, Any]:
-    """Sentences, one figure for each parameter, and the corner picture where there are several."""
-    corner = folder / "posterior" / "corner.png"
-    return {
-        "sentences": text.posterior_sentences(posterior),
-        "notes": text.posterior_notes(posterior),
-        "marginals": [figures.marginal(entry) for entry in posterior["parameters"].values()],
-        "corner": data_url(corner, "posterior") if len(posterior["parameters"]) > 1 and corner.is_file() else None,
-        "simulations": posterior["simulations"],
-        "chains": posterior["chains"],
-    }
+def _corner(data: RunData) -> str:
+    """The picture of every pair of parameters of a posterior, where it has several."""
+    file = data.folder / "posterior" / "corner.png"
+    there = data.posterior is not None and len(data.posterior["parameters"]) > 1 and file.is_file()
+    return data_url(file, "posterior") if there else ""
 
 
 def _findings(data: RunData, judged: Mapping[str, Any] | None) -> list[dict[str, Any]]:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import Any
+
+import numpy as np
 
 #: Loss of a prediction in which nothing moves. The loss is measured in units of it, so this is no choice of ours: a
 #: model that comes to it has explained nothing of what was seen, wherever its estimate lies.
@@ -20,25 +21,6 @@ BEYOND = 2.0
 BEFORE = "before"
 #: Probabilities this close to 0 or to 1 are given as a limit: the evidences aren't known any better.
 LITTLE = 0.005
-
-
-@dataclass(frozen=True)
-class Answer:
-    """A fitted parameter as a reader wants it.
-
-    Attributes:
-        name: "friction angle".
-        number: "35.6 ± 0.8°".
-        state: ``determined``, ``bound`` or ``open``.
-        remark: one sentence when the state isn't ``determined``.
-        truth: "36.0°" where the set is simulated and says it, else empty.
-    """
-
-    name: str
-    number: str
-    state: str
-    remark: str
-    truth: str = ""
 
 
 def with_std(value: float, std: float) -> tuple[str, str]:
@@ -77,8 +59,13 @@ def called_adequate(fit: Mapping[str, Any], judged: Mapping[str, Any] | None) ->
 
 def answers(
     fit: Mapping[str, Any], judged: Mapping[str, Any] | None = None, truth: Mapping[str, float] | None = None
-) -> list[Answer]:
-    """The parameters: averaged over models where a diagnosis or a comparison of this fit is there, else as fitted."""
+) -> list[dict[str, str]]:
+    """The parameters as a reader wants them: averaged over models where a diagnosis or a comparison of this fit is
+    there, else as fitted.
+
+    Each has a ``name`` ("friction angle"), a ``number`` ("35.6 ± 0.8°"), a ``state`` (``determined``, ``bound`` or
+    ``open``), a ``remark`` where that isn't ``determined``, and the ``truth`` ("36.0°") where a simulated set says it.
+    """
     out, better = [], averaged(fit, judged)
     for name, entry in fit["parameters"].items():
         plain, state, remark = name.replace("_", " "), "determined", ""
@@ -97,7 +84,8 @@ def answers(
         unit, true = symbol(entry["unit"]), (truth or {}).get(name)
         decimals = len(value.partition(".")[2])
         said = "" if true is None else f"{true:.{decimals}f}{unit}"
-        out.append(Answer(plain, f"{value} ± {std}{unit}", state, remark, said))
+        number = f"{value} ± {std}{unit}"
+        out.append({"name": plain, "number": number, "state": state, "remark": remark, "truth": said})
     return out
 
 
@@ -173,8 +161,15 @@ def residual_sentence(comparison: Mapping[str, Any] | None, adequate: bool | Non
     left = f"The misfit is {percent(total / rest)} of that of soil at rest" if rest else ""
     ratio = ratio_to_noise(comparison)
     if ratio is None:
-        unknown = f"Its ratio to the camera noise is unknown: {_no_noise(comparison)}."
-        return f"{left}. {unknown}" if left else unknown
+        unknown = "the set has no pre-roll frames to measure the noise on"
+        if comparison.get("noise", {}).get(name) is not None:
+            from splatsoil.experiment.plow import LEAST_NOISE
+
+            unknown = (
+                "the frames before the tool moves are equal to the last bit, so they show no noise; a standard "
+                f"deviation of {LEAST_NOISE:g} grey levels is assumed"
+            )
+        return (f"{left}. " if left else "") + f"Its ratio to the camera noise is unknown: {unknown}."
     if ratio <= AT_THE_NOISE and adequate is not False:
         return f"The misfit is {ratio:.1f} × the camera noise: nothing more to explain here."
     above = f"{ratio:.{1 if ratio < 10.0 else 0}f} × the camera noise"
@@ -189,21 +184,9 @@ def residual_sentence(comparison: Mapping[str, Any] | None, adequate: bool | Non
     )
 
 
-def _no_noise(comparison: Mapping[str, Any]) -> str:
-    """Why a comparison has no noise to be measured by."""
-    if comparison.get("noise", {}).get(comparison["loss"]) is None:
-        return "the set has no pre-roll frames to measure the noise on"
-    from splatsoil.experiment.plow import LEAST_NOISE
-
-    return (
-        "the frames before the tool moves are equal to the last bit, so they show no noise; a standard deviation of "
-        f"{LEAST_NOISE:g} grey levels is assumed"
-    )
-
-
 def verdict(diagnosis: Mapping[str, Any]) -> str:
     """The diagnosis in one line."""
-    named = _joined([name.replace("_", " ") for name in diagnosis["class"]], "or")
+    named = listed([name.replace("_", " ") for name in diagnosis["class"]], "or")
     said = {
         "adequate": "The model is adequate.",
         "missing": f"Missing: {named}.",
@@ -232,8 +215,13 @@ def misfit_sentence(judged: Mapping[str, Any]) -> str:
 def misfit(judged: Mapping[str, Any]) -> float | None:
     """Root mean square of residual over expected standard deviation, all features of the most probable model; None
     where nothing is compared."""
-    values = [v for row in judged["maps"][most_probable(judged)] for v in row if v is not None]
-    return math.sqrt(sum(v * v for v in values) / len(values)) if values else None
+    table = _residuals(judged)
+    return float(np.sqrt(np.nanmean(table**2))) if np.isfinite(table).any() else None
+
+
+def _residuals(judged: Mapping[str, Any]) -> np.ndarray:
+    """Residual over expected standard deviation (times, sites) of the most probable model, NaN where there is none."""
+    return np.array(judged["maps"][most_probable(judged)], dtype=np.float64)
 
 
 def most_probable(judged: Mapping[str, Any]) -> str:
@@ -253,7 +241,7 @@ def begins(judged: Mapping[str, Any], check: Mapping[str, Any]) -> str:
     """When a check's block begins to fail: the first time at which its root mean square residual is beyond `BEYOND`
     expected standard deviations."""
     rows = block_rows(judged, check)
-    first = next((row for row, values in rows.items() if _root_mean_square(values.values()) > BEYOND), None)
+    first = next((row for row, values in rows.items() if _root_mean_square(values) > BEYOND), None)
     if first is None:
         return f"No {judged['time_name']} by itself is beyond {BEYOND:g} expected standard deviations."
     return f"It begins at {judged['time_name']} {judged['times'][first]:g}."
@@ -261,28 +249,22 @@ def begins(judged: Mapping[str, Any], check: Mapping[str, Any]) -> str:
 
 def worst_row(judged: Mapping[str, Any], check: Mapping[str, Any]) -> tuple[int, dict[int, float]]:
     """The row in which a check's block fails most, and its residuals there by site."""
-    return max(block_rows(judged, check).items(), key=lambda item: _root_mean_square(item[1].values()))
+    return max(block_rows(judged, check).items(), key=lambda item: _root_mean_square(item[1]))
 
 
 def block_rows(judged: Mapping[str, Any], check: Mapping[str, Any]) -> dict[int, dict[int, float]]:
     """Residual over expected standard deviation by row and site in a check's block."""
-    table, channels = judged["maps"][most_probable(judged)], [site[0] for site in judged["sites"]]
-    out = {}
-    for row, stage in enumerate(judged["stages"]):
-        places = zip(table[row], judged["regions"][row], channels, strict=True)
-        mine = {
-            site: float(value)
-            for site, (value, region, channel) in enumerate(places)
-            if value is not None and (region, channel) == (check["region"], check["channel"])
-        }
-        if stage == check["stage"] and mine:
-            out[row] = mine
+    table, out = _residuals(judged), dict[int, dict[int, float]]()
+    mine = np.isfinite(table) & (np.array(judged["regions"]) == check["region"])
+    mine &= np.array([site[0] for site in judged["sites"]]) == check["channel"]
+    mine &= (np.array(judged["stages"]) == check["stage"])[:, None]
+    for row, site in np.argwhere(mine).tolist():
+        out.setdefault(row, {})[site] = float(table[row, site])
     return out
 
 
-def _root_mean_square(values: Iterable[float]) -> float:
-    squares = [v * v for v in values]
-    return math.sqrt(sum(squares) / len(squares))
+def _root_mean_square(values: Mapping[int, float]) -> float:
+    return math.sqrt(sum(v * v for v in values.values()) / len(values))
 
 
 def model_label(name: str) -> str:
@@ -351,12 +333,8 @@ def title(name: str) -> str:
     return name.replace("_", " ").capitalize()
 
 
-def listed(words: list[str]) -> str:
+def listed(words: Sequence[str], last: str = "and") -> str:
     """a, b and c."""
-    return _joined(words, "and")
-
-
-def _joined(words: Sequence[str], last: str) -> str:
     return f" {last} ".join(part for part in (", ".join(words[:-1]), *words[-1:]) if part)
 
 

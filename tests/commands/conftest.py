@@ -1,4 +1,4 @@
-"""A run folder with a finished fit, which nothing was simulated for, and sets that are quickly simulated."""
+"""Stages that are not run, and sets that are quickly simulated."""
 
 from __future__ import annotations
 
@@ -7,61 +7,45 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from PIL import Image
 from splatsoil.inverse.run_folder import RunFolder
 
-from splatsoil import __version__
-from splatsoil.commands import _model, _stages
-from splatsoil.files import code_of, write_json
+from splatsoil import cli
+from splatsoil.commands import _crew, _model, _stages, add
+from splatsoil.files import write_json
 
 
-@pytest.fixture
-def fit_of() -> Callable[..., dict[str, Any]]:
-    """Makes what ``fit.json`` holds of a model with some effects, by the sources as they are."""
+@pytest.fixture(scope="session")
+def words() -> Callable[..., list[str]]:
+    """The words of a command on a run folder, with what it needs."""
 
-    def make(effects: Sequence[str] = (), **values: float) -> dict[str, Any]:
-        estimates = {"friction_angle": 35.0, **values}
-        setup = {"effects": sorted(effects), "preset": "tiny", "device": "cpu", "version": __version__}
-        return {
-            "format": "splatsoil-fit/2",
-            "name": "+".join(sorted(effects)) or "base",
-            "loss": 0.5,
-            "loss_std": 0.1,
-            "best": {"loss": 0.5},
-            "evaluations": 10,
-            "parameters": {
-                name: {
-                    "estimate": value,
-                    "std": 1.0,
-                    "unit": "1",
-                    "title": name,
-                    "bounds": [value - 10.0, value + 10.0],
-                    "at_bound": None,
-                    "off": None,
-                }
-                for name, value in estimates.items()
-            },
-            "minimum": {name: {"estimate": v, "low": v - 1.0, "high": v + 1.0} for name, v in estimates.items()},
-            "history": [],
-            "setup": {**setup, "code": code_of(effects)},
-        }
+    def make(command: str, run: Any, *more: object) -> list[str]:
+        own = {"add": ["cohesion"], "export": ["--to", "csv"]}.get(command, [])
+        return [command, str(getattr(run, "path", run)), *own, *map(str, more)]
 
     return make
 
 
 @pytest.fixture
-def run(tmp_path: Path, fit_of: Callable[..., dict[str, Any]]) -> RunFolder:
-    """The run, in a folder whose name a shell would split."""
-    measurement = {"name": "plow", "folder": str(tmp_path / "my set"), "hash": "a" * 64}
-    made = RunFolder.prepare(tmp_path / "my run", measurement=measurement, preset="tiny", seed=0, version="1")
-    made.write_fit("base", fit_of())
-    return made
+def refused(words: Callable[..., list[str]], capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """Gives a command that is to be refused, and returns what it says on stderr: one sentence in the end, the same as
+    the JSON object."""
+
+    def give(command: str, place: Any, *more: object) -> str:
+        capsys.readouterr()
+        assert cli.main([*words(command, place, *more), "--json"]) == 2, command
+        out, err = capsys.readouterr()
+        assert json.loads(out) == {"ok": False, "error": err.splitlines()[-1].removeprefix("splatsoil: ")}
+        return err
+
+    return give
 
 
 @pytest.fixture
@@ -106,6 +90,7 @@ def results(run: RunFolder, fit_of: Callable[..., dict[str, Any]], monkeypatch: 
         "draw_comparison": comparison,
         "check_adequacy": dict(MISFIT),
         "run_diagnosis": dict(DIAGNOSIS),
+        "add_effect": None,
     }
 
     def giving(name: str) -> Callable[..., Any]:
@@ -117,9 +102,9 @@ def results(run: RunFolder, fit_of: Callable[..., dict[str, Any]], monkeypatch: 
         return give
 
     for name in found:
-        monkeypatch.setattr(_model if hasattr(_model, name) else _stages, name, giving(name))
+        monkeypatch.setattr(next(m for m in (_model, _stages, add) if hasattr(m, name)), name, giving(name))
     monkeypatch.setattr("splatsoil.report.write_report", lambda path: path / "report.html")
-    monkeypatch.setattr("splatsoil.commands._crew.Crew", lambda *_: nullcontext())
+    monkeypatch.setattr(_crew, "Crew", lambda *_: nullcontext())
     file = {"format": "splatsoil-comparison/1", "fit": "another", "parameters": {}, **comparison}
     write_json(run.comparison / "comparison.json", file)
     return found
@@ -127,20 +112,26 @@ def results(run: RunFolder, fit_of: Callable[..., dict[str, Any]], monkeypatch: 
 
 @pytest.fixture(scope="session")
 def cut() -> Callable[..., Path]:
-    """Makes a copy of a set with every third view and some video frames."""
+    """Makes a copy of a set with every so many views, some frames of some cameras, and pictures of a size."""
 
-    def make(source: Path, folder: Path, *frames: int) -> Path:
+    def make(
+        source: Path, folder: Path, *frames: int, every: int = 3, cameras: str = "left right", shrunk: int = 1
+    ) -> Path:
         folder.mkdir(parents=True)
         for name in ("experiment.json", "tool.stl", "tool_motion.csv", "tool_force.csv"):
             shutil.copy(source / name, folder)
         for kind in ("views", "video"):
             data = json.loads((source / kind / "transforms.json").read_text())
-            every = data["frames"]
-            data["frames"] = every[::3] if kind == "views" else [f for f in every if f["frame"] in (-2, -1, 0, *frames)]
+            kept = [f for f in data["frames"] if f.get("frame") in (-2, -1, 0, *frames) and f["camera"] in cameras]
+            data["frames"] = data["frames"][::every] if kind == "views" else kept
+            for entry in (data, *data["frames"]):
+                for key in {"w", "h", "fl_x", "fl_y", "cx", "cy"} & entry.keys():
+                    entry[key] = entry[key] // shrunk if key in "wh" else entry[key] / shrunk
             for frame in data["frames"]:
                 target = folder / kind / frame["file_path"]
                 target.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copy(source / kind / frame["file_path"], target)
+                with Image.open(source / kind / frame["file_path"]) as image:
+                    image.reduce(shrunk).save(target, quality=95)
             (folder / kind / "transforms.json").write_text(json.dumps(data))
         return folder
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -231,23 +230,3 @@ def test_what_another_command_put_in_is_on_already(
     capsys.readouterr()
     assert stages.add("cohesion") == 2
     assert "effect cohesion is on already" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        (["add", "cohesion", "cohesion"], "effect named twice: cohesion"),
-        (["add", "cohesion", "--budget", "1"], "--budget: a fit needs at least 2 evaluations, not 1"),
-        (["add", "nonsense"], "effect 'nonsense' is unknown"),
-        (["add", "tilt"], "effect tilt is on already; name one that is off"),
-        (["diagnose", "--effects", "nonsense"], "effect 'nonsense' is unknown"),
-        (["diagnose", "--effects", "tilt"], "effect tilt is on already; name one that is off"),
-    ],
-)
-@pytest.mark.usefixtures("no_work")
-def test_what_makes_no_sense_is_refused_before_any_work(
-    run: RunFolder, capsys: pytest.CaptureFixture[str], fit_of: FitOf, words: list[str], says: str
-) -> None:
-    run.write_fit("tilt", fit_of(["tilt"], tilt_x=1.0))
-    assert cli.main([words[0], str(run.path), *words[1:], "--json"]) == 2
-    assert says in json.loads(capsys.readouterr().out)["error"]

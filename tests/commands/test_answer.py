@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
 from splatsoil.inverse.run_folder import RunFolder
 
 from splatsoil import cli
-from splatsoil.commands import add
 from splatsoil.errors import NoAnswer
 from splatsoil.report.text import no_answer
 
-FitOf = Callable[..., dict[str, Any]]
+COMMANDS = ["fit", "run", "compare", "diagnose", "add", "report"]
+Words = Callable[..., list[str]]
 
 
 @pytest.mark.parametrize(
@@ -27,12 +26,12 @@ FitOf = Callable[..., dict[str, Any]]
         ({}, "no answer: the friction angle ends at the upper bound of its range (50°)"),
     ],
 )
-@pytest.mark.parametrize("command", ["fit", "run", "compare", "diagnose", "add", "posterior", "report"])
+@pytest.mark.parametrize("command", [*COMMANDS, "posterior"])
 def test_no_command_tells_an_estimate_that_means_nothing(
     run: RunFolder,
     results: dict[str, Any],
-    monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
+    words: Words,
     change: dict[str, Any],
     says: str,
     command: str,
@@ -40,20 +39,19 @@ def test_no_command_tells_an_estimate_that_means_nothing(
     fit = results["run_fit"]
     fit |= change
     if not change:
-        fit["parameters"]["friction_angle"] |= {"at_bound": "upper", "bounds": [20.0, 50.0], "unit": "deg"}
+        fit["parameters"]["friction_angle"] |= {"at_bound": "upper", "bounds": [20.0, 50.0]}
     run.write_fit("base", fit)
-    monkeypatch.setattr(add, "add_effect", lambda *_, **__: None)
-    words = [command, str(run.path), *(["cohesion"] if command == "add" else [])]
     for in_json in (False, True):
-        assert cli.main([*words, *["--json"] * in_json]) == NoAnswer.code == 3
+        assert cli.main(words(command, run, *["--json"] * in_json)) == NoAnswer.code == 3
         out, err = capsys.readouterr()
         told = json.loads(out) if in_json else {"ok": False, "error": out.splitlines()[0]}
         assert told["ok"] is False and told["error"].startswith("no answer: ") and says in told["error"]
         assert "Traceback" not in err
         assert not {"35", "35.1", "35.0"} & set(out.replace("°", " ").replace(",", " ").split()), out
+        assert not in_json or (told["run"], told["set"]) == (str(run.path), str(run.path.parent / "my set"))
 
 
-def test_what_is_an_answer(fit_of: FitOf) -> None:
+def test_what_is_an_answer(fit_of: Callable[..., dict[str, Any]]) -> None:
     fit = fit_of(["cohesion"], cohesion=0.0)
     assert no_answer(fit) == ""
     assert no_answer(fit | {"loss": 0.99}) == "" and no_answer(fit | {"loss": 1.0}) != ""
@@ -66,26 +64,13 @@ def test_what_is_an_answer(fit_of: FitOf) -> None:
     assert "where pictures and force together put it" in no_answer(fit | {"loss": 1.2, "best": {"loss": 0.9}})
 
 
-@pytest.mark.parametrize("answer", [True, False])
-@pytest.mark.parametrize("command", ["fit", "run", "compare", "diagnose", "add", "report"])
+@pytest.mark.parametrize("command", COMMANDS)
 def test_json_names_run_and_set(
-    run: RunFolder,
-    results: dict[str, Any],
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    command: str,
-    answer: bool,
+    run: RunFolder, results: dict[str, Any], capsys: pytest.CaptureFixture[str], words: Words, command: str
 ) -> None:
-    """Their folders, also where there is no answer; ``fit.json`` has something else under "run"."""
-    results["run_fit"] |= {"run": {"measurement": {"name": "plow"}}, **({} if answer else {"loss": 1.2})}
+    """Their folders; ``fit.json`` has something else under "run"."""
+    results["run_fit"]["run"] = {"measurement": {"name": "plow"}}
     run.write_fit("base", results["run_fit"])
-    monkeypatch.setattr(add, "add_effect", lambda *_, **__: None)
-    words = [command, str(run.path), *(["cohesion"] if command == "add" else [])]
-    assert cli.main([*words, "--json"]) == (0 if answer else 3)
+    assert cli.main(words(command, run, "--json")) == 0
     told = json.loads(capsys.readouterr().out)
     assert (told["run"], told["set"]) == (str(run.path), run.description["measurement"]["folder"])
-
-
-def test_json_names_the_set(small_set: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["check", str(small_set), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["set"] == str(small_set)

@@ -25,11 +25,6 @@ def test_options_behind_the_name_are_the_benchmarks_own(name: str, capsys: pytes
     assert cli.main(["benchmark", name, "--no-such-option"]) == 2
 
 
-def test_an_unknown_name_is_told_the_known_ones(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["benchmark", "nix"]) == 2
-    assert "bo-vs-mcmc" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize(
     ("words", "says"),
     [

@@ -127,7 +127,7 @@ def test_a_gpu_with_little_memory_keeps_few_helpers(
     free: float, left: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """They began before it was known how much is free there."""
-    monkeypatch.setattr(_crew, "_free", {"cuda:0": free}.__getitem__)
+    monkeypatch.setattr(_crew, "gpu_memory", {"cuda:0": (free, 80.0)}.__getitem__)
     folder: Any = SimpleNamespace(path=tmp_path)
     experiment = experiment_on("cuda:0")
     simulate = Simulations(experiment)
@@ -156,6 +156,7 @@ EARLY = """
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from splatsoil import threads
 from splatsoil.commands import _crew, {command}
 from splatsoil.inverse import executors
 from splatsoil.inverse.run_folder import RunFolder
@@ -173,7 +174,7 @@ RunFolder.open = lambda path: SimpleNamespace(path=path, fit=lambda: fit, check_
 executors.processes = Helpers
 executors.kill = lambda helpers: None
 _crew.MOST_HELPERS = 1
-splatsoil.threads.cores = lambda: 2
+threads.cores = lambda: 2
 {command}.run({command}.Config(Path("run")))
 sys.exit(2)
 """
@@ -182,5 +183,4 @@ sys.exit(2)
 @pytest.mark.parametrize("command", ["diagnose", "compare"])
 def test_helpers_begin_before_what_takes_seconds_is_loaded(command: str) -> None:
     """They load the same, beside it."""
-    script = "import splatsoil.threads\n" + EARLY.format(command=command)
-    assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
+    assert subprocess.run([sys.executable, "-c", EARLY.format(command=command)], check=False).returncode == 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
 import tempfile
 from collections.abc import Callable
@@ -14,21 +13,17 @@ from typing import Any, cast
 import pytest
 from splatsoil.inverse.run_folder import RunFolder
 
-from splatsoil import cli
 from splatsoil.commands import _folder, _model, _stages
 from splatsoil.commands._options import FitOptions
 from splatsoil.errors import RunError
 from splatsoil.files import write_json
 
 FitOf = Callable[..., dict[str, Any]]
+Refused = Callable[..., str]
 ALL = ("compare", "diagnose", "add", "report", "posterior")
 SHOWN = ("add", "report")
 FIT = '{"format": "splatsoil-fit/2", "name": "base"'
 DIAGNOSIS = '{"format": "splatsoil-diagnosis/2", "fit": "base", "values": {}, "model": []'
-
-
-def words(command: str, run: RunFolder) -> list[str]:
-    return [command, str(run.path), *(["cohesion"] if command == "add" else [])]
 
 
 @pytest.mark.usefixtures("no_work")
@@ -52,60 +47,56 @@ def words(command: str, run: RunFolder) -> list[str]:
     ],
 )
 def test_json_of_another_shape_is_named_before_any_work(
-    run: RunFolder, capsys: pytest.CaptureFixture[str], file: str, text: str, says: str, commands: tuple[str, ...]
+    run: RunFolder, refused: Refused, file: str, text: str, says: str, commands: tuple[str, ...]
 ) -> None:
     (run.path / file).parent.mkdir(exist_ok=True)
     (run.path / file).write_text(text)
     for command in commands:
-        assert cli.main([*words(command, run), "--json"]) == 2, command
-        out, err = capsys.readouterr()
-        assert err.count("\n") == 1 and file in err and says in err, err
-        assert json.loads(out) == {"ok": False, "error": err.removeprefix("splatsoil: ").strip()}
+        said = refused(command, run)
+        assert said.count("\n") == 1 and file in said and says in said, said
 
 
-def test_a_page_that_lacks_something_says_so(run: RunFolder, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_page_that_lacks_something_says_so(run: RunFolder, refused: Refused) -> None:
     """A fit without its number of evaluations, say: what makes it one is there."""
-    assert cli.main(["report", str(run.path)]) == 2
-    out, err = capsys.readouterr()
-    assert out == "" and err.count("\n") == 1 and "fit.json: is damaged, it lacks" in err
+    fit = run.fit()
+    del fit["evaluations"]
+    run.write_fit("base", fit)
+    said = refused("report", run)
+    assert said.count("\n") == 1 and "fit.json: is damaged, it lacks" in said
 
 
 def test_a_fit_into_a_run_that_does_not_say_what_it_is_for_is_refused(
-    plow_dry: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    plow_dry: Path, tmp_path: Path, refused: Refused
 ) -> None:
     (tmp_path / "run.json").write_text('{"format": "splatsoil-run/1"}')
-    assert cli.main(["fit", str(plow_dry), "--run", str(tmp_path)]) == 2
-    assert "run.json: is damaged, it lacks measurement" in capsys.readouterr().err
+    assert "run.json: is damaged, it lacks measurement" in refused("fit", plow_dry, "--run", tmp_path)
 
 
 @pytest.mark.usefixtures("no_work")
 @pytest.mark.parametrize("command", ["compare", "diagnose", "add"])
 def test_what_cannot_be_written_to_is_met_before_any_work(
-    run: RunFolder, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, command: str
+    run: RunFolder, refused: Refused, monkeypatch: pytest.MonkeyPatch, command: str
 ) -> None:
     with run.lock():
-        assert cli.main(words(command, run)) == 2
-    assert "another process is writing into this run folder" in capsys.readouterr().err
+        assert "another process is writing into this run folder" in refused(command, run)
 
-    def refused(suffix: str | None = None, prefix: str | None = None, dir: Path | None = None) -> str:
+    def denied(suffix: str | None = None, prefix: str | None = None, dir: Path | None = None) -> str:
         assert dir == run.path
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
     # root may write anywhere
-    monkeypatch.setattr(tempfile, "mkdtemp", refused)
-    assert cli.main(words(command, run)) == 2
-    assert "cannot be written (Permission denied)" in capsys.readouterr().err
+    monkeypatch.setattr(tempfile, "mkdtemp", denied)
+    assert "cannot be written (Permission denied)" in refused(command, run)
 
 
 @pytest.mark.usefixtures("no_work")
 @pytest.mark.parametrize("command", ["fit", "run"])
 def test_a_fit_meets_another_process_before_any_work(
-    plow_dry: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
+    plow_dry: Path, tmp_path: Path, refused: Refused, command: str
 ) -> None:
     _, run = _stages.prepare(FitOptions(plow_dry, run=tmp_path))
     with run.lock():
-        assert cli.main([command, str(plow_dry), "--run", str(tmp_path)]) == 2
-    assert "another process is writing into this run folder" in capsys.readouterr().err
+        assert "another process is writing into this run folder" in refused(command, plow_dry, "--run", tmp_path)
 
 
 def test_pictures_are_written_by_one_process_at_a_time(run: RunFolder) -> None:
@@ -126,7 +117,7 @@ def test_a_damaged_reconstruction_is_to_be_deleted(run: RunFolder) -> None:
 )
 def test_a_fit_by_other_sources_is_said_to_be_one(
     run: RunFolder,
-    capsys: pytest.CaptureFixture[str],
+    refused: Refused,
     monkeypatch: pytest.MonkeyPatch,
     command: str,
     change: dict[str, str],
@@ -141,14 +132,12 @@ def test_a_fit_by_other_sources_is_said_to_be_one(
 
     monkeypatch.setattr(_model, "model_of", goes_on)
     monkeypatch.setattr("splatsoil.report.write_report", goes_on)
-    assert cli.main([*words(command, run), "--json"]) == 2
-    out, err = capsys.readouterr()
-    said, *last = err.splitlines() if change else ["", *err.splitlines()]
-    assert last == ["splatsoil: has gone on"] and json.loads(out)["error"] == "has gone on"
+    *said, last = refused(command, run).splitlines()
+    assert last == "splatsoil: has gone on" and len(said) == bool(change)
     if change:
         was = f"was fitted by splatsoil {fit['setup']['version']}, code {fit['setup']['code']}, and this is "
-        assert was in said and f"splatsoil fit '{run.path.parent}/my set' --parameters friction_angle" in said
-        assert said.endswith(f"--preset tiny --run '{run.path}'")
+        assert was in said[0] and f"splatsoil fit '{run.path.parent}/my set' --parameters friction_angle" in said[0]
+        assert said[0].endswith(f"--preset tiny --run '{run.path}'")
 
 
 def test_a_model_with_effects_is_made_anew_with_them(

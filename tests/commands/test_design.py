@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 from splatsoil.inverse.run_folder import RunFolder
 
-from splatsoil import cli
-from splatsoil.commands.design import best_sentence, show
+from splatsoil.commands.design import show
 from splatsoil.files import JUDGING, code_digest, code_of, write_json
 from splatsoil.report.data import estimates
 
@@ -36,22 +35,16 @@ def diagnose(run: RunFolder, **changes: Any) -> None:
 
 
 @pytest.mark.usefixtures("no_work")
-def test_what_there_is_nothing_to_design_from_is_refused(run: RunFolder, capsys: pytest.CaptureFixture[str]) -> None:
-    def refusal(*words: str) -> str:
-        assert cli.main(["design", str(run.path), *words, "--json"]) == 2
-        assert not (run.path / "design").exists()
-        return str(json.loads(capsys.readouterr().out)["error"])
-
-    make = f"make one first: splatsoil diagnose '{run.path}'"
-    assert refusal().endswith(f"has no diagnosis; {make}")
+def test_what_there_is_nothing_to_design_from_is_refused(run: RunFolder, refused: Callable[..., str]) -> None:
+    make = f"make one first: splatsoil diagnose '{run.path}'\n"
+    assert refused("design", run).endswith(f"has no diagnosis; {make}")
     for changes in ({"values": {"friction_angle": 1.0}}, {"judged_by": "other code"}, {"code": "other code"}):
         diagnose(run, **changes)
-        assert refusal().endswith(f"its diagnosis is of another fit, or by other code; {make}")
+        assert refused("design", run).endswith(f"its diagnosis is of another fit, or by other code; {make}")
     for probability in ({"": 0.97, "cohesion": 0.03}, {"something else": 0.6, "light": 0.3, "": 0.1}):
         diagnose(run, probability=probability)
-        assert "there are no two that a stroke could tell apart" in refusal()
-    diagnose(run)
-    assert "--draws: between 3 and 32 simulations, not 2" in refusal("--draws", "2")
+        assert "there are no two that a stroke could tell apart" in refused("design", run)
+    assert not (run.path / "design").exists()
 
 
 def result(*alike: str) -> dict[str, Any]:
@@ -71,18 +64,17 @@ def result(*alike: str) -> dict[str, Any]:
     }
 
 
-def test_a_stroke_is_called_better_only_beyond_the_error() -> None:
-    best = "Most is expected of the stroke half as fast: 0.80 ± 0.05 bits"
-    assert best_sentence(result()) == f"{best}, more than of any other."
-    assert best_sentence(result("as measured")) == f"{best}; by these simulations it is not better than as measured."
-
-
 def test_the_table_says_what_is_expected_and_told_apart(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """A stroke is called better only beyond the error."""
     monkeypatch.setenv("COLUMNS", "120")
+    best = "Most is expected of the stroke half as fast: 0.80 ± 0.05 bits"
+    show(result("as measured"))
+    assert f"{best}; by these simulations it is not better than as measured." in capsys.readouterr().out
     show(result())
     out = capsys.readouterr().out
+    assert f"{best}, more than of any other." in out
     assert "models: as it is (60 %) and tool adhesion (40 %); to be told at most: 0.97 bits" in out
     row = next(line for line in out.splitlines() if line.strip().startswith("half as fast"))
     assert "0.80 ± 0.05 bits" in row and "as it is from tool adhesion" in row

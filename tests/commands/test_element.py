@@ -48,29 +48,6 @@ def test_the_other_tests(
     assert records[column][-1] == pytest.approx(value, rel=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        (["--with", "dilatancy"], "effect 'dilatancy' is on but all its parameters are at their off values"),
-        (["--confining", "-5"], "confining: -5.0 is not a positive number"),
-        (["--with", "dilatancy", "compaction"], "cannot both be on"),
-        (["--set", "cohesion=5"], "unknown parameter cohesion"),
-        (["--with", "tilt", "--set", "tilt_x=5"], "effect tilt does not act on a specimen"),
-        (["--with", "exposure", "--set", "exposure_gain=1.1"], "effect exposure does not act on a specimen"),
-        (["--plot", "curve.txt"], "ends in .png, .svg or .pdf"),
-        (["--records", "1"], "--records: a curve has 2 to 100000 points"),
-        (["--records", "1000000000000"], "--records: a curve has 2 to 100000 points"),
-        (["--strain", "1e9"], "--strain: 1e+09 is not a strain above 0 and up to 10"),
-        (["--strain", "0"], "--strain: 0 is not a strain above 0"),
-        (["--strain", "nan"], "--strain: nan is not a strain above 0"),
-        (["--test", "isotropic", "--pressure", "1e30"], "6e+25 steps"),
-    ],
-)
-def test_mistakes_are_said_in_a_sentence(words: list[str], says: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["element", *words]) == 2
-    assert says in capsys.readouterr().err
-
-
 def test_the_limits_are_in_the_help() -> None:
     texts = {field.name: field.metadata["text"] for field in dataclasses.fields(Config)}
     assert texts["strain"].endswith(f"at most {LARGEST_STRAIN:g}.") and f"2 to {MOST_RECORDS}." in texts["records"]

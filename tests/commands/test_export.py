@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -16,43 +15,6 @@ from splatsoil import cli
 from splatsoil.commands import export
 from splatsoil.errors import NoAnswer, RunError
 from splatsoil.files import read_json, write_json
-
-
-@pytest.mark.usefixtures("no_work")
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["--every", "0"], "--every: must be 1 or more"),
-        (["--out", "full"], "full is not empty; nothing is overwritten"),
-        (["--out", "full/note.txt"], "is a file and no folder"),
-        (["--to"], "--to: name a format"),
-        (["--device", "abacus"], "abacus"),
-    ],
-)
-def test_mistakes_are_one_line_and_nothing_is_written(
-    words: list[str], said: str, run: RunFolder, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = run.path.parent
-    monkeypatch.chdir(folder)
-    (folder / "full").mkdir()
-    (folder / "full" / "note.txt").write_text("mine")
-    before = sorted(folder.rglob("*"))
-    assert cli.main(["export", str(run.path), *(words if "--to" in words else ["--to", "csv", *words])]) == 2
-    error = capsys.readouterr().err
-    assert said in error and error.count("\n") == 1
-    assert sorted(folder.rglob("*")) == before
-
-
-@pytest.mark.usefixtures("no_work")
-def test_a_missing_package_is_one_sentence(
-    run: RunFolder, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    there = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *_: None if name == "pxr" else there(name))
-    assert cli.main(["export", str(run.path), "--to", "csv", "usd"]) == 2
-    wanted = "splatsoil: --to usd: needs packages that aren't installed; pip install 'splatsoil[export]'\n"
-    assert capsys.readouterr().err == wanted
-    assert not (run.path / "export").exists()
 
 
 def model_with(*effects: str) -> Any:

@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from PIL import Image
 
 from splatsoil import cli
 
@@ -52,28 +51,10 @@ sys.exit(code)
 
 
 @pytest.fixture(scope="module")
-def place(plow_dry: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def place(plow_dry: Path, cut: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a set: five views and four frames of one camera, at half the size."""
     folder = tmp_path_factory.mktemp("killed")
-    made = folder / "set"
-    made.mkdir()
-    for name in ("experiment.json", "tool.stl", "tool_motion.csv", "tool_force.csv"):
-        shutil.copy(plow_dry / name, made)
-    for kind in ("views", "video"):
-        data = json.loads((plow_dry / kind / "transforms.json").read_text())
-        frames = data["frames"]
-        in_video = [f for f in frames if f.get("frame") in (-2, -1, 0, 10) and f.get("camera") == "left"]
-        data["frames"] = frames[::8] if kind == "views" else in_video
-        for entry in (data, *data["frames"]):
-            for key in {"w", "h", "fl_x", "fl_y", "cx", "cy"} & entry.keys():
-                entry[key] = entry[key] // 2 if key in "wh" else entry[key] / 2.0
-        for frame in data["frames"]:
-            target = made / kind / frame["file_path"]
-            target.parent.mkdir(parents=True, exist_ok=True)
-            with Image.open(plow_dry / kind / frame["file_path"]) as image:
-                half = (image.width // 2, image.height // 2)
-                image.resize(half, Image.Resampling.BOX).save(target, quality=95)
-        (made / kind / "transforms.json").write_text(json.dumps(data))
+    cut(plow_dry, folder / "set", 10, every=8, cameras="left", shrunk=2)
     return folder
 
 
@@ -190,67 +171,63 @@ def kinds(run: Path) -> list[Path]:
     return list(found.values())
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("left", ["nothing", "half", "all but a byte"])
-def test_files_cut_short_are_made_anew_or_named(
-    place: Path,
-    whole: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    left: str,
-) -> None:
+@pytest.fixture
+def command(
+    place: Path, whole: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., str]:
+    """Runs a command in a place where ``damaged`` is a copy of the whole run with a file of other contents, if they are
+    given; returns the one sentence that says what is wrong, if anything is."""
     monkeypatch.chdir(place)
     monkeypatch.setattr("splatsoil.threads.cores", lambda: 1)
+
+    def run(words: str, name: Path, contents: bytes | None = None) -> str:
+        if contents is not None:
+            shutil.rmtree("damaged", ignore_errors=True)
+            shutil.copytree(whole, "damaged")
+            (Path("damaged") / name).write_bytes(contents)
+        code = cli.main(words.split())
+        said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("splatsoil: ")]
+        said = [line for line in said if "was fitted by splatsoil" not in line]
+        assert code in (0, 2, 3) and len(said) == (code == 2), (name, words, code, said)
+        return "".join(said)
+
+    return run
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("left", ["nothing", "half", "all but a byte"])
+def test_files_cut_short_are_made_anew_or_named(whole: Path, command: Callable[..., str], left: str) -> None:
     for name in kinds(whole):
-        size = (whole / name).stat().st_size
-        length = {"nothing": 0, "half": size // 2, "all but a byte": size - 1}[left]
-        if length < 0:
-            continue
-        shutil.rmtree("cut", ignore_errors=True)
-        shutil.copytree(whole, "cut")
-        with (Path("cut") / name).open("r+b") as stream:
-            stream.truncate(length)
-        for command, words in (("report", ["report", "cut"]), ("run", ["run", "set", *WHOLE, "--run", "cut"])):
-            code = cli.main(words)
-            said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("splatsoil: ")]
-            assert code in (0, 2) and len(said) == (1 if code else 0), (name, command, code, said)
-            if code:
-                part = name.parent if name.parent.name == "reconstruction" else name
-                assert str(Path("cut") / part) in said[0], (name, command, said)
-            elif command == "run":
-                assert timeless(json.loads(Path("cut/fit.json").read_text())) == timeless(
-                    json.loads((whole / "fit.json").read_text())
-                ), name
+        contents = (whole / name).read_bytes()
+        part = str(Path("damaged") / (name.parent if name.parent.name == "reconstruction" else name))
+        short = contents[: {"nothing": 0, "half": len(contents) // 2, "all but a byte": -1}[left]]
+        said = command("report damaged", name, short)
+        assert not said or part in said
+        said = command(" ".join(("run set", *WHOLE, "--run damaged")), name, short)
+        assert not said or part in said
+        if not said:
+            again, fit = (json.loads((run / "fit.json").read_text()) for run in (Path("damaged"), whole))
+            assert timeless(again) == timeless(fit), name
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [int(os.environ.get("SPLATSOIL_FLIP_SEED", "0"))])
-def test_flipped_bits_are_named_or_do_no_harm(
-    place: Path, whole: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], seed: int
-) -> None:
+def test_flipped_bits_are_named_or_do_no_harm(whole: Path, command: Callable[..., str], seed: int) -> None:
     """One bit of each kind of file; one of the letters of a key where it holds any, so that it can still be read."""
-    monkeypatch.chdir(place)
-    monkeypatch.setattr("splatsoil.threads.cores", lambda: 1)
     chance = random.Random(seed)
     for name in kinds(whole):
         contents = bytearray((whole / name).read_bytes())
         keys = [found.start(1) for found in re.finditer(rb'"([a-z_]+)":', contents)] if name.suffix == ".json" else []
-        for places in (range(len(contents)), keys):
-            if not places:
-                continue
+        read_by_fits = name.parts[0] in ("features", "evaluations.db", "fit.json")
+        for places in filter(None, (range(len(contents)), keys)):
             flipped = contents.copy()
             flipped[chance.choice(places)] ^= 1 << chance.randrange(8 if places is not keys else 3)
-            shutil.rmtree("flipped", ignore_errors=True)
-            shutil.copytree(whole, "flipped")
-            (Path("flipped") / name).write_bytes(flipped)
-            read_by_fits = name.parts[0] in ("features", "evaluations.db", "fit.json")
-            for command in ("report", "compare --quick", "export --to csv", *["posterior --checks 0"] * read_by_fits):
-                first, *options = command.split()
-                code = cli.main([first, "flipped", *options])
-                said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("splatsoil: ")]
-                said = [line for line in said if "was fitted by splatsoil" not in line]
-                assert code in (0, 2, 3) and len(said) == (code == 2), (name, command, code, said)
-                assert code != 2 or "flipped" in said[0], (name, command, said)
+            said = [command("report damaged", name, bytes(flipped))]
+            for words in ("compare damaged --quick", "export damaged --to csv"):
+                said.append(command(words, name))
+            if read_by_fits:
+                said.append(command("posterior damaged --checks 0", name))
+            assert all("damaged" in sentence for sentence in said if sentence), (name, said)
 
 
 def test_two_commands_on_one_run_folder(place: Path, run_elsewhere: Callable[[], Path]) -> None:

@@ -48,14 +48,14 @@ GIVEN = {
 def test_what_ctrl_c_says_can_be_pasted(name: str) -> None:
     """It parses to the very options that were given: all of them, or none."""
     command, given = cli.commands()[name], shlex.split(GIVEN[name])
-    config = parse(name, command.config, given)
+    config = parse(name, command.Config, given)
     as_usual = [f.name for f in dataclasses.fields(config) if getattr(config, f.name) == f.default]
     assert as_usual == (["name", "arguments"] if name == "benchmark" else [])
     places = [f for f in dataclasses.fields(config) if f.default is dataclasses.MISSING]
-    for told in (config, parse(name, command.config, given[: len(places)])):
+    for told in (config, parse(name, command.Config, given[: len(places)])):
         hint = cli.after_interrupt(name, command, told)
         again = shlex.split(hint[hint.index("splatsoil ") :])
-        assert again[:2] == ["splatsoil", name] and parse(name, command.config, again[2:]) == told
+        assert again[:2] == ["splatsoil", name] and parse(name, command.Config, again[2:]) == told
 
 
 def test_a_command_line_leaves_out_what_is_as_usual() -> None:
@@ -112,7 +112,7 @@ def test_help_is_short_and_begins_with_run(monkeypatch: pytest.MonkeyPatch, caps
     assert cli.main(["--help"]) == 0
     pages = {"": capsys.readouterr().out}
     for name, command in commands.items():
-        pages[name] = parser_of(name, command.config).format_help()
+        pages[name] = parser_of(name, command.Config).format_help()
         assert not re.search(r"^  --[\w-]+(?: \S+)*\n  -", pages[name], re.MULTILINE), "each option has a text"
     for name, page in pages.items():
         assert len(page.splitlines()) <= 40 and max(map(len, page.splitlines())) <= 80, name
@@ -133,6 +133,6 @@ def test_the_commands_of_the_documents_parse(repository: Path, document: str) ->
     for line in lines:
         name, *words = [word for word in shlex.split(line, comments=True) if word != "…"]
         if name != "--help":
-            parse(name, commands[name].config, words)
+            parse(name, commands[name].Config, words)
             parsed += 1
     assert parsed >= DOCUMENTS[document]

@@ -138,15 +138,14 @@ def test_compare_and_report_work_on_a_finished_run(
 
 @pytest.mark.slow
 def test_a_run_folder_is_for_one_set_preset_and_seed(
-    place: Path, whole: dict[str, Any], plow_damp: Path, capsys: pytest.CaptureFixture[str]
+    place: Path, whole: dict[str, Any], plow_damp: Path, refused: Callable[..., str]
 ) -> None:
     for words, says in (
         ([str(plow_damp), "--preset", "tiny"], "belongs to another measurement set (plow-dry)"),
         ([str(place / "set"), "--preset", "small"], "belongs to preset tiny, not small"),
         ([str(place / "set"), "--preset", "tiny", "--seed", "1"], "belongs to seed 0, not 1"),
     ):
-        assert cli.main(["fit", *words, "--run", str(place / "whole")]) == 2
-        assert says in capsys.readouterr().err
+        assert says in refused("fit", *words, "--run", place / "whole")
 
 
 @pytest.mark.slow
@@ -247,47 +246,7 @@ def next_stroke(place: Path, program: Program, source: Path) -> None:
     assert Measurement.load(place / "next").tool.motion.times[-1] == motion.times[-1]
 
 
-@pytest.mark.parametrize("name", ["fit", "run"])
-@pytest.mark.parametrize(
-    ("options", "says"),
-    [
-        (["--budget", "1"], "at least 2"),
-        (["--seed", "-1"], "--seed"),
-        (["--with", "antigravity"], "antigravity"),
-        (["--parameters", "phi"], "unknown phi; this model has friction_angle"),
-        (["--parameters", "cohesion"], "unknown cohesion"),
-        (["--device", "cuda:77"], "cuda:77"),
-    ],
-)
-def test_options_that_make_no_sense_write_nothing(
-    plow_dry: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, options: list[str], says: str
-) -> None:
-    assert cli.main([name, str(plow_dry), "--run", str(tmp_path / "run"), *options]) == 2
-    captured = capsys.readouterr()
-    assert says in captured.err and "Traceback" not in captured.err
-    assert not (tmp_path / "run").exists()
-
-
-def test_a_broken_set_leaves_no_run_folder(small_set: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_broken_set_leaves_no_run_folder(small_set: Path, tmp_path: Path, refused: Callable[..., str]) -> None:
     (small_set / "tool.stl").write_bytes(b"")
-    assert cli.main(["run", str(small_set), "--run", str(tmp_path / "run")]) == 2
-    assert "tool.stl" in capsys.readouterr().err
+    assert "tool.stl" in refused("run", small_set, "--run", tmp_path / "run")
     assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize("name", ["compare", "report", "diagnose", "add", "posterior", "design", "export"])
-def test_what_is_no_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
-    more = {"add": ["cohesion"], "export": ["--to", "csv"]}.get(name, [])
-    assert cli.main([name, str(tmp_path / "nothing"), *more]) == 2
-    assert "there is no such run folder" in capsys.readouterr().err
-    assert cli.main([name, str(tmp_path), *more]) == 2
-    assert "run.json" in capsys.readouterr().err
-
-
-def test_somebody_elses_folder_is_left_alone(
-    plow_dry: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "thesis.tex").write_text("years of work")
-    assert cli.main(["fit", str(plow_dry), "--run", str(tmp_path)]) == 2
-    assert "isn't a run folder" in capsys.readouterr().err
-    assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -10,7 +10,6 @@ from typing import Any, cast
 import pytest
 from splatsoil.inverse.run_folder import RunFolder
 
-from splatsoil import cli
 from splatsoil.commands import _resources, _stages
 from splatsoil.commands._options import FitOptions
 from splatsoil.errors import ParameterError
@@ -41,15 +40,18 @@ def test_needs_follow_from_the_set(small_set: Path) -> None:
 
 @pytest.mark.parametrize("preset", ["tiny", "fine"])
 def test_what_a_fit_needs_is_said_and_refused_where_no_memory_holds_it(
-    small_set: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], preset: str
+    small_set: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    refused: Callable[..., str],
+    preset: str,
 ) -> None:
     """Before anything is written."""
     options = FitOptions(small_set, preset="tiny", device="cpu", run=tmp_path / "run")
     monkeypatch.setattr(_resources, "memory", lambda: 0.5)
-    words = ["fit", str(small_set), "--preset", preset, "--device", "cpu", "--run", str(options.run), "--json"]
-    assert cli.main(words) == 2
-    told = capsys.readouterr()
-    assert "and this machine has 0.5 GiB; choose a coarser --preset" in json.loads(told.out)["error"]
+    said = refused("fit", small_set, "--preset", preset, "--device", "cpu", "--run", tmp_path / "run")
+    assert "and this machine has 0.5 GiB; choose a coarser --preset" in said
     assert not (tmp_path / "run").exists()
     monkeypatch.undo()
     _stages.prepare(options)
@@ -64,9 +66,11 @@ def test_soil_that_no_memory_holds_is_refused_before_it_is_simulated(
     options = FitOptions(small_set, preset="tiny", device="cpu", run=tmp_path / "run")
     measurement, run = _stages.prepare(options)
     soil = range(10**9)
-    model: Any = SimpleNamespace(space=lambda names: ["friction_angle"], device="cpu", particles=lambda seed: soil)
+    model: Any = SimpleNamespace(
+        measurement=measurement, space=lambda names: ["friction_angle"], device="cpu", particles=lambda seed: soil
+    )
     with pytest.raises(ParameterError, match=r"1000000000 particles, and the pictures, need \d+ GiB of memory"):
-        _stages.run_fit(options, measurement, cast(RunFolder, run), model, lambda what, share: None)
+        _stages.run_fit(options, cast(RunFolder, run), model, lambda what, share: None)
 
 
 def test_a_control_groups_limit_counts(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -24,19 +24,26 @@ SITES = [
 REGIONS = [["track"] * 3 + ["berm"] * 3 + ["tool"]] * len(STAGES)
 
 
-def compared(name: str, probability: float, **size: Any) -> dict[str, Any]:
+def compared(name: str, probability: float, estimate: Any, std: Any, unit: str, detectable: Any, note: str) -> Any:
+    """A model of a diagnosis."""
     kind = {"": "base", "something else": "discrepancy"}.get(name, "physics")
-    none = {"parameter": None, "estimate": None, "std": None, "unit": "1", "off": 0.0, "meaningful": 0.0}
-    told = {"name": name, "kind": kind, "note": "", "probability": probability, "log_evidence": 0.0}
-    return {**told, "values": {"angle": 1.0}, "stds": {"angle": 0.5}, **none, "detectable": None, **size}
+    size = {"estimate": estimate, "std": std, "unit": unit, "detectable": detectable}
+    return {"name": name, "kind": kind, "note": note, "probability": probability, **size}
 
 
-def judgement() -> dict[str, Any]:
-    """What a diagnosis and a comparison have in common."""
-    before = [[0.5 * t - 0.3 * s for s in range(len(SITES))] for t in range(len(STAGES))]
+@pytest.fixture
+def misfit() -> dict[str, Any]:
+    """The base model is adequate; also what a diagnosis has in common with that."""
+    before: list[list[float | None]] = [[0.5 * t - 0.3 * s for s in range(len(SITES))] for t in range(len(STAGES))]
     before[0][2] = None
     check = {"stage": "push", "channel": "left", "n": 40}
+    curve = {"channel": "force", "unit": "N", "measured": [1.0, 4.0, None, 2.0]}
+    band = {"low": [0.9, 3.6, None, 1.8], "high": [1.1, 4.4, None, 2.2]}
     return {
+        "format": "splatsoil-misfit/2",
+        "adequate": True,
+        "probability": 0.971,
+        "passes": True,
         "fit": "base",
         "values": {"friction_angle": 35.62},
         "estimates": {"friction_angle": {"value": 33.21, "std": 1.64, "determined": True}},
@@ -45,7 +52,6 @@ def judgement() -> dict[str, Any]:
             {**check, "region": "berm", "ratio": 2.31, "p": 0.003},
             {**check, "region": "track", "ratio": 1.12, "p": 0.6},
         ],
-        "passes": False,
         "numerics": 1.3,
         "unit": "grey levels",
         "time_name": "frame",
@@ -53,103 +59,40 @@ def judgement() -> dict[str, Any]:
         "stages": STAGES,
         "sites": SITES,
         "regions": REGIONS,
-        "curves": [
-            {
-                "channel": "force",
-                "unit": "N",
-                "measured": [1.0, 4.0, None, 2.0],
-                "low": [0.9, 3.6, None, 1.8],
-                "high": [1.1, 4.4, None, 2.2],
-                "predicted": {"before": [1.0, 3.0, None, 2.0]},
-            }
-        ],
+        "curves": [{**curve, **band, "predicted": {"before": [1.0, 3.0, None, 2.0]}}],
         "maps": {"before": before},
-        "simulations": 57,
     }
 
 
 @pytest.fixture
-def diagnosis() -> dict[str, Any]:
+def diagnosis(misfit: dict[str, Any]) -> dict[str, Any]:
     """Effect 2 is missing in the base model."""
-    told = judgement()
-    told["maps"]["effect_2"] = [[None if v is None else 0.1 * v for v in row] for row in told["maps"]["before"]]
-    told["curves"][0]["predicted"]["effect_2"] = [1.0, 4.1, None, 2.0]
-    size = {"parameter": "effect_2", "unit": "Pa", "meaningful": 40.0}
+    shared = {key: value for key, value in misfit.items() if key not in ("adequate", "probability")}
+    (curve,), before = misfit["curves"], misfit["maps"]["before"]
+    effect = [[None if v is None else 0.1 * v for v in row] for row in before]
+    predicted = {**curve["predicted"], "effect_2": [1.0, 4.1, None, 2.0]}
     return {
+        **shared,
         "format": "splatsoil-diagnosis/2",
+        "passes": False,
         "model": [],
-        **told,
+        "maps": {"before": before, "effect_2": effect},
+        "curves": [{**curve, "predicted": predicted}],
         "verdict": "missing",
         "class": ["effect_2"],
         "models": [
-            compared("effect_2", 0.973, estimate=553.7, std=160.7, detectable=120.0, note="adds strength.", **size),
-            compared("", 0.022),
-            compared("something else", 0.0042),
-            compared("tilt", 0.0008, estimate=0.31, std=0.22, unit="deg", detectable=0.54, note="leans."),
+            compared("effect_2", 0.973, 553.7, 160.7, "Pa", 120.0, "adds strength."),
+            compared("", 0.022, None, None, "1", None, ""),
+            compared("something else", 0.0042, None, None, "1", None, ""),
+            compared("tilt", 0.0008, 0.31, 0.22, "deg", 0.54, "leans."),
         ],
         "held_out": [
             {"model": "", "error": 5.2, "noise": 1.24, "log_score": -900.0},
             {"model": "effect_2", "error": 1.31, "noise": 1.24, "log_score": -700.0},
         ],
         "aside": "camera right and the withdrawal",
-        "simulated_now": 12,
-        "seconds": 81.2,
-        "preset": "tiny",
-        "device": "cpu",
-        "version": "0",
-        "code": "ab",
-        "seed": 0,
         "notes": ["One thing to know."],
     }
-
-
-@pytest.fixture
-def misfit() -> dict[str, Any]:
-    """The base model is adequate."""
-    return {"format": "splatsoil-misfit/2", "adequate": True, "probability": 0.971, **judgement(), "passes": True}
-
-
-def fit(name: str = "base", effects: tuple[str, ...] = (), **changes: Any) -> dict[str, Any]:
-    """What ``fit.json`` holds: 35.62 ± 0.81°, and 7 of each effect."""
-    x = np.linspace(20.0, 50.0, 31)
-    entry = {"std": 0.81, "low": 34.0, "high": 37.1, "bounds": [20.0, 50.0], "at_bound": None, "determined": True}
-    parameters = {"friction_angle": {"estimate": 35.62, "unit": "deg", "title": "friction angle [°]", **entry}}
-    parameters |= {effect: {"estimate": 7.0, "unit": "1", "title": effect, **entry} for effect in effects}
-    steps = [(30.0, 31.0, "ok", ""), (40.0, 20.0, "ok", ""), (21.0, None, "failed", "particles left the grid")]
-    return {
-        "format": "splatsoil-fit/2",
-        "name": name,
-        "parameters": parameters,
-        "loss": 0.123,
-        "best": {"loss": 0.12},
-        "estimated_from": "loss",
-        "minimum": {key: {"estimate": p["estimate"], "low": 34.0, "high": 37.1} for key, p in parameters.items()},
-        "loss_std": 0.01,
-        "noise_std": 0.02,
-        "evaluations": 3,
-        "failed": 1,
-        "seconds": 83.0,
-        "seed": 5,
-        "device": "cpu",
-        "preset": "small",
-        "version": "0.1.0",
-        "setup": {"effects": list(effects), "preset": "small"},
-        "notes": [],
-        "facts": {"cell": "20 mm", "time step": "0.25 ms"},
-        "curves": {key: {"x": list(x), "mean": list((x - 35.6) ** 2), "std": [0.1] * 31} for key in parameters},
-        "history": [
-            {
-                "step": step,
-                "seed": 7,
-                "parameters": dict.fromkeys(parameters, value),
-                "loss": loss,
-                "status": status,
-                "message": message,
-                "seconds": 8.0,
-            }
-            for step, (value, loss, status, message) in enumerate(steps)
-        ],
-    } | changes
 
 
 def write_comparison(folder: Path, of: dict[str, Any], shade: int = 100) -> None:
@@ -179,21 +122,22 @@ def write_comparison(folder: Path, of: dict[str, Any], shade: int = 100) -> None
 
 
 @pytest.fixture
-def make_run(tmp_path: Path) -> Callable[..., Path]:
+def make_run(tmp_path: Path, fit_of: Callable[..., dict[str, Any]]) -> Callable[..., Path]:
     """Makes a run folder that was fitted, reconstructed and compared."""
 
     def make(name: str = "plow") -> Path:
         measurement = {"name": name, "folder": str(tmp_path / "set"), "hash": "ab" * 32}
         description = {"format": "splatsoil-run/1", "measurement": measurement, "preset": "small", "seed": 5}
         write_json(tmp_path / "run.json", description)
+        fit = fit_of(friction_angle=35.62)
         for file in ("fit.json", "fits/base.json"):
-            write_json(tmp_path / file, fit())
+            write_json(tmp_path / file, fit)
         told = {"held_out": [{}, {}], "psnr": 31.24, "ssim": 0.931, "gaussians": 24011, "seconds": 131.0}
         file = tmp_path / "reconstruction" / "reconstruction.json"
         write_json(file, {"format": "splatsoil-reconstruction/1", **told})
         x, y = np.linspace(0.0025, 0.0975, 20), np.linspace(0.0025, 0.0475, 10)
         np.savez(tmp_path / "reconstruction" / "surface.npz", x=x, y=y, height=0.1 + 0.1 * y[:, None] * x)
-        write_comparison(tmp_path / "comparison", fit())
+        write_comparison(tmp_path / "comparison", fit)
         return tmp_path
 
     return make
@@ -206,21 +150,15 @@ def run(make_run: Callable[..., Path]) -> Path:
 
 
 @pytest.fixture
-def added(run: Path, diagnosis: dict[str, Any]) -> Path:
+def added(run: Path, diagnosis: dict[str, Any], fit_of: Callable[..., dict[str, Any]]) -> Path:
     """One whose diagnosis named effect 2, which was added."""
-    base, after = fit(), fit("effect_2", ("effect_2",))
+    base, after = fit_of(friction_angle=35.62), fit_of(["effect_2"], friction_angle=35.62, effect_2=7.0)
     for file in ("fit.json", "fits/effect_2.json"):
         write_json(run / file, after)
     write_json(run / "diagnoses" / "base.json", diagnosis)
     lines = [
-        {
-            "model": made["name"],
-            "effects": made["setup"]["effects"],
-            "parameters": {k: {n: p[n] for n in ("estimate", "std", "unit")} for k, p in made["parameters"].items()},
-            "loss": 0.2,
-            "held_out": error,
-            "floor": 1.24,
-        }
+        {"effects": made["setup"]["effects"], "loss": 0.2, "floor": 1.24, "model": made["name"], "held_out": error}
+        | {"parameters": {k: {n: p[n] for n in ("estimate", "std", "unit")} for k, p in made["parameters"].items()}}
         for made, error in ((base, 5.2), (after, 1.31))
     ]
     lines[1]["added"] = "effect_2"

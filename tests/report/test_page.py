@@ -40,6 +40,9 @@ def shown(source: str) -> str:
 def test_everything_is_on_the_page(run: Path, page_of: PageOf) -> None:
     page = page_of(run)
     assert write_report(run) == run / "report.html"
+    assert page.addresses and all(a.startswith(("data:image/", "#")) for a in page.addresses), "it asks nobody"
+    assert not re.search(r"@import|url\((?!#)|fetch\(|XMLHttpRequest|<link", page.html)
+    assert "default-src 'none'" in page.html
     for phrase in (
         "35.6 ± 0.8°",
         "The misfit is 2 % of that of soil at rest, 4.0 × the camera noise",
@@ -60,14 +63,6 @@ def test_everything_is_on_the_page(run: Path, page_of: PageOf) -> None:
     shutil.copy(run / "fits" / "base.json", run / "fits" / "cohesion.json")
     page = page_of(run)
     assert "base model with cohesion" in page.text.split("Models tried")[1]
-
-
-def test_the_page_asks_for_nothing_from_anywhere(run: Path, page_of: PageOf) -> None:
-    page = page_of(run)
-    assert page.addresses
-    assert all(a.startswith(("data:image/", "#")) for a in page.addresses)
-    assert not re.search(r"@import|url\((?!#)|fetch\(|XMLHttpRequest|<link", page.html)
-    assert "default-src 'none'" in page.html
 
 
 def frames_of(page: Any) -> list[dict[str, Any]]:
@@ -174,8 +169,10 @@ def test_the_truth_of_a_simulated_set_stands_beside_the_estimate(run: Path, page
 # A diagnosis, and an effect that was added.
 
 
-def test_the_verdict_stands_on_top_with_its_reasons(added: Path, page_of: PageOf) -> None:
+def test_the_verdict_stands_on_top_with_its_reasons(added: Path, page_of: PageOf, misfit: dict[str, Any]) -> None:
     page = page_of(added)
+    assert all(f["before"] != f["predicted"] for camera in frames_of(page) for f in camera["frames"])
+    assert "Observed, before, after, difference" in page.text
     assert "Missing: effect 2. Added. A sentence that says why." in page.text
     assert page.text.index("Missing: effect 2.") < page.text.index("Which model?") < page.text.index("Where it fails")
     assert "The error falls" in page.text and "camera right and the withdrawal" in page.text
@@ -193,6 +190,11 @@ def test_the_verdict_stands_on_top_with_its_reasons(added: Path, page_of: PageOf
     assert re.search(r"<tr><td>push</td><td>berm</td><td>left</td><td>2.3</td><td>0.003</td>", checks)
     assert re.search(r'<tr class="little"><td>push</td><td>track</td>', checks)
     assert "1.3 × that of pairs of coarse and fine runs" in shown(checks)
+    told = {**misfit, "fit": "effect_2", "values": {"friction_angle": 35.62, "effect_2": 7.0}}
+    write_json(added / "comparison" / "misfit.json", told)
+    text = page_of(added).text
+    assert text.index("Missing: effect 2. Added.") < text.index("The model is adequate."), "of the latest fit"
+    assert "No check fails." in text
 
 
 def test_blocks_that_fail_are_outlined_on_their_photographs(
@@ -243,24 +245,6 @@ def test_without_an_added_effect_the_error_is_of_the_models_compared(
         write_json(added / "diagnoses" / "base.json", {**diagnosis, "held_out": told})
         text = page_of(added).text
         assert ("The error does not fall" in text) is says and ("The error" in text) is says
-
-
-def test_a_comparison_of_the_latest_fit_judges_it_after_an_addition(
-    added: Path, page_of: PageOf, misfit: dict[str, Any]
-) -> None:
-    told = {**misfit, "fit": "effect_2", "values": {"friction_angle": 35.62, "effect_2": 7.0}}
-    write_json(added / "comparison" / "misfit.json", told)
-    text = page_of(added).text
-    assert text.index("Missing: effect 2. Added.") < text.index("The model is adequate.")
-    assert "No check fails." in text
-
-
-def test_before_and_after_are_side_by_side_for_every_frame(added: Path, page_of: PageOf) -> None:
-    page = page_of(added)
-    for camera in frames_of(page):
-        assert [f["frame"] for f in camera["frames"]] == FRAMES
-        assert all(f["before"] != f["predicted"] for f in camera["frames"])
-    assert "Observed, before, after, difference" in page.text
 
 
 def test_maps_before_and_after_have_colours_of_one_scale(diagnosis: dict[str, Any]) -> None:
@@ -398,27 +382,21 @@ def test_the_report_knows_nothing_of_how_a_fit_is_made() -> None:
 # A posterior.
 
 
-def marginal(verdict: str, contraction: float, title: str, unit: str) -> dict[str, Any]:
-    return {
-        "mean": 35.0,
-        "std": 1.0,
-        "low": 33.41,
-        "high": 36.58,
-        "low_50": 34.3,
-        "high_50": 35.7,
-        "unit": unit,
-        "title": title,
-        "contraction": contraction,
-        "verdict": verdict,
-        "histogram": {"edges": [20.0, 30.0, 40.0, 50.0], "density": [0.2, 2.5, 0.3]},
-    }
-
-
+MARGINAL = {
+    "mean": 35.0,
+    "std": 1.0,
+    "low": 33.41,
+    "high": 36.58,
+    "low_50": 34.3,
+    "high_50": 35.7,
+    "unit": "deg",
+    "histogram": {"edges": [20.0, 30.0, 40.0, 50.0], "density": [0.2, 2.5, 0.3]},
+}
 POSTERIOR = {
     "format": "splatsoil-posterior/2",
     "parameters": {
-        "friction_angle": marginal("determined", 0.12, "friction angle [°]", "deg"),
-        "cohesion": marginal("not determined", 0.97, "cohesion [Pa]", "Pa"),
+        "friction_angle": {**MARGINAL, "verdict": "determined", "contraction": 0.12, "title": "friction angle [°]"},
+        "cohesion": {**MARGINAL, "verdict": "not determined", "contraction": 0.97, "title": "cohesion [Pa]"},
     },
     "notes": ["cohesion is not determined by this experiment: …", "The chains have not converged."],
     "simulations": 31,
