@@ -263,7 +263,7 @@ def rasteriser(task: Task, count: int = 20_000, size: int = 256) -> Section:
     few = random_gaussians(count, size, "cpu")[0][: max(count // SHARE, 1)]
 
     def ours() -> list[torch.Tensor]:
-        drawn = rasterise(leaves, camera, normals=False)
+        drawn = rasterise(leaves, camera)
         return [drawn.colour, drawn.depth]
 
     def slowly() -> list[torch.Tensor]:
