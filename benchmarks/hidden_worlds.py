@@ -46,7 +46,7 @@ from splatsoil.quiet import hush
 from splatsoil.reconstruction import fill
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
-from splatsoil.synthetic import Appearance, Setup, photograph_run
+from splatsoil.synthetic import Appearance, Recorder, Setup, photograph_run
 
 OWN = ("_hidden", "_newton", "_scenes", "hidden_worlds")
 """Modules beside the package by which the experiments are made."""
@@ -142,16 +142,9 @@ def make_worlds(truths: Sequence[Hidden], options: argparse.Namespace, say: Call
         solver = asdict(numerics) if options.solver == NEWTON else options.solver
         for hidden, setup, trajectory, observation in zip(group, setups, trajectories, seen, strict=True):
             truth = {"hidden": hidden.kind, "size": hidden.size, "values": hidden.values, "solver": solver}
-            photograph_run(
-                sets / hidden.name,
-                setup,
-                trajectory,
-                plain({**truth, "scene": asdict(hidden.scene)}),
-                appearance=Appearance.drawn(hidden.seed),
-                observation=observation,
-                seed=hidden.seed,
-                device=options.device,
-            )
+            look = Appearance.drawn(hidden.seed)
+            recorder = Recorder(setup, trajectory, look, hidden.seed, options.device, observation)
+            photograph_run(sets / hidden.name, recorder, plain({**truth, "scene": asdict(hidden.scene)}))
             say(f"{hidden.name} simulated and photographed")
             yield hidden
 

@@ -48,7 +48,7 @@ from splatsoil.parameters import Parameter
 from splatsoil.quiet import hush
 from splatsoil.reconstruction import Reconstruction, reconstruct
 from splatsoil.soil.library import library
-from splatsoil.synthetic import make_set, plow
+from splatsoil.synthetic import Recipe, make_set, plow
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -247,7 +247,7 @@ def measure(effects: Sequence[str], preset: str, seeds: int, device: str, out: P
     """`left` of the effects of these names, or of all; what is not in the folder is made."""
     place, made = out / "set", out / "reconstruction"
     if not (place / "truth.json").is_file():
-        make_set(place, plow(WORLD), friction_angle=ANGLE, preset=preset, seed=WORLD, device=device)
+        make_set(place, plow(WORLD), Recipe(ANGLE, preset=preset, seed=WORLD, device=device))
     measurement = Measurement.load(place)
     if not (made / "reconstruction.json").is_file():
         reconstruct(measurement, preset=preset, device=device).save(made)

@@ -55,7 +55,7 @@ from splatsoil.parameters import ParameterSpace
 from splatsoil.quiet import hush
 from splatsoil.reconstruction import Reconstruction, reconstruct
 from splatsoil.soil.settings import FRICTION_ANGLE
-from splatsoil.synthetic import make_set, paper
+from splatsoil.synthetic import Recipe, make_set, paper
 
 FloatArray = npt.NDArray[np.float64]
 Images = Mapping[tuple[str, int], npt.NDArray[np.float32]]
@@ -166,11 +166,13 @@ def world(protocol: Protocol, angle: float, number: int, out: Path) -> tuple[Mea
         make_set(
             folder,
             setup if protocol.picture_scale == 1.0 else setup.resized(protocol.picture_scale),
-            friction_angle=angle,
-            preset=protocol.preset("truth", protocol.truth_cells),
-            seed=number,
-            particle_seed=1_000_003 * (number + 1) + round(10 * angle),
-            device=protocol.device,
+            Recipe(
+                friction_angle=angle,
+                preset=protocol.preset("truth", protocol.truth_cells),
+                seed=number,
+                particle_seed=1_000_003 * (number + 1) + round(10 * angle),
+                device=protocol.device,
+            ),
         )
     measurement = Measurement.load(folder)
     kept = out / "reconstructions" / folder.name
