@@ -51,6 +51,13 @@ class Gaussians:
             if tensor.device != self.means.device:
                 raise ParameterError(f"Gaussians: {name} is on {tensor.device}, means are on {self.means.device}")
 
+    @classmethod
+    def discs(cls, means: Tensor, radius: float, thickness: float, opacity: float, colours: Tensor) -> Gaussians:
+        """Level ones at places (n, 3), of standard deviations along the ground and across it, m, and colours (n, 3)."""
+        scales = means.new_tensor([radius, radius, thickness]).expand(len(means), 3)
+        upright = means.new_tensor([1.0, 0.0, 0.0, 0.0]).expand(len(means), 4)
+        return cls(means, scales, upright, means.new_full((len(means),), opacity), colours)
+
     def __len__(self) -> int:
         return self.means.shape[0]
 
