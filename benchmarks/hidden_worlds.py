@@ -44,7 +44,7 @@ from splatsoil.quiet import hush
 from splatsoil.reconstruction import fill
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
-from splatsoil.synthetic import Appearance, Setup, photograph_run
+from splatsoil.synthetic import Appearance, Recorder, Setup, photograph_run
 
 OWN = ("_hidden", "_newton", "_scenes", "hidden_worlds")
 """Modules beside the package by which the experiments are made."""
@@ -147,16 +147,9 @@ class Study:
         """Make the measurement set, with its truth."""
         solver = asdict(Numerics()) if self.solver == NEWTON else self.solver
         truth = {"hidden": hidden.kind, "size": hidden.size, "values": hidden.values, "solver": solver}
-        photograph_run(
-            self.out / "sets" / hidden.name,
-            setup,
-            run,
-            plain({**truth, "scene": asdict(hidden.scene)}),
-            appearance=Appearance.drawn(hidden.seed),
-            observation=hidden.observation(),
-            seed=hidden.seed,
-            device=self.device,
-        )
+        look = Appearance.drawn(hidden.seed)
+        recorder = Recorder(setup, run, look, hidden.seed, self.device, hidden.observation())
+        photograph_run(self.out / "sets" / hidden.name, recorder, plain({**truth, "scene": asdict(hidden.scene)}))
         self.say(f"{hidden.name} simulated and photographed")
 
     def run(self, hidden: Hidden) -> Path:

@@ -49,7 +49,7 @@ from splatsoil.mpm import PRESETS
 from splatsoil.parameters import Parameter
 from splatsoil.quiet import hush
 from splatsoil.soil.library import library
-from splatsoil.synthetic import make_set, plow
+from splatsoil.synthetic import Recipe, make_set, plow
 
 ANGLE, WORLD = 35.0, 1
 """Of the soil, degrees, and the seed of its surface, its looks and the cameras' noise."""
@@ -245,7 +245,7 @@ def measure(effects: Sequence[str], preset: str, seeds: int, device: str, out: P
     """`left` of the effects of these names, or of all; what is not in the folder is made."""
     place, say = out / "set", Clock()
     if not (place / "truth.json").is_file():
-        make_set(place, plow(WORLD), friction_angle=ANGLE, preset=preset, seed=WORLD, device=device)
+        make_set(place, plow(WORLD), Recipe(ANGLE, preset=preset, seed=WORLD, device=device))
     measurement = Measurement.load(place)
     reconstruction = reconstructed(measurement, out / "reconstruction", preset, device)
     known = replace(reconstruction, surface=plow(WORLD).surface)

@@ -50,7 +50,7 @@ from splatsoil.parameters import ParameterSpace
 from splatsoil.quiet import hush
 from splatsoil.reconstruction import Reconstruction
 from splatsoil.soil.settings import FRICTION_ANGLE
-from splatsoil.synthetic import make_set, paper
+from splatsoil.synthetic import Recipe, make_set, paper
 
 Images = Mapping[tuple[str, int], npt.NDArray[np.float32]]
 
@@ -123,8 +123,9 @@ def world(angle: float, picture_scale: float, device: str, out: Path) -> tuple[M
     folder = out / "worlds" / f"{angle:g}"
     if not (folder / "truth.json").is_file():
         setup = paper() if picture_scale == 1.0 else paper().resized(picture_scale)
-        other = 1_000_003 + round(10 * angle)
-        make_set(folder, setup, friction_angle=angle, preset=preset("truth"), particle_seed=other, device=device)
+        seed = 1_000_003 + round(10 * angle)
+        recipe = Recipe(friction_angle=angle, preset=preset("truth"), particle_seed=seed, device=device)
+        make_set(folder, setup, recipe)
     measurement = Measurement.load(folder)
     return measurement, reconstructed(measurement, out / "reconstructions" / folder.name, "small", device)
 

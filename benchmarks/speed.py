@@ -26,14 +26,16 @@ from splatsoil.benchmarks._parts import Row, Section, parts_parser, run_parts
 from splatsoil.benchmarks._truth import Truth
 from splatsoil.benchmarks.effects import acting, strong
 
-from splatsoil.measurement import Measurement
+from splatsoil.measurement import Camera, Measurement
 from splatsoil.mpm import PRESETS, Resolution, Solver, simulate
 from splatsoil.mpm.simulate import base_settings, step_poses
 from splatsoil.quiet import hush
 from splatsoil.reconstruction import fill
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
+from splatsoil.splats import Gaussians, rasterise, reference
 from splatsoil.synthetic import paper
+from splatsoil.threads import at_most
 
 BATCH = 16
 """Parameter sets of one batch on a GPU."""
@@ -41,6 +43,9 @@ WINDOWS, FRAMES = (0, 50, 150), 3
 """Frames at which pieces of Newton's run begin (soil at rest, pushed, tool drawn back), and how many of each count."""
 ROUNDS = 15
 """Steps of each law, taken in turns."""
+LEAVES = ("means", "scales", "quaternions", "opacities", "colours")
+SHARE = 50
+"""One of so many Gaussians is drawn by the slow reference."""
 
 
 @dataclass(frozen=True)
@@ -230,7 +235,51 @@ def effects(task: Task) -> Section:
     return Section("What effects cost", words, (row,))
 
 
-PARTS = (simulation, newton, effects)
+def random_gaussians(count: int, size: int, device: str, pixels: float = 3.0) -> tuple[Gaussians, Camera]:
+    """Leaves of about ``pixels`` px spread over an image of ``size``² px."""
+    g = torch.Generator().manual_seed(0)
+    z = 1 + torch.rand(count, generator=g)
+    xy = (torch.rand(count, 2, generator=g) - 0.5) * z[:, None]
+    drawn = Gaussians(
+        means=torch.cat([xy, z[:, None]], dim=1),
+        scales=(pixels / size * z)[:, None] * torch.exp(0.3 * torch.randn(count, 3, generator=g)),
+        quaternions=torch.randn(count, 4, generator=g),
+        opacities=torch.rand(count, generator=g) * 0.8 + 0.1,
+        colours=torch.rand(count, 3, generator=g),
+    )
+    leaves = Gaussians(*(getattr(drawn, name).to(device).requires_grad_() for name in LEAVES))
+    pose = np.diag([1.0, -1.0, -1.0, 1.0])
+    return leaves, Camera(width=size, height=size, fx=size, fy=size, cx=size / 2, cy=size / 2, camera_to_world=pose)
+
+
+def rasteriser(task: Task, count: int = 20_000, size: int = 256) -> Section:
+    """Forward, and forward with gradients, beside the slow reference on one core of the CPU."""
+    leaves, camera = random_gaussians(count, size, task.device)
+    few = random_gaussians(count, size, "cpu")[0][: max(count // SHARE, 1)]
+
+    def ours() -> list[torch.Tensor]:
+        drawn = rasterise(leaves, camera)
+        return [drawn.colour, drawn.depth]
+
+    def slowly() -> list[torch.Tensor]:
+        covariances = few.covariances()
+        return [reference.rasterise_features(few.means, covariances, few.opacities, few.colours, camera)[0]]
+
+    def backward(draw: Callable[[], list[torch.Tensor]]) -> Callable[[], object]:
+        return lambda: torch.autograd.backward([out.sum() for out in draw()])
+
+    with at_most(1):
+        off = float((rasterise(few.to(task.device), camera).colour.cpu() - slowly()[0]).abs().max().detach())
+        rows = [Row("largest difference from the reference's picture", f"{off:.1e}", "≤ 1e-3", off <= 1e-3)]
+        for what, way in (("forward", torch.no_grad()), ("forward + backward", backward)):
+            mine, slow = timed(way(ours), 5 * task.repeats, task.device, warm=3), timed(way(slowly), 1, "cpu", warm=0)
+            slow = Times((slow.median * count / len(few),))
+            rows.append(Row(f"{count} Gaussians at {size}², {what}", mine.over(slow, "reference")))
+    words = f"Gaussians of 3 px; colour, alpha and depth. The reference draws one of {SHARE}."
+    return Section("Rasteriser", words, tuple(rows))
+
+
+PARTS = (simulation, newton, effects, rasteriser)
 """In the page's order."""
 
 

@@ -175,7 +175,7 @@ class World:
         """Gaussians of the undisturbed surface, bound to these particles."""
         import torch
 
-        from splatsoil.scene import Scene, ToolBody, bind
+        from splatsoil.scene import Scene, ToolBody
         from splatsoil.splats import Gaussians
 
         def tensor(array: npt.ArrayLike) -> torch.Tensor:
@@ -183,22 +183,14 @@ class World:
 
         cell = self.surface.cell[0]
         points = self.surface.points.reshape(-1, 3) - np.array([0.0, 0.0, 0.2 * cell])
-        rest = tensor(particles)
-        covariance = (
-            torch.diag(tensor([0.6 * cell, 0.6 * cell, 0.2 * cell]) ** 2).expand(len(points), 3, 3).contiguous()
-        )
-        empty = tensor(np.zeros((0, 3)))
-        return Scene(
-            soil=bind(tensor(points), covariance, rest, self.resolution.spacing),
-            soil_opacity=torch.full((len(points),), 0.95, device=self.device),
-            soil_albedo=tensor(pattern(points)),
+        return Scene.of(
+            Gaussians.discs(tensor(points), 0.6 * cell, 0.2 * cell, 0.95, tensor(pattern(points))),
+            tensor(particles),
+            self.resolution.spacing,
             grain_albedo=tensor(pattern(particles)),
-            surroundings=Gaussians(empty, empty, tensor(np.zeros((0, 4))), tensor(np.zeros(0)), empty),
-            surrounding_shapes=tensor(np.zeros((0, 3, 3))),
             light=self.light,
             tool=ToolBody(self.measurement.tool.mesh, self.device),
             tool_albedo=np.array([0.08, 0.16, 0.5]),
             bed=self.measurement.bed,
-            spacing=self.resolution.spacing,
             background=np.array([0.75, 0.77, 0.8]),
         )

@@ -197,7 +197,7 @@ def spotted() -> Callable[..., Any]:
     import numpy as np
     import torch
 
-    from splatsoil.scene import Light, Scene, ToolBody, bind, encoded, relief_of_particles
+    from splatsoil.scene import Light, Scene, ToolBody, encoded, relief_of_particles
     from splatsoil.splats import Gaussians
 
     def make(still: Any, spacing: float, bed: Any, spot: float, tool: Any) -> Scene:
@@ -209,20 +209,16 @@ def spotted() -> Callable[..., Any]:
         flat = torch.stack([x.reshape(-1), y.reshape(-1)], dim=1)
         centres = torch.cat([flat, relief.sample(relief.height, flat)[:, None]], dim=1)
         shade = 0.3 + 0.3 * torch.rand(len(centres), 1, generator=torch.Generator().manual_seed(0))
-        none = Gaussians(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, 4), torch.zeros(0), torch.zeros(0, 3))
-        shape = torch.diag(torch.tensor([spot, spot, 0.001]) ** 2).expand(len(centres), 3, 3).contiguous()
-        return Scene(
-            soil=bind(centres, shape, particles, spacing),
-            soil_opacity=torch.full((len(centres),), 0.95),
-            soil_albedo=encoded(shade * torch.tensor([1.0, 0.8, 0.6])),
+        soil = Gaussians.discs(centres, spot, 0.001, 0.95, encoded(shade * torch.tensor([1.0, 0.8, 0.6])))
+        return Scene.of(
+            soil,
+            particles,
+            spacing,
             grain_albedo=encoded(torch.tensor([0.45, 0.36, 0.27])).expand(len(particles), 3).contiguous(),
-            surroundings=none,
-            surrounding_shapes=torch.zeros(0, 3, 3),
             light=Light.from_angles(180.0, 60.0, [0.4, 0.5, 0.6]),
             tool=ToolBody(tool),
             tool_albedo=np.array([0.05, 0.1, 0.9]),
             bed=bed,
-            spacing=spacing,
             background=np.zeros(3),
         )
 

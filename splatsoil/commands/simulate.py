@@ -57,7 +57,7 @@ class Config:
 
 def run(config: Config) -> int:
     """Make the set; ParameterError for options that make no sense, before anything is computed."""
-    from splatsoil.synthetic import make_set
+    from splatsoil.synthetic import Recipe, make_set
     from splatsoil.synthetic.world import check_place
 
     values = parse_values(config.values)
@@ -68,9 +68,7 @@ def run(config: Config) -> int:
     setup = choose_setup(config)
     preset = config.preset or ("paper" if config.scene == "paper" and config.like is None else "small")
     with stages(quiet=config.json) as begin:
-        world = make_set(
-            config.out,
-            setup,
+        recipe = Recipe(
             friction_angle=config.friction_angle,
             effects=config.effects,
             values=values,
@@ -80,8 +78,8 @@ def run(config: Config) -> int:
             device=config.device,
             heights=config.heights,
             depth_maps=config.depth_maps,
-            progress=begin("simulate"),
         )
+        world = make_set(config.out, setup, recipe, begin("simulate"))
     summary = _summary(world)
     return tell(config, summary, lambda: _show(summary))
 

@@ -75,7 +75,7 @@ def likeness(
             out.append((np.nan, np.nan))
             continue
         with torch.no_grad():
-            drawn = rasterise(gaussians, camera, background=background, antialias=True, normals=False).colour
+            drawn = rasterise(gaussians, camera, background=background, antialias=True).colour
         box = tuple(slice(where.min(), where.max() + 1) for where in np.nonzero(seen))
         ours, theirs = (p.mean(dim=2).cpu().numpy()[box] for p in (drawn, views.photograph(k)))
         seen = seen[box]

@@ -243,7 +243,7 @@ def judged(gaussians: Gaussians, views: Views, background: tuple[float, float, f
         photograph = views.photograph(k).contiguous().to(gaussians.device)
         valid = views.valid[k, : camera.height, : camera.width, None].to(gaussians.device)
         with torch.no_grad():
-            seen = rasterise(gaussians, camera, background=background, antialias=True, normals=False)
+            seen = rasterise(gaussians, camera, background=background, antialias=True)
             mixed = seen.colour.clamp(0.0, 1.0) * valid + photograph * (1.0 - valid)
             share = float(valid.mean())
             value = float(psnr(mixed, photograph) + 10.0 * np.log10(share))

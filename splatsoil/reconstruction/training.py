@@ -169,7 +169,7 @@ def train(
             order = torch.randperm(len(views), generator=generator).tolist()
         k = order.pop()
         current = state.gaussians()
-        rendering = rasterise(current, views.cameras[k], background=background, antialias=True, normals=False)
+        rendering = rasterise(current, views.cameras[k], background=background, antialias=True)
         rendering.projection.centres.retain_grad()
         difference = (rendering.colour - photographs[k]) * valid[k]
         likeness = ssim(rendering.colour * valid[k], photographs[k] * valid[k])

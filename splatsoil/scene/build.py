@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +13,6 @@ from torch import Tensor
 from splatsoil.errors import ParameterError
 from splatsoil.measurement import TRANSPARENT, Bed, Frame, Measurement
 from splatsoil.scene import albedo as albedos
-from splatsoil.scene.binding import bind
 from splatsoil.scene.estimate import estimate_light, still_frames
 from splatsoil.scene.intrinsic import Intrinsic
 from splatsoil.scene.layers import Posed
@@ -23,6 +22,9 @@ from splatsoil.scene.relief import Relief, relief_of_particles
 from splatsoil.scene.render import Scene, nearer_side, to_sides
 from splatsoil.scene.tool import ToolBody
 from splatsoil.splats import Gaussians
+
+if TYPE_CHECKING:
+    from splatsoil.reconstruction import Reconstruction
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -36,23 +38,8 @@ _EDGE = 3
 """Pixels around the tool that are not used: lenses, blur and JPEG blocks mix colours there."""
 
 
-class Reconstructed(Protocol):
-    """What a scene needs of a reconstruction: `reconstruction.Reconstruction` has it."""
-
-    @property
-    def gaussians(self) -> Gaussians: ...
-    @property
-    def soil(self) -> Any: ...
-    @property
-    def tool(self) -> Any: ...
-    @property
-    def background(self) -> tuple[float, float, float]: ...
-    @property
-    def container(self) -> str: ...
-
-
 def build_scene(
-    reconstruction: Reconstructed,
+    reconstruction: Reconstruction,
     measurement: Measurement,
     particles: Any,
     spacing: float,
@@ -64,7 +51,7 @@ def build_scene(
     """A scene from photographs of the undisturbed bed: light estimated, albedo taken from colours, Gaussians bound.
 
     Args:
-        reconstruction: has ``gaussians`` (sRGB colours) and masks ``soil`` and ``tool`` (n,).
+        reconstruction: Gaussians, and which of them are soil and tool.
         measurement: the set it was made from.
         particles: (p, 3) at rest, m: those that will move.
         spacing: side of the cube of soil a particle stands for, m.
@@ -94,18 +81,16 @@ def build_scene(
         light = estimate_light(measurement, relief, body)
     motion = measurement.tool.motion
     start = motion.pose(float(motion.times[0]))
-    scene = Scene(
-        soil=bind(soil.means, soil.covariances(), x, spacing),
-        soil_opacity=soil.opacities.contiguous(),
-        soil_albedo=soil.colours,
+    scene = Scene.of(
+        soil,
+        x,
+        spacing,
+        around,
         grain_albedo=x.new_full(x.shape, 0.5),
-        surroundings=around,
-        surrounding_shapes=around.covariances(),
         light=light,
         tool=body,
         tool_albedo=np.ones(3),
         bed=bed,
-        spacing=spacing,
         background=np.asarray(reconstruction.background, dtype=np.float64),
         side_light=_side_light(soil, relief, light, bed) if reconstruction.container == TRANSPARENT else None,
     )

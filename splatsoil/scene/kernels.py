@@ -11,14 +11,11 @@ from __future__ import annotations
 
 import warp as wp
 
-from splatsoil.scene.kernels_maps import Surface, cell_centre, height_at, outward, sample
+from splatsoil.scene.kernels_maps import Maps, Surface, ToolPose, cell_centre, height_at, outward, sample
 from splatsoil.scene.kernels_sky import look_around
 
 STEEP, STEEPEST = wp.constant(0.7), wp.constant(0.5)
 """Upward parts of normals (45°, 60°) between which a surface's slope is less and less that of its heights."""
-
-Shade = wp.types.vector(length=8, dtype=wp.float32)
-"""What decides the light on a place: normal, shares of sky and sun, and light from soil and tool (red, green, blue)."""
 
 
 @wp.struct
@@ -35,15 +32,6 @@ class Illumination:
 
 
 @wp.struct
-class Maps:
-    """What reaches the cells of a surface: shades; what they send back; the share of the sky that the tool takes."""
-
-    shades: wp.array2d(dtype=Shade)
-    sent: wp.array2d(dtype=wp.vec3)
-    hidden: wp.array2d(dtype=wp.float32)
-
-
-@wp.struct
 class Pixels:
     """What splats say of each pixel (depth and share of soil), and what is found for it: light on its soil, and the
     tool's radiance times its share of the pixel with that share."""
@@ -52,17 +40,6 @@ class Pixels:
     soil: wp.array2d(dtype=wp.float32)
     light: wp.array2d(dtype=wp.vec3)
     tool: wp.array2d(dtype=wp.vec4)
-
-
-@wp.struct
-class ToolPose:
-    """The tool's mesh (in its own frame) and where it stands; ``mesh`` is 0 for no tool."""
-
-    mesh: wp.uint64
-    rotation: wp.mat33
-    position: wp.vec3
-    centre: wp.vec3
-    radius: float
 
 
 @wp.func
@@ -267,7 +244,6 @@ def illuminate(
     eye: Eye,
     surface: Surface,
     maps: Maps,
-    no_tool: wp.array2d(dtype=wp.vec2),
     light: Illumination,
     tool: ToolPose,
     pixels: Pixels,
@@ -300,7 +276,7 @@ def illuminate(
         steep = wp.clamp((STEEP - n[2]) / (STEEP - STEEPEST), 0.0, 1.0)
         if steep > 0.0 and found > 0.0 and surface.filling.shape[0] > 0:
             n = wp.normalize(n + steep * (outward(surface, x) - n))
-            seen = look_around(surface, maps.sent, no_tool, x, n)
+            seen = look_around(surface, maps, tool, x, n)
             # The tool takes the share of its sky that it takes of the cell's.
             taken = sample(maps.hidden, surface.grid, x[0], x[1])
             by_tool = seen.sky * taken / wp.max(taken + shade[3], 1.0e-3)

@@ -45,6 +45,38 @@ class Surface:
     reach: float
 
 
+Shade = wp.types.vector(length=8, dtype=wp.float32)
+"""What decides the light on a place: normal, shares of sky and sun, and light from soil and tool (red, green, blue)."""
+
+
+@wp.struct
+class Maps:
+    """What is known of the cells of a surface; what isn't is left empty.
+
+    Attributes:
+        shades: what light reaches them.
+        sent: light that they send back.
+        columns: lowest and highest point of the tool over each.
+        hidden: share of the sky that the tool takes.
+    """
+
+    shades: wp.array2d(dtype=Shade)
+    sent: wp.array2d(dtype=wp.vec3)
+    columns: wp.array2d(dtype=wp.vec2)
+    hidden: wp.array2d(dtype=wp.float32)
+
+
+@wp.struct
+class ToolPose:
+    """The tool's mesh (in its own frame) and where it stands; ``mesh`` is 0 for no tool."""
+
+    mesh: wp.uint64
+    rotation: wp.mat33
+    position: wp.vec3
+    centre: wp.vec3
+    radius: float
+
+
 @wp.func
 def sample(values: wp.array2d(dtype=Any), grid: Grid, x: float, y: float):
     """Bilinear value of a map (ny, nx), held constant beyond its outermost cells' centres."""

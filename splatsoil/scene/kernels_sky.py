@@ -7,10 +7,11 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import warp as wp
 
-from splatsoil.scene.kernels_maps import Surface, cell_centre, height_at
+from splatsoil.scene.kernels_maps import Maps, Surface, ToolPose, cell_centre, height_at
 
 AZIMUTHS = 12
 _TURN = 2.0 * math.pi / AZIMUTHS
@@ -34,26 +35,33 @@ def _wedge(slope: float, up: float, along: float) -> float:
 
 
 @wp.func
+def _cell(values: wp.array2d(dtype=Any), u: float, v: float):
+    """Value of the cell of a map (ny, nx) in which a place lies, or of the nearest one; u and v count cells from the
+    map's corner."""
+    i = int(wp.clamp(v, 0.0, float(values.shape[0]) - 0.5))
+    return values[i, int(wp.clamp(u, 0.0, float(values.shape[1]) - 0.5))]
+
+
+@wp.func
 def look_around(
     surface: Surface,
-    sent: wp.array2d(dtype=wp.vec3),
-    tool: wp.array2d(dtype=wp.vec2),
+    maps: Maps,
+    tool: ToolPose,
     place: wp.vec3,
     normal: wp.vec3,
 ) -> Around:
     """What a place of a unit normal sees, by its horizon in a dozen directions, in steps each a fifth longer than the
     last (horizon-based indirect light, after Bavoil and Sainz, 2009).
 
-    ``sent`` is what each cell sends back, ``tool`` the lowest and highest point of the tool over each cell; both may be
-    left empty.
+    Of the soil's light where maps tell what cells send back, of the tool where they tell what stands over them.
     """
     out = Around()
-    rows = surface.height.shape[0]
-    columns = surface.height.shape[1]
     u = (place[0] - surface.grid.x0) * surface.grid.inverse_x + 0.5
     v = (place[1] - surface.grid.y0) * surface.grid.inverse_y + 0.5
-    here = wp.clamp(int(v), 0, rows - 1) * columns + wp.clamp(int(u), 0, columns - 1)
+    known = maps.sent.shape[0] > 0
     up = wp.max(normal[2], 0.05)  # slopes are finite
+    ahead = tool.centre - place
+    radius = tool.radius + 2.0 * surface.step  # a cell around it may lie in its column
     for a in range(AZIMUTHS):
         angle = _TURN * (float(a) + 0.5)
         c = wp.cos(angle)
@@ -63,38 +71,47 @@ def look_around(
         slope = -along / up
         seen = _wedge(slope, up, along)
         if whole - seen > 0.0:  # else it looks into the wall
-            low = float(1.0e6)
-            high = float(-1.0e6)
-            last = int(here)
+            last = float(0.0)
             below = float(place[2])
             step = float(surface.step)
             r = float(step)
             while r < surface.reach:
-                i = int(wp.clamp(v + r * s * surface.grid.inverse_y, 0.0, float(rows) - 0.5))
-                j = int(wp.clamp(u + r * c * surface.grid.inverse_x, 0.0, float(columns) - 0.5))
                 top = height_at(surface, place[0] + r * c, place[1] + r * s)
                 climb = top - below
                 # A wall between two looks stands midway on the average.
                 rise = (top - place[2]) / wp.where(climb > step, r - 0.5 * step, r)
-                if rise > slope:
-                    slope = rise
-                    upto = _wedge(slope, up, along)
-                    # Soil between two looks sends their mean, but for a wall: none of the light on its top is on it.
+                if known and rise > slope:
+                    upto = _wedge(rise, up, along)
+                    # Soil between two looks sends their mean; but a wall has none of the light on its top.
                     upper = wp.where(climb <= step, 0.5, wp.max(1.0 - 0.5 * climb / step, 0.0))
-                    if sent.shape[0] > 0:
-                        before = sent[last // columns, last % columns]
-                        out.light += (upto - seen) * (before + upper * (sent[i, j] - before))
+                    before = _cell(
+                        maps.sent, u + last * c * surface.grid.inverse_x, v + last * s * surface.grid.inverse_y
+                    )
+                    here = _cell(maps.sent, u + r * c * surface.grid.inverse_x, v + r * s * surface.grid.inverse_y)
+                    out.light += (upto - seen) * (before + upper * (here - before))
                     seen = upto
-                if tool.shape[0] > 0:
-                    low = wp.min(low, (tool[i, j][0] - place[2]) / r)
-                    high = wp.max(high, (tool[i, j][1] - place[2]) / r)
-                last = i * columns + j
+                slope = wp.max(slope, rise)
+                last = r
                 below = top
                 step = wp.max(0.2 * r, surface.step)
                 r += step
-            out.sky += whole - seen
-            if high > wp.max(low, slope):
-                out.tool += _wedge(high, up, along) - _wedge(wp.max(low, slope), up, along)
+            out.sky += whole - _wedge(slope, up, along)
+            way = c * ahead[0] + s * ahead[1]
+            if maps.columns.shape[0] > 0 and way > -radius and wp.abs(s * ahead[0] - c * ahead[1]) < radius:
+                low = float(1.0e6)
+                high = float(-1.0e6)
+                r = surface.step
+                while r < wp.min(surface.reach, way + radius):
+                    if r > way - radius:
+                        column = _cell(
+                            maps.columns, u + r * c * surface.grid.inverse_x, v + r * s * surface.grid.inverse_y
+                        )
+                        low = wp.min(low, (column[0] - place[2]) / r)
+                        high = wp.max(high, (column[1] - place[2]) / r)
+                    r += wp.max(0.2 * r, surface.step)
+                low = wp.max(low, slope)
+                if high > low:
+                    out.tool += _wedge(high, up, along) - _wedge(low, up, along)
     share = 2.0 / float(AZIMUTHS)
     out.light *= share
     out.tool = wp.clamp(share * out.tool, 0.0, 1.0)
@@ -105,13 +122,13 @@ def look_around(
 @wp.kernel(enable_backward=False)
 def cells_look_around(
     surface: Surface,
-    sent: wp.array2d(dtype=wp.vec3),
-    tool: wp.array2d(dtype=wp.vec2),
+    maps: Maps,
+    tool: ToolPose,
     light: wp.array2d(dtype=wp.vec3),
     sky: wp.array2d(dtype=wp.vec2),
 ) -> None:
     """`look_around` of each cell: light, and the shares of the sky that soil leaves open and that the tool takes."""
     i, j = wp.tid()
-    seen = look_around(surface, sent, tool, cell_centre(surface, i, j), surface.normal[i, j])
+    seen = look_around(surface, maps, tool, cell_centre(surface, i, j), surface.normal[i, j])
     light[i, j] = seen.light
     sky[i, j] = wp.vec2(seen.sky, seen.tool)

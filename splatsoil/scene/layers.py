@@ -19,7 +19,7 @@ from splatsoil.scene.lit import LitRelief
 from splatsoil.scene.tool import eye_of
 from splatsoil.splats.steps import Steps, stepwise
 from splatsoil.splats.views import Seen, rasterise_views
-from splatsoil.splats.warp_torch import as_warp, launch, launch_parts, thread_count, upload
+from splatsoil.splats.warp_torch import launch, launch_parts, thread_count, upload
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -121,8 +121,7 @@ def layers_of(
 def _illuminate(lit: LitRelief, camera: Camera, pixels: Any, tool_albedo: FloatArray) -> None:
     """Write light on the soil and the tool's share of each pixel."""
     like, count = lit.openness, camera.height * camera.width
-    none = as_warp(like.new_empty((0, 0, 2)), wp.vec2)
-    inputs = [eye_of(camera), lit.relief.surface, lit.maps, none, lit.light.kernel_form(tool_albedo), lit.tool, pixels]
+    inputs = [eye_of(camera), lit.relief.surface, lit.maps, lit.light.kernel_form(tool_albedo), lit.tool, pixels]
     if like.is_cuda:
         launch(kernels.illuminate, count, [0, *inputs], like)
     else:

@@ -15,6 +15,7 @@ import warp as wp
 from torch import Tensor
 
 from splatsoil.scene import kernels, kernels_sky
+from splatsoil.scene.kernels_maps import Maps, Shade, ToolPose
 from splatsoil.scene.light import SUN_SOFTNESS, Light
 from splatsoil.scene.relief import Relief
 from splatsoil.splats.steps import Steps, stepwise
@@ -58,9 +59,9 @@ class LitRelief:
     def maps(self) -> Any:
         """What a picture is lit by, in the kernels' form."""
         scalars = self.openness[..., None], self.visible[..., None]
-        out = kernels.Maps()
+        out = Maps()
         shades = torch.cat([self.relief.normal, *scalars, self.bounced], dim=2)
-        out.shades = wp.from_torch(shades, dtype=kernels.Shade)
+        out.shades = wp.from_torch(shades, dtype=Shade)
         out.sent, out.hidden = wp.from_torch(self.sent, dtype=wp.vec3), wp.from_torch(self.hidden)
         return out
 
@@ -94,7 +95,7 @@ def light_relief(
     direct = direct_light(relief, light, tool, rough.points.reshape(-1, 3), 0.5 * rough.cell[0])
     first = _mixed(light, sky.reshape(-1), direct).reshape(rough.normal.shape)
     by_tool = tools[..., None] * side
-    once = _look_around(rough, ground * (first + by_tool), None)[0]
+    once = _look_around(rough, ground * (first + by_tool), ToolPose())[0]
     # It goes on between slopes as within a sphere, each place of which sees the same share of the others.
     by_soil = once / (1.0 - ground * (1.0 - sky - tools)[..., None])
     maps = torch.cat([by_soil, ground * (first + by_soil + by_tool)], dim=-1).permute(2, 0, 1)
@@ -109,33 +110,33 @@ def open_sky(relief: Relief, tool: Any) -> tuple[Tensor, Tensor]:
     return _look_around(relief, None, tool)[1:]
 
 
-def _look_around(relief: Relief, sent: Tensor | None, tool: Any | None) -> tuple[Tensor, Tensor, Tensor]:
+def _look_around(relief: Relief, sent: Tensor | None, tool: Any) -> tuple[Tensor, Tensor, Tensor]:
     """What each cell sees around it, by the horizon in a dozen directions.
 
     Args:
         relief: the surface.
         sent: (ny, nx, 3) light sent back by each cell, the same in all directions; None for none.
-        tool: a pose from `ToolBody.at` or `ToolBody.absent`; None where it doesn't matter.
+        tool: a pose from `ToolBody.at` or `ToolBody.absent`.
 
     Returns:
         Light from the soil (ny, nx, 3); the share of the sky (ny, nx) that soil and tool leave open, and the share that
         the tool alone takes.
     """
-    like = relief.normal
+    like, maps = relief.normal, Maps()
     light, sky = torch.empty_like(like), like.new_empty((*like.shape[:2], 2))
-    given = like.new_empty((0, 0, 3)) if sent is None else sent
-    columns = like.new_empty((0, 0, 2)) if tool is None else _tool_columns(relief, tool)
-    maps = [as_warp(m, d) for m, d in ((given, wp.vec3), (columns, wp.vec2), (light, wp.vec3), (sky, wp.vec2))]
-    launch(kernels_sky.cells_look_around, tuple(relief.height.shape), [relief.surface, *maps], like)
+    if sent is not None:
+        maps.sent = wp.from_torch(sent, dtype=wp.vec3)
+    if tool.mesh:
+        maps.columns = wp.from_torch(_tool_columns(relief, tool), dtype=wp.vec2)
+    inputs = [relief.surface, maps, tool, as_warp(light, wp.vec3), as_warp(sky, wp.vec2)]
+    launch(kernels_sky.cells_look_around, tuple(relief.height.shape), inputs, like)
     openness, hidden = sky.unbind(dim=-1)
     return light, openness - hidden, hidden.contiguous()
 
 
 def _tool_columns(relief: Relief, tool: Any) -> Tensor:
-    """Lowest and highest point (ny, nx, 2) of the tool over each cell, m, the lowest over the highest where there is
-    none; (0, 0, 2) without a tool."""
-    if tool.mesh == wp.uint64(0):
-        return relief.height.new_empty((0, 0, 2))
+    """Lowest and highest point (ny, nx, 2) of the tool over each cell, m; the lowest over the highest where there is
+    none."""
     columns = relief.height.new_empty((*relief.height.shape, 2))
     low, high = relief.range[0] - _REACH, relief.range[1] + _REACH
     inputs = [relief.surface, tool, high, low, as_warp(columns, wp.vec2)]

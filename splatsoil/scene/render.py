@@ -18,7 +18,7 @@ from splatsoil.batches import in_batches
 from splatsoil.measurement import Bed, Camera
 from splatsoil.scene import kernels_visible
 from splatsoil.scene.albedo import BRIGHTEST, SurfaceAlbedo, other_grain_albedo
-from splatsoil.scene.binding import Binding
+from splatsoil.scene.binding import Binding, bind
 from splatsoil.scene.layers import Layers, Posed, layers_of
 from splatsoil.scene.light import Light, encoded, linear
 from splatsoil.scene.lit import light_relief
@@ -62,7 +62,6 @@ class Scene:
         soil_albedo: (s, 3) sRGB-encoded albedo, see `light`.
         grain_albedo: (p, 3) the same for each particle's own Gaussian.
         surroundings: Gaussians that neither move nor change their colour.
-        surrounding_shapes: their covariances (m, 3, 3), m².
         light: sun and sky.
         tool: the tool's mesh.
         tool_albedo: (3,) linear.
@@ -79,7 +78,6 @@ class Scene:
     soil_albedo: Tensor
     grain_albedo: Tensor
     surroundings: Gaussians
-    surrounding_shapes: Tensor
     light: Light
     tool: ToolBody
     tool_albedo: FloatArray
@@ -88,6 +86,28 @@ class Scene:
     background: FloatArray
     smoothing: float = SMOOTHING
     side_light: FloatArray | None = None
+
+    @classmethod
+    def of(
+        cls, soil: Gaussians, particles: Tensor, spacing: float, surroundings: Gaussians | None = None, **parts: Any
+    ) -> Scene:
+        """A scene of soil's Gaussians, whose colours are its albedo, that ride on particles (p, 3) at rest, m.
+
+        Args:
+            soil: of the reconstruction.
+            particles: on the device where the scene is drawn.
+            spacing: of the particles, m.
+            surroundings: none by default.
+            parts: the other attributes by name.
+        """
+        return cls(
+            soil=bind(soil.means, soil.covariances(), particles, spacing),
+            soil_opacity=soil.opacities.contiguous(),
+            soil_albedo=soil.colours.contiguous(),
+            surroundings=soil[:0] if surroundings is None else surroundings,
+            spacing=spacing,
+            **parts,
+        )
 
     @property
     def device(self) -> torch.device:
@@ -125,6 +145,12 @@ class Scene:
             np.random.default_rng(seed),
         )
         return self.replace(grain_albedo=encoded(others.clamp(0.0, BRIGHTEST)))
+
+    @cached_property
+    def _still(self) -> tuple[Tensor, ...]:
+        """What is drawn of the surroundings: centres, covariances, opacities, and colours beside 0 for no soil."""
+        around = self.surroundings
+        return around.means, around.covariances(), around.opacities, functional.pad(around.colours, (0, 1))
 
     @cached_property
     def _sides(self) -> Tensor:
@@ -176,8 +202,7 @@ class Scene:
         centres, covariances = self.soil.carry(x, None if f is None else f.contiguous())
         # Numbers of what is drawn, not masks: a GPU makes the host wait for each mask that selects something.
         chosen = yield from _numbers_of(self.shown(relief, centres, x))
-        around, counts = self.surroundings, [len(numbers) for numbers in chosen]
-        counts.append(len(around.means))
+        counts = [*(len(numbers) for numbers in chosen), len(self.surroundings)]
         drawn = tuple(x.new_empty((sum(counts), *shape)) for shape in ((3,), (3, 3), (), (4,)))
         soil, grains, rest = zip(*(part.split(counts) for part in drawn), strict=True)
         inputs = [relief.surface, as_warp(self._sides, wp.float32), as_warp(chosen[0], wp.int32)]
@@ -188,9 +213,8 @@ class Scene:
         inputs = [relief.surface, as_warp(self._sides, wp.float32), as_warp(chosen[1], wp.int32), as_warp(x, wp.vec3)]
         inputs += [as_warp(self.grain_albedo, wp.vec3), sizes, _END, PARTICLE_OPACITY, visible_form(*grains)]
         launch(kernels_visible.grains, counts[1], inputs, x)
-        still = (around.means, self.surrounding_shapes, around.opacities, functional.pad(around.colours, (0, 1)))
-        for part, of_rest in zip(rest, still, strict=True):
-            part.copy_(of_rest)
+        for part, still in zip(rest, self._still, strict=True):
+            part.copy_(still)
         discs = (x.new_zeros((0, 3)), x.new_zeros((0, 3, 3))) if tool is None else self.tool.discs(*tool)
         centres, covariances, opacities, features = drawn
         own = slice(counts[0], counts[0] + counts[1])

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from splatsoil.measurement import Camera
 from splatsoil.scene import kernels
+from splatsoil.scene.kernels_maps import ToolPose
 from splatsoil.splats.warp_torch import launch, upload
 
 _SCALE = 0.004
@@ -53,7 +54,7 @@ class ToolBody:
     def at(self, rotation: npt.ArrayLike, position: npt.ArrayLike) -> Any:
         """The tool at a pose (rotation (3, 3) tool to world, position (3,) m) in the kernels' form."""
         r, x = np.asarray(rotation, dtype=np.float64), np.asarray(position, dtype=np.float64)
-        out = kernels.ToolPose()
+        out = ToolPose()
         out.mesh = wp.uint64(0 if self._mesh is None else self._mesh.id)
         out.rotation = wp.mat33(*r.reshape(-1))
         out.position = wp.vec3(*x)
@@ -68,9 +69,7 @@ class ToolBody:
 
     def absent(self) -> Any:
         """No tool at all."""
-        out = kernels.ToolPose()
-        out.mesh = wp.uint64(0)
-        return out
+        return ToolPose()
 
 
 def _discs(mesh: trimesh.Trimesh) -> tuple[Tensor, Tensor]:

@@ -1,26 +1,17 @@
 """Gaussian splats: the set, its file, its picture and the picture's gradients, on CPU and CUDA."""
 
-from splatsoil.splats.camera import OrthographicCamera
 from splatsoil.splats.gaussians import Gaussians
 from splatsoil.splats.metrics import psnr, ssim, ssim_map
 from splatsoil.splats.ply import load_ply, save_ply
-from splatsoil.splats.rasteriser import (
-    Features,
-    Rendering,
-    rasterise,
-    rasterise_covariances,
-    rasterise_features,
-)
+from splatsoil.splats.rasteriser import Features, Rendering, rasterise, rasterise_features
 
 __all__ = [
     "Features",
     "Gaussians",
-    "OrthographicCamera",
     "Rendering",
     "load_ply",
     "psnr",
     "rasterise",
-    "rasterise_covariances",
     "rasterise_features",
     "save_ply",
     "ssim",

@@ -11,13 +11,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 import warp as wp
+from scipy.sparse import coo_array
 from torch import Tensor
 
-from splatsoil.splats import constants, kernels_cpu
+from splatsoil.measurement import Camera
+from splatsoil.splats import constants
 from splatsoil.splats import kernels_binning as kernels
-from splatsoil.splats.camera import View
 from splatsoil.splats.projection import Projection
 from splatsoil.splats.steps import Steps, stepwise
 from splatsoil.splats.warp_torch import as_warp, launch, upload
@@ -49,16 +51,16 @@ class Bins:
 
 
 @stepwise
-def bin_by_tile(projection: Projection, features: Tensor, view: View, counts: Sequence[int] = ()) -> Steps[Bins]:
+def bin_by_tile(projection: Projection, features: Tensor, camera: Camera, counts: Sequence[int] = ()) -> Steps[Bins]:
     """Sort by depth, pack, list tiles, sort by tile. Nothing here carries gradients.
 
     Args:
         projection: of n Gaussians.
         features: (n, k).
-        view: tells the picture's size.
+        camera: tells the picture's size.
         counts: Gaussians of each of several views of this size, whose Gaussians, and then tiles, follow each other.
     """
-    tiles_x, tiles_y = -(-view.width // constants.TILE), -(-view.height // constants.TILE)
+    tiles_x, tiles_y = -(-camera.width // constants.TILE), -(-camera.height // constants.TILE)
     order = _depth_order(projection)
     count = order.shape[0]
     rows = features.new_empty((count, kernels.HEADER + features.shape[1]))
@@ -96,11 +98,12 @@ def _depth_order(projection: Projection) -> Tensor:
     depths = projection.depths.detach()
     if depths.is_cuda:
         return _depth_order_torch(projection)
-    scratch = torch.empty((4, depths.shape[0]), dtype=torch.int32)
-    count = torch.zeros(1, dtype=torch.int32)
-    inputs = [as_warp(depths, wp.float32), as_warp(projection.reaches, wp.vec2)]
-    launch(kernels_cpu.depth_order, 1, [*inputs, as_warp(scratch, wp.int32), as_warp(count, wp.int32)], depths)
-    return scratch[1, : int(count)]
+    numbers = np.flatnonzero(projection.visible.numpy())
+    bits = depths.numpy()[numbers].view(np.uint32)  # of positive numbers: in the same order
+    # NumPy's stable sort of 16-bit integers is by radix: the lower halves first.
+    order = np.argsort(bits.astype(np.uint16), kind="stable")
+    order = order[np.argsort((bits >> 16).astype(np.uint16)[order], kind="stable")]
+    return torch.from_numpy(numbers[order].astype(np.int32))
 
 
 def _depth_order_torch(projection: Projection) -> Tensor:
@@ -113,10 +116,10 @@ def _sort_by_tile(tiles: Tensor, owners: Tensor, tile_count: int) -> tuple[Tenso
     """Where each tile begins (tile_count + 1,), ranks (m,) and entries (m,) by tile in a stable order; all int32."""
     if tiles.is_cuda:
         return _sort_by_tile_torch(tiles, owners, tile_count)
-    starts = torch.zeros(tile_count + 1, dtype=torch.int32)
-    ranks, entries = torch.empty_like(owners), torch.empty_like(tiles)
-    launch(kernels_cpu.tile_sort, 1, [as_warp(t, wp.int32) for t in (tiles, owners, starts, ranks, entries)], tiles)
-    return starts, ranks, entries
+    # SciPy orders a sparse matrix by rows, which are tiles here, by a stable counting sort.
+    places = (tiles.numpy(), np.arange(len(tiles), dtype=np.int32))
+    rows = coo_array((owners.numpy(), places), shape=(tile_count, len(tiles))).tocsr()
+    return torch.from_numpy(rows.indptr), torch.from_numpy(rows.data), torch.from_numpy(rows.indices)
 
 
 def _sort_by_tile_torch(tiles: Tensor, owners: Tensor, tile_count: int) -> tuple[Tensor, Tensor, Tensor]:

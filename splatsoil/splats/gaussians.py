@@ -51,6 +51,13 @@ class Gaussians:
             if tensor.device != self.means.device:
                 raise ParameterError(f"Gaussians: {name} is on {tensor.device}, means are on {self.means.device}")
 
+    @classmethod
+    def discs(cls, means: Tensor, radius: float, thickness: float, opacity: float, colours: Tensor) -> Gaussians:
+        """Level ones at places (n, 3), of standard deviations along the ground and across it, m, and colours (n, 3)."""
+        scales = means.new_tensor([radius, radius, thickness]).expand(len(means), 3)
+        upright = means.new_tensor([1.0, 0.0, 0.0, 0.0]).expand(len(means), 4)
+        return cls(means, scales, upright, means.new_full((len(means),), opacity), colours)
+
     def __len__(self) -> int:
         return self.means.shape[0]
 
@@ -83,23 +90,3 @@ class Gaussians:
         """Covariance matrices R diag(s²) Rᵀ (n, 3, 3), m²; differentiable."""
         half = self.rotations() * self.scales[:, None, :]
         return half @ half.transpose(1, 2)
-
-    def normals(self, towards: Tensor | None = None) -> Tensor:
-        """Unit normals (n, 3), world frame: the shortest axis of each Gaussian.
-
-        Args:
-            towards: a point (3,), m, that the normals should face (a camera), or None to keep the axis' own sign.
-        """
-        shortest = torch.nn.functional.one_hot(self.scales.detach().argmin(dim=1), 3).to(self.means)
-        w, imaginary = torch.nn.functional.normalize(self.quaternions, dim=1).split([1, 3], dim=1)
-        turned = 2 * torch.linalg.cross(imaginary, shortest)
-        axis = shortest + w * turned + torch.linalg.cross(imaginary, turned)
-        if towards is None:
-            return axis
-        outward = ((towards.to(self.means) - self.means) * axis).sum(dim=1, keepdim=True).detach()
-        return torch.where(outward < 0, -axis, axis)
-
-    @staticmethod
-    def concatenate(parts: list[Gaussians]) -> Gaussians:
-        """All Gaussians of several sets, in order."""
-        return Gaussians(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(Gaussians)))

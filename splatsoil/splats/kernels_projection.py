@@ -22,14 +22,13 @@ _LARGEST = wp.constant(wp.float32(1e30))  # beyond it single precision overflows
 
 @wp.struct
 class Lens:
-    """A `View` for kernels."""
+    """A camera for kernels: x_px = focal·x/z + centre, OpenCV axes."""
 
     rotation: wp.mat33
     translation: wp.vec3
     focal: wp.vec2
     centre: wp.vec2
     size: wp.vec2
-    orthographic: int
     antialias: int
     dilation: float
 
@@ -58,8 +57,6 @@ def _clamped(value: float):
 @wp.func
 def _before_camera(p: wp.vec3, covariance: wp.mat33, lens: Lens):
     """Whether a Gaussian lies far enough before the camera's plane to be drawn; p: the mean in the camera's frame."""
-    if lens.orthographic == 1:
-        return True
     ahead = lens.rotation[2]
     variance = wp.dot(ahead, covariance * ahead)
     return p[2] > _NEAR and p[2] * p[2] > _REACH_TO_EYE * _REACH_TO_EYE * variance
@@ -69,14 +66,10 @@ def _before_camera(p: wp.vec3, covariance: wp.mat33, lens: Lens):
 def _footprint(p: wp.vec3, covariance: wp.mat33, lens: Lens):
     """p: the mean in the camera's frame; J·W row by row, then J·W·Σ·(J·W)ᵀ with and without the dilation."""
     f = Footprint()
-    if lens.orthographic == 1:
-        f.row_x = lens.rotation[0] * lens.focal[0]
-        f.row_y = lens.rotation[1] * lens.focal[1]
-    else:
-        inverse = 1.0 / p[2]
-        ahead = lens.rotation[2]
-        f.row_x = (lens.rotation[0] - ahead * _clamped(p[0] * inverse)) * (lens.focal[0] * inverse)
-        f.row_y = (lens.rotation[1] - ahead * _clamped(p[1] * inverse)) * (lens.focal[1] * inverse)
+    inverse = 1.0 / p[2]
+    ahead = lens.rotation[2]
+    f.row_x = (lens.rotation[0] - ahead * _clamped(p[0] * inverse)) * (lens.focal[0] * inverse)
+    f.row_y = (lens.rotation[1] - ahead * _clamped(p[1] * inverse)) * (lens.focal[1] * inverse)
     f.sx = covariance * f.row_x
     f.sy = covariance * f.row_y
     f.plain_xx = wp.dot(f.row_x, f.sx)
@@ -107,9 +100,7 @@ def project_forward(
     opacity = opacities[i]
     if opacity > _ALPHA_MIN and _before_camera(p, covariances[i], lens):
         f = _footprint(p, covariances[i], lens)
-        place = wp.vec2(p[0], p[1])
-        if lens.orthographic == 0:
-            place = place / p[2]
+        place = wp.vec2(p[0], p[1]) / p[2]
         centre = wp.cw_mul(lens.focal, place) + lens.centre
         strength = opacity
         if lens.antialias == 1:
@@ -173,24 +164,21 @@ def project_backward(
             + 0.5 * v_xy * (mixed + wp.transpose(mixed))
         )
         v_place = wp.cw_mul(lens.focal, v_centres[i])
-        if lens.orthographic == 1:
-            v_p += wp.vec3(v_place[0], v_place[1], 0.0)
-        else:
-            v_row_x = 2.0 * v_xx * f.sx + v_xy * f.sy
-            v_row_y = 2.0 * v_yy * f.sy + v_xy * f.sx
-            inverse = 1.0 / p[2]
-            tx = p[0] * inverse
-            ty = p[1] * inverse
-            v_tx = v_place[0]
-            v_ty = v_place[1]
-            ahead = lens.rotation[2]
-            if wp.abs(tx) < _TANGENT_LIMIT:
-                v_tx -= lens.focal[0] * inverse * wp.dot(v_row_x, ahead)
-            if wp.abs(ty) < _TANGENT_LIMIT:
-                v_ty -= lens.focal[1] * inverse * wp.dot(v_row_y, ahead)
-            # both rows are proportional to 1/z
-            v_z = (wp.dot(v_row_x, f.row_x) + wp.dot(v_row_y, f.row_y) + v_tx * tx + v_ty * ty) * inverse
-            v_p += wp.vec3(v_tx * inverse, v_ty * inverse, -v_z)
+        v_row_x = 2.0 * v_xx * f.sx + v_xy * f.sy
+        v_row_y = 2.0 * v_yy * f.sy + v_xy * f.sx
+        inverse = 1.0 / p[2]
+        tx = p[0] * inverse
+        ty = p[1] * inverse
+        v_tx = v_place[0]
+        v_ty = v_place[1]
+        ahead = lens.rotation[2]
+        if wp.abs(tx) < _TANGENT_LIMIT:
+            v_tx -= lens.focal[0] * inverse * wp.dot(v_row_x, ahead)
+        if wp.abs(ty) < _TANGENT_LIMIT:
+            v_ty -= lens.focal[1] * inverse * wp.dot(v_row_y, ahead)
+        # both rows are proportional to 1/z
+        v_z = (wp.dot(v_row_x, f.row_x) + wp.dot(v_row_y, f.row_y) + v_tx * tx + v_ty * ty) * inverse
+        v_p += wp.vec3(v_tx * inverse, v_ty * inverse, -v_z)
     v_means[i] = wp.transpose(lens.rotation) * v_p
 
 

@@ -10,9 +10,9 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from splatsoil.measurement import Camera
 from splatsoil.splats import constants
 from splatsoil.splats import kernels_projection as kernels
-from splatsoil.splats.camera import View
 from splatsoil.splats.warp_torch import as_warp, launch
 
 
@@ -40,31 +40,33 @@ class Projection:
         return self.reaches[:, 0] > 0
 
 
-def project(means: Tensor, covariances: Tensor, opacities: Tensor, view: View, antialias: bool = False) -> Projection:
+def project(
+    means: Tensor, covariances: Tensor, opacities: Tensor, camera: Camera, antialias: bool = False
+) -> Projection:
     """Project Gaussians; differentiable with respect to means, covariances and opacities (all but ``reaches``).
 
     Args:
         means: (n, 3), m, world frame.
         covariances: (n, 3, 3), m².
         opacities: (n,), in [0, 1].
-        view: the camera.
+        camera: without distortion.
         antialias: dilate by a pixel's own variance only, and scale opacity by √(det Σ / det Σ′), so that the dilation
             does not make small Gaussians heavier.
     """
-    return Projection(*_Project.apply(means, covariances, opacities, view, antialias))
+    return Projection(*_Project.apply(means, covariances, opacities, camera, antialias))
 
 
 def project_each(
-    gaussians: Sequence[tuple[Tensor, Tensor, Tensor]], views: Sequence[View], antialias: bool = False
+    gaussians: Sequence[tuple[Tensor, Tensor, Tensor]], cameras: Sequence[Camera], antialias: bool = False
 ) -> Projection:
-    """Means, covariances and opacities of several scenes, each projected by its own view, one after the other in one
+    """Means, covariances and opacities of several scenes, each projected by its own camera, one after the other in one
     projection; without gradients."""
     counts = [len(means) for means, _, _ in gaussians]
     outputs = _outputs(sum(counts), gaussians[0][0])
-    for inputs, view, parts in zip(
-        gaussians, views, zip(*(o.split(counts) for o in outputs), strict=True), strict=True
+    for inputs, camera, parts in zip(
+        gaussians, cameras, zip(*(o.split(counts) for o in outputs), strict=True), strict=True
     ):
-        arguments = [*_arrays(inputs, _INPUTS), _lens(view, antialias), *_arrays(parts, _OUTPUTS)]
+        arguments = [*_arrays(inputs, _INPUTS), _lens(camera, antialias), *_arrays(parts, _OUTPUTS)]
         launch(kernels.project_forward, len(inputs[0]), arguments, inputs[0])
     return Projection(*outputs)
 
@@ -74,14 +76,12 @@ def covariances_of(scales: Tensor, quaternions: Tensor) -> Tensor:
     return _Covariances.apply(scales, quaternions)
 
 
-def _lens(view: View, antialias: bool) -> Any:
+def _lens(camera: Camera, antialias: bool) -> Any:
     lens = kernels.Lens()
-    lens.rotation = wp.mat33(*view.rotation.reshape(-1).tolist())
-    lens.translation = wp.vec3(*view.translation.tolist())
-    lens.focal = wp.vec2(*view.focal)
-    lens.centre = wp.vec2(*view.centre)
-    lens.size = wp.vec2(float(view.width), float(view.height))
-    lens.orthographic = int(view.orthographic)
+    pose = camera.world_to_camera
+    lens.rotation, lens.translation = wp.mat33(*pose[:3, :3].reshape(-1).tolist()), wp.vec3(*pose[:3, 3].tolist())
+    lens.focal, lens.centre = wp.vec2(camera.fx, camera.fy), wp.vec2(camera.cx, camera.cy)
+    lens.size = wp.vec2(float(camera.width), float(camera.height))
     lens.antialias = int(antialias)
     lens.dilation = constants.PIXEL_VARIANCE if antialias else constants.DILATION
     return lens
@@ -103,12 +103,12 @@ _OUTPUTS = (wp.vec2, wp.vec3, wp.float32, wp.float32, wp.vec2)
 class _Project(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, means: Tensor, covariances: Tensor, opacities: Tensor, view: View, antialias: bool
+        ctx: Any, means: Tensor, covariances: Tensor, opacities: Tensor, camera: Camera, antialias: bool
     ) -> tuple[Tensor, ...]:
         n = means.shape[0]
         inputs = (means, covariances, opacities)
         outputs = _outputs(n, means)
-        ctx.lens = _lens(view, antialias)
+        ctx.lens = _lens(camera, antialias)
         ctx.save_for_backward(*inputs)
         arguments = [*_arrays(inputs, _INPUTS), ctx.lens, *_arrays(outputs, _OUTPUTS)]
         launch(kernels.project_forward, n, arguments, means)

@@ -1,4 +1,4 @@
-"""Drawing Gaussians: `rasterise`, `rasterise_covariances`, `rasterise_features`, all differentiable torch functions."""
+"""Drawing Gaussians: `rasterise` and `rasterise_features`, differentiable torch functions."""
 
 from __future__ import annotations
 
@@ -12,12 +12,11 @@ import warp as wp
 from torch import Tensor
 
 from splatsoil.errors import ParameterError
+from splatsoil.measurement import Camera
 from splatsoil.splats import constants, kernels_binning, kernels_cpu, kernels_cuda
 from splatsoil.splats.binning import Bins, bin_by_tile
-from splatsoil.splats.camera import AnyCamera, View, view_of
 from splatsoil.splats.gaussians import Gaussians
 from splatsoil.splats.projection import Projection, covariances_of, project
-from splatsoil.splats.steps import Steps, finished, stepwise
 from splatsoil.splats.warp_torch import as_warp, launch, launch_parts, thread_count
 
 _ENTRIES_PER_MILLISECOND = 8000
@@ -47,136 +46,96 @@ class Rendering:
         colour: (h, w, 3), over the background.
         alpha: (h, w), coverage in [0, 1].
         depth: (h, w), m: expected depth along the camera's z axis, Σwz / Σw; 0 where nothing is covered.
-        normal: (h, w, 3), world frame: Σ w n, not normalised; None when normals were not asked for.
         projection: the Gaussians on the image plane (centres in px, visible reach, …).
     """
 
     colour: Tensor
     alpha: Tensor
     depth: Tensor
-    normal: Tensor | None
     projection: Projection
 
 
 def rasterise(
     gaussians: Gaussians,
-    camera: AnyCamera,
+    camera: Camera,
     *,
     background: Tensor | Sequence[float] = (0.0, 0.0, 0.0),
     antialias: bool = False,
-    normals: bool = True,
 ) -> Rendering:
     """Draw Gaussians; differentiable with respect to all their tensors, on the device where these live.
 
     Args:
         gaussians: what to draw.
-        camera: a pinhole camera without distortion, or an `OrthographicCamera`.
+        camera: without distortion.
         background: colour behind everything (3,).
         antialias: blur by a pixel's own square only, and keep the total opacity of Gaussians smaller than a pixel
             (Mip-splatting).
-        normals: blend normals, too (each Gaussian's shortest axis, facing the camera); False saves time.
+
+    Raises:
+        ParameterError: a camera with lens distortion (undistort the image and the camera first) or an empty image, or
+            tensors that don't fit.
     """
-    view = view_of(camera)
     covariances = covariances_of(gaussians.scales, gaussians.quaternions)
-    axes = None
-    if normals:
-        # an orthographic camera faces along its axis: put the point to face very far behind it
-        eye = view.position - (1e6 * view.forward if view.orthographic else 0.0)
-        axes = gaussians.normals(torch.as_tensor(eye))
-    return _draw(
-        gaussians.means, covariances, gaussians.opacities, gaussians.colours, axes, view, background, antialias
-    )
+    check(gaussians.means, covariances, gaussians.opacities, camera)
+    projection = project(gaussians.means, covariances, gaussians.opacities, camera, antialias)
+    features = torch.cat([gaussians.colours, projection.depths[:, None]], dim=1)
+    behind = _behind(background, gaussians.colours)
+    image, alpha = _composite(projection, features, camera, torch.cat([behind, behind.new_zeros(1)]))
+    return Rendering(image[:, :, :3], alpha, image[:, :, 3] / alpha.clamp_min(1e-8), projection)
 
 
-def rasterise_covariances(
-    means: Tensor,
-    covariances: Tensor,
-    opacities: Tensor,
-    colours: Tensor,
-    normals: Tensor | None,
-    camera: AnyCamera,
-    *,
-    background: Tensor | Sequence[float] = (0.0, 0.0, 0.0),
-    antialias: bool = False,
-) -> Rendering:
-    """Draw Gaussians given by covariance matrices (of deformed particles, say); differentiable in every tensor.
-
-    Args:
-        means: (n, 3), m.
-        covariances: (n, 3, 3), m², symmetric.
-        opacities: (n,).
-        colours: (n, 3).
-        normals: (n, 3) to blend, or None.
-        camera: a pinhole camera without distortion, or an `OrthographicCamera`.
-        background: colour behind everything (3,).
-        antialias: see `rasterise`.
-    """
-    return _draw(means, covariances, opacities, colours, normals, view_of(camera), background, antialias)
-
-
-@stepwise
 def rasterise_features(
     means: Tensor,
     covariances: Tensor,
     opacities: Tensor,
     features: Tensor,
-    camera: AnyCamera,
+    camera: Camera,
     *,
     background: Tensor | Sequence[float] | None = None,
     antialias: bool = False,
-) -> Steps[Features]:
-    """Blend any features (n, k), 1 ≤ k ≤ 8, with the weights that colours would get; differentiable in every tensor."""
+) -> Features:
+    """Blend any features (n, k), 1 ≤ k ≤ 8, with the weights that colours would get; differentiable in every tensor.
+
+    Args:
+        means: (n, 3), m.
+        covariances: (n, 3, 3), m², symmetric.
+        opacities: (n,).
+        features: (n, k).
+        camera: without distortion.
+        background: (k,) behind everything; zeros by default.
+        antialias: see `rasterise`.
+
+    Raises:
+        ParameterError: see `rasterise`.
+    """
     if features.ndim != 2 or not 1 <= features.shape[1] <= constants.MAX_CHANNELS:
         raise ParameterError(
             f"features have shape {tuple(features.shape)}, expected (n, 1 to {constants.MAX_CHANNELS})"
         )
-    view = view_of(camera)
-    projection = _projected(means, covariances, opacities, view, antialias)
-    behind = torch.as_tensor(
-        features.new_zeros(features.shape[1]) if background is None else background,
-        dtype=torch.float32,
-        device=means.device,
-    )
+    check(means, covariances, opacities, camera)
+    projection = project(means, covariances, opacities, camera, antialias)
+    behind = _behind([0.0] * features.shape[1] if background is None else background, features)
+    return Features(*_composite(projection, features, camera, behind), projection)
+
+
+def _behind(background: Tensor | Sequence[float], features: Tensor) -> Tensor:
+    """The background's features (k,), as a tensor beside those of Gaussians (n, k)."""
+    behind = torch.as_tensor(background, dtype=torch.float32, device=features.device)
     if behind.shape != features.shape[1:]:
         raise ParameterError(f"background has shape {tuple(behind.shape)}, expected ({features.shape[1]},)")
-    image, alpha = yield from _composite(projection, features, view, behind)
-    return Features(image, alpha, projection)
+    return behind
 
 
-def _draw(
-    means: Tensor,
-    covariances: Tensor,
-    opacities: Tensor,
-    colours: Tensor,
-    normals: Tensor | None,
-    view: View,
-    background: Tensor | Sequence[float],
-    antialias: bool,
-) -> Rendering:
-    projection = _projected(means, covariances, opacities, view, antialias)
-    depths = projection.depths[:, None]
-    parts = [colours, depths] if normals is None else [colours, depths, normals]
-    behind = torch.as_tensor(background, dtype=torch.float32, device=means.device)
-    if behind.shape != (3,):
-        raise ParameterError(f"background has shape {tuple(behind.shape)}, expected (3,)")
-    behind = torch.cat([behind, behind.new_zeros(1 if normals is None else 4)])
-    image, alpha = finished(_composite(projection, torch.cat(parts, dim=1), view, behind))
-    colour, weighted_depth, *rest = image.split([3, 1] if normals is None else [3, 1, 3], dim=2)
-    depth = weighted_depth[:, :, 0] / alpha.clamp_min(1e-8)
-    return Rendering(colour, alpha, depth, rest[0] if rest else None, projection)
-
-
-def _projected(means: Tensor, covariances: Tensor, opacities: Tensor, view: View, antialias: bool) -> Projection:
-    checked(means, covariances, opacities)
-    return project(means, covariances, opacities, view, antialias)
-
-
-def checked(means: Tensor, covariances: Tensor, opacities: Tensor) -> None:
-    """Refuse what isn't Gaussians.
+def check(means: Tensor, covariances: Tensor, opacities: Tensor, camera: Camera) -> None:
+    """Refuse what isn't Gaussians, and a camera whose picture is empty or bent.
 
     Raises:
-        ParameterError: shapes or types that don't fit.
+        ParameterError: see `rasterise`.
     """
+    if camera.width < 1 or camera.height < 1:
+        raise ParameterError(f"the camera's image is empty ({camera.width} × {camera.height} px)")
+    if camera.has_distortion:
+        raise ParameterError("the rasteriser draws pinhole images: pass camera.undistorted() and an undistorted image")
     n = means.shape[0]
     for name, tensor, shape in (
         ("means", means, (n, 3)), ("covariances", covariances, (n, 3, 3)), ("opacities", opacities, (n,)),
@@ -187,12 +146,9 @@ def checked(means: Tensor, covariances: Tensor, opacities: Tensor) -> None:
             raise ParameterError(f"{name} are {tensor.dtype}; the rasteriser takes torch.float32")
 
 
-def _composite(
-    projection: Projection, features: Tensor, view: View, background: Tensor
-) -> Steps[tuple[Tensor, Tensor]]:
-    p = projection
-    bins = yield from bin_by_tile.steps(p, features, view)
-    image, transmittance = _Composite.apply(p.centres, p.conics, p.strengths, features, background, bins, view)
+def _composite(projection: Projection, features: Tensor, camera: Camera, background: Tensor) -> tuple[Tensor, Tensor]:
+    p, bins = projection, bin_by_tile(projection, features, camera)
+    image, transmittance = _Composite.apply(p.centres, p.conics, p.strengths, features, background, bins, camera)
     return image, 1.0 - transmittance
 
 
@@ -208,10 +164,10 @@ class _Composite(torch.autograd.Function):
         features: Tensor,
         background: Tensor,
         bins: Bins,
-        view: View,
+        camera: Camera,
     ) -> tuple[Tensor, Tensor]:
-        (image,), (transmittance,) = blend_each(bins, background, view, 1)
-        ctx.bins, ctx.view = bins, view
+        (image,), (transmittance,) = blend_each(bins, background, camera, 1)
+        ctx.bins, ctx.camera = bins, camera
         ctx.save_for_backward(conics, strengths, image, transmittance)
         return image, transmittance
 
@@ -219,12 +175,11 @@ class _Composite(torch.autograd.Function):
     def backward(ctx: Any, v_image: Tensor, v_transmittance: Tensor) -> tuple[Tensor | None, ...]:
         conics, strengths, image, transmittance = ctx.saved_tensors
         bins: Bins = ctx.bins
-        view: View = ctx.view
         n, channels = conics.shape[0], image.shape[2]
         kernels = _kernels(image)
         gradients = image.new_zeros((bins.ranks.shape[0], kernels.PARTS, kernels_binning.MOMENTS + channels))
         tensors = (image, transmittance, v_image, v_transmittance, gradients)
-        inputs = [*_tile_arguments(bins, view), as_warp(bins.entries, wp.int32)]
+        inputs = [*_tile_arguments(bins, ctx.camera), as_warp(bins.entries, wp.int32)]
         inputs += [as_warp(t.reshape(-1), wp.float32) for t in tensors]
         _launch_tiles(kernels.backward_kernel(channels), bins, inputs, image)
         gradients = gradients.sum(dim=1) if kernels.PARTS > 1 else gradients[:, 0]
@@ -240,12 +195,12 @@ class _Composite(torch.autograd.Function):
         return (*outputs, v_background, None, None)
 
 
-def blend_each(bins: Bins, background: Tensor, view: View, count: int) -> tuple[Tensor, Tensor]:
+def blend_each(bins: Bins, background: Tensor, camera: Camera, count: int) -> tuple[Tensor, Tensor]:
     """Features (v, h, w, k) and transmittance (v, h, w) of ``count`` views of one size, whose tiles follow each
     other."""
     channels, tiles = len(background), bins.tiles_x * bins.tiles_y
-    images = background.new_empty((count, view.height, view.width, channels))
-    transmittances = background.new_empty((count, view.height, view.width))
+    images = background.new_empty((count, camera.height, camera.width, channels))
+    transmittances = background.new_empty((count, camera.height, camera.width))
     kernels = _kernels(background)
     kernel = kernels.forward_kernel(channels)
     # A GPU draws all views in one launch: one by itself leaves most of it idle.
@@ -253,7 +208,7 @@ def blend_each(bins: Bins, background: Tensor, view: View, count: int) -> tuple[
     for k in range(0, count, at_once):
         mine = replace(bins, starts=bins.starts[k * tiles : (k + at_once) * tiles + 1])
         tensors = (background, images[k : k + at_once], transmittances[k : k + at_once])
-        inputs = [*_tile_arguments(mine, view), *(as_warp(t.reshape(-1), wp.float32) for t in tensors)]
+        inputs = [*_tile_arguments(mine, camera), *(as_warp(t.reshape(-1), wp.float32) for t in tensors)]
         _launch_tiles(kernel, mine, inputs, background)
     return images, transmittances
 
@@ -276,7 +231,7 @@ def _launch_tiles(kernel: Any, bins: Bins, inputs: list[Any], like: Tensor) -> N
     launch_parts(kernel, [0, *inner, tiles], inputs)
 
 
-def _tile_arguments(bins: Bins, view: View) -> list[Any]:
+def _tile_arguments(bins: Bins, camera: Camera) -> list[Any]:
     """What both tile kernels take first, after the number of the first tile."""
     rows, starts, ranks = as_warp(bins.rows, wp.float32), as_warp(bins.starts, wp.int32), as_warp(bins.ranks, wp.int32)
-    return [view.width, view.height, bins.tiles_x, rows, starts, ranks]
+    return [camera.width, camera.height, bins.tiles_x, rows, starts, ranks]

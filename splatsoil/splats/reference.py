@@ -8,28 +8,22 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from splatsoil.measurement import Camera
 from splatsoil.splats import constants
-from splatsoil.splats.camera import AnyCamera, view_of
 
 
 def project(
-    means: Tensor, covariances: Tensor, opacities: Tensor, camera: AnyCamera, antialias: bool = False
+    means: Tensor, covariances: Tensor, opacities: Tensor, camera: Camera, antialias: bool = False
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Centres (n, 2) px, dilated covariances (n, 2, 2) px², opacities (n,) and depths (n,) m on the image plane."""
-    view = view_of(camera)
-    rotation = torch.as_tensor(view.rotation).to(means)
-    points = means @ rotation.T + torch.as_tensor(view.translation).to(means)
+    pose = torch.as_tensor(camera.world_to_camera).to(means)
+    rotation = pose[:3, :3]
+    points = means @ rotation.T + pose[:3, 3]
     x, y, z = points.unbind(1)
-    fx, fy = view.focal
-    zero, one = torch.zeros_like(z), torch.ones_like(z)
-    if view.orthographic:
-        centres = torch.stack([fx * x, fy * y], dim=1)
-        jacobian = torch.stack([fx * one, zero, zero, zero, fy * one, zero], dim=1).reshape(-1, 2, 3)
-    else:
-        limit = constants.TANGENT_LIMIT
-        tx, ty = (x / z).clamp(-limit, limit), (y / z).clamp(-limit, limit)
-        centres = torch.stack([fx * x / z, fy * y / z], dim=1)
-        jacobian = torch.stack([fx / z, zero, -fx * tx / z, zero, fy / z, -fy * ty / z], dim=1).reshape(-1, 2, 3)
+    fx, fy, zero, limit = camera.fx, camera.fy, torch.zeros_like(z), constants.TANGENT_LIMIT
+    tx, ty = (x / z).clamp(-limit, limit), (y / z).clamp(-limit, limit)
+    centres = torch.stack([fx * x / z + camera.cx, fy * y / z + camera.cy], dim=1)
+    jacobian = torch.stack([fx / z, zero, -fx * tx / z, zero, fy / z, -fy * ty / z], dim=1).reshape(-1, 2, 3)
     moved = jacobian @ rotation
     plain = moved @ covariances @ moved.transpose(1, 2)
     dilation = constants.PIXEL_VARIANCE if antialias else constants.DILATION
@@ -37,7 +31,7 @@ def project(
     if antialias:
         ratio = torch.linalg.det(plain) / torch.linalg.det(dilated)
         opacities = opacities * ratio.clamp_min(constants.ANTIALIAS_MIN**2).sqrt()
-    return centres + torch.tensor(view.centre).to(means), dilated, opacities, z
+    return centres, dilated, opacities, z
 
 
 def rasterise_features(
@@ -45,7 +39,7 @@ def rasterise_features(
     covariances: Tensor,
     opacities: Tensor,
     features: Tensor,
-    camera: AnyCamera,
+    camera: Camera,
     *,
     background: Tensor | None = None,
     antialias: bool = False,
@@ -58,24 +52,23 @@ def rasterise_features(
         covariances: (n, 3, 3), m².
         opacities: (n,).
         features: (n, k).
-        camera: pinhole or orthographic.
+        camera: without distortion.
         background: (k,), zeros by default.
         antialias: see `splatsoil.splats.rasterise`.
         skip_below: opacity under which a Gaussian is skipped in a pixel; 0 makes the picture smooth in the parameters.
     """
-    view = view_of(camera)
     centres, dilated, strengths, depths = project(means, covariances, opacities, camera, antialias)
     conics = torch.linalg.inv(dilated)
-    rows = torch.arange(view.height).to(means) + 0.5
-    columns = torch.arange(view.width).to(means) + 0.5
-    transmittance = torch.ones(view.height, view.width).to(means)
-    finished = torch.zeros(view.height, view.width, dtype=torch.bool, device=means.device)
-    image = torch.zeros(view.height, view.width, features.shape[1]).to(means)
-    ahead = torch.as_tensor(view.forward).to(means)
+    rows = torch.arange(camera.height).to(means) + 0.5
+    columns = torch.arange(camera.width).to(means) + 0.5
+    transmittance = torch.ones(camera.height, camera.width).to(means)
+    finished = torch.zeros(camera.height, camera.width, dtype=torch.bool, device=means.device)
+    image = torch.zeros(camera.height, camera.width, features.shape[1]).to(means)
+    ahead = torch.as_tensor(camera.world_to_camera[2, :3]).to(means)
     nearest = constants.REACH_TO_EYE * torch.einsum("i,nij,j->n", ahead, covariances, ahead).sqrt()
     nearest = nearest.clamp_min(constants.NEAR)
     for i in torch.argsort(depths.detach(), stable=True).tolist():
-        if (not view.orthographic and depths[i] <= nearest[i]) or strengths[i] <= skip_below:
+        if depths[i] <= nearest[i] or strengths[i] <= skip_below:
             continue
         dx, dy = columns[None, :] - centres[i, 0], rows[:, None] - centres[i, 1]
         power = 0.5 * (conics[i, 0, 0] * dx**2 + conics[i, 1, 1] * dy**2) + conics[i, 0, 1] * dx * dy

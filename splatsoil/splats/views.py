@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from splatsoil.measurement import Camera
 from splatsoil.splats.binning import bin_by_tile
-from splatsoil.splats.camera import AnyCamera, view_of
 from splatsoil.splats.projection import project_each
-from splatsoil.splats.rasteriser import blend_each, checked, rasterise_features
+from splatsoil.splats.rasteriser import blend_each, check
 from splatsoil.splats.steps import Steps, stepwise
 
 
@@ -31,14 +31,15 @@ class Seen:
     covariances: Tensor
     opacities: Tensor
     features: Tensor
-    camera: AnyCamera
+    camera: Camera
 
 
 @stepwise
 def rasterise_views(
     views: Sequence[Seen], *, background: Tensor | None = None, antialias: bool = False
 ) -> Steps[tuple[Tensor, Tensor]]:
-    """Blend the features of one view or more, all of one size, number of features and device, without gradients.
+    """Blend the features of one view or more, all of one size, number of features and device, without gradients: all
+    Gaussians are in one list, sorted together, each view's tiles after the one's before.
 
     Args:
         views: what is seen by whom.
@@ -48,29 +49,13 @@ def rasterise_views(
     Returns:
         Features (v, h, w, k) and alpha (v, h, w), as by `rasterise_features` of each.
     """
-    if views[0].means.is_cuda:
-        return (yield from at_once(views, background, antialias))
-    images, alphas = [], []
+    cameras = [v.camera for v in views]
     for v in views:
-        with torch.no_grad():
-            drawn = yield from rasterise_features.steps(
-                v.means, v.covariances, v.opacities, v.features, v.camera, background=background, antialias=antialias
-            )
-        images.append(drawn.image)
-        alphas.append(drawn.alpha)
-    return torch.stack(images), torch.stack(alphas)
-
-
-def at_once(views: Sequence[Seen], background: Tensor | None, antialias: bool) -> Steps[tuple[Tensor, Tensor]]:
-    """`rasterise_views`, with all Gaussians in one list: sorted together, each view's tiles after the one's before."""
-    first = views[0]
-    cameras = [view_of(v.camera) for v in views]
-    for v in views:
-        checked(v.means, v.covariances, v.opacities)
+        check(v.means, v.covariances, v.opacities, v.camera)
     with torch.no_grad():
         projection = project_each([(v.means, v.covariances, v.opacities) for v in views], cameras, antialias)
         features = torch.cat([v.features for v in views])
-        behind = first.features.new_zeros(first.features.shape[1]) if background is None else background
+        behind = features.new_zeros(features.shape[1]) if background is None else background
         bins = yield from bin_by_tile.steps(projection, features, cameras[0], [len(v.means) for v in views])
         image, transmittance = blend_each(bins, behind, cameras[0], len(views))
         return image, 1.0 - transmittance

@@ -1,16 +1,18 @@
 """Synthetic worlds: our own solver moves the sand, a path tracer that shares nothing with the splats photographs it."""
 
 from splatsoil.synthetic.appearance import Appearance
-from splatsoil.synthetic.pictures import Renderer
+from splatsoil.synthetic.recording import Recorder, Renderer
 from splatsoil.synthetic.setups import Setup, like, paper, plow
 from splatsoil.synthetic.soil_surface import soil_surface
 from splatsoil.synthetic.stage import Body, Light, Stage, photograph
-from splatsoil.synthetic.world import World, make_set, photograph_run
+from splatsoil.synthetic.world import Recipe, World, make_set, photograph_run
 
 __all__ = [
     "Appearance",
     "Body",
     "Light",
+    "Recipe",
+    "Recorder",
     "Renderer",
     "Setup",
     "Stage",

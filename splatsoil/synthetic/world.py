@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,16 +19,13 @@ from splatsoil.files import check_folder
 from splatsoil.measurement import Measurement, write_measurement
 from splatsoil.mpm import Preset, Resolution, Trajectory, frames_around, simulate
 from splatsoil.mpm.simulate import base_settings
-from splatsoil.observation import Observation
 from splatsoil.reconstruction.filling import fill
 from splatsoil.soil.effect import Effect
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
 from splatsoil.synthetic.appearance import Appearance
-from splatsoil.synthetic.pictures import NOISE, Photographer, Renderer
-from splatsoil.synthetic.scanning import DEPTH_NOISE, GRID_NOISE, Scanner
+from splatsoil.synthetic.recording import DEPTH_NOISE, GRID_NOISE, NOISE, Recorder
 from splatsoil.synthetic.setups import Setup
-from splatsoil.synthetic.stage import Stage
 
 FloatArray = npt.NDArray[np.float64]
 Report = Callable[[str, float], None]
@@ -54,29 +51,11 @@ class World:
     seconds: Mapping[str, float]
 
 
-def make_set(
-    out: str | Path,
-    setup: Setup,
-    *,
-    friction_angle: float = 35.0,
-    effects: Iterable[str | Effect] = (),
-    values: Mapping[str, float] | None = None,
-    preset: Preset | str = "small",
-    seed: int = 0,
-    particle_seed: int | None = None,
-    device: str = "cpu",
-    appearance: Appearance | None = None,
-    heights: bool = False,
-    depth_maps: bool = False,
-    progress: Report | None = None,
-) -> World:
-    """Make a synthetic measurement set with ``truth.json`` and ``truth_particles.npz``.
+@dataclass(frozen=True)
+class Recipe:
+    """What a synthetic set is made of, besides its setup.
 
-    Nothing is written before everything is computed; the folder then appears whole or not at all.
-
-    Args:
-        out: the set's folder; must not exist, or be empty.
-        setup: bed, surface, tool, motion and cameras.
+    Attributes:
         friction_angle: degrees.
         effects: those that act, by name or from files that define some.
         values: their parameters by name; each effect needs one that differs from its off value.
@@ -85,28 +64,48 @@ def make_set(
         particle_seed: of the particles' places. A model fills its bed by seeds 0, 1, 2 and so on; the default is none
             of them, so that no fit starts from the very particles of the world.
         device: ``auto``, ``cpu`` or ``cuda:N``.
-        appearance: looks; drawn by seed by default.
         heights: whether grids of heights are measured, too.
         depth_maps: whether the fixed cameras measure depths, too.
+    """
+
+    friction_angle: float = 35.0
+    effects: Iterable[str | Effect] = ()
+    values: Mapping[str, float] = field(default_factory=dict)
+    preset: Preset | str = "small"
+    seed: int = 0
+    particle_seed: int | None = None
+    device: str = "cpu"
+    heights: bool = False
+    depth_maps: bool = False
+
+
+def make_set(out: str | Path, setup: Setup, recipe: Recipe, progress: Report = lambda what, share: None) -> World:
+    """Make a synthetic measurement set with ``truth.json`` and ``truth_particles.npz``.
+
+    Nothing is written before everything is computed; the folder then appears whole or not at all.
+
+    Args:
+        out: the set's folder; must not exist, or be empty.
+        setup: bed, surface, tool, motion and cameras.
+        recipe: soil, solver, seeds and instruments.
         progress: called with (what, share done).
 
     Raises:
         ParameterError: unknown or meaningless options, or a place that is taken.
         SimulationError: the simulation could not go on.
     """
-    report = progress or (lambda what, share: None)
-    target = Path(out)
+    target, seed, particle_seed = Path(out), recipe.seed, recipe.particle_seed
     check_place(target)
-    device = check_device(device)
+    device = check_device(recipe.device)
     if seed < 0 or (particle_seed is not None and particle_seed < 0):
         raise ParameterError(f"seeds are whole numbers from 0 on, not {seed if seed < 0 else particle_seed}")
     experiment = setup.experiment()
-    law = Law(effect.for_measurement(experiment) for effect in find_effects(effects))
-    parameters = law.require_on({**(values or {}), "friction_angle": friction_angle})
+    law = Law(effect.for_measurement(experiment) for effect in find_effects(recipe.effects))
+    parameters = law.require_on({**recipe.values, "friction_angle": recipe.friction_angle})
     observation = law.observation(parameters)
     settings = law.settings(base_settings(experiment), parameters)
-    resolution = Resolution.derive(experiment, preset)
-    look = appearance or Appearance.drawn(seed)
+    resolution = Resolution.derive(experiment, recipe.preset)
+    look = Appearance.drawn(seed)
     if particle_seed is None:
         particle_seed = int(np.random.default_rng([seed, 3]).integers(2**16, 2**31))
     particles = fill(setup.surface, setup.bed, resolution.spacing, seed=particle_seed)
@@ -122,7 +121,7 @@ def make_set(
         resolution=resolution,
         frames={*recorded, last},
         device=device,
-        progress=lambda frame, end: report("sand", frame / max(end, 1)),
+        progress=lambda frame, end: progress("sand", frame / max(end, 1)),
     )[0]
     simulated = time.perf_counter()
     truth: dict[str, Any] = {
@@ -133,73 +132,42 @@ def make_set(
         "seed": seed,
         "particle_seed": particle_seed,
         "particles": len(particles),
-        "preset": preset if isinstance(preset, str) else preset.name,
+        "preset": recipe.preset if isinstance(recipe.preset, str) else recipe.preset.name,
         "resolution": asdict(resolution),
         "device": device,
         "appearance": asdict(look),
         "sensor_noise": NOISE,
-        **({"height_noise": GRID_NOISE} if heights else {}),
-        **({"depth_noise": DEPTH_NOISE} if depth_maps else {}),
+        **({"height_noise": GRID_NOISE} if recipe.heights else {}),
+        **({"depth_noise": DEPTH_NOISE} if recipe.depth_maps else {}),
     }
-    measurement = photograph_run(
-        target,
-        setup,
-        trajectory,
-        truth,
-        appearance=look,
-        observation=observation,
-        seed=seed,
-        device=device,
-        heights=heights,
-        depth_maps=depth_maps,
-        progress=lambda share: report("pictures", share),
+    recorder = Recorder(
+        setup, trajectory, look, seed, device, observation, progress=lambda share: progress("pictures", share)
     )
+    measurement = photograph_run(target, recorder, truth, heights=recipe.heights, depth_maps=recipe.depth_maps)
     seconds = {"simulation": simulated - began, "pictures": time.perf_counter() - simulated}
     return World(measurement, truth, len(particles), seconds)
 
 
 def photograph_run(
-    out: str | Path,
-    setup: Setup,
-    trajectory: Trajectory,
-    truth: Mapping[str, Any],
-    *,
-    appearance: Appearance,
-    observation: Observation | None = None,
-    seed: int = 0,
-    device: str = "cpu",
-    heights: bool = False,
-    depth_maps: bool = False,
-    progress: Callable[[float], None] = lambda share: None,
-    renderer: Callable[..., Renderer] = Stage,
+    out: str | Path, recorder: Recorder, truth: Mapping[str, Any], *, heights: bool = False, depth_maps: bool = False
 ) -> Measurement:
     """Make a measurement set from a run of any simulator; the folder appears whole or not at all.
 
     Args:
         out: the set's folder; must not exist, or be empty.
-        setup: bed, surface, tool, motion and cameras.
-        trajectory: particles at all frames of the video; without force where it has none of any frame.
+        recorder: the run, and how it looks.
         truth: what ``truth.json`` is to say.
-        appearance: looks.
-        observation: how the cameras err; not at all by default.
-        seed: of light paths and noise.
-        device: Warp device name.
         heights: whether grids of heights are measured, too.
         depth_maps: whether the fixed cameras measure depths, too.
-        progress: called with the share of the pictures that is done.
-        renderer: makes what pictures are taken of, from `Stage`'s arguments.
 
     Raises:
         ParameterError: a place that is taken.
         MeasurementError: one that cannot be written.
     """
-    target = Path(out)
+    target, setup, trajectory = Path(out), recorder.setup, recorder.trajectory
     check_place(target)
-    observation = observation or Observation()
-    photographer = Photographer(setup, trajectory, appearance, seed, device, progress, observation, renderer)
-    views, video = photographer.take()
-    scanner = Scanner(setup, trajectory, seed, device, observation)
-    video = scanner.with_depth(video) if depth_maps else video
+    views, video = recorder.photographs()
+    video = recorder.with_depth(video) if depth_maps else video
     frames = np.arange(1, len(trajectory.force) + 1)
     force = np.column_stack([frames, frames / setup.frame_rate, trajectory.force]) if len(frames) else None
     return write_measurement(
@@ -213,7 +181,7 @@ def photograph_run(
         gravity=setup.gravity,
         quality=QUALITY,
         truth=truth,
-        heights=scanner.heights() if heights else None,
+        heights=recorder.heights() if heights else None,
         beside=lambda place: save_particles(place / "truth_particles.npz", trajectory, truth_frames(setup.frames)),
     )
 

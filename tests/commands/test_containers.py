@@ -10,7 +10,7 @@ import pytest
 
 from splatsoil.cli import main
 from splatsoil.reconstruction import Reconstruction
-from splatsoil.synthetic import make_set, plow
+from splatsoil.synthetic import Recipe, make_set, plow
 
 
 @pytest.mark.slow
@@ -19,7 +19,7 @@ def test_each_container_is_reconstructed_fitted_compared_and_diagnosed(
     container: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     setup = plow(3, views=16, container=container).resized(0.5)
-    make_set(tmp_path / "set", setup, friction_angle=33.0, preset="tiny", seed=3)
+    make_set(tmp_path / "set", setup, Recipe(33.0, preset="tiny", seed=3))
     capsys.readouterr()  # what Warp says of itself
     run = tmp_path / "run"
     words = ["run", str(tmp_path / "set"), "--run", str(run), "--preset", "tiny", "--stop-at-floor", "--json"]

@@ -21,8 +21,8 @@ from splatsoil.mpm import Resolution, Trajectory, simulate
 from splatsoil.reconstruction import HeightField, fill, reconstruct
 from splatsoil.scene import Relief
 from splatsoil.soil.law import Law
-from splatsoil.synthetic import plow
-from splatsoil.synthetic.scanning import GRID_NOISE, Scanner
+from splatsoil.synthetic import Appearance, Recorder, plow
+from splatsoil.synthetic.recording import GRID_NOISE
 
 FRAMES = (-2, -1, 0, 100, 199)
 DEEP = 0.03
@@ -170,7 +170,7 @@ def scanned(tmp_path_factory: pytest.TempPathFactory) -> Path:
         views=[],
         video=[],
         frame_rate=setup.frame_rate,
-        heights=Scanner(setup, run, 0).heights(),
+        heights=Recorder(setup, run, Appearance.drawn(0)).heights(),
     )
     return made.folder
 

@@ -8,8 +8,7 @@ import torch
 import trimesh
 
 from splatsoil.measurement import Bed, Camera
-from splatsoil.scene import Light, Scene, ToolBody, bind, encoded, linear, relief_of_particles
-from splatsoil.splats import Gaussians
+from splatsoil.scene import Light, linear
 from splatsoil.synthetic import stage as synthetic
 from splatsoil.synthetic.setups import look_at
 from splatsoil.synthetic.soil_surface import soil_surface
@@ -32,46 +31,27 @@ def pit(near, far, lean=0.0):
     return torch.tensor(x[~hole], dtype=torch.float32)
 
 
-def scene_of(particles, light, mesh=None):
-    axis = torch.arange(0.0025, 0.4, 0.005)
-    y, x = torch.meshgrid(axis, axis, indexing="ij")
-    flat = torch.stack([x.reshape(-1), y.reshape(-1)], dim=1)
-    relief = relief_of_particles(particles, SPACING, BED.lower, BED.upper)
-    centres = torch.cat([flat, relief.sample(relief.height, flat)[:, None]], dim=1)
-    shape = torch.diag(torch.tensor([0.003, 0.003, 0.0006]) ** 2).expand(len(centres), 3, 3).contiguous()
-    albedo = encoded(torch.full((3,), ALBEDO))
-    none = Gaussians(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, 4), torch.zeros(0), torch.zeros(0, 3))
-    return Scene(
-        soil=bind(centres, shape, particles, SPACING),
-        soil_opacity=torch.full((len(centres),), 0.9),
-        soil_albedo=albedo.expand(len(centres), 3).contiguous(),
-        grain_albedo=albedo.expand(len(particles), 3).contiguous(),
-        surroundings=none,
-        surrounding_shapes=torch.zeros(0, 3, 3),
-        light=light,
-        tool=ToolBody(mesh),
-        tool_albedo=np.zeros(3),
-        bed=BED,
-        spacing=SPACING,
-        background=np.zeros(3),
-    )
-
-
 def camera(eye, target):
     return Camera(160, 120, 260.0, 260.0, 80.0, 60.0, look_at(eye, target), model="PINHOLE")
 
 
-def both(particles, view, azimuth, mesh=None, sky=AMBIENT):
-    """Light on what each pixel shows, (h, w), over that of level ground: drawn by splats, and path traced; with a black
-    tool where its mesh lies, and a share of ``sky`` in the light."""
-    light = Light.from_angles(azimuth, ELEVATION, sky, level=np.full(3, ALBEDO))
-    pose = None if mesh is None else (np.eye(3), np.zeros(3))
-    drawn = linear(torch.tensor(scene_of(particles, light, mesh).render(particles, None, pose, view)))[..., 1].numpy()
-    bodies = [soil_surface(particles.numpy(), np.full((len(particles), 3), ALBEDO), SPACING, BED)]
-    bodies += [] if mesh is None else [synthetic.Body.flat(mesh, (0.0, 0.0, 0.0))]
-    sun = (1.0 - sky) / math.sin(math.radians(ELEVATION))
-    stage = synthetic.Stage(bodies, synthetic.Light.from_angles(azimuth, ELEVATION, sun, sky), ground=-0.1)
-    return drawn / ALBEDO, stage.radiance(view, seed=1, side=8)[..., 1] / ALBEDO
+@pytest.fixture
+def both(scene_on):
+    """Draws and path traces: light on what each pixel shows, (h, w), over that of level ground; with a black tool where
+    its mesh lies, and a share of ``sky`` in the light."""
+
+    def pictures(particles, view, azimuth, mesh=None, sky=AMBIENT):
+        light = Light.from_angles(azimuth, ELEVATION, sky, level=np.full(3, ALBEDO))
+        scene = scene_on(particles, SPACING, BED, light, np.full(3, ALBEDO), mesh)
+        pose = None if mesh is None else (np.eye(3), np.zeros(3))
+        drawn = linear(torch.tensor(scene.render(particles, None, pose, view)))[..., 1].numpy()
+        bodies = [soil_surface(particles.numpy(), np.full((len(particles), 3), ALBEDO), SPACING, BED)]
+        bodies += [] if mesh is None else [synthetic.Body.flat(mesh, (0.0, 0.0, 0.0))]
+        sun = (1.0 - sky) / math.sin(math.radians(ELEVATION))
+        stage = synthetic.Stage(bodies, synthetic.Light.from_angles(azimuth, ELEVATION, sun, sky), ground=-0.1)
+        return drawn / ALBEDO, stage.radiance(view, seed=1, side=8)[..., 1] / ALBEDO
+
+    return pictures
 
 
 def rows_between(view, *points):
@@ -80,7 +60,7 @@ def rows_between(view, *points):
 
 
 @pytest.mark.parametrize("azimuth", [-90.0, 90.0])
-def test_over_a_near_rim_the_far_wall_shows(azimuth):
+def test_over_a_near_rim_the_far_wall_shows(azimuth, both):
     """A camera looks over the rim of a pit at its far wall, two dozen particles away, once in the sun and once in
     shade. The floor before that wall, which the camera doesn't see, is in the other one's light."""
     view = camera((0.2, -0.35, 0.28), (0.2, 0.2, 0.1))
@@ -93,7 +73,7 @@ def test_over_a_near_rim_the_far_wall_shows(azimuth):
 
 
 @pytest.mark.parametrize(("lean", "azimuth"), [(0.0, -90.0), (15.0, -90.0), (0.0, -30.0), (15.0, 30.0)])
-def test_a_wall_is_lit_as_it_stands(lean, azimuth):
+def test_a_wall_is_lit_as_it_stands(lean, azimuth, both):
     """Straight ahead and from the side, an upright one and one that leans back."""
     view = camera((0.2, -0.35, 0.4), (0.2, 0.25, 0.08))
     drawn, traced = both(pit(0.1, 0.32, lean), view, azimuth)
@@ -108,7 +88,7 @@ def test_a_wall_is_lit_as_it_stands(lean, azimuth):
 
 
 @pytest.mark.parametrize("azimuth", [90.0, -90.0])
-def test_a_pit_sends_itself_the_light_that_it_has(azimuth):
+def test_a_pit_sends_itself_the_light_that_it_has(azimuth, both):
     """An upright wall in the shade and the floor before it in the sun, or the other way round. With what maps say
     between a wall's foot and its rim, and the rim's light for the wall's, they are too bright by up to 13 and 7 %.
     Paths that are traced end after three surfaces, which leaves out up to 3 %."""
@@ -119,7 +99,7 @@ def test_a_pit_sends_itself_the_light_that_it_has(azimuth):
     assert drawn[floor].mean() == pytest.approx(traced[floor].mean(), rel=0.035)
 
 
-def test_a_tool_takes_sky_from_a_wall():
+def test_a_tool_takes_sky_from_a_wall(both):
     """A black plate over half of the pit, under a sky alone; the camera looks beneath it. Without it the wall would be
     33 % too bright, and taking from it what the plate takes of level ground's sky makes it 27 % too dark."""
     view = camera((0.2, -0.35, 0.4), (0.2, 0.25, 0.08))

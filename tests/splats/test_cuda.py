@@ -8,7 +8,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 import warp as wp
@@ -17,7 +16,6 @@ from torch import Tensor
 from splatsoil.measurement import Camera
 from splatsoil.splats import (
     Gaussians,
-    OrthographicCamera,
     binning,
     kernels_binning,
     kernels_cuda,
@@ -27,12 +25,9 @@ from splatsoil.splats import (
     reference,
     ssim,
 )
-from splatsoil.splats.camera import view_of
 
 CameraMaker = Callable[..., Camera]
 CloudMaker = Callable[..., Gaussians]
-
-AnyCamera = Camera | OrthographicCamera
 
 NAMES = ("means", "scales", "quaternions", "opacities", "colours")
 
@@ -56,31 +51,27 @@ def outputs_and_gradients(
     return {name: value.detach().float().cpu() for name, value in (outputs | dict(named)).items()}
 
 
-def draw(g: Gaussians, camera: AnyCamera, antialias: bool = False) -> dict[str, Tensor]:
+def draw(g: Gaussians, camera: Camera, antialias: bool = False) -> dict[str, Tensor]:
     """By the rasteriser, where ``g`` lives."""
 
     def paint(h: Gaussians, background: Tensor) -> dict[str, Tensor]:
         picture = rasterise(h, camera, background=background, antialias=antialias)
-        assert picture.normal is not None
-        return {"colour": picture.colour, "alpha": picture.alpha, "depth": picture.depth, "normal": picture.normal}
+        return {"colour": picture.colour, "alpha": picture.alpha, "depth": picture.depth}
 
     return outputs_and_gradients(g, paint, torch.float32)
 
 
-def draw_slowly(g: Gaussians, camera: AnyCamera, antialias: bool = False) -> dict[str, Tensor]:
+def draw_slowly(g: Gaussians, camera: Camera, antialias: bool = False) -> dict[str, Tensor]:
     """By the reference in double precision: no Warp kernel takes part, so it runs on any machine."""
-    view = view_of(camera)
-    eye = torch.as_tensor(view.position - (1e6 * view.forward if view.orthographic else 0.0))
 
     def paint(h: Gaussians, background: Tensor) -> dict[str, Tensor]:
         depths = reference.project(h.means, h.covariances(), h.opacities, camera)[3]
-        features = torch.cat([h.colours, depths[:, None], h.normals(eye)], dim=1)
-        behind = torch.cat([background, background.new_zeros(4)])
+        features = torch.cat([h.colours, depths[:, None]], dim=1)
+        behind = torch.cat([background, background.new_zeros(1)])
         image, alpha = reference.rasterise_features(
             h.means, h.covariances(), h.opacities, features, camera, background=behind, antialias=antialias
         )
-        colour, depth, normal = image.split([3, 1, 3], dim=2)
-        return {"colour": colour, "alpha": alpha, "depth": depth[:, :, 0] / alpha.clamp_min(1e-8), "normal": normal}
+        return {"colour": image[:, :, :3], "alpha": alpha, "depth": image[:, :, 3] / alpha.clamp_min(1e-8)}
 
     return outputs_and_gradients(g, paint, torch.float64)
 
@@ -94,18 +85,12 @@ def assert_agree(a: dict[str, Tensor], b: dict[str, Tensor]) -> None:
         assert float((value - b[name]).abs().max()) < 0.02 * float(value.abs().max()), name
 
 
-def scenes(camera_at: CameraMaker, cloud: CloudMaker) -> list[tuple[str, Gaussians, AnyCamera, bool]]:
-    """Crowded and saturated, partial tiles, needles, clamped opacities, both kinds of camera."""
-    f = 60.0
-    crowd = cloud(400, f=f, extent=1.0, sigma=3.0)
-    crowd = crowd.replace(opacities=(crowd.opacities * 1.1).clamp(max=1.0))
-    pinhole = camera_at(width=53, height=41, f=f, cx=27.3, cy=18.9)
-    parallel = OrthographicCamera(53, 41, 0.03, np.diag([1.0, -1.0, -1.0, 1.0]))
-    return [
-        ("pinhole", crowd, pinhole, False),
-        ("antialias", crowd, pinhole, True),
-        ("orthographic", crowd, parallel, False),
-    ]
+@pytest.fixture
+def crowd(camera_at: CameraMaker, cloud: CloudMaker) -> tuple[Gaussians, Camera]:
+    """Crowded and saturated, partial tiles, needles, clamped opacities; and a camera."""
+    g = cloud(400, f=60.0, extent=1.0, sigma=3.0)
+    camera = camera_at(width=53, height=41, f=60.0, cx=27.3, cy=18.9)
+    return g.replace(opacities=(g.opacities * 1.1).clamp(max=1.0)), camera
 
 
 def launch_pixels(kernel: Any, bins: binning.Bins, inputs: list[Any], like: Tensor) -> None:
@@ -113,44 +98,39 @@ def launch_pixels(kernel: Any, bins: binning.Bins, inputs: list[Any], like: Tens
     wp.launch(kernel, dim=bins.tiles_x * bins.tiles_y * kernels_cuda.THREADS, inputs=[0, *inputs], device="cpu")
 
 
+@pytest.mark.parametrize("antialias", [False, True])
 @pytest.mark.parametrize("parts", [1, kernels_cuda.WARPS])
 def test_cuda_kernels_on_the_cpu(
-    parts: int, monkeypatch: pytest.MonkeyPatch, camera_at: CameraMaker, cloud: CloudMaker
+    parts: int, antialias: bool, monkeypatch: pytest.MonkeyPatch, crowd: tuple[Gaussians, Camera]
 ) -> None:
     """The same sorting and kernels, a warp being one lane wide: all but three warp-wide operations is tested."""
-    make = kernels_cuda.backward_kernel.__wrapped__
+    expected = draw_slowly(*crowd, antialias)
     monkeypatch.setattr(kernels_cuda, "PARTS", parts)
     monkeypatch.setattr(kernels_cuda, "_PARTS", wp.constant(wp.int32(parts)))
-    monkeypatch.setattr(kernels_cuda, "backward_kernel", make)
-    for _, g, camera, antialias in scenes(camera_at, cloud):
-        expected = draw_slowly(g, camera, antialias)
-        with monkeypatch.context() as patch:
-            patch.setattr(rasteriser, "_kernels", lambda like: kernels_cuda)
-            patch.setattr(rasteriser, "_launch_tiles", launch_pixels)
-            patch.setattr(binning, "_depth_order", binning._depth_order_torch)
-            patch.setattr(binning, "_sort_by_tile", binning._sort_by_tile_torch)
-            assert_agree(draw(g, camera, antialias), expected)
+    monkeypatch.setattr(kernels_cuda, "backward_kernel", kernels_cuda.backward_kernel.__wrapped__)
+    monkeypatch.setattr(rasteriser, "_kernels", lambda like: kernels_cuda)
+    monkeypatch.setattr(rasteriser, "_launch_tiles", launch_pixels)
+    monkeypatch.setattr(binning, "_depth_order", binning._depth_order_torch)
+    monkeypatch.setattr(binning, "_sort_by_tile", binning._sort_by_tile_torch)
+    assert_agree(draw(*crowd, antialias), expected)
 
 
 def test_what_no_pixel_shows_has_no_gradient_in_the_order_of_cuda(
-    monkeypatch: pytest.MonkeyPatch, camera_at: CameraMaker, cloud: CloudMaker
+    monkeypatch: pytest.MonkeyPatch, crowd: tuple[Gaussians, Camera]
 ) -> None:
     """That order has the invisible ones, too; their opacity in the picture is 0, by which gradients are divided."""
     monkeypatch.setattr(binning, "_depth_order", binning._depth_order_torch)
-    for _, g, camera, antialias in scenes(camera_at, cloud):
-        shifted = torch.cat([g.means, g.means + 100.0])
-        both = Gaussians(
-            shifted, *(torch.cat([getattr(g, n)] * 2) for n in ("scales", "quaternions", "opacities", "colours"))
-        )
-        both = Gaussians(*(getattr(both, n).detach().requires_grad_() for n in NAMES))
-        picture = rasterise(both, camera, antialias=antialias)
-        picture.projection.strengths.retain_grad()
-        (picture.colour.sum() + picture.alpha.sum()).backward()
-        gradient = picture.projection.strengths.grad
-        assert gradient is not None
-        hidden = ~picture.projection.visible
-        assert hidden.sum() >= len(g)
-        assert torch.isfinite(gradient).all() and not gradient[hidden].any() and gradient.any()
+    g, camera = crowd
+    parts = {name: torch.cat([getattr(g, name)] * 2) for name in NAMES}
+    parts["means"][len(g) :] += 100.0
+    picture = rasterise(Gaussians(**{name: part.requires_grad_() for name, part in parts.items()}), camera)
+    picture.projection.strengths.retain_grad()
+    (picture.colour.sum() + picture.alpha.sum()).backward()
+    gradient = picture.projection.strengths.grad
+    assert gradient is not None
+    hidden = ~picture.projection.visible
+    assert hidden.sum() >= len(g)
+    assert torch.isfinite(gradient).all() and not gradient[hidden].any() and gradient.any()
 
 
 @pytest.mark.parametrize("channels", [1, 8])
@@ -196,9 +176,9 @@ warp_torch.launch(None, 1, [], SimpleNamespace(is_cuda=True, device=torch.device
 
 
 @on_gpu
-@pytest.mark.parametrize("index", [0, 1, 2])
-def test_values_and_gradients_on_cuda(index: int, camera_at: CameraMaker, cloud: CloudMaker) -> None:
-    _, g, camera, antialias = scenes(camera_at, cloud)[index]
+@pytest.mark.parametrize("antialias", [False, True])
+def test_values_and_gradients_on_cuda(antialias: bool, crowd: tuple[Gaussians, Camera]) -> None:
+    g, camera = crowd
     assert_agree(draw(g.to("cuda"), camera, antialias), draw_slowly(g, camera, antialias))
 
 
@@ -216,8 +196,8 @@ def test_a_large_scene_on_cuda(camera_at: CameraMaker, cloud: CloudMaker) -> Non
 
 
 @on_gpu
-def test_on_a_stream_of_its_own(camera_at: CameraMaker, cloud: CloudMaker) -> None:
-    _, g, camera, _ = scenes(camera_at, cloud)[0]
+def test_on_a_stream_of_its_own(crowd: tuple[Gaussians, Camera]) -> None:
+    g, camera = crowd
     expected = draw(g.to("cuda"), camera)
     moved = g.to("cuda")
     torch.cuda.synchronize()

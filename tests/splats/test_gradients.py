@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from splatsoil.measurement import Camera
-from splatsoil.splats import Gaussians, OrthographicCamera, rasterise, rasterise_features, reference, ssim_map
+from splatsoil.splats import Gaussians, rasterise, rasterise_features, reference, ssim_map
 from splatsoil.splats.gaussians import rotation_matrices
 from splatsoil.splats.projection import covariances_of
 
@@ -29,15 +28,12 @@ def relative(a: Tensor, b: Tensor) -> float:
 
 
 @pytest.mark.parametrize("antialias", [False, True])
-@pytest.mark.parametrize("orthographic", [False, True])
 def test_reference_gradients_against_finite_differences(
-    orthographic: bool, antialias: bool, camera_at: CameraMaker, cloud: CloudMaker
+    antialias: bool, camera_at: CameraMaker, cloud: CloudMaker
 ) -> None:
     """The 1/255 step is taken out: a finite difference would see it jump."""
     g = cloud(4, f=20.0, extent=0.3, seed=4)
     camera = camera_at(width=8, height=7, f=20.0)
-    if orthographic:
-        camera = OrthographicCamera(8, 7, 0.07, np.diag([1.0, -1.0, -1.0, 1.0]))
     weights = torch.rand(7, 8, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
     def loss(means: Tensor, scales: Tensor, quaternions: Tensor, opacities: Tensor, features: Tensor) -> Tensor:
@@ -53,15 +49,12 @@ def test_reference_gradients_against_finite_differences(
 
 
 @pytest.mark.parametrize("channels", [1, 3, 4, 7, 8])
-@pytest.mark.parametrize("kind", ["plain", "antialias", "orthographic"])
-def test_kernels_against_reference(kind: str, channels: int, camera_at: CameraMaker, cloud: CloudMaker) -> None:
+@pytest.mark.parametrize("antialias", [False, True])
+def test_kernels_against_reference(antialias: bool, channels: int, camera_at: CameraMaker, cloud: CloudMaker) -> None:
     """Values and all gradients on a crowded image with partial tiles, clamped and saturated pixels."""
     f = 60.0
     g = cloud(150, f=f, extent=1.0, sigma=3.0, seed=channels)
     camera = camera_at(width=53, height=41, f=f, cx=27.3, cy=18.9)
-    if kind == "orthographic":
-        camera = OrthographicCamera(53, 41, 0.03, np.diag([1.0, -1.0, -1.0, 1.0]))
-    antialias = kind == "antialias"
     generator = torch.Generator().manual_seed(7)
     features = torch.randn(len(g), channels, generator=generator)
     background = torch.rand(channels, generator=generator)
@@ -90,16 +83,14 @@ def test_kernels_against_reference(kind: str, channels: int, camera_at: CameraMa
 def test_kernels_against_finite_differences(camera_at: CameraMaker, cloud: CloudMaker) -> None:
     """Central differences of the float32 picture itself; these Gaussians cover every pixel well above 1/255."""
     g = cloud(6, f=20.0, extent=0.2, sigma=8.0, seed=2)
-    # the shortest axis is clearly the shortest, or the normal would jump
     g = g.replace(opacities=0.3 + 0.3 * g.opacities, scales=g.scales.clamp(0.35, 0.6) * torch.tensor([1.1, 0.8, 1.3]))
     camera = camera_at(width=12, height=10, f=20.0)
-    weights = torch.randn(10, 12, 8, generator=torch.Generator().manual_seed(0))
+    weights = torch.randn(10, 12, 5, generator=torch.Generator().manual_seed(0))
     names = ("means", "scales", "quaternions", "opacities", "colours")
 
     def loss(h: Gaussians) -> Tensor:
         picture = rasterise(h, camera)
-        assert picture.normal is not None
-        channels = [picture.colour, picture.alpha[:, :, None], picture.depth[:, :, None], picture.normal]
+        channels = [picture.colour, picture.alpha[:, :, None], picture.depth[:, :, None]]
         return (torch.cat(channels, dim=2).double() * weights).sum()
 
     leaves = [getattr(g, name).clone().requires_grad_() for name in names]

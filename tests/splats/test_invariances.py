@@ -42,7 +42,7 @@ def test_crop_and_tile_grid(x0: int, y0: int, camera_at: CameraMaker, cloud: Clo
     camera = camera_at(width=80, height=64)
     whole = rasterise(g, camera)
     part = rasterise(g, camera.cropped(x0, y0, 37, 29))
-    for name in ("colour", "alpha", "depth", "normal"):
+    for name in ("colour", "alpha", "depth"):
         full = getattr(whole, name)[y0 : y0 + 29, x0 : x0 + 37]
         assert_same_picture(getattr(part, name), full, pixels=2e-3)
 
@@ -52,22 +52,15 @@ def test_rigid_motion_of_scene_and_camera(camera_at: CameraMaker, cloud: CloudMa
     turn, shift = Rotation.from_euler("xyz", [0.4, -1.1, 2.0]), np.array([0.3, -2.0, 0.7])
     motion = np.eye(4)
     motion[:3, :3], motion[:3, 3] = turn.as_matrix(), shift
-    x, y, z, w = turn.as_quat()
     own = Rotation.from_quat(g.quaternions.double().numpy()[:, [1, 2, 3, 0]])
     moved = g.replace(
         means=(g.means.double() @ torch.from_numpy(turn.as_matrix()).T + torch.from_numpy(shift)).float(),
         quaternions=torch.from_numpy((turn * own).as_quat()[:, [3, 0, 1, 2]]).float(),
     )
-    assert abs(w) < 1
-    assert x * x + y * y + z * z > 0
     before = rasterise(g, camera_at())
     after = rasterise(moved, camera_at(camera_to_world=motion @ POSE))
     assert_same_picture(after.colour, before.colour, pixels=2e-3)
     assert_same_picture(after.depth, before.depth, pixels=2e-3)
-    assert before.normal is not None
-    assert after.normal is not None
-    turned = before.normal @ torch.from_numpy(turn.as_matrix()).float().T
-    assert_same_picture(after.normal, turned, pixels=2e-3)
 
 
 def test_length_of_quaternions(camera_at: CameraMaker, cloud: CloudMaker) -> None:
@@ -77,9 +70,9 @@ def test_length_of_quaternions(camera_at: CameraMaker, cloud: CloudMaker) -> Non
     assert_same_picture(longer.colour, rasterise(g, camera_at()).colour, pixels=2e-3)
 
 
-def test_a_subset_and_a_concatenation_keep_every_tensor(cloud: CloudMaker) -> None:
+def test_a_subset_is_one_of_every_tensor(cloud: CloudMaker) -> None:
     g = cloud(10)
-    halves = Gaussians.concatenate([g[:4], g[torch.arange(4, 10)]])
-    for field in fields(Gaussians):
-        assert torch.equal(getattr(halves, field.name), getattr(g, field.name))
-    assert len(g[g.opacities > 2]) == 0
+    chosen = torch.arange(10) % 3 == 0
+    for subset, numbers in ((g[:4], range(4)), (g[torch.tensor([7, 2])], (7, 2)), (g[chosen], (0, 3, 6, 9))):
+        for field in fields(Gaussians):
+            assert torch.equal(getattr(subset, field.name), torch.stack([getattr(g, field.name)[k] for k in numbers]))

@@ -17,11 +17,12 @@ from splatsoil.measurement import Measurement, ToolMotion, remarks
 from splatsoil.mpm import Resolution, simulate
 from splatsoil.reconstruction import fill
 from splatsoil.soil.law import Law
-from splatsoil.synthetic import Appearance, Setup, World, like, make_set, paper, plow
+from splatsoil.synthetic import Appearance, Recipe, Setup, World, like, make_set, paper, plow
 from splatsoil.synthetic.setups import video_frames
 from splatsoil.synthetic.world import truth_frames
 
 LAST = 60
+DRY = Recipe(friction_angle=31.0, preset="tiny")
 
 
 def short(seed: int = 0, views: int = 12) -> Setup:
@@ -36,7 +37,7 @@ def short(seed: int = 0, views: int = 12) -> Setup:
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> World:
     """A dry world."""
-    return make_set(tmp_path_factory.mktemp("worlds") / "dry", short(), friction_angle=31.0, preset="tiny")
+    return make_set(tmp_path_factory.mktemp("worlds") / "dry", short(), DRY)
 
 
 def particles(folder: Path, frame: int) -> np.ndarray:
@@ -135,7 +136,7 @@ def test_pictures_show_the_push(world: World) -> None:
 
 
 def test_the_same_seed_gives_the_same_bytes(world: World, tmp_path: Path) -> None:
-    again = make_set(tmp_path / "dry", short(), friction_angle=31.0, preset="tiny")
+    again = make_set(tmp_path / "dry", short(), DRY)
     assert again.measurement.hash == world.measurement.hash
     ours, theirs = (np.load(w.measurement.folder / "truth_particles.npz") for w in (again, world))
     for key in theirs:
@@ -147,14 +148,8 @@ def test_the_same_seed_gives_the_same_bytes(world: World, tmp_path: Path) -> Non
 def test_what_cameras_report_changes_the_video_and_nothing_else(world: World, tmp_path: Path) -> None:
     """A gain of 0.6, and a pan of the left camera by a pixel."""
     per_pixel = float(np.degrees(1.0 / short().video["left"].fx))
-    seen = make_set(
-        tmp_path / "seen",
-        short(),
-        friction_angle=31.0,
-        preset="tiny",
-        effects=("exposure", "camera_pose"),
-        values={"exposure_gain": 0.6, "camera_1_pan": per_pixel},
-    )
+    values = {"exposure_gain": 0.6, "camera_1_pan": per_pixel}
+    seen = make_set(tmp_path / "seen", short(), replace(DRY, effects=("exposure", "camera_pose"), values=values))
     assert seen.truth["parameters"]["camera_1_pan"] == per_pixel
     for frame in truth_frames(world.measurement.frames):
         np.testing.assert_array_equal(
@@ -184,7 +179,7 @@ def test_a_late_video_shows_soil_and_tool_as_they_are_later(tmp_path: Path) -> N
 
     def seen(name: str, frame: int, **effects: Any) -> Measurement:
         setup = replace(short(views=2), frames=(0, frame))
-        return make_set(tmp_path / name, setup, friction_angle=31.0, preset="tiny", **effects).measurement
+        return make_set(tmp_path / name, setup, replace(DRY, **effects)).measurement
 
     late = seen("late", 38, effects=("time_offset",), values={"time_offset": 0.04})
     in_time, later = seen("in-time", 38), seen("later", 40)
@@ -203,14 +198,8 @@ def test_a_late_video_shows_soil_and_tool_as_they_are_later(tmp_path: Path) -> N
 
 def test_cohesion_acts(world: World, tmp_path: Path) -> None:
     """With all else equal, it moves the sand by far more than rounding, and the plate needs more force."""
-    damp = make_set(
-        tmp_path / "damp",
-        short(views=1),
-        friction_angle=31.0,
-        effects=["cohesion"],
-        values={"cohesion": 1000.0},
-        preset="tiny",
-    )
+    recipe = replace(DRY, effects=["cohesion"], values={"cohesion": 1000.0})
+    damp = make_set(tmp_path / "damp", short(views=1), recipe)
     assert damp.truth["parameters"] == {"friction_angle": 31.0, "cohesion": 1000.0}
     a, b = (particles(w.measurement.folder, LAST) for w in (world, damp))
     start = [particles(w.measurement.folder, 0) for w in (world, damp)]
@@ -300,7 +289,7 @@ def test_truth_is_kept_at_quarters_of_the_run() -> None:
 )
 def test_bad_options_are_refused_before_any_work(options: dict[str, object], said: str, tmp_path: Path) -> None:
     with pytest.raises(ParameterError, match=said):
-        make_set(tmp_path / "new", short(views=1), **{"preset": "tiny", **options})  # type: ignore[arg-type]
+        make_set(tmp_path / "new", short(views=1), replace(DRY, **options))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -312,7 +301,7 @@ def test_an_interruption_leaves_nothing(moment: str, tmp_path: Path) -> None:
 
     setup = replace(short(views=1), frames=(0, 1))
     with pytest.raises(KeyboardInterrupt):
-        make_set(tmp_path / "deep" / "new", setup, preset="tiny", progress=stop)
+        make_set(tmp_path / "deep" / "new", setup, DRY, stop)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -326,7 +315,7 @@ def test_a_fault_while_writing_leaves_nothing(tmp_path: Path, monkeypatch: pytes
     setup = replace(setup, tool=replace(setup.tool, motion=cut), frames=(0, 1))
     monkeypatch.setattr("splatsoil.synthetic.world.np.savez_compressed", full)
     with pytest.raises(MeasurementError, match="No space left"):
-        make_set(tmp_path / "deep" / "new", setup, preset="tiny")
+        make_set(tmp_path / "deep" / "new", setup, DRY)
     assert list(tmp_path.iterdir()) == []
 
 
