@@ -96,7 +96,7 @@ def test_the_verdict_follows_the_ratio_to_the_noise() -> None:
     assert "unknown: the frames before the tool moves are equal to the last bit" in none and "0.05 grey levels" in none
     assert "160 ×" in words.residual_sentence(comparison(1.6, 0.01))
     with_unit = comparison(0.073, 0.01) | {"motionless": {"robust": 1.0}}
-    assert "7.3 % of that of soil at rest, 7.3 × the camera noise" in words.residual_sentence(with_unit)
+    assert "7.3 % of that of soil at rest, 7.3 × the instruments' noise" in words.residual_sentence(with_unit)
     assert "not been compared" in words.residual_sentence(None)
 
 
