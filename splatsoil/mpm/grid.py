@@ -16,8 +16,9 @@ ROUNDING = 4.0 * float(np.finfo(np.float32).eps)
 
 
 def nearest(ratio: float) -> int:
-    """The whole number nearest to a ratio of lengths; halves go up, and so does what rounding has made of them."""
-    return math.floor((1.0 + ROUNDING) * ratio + 0.5)
+    """The whole number nearest to a ratio of lengths; of two, the odd one, also where rounding has moved the ratio."""
+    below = math.floor(ratio)
+    return below | 1 if abs(ratio - below - 0.5) <= ROUNDING * ratio else math.floor(ratio + 0.5)
 
 
 @wp.struct
@@ -51,7 +52,7 @@ class GridShape:
     def covering(cls, lower: npt.ArrayLike, upper: npt.ArrayLike, cell: float) -> GridShape:
         """Grid over the box from ``lower`` to ``upper`` (3,) in m with cells as near to ``cell`` as division allows.
 
-        Rounding decides nothing: half a cell across counts as a whole one, and no layer on top is made of it.
+        Rounding decides nothing: see `nearest`, and no layer on top is made of it.
         """
         low = np.asarray(lower, dtype=np.float64)
         extent = np.asarray(upper, dtype=np.float64) - low

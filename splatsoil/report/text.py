@@ -146,8 +146,8 @@ def fitted_sentence(fit: Mapping[str, Any], judged: Mapping[str, Any] | None) ->
         )
     return (
         "The ± is one standard deviation of the posterior, averaged over models. It contains instrument noise, "
-        "seed-to-seed scatter, discretisation error (measured by pairs of coarse and fine runs) and unknown albedo of "
-        "buried soil."
+        "seed-to-seed scatter, discretisation error (measured by pairs of coarse and fine runs) and, of pictures, "
+        "unknown albedo of buried soil."
     )
 
 
