@@ -32,18 +32,9 @@ class EmulatedProblem(HiddenTruth):
             raise ParameterError(f"fast: nothing emulates these parameters and effects, only {choices}")
         self.surface = surfaces()[name]
 
-    def observed(self) -> tuple[FloatArray, float]:
-        """Components (k,) of what the cameras saw, and the square sum of what is beside them."""
-        if self._truth is None:
-            raise RuntimeError("begin() has to be called before anything is observed")
-        if self._observed is None:
-            self._observed = self._drawn(self._truth, self._truth_seed)
-        components, beside = self._observed
-        return components, beside
-
     def evaluate(self, parameters: Mapping[str, float], seed: int) -> Evaluation:
         """One draw of what a simulation would come to."""
-        (observed, beside), (predicted, as_well) = self.observed(), self._drawn(parameters, seed)
+        (observed, beside), (predicted, as_well) = self.observed(), self._recorded(parameters, seed)
         residual = observed - predicted
         # What is beside the components is chance: there is none in soil that doesn't move.
         loss = float((residual @ residual + beside + as_well) / (observed @ observed + beside))
@@ -55,8 +46,9 @@ class EmulatedProblem(HiddenTruth):
         """The left camera's last picture: its patches' changes of brightness about grey, four times as strong."""
         return self._picture(self.observed()[0])
 
-    def _drawn(self, parameters: Mapping[str, float], seed: int) -> tuple[FloatArray, float]:
-        return self.surface.draw(self.space.to_unit(self.space.to_vector(parameters)), seed)
+    def _recorded(self, truth: Mapping[str, float], seed: int) -> tuple[FloatArray, float]:
+        """Components (k,) of what the cameras see, and the square sum of what is beside them."""
+        return self.surface.draw(self.space.to_unit(self.space.to_vector(truth)), seed)
 
     def _picture(self, components: FloatArray) -> Image:
         shown = (self.surface.patches @ components).reshape(2, -1, *BLOCKS)[0, -1]

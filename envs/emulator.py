@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -131,16 +132,11 @@ class Surface:
 def surfaces() -> dict[str, Surface]:
     """Those that are shipped, by world: one of GUESSED, or ``stroke/EFFECT``."""
     with np.load(FILE, allow_pickle=False) as file:
-        made = {name.rpartition(".")[0] for name in file.files}
-        of = {world: {f.name: file[f"{world}.{f.name}"] for f in fields(Surface)} for world in made}
-    arrays = {
-        world: {k: v.astype(np.float64) for k, v in found.items() if k not in ("degree", "left")}
-        for world, found in of.items()
-    }
-    return {
-        world: Surface(degree=int(of[world]["degree"]), left=float(of[world]["left"]), **found)
-        for world, found in arrays.items()
-    }
+        of: dict[str, dict[str, Any]] = {}
+        for name, value in file.items():
+            world, _, key = name.rpartition(".")
+            of.setdefault(world, {})[key] = value.astype(np.float64) if value.ndim else value.item()
+    return {world: Surface(**found) for world, found in of.items()}
 
 
 @cache

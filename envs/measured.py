@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -122,9 +120,7 @@ class MeasuredProblem:
         Raises:
             SimulationError: the simulation could not go on.
         """
-        began = time.perf_counter()
-        evaluation = self.judge(self.experiment.prediction(parameters, seed=seed))
-        return replace(evaluation, seconds=time.perf_counter() - began)
+        return self.judge(self.experiment.prediction(parameters, seed=seed))
 
     def judge(self, prediction: Prediction) -> Evaluation:
         """A prediction compared with what was measured."""

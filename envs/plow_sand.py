@@ -84,16 +84,17 @@ class PlowSandEnv(EpisodeEnv[Observation]):
             raise ParameterError(f"render_mode: must be rgb_array or None, not {render_mode}")
         self.render_mode = render_mode
         self.same_particles = bool(same_particles)
-        self.problem = problem or make_problem(measurement, parameters, effects, preset, device, reconstruction, fast)
+        self.problem = problem or _problem(measurement, parameters, effects, preset, device, reconstruction, fast)
         n, b = len(self.problem.space), self.problem.block_count
         box = gym.spaces.Box
         self.action_space = box(-1.0, 1.0, (n,), np.float32)
+        loss = box(0.0, self.problem.worst_loss, (1,), np.float32)
         self.observation_space = gym.spaces.Dict(  # type: ignore[assignment]
             {
-                "best_parameters": box(-1.0, 1.0, (n,), np.float32),
-                "best_loss": box(0.0, self.problem.worst_loss, (1,), np.float32),
-                "last_action": box(-1.0, 1.0, (n,), np.float32),
-                "last_loss": box(0.0, self.problem.worst_loss, (1,), np.float32),
+                "best_parameters": self.action_space,
+                "best_loss": loss,
+                "last_action": self.action_space,
+                "last_loss": loss,
                 "block_residuals": box(-BLOCK_LIMIT, BLOCK_LIMIT, (b,), np.float32),
                 "evaluations_left": box(0.0, float(self.budget), (1,), np.float32),
             }
@@ -142,8 +143,7 @@ class PlowSandEnv(EpisodeEnv[Observation]):
 
     def plan(self, action: Array) -> list[Job]:
         """What a step will simulate, for a guess (n,) as it counts; in an episode's last step the truth, too."""
-        step = 0 if self.same_particles else self.budget - self._left
-        seed = simulation_seed(self._episode_seed, step)
+        seed = simulation_seed(self._episode_seed, 0) if self.same_particles else self.step_seed()
         truth = self.problem.truth() if self._left == 1 else None
         return [(self.values(action), seed), *([] if truth is None else [(truth, seed)])]
 
@@ -205,14 +205,14 @@ def signed_difference(observed: Image, predicted: Image) -> Image:
     return np.clip(0.5 + (observed - predicted), 0.0, 1.0).astype(np.float32)
 
 
-def make_problem(
-    measurement: str | None = None,
-    parameters: Sequence[str] = ("friction_angle",),
-    effects: Sequence[str] = (),
-    preset: str | None = None,
-    device: str = "cpu",
-    reconstruction: str | None = None,
-    fast: bool = False,
+def _problem(
+    measurement: str | None,
+    parameters: Sequence[str],
+    effects: Sequence[str],
+    preset: str | None,
+    device: str,
+    reconstruction: str | None,
+    fast: bool,
 ) -> Problem:
     """The simulate-and-compare that the environment's options describe."""
     if fast:

@@ -6,9 +6,8 @@ loss is chance and not zero. It is a toy for trying agents on; an answer about r
 
 from __future__ import annotations
 
-import time
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -40,6 +39,12 @@ def blurred(pictures: Image) -> FloatArray:
     return gaussian_filter(pictures.astype(np.float64), (0.0, BLUR, BLUR, 0.0))
 
 
+def noisy(pictures: Image, seed: int) -> Image:
+    """Pictures (k, h, w, 3) with a sensor's noise."""
+    noise = np.random.default_rng([seed, 1]).standard_normal(pictures.shape)
+    return np.clip(pictures + SENSOR_NOISE * noise, 0.0, 1.0).astype(np.float32)
+
+
 def patches(pictures: FloatArray) -> FloatArray:
     """Mean of each patch (k · 3 · 4,) of pictures (k, h, w, 3), in grey levels of 255."""
     count, height, width = pictures.shape[:3]
@@ -66,7 +71,7 @@ def compare(observed: Image, predicted: Image, still: Image) -> tuple[float, Flo
     return loss, patches(residual)
 
 
-class HiddenTruth:
+class HiddenTruth(ABC):
     """Parameters of a made-up world, some of them free and hidden.
 
     Args:
@@ -100,8 +105,20 @@ class HiddenTruth:
         self._truth_seed = 0
         self._observed: Any = None
 
+    @abstractmethod
+    def _recorded(self, truth: Mapping[str, float], seed: int) -> Any:
+        """What the cameras see of a truth."""
+
+    def observed(self) -> Any:
+        """What the cameras saw; it is simulated when it is first needed."""
+        if self._truth is None:
+            raise RuntimeError("begin() has to be called before anything is observed")
+        if self._observed is None:
+            self._observed = self._recorded(self._truth, self._truth_seed)
+        return self._observed
+
     def begin(self, seed: int) -> None:
-        """Draw another hidden truth; it is simulated when it is first needed."""
+        """Draw another hidden truth."""
         if self._truth is not None and seed == self._truth_seed:
             return
         unit = 2.0 * np.random.default_rng(seed).uniform(*HIDDEN_RANGE, len(self.space)) - 1.0
@@ -147,29 +164,23 @@ class SyntheticProblem(HiddenTruth):
         self.device = resolve_device(device)
         self._still: Image | None = None
 
-    def observed(self) -> Image:
-        """(k, h, w, 3): the world as the cameras recorded it, sensor noise and all."""
-        if self._truth is None:
-            raise RuntimeError("begin() has to be called before anything is observed")
-        if self._observed is None:
-            self.record(self.world.surely(self._truth, self._truth_seed))
-        return np.asarray(self._observed)
+    def _recorded(self, truth: Mapping[str, float], seed: int) -> Image:
+        """(k, h, w, 3), sensor noise and all."""
+        return noisy(self.world.surely(truth, seed), seed)
 
     def unobserved(self) -> tuple[Mapping[str, float], int] | None:
         """Values and seed of the world's own simulation, as long as it hasn't been made."""
         return (self._truth, self._truth_seed) if self._observed is None and self._truth is not None else None
 
     def record(self, clean: Image | SimulationError) -> None:
-        """Take pictures (k, h, w, 3) of the world's own simulation as what the cameras saw, but for their noise."""
-        if isinstance(clean, SimulationError):
-            assert self._truth is not None
-            clean = self.world.surely(self._truth, self._truth_seed)
-        noise = np.random.default_rng([self._truth_seed, 1]).standard_normal(clean.shape)
-        self._observed = np.clip(clean + SENSOR_NOISE * noise, 0.0, 1.0).astype(np.float32)
+        """Take pictures (k, h, w, 3) of the world's own simulation, if it came to any, as what the cameras saw, but for
+        their noise."""
+        if not isinstance(clean, SimulationError):
+            self._observed = noisy(clean, self._truth_seed)
 
     def observed_image(self) -> Image:
         """The left camera's last picture."""
-        return self.observed()[len(COMPARED) - 1]
+        return np.asarray(self.observed()[len(COMPARED) - 1])
 
     def evaluate(self, parameters: Mapping[str, float], seed: int) -> Evaluation:
         """Simulate, draw, compare.
@@ -177,10 +188,7 @@ class SyntheticProblem(HiddenTruth):
         Raises:
             SimulationError: the simulation could not go on.
         """
-        began = time.perf_counter()
-        self.observed()
-        evaluation = self.judge(self.predict(parameters, seed))
-        return replace(evaluation, seconds=time.perf_counter() - began)
+        return self.judge(self.predict(parameters, seed))
 
     def judge(self, predicted: Image) -> Evaluation:
         """Predicted pictures (k, h, w, 3) compared with the observed ones."""

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,18 +26,19 @@ if TYPE_CHECKING:
 def attempt(problem: Problem, parameters: Mapping[str, float], seed: int) -> Evaluation:
     """An evaluation, a failed simulation being one too, with the time it took."""
     began = time.perf_counter()
-    try:
-        evaluation = problem.evaluate(parameters, seed)
-        if evaluation.loss is not None and not math.isfinite(evaluation.loss):
-            raise SimulationError(f"the loss is {evaluation.loss}")
-    except SimulationError as error:
-        evaluation = failed(problem, error)
+    evaluation = _outcome(problem, lambda: problem.evaluate(parameters, seed))
     return replace(evaluation, seconds=time.perf_counter() - began)
 
 
-def failed(problem: Problem, error: SimulationError) -> Evaluation:
-    """What a simulation that could not go on comes to."""
-    return Evaluation(None, np.zeros(problem.block_count), message=str(error))
+def _outcome(problem: Problem, evaluate: Callable[[], Evaluation]) -> Evaluation:
+    """What an evaluation comes to if its simulation can go on, and if not."""
+    try:
+        evaluation = evaluate()
+        if evaluation.loss is not None and not math.isfinite(evaluation.loss):
+            raise SimulationError(f"the loss is {evaluation.loss}")
+    except SimulationError as error:
+        return Evaluation(None, np.zeros(problem.block_count), message=str(error))
+    return evaluation
 
 
 def evaluate_together(problems: Sequence[Problem], jobs: Sequence[Job]) -> list[Evaluation]:
@@ -91,8 +93,12 @@ def _measured(problem: MeasuredProblem, jobs: Sequence[Job]) -> list[Evaluation]
 
 def _judged(problems: Sequence[Any], made: Iterable[Any], began: float) -> list[Evaluation]:
     """What simulations, or the errors in their place, come to."""
-    out = [
-        failed(problem, one) if isinstance(one, SimulationError) else problem.judge(one)
-        for problem, one in zip(problems, made, strict=True)
-    ]
+
+    def judged(problem: Any, one: Any) -> Evaluation:
+        if isinstance(one, SimulationError):
+            raise one
+        evaluation: Evaluation = problem.judge(one)
+        return evaluation
+
+    out = [_outcome(p, partial(judged, p, one)) for p, one in zip(problems, made, strict=True)]
     return [replace(evaluation, seconds=(time.perf_counter() - began) / len(out)) for evaluation in out]

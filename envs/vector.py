@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from splatsoil.errors import ParameterError
 
-from .plow_sand import PlowSandEnv, make_problem
+from .plow_sand import PlowSandEnv
 from .problem import Problem
 from .together import evaluate_together
 
@@ -36,15 +36,13 @@ class PlowSandVectorEnv(SyncVectorEnv):
     def __init__(self, num_envs: int = 1, problems: Sequence[Problem] | None = None, **options: Any) -> None:
         if num_envs < 1:
             raise ParameterError(f"num_envs: at least one is needed, not {num_envs}")
-        own = {key: options.pop(key) for key in ("budget", "render_mode", "same_particles") if key in options}
-        if problems is None:
-            first = make_problem(**options)
+        worlds: Sequence[Problem | None] = [None] * num_envs if problems is None else problems
+        if len(worlds) != num_envs:
+            raise ParameterError(f"problems: {len(worlds)} do not make {num_envs} environments")
+        if problems is None and options.get("measurement") is not None:
             # A measured world is the same for all; a synthetic one has a hidden truth for each.
-            one = options.get("measurement") is not None
-            problems = [first, *(first if one else make_problem(**options) for _ in range(num_envs - 1))]
-        if len(problems) != num_envs:
-            raise ParameterError(f"problems: {len(problems)} do not make {num_envs} environments")
-        makers = [partial(PlowSandEnv, problem=problem, **own) for problem in problems]
+            worlds = [PlowSandEnv(**options).problem] * num_envs
+        makers = [partial(PlowSandEnv, **options, problem=world) for world in worlds]
         super().__init__(makers, autoreset_mode=AutoresetMode.SAME_STEP)
 
     def step(self, actions: npt.NDArray[np.float32]) -> tuple[Any, Any, Any, Any, dict[str, Any]]:

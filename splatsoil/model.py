@@ -179,6 +179,11 @@ class Model:
         """Particles (n, 3) in m that fill the reconstructed bed."""
         return fill(self.reconstruction.surface, self.measurement.bed, self.resolution.spacing, seed=seed)
 
+    @property
+    def photographed(self) -> bool:
+        """Whether photographs show soil, so that there is a scene; heights alone make none."""
+        return bool(self.reconstruction.soil.any())
+
     def scene(self, seed: int = 0) -> Scene:
         """Scene whose Gaussians ride on the particles of ``seed``; light and albedo are estimated once."""
         return self._scene(seed)

@@ -42,8 +42,8 @@ class Column:
 
     Attributes:
         positions: particles (n, 3) in m by frame.
-        splats: Gaussians over the bed by frame: centres (n, 3) in m, covariances (n, 3, 3), colours (n, 3), opacities
-            (n, 1).
+        splats: Gaussians over the bed by frame, where photographs show the soil: centres (n, 3) in m, covariances
+            (n, 3, 3), colours (n, 3), opacities (n, 1).
         quantities: by name and frame, (n,) of each particle in `UNITS`. The misfit is that of the block of the bed that
             the particle is in, in the camera in which it is largest: |observed − predicted| change since frame 0.
         pictures: (h, w, 3) by one of `PICTURES`, camera and frame.
@@ -64,16 +64,20 @@ class Column:
         self.positions[moment.frame], self._deformations[moment.frame] = moment.positions, moment.deformations
         if moment.frame not in self.model.frames:
             return
+        if self.model.photographed:
+            self.splats[moment.frame] = self._gaussians(moment)
+        self._keep("speed", moment.frame, np.linalg.norm(moment.velocities, axis=1))
+        self._keep("shear strain", moment.frame, shear_strain(moment.deformations))
+        if moment.plastic_strains is not None:
+            self._keep("plastic shear", moment.frame, moment.plastic_strains)
+
+    def _gaussians(self, moment: Moment) -> tuple[Floats, ...]:
         scene = self.model.scene()
         g = lit_gaussians(scene, scene.pose(moment.positions, moment.deformations, moment.tool))
         bed, arrays = self.model.measurement.bed, (g.means, g.covariances(), g.colours, g.opacities[:, None])
         # What surrounds the bed would hide what stands beside it.
         outside = np.abs(arrays[0].numpy() - 0.5 * (bed.lower + bed.upper))[:, :2] > 0.55 * bed.extents[:2]
-        self.splats[moment.frame] = tuple(array.numpy()[~outside.any(axis=1)] for array in arrays)
-        self._keep("speed", moment.frame, np.linalg.norm(moment.velocities, axis=1))
-        self._keep("shear strain", moment.frame, shear_strain(moment.deformations))
-        if moment.plastic_strains is not None:
-            self._keep("plastic shear", moment.frame, moment.plastic_strains)
+        return tuple(array.numpy()[~outside.any(axis=1)] for array in arrays)
 
     def finish(self, force: FloatArray) -> None:
         """Draw the pictures and compare them."""
@@ -84,7 +88,8 @@ class Column:
         for camera, frame in images:
             for kind, picture in self.comparator.pictures(images, camera, frame).items():
                 self.pictures[kind, camera, frame] = _bytes(picture)
-        self._compare(self.comparator.blocks(images))
+        if images:
+            self._compare(self.comparator.blocks(images))
         self._deformations.clear()
 
     def _compare(self, blocks: FloatArray) -> None:
@@ -142,10 +147,12 @@ class Viewer:
             for camera, node in self._video.items():
                 node.image = self._picture(camera, frame)
             for column, (splats, particles) in zip(self.columns, self._soil, strict=True):
-                splats.visible, particles.visible = largest is None, largest is not None
-                if largest is None:
-                    splats.set_gaussians(*column.splats[frame])
-                else:
+                particles.visible = largest is not None
+                if splats is not None:
+                    splats.visible = largest is None
+                    if largest is None:
+                        splats.set_gaussians(*column.splats[frame])
+                if largest is not None:
                     particles.points = column.positions[frame]
                     shares = np.clip(column.quantities[name][frame] / largest, 0.0, 1.0)
                     particles.colors = _bytes(matplotlib.colormaps["viridis"](shares)[:, :3])
@@ -167,7 +174,8 @@ class Viewer:
         self.text = gui.add_markdown("")
         self.slider = gui.add_slider("frame", 0, len(self.frames) - 1, 1, 0)
         self.playing = gui.add_checkbox("play", False)
-        self.colour = gui.add_dropdown("soil", (GAUSSIANS, *self.limits), visible=bool(self.columns))
+        splats = (GAUSSIANS,) if all(column.splats for column in self.columns) else ()
+        self.colour = gui.add_dropdown("soil", (*splats, *self.limits), visible=bool(self.columns))
         self.picture = gui.add_dropdown("video", PICTURES, visible=bool(self.columns))
         self.photographs = gui.add_checkbox("photographs", not self.columns)
         for control in (self.slider, self.colour, self.picture, self.photographs):
@@ -195,7 +203,7 @@ class Viewer:
                 column, above = self.columns[k], [centre[0], bed.upper[1], bed.upper[2]]
                 scene.add_label(f"{name}/title", column.title, position=above, anchor="bottom-center")
                 first = self.frames[0]
-                splats = scene.add_gaussian_splats(f"{name}/splats", *column.splats[first])
+                splats = scene.add_gaussian_splats(f"{name}/splats", *column.splats[first]) if column.splats else None
                 points, spacing = column.positions[first], column.model.resolution.spacing
                 how: dict[str, Any] = {"point_size": spacing, "point_shape": "circle", "precision": "float32"}
                 particles = scene.add_point_cloud(f"{name}/particles", points, (0, 0, 0), visible=False, **how)

@@ -181,12 +181,15 @@ def over_level_soil() -> Callable[..., Any]:
     """Makes a model at the preset tiny: of a measurement, over soil level at a height (m), with some effects."""
     from types import SimpleNamespace
 
+    import numpy as np
+
     from splatsoil.model import Model
     from splatsoil.reconstruction import HeightField
 
     def make(measurement: Any, height: float, *effects: str) -> Model:
         surface = HeightField.over(measurement.bed.lower, measurement.bed.upper, 0.02, height)
-        return Model(measurement, SimpleNamespace(surface=surface), effects=effects, preset="tiny")  # type: ignore[arg-type]
+        seen = SimpleNamespace(surface=surface, soil=np.ones(1, dtype=bool))
+        return Model(measurement, seen, effects=effects, preset="tiny")  # type: ignore[arg-type]
 
     return make
 

@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from splatsoil.comparison import Comparator
 from splatsoil.export import replay
-from splatsoil.measurement import Measurement
+from splatsoil.measurement import HeightMaps, Measurement
 
 viser = pytest.importorskip("viser")
 
@@ -96,6 +97,24 @@ def test_the_scene_of_a_run(server: Any, columns: list[Any]) -> None:
     viewer.picture.value = "predicted"
     viewer.show()
     assert np.array_equal(node("/video/left").image, predicted) and not np.array_equal(predicted, observed)
+
+
+def test_the_scene_of_a_run_without_photographs_is_particles(
+    server: Any, small_set: Path, over_level_soil: Callable[..., Any]
+) -> None:
+    from splatsoil.view import Column, Viewer
+
+    measurement = Measurement.load(small_set)
+    heights = HeightMaps(np.zeros(2), 0.1, {f: np.full((5, 8), DEPTH) for f in measurement.frames}, None)
+    model = over_level_soil(replace(measurement, views=(), video=(), heights=heights), DEPTH)
+    model.reconstruction.soil[:] = False
+    comparator = Comparator(model.measurement, surface=model.reconstruction.surface, frames=model.frames)
+    column = Column("base", model, VALUES, comparator)
+    replay(model, VALUES, model.recorded, [column])
+    viewer = Viewer(server, model.measurement, [column])
+    assert viewer.colour.options == ("speed", "shear strain")
+    particles = server.scene.get_handle_by_name("/prediction 0/particles")
+    assert particles.visible and len(particles.points) == len(column.positions[0])
 
 
 def test_the_scene_of_a_set(server: Any, small_set: Path) -> None:

@@ -96,12 +96,12 @@ def fitted(options: FitOptions, begin: Stage) -> tuple[RunFolder, Model, dict[st
 
 def facts(model: Model) -> dict[str, str]:
     """How a model computes, for readers."""
-    r = model.resolution
+    r, cameras = model.resolution, len(model.measurement.cameras)
     return {
         "cell": f"{1e3 * r.cell:.3g} mm",
         "particles": f"{len(model.particles(0))}, {1e3 * r.spacing:.3g} mm apart",
         "time step": f"{1e3 * r.frame_time / r.steps:.3g} ms, in {r.substeps(r.steps)} substeps",
-        "compared frames": f"{len(model.frames) - 1} of each of {len(model.measurement.cameras)} cameras",
+        "compared frames": f"{len(model.frames) - 1}" + (f" of each of {cameras} cameras" if cameras else ""),
     }
 
 

@@ -65,7 +65,7 @@ def show(result: Mapping[str, Any], folder: str, adequate: bool | None = None) -
         worst = max(frames, key=lambda entry: entry["losses"][name])
         mean, rgb = (float(np.mean([entry["losses"][key] for entry in frames])) for key in (name, "rgb"))
         rows.append((camera, f"{mean:.4g}", f"{worst['losses'][name]:.4g}", str(worst["frame"]), f"{rgb:.3g}"))
-    print_table("loss at the estimate", ("camera", "mean", "worst", "at frame", "rgb mean square"), rows)
+    print_table("loss at the estimate", ("instrument", "mean", "worst", "at frame", "rgb mean square"), rows)
     print_text(residual_sentence(result, adequate), f"pictures in {folder}")
 
 

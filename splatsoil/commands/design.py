@@ -135,8 +135,9 @@ def _designed(
     from splatsoil.inverse.criticism.next_stroke import entropy, probable
 
     began = time.perf_counter()
-    report("light and colours", 0.0)
-    model.scene()  # kept: in other strokes the tool may begin elsewhere than photographs show it
+    if model.measurement.cameras:
+        report("light and colours", 0.0)
+        model.scene()  # kept: in other strokes the tool may begin elsewhere than photographs show it
     measured, kept = _model.experiment_of(folder, model, spec, diagnosis["candidates"] or None)
     probability = probable(diagnosis)
     draws = {name: diagnosis["draws"][name][: config.draws] for name in dict.fromkeys((AS_IT_IS, *probability))}

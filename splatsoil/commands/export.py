@@ -74,6 +74,8 @@ def _exported(config: Config, folder: RunFolder, formats: tuple[str, ...], targe
     with _model.loaded(config, folder) as (fitted, begin):
         model, values = _chosen(config, folder, fitted)
         frames = model.frames if config.every is None else tuple(range(0, model.frames[-1] + 1, config.every))
+        if len(formats) > 1 and not model.photographed:  # splats are made from photographs
+            formats = tuple(name for name in formats if name != "ply")
         target.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}-") as temporary:
             made = Path(temporary) / target.name

@@ -9,13 +9,14 @@ from typing import ClassVar, Generic, Protocol, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from splatsoil.errors import ParameterError
+from splatsoil.errors import ParameterError, SimulationError
 from splatsoil.experiment.base import candidates_of
 from splatsoil.experiment.features import Layout, Site
 from splatsoil.parameters import Parameter
 from splatsoil.soil.effect import Effect
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects, library
+from splatsoil.soil.packing import at_void_ratio
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -31,11 +32,13 @@ class LaboratoryExperiment(ABC):
     Attributes:
         kind: what the test is, as ``experiment.json`` says it.
         always: effects that are on in every model of such a test.
+        of_strength: whether only effects that act on strength can change what it measures.
         known: parameters that other tests of the soil have told, by name; they are not fitted.
     """
 
     kind: ClassVar[str]
     always: ClassVar[tuple[str, ...]] = ("intermediate_stress",)
+    of_strength: ClassVar[bool] = False
     chance: bool = False
     sensor_memory: float = MEMORY
     numerics: tuple[str, ...] = ()
@@ -68,7 +71,7 @@ class LaboratoryExperiment(ABC):
 
     def acts(self, effect: Effect) -> bool:
         """Whether an effect can change what such a test measures."""
-        return not (effect.numerical or effect.observes)
+        return effect.strength is not None if self.of_strength else not (effect.numerical or effect.observes)
 
     def law(self, effects: Iterable[str]) -> Law:
         """The model's law with other effects on, too."""
@@ -160,6 +163,7 @@ class SpecimenExperiment(LaboratoryExperiment, Generic[AnySpecimen]):
     """
 
     always = (*LaboratoryExperiment.always, "stiffness")
+    of_strength = True
     spreads: ClassVar[tuple[float, float]]
     strain_name: ClassVar[str]
 
@@ -187,9 +191,23 @@ class SpecimenExperiment(LaboratoryExperiment, Generic[AnySpecimen]):
             "specimen",
         )
 
-    def acts(self, effect: Effect) -> bool:
-        """Whether it acts on strength."""
-        return effect.strength is not None
+    @abstractmethod
+    def tested(self, law: Law, values: Mapping[str, float], test: AnySpecimen) -> tuple[FloatArray, FloatArray]:
+        """Stress ratio (t,) and logarithmic volume strain (t,), compression positive, of one test."""
+
+    def readings(
+        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
+    ) -> FloatArray:
+        """(t, 2 tests) stress ratio and nominal volume strain; nothing about them is chance."""
+        del seed, numerics
+        law, out = self.law(effects), []
+        for test in self.tests:
+            own = at_void_ratio(self.values(values), self.tests[0].void_ratio, test.void_ratio)
+            ratio, volume = self.tested(law, own, test)
+            if not np.all(np.isfinite(ratio)):
+                raise SimulationError(f"the {self.kind} test with {dict(values)} came to no finite stress")
+            out += [ratio, 1.0 - np.exp(-volume)]
+        return np.stack(out, axis=1)
 
     def features(self, readings: FloatArray) -> FloatArray:
         """In units of spreads."""

@@ -10,10 +10,10 @@ import numpy.typing as npt
 
 from splatsoil.errors import ParameterError
 from splatsoil.experiment.laboratory import FloatArray, LaboratoryExperiment, SpecimenExperiment
-from splatsoil.experiment.triaxial import REFERENCE, SLOW, VOLUME_SPREAD, YOUNG
+from splatsoil.experiment.triaxial import SLOW, VOLUME_SPREAD, young_at
 from splatsoil.soil.effect import Effect
 from splatsoil.soil.element import simple_shear
-from splatsoil.soil.packing import at_void_ratio
+from splatsoil.soil.law import Law
 
 RATIO_SPREAD = 0.024
 """Of shear stress over normal stress between specimens: 1° of friction, as in triaxial tests."""
@@ -53,24 +53,18 @@ class ShearBoxExperiment(SpecimenExperiment[Shearing]):
     spreads = (RATIO_SPREAD, VOLUME_SPREAD)
     strain_name = "displacement over height, %"
 
-    def readings(
-        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
-    ) -> FloatArray:
-        """(t, 2 tests) stress ratio and volume strain; nothing about them is chance."""
-        del seed, numerics
-        law, out, first = self.law(effects), [], self.tests[0].void_ratio
-        for test in self.tests:
-            sheared = simple_shear(
-                law,
-                at_void_ratio(self.values(values), first, test.void_ratio),
-                confining=test.normal,
-                strains=test.strain,
-                void_ratio=test.void_ratio,
-                young=YOUNG * float(np.sqrt(test.normal / REFERENCE)),
-                strain_rate=SLOW,
-            )
-            out += [sheared.shear_stress[0, 1:] / test.normal, 1.0 - np.exp(-sheared.volume_strain[0, 1:])]
-        return np.stack(out, axis=1)
+    def tested(self, law: Law, values: Mapping[str, float], test: Shearing) -> tuple[FloatArray, FloatArray]:
+        """Shear stress over normal stress, and volume strain."""
+        found = simple_shear(
+            law,
+            values,
+            confining=test.normal,
+            strains=test.strain,
+            void_ratio=test.void_ratio,
+            young=young_at(test.normal),
+            strain_rate=SLOW,
+        )
+        return found.shear_stress[0, 1:] / test.normal, found.volume_strain[0, 1:]
 
 
 class ReposeExperiment(LaboratoryExperiment):
@@ -88,6 +82,7 @@ class ReposeExperiment(LaboratoryExperiment):
     """
 
     kind = "repose"
+    of_strength = True
 
     def __init__(
         self,
@@ -109,10 +104,6 @@ class ReposeExperiment(LaboratoryExperiment):
             np.array([[measured.mean()]]), np.array([[spread]]), (1.0,), "heap at rest", "deg", ("angle",), "heap"
         )
 
-    def acts(self, effect: Effect) -> bool:
-        """Whether it acts on strength."""
-        return effect.strength is not None
-
     def readings(
         self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
     ) -> FloatArray:
@@ -123,7 +114,7 @@ class ReposeExperiment(LaboratoryExperiment):
             self.values(values),
             confining=self.normal,
             strains=[REPOSE_STRAIN],
-            young=YOUNG * float(np.sqrt(self.normal / REFERENCE)),
+            young=young_at(self.normal),
             strain_rate=SLOW,
         )
         return np.array([[np.degrees(np.arctan(sheared.shear_stress[0, -1] / self.normal))]])

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from splatsoil.errors import SimulationError
 from splatsoil.experiment.laboratory import FloatArray, SpecimenExperiment
 from splatsoil.soil.element import triaxial
-from splatsoil.soil.packing import at_void_ratio
+from splatsoil.soil.law import Law
 
 RATIO_SPREAD = 0.04
 """Of q/p between specimens of one density: 1° of friction, as peaks scatter in Wichtmann & Triantafyllidis (2016)."""
@@ -21,6 +20,11 @@ YOUNG, REFERENCE = 2.0e7, 1.0e5
 that (Hardin & Richart 1963, J. Soil Mech. Found. Div. 89(1)). The factor is a parameter of the model."""
 SLOW = 1.0e-5
 """Strain rate of a laboratory's test, 1/s."""
+
+
+def young_at(stress: float) -> float:
+    """Young's modulus in Pa under a stress in Pa."""
+    return YOUNG * float(np.sqrt(stress / REFERENCE))
 
 
 @dataclass(frozen=True)
@@ -57,24 +61,15 @@ class TriaxialExperiment(SpecimenExperiment[Curve]):
     spreads = (RATIO_SPREAD, VOLUME_SPREAD)
     strain_name = "axial strain, %"
 
-    def readings(
-        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
-    ) -> FloatArray:
-        """(t, 2 tests) q/p and nominal volume strain; nothing about them is chance."""
-        del seed, numerics
-        law, out, first = self.law(effects), [], self.tests[0].void_ratio
-        for curve in self.tests:
-            test = triaxial(
-                law,
-                at_void_ratio(self.values(values), first, curve.void_ratio),
-                confining=curve.confining,
-                strains=-np.log(1.0 - curve.strain),
-                void_ratio=curve.void_ratio,
-                young=YOUNG * float(np.sqrt(curve.confining / REFERENCE)),
-                strain_rate=curve.strain_rate,
-            )
-            ratio = (test.q / test.p)[0, 1:]
-            if not np.all(np.isfinite(ratio)):
-                raise SimulationError(f"the triaxial test with {dict(values)} came to no finite stress")
-            out += [ratio, 1.0 - np.exp(-test.volume_strain[0, 1:])]
-        return np.stack(out, axis=1)
+    def tested(self, law: Law, values: Mapping[str, float], test: Curve) -> tuple[FloatArray, FloatArray]:
+        """q/p and volume strain."""
+        found = triaxial(
+            law,
+            values,
+            confining=test.confining,
+            strains=-np.log(1.0 - test.strain),
+            void_ratio=test.void_ratio,
+            young=young_at(test.confining),
+            strain_rate=test.strain_rate,
+        )
+        return (found.q / found.p)[0, 1:], found.volume_strain[0, 1:]

@@ -10,6 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from splatsoil.errors import ParameterError
 from splatsoil.export.replay import Moment
 from splatsoil.model import Model
 from splatsoil.scene import Posed, Scene, encoded, linear
@@ -21,7 +22,15 @@ class SplatWriter:
     """Writes ``splats_N.ply`` of the first and the last frame, in the world's metres, z up."""
 
     def __init__(self, folder: Path, model: Model, frames: tuple[int, ...]) -> None:
-        """Args: an empty folder, the model, and its frames that come; the first and the last are written."""
+        """Args: an empty folder, the model, and its frames that come; the first and the last are written.
+
+        Raises:
+            ParameterError: no photograph shows the soil.
+        """
+        if not model.photographed:
+            raise ParameterError(
+                f"--to ply: {model.measurement.name} has no photographs, which Gaussians are made from"
+            )
         self.folder, self.scene, self.frames = folder, model.scene(), (frames[0], frames[-1])
 
     def add(self, moment: Moment) -> None:

@@ -15,8 +15,8 @@ from splatsoil.model import Model
 
 
 class UsdWriter:
-    """Writes ``prediction.usdc``: ``/World/Particles`` (Points: positions, velocities, the soil's albedo),
-    ``/World/Tool`` (Mesh, one transform a frame) and ``/World/Surface`` (Mesh)."""
+    """Writes ``prediction.usdc``: ``/World/Particles`` (Points: positions, velocities, the soil's albedo where
+    photographs show it), ``/World/Tool`` (Mesh, one transform a frame) and ``/World/Surface`` (Mesh)."""
 
     def __init__(self, folder: Path, model: Model, frames: tuple[int, ...]) -> None:
         """Args: an empty folder, the model, and its frames that come."""
@@ -34,8 +34,9 @@ class UsdWriter:
         self.spacing = model.resolution.spacing
         self.particles.CreateWidthsAttr([self.spacing])
         self.particles.SetWidthsInterpolation(UsdGeom.Tokens.constant)
-        colours = linear(model.scene().grain_albedo.cpu().numpy().astype(np.float64))
-        _vectors(self.particles.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).GetAttr(), colours)
+        if model.photographed:
+            colours = linear(model.scene().grain_albedo.cpu().numpy().astype(np.float64))
+            _vectors(self.particles.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).GetAttr(), colours)
 
         mesh = model.measurement.tool.mesh
         self.tool = UsdGeom.Mesh.Define(self.stage, "/World/Tool")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,14 @@ import warp as wp
 
 HEADROOM = 3
 """Cells above the space that the soil may use; a particle that rises higher stops the run."""
+ROUNDING = 4.0 * float(np.finfo(np.float32).eps)
+"""Relative error of the ratio of two lengths whose ends have been through single precision, as an STL's have."""
+
+
+def nearest(ratio: float) -> int:
+    """The whole number nearest to a ratio of lengths; of two, the odd one, also where rounding has moved the ratio."""
+    below = math.floor(ratio)
+    return below | 1 if abs(ratio - below - 0.5) <= ROUNDING * ratio else math.floor(ratio + 0.5)
 
 
 @wp.struct
@@ -41,13 +50,16 @@ class GridShape:
 
     @classmethod
     def covering(cls, lower: npt.ArrayLike, upper: npt.ArrayLike, cell: float) -> GridShape:
-        """Grid over the box from ``lower`` to ``upper`` (3,) in m with cells as near to ``cell`` as division allows."""
+        """Grid over the box from ``lower`` to ``upper`` (3,) in m with cells as near to ``cell`` as division allows.
+
+        Rounding decides nothing: see `nearest`, and no layer on top is made of it.
+        """
         low = np.asarray(lower, dtype=np.float64)
         extent = np.asarray(upper, dtype=np.float64) - low
-        plan = np.maximum(np.rint(extent[:2] / cell), 1).astype(int)
-        tall = int(np.ceil(extent[2] / cell - 1e-9)) + HEADROOM
+        plan = [max(nearest(side / cell), 1) for side in extent[:2]]
+        tall = math.ceil((1.0 - ROUNDING) * extent[2] / cell) + HEADROOM
         size = np.array([extent[0] / plan[0], extent[1] / plan[1], cell])
-        return cls(low, size, (int(plan[0]) + 1, int(plan[1]) + 1, tall + 1))
+        return cls(low, size, (plan[0] + 1, plan[1] + 1, tall + 1))
 
     @property
     def count(self) -> int:

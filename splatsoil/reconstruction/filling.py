@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from splatsoil.errors import ParameterError
 from splatsoil.measurement import Bed
+from splatsoil.mpm.grid import nearest
 from splatsoil.reconstruction.height_field import HeightField
 
 Array = NDArray[np.float64]
@@ -48,7 +49,7 @@ def fill(surface: HeightField, bed: Bed, spacing: float, seed: int = 0, jitter: 
     if not 0.0 <= jitter <= 1.0:
         raise ParameterError(f"jitter must lie between 0 and 1, not {jitter:g}")
     generator = np.random.default_rng(seed)
-    counts_xy = [max(1, round(float(size[k]) / spacing)) for k in (0, 1)]
+    counts_xy = [max(1, nearest(float(size[k]) / spacing)) for k in (0, 1)]
     widths = [float(size[k]) / counts_xy[k] for k in (0, 1)]
     depth = column_depths(surface, bed, counts_xy[0], counts_xy[1])
     share = depth * (widths[0] * widths[1] / spacing**3)

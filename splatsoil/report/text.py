@@ -93,10 +93,11 @@ def no_answer(fit: Mapping[str, Any]) -> str:
     """Why the estimate of ``fit.json`` means nothing, in one sentence; empty where it means something."""
     least, loss = fit["best"]["loss"], max(fit["loss"], fit["best"]["loss"])
     if loss >= NOTHING_MOVES:
-        where = "everywhere it was tried" if least >= NOTHING_MOVES else "where pictures and force together put it"
+        where = "everywhere it was tried" if least >= NOTHING_MOVES else "where all instruments together put it"
         return (
-            f"no answer: {where} the model explains the video no better than soil that never moves (loss {loss:.3g}; "
-            f"such soil has {NOTHING_MOVES:g}); photographs, poses, clock or tool are wrong, or the soil is another"
+            f"no answer: {where} the model explains the measurement no better than soil that never moves (loss "
+            f"{loss:.3g}; such soil has {NOTHING_MOVES:g}); pictures, heights, poses, clock or tool are wrong, or "
+            "the soil is another"
         )
     for name, entry in fit["parameters"].items():
         if entry["at_bound"] is None:
@@ -133,13 +134,13 @@ def fitted_sentence(fit: Mapping[str, Any], judged: Mapping[str, Any] | None) ->
         )
     return (
         "The ± is one standard deviation of the posterior, averaged over models. It contains instrument noise, "
-        "seed-to-seed scatter, discretisation error (measured by pairs of coarse and fine runs) and unknown albedo of "
-        "buried soil."
+        "seed-to-seed scatter, discretisation error (measured by pairs of coarse and fine runs) and, of pictures, "
+        "unknown albedo of buried soil."
     )
 
 
 def ratio_to_noise(comparison: Mapping[str, Any] | None) -> float | None:
-    """The loss over that of camera noise alone; None where that isn't known, or there is none."""
+    """The loss over that of the instruments' noise alone; None where that isn't known, or there is none."""
     if comparison is None:
         return None
     name = comparison["loss"]
@@ -148,14 +149,14 @@ def ratio_to_noise(comparison: Mapping[str, Any] | None) -> float | None:
 
 
 def residual_sentence(comparison: Mapping[str, Any] | None, adequate: bool | None = None) -> str:
-    """How far the prediction is from the pictures, and what that means.
+    """How far the prediction is from what was observed, and what that means.
 
     Args:
-        comparison: with the pictures; None where there is none.
+        comparison: frame by frame; None where there is none.
         adequate: whether a diagnosis or a comparison calls this very fit adequate; None without one.
     """
     if comparison is None:
-        return "The prediction has not been compared with the pictures frame by frame yet."
+        return "The prediction has not been compared frame by frame yet."
     name = comparison["loss"]
     total, rest = float(comparison["total"][name]), comparison.get("motionless", {}).get(name)
     left = f"The misfit is {percent(total / rest)} of that of soil at rest" if rest else ""
@@ -169,13 +170,13 @@ def residual_sentence(comparison: Mapping[str, Any] | None, adequate: bool | Non
                 "the frames before the tool moves are equal to the last bit, so they show no noise; a standard "
                 f"deviation of {LEAST_NOISE:g} grey levels is assumed"
             )
-        return (f"{left}. " if left else "") + f"Its ratio to the camera noise is unknown: {unknown}."
+        return (f"{left}. " if left else "") + f"Its ratio to the instruments' noise is unknown: {unknown}."
     if ratio <= AT_THE_NOISE and adequate is not False:
-        return f"The misfit is {ratio:.1f} × the camera noise: nothing more to explain here."
-    above = f"{ratio:.{1 if ratio < 10.0 else 0}f} × the camera noise"
+        return f"The misfit is {ratio:.1f} × the instruments' noise: nothing more to explain here."
+    above = f"{ratio:.{1 if ratio < 10.0 else 0}f} × the instruments' noise"
     said = f"{left}, {above}." if left else f"The misfit is {above}."
     if adequate:
-        return f"{said} Camera noise, seed-to-seed scatter and discretisation error together are as large."
+        return f"{said} Instruments' noise, seed-to-seed scatter and discretisation error together are as large."
     if adequate is not None:
         return said
     return (
@@ -286,7 +287,7 @@ def steps(models: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def posterior_sentences(posterior: Mapping[str, Any]) -> list[str]:
-    """What the pictures leave possible, a sentence for each parameter; a number only where there is one to give."""
+    """What the data leave possible, a sentence for each parameter; a number only where there is one to give."""
     out = []
     for name, entry in posterior["parameters"].items():
         plain, unit = name.replace("_", " "), symbol(entry["unit"])
@@ -294,13 +295,13 @@ def posterior_sentences(posterior: Mapping[str, Any]) -> list[str]:
         (low, _), (high, _) = (with_std(entry[key], 0.5 * entry["std"]) for key in ("low", "high"))
         if entry["verdict"] == "not determined":
             out.append(
-                f"The {plain} is not identified: its spread is still {share} % of what it was before these pictures, "
+                f"The {plain} is not identified: its spread is still {share} % of what it was before these data, "
                 "so no value is given."
             )
         elif entry["verdict"] == "weakly determined":
             out.append(
                 f"The {plain} is only weakly identified: with 90 % probability it lies between {low} and {high}{unit}, "
-                f"a spread of {share} % of what it was before the pictures."
+                f"a spread of {share} % of what it was before these data."
             )
         else:
             out.append(f"With 90 % probability the {plain} lies between {low} and {high}{unit}.")

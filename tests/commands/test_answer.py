@@ -61,7 +61,7 @@ def test_what_is_an_answer(fit_of: Callable[..., dict[str, Any]]) -> None:
     fit["parameters"]["cohesion"]["at_bound"] = "upper"
     assert "the cohesion ends at the upper bound of its range (1500 Pa)" in no_answer(fit)
     # where forces lead away from what the pictures say
-    assert "where pictures and force together put it" in no_answer(fit | {"loss": 1.2, "best": {"loss": 0.9}})
+    assert "where all instruments together put it" in no_answer(fit | {"loss": 1.2, "best": {"loss": 0.9}})
 
 
 @pytest.mark.parametrize("command", COMMANDS)

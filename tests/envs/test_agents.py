@@ -12,7 +12,7 @@ from types import ModuleType
 import gymnasium as gym
 import pytest
 
-SEARCHES = {"random_search": 12, "cma_es": 20, "optuna_tpe": 12}
+SEARCHES = {"random_search": 12, "cma_es": 20, "optuna_tpe": 12, "turbo": 12}
 LIBRARIES = {"cma_es": "cmaes", "optuna_tpe": "optuna", "stable_baselines": "stable_baselines3"}
 
 

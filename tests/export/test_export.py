@@ -13,6 +13,7 @@ import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from splatsoil.errors import ParameterError
 from splatsoil.export import make_writers, replay
 from splatsoil.measurement import Bed, Camera, Frame, Measurement, Tool, ToolMotion
 from splatsoil.model import Model
@@ -164,6 +165,23 @@ def test_usd_stage(model: Model, trajectory: Trajectory, tmp_path: Path) -> None
     surface = UsdGeom.Mesh(stage.GetPrimAtPath("/World/Surface"))
     assert surface.GetPointsAttr().GetTimeSamples() == list(FRAMES)
     assert max(surface.GetFaceVertexIndicesAttr().Get()) == len(surface.GetPointsAttr().Get(0)) - 1
+
+
+def test_without_photographs_there_is_all_but_splats_and_colours(
+    measurement: Measurement, over_level_soil: Callable[..., Model], tmp_path: Path
+) -> None:
+    pytest.importorskip("pxr")
+    from pxr import Usd, UsdGeom
+
+    model = over_level_soil(measurement, DEPTH)
+    model.reconstruction.soil[:] = False
+    folder = export(model, tmp_path / "e", "vtk", "usd", "csv")
+    assert (folder / "vtk" / "particles.pvd").is_file() and (folder / "csv").is_dir()
+    stage = Usd.Stage.Open(str(folder / "usd" / "prediction.usdc"))
+    points = UsdGeom.Points(stage.GetPrimAtPath("/World/Particles"))
+    assert len(points.GetPointsAttr().Get(6)) and not points.GetDisplayColorPrimvar().HasAuthoredValue()
+    with pytest.raises(ParameterError, match="--to ply: made has no photographs"):
+        make_writers(tmp_path / "ply", ["ply"], model, FRAMES)
 
 
 def test_openusd_finds_no_fault_in_the_stage(model: Model, tmp_path: Path) -> None:

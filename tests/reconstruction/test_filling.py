@@ -74,6 +74,12 @@ def test_the_top_layer_has_no_bias_and_no_steps(waves):
     assert below.std() < 0.05 * spacing
 
 
+def test_a_spacing_from_single_precision_makes_the_same_columns(waves):
+    """0.5 m is 12.5 spacings of 4 cm."""
+    exact, single = (fill(waves, BED, spacing, jitter=0.0) for spacing in (0.04, float(np.float32(0.04))))
+    np.testing.assert_array_equal(exact[:, :2], single[:, :2])
+
+
 def test_seeds_repeat_and_differ(waves):
     one, same, other = (fill(waves, BED, 0.02, seed=s) for s in (5, 5, 6))
     np.testing.assert_array_equal(one, same)

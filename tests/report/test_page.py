@@ -45,7 +45,7 @@ def test_everything_is_on_the_page(run: Path, page_of: PageOf) -> None:
     assert "default-src 'none'" in page.html
     for phrase in (
         "35.6 ± 0.8°",
-        "The misfit is 2 % of that of soil at rest, 4.0 × the camera noise",
+        "The misfit is 2 % of that of soil at rest, 4.0 × the instruments' noise",
         "4 times as strong",
         "31.2 dB",
         "0.931",
@@ -102,7 +102,7 @@ def test_a_fit_without_an_answer_is_said_to_be_one_first(
     update(run / "fit.json", loss=1.29)
     page = page_of(run)
     assert page.html.split("<header>")[1].split(">", 1)[0].strip() == '<p class="banner" role="alert"'
-    assert "No answer: where pictures and force together put it the model explains the video no better" in page.text
+    assert "No answer: where all instruments together put it the model explains the measurement no better" in page.text
     assert "33.2" not in page.text.split("Every evaluation")[0] and "The model is adequate." in page.text
 
 

@@ -101,9 +101,9 @@ def test_the_misfit_is_that_of_the_most_probable_model(diagnosis: dict) -> None:
     ("total", "noise", "adequate", "says", "says_not"),
     [
         (0.011, 0.01, None, "nothing more to explain", "of that of soil at rest"),
-        (0.038, 0.01, None, "3.8 × the camera noise. Part of the rest is seed-to-seed scatter", "nothing more"),
-        (0.073, 0.01, None, "7.3 % of that of soil at rest, 7.3 × the camera noise", "nothing more"),
-        (1.6, 0.01, None, "160 × the camera noise", "nothing more"),
+        (0.038, 0.01, None, "3.8 × the instruments' noise. Part of the rest is seed-to-seed scatter", "nothing more"),
+        (0.073, 0.01, None, "7.3 % of that of soil at rest, 7.3 × the instruments' noise", "nothing more"),
+        (1.6, 0.01, None, "160 × the instruments' noise", "nothing more"),
         (0.038, None, None, "unknown: the set has no pre-roll", "equal to the last bit"),
         (
             0.038,
@@ -113,9 +113,9 @@ def test_the_misfit_is_that_of_the_most_probable_model(diagnosis: dict) -> None:
             "pre-roll",
         ),
         # one far above the cameras' noise is no fault of an adequate model, nor does little noise hide what fails
-        (0.52, 0.01, True, "52 × the camera noise. Camera noise, seed-to-seed scatter and discretisation", "Part of"),
-        (0.52, 0.01, False, "52 × the camera noise.", "discretisation"),
-        (0.011, 0.01, False, "1.1 × the camera noise", "nothing more"),
+        (0.52, 0.01, True, "52 × the instruments' noise. Instruments' noise, seed-to-seed scatter and discretisation", "Part of"),
+        (0.52, 0.01, False, "52 × the instruments' noise.", "discretisation"),
+        (0.011, 0.01, False, "1.1 × the instruments' noise", "nothing more"),
     ],
 )
 def test_the_verdict_follows_the_ratio_to_the_noise(
