@@ -131,8 +131,7 @@ def import_set(options: ImportOptions, report: Report) -> Imported:
             mesh.export(root / "tool.stl")
         if motion is not None:
             steps = resampled(motion, grid)
-            table = np.column_stack([steps.frames, steps.times, steps.positions, steps.quaternions])
-            write_table(root / "tool_motion.csv", MOTION_COLUMNS, table)
+            write_table(root / "tool_motion.csv", MOTION_COLUMNS, steps.table)
             last = int(steps.frames[-1])
         if options.force is not None:
             write_table(root / "tool_force.csv", FORCE_COLUMNS, read_force(options.force, to_world, grid))

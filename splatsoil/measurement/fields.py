@@ -266,7 +266,15 @@ def read_text(file: Path) -> str:
 
 
 def read_table(file: Path, columns: Sequence[str]) -> FloatArray:
-    """A CSV file with a header that has ``columns``: (rows, columns) finite numbers, at least one row.
+    """The numbers of `read_labelled`, of a table without labels."""
+    return read_labelled(file, (), columns)[1]
+
+
+def read_labelled(
+    file: Path, labels: Sequence[str], columns: Sequence[str]
+) -> tuple[list[tuple[str, ...]], FloatArray]:
+    """A CSV file with a header that has ``labels`` and ``columns``: non-empty text of each row, and (rows, columns)
+    finite numbers; at least one row.
 
     Columns may be in any order, in capitals, and among others, which are left out. Cells are parted by commas, tabs or
     semicolons; by the latter two, a comma is a decimal one. Lines that begin with # are comments, or the header.
@@ -274,9 +282,11 @@ def read_table(file: Path, columns: Sequence[str]) -> FloatArray:
     Raises:
         MeasurementError: naming the line and column.
     """
-    places: list[int] | None = None
+    wanted = (*labels, *columns)
+    places: dict[str, int] | None = None
     names: list[str] = []
     delimiter = ","
+    texts: list[tuple[str, ...]] = []
     table: list[list[float]] = []
     for line, text in enumerate(read_text(file).splitlines(), start=1):
         is_comment = text.lstrip().startswith("#")
@@ -291,27 +301,28 @@ def read_table(file: Path, columns: Sequence[str]) -> FloatArray:
             names = [cell.lower() for cell in cells]
             while not names[-1]:
                 names.pop()
-            faulty = [name for name in columns if names.count(name) != 1]
+            faulty = [name for name in wanted if names.count(name) != 1]
             if not faulty:
-                places = [names.index(name) for name in columns]
+                places = {name: names.index(name) for name in wanted}
             elif not is_comment:
-                raise _no_header(columns, ",".join(cells)[:80], faulty, file, line)
+                raise _no_header(wanted, ",".join(cells)[:80], faulty, file, line)
             continue
         if len(cells) < len(names) or any(cells[len(names) :]):
             raise MeasurementError(
                 f"{len(cells)} values where the header has {len(names)}", file=file, field=f"line {line}"
             )
-        table.append(
-            [
-                _cell(cells[k] if delimiter == "," else cells[k].replace(",", "."), file, f"{name}, line {line}")
-                for name, k in zip(columns, places, strict=True)
-            ]
-        )
+        texts.append(tuple(cells[places[name]] for name in labels))
+        if not all(texts[-1]):
+            raise MeasurementError(f"{' and '.join(labels)} must not be empty", file=file, field=f"line {line}")
+        numbers = [cells[places[name]] for name in columns]
+        if delimiter != ",":
+            numbers = [text.replace(",", ".") for text in numbers]
+        table.append([_cell(text, file, f"{name}, line {line}") for name, text in zip(columns, numbers, strict=True)])
     if places is None:
-        raise _no_header(columns, "nothing", columns, file, 1)
+        raise _no_header(wanted, "nothing", wanted, file, 1)
     if not table:
         raise MeasurementError("the table has no rows", file=file)
-    return np.array(table)
+    return texts, np.array(table)
 
 
 def _no_header(columns: Sequence[str], found: str, faulty: Sequence[str], file: Path, line: int) -> MeasurementError:
