@@ -8,7 +8,7 @@ import json
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,7 @@ from PIL import Image
 from splatsoil.errors import MeasurementError
 
 FloatArray = npt.NDArray[np.float64]
+Value = TypeVar("Value")
 
 _ALIKE = 0.8  # difflib's ratio of two words one of which is the other misspelt: a letter of five, two of ten
 _LONGEST_NAME = 60  # characters, of four bytes at most, where a file's name has 255 bytes and more is added
@@ -66,16 +67,11 @@ class Fields:
 
     def child(self, key: str) -> Fields:
         """A nested object."""
-        value = self.raw(key)
-        if not isinstance(value, dict):
-            self.fail(key, f"expected an object, found {_kind(value)}")
-        return Fields(value, self.file, self.path_of(key))
+        return Fields(self._typed(key, dict, "an object"), self.file, self.path_of(key))
 
     def children(self, key: str) -> Iterator[Fields]:
         """The objects of a non-empty list; fields missing in them are looked up in this object."""
-        value = self.raw(key)
-        if not isinstance(value, list):
-            self.fail(key, f"expected a list, found {_kind(value)}")
+        value = self._typed(key, list, "a list")
         if not value:
             self.fail(key, "the list is empty")
         for i, item in enumerate(value):
@@ -98,15 +94,12 @@ class Fields:
 
     def flag(self, key: str) -> bool:
         """True or false."""
-        value = self.raw(key)
-        if not isinstance(value, bool):
-            self.fail(key, f"expected true or false, found {_kind(value)}")
-        return value
+        return self._typed(key, bool, "true or false")
 
     def text(self, key: str) -> str:
         """A non-empty string."""
-        value = self.raw(key)
-        if not isinstance(value, str) or not value.strip():
+        value = self._typed(key, str, "text")
+        if not value.strip():
             self.fail(key, f"expected text, found {_kind(value)}")
         return value
 
@@ -164,6 +157,12 @@ class Fields:
         value = self.data.get(key)
         if value is None and self.parent is not None:
             return self.parent._find(key)
+        return value
+
+    def _typed(self, key: str, kind: type[Value], expected: str) -> Value:
+        value = self.raw(key)
+        if not isinstance(value, kind):
+            self.fail(key, f"expected {expected}, found {_kind(value)}")
         return value
 
     def _finite(self, key: str, value: Any) -> float:

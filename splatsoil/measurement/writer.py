@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,11 +88,8 @@ def write_measurement(
     Raises:
         MeasurementError: the place is taken or can't be written, or the set breaks the format's rules.
     """
-    target = Path(folder)
-    if target.exists() and (not target.is_dir() or any(target.iterdir())):
-        raise MeasurementError("already there and not an empty folder; nothing is overwritten", file=target)
     bed, tool, heights = contents.bed, contents.tool, contents.heights
-    with _whole(target) as root:
+    with whole_folder(Path(folder)) as root:
         tool.mesh.export(root / "tool.stl")
         write_table(root / "tool_motion.csv", MOTION_COLUMNS, tool.motion.table)
         if tool.force is not None:
@@ -133,12 +130,18 @@ def write_measurement(
         if beside is not None:
             beside(root)
         Measurement.load(root)
-    return Measurement.load(target)
+    return Measurement.load(folder)
 
 
 @contextmanager
-def _whole(target: Path) -> Iterator[Path]:
-    """A folder beside ``target`` to fill; in the end it takes its place, or disappears with what was made for it."""
+def whole_folder(target: Path) -> Iterator[Path]:
+    """A folder beside ``target`` to fill; in the end it takes its place, or disappears with what was made for it.
+
+    Raises:
+        MeasurementError: the place is taken or can't be written.
+    """
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise MeasurementError("already there and not an empty folder; nothing is overwritten", file=target)
     new = [p for p in target.absolute().parents if not p.exists()]
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -174,7 +177,9 @@ def transforms(camera: Camera) -> dict[str, Any]:
     }
 
 
-def write_frames(folder: Path, frames: Sequence[Picture | Frame], *, video: bool, suffix: str, quality: int) -> None:
+def write_frames(
+    folder: Path, frames: Iterable[Picture | Frame], *, video: bool, suffix: str = ".jpg", quality: int = 95
+) -> None:
     """Pictures, masks and ``transforms.json`` of views or of a video.
 
     Raises:
