@@ -28,7 +28,7 @@ from splatsoil.importing.tags import tag_scale
 from splatsoil.importing.video import Video
 from splatsoil.measurement.camera import Camera
 from splatsoil.measurement.fields import Fields
-from splatsoil.measurement.frames import read_transforms
+from splatsoil.measurement.frames import read_transforms, undistorted
 from splatsoil.measurement.measurement import EXPERIMENT, FORMAT, Measurement
 from splatsoil.measurement.motion import MOTION_COLUMNS, ToolMotion
 from splatsoil.measurement.tool import FORCE_COLUMNS, read_mesh
@@ -216,19 +216,12 @@ def _footage(video: Video, camera: Camera) -> Footage:
     numbers = set(np.unique(np.linspace(0, video.count - 1, LOOKED_AT).astype(int)).tolist())
     times, pictures = [], []
     for number, picture in video.pictures(numbers):
-        image = Image.fromarray(picture).resize((small.width, small.height), Image.Resampling.BOX)
+        image = np.asarray(Image.fromarray(picture).resize((small.width, small.height), Image.Resampling.BOX))
+        if small.has_distortion:
+            image = np.rint(undistorted(image.astype(np.float32), small)).astype(np.uint8)
         times.append(number / video.rate)
-        pictures.append(_without_distortion(np.asarray(image), small))
+        pictures.append(image)
     return Footage(small.undistorted(), np.array(times), np.stack(pictures))
-
-
-def _without_distortion(picture: npt.NDArray[np.uint8], camera: Camera) -> npt.NDArray[np.uint8]:
-    """Each pixel's nearest one in the picture (h, w, 3) of a lens that bends."""
-    if not camera.has_distortion:
-        return picture
-    where = np.nan_to_num(camera.undistortion_map(), nan=0.0)
-    columns, rows = (np.clip(where[..., k].astype(int), 0, picture.shape[1 - k] - 1) for k in (0, 1))
-    return picture[rows, columns]
 
 
 def _wanted(video: Video, zero: int, last: int | None, every: int) -> set[int]:

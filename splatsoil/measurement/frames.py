@@ -75,7 +75,7 @@ class Frame:
         """The image that ``camera.undistorted()`` would have taken; black where this lens did not see."""
         if not self.camera.has_distortion:
             return self.image()
-        return _resample(self.image(), self.camera)
+        return undistorted(self.image(), self.camera)
 
     def undistorted_mask(self) -> BoolImage:
         """Where ``undistorted_image()`` shows the scene and the mask allows it: (height, width) bool."""
@@ -85,10 +85,10 @@ class Frame:
         if not self.camera.has_distortion:
             return mask
         # A pixel blended from outside the image or from masked pixels is not to be trusted.
-        return _resample(mask[:, :, None].astype(np.float32), self.camera)[:, :, 0] > 0.999
+        return undistorted(mask[:, :, None].astype(np.float32), self.camera)[:, :, 0] > 0.999
 
 
-def _resample(image: FloatImage, camera: Camera) -> FloatImage:
+def undistorted(image: FloatImage, camera: Camera) -> FloatImage:
     """Bilinear resampling of (height, width, channels) to the camera without distortion, zero outside the image."""
     import torch
     from kornia.geometry.transform import remap
