@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -30,11 +28,11 @@ from splatsoil.importing.tags import tag_scale
 from splatsoil.importing.video import Video
 from splatsoil.measurement.camera import Camera
 from splatsoil.measurement.fields import Fields
-from splatsoil.measurement.frames import Frame, read_transforms
+from splatsoil.measurement.frames import read_transforms, undistorted
 from splatsoil.measurement.measurement import EXPERIMENT, FORMAT, Measurement
 from splatsoil.measurement.motion import MOTION_COLUMNS, ToolMotion
 from splatsoil.measurement.tool import FORCE_COLUMNS, read_mesh
-from splatsoil.measurement.writer import write_frames, write_json, write_table
+from splatsoil.measurement.writer import Picture, whole_folder, write_frames, write_json, write_table
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -42,7 +40,6 @@ PRE_ROLL = 8
 """Frames before anything moves that are kept of a video, at most: they measure the noise."""
 LOOKED_AT = 60
 """Pictures of each video that its clock is told from."""
-QUALITY = 95
 
 
 @dataclass(frozen=True)
@@ -87,11 +84,13 @@ def import_set(options: ImportOptions, report: Report) -> Imported:
         MeasurementError: something is missing or faulty; nothing is written.
         ParameterError: a package is missing, or an option makes no sense.
     """
-    out = options.out
     if options.video_every < 1:
         raise ParameterError(f"--video-every: must be 1 or more, not {options.video_every}")
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise MeasurementError("already there and not an empty folder; nothing is overwritten", file=out)
+    with whole_folder(options.out) as root:
+        return _filled(root, options, report)
+
+
+def _filled(root: Path, options: ImportOptions, report: Report) -> Imported:
     report("reading the views", 0.0)
     found = read_source(options.source, options.images)
     similarity, marks, left = _similarity(found, options)
@@ -121,35 +120,31 @@ def import_set(options: ImportOptions, report: Report) -> Imported:
     zero = 0 if motion is None or not videos else int(np.floor((moving(motion)[0] - offset) * rate + 1e-6))
     grid = Grid(rate, zero / rate + offset)
 
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}-") as temporary:
-        root = Path(temporary) / out.name
-        root.mkdir()
-        write_frames(root / "views", views, video=False, suffix=".jpg", quality=QUALITY)
-        last = None
-        if mesh is not None:
-            mesh.export(root / "tool.stl")
-        if motion is not None:
-            steps = resampled(motion, grid)
-            table = np.column_stack([steps.frames, steps.times, steps.positions, steps.quaternions])
-            write_table(root / "tool_motion.csv", MOTION_COLUMNS, table)
-            last = int(steps.frames[-1])
-        if options.force is not None:
-            write_table(root / "tool_force.csv", FORCE_COLUMNS, read_force(options.force, to_world, grid))
-        taken = []
+    write_frames(root / "views", views, video=False)
+    last = None
+    if mesh is not None:
+        mesh.export(root / "tool.stl")
+    if motion is not None:
+        steps = resampled(motion, grid)
+        write_table(root / "tool_motion.csv", MOTION_COLUMNS, steps.table)
+        last = int(steps.frames[-1])
+    if options.force is not None:
+        write_table(root / "tool_force.csv", FORCE_COLUMNS, read_force(options.force, to_world, grid))
+    wanted = {name: _wanted(video, zero, last, options.video_every) for name, video in videos.items()}
+
+    def filmed() -> Iterator[Picture]:
         for k, (name, video) in enumerate(videos.items()):
             report(f"video {name}", 0.4 + 0.5 * k / len(videos))
-            camera, folder = replace(cameras[name], name=name), Path(temporary) / "video" / name
-            taken += _extracted(video, camera, folder, zero, last, options.video_every)
-        if taken:
-            write_frames(root / "video", taken, video=True, suffix=".jpg", quality=QUALITY)
-        report("checking", 0.9)
-        missing = _finish(root, experiment, rate, out)
-        if out.exists():
-            out.rmdir()
-        shutil.move(root, out)
-    count = {name: sum(frame.camera_name == name for frame in taken) for name in videos}
-    return Imported(found.kind, len(views), similarity, marks, left, count, clock, missing)
+            camera = replace(cameras[name], name=name)
+            for number, image in video.pictures(wanted[name]):
+                yield Picture(camera, image, number - zero, (number - zero) / video.rate)
+
+    if videos:
+        write_frames(root / "video", filmed(), video=True)
+    report("checking", 0.9)
+    missing = _finish(root, experiment, rate, options.out)
+    frames = {name: len(numbers) for name, numbers in wanted.items()}
+    return Imported(found.kind, len(views), similarity, marks, left, frames, clock, missing)
 
 
 def _similarity(source: Source, options: ImportOptions) -> tuple[FloatArray, float, float | None]:
@@ -221,34 +216,21 @@ def _footage(video: Video, camera: Camera) -> Footage:
     numbers = set(np.unique(np.linspace(0, video.count - 1, LOOKED_AT).astype(int)).tolist())
     times, pictures = [], []
     for number, picture in video.pictures(numbers):
-        image = Image.fromarray(picture).resize((small.width, small.height), Image.Resampling.BOX)
+        image = np.asarray(Image.fromarray(picture).resize((small.width, small.height), Image.Resampling.BOX))
+        if small.has_distortion:
+            image = np.rint(undistorted(image.astype(np.float32), small)).astype(np.uint8)
         times.append(number / video.rate)
-        pictures.append(_without_distortion(np.asarray(image), small))
+        pictures.append(image)
     return Footage(small.undistorted(), np.array(times), np.stack(pictures))
 
 
-def _without_distortion(picture: npt.NDArray[np.uint8], camera: Camera) -> npt.NDArray[np.uint8]:
-    """Each pixel's nearest one in the picture (h, w, 3) of a lens that bends."""
-    if not camera.has_distortion:
-        return picture
-    where = np.nan_to_num(camera.undistortion_map(), nan=0.0)
-    columns, rows = (np.clip(where[..., k].astype(int), 0, picture.shape[1 - k] - 1) for k in (0, 1))
-    return picture[rows, columns]
-
-
-def _extracted(video: Video, camera: Camera, folder: Path, zero: int, last: int | None, every: int) -> list[Frame]:
-    """Frames of a video as files: every so many from ``zero`` on until the tool rests, and those just before."""
+def _wanted(video: Video, zero: int, last: int | None, every: int) -> set[int]:
+    """Frames of a video: every so many from ``zero`` on until the tool rests, and those just before."""
     end = video.count if last is None else min(video.count, zero + last + 1)
     wanted = {*range(max(zero, zero % every), end, every), *range(max(zero - PRE_ROLL, 0), min(zero, video.count))}
     if not wanted:
         raise MeasurementError("the video ends before the tool moves, or begins after; is the clock's offset right?")
-    folder.mkdir(parents=True)
-    out = []
-    for number, picture in video.pictures(wanted):
-        path = folder / f"{number:06d}.jpg"
-        Image.fromarray(picture).save(path, quality=QUALITY, subsampling=0)
-        out.append(Frame(camera, path, camera.name, number - zero, (number - zero) / video.rate))
-    return out
+    return wanted
 
 
 def _finish(root: Path, experiment: dict[str, Any], rate: float, out: Path) -> tuple[str, ...]:

@@ -1,22 +1,29 @@
-"""How far the video's clock is off the tool's: where the tool would be seen, against the colours that are seen there.
+"""How far the video's clock is off the tool's: where the tool would be seen, against what is seen there.
 
-At the right offset a pixel's colour tells best whether the tool covers it. What is maximised is the mutual information
-between the two (Viola & Wells 1997, Int. J. Comput. Vis. 24:137), over one number. It needs no colour of the tool, and
-soil that hides a part of it in every frame costs the same at every offset.
+Coarsely: at the right offset a pixel's colour tells best whether the tool covers it. The mutual information between the
+two is maximised (Viola & Wells 1997, Int. J. Comput. Vis. 24:137). It needs no colour of the tool. What soil hides of
+the tool biases it by milliseconds: a tool that has sunk less, or has less soil before it, is hidden less.
+
+Finely: a place on the tool keeps its colour, wherever the tool goes. The mean absolute deviation of places' colours
+from their medians over the video is minimised. What soil hides for a time is an outlier at any offset. Pictures are
+compared with pictures: an error of the camera's place, which shifts all of them alike, does not count.
 """
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 import trimesh
+from scipy.ndimage import map_coordinates
 
 from splatsoil.errors import MeasurementError
 from splatsoil.measurement.camera import Camera
 from splatsoil.measurement.motion import ToolMotion
+from splatsoil.reconstruction.views import surface_points
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -24,8 +31,8 @@ WIDTH = 480
 """Pictures are halved until they are no wider, px."""
 LEVELS = 16
 """Of each colour, in the histograms."""
-FINER = 3
-"""Rays along a pixel's side, so that what the tool covers of it changes smoothly; the coarse search has one."""
+PLACES = 2000
+"""On the tool, at least, whose colours are compared."""
 STEP = 0.25
 """Way of the tool, over its width, from one offset of the coarse search to the next."""
 RESTING = 0.01
@@ -63,40 +70,34 @@ class ClockOffset:
     by_camera: tuple[float, ...]
 
 
-class _ToolInformation:
-    """One camera's pictures, cut to where the tool ever is, and their information on it."""
+class _FilmedTool:
+    """One camera's pictures, cut to where the tool ever is."""
 
     def __init__(self, footage: Footage, mesh: trimesh.Trimesh, motion: ToolMotion) -> None:
         from splatsoil.scene import ToolBody
 
         self.motion, self.times, self.body = motion, footage.times, ToolBody(mesh)
-        self.camera = footage.camera
+        self.camera, self.pictures = footage.camera, footage.pictures
         moments = np.linspace(motion.times[0], motion.times[-1], 50)
-        swept = np.any([self._covered(self.camera, time) for time in moments], axis=0)
-        rows, columns = np.nonzero(swept)
-        self.colours: npt.NDArray[np.int64] = np.zeros((0, 0), dtype=np.int64)
+        rows, columns = np.nonzero(np.any([self._covered(time) for time in moments], axis=0))
         self.seen = len(rows) > 0
         if not self.seen:
             return
         margin = max(2, (columns.max() - columns.min()) // 10)
-        height, width = swept.shape
-        x0, x1 = max(columns.min() - margin, 0), min(columns.max() + 1 + margin, width)
-        y0, y1 = max(rows.min() - margin, 0), min(rows.max() + 1 + margin, height)
-        self.camera = self.camera.cropped(int(x0), int(y0), int(x1 - x0), int(y1 - y0))
-        levels = footage.pictures[:, y0:y1, x0:x1].astype(np.int64) * LEVELS // 256
-        self.colours = (levels @ np.array([LEVELS * LEVELS, LEVELS, 1])).reshape(len(levels), -1)
+        x0, y0 = (max(int(places.min()) - margin, 0) for places in (columns, rows))
+        self.pictures = self.pictures[:, y0 : rows.max() + 1 + margin, x0 : columns.max() + 1 + margin]
+        self.camera = self.camera.cropped(x0, y0, self.pictures.shape[2], self.pictures.shape[1])
+        levels = self.pictures.astype(np.int64) * LEVELS // 256
+        self.colours = (levels @ np.array([LEVELS * LEVELS, LEVELS, 1])).reshape(-1)
+        self.places, faces = surface_points(mesh, (mesh.area / PLACES) ** 0.5)
+        self.normals = mesh.face_normals[faces]
 
-    def information(self, offset: float, finer: int = FINER) -> float:
-        """Mutual information in nats a pixel at an offset in s, by so many rays along a pixel's side."""
-        return self.measured(offset, finer)[0]
-
-    def measured(self, offset: float, finer: int = FINER) -> tuple[float, float]:
-        """That, and the entropy of whether the tool covers a pixel, in the same unit."""
-        weights = np.concatenate([self._shares(time + offset, finer) for time in self.times])
-        colours = self.colours.reshape(-1)
-        count = LEVELS**3
-        everywhere = np.bincount(colours, minlength=count) / len(colours)
-        inside = np.bincount(colours, weights=weights, minlength=count) / len(colours)
+    def information(self, offset: float) -> tuple[float, float]:
+        """Mutual information of colour and cover at an offset in s, and the entropy of cover, in nats a pixel."""
+        covered = np.concatenate([self._covered(time + offset).reshape(-1) for time in self.times])
+        everywhere, inside = (
+            np.bincount(which, minlength=LEVELS**3) / len(covered) for which in (self.colours, self.colours[covered])
+        )
         information = entropy = 0.0
         for joint in (inside, everywhere - inside):
             there, share = joint > 1e-15, float(joint.sum())
@@ -104,16 +105,25 @@ class _ToolInformation:
             entropy -= share * float(np.log(share)) if share > 0.0 else 0.0
         return information, entropy
 
-    def _shares(self, time: float, finer: int) -> FloatArray:
-        """What the tool covers of each pixel, one after the other."""
-        covered = self._covered(self.camera.scaled(finer), time)
-        covered = covered.reshape(self.camera.height, finer, self.camera.width, finer)
-        return covered.mean(axis=(1, 3)).reshape(-1)
+    def deviation(self, offset: float) -> float:
+        """Mean absolute deviation, in grey levels, of the colours of places on the tool from their medians."""
+        values = np.full((len(self.times), len(self.places), 3), np.nan)
+        for out, picture, time in zip(values, self.pictures, self.times, strict=True):
+            rotation, position = self.motion.pose(float(time + offset))
+            points = self.places @ rotation.T + position
+            pixels, _ = self.camera.project(points)
+            towards = np.sum((self.camera.position - points) * (self.normals @ rotation.T), axis=1) > 0.0
+            shown = towards & np.all((pixels > 0.5) & (pixels < np.array(picture.shape[1::-1]) - 0.5), axis=1)
+            where = (pixels[shown, ::-1] - 0.5).T
+            out[shown] = np.stack([map_coordinates(picture[..., k], where, np.float64, order=1) for k in range(3)], -1)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # of places that are never shown
+            return float(np.nanmean(np.abs(values - np.nanmedian(values, axis=0))))
 
-    def _covered(self, camera: Camera, time: float) -> npt.NDArray[np.bool_]:
+    def _covered(self, time: float) -> npt.NDArray[np.bool_]:
         from splatsoil.scene import silhouette
 
-        return silhouette(self.body.at(*self.motion.pose(time)), camera).numpy()
+        return silhouette(self.body.at(*self.motion.pose(float(time))), self.camera).numpy()
 
 
 def moving(motion: ToolMotion) -> tuple[float, float, float]:
@@ -143,7 +153,7 @@ def clock_offset(footage: Sequence[Footage], mesh: trimesh.Trimesh, motion: Tool
     """
     from scipy.optimize import minimize_scalar
 
-    cameras = [w for w in (_ToolInformation(one, mesh, motion) for one in footage) if w.seen]
+    cameras = [w for w in (_FilmedTool(one, mesh, motion) for one in footage) if w.seen]
     if not cameras:
         raise MeasurementError("no camera of the video sees the tool's motion; give --clock-offset in seconds")
 
@@ -151,16 +161,15 @@ def clock_offset(footage: Sequence[Footage], mesh: trimesh.Trimesh, motion: Tool
     begin, end, speed = moving(motion)
     step = STEP * float(np.sort(mesh.extents)[1]) / speed
     offsets = np.arange(begin - times.max(), end - times.min() + step, step)
-    found = np.array([sum(w.information(offset, 1) for w in cameras) for offset in offsets])
-    best = float(offsets[found.argmax()])
-    information, entropy = np.sum([w.measured(best) for w in cameras], axis=0)
-    if not information > LEAST_SHARE * entropy:
+    found = np.array([np.sum([w.information(offset) for w in cameras], axis=0) for offset in offsets])
+    best = int(found[:, 0].argmax())
+    if not found[best, 0] > LEAST_SHARE * found[best, 1]:
         raise MeasurementError("the tool cannot be told from what is behind it; give --clock-offset in seconds")
 
-    def refined(*chosen: _ToolInformation) -> float:
+    def refined(*chosen: _FilmedTool) -> float:
         result = minimize_scalar(
-            lambda offset: -sum(w.information(offset) for w in chosen),
-            bounds=(best - step, best + step),
+            lambda offset: sum(w.deviation(offset) for w in chosen),
+            bounds=(offsets[best] - step, offsets[best] + step),
             method="bounded",
             options={"xatol": 1e-4},
         )

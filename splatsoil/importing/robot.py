@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,16 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from splatsoil.errors import MeasurementError
 from splatsoil.measurement.fields import read_table
-from splatsoil.measurement.motion import ToolMotion, check_clock
-from splatsoil.measurement.rotations import nearest_rigid, why_not_rigid
+from splatsoil.measurement.motion import ToolMotion, check_clock, rigid
 from splatsoil.measurement.tool import FORCE_COLUMNS
 
 FloatArray = npt.NDArray[np.float64]
 
-COLUMNS = ("time", "x", "y", "z", "qw", "qx", "qy", "qz")
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 """Metres in each unit of length."""
-_SLACK = 0.05
 
 
 @dataclass(frozen=True)
@@ -61,10 +58,12 @@ def read_rigid(file: Path | None) -> FloatArray:
         matrix = np.loadtxt(file, delimiter="," if "," in file.read_text() else None, ndmin=2)
     except (OSError, ValueError) as error:
         raise MeasurementError(f"expected four rows of four numbers ({error})", file=file) from error
-    fault = "it is not 4 x 4" if matrix.shape != (4, 4) else why_not_rigid(matrix)
-    if fault:
-        raise MeasurementError(f"not a rigid motion: {fault}", file=file)
-    return nearest_rigid(matrix)
+    try:
+        if matrix.shape != (4, 4):
+            raise ValueError("not a rigid motion: it is not 4 x 4")
+        return rigid(matrix)
+    except ValueError as error:
+        raise MeasurementError(str(error), file=file) from error
 
 
 def read_motion(file: Path, unit: str, robot_to_world: FloatArray, mesh_to_flange: FloatArray) -> ToolMotion:
@@ -79,26 +78,13 @@ def read_motion(file: Path, unit: str, robot_to_world: FloatArray, mesh_to_flang
     Raises:
         MeasurementError: naming the line and column.
     """
-    table = read_table(file, COLUMNS)
-    if len(table) < 2:
-        raise MeasurementError("a motion has two rows at least: where the tool is at two moments", file=file)
-    rows = np.arange(len(table), dtype=np.float64)
-    check_clock(rows, table[:, 0], file)
-    norms = np.linalg.norm(table[:, 4:], axis=1)
-    off = np.flatnonzero(np.abs(norms - 1.0) > _SLACK)
-    if off.size:
-        i = int(off[0])
-        raise MeasurementError(
-            f"the quaternion has length {norms[i]:g} instead of 1; the order is w, x, y, z",
-            file=file,
-            field=f"qw,qx,qy,qz, row {i + 1}",
-        )
-    flange = np.tile(np.eye(4), (len(table), 1, 1))
-    flange[:, :3, :3] = Rotation.from_quat(table[:, 4:], scalar_first=True).as_matrix()
-    flange[:, :3, 3] = metres(unit, file) * table[:, 1:4]
+    read = ToolMotion.read(file, numbered=False)
+    flange = np.tile(np.eye(4), (len(read.times), 1, 1))
+    flange[:, :3, :3] = Rotation.from_quat(read.quaternions, scalar_first=True).as_matrix()
+    flange[:, :3, 3] = metres(unit, file) * read.positions
     poses = robot_to_world @ flange @ mesh_to_flange
     quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat(scalar_first=True)
-    return ToolMotion(rows.astype(np.int64), table[:, 0], poses[:, :3, 3], quaternions)
+    return replace(read, positions=poses[:, :3, 3], quaternions=quaternions)
 
 
 def resampled(motion: ToolMotion, grid: Grid) -> ToolMotion:

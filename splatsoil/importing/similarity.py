@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,14 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from splatsoil.errors import MeasurementError
 from splatsoil.importing.source import find_image
-from splatsoil.measurement.fields import read_table, read_text
+from splatsoil.measurement.fields import read_labelled, read_text
 from splatsoil.measurement.frames import Frame
 
 FloatArray = npt.NDArray[np.float64]
 Marks = dict[str, list[tuple[Frame, FloatArray]]]
 """Photographs, and pixels (2,) in them, by point."""
 
-PLACE = ("point", "x", "y", "z")
 _PARALLEL = 1e-4  # squared sine of the angle between rays that meet nowhere in particular
 _FLAT = 1e-3  # of known points' spread along one line, across it: they tell no turn about it
 
@@ -44,10 +42,11 @@ def read_points(file: Path) -> dict[str, FloatArray]:
     Raises:
         MeasurementError: naming file and line.
     """
-    names, table = _named(file, PLACE)
-    if len(set(names)) < len(names):
+    names, places = read_labelled(file, ("point",), ("x", "y", "z"))
+    points = {name: place for (name,), place in zip(names, places, strict=True)}
+    if len(points) < len(names):
         raise MeasurementError("a point is given twice", file=file, field="point")
-    return dict(zip(names, table, strict=True))
+    return points
 
 
 def read_marked(file: Path, frames: Sequence[Frame]) -> Marked:
@@ -60,11 +59,9 @@ def read_marked(file: Path, frames: Sequence[Frame]) -> Marked:
     header = read_text(file).split("\n", 1)[0].lower()
     if "image" not in header:
         return Marked(read_points(file))
-    names, table = _named(file, ("point", "u", "v"))
-    images = [row["image"].strip() for row in _rows(file)]
     marks: Marks = {}
     try:
-        for name, image, pixel in zip(names, images, table, strict=True):
+        for (name, image), pixel in zip(*read_labelled(file, ("point", "image"), ("u", "v")), strict=True):
             marks.setdefault(name, []).append((find_image(frames, image), pixel))
         return intersected(marks)
     except MeasurementError as error:
@@ -113,11 +110,9 @@ def by_known_points(marked: Mapping[str, FloatArray], known: Mapping[str, FloatA
         sizes = np.linalg.svd(spread, compute_uv=False)
         if sizes[1] <= _FLAT * sizes[0]:
             raise MeasurementError(f"the {what} points lie on one line; take one that doesn't")
-    u, sizes, vt = np.linalg.svd(dy.T @ dx)
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
+    turn = Rotation.align_vectors(dy, dx)[0]
     out = np.eye(4)
-    scale = float(sizes @ signs) / float(np.sum(dx**2))
-    out[:3, :3] = scale * (u * signs) @ vt
+    out[:3, :3] = np.sum(dy * turn.apply(dx)) / np.sum(dx**2) * turn.as_matrix()
     out[:3, 3] = y.mean(axis=0) - out[:3, :3] @ x.mean(axis=0)
     left = x @ out[:3, :3].T + out[:3, 3] - y
     return out, float(np.sqrt(np.mean(np.sum(left**2, axis=1))))
@@ -158,25 +153,5 @@ def distance_scale(marked: Mapping[str, FloatArray], first: str, second: str, me
 def moved(frame: Frame, similarity: FloatArray) -> Frame:
     """A photograph in the new world. Its depth, whose unit was the old one's, is left out where the scale changes."""
     scale = float(np.cbrt(np.linalg.det(similarity[:3, :3])))
-    pose = frame.camera.camera_to_world.copy()
-    pose[:3, 3] = similarity[:3, :3] @ pose[:3, 3] + similarity[:3, 3]
-    pose[:3, :3] = similarity[:3, :3] @ pose[:3, :3] / scale
     depth = frame.depth_path if abs(scale - 1.0) < 1e-3 else None
-    return replace(frame, camera=replace(frame.camera, camera_to_world=pose), depth_path=depth)
-
-
-def _named(file: Path, columns: Sequence[str]) -> tuple[list[str], FloatArray]:
-    """The names in the first column, and a table (n, k) of numbers in the others."""
-    table = read_table(file, columns[1:])
-    names = [row.get(columns[0], "").strip() for row in _rows(file)]
-    if len(names) != len(table) or not all(names):
-        raise MeasurementError(f"each row needs a name; the header is {','.join(columns)}", file=file)
-    return names, table
-
-
-def _rows(file: Path) -> list[dict[str, str]]:
-    """Rows of a CSV file by lower-case column."""
-    lines = [line for line in read_text(file).splitlines() if line.strip() and not line.lstrip().startswith("#")]
-    delimiter = next((mark for mark in ";\t" if mark in lines[0]), ",")
-    rows = csv.DictReader(lines, delimiter=delimiter, skipinitialspace=True)
-    return [{(key or "").strip().lower(): value or "" for key, value in row.items() if key} for row in rows]
+    return replace(frame, camera=frame.camera.moved(similarity), depth_path=depth)

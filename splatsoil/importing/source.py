@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splatsoil.errors import MeasurementError
-from splatsoil.measurement.blender import read_blender
 from splatsoil.measurement.colmap import read_colmap
 from splatsoil.measurement.fields import Fields
-from splatsoil.measurement.frames import Frame, read_transforms
+from splatsoil.measurement.frames import Frame, read_blender, read_transforms
 
 CAMERA_FILES = ("transforms.json", "transforms_train.json")
 MODEL_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0")

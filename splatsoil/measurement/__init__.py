@@ -3,16 +3,15 @@
 Nothing here imports torch until an image is undistorted, so that looking at a set is quick.
 """
 
-from splatsoil.measurement.blender import read_blender
 from splatsoil.measurement.camera import CAMERA_MODELS, Camera
 from splatsoil.measurement.colmap import read_colmap
-from splatsoil.measurement.frames import Frame
+from splatsoil.measurement.frames import Frame, read_blender
 from splatsoil.measurement.heights import HeightMaps
 from splatsoil.measurement.measurement import BIN, CONTAINERS, FORMAT, HEAP, OPEN, TRANSPARENT, Bed, Measurement
 from splatsoil.measurement.motion import ToolMotion
 from splatsoil.measurement.remarks import Remark, remarks
 from splatsoil.measurement.tool import Tool
-from splatsoil.measurement.writer import Picture, write_measurement
+from splatsoil.measurement.writer import Contents, Picture, write_measurement
 
 __all__ = [
     "BIN",
@@ -24,6 +23,7 @@ __all__ = [
     "TRANSPARENT",
     "Bed",
     "Camera",
+    "Contents",
     "Frame",
     "HeightMaps",
     "Measurement",

@@ -168,6 +168,12 @@ class Camera:
         pixels, _ = self.project(origins + directions)
         return pixels.reshape(self.height, self.width, 2)
 
+    def moved(self, similarity: FloatArray) -> Camera:
+        """The camera in another world, given the (4, 4) scale, rotation and translation that takes this one there."""
+        pose = similarity @ self.camera_to_world
+        pose[:3, :3] /= np.cbrt(np.linalg.det(similarity[:3, :3]))
+        return replace(self, camera_to_world=pose)
+
     def scaled(self, factor: float) -> Camera:
         """The camera of the image resized by ``factor``; the size is rounded to whole pixels, the rest follows."""
         width, height = max(1, round(self.width * factor)), max(1, round(self.height * factor))

@@ -11,6 +11,7 @@ import math
 import struct
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -47,12 +48,10 @@ def read_colmap(model: str | Path, images: str | Path, *, similarity: npt.ArrayL
         MeasurementError: naming file and field.
     """
     folder, root = Path(model), Path(images)
-    if (folder / "cameras.bin").is_file() and (folder / "images.bin").is_file():
-        calibrations, poses = _read_cameras_bin(folder / "cameras.bin"), _read_images_bin(folder / "images.bin")
-        source, cameras = folder / "images.bin", folder / "cameras.bin"
-    else:
-        calibrations, poses = _read_cameras_txt(folder / "cameras.txt"), _read_images_txt(folder / "images.txt")
-        source, cameras = folder / "images.txt", folder / "cameras.txt"
+    binary = (folder / "cameras.bin").is_file() and (folder / "images.bin").is_file()
+    cameras, source = (folder / f"{name}.{'bin' if binary else 'txt'}" for name in ("cameras", "images"))
+    calibrations = _read_cameras_bin(cameras) if binary else _read_cameras_txt(cameras)
+    poses = _read_images_bin(source) if binary else _read_images_txt(source)
     if not poses:
         raise MeasurementError("the model has no registered image", file=source)
     frames = []
@@ -60,14 +59,16 @@ def read_colmap(model: str | Path, images: str | Path, *, similarity: npt.ArrayL
         if camera_id not in calibrations:
             raise MeasurementError(f"camera {camera_id} is not among the model's cameras", file=source, field=name)
         path = inside(name, root, root, source, "NAME")
-        matrix = _camera_to_world(quaternion, translation, similarity, source, name)
-        camera = _camera(calibrations[camera_id], matrix, cameras, camera_id)
+        pose = _camera_to_world(quaternion, translation, source, name)
+        camera = _camera(calibrations[camera_id], pose, cameras, camera_id)
+        if similarity is not None:
+            camera = camera.moved(np.asarray(similarity, dtype=np.float64))
         check_image(path, (camera.width, camera.height), sizes_from=f"WIDTH and HEIGHT of camera {camera_id}")
         frames.append(Frame(camera, path))
     return tuple(frames)
 
 
-def _camera(calibration: _Calibration, matrix: FloatArray, file: Path, identity: int) -> Camera:
+def _camera(calibration: _Calibration, pose: FloatArray, file: Path, identity: int) -> Camera:
     name, width, height, values = calibration
     if name not in LENSES:
         raise MeasurementError(
@@ -78,16 +79,13 @@ def _camera(calibration: _Calibration, matrix: FloatArray, file: Path, identity:
     model, keys = LENSES[name]
     if len(values) != len(keys) or not np.isfinite(values).all():
         raise MeasurementError(f"{name} has {len(keys)} finite parameters, not {values}", file=file, field="PARAMS")
-    given = dict(zip(keys, values, strict=True))
-    focal = given.pop("f", None)
-    if focal is not None:
-        given |= {"fx": focal, "fy": focal}
-    return Camera(width=width, height=height, camera_to_world=matrix, **given, name="", model=model)
+    given: dict[str, Any] = dict(zip(keys, values, strict=True))
+    if "f" in given:
+        given["fx"] = given["fy"] = given.pop("f")
+    return Camera(width=width, height=height, camera_to_world=pose, **given, model=model)
 
 
-def _camera_to_world(
-    quaternion: FloatArray, translation: FloatArray, similarity: npt.ArrayLike | None, file: Path, name: str
-) -> FloatArray:
+def _camera_to_world(quaternion: FloatArray, translation: FloatArray, file: Path, name: str) -> FloatArray:
     norm = float(np.linalg.norm(quaternion))
     if not np.isfinite(translation).all() or not 0.5 < norm < 2.0:
         raise MeasurementError("the pose is no rigid motion", file=file, field=name)
@@ -95,11 +93,6 @@ def _camera_to_world(
     out = np.eye(4)
     out[:3, :3] = rotation.T @ np.diag([1.0, -1.0, -1.0])  # OpenCV to OpenGL camera axes
     out[:3, 3] = -rotation.T @ translation
-    if similarity is not None:
-        similar = np.asarray(similarity, dtype=np.float64)
-        scale = float(np.cbrt(np.linalg.det(similar[:3, :3])))
-        out[:3, 3] = similar[:3, :3] @ out[:3, 3] + similar[:3, 3]
-        out[:3, :3] = similar[:3, :3] @ out[:3, :3] / scale
     return out
 
 

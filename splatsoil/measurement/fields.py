@@ -8,7 +8,7 @@ import json
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,7 @@ from PIL import Image
 from splatsoil.errors import MeasurementError
 
 FloatArray = npt.NDArray[np.float64]
+Value = TypeVar("Value")
 
 _ALIKE = 0.8  # difflib's ratio of two words one of which is the other misspelt: a letter of five, two of ten
 _LONGEST_NAME = 60  # characters, of four bytes at most, where a file's name has 255 bytes and more is added
@@ -66,16 +67,11 @@ class Fields:
 
     def child(self, key: str) -> Fields:
         """A nested object."""
-        value = self.raw(key)
-        if not isinstance(value, dict):
-            self.fail(key, f"expected an object, found {_kind(value)}")
-        return Fields(value, self.file, self.path_of(key))
+        return Fields(self._typed(key, dict, "an object"), self.file, self.path_of(key))
 
     def children(self, key: str) -> Iterator[Fields]:
         """The objects of a non-empty list; fields missing in them are looked up in this object."""
-        value = self.raw(key)
-        if not isinstance(value, list):
-            self.fail(key, f"expected a list, found {_kind(value)}")
+        value = self._typed(key, list, "a list")
         if not value:
             self.fail(key, "the list is empty")
         for i, item in enumerate(value):
@@ -98,15 +94,12 @@ class Fields:
 
     def flag(self, key: str) -> bool:
         """True or false."""
-        value = self.raw(key)
-        if not isinstance(value, bool):
-            self.fail(key, f"expected true or false, found {_kind(value)}")
-        return value
+        return self._typed(key, bool, "true or false")
 
     def text(self, key: str) -> str:
         """A non-empty string."""
-        value = self.raw(key)
-        if not isinstance(value, str) or not value.strip():
+        value = self._typed(key, str, "text")
+        if not value.strip():
             self.fail(key, f"expected text, found {_kind(value)}")
         return value
 
@@ -164,6 +157,12 @@ class Fields:
         value = self.data.get(key)
         if value is None and self.parent is not None:
             return self.parent._find(key)
+        return value
+
+    def _typed(self, key: str, kind: type[Value], expected: str) -> Value:
+        value = self.raw(key)
+        if not isinstance(value, kind):
+            self.fail(key, f"expected {expected}, found {_kind(value)}")
         return value
 
     def _finite(self, key: str, value: Any) -> float:
@@ -266,7 +265,15 @@ def read_text(file: Path) -> str:
 
 
 def read_table(file: Path, columns: Sequence[str]) -> FloatArray:
-    """A CSV file with a header that has ``columns``: (rows, columns) finite numbers, at least one row.
+    """The numbers of `read_labelled`, of a table without labels."""
+    return read_labelled(file, (), columns)[1]
+
+
+def read_labelled(
+    file: Path, labels: Sequence[str], columns: Sequence[str]
+) -> tuple[list[tuple[str, ...]], FloatArray]:
+    """A CSV file with a header that has ``labels`` and ``columns``: non-empty text of each row, and (rows, columns)
+    finite numbers; at least one row.
 
     Columns may be in any order, in capitals, and among others, which are left out. Cells are parted by commas, tabs or
     semicolons; by the latter two, a comma is a decimal one. Lines that begin with # are comments, or the header.
@@ -274,9 +281,11 @@ def read_table(file: Path, columns: Sequence[str]) -> FloatArray:
     Raises:
         MeasurementError: naming the line and column.
     """
-    places: list[int] | None = None
+    wanted = (*labels, *columns)
+    places: dict[str, int] | None = None
     names: list[str] = []
     delimiter = ","
+    texts: list[tuple[str, ...]] = []
     table: list[list[float]] = []
     for line, text in enumerate(read_text(file).splitlines(), start=1):
         is_comment = text.lstrip().startswith("#")
@@ -291,27 +300,28 @@ def read_table(file: Path, columns: Sequence[str]) -> FloatArray:
             names = [cell.lower() for cell in cells]
             while not names[-1]:
                 names.pop()
-            faulty = [name for name in columns if names.count(name) != 1]
+            faulty = [name for name in wanted if names.count(name) != 1]
             if not faulty:
-                places = [names.index(name) for name in columns]
+                places = {name: names.index(name) for name in wanted}
             elif not is_comment:
-                raise _no_header(columns, ",".join(cells)[:80], faulty, file, line)
+                raise _no_header(wanted, ",".join(cells)[:80], faulty, file, line)
             continue
         if len(cells) < len(names) or any(cells[len(names) :]):
             raise MeasurementError(
                 f"{len(cells)} values where the header has {len(names)}", file=file, field=f"line {line}"
             )
-        table.append(
-            [
-                _cell(cells[k] if delimiter == "," else cells[k].replace(",", "."), file, f"{name}, line {line}")
-                for name, k in zip(columns, places, strict=True)
-            ]
-        )
+        texts.append(tuple(cells[places[name]] for name in labels))
+        if not all(texts[-1]):
+            raise MeasurementError(f"{' and '.join(labels)} must not be empty", file=file, field=f"line {line}")
+        numbers = [cells[places[name]] for name in columns]
+        if delimiter != ",":
+            numbers = [text.replace(",", ".") for text in numbers]
+        table.append([_cell(text, file, f"{name}, line {line}") for name, text in zip(columns, numbers, strict=True)])
     if places is None:
-        raise _no_header(columns, "nothing", columns, file, 1)
+        raise _no_header(wanted, "nothing", wanted, file, 1)
     if not table:
         raise MeasurementError("the table has no rows", file=file)
-    return np.array(table)
+    return texts, np.array(table)
 
 
 def _no_header(columns: Sequence[str], found: str, faulty: Sequence[str], file: Path, line: int) -> MeasurementError:

@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from splatsoil.errors import MeasurementError
+from splatsoil.measurement import images
 from splatsoil.measurement.camera import FISHEYE, LENSES, Camera
-from splatsoil.measurement.fields import Fields
-from splatsoil.measurement.images import check_image, check_photograph, read_alpha, read_depth, read_image, read_mask
-from splatsoil.measurement.rotations import nearest_rigid, why_not_rigid
+from splatsoil.measurement.fields import Fields, named
+from splatsoil.measurement.motion import rigid
 
 FloatImage = npt.NDArray[np.float32]
 BoolImage = npt.NDArray[np.bool_]
@@ -59,23 +59,23 @@ class Frame:
 
     def image(self) -> FloatImage:
         """The image as stored: (height, width, 3) float32, sRGB in [0, 1]."""
-        return read_image(self.path)
+        return images.read_image(self.path)
 
     def mask(self) -> BoolImage | None:
         """Where the image is to be used, by its mask or its own transparency: (height, width) bool, or None."""
         if self.mask_path is not None:
-            return read_mask(self.mask_path)
-        return read_alpha(self.path)
+            return images.read_mask(self.mask_path)
+        return images.read_alpha(self.path)
 
     def depth(self) -> FloatImage | None:
         """Depth along the camera's axis, (height, width) float32 metres, 0 where unknown; None if there is none."""
-        return None if self.depth_path is None else read_depth(self.depth_path, scale=self.depth_scale)
+        return None if self.depth_path is None else images.read_depth(self.depth_path, scale=self.depth_scale)
 
     def undistorted_image(self) -> FloatImage:
         """The image that ``camera.undistorted()`` would have taken; black where this lens did not see."""
         if not self.camera.has_distortion:
             return self.image()
-        return _resample(self.image(), self.camera)
+        return undistorted(self.image(), self.camera)
 
     def undistorted_mask(self) -> BoolImage:
         """Where ``undistorted_image()`` shows the scene and the mask allows it: (height, width) bool."""
@@ -85,10 +85,10 @@ class Frame:
         if not self.camera.has_distortion:
             return mask
         # A pixel blended from outside the image or from masked pixels is not to be trusted.
-        return _resample(mask[:, :, None].astype(np.float32), self.camera)[:, :, 0] > 0.999
+        return undistorted(mask[:, :, None].astype(np.float32), self.camera)[:, :, 0] > 0.999
 
 
-def _resample(image: FloatImage, camera: Camera) -> FloatImage:
+def undistorted(image: FloatImage, camera: Camera) -> FloatImage:
     """Bilinear resampling of (height, width, channels) to the camera without distortion, zero outside the image."""
     import torch
     from kornia.geometry.transform import remap
@@ -122,9 +122,9 @@ def read_transforms(file: Path, root: Path, *, video: bool) -> tuple[Frame, ...]
     for i, frame in enumerate(frames):
         size = (frame.camera.width, frame.camera.height)
         key = f"frames[{i}].file_path" if frame.mask_path is None else f"frames[{i}].mask_path"
-        check_photograph(frame.path, size, sizes_from=told, field=f"frames[{i}].file_path")
+        images.check_photograph(frame.path, size, sizes_from=told, field=f"frames[{i}].file_path")
         if frame.mask_path is not None:
-            check_image(frame.mask_path, size, sizes_from=told, field=key)
+            images.check_image(frame.mask_path, size, sizes_from=told, field=key)
         mask = frame.mask()
         if mask is not None and not mask.any():
             raise MeasurementError(
@@ -135,6 +135,32 @@ def read_transforms(file: Path, root: Path, *, video: bool) -> tuple[Frame, ...]
         if frame.depth_path is not None:
             _check_depth(frame.depth_path, size, told, f"frames[{i}].depth_file_path")
     return frames
+
+
+def read_blender(file: str | Path) -> tuple[Frame, ...]:
+    """Frames of a Blender or NeRF-synthetic ``transforms_train.json``, ordered by image name.
+
+    Most give one horizontal field of view (``camera_angle_x``): the principal point is in the middle then, pixels are
+    square, and nothing bends the image. What else of a lens a file gives is read as in nerfstudio's. File paths may
+    lack their suffix; times, if any, are left out.
+
+    Raises:
+        MeasurementError: naming file and field.
+    """
+    path = Path(file)
+    fields = Fields.read(path)
+    if not fields.has("fl_x"):
+        fields.raw("camera_angle_x")
+    frames = []
+    for item in fields.children("frames"):
+        image = named(item.text("file_path"), path.parent, path, item.path_of("file_path"))
+        if not image.is_file():
+            raise MeasurementError(f"no such image, though {path.name} names it", file=image)
+        camera = read_camera(item, "", images.image_size(image))
+        sizes_from = f"w and h of {path.name}" if item.has("w") or item.has("h") else "its own header"
+        images.check_image(image, (camera.width, camera.height), sizes_from=sizes_from)
+        frames.append(Frame(camera, image))
+    return tuple(sorted(frames, key=lambda frame: frame.path))
 
 
 def read_camera(fields: Fields, name: str, size: tuple[int, int] | None = None) -> Camera:
@@ -208,30 +234,27 @@ def _read_focal(fields: Fields, axis: str, length: int) -> float:
 
 
 def _read_pose(fields: Fields) -> npt.NDArray[np.float64]:
-    matrix = fields.matrix("transform_matrix", 4, 4)
-    fault = why_not_rigid(matrix)
-    if fault:
-        fields.fail("transform_matrix", f"not a rigid motion: {fault}")
-    return nearest_rigid(matrix)
+    try:
+        return rigid(fields.matrix("transform_matrix", 4, 4))
+    except ValueError as error:
+        fields.fail("transform_matrix", str(error))
 
 
 def _read_frame(fields: Fields, root: Path, *, video: bool) -> Frame:
     base = fields.file.parent
     fields.check_names((*FRAME_FIELDS, *VIDEO_FIELDS) if video else FRAME_FIELDS)
     name = fields.name("camera") if video or fields.has("camera") else ""
-    number = fields.integer("frame", -(10**9), 10**9) if video else None
-    time = fields.number("time") if video else None
-    optional = {
-        key: fields.path(key, root, base) if fields.has(key) else None for key in ("mask_path", "depth_file_path")
-    }
+    mask, depth = (
+        fields.path(key, root, base) if fields.has(key) else None for key in ("mask_path", "depth_file_path")
+    )
     return Frame(
+        frame=fields.integer("frame", -(10**9), 10**9) if video else None,
+        time=fields.number("time") if video else None,
         camera=read_camera(fields, name),
         path=fields.path("file_path", root, base),
         camera_name=name,
-        frame=number,
-        time=time,
-        mask_path=optional["mask_path"],
-        depth_path=optional["depth_file_path"],
+        mask_path=mask,
+        depth_path=depth,
         depth_scale=fields.number("integer_depth_scale", 1e-7, 1.0, default=1e-3, hint="it is in metres"),
     )
 
@@ -285,8 +308,8 @@ def _calibration(camera: Camera) -> tuple[object, ...]:
 
 def _check_depth(path: Path, size: tuple[int, int], told: str, field: str) -> None:
     if path.suffix != ".npy":
-        check_image(path, size, sizes_from=told, field=field)
-    depth = read_depth(path, field)
+        images.check_image(path, size, sizes_from=told, field=field)
+    depth = images.read_depth(path, field)
     if depth.shape != size[::-1]:
         raise MeasurementError(f"the depth is {depth.shape[::-1]} where {told} say {size}", file=path, field=field)
     if not depth.any():

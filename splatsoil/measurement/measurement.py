@@ -91,6 +91,11 @@ class Bed:
         pick = np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)])
         return np.where(pick == 1, self.upper, self.lower)
 
+    def beyond(self, points: FloatArray) -> FloatArray:
+        """How far points (..., 2 or more) lie outside of the box's sides in plan, metres (...); negative inside."""
+        xy = points[..., :2]
+        return np.maximum(self.lower[:2] - xy, xy - self.upper[:2]).max(axis=-1)
+
 
 @dataclass(frozen=True, eq=False)
 class Measurement:

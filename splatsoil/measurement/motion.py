@@ -50,9 +50,15 @@ class ToolMotion:
             object.__setattr__(self, name, array)
 
     @classmethod
-    def read(cls, file: Path) -> ToolMotion:
-        """Read ``frame,time,x,y,z,qw,qx,qy,qz``; MeasurementError names the line and column of what is wrong."""
-        table = read_table(file, MOTION_COLUMNS)
+    def read(cls, file: Path, *, numbered: bool = True) -> ToolMotion:
+        """Read ``frame,time,x,y,z,qw,qx,qy,qz``; if not ``numbered``, there are no frames but rows.
+
+        Raises:
+            MeasurementError: naming the line and column.
+        """
+        table = read_table(file, MOTION_COLUMNS[0 if numbered else 1 :])
+        if not numbered:
+            table = np.column_stack([np.arange(len(table)), table])
         frames, times = table[:, 0], table[:, 1]
         check_clock(frames, times, file)
         if len(table) < 2:
@@ -66,8 +72,14 @@ class ToolMotion:
                 if norms[i] < 1e-12
                 else f"the quaternion has length {norms[i]:g} instead of 1; the order is w, x, y, z"
             )
-            raise MeasurementError(message, file=file, field=f"qw,qx,qy,qz, frame {int(frames[i])}")
+            row = f"frame {int(frames[i])}" if numbered else f"row {i + 1}"
+            raise MeasurementError(message, file=file, field=f"qw,qx,qy,qz, {row}")
         return cls(frames.astype(np.int64), times, table[:, 2:5], table[:, 5:] / norms[:, None])
+
+    @property
+    def table(self) -> FloatArray:
+        """(n, 9) its rows, in the order of ``MOTION_COLUMNS``."""
+        return np.column_stack([self.frames, self.times, self.positions, self.quaternions])
 
     def pose(self, time: float) -> tuple[FloatArray, FloatArray]:
         """Rotation (3, 3), tool frame to world, and position (3,) of the tool frame's origin at ``time`` in seconds."""
@@ -109,6 +121,31 @@ class ToolMotion:
         if i >= len(self.times) - 1:
             return len(self.times) - 1, 0.0
         return i, float((time - self.times[i]) / (self.times[i + 1] - self.times[i]))
+
+
+def rigid(matrix: FloatArray, tolerance: float = 1e-3) -> FloatArray:
+    """The rigid motion nearest to a (4, 4) matrix that is one up to rounding.
+
+    Raises:
+        ValueError: what keeps it from being one.
+    """
+    rotation = matrix[:3, :3]
+    fault = ""
+    if np.abs(matrix[3] - [0.0, 0.0, 0.0, 1.0]).max() > tolerance:
+        fault = "its last row is not 0 0 0 1"
+    elif np.abs(rotation.T @ rotation - np.eye(3)).max() > tolerance:
+        fault = "its upper left 3 x 3 part is not a rotation (columns of length 1 at right angles)"
+        scale = float(np.linalg.norm(rotation, axis=0).mean())
+        if scale > 0.0 and np.abs(rotation.T @ rotation / scale**2 - np.eye(3)).max() < tolerance:
+            fault = f"it scales by {scale:g}"
+    elif np.linalg.det(rotation) < 0.0:
+        fault = "it mirrors (its determinant is -1)"
+    if fault:
+        raise ValueError(f"not a rigid motion: {fault}")
+    u, _, vt = np.linalg.svd(rotation)
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = u @ vt, matrix[:3, 3]
+    return out
 
 
 def check_clock(frames: FloatArray, times: FloatArray, file: Path) -> None:

@@ -45,6 +45,10 @@ class Tool:
     mesh_path: Path | None = None
     force_path: Path | None = None
 
+    def placed(self, time: float) -> trimesh.Trimesh:
+        """The mesh in the world at ``time``."""
+        return self.mesh.copy().apply_transform(self.motion.matrix(time))
+
     def bounds(self, time: float) -> tuple[FloatArray, FloatArray]:
         """Lower and upper corner (3,) of the tool's axis-aligned box in the world at ``time``."""
         rotation, position = self.motion.pose(time)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,21 +43,34 @@ class Picture:
     depth: npt.NDArray[np.floating] | None = None
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Contents:
+    """What a set is to hold.
+
+    Attributes:
+        name, bed, tool, frame_rate, gravity: as in Measurement.
+        views, video: pictures to encode, or frames of another set, whose files are copied as they are.
+        heights: grids of heights; beside them views and video may be empty, and are left out then.
+    """
+
+    name: str
+    bed: Bed
+    tool: Tool
+    frame_rate: float
+    gravity: npt.ArrayLike = (0.0, 0.0, -9.81)
+    views: Sequence[Picture | Frame] = ()
+    video: Sequence[Picture | Frame] = ()
+    heights: HeightMaps | None = None
+
+
 def write_measurement(
     folder: str | Path,
+    contents: Contents,
     *,
-    name: str,
-    bed: Bed,
-    tool: Tool,
-    views: Sequence[Picture | Frame],
-    video: Sequence[Picture | Frame],
-    frame_rate: float,
-    gravity: npt.ArrayLike = (0.0, 0.0, -9.81),
     suffix: str = ".jpg",
     quality: int = 95,
     truth: Mapping[str, Any] | None = None,
     beside: Callable[[Path], object] | None = None,
-    heights: HeightMaps | None = None,
 ) -> Measurement:
     """Write a set that ``Measurement.load`` accepts, and load it.
 
@@ -66,39 +79,34 @@ def write_measurement(
 
     Args:
         folder: where to; must not exist, or be an empty folder.
-        name: the set's name.
-        bed, tool, frame_rate, gravity: as in Measurement.
-        views, video: pictures to encode, or frames of another set, whose files are copied as they are.
+        contents: of the set.
         suffix: file type of encoded pictures, ``.jpg`` or ``.png``.
         quality: JPEG quality (no chroma subsampling).
         truth: content of ``truth.json``, for synthetic sets.
         beside: writes further files into the folder that it is given.
-        heights: grids of heights; beside them views and video may be empty, and are left out then.
 
     Raises:
         MeasurementError: the place is taken or can't be written, or the set breaks the format's rules.
     """
-    target = Path(folder)
-    if target.exists() and (not target.is_dir() or any(target.iterdir())):
-        raise MeasurementError("already there and not an empty folder; nothing is overwritten", file=target)
-    with _whole(target) as root:
+    bed, tool, heights = contents.bed, contents.tool, contents.heights
+    with whole_folder(Path(folder)) as root:
         tool.mesh.export(root / "tool.stl")
-        motion = tool.motion
-        table = np.column_stack([motion.frames, motion.times, motion.positions, motion.quaternions])
-        write_table(root / "tool_motion.csv", MOTION_COLUMNS, table)
+        write_table(root / "tool_motion.csv", MOTION_COLUMNS, tool.motion.table)
         if tool.force is not None:
             write_table(root / "tool_force.csv", FORCE_COLUMNS, tool.force)
-        pictures = {kind: frames for kind, frames in (("views", views), ("video", video)) if frames or heights is None}
+        pictures = {"views": contents.views, "video": contents.video}
+        if heights is not None:
+            pictures = {kind: frames for kind, frames in pictures.items() if frames}
         for kind, frames in pictures.items():
             write_frames(root / kind, frames, video=kind == "video", suffix=suffix, quality=quality)
         if heights is not None:
             write_heights(root / "heights", heights)
         experiment = {
             "format": FORMAT,
-            "name": name,
+            "name": contents.name,
             "up": "z",
-            "gravity": np.asarray(gravity, dtype=np.float64).tolist(),
-            "frame_rate": frame_rate,
+            "gravity": np.asarray(contents.gravity, dtype=np.float64).tolist(),
+            "frame_rate": contents.frame_rate,
             "bed": {
                 "lower": bed.lower.tolist(),
                 "upper": bed.upper.tolist(),
@@ -122,12 +130,18 @@ def write_measurement(
         if beside is not None:
             beside(root)
         Measurement.load(root)
-    return Measurement.load(target)
+    return Measurement.load(folder)
 
 
 @contextmanager
-def _whole(target: Path) -> Iterator[Path]:
-    """A folder beside ``target`` to fill; in the end it takes its place, or disappears with what was made for it."""
+def whole_folder(target: Path) -> Iterator[Path]:
+    """A folder beside ``target`` to fill; in the end it takes its place, or disappears with what was made for it.
+
+    Raises:
+        MeasurementError: the place is taken or can't be written.
+    """
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise MeasurementError("already there and not an empty folder; nothing is overwritten", file=target)
     new = [p for p in target.absolute().parents if not p.exists()]
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -163,7 +177,9 @@ def transforms(camera: Camera) -> dict[str, Any]:
     }
 
 
-def write_frames(folder: Path, frames: Sequence[Picture | Frame], *, video: bool, suffix: str, quality: int) -> None:
+def write_frames(
+    folder: Path, frames: Iterable[Picture | Frame], *, video: bool, suffix: str = ".jpg", quality: int = 95
+) -> None:
     """Pictures, masks and ``transforms.json`` of views or of a video.
 
     Raises:

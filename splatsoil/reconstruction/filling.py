@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from splatsoil.errors import ParameterError
 from splatsoil.measurement import Bed
 from splatsoil.mpm.grid import nearest
-from splatsoil.reconstruction.height_field import HeightField
+from splatsoil.reconstruction.height_field import HeightField, centres
 
 Array = NDArray[np.float64]
 
@@ -71,11 +71,8 @@ def fill(surface: HeightField, bed: Bed, spacing: float, seed: int = 0, jitter: 
 
 def column_depths(surface: HeightField, bed: Bed, nx: int, ny: int) -> Array:
     """(ny, nx) mean depth of the soil over the floor in equal columns, metres."""
-    fine = []
-    for k, n in ((0, nx * _SAMPLES), (1, ny * _SAMPLES)):
-        fine.append(bed.lower[k] + (np.arange(n) + 0.5) * (bed.upper[k] - bed.lower[k]) / n)
-    xs, ys = np.meshgrid(*fine)
-    depth = np.maximum(surface.smooth(np.stack([xs.ravel(), ys.ravel()], axis=1)) - bed.lower[2], 0.0)
+    fine = [centres(bed.lower[k], bed.upper[k], n * _SAMPLES) for k, n in enumerate((nx, ny))]
+    depth = np.maximum(surface.smooth(np.stack(np.meshgrid(*fine), axis=-1)) - bed.lower[2], 0.0)
     return depth.reshape(ny, _SAMPLES, nx, _SAMPLES).mean(axis=(1, 3))
 
 

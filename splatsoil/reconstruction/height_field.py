@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +10,11 @@ from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import map_coordinates
 
 Array = NDArray[np.float64]
+
+
+def centres(low: float, high: float, count: int) -> Array:
+    """(count,) middles of equal parts of a stretch."""
+    return low + (np.arange(count) + 0.5) * (high - low) / count
 
 
 @dataclass(frozen=True)
@@ -48,12 +52,8 @@ class HeightField:
     @classmethod
     def over(cls, lower: Array, upper: Array, cell: float, height: float | Array = 0.0) -> HeightField:
         """Cells of about `cell` metres that fill the rectangle from `lower` to `upper` exactly (z is not used)."""
-        axes = []
-        for k in (0, 1):
-            n = max(2, round(float(upper[k] - lower[k]) / cell))
-            axes.append(lower[k] + (np.arange(n) + 0.5) * (upper[k] - lower[k]) / n)
-        shape = (len(axes[1]), len(axes[0]))
-        return cls(axes[0], axes[1], np.broadcast_to(np.asarray(height, dtype=np.float64), shape).copy())
+        x, y = (centres(lower[k], upper[k], max(2, round(float(upper[k] - lower[k]) / cell))) for k in (0, 1))
+        return cls(x, y, np.broadcast_to(np.asarray(height, dtype=np.float64), (len(y), len(x))).copy())
 
     @property
     def cell(self) -> tuple[float, float]:
@@ -74,56 +74,47 @@ class HeightField:
         return normal / np.linalg.norm(normal, axis=-1, keepdims=True)
 
     def sample(self, xy: Array) -> Array:
-        """Heights (n,) at points (n, 2): bilinear between cell centres, and held constant beyond the outermost ones.
+        """Heights (...) at points (..., 2): bilinear between cell centres, and held constant beyond the outermost ones.
 
         Cells without a height (NaN) make the points next to them NaN.
         """
-        xy = np.asarray(xy, dtype=np.float64)
-        column = (xy[:, 0] - self.x[0]) / self.cell[0]
-        row = (xy[:, 1] - self.y[0]) / self.cell[1]
+        column = (xy[..., 0] - self.x[0]) / self.cell[0]
+        row = (xy[..., 1] - self.y[0]) / self.cell[1]
         return map_coordinates(self.height, [row, column], order=1, mode="nearest")
 
     def smooth(self, xy: Array) -> Array:
-        """Heights (n,) at points (n, 2) by a cubic spline through the cell centres, extended beyond them by its slope.
+        """Heights (...) at points (..., 2) by a cubic spline through the cell centres, carried on beyond by its slope.
 
         Unlike `sample` it does not flatten crests or the half cell at the border. All heights must be finite.
         """
-        xy = np.asarray(xy, dtype=np.float64)
         order = min(3, len(self.x) - 1, len(self.y) - 1)
         spline = RectBivariateSpline(self.y, self.x, self.height, kx=order, ky=order)
-        inside = np.stack([np.clip(xy[:, 0], *self.x[[0, -1]]), np.clip(xy[:, 1], *self.y[[0, -1]])], axis=1)
-        value = spline.ev(inside[:, 1], inside[:, 0])
+        inside = np.clip(xy, [self.x[0], self.y[0]], [self.x[-1], self.y[-1]])
+        value = spline.ev(inside[..., 1], inside[..., 0])
         beyond = xy - inside
         for axis, order_of in ((0, {"dy": 1}), (1, {"dx": 1})):
-            out = np.flatnonzero(beyond[:, axis])
+            out = beyond[..., axis] != 0.0
             value[out] += spline.ev(inside[out, 1], inside[out, 0], **order_of) * beyond[out, axis]
         return value
 
     def widened(self, lower: Array, upper: Array) -> HeightField:
         """This field out to a rectangle (2,) or (3,) around it, m, its outermost heights carried on level: by as many
         whole cells as cover it."""
-        count = [
-            [max(0, math.ceil((gap - 0.5 * cell) / cell - 1e-6)) for gap in gaps]
-            for cell, gaps in (
-                (self.cell[0], (self.x[0] - lower[0], upper[0] - self.x[-1])),
-                (self.cell[1], (self.y[0] - lower[1], upper[1] - self.y[-1])),
-            )
-        ]
-        x, y = (
-            axis[0] + (axis[1] - axis[0]) * np.arange(-before, len(axis) + after)
-            for axis, (before, after) in zip((self.x, self.y), count, strict=True)
-        )
-        around = (tuple(count[1]), tuple(count[0]))
-        deviation = None if self.deviation is None else np.pad(self.deviation, around, mode="edge")
-        return HeightField(x, y, np.pad(self.height, around, mode="edge"), deviation)
+        axes, around = [], []
+        for k, axis in enumerate((self.x, self.y)):
+            gaps = np.array([axis[0] - lower[k], upper[k] - axis[-1]])
+            before, after = np.maximum(np.ceil(gaps / self.cell[k] - 0.5 - 1e-6), 0.0).astype(int)
+            axes.append(axis[0] + self.cell[k] * np.arange(-before, len(axis) + after))
+            around.append((before, after))
+        height = np.pad(self.height, around[::-1], mode="edge")
+        deviation = None if self.deviation is None else np.pad(self.deviation, around[::-1], mode="edge")
+        return HeightField(axes[0], axes[1], height, deviation)
 
     def difference(self, other: HeightField) -> Array:
         """(ny, nx) this height minus the other's at this field's cells; NaN where either is unknown."""
         if self.height.shape == other.height.shape and np.allclose(self.x, other.x) and np.allclose(self.y, other.y):
             return self.height - other.height
-        xs, ys = np.meshgrid(self.x, self.y)
-        theirs = other.sample(np.stack([xs.ravel(), ys.ravel()], axis=1)).reshape(self.height.shape)
-        return self.height - theirs
+        return self.height - other.sample(self.points[..., :2])
 
     def rmse(self, other: HeightField) -> float:
         """Root mean square of the height differences to another surface over the cells known to both, metres."""

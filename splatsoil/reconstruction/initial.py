@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
 import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from torch.nn import functional
 
 from splatsoil.measurement import Bed
-from splatsoil.reconstruction.height_field import HeightField
-from splatsoil.reconstruction.stereo import draw, visibility
+from splatsoil.reconstruction.height_field import HeightField, centres
+from splatsoil.reconstruction.stereo import colours_seen
 from splatsoil.reconstruction.surface import Relief, scale_of
 from splatsoil.reconstruction.views import Views, surface_points
 from splatsoil.splats import Gaussians
@@ -52,12 +51,7 @@ class Seeds:
 
     @staticmethod
     def join(parts: list[Seeds]) -> Seeds:
-        return Seeds(
-            *(
-                np.concatenate([getattr(part, name) for part in parts])
-                for name in ("points", "normals", "spacing", "label")
-            )
-        )
+        return Seeds(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Seeds)))
 
 
 def seed_soil(surface: HeightField, bed: Bed, spacing: float) -> Seeds:
@@ -67,9 +61,7 @@ def seed_soil(surface: HeightField, bed: Bed, spacing: float) -> Seeds:
     x, y = np.meshgrid((np.arange(columns) + 0.25) / columns, (np.arange(rows) + 0.5) / rows)
     x[1::2] += 0.5 / columns
     xy = np.stack([bed.lower[0] + width * x.ravel(), bed.lower[1] + depth * y.ravel()], axis=1)
-    normals = np.stack(
-        [HeightField(surface.x, surface.y, surface.normals[..., k]).sample(xy) for k in range(3)], axis=1
-    )
+    normals = np.stack([replace(surface, height=n).sample(xy) for n in np.moveaxis(surface.normals, -1, 0)], axis=1)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     return Seeds.of(np.column_stack([xy, surface.smooth(xy)]), normals, spacing, SOIL)
 
@@ -119,10 +111,9 @@ def around(lower: Array, upper: Array, spacing: float) -> tuple[Array, Array]:
     """Points (n, 2) on a rectangle's border, and outward normals (n, 3)."""
     points, normals = [], []
     for axis in (0, 1):
-        count = max(1, round(float(upper[axis] - lower[axis]) / spacing))
-        along = lower[axis] + (np.arange(count) + 0.5) * (upper[axis] - lower[axis]) / count
+        along = centres(lower[axis], upper[axis], max(1, round(float(upper[axis] - lower[axis]) / spacing)))
         for end, sign in ((lower, -1.0), (upper, 1.0)):
-            point, normal = np.empty((count, 2)), np.zeros((count, 3))
+            point, normal = np.empty((len(along), 2)), np.zeros((len(along), 3))
             point[:, axis], point[:, 1 - axis] = along, end[1 - axis]
             normal[:, 1 - axis] = sign
             points.append(point)
@@ -160,10 +151,7 @@ def seed_far(views: Views, bed: Bed, relief: Relief) -> Seeds:
         slant = np.where(on_ground, np.maximum(-direction[:, 2], 0.2), 1.0)
         spacings.append(distance * PIXELS / np.sqrt(camera.fx * camera.fy) / slant**0.5)
     every, facing, spacing = np.concatenate(points), np.concatenate(normals), np.concatenate(spacings)
-    beside = np.maximum.reduce(
-        [bed.lower[0] - every[:, 0], every[:, 0] - bed.upper[0], bed.lower[1] - every[:, 1], every[:, 1] - bed.upper[1]]
-    )
-    kept = _thinned(every, spacing, beside > relief.rim)
+    kept = _thinned(every, spacing, bed.beyond(every) > relief.rim)
     return Seeds.of(every[kept], facing[kept], spacing[kept], SURROUNDINGS)
 
 
@@ -184,32 +172,20 @@ def _thinned(points: Array, spacing: Array, allowed: NDArray[np.bool_]) -> NDArr
     return np.concatenate(result)
 
 
-def colours_seen(views: Views, relief: Relief, seeds: Seeds, *, batch: int = 8192) -> Array:
+def disc_colours(views: Views, relief: Relief, seeds: Seeds, *, batch: int = 8192) -> Array:
     """(n, 3) median colour of each disc over the photographs that see it.
 
     Discs that none sees get the colour of the nearest one that is seen.
     """
-    n, device = len(seeds.points), views.images.device
-    colour, count = np.zeros((n, 3)), np.zeros(n)
-    # The occluder is as coarse as its cells: step out of it before asking what hides a disc.
+    colour = np.full((len(seeds.points), 3), np.nan)
     cell = max(relief.occluder.cell)
-    lifted = seeds.points + 1.5 * cell * seeds.normals
-    for start in range(0, n, batch):
-        part = slice(start, start + batch)
-        points = torch.tensor(seeds.points[part], dtype=torch.float32, device=device)
-        normals = torch.tensor(seeds.normals[part], dtype=torch.float32, device=device)
-        homogeneous = functional.pad(points, (0, 1), value=1.0)[None]
-        tool = torch.tensor(seeds.label[part] == TOOL, device=device)
-        drawn, seen = draw(views, homogeneous, relief.trust)
-        drawn_tool, seen_tool = draw(views, homogeneous, views.valid)
-        colours = torch.where(tool[None, None, None], drawn_tool, drawn)[:, :, 0]
-        weight = torch.where(tool[None], seen_tool[:, 0], seen[:, 0])
-        facing = ((views.positions[:, None] - points) * normals).sum(-1) > 0
-        weight = weight * facing * visibility(views, lifted[part], relief.occluder, clearance=0.5 * cell)
-        known = torch.where((weight > 0)[:, None], colours, torch.nan)
-        colour[part] = torch.nanmedian(known, dim=0).values.T.cpu().numpy()
-        count[part] = (weight > 0).sum(0).cpu().numpy()
-    blind = count == 0
+    tool = seeds.label == TOOL
+    for trust, kind in ((relief.trust, np.flatnonzero(~tool)), (views.valid, np.flatnonzero(tool))):
+        for start in range(0, len(kind), batch):
+            part = kind[start : start + batch]
+            disc = seeds.points[part], seeds.normals[part]
+            colour[part] = colours_seen(views, disc, trust, relief.occluder, 1.5 * cell, 0.5 * cell)
+    blind = np.isnan(colour).any(axis=1)
     if blind.all():
         colour[:] = 0.5
     elif blind.any():
@@ -252,5 +228,4 @@ def first_gaussians(
         seed_far(views, bed, relief),
     ]
     seeds = Seeds.join(parts)
-    colours = colours_seen(views, relief, seeds)
-    return discs(seeds, colours, 0.8), torch.from_numpy(seeds.label)
+    return discs(seeds, disc_colours(views, relief, seeds), 0.8), torch.from_numpy(seeds.label)

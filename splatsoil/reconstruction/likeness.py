@@ -68,7 +68,7 @@ def likeness(
         with np.errstate(divide="ignore", invalid="ignore"):
             away = (level - origin[:, 2]) / ray[:, 2]
             place = (origin + away[:, None] * ray)[:, :2]
-            soil = (away > 0.0) & np.all((place > bed.lower[:2]) & (place < bed.upper[:2]), axis=1)
+            soil = (away > 0.0) & (bed.beyond(place) < 0.0)
         seen = soil.reshape(camera.height, camera.width)
         seen = seen & (trust[k, : camera.height, : camera.width] > 0.0).cpu().numpy()
         if not seen.any():

@@ -97,8 +97,7 @@ def reconstruct(
             field="views",
         )
     bed = measurement.bed
-    tool = measurement.tool.mesh.copy()
-    tool.apply_transform(measurement.tool.motion.matrix(float(measurement.tool.motion.times[0])))
+    tool = measurement.tool.placed(float(measurement.tool.motion.times[0]))
     report("finding the tool", 0.0)
     hidden = silhouettes(views, tool)
     container, remarks = bed.container or BIN, []
@@ -120,10 +119,11 @@ def reconstruct(
         relief = replace(relief, trust=(views.valid * (1.0 - silhouettes(views, tool))).to(device))
     sides = container == TRANSPARENT
     first, label = first_gaussians(views.to(device), bed, tool, relief, spacing, sides=sides)
+    first = first.to(device)
     if cameras:
         # Before training, which bends the scene to what it is shown.
         level = float(np.median(relief.surface.height))
-        alike = likeness(first.to(device), views, relief.trust, bed, level, NO_BACKGROUND)
+        alike = likeness(first, views, relief.trust, bed, level, NO_BACKGROUND)
         for camera in unlike_cameras(alike, cameras, alike.unrelated(len(cameras))):
             raise MeasurementError(
                 f"the bed that {camera} sees is not that in the views: their poses and lenses must be of one world and"
@@ -131,10 +131,7 @@ def reconstruct(
                 file=measurement.folder,
                 field="video",
             )
-    trained = train(
-        first, label, views, relief.surface, float(bed.lower[2]),
-        iterations=chosen.iterations, growth=chosen.growth, seed=seed, device=device, report=report,
-    )  # fmt: skip
+    trained = train(first, label, views, relief.surface, float(bed.lower[2]), chosen, seed, report)
     on_top, on_tool = segments(trained.gaussians, trained.label, relief.surface, bed, tool)
     if container == HEAP:
         on_top &= torch.from_numpy(relief.surface.sample(trained.gaussians.means.numpy()[:, :2]) > bed.lower[2])
@@ -209,11 +206,9 @@ def segments(
     skin, _ = surface_points(tool, cell)
     distance, _ = cKDTree(skin).query(place)
     began = label.numpy() == TOOL
-    inside = np.all((place[:, :2] > bed.lower[:2]) & (place[:, :2] < bed.upper[:2]), axis=1)
-    above = place[:, 2] - surface.sample(place[:, :2])
-    at_surface = np.abs(above) < 3.0 * cell
-    on_tool = (distance < cell + np.where(began, reach, 0.0)) & (began | ~(inside & at_surface))
-    soil = inside & at_surface & ~on_tool & (label.numpy() != SIDE)
+    of_soil = (bed.beyond(place) < 0.0) & (np.abs(place[:, 2] - surface.sample(place[:, :2])) < 3.0 * cell)
+    on_tool = (distance < cell + np.where(began, reach, 0.0)) & (began | ~of_soil)
+    soil = of_soil & ~on_tool & (label.numpy() != SIDE)
     return torch.from_numpy(soil), torch.from_numpy(on_tool)
 
 
@@ -224,9 +219,8 @@ def at_sides(gaussians: Gaussians, label: torch.Tensor, surface: HeightField, be
     """
     place = gaussians.means.numpy().astype(np.float64)
     cell = max(surface.cell)
-    depth = np.minimum(place[:, :2] - bed.lower[:2], bed.upper[:2] - place[:, :2]).min(axis=1)
-    began = label.numpy() == SIDE
-    near = (depth < 3.0 * cell) & (depth > np.where(began, -3.0 * cell, 0.0))
+    beyond, began = bed.beyond(place), label.numpy() == SIDE
+    near = (beyond > -3.0 * cell) & (beyond < np.where(began, 3.0 * cell, 0.0))
     high = (place[:, 2] > bed.lower[2]) & (place[:, 2] < surface.sample(place[:, :2]) + cell)
     return torch.from_numpy(near & high)
 

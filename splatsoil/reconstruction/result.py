@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import warnings
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -15,7 +14,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from splatsoil.errors import RunError, SetWarning
-from splatsoil.files import check_unpacked, read_json, write_bytes, write_json
+from splatsoil.files import check_unpacked, read_json, write_bytes, write_json, write_npz
 from splatsoil.measurement import BIN
 from splatsoil.reconstruction.height_field import HeightField
 from splatsoil.run_files import RECONSTRUCTION_FORMAT
@@ -103,7 +102,7 @@ class Reconstruction:
             "background": list(self.background),
             "psnr": self.psnr if self.held_out else None,
             "ssim": self.ssim if self.held_out else None,
-            "held_out": [{"name": v.name, "psnr": v.psnr, "ssim": v.ssim} for v in self.held_out],
+            "held_out": [asdict(view) for view in self.held_out],
             "surface": {
                 "cells": [len(self.surface.x), len(self.surface.y)],
                 "cell": list(self.surface.cell),
@@ -120,18 +119,8 @@ class Reconstruction:
         """
         target = Path(folder)
         g = self.gaussians.detach().to("cpu")
-        write_bytes(
-            target / "gaussians.npz",
-            _npz(
-                means=g.means, scales=g.scales, quaternions=g.quaternions, opacities=g.opacities, colours=g.colours,
-                soil=self.soil, tool=self.tool,
-            ),
-        )  # fmt: skip
-        deviation = {} if self.surface.deviation is None else {"deviation": self.surface.deviation}
-        write_bytes(
-            target / "surface.npz",
-            _npz(x=self.surface.x, y=self.surface.y, height=self.surface.height, **deviation),
-        )
+        write_npz(target / "gaussians.npz", **vars(g), soil=self.soil, tool=self.tool)
+        write_npz(target / "surface.npz", **{k: v for k, v in vars(self.surface).items() if v is not None})
         write_bytes(target / "soil.ply", trimesh.exchange.ply.export_ply(self.mesh))
         _whole_ply(target / "gaussians.ply", g)
         write_json(target / "reconstruction.json", self.summary())
@@ -151,35 +140,20 @@ class Reconstruction:
                 f"{source / 'reconstruction.json'}: is not of the format {RECONSTRUCTION_FORMAT}; reconstruct again"
             )
         try:
-            arrays = _load_npz(source / "gaussians.npz")
-            heights = _load_npz(source / "surface.npz")
-            mesh = trimesh.load_mesh(source / "soil.ply", process=False)
-            tensors = {
-                name: torch.from_numpy(arrays[name])
-                for name in ("means", "scales", "quaternions", "opacities", "colours")
-            }
-            measured = (
-                "format",
-                "seconds",
-                "gaussians",
-                "soil_gaussians",
-                "tool_gaussians",
-                "background",
-                "psnr",
-                "ssim",
-            )
+            tensors = {name: torch.from_numpy(array) for name, array in _load_npz(source / "gaussians.npz").items()}
+            soil, tool = tensors.pop("soil"), tensors.pop("tool")
             red, green, blue = facts["background"]
             out = cls(
                 gaussians=Gaussians(**tensors),
-                soil=torch.from_numpy(arrays["soil"]),
-                tool=torch.from_numpy(arrays["tool"]),
-                surface=HeightField(heights["x"], heights["y"], heights["height"], heights.get("deviation")),
-                mesh=mesh,
+                soil=soil,
+                tool=tool,
+                surface=HeightField(**_load_npz(source / "surface.npz")),
+                mesh=trimesh.load_mesh(source / "soil.ply", process=False),
                 background=(float(red), float(green), float(blue)),
                 held_out=tuple(HeldOut(v["name"], _number(v["psnr"]), _number(v["ssim"])) for v in facts["held_out"]),
-                metadata={k: v for k, v in facts.items() if k not in (*measured, "held_out", "surface")},
                 seconds=float(facts["seconds"]),
             )
+            out = replace(out, metadata={k: v for k, v in facts.items() if k not in out.summary()})
         except (OSError, KeyError, TypeError, ValueError, BadZipFile) as error:
             raise RunError(f"{source}: the reconstruction cannot be read ({error}); reconstruct again") from error
         out.say_remarks()
@@ -189,13 +163,6 @@ class Reconstruction:
 def _number(value: float | None) -> float:
     """JSON has no NaN and no infinity; they were written as null."""
     return float("nan") if value is None else float(value)
-
-
-def _npz(**arrays: torch.Tensor | NDArray[Any]) -> bytes:
-    stream = io.BytesIO()
-    plain: dict[str, Any] = {k: v.numpy() if isinstance(v, torch.Tensor) else v for k, v in arrays.items()}
-    np.savez_compressed(stream, **plain)
-    return stream.getvalue()
 
 
 def _load_npz(path: Path) -> dict[str, NDArray[Any]]:

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.stats import chi2
-from torch.nn import functional
 
 from splatsoil.colour import linear
 from splatsoil.measurement import Bed
 from splatsoil.reconstruction.height_field import HeightField
 from splatsoil.reconstruction.initial import around
-from splatsoil.reconstruction.stereo import draw, visibility
+from splatsoil.reconstruction.stereo import colours_seen
 from splatsoil.reconstruction.surface import Relief, scale_of, with_rim
 from splatsoil.reconstruction.views import Views
 
@@ -46,16 +47,15 @@ def sides_seen(views: Views, bed: Bed, relief: Relief) -> bool:
     top = 0.5 * (np.minimum(surface.sample(xy), level) - floor)
     heights = floor + top[:, None] * np.array([0.25, 0.5, 0.75, 1.0])
     side = np.concatenate([np.column_stack([xy, z]) for z in heights.T])
-    flat = HeightField(surface.x, surface.y, np.full_like(surface.height, level))
-    seen = _chromaticity(views, side, np.tile(outward, (4, 1)), relief.trust, with_rim(flat, bed, 0.0))
-    soil = _chromaticity(
-        views, surface.points.reshape(-1, 3), surface.normals.reshape(-1, 3), relief.trust, relief.occluder
-    )
+    flat = replace(surface, height=np.full_like(surface.height, level))
+    seen = _chromaticity(views, (side, np.tile(outward, (4, 1))), relief.trust, with_rim(flat, bed, 0.0))
+    cells = surface.points.reshape(-1, 3), surface.normals.reshape(-1, 3)
+    soil = _chromaticity(views, cells, relief.trust, relief.occluder)
     length = scale_of(bed)
     ring = np.concatenate([around(bed.lower[:2] - out, bed.upper[:2] + out, cell)[0] for out in _RING * length])
     ground = np.column_stack([ring, np.full(len(ring), relief.ground)])
     upward = np.tile([0.0, 0.0, 1.0], (len(ground), 1))
-    beside = _chromaticity(views, ground, upward, relief.trust, with_rim(flat, bed, relief.rim))
+    beside = _chromaticity(views, (ground, upward), relief.trust, with_rim(flat, bed, relief.rim))
     return _alike(seen, soil) and not _alike(beside, soil)
 
 
@@ -68,14 +68,9 @@ def _alike(some: Array, others: Array) -> bool:
     return bool(apart @ np.linalg.pinv(spread) @ apart < _ALIKE)
 
 
-def _chromaticity(views: Views, points: Array, normals: Array, trust: torch.Tensor, occluder: HeightField) -> Array:
-    """Red and green (m, 2) of the sum of linear red, green and blue, of those points (n, 3) that are seen: the median
-    over photographs."""
-    place, facing = (torch.tensor(a, dtype=torch.float32, device=views.images.device) for a in (points, normals))
-    drawn, sure = draw(views, functional.pad(place, (0, 1), value=1.0)[None], trust)
-    clearance = 0.1 * max(occluder.cell)
-    open_to = visibility(views, points + clearance * normals, occluder, clearance=clearance)
-    weight = sure[:, 0] * open_to * (((views.positions[:, None] - place) * facing).sum(-1) > 0)
-    median = torch.where((weight > 0)[:, None], drawn[:, :, 0], torch.nan).nanmedian(dim=0).values.T
-    colours = linear(median[torch.isfinite(median).all(dim=1)].cpu().numpy().astype(np.float64))
+def _chromaticity(views: Views, discs: tuple[Array, Array], trust: torch.Tensor, occluder: HeightField) -> Array:
+    """Red and green (m, 2) of the sum of linear red, green and blue, of those of n discs that are seen."""
+    near = 0.1 * max(occluder.cell)
+    seen = colours_seen(views, discs, trust, occluder, near, near)
+    colours = linear(seen[np.isfinite(seen).all(axis=1)])
     return colours[:, :2] / np.maximum(colours.sum(axis=1, keepdims=True), 1e-6)

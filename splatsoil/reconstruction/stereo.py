@@ -14,7 +14,7 @@ standard deviation.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sparse
@@ -34,38 +34,6 @@ Array = NDArray[np.float64]
 CURVATURE = 8.0
 SLOPE = 0.5  # and of its slope, that of a pile at rest
 FEWEST_VIEWS = 3.0
-
-
-@dataclass(frozen=True)
-class Cells:
-    """Where heights are sought: the cells of a regular grid that `mask` marks; windows and smoothness end at its
-    border.
-
-    Attributes:
-        x: (nx,) cell centres, metres.
-        y: (ny,) cell centres, metres.
-        mask: (ny, nx) float32, 1 inside.
-    """
-
-    x: Array
-    y: Array
-    mask: torch.Tensor
-
-    @classmethod
-    def of(cls, field: HeightField, mask: NDArray[np.bool_] | None = None, device: torch.device | str = "cpu") -> Cells:
-        inside = np.ones(field.height.shape, dtype=bool) if mask is None else mask
-        return cls(field.x, field.y, torch.tensor(inside, dtype=torch.float32, device=device))
-
-    @property
-    def size(self) -> float:
-        """The longer side of a cell, metres."""
-        return max(float(self.x[1] - self.x[0]), float(self.y[1] - self.y[0]))
-
-    def points(self, height: torch.Tensor) -> torch.Tensor:
-        """(ny, nx, 4) homogeneous points on a surface of heights (ny, nx)."""
-        axes = (torch.tensor(axis, dtype=torch.float32, device=height.device) for axis in (self.y, self.x))
-        y, x = torch.meshgrid(*axes, indexing="ij")
-        return torch.stack([x, y, height, torch.ones_like(height)], dim=-1)
 
 
 def _window(sigma: float) -> torch.Tensor:
@@ -108,211 +76,189 @@ def draw(views: Views, points: torch.Tensor, trust: torch.Tensor) -> tuple[torch
     return drawn, ((sure[:, 0] > 0.999) & (depth > 0)).to(torch.float32)
 
 
-def disagreement(
-    views: Views,
-    cells: Cells,
-    height: torch.Tensor,
-    trust: torch.Tensor,
-    weight: torch.Tensor,
-    sigma: float,
-    *,
-    levels: bool = False,
-    normalised: bool = False,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """How much each photograph differs from the others' mean around each cell.
+@dataclass(frozen=True)
+class Matching:
+    """Photographs compared with each other on candidate surfaces.
 
-    Args:
+    Attributes:
         views: the photographs.
-        cells: where.
-        height: (ny, nx) candidate surface.
-        trust: (v, h, w) pixels that may be used.
+        grid: the cells whose heights are sought; its own heights do not count.
+        trust: (v, h, w) 1 where a pixel may be used.
         weight: (v, ny, nx) what each photograph counts at each cell.
-        sigma: the window's standard deviation in cells.
-        levels: whether mean colours count, too.
-        normalised: whether to divide by what the two vary by, as in normalised cross-correlation: plain ground then
-            agrees with nothing, where else it agrees with itself at any height.
-
-    Returns:
-        (v, ny, nx) windowed mean square difference summed over the channels, and (v, ny, nx) the weights that remain
-        (0 where a photograph does not show the cell).
+        normalised: whether differences are divided by what the two vary by, as in normalised cross-correlation: plain
+            ground then agrees with nothing, where else it agrees with itself at any height.
     """
-    colours, seen = draw(views, cells.points(height), trust)
-    weight = (weight * seen * cells.mask)[:, None]
-    wide = _window(max(2.0 * sigma, 4.0))
-    near = _window(sigma)
-    if not levels:
-        colours = colours - _blur(colours * weight, wide) / _blur(weight, wide).clamp_min(1e-6)
-    mean = (colours * weight).sum(0) / weight.sum(0).clamp_min(1e-6)
-    square = ((colours - mean) ** 2).sum(1, keepdim=True)
-    error = _blur(square * weight, near) / _blur(weight, near).clamp_min(1e-6)
-    if normalised:
-        both = (colours**2 + mean**2).sum(1, keepdim=True)
-        error = error / (_blur(both * weight, near) / _blur(weight, near).clamp_min(1e-6)).clamp_min(1e-6)
-    return error[:, 0], weight[:, 0]
+
+    views: Views
+    grid: HeightField
+    trust: torch.Tensor
+    weight: torch.Tensor
+    normalised: bool = False
+
+    def disagreement(
+        self, height: Array | float, sigma: float, *, levels: bool = False
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """How much each photograph differs from the others' mean around each cell.
+
+        Args:
+            height: (ny, nx) candidate surface, or one level, metres.
+            sigma: the window's standard deviation in cells.
+            levels: whether mean colours count, too.
+
+        Returns:
+            (v, ny, nx) windowed mean square difference summed over the channels, and (v, ny, nx) the weights that
+            remain (0 where a photograph does not show the cell).
+        """
+        surface = replace(self.grid, height=np.broadcast_to(height, self.grid.height.shape)).points
+        points = torch.tensor(surface, dtype=torch.float32, device=self.weight.device)
+        colours, seen = draw(self.views, functional.pad(points, (0, 1), value=1.0), self.trust)
+        weight = (self.weight * seen)[:, None]
+        near, wide = _window(sigma), _window(max(2.0 * sigma, 4.0))
+        if not levels:
+            colours = colours - _blur(colours * weight, wide) / _blur(weight, wide).clamp_min(1e-6)
+        mean = (colours * weight).sum(0) / weight.sum(0).clamp_min(1e-6)
+        square = ((colours - mean) ** 2).sum(1, keepdim=True)
+        error = _blur(square * weight, near) / _blur(weight, near).clamp_min(1e-6)
+        if self.normalised:
+            both = (colours**2 + mean**2).sum(1, keepdim=True)
+            error = error / (_blur(both * weight, near) / _blur(weight, near).clamp_min(1e-6)).clamp_min(1e-6)
+        return error[:, 0], weight[:, 0]
+
+    def sweep(self, heights: Array, *, sigma: float) -> Array:
+        """(ny, nx) the best of evenly spaced heights (k,) in each cell under a smoothness term; good to about a step.
+
+        ``sigma`` is the window's standard deviation in cells.
+        """
+        scale = (3.0 * self.views.noise) ** 2 * 3.0
+        costs, counts = [], []
+        for z in heights:
+            error, left = self.disagreement(z, sigma)
+            # What is normalised is bounded, and needs no robust form.
+            costs.append((left * (error if self.normalised else torch.log1p(error / scale))).sum(0))
+            counts.append(left.sum(0))
+        total, count = (torch.stack(parts).cpu().numpy().astype(float) for parts in (costs, counts))
+        # Two photographs agree by chance more easily than twenty: shrink towards what disagreement is usual.
+        usual = total.sum() / max(count.sum(), 1.0)
+        cost = (total + FEWEST_VIEWS * usual) / (count + FEWEST_VIEWS)
+        step = float(heights[1] - heights[0])
+        smoothness = Smoothness(self.grid.height.shape)
+        depth = np.maximum(np.median(cost, axis=0) - cost.min(axis=0), 0.0)
+        trusted = depth**2
+        trusted /= max(float(trusted.mean()), 1e-12)
+        height = heights[cost.argmin(axis=0)]
+        typical = max(float(np.median(depth)), 1e-6)
+        for width in (24.0, 12.0, 6.0, 3.0, 1.5):
+            # A plate of stiffness s bends over about s^(1/4) cells.
+            flat = smoothness.plate(trusted, height, (0.7 * width) ** 4 / 4.0, 0.0)
+            coupled = cost + typical * ((heights[:, None, None] - flat) / (width * step)) ** 2
+            height = heights[coupled.argmin(axis=0)]
+        return smoothness.plate(trusted, height, 1.0, 0.0)
+
+    def refine(
+        self, height: Array, *, reach: float, length: float, iterations: int = 8, sigma: float = 1.5
+    ) -> tuple[Array, Array]:
+        """Gauss-Newton from a good start.
+
+        Args:
+            height: (ny, nx) start, metres.
+            reach: distance of the first trial heights above and below, metres; it shrinks to a third.
+            length: the bed's longest side, metres, which scales the curvature prior.
+            iterations: how many steps.
+            sigma: the last window's standard deviation in cells; the first is twice as wide.
+
+        Returns:
+            (ny, nx) heights and (ny, nx) their standard deviations, metres.
+
+        Raises:
+            MeasurementError: the photographs tell no height in half of the cells or more.
+        """
+        smoothness, cell = Smoothness(height.shape), max(self.grid.cell)
+        prior = 1.0 / (CURVATURE / length * cell**2) ** 2
+        tension = 1.0 / (SLOPE * cell) ** 2
+        current = np.array(height, dtype=np.float64)
+        information = np.zeros_like(current)
+        for k in range(iterations):
+            progress = k / max(iterations - 1, 1)
+            delta = reach * (1.0 / 3.0) ** progress
+            width = sigma * 2.0 ** (1.0 - progress)
+            trials = [self.disagreement(current + offset, width) for offset in (-delta, 0.0, delta)]
+            error, left = trials[1]
+            known = torch.where(left > 0, error, torch.nan)
+            middle = torch.nan_to_num(torch.nanmedian(known, dim=0).values, nan=0.0)
+            typical = float(middle.median())
+            variance = typical if self.normalised else max(typical, (self.views.noise**2) * 3.0 / 4.0)
+            spread = middle.clamp_min(variance)
+            robust = left / (1.0 + error / (4.0 * spread)) ** 2
+            below, here, above = [((robust * e).sum(0) / spread).cpu().numpy().astype(np.float64) for e, _ in trials]
+            # Half the sum of squares over the variance per channel is the negative log-likelihood.
+            slope = 3.0 * (above - below) / (4.0 * delta)
+            information = np.maximum(3.0 * (above - 2.0 * here + below) / (2.0 * delta**2), 0.0)
+            floor = 1e-3 * float(np.median(information))
+            if not floor > 0.0:
+                # Where a height means nothing to the photographs, its misfit curves upwards or downwards by chance.
+                raise MeasurementError(
+                    "the photographs do not tell the height of half of the bed: several must show each place of it,"
+                    " sharply and from different directions; are they taken of it, and their poses right?",
+                    field="views",
+                )
+            damped = information + floor
+            move = np.clip(-slope / damped, -2.0 * delta, 2.0 * delta)
+            current = smoothness.plate(damped, current + move, prior, tension)
+        # The inverse's diagonal is dear; for a uniform weight w and stiffness s it is 1/(8 √(w s)), at most 1/w.
+        certain = np.maximum(information, 1e-12)
+        return current, np.minimum(np.minimum((64.0 * certain * prior) ** -0.25, certain**-0.5), length)
 
 
 class Smoothness:
-    """Sparse energies of a masked grid of heights; no term crosses the mask's border.
+    """Sparse energies of heights on a grid (ny, nx), as matrices over its cells.
 
     Attributes:
-        bending: Σ h_xx² + 2 h_xy² + h_yy², second differences between cells, as a matrix.
-        steps: (e, n) first differences between neighbouring cells.
+        bending: Σ h_xx² + 2 h_xy² + h_yy², second differences between cells.
+        tension: Σ h_x² + h_y², first differences.
     """
 
-    def __init__(self, mask: NDArray[np.bool_]) -> None:
-        self.inside = mask.ravel()
-        self.index = np.arange(mask.size).reshape(mask.shape)
-        index = self.index
-        across = self._differences([index[:, :-1], index[:, 1:]], [-1.0, 1.0])
-        along = self._differences([index[:-1], index[1:]], [-1.0, 1.0])
-        self.steps = sparse.csr_matrix(sparse.vstack([across, along]))
-        second_x = self._differences([index[:, :-2], index[:, 1:-1], index[:, 2:]], [1.0, -2.0, 1.0])
-        second_y = self._differences([index[:-2], index[1:-1], index[2:]], [1.0, -2.0, 1.0])
-        corners = [index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]]
-        twist = self._differences(corners, [1.0, -1.0, -1.0, 1.0])
-        self.bending = second_x.T @ second_x + second_y.T @ second_y + 2.0 * (twist.T @ twist)
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        def along(y: list[float], x: list[float]) -> sparse.csr_array:
+            """These differences along y of these along x."""
+            parts = (
+                sparse.diags_array(row, offsets=range(len(row)), shape=(n + 1 - len(row), n))
+                for row, n in zip((y, x), shape, strict=True)
+            )
+            return sparse.kron(*parts, "csr")
 
-    def _differences(self, places: list[NDArray[np.int64]], values: list[float]) -> sparse.csr_matrix:
-        kept = np.all([self.inside[place] for place in places], axis=0).ravel()
-        columns = np.stack([place.ravel()[kept] for place in places], axis=1)
-        rows = np.repeat(np.arange(len(columns)), columns.shape[1])
-        data = np.tile(values, len(columns))
-        return sparse.csr_matrix((data, (rows, columns.ravel())), shape=(len(columns), len(self.inside)))
+        same, first, second = [1.0], [-1.0, 1.0], [1.0, -2.0, 1.0]
+        x, y, xy = along(same, first), along(first, same), along(first, first)
+        xx, yy = along(same, second), along(second, same)
+        self.bending = xx.T @ xx + yy.T @ yy + 2.0 * (xy.T @ xy)
+        self.tension = x.T @ x + y.T @ y
 
     def plate(self, weight: Array, target: Array, stiffness: float, tension: float) -> Array:
-        """argmin Σ weight (h − target)² + stiffness · bending(h) + tension · Σ steps(h)², heights (ny, nx)."""
-        energy = stiffness * self.bending + tension * (self.steps.T @ self.steps)
-        diagonal = weight.ravel() + 1e-9 * float(weight.mean()) + np.where(self.inside, 0.0, 1.0)
+        """argmin Σ weight (h − target)² + stiffness · bending(h) + tension · tension(h), heights (ny, nx)."""
+        diagonal = weight.ravel() + 1e-9 * float(weight.mean())
+        energy = stiffness * self.bending + tension * self.tension
         system = sparse.csc_matrix(sparse.diags_array(diagonal) + energy)
         return splu(system, permc_spec="MMD_AT_PLUS_A").solve(diagonal * target.ravel()).reshape(target.shape)
 
 
-def sweep(
-    views: Views,
-    cells: Cells,
-    trust: torch.Tensor,
-    weight: torch.Tensor,
-    heights: Array,
-    *,
-    sigma: float = 2.5,
-    normalised: bool = False,
+def colours_seen(
+    views: Views, discs: tuple[Array, Array], trust: torch.Tensor, occluder: HeightField, lift: float, clearance: float
 ) -> Array:
-    """(ny, nx) the best of the given heights in each cell under a smoothness term; good to about a step.
+    """(n, 3) median colour of discs over the photographs that see their fronts; NaN where none does.
 
     Args:
         views: the photographs.
-        cells: where.
-        trust: (v, h, w) pixels that may be used.
-        weight: (v, ny, nx) what each photograph counts at each cell.
-        heights: (k,) evenly spaced candidates, metres.
-        sigma: the window's standard deviation in cells.
-        normalised: see `disagreement`.
+        discs: (n, 3) centres and (n, 3) normals, metres.
+        trust: (v, h, w) 1 where a pixel may be used.
+        occluder: what may hide discs.
+        lift: how far along its normal a disc is looked for: the occluder is as coarse as its cells, metres.
+        clearance: see `visibility`.
     """
-    scale = (3.0 * views.noise) ** 2 * 3.0
-    costs = []
-    counts = []
-    for z in heights:
-        level = torch.full_like(cells.mask, float(z))
-        error, left = disagreement(views, cells, level, trust, weight, sigma, normalised=normalised)
-        # What is normalised is bounded, and needs no robust form.
-        costs.append((left * (error if normalised else torch.log1p(error / scale))).sum(0))
-        counts.append(left.sum(0))
-    total, count = (torch.stack(parts).cpu().numpy().astype(float) for parts in (costs, counts))
-    # Two photographs agree by chance more easily than twenty: shrink towards what disagreement is usual.
-    usual = total.sum() / max(count.sum(), 1.0)
-    cost = (total + FEWEST_VIEWS * usual) / (count + FEWEST_VIEWS)
-    step = float(heights[1] - heights[0])
-    inside = cells.mask.cpu().numpy() > 0
-    smoothness = Smoothness(inside)
-    depth = np.maximum(np.median(cost, axis=0) - cost.min(axis=0), 0.0)
-    trusted = np.where(inside, depth, 0.0) ** 2
-    trusted /= max(float(trusted[inside].mean()), 1e-12)
-    height = heights[cost.argmin(axis=0)]
-    typical = max(float(np.median(depth[inside])), 1e-6)
-    for width in (24.0, 12.0, 6.0, 3.0, 1.5):
-        # A plate of stiffness s bends over about s^(1/4) cells.
-        flat = smoothness.plate(trusted, height, (0.7 * width) ** 4 / 4.0, 0.0)
-        coupled = cost + typical * ((heights[:, None, None] - flat) / (width * step)) ** 2
-        height = heights[coupled.argmin(axis=0)]
-    return smoothness.plate(trusted, height, 1.0, 0.0)
-
-
-def refine(
-    views: Views,
-    cells: Cells,
-    trust: torch.Tensor,
-    weight: torch.Tensor,
-    height: Array,
-    *,
-    iterations: int = 8,
-    sigma: float = 1.5,
-    reach: float,
-    length: float,
-    normalised: bool = False,
-) -> tuple[Array, Array]:
-    """Gauss-Newton from a good start.
-
-    Args:
-        views: the photographs.
-        cells: where.
-        trust: (v, h, w) pixels that may be used.
-        weight: (v, ny, nx) what each photograph counts at each cell.
-        height: (ny, nx) start, metres.
-        iterations: how many steps.
-        sigma: the last window's standard deviation in cells; the first is twice as wide.
-        reach: distance of the first trial heights above and below, metres; it shrinks to a third.
-        length: the bed's longest side, metres, which scales the curvature prior.
-        normalised: see `disagreement`.
-
-    Returns:
-        (ny, nx) heights and (ny, nx) their standard deviations, metres.
-
-    Raises:
-        MeasurementError: the photographs tell no height in half of the cells or more.
-    """
-    inside = cells.mask.cpu().numpy() > 0
-    smoothness = Smoothness(inside)
-    bend = CURVATURE / length * cells.size**2
-    prior = 1.0 / bend**2
-    tension = 1.0 / (SLOPE * cells.size) ** 2
-    current = np.array(height, dtype=np.float64)
-    information = np.zeros_like(current)
-    for k in range(iterations):
-        progress = k / max(iterations - 1, 1)
-        delta = reach * (1.0 / 3.0) ** progress
-        width = sigma * 2.0 ** (1.0 - progress)
-        trials = []
-        for offset in (-delta, 0.0, delta):
-            level = torch.tensor(current + offset, dtype=torch.float32, device=cells.mask.device)
-            trials.append(disagreement(views, cells, level, trust, weight, width, normalised=normalised))
-        error, left = trials[1]
-        known = torch.where(left > 0, error, torch.nan)
-        middle = torch.nan_to_num(torch.nanmedian(known, dim=0).values, nan=0.0)
-        typical = float(middle[cells.mask > 0].median())
-        variance = typical if normalised else max(typical, (views.noise**2) * 3.0 / 4.0)
-        spread = middle.clamp_min(variance)
-        robust = left / (1.0 + error / (4.0 * spread)) ** 2
-        below, here, above = [((robust * e).sum(0) / spread).cpu().numpy().astype(np.float64) for e, _ in trials]
-        # Half the sum of squares over the variance per channel is the negative log-likelihood.
-        slope = 3.0 * (above - below) / (4.0 * delta)
-        information = np.maximum(3.0 * (above - 2.0 * here + below) / (2.0 * delta**2), 0.0)
-        information[~inside] = 0.0
-        floor = 1e-3 * float(np.median(information[inside]))
-        if not floor > 0.0:
-            # Where a height means nothing to the photographs, its misfit curves upwards or downwards by chance.
-            raise MeasurementError(
-                "the photographs do not tell the height of half of the bed: several must show each place of it, sharply"
-                " and from different directions; are they taken of it, and their poses right?",
-                field="views",
-            )
-        damped = np.where(inside, information + floor, 1e-6)
-        move = np.clip(-slope / damped, -2.0 * delta, 2.0 * delta)
-        move[~inside] = 0.0
-        current = smoothness.plate(damped, current + move, prior, tension)
-    # The inverse's diagonal is dear; for a uniform weight w and stiffness s it is 1/(8 √(w s)), at most 1/w.
-    certain = np.maximum(information, 1e-12)
-    deviation = np.where(inside, np.minimum((64.0 * certain * prior) ** -0.25, certain**-0.5), np.nan)
-    return current, np.minimum(deviation, length)
+    points, normals = (torch.tensor(a, dtype=torch.float32, device=views.images.device) for a in discs)
+    drawn, sure = draw(views, functional.pad(points, (0, 1), value=1.0)[None], trust)
+    facing = ((views.positions[:, None] - points) * normals).sum(-1) > 0
+    weight = sure[:, 0] * facing * visibility(views, discs[0] + lift * discs[1], occluder, clearance=clearance)
+    known = torch.where((weight > 0)[:, None], drawn[:, :, 0], torch.nan)
+    return known.nanmedian(dim=0).values.T.cpu().numpy().astype(np.float64)
 
 
 def visibility(views: Views, points: Array, surface: HeightField, *, clearance: float, steps: int = 32) -> torch.Tensor:
@@ -340,10 +286,8 @@ def visibility(views: Views, points: Array, surface: HeightField, *, clearance: 
         where = torch.stack(
             [(ray[..., a] - float(low[a])) * (2.0 / float(high[a] - low[a])) - 1.0 for a in (0, 1)], dim=-1
         )
-        level = functional.grid_sample(grid, where[None], mode="bilinear", padding_mode="border", align_corners=False)[
-            0, 0
-        ]
+        level = functional.grid_sample(grid, where[None], mode="bilinear", padding_mode="border", align_corners=False)
         outside = (where.abs() > 1.0).any(-1)
-        hidden = ((level - ray[..., 2] > clearance) & ~outside).any(-1)
+        hidden = ((level[0, 0] - ray[..., 2] > clearance) & ~outside).any(-1)
         result[k] = (~hidden).to(torch.float32)
     return result

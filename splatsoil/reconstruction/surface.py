@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from splatsoil.errors import MeasurementError
 from splatsoil.measurement import BIN, HEAP, TRANSPARENT, Bed
 from splatsoil.reconstruction.height_field import HeightField
 from splatsoil.reconstruction.presets import Preset
-from splatsoil.reconstruction.stereo import Cells, disagreement, refine, sweep, visibility
+from splatsoil.reconstruction.stereo import Matching, visibility
 from splatsoil.reconstruction.views import Views
 from splatsoil.splats import Gaussians
 
@@ -90,43 +90,26 @@ def find_relief(
             " relief; take them from nearer, and see that their poses are in metres",
             field="views",
         )
-    cells = Cells.of(coarse, device=device)
-    everything = torch.ones(len(views), *cells.mask.shape, device=device)
+    matching = Matching(views, coarse, trust, torch.ones(len(views), *coarse.height.shape, device=device), bare)
     report("sweeping the bed's height", 0.0)
-    levels = np.linspace(bed.lower[2], bed.upper[2], preset.candidates)
-    height = sweep(views, cells, trust, everything, levels, sigma=1.5, normalised=bare)
+    height = matching.sweep(np.linspace(bed.lower[2], bed.upper[2], preset.candidates), sigma=1.5)
     report("refining heights", 0.4)
-    height, deviation = refine(
-        views, cells, trust, everything, height, sigma=1.0, reach=step, length=length, normalised=bare
-    )
+    height, deviation = matching.refine(height, reach=step, length=length, sigma=1.0)
     height, _ = without_backdrop(height, deviation, length)
 
     fine = HeightField.over(bed.lower, bed.upper, cell)
-    where = fine.points[..., :2].reshape(-1, 2)
-    height = HeightField(coarse.x, coarse.y, height).smooth(where).reshape(fine.height.shape)
+    height = replace(coarse, height=height).smooth(fine.points[..., :2])
     rim = 0.0 if bare else RIM * length
     for last in (False, True):
         report("refining heights", 0.6 + 0.2 * last)
-        now = HeightField(fine.x, fine.y, height)
-        occluder = with_rim(now, bed, rim)
-        seen = visibility(views, now.points.reshape(-1, 3), occluder, clearance=1.5 * cell).reshape(
-            len(views), *height.shape
-        )
-        height, deviation = refine(
-            views,
-            Cells.of(now, device=device),
-            trust,
-            seen,
-            height,
-            reach=0.5 * step,
-            length=length,
-            iterations=6 if last else 3,
-            normalised=bare,
-        )
+        now = replace(fine, height=height)
+        seen = visibility(views, now.points.reshape(-1, 3), with_rim(now, bed, rim), clearance=1.5 * cell)
+        matching = Matching(views, fine, trust, seen.reshape(len(views), *height.shape), bare)
+        height, deviation = matching.refine(height, reach=0.5 * step, length=length, iterations=6 if last else 3)
         height, deviation = without_backdrop(height, deviation, length)
     # Around a heap the floor is bare: what is less high than a cell is wide is not told from it.
     least = bed.lower[2] + (0.5 * cell if container == HEAP else 0.0)
-    surface = HeightField(fine.x, fine.y, np.where(height > least, height, bed.lower[2]), deviation)
+    surface = replace(fine, height=np.where(height > least, height, bed.lower[2]), deviation=deviation)
     occluder = with_rim(surface, bed, rim)
     return Relief(surface, occluder, ground_level(views, bed, surface, occluder, rim), trust, rim)
 
@@ -154,16 +137,14 @@ def without_backdrop(height: Array, deviation: Array, length: float) -> tuple[Ar
     return height[tuple(nearest)], np.where(reached, length, deviation)
 
 
-def with_rim(surface: HeightField, bed: Bed, rim: float, *, level: float | None = None) -> HeightField:
-    """The surface, a border of `rim` metres as high as the soil beside it, then `level` (none: far below)."""
+def with_rim(surface: HeightField, bed: Bed, rim: float) -> HeightField:
+    """The surface, a border of `rim` metres as high as the soil beside it, and far below everything beyond."""
     cell = min(surface.cell)
     margin = rim + 2.0 * cell
     outer = HeightField.over(bed.lower[:2] - margin, bed.upper[:2] + margin, cell)
-    xs, ys = np.meshgrid(outer.x, outer.y)
-    beyond = np.maximum.reduce([bed.lower[0] - xs, xs - bed.upper[0], bed.lower[1] - ys, ys - bed.upper[1]])
-    height = surface.sample(np.stack([xs.ravel(), ys.ravel()], axis=1)).reshape(xs.shape)
-    low = bed.lower[2] - 10.0 * scale_of(bed) if level is None else level
-    return HeightField(outer.x, outer.y, np.where(beyond <= rim, height, low))
+    place = outer.points[..., :2]
+    low = bed.lower[2] - 10.0 * scale_of(bed)
+    return replace(outer, height=np.where(bed.beyond(place) <= rim, surface.sample(place), low))
 
 
 def ground_level(views: Views, bed: Bed, surface: HeightField, occluder: HeightField, rim: float) -> float:
@@ -175,15 +156,13 @@ def ground_level(views: Views, bed: Bed, surface: HeightField, occluder: HeightF
     level = float(np.median(np.concatenate([surface.height[[0, -1]].ravel(), surface.height[:, [0, -1]].ravel()])))
     floor = float(bed.lower[2])
     outer = HeightField.over(bed.lower[:2] - 0.4 * length, bed.upper[:2] + 0.4 * length, length / 60.0)
-    xs, ys = np.meshgrid(outer.x, outer.y)
-    beyond = np.maximum.reduce([bed.lower[0] - xs, xs - bed.upper[0], bed.lower[1] - ys, ys - bed.upper[1]])
-    cells = Cells.of(outer, beyond > rim, views.images.device)
+    around = torch.from_numpy(bed.beyond(outer.points) > rim).to(views.images.device)
     misfit = []
     for z in (floor, level):
-        plane = np.stack([xs, ys, np.full_like(xs, z)], axis=-1).reshape(-1, 3)
-        seen = visibility(views, plane, occluder, clearance=length / 200.0, steps=64).reshape(len(views), *xs.shape)
-        height = torch.full_like(cells.mask, z)
-        error, weight = disagreement(views, cells, height, views.valid, seen, 1.0, levels=True)
+        plane = replace(outer, height=np.full_like(outer.height, z)).points.reshape(-1, 3)
+        seen = visibility(views, plane, occluder, clearance=length / 200.0, steps=64)
+        matching = Matching(views, outer, views.valid, seen.reshape(len(views), *around.shape) * around)
+        error, weight = matching.disagreement(z, 1.0, levels=True)
         several = (weight.sum(0) >= 3).to(torch.float32)
         value = (several * weight * torch.log1p(error / (27.0 * views.noise**2))).sum()
         misfit.append(float(value / (several * weight).sum().clamp_min(1.0)))
@@ -218,8 +197,7 @@ def surface_through(soil: Gaussians, start: HeightField) -> HeightField:
     known = weight.sum(axis=1) > 0.1
     correction = np.zeros(len(cells))
     correction[known] = np.linalg.solve(matrix[known], vector[known][..., None])[:, 0, 0]
-    height = start.height + correction.reshape(start.height.shape)
-    return HeightField(start.x, start.y, height, start.deviation)
+    return replace(start, height=start.height + correction.reshape(start.height.shape))
 
 
 def soil_mesh(surface: HeightField, bed: Bed) -> trimesh.Trimesh:
@@ -232,7 +210,7 @@ def soil_mesh(surface: HeightField, bed: Bed) -> trimesh.Trimesh:
     xs, ys = np.meshgrid(x, y)
     floor = float(bed.lower[2])
     thin = 1e-4 * scale_of(bed)
-    top = np.maximum(surface.sample(np.stack([xs.ravel(), ys.ravel()], axis=1)).reshape(xs.shape), floor + thin)
+    top = np.maximum(surface.sample(np.stack([xs, ys], axis=-1)), floor + thin)
     ny, nx = xs.shape
     upper = np.stack([xs, ys, top], axis=-1).reshape(-1, 3)
     lower = np.stack([xs, ys, np.full_like(xs, floor)], axis=-1).reshape(-1, 3)

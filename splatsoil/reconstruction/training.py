@@ -13,6 +13,7 @@ from splatsoil.errors import SimulationError
 from splatsoil.reconstruction.height_field import HeightField
 from splatsoil.reconstruction.hidden import reaching_into_soil
 from splatsoil.reconstruction.initial import SOIL, SURROUNDINGS
+from splatsoil.reconstruction.presets import Preset
 from splatsoil.reconstruction.views import Views
 from splatsoil.splats import Gaussians, rasterise, ssim
 from splatsoil.splats.warp_torch import upload
@@ -122,28 +123,23 @@ def train(
     views: Views,
     surface: HeightField,
     floor: float,
-    *,
-    iterations: int,
-    growth: float,
+    preset: Preset,
     seed: int,
-    device: str,
     report: Report,
 ) -> Trained:
     """Fit Gaussians to photographs.
 
     Args:
-        gaussians: the first ones.
+        gaussians: the first ones; the work is done where they are.
         label: (n,) int8 what each belongs to; the soil's are held near `surface`.
         views: photographs to fit.
         surface: the measured surface and its standard deviations.
         floor: height of the bed's floor, m; from there to the surface there is only soil.
-        iterations: steps, one photograph each.
-        growth: at most this many times the first number of Gaussians.
+        preset: how many steps, and how many times the first number of Gaussians at most.
         seed: of the order of photographs and of what splitting draws.
-        device: where to work.
         report: called with what is being done and how much of it is done.
     """
-    generator = torch.Generator().manual_seed(seed)
+    generator, device = torch.Generator().manual_seed(seed), gaussians.device
     photographs = [views.photograph(k).contiguous().to(device) for k in range(len(views))]
     valid = [
         views.valid[k, : camera.height, : camera.width, None].contiguous().to(device)
@@ -152,19 +148,19 @@ def train(
     behind = torch.stack([p.reshape(-1, 3).median(dim=0).values for p in photographs]).median(dim=0).values.cpu()
     background = (float(behind[0]), float(behind[1]), float(behind[2]))
     anchor = _Anchor(surface, device)
-    state = _Optimiser(gaussians.to(device))
+    state = _Optimiser(gaussians)
     label = label.to(device)
-    most = int(growth * len(gaussians))
-    every = max(iterations // 7, 20)
+    most = int(preset.growth * len(gaussians))
+    every = max(preset.iterations // 7, 20)
     pull = torch.zeros(len(gaussians), device=device)
     hits = torch.zeros(len(gaussians), device=device)
     losses: list[Tensor] = []
     soil = torch.nonzero(label == SOIL)[:, 0]
     order: list[int] = []
-    for step in range(iterations):
+    for step in range(preset.iterations):
         if step % 10 == 0:
             _check(losses)
-            report("training Gaussians", step / iterations)
+            report("training Gaussians", step / preset.iterations)
         if not order:
             order = torch.randperm(len(views), generator=generator).tolist()
         k = order.pop()
@@ -183,7 +179,7 @@ def train(
         seen = (rendering.projection.reaches > 0).all(dim=1)
         pull += torch.where(seen, gradient.norm(dim=1), 0.0)
         hits += seen
-        progress = step / max(iterations - 1, 1)
+        progress = step / max(preset.iterations - 1, 1)
         state.step({**RATES, "means": RATES["means"] * LAST_RATE**progress})
         if (step + 1) % every == 0 and progress > 0.1:
             _check(losses)
@@ -225,7 +221,7 @@ def _thickness(scales: Tensor) -> Tensor:
 class _Anchor:
     """Mean squared distance of points from a surface along z in standard deviations, bounded for strays."""
 
-    def __init__(self, surface: HeightField, device: str) -> None:
+    def __init__(self, surface: HeightField, device: torch.device) -> None:
         spread = np.full_like(surface.height, min(surface.cell)) if surface.deviation is None else surface.deviation
         # Half a cell at least: discs are that coarse, and the photographs may know better than stereo did.
         spread = np.maximum(spread, 0.25 * min(surface.cell))

@@ -39,6 +39,26 @@ class Views:
     cameras: tuple[Camera, ...]
     names: tuple[str, ...]
 
+    @classmethod
+    def of(
+        cls,
+        cameras: Sequence[Camera],
+        pictures: Sequence[Picture],
+        masks: Sequence[NDArray[np.bool_]],
+        names: Sequence[str],
+    ) -> Views:
+        """Pictures (h, w, 3) by cameras free of distortion, and where they may be used (h, w)."""
+        size = [max(side) for side in zip(*(mask.shape for mask in masks), strict=True)]
+        projections = np.stack([camera.intrinsics @ camera.world_to_camera[:3] for camera in cameras])
+        return cls(
+            images=torch.stack([_padded(torch.from_numpy(p).permute(2, 0, 1), size) for p in pictures]).contiguous(),
+            valid=torch.stack([_padded(torch.from_numpy(m).to(torch.float32), size) for m in masks]),
+            projection=torch.tensor(projections, dtype=torch.float32),
+            positions=torch.tensor(np.stack([camera.position for camera in cameras]), dtype=torch.float32),
+            cameras=tuple(cameras),
+            names=tuple(names),
+        )
+
     def __len__(self) -> int:
         return len(self.cameras)
 
@@ -96,20 +116,12 @@ class Views:
         return max(grey_noise * 3.0**0.5, 1.0 / 255.0)
 
 
-def projection_matrix(camera: Camera) -> Array:
-    """(3, 4) world point -> homogeneous pixel of an undistorted camera."""
-    return np.asarray(camera.intrinsics) @ np.asarray(camera.world_to_camera)[:3]
-
-
 def _shrink(image: Picture, width: int, height: int) -> Picture:
-    """Area-averaged to (height, width): a box filter per channel, exact for any ratio."""
-    channels = [
-        np.asarray(
-            Image.fromarray(np.ascontiguousarray(image[..., k]), mode="F").resize((width, height), Image.Resampling.BOX)
-        )
-        for k in range(image.shape[2])
-    ]
-    return np.stack(channels, axis=-1)
+    """An image (h, w) or (h, w, channels) area-averaged to another size: a box filter, exact for any ratio."""
+    if image.ndim == 3:
+        return np.stack([_shrink(channel, width, height) for channel in np.moveaxis(image, -1, 0)], axis=-1)
+    whole = Image.fromarray(np.ascontiguousarray(image), mode="F")
+    return np.asarray(whole.resize((width, height), Image.Resampling.BOX))
 
 
 def load_views(frames: Sequence[Frame], longest_side: int) -> Views:
@@ -120,36 +132,18 @@ def load_views(frames: Sequence[Frame], longest_side: int) -> Views:
     """
     if not frames:
         raise MeasurementError("there are no photographs to reconstruct from", field="views")
-    pictures: list[Picture] = []
-    masks: list[Picture] = []
-    cameras: list[Camera] = []
+    pictures, masks, cameras = [], [], []
     for frame in frames:
         camera = frame.camera.undistorted()
-        image = np.asarray(frame.undistorted_image(), dtype=np.float32)
-        seen = frame.undistorted_mask().astype(np.float32)
+        image, seen = frame.undistorted_image(), frame.undistorted_mask().astype(np.float32)
         factor = longest_side / max(camera.width, camera.height)
         if factor < 1.0:
             camera = camera.scaled(factor)
-            image = _shrink(image, camera.width, camera.height)
-            seen = _shrink(seen[..., None], camera.width, camera.height)[..., 0]
+            image, seen = (_shrink(values, camera.width, camera.height) for values in (image, seen))
         pictures.append(image)
-        masks.append((seen > 0.999).astype(np.float32))
+        masks.append(seen > 0.999)
         cameras.append(camera)
-    height = max(image.shape[0] for image in pictures)
-    width = max(image.shape[1] for image in pictures)
-    images = np.zeros((len(pictures), height, width, 3), dtype=np.float32)
-    valids = np.zeros((len(pictures), height, width), dtype=np.float32)
-    for k, (image, valid) in enumerate(zip(pictures, masks, strict=True)):
-        images[k, : image.shape[0], : image.shape[1]] = image
-        valids[k, : image.shape[0], : image.shape[1]] = valid
-    return Views(
-        images=torch.from_numpy(images).permute(0, 3, 1, 2).contiguous(),
-        valid=torch.from_numpy(valids),
-        projection=torch.tensor(np.stack([projection_matrix(c) for c in cameras]), dtype=torch.float32),
-        positions=torch.tensor(np.stack([c.position for c in cameras]), dtype=torch.float32),
-        cameras=tuple(cameras),
-        names=tuple(frame.path.name for frame in frames),
-    )
+    return Views.of(cameras, pictures, masks, [frame.path.name for frame in frames])
 
 
 def still_video(measurement: Measurement, longest_side: int) -> Views | None:

@@ -16,7 +16,7 @@ import warp as wp
 from splatsoil import __version__
 from splatsoil.errors import ParameterError
 from splatsoil.files import check_folder
-from splatsoil.measurement import Measurement, write_measurement
+from splatsoil.measurement import Contents, Measurement, write_measurement
 from splatsoil.mpm import Preset, Resolution, Trajectory, frames_around, simulate
 from splatsoil.mpm.simulate import base_settings
 from splatsoil.reconstruction.filling import fill
@@ -170,8 +170,7 @@ def photograph_run(
     video = recorder.with_depth(video) if depth_maps else video
     frames = np.arange(1, len(trajectory.force) + 1)
     force = np.column_stack([frames, frames / setup.frame_rate, trajectory.force]) if len(frames) else None
-    return write_measurement(
-        target,
+    contents = Contents(
         name=target.resolve().name,
         bed=setup.bed,
         tool=replace(setup.tool, force=force),
@@ -179,9 +178,13 @@ def photograph_run(
         video=video,
         frame_rate=setup.frame_rate,
         gravity=setup.gravity,
+        heights=recorder.heights() if heights else None,
+    )
+    return write_measurement(
+        target,
+        contents,
         quality=QUALITY,
         truth=truth,
-        heights=recorder.heights() if heights else None,
         beside=lambda place: save_particles(place / "truth_particles.npz", trajectory, truth_frames(setup.frames)),
     )
 

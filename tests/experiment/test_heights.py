@@ -16,7 +16,7 @@ from splatsoil.cli import main
 from splatsoil.comparison import Comparator
 from splatsoil.experiment.heights import CHANNEL, LEAST_NOISE, UNKNOWN_NOISE, Heights
 from splatsoil.experiment.plow import PlowExperiment
-from splatsoil.measurement import Frame, HeightMaps, Measurement, write_measurement
+from splatsoil.measurement import Contents, Frame, HeightMaps, Measurement, write_measurement
 from splatsoil.model import Model
 from splatsoil.mpm import Resolution, Trajectory, simulate
 from splatsoil.reconstruction import HeightField, fill, reconstruct
@@ -163,17 +163,14 @@ def scanned(tmp_path_factory: pytest.TempPathFactory) -> Path:
         frames=setup.frames,
     )[0]
     frames = np.arange(1, len(run.force) + 1)
-    made = write_measurement(
-        tmp_path_factory.mktemp("scanned") / "set",
+    contents = Contents(
         name="scanned",
         bed=setup.bed,
         tool=replace(setup.tool, force=np.column_stack([frames, frames / setup.frame_rate, run.force])),
-        views=[],
-        video=[],
         frame_rate=setup.frame_rate,
         heights=Recorder(setup, run, Appearance.drawn(0)).heights(),
     )
-    return made.folder
+    return write_measurement(tmp_path_factory.mktemp("scanned") / "set", contents).folder
 
 
 def test_heights_alone_tell_the_angle(scanned: Path) -> None:

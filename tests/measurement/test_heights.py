@@ -13,7 +13,7 @@ import skimage.io
 import tifffile
 
 from splatsoil.cli import main
-from splatsoil.measurement import Camera, Frame, HeightMaps, Measurement, Picture, write_measurement
+from splatsoil.measurement import Camera, Contents, Frame, HeightMaps, Measurement, Picture, write_measurement
 from splatsoil.measurement.heights import depth_points, read_heights
 
 RAMP = np.linspace(0.1, 0.14, 16 * 10).reshape(10, 16).astype(np.float32)
@@ -82,29 +82,13 @@ def test_a_set_of_heights_and_depths_is_what_was_written(small_set: Path, tmp_pa
     depth = np.full((camera.height, camera.width), 0.9)
     noise = np.random.default_rng(0).uniform(size=(camera.height, camera.width, 3))
     heights = HeightMaps(np.zeros(2), 0.05, {0: RAMP.astype(np.float64)}, 0.001)
-    made = write_measurement(
-        tmp_path / "made",
-        name="made",
-        bed=given.bed,
-        tool=given.tool,
-        views=given.views,
-        video=[Picture(camera, noise, 0, 0.0, depth)],
-        frame_rate=given.frame_rate,
-        heights=heights,
-    )
+    scanned = Contents(name="made", bed=given.bed, tool=given.tool, frame_rate=given.frame_rate, heights=heights)
+    seen = replace(scanned, views=given.views, video=[Picture(camera, noise, 0, 0.0, depth)])
+    made = write_measurement(tmp_path / "made", seen)
     assert made.heights is not None and made.heights.noise == 0.001
     np.testing.assert_array_equal(made.surface_points(0), heights.points(0))
     np.testing.assert_allclose(replace(made, heights=None).surface_points(0), depth_points(made.video[0]))
-    bare = write_measurement(
-        tmp_path / "bare",
-        name="bare",
-        bed=given.bed,
-        tool=given.tool,
-        views=[],
-        video=[],
-        frame_rate=given.frame_rate,
-        heights=heights,
-    )
+    bare = write_measurement(tmp_path / "bare", scanned)
     assert bare.frames == (0,) and not bare.cameras and not bare.views
     before = bare.hash
     np.save(bare.folder / "heights" / "+0000.npy", RAMP + np.float32(0.001))

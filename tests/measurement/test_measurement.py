@@ -17,7 +17,17 @@ from scipy.spatial.transform import Rotation
 from skimage.draw import polygon
 
 from splatsoil.errors import MeasurementError
-from splatsoil.measurement import Bed, Camera, Measurement, Picture, Tool, ToolMotion, remarks, write_measurement
+from splatsoil.measurement import (
+    Bed,
+    Camera,
+    Contents,
+    Measurement,
+    Picture,
+    Tool,
+    ToolMotion,
+    remarks,
+    write_measurement,
+)
 
 
 def test_plow_dry_holds_what_its_files_say(plow_dry: Path) -> None:
@@ -104,8 +114,8 @@ def test_a_relative_set_is_found_from_another_working_folder(small_set: Path, mo
     np.testing.assert_array_equal(m.views[0].image(), there.views[0].image())
 
 
-def made_up(**bend: float) -> dict:
-    """The parts of a set that stands on nothing but this file."""
+def made_up(**bend: float) -> Contents:
+    """A set that stands on nothing but this file."""
     matrix = np.eye(4)
     matrix[:3, :3] = Rotation.from_euler("x", 40, degrees=True).as_matrix()
     matrix[:3, 3] = [0.2, -0.7, 0.9]
@@ -118,21 +128,21 @@ def made_up(**bend: float) -> dict:
         friction=0.25,
         force=np.array([[1, 0.1, 3.0, -1.0, 0.125]]),
     )
-    return {
-        "name": "made up",
-        "bed": Bed([0, 0, 0], [0.4, 0.3, 0.2], 1500.0, 0.1, 0.4),
-        "tool": tool,
-        "views": [Picture(camera, picture), Picture(camera, 1.0 - picture)],
-        "video": [Picture(replace(camera, name="side"), picture, n, 0.1 * n) for n in (-1, 0, 1, 2)],
-        "frame_rate": 10.0,
-        "gravity": (0.1, 0.0, -1.62),
-    }
+    return Contents(
+        name="made up",
+        bed=Bed([0, 0, 0], [0.4, 0.3, 0.2], 1500.0, 0.1, 0.4),
+        tool=tool,
+        views=[Picture(camera, picture), Picture(camera, 1.0 - picture)],
+        video=[Picture(replace(camera, name="side"), picture, n, 0.1 * n) for n in (-1, 0, 1, 2)],
+        frame_rate=10.0,
+        gravity=(0.1, 0.0, -1.62),
+    )
 
 
 @pytest.mark.parametrize("container", [None, "bin", "transparent", "open", "heap"])
 def test_the_container_is_kept_and_says_what_is_simulated(container: str | None, tmp_path: Path) -> None:
     parts = made_up()
-    bed = write_measurement(tmp_path / "set", **parts | {"bed": replace(parts["bed"], container=container)}).bed
+    bed = write_measurement(tmp_path / "set", replace(parts, bed=replace(parts.bed, container=container))).bed
     assert bed.container == container
     margin = 0.06 if container in ("open", "heap") else 0.0
     np.testing.assert_allclose(bed.domain.lower, [-margin, -margin, 0.0])
@@ -141,31 +151,29 @@ def test_the_container_is_kept_and_says_what_is_simulated(container: str | None,
 
 def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     parts = made_up(k1=-0.1, p2=0.002)
-    m = write_measurement(tmp_path / "out" / "set", **parts, suffix=".png", truth={"phi": 36.0})
+    m = write_measurement(tmp_path / "out" / "set", parts, suffix=".png", truth={"phi": 36.0})
     assert (m.name, m.frame_rate, m.frames, list(m.cameras)) == ("made up", 10.0, (0, 1, 2), ["side"])
-    np.testing.assert_array_equal(m.gravity, parts["gravity"])
-    np.testing.assert_array_equal(m.bed.upper, parts["bed"].upper)
+    np.testing.assert_array_equal(m.gravity, parts.gravity)
+    np.testing.assert_array_equal(m.bed.upper, parts.bed.upper)
     assert (m.bed.density, m.bed.wall_friction, m.bed.floor_friction) == (1500.0, 0.1, 0.4)
     assert m.tool.friction == 0.25
-    np.testing.assert_array_equal(m.tool.force, parts["tool"].force)
-    np.testing.assert_allclose(m.tool.mesh.volume, parts["tool"].mesh.volume, rtol=1e-5)
-    np.testing.assert_allclose(m.tool.motion.quaternions, parts["tool"].motion.quaternions, atol=1e-15)
-    np.testing.assert_allclose(m.tool.motion.positions, parts["tool"].motion.positions)
-    wanted, got = parts["views"][0].camera, m.views[0].camera
+    np.testing.assert_array_equal(m.tool.force, parts.tool.force)
+    np.testing.assert_allclose(m.tool.mesh.volume, parts.tool.mesh.volume, rtol=1e-5)
+    np.testing.assert_allclose(m.tool.motion.table, parts.tool.motion.table, atol=1e-15)
+    wanted, got = parts.views[0].camera, m.views[0].camera
     np.testing.assert_allclose(got.camera_to_world, wanted.camera_to_world, atol=1e-12)
     np.testing.assert_array_equal(got.intrinsics, wanted.intrinsics)
     assert got.distortion == wanted.distortion
-    np.testing.assert_allclose(m.views[1].image(), parts["views"][1].image, atol=0.5 / 255 + 1e-6)
-    np.testing.assert_allclose(m.video_frame("side", -1).image(), parts["video"][0].image, atol=0.5 / 255 + 1e-6)
+    np.testing.assert_allclose(m.views[1].image(), parts.views[1].image, atol=0.5 / 255 + 1e-6)
+    np.testing.assert_allclose(m.video_frame("side", -1).image(), parts.video[0].image, atol=0.5 / 255 + 1e-6)
     assert json.loads((tmp_path / "out/set/truth.json").read_text()) == {"phi": 36.0}
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["set"], "no temporary folder stays"
 
 
 def test_frames_of_another_set_are_copied_bit_by_bit(plow_dry: Path, tmp_path: Path) -> None:
     m = Measurement.load(plow_dry)
-    copy = write_measurement(
-        tmp_path / "copy", name=m.name, bed=m.bed, tool=m.tool, views=m.views[:3], video=m.video[:6], frame_rate=50.0
-    )
+    contents = Contents(name=m.name, bed=m.bed, tool=m.tool, views=m.views[:3], video=m.video[:6], frame_rate=50.0)
+    copy = write_measurement(tmp_path / "copy", contents)
     assert copy.views[2].path.read_bytes() == m.views[2].path.read_bytes()
     np.testing.assert_allclose(copy.views[2].camera.camera_to_world, m.views[2].camera.camera_to_world, atol=1e-12)
     assert copy.frames == () and len(copy.pre_roll) == 6
@@ -178,19 +186,20 @@ def test_nothing_is_overwritten_and_faults_leave_nothing(tmp_path: Path) -> None
     taken.mkdir()
     (taken / "thesis.txt").write_text("three years")
     with pytest.raises(MeasurementError, match="nothing is overwritten"):
-        write_measurement(taken, **parts)
+        write_measurement(taken, parts)
     assert [p.name for p in taken.iterdir()] == ["thesis.txt"]
 
+    nameless, side, black = parts.views[0].camera, parts.video[0].camera, np.zeros((24, 32, 3))
     faults = {
-        "outside": {"gravity": (0, 0, 9.81)},
-        "not finite": {"views": [Picture(parts["views"][0].camera, np.full((24, 32, 3), np.nan))]},
-        "camera says": {"views": [Picture(parts["views"][0].camera, np.zeros((23, 32, 3)))]},
-        "no name for a camera": {"video": [Picture(parts["views"][0].camera, np.zeros((24, 32, 3)), 0, 0.0)]},
-        "needs a number": {"video": [Picture(parts["video"][0].camera, np.zeros((24, 32, 3)))]},
+        "does not point down": {"gravity": (0, 0, 9.81)},
+        "not finite": {"views": [Picture(nameless, black * np.nan)]},
+        "camera says": {"views": [Picture(nameless, black[1:])]},
+        "no name for a camera": {"video": [Picture(nameless, black, 0, 0.0)]},
+        "needs a number": {"video": [Picture(side, black)]},
     }
     for says, change in faults.items():
-        with pytest.raises(MeasurementError, match="does not point down" if says == "outside" else says):
-            write_measurement(tmp_path / "new", **parts | change)
+        with pytest.raises(MeasurementError, match=says):
+            write_measurement(tmp_path / "new", replace(parts, **change))
         assert [p.name for p in tmp_path.iterdir()] == ["taken"], says
 
 

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from splatsoil.cli import main
-from splatsoil.measurement import Bed, Camera, Frame, Measurement, Picture, Tool, ToolMotion, write_measurement
+from splatsoil.measurement import Bed, Camera, Contents, Measurement, Picture, Tool, ToolMotion, write_measurement
 
 SET, VIEWS, VIDEO = "experiment.json", "views/transforms.json", "video/transforms.json"
 MOTION, FORCE, MESH = "tool_motion.csv", "tool_force.csv", "tool.stl"
@@ -43,25 +43,26 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
     way = np.column_stack([0.2 + 0.5 * times, np.full(5, 0.25), np.full(5, 0.15)])
     motion = ToolMotion(np.arange(5), times, way, np.tile([1.0, 0, 0, 0], (5, 1)))
     force = np.column_stack([np.arange(5), times, np.full(5, -4.0), np.zeros(5), np.ones(5)])
-    arguments = {
-        "name": "base",
-        "bed": Bed(np.zeros(3), np.array([0.8, 0.5, 0.25]), 1600.0),
-        "tool": Tool(tool, motion, force=force),
-        "frame_rate": 50.0,
-        "suffix": ".png",
-    }
     video = [
         picture(replace(camera, name=name), frame=n, time=n / 50.0) for n in (-1, 0, 4) for name in ("left", "right")
     ]
-    plain = write_measurement(folder / "plain", views=[picture(camera) for _ in range(3)], video=video, **arguments)
+    contents = Contents(
+        name="base",
+        bed=Bed(np.zeros(3), np.array([0.8, 0.5, 0.25]), 1600.0),
+        tool=Tool(tool, motion, force=force),
+        frame_rate=50.0,
+        views=[picture(camera) for _ in range(3)],
+        video=video,
+    )
+    plain = write_measurement(folder / "plain", contents, suffix=".png")
     mask = folder / "mask.png"
     Image.fromarray(np.uint8(255 * (random.random((24, 32)) > 0.2))).save(mask)
     np.save(folder / "depth.npy", np.full((24, 32), 1.2, dtype=np.float32))
     Image.fromarray(np.full((24, 32), 1200, dtype=np.uint16)).save(folder / "depth.png")
-    extras: list[dict[str, Path]] = [{"mask_path": mask, "depth_path": folder / "depth.npy"}, {}, {}]
-    extras[1] = {"depth_path": folder / "depth.png"}
-    views: list[Frame] = [replace(view, **extra) for view, extra in zip(plain.views, extras, strict=True)]
-    write_measurement(folder / "set", views=views, video=video, **arguments)
+    first, second, third = plain.views
+    first = replace(first, mask_path=mask, depth_path=folder / "depth.npy")
+    second = replace(second, depth_path=folder / "depth.png")
+    write_measurement(folder / "set", replace(contents, views=[first, second, third]), suffix=".png")
     return folder / "set"
 
 

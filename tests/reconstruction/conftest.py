@@ -14,6 +14,7 @@ import pytest
 import trimesh
 
 from splatsoil.measurement import Bed, Camera, Tool, ToolMotion
+from splatsoil.reconstruction import HeightField
 
 Function = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
@@ -83,6 +84,10 @@ class Scene:
             + 0.4 * np.cos(7 * u / self.stretch)
         )
 
+    def surface(self, cells: HeightField) -> HeightField:
+        """That, on the cells of another surface."""
+        return HeightField(cells.x, cells.y, self.height(*np.meshgrid(cells.x, cells.y)))
+
     def soil_colour(self, x: np.ndarray, y: np.ndarray, z: np.ndarray | float = 0.0) -> np.ndarray:
         x, y = x + 0.7 * z, y + 1.3 * z  # blotches of sides, too
         noise = 0.6 * value_noise(x, y, self.grain, self.seed) + 0.4 * value_noise(x, y, self.grain / 2, self.seed + 1)
@@ -138,15 +143,10 @@ class Scene:
         colour[kind == 1] = [0.8, 0.82, 0.82]
         colour[kind == 2] = self.soil_colour(point[:, 0], point[:, 1])[kind == 2]
         e = 1e-4
-        slope = [
-            (
-                self.height(point[:, 0] + e * a, point[:, 1] + e * b)
-                - self.height(point[:, 0] - e * a, point[:, 1] - e * b)
-            )
-            / (2 * e)
-            for a, b in ((1, 0), (0, 1))
-        ]
-        normal = np.stack([-slope[0], -slope[1], np.ones(len(ray))], 1)
+        x, y = point[:, 0], point[:, 1]
+        slope_x = (self.height(x + e, y) - self.height(x - e, y)) / (2 * e)
+        slope_y = (self.height(x, y + e) - self.height(x, y - e)) / (2 * e)
+        normal = np.stack([-slope_x, -slope_y, np.ones(len(ray))], 1)
         if thick is None and not self.heap:
             # Met well beneath the surface: an upright side.
             sunk = (kind == 2) & (point[:, 2] < self.height(point[:, 0], point[:, 1]) - 2e-3)

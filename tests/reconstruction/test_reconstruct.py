@@ -11,7 +11,7 @@ import torch
 
 from splatsoil.cli import main
 from splatsoil.errors import MeasurementError, ParameterError, RunError, SetWarning
-from splatsoil.measurement import Measurement, Picture, write_measurement
+from splatsoil.measurement import Contents, Measurement, Picture, write_measurement
 from splatsoil.reconstruction import HeightField, Reconstruction, reconstruct
 from splatsoil.reconstruction.hidden import reaching_into_soil
 from splatsoil.reconstruction.initial import SOIL, Seeds, discs
@@ -29,17 +29,8 @@ def measurement(scene, tmp_path_factory) -> Measurement:
     cameras = scene.cameras(16, 128, 96, **LENS)
     pictures = [Picture(camera, scene.render(camera, seed=k)) for k, camera in enumerate(cameras)]
     video = [Picture(replace(cameras[0], name="left"), pictures[0].image, frame=0, time=0.0)]
-    folder = tmp_path_factory.mktemp("set") / "waves"
-    return write_measurement(
-        folder,
-        name="waves",
-        bed=scene.bed,
-        tool=scene.tool(),
-        views=pictures,
-        video=video,
-        frame_rate=50,
-        suffix=".png",
-    )
+    contents = Contents(name="waves", bed=scene.bed, tool=scene.tool(), frame_rate=50.0, views=pictures, video=video)
+    return write_measurement(tmp_path_factory.mktemp("set") / "waves", contents, suffix=".png")
 
 
 @pytest.fixture(scope="module")
@@ -61,9 +52,7 @@ def test_views_that_were_set_aside_are_predicted(measurement, result):
 
 
 def test_the_surface_is_metric_and_without_bias(scene, result):
-    exact = HeightField(
-        result.surface.x, result.surface.y, scene.height(*np.meshgrid(result.surface.x, result.surface.y))
-    )
+    exact = scene.surface(result.surface)
     assert result.surface.rmse(exact) < 2.5e-3
     assert abs(result.surface.bias(exact)) < 0.7e-3
 
