@@ -113,7 +113,13 @@ def test_the_misfit_is_that_of_the_most_probable_model(diagnosis: dict) -> None:
             "pre-roll",
         ),
         # one far above the cameras' noise is no fault of an adequate model, nor does little noise hide what fails
-        (0.52, 0.01, True, "52 × the instruments' noise. Instruments' noise, seed-to-seed scatter and discretisation", "Part of"),
+        (
+            0.52,
+            0.01,
+            True,
+            "52 × the instruments' noise. Instruments' noise, seed-to-seed scatter and discretisation",
+            "Part of",
+        ),
         (0.52, 0.01, False, "52 × the instruments' noise.", "discretisation"),
         (0.011, 0.01, False, "1.1 × the instruments' noise", "nothing more"),
     ],
