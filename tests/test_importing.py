@@ -320,6 +320,41 @@ def test_up_becomes_z(up: tuple[float, float, float]) -> None:
     np.testing.assert_allclose(matrix[:3, :3] @ matrix[:3, :3].T, 4.0 * np.eye(3), atol=1e-12)
 
 
+@pytest.mark.slow
+def test_photographs_without_poses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Poses that are thrown away come back by structure from motion, scale and world by the known points."""
+    pytest.importorskip("pycolmap")
+    monkeypatch.chdir(tmp_path)
+    simulate = ["simulate", "set", "--preset", "tiny", "--views", "16", "--picture-scale", "2", "--seed", "1", "--json"]
+    assert cli.main(simulate) == 0
+    true = Measurement.load("set")
+    recorded(true, tmp_path / "recorded")
+    monkeypatch.chdir("recorded")
+    capsys.readouterr()
+    words = ["import", "images", "made", "--sfm", "--known", "known.csv", "--points", "marks.csv", "--json"]
+    assert cli.main(words) == 0
+    said = json.loads(capsys.readouterr().out)
+    entries = json.loads(Path("made/views/transforms.json").read_text())["frames"]
+    assert said["source"] == "pycolmap" and len(entries) == said["views"] == len(true.views) + len(true.cameras)
+    places = {frame.path.read_bytes(): frame.camera.position for frame in (*true.views, *true.pre_roll)}
+    for entry in entries:
+        place = np.array(entry["transform_matrix"])[:3, 3]
+        assert np.linalg.norm(place - places[Path("made/views", entry["file_path"]).read_bytes()]) < 0.002
+
+
+def test_photographs_that_cannot_be_posed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("pycolmap")
+    (tmp_path / "grey").mkdir()
+    for k in range(3):
+        Image.new("RGB", (64, 48), (100 + k,) * 3).save(tmp_path / "grey" / f"{k}.png")
+    for name, said in (("grey", "its photographs cannot be posed"), ("nowhere", "no such folder")):
+        assert cli.main(["import", str(tmp_path / name), str(tmp_path / "out"), "--sfm", "--scale", "1", "--json"]) == 2
+        assert f"{name}: {said}" in json.loads(capsys.readouterr().out)["error"]
+        assert not (tmp_path / "out").exists()
+
+
 CODES = (0xD5D628584, 0xD97F18B49)
 """The first two of the family 36h11: 36 bits, row after row."""
 
@@ -380,6 +415,7 @@ def test_photographs_without_tags(plow: Recorded, importing: Callable[..., dict[
     ("module", "words", "said"),
     [
         ("pupil_apriltags", ["--tags", "0.1"], "--tags: needs pupil-apriltags; pip install 'splatsoil[tags]'"),
+        ("pycolmap", ["--sfm"], "--sfm: needs pycolmap; pip install 'splatsoil[sfm]'"),
         (
             "imageio_ffmpeg",
             ["--scale", "1", "--video", "left.mp4=left.jpg"],

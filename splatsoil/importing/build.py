@@ -91,8 +91,8 @@ def import_set(options: ImportOptions, report: Report) -> Imported:
 
 
 def _filled(root: Path, options: ImportOptions, report: Report) -> Imported:
-    report("reading the views", 0.0)
-    found = read_source(options.source, options.images)
+    report("posing the photographs" if options.sfm else "reading the views", 0.0)
+    found = read_source(options.source, options.images, sfm=options.sfm)
     similarity, marks, left = _similarity(found, options)
     stills = {name: find_image(found.frames, image) for name, (_, image) in options.cameras.items()}
     aside = {still.path for still in stills.values()}

@@ -14,9 +14,10 @@ from splatsoil.options import argument, option
 class ImportOptions:
     """What is imported; one of `scale`, `distance`, `tags` and `known` says how the source's world becomes metres."""
 
-    source: Path = argument("transforms.json, or the folder of it or of a COLMAP model.")
+    source: Path = argument("transforms.json, or the folder of it or of a COLMAP model; of photographs, with --sfm.")
     out: Path = argument("Folder of the new set, or of parts of one; new or empty.")
     images: Path | None = option(None, "Photographs of a COLMAP model.", metavar="FOLDER")
+    sfm: bool = option(False, "SOURCE has photographs without poses; pycolmap finds them.")
     scale: float | None = option(None, "Length of SOURCE's unit.", metavar="METRES")
     distance: tuple[str, str, float] | None = option(
         None, "Between two of --points, for the scale.", metavar="A B METRES"

@@ -1,4 +1,4 @@
-"""Posed photographs as others keep them: nerfstudio, instant-ngp, Blender, COLMAP."""
+"""Posed photographs as others keep them: nerfstudio, instant-ngp, Blender, COLMAP; or photographs to be posed."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splatsoil.errors import MeasurementError
+from splatsoil.importing.sfm import posed
 from splatsoil.measurement.colmap import read_colmap
 from splatsoil.measurement.fields import Fields
 from splatsoil.measurement.frames import Frame, read_blender, read_transforms
@@ -31,17 +32,20 @@ class Source:
     has_up: bool
 
 
-def read_source(path: Path, images: Path | None = None) -> Source:
-    """Read posed photographs.
+def read_source(path: Path, images: Path | None = None, *, sfm: bool = False) -> Source:
+    """Read posed photographs, or pose them.
 
     Args:
         path: a transforms.json (nerfstudio, instant-ngp, Blender), a COLMAP model's folder, or a folder that has one of
             these at the usual place.
         images: of a COLMAP model, the folder that its images' names are relative to; looked for beside it by default.
+        sfm: whether the path is a folder of photographs without poses.
 
     Raises:
         MeasurementError: nothing of the kind is there, or it is faulty; names file and field.
     """
+    if sfm:
+        return Source(posed(path), "pycolmap", has_up=False)
     if path.is_file():
         return _read_json(path)
     if not path.is_dir():
