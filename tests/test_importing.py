@@ -322,26 +322,23 @@ def test_up_becomes_z(up: tuple[float, float, float]) -> None:
 
 @pytest.mark.slow
 def test_photographs_without_poses(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    plow: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Poses that are thrown away come back by structure from motion, scale and world by the known points."""
+    """Poses come back by structure from motion, scale and world by known points: to a pixel on the bed, 1 m away."""
     pytest.importorskip("pycolmap")
-    monkeypatch.chdir(tmp_path)
-    simulate = ["simulate", "set", "--preset", "tiny", "--views", "16", "--picture-scale", "2", "--seed", "1", "--json"]
-    assert cli.main(simulate) == 0
-    true = Measurement.load("set")
-    recorded(true, tmp_path / "recorded")
-    monkeypatch.chdir("recorded")
-    capsys.readouterr()
-    words = ["import", "images", "made", "--sfm", "--known", "known.csv", "--points", "marks.csv", "--json"]
-    assert cli.main(words) == 0
+    monkeypatch.chdir(plow.folder)
+    words = ["import", "images", str(tmp_path / "made"), "--sfm", "--known", "known.csv", "--points", "marks.csv"]
+    assert cli.main([*words, "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
-    entries = json.loads(Path("made/views/transforms.json").read_text())["frames"]
-    assert said["source"] == "pycolmap" and len(entries) == said["views"] == len(true.views) + len(true.cameras)
-    places = {frame.path.read_bytes(): frame.camera.position for frame in (*true.views, *true.pre_roll)}
+    entries = json.loads((tmp_path / "made" / "views" / "transforms.json").read_text())["frames"]
+    true = {frame.path.read_bytes(): frame.camera for frame in (*plow.true.views, *plow.true.pre_roll)}
+    assert said["source"] == "pycolmap" and len(entries) == len(plow.true.views) + len(plow.true.cameras)
+    off = []
     for entry in entries:
-        place = np.array(entry["transform_matrix"])[:3, 3]
-        assert np.linalg.norm(place - places[Path("made/views", entry["file_path"]).read_bytes()]) < 0.002
+        camera = true[(tmp_path / "made" / "views" / entry["file_path"]).read_bytes()]
+        off.append(np.array(entry["transform_matrix"])[:3, 3] - camera.position)
+        assert entry["fl_x"] == pytest.approx(camera.fx, rel=0.02)
+    assert np.sqrt(np.mean(np.sum(np.square(off), axis=1))) < 1.0 / camera.fx
 
 
 def test_photographs_that_cannot_be_posed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
