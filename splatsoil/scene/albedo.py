@@ -192,12 +192,12 @@ def refined(
     for camera, target, mask in targets:
         features = functional.pad(albedo, (0, 1), value=1.0).requires_grad_()
         with torch.enable_grad():
-            drawn = rasterise_features(centres, covariances, opacities, features, camera, antialias=True)
-        covered = drawn.alpha.detach().clamp_min(1e-3)[..., None]
-        residual = (target - drawn.image[..., :3].detach() / covered) * mask[..., None]
+            image, alpha = rasterise_features(centres, covariances, opacities, features, camera, antialias=True)
+        covered = alpha.detach().clamp_min(1e-3)[..., None]
+        residual = (target - image[..., :3].detach() / covered) * mask[..., None]
         # of a number: for the gradient of a picture torch would load half a thousand modules
         with torch.enable_grad():
-            pulled = (drawn.image * torch.cat([residual, mask[..., None]], dim=2)).sum()
+            pulled = (image * torch.cat([residual, mask[..., None]], dim=2)).sum()
         (gradient,) = torch.autograd.grad(pulled, features)
         push += gradient[:, :3]
         weight += gradient[:, 3:]

@@ -54,7 +54,7 @@ class Binding:
 
     def to_particles(self, particles: Tensor, spacing: float) -> Binding:
         """The same Gaussians on other particles (p, 3) at rest, m, with this spacing, m."""
-        index, weights = _riders(self.rest, particles, spacing, NEIGHBOURS)
+        index, weights = _riders(self.rest, particles, spacing)
         return replace(self, particles=particles.detach().float().contiguous(), index=index, weights=weights)
 
     def carry(self, positions: Tensor, deformations: Tensor | None) -> tuple[Tensor, Tensor]:
@@ -82,9 +82,7 @@ class Binding:
         return centres, covariances
 
 
-def bind(
-    centres: Tensor, covariances: Tensor, particles: Tensor, spacing: float, *, neighbours: int = NEIGHBOURS
-) -> Binding:
+def bind(centres: Tensor, covariances: Tensor, particles: Tensor, spacing: float) -> Binding:
     """Let Gaussians ride on the particles nearest to them.
 
     Args:
@@ -92,9 +90,8 @@ def bind(
         covariances: (n, 3, 3) at rest, m².
         particles: (p, 3) at rest, m.
         spacing: side of the cube that a particle stands for, m.
-        neighbours: particles for each Gaussian.
     """
-    index, weights = _riders(centres, particles, spacing, neighbours)
+    index, weights = _riders(centres, particles, spacing)
     smallest = torch.linalg.eigvalsh(covariances.detach().cpu().double())[:, 0].clamp_min(0.0)
     return Binding(
         centres.detach().float().contiguous(),
@@ -106,9 +103,9 @@ def bind(
     )
 
 
-def _riders(centres: Tensor, particles: Tensor, spacing: float, neighbours: int) -> tuple[Tensor, Tensor]:
+def _riders(centres: Tensor, particles: Tensor, spacing: float) -> tuple[Tensor, Tensor]:
     """Particles (n, k) int32 that each Gaussian rides on, and their weights (n, k)."""
-    k = min(neighbours, len(particles))
+    k = min(NEIGHBOURS, len(particles))
     distance, index = cKDTree(particles.detach().cpu().numpy()).query(centres.detach().cpu().numpy(), k=k)
     away = torch.from_numpy(distance.reshape(len(centres), k)).to(centres.device)
     # Relative to the nearest, so that a Gaussian far from all particles still has weights.

@@ -46,10 +46,10 @@ class Intrinsic:
         Raises:
             RunError: it can't be read.
         """
-        names = ("direction", "ambient", "level", "softness", "soil", "grains", "tool")
+        names = ("direction", "ambient", "level", "soil", "grains", "tool")
         kept = read_npz(path, names, remedy="delete it, it will be made anew")
         try:
-            light = Light(kept["direction"], kept["ambient"], kept["level"], float(kept["softness"]))
+            light = Light(kept["direction"], kept["ambient"], kept["level"])
         except (TypeError, ValueError, ParameterError) as error:
             raise RunError(f"{path}: holds no light ({error}); delete it, it will be made anew") from error
         return cls(light, kept["soil"], kept["grains"], kept["tool"])
@@ -60,7 +60,7 @@ class Intrinsic:
         Raises:
             RunError: the folder can't be written to.
         """
-        light = {name: getattr(self.light, name) for name in ("direction", "ambient", "level", "softness")}
+        light = {name: getattr(self.light, name) for name in ("direction", "ambient", "level")}
         write_npz(path, soil=self.soil, grains=self.grains, tool=self.tool, **light)
 
     def coloured(self, scene: Scene) -> Scene:

@@ -17,6 +17,9 @@ from splatsoil.scene.kernels_sky import look_around
 STEEP, STEEPEST = wp.constant(0.7), wp.constant(0.5)
 """Upward parts of normals (45°, 60°) between which a surface's slope is less and less that of its heights."""
 
+SUN_SOFTNESS = wp.constant(0.0047)
+"""Tangent of the sun's angular radius."""
+
 
 @wp.struct
 class Illumination:
@@ -25,7 +28,6 @@ class Illumination:
 
     sun: wp.vec3
     ambient: wp.vec3
-    softness: float
     ground: wp.vec3
     side: wp.vec3
     tool: wp.vec3
@@ -75,7 +77,7 @@ def tool_normal(tool: ToolPose, origin: wp.vec3, direction: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def soil_shadow(surface: Surface, point: wp.vec3, sun: wp.vec3, softness: float) -> float:
+def soil_shadow(surface: Surface, point: wp.vec3, sun: wp.vec3) -> float:
     """Share of the sun (0 to 1) that the soil's surface lets through to a point; soft by the sun's width."""
     open_share = float(1.0)
     flat = wp.sqrt(sun[0] * sun[0] + sun[1] * sun[1])
@@ -87,7 +89,7 @@ def soil_shadow(surface: Surface, point: wp.vec3, sun: wp.vec3, softness: float)
     while z < surface.top and open_share > 0.0:
         gap = z - height_at(surface, point[0] + r * ray[0], point[1] + r * ray[1])
         # A cell's worth of blur near the blocker, the sun's own width farther out.
-        width = softness * r + 0.35 * surface.step
+        width = SUN_SOFTNESS * r + 0.35 * surface.step
         open_share = wp.min(open_share, wp.clamp(0.5 + 0.5 * gap / width, 0.0, 1.0))
         r += surface.step
         z = point[2] + r * ray[2]
@@ -112,7 +114,7 @@ def tool_columns(
 def sun_visibility(surface: Surface, light: Illumination, visible: wp.array2d(dtype=wp.float32)) -> None:
     """Share of the sun that the soil lets through to each cell."""
     i, j = wp.tid()
-    visible[i, j] = soil_shadow(surface, cell_centre(surface, i, j), light.sun, light.softness)
+    visible[i, j] = soil_shadow(surface, cell_centre(surface, i, j), light.sun)
 
 
 @wp.func
@@ -137,7 +139,6 @@ def suns_on_points(
     spread: float,
     surface: Surface,
     suns: wp.array(dtype=wp.vec3),
-    softness: float,
     tool: ToolPose,
     visible: wp.array2d(dtype=wp.float32),
 ) -> None:
@@ -145,7 +146,7 @@ def suns_on_points(
     k, p = wp.tid()
     share = tool_shadow(tool, suns[k], points[p], spread)
     if share > 0.0:
-        share *= soil_shadow(surface, points[p], suns[k], softness)
+        share *= soil_shadow(surface, points[p], suns[k])
     visible[k, p] = share
 
 
@@ -287,7 +288,7 @@ def illuminate(
             sunny = shade[4]
             if sunny > 0.01 and sunny < 0.99:
                 # An edge of a shadow, or a wall too steep for a map: look from the point itself.
-                sunny = soil_shadow(surface, x, light.sun, light.softness)
+                sunny = soil_shadow(surface, x, light.sun)
             direct *= sunny
         if direct > 0.0:
             direct *= tool_shadow(tool, light.sun, x, 0.5 * z / eye.fx)
@@ -312,7 +313,7 @@ def illuminate(
             sky = 0.5 * (1.0 + n[2])
             direct = wp.max(wp.dot(n, light.sun), 0.0) / light.sun[2]
             if direct > 0.0:
-                direct *= soil_shadow(surface, point, light.sun, light.softness)
+                direct *= soil_shadow(surface, point, light.sun)
                 if tool_hit(tool, point + n * 1.0e-4, light.sun, 1.0e3) >= 0.0:
                     direct = 0.0
             lit = light.ambient * sky + (one - light.ambient) * direct + light.ground * (1.0 - sky)

@@ -76,7 +76,10 @@ def look_around(
             step = float(surface.step)
             r = float(step)
             while r < surface.reach:
-                top = height_at(surface, place[0] + r * c, place[1] + r * s)
+                if step > surface.step:  # what lies between two cells is nothing to a look over several
+                    top = _cell(surface.height, u + r * c * surface.grid.inverse_x, v + r * s * surface.grid.inverse_y)
+                else:
+                    top = height_at(surface, place[0] + r * c, place[1] + r * s)
                 climb = top - below
                 # A wall between two looks stands midway on the average.
                 rise = (top - place[2]) / wp.where(climb > step, r - 0.5 * step, r)

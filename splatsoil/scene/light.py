@@ -35,9 +35,6 @@ SOIL_REFLECTANCE = 0.4
 Photographs without a calibration target do not tell it; the light it decides is a tenth of the whole in a deep trench.
 """
 
-SUN_SOFTNESS = 0.0047
-"""Tangent of the sun's angular radius."""
-
 _TOOL_LIGHT = 0.5
 """Light on the side of the tool that a shaded point sees, in units of level ground's."""
 
@@ -50,13 +47,11 @@ class Light:
         direction: unit vector (3,) towards the sun, world frame, z > 0.
         ambient: (3,) share of the light on level, open ground that comes from the sky; red, green, blue.
         level: (3,) linear colour that level, open, sunlit soil shows on average; the exposure is in it.
-        softness: tangent of the half width of the sun, for the edge of shadows.
     """
 
     direction: FloatArray
     ambient: FloatArray
     level: FloatArray = field(default_factory=lambda: np.full(3, SOIL_REFLECTANCE))
-    softness: float = SUN_SOFTNESS
 
     def __post_init__(self) -> None:
         direction = np.array(self.direction, dtype=np.float64).reshape(3)
@@ -98,7 +93,6 @@ class Light:
             min(max(self.elevation + elevation, 1.0), 90.0),
             np.clip(self.ambient + ambient, 0.0, 1.0),
             level=self.level,
-            softness=self.softness,
         )
 
     def reflectance(self, colour: npt.ArrayLike) -> FloatArray:
@@ -108,7 +102,7 @@ class Light:
     def kernel_form(self, tool: npt.ArrayLike = (0.0, 0.0, 0.0)) -> Any:
         """The numbers as the kernels take them, with the tool's linear colour (3,)."""
         out = kernels.Illumination()
-        out.sun, out.ambient, out.softness = wp.vec3(*self.direction), wp.vec3(*self.ambient), float(self.softness)
+        out.sun, out.ambient = wp.vec3(*self.direction), wp.vec3(*self.ambient)
         out.ground, out.side = wp.vec3(*self.reflectance(self.level)), wp.vec3(*self.tool_side(tool))
         out.tool = wp.vec3(*np.asarray(tool, dtype=np.float64))
         return out

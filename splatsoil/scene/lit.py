@@ -16,7 +16,7 @@ from torch import Tensor
 
 from splatsoil.scene import kernels, kernels_sky
 from splatsoil.scene.kernels_maps import Maps, Shade, ToolPose
-from splatsoil.scene.light import SUN_SOFTNESS, Light
+from splatsoil.scene.light import Light
 from splatsoil.scene.relief import Relief
 from splatsoil.splats.steps import Steps, stepwise
 from splatsoil.splats.warp_torch import as_warp, launch, upload
@@ -153,7 +153,7 @@ def _mixed(light: Light, sky: Tensor, direct: Tensor) -> Tensor:
 def direct_light(relief: Relief, light: Light, tool: Any, points: Tensor, spread: float = 0.0) -> Tensor:
     """The sun on points (n, 3) of the surface, (n,); 1 on level, open ground."""
     sun = upload(light.direction[None], relief.device)
-    visible = suns_on_points(relief, tool, sun, points, spread, light.softness)
+    visible = suns_on_points(relief, tool, sun, points, spread)
     return (facing(sun, normals(relief, points)) * visible)[0]
 
 
@@ -167,13 +167,11 @@ def facing(suns: Tensor, normal: Tensor) -> Tensor:
     return (suns @ normal.T).clamp_min(0.0) / suns[:, 2:]
 
 
-def suns_on_points(
-    relief: Relief, tool: Any, suns: Tensor, points: Tensor, spread: float, softness: float = SUN_SOFTNESS
-) -> Tensor:
+def suns_on_points(relief: Relief, tool: Any, suns: Tensor, points: Tensor, spread: float) -> Tensor:
     """Share (k, n) of suns (k, 3) that soil and tool let through to points (n, 3) on the surface, each of which stands
     for a patch of half width ``spread`` metres."""
     visible = torch.empty((len(suns), len(points)), dtype=torch.float32, device=points.device)
-    inputs = [as_warp(points, wp.vec3), float(spread), relief.surface, as_warp(suns, wp.vec3), float(softness), tool]
+    inputs = [as_warp(points, wp.vec3), float(spread), relief.surface, as_warp(suns, wp.vec3), tool]
     launch(kernels.suns_on_points, tuple(visible.shape), [*inputs, as_warp(visible, wp.float32)], visible)
     return visible
 

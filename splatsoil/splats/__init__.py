@@ -3,10 +3,9 @@
 from splatsoil.splats.gaussians import Gaussians
 from splatsoil.splats.metrics import psnr, ssim, ssim_map
 from splatsoil.splats.ply import load_ply, save_ply
-from splatsoil.splats.rasteriser import Features, Rendering, rasterise, rasterise_features
+from splatsoil.splats.rasteriser import Rendering, rasterise, rasterise_features
 
 __all__ = [
-    "Features",
     "Gaussians",
     "Rendering",
     "load_ply",

@@ -61,14 +61,7 @@ def project_each(
 ) -> Projection:
     """Means, covariances and opacities of several scenes, each projected by its own camera, one after the other in one
     projection; without gradients."""
-    counts = [len(means) for means, _, _ in gaussians]
-    outputs = _outputs(sum(counts), gaussians[0][0])
-    for inputs, camera, parts in zip(
-        gaussians, cameras, zip(*(o.split(counts) for o in outputs), strict=True), strict=True
-    ):
-        arguments = [*_arrays(inputs, _INPUTS), _lens(camera, antialias), *_arrays(parts, _OUTPUTS)]
-        launch(kernels.project_forward, len(inputs[0]), arguments, inputs[0])
-    return Projection(*outputs)
+    return Projection(*_projected(gaussians, [_lens(camera, antialias) for camera in cameras]))
 
 
 def covariances_of(scales: Tensor, quaternions: Tensor) -> Tensor:
@@ -91,9 +84,16 @@ def _arrays(tensors: tuple[Tensor, ...], types: tuple[Any, ...]) -> list[Any]:
     return [as_warp(t, d) for t, d in zip(tensors, types, strict=True)]
 
 
-def _outputs(n: int, like: Tensor) -> tuple[Tensor, ...]:
-    """What a projection of n Gaussians is written to."""
-    return tuple(like.new_zeros(shape) for shape in ((n, 2), (n, 3), (n,), (n,), (n, 2)))
+def _projected(gaussians: Sequence[tuple[Tensor, Tensor, Tensor]], lenses: Sequence[Any]) -> tuple[Tensor, ...]:
+    """What a `Projection` of several scenes is made of, each by its own lens."""
+    counts, like = [len(means) for means, _, _ in gaussians], gaussians[0][0]
+    outputs = tuple(like.new_zeros((sum(counts), *shape)) for shape in ((2,), (3,), (), (), (2,)))
+    parts = zip(*(output.split(counts) for output in outputs), strict=True)
+    for inputs, lens, part in zip(gaussians, lenses, parts, strict=True):
+        launch(
+            kernels.project_forward, len(inputs[0]), [*_arrays(inputs, _INPUTS), lens, *_arrays(part, _OUTPUTS)], like
+        )
+    return outputs
 
 
 _INPUTS = (wp.vec3, wp.mat33, wp.float32)
@@ -105,13 +105,10 @@ class _Project(torch.autograd.Function):
     def forward(
         ctx: Any, means: Tensor, covariances: Tensor, opacities: Tensor, camera: Camera, antialias: bool
     ) -> tuple[Tensor, ...]:
-        n = means.shape[0]
         inputs = (means, covariances, opacities)
-        outputs = _outputs(n, means)
         ctx.lens = _lens(camera, antialias)
         ctx.save_for_backward(*inputs)
-        arguments = [*_arrays(inputs, _INPUTS), ctx.lens, *_arrays(outputs, _OUTPUTS)]
-        launch(kernels.project_forward, n, arguments, means)
+        outputs = _projected([inputs], [ctx.lens])
         ctx.mark_non_differentiable(outputs[4])
         return outputs
 

@@ -24,21 +24,6 @@ _ENTRIES_PER_MILLISECOND = 8000
 
 
 @dataclass(frozen=True)
-class Features:
-    """Blended feature channels.
-
-    Attributes:
-        image: (h, w, k), Σ wᵢ fᵢ + T·background.
-        alpha: (h, w), 1 − T: how much of the pixel is covered.
-        projection: the Gaussians on the image plane; retain the gradient of ``projection.centres`` to densify by it.
-    """
-
-    image: Tensor
-    alpha: Tensor
-    projection: Projection
-
-
-@dataclass(frozen=True)
 class Rendering:
     """A picture of Gaussians.
 
@@ -93,7 +78,7 @@ def rasterise_features(
     *,
     background: Tensor | Sequence[float] | None = None,
     antialias: bool = False,
-) -> Features:
+) -> tuple[Tensor, Tensor]:
     """Blend any features (n, k), 1 ≤ k ≤ 8, with the weights that colours would get; differentiable in every tensor.
 
     Args:
@@ -105,6 +90,9 @@ def rasterise_features(
         background: (k,) behind everything; zeros by default.
         antialias: see `rasterise`.
 
+    Returns:
+        Σ wᵢ fᵢ + T·background (h, w, k), and how much of each pixel is covered, 1 − T (h, w).
+
     Raises:
         ParameterError: see `rasterise`.
     """
@@ -115,7 +103,7 @@ def rasterise_features(
     check(means, covariances, opacities, camera)
     projection = project(means, covariances, opacities, camera, antialias)
     behind = _behind([0.0] * features.shape[1] if background is None else background, features)
-    return Features(*_composite(projection, features, camera, behind), projection)
+    return _composite(projection, features, camera, behind)
 
 
 def _behind(background: Tensor | Sequence[float], features: Tensor) -> Tensor:

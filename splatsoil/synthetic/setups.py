@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -49,23 +49,23 @@ class Setup:
         bed: the box of soil.
         surface: the soil's surface before anything moves.
         tool: mesh, motion and friction.
-        gravity: (3,) m/s².
-        frame_rate: frames a second.
         views: cameras of the photographs.
         video: fixed cameras by name.
         frames: video frames, from 0 on.
         pre_roll: video frames before that, negative.
+        gravity: (3,) m/s².
+        frame_rate: frames a second.
     """
 
     bed: Bed
     surface: HeightField
     tool: Tool
-    gravity: FloatArray
-    frame_rate: float
     views: tuple[Camera, ...]
     video: Mapping[str, Camera]
     frames: tuple[int, ...]
     pre_roll: tuple[int, ...] = PRE_ROLL
+    gravity: FloatArray = field(default_factory=lambda: np.array(GRAVITY))
+    frame_rate: float = FRAME_RATE
 
     def experiment(self) -> Measurement:
         """The experiment as the solver takes it; the pictures of its video are yet to be taken.
@@ -128,8 +128,6 @@ def plow(seed: int = 0, *, views: int = VIEWS, depth: float | None = None, conta
         bed=bed,
         surface=wavy_surface(bed, 0.12 if depth is None else depth, seed, tool),
         tool=tool,
-        gravity=np.array(GRAVITY),
-        frame_rate=FRAME_RATE,
         views=tuple(camera(eye, target) for eye in spiral(target, 0.95, views)),
         video={
             "left": camera((-0.1, -0.37, 0.6), (0.43, 0.25, 0.08), "left"),
@@ -161,8 +159,6 @@ def paper(*, views: int = VIEWS) -> Setup:
         bed=bed,
         surface=replace(field, height=0.22 + 0.1 * waves),
         tool=Tool(trimesh.creation.box((0.01, 0.1, 0.1)), motion, friction=0.3),
-        gravity=np.array(GRAVITY),
-        frame_rate=FRAME_RATE,
         views=tuple(camera(eye) for eye in spiral(target, 1.8, views)),
         video={"left": camera((-0.5, -0.5, 0.5), "left"), "right": camera((-0.5, 1.5, 0.5), "right")},
         frames=video_frames(199),

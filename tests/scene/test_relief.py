@@ -41,33 +41,23 @@ def test_plane_is_found_without_bias(slope):
     assert np.allclose(relief.normal.numpy()[inside].mean(axis=0), expected, atol=0.02)
 
 
-@pytest.mark.parametrize("length", [0.06, 0.08, 0.12, 0.2])
-def test_waves_are_rounded_off_by_one_spacing_and_no_more(length):
-    """Against exp(-2 (pi s/l)^2), what a Gaussian of standard deviation s leaves of a wave of length l."""
+def share_left(length, **options):
+    """How much of a wave of so many metres the surface of particles beneath it has."""
     particles = filled(lambda x, y: 0.1 + 0.05 * length * np.sin(2.0 * np.pi / length * x), jitter=1.0)
-    relief = relief_of_particles(particles, 0.01, LOWER, UPPER)
-    points = relief.points.numpy()
+    points = relief_of_particles(particles, 0.01, LOWER, UPPER, **options).points.numpy()
     whole = 0.1 + length * int(0.25 / length)
     inside = (points[..., 0] > 0.1) & (points[..., 0] < whole) & (np.abs(points[..., 1] - 0.15) < 0.12)
     wave = np.sin(2.0 * np.pi / length * points[..., 0][inside])
-    found = np.polyfit(wave, points[..., 2][inside], 1)[0] / (0.05 * length)
-    assert found == pytest.approx(np.exp(-2.0 * (np.pi * 0.01 / length) ** 2), abs=0.05)
+    return np.polyfit(wave, points[..., 2][inside], 1)[0] / (0.05 * length)
 
 
-@pytest.mark.parametrize("length", [0.08, 0.12, 0.2])
-def test_twice_the_rounding_takes_as_much_again(length):
-    """So that the difference tells what the drawing has rounded off: the whole wave, to first order."""
-
-    def height(smoothing):
-        particles = filled(lambda x, y: 0.1 + 0.05 * length * np.sin(2.0 * np.pi / length * x), jitter=1.0)
-        points = relief_of_particles(particles, 0.01, LOWER, UPPER, smoothing=smoothing).points.numpy()
-        whole = 0.1 + length * int(0.25 / length)
-        inside = (points[..., 0] > 0.1) & (points[..., 0] < whole) & (np.abs(points[..., 1] - 0.15) < 0.12)
-        wave = np.sin(2.0 * np.pi / length * points[..., 0][inside])
-        return np.polyfit(wave, points[..., 2][inside], 1)[0] / (0.05 * length)
-
-    once, twice = height(1.0), height(np.sqrt(2.0))
+@pytest.mark.parametrize("length", [0.06, 0.08, 0.12, 0.2])
+def test_waves_are_rounded_off_by_one_spacing_and_twice_as_much_takes_as_much_again(length):
+    """Against exp(-2 (pi s/l)^2), what a Gaussian of standard deviation s leaves of a wave of length l. The difference
+    tells what the drawing has rounded off: with it the whole wave, to first order."""
+    once, twice = share_left(length), share_left(length, smoothing=np.sqrt(2.0))
     lost = 1.0 - np.exp(-2.0 * (np.pi * 0.01 / length) ** 2)
+    assert once == pytest.approx(1.0 - lost, abs=0.05)
     assert 2.0 * once - twice == pytest.approx(1.0, abs=0.05 + lost**2)
     assert once - twice > 0.5 * lost
 
@@ -135,9 +125,3 @@ def test_the_surface_is_the_uppermost_crossing():
     inputs = [as_warp(density[:, None].contiguous(), wp.float32), 0.5, 1.0, 0.1, as_warp(height, wp.float32)]
     launch(kernels_relief.crossing, (1, 4), inputs, height)
     assert height[0].tolist() == pytest.approx([1.0 + 0.1 * 3.0, 1.0, 1.0 + 0.1 * 3.5, 1.0 + 0.1 * 1.9])
-
-
-def test_the_same_particles_give_the_same_bits():
-    x = filled(lambda x, y: 0.1 + 0.02 * np.sin(20 * x))
-    first, second = (relief_of_particles(x, 0.01, LOWER, UPPER).height for _ in range(2))
-    assert torch.equal(first, second)

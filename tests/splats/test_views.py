@@ -36,10 +36,10 @@ def test_views_together_are_the_same_as_each_alone(views: list[Seen]) -> None:
     image, alpha = rasterise_views(views, background=BACKGROUND, antialias=True)
     assert image.shape == (4, 50, 70, 3) and alpha.shape == (4, 50, 70)
     for k, v in enumerate(views):
-        alone = rasterise_features(
+        picture, cover = rasterise_features(
             v.means, v.covariances, v.opacities, v.features, v.camera, background=BACKGROUND, antialias=True
         )
-        assert torch.equal(image[k], alone.image) and torch.equal(alpha[k], alone.alpha)
+        assert torch.equal(image[k], picture) and torch.equal(alpha[k], cover)
     assert alpha[:2].amax(dim=(1, 2)).min() > 0.5 and alpha[2:].max() == 0.0
 
 

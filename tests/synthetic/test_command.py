@@ -21,22 +21,9 @@ SMALL = ("--preset", "tiny", "--picture-scale", "0.15", "--views", "2")
 
 def test_like_another_set_with_an_effect(small_set: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "new"
-    words = ["simulate", str(out), "--like", str(small_set), *SMALL, "--friction-angle", "38", "--seed", "2"]
-    assert (
-        cli.main(
-            [
-                *words,
-                "--with",
-                "cohesion",
-                "tool_friction",
-                "--set",
-                "cohesion=400",
-                "tool_friction_change=0.2",
-                "--json",
-            ]
-        )
-        == 0
-    )
+    words = ["simulate", str(out), "--like", str(small_set), *SMALL, "--friction-angle", "38", "--seed", "2", "--json"]
+    acting = ["--with", "cohesion", "tool_friction", "--set", "cohesion=400", "tool_friction_change=0.2"]
+    assert cli.main([*words, *acting]) == 0
     said = json.loads(capsys.readouterr().out)
     wanted = {"friction_angle": 38.0, "cohesion": 400.0, "tool_friction_change": 0.2}
     assert said["ok"] is True and said["parameters"] == wanted

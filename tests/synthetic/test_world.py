@@ -275,15 +275,9 @@ def test_truth_is_kept_at_quarters_of_the_run() -> None:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"effects": ["witchcraft"]}, "witchcraft"),
-        ({"effects": ["cohesion"]}, "off values"),
-        ({"values": {"cohesion": 100.0}}, "unknown parameter cohesion"),
         ({"effects": ["cohesion"], "values": {"cohesion": -5.0}}, "outside"),
-        ({"friction_angle": 70.0}, "friction_angle"),
         ({"friction_angle": float("nan")}, "finite"),
         ({"preset": "enormous"}, "enormous"),
-        ({"device": "abacus"}, "abacus"),
-        ({"seed": -1}, "-1"),
         ({"particle_seed": -2}, "-2"),
     ],
 )
