@@ -69,7 +69,6 @@ def _synthetic(problems: Sequence[SyntheticProblem], jobs: Sequence[Job]) -> lis
 
 
 def _measured(problem: MeasuredProblem, jobs: Sequence[Job]) -> list[Evaluation]:
-    from splatsoil.model import Prediction
     from splatsoil.mpm import simulate_together
 
     began, model = time.perf_counter(), problem.model
@@ -81,11 +80,7 @@ def _measured(problem: MeasuredProblem, jobs: Sequence[Job]) -> list[Evaluation]
 
     found = in_batches(simulated, jobs, "simulations")
     made = (
-        trajectory
-        if isinstance(trajectory, SimulationError)
-        else Prediction(
-            dict(values), seed, model.draw(trajectory, seed, values), trajectory, {}, model.surfaces(trajectory, values)
-        )
+        trajectory if isinstance(trajectory, SimulationError) else model.reported(trajectory, seed, values)
         for (values, seed), trajectory in zip(jobs, found, strict=True)
     )
     return _judged([problem] * len(jobs), made, began)

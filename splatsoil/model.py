@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 import weakref
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -41,7 +40,6 @@ class Prediction:
         seed: of the particles.
         images: (h, w, 3) sRGB in [0, 1] by (camera, frame), free of lens distortion.
         trajectory: the simulation behind them.
-        seconds: time spent on simulation and on drawing.
         surfaces: the soil's, by frame, where the set has heights.
     """
 
@@ -49,7 +47,6 @@ class Prediction:
     seed: int
     images: Mapping[tuple[str, int], Image]
     trajectory: Trajectory
-    seconds: Mapping[str, float]
     surfaces: Mapping[int, Relief] = field(default_factory=dict)
 
 
@@ -309,18 +306,21 @@ class Model:
         Raises:
             SimulationError, ParameterError: see :meth:`simulate`.
         """
-        started = time.perf_counter()
-        trajectory = self.simulate(values, seed, progress)
-        simulated = time.perf_counter()
-        images = self.draw(trajectory, seed, values)
-        return Prediction(
-            values=dict(values),
-            seed=seed,
-            images=images,
-            trajectory=trajectory,
-            seconds={"simulation": simulated - started, "drawing": time.perf_counter() - simulated},
-            surfaces=self.surfaces(trajectory, values),
-        )
+        return self.reported(self.simulate(values, seed, progress), seed, values)
+
+    def reported(
+        self,
+        trajectory: Trajectory,
+        seed: int,
+        values: Mapping[str, float],
+        *,
+        albedo: int | None = None,
+        rounding: float = 1.0,
+    ) -> Prediction:
+        """What all instruments report of a trajectory; takes and raises what :meth:`draw` does."""
+        images = self.draw(trajectory, seed, values, albedo=albedo, rounding=rounding)
+        surfaces = self.surfaces(trajectory, values, rounding=rounding)
+        return Prediction(dict(values), seed, images, trajectory, surfaces)
 
     def _recorded_frames(self) -> tuple[int, ...]:
         """The model's frames, and those around them between which a time offset within its bounds interpolates."""

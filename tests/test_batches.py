@@ -92,7 +92,7 @@ def test_simulations_for_criticism_and_for_a_fit_go_on(
     base: Any = SimpleNamespace(
         law=SimpleNamespace(effects=()), observation_parameters=(), recorded=(0,), particles=len, measurement=None
     )
-    base.particles, base.draw, base.surfaces = (lambda seed: None), (lambda *_: {}), (lambda *_: {})
+    base.particles, base.reported = (lambda seed: None), (lambda made, seed, values: SimpleNamespace(values=values))
     experiment: Any = object.__new__(PlowExperiment)
     experiment.__dict__ |= {"base": base, "progress": None, "_kept": {}, "together": 3}
     experiment._computed = lambda effects, way: (base, way)

@@ -12,7 +12,7 @@ from torch.quasirandom import SobolEngine
 import splatsoil  # noqa: F401 (registers PlowSand-v0)
 
 FIRST, LONGEST, SHORTEST = 0.8, 1.6, 0.5**7  # sides of the region in the unit cube, as in the paper
-SUCCESSES, CANDIDATES = 3, 1000
+SUCCESSES = 3
 
 
 def proposal(points: torch.Tensor, rewards: torch.Tensor, side: float, seed: int) -> torch.Tensor:
@@ -25,8 +25,10 @@ def proposal(points: torch.Tensor, rewards: torch.Tensor, side: float, seed: int
     sides = 0.5 * side * sides / sides.log().mean().exp()
     best = points[rewards.argmax()]
     low, high = (best - sides).clamp(0.0, 1.0), (best + sides).clamp(0.0, 1.0)
-    candidates = low + (high - low) * SobolEngine(size, scramble=True, seed=seed).draw(CANDIDATES).double()
-    return MaxPosteriorSampling(model, replacement=False)(candidates)[0]
+    candidates = SobolEngine(size, scramble=True, seed=seed).draw(min(100 * size, 5000)).double()
+    candidates = low + (high - low) * candidates
+    with torch.no_grad():
+        return MaxPosteriorSampling(model, replacement=False)(candidates)[0]
 
 
 def search(env: gym.Env, seed: int = 0) -> tuple[dict[str, float], float]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -220,13 +219,8 @@ class PlowExperiment:
         guess = 1 + self.guesses.index(numerics) if numerics in self.guesses else None
         rounding = 2.0 if numerics == ROUNDING else 1.0
         model, way = self._computed(effects, numerics)
-        began = time.perf_counter()
         trajectory = self._trajectory(model, values, seed, way)
-        simulated = time.perf_counter()
-        images = model.draw(trajectory, seed, values, albedo=guess, rounding=rounding)
-        seconds = {"simulation": simulated - began, "drawing": time.perf_counter() - simulated}
-        surfaces = model.surfaces(trajectory, values, rounding=rounding)
-        return Prediction(dict(values), seed, images, trajectory, seconds, surfaces)
+        return model.reported(trajectory, seed, values, albedo=guess, rounding=rounding)
 
     @cached_property
     def together(self) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import os
 import re
 import subprocess
 import sys
@@ -14,32 +13,31 @@ from splatsoil.envs.plow_sand import PlowSandEnv
 from splatsoil.envs.synthetic import SyntheticProblem
 
 
+def run(page: Path, number: int) -> str:
+    """What an example of a page prints."""
+    example = re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)[number]
+    words = [sys.executable, "-c", example]
+    return subprocess.run(words, capture_output=True, text=True, timeout=300, check=True).stdout
+
+
 def test_the_example_runs(repository: Path) -> None:
-    text = (repository / "docs" / "environment.md").read_text()
-    example = re.findall(r"```python\n(.*?)```", text, re.DOTALL)[0]
-    done = subprocess.run([sys.executable, "-c", example], capture_output=True, text=True, timeout=300, check=True)
-    assert done.stdout.count("friction_angle") == 5 and "the truth was" in done.stdout
+    said = run(repository / "docs" / "environment.md", 0)
+    assert said.count("friction_angle") == 5 and "the truth was" in said
 
 
 def test_the_readmes_example_runs_and_comes_nearest_where_the_truth_is(repository: Path) -> None:
-    (example,) = re.findall(r"```python\n(.*?)```", (repository / "README.md").read_text(), re.DOTALL)
-    done = subprocess.run([sys.executable, "-c", example], capture_output=True, text=True, timeout=300, check=True)
-    found = re.findall(r"'friction_angle': ([\d.]+)\} loss ([\d.]+)", done.stdout)
-    (truth,) = re.findall(r"the truth was \{'friction_angle': ([\d.]+)", done.stdout)
+    said = run(repository / "README.md", 0)
+    found = re.findall(r"'friction_angle': ([\d.]+)\} loss ([\d.]+)", said)
+    (truth,) = re.findall(r"the truth was \{'friction_angle': ([\d.]+)", said)
     angles, losses = zip(*((float(a), float(b)) for a, b in found), strict=True)
     assert angles == pytest.approx((23.0, 35.0, 47.0))
     assert losses.index(min(losses)) == min(range(3), key=lambda k: abs(angles[k] - float(truth)))
 
 
-def test_the_recording_example_runs(repository: Path, tmp_path: Path) -> None:
+def test_the_recording_example_runs(repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("minari")
-    text = (repository / "docs" / "environment.md").read_text()
-    example = re.findall(r"```python\n(.*?)```", text, re.DOTALL)[1]
-    environment = os.environ | {"MINARI_DATASETS_PATH": str(tmp_path)}
-    done = subprocess.run(
-        [sys.executable, "-c", example], capture_output=True, text=True, timeout=300, check=True, env=environment
-    )
-    assert "friction_angle" in done.stdout
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    assert "friction_angle" in run(repository / "docs" / "environment.md", 1)
     assert (tmp_path / "plow-sand" / "random-v0" / "data" / "main_data.hdf5").is_file()
 
 

@@ -136,12 +136,15 @@ def test_what_models_differ_by_is_told_without_a_photograph(
     assert np.allclose(experiment.sensor[moves, along], SENSOR / np.sqrt(1.0 + (20.0 / SCALE) ** 2))
 
 
+@pytest.mark.parametrize("pictures", [True, False])
 def test_heights_of_another_stroke_are_seen_where_they_were_measured_but_for_the_tool(
-    damp: Measurement, over_level_soil: Callable[..., Model]
+    damp: Measurement, over_level_soil: Callable[..., Model], pictures: bool
 ) -> None:
     shape = tuple(round(float(v) / 0.01) for v in damp.bed.extents[1::-1])
     level = {f: np.full(shape, SURFACE) for f in damp.frames}
     scanned = replace(damp, heights=HeightMaps(damp.bed.lower[:2], 0.01, level, 0.002))
+    if not pictures:
+        scanned = replace(scanned, views=(), video=())
     measured = PlowExperiment(over_level_soil(scanned, SURFACE))
     second = strokes(scanned, SURFACE)[-1]
     model = over_level_soil(second.prepared(measured), SURFACE)
