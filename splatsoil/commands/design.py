@@ -104,8 +104,8 @@ def _designed(
     def expected(number: int, stroke: Stroke) -> Information:
         """What a stroke is expected to tell."""
         nonlocal made
-        where = (stroke.prepared(measured), folder, model.reconstruction)
-        other = _model.model_on(*where, spec.effects, spec.preset, model.device)
+        measurement = stroke.prepared(measured)
+        other = _model.model_on(measurement, folder, model.reconstruction, spec.effects, spec.preset, model.device)
         experiment = StrokeExperiment(other, measured, candidates)
         motion = {"motion": motion_csv(stroke.measurement.tool.motion), "rate": stroke.measurement.frame_rate}
         identity = {
