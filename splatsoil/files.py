@@ -49,11 +49,10 @@ def write_bytes(path: str | Path, data: bytes) -> Path:
         os.umask(umask)
         Path(name).chmod(0o666 & ~umask)
         Path(name).replace(target)
-    except OSError as error:
+    except BaseException as error:
         Path(name).unlink(missing_ok=True)
-        raise RunError(f"{target}: cannot be written ({error.strerror}); free some space and try again") from error
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise RunError(f"{target}: cannot be written ({error.strerror}); free some space and try again") from error
         raise
     return target
 

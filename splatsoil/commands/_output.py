@@ -9,7 +9,6 @@ from contextlib import contextmanager, redirect_stdout
 from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any, TextIO
 
-from splatsoil.commands._folder import places
 from splatsoil.errors import NoAnswer
 from splatsoil.report.text import amount, interval
 
@@ -43,6 +42,11 @@ def print_json(data: Mapping[str, Any]) -> None:
         ValueError: the data holds NaN or infinity, which JSON cannot.
     """
     print(json.dumps(data, indent=1, allow_nan=False), file=_stdout.get() or sys.stdout, flush=True)
+
+
+def places(run: RunFolder) -> dict[str, str]:
+    """The run folder and its set, as commands' JSON objects have them."""
+    return {"run": str(run.path), "set": str(run.description["measurement"]["folder"])}
 
 
 def tell(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from splatsoil import report
-from splatsoil.commands import _folder, _model, _stages
+from splatsoil.commands import _model, _stages
 from splatsoil.commands._options import BUDGET, ComputingOptions, FitOptions, check_evaluations
 from splatsoil.commands._output import Stage, print_table, tell
 from splatsoil.errors import ParameterError, RunError
@@ -42,8 +42,8 @@ def run(config: Config) -> int:
     from splatsoil.soil.library import find_effects
 
     check_evaluations(config.budget)
-    folder = _folder.opened(config)
-    fit = _folder.latest_fit(folder)
+    folder = _model.opened(config)
+    fit = _model.latest_fit(folder)
     on = fit["setup"]["effects"]
     if not config.effects:
         raise ParameterError("name an effect to add, for example: splatsoil add RUN cohesion")
@@ -69,7 +69,7 @@ def run(config: Config) -> int:
         page = report.write_report(folder.path)
     models = history(folder)["models"]
     write_history(folder, models)
-    _folder.require_answer(folder, folder.fit(), f"report: {page}")
+    _model.require_answer(folder, folder.fit(), f"report: {page}")
     told = {"report": str(page), "models": models}
     return tell(config, told, lambda: show(models), last=f"report: {page}", run=folder)
 
@@ -122,7 +122,7 @@ def add_effect(
     larger = model.variant(effects=effects)
     own = next(e for e in larger.law.effects if e.name == effect.name)
     free = [p.name for p in own.parameters if p.off is not None or p.name in own.shapes]
-    known = _folder.current_diagnosis(folder, folder.path / "diagnoses" / f"{before['name']}.json", (name,))
+    known = _model.current_diagnosis(folder, folder.path / "diagnoses" / f"{before['name']}.json", (name,))
     if known is None or effect.name not in {h["model"] for h in known["held_out"]}:
         # A diagnosis gives the held-out error of the best effect only: alone, it is that.
         known = _stages.run_diagnosis(folder, model, begin, (name,))

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from splatsoil.commands import _crew, _folder, _model, _stages
+from splatsoil.commands import _crew, _model, _stages
 from splatsoil.commands._options import ComputingOptions, command_line
 from splatsoil.commands._output import print_table, print_text, tell
 from splatsoil.options import option
@@ -35,7 +35,7 @@ class Config(ComputingOptions):
 
 def run(config: Config) -> int:
     """Simulate, draw, compare; pictures, losses and the misfit by block go into the run folder."""
-    folder = _folder.opened(config)
+    folder = _model.opened(config)
     none = no_answer(folder.fit())
     folder.check_writable()
     # Helpers begin before what takes seconds to load is loaded.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from concurrent.futures import Future
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from splatsoil import __version__
-from splatsoil.commands import _folder, _model
+from splatsoil.commands import _model
 from splatsoil.commands._options import ComputingOptions, Preset, command_line
 from splatsoil.commands._output import Report, print_table, print_text, tell
 from splatsoil.errors import ParameterError, RunError, SimulationError
@@ -24,10 +24,8 @@ from splatsoil.run_files import DESIGN_FORMAT
 
 if TYPE_CHECKING:
     from splatsoil.commands._model import ModelSpec
-    from splatsoil.experiment.plow import PlowExperiment
     from splatsoil.experiment.strokes import Stroke
     from splatsoil.inverse.criticism.next_stroke import Information
-    from splatsoil.inverse.criticism.simulations import Simulations
     from splatsoil.measurement import ToolMotion
     from splatsoil.model import Model
 
@@ -54,8 +52,8 @@ def run(config: Config) -> int:
 
     if not FEWEST <= config.draws <= KEPT:
         raise ParameterError(f"--draws: between {FEWEST} and {KEPT} simulations, not {config.draws}")
-    folder = _folder.opened(config)
-    fit = _folder.latest_fit(folder)
+    folder = _model.opened(config)
+    fit = _model.latest_fit(folder)
     diagnosis = diagnosis_of(folder)
     probable(diagnosis)  # refused before the rest is loaded
     folder.check_writable()
@@ -76,83 +74,67 @@ def diagnosis_of(folder: RunFolder) -> dict[str, Any]:
     path, make = folder.path / "diagnosis.json", f"make one first: {command_line('diagnose', folder.path)}"
     if not path.is_file():
         raise RunError(f"{folder.path}: has no diagnosis; {make}")
-    data = _folder.current_diagnosis(folder, path)
+    data = _model.current_diagnosis(folder, path)
     if data is None or "draws" not in data:
         raise RunError(f"{folder.path}: its diagnosis is of another fit, or by other code; {make}")
     return data
-
-
-def _expected(
-    stroke: Stroke,
-    measured: PlowExperiment,
-    kept: Simulations,
-    folder: RunFolder,
-    spec: ModelSpec,
-    diagnosis: Mapping[str, Any],
-    draws: Mapping[str, Sequence[Mapping[str, float]]],
-    report: Report,
-) -> tuple[Information, int]:
-    """What another stroke than was measured is expected to tell, and how many new simulations and drawings that took.
-
-    ``kept`` are simulations of the measured one; ``draws`` parameters of the model as it is, and of each that is to be
-    told apart.
-    """
-    from splatsoil.experiment.strokes import StrokeExperiment
-    from splatsoil.inverse.criticism.next_stroke import expected_information, probable, runs_of
-    from splatsoil.inverse.criticism.simulations import Helpers, Simulations
-
-    seed, model = int(folder.description["seed"]), measured.base
-    measurement, reconstruction = stroke.prepared(measured), model.reconstruction
-    other = _model.model_on(measurement, folder, reconstruction, spec.effects, spec.preset, model.device)
-    experiment = StrokeExperiment(other, measured, diagnosis["candidates"] or None)
-    motion = motion_csv(stroke.measurement.tool.motion)
-    identity = {
-        **kept.identity,
-        "stroke": digest({"motion": motion, "rate": stroke.measurement.frame_rate, "start": stroke.start}),
-        "strokes": code_digest(("experiment/strokes.py",)),
-        "layout": list(experiment.layout.shape),
-    }
-    runs = [run for mine in runs_of(draws, seed).values() for run in mine]
-    simulate = Simulations(experiment, kept.folder, identity, sources=kept.sources)
-    count = len(runs) + len(experiment.guesses) + len(experiment.redrawn)
-    simulate.told = lambda purpose: report(purpose.replace("_", " "), simulate.asked / count)
-    # A GPU makes several at a time, all of them in this process.
-    batch = Helpers(lambda jobs: Future(), experiment.together, experiment.prepare)
-    with simulate.helped(batch) if experiment.together > 1 else nullcontext():
-        simulate.ahead(lambda ask: [ask(**run.arguments()) for run in runs])
-        found = expected_information(
-            experiment, draws, probable(diagnosis), simulate, numerics=diagnosis["numerics"], seed=seed
-        )
-    return found, simulate.made
 
 
 def _designed(
     config: Config, folder: RunFolder, diagnosis: Mapping[str, Any], model: Model, spec: ModelSpec, report: Report
 ) -> dict[str, Any]:
     """The strokes, the most informative first; kept in ``design/``."""
-    from splatsoil.experiment.strokes import strokes
+    from splatsoil.experiment.strokes import StrokeExperiment, strokes
     from splatsoil.inverse.criticism.evidence import AS_IT_IS
-    from splatsoil.inverse.criticism.next_stroke import entropy, probable
+    from splatsoil.inverse.criticism.next_stroke import entropy, expected_information, probable, runs_of
+    from splatsoil.inverse.criticism.simulations import Helpers, Simulations
 
-    began = time.perf_counter()
+    began, seed = time.perf_counter(), int(folder.description["seed"])
     if model.measurement.cameras:
         report("light and colours", 0.0)
         model.scene()  # kept: in other strokes the tool may begin elsewhere than photographs show it
-    measured, kept = _model.experiment_of(folder, model, spec, diagnosis["candidates"] or None)
+    candidates = diagnosis["candidates"] or None
+    measured, kept = _model.experiment_of(folder, model, spec, candidates)
     probability = probable(diagnosis)
     draws = {name: diagnosis["draws"][name][: config.draws] for name in dict.fromkeys((AS_IT_IS, *probability))}
+    runs = [run for mine in runs_of(draws, seed).values() for run in mine]
     proposed = {s.name: s for s in strokes(model.measurement, float(np.nanmean(model.reconstruction.surface.height)))}
+    made = 0
+
+    def expected(number: int, stroke: Stroke) -> Information:
+        """What a stroke is expected to tell."""
+        nonlocal made
+        measurement = stroke.prepared(measured)
+        other = _model.model_on(measurement, folder, model.reconstruction, spec.effects, spec.preset, model.device)
+        experiment = StrokeExperiment(other, measured, candidates)
+        motion = {"motion": motion_csv(stroke.measurement.tool.motion), "rate": stroke.measurement.frame_rate}
+        identity = {
+            **kept.identity,
+            "stroke": digest({**motion, "start": stroke.start}),
+            "strokes": code_digest(("experiment/strokes.py",)),
+            "layout": list(experiment.layout.shape),
+        }
+        simulate = Simulations(experiment, kept.folder, identity, sources=kept.sources)
+        count = len(runs) + len(experiment.guesses) + len(experiment.redrawn)
+        simulate.told = lambda purpose: report(
+            f"{stroke.name}, {purpose.replace('_', ' ')}", (number + simulate.asked / count) / len(proposed)
+        )
+        # A GPU makes several at a time, all of them in this process.
+        batch = Helpers(lambda jobs: Future(), experiment.together, experiment.prepare)
+        with simulate.helped(batch) if experiment.together > 1 else nullcontext():
+            simulate.ahead(lambda ask: [ask(**run.arguments()) for run in runs])
+            found = expected_information(
+                experiment, draws, probability, simulate, numerics=diagnosis["numerics"], seed=seed
+            )
+        made += simulate.made
+        return found
+
     found: dict[str, Information] = {}
-    notes, made = [], 0
+    notes = []
     with folder.lock():
         for number, (name, stroke) in enumerate(proposed.items()):
-
-            def progress(what: str, share: float, number: int = number, name: str = name) -> None:
-                report(f"{name}, {what}", (number + share) / len(proposed))
-
             try:
-                found[name], new = _expected(stroke, measured, kept, folder, spec, diagnosis, draws, progress)
-                made += new
+                found[name] = expected(number, stroke)
             except SimulationError as error:
                 notes.append(f"{name}: {error}")
         if not found:
@@ -180,7 +162,7 @@ def _designed(
             "preset": config.preset,
             "device": model.device,
             "version": __version__,
-            "seed": folder.description["seed"],
+            "seed": seed,
             "notes": notes,
             "simulated_now": made,
             "seconds": round(time.perf_counter() - began, 1),

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from splatsoil.commands import _crew, _folder, _laboratory, _model, _stages
+from splatsoil.commands import _crew, _laboratory, _model, _stages
 from splatsoil.commands._options import ComputingOptions
 from splatsoil.commands._output import print_table, print_text, tell
 from splatsoil.files import plain
@@ -35,8 +35,8 @@ def run(config: Config) -> int:
 
     if _laboratory.is_run(config.run) or _laboratory.is_test(config.run):
         return _laboratory.diagnose(config)
-    folder = _folder.opened(config)
-    fit = _folder.latest_fit(folder)
+    folder = _model.opened(config)
+    fit = _model.latest_fit(folder)
     none = no_answer(fit)
     folder.check_writable()
     # Helpers begin before what takes seconds to load is loaded.

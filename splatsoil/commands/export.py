@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from splatsoil import __version__
-from splatsoil.commands import _folder, _model
+from splatsoil.commands import _model
 from splatsoil.commands._options import ComputingOptions
 from splatsoil.commands._output import by_frame, tell
 from splatsoil.errors import ParameterError, RunError
@@ -57,7 +57,7 @@ def run(config: Config) -> int:
         raise ParameterError(f"--every: must be 1 or more, not {config.every}")
     formats = tuple(dict.fromkeys(config.to))
     check_installed(formats)
-    folder = _folder.opened(config)
+    folder = _model.opened(config)
     folder.fit()
     target = folder.path / "export" if config.out is None else config.out
     if config.out is not None and target.is_dir() and any(target.iterdir()):

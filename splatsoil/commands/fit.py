@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from splatsoil.commands import _folder, _laboratory, _stages
+from splatsoil.commands import _laboratory, _model, _stages
 from splatsoil.commands._options import FitOptions, command_line
 from splatsoil.commands._output import print_parameters, stages, tell
 from splatsoil.report.text import duration, model_name
@@ -30,7 +30,7 @@ def run(config: Config) -> int:
     with stages(quiet=config.json) as begin:
         folder, _, result = _stages.fitted(config, begin)
     compare = command_line("compare", folder.path)
-    _folder.require_answer(folder, result, f"`{compare}` shows where")
+    _model.require_answer(folder, result, f"`{compare}` shows where")
     asks = f"Does the model leave more than noise, and where? {compare}"
     return tell(config, result, lambda: show(result, str(folder.path)), last=asks, run=folder)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from splatsoil import __version__
-from splatsoil.commands import _crew, _folder, _model, _stages
+from splatsoil.commands import _crew, _model, _stages
 from splatsoil.commands._options import ComputingOptions, check_seed, command_line
 from splatsoil.commands._output import print_parameters, stages, tell
 from splatsoil.envs.devices import resolve_device
@@ -40,10 +40,10 @@ def run(config: Config) -> int:
     if config.checks < 0:
         raise ParameterError(f"--checks: must be 0 or more, not {config.checks}")
     hush()
-    folder = _folder.opened(config)
+    folder = _model.opened(config)
     fit = folder.fit()
     compare = command_line("compare", folder.path)
-    _folder.require_answer(folder, fit, f"so there is nothing to sample; `{compare}` shows where")
+    _model.require_answer(folder, fit, f"so there is nothing to sample; `{compare}` shows where")
     setup = fit["setup"]
     wanted = ("cuda:0" if setup["device"] == "cuda" else "cpu") if config.device == "auto" else config.device
     device = resolve_device(wanted)

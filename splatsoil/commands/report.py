@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from splatsoil import report
-from splatsoil.commands import _folder
+from splatsoil.commands import _model
 from splatsoil.commands._options import RunOptions
 from splatsoil.commands._output import tell
 from splatsoil.run_files import read_fit
@@ -20,8 +20,8 @@ class Config(RunOptions):
 
 def run(config: Config) -> int:
     """Write the page; RunError when the folder has no finished fit."""
-    folder = _folder.opened(config)
-    _folder.note_other_sources(folder)
+    folder = _model.opened(config)
+    _model.note_other_sources(folder)
     path = report.write_report(folder.path)
-    _folder.require_answer(folder, read_fit(folder.path), f"report: {path}")
+    _model.require_answer(folder, read_fit(folder.path), f"report: {path}")
     return tell(config, {"report": str(path)}, last=f"report: {path}", run=folder)

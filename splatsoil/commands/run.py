@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from splatsoil import report
-from splatsoil.commands import _folder, _stages, add, compare, diagnose, fit
+from splatsoil.commands import _model, _stages, add, compare, diagnose, fit
 from splatsoil.commands._options import FitOptions, command_line
 from splatsoil.commands._output import Stage, stages, tell
 from splatsoil.errors import ParameterError, SplatsoilError
@@ -57,7 +57,7 @@ def run(config: Config) -> int:
         page = report.write_report(folder.path)
     if unknown:
         print(unknown, file=sys.stderr)
-    _folder.require_answer(folder, result, f"report: {page}")
+    _model.require_answer(folder, result, f"report: {page}")
     told: dict[str, Any] = {
         "report": str(page),
         "comparison": {key: comparison[key] for key in ("loss", "total", "noise")},

@@ -96,8 +96,10 @@ def replay(
     measurement, resolution = model.measurement, model.resolution
     bed, tool = measurement.bed.domain, measurement.tool
     start = model.particles(seed).astype(np.float32)
-    soil = (model.law, base_settings(measurement), [values])
-    solver = Solver(start[None], bed.lower, bed.upper, tool.mesh, resolution, *soil, model.device)
+    settings = base_settings(measurement)
+    solver = Solver(
+        start[None], bed.lower, bed.upper, tool.mesh, resolution, model.law, settings, [values], model.device
+    )
     wanted, force = set(frames), []
     last = max(wanted)
     for frame in range(last + 1):

@@ -250,13 +250,10 @@ def _plan_map(judged: Mapping[str, Any], placed: Sequence[int], table: np.ndarra
             rows = table[own]
             for column, channel in enumerate(channels):
                 mine = [i for i, site in enumerate(sites) if site[0] == channel]
-                part = rows[:, mine]
-                count = np.sum(np.isfinite(part), axis=0)
-                value = np.where(count > 0, np.nansum(part, axis=0) / np.maximum(count, 1), np.nan)
-                x, y = np.array([sites[i][1:3] for i in mine], dtype=np.float64).T
-                xs, ys = np.unique(x.round(6)), np.unique(y.round(6))
+                x, y = np.array([sites[i][1:3] for i in mine], dtype=np.float64).round(6).T
+                (xs, at_x), (ys, at_y) = (np.unique(places, return_inverse=True) for places in (x, y))
                 image = np.full((len(ys), len(xs)), np.nan)
-                image[np.searchsorted(ys, y.round(6)), np.searchsorted(xs, x.round(6))] = value
+                image[at_y, at_x] = np.ma.masked_invalid(rows[:, mine]).mean(axis=0).filled(np.nan)
                 place = grid[row][column]
                 shown = place.pcolormesh(xs, ys, image, cmap="RdBu_r", vmin=-limit, vmax=limit, rasterized=False)
                 failed = [c["region"] for c in failing if (c["stage"], c["channel"]) == (name, channel)]

@@ -157,10 +157,9 @@ def _failing(judged: Mapping[str, Any], comparison: Mapping[str, Any] | None, fo
 def _outlined(judged: Mapping[str, Any], comparison: Mapping[str, Any], folder: Path) -> list[dict[str, Any]]:
     """The blocks that fail most: each on the photograph nearest to where it fails most, with words on when it
     begins."""
-    out: list[dict[str, Any]] = []
-    for check in judged["checks"]:
-        if check["p"] >= text.SIGNIFICANT or check["channel"] not in comparison["cameras"] or len(out) == OUTLINED:
-            continue
+    out, seen = [], comparison["cameras"]
+    failed = [check for check in judged["checks"] if check["p"] < text.SIGNIFICANT and check["channel"] in seen]
+    for check in failed[:OUTLINED]:
         row, squares = text.worst_row(judged, check)
         mine = (entry for entry in comparison["frames"] if entry["camera"] == check["channel"])
         entry = min(mine, key=lambda entry: abs(entry["frame"] - judged["times"][row]))

@@ -130,8 +130,10 @@ def cut() -> Callable[..., Path]:
             for frame in data["frames"]:
                 target = folder / kind / frame["file_path"]
                 target.parent.mkdir(parents=True, exist_ok=True)
-                with Image.open(source / kind / frame["file_path"]) as image:
-                    image.reduce(shrunk).save(target, quality=95)
+                shutil.copy(source / kind / frame["file_path"], target)
+                if shrunk > 1:
+                    with Image.open(source / kind / frame["file_path"]) as image:
+                        image.reduce(shrunk).save(target, quality=95)
             (folder / kind / "transforms.json").write_text(json.dumps(data))
         return folder
 

@@ -11,7 +11,7 @@ import pytest
 from splatsoil.inverse.run_folder import RunFolder
 
 from splatsoil import cli
-from splatsoil.commands import _folder, _model, _stages
+from splatsoil.commands import _model, _stages
 from splatsoil.commands._options import FitOptions
 from splatsoil.files import JUDGING, code_digest, code_of, read_json, write_json
 from splatsoil.report.data import estimates
@@ -167,7 +167,7 @@ def test_what_a_current_diagnosis_says_is_not_asked_again(stages: Stages, tmp_pa
         assert stages.add("cohesion") == 130
         assert stages.done == [*(["diagnose cohesion"] if change else []), "fit"], change
     (tmp_path / "own.py").write_text(OWN)
-    assert _folder.current_diagnosis(run, file, (str(tmp_path / "own.py"),)) is None
+    assert _model.current_diagnosis(run, file, (str(tmp_path / "own.py"),)) is None
 
 
 def test_an_effect_that_cannot_be_simulated_is_refused(stages: Stages, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
 from pathlib import Path
@@ -47,12 +48,11 @@ def test_every_command_says_what_is_odd_and_refuses_what_shows_nothing(
     assert "EXIF rotation" in said and "002.jpg" in said
     assert ("work would begin here" in said) == (command != "check")
 
-    whole = (small_set / "views/images/002.jpg").read_bytes()
-    for says in ("one even grey", "damaged or truncated"):
-        if says == "one even grey":
-            Image.new("RGB", (320, 240)).save(small_set / "views/images/002.jpg")
-        else:
-            (small_set / "views/images/002.jpg").write_bytes(whole[: len(whole) // 2])
+    view, stream = small_set / "views/images/002.jpg", io.BytesIO()
+    Image.new("RGB", (320, 240)).save(stream, format="JPEG")
+    half = view.read_bytes()[: view.stat().st_size // 2]
+    for contents, says in ((stream.getvalue(), "one even grey"), (half, "damaged or truncated")):
+        view.write_bytes(contents)
         assert main([command, str(small_set)]) == 2
         out, err = capsys.readouterr()
         assert says in err and "002.jpg" in err and "work would begin" not in err and out == ""
@@ -75,11 +75,9 @@ def test_commands_on_a_run_say_it_too(
 def test_frames_without_noise_are_told_from_a_cameras(small_set: Path) -> None:
     """As a renderer makes them: all that is seen before the tool moves is the same to the last bit."""
     assert not without_noise(Measurement.load(small_set))
-    for camera in ("left", "right"):
-        for frame in json.loads((small_set / "video/transforms.json").read_text())["frames"]:
-            if frame["camera"] == camera and frame["frame"] == 0:
-                still = small_set / "video" / frame["file_path"]
-        for frame in json.loads((small_set / "video/transforms.json").read_text())["frames"]:
-            if frame["camera"] == camera and frame["frame"] < 0:
-                shutil.copy(still, small_set / "video" / frame["file_path"])
+    frames = json.loads((small_set / "video/transforms.json").read_text())["frames"]
+    stills = {frame["camera"]: small_set / "video" / frame["file_path"] for frame in frames if frame["frame"] == 0}
+    for frame in frames:
+        if frame["frame"] < 0:
+            shutil.copy(stills[frame["camera"]], small_set / "video" / frame["file_path"])
     assert without_noise(Measurement.load(small_set))

@@ -13,7 +13,7 @@ from typing import Any, cast
 import pytest
 from splatsoil.inverse.run_folder import RunFolder
 
-from splatsoil.commands import _folder, _model, _stages
+from splatsoil.commands import _model, _stages
 from splatsoil.commands._options import FitOptions
 from splatsoil.errors import RunError
 from splatsoil.files import write_json
@@ -112,9 +112,7 @@ def test_a_damaged_reconstruction_is_to_be_deleted(run: RunFolder) -> None:
 
 
 @pytest.mark.parametrize("command", ["compare", "diagnose", "add", "report"])
-@pytest.mark.parametrize(
-    "change", [{}, {"version": "0.0.1"}, {"code": "of yesterday"}], ids=["same", "version", "code"]
-)
+@pytest.mark.parametrize("change", [{}, {"version": "0.0.1"}, {"code": "of yesterday"}], ids=str)
 def test_a_fit_by_other_sources_is_said_to_be_one(
     run: RunFolder,
     refused: Refused,
@@ -123,9 +121,9 @@ def test_a_fit_by_other_sources_is_said_to_be_one(
     change: dict[str, str],
     fit_of: FitOf,
 ) -> None:
-    fit = fit_of()
+    fit = fit_of(["tilt", "exposure"], tilt_x=1.0)
     fit["setup"] |= change
-    run.write_fit("base", fit)
+    run.write_fit("tilt+exposure", fit)
 
     def goes_on(*_: object, **__: object) -> None:
         raise RunError("has gone on")
@@ -136,17 +134,5 @@ def test_a_fit_by_other_sources_is_said_to_be_one(
     assert last == "splatsoil: has gone on" and len(said) == bool(change)
     if change:
         was = f"was fitted by splatsoil {fit['setup']['version']}, code {fit['setup']['code']}, and this is "
-        assert was in said[0] and f"splatsoil fit '{run.path.parent}/my set' --parameters friction_angle" in said[0]
-        assert said[0].endswith(f"--preset tiny --run '{run.path}'")
-
-
-def test_a_model_with_effects_is_made_anew_with_them(
-    run: RunFolder, capsys: pytest.CaptureFixture[str], fit_of: FitOf
-) -> None:
-    fit = fit_of(["cohesion", "tilt"], tilt_x=1.0, cohesion=100.0)
-    fit["setup"]["code"] = "of yesterday"
-    run.write_fit("cohesion+tilt", fit)
-    _folder.note_other_sources(run)
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert said.strip().endswith(f"--with cohesion tilt --preset tiny --run '{run.path}'")
+        anew = f"splatsoil fit '{run.path.parent}/my set' --parameters friction_angle tilt_x --with exposure tilt"
+        assert was in said[0] and said[0].endswith(f"{anew} --preset tiny --run '{run.path}'")

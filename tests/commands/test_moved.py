@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from splatsoil.inverse.run_folder import RunFolder
 
-from splatsoil.commands import _folder, _model, _stages
+from splatsoil.commands import _model, _stages
 from splatsoil.commands._options import FitOptions
 from splatsoil.errors import RunError
 
@@ -73,7 +73,7 @@ def test_a_run_without_its_way_finds_a_set_beside_it(project: Path) -> None:
     del data["way"]
     (run / "run.json").write_text(json.dumps(data))
     shutil.move(project / "data" / "set", project / "runs" / "set")
-    assert _folder.measurement_of(RunFolder.open(run)).folder == project / "runs" / "set"
+    assert _model.measurement_of(RunFolder.open(run)).folder == project / "runs" / "set"
 
 
 @pytest.mark.usefixtures("reaches")
@@ -81,7 +81,7 @@ def test_a_fit_takes_the_new_place(project: Path, refused: Refused) -> None:
     run, new = project / "runs" / "run", project / "elsewhere" / "new"
     shutil.move(project / "data" / "set", new)
     assert "far enough" in refused("fit", new, "--preset", "tiny", "--run", run)
-    assert _folder.measurement_of(RunFolder.open(run)).folder == new
+    assert _model.measurement_of(RunFolder.open(run)).folder == new
 
 
 @pytest.mark.parametrize("told", [True, False])

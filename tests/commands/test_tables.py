@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from types import SimpleNamespace
+from typing import Any
 
 import pytest
+from splatsoil.inverse.run_folder import RunFolder
 
-from splatsoil.commands import _model, _stages, fit
+from splatsoil import cli
 from splatsoil.commands._output import stages
 from splatsoil.commands.compare import show_misfit
 from splatsoil.commands.diagnose import show
@@ -85,20 +85,13 @@ def test_a_comparison_says_what_fails_and_what_to_ask_next(
 
 
 def test_the_hint_after_a_fit_can_be_pasted(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    run: RunFolder, results: dict[str, Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    parameters = {"friction_angle": {"estimate": 35.62, "std": 0.81, "low": 34.0, "high": 37.1, "unit": "deg"}}
-    parameters["friction_angle"] |= {"at_bound": None}
-    result = {"name": "base", "loss": 0.5, "loss_std": 0.1, "best": {"loss": 0.5}, "parameters": parameters}
-    result |= {"notes": ["[red]one[/red]"], "evaluations": 3, "seconds": 83.0}
-    folder = SimpleNamespace(path="runs/of the year", description={"measurement": {"folder": "set"}})
-    monkeypatch.setattr(_stages, "prepare", lambda config: (None, folder))
-    for place, stage in ((_model, "reconstructed"), (_model, "model_on"), (_stages, "run_fit")):
-        monkeypatch.setattr(place, stage, lambda *_: result)
-    assert fit.run(fit.Config(Path("set"))) == 0
+    results["run_fit"]["notes"] = ["[red]one[/red]"]
+    assert cli.main(["fit", "set"]) == 0
     text = text_of(capsys)
-    assert "friction_angle 35.6 ± 0.8° 34 to 37.1° note [red]one[/red] loss 0.5 ± 0.1" in text
-    assert text.endswith("and where? splatsoil compare 'runs/of the year'")
+    assert "friction_angle 35.0 ± 0.8° 33.4 to 36.5° note [red]one[/red] loss 0.123 ± 0.01" in text
+    assert text.endswith(f"and where? splatsoil compare '{run.path}'")
 
 
 def progress(quiet: bool = False) -> None:
