@@ -213,7 +213,7 @@ def left(
         found = {n: sigmas(changes_of(c, noise, t), p, 2.0 * noise.chance) for n, (noise, t, p) in steps.items()}
         if c.kind == "observation":
             del found["soil"]
-        row = {"effect": c.name, "parameter": c.size, "unit": c.measure.unit}
+        row: dict[str, Any] = {"effect": c.name, "parameter": c.size, "unit": c.measure.unit}
         row |= {"value": sized(c.measure, STEP), "times": times_of(c.measure)}
         known = {name: max(*pair, 1e-9) for name, pair in found.items()}
         row["sigmas"], row["least"] = ({name: pair[k] for name, pair in found.items()} for k in (0, 1))
