@@ -23,6 +23,7 @@ from splatsoil.envs.devices import resolve_device
 from splatsoil import __version__
 from splatsoil.errors import ParameterError, RunError
 from splatsoil.files import code_digest, plain, read_json, write_bytes, write_json, write_text
+from splatsoil.parameters import Parameter
 from splatsoil.threads import cores
 
 if TYPE_CHECKING:
@@ -77,6 +78,12 @@ def tell(
     for name, figure in (figures or {}).items():
         write_figure(options.out / name, figure)
     print(json.dumps(plain(dict(result)), indent=1) if options.json else text)
+
+
+def sized(p: Parameter, times: float) -> float:
+    """A parameter that is so many times its smallest meaningful size away from off, within its bounds; upwards where it
+    has two sides."""
+    return float(np.clip((p.off or 0.0) + (p.sign or 1) * times * p.meaningful, p.lower, p.upper))
 
 
 def write_figure(file: Path, figure: Figure) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from splatsoil.benchmarks import _scenes
+from splatsoil.benchmarks._common import sized
 from splatsoil.benchmarks._scenes import ANGLES, BEDS, TOOLS, Scene
 
 from splatsoil.experiment.base import candidate_of
@@ -87,13 +88,12 @@ class Stream:
         most what the model takes."""
         candidate = candidate_of(library()[name])
         assert candidate is not None
-        p = candidate.measure
-        size = p.meaningful * float(np.exp(self.rng.uniform(*np.log(self.times))))
-        return float(np.clip((p.off or 0.0) + size * self.sign(p.sign), p.lower, p.upper))
+        times = float(np.exp(self.rng.uniform(*np.log(self.times))))
+        return sized(candidate.measure, times if candidate.measure.sign else times * self.side())
 
-    def sign(self, given: int = 0) -> float:
-        """One of a side, either where none is given."""
-        return float(given or self.rng.choice([-1.0, 1.0]))
+    def side(self) -> float:
+        """Either sign."""
+        return float(self.rng.choice([-1.0, 1.0]))
 
     def within(self, hidden: Hidden, least: float, most: float) -> Hidden:
         """The same with an angle between these, and within the range of all, so that no soil leaves it."""
@@ -150,7 +150,7 @@ def _buried_obstacle(stream: Stream, hidden: Hidden) -> Hidden:
     size, rng = min(stream.value("buried_obstacle"), STONE), stream.rng
     # beside the tool's way, or under it: it must not touch the tool
     beside = bool(rng.integers(2))
-    y = stream.sign() * (0.5 * hidden.scene.width + BESIDE + size) if beside else rng.uniform(-0.03, 0.03)
+    y = stream.side() * (0.5 * hidden.scene.width + BESIDE + size) if beside else rng.uniform(-0.03, 0.03)
     x = rng.uniform(0.32, 0.45)
     over = np.array([[x + s * size, MIDDLE[1] + y + t * size] for s in (-1, 0, 1) for t in (-1, 0, 1)])
     cover = COVER if beside else hidden.scene.depth + BESIDE
@@ -160,7 +160,7 @@ def _buried_obstacle(stream: Stream, hidden: Hidden) -> Hidden:
 
 
 def _friction_field(stream: Stream, hidden: Hidden) -> Hidden:
-    size = stream.rng.uniform(6.0, 10.0) * stream.sign()
+    size = stream.rng.uniform(6.0, 10.0) * stream.side()
     hidden = stream.within(hidden, ANGLES[0] + abs(size), ANGLES[1] - abs(size))
     return replace(hidden, size=size, soil={"across": size})
 

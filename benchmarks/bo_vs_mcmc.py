@@ -21,7 +21,7 @@ of guesses it may return an Answer: otherwise its best guess counts.
 from __future__ import annotations
 
 import argparse
-import importlib
+import pkgutil
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -209,16 +209,15 @@ def own_agent(name: str) -> Agent:
     Raises:
         ParameterError: there is none.
     """
-    module, _, function = name.partition(":")
     sys.path.insert(0, str(Path.cwd()))
     try:
-        found = getattr(importlib.import_module(module), function)
+        found = pkgutil.resolve_name(name)
     except (ImportError, AttributeError, ValueError) as error:
         raise ParameterError(f"agent {name}: give MODULE:FUNCTION ({error})") from error
     finally:
         sys.path.pop(0)
     if not callable(found):
-        raise ParameterError(f"agent {name}: is not a function")
+        raise ParameterError(f"agent {name}: give MODULE:FUNCTION (it is not a function)")
     return found
 
 

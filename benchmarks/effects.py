@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from splatsoil.benchmarks._common import FloatArray, markdown, parser_of, write_figure
+from splatsoil.benchmarks._common import FloatArray, markdown, parser_of, sized, write_figure
 from splatsoil.benchmarks._truth import Truth
 
 from splatsoil.errors import SimulationError
@@ -56,9 +56,7 @@ def _described(p: Parameter) -> str:
 
 def acting(effect: Effect) -> dict[str, float]:
     """The effect's size at five times its smallest meaningful one."""
-    p = effect.parameters[0]
-    off = float(p.off or 0.0)
-    return {p.name: float(np.clip(off + (p.sign or 1) * TIMES_MEANINGFUL * p.meaningful, p.lower, p.upper))}
+    return {effect.size: sized(effect.parameters[0], TIMES_MEANINGFUL)}
 
 
 def strong() -> list[str]:

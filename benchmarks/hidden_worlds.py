@@ -129,16 +129,16 @@ class Study:
             setups, seen = [h.scene.setup() for h in group], [h.observation() for h in group]
             rate = setups[0].frame_rate
             frames = sorted({f for o in seen for f in frames_around(setups[0].frames, o.time_offset * rate)})
-            try:
-                if self.solver == NEWTON:
+            if self.solver == NEWTON:
+                try:
                     runs = ploughed_by_newton(group, setups, frames, self.device)
-                else:
-                    ours = zip(group, setups, strict=True)
-                    runs = [ploughed_by_us(h, setup, frames, self.solver, self.device) for h, setup in ours]
-            except ValueError as error:  # a particle that flies off asks Newton for a grid of any size
-                self.say(f"{', '.join(h.name for h in group)}: the solver failed ({error})")
-                groups += [[hidden] for hidden in group if len(group) > 1]
-                continue
+                except ValueError as error:  # a particle that flies off asks for a grid of any size
+                    self.say(f"{', '.join(h.name for h in group)}: the other solver failed ({error})")
+                    groups += [[hidden] for hidden in group if len(group) > 1]
+                    continue
+            else:
+                ours = zip(group, setups, strict=True)
+                runs = [ploughed_by_us(h, setup, frames, self.solver, self.device) for h, setup in ours]
             for each in zip(group, setups, runs, strict=True):
                 self.photograph(*each)
                 yield each[0]

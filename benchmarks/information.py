@@ -27,6 +27,7 @@ from splatsoil.benchmarks._common import (
     keep_to_one_protocol,
     markdown,
     parser_of,
+    sized,
     sources,
     stamp,
     tell,
@@ -134,12 +135,9 @@ def sigmas(changes: FloatArray, precision: FloatArray, chance: FloatArray) -> tu
     return float(np.sqrt(max(square, 0.0))), float(np.sqrt(1.645 * spread))  # the normal distribution's 95 %
 
 
-def size_of(p: Parameter) -> tuple[float, float]:
-    """The value at which an effect's parameter is on, upwards where it has two sides, and its size over the smallest
-    meaningful one: `STEP`, or what its bounds leave."""
-    assert p.off is not None  # of a candidate's parameters
-    value = float(np.clip(p.off + (p.sign or 1) * STEP * p.meaningful, p.lower, p.upper))
-    return value, (value - p.off) / p.meaningful
+def times_of(p: Parameter) -> float:
+    """An effect's size over its smallest meaningful one: `STEP`, or what its bounds leave."""
+    return (sized(p, STEP) - (p.off or 0.0)) / p.meaningful
 
 
 def simulated(
@@ -170,15 +168,14 @@ def simulated(
     # What needs more frames of the simulation comes first, so that one serves all.
     for c in sorted(experiment.candidates if whole else effects, key=lambda c: c.name != "time_offset"):
         for p in c.parameters if c.kind == "observation" else ():
-            value, times = size_of(p)
-            drawn[p.name] = made([Run({**TRUTH, p.name: value}, (c.name,))])[1][0], times
+            drawn[p.name] = made([Run({**TRUTH, p.name: sized(p, STEP)}, (c.name,))])[1][0], times_of(p)
     reference = made([Run(TRUTH)])[1][0]
     drawings = {name: reference + (table - reference) / times for name, (table, times) in drawn.items()}
     for name in (*experiment.guesses, *experiment.redrawn) if whole else ():
         drawings[name] = made([Run(TRUTH, numerics=name)])[1][0]
     base = made([*(Run(TRUTH, seed=s) for s in range(seeds)), *spread(BASE, 101)])
     fine = made(spread(PAIRS if whole else 0, 201, FINE))
-    values = {c.name: {**TRUTH, c.size: size_of(c.measure)[0]} for c in effects if c.kind == "physics"}
+    values = {c.name: {**TRUTH, c.size: sized(c.measure, STEP)} for c in effects if c.kind == "physics"}
     found = {n: made([Run(v, (n,), s) for s in range(seeds)], SimulationError) for n, v in values.items()}
     return Tables(base, fine, {n: f for n, f in found.items() if len(f[0]) > 1}, drawings, reference)
 
@@ -187,7 +184,7 @@ def changes_of(candidate: Candidate, noise: Noise, tables: Tables) -> FloatArray
     """(k, p) what an effect changes, seed by seed; one row for an effect of observation, which has no chance."""
     if candidate.kind == "observation":
         off, on = noise.scores(np.stack([tables.reference, tables.drawn[candidate.size]]))
-        return np.asarray(size_of(candidate.measure)[1] * (on - off)[None])
+        return np.asarray(times_of(candidate.measure) * (on - off)[None])
     runs, found = tables.effects[candidate.name]
     return np.asarray(noise.scores(found) - noise.base[[run.seed for run in runs]])
 
@@ -216,8 +213,8 @@ def left(
         found = {n: sigmas(changes_of(c, noise, t), p, 2.0 * noise.chance) for n, (noise, t, p) in steps.items()}
         if c.kind == "observation":
             del found["soil"]
-        value, times = size_of(c.measure)
-        row = {"effect": c.name, "parameter": c.size, "value": value, "unit": c.measure.unit, "times": times}
+        row: dict[str, Any] = {"effect": c.name, "parameter": c.size, "unit": c.measure.unit}
+        row |= {"value": sized(c.measure, STEP), "times": times_of(c.measure)}
         known = {name: max(*pair, 1e-9) for name, pair in found.items()}
         row["sigmas"], row["least"] = ({name: pair[k] for name, pair in found.items()} for k in (0, 1))
         row["factors"] = {b: known[a] / known[b] for a, b in pairwise(known)}

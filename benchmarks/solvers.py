@@ -42,9 +42,9 @@ OFFSETS = (-6.0, -3.0, 3.0, 6.0)
 """Of the angles of our runs from the true one, degrees."""
 
 
-def world_of(scene: Scene) -> World:
-    """As Newton takes it."""
-    setup, spacing = scene.setup(), Numerics().spacing
+def world_of(scene: Scene, spacing: float) -> World:
+    """As Newton takes it, of particles so far apart, m."""
+    setup = scene.setup()
     x = fill(setup.surface, setup.bed, spacing, seed=scene.seed)
     return World(setup.experiment(), scene.angle, x, spacing)
 
@@ -65,7 +65,7 @@ def ploughed(cases: Mapping[str, Scene], out: Path, device: str, side_by_side: i
     missing = [name for name in cases if not (out / f"{name}.npz").is_file()]
     for group in (missing[k : k + side_by_side] for k in range(0, len(missing), side_by_side)):
         say(f"{', '.join(group)}: begun")
-        worlds = [world_of(cases[name]) for name in group]
+        worlds = [world_of(cases[name], numerics.spacing) for name in group]
         for name, world, run in zip(group, worlds, plough(worlds, numerics, FRAMES, device), strict=True):
             particles = {0: world.particles, **run.particles}
             made = replace(blank[name], particles=particles, volume=world.spacing**3, force=run.force)
@@ -174,7 +174,6 @@ def agreement(truth: Truth, found: Scan) -> dict[str, Any]:
         "best_angle": best,
         "heights_mm": 1e3 * in_patches(found.heights[at] - theirs),
         "heights_mm_at_best": 1e3 * left,
-        "volume": volume_range(found.begun, found.heights[at]),
         "cut_and_heaped_cm3": cut_and_heaped(found.begun, found.heights[at][-1]),
         "their_cut_and_heaped_cm3": cut_and_heaped(first, theirs[-1]),
         "stages": compare_stages(truth, found.force[at], truth.force),

@@ -1,4 +1,4 @@
-"""How fast is simulation, beside something else in the same run? For reconstruction and fits see `whole-path`.
+"""How fast? Simulation and drawing, each beside something else in the same run; for the whole path see `whole-path`.
 
 ``splatsoil benchmark speed --page docs/performance.md`` writes the CPU's section, with ``--device cuda:0`` the GPU's.
 Times of one thread are CPU times, which other programs disturb less than the clock's; all others are the clock's.
@@ -273,7 +273,7 @@ def rasteriser(task: Task, count: int = 20_000, size: int = 256) -> Section:
         rows = [Row("largest difference from the reference's picture", f"{off:.1e}", "≤ 1e-3", off <= 1e-3)]
         for what, way in (("forward", torch.no_grad()), ("forward + backward", backward)):
             mine, slow = timed(way(ours), 5 * task.repeats, task.device, warm=3), timed(way(slowly), 1, "cpu", warm=0)
-            slow = Times((slow.median * count / len(few),))
+            slow = slow.times(count / len(few))
             rows.append(Row(f"{count} Gaussians at {size}², {what}", mine.over(slow, "reference")))
     words = f"Gaussians of 3 px; colour, alpha and depth. The reference draws one of {SHARE}."
     return Section("Rasteriser", words, tuple(rows))

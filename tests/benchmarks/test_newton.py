@@ -11,16 +11,9 @@ import pytest
 from splatsoil.benchmarks._newton import Numerics, Run, World, _model, plough
 from splatsoil.benchmarks._scenes import Scene
 from splatsoil.benchmarks._truth import Truth
-
-from splatsoil.reconstruction import fill
+from splatsoil.benchmarks.solvers import world_of
 
 SPACING, COARSE = 0.02, Numerics(voxel=0.04, substeps=2, iterations=60)
-
-
-def soil(scene: Scene, spacing: float = SPACING) -> World:
-    """A world of a drawn scene."""
-    setup = scene.setup()
-    return World(setup.experiment(), scene.angle, fill(setup.surface, setup.bed, spacing, seed=1), spacing)
 
 
 def test_the_examples_were_made_with_converged_numerics(plow_dry: Path, plow_damp: Path) -> None:
@@ -33,7 +26,7 @@ def test_a_bed_weighs_what_its_soil_does() -> None:
     """Whatever the spacing: volume x density x gravity."""
     scene = Scene(seed=1, angle=35.0, bed="flat", density=1430.0)
     for spacing in (0.02, 0.013):
-        world = soil(scene, spacing=spacing)
+        world = world_of(scene, spacing)
         weight = len(world.particles) * world.weight.astype(np.float64)
         assert weight == pytest.approx([0.0, 0.0, -0.8 * 0.5 * 0.12 * 1430.0 * 9.81], rel=1e-4)
     tilted = replace(world, gravity=(1.0, 0.0, -2.0))
@@ -62,7 +55,7 @@ def test_cohesion_is_the_whole_strength_without_pressure_and_counted_once(plow_d
 def test_soil_falls_as_its_own_world_pulls() -> None:
     """A lump in the air, under 9.81 and under 4 m/s², and one without weight."""
     pytest.importorskip("newton")
-    world = soil(Scene(seed=1, angle=35.0))
+    world = world_of(Scene(seed=1, angle=35.0), SPACING)
     along = np.arange(4) * SPACING
     lump = np.stack(np.meshgrid(0.55 + along, 0.21 + along, 0.12 + along), axis=-1).reshape(-1, 3)
     pulls = (9.81, 4.0, 0.0)
@@ -89,8 +82,8 @@ def ploughed() -> tuple[Truth, list[Run]]:
 def test_a_world_hangs_on_no_other_beside_it() -> None:
     """Of another bed, tool, motion and density."""
     pytest.importorskip("newton")
-    level = soil(Scene(seed=1, angle=35.0, bed="flat", tool="drum", rolling=1.2, depth=0.05))
-    slope = soil(Scene(seed=2, angle=26.0, bed="sloping", slope=6.0, density=1450.0, width=0.16, tilt=0.0))
+    level = world_of(Scene(seed=1, angle=35.0, bed="flat", tool="drum", rolling=1.2, depth=0.05), SPACING)
+    slope = world_of(Scene(seed=2, angle=26.0, bed="sloping", slope=6.0, density=1450.0, width=0.16, tilt=0.0), SPACING)
     beside, alone = plough([level, slope], COARSE, (30,)), plough([slope], COARSE, (30,))[0]
     moved = np.linalg.norm(alone.particles[30] - slope.particles, axis=1)
     apart = np.linalg.norm(beside[1].particles[30] - alone.particles[30], axis=1)
