@@ -106,7 +106,7 @@ def sentences(diagnosis: Diagnosis, candidates: Mapping[str, Candidate]) -> list
     if len(diagnosis.held_out) > 1:
         before, after = diagnosis.held_out[:2]
         out.append(
-            f"On {diagnosis.aside}, which were set aside, the error is {before.error:.2g} without and "
+            f"On what was set aside ({diagnosis.aside}), the error is {before.error:.2g} without and "
             f"{after.error:.2g} with {after.model.replace('_', ' ')}; the noise level is {after.noise:.2g}."
         )
     worst = next((c for c in diagnosis.checks if c.p < SIGNIFICANT), None)
