@@ -9,24 +9,19 @@ from __future__ import annotations
 
 import json
 import math
-import pickle
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import BrokenExecutor, Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from datetime import UTC, datetime
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from splatsoil.envs.problem import Evaluation, Job, Problem
+from splatsoil.envs.problem import Job, Problem
 from splatsoil.envs.together import evaluate_together
 
 from splatsoil.errors import RunError
 from splatsoil.files import digest, plain
-
-from .executors import Serial
 
 #: Marks the file as ours (SQLite's ``application_id``: ASCII "SoIL") and its layout (``user_version``).
 APPLICATION_ID = 0x536F494C
@@ -193,66 +188,41 @@ class EvaluationStore:
 
 
 def evaluate(
-    problem: Problem,
-    jobs: Sequence[Job],
-    store: EvaluationStore,
-    model: Mapping[str, Any],
-    *,
-    together: int = 1,
-    pool: Executor | None = None,
+    problem: Problem, jobs: Sequence[Job], store: EvaluationStore, model: Mapping[str, Any], *, together: int = 1
 ) -> Iterator[EvaluationRecord]:
     """Evaluations of all jobs in their order: stored ones, and new ones, each of which is stored before it is told.
 
     Args:
-        problem: simulate-and-compare; begun, and picklable unless it works in this process.
+        problem: simulate-and-compare; begun.
         jobs: parameters and seeds, no two alike.
         store: open for writing.
         model: what decides a single evaluation beside its parameters and seed.
         together: how many are simulated as one batch.
-        pool: where new ones are simulated; in this process, when they are asked for, by default.
 
     Raises:
-        RunError: the database can't be written, or a worker died.
+        RunError: the database can't be written.
     """
-    pool = pool or Serial()
     keys = [digest({**model, "values": dict(parameters), "seed": seed}) for parameters, seed in jobs]
     known = {key: found for key in keys if (found := store.find(key)) is not None}
     fresh = [job for job, key in zip(jobs, keys, strict=True) if key not in known]
-    parts = [fresh[k : k + together] for k in range(0, len(fresh), together)]
-    work: Any = problem if isinstance(pool, Serial) else pickle.dumps(problem)
-    new = (made for part in pool.map(_evaluated, [work] * len(parts), parts) for made in part)
-    try:
-        for key, (parameters, seed) in zip(keys, jobs, strict=True):
-            if key not in known:
-                made = next(new)
-                known[key] = EvaluationRecord(
-                    key=key,
-                    model=model,
-                    parameters=dict(parameters),
-                    seed=seed,
-                    loss=made.loss,
-                    message=made.message,
-                    blocks=made.blocks.tolist(),
-                    extras=dict(made.extras),
-                    seconds=made.seconds,
-                )
-                store.append(known[key])
-            yield known[key]
-    except BrokenExecutor as error:
-        raise RunError("a worker died; is there enough memory? What is stored is kept: run it again") from error
-
-
-@lru_cache(maxsize=1)
-def _unpacked(packed: bytes) -> Problem:
-    """A problem on a worker, made once however many jobs come with it."""
-    problem: Problem = pickle.loads(packed)
-    return problem
-
-
-def _evaluated(problem: Problem | bytes, jobs: Sequence[Job]) -> list[Evaluation]:
-    """A worker's work. Pictures are for showing; they would be the larger part of what travels back."""
-    here = _unpacked(problem) if isinstance(problem, bytes) else problem
-    return [replace(e, observed=None, predicted=None) for e in evaluate_together([here] * len(jobs), jobs)]
+    parts = (fresh[k : k + together] for k in range(0, len(fresh), together))
+    new = (made for part in parts for made in evaluate_together([problem] * len(part), part))
+    for key, (parameters, seed) in zip(keys, jobs, strict=True):
+        if key not in known:
+            made = next(new)
+            known[key] = EvaluationRecord(
+                key=key,
+                model=model,
+                parameters=dict(parameters),
+                seed=seed,
+                loss=made.loss,
+                message=made.message,
+                blocks=made.blocks.tolist(),
+                extras=dict(made.extras),
+                seconds=made.seconds,
+            )
+            store.append(known[key])
+        yield known[key]
 
 
 @contextmanager

@@ -11,7 +11,6 @@ import signal
 import sqlite3
 import time
 from collections.abc import Callable
-from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -19,7 +18,6 @@ from typing import Any
 
 import pytest
 from splatsoil.inverse.evaluations import EvaluationRecord, EvaluationStore, evaluate, writer_lock
-from splatsoil.inverse.executors import executor
 
 from splatsoil.errors import RunError
 
@@ -133,11 +131,11 @@ def test_a_full_disk_is_said_and_costs_nothing_that_is_stored(tmp_path: Path) ->
         store.append(replace(RECORD, key="last"))
 
 
-def run(problem: Any, count: int, file: Path, pool: Executor | None = None, whole: int = 12) -> list[tuple]:
+def run(problem: Any, count: int, file: Path, whole: int = 12) -> list[tuple]:
     """The first evaluations of a campaign, without their times."""
     jobs = [({"friction_angle": 20.0 + 30.0 * k / whole}, k) for k in range(whole)][:count]
     with EvaluationStore(file) as store:
-        records = list(evaluate(problem, jobs, store, MODEL, together=2, pool=pool))
+        records = list(evaluate(problem, jobs, store, MODEL, together=2))
         assert [(r.parameters, r.seed) for r in records] == jobs
         assert sorted(r.key for r in store.records()) == sorted(r.key for r in records)
     return [(r.key, r.loss, r.blocks, r.message) for r in records]
@@ -175,34 +173,3 @@ def test_killed_at_random_moments(analytic: ModuleType, tmp_path: Path) -> None:
     records = run(problem, 40, file, whole=40)
     assert problem.calls == 40 - kept
     assert records == run(analytic.AnalyticProblem(), 40, tmp_path / "whole.db", whole=40)
-
-
-class Dying:
-    """A problem that ends its worker."""
-
-    def evaluate(self, parameters: Any, seed: int) -> None:
-        os.kill(os.getpid(), signal.SIGKILL)
-
-
-def test_a_worker_that_dies_is_said(tmp_path: Path) -> None:
-    problem: Any = Dying()
-    with executor("processes:1") as pool, EvaluationStore(tmp_path / "e.db") as store:
-        made = evaluate(problem, [({}, 0)], store, MODEL, pool=pool)
-        with pytest.raises(RunError, match="a worker died"):
-            next(made)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("where", ["processes:2", "dask"])
-def test_other_processes_give_the_same(tmp_path: Path, where: str) -> None:
-    from splatsoil.envs.synthetic import SyntheticProblem
-
-    problem = SyntheticProblem()
-    problem.begin(3)
-    here = run(problem, 4, tmp_path / "here.db")
-    if where == "dask":
-        distributed = pytest.importorskip("distributed")
-        cluster = distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None)
-        where = f"dask:{cluster.scheduler_address}"
-    with executor(where) as pool:
-        assert run(problem, 4, tmp_path / "there.db", pool) == here

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
-from splatsoil.inverse.executors import THREADS, executor, kill, processes
+from splatsoil.inverse.executors import THREADS, kill, processes
 
 from splatsoil.errors import ParameterError
 
@@ -71,21 +71,14 @@ def test_workers_share_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in THREADS:
         monkeypatch.delenv(name, raising=False)
     workers = max(2, os.cpu_count() or 1)
-    with executor(f"processes:{workers}") as pool:
+    with processes(workers) as pool:
         assert pool.submit(threads_of_worker).result() == 1
         assert not set(THREADS) & os.environ.keys(), "this process has all cores, whatever it loads later"
     monkeypatch.setenv(THREADS[0], "2")
-    with executor("processes:1") as pool:
+    with processes(1) as pool:
         assert pool.submit(threads_of_worker).result() == min(2, os.cpu_count() or 1), "what the user has set stays"
 
 
-@pytest.mark.parametrize("name", ["", "threads", "processes:", "processes:two", "dask:", "serial:1", "processes:0"])
-def test_executors_that_do_not_exist(name: str) -> None:
-    with pytest.raises(ParameterError, match=r"executor|at least one"), executor(name):
-        pass
-
-
-def test_a_scheduler_that_does_not_answer() -> None:
-    pytest.importorskip("distributed")
-    with pytest.raises(ParameterError, match="no Dask scheduler"), executor("dask:nowhere"):
-        pass
+def test_no_worker_is_refused() -> None:
+    with pytest.raises(ParameterError, match="at least one"):
+        processes(0)
