@@ -35,7 +35,7 @@ class Likeness:
         """Which of the last ``fixed`` pictures are less like the scene than any other: a rank test, by which one of
         v + 1 is said to differ that does not."""
         others = self.upright[:-fixed][np.isfinite(self.upright[:-fixed])]
-        return self.upright[-fixed:] < np.min(others, initial=1.0) if len(others) else np.zeros(fixed, dtype=bool)
+        return self.upright[-fixed:] < others.min() if len(others) else np.zeros(fixed, dtype=bool)
 
     def unrelated(self, fixed: int) -> Flags:
         """Which of the last ``fixed`` pictures are no more like the scene than any picture is upside down.

@@ -165,37 +165,36 @@ def test_views_of_another_world_than_the_video_are_refused(measurement, change):
         reconstruct(moved(measurement, **change), preset="tiny")
 
 
-def test_likeness_is_of_the_soil_and_whatever_the_exposure(measurement, result):
+def alike(measurement, result, change=lambda images: images, bed=None):
+    """How like the reconstruction the first four views are, their pictures changed."""
     views = load_views(measurement.views[:4], 160)
+    shown = replace(views, images=change(views.images))
     level = float(np.median(result.surface.height))
+    return likeness(result.gaussians, shown, views.valid, bed or measurement.bed, level, result.background)
 
-    def alike(images):
-        return likeness(
-            result.gaussians, replace(views, images=images), views.valid, measurement.bed, level, result.background
-        )
 
-    plain = alike(views.images)
+def test_likeness_is_of_the_soil_and_whatever_the_exposure(measurement, result):
+    plain = alike(measurement, result)
     assert plain.upright.min() > 0.8 > 0.4 > np.abs(plain.upside_down).max()
-    np.testing.assert_allclose(alike(0.2 + 0.5 * views.images).upright, plain.upright, atol=1e-4)
-    assert np.isnan(alike(torch.full_like(views.images, 0.5)).upright).all()
+    dimmed = alike(measurement, result, lambda images: 0.2 + 0.5 * images)
+    np.testing.assert_allclose(dimmed.upright, plain.upright, atol=1e-4)
+    grey = alike(measurement, result, lambda images: torch.full_like(images, 0.5))
+    assert np.isnan(grey.upright).all()
     away = replace(measurement.bed, lower=measurement.bed.lower + 50.0, upper=measurement.bed.upper + 50.0)
-    none = likeness(result.gaussians, views, views.valid, away, level, result.background)
+    none = alike(measurement, result, bed=away)
     assert np.isnan(none.upright).all() and not none.unlike(2).any() and not none.unrelated(2).any()
 
 
 def test_a_wall_over_a_tenth_of_the_soil_leaves_a_picture_alike_and_a_shift_does_not(measurement, result):
-    views = load_views(measurement.views[:4], 160)
-    level = float(np.median(result.surface.height))
+    def walled(images):
+        images = images.clone()
+        images[:, -images.shape[1] // 8 :] = 1.0
+        return images
 
-    def alike(images):
-        return likeness(
-            result.gaussians, replace(views, images=images), views.valid, measurement.bed, level, result.background
-        ).upright
-
-    walled, shifted = views.images.clone(), torch.roll(views.images, 8, dims=2)
-    walled[:, -walled.shape[1] // 8 :] = 1.0
-    np.testing.assert_allclose(alike(walled), alike(views.images), atol=0.1)
-    assert alike(shifted).max() < alike(walled).min()
+    plain, hidden = alike(measurement, result).upright, alike(measurement, result, walled).upright
+    shifted = alike(measurement, result, lambda images: torch.roll(images, 8, dims=2)).upright
+    np.testing.assert_allclose(hidden, plain, atol=0.1)
+    assert shifted.max() < hidden.min()
 
 
 def test_less_alike_than_any_other_and_no_more_than_chance():
