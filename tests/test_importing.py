@@ -95,16 +95,17 @@ def robots_record(folder: Path, true: Measurement) -> None:
     (folder / "robot.csv").write_text("\n".join(rows) + "\n")
 
 
-def film(file: Path, true: Measurement, camera: str) -> None:
-    """The camera's frames at an even rate: pre-roll, then each tenth frame."""
+def film(file: Path, true: Measurement, camera: str, painted: Callable[[Frame, int], np.ndarray] | None = None) -> None:
+    """The camera's frames at an even rate, painted on: pre-roll, then each tenth frame."""
     ffmpeg = pytest.importorskip("imageio_ffmpeg")
     numbers = [*range(-BEFORE, 0), *(n for n in true.frames if n % 10 == 0)]
     frames = [true.video_frame(camera, n) for n in numbers]
     size = (frames[0].camera.width, frames[0].camera.height)
     writer = ffmpeg.write_frames(str(file), size, fps=RATE, quality=9, macro_block_size=2)
     writer.send(None)
-    for frame in frames:
-        writer.send(np.ascontiguousarray(np.rint(255.0 * frame.image()).astype(np.uint8)))
+    for number, frame in zip(numbers, frames, strict=True):
+        image = frame.image() if painted is None else painted(frame, number)
+        writer.send(np.ascontiguousarray(np.rint(255.0 * image).astype(np.uint8)))
     writer.close()
 
 
@@ -352,18 +353,23 @@ def test_photographs_that_cannot_be_posed(tmp_path: Path, capsys: pytest.Capture
         assert not (tmp_path / "out").exists()
 
 
-CODES = (0xD5D628584, 0xD97F18B49)
-"""The first two of the family 36h11: 36 bits, row after row."""
+CODES = (0xD5D628584, 0xD97F18B49, 0xDD280910E, 0xE479E9C98)
+"""The first of the family 36h11: 36 bits, row after row."""
 
 
-def photographs_of_tags(folder: Path, edges: tuple[float, ...], unit: float) -> None:
-    """A nerfstudio set of level, grey ground with a tag each 0.3 m along x, in a world of another unit (m)."""
-    (folder / "images").mkdir(parents=True)
+def tag_squares() -> list[np.ndarray]:
+    """(8, 8) black 0 and white 1, the white border with them, row after row from the top left."""
     squares = []
     for code in CODES:
         square = np.zeros((8, 8))
         square[1:7, 1:7] = [[code >> (35 - 6 * i - j) & 1 for j in range(6)] for i in range(6)]
         squares.append(square)
+    return squares
+
+
+def photographs_of_tags(folder: Path, edges: tuple[float, ...], unit: float) -> None:
+    """A nerfstudio set of level, grey ground with a tag each 0.3 m along x, in a world of another unit (m)."""
+    (folder / "images").mkdir(parents=True)
     frames = []
     for k, (x, y) in enumerate([(-0.3, -0.5), (0.2, -0.6), (0.6, -0.4), (0.1, 0.6)]):
         eye, look = np.array([x, y, 0.6]), np.array([0.15, 0.0, 0.0])
@@ -377,7 +383,7 @@ def photographs_of_tags(folder: Path, edges: tuple[float, ...], unit: float) -> 
         origins, ways = fine.rays(np.stack([u, v], axis=-1).reshape(-1, 2))
         ground = origins - ways * (origins[:, 2:] / ways[:, 2:])
         shade = np.full(len(ground), 0.8)
-        for number, (edge, square) in enumerate(zip(edges, squares, strict=True)):
+        for number, (edge, square) in enumerate(zip(edges, tag_squares(), strict=False)):
             column = np.floor(8.0 * ((ground[:, 0] - 0.3 * number) / edge + 0.5)).astype(int)
             row = np.floor(8.0 * (0.5 - ground[:, 1] / edge)).astype(int)
             inside = (column >= 0) & (column < 8) & (row >= 0) & (row < 8)
@@ -400,6 +406,94 @@ def test_scale_from_tags(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert cli.main(["import", str(tmp_path / "unlike"), str(tmp_path / "other"), "--tags", "0.1"]) == 2
     assert "edges of the tags 0, 1 differ by" in capsys.readouterr().err
     assert not (tmp_path / "other").exists()
+
+
+CORNERS = ("lower left", "lower right", "upper right", "upper left")
+
+
+def tags_on_the_tool() -> dict[int, np.ndarray]:
+    """Corners (4, 3) in the tool's frame, m, from the lower left one on, as a tag is printed: two tags a camera, on two
+    plates above the tool."""
+    out = {}
+    for plate, way in enumerate(([-0.5, -0.7, 0.45], [0.62, 0.62, 0.4])):
+        normal = np.array(way) / np.linalg.norm(way)
+        right = np.cross([0.0, 0.0, 1.0], normal)
+        right /= np.linalg.norm(right)
+        up = np.cross(normal, right)
+        for k in range(2):
+            middle = 0.05 * normal + (0.14 * k - 0.07) * right + [0.0, 0.0, 0.04]
+            signs = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+            out[2 * plate + k] = middle + 0.05 * signs @ np.stack([right, up])
+    return out
+
+
+def tagged(frame: Frame, pose: np.ndarray) -> np.ndarray:
+    """The picture (h, w, 3) with the tags in front of all else, by rays."""
+    fine = frame.camera.scaled(3)
+    v, u = np.mgrid[: fine.height, : fine.width] + 0.5
+    origins, ways = fine.rays(np.stack([u, v], axis=-1).reshape(-1, 2))
+    image = frame.image().repeat(3, axis=0).repeat(3, axis=1).reshape(-1, 3)
+    for square, corners in zip(tag_squares(), tags_on_the_tool().values(), strict=True):
+        first, right, _, up = corners @ pose[:3, :3].T + pose[:3, 3]
+        axes = np.stack([right - first, up - first], axis=1)
+        normal = np.cross(*axes.T)
+        if normal @ (frame.camera.position - first) <= 0.0:
+            continue
+        hit = origins + ways * (((first - origins) @ normal) / (ways @ normal))[:, None]
+        x, y = np.linalg.lstsq(axes, (hit - first).T, rcond=None)[0]
+        column, row = np.floor(8.0 * x).astype(int), np.floor(8.0 * (1.0 - y)).astype(int)
+        paper = (np.minimum(column, row) >= -1) & (np.maximum(column, row) <= 8)
+        inside = (np.minimum(column, row) >= 0) & (np.maximum(column, row) < 8)
+        image[paper] = 0.9
+        image[inside] = 0.05 + 0.85 * square[row[inside], column[inside]][:, None]
+    return image.reshape(frame.camera.height, 3, frame.camera.width, 3, 3).mean(axis=(1, 3))
+
+
+def test_motion_from_tags_on_the_tool(plow: Recorded, importing: Callable[..., dict[str, Any]], tmp_path: Path) -> None:
+    pytest.importorskip("pupil_apriltags")
+    motion = plow.true.tool.motion
+    rows = ["tag,corner,x,y,z"]
+    for tag, corners in tags_on_the_tool().items():
+        for name, place in zip(CORNERS, corners, strict=True):
+            rows.append(f"{tag},{name},{','.join(map(repr, place.tolist()))}")
+    (plow.folder / "tags.csv").write_text("\n".join(rows) + "\n")
+    for camera in plow.true.cameras:
+        paint = lambda frame, number: tagged(frame, motion.matrix(float(motion.times[max(number, 0)])))  # noqa: E731
+        film(plow.folder / f"{camera}-tags.mp4", plow.true, camera, paint)
+    words = ["--tool", "tool.stl", "mm", "--experiment", "rest.json", "--motion-tags", "tags.csv"]
+    words += ["--known", "known.csv", "--points", "marks.csv"]
+    words += ["--video", *(f"{name}-tags.mp4={name}.jpg" for name in plow.true.cameras)]
+    said = importing(plow, *words)
+    assert said["code"] == 0 and said["missing"] == [] and said["clock_offset"] is None
+    assert said["tool_tags"]["frames"] == BEFORE + 21 - 1 and said["tool_tags"]["error_px"] < 0.5
+    made = Measurement.load(tmp_path / "made").tool.motion
+    zero = len(Measurement.load(tmp_path / "made").pre_roll) // 2 - BEFORE
+    assert zero in (-1, 0), "the last frame before the tool moves is number 0"
+    for frame in made.frames:
+        turn, place = made.pose(frame / RATE)
+        wanted_turn, wanted = motion.pose((frame + zero) / RATE)
+        assert np.linalg.norm(place - wanted) < 0.002, frame
+        assert np.degrees(Rotation.from_matrix(turn.T @ wanted_turn).magnitude()) < 0.5, frame
+
+
+@pytest.mark.parametrize(
+    ("rows", "error"),
+    [
+        (["1,lower left,0,0,0"], "each tag needs one row for each of lower left, lower right, upper right, upper left"),
+        (["one,lower left,0,0,0"], "'one' is no number of a tag"),
+        ([f"7,{c},{x},{y},0" for c, x, y in zip(CORNERS, (0, 2, 2, 0), (0, 0, 1, 1), strict=True)], "it is a square"),
+        ([f"7,{c},{x},{y},0" for c, x, y in zip(CORNERS, (0, 1, 1, 0), (0, 0, 1, 1), strict=True)], "in 0 frames"),
+    ],
+)
+def test_faulty_tags_of_the_tool(
+    rows: list[str], error: str, plow: Recorded, importing: Callable[..., dict[str, Any]]
+) -> None:
+    pytest.importorskip("pupil_apriltags")
+    (plow.folder / "faulty.csv").write_text("\n".join(["tag,corner,x,y,z", *rows]) + "\n")
+    words = ["--scale", str(plow.unit), "--up", "0", "0", "1", "--motion-tags", "faulty.csv"]
+    assert "needs --video" in importing(plow, *words)["error"]
+    said = importing(plow, *words, "--video", *(f"{name}.mp4={name}.jpg" for name in plow.true.cameras))
+    assert said["code"] == 2 and error in said["error"]
 
 
 def test_photographs_without_tags(plow: Recorded, importing: Callable[..., dict[str, Any]]) -> None:

@@ -38,6 +38,7 @@ def run(config: Config) -> int:
 
 def _as_json(config: Config, made: Imported) -> dict[str, Any]:
     clock = None if made.clock is None else {"seconds": made.clock.seconds, "by_camera": made.clock.by_camera}
+    tags = None if made.tags is None else {"frames": len(made.tags.motion.frames), "error_px": made.tags.error}
     return plain(
         {
             "set": config.out,
@@ -49,6 +50,7 @@ def _as_json(config: Config, made: Imported) -> dict[str, Any]:
             "known_points_m": made.points,
             "video": made.frames,
             "clock_offset": clock,
+            "tool_tags": tags,
             "missing": made.missing,
         }
     )
@@ -64,6 +66,8 @@ def _show(config: Config, made: Imported) -> None:
     if made.clock is not None:
         alone = ", ".join(f"{seconds:.4f}" for seconds in made.clock.by_camera)
         print(f"clock offset {made.clock.seconds:.4f} s (by camera: {alone})")
+    if made.tags is not None:
+        print(f"the tool's tags: {len(made.tags.motion.frames)} frames, {made.tags.error:.2g} px off")
     if made.missing:
         print(f"{config.out} is no whole set yet: it lacks {', '.join(made.missing)} and experiment.json")
     else:

@@ -24,7 +24,7 @@ from splatsoil.importing.similarity import (
     read_points,
 )
 from splatsoil.importing.source import Source, find_image, read_source
-from splatsoil.importing.tags import tag_scale
+from splatsoil.importing.tags import TagMotion, read_tool_tags, tag_motion, tag_scale
 from splatsoil.importing.video import Video
 from splatsoil.measurement.camera import Camera
 from splatsoil.measurement.fields import Fields
@@ -54,6 +54,7 @@ class Imported:
         points: the same of the known points, m; None without any.
         frames: of the video, by camera.
         clock: of the video, where it was told from the pictures.
+        tags: the tool's motion by its tags, where that is the one.
         missing: parts that a set needs and this lacks.
     """
 
@@ -64,6 +65,7 @@ class Imported:
     points: float | None
     frames: dict[str, int]
     clock: ClockOffset | None
+    tags: TagMotion | None
     missing: tuple[str, ...]
 
     @property
@@ -106,6 +108,15 @@ def _filled(root: Path, options: ImportOptions, report: Report) -> Imported:
     mesh = None if options.tool is None else _mesh(*options.tool)
     to_world, to_flange = read_rigid(options.robot_to_world), read_rigid(options.mesh_to_flange)
     motion = None if options.motion is None else read_motion(*options.motion, to_world, to_flange)
+    tags = None
+    if options.motion_tags is not None:
+        if motion is not None or not videos:
+            raise MeasurementError(f"--motion-tags: {'leave --motion out' if videos else 'needs --video'}")
+        report("finding the tool's tags", 0.1)
+        corners = read_tool_tags(options.motion_tags)
+        tags = tag_motion({name: (video, cameras[name]) for name, video in videos.items()}, corners)
+        # What follows is on the clock of the force, as a robot's motion is.
+        motion = replace(tags.motion, times=tags.motion.times + (options.clock_offset or 0.0))
     experiment = {} if options.experiment is None else dict(Fields.read(options.experiment).data)
     rate = _rate(videos, experiment, motion)
 
@@ -144,7 +155,7 @@ def _filled(root: Path, options: ImportOptions, report: Report) -> Imported:
     report("checking", 0.9)
     missing = _finish(root, experiment, rate, options.out)
     frames = {name: len(numbers) for name, numbers in wanted.items()}
-    return Imported(found.kind, len(views), similarity, marks, left, frames, clock, missing)
+    return Imported(found.kind, len(views), similarity, marks, left, frames, clock, tags, missing)
 
 
 def _similarity(source: Source, options: ImportOptions) -> tuple[FloatArray, float, float | None]:
