@@ -19,7 +19,7 @@ from splatsoil.envs.synthetic import SyntheticProblem
 from splatsoil.envs.synthetic_world import World
 from splatsoil.inverse.bayesopt import sobol
 from splatsoil.inverse.criticism.design import Prior, Run
-from splatsoil.inverse.criticism.diagnosis import BASE
+from splatsoil.inverse.criticism.diagnosis import BASE_RUNS
 from splatsoil.inverse.criticism.noise import Tables, noise_of
 from splatsoil.inverse.evaluations import EvaluationRecord, EvaluationStore, digest, evaluate, writer_lock
 from splatsoil.inverse.posterior import Density
@@ -31,7 +31,7 @@ from splatsoil.files import FORWARD, code_digest, own_files
 from splatsoil.mpm import PRESETS
 from splatsoil.parameters import ParameterSpace
 
-FEWEST = BASE // 2
+FEWEST = BASE_RUNS // 2
 """Simulations that a comparison needs."""
 WORLD = 1
 """Seed of the synthetic set's own truth, which cancels in all that is made from its simulations."""
@@ -82,15 +82,15 @@ def density_of(
         slopes={},
         parameters=tuple(space),
         candidates=(),
-        chance_root=np.zeros((b, b)),
+        scatter_root=np.zeros((b, b)),
         sensor=nothing + sensor,
         observed=observed[None],
     )
     prior = Prior(space)
     made = [Run(values) for values in prior.values(points)], features[:, None]
-    tables = Tables(base=made, fine=([], np.zeros((0, 1, b))), effects={}, drawn={}, reference=features[:1])
+    tables = Tables(base=made, fine=([], np.zeros((0, 1, b))), effects={}, variants={}, reference=features[:1])
     noise = noise_of(experiment, prior, tables, ())
-    return Density.of(replace(noise, numerics=np.zeros_like(noise.numerics)), prior, seed)
+    return Density.of(replace(noise, discretisation=np.zeros_like(noise.discretisation)), prior, seed)
 
 
 def world_parser(module_doc: str | None, out: str) -> argparse.ArgumentParser:

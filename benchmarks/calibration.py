@@ -79,7 +79,7 @@ def entry(data: Data, train: Indices, index: int, sensor: float, rng: np.random.
     features, space = -data.residuals, data.space
     observed = features[index] + sensor * rng.standard_normal(features.shape[1])
     density = density_of(space, data.points[train], features[train], observed, sensor)
-    evidence = density.comparison.judge()
+    evidence = density.comparison.evidence()
     marginals = [evidence.marginal(p.name) for p in space]
     weights = marginals[0].weights
     chosen = rng.choice(len(weights), DRAWS, p=weights / weights.sum())

@@ -174,7 +174,7 @@ def by_features(angles: FloatArray, blocks: FloatArray, sensor: float, seed: int
         return None
     points, residuals = SPACE.to_unit(angles[:, None]), blocks[:, seen]
     density = density_of(SPACE, points, -residuals, np.zeros(residuals.shape[1]), sensor, seed)
-    marginal = density.comparison.judge().marginal(SPACE.names[0])
+    marginal = density.comparison.evidence().marginal(SPACE.names[0])
     return {"estimate": marginal.mean, "low": marginal.quantile(0.05), "high": marginal.quantile(0.95)}
 
 

@@ -1,7 +1,7 @@
-"""Bayesian optimisation with BoTorch: a Gaussian process over the loss, and log expected improvement.
+"""Bayesian optimisation with BoTorch: a Gaussian process of the loss, and log expected improvement.
 
-The optimiser asks and is told. What it asks next depends only on the seed and on what it was told, so that a run told
-the evaluations of an interrupted one goes on as that one would have.
+The interface is ask and tell. Proposals depend only on the seed and the evaluations, so that a run which repeats the
+evaluations of an interrupted one continues it exactly.
 """
 
 from __future__ import annotations
@@ -25,26 +25,26 @@ if TYPE_CHECKING:
 FloatArray = npt.NDArray[np.float64]
 Acquisition = Literal["noisy", "best"]
 
-#: Space-filling evaluations before the first acquisition: at least, and for each parameter. With fewer, a search in
-#: many dimensions runs into corners and stays there.
+#: Space-filling evaluations before the first acquisition: minimum, and number for each parameter. With fewer, a search
+#: in many dimensions stays in corners.
 START, START_EACH = 4, 3
-#: Restarts and raw candidates of every optimisation of BoTorch's.
-RESTARTS, RAW = 4, 128
-#: ln of the noise variance beforehand, of standardised losses: BoTorch's median and twice its width, for a simulator
-#: may have hardly any noise.
+#: Restarts and raw samples of each acquisition optimisation.
+RESTARTS, RAW_SAMPLES = 4, 128
+#: Prior of the log noise variance of standardised losses: BoTorch's median and twice its width, because a simulator
+#: may have little noise.
 NOISE_MEAN, NOISE_STD = -4.0, 2.0
-#: Draws of the hyperparameters (emcee's walkers after so many steps), and sample paths of each; points of the prior and
-#: about the peak (in its standard deviations), from which the walkers' starts are chosen.
-DRAWS, STEPS, PATHS = 64, 200, 2
-POOL, NEAR_PEAK = 1024, 0.2
-#: A minimum this close to a bound, as a part of the axis' length, counts as lying on it.
+#: Draws of the hyperparameters (emcee walkers), steps of the chain, and sample paths for each draw.
+HYPERPARAMETER_DRAWS, CHAIN_STEPS, PATHS = 64, 200, 2
+#: Initial points from the prior and from around the mode, and the width of the latter in prior standard deviations.
+INITIAL_POINTS, MODE_WIDTH = 1024, 0.2
+#: A minimum within this share of the axis from a bound lies on the bound.
 AT_BOUND = 0.01
-#: Minimisers whose root mean square distance from the estimate is more than this part of a uniform distribution's
-#: standard deviation do not determine it.
-UNINFORMED = 0.6
+#: A parameter is determined if the root mean square distance of the minimisers from the estimate is less than this
+#: share of a uniform distribution's standard deviation.
+DETERMINED = 0.6
 
 
-class Told(NamedTuple):
+class Trial(NamedTuple):
     """One evaluation: the action (n,) in [-1, 1], and its loss; None where it failed."""
 
     action: FloatArray
@@ -53,12 +53,12 @@ class Told(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Minimum:
-    """Where the loss is least, by the Gaussian process.
+    """Minimum of the loss by the Gaussian process.
 
     Attributes:
         estimate: (n,) minimiser of the posterior mean, in [-1, 1]^n.
         minimisers: (k, n) those of sample paths.
-        constant: all losses were alike.
+        constant: all losses were equal.
     """
 
     estimate: FloatArray
@@ -67,7 +67,7 @@ class Minimum:
 
     @property
     def at_bound(self) -> tuple[Literal["lower", "upper"] | None, ...]:
-        """For each axis the bound that the estimate lies on, if any."""
+        """For each axis the bound on which the estimate lies, if any."""
         near = np.abs(self.estimate) > 1.0 - 2.0 * AT_BOUND
         return tuple(
             ("upper" if value > 0.0 else "lower") if on else None for on, value in zip(near, self.estimate, strict=True)
@@ -75,17 +75,17 @@ class Minimum:
 
     @property
     def determined(self) -> tuple[bool, ...]:
-        """For each axis, False where the evaluations hardly say where along it the minimum is."""
+        """For each axis, whether the evaluations determine the minimum."""
         spread = np.sqrt(np.mean((self.minimisers - self.estimate) ** 2, axis=0))
-        return tuple(bool(s < UNINFORMED * 2.0 / np.sqrt(12.0)) and not self.constant for s in spread)
+        return tuple(bool(s < DETERMINED * 2.0 / np.sqrt(12.0)) and not self.constant for s in spread)
 
     def interval(
         self, to: Callable[[FloatArray], FloatArray] = lambda unit: unit
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Standard deviation, 5 and 95 % quantile (n,) of the minimisers, on the scale that ``to`` leads to.
+        """Standard deviation, 5 and 95 % quantiles (n,) of the minimisers, on the scale of ``to``.
 
-        The first is the distance from the estimate that holds 68.3 % of them, as a root mean square would be ruled by
-        the few paths that dip in a gap between evaluations; it is the latter for an axis that is not determined.
+        The first is the 68.3 % quantile of the distance from the estimate: a root mean square is dominated by few paths
+        with a minimum in a gap between evaluations. For an axis that is not determined, it is the root mean square.
         """
         minimisers = to(self.minimisers)
         distances = np.abs(minimisers - to(self.estimate))
@@ -95,10 +95,10 @@ class Minimum:
 
 
 class Surrogate:
-    """A Gaussian process over a loss: BoTorch's single-task one.
+    """A Gaussian process of a loss: BoTorch's single-task model.
 
-    Proposals and means are those of the most probable hyperparameters. What the minimum could be is averaged over draws
-    of them: ten losses leave them open, and one best guess takes noise for a valley.
+    Proposals and means use the most probable hyperparameters. The distribution of the minimum is averaged over draws
+    of the hyperparameters: ten losses do not determine them.
 
     Args:
         points: (m, n) in [-1, 1].
@@ -141,7 +141,7 @@ class Surrogate:
         return self.shift - self.scale * mean, self.scale * np.sqrt(variance)
 
     def proposals(self, count: int, acquisition: Acquisition = "noisy") -> FloatArray:
-        """(count, n) points of [-1, 1]^n that together are expected to improve most.
+        """(count, n) points of [-1, 1]^n with the largest joint expected improvement.
 
         Args:
             count: of them.
@@ -159,7 +159,7 @@ class Surrogate:
             return self._maximised(improvement, count)
 
     def minimum(self) -> Minimum:
-        """Minimiser of the posterior mean, with the spread that the posterior gives it."""
+        """Minimiser of the posterior mean, and minimisers of posterior sample paths."""
         with _torch(self.seed):
             from botorch.acquisition import PosteriorMean
             from botorch.sampling.pathwise import draw_matheron_paths
@@ -167,12 +167,12 @@ class Surrogate:
 
             estimate = self._maximised(PosteriorMean(self.model), 1)[0]
             paths = draw_matheron_paths(self._ensemble(), torch.Size([PATHS]))
-            best, _ = optimize_posterior_samples(paths, self._bounds, raw_samples=RAW, num_restarts=2)  # type: ignore[arg-type]
+            best, _ = optimize_posterior_samples(paths, self._bounds, raw_samples=RAW_SAMPLES, num_restarts=2)  # type: ignore[arg-type]
         minimisers = 2.0 * best.detach().reshape(-1, self.dimension).numpy() - 1.0
         return Minimum(estimate, minimisers, self.constant)
 
     def _process(self, *batch: int) -> SingleTaskGP:
-        """One, or a batch of them with hyperparameters to be set."""
+        """A Gaussian process, or a batch of them."""
         from botorch.models import SingleTaskGP
         from gpytorch.constraints import GreaterThan
         from gpytorch.likelihoods import GaussianLikelihood
@@ -187,7 +187,7 @@ class Surrogate:
         return SingleTaskGP(x, y, likelihood=likelihood, outcome_transform=None)
 
     def _ensemble(self) -> SingleTaskGP:
-        """A batch of processes whose hyperparameters are drawn from their posterior."""
+        """A batch of processes with hyperparameters from their posterior."""
         n, x, y = self.dimension, self.inputs.numpy(), self.outcomes.numpy()
         lengths = self.model.covar_module.lengthscale_prior
         means = np.array([*[float(lengths.loc)] * n, NOISE_MEAN, 0.0])
@@ -204,23 +204,23 @@ class Surrogate:
             return norm.logpdf(points, means, stds).sum(axis=1) - 0.5 * np.sum(z**2, axis=1) - determinant
 
         random = np.random.RandomState(self.seed)  # the kind that emcee takes
-        # Walkers start at points of the prior and about the most probable one, by their density: in several dimensions
-        # hardly a point of the prior is near the peak.
+        # Initial points come from the prior and from around the mode, weighted by density: in several dimensions hardly
+        # a point of the prior is near the mode.
         mode = torch.cat([self.model.covar_module.lengthscale[0].log(), self.model.likelihood.noise.log()])
         peak = np.append(mode.detach().numpy(), self.model.mean_module.constant.item())
-        spread = random.standard_normal((2, POOL, n + 2)) * stds
-        pool = np.concatenate([means + spread[0], peak + NEAR_PEAK * spread[1]])
+        spread = random.standard_normal((2, INITIAL_POINTS, n + 2)) * stds
+        pool = np.concatenate([means + spread[0], peak + MODE_WIDTH * spread[1]])
         weights = np.exp((logs := log_density(pool)) - logs.max())
-        start = pool[random.choice(len(pool), DRAWS, p=weights / weights.sum())]
-        start = start + 0.05 * stds * random.standard_normal(start.shape)  # twins would never part
+        start = pool[random.choice(len(pool), HYPERPARAMETER_DRAWS, p=weights / weights.sum())]
+        start = start + 0.05 * stds * random.standard_normal(start.shape)  # equal walkers would stay equal
         moves = [(emcee.moves.DEMove(), 0.8), (emcee.moves.StretchMove(), 0.2)]
-        sampler = emcee.EnsembleSampler(DRAWS, n + 2, log_density, vectorize=True, moves=moves)
+        sampler = emcee.EnsembleSampler(HYPERPARAMETER_DRAWS, n + 2, log_density, vectorize=True, moves=moves)
         state = emcee.State(start, random_state=random.get_state())
-        drawn = torch.from_numpy(sampler.run_mcmc(state, STEPS).coords)
-        model = self._process(DRAWS)
-        model.covar_module.lengthscale = drawn[:, None, :n].exp()
-        model.likelihood.noise = drawn[:, n, None].exp() + 1e-6
-        model.mean_module.constant.data = drawn[:, n + 1]
+        draws = torch.from_numpy(sampler.run_mcmc(state, CHAIN_STEPS).coords)
+        model = self._process(HYPERPARAMETER_DRAWS)
+        model.covar_module.lengthscale = draws[:, None, :n].exp()
+        model.likelihood.noise = draws[:, n, None].exp() + 1e-6
+        model.mean_module.constant.data = draws[:, n + 1]
         return model.requires_grad_(False).eval()
 
     @property
@@ -232,13 +232,13 @@ class Surrogate:
         from botorch.optim import optimize_acqf
 
         found, _ = optimize_acqf(
-            acquisition, self._bounds, q=count, num_restarts=RESTARTS, raw_samples=RAW, sequential=count > 1
+            acquisition, self._bounds, q=count, num_restarts=RESTARTS, raw_samples=RAW_SAMPLES, sequential=count > 1
         )
         return np.clip(2.0 * found.detach().numpy() - 1.0, -1.0, 1.0)
 
 
 class BayesianOptimiser:
-    """A Sobol sequence first, then expected improvement over a Gaussian process.
+    """A Sobol sequence first, then expected improvement of a Gaussian process.
 
     Args:
         dimension: number of free parameters; points live in [-1, 1]^dimension.
@@ -254,35 +254,35 @@ class BayesianOptimiser:
         if dimension < 1 or self.start < 1:
             raise ValueError("an optimiser needs at least one dimension and one starting point")
         self.dimension, self.seed, self.acquisition = dimension, seed, acquisition
-        self.told: list[Told] = []
+        self.trials: list[Trial] = []
 
     def tell(self, action: npt.ArrayLike, loss: float | None) -> None:
         """Learn the loss (None: the evaluation failed) at a point (n,) of [-1, 1]^n."""
         usable = loss is not None and np.isfinite(loss)
-        self.told.append(Told(np.array(action, dtype=np.float64).reshape(self.dimension), loss if usable else None))
+        self.trials.append(Trial(np.array(action, dtype=np.float64).reshape(self.dimension), loss if usable else None))
 
     def ask(self, count: int = 1) -> npt.NDArray[np.float32]:
-        """The next points (count, n), in float32 as environments take them; together they are to improve."""
-        done, succeeded = len(self.told), [t.loss for t in self.told if t.loss is not None]
+        """The next points (count, n), float32, with the largest joint expected improvement."""
+        done, succeeded = len(self.trials), [t.loss for t in self.trials if t.loss is not None]
         if done < self.start or not succeeded:
-            # Beyond the start only while nothing has succeeded: keep filling the space.
+            # Also later, while no evaluation has succeeded.
             return sobol(done + count, self.dimension, self.seed)[done:].astype(np.float32)
-        # A failed simulation tells where not to go: for the search (not for the result) it counts as the worst seen.
-        losses = [max(succeeded) if t.loss is None else t.loss for t in self.told]
-        surrogate = Surrogate([t.action for t in self.told], losses, seed=self._stream(done))
+        # In the search (not in the result) a failed simulation has the worst loss so far.
+        losses = [max(succeeded) if t.loss is None else t.loss for t in self.trials]
+        surrogate = Surrogate([t.action for t in self.trials], losses, seed=self._stream(done))
         return surrogate.proposals(count, self.acquisition).astype(np.float32)
 
     def surrogate(self) -> Surrogate:
-        """The Gaussian process over every evaluation that succeeded.
+        """The Gaussian process of all evaluations that succeeded.
 
         Raises:
             ValueError: none has.
         """
-        good = [(t.action, t.loss) for t in self.told if t.loss is not None]
+        good = [(t.action, t.loss) for t in self.trials if t.loss is not None]
         return Surrogate([action for action, _ in good], [loss for _, loss in good], seed=self._stream(0))
 
     def result(self) -> Minimum:
-        """Where the loss is least."""
+        """The minimum of the loss."""
         return self.surrogate().minimum()
 
     def _stream(self, index: int) -> int:
@@ -291,7 +291,7 @@ class BayesianOptimiser:
 
 
 def optimise(env: gym.Env[Any, Any], *, seed: int = 0) -> BayesianOptimiser:
-    """Play one episode of an environment whose reward is minus a loss, until it truncates or terminates.
+    """Run one episode of an environment whose reward is minus a loss, until it truncates or terminates.
 
     Args:
         env: action space Box(-1, 1, (n,)); ``info["status"] == "failed"`` marks an evaluation without a loss.
@@ -322,7 +322,7 @@ def sobol(count: int, dimension: int, seed: int) -> FloatArray:
 
 @contextmanager
 def _torch(seed: int) -> Iterator[None]:
-    """Torch's CPU generator seeded inside the block, as it was outside; remarks that say nothing to a user silenced."""
+    """Seed torch's CPU generator inside the block, and silence warnings that concern no user."""
     with warnings.catch_warnings(), torch.random.fork_rng(devices=[]):
         warnings.simplefilter("ignore", FutureWarning)  # torch.jit, on BoTorch's import
         from botorch.exceptions.warnings import BotorchWarning

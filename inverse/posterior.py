@@ -1,7 +1,7 @@
-"""A posterior by Markov chains: the one that a comparison integrates over, of the base model and "something else".
+"""The posterior of a fit by Markov chain Monte Carlo, averaged over the base model and the discrepancy model.
 
-These two differ in what is believed of the numerics' factor alone, so the density that is averaged over both is that of
-one model with the mean of both beliefs.
+These two models differ only in the prior of the factors of the discretisation error. Their average is one model with
+the mean of both priors.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from splatsoil.run_files import POSTERIOR_FORMAT
 from splatsoil.threads import one_thread
 
 from .criticism.design import Prior, Run
-from .criticism.evidence import PRIOR, Comparison, Marginal
+from .criticism.evidence import BASE_PRIOR, Comparison, Marginal
 from .criticism.noise import FACTORS, Noise
 from .criticism.simulations import Simulations
 from .mcmc import Chains, sample
@@ -32,24 +32,25 @@ from .run_folder import RunFolder
 
 FloatArray = npt.NDArray[np.float64]
 
-#: Posterior over prior standard deviation: below the first a parameter is determined, above the second it is not.
+#: Posterior over prior standard deviation: a parameter is determined below the first, and not determined above the
+#: second.
 DETERMINED, UNDETERMINED = 0.5, 0.8
 QUANTILES = {"median": 0.5, "low": 0.05, "high": 0.95, "low_50": 0.25, "high_50": 0.75}
-#: Bins of the histograms kept for the report.
+#: Bins of the histograms in the report.
 BINS = 60
-#: Seeds of simulations at points drawn from the posterior, above those of a comparison.
+#: First seed of simulations at draws from the posterior; a comparison uses lower ones.
 FIRST_SEED = 1_000_000
-#: χ² per score of these from which the emulator is said to have been too sure.
-SURPRISING = 3.0
+#: χ² per score of these from which a note says that the emulator's variance is too small.
+MAX_CHI2 = 3.0
 
 
 @dataclass(frozen=True, eq=False)
 class Density:
-    """Logarithm of a posterior's density at points of [-1, 1]^n, up to a constant.
+    """Log density of the posterior at points of [-1, 1]^n, up to a constant.
 
     Attributes:
         prior: of the parameters, uniform on that cube.
-        comparison: of the base model; knows the observation.
+        comparison: of the base model, with the observation.
     """
 
     prior: Prior
@@ -66,9 +67,10 @@ class Density:
         return self.comparison.noise
 
     @property
-    def beliefs(self) -> FloatArray:
-        """(f,) logarithms of the probability of each of the numerics' factors beforehand, over both models."""
-        return np.asarray(np.logaddexp(np.log(PRIOR) + self.noise.expected, np.log(1.0 - PRIOR) + self.noise.beyond))
+    def log_prior(self) -> FloatArray:
+        """(f,) log prior probability of the factors of the discretisation error, averaged over both models."""
+        base, discrepancy = self.noise.log_prior, self.noise.log_prior_discrepancy
+        return np.asarray(np.logaddexp(np.log(BASE_PRIOR) + base, np.log(1.0 - BASE_PRIOR) + discrepancy))
 
     def predict(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Mean (q, p) of whitened scores at points (q, n), and the emulator's variance."""
@@ -77,14 +79,14 @@ class Density:
         return mean, variance
 
     def by_factor(self, points: FloatArray) -> FloatArray:
-        """(f, q) logarithms of factors' beliefs times their likelihoods at points (q, n)."""
+        """(f, q) log prior plus log likelihood of each factor at points (q, n)."""
         mean, variance = self.predict(points)
         white = self.comparison.likelihood.white(self.noise.observed)
         log = self.comparison.likelihood.log(white - mean, variance, np.zeros((0, mean.shape[1])))
-        return np.asarray(log + self.beliefs[:, None])
+        return np.asarray(log + self.log_prior[:, None])
 
     def __call__(self, points: npt.ArrayLike) -> FloatArray:
-        """(q,) at points (q, n); −∞ outside of the cube."""
+        """(q,) at points (q, n); −∞ outside the cube."""
         where = np.atleast_2d(np.asarray(points, dtype=np.float64))
         out = np.full(len(where), -np.inf)
         inside = np.all(np.abs(where) <= 1.0, axis=1)
@@ -93,7 +95,7 @@ class Density:
         return out
 
     def replicates(self, points: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """(q, p) scores that would be observed again at points (q, n), every source of doubt included."""
+        """(q, p) draws of the posterior predictive scores at points (q, n)."""
         mean, variance = self.predict(points)
         root = self.comparison.likelihood.root
         log = self.by_factor(points)
@@ -104,13 +106,13 @@ class Density:
             row += rng.multivariate_normal(np.zeros(len(row)), covariance, method="eigh")
         return np.asarray(scores)
 
-    def surprise(self, tables: FloatArray, points: FloatArray) -> FloatArray:
-        """(q,) χ² per score of new simulations (q, t, s) at points (q, n): about 1 by what the emulator promised."""
+    def chi2(self, tables: FloatArray, points: FloatArray) -> FloatArray:
+        """(q,) χ² per score of new simulations (q, t, s) at points (q, n); about 1 for a correct emulator."""
         mean, variance = self.predict(points)
         white = self.comparison.likelihood.white
-        chance = white(white(self.noise.chance).T)
+        scatter = white(white(self.noise.scatter).T)
         error = white(self.noise.scores(tables)) - mean
-        covariance = chance + (variance[:, :, None] + 1e-9) * np.eye(mean.shape[1])
+        covariance = scatter + (variance[:, :, None] + 1e-9) * np.eye(mean.shape[1])
         return np.asarray(np.mean(error * np.linalg.solve(covariance, error[..., None])[..., 0], axis=1))
 
 
@@ -119,7 +121,7 @@ class Posterior:
     """Samples of the parameters.
 
     Attributes:
-        density: that they are drawn from.
+        density: of the posterior.
         chains: in [-1, 1]^n.
     """
 
@@ -175,15 +177,15 @@ def run_posterior(
 
     posterior = Posterior(density, sample(density, len(density.prior.space), seed=seed, progress=sampling))
     progress("checks", 0.5)
-    checked = _checked(posterior, simulate, checks, seed)
+    checked = _check_emulator(posterior, simulate, checks, seed)
     result = summarise(posterior, own)
-    surprise = float(np.mean([c["chi2"] for c in checked])) if checked else 0.0
+    mean_chi2 = float(np.mean([c["chi2"] for c in checked])) if checked else 0.0
     if len(checked) < checks:
         result["notes"].append(f"{checks - len(checked)} of {checks} checks could not be simulated.")
-    if surprise > SURPRISING:
+    if mean_chi2 > MAX_CHI2:
         result["notes"].append(
-            "Simulations at points drawn from the posterior lay farther from the emulator than its variance says "
-            f"(χ² per score {surprise:.1f} instead of 1): more evaluations would help."
+            "Simulations at draws from the posterior differ from the emulator by more than its variance "
+            f"(χ² per score {mean_chi2:.1f} instead of 1): more evaluations would help."
         )
     files = run.path / "posterior"
     write_inference_data(posterior, files / "posterior.nc")
@@ -197,32 +199,32 @@ def run_posterior(
         "seed": seed,
         **{key: fit[key] for key in ("device", "preset", "version")},
     }
-    told: dict[str, Any] = plain(result)
-    write_json(run.path / "posterior.json", told)
-    return told
+    data: dict[str, Any] = plain(result)
+    write_json(run.path / "posterior.json", data)
+    return data
 
 
-def _checked(posterior: Posterior, simulate: Simulations, count: int, seed: int) -> list[dict[str, Any]]:
-    """Simulations at draws that could be made: where, and how far they lie from what the emulator says."""
+def _check_emulator(posterior: Posterior, simulate: Simulations, count: int, seed: int) -> list[dict[str, Any]]:
+    """Parameters and χ² of simulations at draws from the posterior, those that succeeded."""
     prior = posterior.density.prior
     chosen = np.random.default_rng([seed, 7]).choice(len(posterior.unit), count, replace=False)
     jobs = [Run(v, seed=FIRST_SEED + seed + i) for i, v in enumerate(prior.values(posterior.unit[chosen]))]
-    simulate.ahead(lambda noted: [noted(job.values, seed=job.seed) for job in jobs])
+    simulate.prefetch(lambda request: [request(job.values, seed=job.seed) for job in jobs])
     out = []
     for job in jobs:
         with suppress(SimulationError):
             table = simulate(job.values, seed=job.seed, purpose="check")
-            chi2 = posterior.density.surprise(table[None], prior.unit([job]))
+            chi2 = posterior.density.chi2(table[None], prior.unit([job]))
             out.append({"parameters": dict(job.values), "chi2": float(chi2[0])})
     return out
 
 
 def summarise(posterior: Posterior, own: Sequence[Parameter]) -> dict[str, Any]:
-    """A posterior in plain numbers, physical units and words.
+    """A posterior as plain data.
 
     Args:
         posterior: of parameters whose bounds are those of the prior's box.
-        own: the same parameters with their own bounds.
+        own: the same parameters with their full bounds.
     """
     unit, chains, noise = posterior.unit, posterior.chains, posterior.density.noise
     parameters = {p.name: _marginal(posterior, i, p) for i, p in enumerate(own)}
@@ -252,7 +254,7 @@ def summarise(posterior: Posterior, own: Sequence[Parameter]) -> dict[str, Any]:
 
 
 def verdicts(unit: FloatArray) -> list[str]:
-    """Of samples (k, n) in [-1, 1]: whether each parameter is determined, by its spread over the prior's."""
+    """Whether each parameter is determined, from samples (k, n) in [-1, 1]."""
     return [
         "determined" if c < DETERMINED else "weakly determined" if c < UNDETERMINED else "not determined"
         for c in unit.std(axis=0) * np.sqrt(3.0)
@@ -262,7 +264,7 @@ def verdicts(unit: FloatArray) -> list[str]:
 def _marginal(posterior: Posterior, index: int, parameter: Parameter) -> dict[str, Any]:
     values, unit = posterior.values[:, index], posterior.unit[:, index]
     space = posterior.density.prior.space
-    # Compared on the axis that the prior is uniform on: the logarithmic one where the parameter is.
+    # On the axis on which the prior is uniform.
     contraction = float(unit.std() * np.sqrt(3.0))
     (verdict,) = verdicts(unit[:, None])
     bounds = Marginal(values, np.full(len(values), 1.0 / len(values))).bounds_reached(parameter)
@@ -279,13 +281,13 @@ def _marginal(posterior: Posterior, index: int, parameter: Parameter) -> dict[st
         "contraction": contraction,
         "verdict": verdict,
         "at_bound": [] if verdict == "not determined" else bounds,
-        # Density on the axis of the prior, whose own is 1 everywhere on it.
+        # Over the density of the prior.
         "histogram": {"edges": space.from_unit(ends)[:, index].tolist(), "density": (2.0 * counts).tolist()},
     }
 
 
 def notes(posterior: Posterior, parameters: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """What a reader must know before believing the numbers."""
+    """Warnings for the reader."""
     out = []
     for name, entry in parameters.items():
         share = round(100.0 * entry["contraction"])

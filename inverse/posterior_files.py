@@ -1,4 +1,4 @@
-"""A posterior as files: ArviZ InferenceData, and a corner plot."""
+"""Files of a posterior: ArviZ InferenceData and a corner plot."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 FloatArray = npt.NDArray[np.float64]
 
-#: Draws from which posterior predictive features are made.
-PREDICTIVE = 200
+#: Draws for the posterior predictive.
+PREDICTIVE_DRAWS = 200
 
 
 def inference_data(posterior: Posterior) -> arviz.InferenceData:
@@ -44,11 +44,11 @@ def inference_data(posterior: Posterior) -> arviz.InferenceData:
     values = space.from_unit(chains.samples).reshape(chains.samples.shape[0], -1, n)
     prior = space.from_unit(np.random.default_rng(0).uniform(-1.0, 1.0, (1, 4000, n)))
     random = np.random.default_rng(0)
-    drawn = posterior.unit[random.choice(len(posterior.unit), PREDICTIVE)]
+    draws = posterior.unit[random.choice(len(posterior.unit), PREDICTIVE_DRAWS)]
     return arviz.from_dict(
         posterior={name: values[..., i] for i, name in enumerate(space.names)},
         sample_stats={"lp": chains.log_density.reshape(values.shape[0], -1)},
-        posterior_predictive={"scores": posterior.density.replicates(drawn, random)[None]},
+        posterior_predictive={"scores": posterior.density.replicates(draws, random)[None]},
         observed_data={"scores": posterior.density.noise.observed},
         prior={name: prior[..., i] for i, name in enumerate(space.names)},
         dims={"scores": ["score"]},
@@ -61,8 +61,8 @@ def write_inference_data(posterior: Posterior, path: Path) -> Path:
     data = inference_data(posterior)
     try:
         with tempfile.TemporaryDirectory() as folder:
-            made = Path(data.to_netcdf(str(Path(folder) / path.name), engine="h5netcdf"))
-            return write_bytes(path, made.read_bytes())
+            file = Path(data.to_netcdf(str(Path(folder) / path.name), engine="h5netcdf"))
+            return write_bytes(path, file.read_bytes())
     except OSError as error:
         raise RunError(f"{path}: cannot be made ({error}); free some space and try again") from error
 
@@ -78,7 +78,7 @@ def write_corner(posterior: Posterior, own: Sequence[Parameter], path: Path) -> 
 
 
 def corner_figure(posterior: Posterior, own: Sequence[Parameter]) -> Figure:
-    """Every parameter and every pair, framed by their own bounds; what is not determined gets no number."""
+    """Corner plot within the parameters' bounds; a parameter that is not determined gets no number."""
     import corner
     from matplotlib.figure import Figure
 
@@ -97,6 +97,6 @@ def corner_figure(posterior: Posterior, own: Sequence[Parameter]) -> Figure:
     axes = np.array(figure.axes).reshape(len(space), len(space))
     for i, (p, verdict) in enumerate(zip(space, verdicts(posterior.unit), strict=True)):
         low, median, high = (f"{q:.4g}" for q in np.quantile(posterior.values[:, i], [0.05, 0.5, 0.95]))
-        told = "not identified" if verdict == "not determined" else f"{median} ({low} to {high})"
-        axes[i, i].set_title(f"{p.label or p.name.replace('_', ' ')}: {told}", fontsize=8)
+        label = "not identified" if verdict == "not determined" else f"{median} ({low} to {high})"
+        axes[i, i].set_title(f"{p.label or p.name.replace('_', ' ')}: {label}", fontsize=8)
     return figure

@@ -53,10 +53,10 @@ RISE = 0.5
 GAIN = 4.0
 """Differences are shown this many times as strong as they are."""
 
-_FEWEST = 12
+_MIN_PIXELS = 12
 """Pixels a block needs."""
 
-_SEPARATE = 4.0
+_MIN_SEPARATION = 4.0
 """Standard deviations between the tool's and the soil's colours from which pixels are told apart by colour."""
 
 
@@ -297,7 +297,7 @@ class Comparator:
         spread = 0.5 * (np.cov(tool.T) + np.cov(soil.T)) + 1e-6 * np.eye(2)
         apart = tool.mean(axis=0) - soil.mean(axis=0)
         weights = np.linalg.solve(spread, apart)
-        if float(np.sqrt(weights @ apart)) < _SEPARATE:
+        if float(np.sqrt(weights @ apart)) < _MIN_SEPARATION:
             return None
         return weights, float(weights @ (tool.mean(axis=0) + soil.mean(axis=0)) / 2)
 
@@ -324,7 +324,7 @@ class Comparator:
             cell[inside] = np.clip(((self.ground[camera][inside] - low) / size).astype(int), 0, count - 1)
             flat = np.where(inside, cell[..., 1] * count[0] + cell[..., 0], -1)
             pixels = np.bincount(flat[inside], minlength=int(np.prod(count)))
-            kept = np.flatnonzero(pixels >= _FEWEST)
+            kept = np.flatnonzero(pixels >= _MIN_PIXELS)
             number = np.full(int(np.prod(count)) + 1, -1)
             number[kept] = np.arange(len(kept))
             patches[camera] = number[flat]
@@ -341,7 +341,7 @@ class Comparator:
             good = mask & (patch >= 0)
             count = np.bincount(patch[good], minlength=blocks)
             total = np.bincount(patch[good], residual.mean(axis=-1, dtype=np.float64)[good], minlength=blocks)
-            out[k] = np.where(count >= _FEWEST / 2, total / np.maximum(count, 1), 0.0)
+            out[k] = np.where(count >= _MIN_PIXELS / 2, total / np.maximum(count, 1), 0.0)
         return out
 
     def _scaled_losses(self, camera: str, change: list[Image], masks: list[BoolImage]) -> FloatArray:

@@ -218,7 +218,7 @@ FORWARD = (
     *("experiment/plow.py", "experiment/scene_parts.py"),
 )
 #: Parts that draw verdicts from features.
-JUDGING = ("inverse/criticism",)
+CRITICISM = ("inverse/criticism",)
 
 
 def code_digest(parts: Iterable[str] = FORWARD, others: Iterable[str | Path] = ()) -> str:

@@ -14,11 +14,11 @@ from splatsoil.files import ANEW, read_json
 RUN_FORMAT = "splatsoil-run/1"
 FIT_FORMAT = "splatsoil-fit/2"
 COMPARISON_FORMAT = "splatsoil-comparison/1"
-DIAGNOSIS_FORMAT = "splatsoil-diagnosis/2"
-MISFIT_FORMAT = "splatsoil-misfit/2"
+DIAGNOSIS_FORMAT = "splatsoil-diagnosis/3"
+MISFIT_FORMAT = "splatsoil-misfit/3"
 POSTERIOR_FORMAT = "splatsoil-posterior/2"
-DESIGN_FORMAT = "splatsoil-design/1"
-HISTORY_FORMAT = "splatsoil-history/1"
+DESIGN_FORMAT = "splatsoil-design/2"
+HISTORY_FORMAT = "splatsoil-history/2"
 RECONSTRUCTION_FORMAT = "splatsoil-reconstruction/1"
 
 

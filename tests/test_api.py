@@ -26,7 +26,7 @@ FUNCTIONS = [name for name in ss.__all__ if name not in ("Run", "Estimate", "__v
 @pytest.fixture
 def fitted(run: Any) -> Path:
     """A run whose fit says 35 ± 0.8° and whose comparison says 36.5 ± 2°, and adequate."""
-    said = {"format": "splatsoil-misfit/2", "fit": "base", "values": {"friction_angle": 35.0}, "adequate": True}
+    said = {"format": "splatsoil-misfit/3", "fit": "base", "values": {"friction_angle": 35.0}, "adequate": True}
     better = {"friction_angle": {"value": 36.5, "std": 2.0, "determined": True}}
     write_json(run.comparison / "misfit.json", {**said, "estimates": better})
     return Path(run.path)
@@ -84,7 +84,7 @@ def test_a_run_is_what_its_files_say(fitted: Path) -> None:
     with pytest.raises(RunError, match=r"left_0050_observed\.jpg: is no whole"):
         run.picture("left", 50, "observed")
     models = [{"name": "", "probability": 0.9}, {"name": "tilt", "probability": 0.1}]
-    found = {"format": "splatsoil-diagnosis/2", "fit": "base", "values": {"friction_angle": 35.0}, "model": []}
+    found = {"format": "splatsoil-diagnosis/3", "fit": "base", "values": {"friction_angle": 35.0}, "model": []}
     write_json(fitted / "diagnoses" / "base.json", {**found, "models": models})
     assert run.probabilities == {"": 0.9, "tilt": 0.1}
 

@@ -94,11 +94,11 @@ def test_simulations_for_criticism_and_for_a_fit_go_on(
     )
     base.particles, base.reported = (lambda seed: None), (lambda made, seed, values: SimpleNamespace(values=values))
     experiment: Any = object.__new__(PlowExperiment)
-    experiment.__dict__ |= {"base": base, "progress": None, "_kept": {}, "together": 3}
-    experiment._computed = lambda effects, way: (base, way)
+    experiment.__dict__ |= {"base": base, "progress": None, "_trajectories": {}, "batch_size": 3}
+    experiment._model_of = lambda effects, variant: (base, variant)
     angles = [1.0, 2.0, 3.0]
-    experiment.prepare([{"values": {"angle": a}, "effects": (), "seed": 0, "numerics": ""} for a in angles])
-    assert [float(kept.positions[0, 0, 0]) for kept in experiment._kept.values()] == angles
+    experiment.prepare([{"values": {"angle": a}, "effects": (), "seed": 0, "variant": ""} for a in angles])
+    assert [float(kept.positions[0, 0, 0]) for kept in experiment._trajectories.values()] == angles
     problem = cast(Any, object.__new__(MeasuredProblem))
     problem.__dict__ |= {"model": base, "experiment": SimpleNamespace(progress=None)}
     monkeypatch.setattr(MeasuredProblem, "judge", lambda self, p: Evaluation(p.values["angle"], np.zeros(1)))

@@ -10,8 +10,8 @@ import pytest
 
 from splatsoil.errors import RunError
 from splatsoil.files import (
+    CRITICISM,
     FORWARD,
-    JUDGING,
     RECONSTRUCTING,
     code_digest,
     digest,
@@ -45,7 +45,7 @@ NEUTRAL = {
         ("reconstruction.pipeline", RECONSTRUCTING),
         ("envs.measured", FORWARD),
         ("experiment.plow", FORWARD),
-        ("inverse.criticism.diagnosis", (*FORWARD, *JUDGING)),
+        ("inverse.criticism.diagnosis", (*FORWARD, *CRITICISM)),
     ],
 )
 def test_the_code_that_decides_a_result_is_in_its_digest(
@@ -65,7 +65,7 @@ def test_the_code_that_decides_a_result_is_in_its_digest(
 def test_every_part_of_a_digest_is_there(tmp_path: Path) -> None:
     """One that were not would change nothing, unnoticed."""
     nothing = code_digest(())
-    for name in (*FORWARD, *JUDGING):
+    for name in (*FORWARD, *CRITICISM):
         assert code_digest((name,)) != nothing, name
 
 

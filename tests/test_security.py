@@ -114,7 +114,7 @@ EVIL = [{"name": "evil.py", "probability": 1.0}]
             ("comparison/comparison.json", {**COMPARISON, "frames": [{"observed": place}]}, "frames")
             for place in ("../../secret.png", "/secret.png", "a/../../b.png")
         ),
-        ("diagnoses/base.json", {"format": "splatsoil-diagnosis/2", "model": [], "models": EVIL}, "models.0.name"),
+        ("diagnoses/base.json", {"format": "splatsoil-diagnosis/3", "model": [], "models": EVIL}, "models.0.name"),
     ],
 )
 def test_a_runs_files_name_no_file_outside_and_no_program(

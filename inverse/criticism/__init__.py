@@ -1,4 +1,4 @@
-"""Criticism: is the model adequate, where is it not, and which effect is missing?
+"""Model criticism: Bayesian comparison of models of an experiment, and predictive checks.
 
-It knows experiments (`splatsoil.experiment`) and nothing of pictures, sand or solvers.
+It depends on `splatsoil.experiment` only, not on pictures, soil or solvers.
 """

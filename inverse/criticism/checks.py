@@ -1,8 +1,8 @@
-"""Posterior predictive checks: by instrument, stage and region, is the observation like what the model would give?
+"""Posterior predictive checks by instrument, stage and region.
 
-The statistic of a block is its mean square over what is expected of that; replicates drawn from the noise say
-how large it would be with nothing wrong (Gelman, Meng & Stern 1996, Stat. Sinica 6:733). Over blocks p is adjusted
-(Holm 1979, Scand. J. Stat. 6:65).
+The statistic of a block of features is the mean square of the residual over its expectation. Its distribution for a
+correct model comes from replicates of the noise (Gelman, Meng & Stern 1996, Stat. Sinica 6:733). The p-values are
+adjusted for the number of blocks (Holm 1979, Scand. J. Stat. 6:65).
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from splatsoil.experiment.base import Experiment
 
 FloatArray = npt.NDArray[np.float64]
 
-DRAWS = 999
-FEWEST = 4
-"""Features that make a block."""
+REPLICATES = 999
+MIN_FEATURES = 4
+"""Features that a block needs."""
 SIGNIFICANT = 0.05
 
 
 @dataclass(frozen=True)
 class Check:
-    """One block.
+    """The check of one block.
 
     Attributes:
-        stage, region, channel: what it is.
-        ratio: root mean square of the residual over what is expected.
-        p: chance of as much with nothing wrong, in any block.
-        n: features in it.
+        stage, region, channel: of the block.
+        ratio: root mean square of the residual over its expectation.
+        p: adjusted p-value.
+        n: number of features.
     """
 
     stage: str
@@ -43,30 +43,30 @@ class Check:
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """What a residual is made of with nothing wrong, feature by feature.
+    """The noise model, feature by feature: independent parts, each times a standard normal number.
 
     Attributes:
-        sensor: (t, s) standard deviation of instruments.
-        fixed: (m, t, s) chance, guesses and effects of observation: independent parts, each of a standard normal size.
-        numerics: (k, t, s) the model's own error, likewise.
-        doubt: standard deviation of the logarithm of a factor of that, drawn anew for each replicate.
+        sensor: (t, s) standard deviation of the instruments.
+        fixed: (m, t, s) seed-to-seed scatter, unknown albedo, effects of observation.
+        discretisation: (k, t, s) discretisation error.
+        factor_std: standard deviation of the logarithm of a common factor of the discretisation error.
     """
 
     sensor: FloatArray
     fixed: FloatArray
-    numerics: FloatArray
-    doubt: float = 0.0
+    discretisation: FloatArray
+    factor_std: float = 0.0
 
     @property
     def variance(self) -> FloatArray:
         """(t, s)."""
-        return np.asarray(self.sensor**2 + np.sum(self.fixed**2, axis=0) + np.sum(self.numerics**2, axis=0))
+        return np.asarray(self.sensor**2 + np.sum(self.fixed**2, axis=0) + np.sum(self.discretisation**2, axis=0))
 
     def replicate(self, rng: np.random.Generator) -> FloatArray:
-        """(t, s) a residual."""
-        factor = np.exp(self.doubt * np.abs(rng.standard_normal()))
+        """(t, s) a random residual of a correct model."""
+        factor = np.exp(self.factor_std * np.abs(rng.standard_normal()))
         out = self.sensor * rng.standard_normal(self.sensor.shape)
-        for parts, size in ((self.fixed, 1.0), (self.numerics, factor)):
+        for parts, size in ((self.fixed, 1.0), (self.discretisation, factor)):
             out = out + size * np.tensordot(rng.standard_normal(len(parts)), parts, axes=1)
         return np.asarray(out)
 
@@ -74,13 +74,13 @@ class Expected:
 def checks(
     experiment: Experiment, residual: FloatArray, expected: Expected, mask: npt.NDArray[np.bool_], seed: int = 0
 ) -> list[Check]:
-    """Every block of a residual (t, s), the most surprising first."""
+    """Checks of a residual (t, s) where ``mask`` (t, s) is set, the smallest p-value first."""
     layout, rng = experiment.layout, np.random.default_rng([seed, 13])
     stages = np.broadcast_to(np.array(layout.stages)[:, None], mask.shape)[mask]
     channels = np.broadcast_to(np.array([s.channel for s in layout.sites]), mask.shape)[mask]
     labels = np.stack([stages, layout.regions[mask], channels], axis=1)
     inside = {tuple(map(str, key)): np.flatnonzero(np.all(labels == key, axis=1)) for key in np.unique(labels, axis=0)}
-    blocks = {key: index for key, index in inside.items() if len(index) >= FEWEST}
+    blocks = {key: index for key, index in inside.items() if len(index) >= MIN_FEATURES}
     variance = expected.variance[mask]
 
     def statistics(table: FloatArray) -> FloatArray:
@@ -88,17 +88,17 @@ def checks(
         return np.array([squares[index].sum() / variance[index].sum() for index in blocks.values()])
 
     own = statistics(residual)
-    replicates = np.array([statistics(expected.replicate(rng)) for _ in range(DRAWS)])
-    p = (1.0 + np.sum(replicates >= own, axis=0)) / (1.0 + DRAWS)
+    replicates = np.array([statistics(expected.replicate(rng)) for _ in range(REPLICATES)])
+    p = (1.0 + np.sum(replicates >= own, axis=0)) / (1.0 + REPLICATES)
     order, adjusted = np.argsort(p), np.ones(len(p))
     adjusted[order] = np.minimum(np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1)), 1.0)
     found = [
-        Check(stage, region, channel, float(ratio), float(chance), len(index))
-        for ((stage, region, channel), index), ratio, chance in zip(blocks.items(), np.sqrt(own), adjusted, strict=True)
+        Check(stage, region, channel, float(ratio), float(value), len(index))
+        for ((stage, region, channel), index), ratio, value in zip(blocks.items(), np.sqrt(own), adjusted, strict=True)
     ]
     return sorted(found, key=lambda c: (c.p, -c.ratio))
 
 
 def passes(found: list[Check]) -> bool:
-    """Whether no block stands out."""
+    """Whether no check fails."""
     return all(check.p >= SIGNIFICANT for check in found)

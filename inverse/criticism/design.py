@@ -1,8 +1,9 @@
-"""Which simulations a comparison of models asks for.
+"""Prior and design of experiments: which simulations a comparison of models needs.
 
-Every model's parameters are spread by a Sobol sequence (Owen 1998, ACM Trans. Model. Comput. Simul. 8), the size of an
-effect log-uniformly between the smallest that matters and sixteen times that, on both sides where it has two. A
-derivative at size zero would not see a stone smaller than a cell, or friction that is already enough for soil to stick.
+Parameters are spread by a Sobol sequence (Owen 1998, ACM Trans. Model. Comput. Simul. 8). The size of an effect is
+log-uniform between its smallest meaningful size and 16 times that, of either sign where it has two. Finite sizes are
+needed: a derivative at size zero misses a stone smaller than a cell, or tool friction beyond the angle at which soil
+sticks.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ from splatsoil.parameters import Parameter, ParameterSpace
 
 FloatArray = npt.NDArray[np.float64]
 
-LARGEST = 16.0
-"""Size of an effect, over the smallest that matters."""
+MAX_SIZE = 16.0
+"""Largest size of an effect, over its smallest meaningful size."""
 
 
 @dataclass(frozen=True)
@@ -31,43 +32,43 @@ class Run:
     values: Mapping[str, float]
     effects: tuple[str, ...] = ()
     seed: int = 0
-    numerics: str = ""
+    variant: str = ""
 
     def arguments(self) -> dict[str, Any]:
         """By name."""
-        return {"values": dict(self.values), "effects": self.effects, "seed": self.seed, "numerics": self.numerics}
+        return {"values": dict(self.values), "effects": self.effects, "seed": self.seed, "variant": self.variant}
 
 
 @dataclass(frozen=True)
 class Prior:
-    """What is believed of the base model's parameters beforehand: uniform on a box of their scale.
+    """Prior of the base model's parameters: uniform on a box, on the logarithm of a logarithmic parameter.
 
     Attributes:
-        space: the parameters, their bounds those of the box.
+        space: the parameters; their bounds are those of the box.
     """
 
     space: ParameterSpace
 
     @classmethod
     def of(cls, experiment: Experiment, *values: Mapping[str, float]) -> Prior:
-        """The whole range of a parameter of the base law; of an effect that is on, from off to twice what was fitted.
+        """The whole range for a parameter of the base law; from off to twice the fitted value for an effect that is on.
 
         Args:
             experiment: its parameters.
-            values: fitted ones, by name; or both ends of what a search leaves possible.
+            values: fitted values by name, or both ends of the interval that a search has found.
         """
         return cls(ParameterSpace(_narrowed(p, [v[p.name] for v in values]) for p in experiment.parameters))
 
     def inside(self, runs: Sequence[Run]) -> list[Run]:
-        """Those of some runs whose parameters lie in the box."""
+        """The runs whose parameters lie in the box."""
         return [r for r, point in zip(runs, self.unit(runs), strict=True) if np.abs(point).max() <= 1.0 + 1e-9]
 
     def points(self, count: int, seed: int) -> FloatArray:
-        """(count, n) in [-1, 1]."""
+        """(count, n) Sobol points in [-1, 1]."""
         return 2.0 * qmc.Sobol(len(self.space), seed=seed).random(count) - 1.0
 
     def values(self, points: FloatArray) -> list[dict[str, float]]:
-        """Of points (m, n)."""
+        """Physical values by name of points (m, n)."""
         return [self.space.to_dict(row) for row in self.space.from_unit(points)]
 
     def unit(self, runs: Sequence[Run]) -> FloatArray:
@@ -77,13 +78,13 @@ class Prior:
 
 
 def sizes(candidate: Candidate, cube: FloatArray) -> FloatArray:
-    """(m, k) sizes of an effect's parameters over their smallest meaningful ones, from points (m, k) of [0, 1]^k."""
+    """(m, k) sizes of an effect's parameters over their smallest meaningful sizes, from points (m, k) of [0, 1]^k."""
     out = np.empty_like(cube)
     for i, p in enumerate(candidate.parameters):
         side = np.full(len(cube), float(p.sign)) if p.sign else np.where(cube[:, i] > 0.5, 1.0, -1.0)
         share = cube[:, i] if p.sign else 2.0 * np.abs(cube[:, i] - 0.5)
         room = np.where(side > 0.0, p.upper - _off(p), _off(p) - p.lower) / p.meaningful
-        out[:, i] = side * np.minimum(LARGEST, np.maximum(room, 1.0)) ** share
+        out[:, i] = side * np.minimum(MAX_SIZE, np.maximum(room, 1.0)) ** share
     return out
 
 
@@ -109,7 +110,7 @@ def effect_points(candidate: Candidate, runs: Sequence[Run]) -> tuple[FloatArray
 
 
 def effect_runs(candidate: Candidate, prior: Prior, count: int, seed: int) -> list[Run]:
-    """Runs with an effect on, spread over all of its and the base model's parameters."""
+    """Runs with an effect on, spread over its parameters and those of the base model."""
     n, k, j = len(prior.space), len(candidate.parameters), len(candidate.shapes)
     cube = qmc.Sobol(n + k + j, seed=seed).random(1 << max(count - 1, 0).bit_length())[:count]
     base = prior.values(2.0 * cube[:, :n] - 1.0)

@@ -1,7 +1,7 @@
-"""Emulators: what any parameters would give, from a few simulations, with the doubt of that.
+"""Gaussian-process emulators of simulations (Rasmussen & Williams 2006).
 
-Gaussian processes (Rasmussen & Williams 2006), one for each component, that share their lengths. The base model's has a
-constant, linear and quadratic part and a smooth rest; an effect's increment to it vanishes with its size.
+There is one process for each component of the output; they share their length scales. The kernel of the base model has
+a constant, a linear, a quadratic and a smooth part. An effect's increment to the base model vanishes with its size.
 """
 
 from __future__ import annotations
@@ -16,61 +16,61 @@ from scipy.linalg import cho_factor, cho_solve
 
 FloatArray = npt.NDArray[np.float64]
 Points = tuple[FloatArray, FloatArray, FloatArray]
-"""Base parameters (m, n) in [-1, 1], sizes (m, k) over meaningful ones, shapes (m, j) in [-1, 1]."""
+"""Base parameters (m, n) in [-1, 1], sizes (m, k) over the smallest meaningful ones, shapes (m, j) in [-1, 1]."""
 
-SHARES = (9.0, 9.0, 4.0)
-"""Prior variance of the constant, linear and quadratic parts of the base emulator over that of the smooth rest."""
+TREND_VARIANCES = (9.0, 9.0, 4.0)
+"""Prior variance of the constant, linear and quadratic parts of the base emulator over that of the smooth part."""
 LENGTH = 0.8
-"""Of the smooth rest, in halves of the parameters' ranges."""
-HALFWAY = 4.0
-"""Size, over the meaningful one, at which an increment has its prior amplitude."""
+"""Length scale of the smooth part, in halves of the parameters' ranges."""
+UNIT_SIZE = 4.0
+"""Size, over the smallest meaningful one, at which an increment has its prior amplitude."""
 AMPLITUDES = np.array([0.0, *np.geomspace(0.01, 10.0, 10)])
-"""Prior variances of an increment that are tried, over what its simulations have."""
+"""Prior variances of an increment that are tried, over the mean square of its simulations."""
 LENGTHS = ((0.7, 2.0), (4.0, 10.0), (0.3, 0.8))
-"""Lengths that are tried of an increment in base parameters, sizes and shapes."""
+"""Length scales that are tried for an increment in base parameters, sizes and shapes."""
 
 
 @dataclass(frozen=True)
 class BaseEmulator:
-    """The base model.
+    """Emulator of the base model.
 
     Attributes:
         points: (m, n) of the simulations, in [-1, 1].
-        chance: (p,) variance of one simulation's own chance.
-        signal: (p,) variance of the smooth rest.
-        scores: (m, p) simulations.
+        scatter: (p,) variance between simulations with different seeds.
+        signal: (p,) variance of the smooth part.
+        scores: (m, p) of the simulations.
     """
 
     points: FloatArray
-    chance: FloatArray
+    scatter: FloatArray
     signal: FloatArray
     scores: FloatArray
 
     @classmethod
-    def through(cls, points: FloatArray, scores: FloatArray, chance: FloatArray) -> BaseEmulator:
-        """Through simulations' scores (m, p) at points (m, n), whose own chance has a variance (p,)."""
-        signal = np.maximum(scores.var(axis=0) - chance, 0.05 * chance) / sum(SHARES[1:2])
-        return cls(points, chance, signal, scores)
+    def through(cls, points: FloatArray, scores: FloatArray, scatter: FloatArray) -> BaseEmulator:
+        """Through scores (m, p) at points (m, n) whose seed-to-seed scatter has a variance (p,)."""
+        signal = np.maximum(scores.var(axis=0) - scatter, 0.05 * scatter) / sum(TREND_VARIANCES[1:2])
+        return cls(points, scatter, signal, scores)
 
     def predict(self, where: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Mean and variance (q, p) at points (q, n)."""
         square = np.sum(where**2, axis=1)
-        alone = SHARES[0] + SHARES[1] * square + SHARES[2] * square**2 + 1.0
+        alone = TREND_VARIANCES[0] + TREND_VARIANCES[1] * square + TREND_VARIANCES[2] * square**2 + 1.0
         kernels = _base_kernel(self.points, self.points), _base_kernel(where, self.points)
-        noise = np.broadcast_to(self.chance, self.scores.shape)
+        noise = np.broadcast_to(self.scatter, self.scores.shape)
         return _regressed(*kernels, alone, self.signal, noise, self.scores)
 
 
 @dataclass(frozen=True)
 class IncrementEmulator:
-    """What an effect adds to the base model; its lengths and amplitudes are those of the largest likelihood.
+    """Emulator of an effect's increment to the base model; hyperparameters maximise the likelihood.
 
     Attributes:
         points: of the simulations.
         lengths: in base parameters, sizes and shapes.
-        amplitude: (p,) prior variance at `HALFWAY`.
-        noise: (m, p) variance of an increment that was simulated.
-        increments: (m, p).
+        amplitude: (p,) prior variance at `UNIT_SIZE`.
+        noise: (m, p) variance of a simulated increment.
+        increments: (m, p) of the simulations.
     """
 
     points: Points
@@ -98,15 +98,15 @@ class IncrementEmulator:
     def predict(self, where: Points) -> tuple[FloatArray, FloatArray]:
         """Mean and variance (q, p) of the increment."""
         inner, cross = (_increment_kernel(x, self.points, self.lengths) for x in (self.points, where))
-        alone = np.sum(where[1] ** 2, axis=1) / HALFWAY**2
+        alone = np.sum(where[1] ** 2, axis=1) / UNIT_SIZE**2
         return _regressed(inner, cross, alone, self.amplitude, self.noise, self.increments)
 
 
 def _regressed(
     inner: FloatArray, cross: FloatArray, alone: FloatArray, signal: FloatArray, noise: FloatArray, values: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Mean and variance (q, p) of Gaussian processes: kernels (m, m), (q, m), (q,) times signals (p,), through values
-    (m, p) whose noise has a variance (m, p)."""
+    """Mean and variance (q, p) of Gaussian-process regression: kernels (m, m), (q, m), (q,) times signals (p,), through
+    values (m, p) whose noise has a variance (m, p)."""
     mean, variance = np.zeros((len(cross), len(signal))), np.zeros((len(cross), len(signal)))
     for c in np.flatnonzero(signal):
         factor = cho_factor(signal[c] * inner + np.diag(noise[:, c]))
@@ -126,13 +126,13 @@ def _likelihoods(kernel: FloatArray, amplitude: FloatArray, noise: FloatArray, v
 
 
 def _base_kernel(a: FloatArray, b: FloatArray) -> FloatArray:
-    product_ = a @ b.T
+    inner = a @ b.T
     near = np.exp(-0.5 * np.sum((a[:, None] - b[None]) ** 2, axis=-1) / LENGTH**2)
-    return SHARES[0] + SHARES[1] * product_ + SHARES[2] * product_**2 + near
+    return TREND_VARIANCES[0] + TREND_VARIANCES[1] * inner + TREND_VARIANCES[2] * inner**2 + near
 
 
 def _increment_kernel(a: Points, b: Points, lengths: Sequence[float]) -> FloatArray:
     apart = [
         np.sum(((x[:, None] - y[None]) / length) ** 2, axis=-1) for x, y, length in zip(a, b, lengths, strict=True)
     ]
-    return np.asarray(a[1] @ b[1].T / HALFWAY**2 * np.exp(-0.5 * sum(apart)))
+    return np.asarray(a[1] @ b[1].T / UNIT_SIZE**2 * np.exp(-0.5 * sum(apart)))

@@ -1,11 +1,12 @@
-"""How probable each model is, and what its parameters are: importance sampling over emulators.
+"""Evidence and posterior of each model, by importance sampling on emulators.
 
-The evidence of a model is the mean of its likelihood over its prior (MacKay 2003, Information Theory, Inference, and
-Learning Algorithms, ch. 28; Kass & Raftery 1995, J. Am. Stat. Assoc. 90:773). The likelihood is normal, with the
-emulator's own doubt beside the noise; the numerics' factors are integrated over, which makes its tails long. Points are
-a Sobol sequence over the prior, then draws where the posterior is (adaptive importance sampling with a defensive share
-of the prior: Cappé et al. 2008, Stat. Comput. 18:447; Hesterberg 1995, Technometrics 37:185). "Something else" is the
-base model with a discrepancy larger than numerics (Kennedy & O'Hagan 2001, J. R. Stat. Soc. B 63:425).
+The evidence is the mean of the likelihood over the prior (MacKay 2003, Information Theory, Inference, and Learning
+Algorithms, ch. 28; Kass & Raftery 1995, J. Am. Stat. Assoc. 90:773). The likelihood is normal; its covariance is noise
+plus the emulator's variance. Integrating over the factors of the discretisation error gives it long tails. Points are a
+Sobol sequence over the prior, then draws near the posterior (adaptive importance sampling with a defensive share of the
+prior: Cappé et al. 2008, Stat. Comput. 18:447; Hesterberg 1995, Technometrics 37:185). The discrepancy model
+("something else") is the base model with an error larger than the discretisation error (Kennedy & O'Hagan 2001, J. R.
+Stat. Soc. B 63:425).
 """
 
 from __future__ import annotations
@@ -33,18 +34,18 @@ Prediction = tuple[Mapping[str, FloatArray], FloatArray, FloatArray]
 Predict = Callable[[FloatArray], Prediction]
 """At points (q, d) of the unit cube."""
 
-POINTS = 2048
-"""Of the sequence, and of each later round's draws."""
-ROUNDS, DEFENSIVE, HEAVY = 2, 0.2, 5.0
-"""Later rounds, the prior's share in them, and degrees of freedom of Student's distribution that makes the rest."""
-FEWEST = 40.0
-"""Effective points from which a distribution is fitted: weights are flattened until there are as many."""
-AS_IT_IS, ELSE = "", "something else"
+SAMPLES = 2048
+"""Points of the Sobol sequence, and draws of each later round."""
+ROUNDS, DEFENSIVE_SHARE, STUDENT_DOF = 2, 0.2, 5.0
+"""Later rounds, the prior's share in them, and degrees of freedom of the Student distribution of the rest."""
+MIN_EFFECTIVE_SAMPLES = 40.0
+"""Weights are flattened until the effective sample size reaches this; then the Student distribution is fitted."""
+BASE_MODEL, DISCREPANCY = "", "something else"
 """Names of the two models without an effect."""
-PRIOR = 0.5
-"""Probability of the base model beforehand; the others share the rest."""
-SLAB = 4.0
-"""Standard deviation of an observation effect's sizes, over the smallest meaningful ones: its drawings are linear."""
+BASE_PRIOR = 0.5
+"""Prior probability of the base model; the others share the rest equally."""
+OBSERVATION_SIZE_STD = 4.0
+"""Prior standard deviation of an observation effect's sizes, over the smallest meaningful ones."""
 NEAR_BOUND, CROWDED = 0.05, 0.10
 """A bound is reached where this share of the axis near it holds more than twice its share of the posterior."""
 
@@ -78,7 +79,7 @@ class Marginal:
         return float(self.values[order][min(int(index), len(order) - 1)])
 
     def bounds_reached(self, parameter: Parameter) -> list[Literal["lower", "upper"]]:
-        """Bounds of the parameter's range that the posterior crowds at."""
+        """Bounds of the parameter's range near which the posterior concentrates."""
         unit = ParameterSpace([parameter]).to_unit(self.values[:, None])[:, 0]
         edge = 1.0 - 2.0 * NEAR_BOUND
         near: dict[Literal["lower", "upper"], npt.NDArray[np.bool_]] = {"lower": unit < -edge, "upper": unit > edge}
@@ -87,13 +88,13 @@ class Marginal:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """One model that could be true.
+    """A model's evidence and posterior.
 
     Attributes:
-        name: the effect's; `AS_IT_IS`, `ELSE`.
-        values: parameters (q,) by name at the points.
-        weights: (f, q) posterior by the numerics' factors, summing to 1.
-        log_evidence: of it.
+        name: the effect's; `BASE_MODEL`, `DISCREPANCY`.
+        values: parameters (q,) by name at the importance samples.
+        weights: (f, q) posterior over factors of the discretisation error and samples, summing to 1.
+        log_evidence: natural logarithm of the evidence.
     """
 
     name: str
@@ -102,9 +103,9 @@ class Model:
     log_evidence: float
 
     @classmethod
-    def of(cls, name: str, values: Mapping[str, FloatArray], log: FloatArray, factors: FloatArray) -> Model:
-        """From logarithms (f, q) of likelihoods times importance weights, and of the factors' probabilities (f,)."""
-        joint = log + factors[:, None]
+    def of(cls, name: str, values: Mapping[str, FloatArray], log: FloatArray, log_prior: FloatArray) -> Model:
+        """From log likelihoods plus log importance weights (f, q), and log prior probabilities of the factors (f,)."""
+        joint = log + log_prior[:, None]
         weights = np.exp(joint - joint.max())
         return cls(name, values, weights / weights.sum(), float(logsumexp(joint)) - float(np.log(joint.shape[1])))
 
@@ -115,11 +116,11 @@ class Model:
 
     @property
     def factors(self) -> FloatArray:
-        """(2,) geometric means of the numerics' factors."""
+        """(2,) geometric means of the factors of the discretisation error."""
         return np.asarray(np.exp(self.weights.sum(axis=1) @ np.log(FACTORS)))
 
-    def drawn(self, count: int, rng: np.random.Generator) -> list[dict[str, float]]:
-        """Parameters drawn from the posterior."""
+    def sample(self, count: int, rng: np.random.Generator) -> list[dict[str, float]]:
+        """Draws of the parameters from the posterior."""
         weights = self.weights.sum(axis=0)
         chosen = rng.choice(len(weights), count, p=weights / weights.sum())
         return [{name: float(v[i]) for name, v in self.values.items()} for i in chosen]
@@ -127,12 +128,12 @@ class Model:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """All models, against one observation.
+    """All models, given one observation.
 
     Attributes:
         noise: of the scores.
         models: by name.
-        probability: of each.
+        probability: posterior probability of each.
     """
 
     noise: Noise
@@ -153,11 +154,11 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Likelihood:
-    """Of scores whitened by the expected noise.
+    """Normal likelihood of scores that are whitened by the noise for factors of 1.
 
     Attributes:
-        root: (p, p) Cholesky factor of that.
-        rotations: for each factor the variances (p,) and directions (p, p) in which its noise is independent.
+        root: (p, p) Cholesky factor of that noise.
+        rotations: for each factor the eigenvalues (p,) and eigenvectors (p, p) of its whitened noise.
     """
 
     root: FloatArray
@@ -165,7 +166,7 @@ class Likelihood:
 
     @classmethod
     def of(cls, noise: Noise) -> Likelihood:
-        """With the noise of scores."""
+        """With this noise model."""
         root = np.linalg.cholesky(noise.covariance(np.ones(2)) + 1e-9 * np.eye(len(noise.fixed)))
         rotations = []
         for factor in FACTORS:
@@ -178,15 +179,21 @@ class Likelihood:
         """(q, p) whitened scores (q, p)."""
         return np.asarray(solve_triangular(self.root, np.atleast_2d(scores).T, lower=True).T)
 
-    def log(self, left: FloatArray, variance: FloatArray, pattern: FloatArray, every: int = 1) -> FloatArray:
-        """(f, q) of whitened residuals (q, p) with the emulator's variance (q, p), and free sizes of a pattern (k, p);
-        for ``every`` so many factors."""
+    def log(self, residual: FloatArray, variance: FloatArray, pattern: FloatArray, every: int = 1) -> FloatArray:
+        """(f, q) log likelihoods up to a constant.
+
+        Args:
+            residual: (q, p) whitened.
+            variance: (q, p) of the emulator.
+            pattern: (k, p) of an observation effect, whose sizes are integrated over; empty for none.
+            every: step through the factors.
+        """
         out = []
         for size, modes in self.rotations[::every]:
-            turned, spread = left @ modes, size + variance @ modes**2
+            turned, spread = residual @ modes, size + variance @ modes**2
             if len(pattern):
-                # one doubt for all points: a pattern's sizes are integrated over in closed form
-                inner = np.diag(spread.mean(axis=0)) + SLAB**2 * (pattern @ modes).T @ (pattern @ modes)
+                # In closed form, with one emulator variance for all points: the mean.
+                inner = np.diag(spread.mean(axis=0)) + OBSERVATION_SIZE_STD**2 * (pattern @ modes).T @ (pattern @ modes)
                 root = np.linalg.cholesky(inner)
                 z = solve_triangular(root, turned.T, lower=True)
                 out.append(-0.5 * np.sum(z**2, axis=0) - np.log(np.diag(root)).sum())
@@ -197,13 +204,13 @@ class Likelihood:
 
 @dataclass(frozen=True, eq=False)
 class Emulated:
-    """A model's emulator over the unit cube, on which its prior is uniform.
+    """A model's emulator on the unit cube, where its prior is uniform.
 
     Attributes:
-        name: the effect's; `AS_IT_IS`.
+        name: the effect's; `BASE_MODEL`.
         predict: values by name, mean and variance (q, p) of whitened scores, at points (q, d) of the cube.
-        pattern: (k, p) of an effect of observation, else empty.
-        prior: what it predicts at a Sobol sequence.
+        pattern: (k, p) of an observation effect, else empty.
+        prior: a Sobol sequence and the prediction there.
     """
 
     name: str
@@ -214,13 +221,13 @@ class Emulated:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Emulators of all models, ready to meet an observation.
+    """Emulators of all models.
 
     Attributes:
-        noise: of the scores.
-        likelihood: of whitened ones.
-        models: all but "something else".
-        seed: of draws.
+        noise: of the scores, with the observation.
+        likelihood: of whitened scores.
+        models: all but the discrepancy model.
+        seed: of the samples.
     """
 
     noise: Noise
@@ -237,24 +244,23 @@ class Comparison:
         simulated: Mapping[str, tuple[Sequence[Run], FloatArray]],
         seed: int = 0,
     ) -> Comparison:
-        """Emulators.
+        """Train the emulators.
 
         Args:
             noise: of the observation.
             prior: of the base model's parameters.
-            candidates: effects; those of physics that weren't simulated, and those of observation that weren't drawn,
-                are left out.
+            candidates: effects; those without simulations, or without a pattern, are left out.
             simulated: runs and scores (m, p) by effect.
-            seed: of sequences and draws.
+            seed: of sequences and samples.
         """
         likelihood = Likelihood.of(noise)
         n = len(prior.space)
-        chance = np.maximum(np.diag(likelihood.white(likelihood.white(noise.chance).T)), 1e-4)
+        scatter = np.maximum(np.diag(likelihood.white(likelihood.white(noise.scatter).T)), 1e-4)
         white = likelihood.white(noise.base)
         middle = white.mean(axis=0)
-        base = BaseEmulator.through(noise.points, white - middle, chance)
+        base = BaseEmulator.through(noise.points, white - middle, scatter)
 
-        def as_it_is(cube: FloatArray) -> Prediction:
+        def base_model(cube: FloatArray) -> Prediction:
             where = 2.0 * cube[:, :n] - 1.0
             physical = prior.space.from_unit(where)
             mean, variance = base.predict(where)
@@ -262,75 +268,78 @@ class Comparison:
 
         def with_effect(candidate: Candidate, runs: Sequence[Run], scores: FloatArray) -> Predict:
             k = len(candidate.parameters)
-            there, doubt = base.predict(prior.unit(runs))
+            mean_there, variance_there = base.predict(prior.unit(runs))
             points = (prior.unit(runs), *effect_points(candidate, runs))
-            emulator = IncrementEmulator.through(points, likelihood.white(scores) - middle - there, chance + doubt)
+            increments = likelihood.white(scores) - middle - mean_there
+            emulator = IncrementEmulator.through(points, increments, scatter + variance_there)
 
             def predict(cube: FloatArray) -> Prediction:
-                values, mean, variance = as_it_is(cube)
+                values, mean, variance = base_model(cube)
                 size, shape = sizes(candidate, cube[:, n : n + k]), 2.0 * cube[:, n + k :] - 1.0
-                added, own = emulator.predict((2.0 * cube[:, :n] - 1.0, size, shape))
-                return {**values, **effect_values(candidate, size, shape)}, mean + added, variance + own
+                increment, its_variance = emulator.predict((2.0 * cube[:, :n] - 1.0, size, shape))
+                return {**values, **effect_values(candidate, size, shape)}, mean + increment, variance + its_variance
 
             return predict
 
         def emulated(name: str, dimension: int, predict: Predict, *patterns: FloatArray) -> Emulated:
-            cube = qmc.Sobol(dimension, seed=seed).random(POINTS)
+            cube = qmc.Sobol(dimension, seed=seed).random(SAMPLES)
             return Emulated(name, predict, np.reshape(patterns, (-1, white.shape[1])), (cube, predict(cube)))
 
-        models = [emulated(AS_IT_IS, n, as_it_is)]
+        models = [emulated(BASE_MODEL, n, base_model)]
         for candidate in candidates:
             if candidate.name in noise.patterns:
-                models.append(emulated(candidate.name, n, as_it_is, *likelihood.white(noise.patterns[candidate.name])))
+                patterns = likelihood.white(noise.patterns[candidate.name])
+                models.append(emulated(candidate.name, n, base_model, *patterns))
             elif candidate.name in simulated:
                 dimension = n + len(candidate.parameters) + len(candidate.shapes)
                 models.append(emulated(candidate.name, dimension, with_effect(candidate, *simulated[candidate.name])))
         return cls(noise, likelihood, models, seed)
 
-    def judge(self) -> Evidence:
-        """Every model against the observation."""
-        sampled = {model.name: self._sampled(model) for model in self.models}
-        found = {name: Model.of(name, *points, self.noise.expected) for name, points in sampled.items()}
-        found[ELSE] = Model.of(ELSE, *sampled[AS_IT_IS], self.noise.beyond)
+    def evidence(self) -> Evidence:
+        """Evidence and posterior of every model."""
+        sampled = {model.name: self._sample(model) for model in self.models}
+        models = {name: Model.of(name, *samples, self.noise.log_prior) for name, samples in sampled.items()}
+        models[DISCREPANCY] = Model.of(DISCREPANCY, *sampled[BASE_MODEL], self.noise.log_prior_discrepancy)
         weight = {
-            name: model.log_evidence + np.log(PRIOR if name == AS_IT_IS else (1.0 - PRIOR) / (len(found) - 1))
-            for name, model in found.items()
+            name: model.log_evidence
+            + np.log(BASE_PRIOR if name == BASE_MODEL else (1.0 - BASE_PRIOR) / (len(models) - 1))
+            for name, model in models.items()
         }
         total = logsumexp(list(weight.values()))
-        return Evidence(self.noise, found, {name: float(np.exp(w - total)) for name, w in weight.items()})
+        return Evidence(self.noise, models, {name: float(np.exp(w - total)) for name, w in weight.items()})
 
-    def _sampled(self, model: Emulated) -> tuple[Mapping[str, FloatArray], FloatArray]:
-        """Parameters (q,) at points drawn where the posterior is, and logarithms (f, q) of their likelihoods times
-        importance weights."""
+    def _sample(self, model: Emulated) -> tuple[Mapping[str, FloatArray], FloatArray]:
+        """Importance samples: parameters (q,), and log likelihoods plus log importance weights (f, q)."""
         rng, white = np.random.default_rng([self.seed, 23]), self.likelihood.white(self.noise.observed)[0]
         cube, (values, mean, variance) = model.prior
         importance = np.zeros(len(cube))
         for _ in range(ROUNDS):
-            log = self.likelihood.log(white - mean, variance, model.pattern) + self.noise.expected[:, None]
-            cube, importance = _drawn(cube, logsumexp(log, axis=0) + importance, rng)
+            log = self.likelihood.log(white - mean, variance, model.pattern) + self.noise.log_prior[:, None]
+            cube, importance = _resampled(cube, logsumexp(log, axis=0) + importance, rng)
             values, mean, variance = model.predict(cube)
         return values, self.likelihood.log(white - mean, variance, model.pattern) + importance
 
 
-def _drawn(cube: FloatArray, weights: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """New points (q, d) of the cube where weights (their logarithms) are large, and the logarithms of the prior's
-    density over theirs."""
+def _resampled(cube: FloatArray, log_weights: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """New points (q, d) of the cube near the posterior, given points (m, d) and their log weights (m,), and log
+    importance weights (q,): the prior's density over theirs."""
     power, d = 1.0, cube.shape[1]
     while True:
-        flat = np.exp(power * (weights - weights.max()))
+        flat = np.exp(power * (log_weights - log_weights.max()))
         flat /= flat.sum()
-        if 1.0 / np.sum(flat**2) >= FEWEST or power < 1e-4:
+        if 1.0 / np.sum(flat**2) >= MIN_EFFECTIVE_SAMPLES or power < 1e-4:
             break
         power *= 0.7
     middle = flat @ cube
     spread = (cube - middle).T @ ((cube - middle) * flat[:, None]) + 1e-8 * np.eye(d)
-    student = multivariate_t(middle, spread, df=HEAVY)
+    student = multivariate_t(middle, spread, df=STUDENT_DOF)
+    defensive = round(DEFENSIVE_SHARE * SAMPLES)
     points = np.concatenate(
-        [rng.uniform(size=(round(DEFENSIVE * POINTS), d)), student.rvs(POINTS, random_state=rng).reshape(POINTS, d)]
+        [rng.uniform(size=(defensive, d)), student.rvs(SAMPLES, random_state=rng).reshape(SAMPLES, d)]
     )
     points = points[np.all((points >= 0.0) & (points <= 1.0), axis=1)]
-    # Draws outside of the cube are left out: what is inside is the share that counts.
-    inside = max(len(points) - round(DEFENSIVE * POINTS), 1) / POINTS
-    share = DEFENSIVE / (DEFENSIVE + inside)
+    # Draws outside the cube are rejected; the density is normalised by the share that is left.
+    inside = max(len(points) - defensive, 1) / SAMPLES
+    share = DEFENSIVE_SHARE / (DEFENSIVE_SHARE + inside)
     density = share + (1.0 - share) * student.pdf(points).reshape(-1) / inside
     return points, -np.log(density)

@@ -1,22 +1,23 @@
-"""What observation and prediction differ by with nothing wrong, along the few directions in which any model acts.
+"""The noise model: covariance of observation minus prediction for a correct model, in a low-dimensional projection.
 
-Squares of pictures are projected on the leading modes of all simulations (principal components whose variance is well
-above chance's); instruments without a place (forces, stresses) are kept as they are. Noise in these scores has parts:
+Pictures are projected on the leading principal components of all simulations, those whose variance is well above the
+seed-to-seed scatter. Instruments without a place (forces, stresses) keep their features. The covariance of these scores
+is a sum of independent parts:
 
-========== ============================================================================================================
-instruments from still frames; stated for the others
-chance      what base simulations with particles of their own scatter by about their trend, shrunk towards its diagonal
-            (Ledoit & Wolf 2004, J. Multivariate Anal. 88:365)
-guesses     colours that no photograph shows, other drawings of the same simulation
-nuisances   effects of observation in their smallest meaningful sizes
-numerics    the model's own error: so many times all of the above as pairs of coarse and fine runs say; for instruments
-            without a place a size for each stage, moderated by the others' (Smyth 2004). Its factors, one for pictures
-            and one for forces, are unknown and integrated over. Without pairs it lies along what soil could do
-            otherwise (all simulations)
-========== ============================================================================================================
+================== ====================================================================================================
+instruments        frames before the tool moves; stated for the others
+scatter            residuals of base simulations with different seeds about their trend; the covariance is shrunk
+                   towards its diagonal (Ledoit & Wolf 2004, J. Multivariate Anal. 88:365)
+unknown albedo     random draws of the colour of buried soil
+observation        effects of observation, each at its smallest meaningful size
+discretisation     pictures: a multiple of all parts above, measured on pairs of coarse and fine simulations;
+                   instruments without a place: one variance for each stage, moderated by the others (Smyth 2004). Two
+                   unknown factors, one for pictures and one for forces, are integrated over. Without pairs, it lies
+                   along what the parameters of all models can change
+================== ====================================================================================================
 
-Fine runs also correct coarse ones (Kennedy & O'Hagan 2000, Biometrika 87:1): their mean difference, as far as it stands
-above chance, is taken off the observation.
+Fine simulations also correct coarse ones (Kennedy & O'Hagan 2000, Biometrika 87:1): their mean difference, shrunk by
+its own uncertainty, is subtracted from the observation.
 """
 
 from __future__ import annotations
@@ -36,82 +37,83 @@ from splatsoil.experiment.base import Candidate, Experiment
 from .design import Prior, Run
 
 FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
 
-ABOVE_CHANCE = 4.0
-"""Variance of a mode over chance's from which it is kept: twice its standard deviation."""
-MOST_MODES = 40
-REMAINING = 1.3
-"""What a fine run's own error is expected to be over the difference of coarse and fine: 2 for an error of first order
-in the cell and cells of 1 and 1.5, 0.8 for second order (Roache 1994); the geometric mean."""
-DOUBT = 0.5
-"""Standard deviation of the logarithm of that factor, which holds both orders."""
-UNMEASURED, NO_PAIRS = 0.2, 1.0
-"""Numerics, over what soil could do otherwise (every effect's simulations about the trend, and the base model's about
-their mean), and the deviation of its logarithm, where there are no pairs."""
-STEPS = np.array(list(product(range(6), range(6))))
-"""(f, 2) standard deviations by which the logarithms of both factors of the numerics, of placed instruments and of
-others, exceed what is expected. None is less: that most features agree is no proof that the one which counts does."""
-FACTORS = np.exp(DOUBT * STEPS)
-"""(f, 2) factors that are integrated over."""
-SOMETHING_ELSE = 2.0
-"""Standard deviations above the expected factor from which the model's own error is more than numerics."""
-STAGE, CHANNEL = 0.9, 0.5
-"""Correlation of an unplaced instrument's numerics within a stage, and between two of one unit there."""
+MIN_VARIANCE_RATIO = 4.0
+"""A component is kept if its variance exceeds the scatter's by this factor: twice its standard deviation."""
+MAX_COMPONENTS = 40
+FINE_ERROR_RATIO = 1.3
+"""Error of a fine simulation over the difference of coarse and fine: for cells of 1 and 1.5, it is 2 for a method of
+first order and 0.8 for second order (Roache 1994). The value is the geometric mean."""
+FINE_ERROR_LOG_STD = 0.5
+"""Standard deviation of the logarithm of that ratio, which covers both orders."""
+UNPAIRED_RATIO, UNPAIRED_LOG_STD = 0.2, 1.0
+"""Without pairs: discretisation error over the scatter of all simulations about the base model's trend, and the
+standard deviation of its logarithm."""
+LOG_FACTOR_STEPS = np.array(list(product(range(6), range(6))))
+"""(f, 2) logarithms of both factors of the discretisation error, in standard deviations. None is negative: agreement of
+most features does not show that the decisive one agrees."""
+FACTORS = np.exp(FINE_ERROR_LOG_STD * LOG_FACTOR_STEPS)
+"""(f, 2) values of both factors on which they are integrated: of instruments with a place, and of the others."""
+DISCREPANCY_STDS = 2.0
+"""From this many standard deviations on, a factor is a model discrepancy."""
+STAGE_CORRELATION, CHANNEL_CORRELATION = 0.9, 0.5
+"""Correlation of an unplaced instrument's discretisation error within a stage, and between two of one unit there."""
 
 
 @dataclass(frozen=True)
 class Tables:
-    """Simulations (m, t, s) by what they were made for.
+    """Feature tables (m, t, s) of simulations.
 
     Attributes:
-        base: of the model as it is.
-        fine: pairs' fine ones.
+        base: of the base model.
+        fine: of the base model with fine cells.
         effects: by effect.
-        drawn: one base simulation reported or drawn otherwise, by guess or parameter.
-        reference: (t, s) that one, as usual.
+        variants: (t, s) the reference simulation in another variant or with an effect of observation, by name.
+        reference: (t, s) one simulation of the base model.
     """
 
     base: tuple[Sequence[Run], FloatArray]
     fine: tuple[Sequence[Run], FloatArray]
     effects: Mapping[str, tuple[Sequence[Run], FloatArray]]
-    drawn: Mapping[str, FloatArray]
+    variants: Mapping[str, FloatArray]
     reference: FloatArray
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Scores and their noise.
+    """Scores and their noise model.
 
     Attributes:
         mask: (t, s) features that are compared.
-        mean: (n,) of them, taken off before they are projected.
-        basis: (n, p).
-        observed: (p,) scores, corrected for the cell.
-        correction: (p,) what is taken off for it.
+        mean: (n,) of them, subtracted before the projection.
+        basis: (n, p) of the projection.
+        observed: (p,) scores, corrected for the cell size.
+        correction: (p,) mean difference of fine and coarse simulations.
         base: (m, p) scores of the base simulations.
-        points: (m, k) of these.
-        chance: (p, p) covariance of one simulation's own.
-        fixed: (p, p) covariance of all parts but numerics.
-        numerics: (p, p) that of numerics of factors 1.
+        points: (m, k) their parameters in [-1, 1].
+        scatter: (p, p) covariance between simulations with different seeds.
+        fixed: (p, p) covariance of all parts but the discretisation error.
+        discretisation: (p, p) covariance of the discretisation error for factors of 1.
         placed: (p,) scores of instruments that have a place.
-        share: numerics of factor 1 over the other parts, for these; without pairs, over what soil could do otherwise.
-        factor_std: standard deviation of the logarithm of the numerics' factor.
-        patterns: (k, p) what each observation effect does in its smallest meaningful sizes, by name.
-        trend: (m, m) projector on the base simulations' trend.
+        ratio: standard deviation of the discretisation error over that of all other parts, for these scores.
+        factor_std: standard deviation of the logarithm of a factor of the discretisation error.
+        patterns: (k, p) change by each effect of observation at its smallest meaningful sizes, by name.
+        trend: (m, m) projector on the trend of the base simulations.
     """
 
-    mask: npt.NDArray[np.bool_]
+    mask: BoolArray
     mean: FloatArray
     basis: FloatArray
     observed: FloatArray
     correction: FloatArray
     base: FloatArray
     points: FloatArray
-    chance: FloatArray
+    scatter: FloatArray
     fixed: FloatArray
-    numerics: FloatArray
-    placed: npt.NDArray[np.bool_]
-    share: float
+    discretisation: FloatArray
+    placed: BoolArray
+    ratio: float
     factor_std: float
     patterns: Mapping[str, FloatArray]
     trend: FloatArray
@@ -121,31 +123,32 @@ class Noise:
         return np.asarray((tables[:, self.mask] - self.mean) @ self.basis)
 
     @property
-    def cell(self) -> FloatArray:
-        """(t, s) what finer cells add to a prediction."""
+    def cell_correction(self) -> FloatArray:
+        """(t, s) features of fine cells minus those of coarse cells."""
         out = np.zeros(self.mask.shape)
         out[self.mask] = self.basis @ self.correction
         return out
 
     def covariance(self, factors: npt.ArrayLike) -> FloatArray:
-        """(p, p) with numerics of factors (2,), that of placed instruments and that of others, or of one for both."""
+        """(p, p) for factors (2,) of the discretisation error, of placed instruments and of others, or one for both."""
         size = np.where(self.placed, *np.broadcast_to(np.asarray(factors, dtype=np.float64), 2))
-        return self.fixed + np.outer(size, size) * self.numerics
+        return self.fixed + np.outer(size, size) * self.discretisation
 
     @property
-    def expected(self) -> FloatArray:
-        """(f,) logarithms of the probability of each of `FACTORS`, if nothing is wrong."""
-        return self._probability(np.zeros(FACTORS.shape, dtype=bool))
+    def log_prior(self) -> FloatArray:
+        """(f,) log prior probability of each of `FACTORS` for a correct model."""
+        return self._log_prior(np.zeros(FACTORS.shape, dtype=bool))
 
     @property
-    def beyond(self) -> FloatArray:
-        """(f,) the same where one of the factors at least is more than numerics: any such one is as probable."""
-        large = np.log(FACTORS) >= SOMETHING_ELSE * self.factor_std - 1e-9
-        density = np.where(large.any(axis=1), self._probability(large), -np.inf)
+    def log_prior_discrepancy(self) -> FloatArray:
+        """(f,) the same for the model with a discrepancy: one factor at least is large; large ones are equally
+        probable."""
+        large = np.log(FACTORS) >= DISCREPANCY_STDS * self.factor_std - 1e-9
+        density = np.where(large.any(axis=1), self._log_prior(large), -np.inf)
         return np.asarray(density - logsumexp(density))
 
-    def _probability(self, free: npt.NDArray[np.bool_]) -> FloatArray:
-        density = np.sum(np.where(free, 0.0, -0.5 * (np.log(FACTORS) / self.factor_std) ** 2), axis=1)
+    def _log_prior(self, flat: BoolArray) -> FloatArray:
+        density = np.sum(np.where(flat, 0.0, -0.5 * (np.log(FACTORS) / self.factor_std) ** 2), axis=1)
         return np.asarray(density - logsumexp(density))
 
 
@@ -154,102 +157,105 @@ def noise_of(
     prior: Prior,
     tables: Tables,
     candidates: Sequence[Candidate],
-    aside: npt.NDArray[np.bool_] | None = None,
+    held_out: BoolArray | None = None,
 ) -> Noise:
-    """Projection and noise.
+    """Projection and noise model.
 
     Args:
         experiment: whose features these are.
         prior: of the base model.
         tables: the simulations.
-        candidates: effects, of which those of observation are nuisances.
-        aside: (t, s) features to leave out.
+        candidates: effects; those of observation are nuisances.
+        held_out: (t, s) features to leave out.
     """
-    mask = compared(experiment) if aside is None else compared(experiment) & ~aside
+    mask = compared(experiment) if held_out is None else compared(experiment) & ~held_out
     placed = np.broadcast_to(experiment.layout.placed, mask.shape)[mask]
     (base_runs, base), (fine_runs, fine) = tables.base, tables.fine
     points = prior.unit(base_runs)
-    varied = np.concatenate([base, *(found for _, found in tables.effects.values())])[:, mask]
+    varied = np.concatenate([base, *(table for _, table in tables.effects.values())])[:, mask]
     mean = varied.mean(axis=0)
     hat = trend_of(points, points)
     rest = (base[:, mask] - hat @ base[:, mask]) / np.sqrt(np.maximum(1.0 - np.diag(hat), 1e-9))[:, None]
-    basis = _modes(varied - mean, rest, placed)
+    basis = _principal_components(varied - mean, rest, placed)
     count = basis.shape[1]
     in_place = np.arange(count) < count - int((~placed).sum())
     both = np.outer(in_place, in_place)
 
-    def scored(found: FloatArray) -> FloatArray:
-        return np.asarray((found[..., mask] - mean) @ basis)
+    def scores(table: FloatArray) -> FloatArray:
+        return np.asarray((table[..., mask] - mean) @ basis)
 
-    def apart(runs: Sequence[Run], found: FloatArray) -> FloatArray:
-        """Scores about the base simulations' trend."""
-        return np.asarray(scored(found) - trend_of(prior.unit(runs), points) @ own)
+    def about_trend(runs: Sequence[Run], table: FloatArray) -> FloatArray:
+        """Scores minus the trend of the base simulations."""
+        return np.asarray(scores(table) - trend_of(prior.unit(runs), points) @ own)
 
-    own = scored(base)
-    chance = shrunk(rest @ basis) if experiment.chance else np.zeros((count, count))
-    drawn = {name: scored(table) - scored(tables.reference) for name, table in tables.drawn.items()}
+    own = scores(base)
+    scatter = shrunk(rest @ basis) if experiment.stochastic else np.zeros((count, count))
+    changes = {name: scores(table) - scores(tables.reference) for name, table in tables.variants.items()}
     patterns = {
-        c.name: np.array([drawn[p.name] for p in c.parameters if p.name in drawn])
+        c.name: np.array([changes[p.name] for p in c.parameters if p.name in changes])
         for c in candidates
-        if c.kind == "observation" and any(p.name in drawn for p in c.parameters)
+        if c.kind == "observation" and any(p.name in changes for p in c.parameters)
     }
-    rows = drawings(experiment, tables, candidates)[:, mask] @ basis
-    fixed = chance + _instruments(experiment, mask, basis) + rows.T @ rows
+    rows = nuisances(experiment, tables, candidates)[:, mask] @ basis
+    fixed = scatter + _instruments(experiment, mask, basis) + rows.T @ rows
     if len(fine_runs):
-        pairs = apart(fine_runs, fine)
-        # of a fine run, and of the trend there; its covariance is estimated: the mean of an F-distribution
+        pairs = about_trend(fine_runs, fine)
+        # Scatter of a fine simulation and of the trend; estimated, hence the mean of an F-distribution.
         free = len(own) - np.trace(hat)
-        scatter = chance * (1.0 + np.sum(trend_of(prior.unit(fine_runs), points) ** 2) / len(pairs))
-        scatter *= free / max(free - 2.0, 1.0)
-        share = _share(pairs[:, in_place], *(c[np.ix_(in_place, in_place)] for c in (fixed, scatter)))
-        numerics = np.where(both, share**2 * fixed, 0.0)
+        pair_scatter = scatter * (1.0 + np.sum(trend_of(prior.unit(fine_runs), points) ** 2) / len(pairs))
+        pair_scatter *= free / max(free - 2.0, 1.0)
+        ratio = _excess_ratio(pairs[:, in_place], *(c[np.ix_(in_place, in_place)] for c in (fixed, pair_scatter)))
+        discretisation = np.where(both, ratio**2 * fixed, 0.0)
         difference = np.where(in_place, pairs.mean(axis=0), 0.0)
-        of_mean = numerics + scatter / len(pairs) + 1e-9 * np.eye(count)
-        correction = np.where(in_place, numerics @ np.linalg.solve(of_mean, difference), 0.0)
-        numerics = REMAINING**2 * (numerics + _of_unplaced(experiment, mask, pairs, in_place))
-        share, factor_std = REMAINING * share, DOUBT
+        of_mean = discretisation + pair_scatter / len(pairs) + 1e-9 * np.eye(count)
+        correction = np.where(in_place, discretisation @ np.linalg.solve(of_mean, difference), 0.0)
+        discretisation = FINE_ERROR_RATIO**2 * (discretisation + _of_unplaced(experiment, mask, pairs, in_place))
+        ratio, factor_std = FINE_ERROR_RATIO * ratio, FINE_ERROR_LOG_STD
     else:
-        varied_by = [apart(*made) for made in tables.effects.values()] + [own - own.mean(axis=0)]
-        otherwise = _positive(sum(e.T @ e / len(e) for e in varied_by) / len(varied_by) - chance)
-        correction, share, factor_std = np.zeros(count), UNMEASURED, NO_PAIRS
-        numerics = share**2 * otherwise
+        varied_by = [about_trend(*runs) for runs in tables.effects.values()] + [own - own.mean(axis=0)]
+        reachable = _positive(sum(e.T @ e / len(e) for e in varied_by) / len(varied_by) - scatter)
+        correction, ratio, factor_std = np.zeros(count), UNPAIRED_RATIO, UNPAIRED_LOG_STD
+        discretisation = ratio**2 * reachable
     return Noise(
         mask=mask,
         mean=mean,
         basis=basis,
-        observed=scored(experiment.observed) - correction,
+        observed=scores(experiment.observed) - correction,
         correction=correction,
         base=own,
         points=points,
-        chance=chance,
+        scatter=scatter,
         fixed=fixed,
-        numerics=numerics,
+        discretisation=discretisation,
         placed=in_place,
-        share=share,
+        ratio=ratio,
         factor_std=factor_std,
         patterns=patterns,
         trend=hat,
     )
 
 
-def drawings(experiment: Experiment, tables: Tables, candidates: Sequence[Candidate]) -> FloatArray:
-    """(k, t, s) what one simulation reported or drawn otherwise differs by: independent parts of the noise."""
-    apart = {name: table - tables.reference for name, table in tables.drawn.items()}
-    guessed = [apart[name] for name in experiment.guesses if name in apart]
+def nuisances(experiment: Experiment, tables: Tables, candidates: Sequence[Candidate]) -> FloatArray:
+    """(k, t, s) independent parts of the noise from variants of one simulation: unknown albedo, rendering, and effects
+    of observation."""
+    changes = {name: table - tables.reference for name, table in tables.variants.items()}
+    albedo = [changes[name] for name in experiment.albedo_draws if name in changes]
     named = [p.name for c in candidates if c.kind == "observation" for p in c.parameters]
-    rows = [guess / np.sqrt(len(guessed)) for guess in guessed]
-    rows += [apart[name] for name in (*experiment.redrawn, *named) if name in apart]
+    rows = [change / np.sqrt(len(albedo)) for change in albedo]
+    rows += [changes[name] for name in (*experiment.renderings, *named) if name in changes]
     return np.array(rows).reshape(-1, *experiment.layout.shape)
 
 
-def compared(experiment: Experiment) -> npt.NDArray[np.bool_]:
+def compared(experiment: Experiment) -> BoolArray:
     """(t, s) features that are compared: all that are seen where something can move."""
     return np.asarray(experiment.seen & ~experiment.quiet)
 
 
 def trend_of(where: FloatArray, points: FloatArray) -> FloatArray:
-    """(q, m) weights that make the trend at points (q, n) of values at points (m, n): cubic in one parameter, quadratic
-    in several, as far as the points allow (ridge)."""
+    """(q, m) weights of a polynomial regression: from values at points (m, n) to their trend at points (q, n).
+
+    Cubic in one parameter, quadratic in several; a small ridge serves where points are too few.
+    """
 
     def terms(x: FloatArray) -> FloatArray:
         columns = [np.ones(len(x)), *x.T, *(x.T**2)]
@@ -263,8 +269,8 @@ def trend_of(where: FloatArray, points: FloatArray) -> FloatArray:
 
 
 def shrunk(rows: FloatArray) -> FloatArray:
-    """(p, p) covariance of rows (m, p) of mean 0, shrunk towards its diagonal by the amount that is best on average
-    (Ledoit & Wolf 2004; Schäfer & Strimmer 2005, Stat. Appl. Genet. Mol. Biol. 4:32)."""
+    """(p, p) covariance of rows (m, p) of mean 0, optimally shrunk towards its diagonal (Ledoit & Wolf 2004;
+    Schäfer & Strimmer 2005, Stat. Appl. Genet. Mol. Biol. 4:32)."""
     m = len(rows)
     products = rows[:, :, None] * rows[:, None, :]
     covariance = products.mean(axis=0)
@@ -275,8 +281,8 @@ def shrunk(rows: FloatArray) -> FloatArray:
 
 
 def moderated(variances: FloatArray, freedom: int) -> FloatArray:
-    """(k,) sample variances of so many degrees of freedom each, drawn towards what they have in common as far as chance
-    alone explains that they differ (empirical Bayes: Smyth 2004, Stat. Appl. Genet. Mol. Biol. 3:3, section 6.2)."""
+    """(k,) moderated variances: sample variances of so many degrees of freedom, shrunk towards their common value
+    (empirical Bayes: Smyth 2004, Stat. Appl. Genet. Mol. Biol. 3:3, section 6.2)."""
     half = 0.5 * freedom
     logs = np.log(np.maximum(variances, 1e-12)) - digamma(half) + np.log(half)
     beyond = float(np.var(logs, ddof=1) - polygamma(1, half)) if len(logs) > 1 else 0.0
@@ -287,40 +293,36 @@ def moderated(variances: FloatArray, freedom: int) -> FloatArray:
     return np.asarray((prior * common + half * variances) / (prior + half))
 
 
-def _modes(varied: FloatArray, rest: FloatArray, placed: npt.NDArray[np.bool_]) -> FloatArray:
-    """(n, p) leading modes of placed features, beside them the unplaced ones themselves."""
+def _principal_components(varied: FloatArray, rest: FloatArray, placed: BoolArray) -> FloatArray:
+    """(n, p) principal components of placed features, followed by the unplaced features themselves."""
     n, columns = varied.shape[1], []
     if placed.any():
         _, _, right = np.linalg.svd(varied[:, placed], full_matrices=False)
-        right = right[:MOST_MODES]
+        right = right[:MAX_COMPONENTS]
         of_all = np.var(varied[:, placed] @ right.T, axis=0)
-        of_chance = np.mean((rest[:, placed] @ right.T) ** 2, axis=0)
-        kept = of_all > ABOVE_CHANCE * np.maximum(of_chance, 1e-12)
-        kept[0] = True
-        modes = np.zeros((n, int(kept.sum())))
-        modes[placed] = right[kept].T
-        columns.append(modes)
+        of_scatter = np.mean((rest[:, placed] @ right.T) ** 2, axis=0)
+        significant = of_all > MIN_VARIANCE_RATIO * np.maximum(of_scatter, 1e-12)
+        significant[0] = True
+        components = np.zeros((n, int(significant.sum())))
+        components[placed] = right[significant].T
+        columns.append(components)
     columns.append(np.eye(n)[:, ~placed])
     return np.concatenate(columns, axis=1)
 
 
-def _share(apart: FloatArray, noise: FloatArray, scatter: FloatArray) -> float:
-    """Size of what fine and coarse runs (m, p) differ by beyond their scatter, over noise, both covariances (p, p)."""
-    if not apart.shape[1]:
+def _excess_ratio(pairs: FloatArray, noise: FloatArray, scatter: FloatArray) -> float:
+    """Root mean square of fine minus coarse (m, p) beyond their scatter, in units of the noise; covariances (p, p)."""
+    if not pairs.shape[1]:
         return 0.0
     root = np.linalg.cholesky(noise + 1e-9 * np.eye(len(noise)))
-    white = solve_triangular(root, apart.T, lower=True)
-    by_chance = np.trace(solve_triangular(root, solve_triangular(root, scatter, lower=True).T, lower=True))
-    return float(np.sqrt(max(np.mean(white**2) - by_chance / len(root), 0.0)))
+    white = solve_triangular(root, pairs.T, lower=True)
+    expected = np.trace(solve_triangular(root, solve_triangular(root, scatter, lower=True).T, lower=True))
+    return float(np.sqrt(max(np.mean(white**2) - expected / len(root), 0.0)))
 
 
-def _of_unplaced(
-    experiment: Experiment, mask: npt.NDArray[np.bool_], pairs: FloatArray, in_place: npt.NDArray[np.bool_]
-) -> FloatArray:
-    """(p, p) numerics of instruments without a place, one size for each channel and stage.
-
-    Few pairs say little of a size: that they agree in one stage is often luck. So sizes are moderated by each other.
-    """
+def _of_unplaced(experiment: Experiment, mask: BoolArray, pairs: FloatArray, in_place: BoolArray) -> FloatArray:
+    """(p, p) covariance of the discretisation error of instruments without a place, one variance for each channel and
+    stage. Few pairs estimate a variance poorly, so variances are moderated by each other."""
     out = np.zeros((len(in_place),) * 2)
     layout = experiment.layout
     there = np.argwhere(mask & ~layout.placed)
@@ -330,24 +332,25 @@ def _of_unplaced(
     channels, units = (np.array([(s.channel, s.unit) for s in layout.sites])[there[:, 1]]).T
     own = pairs[:, ~in_place]
     blocks = [(stages == s) & (channels == c) for s, c in sorted(set(zip(stages, channels, strict=True)))]
-    sizes = moderated(np.array([np.mean(own[:, block] ** 2) for block in blocks]), len(pairs))
-    spread = np.sqrt(np.sum(sizes[:, None] * blocks, axis=0))
-    alike = np.where(channels[:, None] == channels[None], STAGE, CHANNEL) * (stages[:, None] == stages[None])
-    alike *= units[:, None] == units[None]
-    np.fill_diagonal(alike, 1.0)
-    out[np.ix_(~in_place, ~in_place)] = alike * np.outer(spread, spread)
+    variances = moderated(np.array([np.mean(own[:, block] ** 2) for block in blocks]), len(pairs))
+    spread = np.sqrt(np.sum(variances[:, None] * blocks, axis=0))
+    correlation = np.where(channels[:, None] == channels[None], STAGE_CORRELATION, CHANNEL_CORRELATION)
+    correlation = correlation * (stages[:, None] == stages[None])
+    correlation *= units[:, None] == units[None]
+    np.fill_diagonal(correlation, 1.0)
+    out[np.ix_(~in_place, ~in_place)] = correlation * np.outer(spread, spread)
     return out
 
 
-def _instruments(experiment: Experiment, mask: npt.NDArray[np.bool_], basis: FloatArray) -> FloatArray:
-    """(p, p) covariance of what instruments add; neighbouring times of a site are correlated by the sensor's memory."""
+def _instruments(experiment: Experiment, mask: BoolArray, basis: FloatArray) -> FloatArray:
+    """(p, p) covariance of the instruments' noise, with the sensor's correlation between neighbouring times."""
     std = experiment.sensor[mask]
     if experiment.sensor_memory == 0.0:
         scaled = std[:, None] * basis
         return np.asarray(scaled.T @ scaled)
     rows, sites = np.nonzero(mask)
-    alike = experiment.sensor_memory ** np.abs(rows[:, None] - rows[None]) * (sites[:, None] == sites[None])
-    return np.asarray(basis.T @ (alike * np.outer(std, std)) @ basis)
+    correlation = experiment.sensor_memory ** np.abs(rows[:, None] - rows[None]) * (sites[:, None] == sites[None])
+    return np.asarray(basis.T @ (correlation * np.outer(std, std)) @ basis)
 
 
 def _positive(matrix: FloatArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""A comparison of models as plain data and in plain words: what ``diagnosis.json`` and ``misfit.json`` hold."""
+"""The contents of ``diagnosis.json`` and ``misfit.json``: a comparison of models as data and sentences."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from splatsoil.run_files import DIAGNOSIS_FORMAT, MISFIT_FORMAT
 
 from .checks import SIGNIFICANT
 from .diagnosis import Diagnosis
-from .evidence import AS_IT_IS, ELSE
+from .evidence import BASE_MODEL, DISCREPANCY
 
-ABOUT_MISFIT = (
-    *("estimates", "sentences", "checks", "passes", "numerics", "unit", "time_name", "times", "stages", "sites"),
-    *("curves", "regions", "maps", "simulations", "fit", "values"),
+MISFIT_KEYS = (
+    *("estimates", "sentences", "checks", "passes", "discretisation_factor", "unit", "time_name", "times", "stages"),
+    *("sites", "curves", "regions", "maps", "simulations", "fit", "values"),
 )
 
 
 def record(experiment: Experiment, diagnosis: Diagnosis, simulations: int) -> dict[str, Any]:
-    """Everything a reader, a report or another command may ask for."""
+    """The diagnosis as plain data, after so many simulations."""
     layout = experiment.layout
     candidates = {c.name: c for c in experiment.candidates}
     evidence = diagnosis.evidence
@@ -44,22 +44,22 @@ def record(experiment: Experiment, diagnosis: Diagnosis, simulations: int) -> di
         },
         "models": [_model(diagnosis, name, candidates.get(name)) for name in order],
         "held_out": [dict(vars(one)) for one in diagnosis.held_out],
-        "aside": diagnosis.aside,
+        "held_out_data": diagnosis.held_out_data,
         "checks": [dict(vars(check)) for check in diagnosis.checks],
         "passes": diagnosis.passes,
-        "numerics": float(evidence.models[evidence.best].factors.max()),
+        "discretisation_factor": float(evidence.models[evidence.best].factors.max()),
         "unit": layout.unit,
         "time_name": layout.time_name,
         "times": list(layout.times),
         "stages": list(layout.stages),
-        # What has no place is drawn as curves instead.
+        # Instruments without a place are drawn as curves instead.
         "sites": [
             [s.channel, *((s.x, s.y) if there else (None, None)), [[round(u, 5), round(v, 5)] for u, v in s.outline]]
             for s, there in zip(layout.sites, layout.placed, strict=True)
         ],
         "regions": layout.regions.tolist(),
         "curves": [_curve(experiment, diagnosis, column) for column, there in enumerate(layout.placed) if not there],
-        # In units of what each feature is expected to be off; null where nothing is compared.
+        # Residuals over their expected standard deviation; null where nothing is compared.
         "maps": {name or "before": _map(table, diagnosis) for name, table in diagnosis.residuals.items()},
         "simulations": simulations,
         "notes": list(diagnosis.notes),
@@ -67,18 +67,18 @@ def record(experiment: Experiment, diagnosis: Diagnosis, simulations: int) -> di
 
 
 def misfit_of(whole: Mapping[str, Any]) -> dict[str, Any]:
-    """Of a comparison without effects: whether the model is adequate, where and when it isn't."""
+    """``misfit.json`` from a diagnosis without effects: whether the model is adequate, and where it fails."""
     probability = {model["name"]: model["probability"] for model in whole["models"]}
     return {
         "format": MISFIT_FORMAT,
         "adequate": whole["verdict"] == "adequate",
-        "probability": probability[AS_IT_IS],
-        **{key: whole[key] for key in ABOUT_MISFIT},
+        "probability": probability[BASE_MODEL],
+        **{key: whole[key] for key in MISFIT_KEYS},
     }
 
 
 def sentences(diagnosis: Diagnosis, candidates: Mapping[str, Candidate]) -> list[str]:
-    """What was found, the most important first. Each says no more than the numbers do."""
+    """The result in sentences, the most important first."""
     evidence = diagnosis.evidence
     out = []
     if diagnosis.verdict == "missing":
@@ -88,8 +88,8 @@ def sentences(diagnosis: Diagnosis, candidates: Mapping[str, Candidate]) -> list
             f"probability is {probability(evidence.probability[name])}."
         )
     elif diagnosis.verdict == "one of":
-        told = [f"{n.replace('_', ' ')} ({probability(evidence.probability[n])})" for n in diagnosis.members]
-        out.append(f"One of these is missing: {listed(told)}. The data do not tell them apart.")
+        named = [f"{n.replace('_', ' ')} ({probability(evidence.probability[n])})" for n in diagnosis.members]
+        out.append(f"One of these is missing: {listed(named)}. The data do not tell them apart.")
     elif diagnosis.verdict == "something else":
         none = ", and no effect of the library explains it" if candidates else ""
         out.append(f"The residual is larger than noise and discretisation error{none}.")
@@ -100,13 +100,13 @@ def sentences(diagnosis: Diagnosis, candidates: Mapping[str, Candidate]) -> list
         ]
         out.append(f"No model is probable enough to be named: {listed(shares)}.")
     else:
-        others = "" if not candidates else f" Its probability is {probability(evidence.probability[AS_IT_IS])}."
+        others = "" if not candidates else f" Its probability is {probability(evidence.probability[BASE_MODEL])}."
         out.append(f"The model as it is explains the data.{others}")
     out += [undetermined(name) for name, determined in diagnosis.determined.items() if not determined]
     if len(diagnosis.held_out) > 1:
         before, after = diagnosis.held_out[:2]
         out.append(
-            f"On what was set aside ({diagnosis.aside}), the error is {before.error:.2g} without and "
+            f"On what was set aside ({diagnosis.held_out_data}), the error is {before.error:.2g} without and "
             f"{after.error:.2g} with {after.model.replace('_', ' ')}; the noise level is {after.noise:.2g}."
         )
     worst = next((c for c in diagnosis.checks if c.p < SIGNIFICANT), None)
@@ -126,20 +126,20 @@ def _size(diagnosis: Diagnosis, candidate: Candidate) -> str:
 
 
 def _power(diagnosis: Diagnosis, candidates: Mapping[str, Candidate]) -> list[str]:
-    """What would have been seen, and what not."""
+    """Which effects the data can and cannot detect."""
     named = diagnosis.members if diagnosis.verdict == "missing" else ()
     sizes = {name: size for name, size in diagnosis.detectable.items() if name not in named}
-    seen = [
+    detected = [
         f"{name.replace('_', ' ')} of {amount(size, 0.0, candidates[name].measure.unit)}"
         for name, size in sizes.items()
         if size is not None
     ]
-    blind = [name.replace("_", " ") for name, size in sizes.items() if size is None]
+    hidden = [name.replace("_", " ") for name, size in sizes.items() if size is None]
     out = []
-    if seen and diagnosis.verdict != "missing":
-        out.append(f"These would have been named in 8 of 10 cases: {listed(seen)}.")
-    if blind:
-        out.append(f"These data cannot show {listed(blind)}.")
+    if detected and diagnosis.verdict != "missing":
+        out.append(f"These would have been named in 8 of 10 cases: {listed(detected)}.")
+    if hidden:
+        out.append(f"These data cannot show {listed(hidden)}.")
     return out
 
 
@@ -150,10 +150,10 @@ def _model(diagnosis: Diagnosis, name: str, candidate: Candidate | None) -> dict
     size = (None, None) if measure is None else moments.get(measure.name, (None, None))
     return {
         "name": name,
-        "kind": candidate.kind if candidate is not None else "discrepancy" if name == ELSE else "base",
+        "kind": candidate.kind if candidate is not None else "discrepancy" if name == DISCREPANCY else "base",
         "note": "" if candidate is None else candidate.note,
         "probability": diagnosis.evidence.probability[name],
-        "log_evidence": model.log_evidence - diagnosis.evidence.models[AS_IT_IS].log_evidence,
+        "log_evidence": model.log_evidence - diagnosis.evidence.models[BASE_MODEL].log_evidence,
         "values": {parameter: value for parameter, (value, _) in moments.items()},
         "stds": {parameter: std for parameter, (_, std) in moments.items()},
         "parameter": None if measure is None else measure.name,
@@ -167,8 +167,7 @@ def _model(diagnosis: Diagnosis, name: str, candidate: Candidate | None) -> dict
 
 
 def _curve(experiment: Experiment, diagnosis: Diagnosis, column: int) -> dict[str, Any]:
-    """An instrument without a place, in its unit: what it measured, one expected standard deviation below and above
-    that, and what is predicted."""
+    """Readings of an instrument without a place, plus and minus one expected standard deviation, and predictions."""
     site, seen = experiment.layout.sites[column], experiment.seen
     std = np.sqrt(diagnosis.expected)
 

@@ -1,4 +1,4 @@
-"""Simulations that criticism asks for, each made once and kept, so that an interruption costs one."""
+"""Cached simulations of an experiment: each is run once and its feature table stored on disk."""
 
 from __future__ import annotations
 
@@ -24,37 +24,40 @@ Arguments = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
-class Helpers:
-    """Other processes that simulate the same experiment and keep what they make in the same folder.
+class Executor:
+    """Worker processes that run simulations of the same experiment and store them in the same folder.
 
     Attributes:
-        submit: simulations to a future that is done when they are kept, or could not be made.
-        together: how many simulations are best made by one at a time.
-        prepare: has this process do for simulations what is best done for all of them at once.
+        submit: simulations to a future that is done when they are stored or have failed.
+        batch_size: number of simulations that one worker runs as a batch.
+        prepare: runs a batch of simulations in this process.
     """
 
     submit: Callable[[Sequence[Arguments]], Future[Any]]
-    together: int = 1
+    batch_size: int = 1
     prepare: Callable[[Sequence[Arguments]], object] = lambda jobs: None
 
 
 @dataclass(frozen=True)
-class _Plan:
-    """Simulations by key that a helper will make, unless this process is there first."""
+class _Batch:
+    """Simulations by key, submitted together."""
 
     jobs: Mapping[str, Arguments]
     future: Future[Any]
 
 
 class Simulations:
-    """An experiment's predictions, from a folder where they are there already.
+    """An experiment's predictions, cached in a folder.
 
     Args:
         experiment: predicts.
-        folder: where feature tables are kept; None keeps them in memory only.
-        identity: everything beside the arguments of ``predict`` that decides a prediction.
-        told: called before each new simulation with what it is for.
-        sources: digests of the files that define effects, by their names, where these are a user's own.
+        folder: holds the feature tables; None caches in memory only.
+        identity: everything that decides a prediction, besides the arguments of ``predict``.
+        sources: digests of the files that define a user's own effects, by effect.
+
+    Attributes:
+        simulated: number of simulations that were run, not read.
+        report: called before each new simulation with its purpose.
     """
 
     def __init__(
@@ -62,20 +65,19 @@ class Simulations:
         experiment: Experiment,
         folder: Path | None = None,
         identity: Mapping[str, Any] | None = None,
-        told: Callable[[str], None] = lambda purpose: None,
         sources: Mapping[str, str] | None = None,
     ) -> None:
         self.experiment, self.folder = experiment, folder
-        self.identity, self.sources, self.told = dict(identity or {}), dict(sources or {}), told
-        self.made = 0
-        """Simulations made, not read."""
+        self.identity, self.sources = dict(identity or {}), dict(sources or {})
+        self.report: Callable[[str], None] = lambda purpose: None
+        self.simulated = 0
         self._tables: dict[str, FloatArray | SimulationError] = {}
-        self._planned: dict[str, _Plan] = {}
-        self._helpers: Helpers | None = None
+        self._submitted: dict[str, _Batch] = {}
+        self._executor: Executor | None = None
 
     @property
-    def asked(self) -> int:
-        """Different simulations that were needed, and could be made."""
+    def requested(self) -> int:
+        """Number of different simulations that were requested and succeeded."""
         return sum(not isinstance(table, SimulationError) for table in self._tables.values())
 
     def __call__(
@@ -84,20 +86,20 @@ class Simulations:
         *,
         effects: tuple[str, ...] = (),
         seed: int = 0,
-        numerics: str = "",
+        variant: str = "",
         purpose: str = "",
     ) -> FloatArray:
         """(t, s) predicted features.
 
         Raises:
-            SimulationError: the simulation could not go on.
-            RunError: what is kept of it is damaged.
+            SimulationError: the simulation failed.
+            RunError: the cached file is damaged.
         """
-        what = {"values": dict(values), "effects": effects, "seed": seed, "numerics": numerics}
-        key = self._key(what)
+        arguments = {"values": dict(values), "effects": effects, "seed": seed, "variant": variant}
+        key = self._key(arguments)
         if key not in self._tables:
             try:
-                self._tables[key] = self._found(key, what, purpose)
+                self._tables[key] = self._load_or_run(key, arguments, purpose)
             except SimulationError as error:
                 self._tables[key] = error
         table = self._tables[key]
@@ -105,98 +107,102 @@ class Simulations:
             raise table
         return table
 
-    def keep(self, table: FloatArray, values: Mapping[str, float], seed: int) -> None:
-        """A prediction (t, s) of the base model that was made elsewhere; one that is there already stays.
+    def store(self, table: FloatArray, values: Mapping[str, float], seed: int) -> None:
+        """Cache a prediction (t, s) of the base model from another source; an existing one stays.
 
         Raises:
             RunError: the folder can't be written to.
         """
-        key = self._key({"values": dict(values), "effects": (), "seed": seed, "numerics": ""})
-        if self._kept(key) is None:
+        key = self._key({"values": dict(values), "effects": (), "seed": seed, "variant": ""})
+        if self._cached(key) is None:
             self._write(key, table)
 
     @contextmanager
-    def helped(self, helpers: Helpers) -> Iterator[None]:
-        """While the block runs, others simulate, too."""
-        self._helpers = helpers
+    def using(self, executor: Executor) -> Iterator[None]:
+        """While the block runs, ``prefetch`` submits simulations to the executor."""
+        self._executor = executor
         try:
             yield
         finally:
-            self._helpers, self._planned = None, {}
+            self._executor, self._submitted = None, {}
 
-    def ahead(self, work: Callable[[Simulate], object]) -> None:
-        """Have the helpers make what some work will ask for, from the last on; the first ones are made here.
+    def prefetch(self, work: Callable[[Simulate], object]) -> None:
+        """Submit the simulations that some work will request, the last ones first: this process runs the first.
 
         Args:
-            work: asks its argument for simulations, as it would ask this, and gets zeros.
+            work: requests simulations from its argument, which returns zeros here.
         """
-        if self._helpers is None:
+        if self._executor is None:
             return
-        asked: dict[str, Arguments] = {}
+        requested: dict[str, Arguments] = {}
 
-        def noted(values: Mapping[str, float], *, purpose: str = "", **others: Any) -> FloatArray:
-            what = {"values": dict(values), "effects": (), "seed": 0, "numerics": "", **others}
-            asked.setdefault(self._key(what), what)
+        def record(values: Mapping[str, float], *, purpose: str = "", **others: Any) -> FloatArray:
+            arguments = {"values": dict(values), "effects": (), "seed": 0, "variant": "", **others}
+            requested.setdefault(self._key(arguments), arguments)
             return np.zeros(self.experiment.layout.shape)
 
-        work(noted)
-        drawings = {*self.experiment.guesses, *self.experiment.redrawn}
-        shares: list[dict[str, Arguments]] = []
+        work(record)
+        drawings = {*self.experiment.albedo_draws, *self.experiment.renderings}
+        batches: list[dict[str, Arguments]] = []
         latest: dict[object, dict[str, Arguments]] = {}
-        for key, what in asked.items():
-            if key in self._tables or key in self._planned or self._kept(key) is not None:
+        for key, arguments in requested.items():
+            if key in self._tables or key in self._submitted or self._cached(key) is not None:
                 continue
-            # What only draws a simulation otherwise is left to one process: on a GPU no second one is quite the same.
-            drawn = what["numerics"] in drawings
-            kind = self._key({**what, "numerics": ""}) if drawn else (*sorted(what["effects"]), what["numerics"])
-            if kind not in latest or (len(latest[kind]) == self._helpers.together and not drawn):
+            # Renderings of one simulation stay in one process: on a GPU a second simulation differs in the last bits.
+            drawn = arguments["variant"] in drawings
+            kind = (
+                self._key({**arguments, "variant": ""})
+                if drawn
+                else (*sorted(arguments["effects"]), arguments["variant"])
+            )
+            if kind not in latest or (len(latest[kind]) == self._executor.batch_size and not drawn):
                 latest[kind] = {}
-                shares.append(latest[kind])
-            latest[kind][key] = what
-        with suppress(BrokenExecutor):  # helpers that died cost nothing but their help
-            for jobs in reversed(shares):
-                self._planned |= dict.fromkeys(jobs, _Plan(jobs, self._helpers.submit(list(jobs.values()))))
+                batches.append(latest[kind])
+            latest[kind][key] = arguments
+        with suppress(BrokenExecutor):  # without workers this process runs everything
+            for jobs in reversed(batches):
+                self._submitted |= dict.fromkeys(jobs, _Batch(jobs, self._executor.submit(list(jobs.values()))))
 
-    def _key(self, what: Arguments) -> str:
-        effects = sorted(f"{name} {self.sources.get(name, '')}".rstrip() for name in what["effects"])
-        return digest({**self.identity, **what, "effects": effects})
+    def _key(self, arguments: Arguments) -> str:
+        effects = sorted(f"{name} {self.sources.get(name, '')}".rstrip() for name in arguments["effects"])
+        return digest({**self.identity, **arguments, "effects": effects})
 
-    def _found(self, key: str, what: Arguments, purpose: str) -> FloatArray:
-        """What is kept, or will be by a helper; else made here, with all that goes with it."""
-        plan, kept = self._planned.pop(key, None), self._kept(key)
-        if kept is not None and plan is None:
-            return kept
-        self.told(purpose)
-        if plan is not None and plan.future.cancel():
-            self._planned = {name: other for name, other in self._planned.items() if other is not plan}
-            return self._make(key, plan.jobs)
-        if plan is not None:
-            wait([plan.future])
-            if (kept := self._kept(key)) is not None:
-                self.made += 1
-                return kept
-        # Whatever went wrong there, it will be met here, too, and said.
-        return self._make(key, {key: what})
+    def _load_or_run(self, key: str, arguments: Arguments, purpose: str) -> FloatArray:
+        """From the cache, from a worker that has begun it, or run here with the rest of its batch."""
+        batch, cached = self._submitted.pop(key, None), self._cached(key)
+        if cached is not None and batch is None:
+            return cached
+        self.report(purpose)
+        if batch is not None and batch.future.cancel():
+            self._submitted = {name: other for name, other in self._submitted.items() if other is not batch}
+            return self._run_batch(key, batch.jobs)
+        if batch is not None:
+            wait([batch.future])
+            if (cached := self._cached(key)) is not None:
+                self.simulated += 1
+                return cached
+        # A worker's error is raised here again, with its message.
+        return self._run(key, arguments)
 
-    def _make(self, key: str, jobs: Mapping[str, Arguments]) -> FloatArray:
-        """New simulations by key, kept; the one with this key is returned."""
-        if len(jobs) > 1 and self._helpers is not None:
-            self._helpers.prepare(list(jobs.values()))
-        made = self._predicted(key, jobs[key])
+    def _run_batch(self, key: str, jobs: Mapping[str, Arguments]) -> FloatArray:
+        """Run and cache a batch; return the table of ``key``."""
+        if len(jobs) > 1 and self._executor is not None:
+            self._executor.prepare(list(jobs.values()))
+        table = self._run(key, jobs[key])
         for other in (name for name in jobs if name != key):
-            # whoever asks for it meets the error
+            # the error is raised when this simulation is requested
             with suppress(SimulationError):
-                if self._kept(other) is None:
-                    self._predicted(other, jobs[other])
-        return made
+                if self._cached(other) is None:
+                    self._run(other, jobs[other])
+        return table
 
-    def _predicted(self, key: str, what: Arguments) -> FloatArray:
-        made = self.experiment.predict(**what)
-        self.made += 1
-        self._write(key, made)
-        return made
+    def _run(self, key: str, arguments: Arguments) -> FloatArray:
+        table = self.experiment.predict(**arguments)
+        self.simulated += 1
+        self._write(key, table)
+        return table
 
-    def _kept(self, key: str) -> FloatArray | None:
+    def _cached(self, key: str) -> FloatArray | None:
         if self.folder is None:
             table = self._tables.get(key)
             return None if isinstance(table, SimulationError) else table

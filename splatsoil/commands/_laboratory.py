@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from splatsoil.commands._options import FitOptions
-from splatsoil.commands._output import stages, tell
+from splatsoil.commands._output import print_result, stages
 from splatsoil.envs.devices import resolve_device
 from splatsoil.errors import MeasurementError, RunError
 from splatsoil.files import plain, write_json
@@ -84,8 +84,8 @@ def _answered(
     else:
         write_json(run / ABOUT, {"format": ABOUT_FORMAT, **about})
         write_json(run / "fit.json", result)
-    told = {**plain(result), "run": str(run), "set": str(folder)}
-    return tell(config, told, lambda: show(result), last=f"kept in {run}")
+    data = {**plain(result), "run": str(run), "set": str(folder)}
+    return print_result(config, data, lambda: show(result), last=f"kept in {run}")
 
 
 def check(config: Any) -> int:
@@ -109,7 +109,7 @@ def check(config: Any) -> int:
         f"{readings} readings of {', '.join(layout.channels)}",
         f"{layout.time_name}: {layout.times[0]:g} to {layout.times[-1]:g}",
     )
-    return tell(config, about, last="\n".join(said))
+    return print_result(config, about, last="\n".join(said))
 
 
 def simulate(config: Any, values: Mapping[str, float]) -> int:
@@ -118,6 +118,6 @@ def simulate(config: Any, values: Mapping[str, float]) -> int:
 
     hush()
     shape = write(config.scene, config.out, values, config.effects, config.preset or "small", config.seed)
-    told = {"set": str(config.out), "kind": config.scene, "parameters": dict(values), "effects": list(shape.model)}
+    data = {"set": str(config.out), "kind": config.scene, "parameters": dict(values), "effects": list(shape.model)}
     said = ", ".join(f"{name} {value:g}" for name, value in values.items())
-    return tell(config, told, last=f"{config.scene.replace('_', ' ')} with {said}: written to {config.out}")
+    return print_result(config, data, last=f"{config.scene.replace('_', ' ')} with {said}: written to {config.out}")

@@ -17,7 +17,7 @@ from splatsoil.commands._options import FitOptions, RunOptions, command_line, sa
 from splatsoil.commands._output import Report, Stage, places, print_remarks, stages
 from splatsoil.envs.devices import resolve_device
 from splatsoil.errors import MeasurementError, NoAnswer, ParameterError, RunError
-from splatsoil.files import FORWARD, JUDGING, RECONSTRUCTING, code_digest, code_of, digest, own_files
+from splatsoil.files import CRITICISM, FORWARD, RECONSTRUCTING, code_digest, code_of, digest, own_files
 from splatsoil.inverse.run_folder import RunFolder
 from splatsoil.quiet import hush
 from splatsoil.report.data import kept_of
@@ -130,8 +130,8 @@ def current_diagnosis(folder: RunFolder, path: Path, effects: tuple[str, ...] | 
     if data is None:
         return None
     candidates = data.get("candidates", ()) if effects is None else effects
-    digests = code_of((*fit["setup"]["effects"], *candidates)), code_digest(JUDGING)
-    return data if (data.get("code"), data.get("judged_by")) == digests else None
+    digests = code_of((*fit["setup"]["effects"], *candidates)), code_digest(CRITICISM)
+    return data if (data.get("code"), data.get("criticism_code")) == digests else None
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,7 @@ def places(run: RunFolder) -> dict[str, str]:
     return {"run": str(run.path), "set": str(run.description["measurement"]["folder"])}
 
 
-def tell(
+def print_result(
     config: Any,
     data: Mapping[str, Any],
     show: Callable[[], object] = lambda: None,

@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from splatsoil import __version__
-from splatsoil.commands import _crew, _model
+from splatsoil.commands import _model, _workers
 from splatsoil.commands._model import ModelSpec, experiment_of, reconstruction_digest
 from splatsoil.commands._options import EVALUATIONS, FitOptions, check_evaluations, check_seed
 from splatsoil.commands._output import Report, Stage, by_frame, print_remarks
 from splatsoil.commands._resources import COMPARISON, check_memory, needs
 from splatsoil.envs.devices import resolve_device
 from splatsoil.errors import MeasurementError, ParameterError, RunError
-from splatsoil.files import JUDGING, code_digest, code_of, plain, write_bytes, write_json
+from splatsoil.files import CRITICISM, code_digest, code_of, plain, write_bytes, write_json
 from splatsoil.inverse.evaluations import EvaluationStore
 from splatsoil.inverse.run_folder import RunFolder
 from splatsoil.quiet import hush
@@ -29,7 +29,7 @@ from splatsoil.report.text import NOTHING_MOVES, symbol
 from splatsoil.run_files import COMPARISON_FORMAT
 
 if TYPE_CHECKING:
-    from splatsoil.commands._crew import Crew
+    from splatsoil.commands._workers import Workers
     from splatsoil.experiment.base import Experiment
     from splatsoil.inverse.criticism.design import Prior
     from splatsoil.inverse.criticism.diagnosis import Diagnosis
@@ -138,7 +138,7 @@ def run_fit(options: FitOptions, run: RunFolder, model: Model, report: Report) -
         nonlocal finished
         finished = done
         if record.loss is not None:
-            simulate.keep(problem.features(record.blocks), record.parameters, record.seed)
+            simulate.store(problem.features(record.blocks), record.parameters, record.seed)
         said = ", ".join(f"{p.name} {record.parameters[p.name]:.4g}{symbol(p.unit)}" for p in space)
         outcome = "failed" if record.loss is None else f"loss {record.loss:.4g}"
         report(f"{done} of {budget}: {said}, {outcome}", SEARCH * done / budget)
@@ -152,7 +152,7 @@ def run_fit(options: FitOptions, run: RunFolder, model: Model, report: Report) -
 
     def compared(found: dict[str, Any]) -> Diagnosis:
         experiment.progress = None
-        with _crew.Crew(run, model.device, ()) as crew, crew.helping(spec, experiment, simulate):
+        with _workers.Workers(run, model.device, ()) as workers, workers.simulating(spec, experiment, simulate):
             return compare_models(experiment, simulate, found, comparing, options.seed, with_effects=False)
 
     experiment.progress = simulating
@@ -191,8 +191,8 @@ def draw_comparison(run: RunFolder, model: Model, report: Report) -> dict[str, A
             rgb = float(np.mean((pictures["observed"] - pictures["predicted"]) ** 2))
             losses = {LOSS: loss, "rgb": comparison.rgb_mse.get((camera, frame), rgb)}
             frames.append({"camera": camera, "frame": frame, "losses": losses, **names})
-        # Heights count where there are no pictures.
-        told = [f for f in frames if f["camera"] in (comparator.cameras or (CHANNEL,))]
+        # The total is that of heights where there are no pictures.
+        counted = [f for f in frames if f["camera"] in (comparator.cameras or (CHANNEL,))]
         if heights is not None and not comparator.cameras:
             noise = heights.noise_loss
         data = {
@@ -205,7 +205,7 @@ def draw_comparison(run: RunFolder, model: Model, report: Report) -> dict[str, A
             "version": __version__,
             "measurement": run.description["measurement"]["hash"],
             "loss": LOSS,
-            "total": {key: float(np.mean([f["losses"][key] for f in told])) for key in (LOSS, "rgb")},
+            "total": {key: float(np.mean([f["losses"][key] for f in counted])) for key in (LOSS, "rgb")},
             "noise": {} if noise is None else {LOSS: noise},
             "motionless": {LOSS: NOTHING_MOVES},
             "gain": GAIN,
@@ -249,22 +249,24 @@ def kept(options: FitOptions) -> str:
 
 
 def run_diagnosis(
-    folder: RunFolder, model: Model, begin: Stage, effects: Iterable[str] = (), *, crew: Crew | None = None
+    folder: RunFolder, model: Model, begin: Stage, effects: Iterable[str] = (), *, workers: Workers | None = None
 ) -> dict[str, Any]:
     """Compare the latest fit's model with those that have an effect more; the result is ``diagnosis.json`` and, by
-    model, ``diagnoses/NAME.json``. ``crew`` are processes for these effects that are there already."""
-    result = _compared_models(folder, model, begin("diagnose"), tuple(effects), crew, with_effects=True)
+    model, ``diagnoses/NAME.json``. ``workers`` are processes for these effects that are there already."""
+    result = _compared_models(folder, model, begin("diagnose"), tuple(effects), workers, with_effects=True)
     write_json(folder.path / "diagnoses" / f"{result['fit']}.json", result)
     write_json(folder.path / "diagnosis.json", result)
     return result
 
 
-def check_adequacy(folder: RunFolder, model: Model, report: Report, *, crew: Crew | None = None) -> dict[str, Any]:
+def check_adequacy(
+    folder: RunFolder, model: Model, report: Report, *, workers: Workers | None = None
+) -> dict[str, Any]:
     """Whether the latest fit's model leaves more than noise, where and when; kept as ``comparison/misfit.json``.
-    ``crew`` are processes for no effects that are there already."""
+    ``workers`` are processes for no effects that are there already."""
     from splatsoil.inverse.criticism.record import misfit_of
 
-    result = misfit_of(_compared_models(folder, model, report, (), crew, with_effects=False))
+    result = misfit_of(_compared_models(folder, model, report, (), workers, with_effects=False))
     write_json(folder.comparison / "misfit.json", result)
     return dict(plain(result))
 
@@ -274,7 +276,7 @@ def _compared_models(
     model: Model,
     report: Report,
     effects: tuple[str, ...],
-    crew: Crew | None,
+    workers: Workers | None,
     *,
     with_effects: bool,
 ) -> dict[str, Any]:
@@ -287,12 +289,12 @@ def _compared_models(
     experiment, simulate = experiment_of(folder, model, spec, (effects or None) if with_effects else ())
     with (
         folder.lock(),
-        _crew.Crew(folder, model.device, effects) if crew is None else nullcontext(crew) as mine,
-        mine.helping(spec, experiment, simulate),
+        _workers.Workers(folder, model.device, effects) if workers is None else nullcontext(workers) as mine,
+        mine.simulating(spec, experiment, simulate),
     ):
         found = compare_models(experiment, simulate, fit, report, seed, with_effects=with_effects)
     return {
-        **record(experiment, found, simulate.asked),
+        **record(experiment, found, simulate.requested),
         "draws": posterior_draws(found.evidence, seed),
         "candidates": list(effects),
         "fit": fit["name"],
@@ -301,10 +303,10 @@ def _compared_models(
         "device": model.device,
         "version": __version__,
         "code": code_of((*spec.effects, *effects)),
-        "judged_by": code_digest(JUDGING),
+        "criticism_code": code_digest(CRITICISM),
         "seed": seed,
         "seconds": round(time.perf_counter() - began, 1),
-        "simulated_now": simulate.made,
+        "simulated_now": simulate.simulated,
     }
 
 
@@ -333,7 +335,7 @@ def compare_models(
         at = what, share
         report(what, share)
 
-    simulate.told = lambda purpose: report(f"{at[0]}, {simulate.made + 1}: {purpose.replace('_', ' ')}", at[1])
+    simulate.report = lambda purpose: report(f"{at[0]}, {simulate.simulated + 1}: {purpose.replace('_', ' ')}", at[1])
     return diagnose(
         experiment,
         {name: entry["estimate"] for name, entry in fit["minimum"].items()},

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from splatsoil import report
 from splatsoil.commands import _model, _stages
 from splatsoil.commands._options import BUDGET, ComputingOptions, FitOptions, check_evaluations
-from splatsoil.commands._output import Stage, print_table, tell
+from splatsoil.commands._output import Stage, print_result, print_table
 from splatsoil.errors import ParameterError, RunError
 from splatsoil.files import write_json
 from splatsoil.inverse.run_folder import RunFolder
@@ -70,8 +70,8 @@ def run(config: Config) -> int:
     models = history(folder)["models"]
     write_history(folder, models)
     _model.require_answer(folder, folder.fit(), f"report: {page}")
-    told = {"report": str(page), "models": models}
-    return tell(config, told, lambda: show(models), last=f"report: {page}", run=folder)
+    data = {"report": str(page), "models": models}
+    return print_result(config, data, lambda: show(models), last=f"report: {page}", run=folder)
 
 
 def history(folder: RunFolder) -> dict[str, Any]:
@@ -98,7 +98,7 @@ def _line(fit: Mapping[str, Any], held_out: Mapping[str, Any]) -> dict[str, Any]
         "parameters": {name: {key: p[key] for key in kept} for name, p in fit["parameters"].items()},
         "loss": fit["loss"],
         "held_out": held_out["error"],
-        "floor": held_out["noise"],
+        "noise_level": held_out["noise"],
     }
 
 
@@ -132,7 +132,7 @@ def add_effect(
     models = history(folder)["models"]
     if not models or models[-1]["model"] != before["name"]:
         models = [_line(before, scores[""])]
-    models[-1] |= {"held_out": scores[""]["error"], "floor": scores[""]["noise"]}
+    models[-1] |= {"held_out": scores[""]["error"], "noise_level": scores[""]["noise"]}
     if not _compared(folder):
         _stages.draw_comparison(folder, model, begin("compare"))
     under_way = {
@@ -182,7 +182,7 @@ def show(models: Sequence[Mapping[str, Any]]) -> None:
         (
             (
                 model_name(entry["model"]),
-                *(f"{entry[key]:.3g}" for key in ("held_out", "floor", "loss")),
+                *(f"{entry[key]:.3g}" for key in ("held_out", "noise_level", "loss")),
                 ", ".join(f"{n} {amount(p['estimate'], p['std'], p['unit'])}" for n, p in entry["parameters"].items()),
             )
             for entry in models

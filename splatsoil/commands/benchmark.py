@@ -7,7 +7,7 @@ import pkgutil
 import sys
 from dataclasses import dataclass
 
-from splatsoil.commands._output import tell
+from splatsoil.commands._output import print_result
 from splatsoil.errors import ParameterError
 from splatsoil.options import argument, option
 
@@ -37,7 +37,7 @@ def run(config: Config) -> int:
     texts = {name: importlib.import_module(module).__doc__ or "" for name, module in known.items()}
     titles = {name: text.strip().splitlines()[0] for name, text in texts.items()}
     lines = [f"{name:<16}{title}" for name, title in titles.items()]
-    return tell(config, {"benchmarks": titles}, last="\n".join(lines))
+    return print_result(config, {"benchmarks": titles}, last="\n".join(lines))
 
 
 def _execute(name: str, module: str, arguments: tuple[str, ...]) -> int:

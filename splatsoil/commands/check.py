@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from splatsoil.commands import _laboratory
 from splatsoil.commands._options import SET
-from splatsoil.commands._output import print_table, print_text, tell
+from splatsoil.commands._output import print_result, print_table, print_text
 from splatsoil.files import plain
 from splatsoil.options import JSON, argument, option
 
@@ -41,9 +41,9 @@ def run(config: Config) -> int:
         print_table(f"{measurement.name} ({measurement.folder})", (), _rows(measurement))
         print_text(*(f"remark {remark.about}: {remark.text}" for remark in found), style="yellow")
 
-    told = {**_as_json(measurement), "remarks": [asdict(remark) for remark in found]}
+    data = {**_as_json(measurement), "remarks": [asdict(remark) for remark in found]}
     last = "The set can be used as it is." if found else "The set is complete and consistent."
-    return tell(config, told, show, last=last)
+    return print_result(config, data, show, last=last)
 
 
 def _as_json(measurement: Measurement) -> dict[str, Any]:

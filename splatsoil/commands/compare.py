@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from splatsoil.commands import _crew, _model, _stages
+from splatsoil.commands import _model, _stages, _workers
 from splatsoil.commands._options import ComputingOptions, command_line
-from splatsoil.commands._output import print_table, print_text, tell
+from splatsoil.commands._output import print_result, print_table, print_text
 from splatsoil.options import option
 from splatsoil.report.text import SIGNIFICANT, averaged_sentence, no_answer, probability, residual_sentence
 
@@ -40,11 +40,11 @@ def run(config: Config) -> int:
     folder.check_writable()
     # Helpers begin before what takes seconds to load is loaded.
     with (
-        nullcontext() if config.quick else _crew.Crew(folder, config.device, ()) as crew,
+        nullcontext() if config.quick else _workers.Workers(folder, config.device, ()) as workers,
         _model.loaded(config, folder) as (model, begin),
     ):
         result = _stages.draw_comparison(folder, model, begin("compare"))
-        misfit = {} if config.quick else _stages.check_adequacy(folder, model, begin("models"), crew=crew)
+        misfit = {} if config.quick else _stages.check_adequacy(folder, model, begin("models"), workers=workers)
     misfit = {key: value for key, value in misfit.items() if not (none and key == "estimates")}
     extra = {"misfit": {key: misfit[key] for key in MISFIT if key in misfit}} if misfit else {}
 
@@ -53,7 +53,7 @@ def run(config: Config) -> int:
         if misfit:
             show_misfit(misfit, str(folder.path))
 
-    return tell(config, {**result, **extra}, show_all, run=folder, none=none)
+    return print_result(config, {**result, **extra}, show_all, run=folder, none=none)
 
 
 def show(result: Mapping[str, Any], folder: str, adequate: bool | None = None) -> None:

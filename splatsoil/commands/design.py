@@ -14,7 +14,7 @@ import numpy as np
 from splatsoil import __version__
 from splatsoil.commands import _model
 from splatsoil.commands._options import ComputingOptions, Preset, command_line
-from splatsoil.commands._output import Report, print_table, print_text, tell
+from splatsoil.commands._output import Report, print_result, print_table, print_text
 from splatsoil.errors import ParameterError, RunError, SimulationError
 from splatsoil.files import check_folder, code_digest, digest, write_json, write_text
 from splatsoil.inverse.run_folder import RunFolder
@@ -48,10 +48,10 @@ class Config(ComputingOptions):
 
 def run(config: Config) -> int:
     """Simulate other strokes; the result goes into ``design/`` of the run folder."""
-    from splatsoil.inverse.criticism.next_stroke import FEWEST, KEPT, probable
+    from splatsoil.inverse.criticism.next_stroke import MIN_SIMULATIONS, STORED_DRAWS, probable
 
-    if not FEWEST <= config.draws <= KEPT:
-        raise ParameterError(f"--draws: between {FEWEST} and {KEPT} simulations, not {config.draws}")
+    if not MIN_SIMULATIONS <= config.draws <= STORED_DRAWS:
+        raise ParameterError(f"--draws: between {MIN_SIMULATIONS} and {STORED_DRAWS} simulations, not {config.draws}")
     folder = _model.opened(config)
     fit = _model.latest_fit(folder)
     diagnosis = diagnosis_of(folder)
@@ -62,7 +62,7 @@ def run(config: Config) -> int:
     spec = replace(_model.ModelSpec.of(fit), preset=config.preset)
     with _model.loaded(config, folder, spec) as (model, begin):
         result = _designed(config, folder, diagnosis, model, spec, begin("design"))
-    return tell(config, result, lambda: show(result), last=f"kept in {folder.path / 'design'}", run=folder)
+    return print_result(config, result, lambda: show(result), last=f"kept in {folder.path / 'design'}", run=folder)
 
 
 def diagnosis_of(folder: RunFolder) -> dict[str, Any]:
@@ -85,9 +85,9 @@ def _designed(
 ) -> dict[str, Any]:
     """The strokes, the most informative first; kept in ``design/``."""
     from splatsoil.experiment.strokes import StrokeExperiment, strokes
-    from splatsoil.inverse.criticism.evidence import AS_IT_IS
+    from splatsoil.inverse.criticism.evidence import BASE_MODEL
     from splatsoil.inverse.criticism.next_stroke import entropy, expected_information, probable, runs_of
-    from splatsoil.inverse.criticism.simulations import Helpers, Simulations
+    from splatsoil.inverse.criticism.simulations import Executor, Simulations
 
     began, seed = time.perf_counter(), int(folder.description["seed"])
     if model.measurement.cameras:
@@ -96,7 +96,7 @@ def _designed(
     candidates = diagnosis["candidates"] or None
     measured, kept = _model.experiment_of(folder, model, spec, candidates)
     probability = probable(diagnosis)
-    draws = {name: diagnosis["draws"][name][: config.draws] for name in dict.fromkeys((AS_IT_IS, *probability))}
+    draws = {name: diagnosis["draws"][name][: config.draws] for name in dict.fromkeys((BASE_MODEL, *probability))}
     runs = [run for mine in runs_of(draws, seed).values() for run in mine]
     proposed = {s.name: s for s in strokes(model.measurement, float(np.nanmean(model.reconstruction.surface.height)))}
     made = 0
@@ -115,18 +115,23 @@ def _designed(
             "layout": list(experiment.layout.shape),
         }
         simulate = Simulations(experiment, kept.folder, identity, sources=kept.sources)
-        count = len(runs) + len(experiment.guesses) + len(experiment.redrawn)
-        simulate.told = lambda purpose: report(
-            f"{stroke.name}, {purpose.replace('_', ' ')}", (number + simulate.asked / count) / len(proposed)
+        count = len(runs) + len(experiment.albedo_draws) + len(experiment.renderings)
+        simulate.report = lambda purpose: report(
+            f"{stroke.name}, {purpose.replace('_', ' ')}", (number + simulate.requested / count) / len(proposed)
         )
         # A GPU makes several at a time, all of them in this process.
-        batch = Helpers(lambda jobs: Future(), experiment.together, experiment.prepare)
-        with simulate.helped(batch) if experiment.together > 1 else nullcontext():
-            simulate.ahead(lambda ask: [ask(**run.arguments()) for run in runs])
+        batch = Executor(lambda jobs: Future(), experiment.batch_size, experiment.prepare)
+        with simulate.using(batch) if experiment.batch_size > 1 else nullcontext():
+            simulate.prefetch(lambda ask: [ask(**run.arguments()) for run in runs])
             found = expected_information(
-                experiment, draws, probability, simulate, numerics=diagnosis["numerics"], seed=seed
+                experiment,
+                draws,
+                probability,
+                simulate,
+                discretisation_factor=diagnosis["discretisation_factor"],
+                seed=seed,
             )
-        made += simulate.made
+        made += simulate.simulated
         return found
 
     found: dict[str, Information] = {}
@@ -145,16 +150,16 @@ def _designed(
             "format": DESIGN_FORMAT,
             "fit": diagnosis["fit"],
             "models": dict(probability),
-            "most": entropy(probability),
+            "entropy": entropy(probability),
             "stroke": order[0],
             "strokes": [
                 {
                     "name": name,
                     "bits": found[name].mean,
                     "std": found[name].std,
-                    "told_apart": [list(pair) for pair in found[name].told_apart],
+                    "distinguished": [list(pair) for pair in found[name].distinguished],
                     "pairs": [[*pair, right] for pair, right in found[name].pairs.items()],
-                    "less_than_best": best.beyond(found[name]),
+                    "less_than_best": best.exceeds(found[name]),
                 }
                 for name in order
             ],
@@ -185,19 +190,19 @@ def motion_csv(motion: ToolMotion) -> str:
 def show(result: Mapping[str, Any]) -> None:
     """The strokes, what each is expected to tell, and which to make."""
     models = listed([f"{model_label(name)} ({100.0 * p:.0f} %)" for name, p in result["models"].items()])
-    print_text(f"models: {models}; to be told at most: {result['most']:.2f} bits")
+    print_text(f"models: {models}; at most {result['entropy']:.2f} bits of information")
     print_table(
         "the next stroke",
-        ("motion", "expected information", "would tell apart"),
+        ("motion", "expected information", "distinguishes"),
         (
             (
                 stroke["name"],
                 f"{stroke['bits']:.2f} ± {stroke['std']:.2f} bits",
-                "; ".join(f"{model_label(a)} from {model_label(b)}" for a, b in stroke["told_apart"]) or "–",
+                "; ".join(f"{model_label(a)} from {model_label(b)}" for a, b in stroke["distinguished"]) or "–",
             )
             for stroke in result["strokes"]
         ),
-        left=("motion", "would tell apart"),
+        left=("motion", "distinguishes"),
     )
     first, *others = result["strokes"]
     best = f"Most is expected of the stroke {first['name']}: {first['bits']:.2f} ± {first['std']:.2f} bits"

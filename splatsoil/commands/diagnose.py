@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from splatsoil.commands import _crew, _laboratory, _model, _stages
+from splatsoil.commands import _laboratory, _model, _stages, _workers
 from splatsoil.commands._options import ComputingOptions
-from splatsoil.commands._output import print_table, print_text, tell
+from splatsoil.commands._output import print_result, print_table, print_text
 from splatsoil.files import plain
 from splatsoil.options import option
 from splatsoil.report.text import LITTLE, averaged_sentence, estimate, model_label, no_answer, probability, verdict
@@ -40,13 +40,13 @@ def run(config: Config) -> int:
     none = no_answer(fit)
     folder.check_writable()
     # Helpers begin before what takes seconds to load is loaded.
-    with _crew.Crew(folder, config.device, config.effects) as crew:
+    with _workers.Workers(folder, config.device, config.effects) as workers:
         _model.off_effects(config.effects, find_effects(fit["setup"]["effects"]))
         with _model.loaded(config, folder) as (model, begin):
-            result = _stages.run_diagnosis(folder, model, begin, config.effects, crew=crew)
+            result = _stages.run_diagnosis(folder, model, begin, config.effects, workers=workers)
     result = {key: value for key, value in result.items() if not (none and key == "estimates")}
     kept = f"kept in {folder.path / 'diagnosis.json'}"
-    return tell(config, plain(result), lambda: show(result), last=kept, run=folder, none=none)
+    return print_result(config, plain(result), lambda: show(result), last=kept, run=folder, none=none)
 
 
 def show(result: Mapping[str, Any]) -> None:

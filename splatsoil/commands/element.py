@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from splatsoil.commands._options import ACTING, VALUES
-from splatsoil.commands._output import print_table, tell
+from splatsoil.commands._output import print_result, print_table
 from splatsoil.commands.simulate import parse_values
 from splatsoil.errors import ParameterError
 from splatsoil.files import write_bytes
@@ -75,14 +75,14 @@ def run(config: Config) -> int:
     refuse_idle(law, full)
     parameters, columns = perform(law, full, config)
     draw(columns, config)
-    told = {
+    data = {
         "test": config.test,
         "parameters": parameters,
         "effects": [effect.name for effect in law.effects],
         "plot": str(config.plot),
         "records": {name: [float(v) for v in column] for name, column in columns.items()},
     }
-    return tell(config, told, lambda: show(columns, config))
+    return print_result(config, data, lambda: show(columns, config))
 
 
 def refuse_idle(law: Law, values: dict[str, float]) -> None:

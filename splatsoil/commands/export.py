@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from splatsoil import __version__
 from splatsoil.commands import _model
 from splatsoil.commands._options import ComputingOptions
-from splatsoil.commands._output import by_frame, tell
+from splatsoil.commands._output import by_frame, print_result
 from splatsoil.errors import ParameterError, RunError
 from splatsoil.files import check_folder, plain, write_json
 from splatsoil.inverse.run_folder import RunFolder
@@ -64,7 +64,7 @@ def run(config: Config) -> int:
         raise ParameterError(f"--out: {target} is not empty; nothing is overwritten")
     check_folder(target)
     about = _exported(config, folder, formats, target)
-    return tell(config, about, lambda: _show(about), run=folder)
+    return print_result(config, about, lambda: _show(about), run=folder)
 
 
 def _exported(config: Config, folder: RunFolder, formats: tuple[str, ...], target: Path) -> dict[str, Any]:

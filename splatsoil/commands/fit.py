@@ -8,7 +8,7 @@ from typing import Any
 
 from splatsoil.commands import _laboratory, _model, _stages
 from splatsoil.commands._options import FitOptions, command_line
-from splatsoil.commands._output import print_parameters, stages, tell
+from splatsoil.commands._output import print_parameters, print_result, stages
 from splatsoil.report.text import duration, model_name
 
 INTERRUPTED = _stages.kept
@@ -32,7 +32,7 @@ def run(config: Config) -> int:
     compare = command_line("compare", folder.path)
     _model.require_answer(folder, result, f"`{compare}` shows where")
     asks = f"Does the model leave more than noise, and where? {compare}"
-    return tell(config, result, lambda: show(result, str(folder.path)), last=asks, run=folder)
+    return print_result(config, result, lambda: show(result, str(folder.path)), last=asks, run=folder)
 
 
 def show(result: Mapping[str, Any], folder: str) -> None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from splatsoil.commands._options import command_line
-from splatsoil.commands._output import stages, tell
+from splatsoil.commands._output import print_result, stages
 from splatsoil.files import plain
 from splatsoil.importing.options import ImportOptions
 from splatsoil.options import JSON, option
@@ -33,7 +33,7 @@ def run(config: Config) -> int:
         hush()
     with stages(quiet=config.json) as begin:
         made = import_set(config, begin("import"))
-    return tell(config, _as_json(config, made), lambda: _show(config, made))
+    return print_result(config, _as_json(config, made), lambda: _show(config, made))
 
 
 def _as_json(config: Config, made: Imported) -> dict[str, Any]:

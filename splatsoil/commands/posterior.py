@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from splatsoil import __version__
-from splatsoil.commands import _crew, _model, _stages
+from splatsoil.commands import _model, _stages, _workers
 from splatsoil.commands._options import ComputingOptions, check_seed, command_line
-from splatsoil.commands._output import print_parameters, stages, tell
+from splatsoil.commands._output import print_parameters, print_result, stages
 from splatsoil.envs.devices import resolve_device
 from splatsoil.errors import ParameterError
 from splatsoil.files import code_of
@@ -61,7 +61,11 @@ def run(config: Config) -> int:
     with stages(quiet=config.json) as begin:
         model = _model.model_of(folder, device, begin("reconstruct"))
         experiment, simulate = _model.experiment_of(folder, model, spec, ())
-        with folder.lock(), _crew.Crew(folder, device, ()) as crew, crew.helping(spec, experiment, simulate):
+        with (
+            folder.lock(),
+            _workers.Workers(folder, device, ()) as workers,
+            workers.simulating(spec, experiment, simulate),
+        ):
             seed = folder.description["seed"]
             found = _stages.compare_models(experiment, simulate, fit, begin("models"), seed, with_effects=False)
             result = run_posterior(
@@ -73,7 +77,7 @@ def run(config: Config) -> int:
                 seed=config.seed,
                 progress=begin("posterior"),
             )
-    return tell(config, result, lambda: show(result, str(folder.path)), run=folder)
+    return print_result(config, result, lambda: show(result, str(folder.path)), run=folder)
 
 
 def show(result: Mapping[str, Any], folder: str) -> None:

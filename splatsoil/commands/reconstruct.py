@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from splatsoil.commands._options import PRESET, SEED, SET, Preset, check_seed
-from splatsoil.commands._output import print_remarks, print_table, print_text, stages, tell
+from splatsoil.commands._output import print_remarks, print_result, print_table, print_text, stages
 from splatsoil.envs.devices import resolve_device
 from splatsoil.files import check_folder
 from splatsoil.options import JSON, argument, option
@@ -54,8 +54,8 @@ def run(config: Config) -> int:
             progress=begin("reconstruct"),
         )
     result.save(out)
-    told = {"set": str(measurement.folder), "out": str(out), **result.summary()}
-    return tell(config, told, lambda: _show(result, out))
+    data = {"set": str(measurement.folder), "out": str(out), **result.summary()}
+    return print_result(config, data, lambda: _show(result, out))
 
 
 def _show(result: Reconstruction, out: Path) -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from splatsoil import report
 from splatsoil.commands import _model
 from splatsoil.commands._options import RunOptions
-from splatsoil.commands._output import tell
+from splatsoil.commands._output import print_result
 from splatsoil.run_files import read_fit
 
 INTERRUPTED = "the page was not written; start again with"
@@ -24,4 +24,4 @@ def run(config: Config) -> int:
     _model.note_other_sources(folder)
     path = report.write_report(folder.path)
     _model.require_answer(folder, read_fit(folder.path), f"report: {path}")
-    return tell(config, {"report": str(path)}, last=f"report: {path}", run=folder)
+    return print_result(config, {"report": str(path)}, last=f"report: {path}", run=folder)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from splatsoil import report
 from splatsoil.commands import _model, _stages, add, compare, diagnose, fit
 from splatsoil.commands._options import FitOptions, command_line
-from splatsoil.commands._output import Stage, stages, tell
+from splatsoil.commands._output import Stage, print_result, stages
 from splatsoil.errors import ParameterError, SplatsoilError
 from splatsoil.files import plain, read_json
 from splatsoil.inverse.run_folder import RunFolder
@@ -58,15 +58,15 @@ def run(config: Config) -> int:
     if unknown:
         print(unknown, file=sys.stderr)
     _model.require_answer(folder, result, f"report: {page}")
-    told: dict[str, Any] = {
+    data: dict[str, Any] = {
         "report": str(page),
         "comparison": {key: comparison[key] for key in ("loss", "total", "noise")},
     }
     models = [] if diagnosis is None else add.history(folder)["models"]
     if misfit is not None:
-        told["misfit"] = {key: misfit[key] for key in compare.MISFIT}
+        data["misfit"] = {key: misfit[key] for key in compare.MISFIT}
     if diagnosis is not None:
-        told |= {"diagnosis": plain({key: diagnosis[key] for key in DIAGNOSIS}), "models": models, "stopped": stopped}
+        data |= {"diagnosis": plain({key: diagnosis[key] for key in DIAGNOSIS}), "models": models, "stopped": stopped}
 
     def show() -> None:
         fit.show(result, str(folder.path))
@@ -79,7 +79,7 @@ def run(config: Config) -> int:
         elif misfit is not None:
             compare.show_misfit(misfit, str(folder.path))
 
-    return tell(config, {**told, **result}, show, last=f"report: {page}", run=folder)
+    return print_result(config, {**data, **result}, show, last=f"report: {page}", run=folder)
 
 
 def add_missing(folder: RunFolder, model: Model, most: int, begin: Stage) -> tuple[dict[str, Any], str]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from splatsoil.commands import _laboratory
 from splatsoil.commands._options import ACTING, VALUES, Preset, check_seed
-from splatsoil.commands._output import print_table, stages, tell
+from splatsoil.commands._output import print_result, print_table, stages
 from splatsoil.errors import ParameterError
 from splatsoil.options import JSON, argument, option
 from splatsoil.quiet import hush
@@ -81,7 +81,7 @@ def run(config: Config) -> int:
         )
         world = make_set(config.out, setup, recipe, begin("simulate"))
     summary = _summary(world)
-    return tell(config, summary, lambda: _show(summary))
+    return print_result(config, summary, lambda: _show(summary))
 
 
 def parse_values(words: Sequence[str]) -> dict[str, float]:

@@ -60,10 +60,10 @@ class Experiment(Protocol):
         parameters: free parameters of the model.
         model: names of the effects that are on.
         candidates: effects that are off.
-        numerics: names of the ways to compute the same physics otherwise.
-        redrawn: those of them that only draw the same simulation otherwise, with no chance of their own.
-        guesses: names of other guesses of what no instrument shows (the colour of buried soil).
-        chance: True where another seed gives another prediction.
+        discretisations: names of finer discretisations of the same physics.
+        renderings: names of other renderings of the same simulation.
+        albedo_draws: names of random draws of the albedo of buried soil, which no photograph shows.
+        stochastic: True where another seed gives another prediction.
     """
 
     @property
@@ -87,24 +87,24 @@ class Experiment(Protocol):
     @property
     def candidates(self) -> tuple[Candidate, ...]: ...
     @property
-    def numerics(self) -> tuple[str, ...]: ...
+    def discretisations(self) -> tuple[str, ...]: ...
     @property
-    def redrawn(self) -> tuple[str, ...]: ...
+    def renderings(self) -> tuple[str, ...]: ...
     @property
-    def guesses(self) -> tuple[str, ...]: ...
+    def albedo_draws(self) -> tuple[str, ...]: ...
     @property
-    def chance(self) -> bool: ...
+    def stochastic(self) -> bool: ...
 
     def predict(
-        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
+        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, variant: str = ""
     ) -> FloatArray:
         """(t, s) predicted features.
 
         Args:
             values: parameters by name, those of ``effects`` included.
             effects: candidates to switch on, by name.
-            seed: of what is chance in the simulation.
-            numerics: one of ``numerics`` or ``guesses``, or nothing for the usual way.
+            seed: of the simulation's random numbers.
+            variant: one of ``discretisations``, ``renderings`` or ``albedo_draws``; empty for the standard simulation.
 
         Raises:
             SimulationError: the simulation could not go on.

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from splatsoil.errors import ParameterError
 from splatsoil.experiment.laboratory import FloatArray, LaboratoryExperiment
-from splatsoil.experiment.plow import NUMERICS
+from splatsoil.experiment.plow import FINER_RESOLUTIONS
 from splatsoil.mpm import PRESETS, Resolution, Solver
 from splatsoil.soil.effect import Effect
 from splatsoil.soil.settings import FRICTION_ANGLE, Settings
@@ -49,8 +49,8 @@ class ColumnExperiment(LaboratoryExperiment):
     """
 
     kind = "column"
-    chance = True
-    numerics = tuple(NUMERICS)
+    stochastic = True
+    discretisations = tuple(FINER_RESOLUTIONS)
 
     def __init__(
         self,
@@ -99,19 +99,19 @@ class ColumnExperiment(LaboratoryExperiment):
         return readings / self.radius
 
     def readings(
-        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
+        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, variant: str = ""
     ) -> FloatArray:
         """(1, 2) radius and height of the deposit, m; arguments as for `predict`."""
-        r, thickness = self._profile(values, effects=effects, seed=seed, numerics=numerics)
+        r, thickness = self._profile(values, effects=effects, seed=seed, variant=variant)
         end = int(np.argmax(thickness < THIN * self.radius))
         share = (thickness[end - 1] - THIN * self.radius) / (thickness[end - 1] - thickness[end])
         return np.array([[r[end - 1] + share * (r[end] - r[end - 1]), thickness[:2].max()]])
 
     def _profile(
-        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
+        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, variant: str = ""
     ) -> tuple[FloatArray, FloatArray]:
         """Radii (n,) and mean thickness (n,) of the deposit in rings, m; empty beyond its end."""
-        resolution = NUMERICS[numerics](self.resolution) if numerics else self.resolution
+        resolution = FINER_RESOLUTIONS[variant](self.resolution) if variant else self.resolution
         # one step a frame, as short as the way of falling soil allows
         resolution = replace(resolution, frame_time=resolution.frame_time / resolution.steps, steps=1)
         spacing, cell = resolution.spacing, resolution.cell

@@ -1,4 +1,4 @@
-"""An experiment whose predictions cost nothing: patterns instead of a simulation, for measuring criticism itself."""
+"""An experiment with an analytic forward model, for tests of model criticism."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ FloatArray = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class EmulatedExperiment:
-    """Features that are known functions of parameters, with chance and instruments' noise drawn from known covariances.
+    """Features that are known functions of parameters, with scatter and instrument noise of known covariance.
 
     A prediction is the middle, plus each parameter's (and effect's) slope times its distance from home, plus half its
-    curve times the square of that, plus chance of the seed.
+    curve times the square of that, plus the scatter of the seed.
 
     Attributes:
         layout: labels.
@@ -30,11 +30,11 @@ class EmulatedExperiment:
         curves: (t, s) likewise; absent ones are 0.
         parameters: free parameters of the model.
         candidates: effects that are off.
-        chance_root: (t s, t s) lower Cholesky factor of one simulation's chance.
+        scatter_root: (t s, t s) lower Cholesky factor of one simulation's scatter.
         sensor: (t, s) standard deviation of the instruments.
         observed: (t, s).
-        patterns: (t, s) what other numerics add, by name.
-        guessed: (t, s) what other guesses of what no instrument shows add, by name.
+        patterns: (t, s) what another discretisation adds, by name.
+        albedo_patterns: (t, s) what another draw of the unknown albedo adds, by name.
         quiet: (t, s) where no physics acts.
         name: for people.
     """
@@ -45,17 +45,17 @@ class EmulatedExperiment:
     slopes: Mapping[str, FloatArray]
     parameters: tuple[Parameter, ...]
     candidates: tuple[Candidate, ...]
-    chance_root: FloatArray
+    scatter_root: FloatArray
     sensor: FloatArray
     observed: FloatArray
     curves: Mapping[str, FloatArray] = field(default_factory=dict)
     patterns: Mapping[str, FloatArray] = field(default_factory=dict)
-    guessed: Mapping[str, FloatArray] = field(default_factory=dict)
+    albedo_patterns: Mapping[str, FloatArray] = field(default_factory=dict)
     quiet: npt.NDArray[np.bool_] = field(default_factory=lambda: np.zeros((0, 0), dtype=bool))
     name: str = "emulated"
     model: tuple[str, ...] = ()
-    redrawn: tuple[str, ...] = ()
-    chance: bool = True
+    renderings: tuple[str, ...] = ()
+    stochastic: bool = True
     sensor_memory: float = 0.0
 
     def __post_init__(self) -> None:
@@ -68,17 +68,17 @@ class EmulatedExperiment:
         return np.ones(self.layout.shape, dtype=bool)
 
     @property
-    def numerics(self) -> tuple[str, ...]:
-        """Names of the other numerics."""
+    def discretisations(self) -> tuple[str, ...]:
+        """Names of the other discretisations."""
         return tuple(self.patterns)
 
     @property
-    def guesses(self) -> tuple[str, ...]:
-        """Names of the other guesses."""
-        return tuple(self.guessed)
+    def albedo_draws(self) -> tuple[str, ...]:
+        """Names of the draws of unknown albedo."""
+        return tuple(self.albedo_patterns)
 
-    def expected(self, values: Mapping[str, float], numerics: str = "") -> FloatArray:
-        """(t, s) features without chance."""
+    def expected(self, values: Mapping[str, float], variant: str = "") -> FloatArray:
+        """(t, s) features without scatter."""
         out = self.middle.copy()
         off = {p.name: float(p.off or 0.0) for c in self.candidates for p in c.parameters}
         for name, value in values.items():
@@ -86,24 +86,24 @@ class EmulatedExperiment:
             out += step * self.slopes[name]
             if name in self.curves:
                 out += 0.5 * step**2 * self.curves[name]
-        if numerics:
-            out += {**self.patterns, **self.guessed}[numerics]
+        if variant:
+            out += {**self.patterns, **self.albedo_patterns}[variant]
         return out
 
     def predict(
-        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
+        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, variant: str = ""
     ) -> FloatArray:
-        """(t, s) features; the same seed has the same chance."""
+        """(t, s) features; the same seed gives the same scatter."""
         del effects
-        return self.expected(values, numerics) + self.drawn(seed)
+        return self.expected(values, variant) + self.scatter(seed)
 
-    def drawn(self, seed: int | Sequence[int]) -> FloatArray:
-        """(t, s) chance of one seed."""
+    def scatter(self, seed: int | Sequence[int]) -> FloatArray:
+        """(t, s) scatter of one seed."""
         generator = np.random.default_rng(seed)
-        return (self.chance_root @ generator.standard_normal(len(self.chance_root))).reshape(self.layout.shape)
+        return (self.scatter_root @ generator.standard_normal(len(self.scatter_root))).reshape(self.layout.shape)
 
     def measured(self, values: Mapping[str, float], seed: Sequence[int], extra: FloatArray | None = None) -> FloatArray:
-        """(t, s) what instruments would report of a truth: its own chance, their noise, and whatever else is there."""
+        """(t, s) a synthetic observation of known parameters: scatter, instrument noise, and ``extra``."""
         generator = np.random.default_rng([*seed, 1])
         noise = self.sensor * generator.standard_normal(self.layout.shape)
-        return self.expected(values) + self.drawn(seed) + noise + (0.0 if extra is None else extra)
+        return self.expected(values) + self.scatter(seed) + noise + (0.0 if extra is None else extra)

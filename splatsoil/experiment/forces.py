@@ -23,7 +23,7 @@ ALONG, UP = "force along", "force up"
 REGION, UNIT = "tool", "N"
 STAGE, PAUSE = "pushing", "pause"
 """The one whose largest force is the unit, and the one in which the tool stands."""
-LEAST, FEWEST = 0.25, 2
+MIN_FORCE, MIN_ROWS = 0.25, 2
 """Rows in which the tool is pushed with this share of the largest force: with fewer there is nothing to go by."""
 SENSOR = 1.0
 """Standard deviation of what is measured, % of the largest force."""
@@ -87,7 +87,7 @@ class ToolForces:
         size = np.linalg.norm(table, axis=1)
         moving = (np.array(stages) == STAGE) & (weights.sum(axis=1) > 0.0)
         largest = float(size[moving].max(initial=0.0))
-        if (moving & (size > LEAST * largest)).sum() < FEWEST:
+        if (moving & (size > MIN_FORCE * largest)).sum() < MIN_ROWS:
             return None
         there = np.repeat((weights.sum(axis=1) > 0.0)[:, None], len(axes), axis=1)
         return cls((ALONG, UP), 100.0 * table / largest, stages, there, largest, axes, weights)

@@ -39,11 +39,11 @@ class LaboratoryExperiment(ABC):
     kind: ClassVar[str]
     always: ClassVar[tuple[str, ...]] = ("intermediate_stress",)
     of_strength: ClassVar[bool] = False
-    chance: bool = False
+    stochastic: bool = False
     sensor_memory: float = MEMORY
-    numerics: tuple[str, ...] = ()
-    redrawn: tuple[str, ...] = ()
-    guesses: tuple[str, ...] = ()
+    discretisations: tuple[str, ...] = ()
+    renderings: tuple[str, ...] = ()
+    albedo_draws: tuple[str, ...] = ()
 
     def __init__(
         self,
@@ -108,7 +108,7 @@ class LaboratoryExperiment(ABC):
 
     @abstractmethod
     def readings(
-        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
+        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, variant: str = ""
     ) -> FloatArray:
         """(t, s) what the instruments would read, in SI units; arguments as for `predict`."""
 
@@ -117,10 +117,10 @@ class LaboratoryExperiment(ABC):
         """(t, s) features of readings (t, s)."""
 
     def predict(
-        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
+        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, variant: str = ""
     ) -> FloatArray:
         """(t, s) features; see :class:`~splatsoil.experiment.base.Experiment`."""
-        return self.features(self.readings(values, effects=effects, seed=seed, numerics=numerics))
+        return self.features(self.readings(values, effects=effects, seed=seed, variant=variant))
 
 
 class Specimen(Protocol):
@@ -142,7 +142,7 @@ AnySpecimen = TypeVar("AnySpecimen", bound=Specimen)
 
 
 class SpecimenExperiment(LaboratoryExperiment, Generic[AnySpecimen]):
-    """Tests of specimens of one soil, and a model of it: the law at a single point, no chance.
+    """Tests of specimens of one soil, and a model of it: the law at a single point; deterministic.
 
     Features are the stress ratio and the volume strain, each in units of its spread between specimens. The elastic
     stiffness is a parameter of the model: a laboratory's sand is not rigid. Parameters are those of the first test's
@@ -196,10 +196,10 @@ class SpecimenExperiment(LaboratoryExperiment, Generic[AnySpecimen]):
         """Stress ratio (t,) and logarithmic volume strain (t,), compression positive, of one test."""
 
     def readings(
-        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
+        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, variant: str = ""
     ) -> FloatArray:
-        """(t, 2 tests) stress ratio and nominal volume strain; nothing about them is chance."""
-        del seed, numerics
+        """(t, 2 tests) stress ratio and nominal volume strain; the test is deterministic."""
+        del seed, variant
         law, out = self.law(effects), []
         for test in self.tests:
             own = at_void_ratio(self.values(values), self.tests[0].void_ratio, test.void_ratio)

@@ -13,7 +13,7 @@ import trimesh
 from splatsoil.errors import ParameterError
 from splatsoil.experiment.forces import SCALE, compressed
 from splatsoil.experiment.laboratory import FloatArray, LaboratoryExperiment
-from splatsoil.experiment.plow import NUMERICS
+from splatsoil.experiment.plow import FINER_RESOLUTIONS
 from splatsoil.measurement import Bed, Measurement, Tool, ToolMotion
 from splatsoil.mpm import PRESETS, Preset, Resolution, simulate
 from splatsoil.reconstruction import HeightField, fill
@@ -44,7 +44,7 @@ class PlateExperiment(LaboratoryExperiment):
     """A flat circular plate pressed straight down into level soil, of which a quarter is simulated.
 
     Features are forces at the depths that were measured, in % of the largest and relative where they are large, see
-    :func:`~splatsoil.experiment.forces.compressed`. Forces wave by the cell; where the grid lies is chance, therefore.
+    :func:`~splatsoil.experiment.forces.compressed`. Forces wave by the cell; so the grid's offset is drawn by the seed.
     The skeleton is at least `RIGID` times as stiff as the largest mean
     pressure under the plate.
 
@@ -66,8 +66,8 @@ class PlateExperiment(LaboratoryExperiment):
     """
 
     kind = "plate"
-    chance = True
-    numerics = tuple(NUMERICS)
+    stochastic = True
+    discretisations = tuple(FINER_RESOLUTIONS)
 
     def __init__(
         self,
@@ -114,10 +114,10 @@ class PlateExperiment(LaboratoryExperiment):
         return compressed(100.0 * readings / self._largest)
 
     def readings(
-        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
+        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, variant: str = ""
     ) -> FloatArray:
         """(t, 1) upward forces in N; arguments as for `predict`."""
-        resolution = NUMERICS[numerics](self.resolution) if numerics else self.resolution
+        resolution = FINER_RESOLUTIONS[variant](self.resolution) if variant else self.resolution
         # soil stops at a distance from the tool's faces: the plate is that much narrower than what the soil feels
         offset = float(np.random.default_rng([seed, 1]).random()) * resolution.cell
         experiment = self.set_up(resolution.skin * resolution.spacing, offset)

@@ -1,4 +1,4 @@
-"""Parts of a plow experiment that people have words for: stages of the motion, regions of the bed."""
+"""Stages of the tool's motion and regions of the bed, as labels of features."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from splatsoil.reconstruction.height_field import HeightField
 
 FloatArray = npt.NDArray[np.float64]
 
-QUIET = "undisturbed"
+UNDISTURBED = "undisturbed"
 """Region that the tool does not reach."""
-SLOW = 0.02
-"""Share of the motion's greatest speed below which the tool pauses."""
-BESIDE = 0.75
-"""Widths of the tool beside its track that berms may cover."""
-AHEAD = 0.6
-"""Widths of the tool ahead of it that count as its face, and behind it as behind."""
-POINTS = 400
-"""Of the tool's surface, to know where it stands in the soil."""
+PAUSE_SPEED = 0.02
+"""Share of the greatest speed below which the tool pauses."""
+BERM_WIDTH = 0.75
+"""Half width of the berms beside the track, in tool widths."""
+FACE_LENGTH = 0.6
+"""Length of the regions at the tool's face and behind it, in tool widths."""
+SURFACE_POINTS = 400
+"""Points on the tool's surface that locate it in the soil."""
 
 
 def stages_of(measurement: Measurement, frames: Sequence[float]) -> tuple[str, ...]:
-    """Lowering, pushing, pause, withdrawal or lifting at each frame."""
+    """Stage of the motion at each frame: lowering, pushing, pause, withdrawal or lifting."""
     motion, rate = measurement.tool.motion, measurement.frame_rate
     last = float(motion.times[-1])
     velocity = []
     for frame in frames:
-        # The step that leads to the frame: a frame at the end of a stage belongs to it.
+        # Velocity of the step that ends at the frame.
         end = min(max(frame / rate, 0.5 / rate), last)
         begin = max(end - 1.0 / rate, 0.0)
         velocity.append((motion.pose(end)[1] - motion.pose(begin)[1]) / max(end - begin, 1e-9))
     speed = np.linalg.norm(np.diff(motion.positions, axis=0), axis=1) / np.diff(motion.times)
-    slow = SLOW * float(speed.max(initial=0.0))
+    slow = PAUSE_SPEED * float(speed.max(initial=0.0))
     forward = heading_of(measurement)
     out = []
     for v in velocity:
@@ -52,7 +52,7 @@ def stages_of(measurement: Measurement, frames: Sequence[float]) -> tuple[str, .
 
 
 def bins_of(measurement: Measurement, frames: Sequence[int], most: int) -> list[list[int]]:
-    """Neighbouring compared frames (as indices) of one stage, few enough together for about ``most`` rows."""
+    """Groups of neighbouring frames (as indices) of one stage, about ``most`` groups."""
     stages = stages_of(measurement, [float(f) for f in frames])
     size = math.ceil(len(frames) / most)
     bins: list[list[int]] = []
@@ -65,10 +65,10 @@ def bins_of(measurement: Measurement, frames: Sequence[int], most: int) -> list[
 
 
 def heading_of(measurement: Measurement) -> FloatArray:
-    """(2,) unit vector along which the tool is first pushed, in the lower half of its way; 0 where it never is."""
+    """(2,) unit vector of the first horizontal motion in the lower half of the tool's path; 0 where there is none."""
     positions = measurement.tool.motion.positions
     level, height = np.diff(positions, axis=0)[:, :2], positions[:, 2]
-    # Carried through the air it isn't pushed.
+    # Above, the tool moves through air.
     low = 0.5 * (height[1:] + height[:-1]) <= 0.5 * (height.min() + height.max()) + 1e-9
     length = np.where(low, np.linalg.norm(level, axis=1), 0.0)
     if not length.max(initial=0.0) > 0.0:
@@ -78,7 +78,7 @@ def heading_of(measurement: Measurement) -> FloatArray:
 
 
 def _placed(measurement: Measurement, points: FloatArray, moment: float) -> FloatArray:
-    """(n, 3) where the tool's ``points`` are at a moment in frames."""
+    """(n, 3) positions of ``points`` of the tool at a moment in frames."""
     rotation, position = measurement.tool.motion.pose(moment / measurement.frame_rate)
     return np.asarray(points @ np.asarray(rotation).T + position)
 
@@ -86,14 +86,15 @@ def _placed(measurement: Measurement, points: FloatArray, moment: float) -> Floa
 def regions_of(
     measurement: Measurement, surface: HeightField, frames: Sequence[float], sites: Sequence[Site]
 ) -> npt.NDArray[np.str_]:
-    """(t, s) tool face, behind the tool, trench, berm or undisturbed, from where the tool has been in the soil."""
+    """(t, s) region of each site: tool face, behind the tool, trench, berm or undisturbed, from the tool's path in the
+    soil."""
     tool, rate = measurement.tool, measurement.frame_rate
     place = np.array([[site.x, site.y] for site in sites])
-    points = np.asarray(tool.mesh.sample(POINTS, seed=0), dtype=np.float64)
+    points = np.asarray(tool.mesh.sample(SURFACE_POINTS, seed=0), dtype=np.float64)
     width = float(np.sort(tool.mesh.extents)[1])
     moments = np.unique(np.concatenate([np.arange(0.0, max(frames) + 1.0, 2.0), frames]))
     nearest = np.full(len(sites), np.inf)
-    out = np.full((len(frames), len(sites)), QUIET, dtype="<U16")
+    out = np.full((len(frames), len(sites)), UNDISTURBED, dtype="<U16")
     previous = None
     for moment in moments:
         position = tool.motion.pose(moment / rate)[1]
@@ -107,10 +108,10 @@ def regions_of(
         heading = np.zeros(2) if previous is None else np.asarray(position)[:2] - previous
         previous = np.asarray(position)[:2] if previous is None or np.linalg.norm(heading) > 0.0 else previous
         for row in rows:
-            out[row, nearest < BESIDE * width] = "berm"
+            out[row, nearest < BERM_WIDTH * width] = "berm"
             out[row, nearest < 0.25 * width] = "trench"
             side = (place - np.asarray(position)[:2]) @ heading
-            close = distance < AHEAD * width
+            close = distance < FACE_LENGTH * width
             out[row, close & (side > 0.0)] = "tool face"
             out[row, close & (side <= 0.0) & (nearest < 0.25 * width)] = "behind the tool"
     return out

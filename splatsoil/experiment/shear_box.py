@@ -105,10 +105,10 @@ class ReposeExperiment(LaboratoryExperiment):
         )
 
     def readings(
-        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
+        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, variant: str = ""
     ) -> FloatArray:
-        """(1, 1) degrees; nothing about them is chance."""
-        del seed, numerics
+        """(1, 1) degrees; the test is deterministic."""
+        del seed, variant
         sheared = simple_shear(
             self.law(effects),
             self.values(values),

@@ -1,4 +1,4 @@
-"""Drained triaxial tests as an experiment: the law at a single point, no pictures, no chance."""
+"""Drained triaxial tests as an experiment: the law at a single point, no pictures; deterministic."""
 
 from __future__ import annotations
 

@@ -55,10 +55,10 @@ def _compared(
         progress=report,
     )
     return {
-        **record(experiment, found, simulations.asked),
+        **record(experiment, found, simulations.requested),
         "fit": "+".join(experiment.model),
         "values": values,
-        "simulated_now": simulations.made,
+        "simulated_now": simulations.simulated,
     }
 
 
@@ -80,7 +80,7 @@ def search(
         runs.append(Run(values, seed=seed))
         return ((table - experiment.observed) / experiment.sensor).ravel()
 
-    chance = experiment.chance
+    chance = experiment.stochastic
     found = [
         least_squares(
             residuals,

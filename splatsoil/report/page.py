@@ -215,9 +215,9 @@ def _series(*columns: Sequence[float | None]) -> tuple[np.ndarray, ...]:
 
 def _falling(data: RunData) -> dict[str, Any] | None:
     """The error on data set aside: of the models tried or, where there is only one, of those that were compared."""
-    diagnosis = data.diagnosis or {"held_out": [], "aside": "data set aside", "unit": "grey levels"}
+    diagnosis = data.diagnosis or {"held_out": [], "held_out_data": "data set aside", "unit": "grey levels"}
     if len(data.history) > 1:
-        rows = [(entry["held_out"], entry["floor"]) for entry in data.history]
+        rows = [(entry["held_out"], entry["noise_level"]) for entry in data.history]
         names = text.steps(data.history)
     else:
         rows = [(entry["error"], entry["noise"]) for entry in diagnosis["held_out"]]
@@ -226,7 +226,7 @@ def _falling(data: RunData) -> dict[str, Any] | None:
         return None
     errors, noise = zip(*rows, strict=True)
     figure = figures.falling(errors, noise, names, diagnosis["unit"])
-    return {"figure": figure, "falls": errors[-1] < errors[0], "aside": diagnosis["aside"]}
+    return {"figure": figure, "falls": errors[-1] < errors[0], "held_out_data": diagnosis["held_out_data"]}
 
 
 def data_url(path: Path, made_by: str = "compare") -> str:

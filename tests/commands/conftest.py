@@ -18,7 +18,7 @@ from PIL import Image
 from splatsoil.inverse.run_folder import RunFolder
 
 from splatsoil import cli
-from splatsoil.commands import _crew, _model, _stages, add
+from splatsoil.commands import _model, _stages, _workers, add
 from splatsoil.files import write_json
 
 
@@ -104,7 +104,7 @@ def results(run: RunFolder, fit_of: Callable[..., dict[str, Any]], monkeypatch: 
     for name in found:
         monkeypatch.setattr(next(m for m in (_model, _stages, add) if hasattr(m, name)), name, giving(name))
     monkeypatch.setattr("splatsoil.report.write_report", lambda path: path / "report.html")
-    monkeypatch.setattr(_crew, "Crew", lambda *_: nullcontext())
+    monkeypatch.setattr(_workers, "Workers", lambda *_: nullcontext())
     file = {"format": "splatsoil-comparison/1", "fit": "another", "parameters": {}, **comparison}
     write_json(run.comparison / "comparison.json", file)
     return found

@@ -13,7 +13,7 @@ from splatsoil.inverse.run_folder import RunFolder
 from splatsoil import cli
 from splatsoil.commands import _model, _stages
 from splatsoil.commands._options import FitOptions
-from splatsoil.files import JUDGING, code_digest, code_of, read_json, write_json
+from splatsoil.files import CRITICISM, code_digest, code_of, read_json, write_json
 from splatsoil.report.data import estimates
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
@@ -144,20 +144,20 @@ def test_what_a_current_diagnosis_says_is_not_asked_again(stages: Stages, tmp_pa
     """One of another estimate, by other code, or without the effect's error, is none."""
     run = stages.run
     whole = {
-        "format": "splatsoil-diagnosis/2",
+        "format": "splatsoil-diagnosis/3",
         "fit": "base",
         "model": [],
         "models": [],
         "values": {"friction_angle": 35.0},
         "code": code_of(()),
-        "judged_by": code_digest(JUDGING),
+        "criticism_code": code_digest(CRITICISM),
         **stages.diagnosis("cohesion"),
     }
     file = run.path / "diagnoses" / "base.json"
     for change in (
         {},
         {"code": "of yesterday"},
-        {"judged_by": "of yesterday"},
+        {"criticism_code": "of yesterday"},
         {"values": {"friction_angle": 31.0}},
         stages.diagnosis("tilt"),
     ):
@@ -202,7 +202,7 @@ def test_the_same_command_goes_on_to_the_same_end(
     assert [entry["model"] for entry in models] == ["base", "cohesion", "cohesion+tilt"][: len(effects) + 1]
     assert [entry.get("added") for entry in models] == [None, *effects]
     assert [entry["held_out"] for entry in models] == [ERRORS[entry["model"]] for entry in models]
-    assert [entry["floor"] for entry in models] == [1.0] * len(models)
+    assert [entry["noise_level"] for entry in models] == [1.0] * len(models)
     before = read_json(stages.run.path / "before" / "comparison.json")
     assert before["fit"] == models[-2]["model"] and stages.run.fit()["name"] == models[-1]["model"]
     assert "adding" not in kept, "nothing is under way any more"

@@ -23,7 +23,7 @@ Refused = Callable[..., str]
 ALL = ("compare", "diagnose", "add", "report", "posterior")
 SHOWN = ("add", "report")
 FIT = '{"format": "splatsoil-fit/2", "name": "base"'
-DIAGNOSIS = '{"format": "splatsoil-diagnosis/2", "fit": "base", "values": {}, "model": []'
+DIAGNOSIS = '{"format": "splatsoil-diagnosis/3", "fit": "base", "values": {}, "model": []'
 
 
 @pytest.mark.usefixtures("no_work")
@@ -38,11 +38,11 @@ DIAGNOSIS = '{"format": "splatsoil-diagnosis/2", "fit": "base", "values": {}, "m
         ("run.json", '{"format": "splatsoil-run/1"}', "lacks measurement", ALL),
         ("run.json", '{"format": "splatsoil-run/1", "measurement": {}}', "lacks measurement.name", ALL),
         ("run.json", '{"format": "splatsoil-run/2"}', "isn't of format splatsoil-run/1", ALL),
-        ("history.json", "{}", "isn't of format splatsoil-history/1", SHOWN),
-        ("history.json", '{"format": "splatsoil-history/1", "models": [{}]}', "lacks models.0.model", SHOWN),
-        ("diagnoses/base.json", "{}", "isn't of format splatsoil-diagnosis/2", SHOWN),
+        ("history.json", "{}", "isn't of format splatsoil-history/2", SHOWN),
+        ("history.json", '{"format": "splatsoil-history/2", "models": [{}]}', "lacks models.0.model", SHOWN),
+        ("diagnoses/base.json", "{}", "isn't of format splatsoil-diagnosis/3", SHOWN),
         ("diagnoses/base.json", DIAGNOSIS + ', "models": [{"name": ""}]}', "lacks models.0.probability", SHOWN),
-        ("comparison/misfit.json", "{}", "isn't of format splatsoil-misfit/2", SHOWN),
+        ("comparison/misfit.json", "{}", "isn't of format splatsoil-misfit/3", SHOWN),
         ("comparison/comparison.json", "{}", "isn't of format splatsoil-comparison/1", SHOWN),
     ],
 )

@@ -9,7 +9,7 @@ import pytest
 from splatsoil.inverse.run_folder import RunFolder
 
 from splatsoil.commands.design import show
-from splatsoil.files import JUDGING, code_digest, code_of, write_json
+from splatsoil.files import CRITICISM, code_digest, code_of, write_json
 from splatsoil.report.data import estimates
 
 KINDS = {"": "base", "something else": "discrepancy", "light": "observation"}
@@ -20,14 +20,14 @@ def diagnose(run: RunFolder, **changes: Any) -> None:
     fit = run.fit()
     probability = changes.pop("probability", {"": 0.5, "cohesion": 0.5})
     data = {
-        "format": "splatsoil-diagnosis/2",
+        "format": "splatsoil-diagnosis/3",
         "fit": fit["name"],
         "values": estimates(fit),
         "model": [],
         "models": [{"name": n, "kind": KINDS.get(n, "physics"), "probability": p} for n, p in probability.items()],
         "draws": {},
         "candidates": [],
-        "judged_by": code_digest(JUDGING),
+        "criticism_code": code_digest(CRITICISM),
         "code": code_of(fit["setup"]["effects"]),
         **changes,
     }
@@ -38,12 +38,12 @@ def diagnose(run: RunFolder, **changes: Any) -> None:
 def test_what_there_is_nothing_to_design_from_is_refused(run: RunFolder, refused: Callable[..., str]) -> None:
     make = f"make one first: splatsoil diagnose '{run.path}'\n"
     assert refused("design", run).endswith(f"has no diagnosis; {make}")
-    for changes in ({"values": {"friction_angle": 1.0}}, {"judged_by": "other code"}, {"code": "other code"}):
+    for changes in ({"values": {"friction_angle": 1.0}}, {"criticism_code": "other code"}, {"code": "other code"}):
         diagnose(run, **changes)
         assert refused("design", run).endswith(f"its diagnosis is of another fit, or by other code; {make}")
     for probability in ({"": 0.97, "cohesion": 0.03}, {"something else": 0.6, "light": 0.3, "": 0.1}):
         diagnose(run, probability=probability)
-        assert "there are no two that a stroke could tell apart" in refused("design", run)
+        assert "a stroke has no two models to distinguish" in refused("design", run)
     assert not (run.path / "design").exists()
 
 
@@ -51,12 +51,13 @@ def result(*alike: str) -> dict[str, Any]:
     """A design by which some strokes are as good as the best."""
     bits = {"half as fast": 0.8, "as measured": 0.7, "half as deep": 0.1}
     strokes = [
-        {"name": n, "bits": b, "std": 0.05, "told_apart": [], "less_than_best": n not in alike} for n, b in bits.items()
+        {"name": n, "bits": b, "std": 0.05, "distinguished": [], "less_than_best": n not in alike}
+        for n, b in bits.items()
     ]
-    strokes[0]["told_apart"] = [["", "tool_adhesion"]]
+    strokes[0]["distinguished"] = [["", "tool_adhesion"]]
     return {
         "models": {"": 0.6, "tool_adhesion": 0.4},
-        "most": 0.97,
+        "entropy": 0.97,
         "strokes": strokes,
         "notes": ["twice as fast: could not be simulated (no step is short enough)"],
         "simulated_now": 3,
@@ -75,7 +76,7 @@ def test_the_table_says_what_is_expected_and_told_apart(
     show(result())
     out = capsys.readouterr().out
     assert f"{best}, more than of any other." in out
-    assert "models: as it is (60 %) and tool adhesion (40 %); to be told at most: 0.97 bits" in out
+    assert "models: as it is (60 %) and tool adhesion (40 %); at most 0.97 bits of information" in out
     row = next(line for line in out.splitlines() if line.strip().startswith("half as fast"))
     assert "0.80 ± 0.05 bits" in row and "as it is from tool adhesion" in row
     assert "could not be simulated" in out

@@ -36,7 +36,7 @@ def diagnosis(fit: dict[str, Any], best: str) -> dict[str, Any]:
         for name, chance in chances.items()
     ]
     estimates = {name: entry["estimate"] for name, entry in fit["parameters"].items()}
-    return {"format": "splatsoil-diagnosis/2", "fit": fit["name"], "values": estimates, "model": [], "models": models}
+    return {"format": "splatsoil-diagnosis/3", "fit": fit["name"], "values": estimates, "model": [], "models": models}
 
 
 @pytest.mark.parametrize("best", ["", "cohesion"])

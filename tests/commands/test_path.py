@@ -232,10 +232,10 @@ def next_stroke(place: Path, program: Program, source: Path) -> None:
     again = program("design", "run", "--draws", "3", cwd=place)
     assert again["simulated_now"] == 0 and again["strokes"] == first["strokes"], "everything was kept"
     kept = read_json(run / "design" / "design.json")
-    assert kept["format"] == "splatsoil-design/1" and kept["strokes"] == first["strokes"]
+    assert kept["format"] == "splatsoil-design/2" and kept["strokes"] == first["strokes"]
     assert first["stroke"] == first["strokes"][0]["name"]
     bits = [stroke["bits"] for stroke in first["strokes"]]
-    assert bits == sorted(bits, reverse=True) and all(0.0 <= b <= first["most"] + 1e-9 for b in bits)
+    assert bits == sorted(bits, reverse=True) and all(0.0 <= b <= first["entropy"] + 1e-9 for b in bits)
     motion = ToolMotion.read(run / "design" / "tool_motion.csv")
     assert (abs(motion.times - motion.frames / Measurement.load(source).frame_rate) < 1e-9).all()
     # A set with this motion is one; its force is still to be measured.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from splatsoil.inverse.criticism.diagnosis import MENTIONED, diagnose
+from splatsoil.inverse.criticism.diagnosis import SUBSTANTIAL, diagnose
 
 from splatsoil.errors import ParameterError
 from splatsoil.experiment.plate import PlateExperiment
@@ -39,4 +39,4 @@ def test_six_forces_do_not_claim_what_they_cannot_tell() -> None:
     assert (found.detectable["cohesion"] or np.inf) > 600.0
     # There is no strong evidence against cohesion, which is there.
     models = found.evidence.models
-    assert models["cohesion"].log_evidence - models[""].log_evidence > -np.log(MENTIONED)
+    assert models["cohesion"].log_evidence - models[""].log_evidence > -np.log(SUBSTANTIAL)

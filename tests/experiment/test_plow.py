@@ -65,26 +65,26 @@ def test_soil_prepared_together_is_that_of_single_simulations(model: Model, monk
     def experiment() -> PlowExperiment:
         return PlowExperiment(model, candidates=("buried_obstacle", "cohesion", "exposure"))
 
-    def job(seed: int = 0, numerics: str = "", effects: tuple[str, ...] = (), **values: float) -> dict[str, Any]:
-        return {"values": {"friction_angle": 35.0, **values}, "effects": effects, "seed": seed, "numerics": numerics}
+    def job(seed: int = 0, variant: str = "", effects: tuple[str, ...] = (), **values: float) -> dict[str, Any]:
+        return {"values": {"friction_angle": 35.0, **values}, "effects": effects, "seed": seed, "variant": variant}
 
     jobs = [
         job(),
         job(1),
-        job(numerics="albedo 2"),
+        job(variant="albedo 2"),
         job(effects=("exposure",), exposure_gain=0.9),
         job(effects=("cohesion",), cohesion=300.0),
         job(1, effects=("cohesion",), cohesion=300.0),
-        job(numerics="fine"),
+        job(variant="fine"),
     ]
     unseen = job(effects=("buried_obstacle",), obstacle_radius=0.001)
     alone = [experiment().prediction(**each).trajectory.positions for each in jobs]
     assert drawn[:3] == [(0, None, 1.0), (1, None, 1.0), (0, 2, 1.0)]
     prepared = experiment()
-    assert prepared.together == 1, "a CPU makes one at a time, and keeps one"
-    prepared.__dict__["together"] = 5
+    assert prepared.batch_size == 1, "a CPU makes one at a time, and keeps one"
+    prepared.__dict__["batch_size"] = 5
     prepared.prepare([unseen, *jobs])
-    assert len(prepared._kept) == 5
+    assert len(prepared._trajectories) == 5
     with pytest.raises(SimulationError, match="no node"):
         prepared.prediction(**unseen)
     monkeypatch.delattr(Model, "simulate")
@@ -93,9 +93,9 @@ def test_soil_prepared_together_is_that_of_single_simulations(model: Model, monk
     different = [alone[0], alone[1], *alone[4:]]
     assert not any(np.array_equal(a, b) for a, b in combinations(different, 2))
     prepared.prepare([job(2)])
-    assert len(prepared._kept) == 5, "what is kept doesn't grow"
+    assert len(prepared._trajectories) == 5, "the cache doesn't grow"
     drawn.clear()
-    prepared.prediction(**job(2, numerics="rounding"))
+    prepared.prediction(**job(2, variant="rounding"))
     assert drawn == [(2, None, 2.0)], "another drawing of the same simulation"
     with pytest.raises(KeyError, match="finer"):
-        prepared.prediction(**job(numerics="finer"))
+        prepared.prediction(**job(variant="finer"))

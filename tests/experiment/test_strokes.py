@@ -13,7 +13,7 @@ import pytest
 
 from splatsoil.commands.design import motion_csv
 from splatsoil.experiment.forces import ALONG, SCALE, SENSOR
-from splatsoil.experiment.plow import MOST_FEATURES, PlowExperiment
+from splatsoil.experiment.plow import MAX_FEATURES, PlowExperiment
 from splatsoil.experiment.strokes import StrokeExperiment, strokes
 from splatsoil.measurement import HeightMaps, Measurement, ToolMotion
 from splatsoil.model import Model
@@ -103,7 +103,7 @@ def test_what_models_differ_by_is_told_without_a_photograph(
     """Pictures that are darker by 10 grey levels, and twice the force, are told as that; the force's noise is that of
     the size that is expected."""
     measured = PlowExperiment(over_level_soil(damp, SURFACE))
-    assert 0.8 * MOST_FEATURES < measured.layout.placed.sum() * measured.layout.shape[0] < 1.1 * MOST_FEATURES
+    assert 0.8 * MAX_FEATURES < measured.layout.placed.sum() * measured.layout.shape[0] < 1.1 * MAX_FEATURES
     second = strokes(damp, SURFACE)[-1]
     experiment = StrokeExperiment(over_level_soil(second.prepared(measured), SURFACE), measured)
     assert experiment.layout.times[-1] == measured.layout.times[-1] + second.start

@@ -13,7 +13,7 @@ import pytest
 from splatsoil.benchmarks._validation.sand import karlsruhe
 from splatsoil.inverse.criticism.design import Prior
 from splatsoil.inverse.criticism.diagnosis import Diagnosis, diagnose
-from splatsoil.inverse.criticism.evidence import AS_IT_IS, ELSE
+from splatsoil.inverse.criticism.evidence import BASE_MODEL, DISCREPANCY
 from splatsoil.inverse.criticism.simulations import Simulations
 
 from splatsoil.experiment.triaxial import Curve, TriaxialExperiment
@@ -36,7 +36,7 @@ def criticised(curve: Curve) -> Diagnosis:
 
 def effects(found: Diagnosis) -> dict[str, float]:
     """Probabilities of the library's effects, the most probable first."""
-    known = {name: p for name, p in found.evidence.probability.items() if name not in (AS_IT_IS, ELSE)}
+    known = {name: p for name, p in found.evidence.probability.items() if name not in (BASE_MODEL, DISCREPANCY)}
     return dict(sorted(known.items(), key=lambda item: -item[1]))
 
 

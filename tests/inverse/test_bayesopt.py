@@ -96,12 +96,12 @@ def test_what_is_asked_hangs_on_the_seed_and_what_was_told_alone() -> None:
     whole = play(two_valleys, 1, 7, 0.01, 4)
     assert torch.equal(torch.rand(3), expected), "the caller's generator is as it was"
     resumed = BayesianOptimiser(1, seed=4)
-    for told in whole.told[:6]:
-        resumed.tell(*told)
-    assert resumed.ask()[0].astype(np.float64).tobytes() == whole.told[6].action.tobytes()
-    resumed.tell(*whole.told[6])
+    for trial in whole.trials[:6]:
+        resumed.tell(*trial)
+    assert resumed.ask()[0].astype(np.float64).tobytes() == whole.trials[6].action.tobytes()
+    resumed.tell(*whole.trials[6])
     assert resumed.result().minimisers.tobytes() == whole.result().minimisers.tobytes()
-    assert play(two_valleys, 1, 1, 0.0, 5).told[0].action != whole.told[0].action
+    assert play(two_valleys, 1, 1, 0.0, 5).trials[0].action != whole.trials[0].action
 
 
 def test_noise_without_a_minimum_is_not_taken_for_one() -> None:
@@ -133,8 +133,8 @@ def test_failed_evaluations_are_avoided_and_left_out() -> None:
     for _ in range(10):
         (action,) = optimiser.ask()
         optimiser.tell(action, None if action[0] < -0.2 else float((action[0] - 0.3) ** 2))
-    assert any(t.loss is None for t in optimiser.told), "the start covers the range where evaluations fail"
-    assert sum(t.loss is None for t in optimiser.told[4:]) <= 2
+    assert any(t.loss is None for t in optimiser.trials), "the start covers the range where evaluations fail"
+    assert sum(t.loss is None for t in optimiser.trials[4:]) <= 2
     assert optimiser.result().estimate[0] == pytest.approx(0.3, abs=0.05)
 
 
@@ -177,7 +177,7 @@ class Valley(gym.Env):
 def test_an_agent_that_knows_the_environments_interface_and_no_more() -> None:
     env = Valley()
     optimiser = optimise(env)
-    assert len(optimiser.told) == 8
+    assert len(optimiser.trials) == 8
     assert optimiser.result().estimate[0] == pytest.approx(-0.4, abs=0.02)
     env.action_space = gym.spaces.Box(0.0, 1.0, (1,), np.float32)
     with pytest.raises(ValueError, match="actions in"):

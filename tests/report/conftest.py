@@ -40,7 +40,7 @@ def misfit() -> dict[str, Any]:
     curve = {"channel": "force", "unit": "N", "measured": [1.0, 4.0, None, 2.0]}
     band = {"low": [0.9, 3.6, None, 1.8], "high": [1.1, 4.4, None, 2.2]}
     return {
-        "format": "splatsoil-misfit/2",
+        "format": "splatsoil-misfit/3",
         "adequate": True,
         "probability": 0.971,
         "passes": True,
@@ -52,7 +52,7 @@ def misfit() -> dict[str, Any]:
             {**check, "region": "berm", "ratio": 2.31, "p": 0.003},
             {**check, "region": "track", "ratio": 1.12, "p": 0.6},
         ],
-        "numerics": 1.3,
+        "discretisation_factor": 1.3,
         "unit": "grey levels",
         "time_name": "frame",
         "times": [10, 20, 30, 40],
@@ -73,7 +73,7 @@ def diagnosis(misfit: dict[str, Any]) -> dict[str, Any]:
     predicted = {**curve["predicted"], "effect_2": [1.0, 4.1, None, 2.0]}
     return {
         **shared,
-        "format": "splatsoil-diagnosis/2",
+        "format": "splatsoil-diagnosis/3",
         "passes": False,
         "model": [],
         "maps": {"before": before, "effect_2": effect},
@@ -90,7 +90,7 @@ def diagnosis(misfit: dict[str, Any]) -> dict[str, Any]:
             {"model": "", "error": 5.2, "noise": 1.24, "log_score": -900.0},
             {"model": "effect_2", "error": 1.31, "noise": 1.24, "log_score": -700.0},
         ],
-        "aside": "camera right and the withdrawal",
+        "held_out_data": "camera right and the withdrawal",
         "notes": ["One thing to know."],
     }
 
@@ -157,12 +157,13 @@ def added(run: Path, diagnosis: dict[str, Any], fit_of: Callable[..., dict[str, 
         write_json(run / file, after)
     write_json(run / "diagnoses" / "base.json", diagnosis)
     lines = [
-        {"effects": made["setup"]["effects"], "loss": 0.2, "floor": 1.24, "model": made["name"], "held_out": error}
+        {"effects": made["setup"]["effects"], "loss": 0.2, "noise_level": 1.24, "model": made["name"]}
+        | {"held_out": error}
         | {"parameters": {k: {n: p[n] for n in ("estimate", "std", "unit")} for k, p in made["parameters"].items()}}
         for made, error in ((base, 5.2), (after, 1.31))
     ]
     lines[1]["added"] = "effect_2"
-    write_json(run / "history.json", {"format": "splatsoil-history/1", "models": lines})
+    write_json(run / "history.json", {"format": "splatsoil-history/2", "models": lines})
     write_comparison(run / "before", base, 40)
     write_comparison(run / "comparison", after, 200)
     return run

@@ -280,7 +280,7 @@ def test_maps_before_and_after_have_colours_of_one_scale(diagnosis: dict[str, An
         ("reconstruction/surface.npz", "x", r"surface\.npz"),
         ("reconstruction/surface.npz", -100, r"surface\.npz.*; delete the folder .*reconstruction;"),
         ("reconstruction/reconstruction.json", "[]", "reconstruction.json: isn't of format"),
-        ("history.json", '{"format": "splatsoil-history/1"}', "history.json.*lacks models"),
+        ("history.json", '{"format": "splatsoil-history/2"}', "history.json.*lacks models"),
     ],
 )
 def test_what_is_missing_or_damaged_is_named(run: Path, file: str, contents: str | int | None, says: str) -> None:

@@ -67,7 +67,10 @@ def make() -> Make:
     names = ("one", "two", "three", "blurred")
 
     def made(
-        truth: dict[str, float] | None = None, seed: int = 0, extra: np.ndarray | None = None, numerics: float = 0.5
+        truth: dict[str, float] | None = None,
+        seed: int = 0,
+        extra: np.ndarray | None = None,
+        discretisation: float = 0.5,
     ) -> EmulatedExperiment:
         candidates = (
             candidate("one"),
@@ -91,13 +94,13 @@ def make() -> Make:
             np.full(shape, 0.5),
             np.zeros(shape),
             curves={"friction_angle": 0.02 * waves(3, layout)},
-            patterns={"fine": numerics * waves(4, layout)},
-            guessed={"guess 1": 0.3 * waves(6, layout), "guess 2": 0.3 * rng.normal(size=shape)},
+            patterns={"fine": discretisation * waves(4, layout)},
+            albedo_patterns={"guess 1": 0.3 * waves(6, layout), "guess 2": 0.3 * rng.normal(size=shape)},
         )
         values = {"friction_angle": 33.0, **(truth or {})}
         observed = experiment.measured(values, [1000 + seed], extra)
         # Nature is the fine one, and as far from it again.
-        observed = observed + experiment.patterns["fine"] + numerics * waves(100 + seed, layout)
+        observed = observed + experiment.patterns["fine"] + discretisation * waves(100 + seed, layout)
         return EmulatedExperiment(**{**vars(experiment), "observed": observed})
 
     return made

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from splatsoil.inverse.criticism.diagnosis import diagnose, judged, set_aside
+from splatsoil.inverse.criticism.diagnosis import diagnose, held_out_mask, verdict_of
 from splatsoil.inverse.criticism.record import misfit_of, record
 
 from splatsoil.experiment.emulated import EmulatedExperiment
@@ -84,7 +84,7 @@ def test_the_same_seed_gives_the_same_answer_and_the_record_is_plain_json(make: 
 
 
 def test_what_fine_runs_add_is_taken_off_the_observation(make: Make) -> None:
-    experiment = make(numerics=4.0)
+    experiment = make(discretisation=4.0)
     diagnosis = diagnose(experiment, START, effects=False)
     noise = diagnosis.evidence.noise
     added = experiment.patterns["fine"][noise.mask] @ noise.basis
@@ -100,21 +100,21 @@ def test_what_fine_runs_add_is_taken_off_the_observation(make: Make) -> None:
 
 def test_what_is_set_aside_is_the_last_camera_and_the_last_stage(make: Make) -> None:
     layout = make().layout
-    aside, what = set_aside(make())
+    held_out, what = held_out_mask(make())
     assert what == "camera right and the withdrawal"
     right = np.array([s.channel == "right" for s in layout.sites])
-    assert aside[:, right].all() and aside[4:].all() and not aside[:4, ~right].any()
+    assert held_out[:, right].all() and held_out[4:].all() and not held_out[:4, ~right].any()
 
 
 def test_what_is_set_aside_has_no_say_in_the_models_that_it_judges(make: Make) -> None:
     """The angle is 8 degrees higher there alone: of that, models fitted to the rest miss all."""
-    experiment = make(numerics=0.0)
-    aside, _ = set_aside(experiment)
-    shift = np.where(aside, 8.0 * experiment.slopes["friction_angle"], 0.0)
+    experiment = make(discretisation=0.0)
+    held_out, _ = held_out_mask(experiment)
+    shift = np.where(held_out, 8.0 * experiment.slopes["friction_angle"], 0.0)
     found = diagnose(replace(experiment, observed=experiment.observed + shift, candidates=()), START)
-    judged_on = aside & found.mask & experiment.layout.common[None]
+    scored = held_out & found.mask & experiment.layout.common[None]
     (held_out,) = found.held_out
-    assert held_out.error == pytest.approx(np.sqrt(np.mean(shift[judged_on] ** 2)), rel=0.2)
+    assert held_out.error == pytest.approx(np.sqrt(np.mean(shift[scored] ** 2)), rel=0.2)
     assert held_out.noise == pytest.approx(np.hypot(1.0, 0.5), rel=0.25), "of chance and of the sensor"
 
 
@@ -122,7 +122,7 @@ def test_the_noise_holds_what_seeds_scatter_by(make: Make) -> None:
     """Of chance of unit size in every feature and of sensors of half of it, in scores of unit directions."""
     ratios, sizes = [], []
     for seed in WORLDS:
-        experiment = make(numerics=0.0, seed=seed)
+        experiment = make(discretisation=0.0, seed=seed)
         found = diagnose(experiment, START, effects=False, seed=seed)
         noise = found.evidence.noise
         drawn = noise.scores(np.array([experiment.predict(START, seed=k) for k in range(5000, 5200)]))
@@ -134,11 +134,13 @@ def test_the_noise_holds_what_seeds_scatter_by(make: Make) -> None:
 
 
 def test_checks_expect_what_nobody_knows_of_the_soil(make: Make) -> None:
-    """A guess as far off as 3 grey levels, one of two, adds half of its square to what is expected."""
-    experiment = make(numerics=0.0)
-    guessed = {**experiment.guessed, "guess 1": 10.0 * experiment.guessed["guess 1"]}
-    before, after = (diagnose(e, START, effects=False) for e in (experiment, replace(experiment, guessed=guessed)))
-    added = 0.5 * (guessed["guess 1"] ** 2 - experiment.guessed["guess 1"] ** 2)
+    """A draw of the albedo that is 3 grey levels off, one of two, adds half of its square to what is expected."""
+    experiment = make(discretisation=0.0)
+    patterns = {**experiment.albedo_patterns, "guess 1": 10.0 * experiment.albedo_patterns["guess 1"]}
+    before, after = (
+        diagnose(e, START, effects=False) for e in (experiment, replace(experiment, albedo_patterns=patterns))
+    )
+    added = 0.5 * (patterns["guess 1"] ** 2 - experiment.albedo_patterns["guess 1"] ** 2)
     pictures = before.mask & experiment.layout.placed
     np.testing.assert_allclose((after.expected - before.expected)[pictures], added[pictures], atol=1e-6)
 
@@ -157,4 +159,4 @@ def test_checks_expect_what_nobody_knows_of_the_soil(make: Make) -> None:
     ],
 )
 def test_verdicts(probability: dict[str, float], fits: bool, verdict: str, members: tuple[str, ...]) -> None:
-    assert judged(probability, fits=fits) == (verdict, members)
+    assert verdict_of(probability, fits=fits) == (verdict, members)

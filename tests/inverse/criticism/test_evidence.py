@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 from splatsoil.inverse.criticism.checks import Expected, checks, passes
-from splatsoil.inverse.criticism.design import LARGEST, Prior, Run, effect_runs, sizes
+from splatsoil.inverse.criticism.design import MAX_SIZE, Prior, Run, effect_runs, sizes
 from splatsoil.inverse.criticism.diagnosis import diagnose
 from splatsoil.inverse.criticism.emulator import BaseEmulator, IncrementEmulator
 from splatsoil.inverse.criticism.evidence import Comparison
@@ -23,7 +23,7 @@ ANGLE = Parameter("friction_angle", "deg", 20.0, 50.0, 35.0)
 
 
 def linear_noise(slope: np.ndarray, observed: np.ndarray, points: np.ndarray) -> Noise:
-    """Scores that grow with the one parameter, with unit noise and numerics of the same size."""
+    """Scores that grow with the one parameter, with unit noise and a discretisation error of the same size."""
     p = len(slope)
     return Noise(
         np.ones((1, p), dtype=bool),
@@ -49,9 +49,9 @@ def test_evidence_is_the_integral_of_the_likelihood() -> None:
     points = np.linspace(-1.0, 1.0, 12)[:, None]
     noise = linear_noise(slope, observed, points)
     prior = Prior(ParameterSpace([ANGLE]))
-    found = Comparison.of(noise, prior, (), {}).judge()
+    found = Comparison.of(noise, prior, (), {}).evidence()
     grid = np.linspace(-1.0, 1.0, 2001)
-    weights = np.exp(noise.expected)
+    weights = np.exp(noise.log_prior)
     likelihood = np.array(
         [
             sum(
@@ -67,7 +67,7 @@ def test_evidence_is_the_integral_of_the_likelihood() -> None:
     whitening = 0.5 * np.log(np.linalg.det(noise.covariance(np.ones(2))))
     assert base.log_evidence - whitening == pytest.approx(wanted, abs=0.05)
     # In "something else" one of the factors at least is beyond two standard deviations, in both kinds or in one.
-    weights = np.exp(noise.beyond)
+    weights = np.exp(noise.log_prior_discrepancy)
     assert weights.sum() == pytest.approx(1.0)
     assert np.array_equal(weights > 0.0, (np.log(FACTORS) >= 0.999 * 2.0 * noise.factor_std).any(axis=1))
     unit = grid @ likelihood / likelihood.sum()
@@ -146,7 +146,7 @@ def test_variances_far_apart_stay_as_they_are() -> None:
 def test_sizes_are_log_uniform_from_the_meaningful_one_on_both_sides(candidate: Callable[..., Candidate]) -> None:
     cube = np.random.default_rng(0).uniform(size=(4000, 1))
     one = sizes(candidate("one"), cube)[:, 0]
-    assert one.min() >= 1.0 and one.max() <= LARGEST
+    assert one.min() >= 1.0 and one.max() <= MAX_SIZE
     assert np.median(one) == pytest.approx(4.0, rel=0.1)
     two = sizes(candidate("two", sign=0), cube)[:, 0]
     assert np.mean(two > 0.0) == pytest.approx(0.5, abs=0.05) and np.abs(two).min() >= 1.0
@@ -179,11 +179,11 @@ def test_checks_find_a_block_that_is_off_and_hardly_ever_one_that_is_not(make: M
 
 
 def test_a_size_that_is_called_detectable_is_found_and_noise_hides_more(make: Make) -> None:
-    quiet, loud = (diagnose(make(numerics=n), {"friction_angle": 35.0}) for n in (0.3, 4.0))
+    quiet, loud = (diagnose(make(discretisation=n), {"friction_angle": 35.0}) for n in (0.3, 4.0))
     large, small = loud.detectable["two"], quiet.detectable["two"]
     assert small is not None and (large is None or small <= large)
     named = [
-        diagnose(make({"two_size": 2.0 * small}, seed=k, numerics=0.3), {"friction_angle": 35.0}, seed=k).members
+        diagnose(make({"two_size": 2.0 * small}, seed=k, discretisation=0.3), {"friction_angle": 35.0}, seed=k).members
         for k in range(4)
     ]
     assert named.count(("two",)) >= 3

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from splatsoil.envs.problem import Evaluation, Image
 from splatsoil.inverse.criticism.design import Prior, Run
-from splatsoil.inverse.criticism.diagnosis import BASE, PAIRS
+from splatsoil.inverse.criticism.diagnosis import BASE_RUNS, PAIRS
 from splatsoil.inverse.criticism.simulations import Simulations
 from splatsoil.inverse.evaluations import EvaluationRecord
 from splatsoil.inverse.fitting import FitSetup, fit
@@ -62,20 +62,20 @@ def fitted(experiment: EmulatedExperiment, folder: Path, budget: int = BUDGET) -
 
     def kept(done: int, record: EvaluationRecord) -> None:
         table = experiment.observed - np.reshape(record.blocks, experiment.layout.shape)
-        simulate.keep(table, record.parameters, record.seed)
+        simulate.store(table, record.parameters, record.seed)
 
     def compared(found: dict[str, Any]) -> Any:
         return compare_models(experiment, simulate, found, lambda what, share: None, 3, with_effects=False)
 
     result = fit(Searched(experiment), run, setup, budget=budget, compare=compared, after_evaluation=kept)
-    return run, result, simulate.made
+    return run, result, simulate.simulated
 
 
 def test_nothing_is_simulated_twice_and_all_say_the_same(make: Make, tmp_path: Path) -> None:
     experiment = make()
     run, result, made = fitted(experiment, tmp_path)
     assert result["estimated_from"] == "comparison"
-    assert made == BASE - BUDGET + PAIRS + DRAWN
+    assert made == BASE_RUNS - BUDGET + PAIRS + DRAWN
     angle = result["parameters"]["friction_angle"]
     assert abs(angle["estimate"] - 33.0) < 3.0 * angle["std"] < 6.0
     assert angle["low"] < angle["estimate"] < angle["high"] and angle["determined"]
@@ -83,12 +83,12 @@ def test_nothing_is_simulated_twice_and_all_say_the_same(make: Make, tmp_path: P
 
     again = Simulations(experiment, tmp_path / "features")
     found = compare_models(experiment, again, run.fit(), lambda what, share: None, 3, with_effects=False)
-    assert again.made == 0, "a comparison finds every simulation"
+    assert again.simulated == 0, "a comparison finds every simulation"
     assert found.estimates["friction_angle"] == (angle["estimate"], angle["std"])
     more = Simulations(experiment, tmp_path / "features")
     found = compare_models(experiment, more, run.fit(), lambda what, share: None, 3, with_effects=True)
     assert set(found.evidence.models) > {"one", "two", "three"}
-    assert more.asked - more.made >= BUDGET + made, "so does a diagnosis"
+    assert more.requested - more.simulated >= BUDGET + made, "so does a diagnosis"
 
     resumed, same, none = fitted(experiment, tmp_path)
     assert none == 0 and same["parameters"] == result["parameters"] and resumed.fit()["minimum"] == result["minimum"]

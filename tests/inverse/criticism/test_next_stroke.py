@@ -11,7 +11,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
 from splatsoil.inverse.criticism.diagnosis import diagnose
-from splatsoil.inverse.criticism.evidence import ELSE
+from splatsoil.inverse.criticism.evidence import DISCREPANCY
 from splatsoil.inverse.criticism.next_stroke import (
     Information,
     entropy,
@@ -69,7 +69,7 @@ def test_correlated_noise_counts_as_it_is() -> None:
 def test_models_that_predict_the_same_tell_nothing() -> None:
     found = [information(scattered(8, 0.0, 1.0, seed), EVEN, 0.1 * np.eye(2), seed) for seed in range(20)]
     assert np.mean([f.mean for f in found]) < 0.05
-    assert all(not f.told_apart for f in found)
+    assert all(not f.distinguished for f in found)
 
 
 def test_few_simulations_in_many_dimensions_do_not_make_models_differ() -> None:
@@ -86,7 +86,7 @@ def test_models_far_apart_tell_all_there_is() -> None:
     found = information(made, probability, np.eye(3))
     assert found.mean == pytest.approx(entropy(probability), abs=0.01)
     assert entropy(probability) == pytest.approx(1.1568, abs=1e-4)
-    assert found.told_apart == [("a", "b"), ("a", "c"), ("b", "c")]
+    assert found.distinguished == [("a", "b"), ("a", "c"), ("b", "c")]
 
 
 def test_few_simulations_must_differ_by_more() -> None:
@@ -96,7 +96,7 @@ def test_few_simulations_must_differ_by_more() -> None:
         more = 1.0 + 0.35 * np.sqrt(count) * scaled(np.arange(count, dtype=np.float64))
         few = Information({"a": more, "b": zero[:count]}, {"a": 1.0, "b": 0.0}, {})
         assert few.std == pytest.approx(0.35)
-        assert few.beyond(Information({"a": zero[:count], "b": zero[:count]}, few.probability, {})) is clear
+        assert few.exceeds(Information({"a": zero[:count], "b": zero[:count]}, few.probability, {})) is clear
 
 
 def scaled(values: np.ndarray) -> np.ndarray:
@@ -124,7 +124,7 @@ def test_probable_models_of_the_soil_are_told_apart() -> None:
 
 @pytest.mark.parametrize("given", [{"as_it_is": 0.99, "tilt": 0.01}, {"something_else": 0.97, "tilt": 0.03}])
 def test_a_single_probable_model_is_refused(given: dict[str, float]) -> None:
-    with pytest.raises(RunError, match="no two that a stroke could tell apart"):
+    with pytest.raises(RunError, match="no two models to distinguish"):
         probable(diagnosis(**given))
 
 
@@ -158,8 +158,8 @@ def test_the_experiment_in_which_an_effect_acts_tells_most(make: Callable[..., E
 
     none, usual, strong = told(0.0), told(1.0), told(3.0)
     assert none.mean < 0.05
-    assert strong.beyond(none) and strong.mean >= usual.mean
-    assert strong.told_apart == [("", "one")]
+    assert strong.exceeds(none) and strong.mean >= usual.mean
+    assert strong.distinguished == [("", "one")]
     assert strong.mean == pytest.approx(entropy(probability), abs=0.1)
 
 
@@ -188,7 +188,7 @@ def test_a_simulation_that_cannot_go_on_costs_itself_alone(make: Callable[..., E
 def test_draws_are_of_the_posterior(make: Callable[..., EmulatedExperiment]) -> None:
     found = diagnose(make({"one_size": 6.0}), {"friction_angle": 35.0})
     draws = posterior_draws(found.evidence, 0)
-    assert "" in draws and ELSE not in draws
+    assert "" in draws and DISCREPANCY not in draws
     assert all(found.evidence.probability[name] >= 0.05 for name in draws if name)
     mean, std = found.evidence.models["one"].moments("one_size")
     drawn = np.array([d["one_size"] for d in draws["one"]])

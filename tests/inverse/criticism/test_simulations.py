@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from splatsoil.inverse.criticism.simulations import Helpers, Simulations
+from splatsoil.inverse.criticism.simulations import Executor, Simulations
 
 from splatsoil.errors import RunError, SimulationError
 from splatsoil.experiment.features import Layout, Site
@@ -19,9 +19,9 @@ from splatsoil.experiment.features import Layout, Site
 AT = {"angle": 0.5}
 
 
-def table(values: Mapping[str, float], seed: int = 0, numerics: str = "", effects: Sequence[str] = ()) -> np.ndarray:
+def table(values: Mapping[str, float], seed: int = 0, variant: str = "", effects: Sequence[str] = ()) -> np.ndarray:
     """(2, 1) another one for every simulation."""
-    name = "".join(sorted(effects)) + numerics
+    name = "".join(sorted(effects)) + variant
     return np.array([[values["angle"]], [100.0 * seed + sum(map(ord, name))]])
 
 
@@ -29,7 +29,7 @@ class Watched:
     """An experiment that notes what it is asked for, and by itself takes a moment for each."""
 
     layout = Layout((0.0, 1.0), (Site("camera", 0.0, 0.0),), "frame", "1", ("pushing",) * 2, np.full((2, 1), "trench"))
-    guesses, redrawn = ("guess 1", "guess 2"), ("rounding",)
+    albedo_draws, renderings = ("guess 1", "guess 2"), ("rounding",)
 
     def __init__(self, fails: Callable[[Mapping[str, float]], bool] = lambda values: False) -> None:
         self.fails = fails
@@ -49,7 +49,7 @@ def simulations(experiment: Watched, folder: Path | None = None) -> Simulations:
 
 
 @contextmanager
-def helper(experiment: Watched, folder: Path, together: int = 1, mine: Watched | None = None) -> Iterator[Helpers]:
+def helper(experiment: Watched, folder: Path, together: int = 1, mine: Watched | None = None) -> Iterator[Executor]:
     """One, of whom nothing is heard but what it keeps in the folder."""
     theirs = simulations(experiment, folder)
 
@@ -62,15 +62,15 @@ def helper(experiment: Watched, folder: Path, together: int = 1, mine: Watched |
                 continue
 
     with ThreadPoolExecutor(1) as pool:
-        yield Helpers(lambda jobs: pool.submit(work, jobs), together, mine.prepared.append if mine else len)
+        yield Executor(lambda jobs: pool.submit(work, jobs), together, mine.prepared.append if mine else len)
 
 
 def everything(ask: Callable[..., np.ndarray]) -> list[np.ndarray]:
     """Work that asks for simulations of several kinds, some of them twice."""
     base = [ask({"angle": 0.1 * k}, seed=k) for k in range(6)]
     effects = [ask({"angle": 0.1 * k}, effects=("cohesion",), seed=k) for k in range(6)]
-    fine = [ask({"angle": 0.1 * k}, numerics="fine") for k in range(3)]
-    drawn = [ask(AT, numerics=name) for name in ("", "guess 1", "guess 2", "rounding")]
+    fine = [ask({"angle": 0.1 * k}, variant="fine") for k in range(3)]
+    drawn = [ask(AT, variant=name) for name in ("", "guess 1", "guess 2", "rounding")]
     return [*base, *effects, *fine, *drawn, ask({"angle": 0.1}, seed=1)]
 
 
@@ -78,16 +78,16 @@ def everything(ask: Callable[..., np.ndarray]) -> list[np.ndarray]:
 def test_what_will_be_asked_for_is_made_by_both_and_only_once(batch: int, tmp_path: Path) -> None:
     mine, theirs = Watched(), Watched()
     simulate = simulations(mine, tmp_path)
-    with helper(theirs, tmp_path, batch, mine) as helpers, simulate.helped(helpers):
-        simulate.ahead(everything)
+    with helper(theirs, tmp_path, batch, mine) as helpers, simulate.using(helpers):
+        simulate.prefetch(everything)
         together = everything(simulate)
     assert mine.calls and theirs.calls
-    assert len(mine.calls) + len(theirs.calls) == simulate.asked == simulate.made == 19
+    assert len(mine.calls) + len(theirs.calls) == simulate.requested == simulate.simulated == 19
     # What goes together is alike, and no more of it than is good; what is one by itself needs no preparing.
-    drawings = {*Watched.guesses, *Watched.redrawn}
+    drawings = {*Watched.albedo_draws, *Watched.renderings}
     for jobs in (*mine.prepared, *theirs.prepared):
-        assert len({(*job["effects"], "" if job["numerics"] in drawings else job["numerics"]) for job in jobs}) == 1
-        assert len(jobs) <= batch or {job["numerics"] for job in jobs} == drawings
+        assert len({(*job["effects"], "" if job["variant"] in drawings else job["variant"]) for job in jobs}) == 1
+        assert len(jobs) <= batch or {job["variant"] for job in jobs} == drawings
     assert all(len(jobs) > 1 for jobs in mine.prepared)
     assert any(len(jobs) == 4 for jobs in (*mine.prepared, *theirs.prepared)) is (batch == 4)
     assert all(np.array_equal(a, b) for a, b in zip(everything(simulations(Watched())), together, strict=True))
@@ -95,13 +95,13 @@ def test_what_will_be_asked_for_is_made_by_both_and_only_once(batch: int, tmp_pa
 
 def test_what_is_kept_is_read_and_not_made_again(tmp_path: Path) -> None:
     first, again = simulations(Watched(), tmp_path), simulations(Watched(), tmp_path)
-    told: list[str] = []
-    again.told = told.append
+    reported: list[str] = []
+    again.report = reported.append
     kept = everything(first)
     assert all(np.array_equal(a, b) for a, b in zip(kept, everything(again), strict=True))
-    assert (first.made, again.made, again.asked, told) == (19, 0, 19, [])
+    assert (first.simulated, again.simulated, again.requested, reported) == (19, 0, 19, [])
     again({"angle": 9.0}, purpose="another")
-    assert (again.made, told) == (1, ["another"])
+    assert (again.simulated, reported) == (1, ["another"])
 
 
 def test_a_share_is_made_whole_by_who_takes_it_and_one_failure_in_it_is_no_other_ones(tmp_path: Path) -> None:
@@ -114,8 +114,8 @@ def test_a_share_is_made_whole_by_who_takes_it_and_one_failure_in_it_is_no_other
         return Future()
 
     angles = (1.0, 2.0, 3.0)
-    with simulate.helped(Helpers(never, 4)):
-        simulate.ahead(lambda ask: [ask({"angle": angle}) for angle in angles])
+    with simulate.using(Executor(never, 4)):
+        simulate.prefetch(lambda ask: [ask({"angle": angle}) for angle in angles])
         assert [len(jobs) for jobs in shares] == [3]
         assert np.array_equal(simulate({"angle": 1.0}), table({"angle": 1.0}))
         assert len(list(tmp_path.iterdir())) == 2, "the third is there, too"
@@ -123,19 +123,19 @@ def test_a_share_is_made_whole_by_who_takes_it_and_one_failure_in_it_is_no_other
             simulate({"angle": 2.0})
         assert np.array_equal(simulate({"angle": 3.0}), table({"angle": 3.0}))
     assert [call["angle"] for call in mine.calls] == [1.0, 2.0, 3.0, 2.0]
-    assert simulate.asked == simulate.made == 2
+    assert simulate.requested == simulate.simulated == 2
 
 
 def test_all_drawings_of_a_simulation_are_one_share_whatever_is_best_made_at_a_time() -> None:
     shares: list[list[str]] = []
 
     def never(jobs: Sequence[Mapping[str, Any]]) -> Future[None]:
-        shares.append([job["numerics"] for job in jobs])
+        shares.append([job["variant"] for job in jobs])
         return Future()
 
     simulate = simulations(Watched())
-    with simulate.helped(Helpers(never, 2)):
-        simulate.ahead(lambda ask: [ask(AT, numerics=n) for n in ("guess 1", "guess 2", "fine", "rounding", "")])
+    with simulate.using(Executor(never, 2)):
+        simulate.prefetch(lambda ask: [ask(AT, variant=n) for n in ("guess 1", "guess 2", "fine", "rounding", "")])
     assert sorted(sorted(share) for share in shares) == [[""], ["fine"], ["guess 1", "guess 2", "rounding"]]
 
 
@@ -148,13 +148,13 @@ def test_a_helper_that_fails_or_dies_costs_nothing_but_its_help(tmp_path: Path, 
 
     mine = Watched(lambda values: values["angle"] > 1.0)
     simulate = simulations(mine, tmp_path)
-    with simulate.helped(Helpers(dead)):
-        simulate.ahead(lambda ask: [ask(AT), ask({"angle": 2.0})])
+    with simulate.using(Executor(dead)):
+        simulate.prefetch(lambda ask: [ask(AT), ask({"angle": 2.0})])
         assert np.array_equal(simulate(AT), table(AT))
         for _ in range(2):
             with pytest.raises(SimulationError, match="blew up"):
                 simulate({"angle": 2.0})
-    assert len(mine.calls) == 2 and simulate.asked == 1
+    assert len(mine.calls) == 2 and simulate.requested == 1
 
 
 def test_what_decides_a_simulation_and_nothing_else_makes_it_another(tmp_path: Path) -> None:
@@ -162,21 +162,21 @@ def test_what_decides_a_simulation_and_nothing_else_makes_it_another(tmp_path: P
     simulate = Simulations(Watched(), tmp_path, sources={"own": "one"})  # type: ignore[arg-type]
     for effects in (("tilt", "own"), ("own", "tilt"), ("tilt",), ()):
         simulate(AT, effects=effects, purpose="any")
-    assert simulate.made == 3
+    assert simulate.simulated == 3
     simulate(AT, effects=("tilt",), seed=1)
-    simulate(AT, effects=("tilt",), numerics="fine")
+    simulate(AT, effects=("tilt",), variant="fine")
     simulate({"angle": 0.6}, effects=("tilt",))
-    assert simulate.made == 6
+    assert simulate.simulated == 6
     other = Simulations(Watched(), tmp_path, sources={"own": "other"})  # type: ignore[arg-type]
     for effects in (("tilt", "own"), ("tilt",), ()):
         other(AT, effects=effects)
-    assert other.made == 1
+    assert other.simulated == 1
 
 
 def test_what_was_made_elsewhere_is_kept_and_not_made_again(tmp_path: Path) -> None:
     experiment = Watched()
-    simulations(experiment, tmp_path).keep(table(AT, 7), AT, 7)
+    simulations(experiment, tmp_path).store(table(AT, 7), AT, 7)
     later = simulations(experiment, tmp_path)
-    later.keep(table(AT, 8), AT, 7)
+    later.store(table(AT, 8), AT, 7)
     assert np.array_equal(later(AT, seed=7), table(AT, 7)), "the first one stays"
-    assert experiment.calls == [] and (later.made, later.asked) == (0, 1)
+    assert experiment.calls == [] and (later.simulated, later.requested) == (0, 1)

@@ -25,12 +25,12 @@ if TYPE_CHECKING:
     from splatsoil.experiment.plow import PlowExperiment
     from splatsoil.inverse.criticism.simulations import Arguments, Simulations
 
-MOST_HELPERS = 3
+MAX_WORKERS = 3
 SHARE = {"cpu": 2.0, "cuda": 4.0}
 """Memory that each process is to have, GiB: it holds a reconstruction, a scene and soil."""
 
 
-class Crew:
+class Workers:
     """Other processes that simulate, too: one for every other core, as far as there is use for them.
 
     They begin at once, so that they have loaded what takes seconds when the first process has. All keep what they make
@@ -46,35 +46,35 @@ class Crew:
     """
 
     def __init__(self, folder: RunFolder, device: str, effects: Iterable[str]) -> None:
-        self.count = max(0, int(min(threads.cores(), 1 + MOST_HELPERS, memory() / SHARE["cpu"])) - 1)
+        self.count = max(0, int(min(threads.cores(), 1 + MAX_WORKERS, memory() / SHARE["cpu"])) - 1)
         self._path, self._effects = folder.path, tuple(effects)
-        self._workers = self._started(device)
+        self._pool = self._started(device)
 
-    def __enter__(self) -> Crew:
+    def __enter__(self) -> Workers:
         return self
 
     def __exit__(self, *_: object) -> None:
         """End those that never came to help."""
-        if self._workers is not None:
-            executors.kill(self._workers)
-        self._workers = None
+        if self._pool is not None:
+            executors.kill(self._pool)
+        self._pool = None
 
     def _started(self, device: str) -> ProcessPoolExecutor | None:
         """As many helpers as there are to be, on their way."""
         if self.count == 0:
             return None
-        workers = executors.processes(self.count)
+        pool = executors.processes(self.count)
         try:
             with _unheard():
                 for _ in range(self.count):
-                    workers.submit(_ready, device)
+                    pool.submit(_ready, device)
         except BaseException:
-            executors.kill(workers)
+            executors.kill(pool)
             raise
-        return workers
+        return pool
 
     @contextmanager
-    def helping(self, spec: ModelSpec, experiment: PlowExperiment, simulate: Simulations) -> Iterator[None]:
+    def simulating(self, spec: ModelSpec, experiment: PlowExperiment, simulate: Simulations) -> Iterator[None]:
         """While the block runs, where this process holds the folder's lock, they simulate.
 
         Args:
@@ -82,27 +82,27 @@ class Crew:
             experiment: of it.
             simulate: what is helped.
         """
-        from splatsoil.inverse.criticism.simulations import Helpers
+        from splatsoil.inverse.criticism.simulations import Executor
 
         device = experiment.base.device
-        if self._workers is not None and device != "cpu":
+        if self._pool is not None and device != "cpu":
             count = max(0, min(self.count, int(gpu_memory(device)[0] / SHARE["cuda"]) - 1))
             if count < self.count:  # they began before it was known how much memory is free there
                 self.__exit__()
                 self.count = count
-                self._workers = self._started(device)
+                self._pool = self._started(device)
         with threads.at_most(_threads(device, self.count)):
-            if self._workers is None:
+            if self._pool is None:
                 yield
                 return
-            workers, what = self._workers, (self._path, device, spec, self._effects, self.count)
-            helpers = Helpers(
-                lambda jobs: workers.submit(_simulate, *what, jobs), experiment.together, experiment.prepare
+            pool, what = self._pool, (self._path, device, spec, self._effects, self.count)
+            helpers = Executor(
+                lambda jobs: pool.submit(_simulate, *what, jobs), experiment.batch_size, experiment.prepare
             )
-            with simulate.helped(helpers):
+            with simulate.using(helpers):
                 yield
-            workers.shutdown(cancel_futures=True)
-            self._workers = None
+            pool.shutdown(cancel_futures=True)
+            self._pool = None
 
 
 @contextmanager

@@ -14,7 +14,7 @@ import pytest
 from splatsoil.inverse.criticism.simulations import Simulations
 from splatsoil.inverse.executors import processes
 
-from splatsoil.commands import _crew, _stages
+from splatsoil.commands import _stages, _workers
 from splatsoil.commands._model import ModelSpec
 from splatsoil.errors import RunError, SimulationError
 
@@ -34,14 +34,14 @@ def test_a_helper_prepares_what_goes_together_and_makes_what_can_be_made(
         made.append(number)
 
     experiment = SimpleNamespace(prepare=prepared.append)
-    monkeypatch.setitem(_crew._known, (tmp_path, "cpu", BASE, ()), (experiment, simulate))  # type: ignore[misc]
+    monkeypatch.setitem(_workers._known, (tmp_path, "cpu", BASE, ()), (experiment, simulate))  # type: ignore[misc]
     jobs = [{"number": number} for number in range(count)]
-    _crew._simulate(tmp_path, "cpu", BASE, (), 2, jobs)
+    _workers._simulate(tmp_path, "cpu", BASE, (), 2, jobs)
     assert made == [number for number in range(count) if number != 1]
     assert prepared == ([] if count == 1 else [jobs])
 
 
-class Workers:
+class Pool:
     """Processes that are none, and what becomes of them."""
 
     def __init__(self, count: int) -> None:
@@ -58,15 +58,15 @@ class Workers:
         self.ended.append("let go")
 
 
-made: list[Workers] = []
+made: list[Pool] = []
 
 
 @pytest.fixture
 def three_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     """A machine with as many, whose processes are none."""
     made.clear()
-    monkeypatch.setattr("splatsoil.inverse.executors.processes", Workers)
-    monkeypatch.setattr("splatsoil.inverse.executors.kill", lambda workers: workers.ended.append("killed"))
+    monkeypatch.setattr("splatsoil.inverse.executors.processes", Pool)
+    monkeypatch.setattr("splatsoil.inverse.executors.kill", lambda pool: pool.ended.append("killed"))
     monkeypatch.setattr("splatsoil.threads.cores", lambda: 3)
 
 
@@ -74,7 +74,7 @@ def experiment_on(device: str) -> Any:
     """What helpers need of one."""
     layout = SimpleNamespace(shape=(1, 1))
     base = SimpleNamespace(device=device)
-    return SimpleNamespace(together=1, prepare=len, base=base, layout=layout, guesses=(), redrawn=())
+    return SimpleNamespace(batch_size=1, prepare=len, base=base, layout=layout, albedo_draws=(), renderings=())
 
 
 @pytest.mark.usefixtures("three_cores")
@@ -83,23 +83,23 @@ def test_helpers_begin_with_the_command_and_nothing_outlives_it(helps: bool, fai
     folder: Any = SimpleNamespace(path=tmp_path)
     experiment = experiment_on("cpu")
     simulate = Simulations(experiment)
-    with suppress(SimulationError), _crew.Crew(folder, "cpu", ("tilt",)) as crew:
-        (workers,) = made
-        assert crew.count == 2 and workers.jobs == [_crew._ready] * 2
+    with suppress(SimulationError), _workers.Workers(folder, "cpu", ("tilt",)) as workers:
+        (pool,) = made
+        assert workers.count == 2 and pool.jobs == [_workers._ready] * 2
         if helps:
-            with crew.helping(BASE, experiment, simulate):
-                simulate.ahead(lambda ask: [ask({"angle": 30.0}, seed=seed) for seed in (1, 2)])
-                assert workers.jobs[2:] == [_crew._simulate] * 2
-                *known, (job,) = workers.words[-1]
+            with workers.simulating(BASE, experiment, simulate):
+                simulate.prefetch(lambda ask: [ask({"angle": 30.0}, seed=seed) for seed in (1, 2)])
+                assert pool.jobs[2:] == [_workers._simulate] * 2
+                *known, (job,) = pool.words[-1]
                 assert known == [tmp_path, "cpu", BASE, ("tilt",), 2]
                 assert (job["values"], job["seed"]) == ({"angle": 30.0}, 1), "the first ones are made here"
                 if fails:
                     raise SimulationError("blew up")
-            simulate.ahead(lambda ask: ask({"angle": 31.0}))
-            assert len(workers.jobs) == 4, "nobody helps any more"
+            simulate.prefetch(lambda ask: ask({"angle": 31.0}))
+            assert len(pool.jobs) == 4, "nobody helps any more"
         elif fails:
             raise SimulationError("blew up")
-    assert workers.ended == ["let go" if helps and not fails else "killed"]
+    assert pool.ended == ["let go" if helps and not fails else "killed"]
 
 
 @pytest.mark.usefixtures("three_cores")
@@ -127,29 +127,29 @@ def test_a_gpu_with_little_memory_keeps_few_helpers(
     free: float, left: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """They began before it was known how much is free there."""
-    monkeypatch.setattr(_crew, "gpu_memory", {"cuda:0": (free, 80.0)}.__getitem__)
+    monkeypatch.setattr(_workers, "gpu_memory", {"cuda:0": (free, 80.0)}.__getitem__)
     folder: Any = SimpleNamespace(path=tmp_path)
     experiment = experiment_on("cuda:0")
     simulate = Simulations(experiment)
-    with _crew.Crew(folder, "auto", ()) as crew, crew.helping(BASE, experiment, simulate):
-        assert crew.count == left
-        simulate.ahead(lambda ask: ask({"angle": 30.0}))
-    assert [workers.jobs.count(_crew._ready) for workers in made] == ([2] if left == 2 else [2, 1] if left else [2])
-    assert [workers.ended for workers in made] == {2: [["let go"]], 1: [["killed"], ["let go"]], 0: [["killed"]]}[left]
-    assert (_crew._simulate in made[-1].jobs) is (left > 0)
+    with _workers.Workers(folder, "auto", ()) as workers, workers.simulating(BASE, experiment, simulate):
+        assert workers.count == left
+        simulate.prefetch(lambda ask: ask({"angle": 30.0}))
+    assert [pool.jobs.count(_workers._ready) for pool in made] == ([2] if left == 2 else [2, 1] if left else [2])
+    assert [pool.ended for pool in made] == {2: [["let go"]], 1: [["killed"], ["let go"]], 0: [["killed"]]}[left]
+    assert (_workers._simulate in made[-1].jobs) is (left > 0)
 
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="this system has no masks")
 def test_helpers_never_hear_of_an_interrupt_and_the_first_process_does() -> None:
     """Not even while they load: one would print a traceback beside the sentence of the first."""
-    workers = processes(1)
+    pool = processes(1)
     try:
-        with _crew._unheard():
-            masked = workers.submit(signal.pthread_sigmask, signal.SIG_BLOCK, [])
+        with _workers._unheard():
+            masked = pool.submit(signal.pthread_sigmask, signal.SIG_BLOCK, [])
         assert signal.SIGINT in masked.result()
         assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
     finally:
-        workers.shutdown()
+        pool.shutdown()
 
 
 EARLY = """
@@ -157,7 +157,7 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 from splatsoil import threads
-from splatsoil.commands import _crew, {command}
+from splatsoil.commands import _workers, {command}
 from splatsoil.inverse import executors
 from splatsoil.inverse.run_folder import RunFolder
 
@@ -166,14 +166,14 @@ class Helpers:
         pass
 
     def submit(self, job, *words):
-        if job is _crew._ready:
+        if job is _workers._ready:
             sys.exit(1 if {{"torch", "kornia"}} & sys.modules.keys() else 0)
 
 fit = {{"setup": {{"effects": []}}, "loss": 0.5, "best": {{"loss": 0.5}}, "parameters": {{}}}}
 RunFolder.open = lambda path: SimpleNamespace(path=path, fit=lambda: fit, check_writable=lambda: None)
 executors.processes = Helpers
 executors.kill = lambda helpers: None
-_crew.MOST_HELPERS = 1
+_workers.MAX_WORKERS = 1
 threads.cores = lambda: 2
 {command}.run({command}.Config(Path("run")))
 sys.exit(2)
