@@ -196,7 +196,7 @@ def left(
 
     def bare(experiment: PlowExperiment, tables: Tables, aside: npt.NDArray[np.bool_]) -> tuple[Noise, Tables]:
         everywhere = np.broadcast_to(aside, experiment.layout.shape)
-        return noise_of(experiment, prior, replace(tables, drawn={}), (), everywhere), tables
+        return noise_of(experiment, prior, replace(tables, variants={}), (), everywhere), tables
 
     heights = np.array([site.channel == HEIGHT for site in true[0].layout.sites])
     views = {"soil": bare(*true, true[0].layout.placed & ~heights), "drawn": bare(*true, heights)}

@@ -1,5 +1,6 @@
 """The command line's subcommands, one module each: a frozen dataclass of options and a function that acts on it.
 
-What they share: ``_options`` (parser, help), ``_output`` (JSON, tables, progress), ``_model`` (a run folder and its
-model), ``_stages`` (fit, compare, diagnose), ``_resources`` (memory, time), ``_workers`` (helpers), ``_laboratory``.
+Shared modules: ``_options`` (parser, help), ``_output`` (JSON, tables, progress), ``_model`` (a run folder and its
+model), ``_stages`` (fit, compare, diagnose), ``_resources`` (memory, time), ``_workers`` (worker processes) and
+``_laboratory`` (laboratory tests).
 """

@@ -1,4 +1,4 @@
-"""Other processes that simulate for criticism beside this one."""
+"""Worker processes that simulate for a comparison of models in parallel with this process."""
 
 from __future__ import annotations
 
@@ -26,27 +26,29 @@ if TYPE_CHECKING:
     from splatsoil.inverse.criticism.simulations import Arguments, Simulations
 
 MAX_WORKERS = 3
-SHARE = {"cpu": 2.0, "cuda": 4.0}
-"""Memory that each process is to have, GiB: it holds a reconstruction, a scene and soil."""
+PROCESS_MEMORY = {"cpu": 2.0, "cuda": 4.0}
+"""Memory for each process, GiB: it loads a reconstruction, a scene and soil."""
 
 
 class Workers:
-    """Other processes that simulate, too: one for every other core, as far as there is use for them.
+    """Worker processes for simulations, at most one for each further core; a context manager.
 
-    They begin at once, so that they have loaded what takes seconds when the first process has. All keep what they make
-    in ``features/`` and find it there, and those that die cost nothing but their help. Simulations wait until the first
-    process holds the folder's lock. On a CPU each process keeps to one thread, the first one too: the results are those
-    of one process, bit for bit, and with more they would wait for each other. A GPU is shared: each process makes
-    simulations that are alike as one batch, as one leaves most of it idle, and cores are shared out.
+    They start at once and load the libraries while this process loads its own. All processes store simulations in
+    ``features/``; if a worker dies, this process simulates instead. Simulations start once this process has the
+    folder's lock. On a CPU each process uses one thread, this one too, so results equal those of one process bit for
+    bit. On a shared GPU each process simulates batches, and the processes share the cores.
 
     Args:
         folder: the run folder.
-        device: where it is computed, in the user's word.
+        device: as the user names it.
         effects: the candidates, as `experiment_of` takes them; none for all.
+
+    Attributes:
+        count: number of worker processes.
     """
 
     def __init__(self, folder: RunFolder, device: str, effects: Iterable[str]) -> None:
-        self.count = max(0, int(min(threads.cores(), 1 + MAX_WORKERS, memory() / SHARE["cpu"])) - 1)
+        self.count = max(0, int(min(threads.cores(), 1 + MAX_WORKERS, memory() / PROCESS_MEMORY["cpu"])) - 1)
         self._path, self._effects = folder.path, tuple(effects)
         self._pool = self._started(device)
 
@@ -54,20 +56,19 @@ class Workers:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """End those that never came to help."""
+        """End workers that are still running."""
         if self._pool is not None:
             executors.kill(self._pool)
         self._pool = None
 
     def _started(self, device: str) -> ProcessPoolExecutor | None:
-        """As many helpers as there are to be, on their way."""
         if self.count == 0:
             return None
         pool = executors.processes(self.count)
         try:
-            with _unheard():
+            with _ignoring_interrupts():
                 for _ in range(self.count):
-                    pool.submit(_ready, device)
+                    pool.submit(_load, device)
         except BaseException:
             executors.kill(pool)
             raise
@@ -75,19 +76,19 @@ class Workers:
 
     @contextmanager
     def simulating(self, spec: ModelSpec, experiment: PlowExperiment, simulate: Simulations) -> Iterator[None]:
-        """While the block runs, where this process holds the folder's lock, they simulate.
+        """While the block runs, in which this process holds the folder's lock, the workers run simulations.
 
         Args:
             spec: the model.
             experiment: of it.
-            simulate: what is helped.
+            simulate: its simulations.
         """
         from splatsoil.inverse.criticism.simulations import Executor
 
         device = experiment.base.device
         if self._pool is not None and device != "cpu":
-            count = max(0, min(self.count, int(gpu_memory(device)[0] / SHARE["cuda"]) - 1))
-            if count < self.count:  # they began before it was known how much memory is free there
+            count = max(0, min(self.count, int(gpu_memory(device)[0] / PROCESS_MEMORY["cuda"]) - 1))
+            if count < self.count:  # the free GPU memory is known only now
                 self.__exit__()
                 self.count = count
                 self._pool = self._started(device)
@@ -95,23 +96,21 @@ class Workers:
             if self._pool is None:
                 yield
                 return
-            pool, what = self._pool, (self._path, device, spec, self._effects, self.count)
-            helpers = Executor(
-                lambda jobs: pool.submit(_simulate, *what, jobs), experiment.batch_size, experiment.prepare
-            )
-            with simulate.using(helpers):
+            pool, model = self._pool, (self._path, device, spec, self._effects, self.count)
+            submit = lambda jobs: pool.submit(_simulate, *model, jobs)  # noqa: E731
+            with simulate.using(Executor(submit, experiment.batch_size, experiment.prepare)):
                 yield
             pool.shutdown(cancel_futures=True)
             self._pool = None
 
 
 @contextmanager
-def _unheard() -> Iterator[None]:
-    """Processes that begin meanwhile never hear of Ctrl-C, not even while they load: the first process ends them."""
-    if not hasattr(signal, "pthread_sigmask"):  # not every system has masks
+def _ignoring_interrupts() -> Iterator[None]:
+    """Processes started in the block ignore Ctrl-C, also while they load: this process ends them."""
+    if not hasattr(signal, "pthread_sigmask"):  # not on every system
         yield
         return
-    resource_tracker.ensure_running()  # it has the mask its own way when it begins
+    resource_tracker.ensure_running()  # it sets its own mask when it starts
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -119,17 +118,17 @@ def _unheard() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _threads(device: str, helpers: int) -> int:
-    """How many each process keeps to."""
-    return 1 if device == "cpu" or helpers == 0 else max(1, threads.cores() // (1 + helpers))
+def _threads(device: str, workers: int) -> int:
+    """Threads of each process."""
+    return 1 if device == "cpu" or workers == 0 else max(1, threads.cores() // (1 + workers))
 
 
-_known: dict[tuple[Path, str, ModelSpec, tuple[str, ...]], tuple[PlowExperiment, Simulations]] = {}
+_experiments: dict[tuple[Path, str, ModelSpec, tuple[str, ...]], tuple[PlowExperiment, Simulations]] = {}
 
 
-def _ready(device: str) -> None:
-    """A helper's work: to load what takes seconds, before it is needed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process ends this one
+def _load(device: str) -> None:
+    """A worker's first job: load the libraries."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main process ends this one
 
     def load(here: str) -> None:
         import torch
@@ -138,47 +137,47 @@ def _ready(device: str) -> None:
 
         torch.zeros(1, device=here)
 
-    _quietly(load, device, 0)
+    _run(load, device, 0)
 
 
 def _simulate(
-    path: Path, device: str, spec: ModelSpec, effects: tuple[str, ...], helpers: int, jobs: Sequence[Arguments]
+    path: Path, device: str, spec: ModelSpec, effects: tuple[str, ...], workers: int, jobs: Sequence[Arguments]
 ) -> None:
-    """A helper's work."""
+    """A worker's job: run and store simulations."""
 
-    def make(here: str) -> None:
-        experiment, simulate = _known_here(path, here, spec, effects)
+    def simulate_all(here: str) -> None:
+        experiment, simulate = _experiment(path, here, spec, effects)
         if len(jobs) > 1:
             experiment.prepare(jobs)
         for job in jobs:
-            # one that can't be made doesn't keep the others from being made
+            # a failure does not stop the others
             with suppress(SplatsoilError):
                 simulate(**job)
 
-    _quietly(make, device, helpers)
+    _run(simulate_all, device, workers)
 
 
-def _quietly(work: Callable[[str], object], device: str, helpers: int) -> None:
-    """Work on a device. Whatever goes wrong, the first process meets it too, and says so."""
+def _run(work: Callable[[str], object], device: str, workers: int) -> None:
+    """Work on a device. The main process meets the same errors, and reports them."""
     with suppress(SplatsoilError, OSError):
         here = resolve_device(device)
-        with threads.at_most(_threads(here, helpers)):
+        with threads.at_most(_threads(here, workers)):
             work(here)
 
 
-def _known_here(
+def _experiment(
     path: Path, device: str, spec: ModelSpec, effects: tuple[str, ...]
 ) -> tuple[PlowExperiment, Simulations]:
-    """What a helper works with, made once."""
+    """A worker's experiment and simulations, cached."""
     from splatsoil.commands._model import experiment_of, model_of
 
     key = (path, device, spec, effects)
-    if key not in _known:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process ends this one
+    if key not in _experiments:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main process ends this one
         hush()
-        warnings.simplefilter("ignore", SetWarning)  # the first process has said it
+        warnings.simplefilter("ignore", SetWarning)  # the main process has printed it
         folder = RunFolder.open(path)
-        # a reconstruction that isn't kept is the first process's to make
+        # a missing reconstruction is made by the main process
         model = model_of(folder, device, lambda what, share: None, spec=spec, make=False)
-        _known[key] = experiment_of(folder, model, spec, effects or None)
-    return _known[key]
+        _experiments[key] = experiment_of(folder, model, spec, effects or None)
+    return _experiments[key]

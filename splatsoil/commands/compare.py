@@ -38,7 +38,7 @@ def run(config: Config) -> int:
     folder = _model.opened(config)
     none = no_answer(folder.fit())
     folder.check_writable()
-    # Helpers begin before what takes seconds to load is loaded.
+    # Workers start first: they load libraries for seconds.
     with (
         nullcontext() if config.quick else _workers.Workers(folder, config.device, ()) as workers,
         _model.loaded(config, folder) as (model, begin),

@@ -205,11 +205,10 @@ def show(result: Mapping[str, Any]) -> None:
         left=("motion", "distinguishes"),
     )
     first, *others = result["strokes"]
-    best = f"Most is expected of the stroke {first['name']}: {first['bits']:.2f} ± {first['std']:.2f} bits"
-    # Better only where that can be said.
+    best = f"Largest expected information: {first['name']}, {first['bits']:.2f} ± {first['std']:.2f} bits"
     if alike := [s["name"] for s in others if not s["less_than_best"]]:
-        best += f"; by these simulations it is not better than {listed(alike)}"
+        best += f"; not significantly better than {listed(alike)}"
     elif others:
-        best += ", more than of any other"
+        best += ", significantly more than the others"
     print_text(f"{best}.", notes=result["notes"])
-    print(f"{result['simulated_now']} new simulations and drawings, {result['seconds']:.0f} s")
+    print(f"{result['simulated_now']} new simulations and renderings, {result['seconds']:.0f} s")

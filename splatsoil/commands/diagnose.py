@@ -39,7 +39,7 @@ def run(config: Config) -> int:
     fit = _model.latest_fit(folder)
     none = no_answer(fit)
     folder.check_writable()
-    # Helpers begin before what takes seconds to load is loaded.
+    # Workers start first: they load libraries for seconds.
     with _workers.Workers(folder, config.device, config.effects) as workers:
         _model.off_effects(config.effects, find_effects(fit["setup"]["effects"]))
         with _model.loaded(config, folder) as (model, begin):

@@ -239,9 +239,9 @@ class PlowExperiment:
                 found = in_batches(self._batch, list(group.values()), "simulations")
             except (SplatsoilError, RuntimeError):  # `predict` raises it again
                 continue
-            for key, trajectory in zip(group, found, strict=True):
+            for name, trajectory in zip(group, found, strict=True):
                 if isinstance(trajectory, Trajectory):
-                    self._cache(key, trajectory)
+                    self._cache(name, trajectory)
 
     def _batch(self, group: Sequence[tuple[Model, dict[str, float], int]]) -> Sequence[Trajectory | SimulationError]:
         """Simulations with one law and resolution, as one batch."""

@@ -65,17 +65,17 @@ def result(*alike: str) -> dict[str, Any]:
     }
 
 
-def test_the_table_says_what_is_expected_and_told_apart(
+def test_the_table_shows_information_and_distinguished_models(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A stroke is called better only beyond the error."""
     monkeypatch.setenv("COLUMNS", "120")
-    best = "Most is expected of the stroke half as fast: 0.80 ± 0.05 bits"
+    best = "Largest expected information: half as fast, 0.80 ± 0.05 bits"
     show(result("as measured"))
-    assert f"{best}; by these simulations it is not better than as measured." in capsys.readouterr().out
+    assert f"{best}; not significantly better than as measured." in capsys.readouterr().out
     show(result())
     out = capsys.readouterr().out
-    assert f"{best}, more than of any other." in out
+    assert f"{best}, significantly more than the others." in out
     assert "models: as it is (60 %) and tool adhesion (40 %); at most 0.97 bits of information" in out
     row = next(line for line in out.splitlines() if line.strip().startswith("half as fast"))
     assert "0.80 ± 0.05 bits" in row and "as it is from tool adhesion" in row

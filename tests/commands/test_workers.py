@@ -22,7 +22,7 @@ BASE = ModelSpec((), "tiny", ("friction_angle",))
 
 
 @pytest.mark.parametrize("count", [1, 3])
-def test_a_helper_prepares_what_goes_together_and_makes_what_can_be_made(
+def test_a_worker_prepares_what_goes_together_and_makes_what_can_be_made(
     count: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     prepared: list[Sequence[Any]] = []
@@ -34,7 +34,7 @@ def test_a_helper_prepares_what_goes_together_and_makes_what_can_be_made(
         made.append(number)
 
     experiment = SimpleNamespace(prepare=prepared.append)
-    monkeypatch.setitem(_workers._known, (tmp_path, "cpu", BASE, ()), (experiment, simulate))  # type: ignore[misc]
+    monkeypatch.setitem(_workers._experiments, (tmp_path, "cpu", BASE, ()), (experiment, simulate))  # type: ignore[misc]
     jobs = [{"number": number} for number in range(count)]
     _workers._simulate(tmp_path, "cpu", BASE, (), 2, jobs)
     assert made == [number for number in range(count) if number != 1]
@@ -71,7 +71,7 @@ def three_cores(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def experiment_on(device: str) -> Any:
-    """What helpers need of one."""
+    """What workers need of one."""
     layout = SimpleNamespace(shape=(1, 1))
     base = SimpleNamespace(device=device)
     return SimpleNamespace(batch_size=1, prepare=len, base=base, layout=layout, albedo_draws=(), renderings=())
@@ -79,13 +79,13 @@ def experiment_on(device: str) -> Any:
 
 @pytest.mark.usefixtures("three_cores")
 @pytest.mark.parametrize(("helps", "fails"), [(False, False), (False, True), (True, False), (True, True)])
-def test_helpers_begin_with_the_command_and_nothing_outlives_it(helps: bool, fails: bool, tmp_path: Path) -> None:
+def test_workers_begin_with_the_command_and_nothing_outlives_it(helps: bool, fails: bool, tmp_path: Path) -> None:
     folder: Any = SimpleNamespace(path=tmp_path)
     experiment = experiment_on("cpu")
     simulate = Simulations(experiment)
     with suppress(SimulationError), _workers.Workers(folder, "cpu", ("tilt",)) as workers:
         (pool,) = made
-        assert workers.count == 2 and pool.jobs == [_workers._ready] * 2
+        assert workers.count == 2 and pool.jobs == [_workers._load] * 2
         if helps:
             with workers.simulating(BASE, experiment, simulate):
                 simulate.prefetch(lambda ask: [ask({"angle": 30.0}, seed=seed) for seed in (1, 2)])
@@ -104,7 +104,7 @@ def test_helpers_begin_with_the_command_and_nothing_outlives_it(helps: bool, fai
 
 @pytest.mark.usefixtures("three_cores")
 @pytest.mark.parametrize("stage", ["run_diagnosis", "check_adequacy"])
-def test_who_is_not_alone_in_a_folder_has_no_helpers(stage: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_who_is_not_alone_in_a_folder_has_no_workers(stage: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def taken() -> NoReturn:
         raise RunError("another process is writing")
 
@@ -123,7 +123,7 @@ def test_who_is_not_alone_in_a_folder_has_no_helpers(stage: str, monkeypatch: py
 
 @pytest.mark.usefixtures("three_cores")
 @pytest.mark.parametrize(("free", "left"), [(20.0, 2), (9.0, 1), (5.0, 0), (3.0, 0)])
-def test_a_gpu_with_little_memory_keeps_few_helpers(
+def test_a_gpu_with_little_memory_keeps_few_workers(
     free: float, left: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """They began before it was known how much is free there."""
@@ -134,17 +134,17 @@ def test_a_gpu_with_little_memory_keeps_few_helpers(
     with _workers.Workers(folder, "auto", ()) as workers, workers.simulating(BASE, experiment, simulate):
         assert workers.count == left
         simulate.prefetch(lambda ask: ask({"angle": 30.0}))
-    assert [pool.jobs.count(_workers._ready) for pool in made] == ([2] if left == 2 else [2, 1] if left else [2])
+    assert [pool.jobs.count(_workers._load) for pool in made] == ([2] if left == 2 else [2, 1] if left else [2])
     assert [pool.ended for pool in made] == {2: [["let go"]], 1: [["killed"], ["let go"]], 0: [["killed"]]}[left]
     assert (_workers._simulate in made[-1].jobs) is (left > 0)
 
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="this system has no masks")
-def test_helpers_never_hear_of_an_interrupt_and_the_first_process_does() -> None:
+def test_workers_never_hear_of_an_interrupt_and_the_first_process_does() -> None:
     """Not even while they load: one would print a traceback beside the sentence of the first."""
     pool = processes(1)
     try:
-        with _workers._unheard():
+        with _workers._ignoring_interrupts():
             masked = pool.submit(signal.pthread_sigmask, signal.SIG_BLOCK, [])
         assert signal.SIGINT in masked.result()
         assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
@@ -161,18 +161,18 @@ from splatsoil.commands import _workers, {command}
 from splatsoil.inverse import executors
 from splatsoil.inverse.run_folder import RunFolder
 
-class Helpers:
+class Pools:
     def __init__(self, count):
         pass
 
     def submit(self, job, *words):
-        if job is _workers._ready:
+        if job is _workers._load:
             sys.exit(1 if {{"torch", "kornia"}} & sys.modules.keys() else 0)
 
 fit = {{"setup": {{"effects": []}}, "loss": 0.5, "best": {{"loss": 0.5}}, "parameters": {{}}}}
 RunFolder.open = lambda path: SimpleNamespace(path=path, fit=lambda: fit, check_writable=lambda: None)
-executors.processes = Helpers
-executors.kill = lambda helpers: None
+executors.processes = Pools
+executors.kill = lambda pool: None
 _workers.MAX_WORKERS = 1
 threads.cores = lambda: 2
 {command}.run({command}.Config(Path("run")))
@@ -181,6 +181,6 @@ sys.exit(2)
 
 
 @pytest.mark.parametrize("command", ["diagnose", "compare"])
-def test_helpers_begin_before_what_takes_seconds_is_loaded(command: str) -> None:
+def test_workers_begin_before_what_takes_seconds_is_loaded(command: str) -> None:
     """They load the same, beside it."""
     assert subprocess.run([sys.executable, "-c", EARLY.format(command=command)], check=False).returncode == 0

@@ -140,7 +140,7 @@ def test_all_drawings_of_a_simulation_are_one_share_whatever_is_best_made_at_a_t
 
 
 @pytest.mark.parametrize("error", [None, RunError("a worker died 4 times")])
-def test_a_helper_that_fails_or_dies_costs_nothing_but_its_help(tmp_path: Path, error: Exception | None) -> None:
+def test_a_worker_that_fails_or_dies_costs_nothing(tmp_path: Path, error: Exception | None) -> None:
     def dead(jobs: Sequence[Mapping[str, Any]]) -> Future[None]:
         done: Future[None] = Future()
         done.set_exception(error) if error else done.set_result(None)
