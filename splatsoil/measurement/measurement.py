@@ -28,6 +28,7 @@ BED_FIELDS = ("lower", "upper", "density", "container", "wall_friction", "floor_
 BIN, TRANSPARENT, OPEN, HEAP = "bin", "transparent", "open", "heap"
 CONTAINERS = (BIN, TRANSPARENT, OPEN, HEAP)
 TOOL_FIELDS = ("mesh", "motion", "force", "friction")
+FRAME_RATES = (1e-3, 1e6)
 
 # What a laboratory or a field could hold; beyond it a unit is wrong (millimetres, g/cm³).
 _SMALLEST_BED, _LARGEST_BED = 0.01, 50.0
@@ -167,7 +168,7 @@ class Measurement:
             folder=root,
             name=fields.name("name", root.resolve().name),
             gravity=_read_gravity(fields),
-            frame_rate=fields.number("frame_rate", 1e-3, 1e6, hint="it is in frames a second"),
+            frame_rate=fields.number("frame_rate", *FRAME_RATES, hint="it is in frames a second"),
             bed=bed,
             tool=tool,
             views=views,
