@@ -338,13 +338,10 @@ def _check_clocks(measurement: Measurement) -> None:
         file, field = off[0][:2] if len(off) == 1 else (experiment, "frame_rate")
         raise MeasurementError(f"{off[0][2]}; times are in seconds, 0 at frame 0", file=file, field=field)
     first, last = (int(motion.frames[k]) for k in (0, -1))
-    far = next(
-        (i for i, f in enumerate(measurement.video) if (f.frame or 0) > last + _LONG_REST * (last - first)), None
-    )
-    if far is not None:
-        number = measurement.video[far].frame
-        fault = f"frame {number} is long after the tool's motion, which ends at frame {last}; leave it out"
-        raise MeasurementError(fault, file=video, field=f"frames[{far}].frame")
+    for i, frame in enumerate(measurement.video):
+        if (frame.frame or 0) > last + _LONG_REST * (last - first):
+            fault = f"frame {frame.frame} is long after the tool's motion, which ends at frame {last}; leave it out"
+            raise MeasurementError(fault, file=video, field=f"frames[{i}].frame")
 
 
 def _check_tool(measurement: Measurement) -> None:
