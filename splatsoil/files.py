@@ -61,9 +61,17 @@ def check_folder(path: str | Path) -> None:
     """See that results can go into a folder, which need not exist yet, before hours are spent on them; leaves nothing.
 
     Raises:
-        RunError: a file is in the way, or the folder can't be written to.
+        RunError: a file is in the way, the folder is a measurement set, or it can't be written to.
     """
     folder = Path(path).absolute()
+    try:
+        folder.lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        pass
+    except (OSError, ValueError) as error:  # a name that no file can have
+        raise RunError(f"{path}: is no usable path ({error}); choose another folder for the result") from error
+    if (folder / "experiment.json").exists():
+        raise RunError(f"{path}: is a measurement set, which is not written to; choose another folder for the result")
     there = next(place for place in (folder, *folder.parents) if place.exists())
     if not there.is_dir():
         raise RunError(f"{path}: {there} is a file and no folder; choose another folder for the result")

@@ -13,6 +13,7 @@ from splatsoil.files import (
     CRITICISM,
     FORWARD,
     RECONSTRUCTING,
+    check_folder,
     code_digest,
     digest,
     read_npy,
@@ -142,3 +143,22 @@ def test_json_is_strict(tmp_path: Path) -> None:
 def test_digests_know_contents_and_not_order() -> None:
     assert digest({"a": 1, "b": [1, 2]}) == digest({"b": [1, 2], "a": 1})
     assert digest({"a": 1.0}) != digest({"a": 1.0 + 2**-52})
+
+
+@pytest.mark.parametrize(
+    ("place", "says"),
+    [
+        ("a\0b", "no usable path"),
+        ("a" * 300, "no usable path"),
+        ("set", "is a measurement set"),
+        ("file/x", "is a file"),
+    ],
+)
+def test_a_folder_for_results_is_refused_before_work_is_spent_on_it(place: str, says: str, tmp_path: Path) -> None:
+    (tmp_path / "set").mkdir()
+    (tmp_path / "set" / "experiment.json").write_text("{}")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RunError, match=says):
+        check_folder(tmp_path / place)
+    check_folder(tmp_path / "set" / "runs" / "one")
+    assert sorted(p.name for p in tmp_path.rglob("*")) == ["experiment.json", "file", "set"]

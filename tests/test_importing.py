@@ -138,6 +138,10 @@ def recorded(true: Measurement, folder: Path) -> Recorded:
     (folder / "marks.csv").write_text("\n".join(marks) + "\n")
     rows = [f"{name},{','.join(map(str, place))}" for name, place in known.items()]
     (folder / "known.csv").write_text("\n".join(["point,x,y,z", *rows]) + "\n")
+    exchanged = [row.replace("p0,", "p,").replace("p2,", "p0,").replace("p,", "p2,") for row in rows]
+    (folder / "exchanged.csv").write_text("\n".join(["point,x,y,z", *exchanged]) + "\n")
+    np.savetxt(folder / "nan.txt", np.full((4, 4), np.nan))
+    (folder / "still.json").write_text(json.dumps({"frame_rate": 0}))
     mesh = true.tool.mesh.copy()
     mesh.apply_scale(1000.0).export(folder / "tool.stl")
     bed = {"lower": low.tolist(), "upper": high.tolist(), "density": true.bed.density}
@@ -307,8 +311,8 @@ def test_known_points_undo_any_similarity() -> None:
     np.testing.assert_allclose(found, truth, atol=1e-12)
     assert left < 1e-12
     mirrored = {name: place * [1.0, 1.0, -1.0] for name, place in places.items()}
-    found, left = by_known_points(places, mirrored)
-    assert np.linalg.det(found[:3, :3]) > 0.0 and left > 0.1, "a photograph's world is never mirrored"
+    with pytest.raises(MeasurementError, match="an axis mirrored"):
+        by_known_points(places, mirrored)
     line = {name: np.array([k, 2.0 * k, 0.0]) for k, name in enumerate(places)}
     with pytest.raises(MeasurementError, match="one line"):
         by_known_points(line, known)
@@ -545,6 +549,9 @@ def test_forces_are_means_over_frames_in_world_axes(tmp_path: Path) -> None:
     assert np.abs(force[:, 4]).max() == 0.0
 
 
+SCALED = ["--scale", "1", "--up", "0", "0", "1"]
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -570,6 +577,10 @@ def test_forces_are_means_over_frames_in_world_axes(tmp_path: Path) -> None:
         (["--motion", "robot.csv", "mm", "--robot-to-world", "known.csv"], "four rows of four numbers"),
         (["--motion", "robot.csv", "mm", "--video", "left.mp4=left.jpg"], "give --tool or --clock-offset"),
         (["--tool", "known.csv", "mm"], "known.csv"),
+        (["--clock-offset", "nan", *SCALED], "--clock-offset: must be a number"),
+        (["--motion", "robot.csv", "mm", "--robot-to-world", "nan.txt", *SCALED], "numbers are not finite"),
+        (["--known", "exchanged.csv", "--points", "marks.csv"], "are names exchanged"),
+        (["--experiment", "still.json", *SCALED], "frame_rate: 0 lies outside"),
         (["--motion", "robot.csv", "km"], "its unit 'km' is none of m, cm, mm, in"),
     ],
 )
@@ -579,7 +590,7 @@ def test_mistakes_are_one_sentence_and_nothing_is_written(
     if said.startswith(
         ("write", "two", "no posed", "cannot", "--video", "a motion", "expected", "four", "give", "known", "its unit")
     ):
-        words = [*words, "--scale", "1", "--up", "0", "0", "1"]
+        words = [*words, *SCALED]
     result = importing(plow, *words)
     assert result["code"] == 2 and said in result["error"], result
     assert list(tmp_path.iterdir()) == []

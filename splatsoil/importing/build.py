@@ -29,7 +29,7 @@ from splatsoil.importing.video import Video
 from splatsoil.measurement.camera import Camera
 from splatsoil.measurement.fields import Fields
 from splatsoil.measurement.frames import read_transforms, undistorted
-from splatsoil.measurement.measurement import EXPERIMENT, FORMAT, Measurement
+from splatsoil.measurement.measurement import EXPERIMENT, FORMAT, FRAME_RATES, Measurement
 from splatsoil.measurement.motion import MOTION_COLUMNS, ToolMotion
 from splatsoil.measurement.tool import FORCE_COLUMNS, read_mesh
 from splatsoil.measurement.writer import Picture, whole_folder, write_frames, write_json, write_table
@@ -88,6 +88,8 @@ def import_set(options: ImportOptions, report: Report) -> Imported:
     """
     if options.video_every < 1:
         raise ParameterError(f"--video-every: must be 1 or more, not {options.video_every}")
+    if not np.isfinite(options.clock_offset or 0.0):
+        raise ParameterError(f"--clock-offset: must be a number of seconds, not {options.clock_offset}")
     with whole_folder(options.out) as root:
         return _filled(root, options, report)
 
@@ -117,7 +119,7 @@ def _filled(root: Path, options: ImportOptions, report: Report) -> Imported:
         tags = tag_motion({name: (video, cameras[name]) for name, video in videos.items()}, corners)
         # What follows is on the clock of the force, as a robot's motion is.
         motion = replace(tags.motion, times=tags.motion.times + (options.clock_offset or 0.0))
-    experiment = {} if options.experiment is None else dict(Fields.read(options.experiment).data)
+    experiment = Fields({}, options.out) if options.experiment is None else Fields.read(options.experiment)
     rate = _rate(videos, experiment, motion)
 
     clock, offset = None, options.clock_offset or 0.0
@@ -153,7 +155,7 @@ def _filled(root: Path, options: ImportOptions, report: Report) -> Imported:
     if videos:
         write_frames(root / "video", filmed(), video=True)
     report("checking", 0.9)
-    missing = _finish(root, experiment, rate, options.out)
+    missing = _finish(root, experiment.data, rate, options.out)
     frames = {name: len(numbers) for name, numbers in wanted.items()}
     return Imported(found.kind, len(views), similarity, marks, left, frames, clock, tags, missing)
 
@@ -205,10 +207,11 @@ def _opened(path: Path, image: str, camera: Camera) -> Video:
     return video
 
 
-def _rate(videos: dict[str, Video], experiment: dict[str, Any], motion: ToolMotion | None) -> float:
+def _rate(videos: dict[str, Video], experiment: Fields, motion: ToolMotion | None) -> float:
     """The set's frames a second: the videos', or the experiment's."""
-    told = experiment.get("frame_rate")
-    rates = {video.rate for video in videos.values()} | ({float(told)} if isinstance(told, int | float) else set())
+    rates = {video.rate for video in videos.values()}
+    if experiment.has("frame_rate"):
+        rates.add(experiment.number("frame_rate", *FRAME_RATES, hint="it is in frames a second"))
     if len(rates) > 1 and max(rates) > 1.001 * min(rates):
         raise MeasurementError(
             f"videos and experiment.json have different frame rates: {', '.join(f'{r:g}' for r in sorted(rates))}"

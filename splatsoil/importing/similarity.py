@@ -20,6 +20,7 @@ Marks = dict[str, list[tuple[Frame, FloatArray]]]
 """Photographs, and pixels (2,) in them, by point."""
 
 _PARALLEL = 1e-4  # squared sine of the angle between rays that meet nowhere in particular
+_UNLIKE = 0.1  # of known points' spread about their middle: what no survey is off by
 _FLAT = 1e-3  # of known points' spread along one line, across it: they tell no turn about it
 
 
@@ -114,8 +115,13 @@ def by_known_points(marked: Mapping[str, FloatArray], known: Mapping[str, FloatA
     out = np.eye(4)
     out[:3, :3] = np.sum(dy * turn.apply(dx)) / np.sum(dx**2) * turn.as_matrix()
     out[:3, 3] = y.mean(axis=0) - out[:3, :3] @ x.mean(axis=0)
-    left = x @ out[:3, :3].T + out[:3, 3] - y
-    return out, float(np.sqrt(np.mean(np.sum(left**2, axis=1))))
+    left = float(np.linalg.norm(x @ out[:3, :3].T + out[:3, 3] - y))
+    if left > _UNLIKE * float(np.linalg.norm(dy)):
+        raise MeasurementError(
+            f"the known points are {left / np.sqrt(len(x)):.2g} m off the marked ones (root mean square); are names"
+            " exchanged, or an axis mirrored?"
+        )
+    return out, left / float(np.sqrt(len(x)))
 
 
 def by_scale(scale: float, up: npt.ArrayLike = (0.0, 0.0, 1.0)) -> FloatArray:

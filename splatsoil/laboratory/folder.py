@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
-from splatsoil.errors import MeasurementError
+from splatsoil.errors import MeasurementError, ParameterError
 from splatsoil.experiment.column import ColumnExperiment
 from splatsoil.experiment.laboratory import FloatArray, LaboratoryExperiment
-from splatsoil.experiment.plate import PlateExperiment
+from splatsoil.experiment.plate import GRAVITY, PlateExperiment
 from splatsoil.experiment.shear_box import ReposeExperiment, ShearBoxExperiment, Shearing
 from splatsoil.experiment.triaxial import Curve, TriaxialExperiment
 from splatsoil.files import write_text
@@ -37,6 +38,17 @@ GRAINS = 2650.0
 """Density of quartz, kg/m³."""
 PLATE_READINGS = 12
 """Depths at which a plate's force is read, evenly from a twelfth of the largest on."""
+ANGLES = (3.0, 80.0)
+"""Of friction, °, that soils mobilise, cohesive ones at small stresses included."""
+CRUSHING = 1e7
+"""Pressure at which grains of sand crush (Yamamuro, Bopp & Lade 1996, J. Geotech. Eng. 122:147), Pa."""
+SINKAGES = (0.01, 3.0)
+"""Of a plate, in its diameters."""
+SPREADING = (0.8, 10.0)
+"""Square of a deposit's radius times its height, by the column's: 3 for a cone, about 5 where columns were high (Lube
+et al. 2004, J. Fluid Mech. 508:175)."""
+DENSITIES = (-0.25, 1.25)
+"""Relative densities that are poured or tamped, beyond those of index tests."""
 TRIALS_DIFFER = 0.1
 """Standard deviation of a plate's force between trials, relative, where there are too few to tell: the nine trials of
 Pavlov & Johnson (github.com/robomechanics/3d-terramechanics) differ by 5 to 21 % from least to most."""
@@ -83,6 +95,10 @@ def load(folder: Path, options: Options | None = None) -> LaboratoryExperiment:
     if fields.text("format") != FORMAT:
         fields.fail("format", f"expected {FORMAT!r}")
     fields.name("name")
+    repeated = "tests" if "file" in KINDS[kind].each else "trials"
+    fields.check_names(("format", "kind", "name", repeated, *KINDS[kind].fields))
+    for one in fields.children(repeated):
+        one.check_names(KINDS[kind].each)
     return KINDS[kind].read(fields, folder, options or Options())
 
 
@@ -126,12 +142,55 @@ def _header(file: Path) -> str:
     return lines[0].lower() if lines else ""
 
 
+def _tests(fields: Fields, folder: Path) -> Iterator[tuple[Fields, Path]]:
+    """Each test and its table."""
+    seen: set[Path] = set()
+    for test in fields.children("tests"):
+        file = test.path("file", folder, folder)
+        if file in seen:
+            test.fail("file", f"{file.name} is given twice")
+        seen.add(file)
+        yield test, file
+
+
+def _first(values: FloatArray) -> npt.NDArray[np.bool_]:
+    """Which of the values (n,) are larger than all before: readings of first loading, without what was unloaded and
+    loaded again in between."""
+    return np.concatenate([[True], values[1:] > np.maximum.accumulate(values)[:-1]])
+
+
 def _at_strains(file: Path, what: str, strain: FloatArray, *curves: FloatArray) -> tuple[FloatArray, ...]:
-    """Those of `STRAINS` that are reached, and curves (n,) over strains (n,) there; MeasurementError for too few."""
-    kept, order = STRAINS[strain.max() * 1.0001 >= STRAINS], np.argsort(strain, kind="stable")
+    """Those of `STRAINS` that are reached, and curves (n,) over strains (n,) there, in first loading.
+
+    Raises:
+        MeasurementError: too few readings, or strains in another unit.
+    """
+    loading, largest = _first(strain), float(strain.max())
+    kept = STRAINS[largest * 1.0001 >= STRAINS]
     if len(kept) < FEWEST:
-        raise MeasurementError(f"ends before {what} {100 * STRAINS[FEWEST - 1]:g} %", file=file)
-    return kept, *(np.interp(kept, strain[order], curve[order]) for curve in curves)
+        fault = f"ends before {what} {100 * STRAINS[FEWEST - 1]:g} %; is it positive, and in its column's unit?"
+        raise MeasurementError(fault, file=file)
+    if largest > 10.0:
+        raise MeasurementError(f"reaches {what} {100 * largest:g} %; is it in its column's unit?", file=file)
+    if loading.sum() < FEWEST:
+        raise MeasurementError(f"has {loading.sum()} readings of first loading, fewer than {FEWEST}", file=file)
+    return kept, *(np.interp(kept, strain[loading], curve[loading]) for curve in curves)
+
+
+def _check_strength(file: Path, column: str, degrees: float) -> None:
+    if not ANGLES[0] <= degrees <= ANGLES[1]:
+        raise MeasurementError(
+            f"its largest value means a friction angle of {degrees:.3g}°, which no soil has; are stresses positive, in"
+            " Pa in experiment.json and in kPa in tables?",
+            file=file,
+            field=column,
+        )
+
+
+def _check_volume(file: Path, column: str, lost: FloatArray) -> None:
+    if np.abs(lost).max() > 0.5:
+        fault = f"reaches {100 * np.abs(lost).max():g} % of the volume, more than all pores"
+        raise MeasurementError(fault, file=file, field=column)
 
 
 def read_curve(file: Path, confining: float, void_ratio: float = 0.8, *, drained: bool = True) -> Curve:
@@ -154,6 +213,7 @@ def read_curve(file: Path, confining: float, void_ratio: float = 0.8, *, drained
     volume = "void_ratio" if by_ratio else "volume_strain_percent"
     table = read_table(file, ("axial_strain_percent", "q_kpa", volume))
     strain, q = table[:, 0] / 100.0, 1e3 * table[:, 1]
+    _check_strength(file, "q_kPa", 2.0 * np.rad2deg(np.arctan(np.sqrt(max(0.0, 1.0 + q.max() / confining)))) - 90.0)
     if "p_kpa" in header:
         pore = confining + q / 3.0 - 1e3 * read_table(file, ("p_kpa",))[:, 0]
         drained = drained and bool(np.abs(pore).max() <= PORE_PRESSURE * confining)
@@ -162,6 +222,7 @@ def read_curve(file: Path, confining: float, void_ratio: float = 0.8, *, drained
             "is undrained: pore water bears a part of the stress, and the law knows none; give drained tests", file=file
         )
     lost = (table[0, 2] - table[:, 2]) / (1.0 + table[0, 2]) if by_ratio else table[:, 2] / 100.0
+    _check_volume(file, volume, lost)
     kept, lost, ratio = _at_strains(file, "a strain of", strain, lost, q / (confining + q / 3.0))
     return Curve(file.stem, kept, lost, ratio, confining, void_ratio=void_ratio)
 
@@ -169,12 +230,12 @@ def read_curve(file: Path, confining: float, void_ratio: float = 0.8, *, drained
 def _read_triaxial(fields: Fields, folder: Path, options: Options) -> TriaxialExperiment:
     curves = [
         read_curve(
-            test.path("file", folder, folder),
+            file,
             test.number("confining", 1e2, 1e8, hint="it is in Pa"),
             test.number("void_ratio", 0.1, 3.0, default=0.8),
             drained=not test.has("drained") or test.flag("drained"),
         )
-        for test in fields.children("tests")
+        for test, file in _tests(fields, folder)
     ]
     return TriaxialExperiment(together(curves), known=_limits(fields, curves[0].void_ratio), **options.model)
 
@@ -191,7 +252,13 @@ def _limits(fields: Fields, void_ratio: float) -> dict[str, float]:
     if not fields.has("void_ratio_limits"):
         return {}
     least, most = fields.vector("void_ratio_limits", 2)
-    return of_limits(void_ratio, float(least), float(most))
+    try:
+        found = of_limits(void_ratio, float(least), float(most))
+    except ParameterError as error:
+        fields.fail("void_ratio_limits", str(error))
+    if not DENSITIES[0] <= found["relative_density"] <= DENSITIES[1]:
+        fields.fail("void_ratio_limits", f"the void ratio of {void_ratio:g} is not between {least:g} and {most:g}")
+    return found
 
 
 def _untested(kind: type[AnyTest], *stresses: float) -> list[AnyTest]:
@@ -217,11 +284,12 @@ def _write_triaxial(shape: TriaxialExperiment, readings: FloatArray) -> tuple[di
 def _read_shear_box(fields: Fields, folder: Path, options: Options) -> ShearBoxExperiment:
     height = fields.number("height", 1e-3, 1.0, hint="it is in m")
     found = []
-    for test in fields.children("tests"):
-        file = test.path("file", folder, folder)
+    for test, file in _tests(fields, folder):
         normal = test.number("normal_stress", 1e1, 1e8, hint="it is in Pa")
         table = read_table(file, ("displacement_mm", "shear_stress_kpa", "vertical_displacement_mm"))
         strain, lost = 1e-3 * table[:, 0] / height, -1e-3 * table[:, 2] / height
+        _check_strength(file, "shear_stress_kPa", np.rad2deg(np.arctan(1e3 * table[:, 1].max() / normal)))
+        _check_volume(file, "vertical_displacement_mm", lost)
         what = "a displacement over the height of"
         kept, ratio, lost = _at_strains(file, what, strain, 1e3 * table[:, 1] / normal, lost)
         found.append(Shearing(file.stem, kept, ratio, lost, normal, test.number("void_ratio", 0.1, 3.0, default=0.8)))
@@ -246,22 +314,24 @@ def _write_shear_box(shape: ShearBoxExperiment, readings: FloatArray) -> tuple[d
 def _read_plate(fields: Fields, folder: Path, options: Options) -> PlateExperiment:
     diameter = fields.number("diameter", 1e-3, 10.0, hint="it is in m")
     area = 0.25 * np.pi * diameter**2
+    density = fields.number("density", 100.0, 20_000.0, hint="it is in kg/m³")
+    grains = fields.number("grain_density", 500.0, 20_000.0, default=GRAINS, hint="it is in kg/m³")
+    if grains <= density:
+        fields.fail("grain_density", f"grains of {grains:g} kg/m³ make no soil of {density:g} kg/m³")
     curves = []
-    for trial in fields.children("tests"):
-        file = trial.path("file", folder, folder)
+    for _, file in _tests(fields, folder):
         as_pressure = "pressure_kpa" in _header(file)
         table = read_table(file, ("sinkage_mm", "pressure_kpa" if as_pressure else "force_n"))
-        # a plate that is lifted in between bears only where it is deeper than before
-        down = np.concatenate([[True], table[1:, 0] > np.maximum.accumulate(table[:-1, 0])])
-        depth = 1e-3 * table[down, 0]
-        curves.append((depth, table[down, 1] * (1e3 * area if as_pressure else 1.0)))
+        down = _first(table[:, 0])
+        depth, force = 1e-3 * table[down, 0], table[down, 1] * (1e3 * area if as_pressure else 1.0)
+        if depth[-1] > 0.0:
+            _check_plate(file, depth[-1] / diameter, force[-1] / area, GRAVITY * density * depth[-1])
+        curves.append((depth, force))
     deepest = min(float(depth[-1]) for depth, _ in curves)
     if not deepest > 0.0:
         fields.fail("tests", "sinkage grows downwards from 0 where the plate touches the soil; one never does")
     depths = deepest * (np.arange(PLATE_READINGS) + 1.0) / PLATE_READINGS
     forces = np.array([np.interp(depths, *curve) for curve in curves])
-    density = fields.number("density", 100.0, 20_000.0, hint="it is in kg/m³")
-    grains = fields.number("grain_density", 500.0, 20_000.0, default=GRAINS, hint="it is in kg/m³")
     mean = forces.mean(axis=0)
     spread = forces.std(axis=0, ddof=1) if len(forces) > 2 else TRIALS_DIFFER * mean
     return PlateExperiment(
@@ -275,6 +345,20 @@ def _read_plate(fields: Fields, folder: Path, options: Options) -> PlateExperime
         **options.simulation,
         name=fields.text("name"),
     )
+
+
+def _check_plate(file: Path, depth: float, pressure: float, least: float) -> None:
+    """A plate's largest sinkage, in diameters, and its pressure there, Pa: as large as the weight of the soil that was
+    there before, and too small to crush the grains."""
+    if not SINKAGES[0] <= depth <= SINKAGES[1]:
+        fault = f"reaches {depth:.3g} diameters of the plate; sinkages are in mm, the diameter in m"
+        raise MeasurementError(fault, file=file, field="sinkage_mm")
+    if not least <= pressure <= CRUSHING:
+        raise MeasurementError(
+            f"the plate bears {pressure:.3g} Pa in the end, outside [{least:.3g}, {CRUSHING:.3g}]: soil bears its own"
+            " weight, and grains crush; is it in its column's unit?",
+            file=file,
+        )
 
 
 def _example_plate(name: str, options: Options) -> PlateExperiment:
@@ -291,7 +375,7 @@ def _write_plate(shape: PlateExperiment, readings: FloatArray) -> tuple[dict[str
 def _read_repose(fields: Fields, folder: Path, options: Options) -> ReposeExperiment:
     del folder
     return ReposeExperiment(
-        [trial.number("angle", 1.0, 80.0, hint="it is in degrees") for trial in fields.children("trials")],
+        [trial.number("angle", *ANGLES, hint="it is in degrees") for trial in fields.children("trials")],
         height=fields.number("height", 1e-3, 100.0, default=0.1, hint="it is in m"),
         density=fields.number("density", 100.0, 20_000.0, default=1600.0, hint="it is in kg/m³"),
         **options.model,
@@ -302,13 +386,19 @@ def _read_repose(fields: Fields, folder: Path, options: Options) -> ReposeExperi
 def _read_column(fields: Fields, folder: Path, options: Options) -> ColumnExperiment:
     del folder
     metres = "it is in m"
+    radius, height = (fields.number(key, 1e-3, 100.0, hint=metres) for key in ("radius", "height"))
+    trials = []
+    for trial in fields.children("trials"):
+        end = trial.number("final_radius", radius, 1e3, hint=f"{metres}, and a column spreads")
+        left = trial.number("final_height", 1e-4, height, hint=f"{metres}, and a column sinks")
+        spread = end**2 * left / (radius**2 * height)
+        if not SPREADING[0] <= spread <= SPREADING[1]:
+            trial.fail("final_radius", f"a deposit of {end:g} x {left:g} m has not the volume of the column")
+        trials.append([end, left])
     return ColumnExperiment(
-        fields.number("radius", 1e-3, 100.0, hint=metres),
-        fields.number("height", 1e-3, 100.0, hint=metres),
-        [
-            [trial.number(key, 1e-4, 1e3, hint=metres) for key in ("final_radius", "final_height")]
-            for trial in fields.children("trials")
-        ],
+        radius,
+        height,
+        trials,
         density=fields.number("density", 100.0, 20_000.0, default=1600.0, hint="it is in kg/m³"),
         floor_friction=fields.number("floor_friction", 0.0, 10.0, default=0.6),
         **options.simulation,
@@ -324,11 +414,15 @@ class Kind:
         read: the experiment of a folder.
         example: one of usual size, with nothing measured yet, by its name.
         write: what describes readings in ``experiment.json``, and the tables beside it by file name.
+        fields: of ``experiment.json``, beside those that all have.
+        each: of each of its tests or trials.
     """
 
     read: Callable[[Fields, Path, Options], LaboratoryExperiment]
     example: Callable[[str, Options], LaboratoryExperiment]
     write: Callable[..., tuple[dict[str, object], dict[str, str]]]
+    fields: tuple[str, ...]
+    each: tuple[str, ...]
 
 
 def _trials(*keys: str) -> Callable[[LaboratoryExperiment, FloatArray], tuple[dict[str, object], dict[str, str]]]:
@@ -345,17 +439,35 @@ KINDS: dict[str, Kind] = {
         _read_triaxial,
         lambda name, o: TriaxialExperiment(_untested(Curve, 50.0, 100.0, 200.0), **o.model),
         _write_triaxial,
+        ("void_ratio_limits",),
+        ("file", "confining", "void_ratio", "drained"),
     ),
     "shear_box": Kind(
         _read_shear_box,
         lambda name, o: ShearBoxExperiment(_untested(Shearing, 25.0, 50.0, 100.0), **o.model),
         _write_shear_box,
+        ("height", "void_ratio_limits"),
+        ("file", "normal_stress", "void_ratio"),
     ),
-    "plate": Kind(_read_plate, _example_plate, _write_plate),
-    "repose": Kind(_read_repose, lambda name, o: ReposeExperiment([30.0], name=name, **o.model), _trials("angle")),
+    "plate": Kind(
+        _read_plate,
+        _example_plate,
+        _write_plate,
+        ("diameter", "density", "grain_density", "friction", "void_ratio_limits"),
+        ("file",),
+    ),
+    "repose": Kind(
+        _read_repose,
+        lambda name, o: ReposeExperiment([30.0], name=name, **o.model),
+        _trials("angle"),
+        ("height", "density"),
+        ("angle",),
+    ),
     "column": Kind(
         _read_column,
         lambda name, o: ColumnExperiment(0.1, 0.1, [[0.2, 0.05]], name=name, **o.simulation),
         _trials("final_radius", "final_height"),
+        ("radius", "height", "density", "floor_friction"),
+        ("final_radius", "final_height"),
     ),
 }

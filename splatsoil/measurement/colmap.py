@@ -107,13 +107,22 @@ def _numbers(words: Sequence[str], file: Path, field: str) -> tuple[float, ...]:
         raise MeasurementError(f"expected numbers, found {' '.join(words)[:60]!r}", file=file, field=field) from error
 
 
+def _whole(words: Sequence[str], file: Path, field: str) -> tuple[int, ...]:
+    try:
+        return tuple(int(word) for word in words)
+    except ValueError as error:
+        raise MeasurementError(
+            f"expected whole numbers, found {' '.join(words)[:60]!r}", file=file, field=field
+        ) from error
+
+
 def _read_cameras_txt(file: Path) -> dict[int, _Calibration]:
     out: dict[int, _Calibration] = {}
     for line in filter(None, _lines(file)):
         words = line.split()
         if len(words) < 5:
             raise MeasurementError("expected CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", file=file, field=line[:40])
-        identity, width, height = (int(v) for v in _numbers([words[0], *words[2:4]], file, line[:40]))
+        identity, width, height = _whole([words[0], *words[2:4]], file, line[:40])
         out[identity] = words[1], width, height, _numbers(words[4:], file, f"camera {identity}, PARAMS")
     return out
 
@@ -129,8 +138,8 @@ def _read_images_txt(file: Path) -> list[_Pose]:
             raise MeasurementError(
                 "expected IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", file=file, field=line[:40]
             )
-        values = np.array(_numbers(words[1:9], file, words[9]))
-        out.append((int(values[7]), words[9], values[:4], values[4:7]))
+        values, (camera,) = np.array(_numbers(words[1:8], file, words[9])), _whole(words[8:9], file, words[9])
+        out.append((camera, words[9], values[:4], values[4:]))
     return out
 
 

@@ -6,6 +6,7 @@ import csv
 import difflib
 import json
 import math
+import unicodedata
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
@@ -20,6 +21,7 @@ FloatArray = npt.NDArray[np.float64]
 Value = TypeVar("Value")
 
 _ALIKE = 0.8  # difflib's ratio of two words one of which is the other misspelt: a letter of five, two of ten
+_LARGEST = float(np.finfo(np.float32).max)  # the simulation's numbers are single precision
 _LONGEST_NAME = 60  # characters, of four bytes at most, where a file's name has 255 bytes and more is added
 
 
@@ -103,9 +105,9 @@ class Fields:
             self.fail(key, f"expected text, found {_kind(value)}")
         return value
 
-    def name(self, key: str) -> str:
+    def name(self, key: str, default: str | None = None) -> str:
         """A string that can be part of a file's name, as those of results made from a set are."""
-        value = self.text(key)
+        value = default if default is not None and not self.has(key) else self.text(key)
         if not value.isprintable() or set(value) & set("/\\") or value.startswith(".") or len(value) > _LONGEST_NAME:
             self.fail(
                 key,
@@ -172,8 +174,8 @@ class Fields:
             number = float(value)
         except OverflowError:
             number = math.inf
-        if not math.isfinite(number):
-            self.fail(key, f"{number} is not a finite number")
+        if not abs(number) <= _LARGEST:
+            self.fail(key, f"{number:g} is not a finite number of single precision")
         return number
 
 
@@ -204,7 +206,8 @@ def inside(name: str, root: Path, base: Path, file: Path, field: str) -> Path:
 
 
 def named(name: str, base: Path, file: Path, field: str) -> Path:
-    """Where ``name`` is, relative to ``base``: as it stands, by Windows' backslashes, or an image without its suffix.
+    """Where ``name`` is, relative to ``base``: as it stands, by Windows' backslashes, in another of Unicode's normal
+    forms, or an image without its suffix.
 
     Raises:
         MeasurementError: several images have the name.
@@ -216,14 +219,22 @@ def named(name: str, base: Path, file: Path, field: str) -> Path:
         other = base / name.replace("\\", "/")
         if other.exists():
             return other
-        known = Image.registered_extensions()
-        images = [p for p in other.parent.iterdir() if p.stem == other.name and p.suffix.lower() in known]
+        known, wanted = Image.registered_extensions(), _composed(other.name)
+        found = [
+            p
+            for p in other.parent.iterdir()
+            if wanted == _composed(p.name) or (wanted == _composed(p.stem) and p.suffix.lower() in known)
+        ]
     except (OSError, ValueError):
         return path
-    if len(images) > 1:
-        several = ", ".join(sorted(p.name for p in images))
+    if len(found) > 1:
+        several = ", ".join(sorted(p.name for p in found))
         raise MeasurementError(f"{name!r} lacks its suffix, and there are {several}", file=file, field=field)
-    return images[0] if images else other
+    return found[0] if found else other
+
+
+def _composed(name: str) -> str:
+    return unicodedata.normalize("NFC", name)
 
 
 def read_json(file: Path) -> Any:
@@ -260,8 +271,8 @@ def read_text(file: Path) -> str:
         raise MeasurementError("no such file", file=file) from error
     except UnicodeDecodeError as error:
         raise MeasurementError("not a text file (it is not UTF-8)", file=file) from error
-    except OSError as error:
-        raise MeasurementError(f"cannot be read: {error.strerror}", file=file) from error
+    except (OSError, ValueError) as error:  # also a path with a null character
+        raise MeasurementError(f"cannot be read ({error})", file=file) from error
 
 
 def read_table(file: Path, columns: Sequence[str]) -> FloatArray:
@@ -276,7 +287,8 @@ def read_labelled(
     finite numbers; at least one row.
 
     Columns may be in any order, in capitals, and among others, which are left out. Cells are parted by commas, tabs or
-    semicolons; by the latter two, a comma is a decimal one. Lines that begin with # are comments, or the header.
+    semicolons; by the latter two, numbers may have decimal commas, or points, but not both. Lines that begin with # are
+    comments, or the header.
 
     Raises:
         MeasurementError: naming the line and column.
@@ -287,6 +299,7 @@ def read_labelled(
     delimiter = ","
     texts: list[tuple[str, ...]] = []
     table: list[list[float]] = []
+    marks: set[str] = set()
     for line, text in enumerate(read_text(file).splitlines(), start=1):
         is_comment = text.lstrip().startswith("#")
         if not text.strip() or (is_comment and places is not None):
@@ -314,6 +327,9 @@ def read_labelled(
         if not all(texts[-1]):
             raise MeasurementError(f"{' and '.join(labels)} must not be empty", file=file, field=f"line {line}")
         numbers = [cells[places[name]] for name in columns]
+        marks |= set(",.") & set("".join(numbers))
+        if len(marks) > 1:
+            raise MeasurementError("numbers have decimal points and commas; use one", file=file, field=f"line {line}")
         if delimiter != ",":
             numbers = [text.replace(",", ".") for text in numbers]
         table.append([_cell(text, file, f"{name}, line {line}") for name, text in zip(columns, numbers, strict=True)])
@@ -344,9 +360,9 @@ def _cell(text: str, file: Path, field: str) -> float:
     try:
         number = float(text.replace("_", "?"))  # Python's grouping of digits is no one else's
     except ValueError as error:
-        raise MeasurementError(f"{text.strip()[:40]!r} is not a number", file=file, field=field) from error
-    if not math.isfinite(number):
-        raise MeasurementError(f"{text.strip()} is not a finite number", file=file, field=field)
+        raise MeasurementError(f"{text[:40]!r} is not a number", file=file, field=field) from error
+    if not abs(number) <= _LARGEST:
+        raise MeasurementError(f"{text} is not a finite number of single precision", file=file, field=field)
     return number
 
 

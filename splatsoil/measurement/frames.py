@@ -29,7 +29,11 @@ LENS_FIELDS = (
 )
 FRAME_FIELDS = (*LENS_FIELDS, "file_path", "transform_matrix", "mask_path", "depth_file_path", "integer_depth_scale")
 VIDEO_FIELDS = ("camera", "frame", "time")
-_LENS_KEY = re.compile(r"[kps]\d|skew|distortion_params")  # what bends an image in any of the formats alike
+# What describes a lens or a shutter in formats alike: COLMAP's, Metashape's, OpenCV's, nerfstudio's and instant-ngp's.
+_LENS_KEY = re.compile(
+    r"[kpsb]\d|skew|.*dist(ortion)?(_.*)?|ftheta.*|fisheye_crop_radius|rolling_shutter.*"
+    r"|equirectangular|latlong|orthographic"
+)
 _FOCAL_SLACK = 0.01  # further apart than digits that were cut off explain
 
 
@@ -123,9 +127,11 @@ def read_transforms(file: Path, root: Path, *, video: bool) -> tuple[Frame, ...]
         size = (frame.camera.width, frame.camera.height)
         key = f"frames[{i}].file_path" if frame.mask_path is None else f"frames[{i}].mask_path"
         images.check_photograph(frame.path, size, sizes_from=told, field=f"frames[{i}].file_path")
-        if frame.mask_path is not None:
+        if frame.mask_path is None:
+            mask = frame.mask()
+        else:
             images.check_image(frame.mask_path, size, sizes_from=told, field=key)
-        mask = frame.mask()
+            mask = images.read_mask(frame.mask_path, key)
         if mask is not None and not mask.any():
             raise MeasurementError(
                 "nothing of the photograph is left: all of it is masked or transparent",
@@ -188,7 +194,8 @@ def read_camera(fields: Fields, name: str, size: tuple[int, int] | None = None) 
     # nerfstudio's OPENCV has four radial coefficients, where COLMAP's has two.
     known = _COEFFICIENTS if lens == "OPENCV" else parameters
     for key in fields.names():
-        if _LENS_KEY.fullmatch(key) and key not in known and fields.raw(key) not in (0, False, [], None):
+        unused = key == "fisheye_crop_radius" and model != FISHEYE
+        if _LENS_KEY.fullmatch(key) and key not in known and not unused and _acts(fields.raw(key)):
             advice = "undistort the images first" if model == FISHEYE or key not in _COEFFICIENTS else "say OPENCV"
             fields.fail(key, f"the model {lens} has no {key}, and this one is not 0; {advice}")
     bend = {key: fields.number(key, default=0.0) for key in _COEFFICIENTS if key in known}
@@ -217,6 +224,13 @@ def read_camera(fields: Fields, name: str, size: tuple[int, int] | None = None) 
     if not np.isfinite(camera.rays([[camera.cx, camera.cy]])[1]).all():
         fields.fail("k1", "the distortion leaves no image, not even at the principal point")
     return camera
+
+
+def _acts(value: object) -> bool:
+    """Whether a lens's numbers or switch, or one of a list of them, are not 0."""
+    if isinstance(value, list):
+        return any(map(_acts, value))
+    return isinstance(value, int | float) and value != 0
 
 
 def _read_focal(fields: Fields, axis: str, length: int) -> float:
@@ -307,8 +321,6 @@ def _calibration(camera: Camera) -> tuple[object, ...]:
 
 
 def _check_depth(path: Path, size: tuple[int, int], told: str, field: str) -> None:
-    if path.suffix != ".npy":
-        images.check_image(path, size, sizes_from=told, field=field)
     depth = images.read_depth(path, field)
     if depth.shape != size[::-1]:
         raise MeasurementError(f"the depth is {depth.shape[::-1]} where {told} say {size}", file=path, field=field)

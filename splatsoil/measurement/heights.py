@@ -19,6 +19,7 @@ FloatArray = npt.NDArray[np.float64]
 
 FIELDS = ("corner", "cell", "noise", "frames")
 FRAME_FIELDS = ("file_path", "frame")
+_HIGHEST_TOOL = 50.0  # m over the bed
 _NO_DATA = 42113
 """TIFF tag in which GDAL keeps the number that stands for an unknown height."""
 
@@ -77,8 +78,19 @@ class HeightMaps:
         order = sorted(grids)
         return cls(corner, cell, {n: grids[n] for n in order}, noise, (file, *(paths[n] for n in order)))
 
-    def check(self, lower: FloatArray, upper: FloatArray) -> None:
-        """Raise MeasurementError unless each grid shows the box from ``lower`` to ``upper`` (3,), in its unit."""
+    def check(self, lower: FloatArray, upper: FloatArray, slack: float) -> None:
+        """Raise MeasurementError unless each grid shows the box from ``lower`` to ``upper`` (3,), in its unit.
+
+        Half of the heights lie in the box, which may be off by ``slack``, a share of it; none, the tool's included, is
+        far from it.
+        """
+        depth = float(upper[2] - lower[2])
+        if self.noise is not None and self.noise > depth:
+            raise MeasurementError(
+                f"{self.noise:g} m is more than the bed's depth; it is a height's standard deviation in metres",
+                file=self.paths[0],
+                field="noise",
+            )
         for number, path in zip(self.grids, self.paths[1:], strict=True):
             points = self.points(number)
             points = points[np.all((points[:, :2] > lower[:2]) & (points[:, :2] < upper[:2]), axis=1)]
@@ -87,11 +99,17 @@ class HeightMaps:
                     "no known height lies over the soil's box; are corner and cell in metres, in the world of the bed?",
                     file=path,
                 )
-            typical, depth = float(np.median(points[:, 2])), float(upper[2] - lower[2])
-            if not lower[2] - depth < typical < upper[2] + depth:
+            z, reaches = points[:, 2], f"the bed reaches from {lower[2]:g} to {upper[2]:g} m"
+            off = (z < lower[2] - depth) | (z > upper[2] + _HIGHEST_TOOL)
+            if 0 < off.sum() < len(z):
                 raise MeasurementError(
-                    f"half of the heights are beyond {typical:g} m, where the bed reaches from {lower[2]:g} to"
-                    f" {upper[2]:g} m; heights are in metres, in the world of the bed",
+                    f"{off.sum()} heights are as {z[off][0]:g} m, where {reaches}; an unknown height is NaN", file=path
+                )
+            typical = float(np.median(z))
+            if not lower[2] - slack * depth < typical < upper[2] + slack * depth:
+                raise MeasurementError(
+                    f"half of the heights are beyond {typical:g} m, where {reaches}; heights are in metres, upwards, in"
+                    " the world of the bed",
                     file=path,
                 )
 
@@ -116,7 +134,7 @@ def read_heights(path: Path, field: str | None = None) -> FloatArray:
             "a grid of heights is a table of floating-point metres with rows and columns", file=path, field=field
         )
     grid = values.astype(np.float64)
-    if path.suffix != ".npy":
+    if path.suffix.lower() != ".npy":
         grid = np.where(grid == _no_data(path), np.nan, grid)[::-1]
     grid = np.where(np.isfinite(grid), grid, np.nan)
     if not np.isfinite(grid).any():
@@ -124,12 +142,14 @@ def read_heights(path: Path, field: str | None = None) -> FloatArray:
     return grid
 
 
-def depth_points(frame: Frame) -> FloatArray:
-    """(n, 3) points in m that a frame's depth map shows, where its mask allows it; none without a map."""
+def depth_points(frame: Frame, step: int = 1) -> FloatArray:
+    """(n, 3) points in m that every ``step``-th pixel of a frame's depth map shows, where its mask allows it; none
+    without a map."""
     depth, mask = frame.depth(), frame.mask()
     if depth is None:
         return np.zeros((0, 3))
-    rows, columns = np.nonzero(depth > 0.0 if mask is None else (depth > 0.0) & mask)
+    known = depth > 0.0 if mask is None else (depth > 0.0) & mask
+    rows, columns = (index[::step] for index in np.nonzero(known))
     origins, rays = frame.camera.rays(np.stack([columns, rows], axis=1) + 0.5)
     along = rays @ -frame.camera.camera_to_world[:3, 2]
     points = origins + rays * (depth[rows, columns] / along)[:, None]

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +19,12 @@ FloatImage = npt.NDArray[np.float32]
 #: Pillow's names of the types that are read. It knows more, among them ones that it hands to other programs (EPS).
 FORMATS = ("AVIF", "BMP", "GIF", "JPEG", "JPEG2000", "MPO", "PNG", "PPM", "TGA", "TIFF", "WEBP")
 _ORIENTATION = 0x0112  # EXIF
+_PHOTOMETRIC, _WHITE_IS_ZERO = 262, 0  # TIFF
 _BLOCK = 8  # pixels over which noise is averaged before a photograph is asked for what it shows
 _OPAQUE = 128  # of 255: half, so that the pixel's centre belongs to what is shown
 
 
-def check_image(path: Path, size: tuple[int, int], *, sizes_from: str, field: str | None = None) -> Image.Image:
+def check_image(path: Path, size: tuple[int, int], *, sizes_from: str, field: str | None = None) -> None:
     """Raise MeasurementError unless ``path`` is a whole image of ``size`` (width, height) of the type its name says.
 
     Args:
@@ -29,10 +32,14 @@ def check_image(path: Path, size: tuple[int, int], *, sizes_from: str, field: st
         size: (width, height) in pixels.
         sizes_from: what told the size, for the message.
         field: what named the file, for the message.
-
-    Returns:
-        The image, a JPEG at an eighth of its size.
     """
+    with _checked(path, size, sizes_from, field):
+        pass
+
+
+@contextmanager
+def _checked(path: Path, size: tuple[int, int], sizes_from: str, field: str | None) -> Iterator[Image.Image]:
+    """The image that `check_image` has checked, a JPEG at an eighth of its size."""
     expected = Image.registered_extensions().get(path.suffix.lower())
     if expected not in FORMATS:
         raise MeasurementError(
@@ -47,17 +54,17 @@ def check_image(path: Path, size: tuple[int, int], *, sizes_from: str, field: st
             )
         if image.size != size:
             found, wanted = "{} x {}".format(*image.size), "{} x {}".format(*size)
-            turned = image.size == size[::-1] and is_turned(image)
+            as_shown = image.size == size[::-1] and _turned(image)
             advice = ": its EXIF data turn it, and images are used as stored; save it turned, without EXIF"
             raise MeasurementError(
-                f"the image is {found} pixels where {sizes_from} say {wanted}{advice if turned else ''}",
+                f"the image is {found} pixels where {sizes_from} say {wanted}{advice if as_shown else ''}",
                 file=path,
                 field=field,
             )
         # A JPEG decoded at an eighth of its size still reads the whole stream, at a fraction of the cost.
         image.draft(None, (1, 1))
         _decode(image, path, field)
-        return image
+        yield image
 
 
 def check_photograph(path: Path, size: tuple[int, int], *, sizes_from: str, field: str | None = None) -> None:
@@ -66,9 +73,9 @@ def check_photograph(path: Path, size: tuple[int, int], *, sizes_from: str, fiel
     Raises:
         MeasurementError: naming file and field.
     """
-    image = check_image(path, size, sizes_from=sizes_from, field=field)
-    values = _values(image, path, field)
-    if image.size == size:
+    with _checked(path, size, sizes_from, field) as image:
+        values = _values(image, path, field)
+    if values.shape[1::-1] == size:
         height, width = (max(1, n // _BLOCK) for n in values.shape[:2])
         rows, columns = values.shape[0] // height, values.shape[1] // width
         blocks = values[: height * rows, : width * columns].reshape(height, rows, width, columns, 3)
@@ -81,8 +88,13 @@ def check_photograph(path: Path, size: tuple[int, int], *, sizes_from: str, fiel
         )
 
 
-def is_turned(image: Image.Image) -> bool:
-    """Whether EXIF data ask for the image to be turned or mirrored."""
+def turned(path: Path) -> bool:
+    """Whether an image's EXIF data ask for it to be turned or mirrored."""
+    with _opened(path) as image:
+        return _turned(image)
+
+
+def _turned(image: Image.Image) -> bool:
     return image.getexif().get(_ORIENTATION, 1) not in (0, 1)
 
 
@@ -92,20 +104,20 @@ def image_size(path: Path) -> tuple[int, int]:
         return image.size
 
 
-def read_image(path: Path) -> FloatImage:
+def read_image(path: Path, field: str | None = None) -> FloatImage:
     """An image file's stored values: (height, width, 3) float32 in [0, 1]; grey is repeated, alpha left out.
 
     Raises:
         MeasurementError: it can't be read, or has floating-point values outside [0, 1].
     """
-    with _opened(path) as image:
-        _decode(image, path)
-        return _values(image, path)
+    with _opened(path, field) as image:
+        _decode(image, path, field)
+        return _values(image, path, field)
 
 
-def read_mask(path: Path) -> npt.NDArray[np.bool_]:
+def read_mask(path: Path, field: str | None = None) -> npt.NDArray[np.bool_]:
     """Where a mask is brighter than half of its brightest pixel: (height, width) bool."""
-    grey = read_image(path).max(axis=2)
+    grey = read_image(path, field).max(axis=2)
     return grey > 0.5 * grey.max()
 
 
@@ -150,15 +162,20 @@ def read_numbers(path: Path, field: str | None = None) -> npt.NDArray[np.generic
     Raises:
         MeasurementError: it can't be read, or stores something else than one array of numbers.
     """
-    if path.suffix == ".npy":
+    suffix = path.suffix.lower()
+    if suffix == ".npy":
         try:
             values = np.load(path, allow_pickle=False)
         except (OSError, ValueError, EOFError, MemoryError) as error:
             raise MeasurementError("not a NumPy array of numbers", file=path, field=field) from error
-    else:
+    elif Image.registered_extensions().get(suffix) in FORMATS:
         with _opened(path, field) as image:
             _decode(image, path, field)
             values = np.asarray(image)
+    else:
+        raise MeasurementError(
+            f"numbers are not read from {suffix or 'such'} files; save a .npy or a TIFF", file=path, field=field
+        )
     if not isinstance(values, np.ndarray) or values.dtype.kind not in "uif":
         raise MeasurementError("not one array of numbers", file=path, field=field)
     return values
@@ -169,6 +186,9 @@ def _values(image: Image.Image, path: Path, field: str | None = None) -> FloatIm
     if image.mode != "F" and not image.mode.startswith("I"):
         return np.asarray(image.convert("RGB"), dtype=np.float32) / np.float32(255.0)
     grey = np.asarray(image, dtype=np.float32) / np.float32(1.0 if image.mode == "F" else 65535.0)
+    tags = getattr(image, "tag_v2", {})
+    if tags.get(_PHOTOMETRIC) == _WHITE_IS_ZERO:  # Pillow turns 8 bits round alone
+        grey = np.float32(1.0) - grey
     if not (grey.min() >= 0.0 and grey.max() <= 1.0):
         raise MeasurementError(
             f"values reach from {grey.min():g} to {grey.max():g}; those of floating-point images lie in [0, 1], whole"
@@ -179,20 +199,26 @@ def _values(image: Image.Image, path: Path, field: str | None = None) -> FloatIm
     return np.repeat(grey[:, :, None], 3, axis=2)
 
 
-def _opened(path: Path, field: str | None = None) -> Image.Image:
+@contextmanager
+def _opened(path: Path, field: str | None = None) -> Iterator[Image.Image]:
+    """The image; what Pillow has to remark on it meanwhile is left out."""
     Image.init()  # or types of the list are unknown yet
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            return Image.open(path, formats=[name for name in FORMATS if name in Image.OPEN])
+            warnings.simplefilter("ignore")
+            image = Image.open(path, formats=[name for name in FORMATS if name in Image.OPEN])
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         faults = {
             FileNotFoundError: "no such image",
-            UnidentifiedImageError: "not an image of a known kind, or its beginning is damaged",
+            UnidentifiedImageError: "not an image that is read: its beginning is damaged, or it is of another kind, as"
+            " TIFFs of floating-point colours are; convert it to PNG",
             Image.DecompressionBombError: "the image claims to be larger than any photograph",
         }
         fault = faults.get(type(error), f"the image cannot be opened: {error}")
         raise MeasurementError(fault, file=path, field=field) from error
+    with image, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield image
 
 
 def _decode(image: Image.Image, path: Path, field: str | None = None) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -29,6 +28,7 @@ BED_FIELDS = ("lower", "upper", "density", "container", "wall_friction", "floor_
 BIN, TRANSPARENT, OPEN, HEAP = "bin", "transparent", "open", "heap"
 CONTAINERS = (BIN, TRANSPARENT, OPEN, HEAP)
 TOOL_FIELDS = ("mesh", "motion", "force", "friction")
+FRAME_RATES = (1e-3, 1e6)
 
 # What a laboratory or a field could hold; beyond it a unit is wrong (millimetres, g/cm³).
 _SMALLEST_BED, _LARGEST_BED = 0.01, 50.0
@@ -36,10 +36,11 @@ _FARTHEST_BED = 1000.0  # from the origin: positions are single precision in pla
 _DENSITIES = (100.0, 20_000.0)
 _GRAVITIES = (1e-3, 300.0)
 _FAR_CAMERA = 100.0  # in diagonals of the bed
-_OTHER_UNIT = math.sqrt(1000.0)  # half-way between metres and millimetres
+_DEPTHS = 10_000  # pixels of a depth map that are asked whether they show the bed
 _AROUND = 0.2  # of the bed's narrower side: how much beyond it is simulated where nothing stands at its sides
 _SLACK = 0.1  # of the bed: what its floor and walls, which the tool can't pass, may be off by
 _SMALL_TOOL = 1e5  # cubes of the tool's width in the bed; cells are a fraction of it, and no memory holds as many
+_LONG_REST = 10  # durations of the motion, after it: what rests need not be simulated for longer
 _FASTEST_TOOL = 100.0  # m/s, the speed of sound in loose soil: nothing is pushed through it faster
 
 
@@ -135,11 +136,13 @@ class Measurement:
             MeasurementError: at the first thing that is wrong, naming the file and the field.
         """
         root = Path(folder).absolute()  # images are read later, perhaps from another working folder
-        if not root.exists():
-            raise MeasurementError("no such folder; give the folder of a measurement set", file=root)
-        if not root.is_dir():
-            raise MeasurementError("not a folder; give the folder of a measurement set", file=root)
         file = root / EXPERIMENT
+        try:
+            fault = "" if root.is_dir() else "not a folder" if root.exists() else "no such folder"
+        except OSError as error:
+            fault = f"no folder ({error.strerror})"
+        if fault:
+            raise MeasurementError(f"{fault}; give the folder of a measurement set", file=root)
         if not file.is_file():
             raise MeasurementError(f"no {EXPERIMENT} in this folder; it is no measurement set", file=file)
         fields = Fields.read(inside(EXPERIMENT, root, root, file, ""))
@@ -163,9 +166,9 @@ class Measurement:
         )
         measurement = cls(
             folder=root,
-            name=fields.name("name") if fields.has("name") else root.resolve().name,
+            name=fields.name("name", root.resolve().name),
             gravity=_read_gravity(fields),
-            frame_rate=fields.number("frame_rate", 1e-3, 1e6, hint="it is in frames a second"),
+            frame_rate=fields.number("frame_rate", *FRAME_RATES, hint="it is in frames a second"),
             bed=bed,
             tool=tool,
             views=views,
@@ -177,6 +180,7 @@ class Measurement:
         _check_clocks(measurement)
         _check_tool(measurement)
         _check_force(measurement)
+        _check_views(measurement)
         _check_cameras(measurement)
         _check_heights(measurement)
         # Sums are taken in the frames' order: it must not be that in which a file happens to list them.
@@ -333,6 +337,11 @@ def _check_clocks(measurement: Measurement) -> None:
         # What both contradict is itself at fault.
         file, field = off[0][:2] if len(off) == 1 else (experiment, "frame_rate")
         raise MeasurementError(f"{off[0][2]}; times are in seconds, 0 at frame 0", file=file, field=field)
+    first, last = (int(motion.frames[k]) for k in (0, -1))
+    for i, frame in enumerate(measurement.video):
+        if (frame.frame or 0) > last + _LONG_REST * (last - first):
+            fault = f"frame {frame.frame} is long after the tool's motion, which ends at frame {last}; leave it out"
+            raise MeasurementError(fault, file=video, field=f"frames[{i}].frame")
 
 
 def _check_tool(measurement: Measurement) -> None:
@@ -424,6 +433,19 @@ def _level(points: FloatArray, edges: npt.NDArray[np.int64], z: float) -> FloatA
     return (start + share[:, None] * (end - start))[:, :2]
 
 
+def _check_views(measurement: Measurement) -> None:
+    """Whether views were taken before the tool moved, so far as the video shows them, too."""
+    later = {frame.path.resolve(): frame.frame for frame in measurement.video if (frame.frame or 0) > 0}
+    for i, view in enumerate(measurement.views):
+        number = later.get(view.path.resolve())
+        if number is not None:
+            raise MeasurementError(
+                f"it is frame {number} of the video; views are photographs before the tool moves",
+                file=measurement.sources[1],
+                field=f"frames[{i}].file_path",
+            )
+
+
 def _check_cameras(measurement: Measurement) -> None:
     """The cameras' places and directions against the bed."""
     bed = measurement.bed
@@ -438,14 +460,14 @@ def _check_cameras(measurement: Measurement) -> None:
                     file=file,
                     field=f"frames[{i}].transform_matrix",
                 )
-            depth = frame.depth()
-            if depth is None:
+            if frame.depth_path is None or not sees(frame, bed):
                 continue
-            typical = float(np.median(depth[depth > 0.0]))
-            if not distance / _OTHER_UNIT < typical < distance * _OTHER_UNIT:
+            points = depth_points(frame, 1 + frame.camera.width * frame.camera.height // _DEPTHS)
+            within = (points > bed.lower - _SLACK * bed.extents) & (points < bed.upper + _SLACK * bed.extents)
+            if not within.all(axis=1).any():
                 raise MeasurementError(
-                    f"half of the depths are beyond {typical:g} m, where the bed is {distance:.2g} m away; whole"
-                    " numbers are millimetres, floating-point ones metres",
+                    f"no depth is one of the bed, which is {distance:.2g} m away; depths are along the camera's axis,"
+                    " whole numbers in millimetres, floating-point ones in metres",
                     file=frame.depth_path,
                     field=f"frames[{i}].depth_file_path",
                 )
@@ -463,7 +485,7 @@ def _check_heights(measurement: Measurement) -> None:
     heights, frames = measurement.heights, measurement.frames
     if heights is None:
         return
-    heights.check(measurement.bed.lower, measurement.bed.upper)
+    heights.check(measurement.bed.lower, measurement.bed.upper, _SLACK)
     if frames and frames[0] not in heights.grids:
         raise MeasurementError(
             f"there is no grid of frame {frames[0]}, since which changes are compared", file=heights.paths[0]

@@ -131,7 +131,9 @@ def rigid(matrix: FloatArray, tolerance: float = 1e-3) -> FloatArray:
     """
     rotation = matrix[:3, :3]
     fault = ""
-    if np.abs(matrix[3] - [0.0, 0.0, 0.0, 1.0]).max() > tolerance:
+    if not np.isfinite(matrix).all():
+        fault = "its numbers are not finite"
+    elif np.abs(matrix[3] - [0.0, 0.0, 0.0, 1.0]).max() > tolerance:
         fault = "its last row is not 0 0 0 1"
     elif np.abs(rotation.T @ rotation - np.eye(3)).max() > tolerance:
         fault = "its upper left 3 x 3 part is not a rotation (columns of length 1 at right angles)"

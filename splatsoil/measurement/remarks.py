@@ -6,13 +6,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from PIL import Image
 
-from splatsoil.measurement.frames import Frame
-from splatsoil.measurement.images import is_turned
+from splatsoil.measurement.images import turned
 from splatsoil.measurement.measurement import Measurement, sees
 
 _FEW_VIEWS = 12
+_EARTH = (9.76, 9.84)  # m/s², from the equator's mountains to the poles
+_OFF_MIDDLE = 0.25  # of the image: further off its middle a principal point is that of a crop, or in another unit
 # Largest forces, by the weight of a cube of soil as wide as the tool: sand takes a tenth to ten of it where the cut is
 # a tenth to all of the width deep, clay hundreds where the tool is small. In kN the former are below, in mN above.
 _FORCES = (0.03, 1000.0)
@@ -23,7 +23,7 @@ class Remark:
     """Something to know about a set.
 
     Attributes:
-        about: what it concerns: views, video, tool, bed.
+        about: what it concerns: views, video, heights, tool, bed.
         text: one sentence for a person.
     """
 
@@ -37,8 +37,23 @@ def remarks(measurement: Measurement) -> tuple[Remark, ...]:
         Remark("bed" if field.startswith("bed") else "tool", f"{field} is not given; {value:g} is taken.")
         for field, value in measurement.assumed.items()
     ]
-    parts = (("views", _on_views), ("video", _on_video), ("tool", _on_tool), ("tool", _on_force))
+    parts = (
+        *(("bed", _on_bed), ("views", _on_views), ("video", _on_video), ("heights", _on_heights)),
+        *(("tool", _on_tool), ("tool", _on_force)),
+    )
     return (*assumed, *(Remark(about, text) for about, look in parts for text in look(measurement)))
+
+
+def _on_bed(measurement: Measurement) -> Iterator[str]:
+    size = float(np.linalg.norm(measurement.gravity))
+    if not _EARTH[0] <= size <= _EARTH[1]:
+        yield f"Gravity is {size:g} m/s²; on Earth it is 9.81."
+
+
+def _on_heights(measurement: Measurement) -> Iterator[str]:
+    grids = () if measurement.heights is None else measurement.heights.grids.values()
+    if zeros := sum(int(np.sum(grid == 0.0)) for grid in grids):
+        yield f"{zeros} heights are exactly 0 m; an unknown height is NaN."
 
 
 def _on_views(measurement: Measurement) -> Iterator[str]:
@@ -49,13 +64,19 @@ def _on_views(measurement: Measurement) -> Iterator[str]:
         yield f"{len(blind)} of {n} views do not show the soil's box: {_some(blind)}."
     if below := [f.path.name for f in views if f.camera.position[2] < bed.lower[2]]:
         yield f"{len(below)} of {n} views are taken from below the bed's floor: {_some(below)}."
-    if turned := [f.path.name for f in (*views, *measurement.video) if _turned(f)]:
-        yield f"{len(turned)} images carry an EXIF rotation, which is not applied: {_some(turned)}."
+    if askew := [f.path.name for f in (*views, *measurement.video) if turned(f.path)]:
+        yield f"{len(askew)} images carry an EXIF rotation, which is not applied: {_some(askew)}."
     for name, camera in (*(("", f.camera) for f in views[:1]), *measurement.cameras.items()):
         corners = [[x, y] for x in (0.5, camera.width - 0.5) for y in (0.5, camera.height - 0.5)]
+        who = f"camera {name!r}" if name else "the views' camera"
         if np.isnan(camera.rays(corners)[1]).any():
-            who = f"camera {name!r}" if name else "the views' camera"
             yield f"The distortion of {who} folds over before the image's corners; is its calibration right?"
+        off = np.abs([camera.cx / camera.width - 0.5, camera.cy / camera.height - 0.5])
+        if off.max() > _OFF_MIDDLE:
+            yield (
+                f"The principal point of {who} is {camera.cx:g}, {camera.cy:g} in images of {camera.width} x"
+                f" {camera.height}; is it in their pixels, from their upper left corner?"
+            )
 
 
 def _on_video(measurement: Measurement) -> Iterator[str]:
@@ -86,6 +107,8 @@ def _on_video(measurement: Measurement) -> Iterator[str]:
 
 def _on_tool(measurement: Measurement) -> Iterator[str]:
     bed, tool, motion = measurement.bed, measurement.tool, measurement.tool.motion
+    if tool.mesh_path is not None and tool.mesh_path.suffix.lower() in (".glb", ".gltf"):
+        yield "The tool's mesh is a glTF, which exporters turn so that y is up; its coordinates are taken as they are."
     touching = tool.touches(bed.lower, bed.upper).mean()
     if touching < 0.5:
         yield f"The tool is in the soil's box in only {100.0 * touching:.0f} % of the rows of its motion."
@@ -150,11 +173,6 @@ def _lost(frames: tuple[int, ...]) -> list[int]:
     usual = int(np.bincount(steps).argmax())
     gaps = [(n, int(step)) for n, step in zip(frames, steps, strict=False) if step > usual and step % usual == 0]
     return [n + k for n, step in gaps for k in range(usual, step, usual)]
-
-
-def _turned(frame: Frame) -> bool:
-    with Image.open(frame.path) as image:
-        return is_turned(image)
 
 
 def _some(names: Sequence[object], most: int = 4) -> str:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import io
-import re
 from dataclasses import dataclass
 from pathlib import Path
-from zipfile import is_zipfile
+from zipfile import BadZipFile, is_zipfile
 
 import numpy as np
 import numpy.typing as npt
@@ -68,8 +67,8 @@ def read_mesh(file: Path) -> trimesh.Trimesh:
     """A closed mesh in metres with outward faces, on each of its bodies, from a file of one of the types `FORMATS`.
     Nothing that the file names is read.
 
-    Corners that differ by texture or normal alone are joined, faces without area or given twice left out, and units
-    that the file tells (3MF does) converted.
+    Corners that differ by texture or normal alone are joined, and units that the file tells (3MF does) converted.
+    Bodies may touch.
 
     Raises:
         MeasurementError: it can't be read, or encloses no volume.
@@ -85,18 +84,16 @@ def read_mesh(file: Path) -> trimesh.Trimesh:
         data = file.read_bytes()
         if is_zipfile(io.BytesIO(data)):
             check_unpacked(io.BytesIO(data))
+    except (OSError, ValueError, BadZipFile) as error:
+        raise MeasurementError(f"cannot be read ({error})", file=file) from error
+    try:
         mesh = trimesh.load_mesh(io.BytesIO(data), file_type=kind)
-    except Exception as error:  # trimesh's readers raise whatever their parsers do
-        reason = " ".join(str(error).split())[:160] or type(error).__name__
-        missing = re.search(r"No module named '(\w+)", reason) if isinstance(error, ImportError) else None
-        # For bytes that are no text trimesh asks for a module that guesses encodings: no hint for a user.
-        if missing and missing[1] not in ("chardet", "charset_normalizer"):
-            raise MeasurementError(
-                f"a file of this type is read by the package {missing[1]}, which is missing: pip install {missing[1]}",
-                file=file,
-            ) from error
-        reason = "it is no text" if missing else reason
-        raise MeasurementError(f"the mesh cannot be read ({reason}); is it what its name says?", file=file) from error
+    except Exception as error:  # trimesh's readers raise whatever their parsers do, in their own terms
+        if kind == "3mf" and isinstance(error, ImportError):
+            fault = "a file of this type is read by the package lxml, which is missing: pip install lxml"
+        else:
+            fault = "the mesh cannot be read; is it whole, in one file, uncompressed, and what its name says?"
+        raise MeasurementError(fault, file=file) from error
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise MeasurementError("the file holds no triangles; is it what its name says?", file=file)
     if not np.isfinite(mesh.vertices).all():
@@ -104,25 +101,68 @@ def read_mesh(file: Path) -> trimesh.Trimesh:
     if mesh.units:
         mesh.convert_units("meters")
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
-    edges = mesh.faces != np.roll(mesh.faces, 1, axis=1)
-    mesh.update_faces(mesh.unique_faces() & edges.all(axis=1))
-    if not mesh.is_watertight:  # else thin faces may be what closes it
-        mesh.update_faces(mesh.nondegenerate_faces())
-    mesh.remove_unreferenced_vertices()
-    extents = np.zeros(3) if mesh.extents is None else np.asarray(mesh.extents)
+    mesh.update_faces((mesh.faces != np.roll(mesh.faces, 1, axis=1)).all(axis=1))
     with np.errstate(all="ignore"):  # the centre of mass of a flat mesh divides by zero
-        # Bodies one by one: one that is inside out takes its volume from the others'.
-        trimesh.repair.fix_normals(mesh, multibody=True)
-        volume = abs(float(mesh.volume))
-    if not volume > 1e-9 * float(np.prod(np.maximum(extents, extents.max() * 1e-3))):
+        closed = _closed(mesh)
+        solid = mesh if closed is None else closed
+        volume = float(solid.volume)
+    extents = np.zeros(3) if solid.extents is None else np.asarray(solid.extents)
+    if not abs(volume) > 1e-9 * float(np.prod(np.maximum(extents, extents.max() * 1e-3))):
         raise MeasurementError(
             "the mesh has no volume; give the tool its thickness and close its surface", file=file, field="faces"
         )
-    if not mesh.is_watertight:
+    if closed is None:
         raise MeasurementError(
-            "the mesh has holes or loose edges, so it has no volume; close its surface", file=file, field="faces"
+            "the mesh has holes or loose edges, so it has no volume; close its surface, and turn its faces outwards",
+            file=file,
+            field="faces",
         )
-    return mesh
+    return closed
+
+
+def _closed(mesh: trimesh.Trimesh) -> trimesh.Trimesh | None:
+    """The mesh with outward faces, without those that keep it from enclosing a volume: faces that are given again, both
+    faces where two bodies touch, faces without area. None if that does not close it."""
+    once = mesh.unique_faces()
+    _, number, times = np.unique(np.sort(mesh.faces, axis=1), axis=0, return_inverse=True, return_counts=True)
+    outer, thick = once & (times[number.ravel()] % 2 == 1), mesh.nondegenerate_faces()
+    for kept in (once, outer, once & thick, outer & thick):
+        found = mesh.copy()
+        found.update_faces(kept)
+        found.remove_unreferenced_vertices()
+        if found.is_watertight:
+            # Bodies one by one: one that is inside out takes its volume from the others'.
+            trimesh.repair.fix_normals(found, multibody=True)
+            return found
+        if found.volume < 0.0:
+            found.invert()
+        if _looks_outwards(found):
+            return found
+    return None
+
+
+def _looks_outwards(mesh: trimesh.Trimesh) -> bool:
+    """Whether bodies that share edges are closed and have outward faces: faces run along each edge as often to the one
+    side as to the other, and the winding number just behind a face is 1 or more, in each part that shared edges bound.
+
+    The winding number is the sum of the triangles' solid angles (van Oosterom & Strackee 1983, IEEE Trans. Biomed. Eng.
+    30:125).
+    """
+    side = np.where(mesh.edges[:, 0] < mesh.edges[:, 1], 1.0, -1.0)
+    if np.any(np.bincount(mesh.edges_unique_inverse, side)):
+        return False
+    parts = trimesh.graph.connected_component_labels(mesh.face_adjacency, node_count=len(mesh.faces))
+    for face in np.unique(parts, return_index=True)[1]:
+        behind = mesh.triangles_center[face] - 1e-3 * np.sqrt(mesh.area_faces[face]) * mesh.face_normals[face]
+        corners = np.moveaxis(mesh.triangles - behind, 1, 0)
+        lengths = np.linalg.norm(corners, axis=2)
+        below = np.prod(lengths, axis=0)
+        for k in range(3):
+            below = below + np.sum(corners[k] * corners[k - 1], axis=1) * lengths[k - 2]
+        above = np.sum(corners[0] * np.cross(corners[1], corners[2]), axis=1)
+        if np.arctan2(above, below).sum() < np.pi:  # half of a solid angle of 4 pi
+            return False
+    return True
 
 
 def read_force(file: Path) -> FloatArray:

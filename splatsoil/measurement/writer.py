@@ -140,7 +140,14 @@ def whole_folder(target: Path) -> Iterator[Path]:
     Raises:
         MeasurementError: the place is taken or can't be written.
     """
-    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+    try:
+        target.lstat()
+        taken = not target.is_dir() or any(target.iterdir())
+    except FileNotFoundError:
+        taken = False
+    except (OSError, ValueError) as error:  # also a name that no file can have
+        raise MeasurementError(f"cannot be written ({error}); choose another place", file=target) from error
+    if taken:
         raise MeasurementError("already there and not an empty folder; nothing is overwritten", file=target)
     new = [p for p in target.absolute().parents if not p.exists()]
     try:

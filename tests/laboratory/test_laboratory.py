@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -96,7 +97,15 @@ def write(folder: Path, description: dict, table: str = "") -> Path:
 
 TRIAXIAL = {"kind": "triaxial", "tests": [{"file": "a.csv", "confining": 1e5}]}
 PLATE = {"kind": "plate", "diameter": 0.1, "density": 1500, "tests": [{"file": "a.csv"}]}
+BOX = {"kind": "shear_box", "height": 0.02, "tests": [{"file": "a.csv", "normal_stress": 1e5}]}
+COLUMN = {"kind": "column", "radius": 0.1, "height": 0.1}
 HEAD = "axial_strain_percent,q_kPa,volume_strain_percent\n"
+BOX_HEAD = "displacement_mm,shear_stress_kPa,vertical_displacement_mm\n"
+
+
+def curve(stress: Callable[[float], float], unit: float = 1.0, volume: float = 0.0) -> str:
+    """Six rows: a strain to 5 in a unit, the stress there, and a volume that grows with it."""
+    return "".join(f"{unit * s},{stress(s)},{volume * s}\n" for s in range(6))
 
 
 @pytest.mark.parametrize(
@@ -107,6 +116,29 @@ HEAD = "axial_strain_percent,q_kPa,volume_strain_percent\n"
         (TRIAXIAL, "strain,q\n1,2\n", "axial_strain_percent"),
         (TRIAXIAL, HEAD + "0,0,0\n1,100,0.1\n", "ends before a strain of 2 %"),
         ({"kind": "column", "radius": 0.1, "height": 0.1, "trials": [{"final_radius": 0.2}]}, "", "final_height"),
+        # another unit or sign
+        (TRIAXIAL, HEAD + curve(lambda s: 4e4 * s), "q_kPa: its largest value means a friction angle of 87.4°"),
+        (TRIAXIAL, HEAD + curve(lambda s: 0.04 * s), "angle of 0.0572°"),
+        (TRIAXIAL, HEAD + curve(lambda s: -40.0 * s), "which no soil has"),
+        ({**TRIAXIAL, "tests": [{"file": "a.csv", "confining": 100.0}]}, HEAD + curve(lambda s: 40.0 * s), "no soil"),
+        (TRIAXIAL, HEAD + curve(lambda s: 40.0 * s, 1000.0), "reaches a strain of 5000 %"),
+        (TRIAXIAL, HEAD + curve(lambda s: 40.0 * s, -1.0), "is it positive"),
+        (TRIAXIAL, HEAD + curve(lambda s: 40.0 * s, volume=20.0), "more than all pores"),
+        (BOX, BOX_HEAD + curve(lambda s: 1e4 * s), "shear_stress_kPa: its largest value means"),
+        (PLATE, "sinkage_mm,force_N,note\n" + curve(lambda s: 0.01 * s, 6.0), "soil bears its own weight"),
+        (PLATE, "sinkage_mm,force_N,note\n" + curve(lambda s: 1e6 * s, 6.0), "grains crush"),
+        (PLATE, "sinkage_mm,force_N,note\n" + curve(lambda s: 10.0 * s, 0.006), "diameters of the plate"),
+        ({**PLATE, "grain_density": 1400}, "sinkage_mm,force_N,note\n" + curve(lambda s: 10.0 * s), "make no soil"),
+        ({"kind": "repose", "trials": [{"angle": 0.6}]}, "", "it is in degrees"),
+        ({**COLUMN, "trials": [{"final_radius": 200.0, "final_height": 0.05}]}, "", "not the volume of the column"),
+        ({**COLUMN, "trials": [{"final_radius": 0.05, "final_height": 0.05}]}, "", "a column spreads"),
+        ({**COLUMN, "trials": [{"final_radius": 0.2, "final_height": 50.0}]}, "", "a column sinks"),
+        # what does not fit together
+        ({**TRIAXIAL, "void_ratio_limits": [0.9, 0.5]}, HEAD + curve(lambda s: 40.0 * s), "give the densest"),
+        ({**TRIAXIAL, "void_ratio_limits": [0.3, 0.4]}, HEAD + curve(lambda s: 40.0 * s), "not between 0.3 and 0.4"),
+        ({**TRIAXIAL, "void_ratio_limit": [0.5, 0.9]}, "", "did you mean 'void_ratio_limits'?"),
+        ({**TRIAXIAL, "tests": 2 * TRIAXIAL["tests"]}, HEAD + curve(lambda s: 40.0 * s), "a.csv is given twice"),
+        (TRIAXIAL, HEAD + "0,0,0\n3,90,0\n6,150,0\n", "3 readings of first loading"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_said_in_one_sentence_and_nothing_is_written(
@@ -139,13 +171,25 @@ def test_a_plate_that_was_lifted_in_between_and_one_in_kilopascals_are_read(tmp_
     np.testing.assert_allclose(found / found[-1], np.arange(1, 13) / 12.0, rtol=1e-6)
 
 
+def test_what_is_unloaded_and_loaded_again_in_between_is_left_out(tmp_path: Path) -> None:
+    loop = [(2.0, 80), (1.8, 10), (1.9, 40)]
+    rows = [f"{s},{q},0\n" for s, q in [*((0.5 * k, 20 * k) for k in range(4)), *loop, (3.0, 120), (5.0, 200)]]
+    whole, bare = (
+        read_curve(write(tmp_path / name, TRIAXIAL, HEAD + "".join(rows[k] for k in kept)) / "a.csv", 1e5)
+        for name, kept in (("whole", range(9)), ("bare", (0, 1, 2, 3, 4, 7, 8)))
+    )
+    np.testing.assert_array_equal(whole.ratio, bare.ratio)
+    assert 3.0 * whole.ratio[0] / (3.0 - whole.ratio[0]) == pytest.approx(0.2, rel=1e-6), (
+        "20 kPa at 0.5 %, over 100 kPa"
+    )
+
+
 def test_a_shear_box_is_read_in_shares_of_its_height_and_stress(tmp_path: Path) -> None:
     """Stress grows by 10 kPa, and the lid rises by 0.1 mm, with each millimetre of a box of 20 mm under 100 kPa."""
     rows = "displacement_mm,shear_stress_kPa,vertical_displacement_mm\n" + "".join(
-        f"{d},{10 * d},{0.1 * d}\n" for d in (0.0, 1.0, 4.0)
+        f"{d},{10 * d},{0.1 * d}\n" for d in (0.0, 1.0, 3.0, 4.0)
     )
-    box = {"kind": "shear_box", "height": 0.02, "tests": [{"file": "a.csv", "normal_stress": 1e5}]}
-    (test,) = load(write(tmp_path / "set", box, rows)).tests
+    (test,) = load(write(tmp_path / "set", BOX, rows)).tests
     assert test.strain[-1] == pytest.approx(0.2) and test.void_ratio == 0.8, "the usual one"
     np.testing.assert_allclose(test.ratio, 10e3 * 20.0 * test.strain / 1e5)
     np.testing.assert_allclose(test.volume, -0.1 * test.strain)

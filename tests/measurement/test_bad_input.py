@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import math
 import shutil
+import struct
+import unicodedata
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,7 +18,7 @@ from PIL import Image
 
 from splatsoil.cli import main
 from splatsoil.errors import MeasurementError
-from splatsoil.measurement import Measurement
+from splatsoil.measurement import Measurement, remarks
 
 Spoil = Callable[[Path], object]
 VIEWS, VIDEO, SET = "views/transforms.json", "video/transforms.json", "experiment.json"
@@ -103,6 +105,18 @@ def cell(row: int, column: int, value: str) -> Spoil:
     return spoil
 
 
+def cells(old: str, mark: str, *changes: tuple[int, int, str]) -> Spoil:
+    """Another mark between the motion's cells, and other cells, by row and column."""
+
+    def spoil(folder: Path) -> None:
+        rows = [line.split(old) for line in (folder / MOTION).read_text().splitlines()]
+        for row, column, value in changes:
+            rows[row][column] = value
+        (folder / MOTION).write_text("\n".join(mark.join(row) for row in rows))
+
+    return spoil
+
+
 def numbers(change: Callable[[np.ndarray], np.ndarray], name: str = MOTION) -> Spoil:
     """Change the numbers of a CSV file as a whole."""
 
@@ -164,6 +178,18 @@ RAMP = Image.fromarray(np.linspace(0.0, 255.0, 240 * 320, dtype=np.float32).resh
 NOISE = Image.effect_noise((320, 240), 60)
 TRANSPARENT = NOISE.convert("RGBA")
 TRANSPARENT.putalpha(3)
+FLOAT_COLOURS = (
+    b"II*\0\x08\0\0\0\x09\0"
+    + b"".join(
+        struct.pack("<HHII", tag, kind, 1, value)
+        for tag, kind, value in [
+            *((256, 3, 2), (257, 3, 2), (258, 3, 32), (259, 3, 1), (262, 3, 2), (273, 4, 122), (277, 3, 3)),
+            *((279, 4, 48), (339, 3, 3)),
+        ]
+    )
+    + bytes(52)
+)
+"""A TIFF of 2 x 2 pixels with three colours of 32 bits, which Pillow doesn't read."""
 TURNED = Image.Exif()
 TURNED[0x0112] = 6
 
@@ -250,6 +276,16 @@ CASES: dict[str, tuple[Spoil, str, str | None, str]] = {
     "depth-whole-metres": (depth("d.npy", np.full((240, 320), 1)), "views/d.npy", DEPTH, "millimetres"),
     "depth-unknown": (depth("d.npy", np.full((240, 320), math.nan)), "views/d.npy", DEPTH, "no depth is known"),
     "depth-of-another-size": (depth("d.npy", np.ones((320, 240))), "views/d.npy", DEPTH, "(240, 320)"),
+    "depth-of-a-tenth-of-a-millimetre": (depth("d.png", np.full((240, 320), 9000, np.uint16)), "views/d.png", DEPTH,
+        "one of the bed"),
+    "depth-of-no-type": (both(replace("views/d.exr", b"v/1\x01"), view(1, "depth_file_path", "d.exr")), "views/d.exr",
+        DEPTH, "save a .npy or a TIFF"),
+    "mask-of-floats": (both(lambda f: RAMP.save(f / "views/m.tif"), view(1, "mask_path", "m.tif")), "views/m.tif",
+        "frames[1].mask_path", "lie in [0, 1]"),
+    "image-of-floating-colours": (both(replace("views/images/c.tif", FLOAT_COLOURS), view(2, "file_path",
+        "images/c.tif")), "views/images/c.tif", SECOND, "floating-point colours"),
+    "view-of-the-moving-tool": (edit(SET, "views", to=VIDEO), VIDEO, "frames[6].file_path",
+        "it is frame 10 of the video"),
     # paths
     "path-absolute": (outside("absolute"), VIEWS, FIRST, LEAVES),
     "path-through-link": (outside("link"), VIEWS, FIRST, LEAVES),
@@ -280,7 +316,17 @@ CASES: dict[str, tuple[Spoil, str, str | None, str]] = {
     "views-without-frames": (edit(VIEWS, "frames", to=[]), VIEWS, "frames", "empty"),
     "views-frames-not-a-list": (edit(VIEWS, "frames", to={"a": 1}), VIEWS, "frames", "expected a list"),
     "cameras-in-millimetres": (of_frames(VIEWS, millimetres), VIEWS, POSES, "positions are in metres"),
+    "distortion-by-a-list": (edit(VIEWS, "distortion", to=[0.1, 0.0]), VIEWS, "distortion", "has no distortion"),
+    "distortion-by-opencvs-name": (view(1, "dist_coeffs", [[0.1, 0.0]]), VIEWS, "frames[1].dist_coeffs", "undistort"),
+    "affinity-by-metashape": (edit(VIEWS, "b1", to=1.5), VIEWS, "b1", "undistort"),
+    "lens-of-instant-ngp": (edit(VIEWS, "ftheta_p1", to=1e-3), VIEWS, "ftheta_p1", "undistort"),
+    "panorama": (edit(VIEWS, "equirectangular", to=True), VIEWS, "equirectangular", "undistort"),
+    "rolling-shutter": (edit(VIEWS, "rolling_shutter", to=[0, 0, 0.03, 0]), VIEWS, "rolling_shutter", "has no"),
+    "fisheye-cropped": (both(edit(VIEWS, "camera_model", to="OPENCV_FISHEYE"), edit(VIEWS, "fisheye_crop_radius",
+        to=100)), VIEWS, "fisheye_crop_radius", "has no"),
     # video
+    "video-frame-long-after-the-motion": (both(shot(3, "frame", 10**8), shot(3, "time", 2e6)), VIDEO, "frames[3].frame",
+        "long after the tool's motion"),
     "video-frame-twice": (in_json(VIDEO, duplicated), VIDEO, "frames[2].frame", "given twice"),
     "video-time-backwards": (shot(6, "time", -5.0), VIDEO, "frames[6].time", "runs backwards"),
     "video-without-camera": (drop(VIDEO, "frames", 0, "camera"), VIDEO, "frames[0].camera", "missing"),
@@ -334,7 +380,10 @@ CASES: dict[str, tuple[Spoil, str, str | None, str]] = {
     "motion-with-decimal-commas-and-no-other-mark": (replace(MOTION, HEADER + "0,0,0,2,0,25,0,21,1,0,0,0\n"), MOTION,
         "line 2", "12 values where the header has 9"),
     "motion-with-thousands": (replace(MOTION, "frame;time;x;y;z;qw;qx;qy;qz\n0;0;1.000,2;0;0;1;0;0;0\n"), MOTION,
-        "x, line 2", "'1.000.2' is not a number"),
+        "line 2", "decimal points and commas"),
+    "motion-with-thousands-of-one-number": (cells(",", "\t", (9, 2, "1,234")), MOTION, "line 10",
+        "decimal points and commas"),
+    "motion-beyond-single-precision": (cell(10, 3, "1e39"), MOTION, "y, line 11", "single precision"),
     "motion-without-rows": (replace(MOTION, HEADER), MOTION, None, "no rows"),
     "motion-of-one-row": (replace(MOTION, HEADER + "0,0,0.2,0.25,0.21,1,0,0,0\n"), MOTION, None, "two rows at least"),
     "motion-time-backwards": (cell(10, 1, "0.1"), MOTION, "time, row 10", "runs backwards"),
@@ -399,6 +448,25 @@ def test_a_set_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[s
     (tmp_path / "file").write_text("")
     assert main(["check", str(tmp_path / "file")]) == 2
     assert "not a folder" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["a\0b", "a" * 5000])
+def test_a_name_that_no_folder_can_have(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", name]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_a_name_in_another_of_unicodes_normal_forms(small_set: Path) -> None:
+    """As disks of Macs have it, where JSON files have the other one."""
+    (small_set / ONE).rename(small_set / "views" / "images" / unicodedata.normalize("NFD", "für.jpg"))
+    image_path("images/" + unicodedata.normalize("NFC", "für.jpg"))(small_set)
+    assert len(Measurement.load(small_set).views) == 4
+
+
+def test_what_pillow_remarks_on_a_file_is_not_printed(small_set: Path, recwarn: pytest.WarningsRecorder) -> None:
+    photograph(NOISE, "e.jpg", exif=b"Exif\0\0II*\0\x08\0\0\0\xff\xff" + bytes(30))(small_set)
+    remarks(Measurement.load(small_set))
+    assert not recwarn.list
 
 
 def test_an_error_as_json(small_set: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,7 +13,7 @@ import skimage.io
 import tifffile
 
 from splatsoil.cli import main
-from splatsoil.measurement import Camera, Contents, Frame, HeightMaps, Measurement, Picture, write_measurement
+from splatsoil.measurement import Camera, Contents, Frame, HeightMaps, Measurement, Picture, remarks, write_measurement
 from splatsoil.measurement.heights import depth_points, read_heights
 
 RAMP = np.linspace(0.1, 0.14, 16 * 10).reshape(10, 16).astype(np.float32)
@@ -95,11 +95,35 @@ def test_a_set_of_heights_and_depths_is_what_was_written(small_set: Path, tmp_pa
     assert Measurement.load(bare.folder).hash != before
 
 
+def renamed_grid(folder: Path, suffix: str) -> Path:
+    """Heights of frame 0 in a file of another suffix."""
+    listed = with_heights(folder, {0: RAMP}) / "heights"
+    (listed / "0.npy").rename(listed / f"0{suffix}")
+    file = listed / "heights.json"
+    file.write_text(file.read_text().replace("0.npy", f"0{suffix}"))
+    return folder
+
+
+def test_suffixes_may_be_in_capitals_and_exact_zeros_get_a_remark(small_set: Path) -> None:
+    renamed_grid(small_set, ".NPY")
+    before = Measurement.load(small_set)
+    assert np.isfinite(before.surface_points(0)).all() and not [r for r in remarks(before) if r.about == "heights"]
+    grid = RAMP.copy()
+    grid[0, :3] = 0.0
+    with (small_set / "heights" / "0.NPY").open("wb") as file:
+        np.save(file, grid)
+    assert "3 heights are exactly 0 m" in " ".join(r.text for r in remarks(Measurement.load(small_set)))
+
+
 BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     "another shape": (lambda s: with_heights(s, {0: RAMP, 10: RAMP[:-1]}), "9 x 16 cells where that of frames"),
     "no corner": (lambda s: with_heights(s, {0: RAMP}, corner=None), "corner"),
     "no cell": (lambda s: with_heights(s, {0: RAMP}, cell=None), "cell"),
     "millimetres": (lambda s: with_heights(s, {0: 1000.0 * RAMP}), "heights are in metres"),
+    "depths": (lambda s: with_heights(s, {0: -RAMP}), "upwards"),
+    "no number for unknown": (lambda s: with_heights(s, {0: np.where(RAMP.mean() < RAMP, RAMP, -9999.0)}), "is NaN"),
+    "noise in millimetres": (lambda s: with_heights(s, {0: RAMP}, noise=0.5), "more than the bed's depth"),
+    "a table": (lambda s: renamed_grid(s, ".csv"), "save a .npy or a TIFF"),
     "all unknown": (lambda s: with_heights(s, {0: np.nan * RAMP}), "no height is known"),
     "whole numbers": (lambda s: with_heights(s, {0: np.ones((4, 4), int)}), "floating-point metres"),
     "elsewhere": (lambda s: with_heights(s, {0: RAMP}, corner=[10.0, 0.0]), "no known height lies over the soil's box"),

@@ -36,6 +36,11 @@ def test_values(stored: np.ndarray, name: str, value: np.ndarray, tmp_path: Path
     np.testing.assert_allclose(image, np.repeat(value[:, :, None], 3, axis=2), atol=1e-6)
 
 
+def test_a_tiff_of_16_bits_in_which_0_is_white(tmp_path: Path) -> None:
+    Image.fromarray(65535 - GREY.astype(np.uint16) * 257).save(tmp_path / "a.tif", tiffinfo={262: 0})
+    np.testing.assert_allclose(Frame(CAMERA, tmp_path / "a.tif").image()[:, :, 0], GREY / 255.0, atol=1e-6)
+
+
 def palette(path: Path) -> None:
     """Colour 7 of a palette is transparent."""
     image = Image.fromarray(np.where(SEEN, 3, 7).astype(np.uint8)).convert("P")

@@ -230,6 +230,10 @@ def test_faulty_imports_are_named(poses: list[tuple], tmp_path: Path) -> None:
     assert "no registered image" in complaint()
     (tmp_path / "images.txt").write_text("1 1 0 0\n\n")
     assert "expected IMAGE_ID" in complaint()
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 nan a.png\n\n")
+    assert "whole numbers, found 'nan'" in complaint("a.png")
+    (tmp_path / "cameras.txt").write_text("7 PINHOLE inf 24 50 50 16 12\n")
+    assert "whole numbers, found '7 inf 24'" in complaint()
     colmap_binary(tmp_path, 1, MODELS[1][2], poses)
     raw = (tmp_path / "images.bin").read_bytes()
     for length in (4, 40, len(raw) - 3):

@@ -51,6 +51,11 @@ def images(folder: Path) -> Iterator[tuple[str, str]]:
 
         return attempt
 
+    def white_is_zero() -> str:
+        Image.fromarray((65535 * HALF).astype(np.uint16)).save(folder / "w.tif", tiffinfo={262: 0})
+        check_photograph(folder / "w.tif", (16, 16), sizes_from="w and h")
+        return f"read, 0 is {Frame(CAMERA, folder / 'w.tif').image()[0, 0, 0]:g}"
+
     def heic() -> str:
         (folder / "a.heic").write_bytes(b"ftypheic")
         check_photograph(folder / "a.heic", (16, 16), sizes_from="w and h")
@@ -71,6 +76,7 @@ def images(folder: Path) -> Iterator[tuple[str, str]]:
     yield "floating-point TIFF in [0, 1]", outcome(of(Image.fromarray(HALF.astype(np.float32)), "c.tif"))
     yield "floating-point TIFF to 255", outcome(of(Image.fromarray((255 * HALF).astype(np.float32)), "d.tif"))
     yield "alpha from 0 to 255 (opaque by half or more is used)", outcome(of(see_through, "e.png"))
+    yield "16 bits, grey, TIFF in which 0 is white", outcome(white_is_zero)
     yield "a transparent colour, here the darkest (palette, tRNS)", outcome(of(eight, "f.png", transparency=0))
     yield "turned by EXIF, where `w` and `h` are as displayed", outcome(turned)
     yield "one even grey", outcome(of(Image.new("RGB", (16, 16), (127, 127, 127)), "g.png"))
@@ -106,11 +112,16 @@ def meshes(folder: Path) -> Iterator[tuple[str, str]]:
     away = box.copy()
     away.apply_translation([1.0, 0.0, 0.0])
     away.invert()
+    below, aside = box.copy(), box.copy()
+    below.apply_translation([0.0, 0.0, -0.1])
+    aside.apply_translation([0.1, 0.0, -0.1])
     doubled = trimesh.Trimesh(box.vertices, np.vstack([box.faces, box.faces[:1]]), process=False)
     for name, mesh, suffix in (
         *((f"{kind.upper()}", box, kind) for kind in ("stl", "obj", "ply", "off", "glb")),
         ("two bodies, one inside out", trimesh.util.concatenate([box, away]), "stl"),
         ("a face given twice", doubled, "ply"),
+        ("two bodies that touch along a face", trimesh.util.concatenate([box, below]), "stl"),
+        ("two bodies that touch along an edge", trimesh.util.concatenate([box, aside]), "stl"),
         ("a face missing", trimesh.Trimesh(box.vertices, box.faces[1:]), "stl"),
     ):
         mesh.export(folder / f"tool.{suffix}")
@@ -133,6 +144,7 @@ def tables(folder: Path) -> Iterator[tuple[str, str]]:
         ("a further column", plain.replace("\n", ",7\n").replace("qz,7", "qz,torque")),
         ("other units by the header", plain.replace("x,y", "x [mm],y")),
         ("commas and decimal commas", plain.replace(".", ",")),
+        ("semicolons, decimal commas and points", plain.replace(",", ";").replace("0.5", "0,5")),
     ):
         (folder / "motion.csv").write_text(text, encoding="utf-8")
 
@@ -156,7 +168,6 @@ def sizes() -> Iterator[tuple[str, str]]:
     yield "bulk density", "{:g} to {:g} kg/m³".format(*limits._DENSITIES)
     yield "gravity", "{:g} to {:g} m/s², downwards".format(*limits._GRAVITIES)
     yield "a camera's distance", f"to {limits._FAR_CAMERA:g} diagonals of the bed"
-    yield "a depth, by the bed's distance", f"{1 / limits._OTHER_UNIT:.2g} to {limits._OTHER_UNIT:.2g}"
     yield (
         "the tool's width (the second of its three extents)",
         f"a bed holds {limits._SMALL_TOOL:g} of its cubes at most",

@@ -215,6 +215,9 @@ def test_nothing_is_overwritten_and_faults_leave_nothing(tmp_path: Path) -> None
         (lambda e, v, w: [f.update(frame=90, time=1.8) for f in w["frames"] if f["frame"] == 10], "does not cover"),
         (lambda e, v, w: e["bed"].update(lower=[0.1, 0.2, -0.1], upper=[0.5, 0.3, 0.06]), "in only 44 %"),
         (lambda e, v, w: v.update(k1=-3.0), "folds over before the image's corners"),
+        (lambda e, v, w: v.update(cx=0.5, cy=0.5), "principal point of the views' camera is 0.5, 0.5"),
+        (lambda e, v, w: w.update(cx=0.0, cy=0.0), "principal point of camera 'left' is 0, 0"),
+        (lambda e, v, w: e.update(gravity=[0.0, 0.0, -1.0]), "Gravity is 1 m/s²"),
         (lambda e, v, w: v["frames"][2]["transform_matrix"][2].__setitem__(3, -0.2), "below the bed's floor: 002.jpg"),
         (lambda e, v, w: v["frames"][2]["transform_matrix"][0].__setitem__(3, 9.0), "do not show the soil's box: 002"),
     ],
@@ -227,6 +230,23 @@ def test_remarks_say_in_plain_words_what_is_odd(small_set: Path, spoil: object, 
         file.write_text(json.dumps(content))
     texts = [remark.text for remark in remarks(Measurement.load(small_set))]
     assert any(says in text for text in texts), texts
+
+
+def test_a_gltf_gets_a_remark_on_its_axes(small_set: Path) -> None:
+    trimesh.load_mesh(small_set / "tool.stl").export(small_set / "tool.glb")
+    file = small_set / "experiment.json"
+    file.write_text(file.read_text().replace("tool.stl", "tool.glb"))
+    assert "y is up" in " ".join(remark.text for remark in remarks(Measurement.load(small_set)))
+
+
+def test_the_folders_name_is_a_sets_name(small_set: Path) -> None:
+    file = small_set / "experiment.json"
+    file.write_text(json.dumps({k: v for k, v in json.loads(file.read_text()).items() if k != "name"}))
+    assert Measurement.load(small_set).name == small_set.name
+    odd = small_set.rename(small_set.parent / "red\x1b[31m")
+    with pytest.raises(MeasurementError, match="unprintable") as caught:
+        Measurement.load(odd)
+    assert caught.value.field == "name"
 
 
 def test_lost_video_frames_are_named(plow_dry: Path, tmp_path: Path) -> None:

@@ -67,6 +67,14 @@ def stl_of(*bodies: trimesh.Trimesh) -> Callable[[Path], Path]:
     return write
 
 
+def turned_over(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Its upper side is its lower one, and divided into triangles in the other way."""
+    height = 2.0 * mesh.centroid[2]
+    mesh.vertices[:, 2] = height - mesh.vertices[:, 2]
+    mesh.invert()
+    return mesh
+
+
 def three_mf(folder: Path) -> Path:
     """In millimetres, as the file tells."""
     pytest.importorskip("lxml")
@@ -109,6 +117,35 @@ def test_a_closed_mesh_is_read_with_its_volume(write: Callable[[Path], Path], bo
     for body in mesh.split():
         assert body.volume == pytest.approx(VOLUME, rel=1e-6), "each body's faces look outwards"
         np.testing.assert_allclose(body.extents, SIZE, rtol=1e-6)
+
+
+ABOVE, ACROSS = (0.0, 0.0, SIZE[2]), (SIZE[0], 0.0, SIZE[2])
+
+
+@pytest.mark.parametrize(
+    ("other", "at"),
+    [
+        (box(ABOVE), ABOVE),
+        (turned_over(box(ABOVE)), ABOVE),
+        (box(ACROSS), ACROSS),
+    ],
+    ids=["face", "face-of-other-triangles", "edge"],
+)
+def test_bodies_may_touch(other: trimesh.Trimesh, at: tuple[float, float, float], tmp_path: Path) -> None:
+    """Points in both have the winding number 1, by the solid angles of the triangles (van Oosterom & Strackee 1983)."""
+    mesh = read_mesh(stl_of(box(), other)(tmp_path))
+    assert mesh.volume == pytest.approx(2.0 * VOLUME, rel=1e-6)
+    for point, inside in (((0.0, 0.0, 0.4 * SIZE[2]), 1.0), (at, 1.0), ((0.0, 0.0, 2.0 * SIZE[2]), 0.0)):
+        a, b, c = np.moveaxis(mesh.triangles - point, 1, 0)
+        la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
+        dots = [np.sum(u * v, axis=1) * w for u, v, w in ((a, b, lc), (b, c, la), (c, a, lb))]
+        solid_angles = 2.0 * np.arctan2(np.sum(a * np.cross(b, c), axis=1), la * lb * lc + sum(dots))
+        assert solid_angles.sum() / (4.0 * np.pi) == pytest.approx(inside, abs=1e-6)
+
+
+def test_bodies_that_touch_and_look_into_different_directions_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(MeasurementError, match="turn its faces outwards"):
+        read_mesh(stl_of(box(), box(ACROSS, inside_out=True), box(APART))(tmp_path))
 
 
 def test_what_a_type_of_file_needs_is_named(tmp_path: Path) -> None:
