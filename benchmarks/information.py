@@ -56,13 +56,6 @@ ANGLE, WORLD = 35.0, 1
 """Of the soil, degrees, and the seed of its surface, its looks and the cameras' noise."""
 TRUTH = {"friction_angle": ANGLE}
 HEIGHT = "height"
-COMPUTED = (
-    f"Each effect is on at {STEP:g} times its smallest meaningful size; σ is the Mahalanobis length of what it changes "
-    "along the modes of all simulations, by products of different particle seeds, in which their scatter cancels. In "
-    "(a) to (c) the noise is seed-to-seed scatter and that of instruments; true heights have no other. In (d) it "
-    "is the comparison's own, with unknown albedo, observation and discretisation error, and what a change of the "
-    "angle does is left out."
-)
 
 
 class TrueSoil(PlowExperiment):
@@ -258,22 +251,21 @@ def measure(effects: Sequence[str], preset: str, seeds: int, device: str, out: P
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure, print the table, and write it into a page; exit code 0."""
-    parser = parser_of(__doc__, "runs/information")
+    parser = parser_of(__doc__, "runs/information", page=True)
     known = [name for name, effect in library().items() if not effect.numerical]
     parser.add_argument("--effects", nargs="+", default=[], choices=known, metavar="EFFECT", help="all by default")
     parser.add_argument("--preset", default="tiny", choices=sorted(PRESETS))
     parser.add_argument("--seeds", type=at_least(2), default=3, help="of the particles, with each effect")
-    parser.add_argument("--page", type=Path, help="write the table into this page")
     options = parser.parse_args(arguments)
     hush()
     mark = f"information {options.preset}"
     if options.page:
         with_section(options.page, mark, "")  # a page without a place for the table fails now, not at the end
-    device, own = options.device.split(":")[0], sources([Path(__file__)])
+    device, own = options.device.split(":")[0], sources("information")
     keep_to_one_protocol(options.out, {"preset": options.preset, "device": device, "code": own})
     rows = measure(options.effects, options.preset, options.seeds, options.device, options.out)
     result = {"made_by": stamp(options.device), "preset": options.preset, "seeds": options.seeds, **TRUTH, "rows": rows}
-    shown = f"Preset `{options.preset}`, {options.seeds} seeds. {COMPUTED}\n\n{table(rows)}"
+    shown = f"Preset `{options.preset}`, {options.seeds} seeds.\n\n{table(rows)}"
     if options.page:
         write_text(options.page, with_section(options.page, mark, shown))
     tell(options, result, shown)
