@@ -1,4 +1,4 @@
-"""What benchmarks share: options, progress, tables, and what a result was made with."""
+"""What benchmarks share: options, progress, tables, pages, and what a result was made with."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import platform
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,16 +31,17 @@ if TYPE_CHECKING:
 
 FloatArray = npt.NDArray[np.float64]
 
-PARTS = ("measurement", "splats", "reconstruction", "soil", "mpm", "scene", "experiment", "synthetic")
-FILES = ("parameters.py", "model.py", "comparison.py", "robust_loss.py")
-BESIDE = ("splatsoil.envs", "splatsoil.inverse")
-"""All that a benchmark's numbers may depend on: parts of the package, and packages beside it."""
+PARTS = (
+    *("measurement", "splats", "reconstruction", "soil", "mpm", "scene", "experiment", "synthetic", "envs", "inverse"),
+    *("parameters.py", "model.py", "comparison.py", "robust_loss.py"),
+)
+"""Parts of the package that a benchmark's numbers may depend on."""
 PACKAGES = ("numpy", "torch", "warp-lang", "newton")
 """Packages whose versions are stated."""
 
 
 def at_least(least: int) -> Callable[[str], int]:
-    """Whole numbers from one on, for an argument parser."""
+    """Type of an option: an integer that is not smaller."""
 
     def number(text: str) -> int:
         value = int(text)
@@ -52,20 +53,23 @@ def at_least(least: int) -> Callable[[str], int]:
 
 
 class Formatter(argparse.RawDescriptionHelpFormatter):
-    """Shows texts as they are, and defaults."""
+    """Shows descriptions as they are, and the defaults of options that have one."""
 
     def _get_help_string(self, action: argparse.Action) -> str | None:
-        unsaid = action.default in (None, False, argparse.SUPPRESS, "", [])
-        return action.help if unsaid else f"{action.help} (default: %(default)s)"
+        without = action.default in (None, False, argparse.SUPPRESS, "", [])
+        return action.help if without else f"{action.help} (default: %(default)s)"
 
 
-def parser_of(module_doc: str | None, out: str = "") -> argparse.ArgumentParser:
-    """An argument parser with the option ``--device``, and where results have a folder ``--out`` and ``--json``."""
+def parser_of(module_doc: str | None, out: str = "", *, page: bool = False) -> argparse.ArgumentParser:
+    """An argument parser with ``--device``; with ``--out`` and ``--json`` where results have a folder; with ``--page``
+    where they have a place on a page."""
     parser = argparse.ArgumentParser(description=module_doc, formatter_class=Formatter)
     parser.add_argument("--device", type=resolve_device, default="cpu", help="cpu or cuda:0")
     if out:
         parser.add_argument("--out", type=Path, default=Path(out), help="folder of results, to continue from")
         parser.add_argument("--json", action="store_true", help="print one JSON object instead of tables")
+    if page:
+        parser.add_argument("--page", type=Path, help="write the tables into their place on this page (.md)")
     return parser
 
 
@@ -81,8 +85,8 @@ def tell(
 
 
 def sized(p: Parameter, times: float) -> float:
-    """A parameter that is so many times its smallest meaningful size away from off, within its bounds; upwards where it
-    has two sides."""
+    """A parameter whose distance from off is a multiple of its smallest meaningful change, within its bounds; upwards
+    where it has two sides."""
     return float(np.clip((p.off or 0.0) + (p.sign or 1) * times * p.meaningful, p.lower, p.upper))
 
 
@@ -117,11 +121,9 @@ def with_section(page: Path, name: str, text: str) -> str:
     return f"{before}{begin}{text}\n{end}{after}"
 
 
-def sources(others: Iterable[Path] = ()) -> str:
-    """Digest of the sources behind a benchmark's numbers, from photographs to estimates, and of other files."""
-    specs = [find_spec(name) for name in BESIDE]
-    folders = [Path(p) for spec in specs if spec is not None for p in spec.submodule_search_locations or ()]
-    return code_digest((*PARTS, *FILES), [*sorted(f for d in folders for f in d.rglob("*.py")), *others])
+def sources(*benchmarks: str) -> str:
+    """Digest of the sources behind a benchmark's numbers: the package's, and those of modules beside this one."""
+    return code_digest((*PARTS, *(f"benchmarks/{name}.py" for name in benchmarks)))
 
 
 def keep_to_one_protocol(out: Path, described: Mapping[str, Any]) -> None:
@@ -132,7 +134,7 @@ def keep_to_one_protocol(out: Path, described: Mapping[str, Any]) -> None:
     """
     file, protocol = out / "protocol.json", plain(dict(described))
     if file.is_file() and read_json(file) != protocol:
-        raise ParameterError(f"{out}: holds results of another protocol or other sources; choose another --out")
+        raise ParameterError(f"{out}: contains results of another protocol or other sources; choose another --out")
     write_json(file, protocol)
 
 
@@ -149,10 +151,8 @@ def stamp(device: str) -> dict[str, str]:
         "made": datetime.now(UTC).isoformat(timespec="seconds"),
     }
     for name in PACKAGES:
-        try:
+        with suppress(PackageNotFoundError):
             made[name] = version(name)
-        except PackageNotFoundError:
-            continue
     if device != "cpu":
         import torch
 
@@ -171,15 +171,14 @@ def sentence(made: Mapping[str, str]) -> str:
 
 
 def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return platform.processor() or "unknown processor"
-    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "unknown processor")
+    file = Path("/proc/cpuinfo")
+    lines = file.read_text(encoding="utf-8").splitlines() if file.is_file() else []
+    names = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    return next(names, platform.processor() or "unknown processor")
 
 
 class Clock:
-    """Says on stderr what goes on, and how long after the start."""
+    """Prints progress on stderr, with the seconds since the start."""
 
     def __init__(self) -> None:
         self.began = time.monotonic()

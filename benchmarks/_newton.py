@@ -52,7 +52,7 @@ class Numerics:
 
 
 @dataclass(frozen=True)
-class World:
+class Soil:
     """Soil to plough.
 
     Attributes:
@@ -92,7 +92,7 @@ class World:
 
 @dataclass(frozen=True)
 class Run:
-    """What became of a world.
+    """What became of soil.
 
     Attributes:
         particles: (n, 3) in m, by frame.
@@ -112,7 +112,7 @@ def load_newton() -> Any:
 
 
 def plough(
-    worlds: Sequence[World],
+    soils: Sequence[Soil],
     numerics: Numerics,
     frames: Iterable[int],
     device: str = "cpu",
@@ -120,30 +120,33 @@ def plough(
     begin: int = 0,
     progress: Callable[[int, int], None] = lambda frame, last: None,
 ) -> list[Run]:
-    """Run the worlds side by side, each in a box of its own, to the last frame.
+    """Plough soils side by side, each in a box of its own, to the last frame.
 
     Args:
-        worlds: soils, beds, tools and motions.
+        soils: with their beds, tools and motions.
         numerics: of the solver.
         frames: to keep, of those after the first.
         device: Warp device name.
-        begin: frame at which the worlds' particles rest and the run begins.
+        begin: frame at which the soils' particles rest and the run begins.
         progress: called with (frame, last frame) after each.
 
     Returns:
-        What became of each world.
+        What became of each soil.
 
     Raises:
-        RunError: the ``newton`` package is missing, or the worlds' floors or frame rates differ.
+        RunError: the ``newton`` package is missing, or the soils' floors or frame rates differ.
         SimulationError: particles left the numbers.
     """
     newton = load_newton()
-    measurements = [world.measurement for world in worlds]
+    measurements = [soil.measurement for soil in soils]
     rates, beds = {m.frame_rate for m in measurements}, [m.bed for m in measurements]
     if len(rates) > 1 or len({(float(bed.lower[2]), bed.floor_friction) for bed in beds}) > 1:
-        raise RunError("worlds side by side stand on one floor and share their frames: plough these one by one")
-    shifts = _shifts(worlds, numerics.voxel)
-    model = _model(newton, worlds, shifts, device)
+        raise RunError("beds side by side stand on one floor and share their frames: plough these one by one")
+    # Along y, so that no walls meet; by whole voxels, so that every box lies on the grid as it would alone.
+    span = max(bed.upper[1] for bed in beds) - min(bed.lower[1] for bed in beds) + 4.0 * WALL
+    pitch = numerics.voxel * math.ceil(span / numerics.voxel)
+    shifts = np.array([[0.0, pitch * k, 0.0] for k in range(len(beds))])
+    model = _model(newton, soils, shifts, device)
     config = newton.solvers.SolverImplicitMPM.Config()
     config.voxel_size, config.max_iterations, config.tolerance = numerics.voxel, numerics.iterations, numerics.tolerance
     # The other kind of cells is laid anew around the soil in every substep: soil then loses half as much volume again.
@@ -151,14 +154,14 @@ def plough(
     solver = newton.solvers.SolverImplicitMPM(model, config=config)
     states = model.state(), model.state()
     for state in states:
-        state.particle_f.assign(np.concatenate([np.tile(w.weight, (len(w.particles), 1)) for w in worlds]))
+        state.particle_f.assign(np.concatenate([np.tile(w.weight, (len(w.particles), 1)) for w in soils]))
     now, following = states
     frame_time = 1.0 / rates.pop()
     step = frame_time / numerics.substeps
     wanted = sorted(f for f in frames if f > begin)
-    ends = np.cumsum([len(w.particles) for w in worlds])[:-1]
-    found: list[dict[int, FloatArray]] = [{} for _ in worlds]
-    force = np.zeros((len(worlds), wanted[-1], 3))
+    ends = np.cumsum([len(w.particles) for w in soils])[:-1]
+    found: list[dict[int, FloatArray]] = [{} for _ in soils]
+    force = np.zeros((len(soils), wanted[-1], 3))
     for frame in range(begin + 1, wanted[-1] + 1):
         start = (frame - 1) * frame_time
         ways = [step_poses(m.tool.motion, start, frame_time, numerics.substeps) for m in measurements]
@@ -170,7 +173,7 @@ def plough(
                 state.body_q.assign(np.array(places, dtype=np.float32))
                 state.body_qd.assign(np.array(twists, dtype=np.float32))
             solver.step(now, following, None, None, step)
-            force[:, frame - 1] += _impulses(solver, following, len(worlds)) / frame_time
+            force[:, frame - 1] += _impulses(solver, following, len(soils)) / frame_time
             # Soil is pushed out of where the tool stood when the substep began, as in the example sets: it stands up
             # to one substep's way deep in the moving tool, a tenth of a voxel.
             following.body_qd.zero_()
@@ -183,23 +186,11 @@ def plough(
             for k, part in enumerate(np.split(x, ends)):
                 found[k][frame] = part - shifts[k]
         progress(frame, wanted[-1])
-    return [Run(particles, of_world) for particles, of_world in zip(found, force, strict=True)]
-
-
-def _shifts(worlds: Sequence[World], voxel: float) -> FloatArray:
-    """(w, 3) m by which each world is moved along y so that no walls meet; whole voxels, so that every box lies on the
-    grid as it would alone."""
-    shifts, free = np.zeros((len(worlds), 3)), -math.inf
-    for shift, world in zip(shifts, worlds, strict=True):
-        bed = world.measurement.bed
-        begin, end = float(bed.lower[1]) - 2.0 * WALL, float(bed.upper[1]) + 2.0 * WALL
-        shift[1] = voxel * max(0, math.ceil((free - begin) / voxel)) if math.isfinite(free) else 0.0
-        free = end + shift[1]
-    return shifts
+    return [Run(particles, each) for particles, each in zip(found, force, strict=True)]
 
 
 def _impulses(solver: Any, state: Any, bodies: int) -> FloatArray:
-    """(b, 3) N s that soil gave each body, a world's tool, in the last step."""
+    """(b, 3) N s that soil gave each body, a tool, in the last step."""
     impulses, _, colliders = (array.numpy() for array in solver.collect_collider_impulses(state))
     body_of = solver.collider_body_index.numpy()
     there = (colliders >= 0) & (colliders < len(body_of))
@@ -209,61 +200,61 @@ def _impulses(solver: Any, state: Any, bodies: int) -> FloatArray:
     return given
 
 
-def _model(newton: Any, worlds: Sequence[World], shifts: FloatArray, device: str) -> Any:
-    """Newton's model: one floor; walls, a tool and soil for every world. Their weight is not in it."""
+def _model(newton: Any, soils: Sequence[Soil], shifts: FloatArray, device: str) -> Any:
+    """Newton's model: one floor; walls, a tool and particles for every soil. Their weight is not in it."""
     builder = newton.ModelBuilder()
     newton.solvers.SolverImplicitMPM.register_custom_attributes(builder)
     surface = newton.ModelBuilder.ShapeConfig
-    ground = worlds[0].measurement.bed
+    ground = soils[0].measurement.bed
     builder.add_ground_plane(height=float(ground.lower[2]), cfg=surface(mu=ground.floor_friction, density=0.0))
-    for world, shift in zip(worlds, shifts, strict=True):
-        bed, tool = world.measurement.bed, world.measurement.tool
+    for soil, shift in zip(soils, shifts, strict=True):
+        bed, tool = soil.measurement.bed, soil.measurement.tool
         for centre, half in _walls(bed.lower + shift, bed.upper + shift):
             place = wp.transform(wp.vec3(*centre), wp.quat_identity())
             smooth = surface(mu=bed.wall_friction, density=0.0)
             builder.add_shape_box(body=-1, cfg=smooth, xform=place, hx=half[0], hy=half[1], hz=half[2])
-        if world.obstacle is not None:
-            place = wp.transform(wp.vec3(*(np.array(world.obstacle[:3]) + shift)), wp.quat_identity())
-            builder.add_shape_sphere(body=-1, cfg=surface(mu=ROUGH, density=0.0), xform=place, radius=world.obstacle[3])
-        friction = tool.friction if world.tool_friction is None else world.tool_friction
-        sticky = {"mpm:collider_adhesion": world.tool_adhesion}
+        if soil.obstacle is not None:
+            place = wp.transform(wp.vec3(*(np.array(soil.obstacle[:3]) + shift)), wp.quat_identity())
+            builder.add_shape_sphere(body=-1, cfg=surface(mu=ROUGH, density=0.0), xform=place, radius=soil.obstacle[3])
+        friction = tool.friction if soil.tool_friction is None else soil.tool_friction
+        sticky = {"mpm:collider_adhesion": soil.tool_adhesion}
         body = builder.add_body()
         mesh = newton.Mesh(np.asarray(tool.mesh.vertices), np.asarray(tool.mesh.faces).ravel(), compute_inertia=False)
         builder.add_shape_mesh(body=body, mesh=mesh, cfg=surface(mu=friction, density=0.0), custom_attributes=sticky)
-        n = len(world.particles)
+        n = len(soil.particles)
         builder.add_particles(
-            pos=(world.particles + shift).tolist(),
+            pos=(soil.particles + shift).tolist(),
             vel=[(0.0, 0.0, 0.0)] * n,
-            mass=[bed.density * world.spacing**3] * n,
-            radius=[world.spacing / 2.0] * n,
+            mass=[bed.density * soil.spacing**3] * n,
+            radius=[soil.spacing / 2.0] * n,
         )
     model = builder.finalize(device=device)
     model.set_gravity((0.0, 0.0, 0.0))
 
     def each(values: Sequence[float | FloatArray]) -> npt.NDArray[np.float32]:
-        parts = [np.broadcast_to(value, len(w.particles)) for value, w in zip(values, worlds, strict=True)]
+        parts = [np.broadcast_to(value, len(w.particles)) for value, w in zip(values, soils, strict=True)]
         return np.concatenate(parts).astype(np.float32)
 
     material = model.mpm
-    material.young_modulus.assign(each([w.young for w in worlds]))
+    material.young_modulus.assign(each([w.young for w in soils]))
     material.poisson_ratio.fill_(0.3)
-    material.friction.assign(each([np.vectorize(cone_slope)(w.angle) for w in worlds]))
-    material.dilatancy.assign(each([w.dilatancy for w in worlds]))
-    material.viscosity.assign(each([w.viscosity for w in worlds]))
-    if any(np.any(w.cohesion) for w in worlds):
+    material.friction.assign(each([np.vectorize(cone_slope)(w.angle) for w in soils]))
+    material.dilatancy.assign(each([w.dilatancy for w in soils]))
+    material.viscosity.assign(each([w.viscosity for w in soils]))
+    if any(np.any(w.cohesion) for w in soils):
         # Newton's strength is yield_stress + friction (p + tension): the cone's apex alone makes the whole cohesion,
         # and a yield stress beside it would double that.
         material.yield_pressure.fill_(YIELD_PRESSURE)
-        material.tensile_yield_ratio.assign(each([_tension(w) / YIELD_PRESSURE for w in worlds]))
+        material.tensile_yield_ratio.assign(each([_tension(w) / YIELD_PRESSURE for w in soils]))
     return model
 
 
-def _tension(world: World) -> float | FloatArray:
+def _tension(soil: Soil) -> float | FloatArray:
     """Pressure of the cone's apex, Pa; one, or (n,)."""
-    if not np.any(world.cohesion):
+    if not np.any(soil.cohesion):
         return 0.0
-    angle = float(world.angle)
-    return world.cohesion * cone_intercept(angle, 1.0) / cone_slope(angle)
+    angle = float(soil.angle)
+    return soil.cohesion * cone_intercept(angle, 1.0) / cone_slope(angle)
 
 
 def _walls(lower: FloatArray, upper: FloatArray) -> list[tuple[FloatArray, FloatArray]]:

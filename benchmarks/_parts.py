@@ -1,19 +1,18 @@
-"""Benchmarks of several parts: each part is a section, kept in a folder when it ends, and written into a page."""
+"""Benchmarks of several parts: each part is a table, kept in a folder when it ends, and written into a page."""
 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 import time
-from collections.abc import Callable, Mapping
-from contextlib import nullcontext
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatsoil.benchmarks._common import FloatArray, markdown, parser_of, sentence, stamp, with_section, write_figure
 
-from splatsoil.commands._output import only_json, print_json
 from splatsoil.errors import ParameterError, SplatsoilError
 from splatsoil.files import check_folder, plain, read_json, write_bytes, write_json, write_text
 
@@ -56,27 +55,17 @@ class Row:
 
 @dataclass(frozen=True)
 class Section:
-    """One part of the page.
+    """One part of a page.
 
     Attributes:
         title: of the part.
-        before: what is compared and with what, markdown.
         rows: the comparisons.
-        after: how to read them, markdown.
         figure: its picture; None when it has none.
     """
 
     title: str
-    before: str
-    rows: tuple[Row, ...]
-    after: str = ""
+    rows: Sequence[Row]
     figure: Figure | None = field(default=None, compare=False)
-
-    def text(self, picture: str) -> str:
-        """Markdown, with the picture's file name."""
-        table = markdown(("case", "found", "expected", "verdict"), [row.cells for row in self.rows])
-        link = f"![{self.title}]({picture})" if self.figure is not None else ""
-        return "\n\n".join(part for part in (f"### {self.title}", self.before, table, link, self.after) if part)
 
 
 def percent(found: float, expected: float) -> str:
@@ -100,10 +89,9 @@ def curves_of(curves: Mapping[str, tuple[FloatArray, FloatArray]], xlabel: str, 
 
 def parts_parser(module_doc: str | None, out: str) -> argparse.ArgumentParser:
     """An argument parser with options that choose parts, and say where results go."""
-    parser = parser_of(module_doc, out)
+    parser = parser_of(module_doc, out, page=True)
     parser.add_argument("--only", nargs="+", metavar="PART", help="parts to measure; all by default")
     parser.add_argument("--again", action="store_true", help="measure parts again that are in the folder")
-    parser.add_argument("--page", type=Path, help="write the parts into their place on this page (.md)")
     return parser
 
 
@@ -135,24 +123,22 @@ def run_parts(
     if options.page:
         with_section(options.page, mark, "")  # a page without a place fails now, not at the end
     check_folder(options.out)
-    made_by, kept = stamp(options.device), {}
-    with only_json() if options.json else nullcontext():
-        for name, measure in parts.items():
-            file, known = options.out / f"{name}.json", plain({"device": options.device, **key(name)})
-            stored = read_json(file) if file.is_file() else {}
-            if not options.only or name in options.only:
-                if options.again or stored.get("key") != known:
-                    stored = {"key": known, "made_by": made_by, **_measured(name, measure, options.out, mark)}
-                    write_json(file, stored)
-                if not options.json:
-                    print(f"\n{stored['text']}")
-            if stored.get("key") == known:
-                kept[name] = stored
-        if options.page and kept:
-            _write_page(options.page, options.out, list(kept.values()), mark)
-        if options.json:
-            told = {name: {k: kept[name][k] for k in ("title", "rows")} for name in options.only or kept}
-            print_json({"ok": True, "made_by": made_by, "parts": told})
+    chosen, made_by, kept = options.only or list(parts), stamp(options.device), dict[str, Any]()
+    for name, measure in parts.items():
+        file, known = options.out / f"{name}.json", plain({"device": options.device, **key(name)})
+        part = read_json(file) if file.is_file() else {}
+        if name in chosen and (options.again or part.get("key") != known):
+            part = {"key": known, "made_by": made_by, **_measured(name, measure, options.out, mark)}
+            write_json(file, part)
+        if part.get("key") == known:
+            kept[name] = part
+            if name in chosen and not options.json:
+                print(f"\n{_text(part)}", flush=True)
+    if options.page and kept:
+        _write_page(options.page, options.out, list(kept.values()), mark)
+    if options.json:
+        shown = {name: {k: kept[name][k] for k in ("title", "rows")} for name in chosen if name in kept}
+        print(json.dumps({"ok": True, "made_by": made_by, "parts": shown}, indent=1))
     return 0
 
 
@@ -166,27 +152,23 @@ def _measured(name: str, measure: Callable[[], Section], out: Path, mark: str) -
         write_figure(out / picture, section.figure)
     seconds = time.monotonic() - began
     print(f"{name}: {seconds:.0f} s", file=sys.stderr, flush=True)
-    return {
-        "title": section.title,
-        "rows": [asdict(row) for row in section.rows],
-        "text": section.text(picture),
-        "picture": picture if section.figure is not None else "",
-        "seconds": seconds,
-    }
+    rows = [asdict(row) for row in section.rows]
+    return {"title": section.title, "rows": rows, "picture": picture if section.figure else "", "seconds": seconds}
 
 
-def _write_page(page: Path, out: Path, kept: list[Mapping[str, Any]], mark: str) -> None:
-    """How many rows hold, which fail, and all sections."""
-    judged = [(part["title"], Row(**row)) for part in kept for row in part["rows"] if row["held"] is not None]
-    failed = [f"- {title}: {row.case}: {row.found} ({row.expected})" for title, row in judged if not row.held]
-    count = f"{len(judged) - len(failed)} of {len(judged)} comparisons hold."
-    minutes = sum(part["seconds"] for part in kept) / 60.0
-    made = max((part["made_by"] for part in kept), key=lambda made: str(made["made"]))
-    told = [
-        f"{count} What fails:\n\n" + "\n".join(failed) if failed else count,
-        *(part["text"] for part in kept),
-        f"Measured in {minutes:.0f} min, {sentence(made)}.",
-    ]
-    for picture in filter(None, (part["picture"] for part in kept)):
+def _text(part: Mapping[str, Any]) -> str:
+    table = markdown(("case", "found", "expected", "verdict"), [Row(**row).cells for row in part["rows"]])
+    picture = [f"![{part['title']}]({part['picture']})"] if part["picture"] else []
+    return "\n\n".join([f"### {part['title']}", table, *picture])
+
+
+def _write_page(page: Path, out: Path, parts: Sequence[Mapping[str, Any]], mark: str) -> None:
+    """How many rows hold, all tables and pictures, and what measured them."""
+    judged = [row["held"] for part in parts for row in part["rows"] if row["held"] is not None]
+    minutes = sum(part["seconds"] for part in parts) / 60.0
+    newest = max((part["made_by"] for part in parts), key=lambda made: str(made["made"]))
+    text = [f"{sum(judged)} of {len(judged)} comparisons hold.", *map(_text, parts)]
+    text.append(f"Measured in {minutes:.0f} min, {sentence(newest)}.")
+    for picture in filter(None, (part["picture"] for part in parts)):
         write_bytes(page.parent / picture, (out / picture).read_bytes())
-    write_text(page, with_section(page, mark, "\n\n".join(told)))
+    write_text(page, with_section(page, mark, "\n\n".join(text)))

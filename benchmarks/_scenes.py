@@ -1,4 +1,4 @@
-"""Scenes for worlds: beds, tools and soils drawn from one stream of random numbers."""
+"""Scenes of synthetic experiments: beds, tools and soils drawn from one stream of random numbers."""
 
 from __future__ import annotations
 

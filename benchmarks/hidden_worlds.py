@@ -25,7 +25,6 @@ import numpy as np
 from scipy.stats import binomtest
 from splatsoil.benchmarks._common import (
     Clock,
-    FloatArray,
     at_least,
     keep_to_one_protocol,
     markdown,
@@ -35,7 +34,7 @@ from splatsoil.benchmarks._common import (
     tell,
 )
 from splatsoil.benchmarks._hidden import KINDS, NOTHING, OUTSIDE, TIMES, Hidden, draw
-from splatsoil.benchmarks._newton import Numerics, World, plough
+from splatsoil.benchmarks._newton import Numerics, plough
 
 from splatsoil.errors import ParameterError
 from splatsoil.files import plain, read_json
@@ -57,32 +56,12 @@ LEAST = 1e-6
 """Probability from which on down the log score falls no further."""
 
 
-def soil_of(hidden: Hidden, setup: Setup, spacing: float) -> World:
-    """What the solver ploughs, of particles so far apart."""
-    told = dict(hidden.soil)
-    x = fill(setup.surface, setup.bed, spacing, seed=hidden.seed)
-    angle: float | FloatArray = hidden.angle
-    if "layer" in told:
-        excess, below = told.pop("layer")
-        angle = hidden.angle + np.where(setup.surface.sample(x[:, :2]) - x[:, 2] > below, excess, 0.0)
-    if "across" in told:
-        middle, half = setup.bed.lower[1] + 0.5 * setup.bed.extents[1], 0.5 * setup.bed.extents[1]
-        angle = hidden.angle + told.pop("across") * (x[:, 1] - middle) / half
-    if "crust" in told:
-        cohesion, thick = told.pop("crust")
-        told["cohesion"] = np.where(setup.surface.sample(x[:, :2]) - x[:, 2] < thick, cohesion, 0.0)
-    if "obstacle" in told:
-        keep = np.linalg.norm(x - np.array(told["obstacle"][:3]), axis=1) > told["obstacle"][3]
-        x = x[keep]
-    return World(setup.experiment(), angle, x, spacing, gravity=hidden.gravity, **told)
-
-
 def ploughed_by_newton(
     group: Sequence[Hidden], setups: Sequence[Setup], frames: Sequence[int], device: str
 ) -> list[Trajectory]:
-    """Worlds side by side."""
+    """Synthetic experiments side by side."""
     numerics = Numerics()
-    soils = [soil_of(hidden, setup, numerics.spacing) for hidden, setup in zip(group, setups, strict=True)]
+    soils = [hidden.soil(setup, numerics.spacing) for hidden, setup in zip(group, setups, strict=True)]
     found = []
     for setup, soil, run in zip(setups, soils, plough(soils, numerics, frames, device), strict=True):
         positions = np.stack([soil.particles, *(run.particles[f] for f in frames if f > 0)]).astype(np.float32)
@@ -100,11 +79,11 @@ def ploughed_by_newton(
 
 
 def ploughed_by_us(hidden: Hidden, setup: Setup, frames: Sequence[int], preset: str, device: str) -> Trajectory:
-    """A world of our own solver, of particles that no fit starts from."""
+    """A synthetic experiment of our own solver, of particles that no fit starts from."""
     experiment = setup.experiment()
-    law = Law(effect.for_measurement(experiment) for effect in find_effects([hidden.kind] if hidden.values else []))
+    law = Law(effect.for_measurement(experiment) for effect in find_effects(hidden.effects))
     resolution = Resolution.derive(experiment, preset)
-    x = fill(setup.surface, setup.bed, resolution.spacing, seed=hidden.seed)
+    x = fill(setup.surface, setup.bed, resolution.spacing, seed=hidden.scene.seed)
     values = law.require_on({**hidden.values, "friction_angle": hidden.angle})
     return simulate(experiment, x, values, law=law, resolution=resolution, frames=frames, device=device)[0]
 
@@ -119,7 +98,7 @@ class Study:
     device: str
     say: Clock
 
-    def worlds(self, truths: Sequence[Hidden], side_by_side: int) -> Iterator[Hidden]:
+    def made(self, truths: Sequence[Hidden], side_by_side: int) -> Iterator[Hidden]:
         """Simulate and photograph the experiments that the folder lacks, so many at a time; each that is there."""
         missing = [h for h in truths if not (self.out / "sets" / h.name / "truth.json").is_file()]
         yield from (h for h in truths if h not in missing)
@@ -146,9 +125,8 @@ class Study:
     def photograph(self, hidden: Hidden, setup: Setup, run: Trajectory) -> None:
         """Make the measurement set, with its truth."""
         solver = asdict(Numerics()) if self.solver == NEWTON else self.solver
-        truth = {"hidden": hidden.kind, "size": hidden.size, "values": hidden.values, "solver": solver}
-        look = Appearance.drawn(hidden.seed)
-        recorder = Recorder(setup, run, look, hidden.seed, self.device, hidden.observation())
+        truth, seed = {"hidden": hidden.kind, "values": hidden.values, "solver": solver}, hidden.scene.seed
+        recorder = Recorder(setup, run, Appearance.drawn(seed), seed, self.device, hidden.observation())
         photograph_run(self.out / "sets" / hidden.name, recorder, plain({**truth, "scene": asdict(hidden.scene)}))
         self.say(f"{hidden.name} simulated and photographed")
 
@@ -181,7 +159,7 @@ class Study:
 
 
 def score(hidden: Hidden, fit: Mapping[str, Any], told: Mapping[str, Any]) -> dict[str, Any]:
-    """What fit and diagnosis said of a world, beside the truth.
+    """What fit and diagnosis report of a synthetic experiment, beside the truth.
 
     ``size`` is that of the effect's parameter, ``times`` and ``detectable`` are over its smallest meaningful change.
     """
@@ -192,7 +170,7 @@ def score(hidden: Hidden, fit: Mapping[str, Any], told: Mapping[str, Any]) -> di
     row = {
         "hidden": hidden.kind,
         "truth": truth,
-        "size": hidden.size,
+        "size": next(iter(hidden.values.values()), 0.0),
         "angle": hidden.angle,
         "verdict": verdict,
         "class": told["class"],
@@ -204,7 +182,7 @@ def score(hidden: Hidden, fit: Mapping[str, Any], told: Mapping[str, Any]) -> di
         "z": (angle["value"] - hidden.angle) / angle["std"],
         "seconds": [fit["seconds"], told["seconds"]],
     }
-    if hidden.values and truth in models:
+    if hidden.effects and truth in models:
         model = models[truth]
         size, meaningful = hidden.values[model["parameter"]], model["meaningful"]
         row |= {"size": size, "times": abs(size - model["off"]) / meaningful}
@@ -216,7 +194,7 @@ def score(hidden: Hidden, fit: Mapping[str, Any], told: Mapping[str, Any]) -> di
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """All worlds, those whose truth was not told first, and what they come to, as Markdown."""
+    """All experiments, those whose truth was missed first, and what they come to, as Markdown."""
     head = ["hidden", "size (over the smallest meaningful)", "verdict", "class", "probability: truth, base law"]
     head += ["angle: true; found (error over ±)", "size found", "fit, diagnosis"]
     lines = []
@@ -237,7 +215,7 @@ def _counts(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     large = [r for r in library if r.get("detectable") and r["times"] >= r["detectable"]]
     yield from _share("nothing hidden: some effect named", [bool(r["named"]) for r in dry])
     yield from _share("an effect hidden: it alone named", [r["named"] == [r["truth"]] for r in library])
-    same = "the same, of what is at least as large as told detectable"
+    same = "the same, of what is at least as large as stated detectable"
     yield from _share(same, [r["named"] == [r["truth"]] for r in large])
     yield from _share("an effect hidden: named, or in the set", [r["right"] for r in library])
     others = "hidden outside the library: something else, or undecided"
@@ -290,8 +268,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--side-by-side", type=at_least(1), default=1, help="fits and diagnoses at a time")
     solvers = "newton needs the package, the others are ours by preset (not friction_field, crust)"
     parser.add_argument("--solver", choices=[NEWTON, *PRESETS], default=NEWTON, help=solvers)
-    parser.add_argument("--worlds-side-by-side", type=at_least(1), default=4, help="simulated at a time by Newton")
-    parser.add_argument("--worlds-only", action="store_true", help="make the sets and stop")
+    parser.add_argument("--simulated-side-by-side", type=at_least(1), default=4, help="simulated at a time by Newton")
+    parser.add_argument("--sets-only", action="store_true", help="make the sets and stop")
     options = parser.parse_args(arguments)
     foreign = [kind for kind in options.kinds if kind in OUTSIDE]
     if options.solver != NEWTON and foreign:
@@ -303,7 +281,7 @@ def main(arguments: list[str] | None = None) -> int:
     hush()
     numerics = {"voxel": Numerics.voxel, "iterations": Numerics.iterations}
     decides = {name: getattr(options, name) for name in ("seed", "times", "preset", "solver")} | numerics
-    decides["code"] = sources([Path(__file__).with_name(f"{name}.py") for name in OWN])
+    decides["code"] = sources(*OWN)
     keep_to_one_protocol(options.out, decides)
     truths = [
         draw(kind, k, options.seed, tuple(options.times))
@@ -314,11 +292,11 @@ def main(arguments: list[str] | None = None) -> int:
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // options.side_by_side)))
     # an experiment is judged while the next ones are made
     with ThreadPoolExecutor(options.side_by_side) as pool:
-        worlds = study.worlds(truths, options.worlds_side_by_side)
-        judged = [pool.submit(study.judge, hidden) for hidden in worlds if not options.worlds_only]
+        made = study.made(truths, options.simulated_side_by_side)
+        judged = [pool.submit(study.judge, hidden) for hidden in made if not options.sets_only]
         for one in judged:
             one.result()
-    if options.worlds_only:
+    if options.sets_only:
         return 0
     rows = study.rows(truths)
     tell(options, {"made_by": stamp(options.device), **decides, "rows": rows}, table(rows))

@@ -26,6 +26,6 @@ def main(arguments: list[str] | None = None) -> int:
     if measured == Path():
         parser.error(f"the data are not part of the product: name their folder by --measured or {MEASURED}")
     hush()
-    code = sources([Path(str(part.__file__)) for part in PARTS.values()])
+    code = sources("_validation/sand", "_validation/plates")
     parts = {name: partial(part.validate, options.device, measured) for name, part in PARTS.items()}
     return run_parts(options, parts, lambda _: {"code": code, "measured": str(measured)}, "real sand")

@@ -13,8 +13,9 @@ on finer cells and with one of its numbers changed at a time; neither needs the 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,8 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter
 from splatsoil.benchmarks._common import Clock, FloatArray, at_least, markdown, parser_of, stamp, tell
-from splatsoil.benchmarks._newton import Numerics, World, plough
+from splatsoil.benchmarks._hidden import NOTHING, Hidden
+from splatsoil.benchmarks._newton import Numerics, plough
 from splatsoil.benchmarks._scenes import Scene, scenes
 from splatsoil.benchmarks._truth import PATCH, Truth, cut_and_heaped, in_patches, stage_forces, volume_range
 
@@ -31,7 +33,6 @@ from splatsoil.errors import MeasurementError, ParameterError
 from splatsoil.files import write_json
 from splatsoil.mpm import PRESETS, Resolution, simulate
 from splatsoil.quiet import hush
-from splatsoil.reconstruction import fill
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
 from splatsoil.soil.settings import FRICTION_ANGLE
@@ -40,13 +41,6 @@ FRAMES = (50, 100, 150, 199)
 """At which drawn scenes are compared; sets at those of their true particles."""
 OFFSETS = (-6.0, -3.0, 3.0, 6.0)
 """Of the angles of our runs from the true one, degrees."""
-
-
-def world_of(scene: Scene, spacing: float) -> World:
-    """As Newton takes it, of particles so far apart, m."""
-    setup = scene.setup()
-    x = fill(setup.surface, setup.bed, spacing, seed=scene.seed)
-    return World(setup.experiment(), scene.angle, x, spacing)
 
 
 def ploughed(cases: Mapping[str, Scene], out: Path, device: str, side_by_side: int, say: Clock) -> dict[str, Truth]:
@@ -59,16 +53,16 @@ def ploughed(cases: Mapping[str, Scene], out: Path, device: str, side_by_side: i
     numerics = Numerics()
     about = {name: {"scene": asdict(scene), "numerics": asdict(numerics)} for name, scene in cases.items()}
     blank = {
-        name: Truth(scene.setup().experiment(), {}, 0.0, {"friction_angle": scene.angle}, ())
+        name: Truth(scene.setup().experiment(), {}, numerics.spacing**3, {"friction_angle": scene.angle}, ())
         for name, scene in cases.items()
     }
     missing = [name for name in cases if not (out / f"{name}.npz").is_file()]
     for group in (missing[k : k + side_by_side] for k in range(0, len(missing), side_by_side)):
         say(f"{', '.join(group)}: begun")
-        worlds = [world_of(cases[name], numerics.spacing) for name in group]
-        for name, world, run in zip(group, worlds, plough(worlds, numerics, FRAMES, device), strict=True):
-            particles = {0: world.particles, **run.particles}
-            made = replace(blank[name], particles=particles, volume=world.spacing**3, force=run.force)
+        plain_sand = [Hidden(NOTHING, 0, cases[name]) for name in group]
+        soils = [each.soil(each.scene.setup(), numerics.spacing) for each in plain_sand]
+        for name, soil, run in zip(group, soils, plough(soils, numerics, FRAMES, device), strict=True):
+            made = replace(blank[name], particles={0: soil.particles, **run.particles}, force=run.force)
             made.save(out / f"{name}.npz", about[name])
     return {name: Truth.saved(out / f"{name}.npz", about[name], truth) for name, truth in blank.items()}
 
@@ -86,70 +80,63 @@ class Scan:
     """Our solver over friction angles.
 
     Attributes:
+        truth: where particles begin, and the frames at which heights are taken.
         angles: (n,) in degrees, increasing.
         begun: (ny, nx) heights at frame 0 in m, averaged over seeds as all that follows.
         heights: (n, frames, ny, nx) in m.
         force: (n, f, 3) of the soil on the tool at frames 1, 2, …, f, N.
     """
 
+    truth: Truth
     angles: FloatArray
     begun: FloatArray
     heights: FloatArray
     force: FloatArray
 
-    def at(self, angle: float) -> int:
-        """Index of the angle nearest to one."""
-        return int(np.argmin(np.abs(self.angles - angle)))
+    @classmethod
+    def simulated(
+        cls, truth: Truth, seeds: Sequence[int], device: str, resolution: Resolution, offsets: Sequence[float] = ()
+    ) -> Scan:
+        """The true angle and others by offsets in degrees, for all seeds of the particles; on a GPU as one batch."""
+        volume, true = resolution.spacing**3, truth.values["friction_angle"]
+        low, high = FRICTION_ANGLE.limits or (FRICTION_ANGLE.lower, FRICTION_ANGLE.upper)
+        angles = sorted({true + o for o in (*offsets, 0.0) if low <= true + o <= high})
+        batch = [{**truth.values, "friction_angle": angle} for angle in angles]
+        given: dict[str, Any] = {"law": Law(find_effects(truth.effects)), "resolution": resolution}
+        begun, heights, forces = [], [], []
+        for seed in seeds:
+            x = truth.start(resolution.spacing, seed)
+            runs = [
+                run
+                for group in ([[values] for values in batch] if device == "cpu" else [batch])
+                for run in simulate(truth.measurement, x, group, **given, frames=truth.frames, device=device)
+            ]
+            begun.append(truth.heights(x, volume))
+            heights.append([[truth.heights(p, volume) for p in run.positions] for run in runs])
+            forces.append([run.force for run in runs])
+        return cls(truth, np.array(angles), *(np.mean(found, axis=0) for found in (begun, heights, forces)))
+
+    @property
+    def at(self) -> int:
+        """Index of the true angle."""
+        return int(np.argmin(np.abs(self.angles - self.truth.values["friction_angle"])))
+
+    @property
+    def push(self) -> float:
+        """Mean force along the tool's way while it is pushed at the true angle, N."""
+        return abs(stage_forces(self.truth.measurement, self.force[self.at])["pushing"][0])
 
     def best(self, other: FloatArray) -> tuple[float, float]:
         """Angle whose heights lie nearest to ``other`` (frames, ny, nx) in patches, by a cubic spline through mean
-        squares, and the difference in m that is left there."""
+        squares, and the difference in m that remains there."""
         smooth = gaussian_filter(self.heights - other, (0, 0, PATCH, PATCH))
         fine = np.linspace(self.angles[0], self.angles[-1], 2001)
         loss = CubicSpline(self.angles, np.mean(smooth**2, axis=(1, 2, 3)))(fine)
         return float(fine[np.argmin(loss)]), float(np.sqrt(max(loss.min(), 0.0)))
 
 
-@dataclass(frozen=True)
-class Scanner:
-    """Makes scans of one truth.
-
-    Attributes:
-        truth: where particles begin, and the frames at which heights are taken.
-        seeds: of the particles, that heights and forces are averaged over.
-        device: where to compute.
-    """
-
-    truth: Truth
-    seeds: Sequence[int]
-    device: str
-
-    def __call__(self, resolution: Resolution, offsets: Sequence[float] = ()) -> Scan:
-        """Simulate the true angle and others by their offsets in degrees for all seeds, on a GPU as one batch."""
-        truth, volume = self.truth, resolution.spacing**3
-        low, high = FRICTION_ANGLE.limits or (FRICTION_ANGLE.lower, FRICTION_ANGLE.upper)
-        true = truth.values["friction_angle"]
-        angles = sorted({true + o for o in (*offsets, 0.0) if low <= true + o <= high})
-        batch = [{**truth.values, "friction_angle": angle} for angle in angles]
-        given: dict[str, Any] = {"law": Law(find_effects(truth.effects)), "resolution": resolution}
-        begun, heights, forces = [], [], []
-        for seed in self.seeds:
-            x = truth.start(resolution.spacing, seed)
-            runs = [
-                run
-                for group in ([[values] for values in batch] if self.device == "cpu" else [batch])
-                for run in simulate(truth.measurement, x, group, **given, frames=truth.frames, device=self.device)
-            ]
-            begun.append(truth.heights(x, volume))
-            heights.append([[truth.heights(p, volume) for p in run.positions] for run in runs])
-            forces.append([run.force for run in runs])
-        start, height, force = (np.mean(found, axis=0) for found in (begun, heights, forces))
-        return Scan(np.array(angles), start, height, force)
-
-    def push(self, found: Scan) -> float:
-        """Mean force along the tool's way while it is pushed at the true angle, N."""
-        force = found.force[found.at(self.truth.values["friction_angle"])]
-        return abs(stage_forces(self.truth.measurement, force)["pushing"][0])
+Scanner = Callable[..., Scan]
+"""Makes scans of one truth, of a resolution and offsets; see :meth:`Scan.simulated`."""
 
 
 def compare_stages(truth: Truth, ours: FloatArray, other: FloatArray) -> dict[str, dict[str, Any]]:
@@ -163,9 +150,9 @@ def compare_stages(truth: Truth, ours: FloatArray, other: FloatArray) -> dict[st
     }
 
 
-def agreement(truth: Truth, found: Scan) -> dict[str, Any]:
+def agreement(found: Scan) -> dict[str, Any]:
     """A scan beside the independent solver's particles and force, JSON-able."""
-    at, theirs = found.at(truth.values["friction_angle"]), truth.surfaces()
+    truth, at, theirs = found.truth, found.at, found.truth.surfaces()
     first, (best, left) = truth.heights(truth.particles[0], truth.volume), found.best(theirs)
     assert truth.force is not None
     return {
@@ -195,28 +182,27 @@ def changed(base: Resolution) -> dict[str, Resolution]:
 
 def sensitivity(scan: Scanner, base: Resolution, found: Scan) -> list[dict[str, Any]]:
     """By how much each of the solver's numbers shifts the angle that the scan reads, in degrees, and the push force."""
-    angle, _ = found.best(found.heights[found.at(scan.truth.values["friction_angle"])])
-    rows = []
-    for name, resolution in changed(base).items():
-        other = scan(resolution)
-        shift = found.best(other.heights[0])[0] - angle
-        rows.append({"change": name, "angle": shift, "force": scan.push(other) / scan.push(found) - 1.0})
-    return rows
+    angle, _ = found.best(found.heights[found.at])
+    others = {name: scan(resolution) for name, resolution in changed(base).items()}
+    return [
+        {"change": name, "angle": found.best(o.heights[0])[0] - angle, "force": o.push / found.push - 1.0}
+        for name, o in others.items()
+    ]
 
 
-def convergence(scan: Scanner, preset: str, cells: Sequence[float]) -> list[dict[str, float]]:
+def convergence(scan: Scanner, truth: Truth, preset: str, cells: Sequence[float]) -> list[dict[str, float]]:
     """One row for each number of cells across the tool, the coarsest first, compared with the finest one's heights."""
-    true, measurement, rows = scan.truth.values["friction_angle"], scan.truth.measurement, []
-    grids = [Resolution.derive(measurement, replace(PRESETS[preset], cells_across_tool=c)) for c in sorted(cells)]
-    finest = scan(grids[-1])
-    for grid in grids:
-        found = finest if grid is grids[-1] else scan(grid, OFFSETS)
-        heights = found.heights[found.at(true)]
+    rows = []
+    across = [replace(PRESETS[preset], cells_across_tool=c) for c in sorted(cells)]
+    *grids, last = (Resolution.derive(truth.measurement, p) for p in across)
+    finest = scan(last)
+    for grid, found in [*((grid, scan(grid, OFFSETS)) for grid in grids), (last, finest)]:
+        heights = found.heights[found.at]
         low, high = volume_range(found.begun, heights)
-        rows.append({"cell_mm": 1e3 * grid.cell, "force": scan.push(found), "lost": low, "gained": high})
+        rows.append({"cell_mm": 1e3 * grid.cell, "force": found.push, "lost": low, "gained": high})
         if found is not finest:
             rows[-1]["heights_mm"] = 1e3 * in_patches(heights - finest.heights[0])
-            rows[-1]["angle_off"] = found.best(finest.heights[0])[0] - true
+            rows[-1]["angle_off"] = found.best(finest.heights[0])[0] - truth.values["friction_angle"]
     return rows
 
 
@@ -293,16 +279,16 @@ def main(arguments: list[str] | None = None) -> int:
     truths |= ploughed(drawn, options.out, options.device, options.side_by_side, say)
     result: dict[str, Any] = {"made_by": stamp(options.device), "seeds": options.seeds, "preset": preset, "cases": {}}
     for name, truth in truths.items():
-        scan = Scanner(truth, range(options.seeds), options.device)
+        scan = partial(Scan.simulated, truth, range(options.seeds), options.device)
         base = Resolution.derive(truth.measurement, preset)
         scanned = scan(base, OFFSETS)
-        found: dict[str, Any] = {"agreement": agreement(truth, scanned)}
+        found: dict[str, Any] = {"agreement": agreement(scanned)}
         if name in drawn:
             found["scene"] = asdict(drawn[name])
         if options.changes:
             found["changes"] = sensitivity(scan, base, scanned)
         if options.cells:
-            found["convergence"] = convergence(scan, preset, options.cells)
+            found["convergence"] = convergence(scan, truth, preset, options.cells)
         result["cases"][name] = found
         write_json(options.out / "result.json", result)
         say(f"{name}: compared")

@@ -1,4 +1,4 @@
-"""How fast? Simulation and drawing, each beside something else in the same run; for the whole path see `whole-path`.
+"""How fast is a simulation? Times, each beside another in the same run; for the whole path see `whole-path`.
 
 ``splatsoil benchmark speed --page docs/performance.md`` writes the CPU's section, with ``--device cuda:0`` the GPU's.
 Times of one thread are CPU times, which other programs disturb less than the clock's; all others are the clock's.
@@ -7,7 +7,6 @@ Newton (extra ``independent``) is measured where it is installed.
 
 from __future__ import annotations
 
-import statistics
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -19,23 +18,20 @@ from typing import Any
 
 import numpy as np
 import torch
-import warp as wp
 from splatsoil.benchmarks._common import FloatArray, at_least, sources, stamp
-from splatsoil.benchmarks._newton import Numerics, World, plough
+from splatsoil.benchmarks._newton import Numerics, Soil, plough
 from splatsoil.benchmarks._parts import Row, Section, parts_parser, run_parts
 from splatsoil.benchmarks._truth import Truth
 from splatsoil.benchmarks.effects import acting, strong
 
-from splatsoil.measurement import Camera, Measurement
+from splatsoil.measurement import Measurement
 from splatsoil.mpm import PRESETS, Resolution, Solver, simulate
 from splatsoil.mpm.simulate import base_settings, step_poses
 from splatsoil.quiet import hush
 from splatsoil.reconstruction import fill
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
-from splatsoil.splats import Gaussians, rasterise, reference
 from splatsoil.synthetic import paper
-from splatsoil.threads import at_most
 
 BATCH = 16
 """Parameter sets of one batch on a GPU."""
@@ -43,58 +39,39 @@ WINDOWS, FRAMES = (0, 50, 150), 3
 """Frames at which pieces of Newton's run begin (soil at rest, pushed, tool drawn back), and how many of each count."""
 ROUNDS = 15
 """Steps of each law, taken in turns."""
-LEAVES = ("means", "scales", "quaternions", "opacities", "colours")
-SHARE = 50
-"""One of so many Gaussians is drawn by the slow reference."""
 
 
-@dataclass(frozen=True)
-class Times:
-    """Repetitions of one measurement, in s."""
-
-    values: tuple[float, ...]
-
-    @property
-    def median(self) -> float:
-        """Of the repetitions, s."""
-        return statistics.median(self.values)
-
-    def __str__(self) -> str:
-        factor, unit = (1e3, "ms") if self.median < 0.1 else (1.0, "s")
-        spread = 0.5 * factor * (max(self.values) - min(self.values))
-        digits = f" ± {spread:.2g}" if len(self.values) > 1 else ""
-        return f"{factor * self.median:.3g}{digits} {unit}"
-
-    def times(self, count: float) -> Times:
-        """So many of it, one after the other."""
-        return Times(tuple(count * value for value in self.values))
-
-    def over(self, other: Times, name: str) -> str:
-        """This time, the other's, and how many times as fast this is."""
-        ratio = other.median / self.median
-        return f"{self}; {name} {other}: {f'{ratio:.0f}' if ratio >= 100 else f'{ratio:.3g}'} × as fast"
+def shown(times: FloatArray) -> str:
+    """Median of repetitions (n,) in s, ± half of what lies between the least and the largest."""
+    factor, unit = (1e3, "ms") if np.median(times) < 0.1 else (1.0, "s")
+    spread = f" ± {0.5 * factor * np.ptp(times):.2g}" if len(times) > 1 else ""
+    return f"{factor * np.median(times):.3g}{spread} {unit}"
 
 
-def timed(task: Callable[[], object], repeats: int, device: str, *, warm: int = 1, wall: bool = False) -> Times:
-    """Times after ``warm`` calls that do not count: of this thread on a CPU, unless ``wall``; else the clock's."""
-    clock = time.thread_time if device == "cpu" and not wall else time.perf_counter
+def ratio(times: FloatArray, other: FloatArray, name: str) -> str:
+    """A time, the other's by its name, and how many times as fast the first is."""
+    faster = np.median(other) / np.median(times)
+    return f"{shown(times)}; {name} {shown(other)}: {f'{faster:.0f}' if faster >= 100 else f'{faster:.3g}'} × as fast"
 
-    def once() -> float:
+
+def timed(task: Callable[[], object], repeats: int, device: str, *, warm: int = 1, wall: bool = False) -> FloatArray:
+    """Times (repeats,) in s after ``warm`` calls that do not count: of this thread on a CPU, unless ``wall``; else the
+    clock's."""
+    clock, times = time.thread_time if device == "cpu" and not wall else time.perf_counter, []
+    for _ in range(warm):
+        task()
+    for _ in range(repeats):
         _synchronise(device)
         began = clock()
         task()
         _synchronise(device)
-        return clock() - began
-
-    for _ in range(warm):
-        task()
-    return Times(tuple(once() for _ in range(repeats)))
+        times.append(clock() - began)
+    return np.array(times)
 
 
 def _synchronise(device: str) -> None:
     """Wait until a GPU has done what it was given, by Warp and by torch."""
     if device != "cpu":
-        wp.synchronize_device(device)
         torch.cuda.synchronize(device)
 
 
@@ -166,7 +143,7 @@ def published_scene() -> Scene:
 
 
 def simulation(task: Task) -> Section:
-    """Whole runs: one alone, and several at a time."""
+    """Whole runs: one alone, and several at a time. A particle-step is a particle times a substep of the grid."""
     scene, device, rows = task.scene, task.device, []
     cases = {scene.measurement.name: scene}
     if device != "cpu":
@@ -174,49 +151,43 @@ def simulation(task: Task) -> Section:
     for name, one in cases.items():
         alone = timed(partial(one.run, device), task.repeats, device)
         what = f"{name}: {len(one.x)} particles, {one.last} frames"
-        rows.append(Row(what, f"{alone}; {1e-6 * one.particle_steps / alone.median:.3g} M particle-steps/s"))
+        rows.append(Row(what, f"{shown(alone)}; {1e-6 * one.particle_steps / np.median(alone):.3g} M particle-steps/s"))
         if device != "cpu":
             batch = timed(partial(one.run, device, BATCH), task.repeats, device)
-            each = batch.over(alone.times(BATCH), "one after the other")
+            each = ratio(batch, BATCH * alone, "one after the other")
             rows.append(Row(f"{name}: {BATCH} parameter sets as one batch", each))
     if device == "cpu":
         with ThreadPoolExecutor(2) as pool:
             pair = timed(lambda: list(pool.map(scene.run, ["cpu"] * 2)), task.repeats, "cpu", wall=True)
         alone = timed(partial(scene.run, "cpu"), task.repeats, "cpu", warm=0, wall=True)
-        rows.append(Row("two runs side by side on two cores", pair.over(alone.times(2), "one after the other")))
-    return Section("Simulation", "A particle-step is a particle times a substep of the grid.", tuple(rows))
+        rows.append(Row("two runs side by side on two cores", ratio(pair, 2.0 * alone, "one after the other")))
+    return Section("Simulation", rows)
 
 
 def newton(task: Task) -> Section:
-    """The whole run with ours, and in Newton's implicit MPM by pieces of it."""
+    """The whole run with ours, and in Newton's implicit MPM by pieces of it, from the true particles there."""
     scene, truth = task.scene, task.truth
     numerics = Numerics(voxel=scene.resolution.cell, substeps=2, iterations=120, tolerance=1e-4)
     rng, seconds = np.random.default_rng(0), []
     for start in (w for w in WINDOWS if w in truth.particles):
         # as many particles as ours, which stand for as much soil
         x = rng.permutation(truth.particles[start])[: len(scene.x)]
-        world = World(truth.measurement, scene.values["friction_angle"], x, scene.resolution.spacing)
+        soil = Soil(truth.measurement, scene.values["friction_angle"], x, scene.resolution.spacing)
         ends: list[float] = []
         plough(
-            [world], numerics, (start + 1 + FRAMES,), task.device, begin=start,
+            [soil], numerics, (start + 1 + FRAMES,), task.device, begin=start,
             progress=lambda *_, ends=ends: ends.append(time.perf_counter()),
         )  # fmt: skip
         seconds.append(np.diff(ends))  # the first frame compiles, and lets stress build up
-    whole = Times(tuple(np.mean(seconds, axis=0).tolist())).times(scene.last)
+    whole = scene.last * np.mean(seconds, axis=0)
     ours = timed(partial(scene.run, task.device), task.repeats, task.device, wall=True)
-    ratio = whole.median / ours.median
-    row = Row(f"{scene.measurement.name}, {scene.last} frames", ours.over(whole, "Newton"), "≥ 20 ×", ratio >= 20.0)
-    return Section(
-        "Against Newton's implicit MPM",
-        f"{len(scene.x)} particles and cells of {1e3 * numerics.voxel:.3g} mm in both; Newton: {numerics.substeps} "
-        f"substeps a frame, at most {numerics.iterations} iterations to {numerics.tolerance:g}; {FRAMES} frames from "
-        f"each of the frames {', '.join(map(str, WINDOWS))} with the true particles there, times {scene.last}.",
-        (row,),
-    )
+    held = bool(np.median(whole) >= 20.0 * np.median(ours))
+    row = Row(f"{scene.measurement.name}, {scene.last} frames", ratio(ours, whole, "Newton"), "≥ 20 ×", held)
+    return Section("Against Newton's implicit MPM", [row])
 
 
 def effects(task: Task) -> Section:
-    """A step with all effects on strength that act together, over the base law's."""
+    """A step with all effects on strength that act together, over the base law's: least times, on the CPU."""
     names = strong()
     acts = find_effects(names)
     values = {key: value for effect in acts for key, value in acting(effect).items()}
@@ -226,60 +197,13 @@ def effects(task: Task) -> Section:
     for frame in range(ROUNDS):
         poses = step_poses(scene.measurement.tool.motion, frame * r.frame_time, r.frame_time, r.steps)
         for run, own in zip(runs, spent, strict=True):
-            own += timed(partial(run.advance, poses), 1, "cpu", warm=0).values
+            own.extend(timed(partial(run.advance, poses), 1, "cpu", warm=0))
     base, whole = (min(own[1:]) for own in spent)
-    found, words = whole / base, f"On: {', '.join(names)}; least times of {ROUNDS - 1} frames, on the CPU."
-    row = Row(
-        f"a frame with {len(names)} effects on strength, over the base law's", f"{found:.2f}", "≤ 2", found <= 2.0
-    )
-    return Section("What effects cost", words, (row,))
+    found, what = whole / base, f"a frame with {len(names)} effects on strength, over the base law's"
+    return Section("What effects cost", [Row(what, f"{found:.2f}", "≤ 2", found <= 2.0)])
 
 
-def random_gaussians(count: int, size: int, device: str, pixels: float = 3.0) -> tuple[Gaussians, Camera]:
-    """Leaves of about ``pixels`` px spread over an image of ``size``² px."""
-    g = torch.Generator().manual_seed(0)
-    z = 1 + torch.rand(count, generator=g)
-    xy = (torch.rand(count, 2, generator=g) - 0.5) * z[:, None]
-    drawn = Gaussians(
-        means=torch.cat([xy, z[:, None]], dim=1),
-        scales=(pixels / size * z)[:, None] * torch.exp(0.3 * torch.randn(count, 3, generator=g)),
-        quaternions=torch.randn(count, 4, generator=g),
-        opacities=torch.rand(count, generator=g) * 0.8 + 0.1,
-        colours=torch.rand(count, 3, generator=g),
-    )
-    leaves = Gaussians(*(getattr(drawn, name).to(device).requires_grad_() for name in LEAVES))
-    pose = np.diag([1.0, -1.0, -1.0, 1.0])
-    return leaves, Camera(width=size, height=size, fx=size, fy=size, cx=size / 2, cy=size / 2, camera_to_world=pose)
-
-
-def rasteriser(task: Task, count: int = 20_000, size: int = 256) -> Section:
-    """Forward, and forward with gradients, beside the slow reference on one core of the CPU."""
-    leaves, camera = random_gaussians(count, size, task.device)
-    few = random_gaussians(count, size, "cpu")[0][: max(count // SHARE, 1)]
-
-    def ours() -> list[torch.Tensor]:
-        drawn = rasterise(leaves, camera)
-        return [drawn.colour, drawn.depth]
-
-    def slowly() -> list[torch.Tensor]:
-        covariances = few.covariances()
-        return [reference.rasterise_features(few.means, covariances, few.opacities, few.colours, camera)[0]]
-
-    def backward(draw: Callable[[], list[torch.Tensor]]) -> Callable[[], object]:
-        return lambda: torch.autograd.backward([out.sum() for out in draw()])
-
-    with at_most(1):
-        off = float((rasterise(few.to(task.device), camera).colour.cpu() - slowly()[0]).abs().max().detach())
-        rows = [Row("largest difference from the reference's picture", f"{off:.1e}", "≤ 1e-3", off <= 1e-3)]
-        for what, way in (("forward", torch.no_grad()), ("forward + backward", backward)):
-            mine, slow = timed(way(ours), 5 * task.repeats, task.device, warm=3), timed(way(slowly), 1, "cpu", warm=0)
-            slow = slow.times(count / len(few))
-            rows.append(Row(f"{count} Gaussians at {size}², {what}", mine.over(slow, "reference")))
-    words = f"Gaussians of 3 px; colour, alpha and depth. The reference draws one of {SHARE}."
-    return Section("Rasteriser", words, tuple(rows))
-
-
-PARTS = (simulation, newton, effects, rasteriser)
+PARTS = (simulation, newton, effects)
 """In the page's order."""
 
 
@@ -294,7 +218,7 @@ def main(arguments: list[str] | None = None) -> int:
     task = Task(options.set, options.preset, options.device, options.repeats)
     made = stamp(options.device)
     key: dict[str, Any] = {name: made.get(name) for name in ("processor", "cores", "gpu")}
-    key |= {"code": sources([Path(__file__)]), "set": task.truth.measurement.hash}
+    key |= {"code": sources("speed", "_newton", "effects"), "set": task.truth.measurement.hash}
     key |= {"preset": task.preset, "repeats": task.repeats}
     options.out = options.out / made["device"]
     measured = [part for part in PARTS if part is not newton or find_spec("newton")]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from splatsoil.benchmarks._parts import parts_parser, run_parts
@@ -19,8 +18,8 @@ PARTS = {"element": element, "columns": columns, "cuts": cuts, "blades": blades,
 
 def key(name: str) -> Mapping[str, Any]:
     """Digest of all code that a part's numbers may depend on."""
-    folder = Path(__file__).parent / "_validation"
-    return {"code": code_digest(("soil", "mpm"), [folder / "scene.py", folder / f"{name}.py"])}
+    own = (f"benchmarks/_validation/{module}.py" for module in ("scene", name))
+    return {"code": code_digest(("soil", "mpm", *own))}
 
 
 def main(arguments: list[str] | None = None) -> int:

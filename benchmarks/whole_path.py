@@ -10,11 +10,9 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
@@ -113,7 +111,7 @@ def reconstruction(task: Task) -> Section:
             rmse <= 4.0 and abs(bias) <= 1.0,
         ),
     )
-    return Section("Reconstruction", "", rows)
+    return Section("Reconstruction", rows)
 
 
 def renderer(task: Task) -> Section:
@@ -128,27 +126,23 @@ def renderer(task: Task) -> Section:
     )
     rows = (
         Row(
-            "loss of the true particles; of simulations",
+            f"loss of the true particles; of simulations {AWAY:g}° too weak and too strong",
             f"{least.loss:.3f}; {weak.loss:.3f} and {strong.loss:.3f}",
             "less than half",
             least.loss < 0.5 * min(weak.loss, strong.loss),
         ),
         Row("raw colour error", f"{1e5 * least.rgb:.0f}; {1e5 * weak.rgb:.0f} and {1e5 * strong.rgb:.0f} · 10⁻⁵"),
     )
-    words = (
-        f"True particles, and simulations {AWAY:g}° too weak and too strong, frames {', '.join(map(str, frames[1:]))}."
-    )
-    return Section("Renderer", words, rows)
+    return Section("Renderer", rows)
 
 
-def angle(task: Task) -> Section:
-    """The commands that a user gives, for three seeds."""
+def dry(task: Task) -> Section:
+    """The command that a user gives, for three seeds."""
     true = Truth.load(task.dry).values["friction_angle"]
     # only a run that has not begun can be timed
     fresh = not (task.out / "runs" / f"{task.dry.name}-0").exists()
-    options = ("run", "--stop-at-floor", "--seed")
-    runs = [_fitted(task, task.dry, f"{task.dry.name}-{seed}", *options, str(seed)) for seed in FIT_SEEDS]
-    angles = [fit["parameters"]["friction_angle"] for fit, _ in runs]
+    runs = [_run(task, task.dry, seed, "--stop-at-floor") for seed in FIT_SEEDS]
+    angles = [read_json(run / "fit.json")["parameters"]["friction_angle"] for run, _ in runs]
     stds, estimates = sorted(a["std"] for a in angles), ", ".join(f"{a['estimate']:.1f}" for a in angles)
     rows = [
         Row(
@@ -159,25 +153,23 @@ def angle(task: Task) -> Section:
         )
     ]
     if fresh:
-        seconds, memory = runs[0][1].seconds, runs[0][1].memory
-        what, met = "all of it by `splatsoil run`; its largest process", seconds <= 480.0 and memory <= 2**31
-        rows.append(Row(what, f"{seconds / 60.0:.1f} min; {memory / 2**30:.1f} GiB", "8 min; 2 GiB", met))
-    return Section("Friction angle", "From photographs and force.", tuple(rows))
+        took = runs[0][1]
+        what, met = "all of it by `splatsoil run`; its largest process", took.seconds <= 480.0 and took.memory <= 2**31
+        rows.append(Row(what, f"{took.seconds / 60.0:.1f} min; {took.memory / 2**30:.1f} GiB", "8 min; 2 GiB", met))
+    return Section("Friction angle from photographs and force", rows)
 
 
-def missing_effect(task: Task) -> Section:
-    """The damp set under the base model and with what it lacks, beside its true particles, drawn."""
-    name = task.damp.name
-    base = _fitted(task, task.damp, f"{name}-base", "fit")[0]["loss"]
-    added = _fitted(task, task.damp, f"{name}-{EFFECT}", "fit", "--with", EFFECT)[0]["loss"]
-    least = floor(Truth.load(task.damp), _reconstructed(task.damp, task.preset, task.device), task.device)[1].loss
-    row = Row(
-        f"loss of {name}: base model, with {EFFECT}, true particles drawn",
-        f"{base:.3f}, {added:.3f}, {least:.3f}",
-        f"falls with {EFFECT}, towards the last",
-        added < base and base > 1.5 * least,
-    )
-    return Section("Missing effect", "", (row,))
+def damp(task: Task) -> Section:
+    """The command adds what the damp set has and the base model lacks, and nothing else."""
+    true, run = Truth.load(task.damp).values, _run(task, task.damp, 0)[0]
+    added, estimates = read_json(run / "fit.json")["setup"]["effects"], read_json(run / "diagnosis.json")["estimates"]
+    rows = [Row(f"{task.damp.name}: effects added", ", ".join(added), EFFECT, added == [EFFECT])]
+    for name, unit, low, high in (("friction_angle", "°", -2.0, 2.0), (EFFECT, " Pa", -60.0, 75.0)):
+        if name in estimates:
+            found, least, most = estimates[name]["value"], true[name] + low, true[name] + high
+            text = f"{found:.3g} ± {estimates[name]['std']:.2g}{unit}"
+            rows.append(Row(name.replace("_", " "), text, f"{least:g} to {most:g}{unit}", least <= found <= most))
+    return Section("A missing effect", rows)
 
 
 @cache
@@ -202,29 +194,23 @@ sys.exit(code)
 """
 
 
-def command_line(*words: object) -> Ran:
-    """Run ``splatsoil`` with these words, in a process of its own.
+def _run(task: Task, folder: Path, seed: int, *options: str) -> tuple[Path, Ran]:
+    """The folder of ``splatsoil run`` in a process of its own, and what it took; a run that began before goes on.
 
     Raises:
         RunError: it failed.
     """
-    told, began = [str(word) for word in words], time.monotonic()
-    counted = [sys.executable, "-c", _COUNTED, sys.executable, "-m", "splatsoil", *told]
+    run, began = task.out / "runs" / f"{folder.name}-{seed}", time.monotonic()
+    words = ["run", folder, "--run", run, "--preset", task.preset, "--device", task.device, "--seed", seed, *options]
+    counted = [sys.executable, "-c", _COUNTED, sys.executable, "-m", "splatsoil", *map(str, words)]
     done = subprocess.run(counted, capture_output=True, text=True, check=False)
     if done.returncode:
-        raise RunError(f"splatsoil {' '.join(told)}: {' '.join(done.stderr.split())[-300:]}")
+        raise RunError(f"splatsoil {' '.join(map(str, words))}: {' '.join(done.stderr.split())[-300:]}")
     # Linux counts in KiB, macOS in bytes
-    return Ran(time.monotonic() - began, int(done.stdout) * (1 if sys.platform == "darwin" else 1024))
+    return run, Ran(time.monotonic() - began, int(done.stdout) * (1 if sys.platform == "darwin" else 1024))
 
 
-def _fitted(task: Task, folder: Path, name: str, command: str, *options: str) -> tuple[Mapping[str, Any], Ran]:
-    """A command's ``fit.json``, and what it took; evaluations of a run that began before are not repeated."""
-    run = task.out / "runs" / name
-    took = command_line(command, folder, "--run", run, "--preset", task.preset, "--device", task.device, *options)
-    return read_json(run / "fit.json"), took
-
-
-PARTS = (reconstruction, renderer, angle, missing_effect)
+PARTS = (reconstruction, renderer, dry, damp)
 """In the page's order."""
 
 
@@ -238,6 +224,6 @@ def main(arguments: list[str] | None = None) -> int:
     hush()
     task = Task(options.dry, options.damp, options.preset, options.device, options.out)
     sets = {name: Measurement.load(folder).hash for name, folder in (("dry", task.dry), ("damp", task.damp))}
-    key = {"code": sources([Path(__file__)]), "preset": task.preset, **sets}
+    key = {"code": sources("whole_path"), "preset": task.preset, **sets}
     parts = {part.__name__.replace("_", "-"): partial(part, task) for part in PARTS}
     return run_parts(options, parts, lambda _: key, "whole path")

@@ -1,4 +1,4 @@
-"""Simulate-and-compare in the made-up world, by response surfaces of its simulations instead of the simulator."""
+"""The synthetic simulate-and-compare by response surfaces of its simulations instead of the simulator."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Response surfaces of simulations of the made-up world, which the ``Fast`` environments answer from.
+"""Response surfaces of simulations of the synthetic experiment, which the ``Fast`` environments answer from.
 
     python -m splatsoil.envs.emulator FILE
 
@@ -24,18 +24,18 @@ from splatsoil.parameters import Parameter, ParameterSpace
 
 from .problem import Image
 from .synthetic import SyntheticProblem, blurred, patches
-from .synthetic_world import Stroke, World
+from .synthetic_experiment import Stroke, SyntheticExperiment
 
 FloatArray = npt.NDArray[np.float64]
 
 FILE = Path(__file__).with_name("emulated.npz")
 SEED = 0
-#: Worlds whose parameters are guessed: free parameters, effects, simulations.
+#: Tasks of guessing parameters: free parameters, effects, simulations.
 GUESSED: dict[str, tuple[tuple[str, ...], tuple[str, ...], int]] = {
     "one": (("friction_angle",), (), 32),
     "several": (("friction_angle", "cohesion", "dilatancy_angle"), ("cohesion", "dilatancy"), 96),
 }
-#: Worlds that strokes are made in, by the effect that is on: the parameter that says how strongly.
+#: Soils that strokes are made in, by the effect that is on: the parameter that measures its strength.
 STRENGTHS = {
     "none": None,
     "cohesion": "cohesion",
@@ -52,14 +52,14 @@ HIGHEST_DEGREE = 6
 
 
 def soil_of(effect: str) -> SyntheticProblem:
-    """The made-up world with one effect on, or ``none``: friction angle and the effect's strength are free."""
+    """The synthetic experiment with one effect on, or ``none``: friction angle and the effect's strength are free."""
     strength = STRENGTHS[effect]
     return SyntheticProblem(["friction_angle", *([strength] if strength else [])], [effect] if strength else [])
 
 
-def evidence(world: World, pictures: Image) -> FloatArray:
+def evidence(experiment: SyntheticExperiment, pictures: Image) -> FloatArray:
     """(72,) how much brighter a stroke makes each patch of its pictures (k, h, w, 3), in grey levels."""
-    return patches(blurred(pictures) - blurred(world.still()))
+    return patches(blurred(pictures) - blurred(experiment.still()))
 
 
 @dataclass(frozen=True)
@@ -130,13 +130,13 @@ class Surface:
 
 @cache
 def surfaces() -> dict[str, Surface]:
-    """Those that are shipped, by world: one of GUESSED, or ``stroke/EFFECT``."""
+    """Those that are shipped, by task: one of GUESSED, or ``stroke/EFFECT``."""
     with np.load(FILE, allow_pickle=False) as file:
         of: dict[str, dict[str, Any]] = {}
         for name, value in file.items():
-            world, _, key = name.rpartition(".")
-            of.setdefault(world, {})[key] = value.astype(np.float64) if value.ndim else value.item()
-    return {world: Surface(**found) for world, found in of.items()}
+            task, _, key = name.rpartition(".")
+            of.setdefault(task, {})[key] = value.astype(np.float64) if value.ndim else value.item()
+    return {task: Surface(**found) for task, found in of.items()}
 
 
 @cache
@@ -184,9 +184,9 @@ def simulate_guessed(name: str) -> tuple[FloatArray, FloatArray]:
     """Points (N, n) and blurred changes of pictures (N, k, h, w, 3); a simulation that fails is left out."""
     parameters, effects, count = GUESSED[name]
     problem = SyntheticProblem(parameters, effects)
-    still, kept = blurred(problem.world.still()), []
+    still, kept = blurred(problem.experiment.still()), []
     for seed, point in enumerate(sobol(count, len(parameters))):
-        (made,) = problem.world.simulated([(problem.space.to_dict(problem.space.from_unit(point)), seed)])
+        (made,) = problem.experiment.simulated([(problem.space.to_dict(problem.space.from_unit(point)), seed)])
         if not isinstance(made, SimulationError):
             kept.append((point, blurred(made) - still))
     return np.array([p for p, _ in kept]), np.array([change for _, change in kept])
@@ -197,10 +197,10 @@ def simulate_strokes(effect: str) -> tuple[FloatArray, FloatArray]:
     problem, kept = soil_of(effect), []
     n = len(problem.space)
     for seed, point in enumerate(sobol(STROKE_SIMULATIONS, n + 2)):
-        world = World(problem.effects, "tiny", "cpu", stroke_at(point[n:]))
-        (made,) = world.simulated([(problem.space.to_dict(problem.space.from_unit(point[:n])), seed)])
+        experiment = SyntheticExperiment(problem.effects, "tiny", "cpu", stroke_at(point[n:]))
+        (made,) = experiment.simulated([(problem.space.to_dict(problem.space.from_unit(point[:n])), seed)])
         if not isinstance(made, SimulationError):
-            kept.append((point, evidence(world, made)))
+            kept.append((point, evidence(experiment, made)))
     return np.array([p for p, _ in kept]), np.array([seen for _, seen in kept])
 
 
@@ -216,7 +216,7 @@ def sobol(count: int, dimension: int) -> FloatArray:
 
 def save(file: Path, made: Mapping[str, Surface]) -> None:
     """Arrays by name, in single precision, without pickle."""
-    arrays = {f"{world}.{f.name}": np.asarray(getattr(s, f.name)) for world, s in made.items() for f in fields(s)}
+    arrays = {f"{task}.{f.name}": np.asarray(getattr(s, f.name)) for task, s in made.items() for f in fields(s)}
     np.savez_compressed(file, **{k: v.astype(np.float32) if v.ndim else v for k, v in arrays.items()})  # type: ignore[arg-type]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -41,7 +41,6 @@ class MeasuredProblem:
         self.space = ParameterSpace(experiment.parameters)
         self.comparator = experiment.comparator
         self._shown = next(((camera, self.comparator.frames[-1]) for camera in self.comparator.cameras), None)
-        self._recipe: dict[str, Any] | None = None
 
     @classmethod
     def load(
@@ -73,14 +72,6 @@ class MeasuredProblem:
         from splatsoil.model import Model
         from splatsoil.reconstruction import Reconstruction
 
-        recipe = {
-            "measurement": str(Path(measurement).absolute()),
-            "parameters": tuple(parameters),
-            "effects": tuple(effects),
-            "preset": preset,
-            "device": device,
-            "reconstruction": None if reconstruction is None else str(Path(reconstruction).absolute()),
-        }
         device = resolve_device(device)
         measured = Measurement.load(measurement)
         if reconstruction is None:
@@ -88,9 +79,7 @@ class MeasuredProblem:
         else:
             scene = Reconstruction.load(reconstruction)
         model = Model(measured, scene, effects=effects, preset=preset, device=device)
-        problem = cls(PlowExperiment(model, parameters, candidates=()))
-        problem._recipe = recipe
-        return problem
+        return cls(PlowExperiment(model, parameters, candidates=()))
 
     @property
     def block_count(self) -> int:
@@ -104,7 +93,7 @@ class MeasuredProblem:
         return height, width
 
     def begin(self, seed: int) -> None:
-        """Nothing is drawn: the world is what was measured."""
+        """Nothing is drawn: the soil is what was measured."""
 
     def truth(self) -> Mapping[str, float] | None:
         """None: nobody knows it."""
@@ -138,16 +127,6 @@ class MeasuredProblem:
     def features(self, blocks: Sequence[float]) -> FloatArray:
         """(t, s) predicted features of an evaluation with these block residuals, where they are seen."""
         return np.asarray(self.experiment.observed - np.reshape(blocks, self.experiment.layout.shape))
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        # Scenes and solver kernels don't travel between processes; folders and names do.
-        if self._recipe is None:
-            raise TypeError("only a problem made by MeasuredProblem.load, from folders and names, can be pickled")
-        return _load, (self._recipe,)
-
-
-def _load(recipe: dict[str, Any]) -> MeasuredProblem:
-    return MeasuredProblem.load(**recipe)
 
 
 def cache_folder() -> Path:

@@ -219,7 +219,7 @@ def _problem(
         from .emulated import EmulatedProblem
 
         if any(option is not None for option in (measurement, preset, reconstruction)):
-            raise ParameterError("fast: the emulated world takes no measurement, preset or reconstruction")
+            raise ParameterError("fast: the emulated experiment takes no measurement, preset or reconstruction")
         return EmulatedProblem(parameters, effects)
     if measurement is None:
         from .synthetic import SyntheticProblem

@@ -1,4 +1,4 @@
-"""What an environment needs of the world: something that simulates a parameter vector and compares it with data."""
+"""What an environment needs: something that simulates a parameter vector and compares it with data."""
 
 from __future__ import annotations
 

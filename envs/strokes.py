@@ -13,7 +13,7 @@ from splatsoil.errors import ParameterError
 from .devices import resolve_device
 from .emulator import STRENGTHS, STROKES, FloatArray, evidence, sobol, soil_of, stroke_at, surfaces
 from .episode import Array, EpisodeEnv
-from .synthetic_world import World
+from .synthetic_experiment import SyntheticExperiment
 
 #: Patches' changes are clipped to this many grey levels.
 LIMIT = 255.0
@@ -66,8 +66,9 @@ class HiddenSoil:
             surface = surfaces()[f"stroke/{self.effect}"]
             seen = surface.patches @ surface.draw(np.append(self.point, stroke), seed)[0]
         else:
-            world = World(soil_of(self.effect).effects, "tiny", self.device, stroke_at(stroke))
-            seen = evidence(world, world.surely(self.truth(), seed))
+            effects = soil_of(self.effect).effects
+            experiment = SyntheticExperiment(effects, "tiny", self.device, stroke_at(stroke))
+            seen = evidence(experiment, experiment.surely(self.truth(), seed))
         return np.clip(seen, -LIMIT, LIMIT)
 
 

@@ -1,4 +1,4 @@
-"""Simulate-and-compare against a hidden truth of the experiment that `synthetic_world` makes up.
+"""Simulate-and-compare against a hidden truth of the experiment in `synthetic_experiment`.
 
 The same solver and the same renderer make the observation and the predictions, with other particles, so that the best
 loss is chance and not zero. It is a toy for trying agents on; an answer about real soil needs a measurement set.
@@ -20,7 +20,7 @@ from splatsoil.parameters import ParameterSpace
 
 from .devices import resolve_device
 from .problem import Evaluation, Image
-from .synthetic_world import COMPARED, HEIGHT, WIDTH, World
+from .synthetic_experiment import COMPARED, HEIGHT, WIDTH, SyntheticExperiment
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -72,11 +72,11 @@ def compare(observed: Image, predicted: Image, still: Image) -> tuple[float, Flo
 
 
 class HiddenTruth(ABC):
-    """Parameters of a made-up world, some of them free and hidden.
+    """Parameters of a synthetic experiment, some of them free and hidden.
 
     Args:
         parameters: names of the free parameters, whose hidden values are drawn at ``begin``; the rest have defaults.
-        effects: names of effects that are on, in the world and in the model.
+        effects: names of effects that are on, in the experiment and in the model.
 
     Raises:
         ParameterError: unknown names.
@@ -94,7 +94,9 @@ class HiddenTruth(ABC):
         law = Law(find_effects(effects))
         seen = [effect.name for effect in law.effects if effect.observes]
         if seen:
-            raise ParameterError(f"the made-up world has no {seen[0]}: it is seen as it is; give a measurement set")
+            raise ParameterError(
+                f"the synthetic experiment has no {seen[0]}: it is seen as it is; give a measurement set"
+            )
         known = {p.name: p for p in law.parameters}
         unknown = [name for name in parameters if name not in known]
         if unknown:
@@ -166,15 +168,15 @@ class SyntheticProblem(HiddenTruth):
 
     def _recorded(self, truth: Mapping[str, float], seed: int) -> Image:
         """(k, h, w, 3), sensor noise and all."""
-        return noisy(self.world.surely(truth, seed), seed)
+        return noisy(self.experiment.surely(truth, seed), seed)
 
     def unobserved(self) -> tuple[Mapping[str, float], int] | None:
-        """Values and seed of the world's own simulation, as long as it hasn't been made."""
+        """Values and seed of the experiment's own simulation, as long as it hasn't been made."""
         return (self._truth, self._truth_seed) if self._observed is None and self._truth is not None else None
 
     def record(self, clean: Image | SimulationError) -> None:
-        """Take pictures (k, h, w, 3) of the world's own simulation, if it came to any, as what the cameras saw, but for
-        their noise."""
+        """Take pictures (k, h, w, 3) of the experiment's own simulation, if it came to any, as what the cameras saw,
+        but for their noise."""
         if not isinstance(clean, SimulationError):
             self._observed = noisy(clean, self._truth_seed)
 
@@ -194,7 +196,7 @@ class SyntheticProblem(HiddenTruth):
         """Predicted pictures (k, h, w, 3) compared with the observed ones."""
         observed = self.observed()
         if self._still is None:
-            self._still = self.world.still()
+            self._still = self.experiment.still()
         loss, blocks = compare(observed, predicted, self._still)
         shown = len(COMPARED) - 1
         return Evaluation(
@@ -211,7 +213,7 @@ class SyntheticProblem(HiddenTruth):
         Raises:
             SimulationError: the simulation could not go on.
         """
-        (made,) = self.world.simulated([(parameters, seed)])
+        (made,) = self.experiment.simulated([(parameters, seed)])
         if isinstance(made, SimulationError):
             raise made
         return made
@@ -219,13 +221,13 @@ class SyntheticProblem(HiddenTruth):
     def share(self, other: SyntheticProblem) -> None:
         """Use another problem's solver and scene, if they are for the same law, preset and device."""
         if (self.effects, self.preset, self.device) == (other.effects, other.preset, other.device):
-            self.world = other.world
+            self.experiment = other.experiment
 
     @cached_property
-    def world(self) -> World:
+    def experiment(self) -> SyntheticExperiment:
         """What all simulations share."""
-        return World(self.effects, self.preset, self.device)
+        return SyntheticExperiment(self.effects, self.preset, self.device)
 
     def __getstate__(self) -> dict[str, Any]:
         # Solver and scene are made again from their names: kernels and meshes don't travel between processes.
-        return {key: value for key, value in self.__dict__.items() if key != "world"}
+        return {key: value for key, value in self.__dict__.items() if key != "experiment"}

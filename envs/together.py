@@ -44,7 +44,7 @@ def _outcome(problem: Problem, evaluate: Callable[[], Evaluation]) -> Evaluation
 def evaluate_together(problems: Sequence[Problem], jobs: Sequence[Job]) -> list[Evaluation]:
     """Evaluate one job (parameters, seed) on each problem; the simulations run as one batch where they can.
 
-    Worlds made up on the spot share everything but their hidden truth, and one measured problem may stand in several
+    Synthetic problems share everything but their hidden truth, and one measured problem may stand in several
     places. Anything else is evaluated one by one. The results are those of single evaluations.
     """
     from .measured import MeasuredProblem
@@ -62,7 +62,7 @@ def _synthetic(problems: Sequence[SyntheticProblem], jobs: Sequence[Job]) -> lis
     for problem in problems:
         problem.share(first)
     new = {id(p): (p, truth) for p in problems if (truth := p.unobserved()) is not None}
-    made = first.world.simulated([*(truth for _, truth in new.values()), *jobs])
+    made = first.experiment.simulated([*(truth for _, truth in new.values()), *jobs])
     for (problem, _), clean in zip(new.values(), made, strict=False):
         problem.record(clean)
     return _judged(problems, made[len(new) :], began)

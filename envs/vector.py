@@ -36,17 +36,17 @@ class PlowSandVectorEnv(SyncVectorEnv):
     def __init__(self, num_envs: int = 1, problems: Sequence[Problem] | None = None, **options: Any) -> None:
         if num_envs < 1:
             raise ParameterError(f"num_envs: at least one is needed, not {num_envs}")
-        worlds: Sequence[Problem | None] = [None] * num_envs if problems is None else problems
-        if len(worlds) != num_envs:
-            raise ParameterError(f"problems: {len(worlds)} do not make {num_envs} environments")
+        chosen: Sequence[Problem | None] = [None] * num_envs if problems is None else problems
+        if len(chosen) != num_envs:
+            raise ParameterError(f"problems: {len(chosen)} do not make {num_envs} environments")
         if problems is None and options.get("measurement") is not None:
-            # A measured world is the same for all; a synthetic one has a hidden truth for each.
-            worlds = [PlowSandEnv(**options).problem] * num_envs
-        makers = [partial(PlowSandEnv, **options, problem=world) for world in worlds]
+            # A measured problem is the same for all; a synthetic one has a hidden truth for each.
+            chosen = [PlowSandEnv(**options).problem] * num_envs
+        makers = [partial(PlowSandEnv, **options, problem=one) for one in chosen]
         super().__init__(makers, autoreset_mode=AutoresetMode.SAME_STEP)
 
     def step(self, actions: npt.NDArray[np.float32]) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Simulate N guesses (N, n) as one batch, and compare each with its world."""
+        """Simulate N guesses (N, n) as one batch, and compare each with its observation."""
         actions = np.asarray(actions, dtype=np.float32)
         if actions.shape != self.action_space.shape:
             raise ParameterError(f"actions: expected an array of shape {self.action_space.shape}, got {actions.shape}")

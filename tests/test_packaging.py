@@ -129,14 +129,3 @@ def test_the_command_line_works(elsewhere: Path, plow_dry: Path, project: dict[s
     checked = run(elsewhere / "venv/bin/python", "-m", "splatsoil", "check", plow_dry, "--json", cwd=elsewhere)
     assert checked.returncode == 0, checked.stderr
     assert json.loads(checked.stdout)["views"] == 40
-
-
-def test_the_made_up_world_finds_its_own_source(elsewhere: Path, tmp_path: Path) -> None:
-    """Its source is part of what a kept simulation is known by; installed, it lies elsewhere than in the repository."""
-    code = (
-        "from splatsoil.benchmarks._simulations import simulated, world_parser\n"
-        "data, file = simulated(world_parser('', 'runs').parse_args([]), 4, repeats=2)\n"
-        "assert file.is_file() and data.residuals.shape[0] == 6\n"
-    )
-    done = run(elsewhere / "venv/bin/python", "-c", code, cwd=tmp_path, XDG_CACHE_HOME=str(tmp_path))
-    assert done.returncode == 0, done.stderr

@@ -168,20 +168,4 @@ def validate(device: str) -> Section:
     axes.axhspan(1.0 - SCATTER, 1.0 + SCATTER, color="0.92", zorder=0)
     axes.axvspan(*WINDOW, color="0.85", zorder=0)
     axes.set_ylim(0.0, 1.8)
-    return Section(
-        "Blade force",
-        f"A flat blade, 8 cm deep in a bed of {DENSITY:g} kg/m³, pushed at {SPEED:g} m/s; mean force while it goes "
-        "from 0.10 to 0.25 of its depth; 12 cells over the depth, 8 for narrow blades. Against Reece's equation with "
-        "McKyes' straight slip plane (N_γ checked: 1.8451, 4.162 and 1.820 for (90, 0, 35), (90, 20, 35) and (60, 20, "
-        "35) degrees), and in brackets the same at the angle that Davis (1968) gives sand that keeps its volume, as "
-        "ours does: tan φ* = sin φ. Full width: a channel with smooth walls, per metre. Narrow: McKyes' side "
-        "crescents, 1 + 2s/3w. Matching in plane strain.",
-        tuple(rows),
-        "McKyes' plane is an upper bound for sand that dilates as much as it is strong, and overestimates most with "
-        "friction on an upright blade, where log-spiral planes give a smaller passive pressure (Caquot & Kérisel "
-        "1948). Sand that keeps its volume bears less, down to the number at φ*: by that much the rough upright blade "
-        "and the narrow one miss McKyes. The cell that holds the blade's foot acts like extra depth, of half a cell to "
-        "one; so the exponent is too small with 4 cells over the depth and right from 12 on, and coarser grids would "
-        "let more of the rows above hold, for the wrong reason. A is what a very fine grid would give.",
-        figure,
-    )
+    return Section("Blade force", rows, figure)

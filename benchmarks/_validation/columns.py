@@ -137,19 +137,4 @@ def validate(device: str) -> Section:
     ):
         rows.append(Row.near(name, column.run_out(device), base, 0.1))
     figure, _ = curves_of(profiles, "radius / R₀", "thickness / R₀")
-    return Section(
-        "Columns that collapse",
-        f"Run-out (R − R₀)/R₀ of columns of height a R₀, friction angle {ANGLE:g}°, on a floor that sand cannot slide "
-        f"on: a quarter of the cylinder, or half of a planar column, of about {PARTICLES} particles, between smooth "
-        "walls. The front is where the mean thickness falls under 0.02 R₀. Axisymmetric: 1.24 a for a < 1.7, 1.6 √a "
-        "above (Lube et al. 2004), ± 20 %. Planar: between the fits of Lube et al. (2005) and Lajeunesse et al. "
-        "(2005). Matching in plane strain, which is how the sand shears here, unless a row says otherwise.",
-        tuple(rows),
-        "The matching matters more than anything else in this part: a cone that agrees with Mohr–Coulomb in triaxial "
-        "compression is too strong when sand spreads, and holds it back. It is the default of the fits all the same, "
-        "because a friction angle from a laboratory is one in triaxial compression. The tallest column of the base law "
-        "goes too far, on finer grids too, because the base law's friction does not grow with the rate of shear: with "
-        f"`rate_dependence` (μ₂/μₛ = {1.0 + GAIN:.2f}, I₀ = 0.279 as for glass beads, grains of {1000 * GRAIN:g} mm; "
-        "taken from the literature, not fitted) it comes into the band.",
-        figure,
-    )
+    return Section("Columns that collapse", rows, figure)

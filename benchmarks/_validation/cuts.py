@@ -85,15 +85,4 @@ def validate(device: str) -> Section:
         case = f"φ = {angle:g}°, {cells} cells high" if inside else f"control: matched in compression, φ = {angle:g}°"
         held = (low <= found <= high) is inside
         rows.append(Row(case, f"{found:.0f} Pa", wanted if inside else f"outside {wanted}", held))
-    return Section(
-        "Cuts that stand",
-        f"Cohesion at which a vertical cut {100.0 * HEIGHT:g} cm high begins to stand (its crest sinks by less than "
-        f"{100.0 * FALLEN:g} % of that in {SECONDS:g} s), by {ROUNDS} halvings. In plane strain between smooth walls, "
-        f"matched so. Flow that dilates by the friction angle needs γH / ({STABILITY:g} tan(45° + φ/2)) at least, by "
-        "the upper bound of limit analysis (Taylor 1937; Chen 1975), which is within 2 % of exact without friction. "
-        "Soil here keeps its volume in shear, and such soil needs more, at most what Davis (1968) says: c and tan φ "
-        f"are worth cos φ times as much. By our estimate a grid of eight cells may let {100.0 * EARLY:g} % less do.",
-        tuple(rows),
-        "Not converged: from 4 to 8 and 12 cells the cohesion that is needed grows by a quarter, into the range. Over "
-        "a small plough's trench, preset `small` has 4 cells, so that soil there stands with a sixth less.",
-    )
+    return Section("Cuts that stand", rows)

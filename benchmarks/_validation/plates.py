@@ -1,4 +1,9 @@
-"""Part ``plates``: plates pressed into dry sand, from triaxial tests of the same sand and from one plate to another."""
+"""Part ``plates``: plates pressed into dry sand, from triaxial tests of the same sand and from one plate to another.
+
+A quarter of a flat circular plate is simulated, with 8 cells across unless a row states otherwise. Pressures of
+cohesionless sand without a stress of its own are ρ g D f(z/D)/2, so one curve for each friction angle serves all
+plates. Data: docs/real-sand.md.
+"""
 
 from __future__ import annotations
 
@@ -237,12 +242,4 @@ def of_cullinan(folder: Path, base: BaseLaw, device: str) -> list[Row]:
 def validate(device: str, folder: Path) -> Section:
     """Refinement, both sands."""
     base = BaseLaw.simulated(device)
-    return Section(
-        "Plates",
-        "Flat circular plates, of which a quarter is simulated with 8 cells across and Matsuoka and Nakai's surface "
-        "unless a row says otherwise. Pressures of cohesionless sand without a stress of its own are ρ g D f(z/D)/2: "
-        "one curve for each friction angle serves all plates. CMU: 60, 80 and 100 mm on dry sand of 1330 kg/m³ "
-        "(Pavlov & Johnson, github.com/robomechanics/3d-terramechanics, MIT licence). Cullinan: 0.018 m², strongly "
-        "(method 4, 1511 kg/m³) and lightly (method 2) compacted (Kruger, Els & Hamersma 2023, CC BY 4.0).",
-        (*refinement(device), *cmu(folder, base), *of_cullinan(folder, base, device)),
-    )
+    return Section("Plates", [*refinement(device), *cmu(folder, base), *of_cullinan(folder, base, device)])

@@ -1,4 +1,8 @@
-"""Part ``sand``: one sand through its triaxial tests, from some of them to the others, and what diagnoses say."""
+"""Part ``triaxial``: one sand through its triaxial tests, from some of them to the others, and its diagnoses.
+
+Misfits are root mean squares in units of what specimens of one density differ by (q/p: 0.04, volume strain: 0.005).
+Tests right of an arrow are predicted. Data: docs/real-sand.md.
+"""
 
 from __future__ import annotations
 
@@ -139,13 +143,4 @@ def validate(device: str, folder: Path) -> Section:
         read_curve(folder / "cullinan_sand" / "triaxial_TX4_CU100.csv", 1e5)
     except MeasurementError as error:
         rows.append(Row("Cullinan, TX4", str(error).split(": ", 1)[-1], "undrained: refused", True))
-    return Section(
-        "Triaxial tests",
-        "Misfits are root mean squares in units of what specimens of one density differ by (q/p: 0.04, volume strain: "
-        "0.005); 1 is as good as another specimen. Karlsruhe fine sand (Wichtmann & Triantafyllidis 2016; compiled by "
-        "H. Wang, 4TU.ResearchData, CC BY 4.0): TMD2 loose, TMD22 dense, 100 kPa; its relative density follows from "
-        "published void ratio limits, and its published critical angle is 33.1°. Cullinan sand (Kruger, Els & "
-        "Hamersma 2023, CC BY 4.0): TX13 loose at 400 kPa, TX16 and TX17 dense at 50 and 100 kPa; its limits are not "
-        "told, so relative density and volume range are fitted. Tests right of an arrow are predicted.",
-        tuple(rows),
-    )
+    return Section("Triaxial tests", rows)

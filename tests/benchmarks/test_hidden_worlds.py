@@ -1,4 +1,4 @@
-"""Hidden worlds: sealed truths, the soil that they make, and how a verdict is scored."""
+"""``splatsoil benchmark hidden-worlds``: sealed truths, the soil that they make, and how a verdict is scored."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from splatsoil.benchmarks import hidden_worlds
 from splatsoil.benchmarks._hidden import FIELD, KINDS, NOTHING, OUTSIDE, draw
 from splatsoil.benchmarks._scenes import ANGLES, Scene
-from splatsoil.benchmarks.hidden_worlds import ELSE, main, score, soil_of, table
+from splatsoil.benchmarks.hidden_worlds import ELSE, main, score, table
 
 from splatsoil.errors import ParameterError
 from splatsoil.mpm.simulate import base_settings
@@ -38,7 +38,7 @@ def test_no_part_of_the_soil_is_outside_of_what_the_model_takes(kind: str) -> No
     low, high = FRICTION_ANGLE.limits or (FRICTION_ANGLE.lower, FRICTION_ANGLE.upper)
     for number in range(30):
         hidden = draw(kind, number, 1)
-        angles = np.asarray(soil_of(hidden, hidden.scene.setup(), 0.04).angle)
+        angles = np.asarray(hidden.soil(hidden.scene.setup(), 0.04).angle)
         assert low <= angles.min() < angles.max() <= high
 
 
@@ -47,7 +47,7 @@ def test_no_photograph_shows_a_stone_and_no_tool_meets_one() -> None:
     under = []
     for number in range(16):
         hidden = draw("buried_obstacle", number, 3)
-        x, y, z, radius = hidden.soil["obstacle"]
+        x, y, z, radius = hidden.soil(hidden.scene.setup(), 0.04).obstacle
         over = [x, y] + radius * np.stack(np.meshgrid(*[np.linspace(-1, 1, 9)] * 2), axis=-1).reshape(-1, 2)
         setup = hidden.scene.setup()
         assert setup.surface.sample(over).min() - (z + radius) > 0.014
@@ -67,7 +67,7 @@ def test_both_solvers_are_told_the_same(kind: str) -> None:
     law = Law(effect.for_measurement(experiment) for effect in find_effects([kind]))
     values = law.require_on(hidden.values)
     settings = law.settings(base_settings(experiment), values)
-    told = soil_of(hidden, setup, 0.01)
+    told = hidden.soil(setup, 0.01)
     weight = told.weight / (experiment.bed.density * told.spacing**3)
     assert settings.gravity == pytest.approx(tuple(weight), abs=1e-5)
     friction = setup.tool.friction if told.tool_friction is None else told.tool_friction
@@ -95,12 +95,12 @@ def test_both_solvers_are_told_the_same(kind: str) -> None:
 )
 def test_what_makes_no_sense_is_refused(tmp_path: Path, words: list[str], says: str) -> None:
     with pytest.raises(ParameterError, match=says):
-        main(["--kinds", NOTHING, "--out", str(tmp_path / "worlds"), *words])
-    assert not (tmp_path / "worlds").exists()
+        main(["--kinds", NOTHING, "--out", str(tmp_path / "out"), *words])
+    assert not (tmp_path / "out").exists()
 
 
-def test_a_world_that_newton_fails_on_costs_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Worlds of its group are made alone."""
+def test_an_experiment_that_newton_fails_on_costs_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of its group are simulated alone."""
     asked, done = [], []
 
     def plough(group: Any, *_: Any) -> list[None]:
@@ -113,13 +113,13 @@ def test_a_world_that_newton_fails_on_costs_no_other(tmp_path: Path, monkeypatch
     monkeypatch.setattr(hidden_worlds, "photograph_run", lambda *_, **__: None)
     monkeypatch.setattr(hidden_worlds.Study, "judge", lambda _, hidden: done.append(hidden.name))
     kinds = ("gravity", "tilt", "cohesion", "viscosity")
-    assert main(["--kinds", *kinds, "--worlds-side-by-side", "3", "--out", str(tmp_path / "worlds")]) == 1
+    assert main(["--kinds", *kinds, "--simulated-side-by-side", "3", "--out", str(tmp_path / "out")]) == 1
     assert asked == [["gravity-0", "tilt-0", "cohesion-0"], ["viscosity-0"], ["gravity-0"], ["tilt-0"], ["cohesion-0"]]
     assert sorted(done) == ["cohesion-0", "gravity-0", "viscosity-0"]
 
 
 def judged(kind: str, verdict: str, members: list[str], sure: float = 0.95) -> dict[str, Any]:
-    """A world of 32°, a tilt of 4° if that is hidden, of which one model is told to be so probable; read as 31 ± 1.25°
+    """An experiment at 32°, a tilt of 4° if that is hidden, of which one model has a probability; read as 31 ± 1.25°
     and 5 ± 0.5°."""
     best = {"adequate": "", ELSE: ELSE}.get(verdict, (*members, "")[0])
     others = [name for name in ("", "tilt", "gravity", ELSE) if name != best]
@@ -165,12 +165,12 @@ def test_names_are_counted_against_what_is_hidden() -> None:
     told = table(rows)
     assert "nothing hidden: some effect named: 1 of 2 (9–91 %)" in told
     assert "an effect hidden: it alone named: 1 of 4" in told
-    assert "at least as large as told detectable: 1 of 4" in told
+    assert "at least as large as stated detectable: 1 of 4" in told
     assert "an effect hidden: named, or in the set: 2 of 4" in told
     assert "outside the library: something else, or undecided: 1 of 2" in told
     assert "named wrongly, of all with something hidden: 2 of 6" in told
-    worlds = [line.split(" | ")[0] for line in told.splitlines() if line.startswith("| ")][1:]
-    assert len(worlds) == len(rows) and worlds[-3:] == [f"| {NOTHING}", "| tilt", "| tilt"], "what is missed is first"
+    first = [line.split(" | ")[0] for line in told.splitlines() if line.startswith("| ")][1:]
+    assert len(first) == len(rows) and first[-3:] == [f"| {NOTHING}", "| tilt", "| tilt"], "what is missed is first"
 
 
 def test_estimates_are_held_against_the_truth() -> None:

@@ -8,12 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from splatsoil.benchmarks._newton import Numerics, Run, World, _model, plough
+from splatsoil.benchmarks._hidden import NOTHING, Hidden
+from splatsoil.benchmarks._newton import Numerics, Run, Soil, _model, plough
 from splatsoil.benchmarks._scenes import Scene
 from splatsoil.benchmarks._truth import Truth
-from splatsoil.benchmarks.solvers import world_of
 
 SPACING, COARSE = 0.02, Numerics(voxel=0.04, substeps=2, iterations=60)
+
+
+def soil_of(scene: Scene, spacing: float) -> Soil:
+    return Hidden(NOTHING, 0, scene).soil(scene.setup(), spacing)
 
 
 def test_the_examples_were_made_with_converged_numerics(plow_dry: Path, plow_damp: Path) -> None:
@@ -26,10 +30,10 @@ def test_a_bed_weighs_what_its_soil_does() -> None:
     """Whatever the spacing: volume x density x gravity."""
     scene = Scene(seed=1, angle=35.0, bed="flat", density=1430.0)
     for spacing in (0.02, 0.013):
-        world = world_of(scene, spacing)
-        weight = len(world.particles) * world.weight.astype(np.float64)
+        soil = soil_of(scene, spacing)
+        weight = len(soil.particles) * soil.weight.astype(np.float64)
         assert weight == pytest.approx([0.0, 0.0, -0.8 * 0.5 * 0.12 * 1430.0 * 9.81], rel=1e-4)
-    tilted = replace(world, gravity=(1.0, 0.0, -2.0))
+    tilted = replace(soil, gravity=(1.0, 0.0, -2.0))
     assert tilted.weight == pytest.approx(1430.0 * 0.013**3 * np.array([1.0, 0.0, -2.0]))
 
 
@@ -37,7 +41,7 @@ def test_cohesion_is_the_whole_strength_without_pressure_and_counted_once(plow_d
     newton = pytest.importorskip("newton")
     truth = Truth.load(plow_damp)
     x = truth.start(SPACING, 0)
-    damp = World(truth.measurement, 33.0, x, SPACING, cohesion=300.0)
+    damp = Soil(truth.measurement, 33.0, x, SPACING, cohesion=300.0)
     material = _model(newton, [damp, replace(damp, angle=30.0, cohesion=0.0)], np.zeros((2, 3)), "cpu").mpm
     # Newton's shear strength is yield_stress + friction (p + tension)
     tension = material.yield_pressure.numpy() * material.tensile_yield_ratio.numpy()
@@ -52,15 +56,15 @@ def test_cohesion_is_the_whole_strength_without_pressure_and_counted_once(plow_d
 
 
 @pytest.mark.slow
-def test_soil_falls_as_its_own_world_pulls() -> None:
+def test_soil_falls_as_its_own_gravity_pulls() -> None:
     """A lump in the air, under 9.81 and under 4 m/s², and one without weight."""
     pytest.importorskip("newton")
-    world = world_of(Scene(seed=1, angle=35.0), SPACING)
+    soil = soil_of(Scene(seed=1, angle=35.0), SPACING)
     along = np.arange(4) * SPACING
     lump = np.stack(np.meshgrid(0.55 + along, 0.21 + along, 0.12 + along), axis=-1).reshape(-1, 3)
     pulls = (9.81, 4.0, 0.0)
-    worlds = [replace(world, particles=lump, gravity=(0.0, 0.0, -g)) for g in pulls]
-    runs = plough(worlds, COARSE, (5,))
+    soils = [replace(soil, particles=lump, gravity=(0.0, 0.0, -g)) for g in pulls]
+    runs = plough(soils, COARSE, (5,))
     substeps = 5 * COARSE.substeps
     for pull, run in zip(pulls, runs, strict=True):
         fall = pull * 0.01**2 * substeps * (substeps + 1) / 2  # each step by the velocity at its end
@@ -69,21 +73,21 @@ def test_soil_falls_as_its_own_world_pulls() -> None:
 
 @pytest.fixture(scope="module")
 def ploughed() -> tuple[Truth, list[Run]]:
-    """Two coarse worlds, ten frames into the push."""
+    """Two coarse soils, ten frames into the push."""
     pytest.importorskip("newton")
     truth = Truth.load(Path(__file__).parents[2] / "examples" / "plow-damp")
     x = truth.start(SPACING, 0)
     short = replace(truth, particles={0: x, 5: x, 35: x}, volume=SPACING**3)
-    true = World(short.measurement, 33.0, x, SPACING, cohesion=300.0)
+    true = Soil(short.measurement, 33.0, x, SPACING, cohesion=300.0)
     return short, plough([true, replace(true, angle=20.0)], COARSE, (5, 35))
 
 
 @pytest.mark.slow
-def test_a_world_hangs_on_no_other_beside_it() -> None:
+def test_soil_depends_on_no_other_beside_it() -> None:
     """Of another bed, tool, motion and density."""
     pytest.importorskip("newton")
-    level = world_of(Scene(seed=1, angle=35.0, bed="flat", tool="drum", rolling=1.2, depth=0.05), SPACING)
-    slope = world_of(Scene(seed=2, angle=26.0, bed="sloping", slope=6.0, density=1450.0, width=0.16, tilt=0.0), SPACING)
+    level = soil_of(Scene(seed=1, angle=35.0, bed="flat", tool="drum", rolling=1.2, depth=0.05), SPACING)
+    slope = soil_of(Scene(seed=2, angle=26.0, bed="sloping", slope=6.0, density=1450.0, width=0.16, tilt=0.0), SPACING)
     beside, alone = plough([level, slope], COARSE, (30,)), plough([slope], COARSE, (30,))[0]
     moved = np.linalg.norm(alone.particles[30] - slope.particles, axis=1)
     apart = np.linalg.norm(beside[1].particles[30] - alone.particles[30], axis=1)

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Mapping
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from splatsoil.benchmarks import paper_table
-from splatsoil.benchmarks.paper_table import CELLS, FRAMES, SPACE, collect, preset, published_loss, search, table
+from splatsoil.benchmarks._agents import FEWEST, Answer
+from splatsoil.benchmarks.paper_table import CELLS, FRAMES, SPACE, collect, preset, published_loss, table, trial
+from splatsoil.envs.problem import Evaluation, Image
 
-from splatsoil.files import read_json, write_json
+from splatsoil.errors import SimulationError
+from splatsoil.files import write_json
 from splatsoil.mpm import Resolution
 from splatsoil.synthetic import paper
 
@@ -25,54 +28,53 @@ def one_thread() -> None:
     torch.set_num_threads(1)
 
 
-class KnownSight:
+class KnownProblem:
     """Losses are parabolas about 41°; features are straight lines, with scatter that depends on the seed; simulations
     at angles above 50° fail."""
 
+    space, block_count, worst_loss, image_size = SPACE, 6, 10.0, (4, 6)
+
     def __init__(self) -> None:
-        self.comparator = SimpleNamespace(block_noise=lambda: 0.1)
-        self.batches: list[list[tuple[float, int]]] = []
+        self.calls: list[tuple[float, int]] = []
 
-    def evaluate(self, way: str, jobs: Sequence[tuple[float, int]]) -> list[tuple[float, np.ndarray] | None]:
-        self.batches.append(list(jobs))
-        return [None if angle > 50.0 else self.found(way, angle, seed) for angle, seed in jobs]
+    def begin(self, seed: int) -> None: ...
 
-    def found(self, way: str, angle: float, seed: int) -> tuple[float, np.ndarray]:
+    def evaluate(self, parameters: Mapping[str, float], seed: int) -> Evaluation:
+        angle = parameters["friction_angle"]
+        self.calls.append((angle, seed))
+        if angle > 50.0:
+            raise SimulationError("it flies")
         scatter = 0.2 * np.random.default_rng(seed).normal(size=6)
-        blocks = (angle - TRUTH) * np.arange(1.0, 7.0) + scatter
-        return ((angle - TRUTH) / 10.0) ** 2, blocks if way == "ours" else np.zeros(0)
+        return Evaluation(((angle - TRUTH) / 10.0) ** 2, (TRUTH - angle) * np.arange(1.0, 7.0) + scatter)
 
+    def observed_image(self) -> Image:
+        return np.zeros((4, 6, 3), np.float32)
 
-def trials(sight: Any, out: Path) -> dict[str, Any]:
-    search(sight, TRUTH, 2, 8, out)
-    return {f.name: read_json(f) for f in sorted((out / "trials").glob("*.json"))}
+    def truth(self) -> None: ...
 
 
 @pytest.mark.slow
-def test_features_find_the_angle(tmp_path: Path) -> None:
-    found = trials(KnownSight(), tmp_path)
-    for t in (0, 1):
-        told = found[f"41-{t}-ours.json"]["features"]
-        assert told["estimate"] == pytest.approx(TRUTH, abs=0.5) and told["low"] < TRUTH < told["high"]
+def test_features_find_the_angle() -> None:
+    for number in (0, 1):
+        found = trial(KnownProblem(), "ours", number, 10, 0.1, {"friction_angle": TRUTH})["features"]
+        assert found["error"] == pytest.approx([0.0], abs=0.5) and 0.02 < found["rank"][0] < 0.98
 
 
-def test_trials_go_on_side_by_side_and_find_the_angle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_trials_begin_apart_and_find_the_angle(monkeypatch: pytest.MonkeyPatch) -> None:
     """Searches only: a posterior takes as long as all of them together."""
-    monkeypatch.setattr(paper_table, "by_features", lambda *_: None)
-    sight = KnownSight()
-    found = trials(sight, tmp_path)
-    assert set(found) == {f"41-{t}-{way}.json" for t in (0, 1) for way in ("published", "ours")}
-    assert [len(batch) for batch in sight.batches] == [2] * 16, "one batch for each way and step"
-    assert len({seed for batch in sight.batches for _, seed in batch}) == 32, "every simulation has its own particles"
-    for t in (0, 1):
-        assert found[f"41-{t}-ours.json"]["ours"]["estimate"] == pytest.approx(TRUTH, abs=0.5)
-        assert "features" not in found[f"41-{t}-published.json"]
-    calls = [call for trial in found.values() for call in trial["calls"]]
-    assert any(c["loss"] is None for c in calls) and all((c["loss"] is None) == (c["angle"] > 50.0) for c in calls)
-    # the paper's search begins at one random point, ours with a Sobol sequence: trials begin apart
-    firsts = {trial["calls"][0]["angle"] for trial in found.values()}
+    monkeypatch.setattr(paper_table, "posterior", lambda *_, **__: Answer(np.zeros(1), np.zeros((2, 1))))
+    calls = []
+    for way, number in itertools.product(("published", "ours"), (0, 1)):
+        problem = KnownProblem()
+        found = trial(problem, way, number, 8, 0.1, {"friction_angle": TRUTH})
+        assert way == "published" or found["ours"]["error"] == pytest.approx([0.0], abs=0.5)
+        assert ("features" in found) == (way == "ours" and sum(angle <= 50.0 for angle, _ in problem.calls) >= FEWEST)
+        calls.append(problem.calls)
+    assert {len(made) for made in calls} == {8} and any(angle > 50.0 for made in calls for angle, _ in made)
+    assert len({seed for made in calls for _, seed in made}) == 32, "every simulation has its own particles"
+    # the paper's search begins at one random point, ours with a Sobol sequence
+    firsts = {made[0][0] for made in calls}
     assert len(firsts) == 4 and all(25.0 <= a <= 55.0 for a in firsts)
-    assert trials(sight, tmp_path) == found and len(sight.batches) == 16, "what is kept is not made again"
 
 
 def test_the_published_loss_is_the_mean_square_over_four_frames() -> None:
@@ -97,13 +99,13 @@ def test_the_protocol_is_the_papers() -> None:
 
 
 def test_errors_are_counted(tmp_path: Path) -> None:
-    for trial, error in enumerate((1.0, -2.0)):
+    for number, (error, rank) in enumerate(((1.0, 0.5), (-2.0, 0.99))):
         for way in ("published", "ours"):
-            told = {"estimate": 35.0 + error, "low": 34.5, "high": 36.5}
-            write_json(tmp_path / "trials" / f"35-{trial}-{way}.json", {way: told, "features": None})
+            told = {"error": [error], "width": [2.0], "rank": [rank]}
+            write_json(tmp_path / "trials" / f"35-{number}-{way}.json", {way: told})
     entries = collect([35.0], 2, tmp_path)
     first = entries[0]
-    assert (first["mae"], first["bias"], first["width_90"], first["coverage_90"]) == (1.5, -0.5, 2.0, 1.0)
-    assert first["std"] == pytest.approx(0.5**0.5) and first["scatter"] == pytest.approx(4.5**0.5)
-    assert len(entries) == 2 and "| 35° | 1.24 ± 0.96° | 1.50 ± 0.71° |" in table(entries)
-    assert "| 35° | 1.24 ± 0.96° | 1.00° |" in table(collect([35.0], 1, tmp_path)), "one trial has no spread"
+    assert (first["mae"], first["bias"], first["width_90"], first["coverage_90"]) == (1.5, -0.5, 2.0, 0.5)
+    assert first["mae_std"] == pytest.approx(0.5**0.5) and first["scatter"] == pytest.approx(4.5**0.5)
+    assert len(entries) == 2 and "| 35° | 1.24 ± 0.96° | 1.50 ± 0.71° | 1.50 ± 0.71° | – |" in table(entries)
+    assert "| 35° | ours | -0.50° | 2.12° | 2.00° | 50% |" in table(entries)

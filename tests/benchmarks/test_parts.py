@@ -52,7 +52,7 @@ def test_parts_are_kept_and_put_together(tmp_path: Path, capsys: pytest.CaptureF
     def part(name: str, held: bool) -> Section:
         done.append(name)
         file.write_text(file.read_text() + "written meanwhile")
-        return Section(name, "", (Row(f"row of {name}", "1", "2", held),))
+        return Section(name, [Row(f"row of {name}", "1", "2", held)])
 
     parts = {"first": partial(part, "first", True), "second": partial(part, "second", False)}
     out = ["--out", str(tmp_path / "out")]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 from splatsoil.benchmarks import solvers
 from splatsoil.benchmarks._scenes import ANGLES, BEDS, RADIUS, TOOLS, Scene, scenes
 from splatsoil.benchmarks._truth import Truth, in_patches
-from splatsoil.benchmarks.solvers import Scan, Scanner, agreement, compare_stages, main
+from splatsoil.benchmarks.solvers import Scan, agreement, compare_stages, main
 
 from splatsoil.errors import ParameterError
 from splatsoil.mpm import Resolution, simulate
@@ -63,7 +64,13 @@ def test_soil_between_two_angles_is_estimated_between_them() -> None:
     # a ridge that grows with the angle by 1 mm a degree
     ridge = 1e-3 * np.exp(-((np.arange(40) - 20.0) ** 2) / 50.0) * np.ones((1, 30, 1))
     angles = np.array([27.0, 30.0, 33.0, 36.0, 39.0])
-    found = Scan(angles, 0.0 * ridge[0], angles[:, None, None, None] * ridge, np.zeros((5, 9, 3)))
+    found = Scan(
+        Truth(SLOPING.setup().experiment(), {}, 0.0, {}, ()),
+        angles,
+        0.0 * ridge[0],
+        angles[:, None, None, None] * ridge,
+        np.zeros((5, 9, 3)),
+    )
     assert found.best(34.3 * ridge) == (pytest.approx(34.3, abs=0.01), pytest.approx(0.0, abs=1e-6))
     angle, left = found.best(34.3 * ridge + 2e-3)
     assert angle > 36.0 and left > 1e-3
@@ -95,15 +102,15 @@ def ours() -> Truth:
 def test_our_own_run_is_found_to_be_one(ours: Truth) -> None:
     """By other particles, whose scatter is large with so few; an angle stated 6 degrees too low is found out."""
     tiny = Resolution.derive(ours.measurement, "tiny")
-    found = agreement(ours, Scanner(ours, range(6), "cpu")(tiny, (-6.0, 6.0)))
-    one, other = (Scanner(ours, [seed], "cpu")(tiny).heights[0] for seed in (0, 1))
+    found = agreement(Scan.simulated(ours, range(6), "cpu", tiny, (-6.0, 6.0)))
+    one, other = (Scan.simulated(ours, [seed], "cpu", tiny).heights[0] for seed in (0, 1))
     assert found["best_angle"] == pytest.approx(36.0, abs=3.0)
     assert found["heights_mm"] < 1e3 * in_patches(one - other), "six seeds are nearer than one is to another"
     assert found["stages"]["pushing"]["off"] < 0.1
     for own, other in zip(found["cut_and_heaped_cm3"], found["their_cut_and_heaped_cm3"], strict=True):
         assert own == pytest.approx(other, rel=0.15) and 200.0 < other < 5000.0
     wrong = replace(ours, values={"friction_angle": 30.0})
-    low = agreement(wrong, Scanner(wrong, [0], "cpu")(tiny, (6.0, 12.0)))
+    low = agreement(Scan.simulated(wrong, [0], "cpu", tiny, (6.0, 12.0)))
     assert low["best_angle"] > 33.0
     assert low["stages"]["pushing"]["off"] > 0.1
 
@@ -116,7 +123,7 @@ def test_a_change_of_nothing_shifts_nothing_and_each_change_is_of_one_thing(
         apart = {k for k, v in vars(resolution).items() if v != getattr(base, k)}
         assert apart == ({"bulk", "shear"} if "Young" in name else apart) and len(apart) <= 2, name
     monkeypatch.setattr(solvers, "changed", lambda base: {"nothing": base})
-    scan = Scanner(ours, [0], "cpu")
+    scan = partial(Scan.simulated, ours, [0], "cpu")
     (row,) = solvers.sensitivity(scan, base, scan(base, (-6.0, 6.0)))
     assert row == {"change": "nothing", "angle": 0.0, "force": 0.0}
 

@@ -14,11 +14,11 @@ def test_listed_are_the_modules_of_the_folder(repository: Path, capsys: pytest.C
     assert cli.main(["benchmark", "--json"]) == 0
     listed = json.loads(capsys.readouterr().out)["benchmarks"]
     modules = {p.stem.replace("_", "-") for p in (repository / "benchmarks").glob("[!_]*.py")}
-    assert set(listed) == modules and {"bo-vs-mcmc", "calibration", "paper-table", "solvers"} <= modules
+    assert set(listed) == modules and {"bo-vs-mcmc", "information", "paper-table", "solvers"} <= modules
     assert all(listed.values())
 
 
-@pytest.mark.parametrize("name", ["bo-vs-mcmc", "calibration", "paper-table", "speed"])
+@pytest.mark.parametrize("name", ["bo-vs-mcmc", "information", "paper-table", "speed"])
 def test_options_behind_the_name_are_the_benchmarks_own(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["benchmark", name, "--help"]) == 0
     assert f"usage: splatsoil benchmark {name}" in capsys.readouterr().out

@@ -36,6 +36,7 @@ def test_the_readmes_example_runs_and_comes_nearest_where_the_truth_is(repositor
 
 def test_the_recording_example_runs(repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("minari")
+    pytest.importorskip("jax")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     assert "friction_angle" in run(repository / "docs" / "environment.md", 1)
     assert (tmp_path / "plow-sand" / "random-v0" / "data" / "main_data.hdf5").is_file()

@@ -17,7 +17,7 @@ from gymnasium.utils.env_checker import check_env
 from splatsoil.envs import register
 from splatsoil.envs.plow_sand import PlowSandEnv
 from splatsoil.envs.synthetic import BLOCKS, SyntheticProblem, compare
-from splatsoil.envs.synthetic_world import HEIGHT, WIDTH, World, pattern
+from splatsoil.envs.synthetic_experiment import HEIGHT, WIDTH, SyntheticExperiment, pattern
 
 from splatsoil.errors import ParameterError, SimulationError
 
@@ -100,17 +100,17 @@ def test_unknown_names_are_refused_when_the_environment_is_made(options: dict, s
 
 
 def test_a_hidden_truth_that_fails_is_simulated_with_other_particles(monkeypatch: pytest.MonkeyPatch) -> None:
-    world, picture = World([], "tiny", "cpu"), np.zeros((1, 2, 2, 3), np.float32)
+    experiment, picture = SyntheticExperiment([], "tiny", "cpu"), np.zeros((1, 2, 2, 3), np.float32)
     seeds: list[int] = []
 
     def simulated(jobs: list) -> list:
         seeds.append(jobs[0][1])
         return [picture if len(seeds) == 3 else SimulationError("it flies")]
 
-    monkeypatch.setattr(world, "simulated", simulated)
-    assert world.surely({}, 5) is picture and len(set(seeds)) == 3 and seeds[0] == 5
+    monkeypatch.setattr(experiment, "simulated", simulated)
+    assert experiment.surely({}, 5) is picture and len(set(seeds)) == 3 and seeds[0] == 5
     with pytest.raises(SimulationError, match="it flies"):
-        world.surely({}, 5)
+        experiment.surely({}, 5)
 
 
 def test_the_comparison_by_hand() -> None:
@@ -127,7 +127,7 @@ def test_the_comparison_by_hand() -> None:
     assert compare(observed, still, still)[0] == pytest.approx(1.0)
 
 
-def test_the_pattern_is_sand_and_the_same_in_every_world() -> None:
+def test_the_pattern_is_sand_and_the_same_in_every_experiment() -> None:
     points = np.random.default_rng(0).uniform(0.0, 0.3, (500, 3))
     first = pattern(points)
     assert first.shape == (500, 3) and first.min() > 0.1 and first.max() <= 1.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from splatsoil.benchmarks._simulations import density_of
+from splatsoil.benchmarks._agents import density_of
 from splatsoil.inverse.bayesopt import sobol
 from splatsoil.inverse.mcmc import sample
 from splatsoil.inverse.posterior import Density, Posterior, summarise

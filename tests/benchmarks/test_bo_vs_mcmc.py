@@ -1,4 +1,4 @@
-"""The benchmarks' own arithmetic, on worlds whose answers are known."""
+"""``splatsoil benchmark bo-vs-mcmc``: how agents are scored, on answers that are known."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from splatsoil.benchmarks import bo_vs_mcmc, calibration
-from splatsoil.benchmarks._simulations import Data
-from splatsoil.inverse.bayesopt import sobol
+from scipy.stats import norm
+from splatsoil.benchmarks import bo_vs_mcmc
+from splatsoil.benchmarks._agents import Answer
+from splatsoil.benchmarks.bo_vs_mcmc import accuracy, scored
 
 from splatsoil.errors import ParameterError
 from splatsoil.files import read_json
@@ -25,40 +26,23 @@ def one_thread() -> None:
     torch.set_num_threads(1)
 
 
-def made_up(count: int) -> Data:
+@pytest.mark.parametrize(("wide", "uniform"), [(1.0, True), (0.3, False), (4.0, False)])
+def test_intervals_are_calibrated_where_the_posterior_is_right(wide: float, uniform: bool) -> None:
+    """A normal likelihood far from the bounds, whose posterior is known; and one too narrow or too wide."""
     rng = np.random.default_rng(0)
-    points = np.concatenate([sobol(count, 1, 0), np.zeros((4, 1))])
-    directions = np.linalg.qr(rng.normal(size=(20, 2)))[0].T
-    features = np.concatenate([5.0 * points, points**2], axis=1) + 0.5 * rng.normal(size=(len(points), 2))
-    return Data(SPACE, points, -features @ directions)
-
-
-def entry(truth: float, rank: int, inside: tuple[bool, bool]) -> dict:
-    within = {"0.5": [inside[0]], "0.9": [inside[1]]}
-    return {
-        "truth": [truth],
-        "rank": [rank],
-        "within": within,
-        "mean": [0.0],
-        "std": [0.5],
-    }
-
-
-def test_coverage_and_ranks_are_counted() -> None:
-    entries = [entry(0.5, 20 * k + 5, (k < 5, k < 9)) for k in range(10)]
-    told = calibration.summarise(entries, SPACE)["parameters"]["friction_angle"]
-    assert told["coverage"] == {"0.5": 0.5, "0.9": 0.9}
-    assert told["ranks"] == [1] * 10 and told["p_uniform"] == pytest.approx(1.0)
-    assert told["rms_z"] == pytest.approx(1.0)
-    piled = calibration.summarise([entry(0.5, 199, (False, False))] * 10, SPACE)["parameters"]["friction_angle"]
-    assert piled["p_uniform"] < 1e-6 and piled["coverage"]["0.9"] == 0.0
-
-
-@pytest.mark.slow
-def test_a_known_world_is_calibrated() -> None:
-    entries = calibration.calibrate(made_up(16), 16, sensor=0.1)
-    held = np.mean([e["within"]["0.9"][0] for e in entries])
-    assert len(entries) == 16 and held >= 11 / 16  # less has a chance of 0.2 % when 90 % is right
+    truths = rng.uniform(-0.5, 0.5, 400)
+    means = truths + 0.1 * rng.standard_normal(400)
+    draws = means[:, None, None] + wide * 0.1 * rng.standard_normal((400, 500, 1))
+    angles = SPACE.from_unit(truths[:, None])
+    rows = [
+        scored(Answer(d.mean(axis=0), d), SPACE, {"friction_angle": float(angle)})
+        for d, (angle,) in zip(draws, angles, strict=True)
+    ]
+    found = {name: value[0] for name, value in accuracy(rows).items()}
+    assert (found["p_uniform"] > 0.01) == uniform
+    assert found["scatter"] == pytest.approx(1.5, rel=0.1) and found["width_90"] == pytest.approx(wide * 4.93, rel=0.05)
+    for level, z in ((50, 0.674), (90, 1.645)):
+        assert found[f"coverage_{level}"] == pytest.approx(2.0 * norm.cdf(wide * z) - 1.0, abs=0.06)
 
 
 def stops_early(env: gym.Env, seed: int) -> None:
@@ -67,11 +51,11 @@ def stops_early(env: gym.Env, seed: int) -> None:
 
 
 def in_the_middle(env: gym.Env, seed: int) -> bo_vs_mcmc.Answer:
-    """Guesses 35 degrees, and says 20, or 20 to 35."""
+    """Guesses 35 degrees, and answers 20, or 20 to 35."""
     env.reset(seed=seed)
     while not env.step(np.zeros(1, np.float32))[3]:
         pass
-    return bo_vs_mcmc.Answer(-np.ones(1), -np.ones(1), np.zeros(1))
+    return Answer(-np.ones(1), np.linspace(-1.0 - 1 / 18, 1 / 18, 1801)[:, None])
 
 
 def compared(out: Path, *words: str) -> list[dict]:

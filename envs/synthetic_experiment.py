@@ -1,4 +1,4 @@
-"""A small experiment made up on the spot: a blade dips into a patterned bed and pushes, two cameras watch."""
+"""A small synthetic experiment: a blade is lowered into a patterned bed and pushed, and two cameras see it."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def blade_motion(stroke: Stroke) -> tuple[FloatArray, FloatArray]:
     return frames / FRAME_RATE, np.stack([x, np.full(len(frames), 0.5 * BED[1]), z], axis=1)
 
 
-def experiment(stroke: Stroke) -> Measurement:
+def measurement_of(stroke: Stroke) -> Measurement:
     """Bed, blade and motion; there are no photographs."""
     import trimesh
 
@@ -96,7 +96,7 @@ def cameras() -> dict[str, Camera]:
 
 
 def pattern(points: FloatArray) -> FloatArray:
-    """Albedo (n, 3) in sRGB of the soil at places (n, 3): sand with darker spots, the same in every world."""
+    """Albedo (n, 3) in sRGB of the soil at places (n, 3): sand with darker spots, the same in every experiment."""
     generator = np.random.default_rng(7)
     waves = generator.normal(0.0, 260.0, (24, 3))
     phases = generator.uniform(0.0, 2.0 * np.pi, 24)
@@ -105,7 +105,7 @@ def pattern(points: FloatArray) -> FloatArray:
     return np.clip(shade[:, None] * np.array([0.72, 0.6, 0.43]), 0.0, 1.0)
 
 
-class World:
+class SyntheticExperiment:
     """The unchanging part: bed, blade, cameras, surface, light."""
 
     def __init__(self, effects: Sequence[str], preset: str, device: str, stroke: Stroke | None = None) -> None:
@@ -115,7 +115,7 @@ class World:
         from splatsoil.soil.law import Law
         from splatsoil.soil.library import find_effects
 
-        self.measurement = experiment(stroke or Stroke())
+        self.measurement = measurement_of(stroke or Stroke())
         self.cameras = cameras()
         self.law = Law(find_effects(effects))
         self.resolution = Resolution.derive(self.measurement, preset)
