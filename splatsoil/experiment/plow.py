@@ -114,6 +114,7 @@ class PlowExperiment:
             surface=model.reconstruction.surface,
             frames=model.frames,
             patch=max(PATCH, math.sqrt(area / MOST_FEATURES)),
+            surroundings=model.reconstruction.standing,
         )
         self._kept: dict[object, Trajectory] = {}
         self._bins = bins_of(model.measurement, self.comparator.frames, MOST_ROWS)
