@@ -35,13 +35,13 @@ from splatsoil.benchmarks._common import (
 )
 from splatsoil.benchmarks._truth import CELL, Truth, reconstructed
 from splatsoil.inverse.criticism.design import Prior, Run
-from splatsoil.inverse.criticism.diagnosis import BASE, FINE, PAIRS, STEP
+from splatsoil.inverse.criticism.diagnosis import BASE_RUNS, FINE, OBSERVATION_STEP, PAIRS
 from splatsoil.inverse.criticism.noise import Noise, Tables, noise_of, trend_of
 from splatsoil.inverse.criticism.simulations import Simulations
 
 from splatsoil.errors import SimulationError
 from splatsoil.experiment import Candidate, Layout, Site
-from splatsoil.experiment.plow import MOST_ROWS, PlowExperiment
+from splatsoil.experiment.plow import MAX_ROWS, PlowExperiment
 from splatsoil.experiment.scene_parts import bins_of
 from splatsoil.files import write_text
 from splatsoil.measurement import Measurement
@@ -87,14 +87,14 @@ class TrueSoil(PlowExperiment):
         return self._after(0.0, super().sensor)
 
     def predict(
-        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, numerics: str = ""
+        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, variant: str = ""
     ) -> FloatArray:
         """(t, s) true heights, and what would be seen."""
-        prediction = self.prediction(values, effects=effects, seed=seed, numerics=numerics)
+        prediction = self.prediction(values, effects=effects, seed=seed, variant=variant)
         run, measurement, frames = prediction.trajectory, self.base.measurement, self.comparator.frames
         truth = Truth(measurement, {}, run.spacing**3, dict(values), ())
         first, *later = (1e3 * truth.heights(run.at(f)[0], truth.volume) for f in (self.comparator.reference, *frames))
-        rows = [np.mean([later[i] - first for i in group], axis=0) for group in bins_of(measurement, frames, MOST_ROWS)]
+        rows = [np.mean([later[i] - first for i in group], axis=0) for group in bins_of(measurement, frames, MAX_ROWS)]
         return np.concatenate([np.reshape(rows, (len(rows), -1)), self.features(prediction)], axis=1)
 
     def _after(self, height: float, features: npt.NDArray[Any]) -> FloatArray:
@@ -118,7 +118,7 @@ def sigmas(changes: FloatArray, precision: FloatArray, chance: FloatArray) -> tu
     Args:
         changes: (k, p) the same change, each with chance of its own; a single one has none.
         precision: (p, p) of the noise.
-        chance: (p, p) covariance of the changes.
+        scatter: (p, p) covariance of the changes.
     """
     products, k = changes @ precision @ changes.T, len(changes)
     if k == 1:
@@ -129,8 +129,8 @@ def sigmas(changes: FloatArray, precision: FloatArray, chance: FloatArray) -> tu
 
 
 def times_of(p: Parameter) -> float:
-    """An effect's size over its smallest meaningful one: `STEP`, or what its bounds leave."""
-    return (sized(p, STEP) - (p.off or 0.0)) / p.meaningful
+    """An effect's size over its smallest meaningful one: `OBSERVATION_STEP`, or what its bounds leave."""
+    return (sized(p, OBSERVATION_STEP) - (p.off or 0.0)) / p.meaningful
 
 
 def simulated(
@@ -145,30 +145,30 @@ def simulated(
     def made(runs: Sequence[Run], *allowed: type[Exception]) -> tuple[Sequence[Run], FloatArray]:
         kept, tables = list[Run](), list[FloatArray]()
         for r in runs:
-            told = f"{type(experiment).__name__}: {', '.join(r.effects) or r.numerics or 'base'}"
+            told = f"{type(experiment).__name__}: {', '.join(r.effects) or r.variant or 'base'}"
             with suppress(*allowed):
-                tables.append(ask(r.values, effects=r.effects, seed=r.seed, numerics=r.numerics, purpose=told))
+                tables.append(ask(r.values, effects=r.effects, seed=r.seed, variant=r.variant, purpose=told))
                 kept.append(r)
         if len(kept) < len(runs):
             print(f"{told}: {len(kept)} of {len(runs)} could be simulated", file=sys.stderr)
         return kept, np.array(tables).reshape(len(kept), *experiment.layout.shape)
 
-    def spread(count: int, first: int, numerics: str = "") -> list[Run]:
+    def spread(count: int, first: int, variant: str = "") -> list[Run]:
         points = (2.0 * (np.arange(count) + 0.5) / max(count, 1) - 1.0)[:, None]
-        return [Run(v, seed=first + i, numerics=numerics) for i, v in enumerate(prior.values(points))]
+        return [Run(v, seed=first + i, variant=variant) for i, v in enumerate(prior.values(points))]
 
     drawn = {}
     # What needs more frames of the simulation comes first, so that one serves all.
     for c in sorted(experiment.candidates if whole else effects, key=lambda c: c.name != "time_offset"):
         for p in c.parameters if c.kind == "observation" else ():
-            drawn[p.name] = made([Run({**TRUTH, p.name: sized(p, STEP)}, (c.name,))])[1][0], times_of(p)
+            drawn[p.name] = made([Run({**TRUTH, p.name: sized(p, OBSERVATION_STEP)}, (c.name,))])[1][0], times_of(p)
     reference = made([Run(TRUTH)])[1][0]
     drawings = {name: reference + (table - reference) / times for name, (table, times) in drawn.items()}
-    for name in (*experiment.guesses, *experiment.redrawn) if whole else ():
-        drawings[name] = made([Run(TRUTH, numerics=name)])[1][0]
-    base = made([*(Run(TRUTH, seed=s) for s in range(seeds)), *spread(BASE, 101)])
+    for name in (*experiment.albedo_draws, *experiment.renderings) if whole else ():
+        drawings[name] = made([Run(TRUTH, variant=name)])[1][0]
+    base = made([*(Run(TRUTH, seed=s) for s in range(seeds)), *spread(BASE_RUNS, 101)])
     fine = made(spread(PAIRS if whole else 0, 201, FINE))
-    values = {c.name: {**TRUTH, c.size: sized(c.measure, STEP)} for c in effects if c.kind == "physics"}
+    values = {c.name: {**TRUTH, c.size: sized(c.measure, OBSERVATION_STEP)} for c in effects if c.kind == "physics"}
     found = {n: made([Run(v, (n,), s) for s in range(seeds)], SimulationError) for n, v in values.items()}
     return Tables(base, fine, {n: f for n, f in found.items() if len(f[0]) > 1}, drawings, reference)
 
@@ -176,7 +176,7 @@ def simulated(
 def changes_of(candidate: Candidate, noise: Noise, tables: Tables) -> FloatArray:
     """(k, p) what an effect changes, seed by seed; one row for an effect of observation, which has no chance."""
     if candidate.kind == "observation":
-        off, on = noise.scores(np.stack([tables.reference, tables.drawn[candidate.size]]))
+        off, on = noise.scores(np.stack([tables.reference, tables.variants[candidate.size]]))
         return np.asarray(times_of(candidate.measure) * (on - off)[None])
     runs, found = tables.effects[candidate.name]
     return np.asarray(noise.scores(found) - noise.base[[run.seed for run in runs]])
@@ -189,7 +189,7 @@ def left(
 
     def bare(experiment: PlowExperiment, tables: Tables, aside: npt.NDArray[np.bool_]) -> tuple[Noise, Tables]:
         everywhere = np.broadcast_to(aside, experiment.layout.shape)
-        return noise_of(experiment, prior, replace(tables, drawn={}), (), everywhere), tables
+        return noise_of(experiment, prior, replace(tables, variants={}), (), everywhere), tables
 
     heights = np.array([site.channel == HEIGHT for site in true[0].layout.sites])
     views = {"soil": bare(*true, true[0].layout.placed & ~heights), "drawn": bare(*true, heights)}
@@ -203,11 +203,11 @@ def left(
     steps["discretisation"] = whole, seen[1], precision_of(whole.covariance(1.0), free)
     rows = []
     for c in (c for c in effects if c.kind == "observation" or c.name in true[1].effects.keys() & seen[1].effects):
-        found = {n: sigmas(changes_of(c, noise, t), p, 2.0 * noise.chance) for n, (noise, t, p) in steps.items()}
+        found = {n: sigmas(changes_of(c, noise, t), p, 2.0 * noise.scatter) for n, (noise, t, p) in steps.items()}
         if c.kind == "observation":
             del found["soil"]
         row: dict[str, Any] = {"effect": c.name, "parameter": c.size, "unit": c.measure.unit}
-        row |= {"value": sized(c.measure, STEP), "times": times_of(c.measure)}
+        row |= {"value": sized(c.measure, OBSERVATION_STEP), "times": times_of(c.measure)}
         known = {name: max(*pair, 1e-9) for name, pair in found.items()}
         row["sigmas"], row["least"] = ({name: pair[k] for name, pair in found.items()} for k in (0, 1))
         row["factors"] = {b: known[a] / known[b] for a, b in pairwise(known)}
@@ -243,7 +243,8 @@ def measure(effects: Sequence[str], preset: str, seeds: int, device: str, out: P
     for kind, start in ((TrueSoil, known), (PlowExperiment, reconstruction)):
         experiment = kind(Model(measurement, start, preset=preset, device=device), TRUTH)
         wanted = [c for c in experiment.candidates if not effects or c.name in effects]
-        ask = Simulations(experiment, out / "features", {"experiment": kind.__name__}, say)
+        ask = Simulations(experiment, out / "features", {"experiment": kind.__name__})
+        ask.report = say
         prior = Prior.of(experiment, TRUTH)
         prepared.append((experiment, simulated(experiment, ask, prior, wanted, seeds, kind is PlowExperiment)))
     return left(prepared[0], prepared[1], prior, wanted)

@@ -34,6 +34,7 @@ from splatsoil.measurement import Measurement
 from splatsoil.reconstruction.height_field import HeightField
 from splatsoil.robust_loss import robust_losses
 from splatsoil.scene import Relief, ToolBody, ground_of_pixels, silhouette
+from splatsoil.splats import Gaussians
 
 FloatArray = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
@@ -111,6 +112,7 @@ class Comparator:
         surface: the undisturbed surface, to know which pixels show the bed.
         frames: frames to compare. The first one in the video is what changes refer to and has no loss of its own.
         patch: side of a block on the bed, m.
+        surroundings: Gaussians of what does not move, which may hide parts of the bed; none by default.
 
     Attributes:
         observed: (h, w, 3) undistorted photographs by camera and frame.
@@ -129,9 +131,15 @@ class Comparator:
     """
 
     def __init__(
-        self, measurement: Measurement, *, surface: HeightField, frames: Iterable[int], patch: float = PATCH
+        self,
+        measurement: Measurement,
+        *,
+        surface: HeightField,
+        frames: Iterable[int],
+        patch: float = PATCH,
+        surroundings: Gaussians | None = None,
     ) -> None:
-        self.measurement = measurement
+        self.measurement, self._surroundings = measurement, surroundings
         self.reference = int(measurement.frames[0])
         self.cameras = tuple(measurement.cameras)
         self.frames = tuple(sorted({int(f) for f in frames} - {self.reference}))
@@ -273,7 +281,10 @@ class Comparator:
         """Where each pixel looks, a strip along the walls left out."""
         low, high = self.measurement.bed.lower[:2], self.measurement.bed.upper[:2]
         margin = min(MARGIN, 0.1 * float(np.min(high - low)))
-        return {c: ground_of_pixels(relief, view, low + margin, high - margin, rise) for c, view in self._views.items()}
+        return {
+            c: ground_of_pixels(relief, view, low + margin, high - margin, rise, self._surroundings)
+            for c, view in self._views.items()
+        }
 
     def _tool_silhouettes(self) -> dict[Key, BoolImage]:
         body, motion = ToolBody(self.measurement.tool.mesh), self.measurement.tool.motion

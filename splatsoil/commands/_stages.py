@@ -170,7 +170,10 @@ def draw_comparison(run: RunFolder, model: Model, report: Report) -> dict[str, A
         result = run.fit()
         values = estimates(result)
         report("reading the video", 0.0)
-        comparator = Comparator(model.measurement, surface=model.reconstruction.surface, frames=model.frames)
+        made = model.reconstruction
+        comparator = Comparator(
+            model.measurement, surface=made.surface, frames=model.frames, surroundings=made.standing
+        )
         began = time.perf_counter()
         prediction = model.predict(values, 0, by_frame(report, 0.9))
         comparison = comparator.compare(prediction.images)

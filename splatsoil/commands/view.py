@@ -81,7 +81,10 @@ def _loaded(config: Config) -> tuple[Measurement, list[Column]]:
         raise RunError(f"--beside: {folder.path} has no fit {config.beside!r}; it has {', '.join(data.fits)}")
     columns = []
     with _model.loaded(config, folder) as (model, begin):
-        comparator = Comparator(model.measurement, surface=model.reconstruction.surface, frames=model.frames)
+        made = model.reconstruction
+        comparator = Comparator(
+            model.measurement, surface=made.surface, frames=model.frames, surroundings=made.standing
+        )
         for fit in (data.fit, *([data.fits[config.beside]] if config.beside else [])):
             values, report = estimates(fit), begin(fit["name"])
             said = (f"{n} {amount(p['estimate'], p['std'], p['unit'])}" for n, p in fit["parameters"].items())

@@ -110,6 +110,7 @@ class PlowExperiment:
             surface=model.reconstruction.surface,
             frames=model.frames,
             patch=max(PATCH, math.sqrt(area / MAX_FEATURES)),
+            surroundings=model.reconstruction.standing,
         )
         self._trajectories: dict[object, Trajectory] = {}
         self._bins = bins_of(model.measurement, self.comparator.frames, MAX_ROWS)

@@ -17,6 +17,20 @@ def centres(low: float, high: float, count: int) -> Array:
     return low + (np.arange(count) + 0.5) * (high - low) / count
 
 
+def around(lower: Array, upper: Array, spacing: float) -> tuple[Array, Array]:
+    """Points (n, 2) on a rectangle's border, and outward normals (n, 3)."""
+    points, normals = [], []
+    for axis in (0, 1):
+        along = centres(lower[axis], upper[axis], max(1, round(float(upper[axis] - lower[axis]) / spacing)))
+        for end, sign in ((lower, -1.0), (upper, 1.0)):
+            point, normal = np.empty((len(along), 2)), np.zeros((len(along), 3))
+            point[:, axis], point[:, 1 - axis] = along, end[1 - axis]
+            normal[:, 1 - axis] = sign
+            points.append(point)
+            normals.append(normal)
+    return np.concatenate(points), np.concatenate(normals)
+
+
 @dataclass(frozen=True)
 class HeightField:
     """Heights on a regular grid of cells, in the world's frame.

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from splatsoil.measurement import Bed
-from splatsoil.reconstruction.height_field import HeightField, centres
+from splatsoil.reconstruction.height_field import HeightField, around
 from splatsoil.reconstruction.stereo import colours_seen
 from splatsoil.reconstruction.surface import Relief, scale_of
 from splatsoil.reconstruction.views import Views, surface_points
@@ -80,45 +80,36 @@ def seed_tool(mesh: trimesh.Trimesh, spacing: float, most: int) -> Seeds:
 
 
 def seed_rim(relief: Relief, bed: Bed, spacing: float) -> Seeds:
-    """Discs on a border around the bed, level with the soil beside it, and on its outer side down to the ground."""
+    """Discs on a border around the bed: its top, as high as the walls or the soil beside it; its outer side, down to
+    the ground; and the walls' inner sides, down to the soil."""
     parts = []
     lower, upper = bed.lower[:2], bed.upper[:2]
     for inset in np.arange(0.5 * spacing, relief.rim, spacing):
         xy, _ = around(lower - inset, upper + inset, spacing)
-        top = np.column_stack([xy, relief.surface.sample(xy)])
+        top = np.column_stack([xy, np.maximum(relief.surface.sample(xy), relief.wall)])
         parts.append(Seeds.of(top, np.tile([0.0, 0.0, 1.0], (len(top), 1)), spacing, SURROUNDINGS))
-    return Seeds.join([*parts, _upright(relief, bed, relief.rim, relief.ground, spacing, SURROUNDINGS)])
+    xy, outward = around(lower - relief.rim, upper + relief.rim, spacing)
+    top = np.maximum(relief.surface.sample(xy), relief.wall)
+    parts.append(_upright(xy, outward, np.full(len(xy), relief.ground), top, spacing, SURROUNDINGS))
+    xy, outward = around(lower, upper, spacing)
+    parts.append(
+        _upright(xy, -outward, relief.surface.sample(xy), np.full(len(xy), relief.wall), spacing, SURROUNDINGS)
+    )
+    return Seeds.join(parts)
 
 
 def seed_sides(relief: Relief, bed: Bed, spacing: float) -> Seeds:
     """Discs on the sides of the bed's box, from its floor to the soil's surface."""
-    return _upright(relief, bed, 0.0, float(bed.lower[2]), spacing, SIDE)
+    xy, outward = around(bed.lower[:2], bed.upper[:2], spacing)
+    return _upright(xy, outward, np.full(len(xy), bed.lower[2]), relief.surface.sample(xy), spacing, SIDE)
 
 
-def _upright(relief: Relief, bed: Bed, inset: float, floor: float, spacing: float, label: int) -> Seeds:
-    """Discs on the sides of a box that is larger than the bed's by ``inset``, as high as the soil beside them."""
-    xy, outward = around(bed.lower[:2] - inset, bed.upper[:2] + inset, spacing)
-    height = relief.surface.sample(xy)
-    parts = [Seeds.of(np.zeros((0, 3)), np.zeros((0, 3)), spacing, label)]
-    for level in np.arange(floor + 0.5 * spacing, float(height.max()), spacing):
-        kept = height > level
-        side = np.column_stack([xy[kept], np.full(int(kept.sum()), level)])
-        parts.append(Seeds.of(side, outward[kept], spacing, label))
-    return Seeds.join(parts)
-
-
-def around(lower: Array, upper: Array, spacing: float) -> tuple[Array, Array]:
-    """Points (n, 2) on a rectangle's border, and outward normals (n, 3)."""
-    points, normals = [], []
-    for axis in (0, 1):
-        along = centres(lower[axis], upper[axis], max(1, round(float(upper[axis] - lower[axis]) / spacing)))
-        for end, sign in ((lower, -1.0), (upper, 1.0)):
-            point, normal = np.empty((len(along), 2)), np.zeros((len(along), 3))
-            point[:, axis], point[:, 1 - axis] = along, end[1 - axis]
-            normal[:, 1 - axis] = sign
-            points.append(point)
-            normals.append(normal)
-    return np.concatenate(points), np.concatenate(normals)
+def _upright(xy: Array, normals: Array, low: Array, high: Array, spacing: float, label: int) -> Seeds:
+    """Discs on upright faces through points (n, 2) with normals (n, 3), from one height (n,) to another."""
+    count = np.maximum(np.ceil((high - low) / spacing - 0.5), 0.0)
+    level, which = np.nonzero(np.arange(count.max(initial=0.0))[:, None] < count)
+    points = np.column_stack([xy[which], low[which] + (level + 0.5) * spacing])
+    return Seeds.of(points, normals[which], spacing, label)
 
 
 def seed_far(views: Views, bed: Bed, relief: Relief) -> Seeds:

@@ -71,6 +71,11 @@ class Reconstruction:
         return ~(self.soil | self.tool)
 
     @property
+    def standing(self) -> Gaussians:
+        """The Gaussians of the surroundings, which stay when soil and tool move."""
+        return self.gaussians[self.surroundings]
+
+    @property
     def container(self) -> str:
         """What holds the soil, see `measurement.Bed`; where the set doesn't say, what photographs show."""
         return str(self.metadata.get("container", BIN))

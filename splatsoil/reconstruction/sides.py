@@ -11,8 +11,7 @@ from scipy.stats import chi2
 
 from splatsoil.colour import linear
 from splatsoil.measurement import Bed
-from splatsoil.reconstruction.height_field import HeightField
-from splatsoil.reconstruction.initial import around
+from splatsoil.reconstruction.height_field import HeightField, around
 from splatsoil.reconstruction.stereo import colours_seen
 from splatsoil.reconstruction.surface import Relief, scale_of, with_rim
 from splatsoil.reconstruction.views import Views

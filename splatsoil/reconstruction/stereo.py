@@ -137,9 +137,7 @@ class Matching:
             costs.append((left * (error if self.normalised else torch.log1p(error / scale))).sum(0))
             counts.append(left.sum(0))
         total, count = (torch.stack(parts).cpu().numpy().astype(float) for parts in (costs, counts))
-        # Two photographs agree by chance more easily than twenty: shrink towards what disagreement is usual.
-        usual = total.sum() / max(count.sum(), 1.0)
-        cost = (total + FEWEST_VIEWS * usual) / (count + FEWEST_VIEWS)
+        cost = shrunk(total, count)
         step = float(heights[1] - heights[0])
         smoothness = Smoothness(self.grid.height.shape)
         depth = np.maximum(np.median(cost, axis=0) - cost.min(axis=0), 0.0)
@@ -238,6 +236,13 @@ class Smoothness:
         energy = stiffness * self.bending + tension * self.tension
         system = sparse.csc_matrix(sparse.diags_array(diagonal) + energy)
         return splu(system, permc_spec="MMD_AT_PLUS_A").solve(diagonal * target.ravel()).reshape(target.shape)
+
+
+def shrunk(total: Array, count: Array) -> Array:
+    """Mean disagreement (…) of sums (…) over so many photographs (…), shrunk towards the usual one, as two agree by
+    chance more easily than twenty."""
+    usual = total.sum() / max(count.sum(), 1.0)
+    return (total + FEWEST_VIEWS * usual) / (count + FEWEST_VIEWS)
 
 
 def colours_seen(

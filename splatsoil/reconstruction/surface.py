@@ -11,12 +11,13 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.ndimage import binary_propagation, distance_transform_edt
 from scipy.spatial import cKDTree
+from torch.nn import functional
 
 from splatsoil.errors import MeasurementError
 from splatsoil.measurement import BIN, HEAP, TRANSPARENT, Bed
-from splatsoil.reconstruction.height_field import HeightField
+from splatsoil.reconstruction.height_field import HeightField, around
 from splatsoil.reconstruction.presets import Preset
-from splatsoil.reconstruction.stereo import Matching, visibility
+from splatsoil.reconstruction.stereo import Matching, draw, shrunk, visibility
 from splatsoil.reconstruction.views import Views
 from splatsoil.splats import Gaussians
 
@@ -27,6 +28,7 @@ RIM = 0.04  # width of what is taken to border the bed (a bin's wall), in square
 # How many times better the soil's level must explain the surroundings than the bed's floor, to be their height.
 LEVEL_GAIN = 1.5
 CELLS = 4  # along each side of the bed, at least: a cubic spline needs them
+ROWS = 16  # heights swept at once
 NEIGHBOURS = 24  # Gaussians that a height is drawn from
 DOUBTFUL = 3.0  # times the median standard deviation: at the bed's border, the height of something behind it
 
@@ -37,10 +39,11 @@ class Relief:
 
     Attributes:
         surface: the soil's surface over the bed's box, with standard deviations.
-        occluder: `surface` with a rim as high as the soil beside it, and far below everything beyond.
+        occluder: `surface` with a rim as high as the walls or the soil beside it, and far below everything beyond.
         ground: height of the level ground around the bed, metres.
         trust: (v, h, w) float32, 1 where a photograph shows no tool and may be used.
         rim: the rim's width, metres.
+        wall: height of the walls' top, metres; minus infinity without walls.
     """
 
     surface: HeightField
@@ -48,6 +51,7 @@ class Relief:
     ground: float
     trust: torch.Tensor
     rim: float
+    wall: float
 
 
 def scale_of(bed: Bed) -> float:
@@ -100,18 +104,48 @@ def find_relief(
     fine = HeightField.over(bed.lower, bed.upper, cell)
     height = replace(coarse, height=height).smooth(fine.points[..., :2])
     rim = 0.0 if bare else RIM * length
+    wall = wall_top(views, bed, trust) if container == BIN else -np.inf
     for last in (False, True):
         report("refining heights", 0.6 + 0.2 * last)
         now = replace(fine, height=height)
-        seen = visibility(views, now.points.reshape(-1, 3), with_rim(now, bed, rim), clearance=1.5 * cell)
+        seen = visibility(views, now.points.reshape(-1, 3), with_rim(now, bed, rim, wall), clearance=1.5 * cell)
         matching = Matching(views, fine, trust, seen.reshape(len(views), *height.shape), bare)
         height, deviation = matching.refine(height, reach=0.5 * step, length=length, iterations=6 if last else 3)
         height, deviation = without_backdrop(height, deviation, length)
     # Around a heap the floor is bare: what is less high than a cell is wide is not told from it.
     least = bed.lower[2] + (0.5 * cell if container == HEAP else 0.0)
     surface = replace(fine, height=np.where(height > least, height, bed.lower[2]), deviation=deviation)
-    occluder = with_rim(surface, bed, rim)
-    return Relief(surface, occluder, ground_level(views, bed, surface, occluder, rim), trust, rim)
+    occluder = with_rim(surface, bed, rim, wall)
+    return Relief(surface, occluder, ground_level(views, bed, surface, occluder, rim), trust, rim, wall)
+
+
+def wall_top(views: Views, bed: Bed, trust: torch.Tensor) -> float:
+    """Height of the walls' top, metres, by a plane sweep (Collins 1996) along their inner edge.
+
+    Photographs agree on the colour of a place that is on an opaque body, and mostly of one within a plain one, but not
+    of one in the air (Kutulakos & Seitz 2000): the top is where their disagreement rises most. Without walls this is
+    about the height of the ground there.
+
+    Args:
+        views: the photographs.
+        bed: the box; its walls are equally high.
+        trust: (v, h, w) 1 where a pixel may be used.
+    """
+    step = footprint(views, bed)
+    edge, _ = around(bed.lower[:2] - step, bed.upper[:2] + step, 2.0 * step)
+    heights = np.arange(float(bed.lower[2]), max(float(views.positions[:, 2].min()), float(bed.upper[2])), step)
+    xy, z = (torch.tensor(a, dtype=torch.float32, device=views.images.device) for a in (edge, heights))
+    places = functional.pad(xy.expand(len(z), -1, -1), (0, 2), value=1.0)
+    places[..., 2] = z[:, None]
+    swept = []
+    for some in places.split(ROWS):
+        colours, seen = draw(views, some, trust)
+        count = seen.sum(dim=0)
+        mean = (colours * seen[:, None]).sum(dim=0) / count.clamp_min(1.0)
+        error = torch.log1p(((colours - mean) ** 2).sum(dim=1) / (27.0 * views.noise**2))
+        swept.append(torch.stack([(seen * error).sum(dim=0), count]))
+    total, count = torch.cat(swept, dim=1).cpu().numpy().astype(np.float64)
+    return float(heights[int(np.argmax(np.diff(shrunk(total, count).mean(axis=1))))])
 
 
 def without_backdrop(height: Array, deviation: Array, length: float) -> tuple[Array, Array]:
@@ -137,14 +171,17 @@ def without_backdrop(height: Array, deviation: Array, length: float) -> tuple[Ar
     return height[tuple(nearest)], np.where(reached, length, deviation)
 
 
-def with_rim(surface: HeightField, bed: Bed, rim: float) -> HeightField:
-    """The surface, a border of `rim` metres as high as the soil beside it, and far below everything beyond."""
+def with_rim(surface: HeightField, bed: Bed, rim: float, wall: float = -np.inf) -> HeightField:
+    """The surface, a border of `rim` metres as high as the soil beside it, or as a wall's top at height `wall`, and far
+    below everything beyond."""
     cell = min(surface.cell)
     margin = rim + 2.0 * cell
     outer = HeightField.over(bed.lower[:2] - margin, bed.upper[:2] + margin, cell)
     place = outer.points[..., :2]
     low = bed.lower[2] - 10.0 * scale_of(bed)
-    return replace(outer, height=np.where(bed.beyond(place) <= rim, surface.sample(place), low))
+    beyond = bed.beyond(place)
+    height = np.where(beyond > 0.0, np.maximum(surface.sample(place), wall), surface.sample(place))
+    return replace(outer, height=np.where(beyond <= rim, height, low))
 
 
 def ground_level(views: Views, bed: Bed, surface: HeightField, occluder: HeightField, rim: float) -> float:

@@ -27,8 +27,6 @@ PATHS = 4
 """Each pixel is the mean of this many light paths, squared."""
 WALL = 0.03
 """Thickness of the bin's walls and floor, as a share of the bed's narrower side."""
-RIM = 0.006
-"""How far the bin's walls stand over the soil along them, m."""
 FIELD = 5.0
 """How far open ground goes on, in lengths of the bed."""
 GRAIN = 0.1
@@ -195,7 +193,7 @@ def surroundings_of(setup: Setup) -> tuple[list[trimesh.Trimesh], float]:
     bed, height = setup.bed.domain, setup.surface.height
     thick = WALL * float(bed.extents[:2].min())
     edges = np.concatenate([height[0], height[-1], height[:, 0], height[:, -1]])
-    top = float(edges.max()) + RIM
+    top = float(edges.max()) + setup.rim
     if setup.bed.container == HEAP:
         return [], float(bed.lower[2])
     if setup.bed.container == OPEN:

@@ -39,6 +39,8 @@ FOOT, FLANK = 0.05, 25.0
 """Of a heap: what its foot keeps off the bed's sides, of the narrower one, and its slopes in degrees."""
 CLEARANCE = 0.004
 """Between the soil and the tool before it moves, m."""
+RIM = 0.006
+"""How far a bin's walls stand over the soil along them, m."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +57,7 @@ class Setup:
         pre_roll: video frames before that, negative.
         gravity: (3,) m/s².
         frame_rate: frames a second.
+        rim: how far a bin's walls stand over the soil along them, m.
     """
 
     bed: Bed
@@ -66,6 +69,7 @@ class Setup:
     pre_roll: tuple[int, ...] = PRE_ROLL
     gravity: FloatArray = field(default_factory=lambda: np.array(GRAVITY))
     frame_rate: float = FRAME_RATE
+    rim: float = RIM
 
     def experiment(self) -> Measurement:
         """The experiment as the solver takes it; the pictures of its video are yet to be taken.

@@ -42,8 +42,9 @@ class Scene:
         wave: half the height of the surface's waves.
         grain: size of the texture's features.
         contrast: of the texture, 0 to 1.
-        wall: thickness of the bin's walls, which are as high as the soil's mean level; 0 for a bed in a field, where
-            soil and texture go on beyond the box; None for no walls, so that the soil's sides are seen.
+        wall: thickness of the bin's walls; 0 for a bed in a field, where soil and texture go on beyond the box; None
+            for no walls, so that the soil's sides are seen.
+        rim: how far the walls stand over the soil's mean level.
         heap: whether the soil slopes down to the floor within the box.
         sun: direction to the sun.
         tool_centre: of the box-shaped tool.
@@ -56,6 +57,7 @@ class Scene:
     grain: float = 0.02
     contrast: float = 0.6
     wall: float | None = 0.02
+    rim: float = 0.0
     heap: bool = False
     sun: tuple[float, float, float] = (0.4, 0.3, 0.85)
     tool_height: float = 0.12
@@ -103,11 +105,18 @@ class Scene:
 
     def render(self, camera: Camera, seed: int = 0) -> np.ndarray:
         """(h, w, 3) photograph, float in [0, 1]."""
+        return self._cast(camera, seed)[0]
+
+    def shows_wall(self, camera: Camera) -> np.ndarray:
+        """(h, w) pixels whose ray, which the tool does not stop, ends at a wall."""
+        return self._cast(camera, 0)[1]
+
+    def _cast(self, camera: Camera, seed: int) -> tuple[np.ndarray, np.ndarray]:
         columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
         origin, ray = camera.rays(np.stack([columns.ravel(), rows.ravel()], 1))
         lower, upper, thick = self.bed.lower, self.bed.upper, self.wall
         sun = np.array(self.sun) / np.linalg.norm(self.sun)
-        top = self.level + 1.5 * self.wave
+        top = self.level + max(1.5 * self.wave, self.rim)
 
         def terrain(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             """Height, and kind: 0 ground, 1 wall, 2 soil."""
@@ -117,7 +126,7 @@ class Scene:
             kind = np.where(out < 0, 2, np.where(out < (thick or 0.0), 1, 0))
             if self.heap:
                 kind = np.where((kind == 2) & (self.height(x, y) <= lower[2]), 0, kind)
-            return np.where(kind == 2, self.height(x, y), np.where(kind == 1, self.level, lower[2])), kind
+            return np.where(kind == 2, self.height(x, y), np.where(kind == 1, self.level + self.rim, lower[2])), kind
 
         # March from where a ray enters the slab under `top`, then bisect.
         near = np.maximum((top - origin[:, 2]) / ray[:, 2], 0.0)
@@ -165,7 +174,8 @@ class Scene:
         hit &= at < end
         colour[hit] = np.array([0.2, 0.3, 0.7]) * (0.35 + 0.65 * np.maximum(face[hit] @ sun, 0.0))[:, None]
         grain = np.random.default_rng(seed).normal(0.0, self.noise, colour.shape)
-        return np.clip(colour + grain, 0.0, 1.0).reshape(camera.height, camera.width, 3).astype(np.float32)
+        photograph = np.clip(colour + grain, 0.0, 1.0).astype(np.float32)
+        return photograph.reshape(camera.height, camera.width, 3), (kind == 1).reshape(camera.height, camera.width)
 
     def _meets_tool(self, origin: np.ndarray, ray: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Slab test: whether, how far along, and the face's normal."""

@@ -96,7 +96,8 @@ def test_the_rim_is_as_high_as_the_soil_beside_it(scene, relief):
 
 
 def test_discs_cover_the_border_around_the_bed(scene, relief):
-    """As many as fit on its top, and on its outer side down to the ground; none leaves a gap."""
+    """As many as fit on its top, on its outer side down to the ground, and on its inner one down to the soil; none
+    leaves a gap."""
     spacing, rim, lower, upper = 0.01, relief.rim, scene.bed.lower[:2], scene.bed.upper[:2]
     seeds = seed_rim(relief, scene.bed, spacing)
     flat = seeds.normals[:, 2] == 1.0
@@ -106,9 +107,16 @@ def test_discs_cover_the_border_around_the_bed(scene, relief):
     assert cKDTree(top[:, :2]).query(grid[beyond > 0.0])[0].max() < spacing
     area = np.prod(upper - lower + 2.0 * rim) - np.prod(upper - lower)
     assert len(top) * spacing**2 == pytest.approx(area, rel=0.1)
-    assert np.maximum(lower - side[:, :2], side[:, :2] - upper).max(axis=1) == pytest.approx(rim)
+    away = np.maximum(lower - side[:, :2], side[:, :2] - upper).max(axis=1)
+    outer = np.isclose(away, rim)
+    assert away[~outer] == pytest.approx(0.0, abs=1e-9)
     height = top[:, 2].mean() - relief.ground
-    assert len(side) * spacing**2 == pytest.approx(2.0 * (upper - lower + 2.0 * rim).sum() * height, rel=0.1)
+    assert outer.sum() * spacing**2 == pytest.approx(2.0 * (upper - lower + 2.0 * rim).sum() * height, rel=0.1)
+    high = replace(relief, wall=float(relief.surface.height.max()) + 0.1)
+    inner = seed_rim(high, scene.bed, spacing).points
+    inner = inner[np.isclose(np.maximum(lower - inner[:, :2], inner[:, :2] - upper).max(axis=1), 0.0)]
+    edge = np.concatenate([relief.surface.height[[0, -1]].ravel(), relief.surface.height[:, [0, -1]].ravel()])
+    assert len(inner) * spacing**2 == pytest.approx(2.0 * (upper - lower).sum() * (high.wall - edge.mean()), rel=0.1)
 
 
 def test_first_discs_far_away_lie_on_the_ground_and_on_a_sphere_around_all_cameras(scene, relief):
