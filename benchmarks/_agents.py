@@ -15,7 +15,7 @@ from splatsoil.envs.plow_sand import PlowSandEnv
 from splatsoil.envs.strokes import LOGITS, DesignEnv, NamingEnv
 from splatsoil.inverse.bayesopt import BayesianOptimiser, sobol
 from splatsoil.inverse.criticism.design import Prior, Run
-from splatsoil.inverse.criticism.diagnosis import BASE
+from splatsoil.inverse.criticism.diagnosis import BASE_RUNS
 from splatsoil.inverse.criticism.noise import Tables, noise_of
 from splatsoil.inverse.mcmc import sample
 from splatsoil.inverse.posterior import Density
@@ -25,7 +25,7 @@ from splatsoil.experiment import Layout, Site
 from splatsoil.experiment.emulated import EmulatedExperiment
 from splatsoil.parameters import ParameterSpace
 
-FEWEST = BASE // 2
+FEWEST = BASE_RUNS // 2
 """Simulations that a comparison needs."""
 NAMING_EPISODES, TRAINING = 4000, 10**6
 """Episodes that an agent learns from, and the first one's seed."""
@@ -125,15 +125,15 @@ def density_of(
         slopes={},
         parameters=tuple(space),
         candidates=(),
-        chance_root=np.zeros((b, b)),
+        scatter_root=np.zeros((b, b)),
         sensor=nothing + sensor,
         observed=observed[None],
     )
     prior = Prior(space)
     made = [Run(values) for values in prior.values(points)], features[:, None]
-    tables = Tables(base=made, fine=([], np.zeros((0, 1, b))), effects={}, drawn={}, reference=features[:1])
+    tables = Tables(base=made, fine=([], np.zeros((0, 1, b))), effects={}, variants={}, reference=features[:1])
     noise = noise_of(experiment, prior, tables, ())
-    return Density.of(replace(noise, numerics=np.zeros_like(noise.numerics)), prior, seed)
+    return Density.of(replace(noise, discretisation=np.zeros_like(noise.discretisation)), prior, seed)
 
 
 def directly(env: Env, seed: int) -> Answer:

@@ -109,14 +109,14 @@ def precision_of(covariance: FloatArray, free: FloatArray | None = None) -> Floa
     return np.asarray(precision if free is None else precision - np.outer(along, along) / (free @ along))
 
 
-def sigmas(changes: FloatArray, precision: FloatArray, chance: FloatArray) -> tuple[float, float]:
-    """Mahalanobis length of a change, in standard deviations of the noise, and what chance alone reaches in one of 20.
+def sigmas(changes: FloatArray, precision: FloatArray, scatter: FloatArray) -> tuple[float, float]:
+    """Mahalanobis length of a change, in standard deviations of the noise, and what scatter alone reaches in one of 20.
 
     The length's square is the mean product of different rows (a U-statistic: Hoeffding 1948, Ann. Math. Stat. 19:293),
-    whose own chance cancels. Where that is negative it is 0.
+    whose own scatter cancels. Where that is negative it is 0.
 
     Args:
-        changes: (k, p) the same change, each with chance of its own; a single one has none.
+        changes: (k, p) the same change, each with scatter of its own; a single one has none.
         precision: (p, p) of the noise.
         scatter: (p, p) covariance of the changes.
     """
@@ -124,7 +124,7 @@ def sigmas(changes: FloatArray, precision: FloatArray, chance: FloatArray) -> tu
     if k == 1:
         return float(np.sqrt(products.sum())), 0.0
     square = (products.sum() - np.trace(products)) / (k * (k - 1))
-    spread = np.sqrt(2.0 * np.trace(precision @ chance @ precision @ chance) / (k * (k - 1)))
+    spread = np.sqrt(2.0 * np.trace(precision @ scatter @ precision @ scatter) / (k * (k - 1)))
     return float(np.sqrt(max(square, 0.0))), float(np.sqrt(1.645 * spread))  # the normal distribution's 95 %
 
 
@@ -139,7 +139,7 @@ def simulated(
     """Simulations: with each effect, and of the model as it is with the same seeds and over its prior.
 
     Observation effects are drawn as changes by their smallest meaningful size; with ``whole`` all of them are, as are
-    guesses, and pairs of coarse and fine runs are there. An effect that fails but for one seed is left out.
+    unknown albedo, and pairs of coarse and fine runs are there. An effect that fails but for one seed is left out.
     """
 
     def made(runs: Sequence[Run], *allowed: type[Exception]) -> tuple[Sequence[Run], FloatArray]:
@@ -174,7 +174,7 @@ def simulated(
 
 
 def changes_of(candidate: Candidate, noise: Noise, tables: Tables) -> FloatArray:
-    """(k, p) what an effect changes, seed by seed; one row for an effect of observation, which has no chance."""
+    """(k, p) what an effect changes, seed by seed; one row for an effect of observation, which has no scatter."""
     if candidate.kind == "observation":
         off, on = noise.scores(np.stack([tables.reference, tables.variants[candidate.size]]))
         return np.asarray(times_of(candidate.measure) * (on - off)[None])
