@@ -30,7 +30,7 @@ SOURCES := $(shell find $(PACKAGES) -type f -not -path '*/__pycache__/*')
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.use
-	$(BIN)/splatsoil run examples/plow-dry --run runs/demo --stop-at-floor
+	$(BIN)/splatsoil run examples/plow-dry --run runs/demo --no-effects
 
 # One thread per worker: the workers together already fill the machine.
 test: $(VENV)/.develop

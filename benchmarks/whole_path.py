@@ -141,7 +141,7 @@ def dry(task: Task) -> Section:
     true = Truth.load(task.dry).values["friction_angle"]
     # only a run that has not begun can be timed
     fresh = not (task.out / "runs" / f"{task.dry.name}-0").exists()
-    runs = [_run(task, task.dry, seed, "--stop-at-floor") for seed in FIT_SEEDS]
+    runs = [_run(task, task.dry, seed, "--no-effects") for seed in FIT_SEEDS]
     angles = [read_json(run / "fit.json")["parameters"]["friction_angle"] for run, _ in runs]
     stds, estimates = sorted(a["std"] for a in angles), ", ".join(f"{a['estimate']:.1f}" for a in angles)
     rows = [

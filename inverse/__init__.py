@@ -1,1 +1,1 @@
-"""From observed to parameters: agents that act on an environment, and the database of what they tried."""
+"""Inverse problem: search, posterior and model criticism, and the database of evaluations."""

@@ -1,8 +1,8 @@
-"""Evaluations: simulated where it is asked for, and kept in an SQLite file from the moment each ends.
+"""Evaluations of the loss, each stored in an SQLite file as soon as it ends.
 
-An evaluation is known by a digest of everything that decides it, so an interrupted run that asks for the same again
-finds it. One process writes (it holds ``writer.lock``, which the system releases however the process ends); any number
-may read meanwhile. A failed simulation is a row with a message and no loss, never a NaN.
+The key of an evaluation is a digest of everything that decides it, so an interrupted run finds it again. One process
+writes; it holds ``writer.lock``, which the system releases when the process ends. Any number of processes may read. A
+failed simulation is a row with a message and no loss.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from splatsoil.files import digest, plain
 APPLICATION_ID = 0x536F494C
 LAYOUT = 2
 
-#: ``model`` is what decides an evaluation beside its parameters and seed, as JSON: measurement, device, version, ...
+#: ``model`` is what decides an evaluation besides parameters and seed, as JSON: measurement, device, version, ...
 SCHEMA = """
 CREATE TABLE evaluations (
   key TEXT PRIMARY KEY,
@@ -47,19 +47,19 @@ CREATE TABLE evaluations (
 
 @dataclass(frozen=True)
 class EvaluationRecord:
-    """One simulate-and-compare, as stored.
+    """One simulation and its loss, as stored.
 
     Attributes:
         key: digest of everything that decides it.
-        model: what decides it beside parameters and seed.
+        model: what decides it besides parameters and seed.
         parameters: physical values by name.
         seed: the simulation's seed.
         loss: None where it failed.
         message: why it failed; empty where it did not.
         blocks: block residuals.
-        extras: further numbers worth keeping.
+        extras: further numbers.
         seconds: wall time it took.
-        created: ISO time at which it ended, filled in on storing.
+        created: ISO time of storing.
     """
 
     key: str
@@ -104,7 +104,7 @@ class EvaluationStore:
             raise RunError(f"{self.path}: there is no run database; run `splatsoil fit` first")
         with self._explained():
             self._connection = self._connect(writable)
-            # Without tables: new, or of a process killed between making the file and its first commit.
+            # Without tables it is new, or its process was killed before the first commit.
             if writable and self._one("SELECT count(*) FROM sqlite_master") == 0:
                 self._connection.executescript(
                     f"BEGIN; PRAGMA application_id={APPLICATION_ID}; PRAGMA user_version={LAYOUT}; {SCHEMA}COMMIT;"
@@ -120,7 +120,7 @@ class EvaluationStore:
             raise RunError(f"{self.path.parent}: cannot be made ({error.strerror}); choose another folder") from error
         connection = sqlite3.connect(self.path, timeout=10.0)
         connection.execute("PRAGMA journal_mode=WAL")
-        # An evaluation costs seconds to minutes; one fsync each is nothing, and a power cut then loses none.
+        # One fsync for each evaluation: a power cut loses none.
         connection.execute("PRAGMA synchronous=FULL")
         return connection
 
@@ -137,29 +137,29 @@ class EvaluationStore:
 
     @contextmanager
     def _explained(self) -> Iterator[None]:
-        """SQLite's errors as sentences."""
+        """Turn SQLite's errors into sentences."""
         try:
             yield
         except sqlite3.IntegrityError as error:
             raise RunError(f"{self.path}: the evaluation can't be stored ({error})") from error
         except sqlite3.Error as error:
-            text, says = str(error), "is damaged or not a run database ({}); move it away and fit again"
+            text, sentence = str(error), "is damaged or not a run database ({}); move it away and fit again"
             if "readonly" in text or "unable to open" in text:
-                says = "cannot be written ({}); choose a run folder you may write to"
+                sentence = "cannot be written ({}); choose a run folder you may write to"
             elif "full" in text or "disk I/O" in text:
-                says = "cannot be written ({}); free some space and run again, what is stored is kept"
+                sentence = "cannot be written ({}); free some space and run again, what is stored is kept"
             elif "locked" in text:
-                says = "is locked by another process ({}); wait for it or choose another run folder"
-            raise RunError(f"{self.path}: {says.format(text)}") from error
+                sentence = "is locked by another process ({}); wait for it or choose another run folder"
+            raise RunError(f"{self.path}: {sentence.format(text)}") from error
 
     def append(self, record: EvaluationRecord) -> None:
-        """Store one evaluation; when this returns, it is on the disk.
+        """Store one evaluation on the disk.
 
         Raises:
             RunError: it is already stored, or the disk refuses.
         """
-        made = replace(record, created=record.created or datetime.now(UTC).isoformat(timespec="microseconds"))
-        row = [json.dumps(plain(getattr(made, c))) if c in JSON else getattr(made, c) for c in COLUMNS]
+        stored = replace(record, created=record.created or datetime.now(UTC).isoformat(timespec="microseconds"))
+        row = [json.dumps(plain(getattr(stored, c))) if c in JSON else getattr(stored, c) for c in COLUMNS]
         insert = f"INSERT INTO evaluations ({', '.join(COLUMNS)}) VALUES ({', '.join('?' * len(row))})"
         with self._explained(), self._connection:
             self._connection.execute(insert, row)
@@ -170,7 +170,7 @@ class EvaluationStore:
         return found[0] if found else None
 
     def records(self) -> list[EvaluationRecord]:
-        """All evaluations, in the order of their end."""
+        """All evaluations, in order of time."""
         return self._read("ORDER BY created, rowid")
 
     def _read(self, which: str, *values: str) -> list[EvaluationRecord]:
@@ -188,16 +188,16 @@ class EvaluationStore:
 
 
 def evaluate(
-    problem: Problem, jobs: Sequence[Job], store: EvaluationStore, model: Mapping[str, Any], *, together: int = 1
+    problem: Problem, jobs: Sequence[Job], store: EvaluationStore, model: Mapping[str, Any], *, batch_size: int = 1
 ) -> Iterator[EvaluationRecord]:
-    """Evaluations of all jobs in their order: stored ones, and new ones, each of which is stored before it is told.
+    """Evaluations of all jobs in order: stored ones, and new ones, which are stored first.
 
     Args:
-        problem: simulate-and-compare; begun.
+        problem: simulates and compares; begun.
         jobs: parameters and seeds, no two alike.
         store: open for writing.
-        model: what decides a single evaluation beside its parameters and seed.
-        together: how many are simulated as one batch.
+        model: what decides an evaluation besides parameters and seed.
+        batch_size: number of simulations in a batch.
 
     Raises:
         RunError: the database can't be written.
@@ -205,21 +205,21 @@ def evaluate(
     keys = [digest({**model, "values": dict(parameters), "seed": seed}) for parameters, seed in jobs]
     known = {key: found for key in keys if (found := store.find(key)) is not None}
     fresh = [job for job, key in zip(jobs, keys, strict=True) if key not in known]
-    parts = (fresh[k : k + together] for k in range(0, len(fresh), together))
-    new = (made for part in parts for made in evaluate_together([problem] * len(part), part))
+    parts = (fresh[k : k + batch_size] for k in range(0, len(fresh), batch_size))
+    new = (evaluation for part in parts for evaluation in evaluate_together([problem] * len(part), part))
     for key, (parameters, seed) in zip(keys, jobs, strict=True):
         if key not in known:
-            made = next(new)
+            evaluation = next(new)
             known[key] = EvaluationRecord(
                 key=key,
                 model=model,
                 parameters=dict(parameters),
                 seed=seed,
-                loss=made.loss,
-                message=made.message,
-                blocks=made.blocks.tolist(),
-                extras=dict(made.extras),
-                seconds=made.seconds,
+                loss=evaluation.loss,
+                message=evaluation.message,
+                blocks=evaluation.blocks.tolist(),
+                extras=dict(evaluation.extras),
+                seconds=evaluation.seconds,
             )
             store.append(known[key])
         yield known[key]
@@ -227,10 +227,10 @@ def evaluate(
 
 @contextmanager
 def writer_lock(folder: str | Path) -> Iterator[None]:
-    """Be the one process that writes into ``folder``.
+    """Be the only process that writes into ``folder``.
 
-    An exclusive transaction on an empty SQLite file: works wherever SQLite does, and the operating system lets it go
-    when the process ends, killed or not.
+    The lock is an exclusive transaction on an empty SQLite file. The operating system releases it when the process
+    ends.
 
     Raises:
         RunError: another process is writing there, or the folder can't be written.

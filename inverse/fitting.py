@@ -1,4 +1,4 @@
-"""A fit: Bayesian optimisation of the loss, each evaluation stored as it ends, and what it all came to."""
+"""A fit: Bayesian optimisation of the loss, then the posterior of a comparison of models."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from .criticism.diagnosis import Diagnosis
 from .evaluations import EvaluationRecord, evaluate
 from .run_folder import RunFolder
 
-#: Evaluations that are chosen and simulated together: as many cores as a small laptop has.
-TOGETHER = 2
-#: Points of the Gaussian process' curve kept for the figure.
-CURVE = 201
+#: Evaluations that are chosen and simulated as a batch: the cores of a small laptop.
+BATCH_SIZE = 2
+#: Points of a curve of the Gaussian process.
+CURVE_POINTS = 201
 
 
 @dataclass(frozen=True)
 class FitSetup:
-    """Everything that decides what a fit comes to, but its budget (a longer fit begins like a shorter one).
+    """Everything that decides the result of a fit, except its budget: a longer fit begins like a shorter one.
 
     Attributes:
         measurement: hash of the measurement set.
@@ -58,13 +58,13 @@ class FitSetup:
 
     @property
     def name(self) -> str:
-        """Short name of the model that is fitted: ``base``, or its effects joined by plus signs."""
-        # A user's effect is known by its file's name; a path would lead out of the run folder.
+        """Name of the fitted model: ``base``, or its effects joined by plus signs."""
+        # The stem of a user's file: a path would lead out of the run folder.
         names = (Path(effect).stem if effect.endswith(".py") else effect for effect in self.effects)
         return "+".join(sorted(names)) or "base"
 
     def model(self) -> dict[str, Any]:
-        """What decides a single evaluation, but its parameters and seed. One CUDA device is like another."""
+        """What decides an evaluation, besides parameters and seed; CUDA devices are equivalent."""
         return {
             "measurement": self.measurement,
             "reconstruction": self.reconstruction,
@@ -92,20 +92,20 @@ def fit(
     compare: Callable[[dict[str, Any]], Diagnosis] | None = None,
     after_evaluation: Callable[[int, EvaluationRecord], None] | None = None,
 ) -> dict[str, Any]:
-    """Fit the free parameters and write ``fit.json``; goes on where an interrupted fit of the same setup stopped.
+    """Fit the free parameters and write ``fit.json``; continues an interrupted fit of the same setup.
 
     Args:
-        problem: simulate-and-compare.
+        problem: simulates and compares.
         run: the run folder; only this process may write to it meanwhile.
         setup: what is fitted and how.
         budget: evaluations, those already stored included.
-        facts: what the fit should say of how it was computed (time step, spacing, ...).
-        compare: compares the model with something else, given what the search came to as ``fit.json`` will hold it; the
-            parameters are its. Without it, and where simulations are too few for it, they are the loss' minimum.
-        after_evaluation: called with the number done and the record of the last.
+        facts: how the fit was computed (time step, spacing, ...).
+        compare: compares the base with the discrepancy model, given the result of the search; it returns the estimate.
+            Without it, or with too few simulations, the estimate is the minimum of the loss.
+        after_evaluation: called with the number of evaluations and the last one.
 
     Returns:
-        What ``fit.json`` holds.
+        Contents of ``fit.json``.
 
     Raises:
         RunError: every evaluation failed, or the run folder can't be written.
@@ -117,15 +117,14 @@ def fit(
         known = {record.key for record in store.records()}
         problem.begin(setup.seed)
         while len(records) < budget:
-            actions = optimiser.ask(TOGETHER)[: budget - len(records)]
-            # Each evaluation has particles of its own: a scatter that all of them shared would shift the estimate,
-            # unseen.
+            actions = optimiser.ask(BATCH_SIZE)[: budget - len(records)]
+            # Each evaluation has its own seed: common scatter would bias the estimate.
             jobs: list[Job] = [
                 (problem.space.to_dict(problem.space.from_unit(action)), simulation_seed(setup.seed, len(records) + k))
                 for k, action in enumerate(actions)
             ]
-            made = evaluate(problem, jobs, store, setup.model(), together=TOGETHER)
-            for action, record in zip(actions, made, strict=True):
+            evaluated = evaluate(problem, jobs, store, setup.model(), batch_size=BATCH_SIZE)
+            for action, record in zip(actions, evaluated, strict=True):
                 optimiser.tell(action, record.loss)
                 records.append(record)
                 earlier += record.seconds if record.key in known else 0.0
@@ -148,7 +147,7 @@ def summarise(
     records: Sequence[EvaluationRecord],
     compare: Callable[[dict[str, Any]], Diagnosis] | None = None,
 ) -> dict[str, Any]:
-    """A fit in plain numbers, physical units and words; see :func:`fit`."""
+    """A fit as plain data; see :func:`fit`."""
     minimum = surrogate.minimum()
     losses = [np.inf if record.loss is None else record.loss for record in records]
     best = int(np.argmin(losses))
@@ -190,12 +189,12 @@ def summarise(
             for step, record in enumerate(records)
         ],
     }
-    remarks = []
+    failure = []
     if compare is not None:
         try:
             found = compare(result)
         except SimulationError as error:
-            remarks = [f"The estimate is the loss' minimum alone: the model could not be compared ({error})."]
+            failure = [f"The estimate is the loss' minimum alone: the model could not be compared ({error})."]
         else:
             result["estimated_from"] = "comparison"
             result["parameters"] = {p.name: _averaged(p, found) for p in space}
@@ -205,18 +204,18 @@ def summarise(
         **result,
         "loss": float(loss[0]),
         "loss_std": float(loss_std[0]),
-        "notes": [*remarks, *notes(result, space)],
+        "notes": [*failure, *notes(result, space)],
         "curves": {p.name: _curve(i, point, surrogate, space) for i, p in enumerate(space)},
     }
 
 
 def notes(result: Mapping[str, Any], space: ParameterSpace) -> list[str]:
-    """What a reader must know before believing the numbers."""
+    """Warnings for the reader."""
     out = []
     for name, entry in result["parameters"].items():
         if not entry["determined"]:
             out.append(
-                f"The evaluations hardly say where the loss is least: {name} is not determined by them."
+                f"The evaluations do not determine {name}."
                 if result["estimated_from"] == "loss"
                 else undetermined(name)
             )
@@ -234,7 +233,7 @@ def notes(result: Mapping[str, Any], space: ParameterSpace) -> list[str]:
 
 
 def _averaged(parameter: Parameter, found: Diagnosis) -> dict[str, Any]:
-    """A parameter, averaged over the models of a comparison."""
+    """A parameter's posterior, averaged over models."""
     marginal = found.evidence.marginal(parameter.name)
     determined = bool(found.determined[parameter.name])
     return {
@@ -254,8 +253,8 @@ def _about(parameter: Parameter) -> dict[str, Any]:
 
 
 def _curve(index: int, point: FloatArray, surrogate: Surrogate, space: ParameterSpace) -> dict[str, list[float]]:
-    """The Gaussian process along one parameter, the others at their estimates."""
-    points = np.repeat(point[None], CURVE, axis=0)
-    points[:, index] = np.linspace(-1.0, 1.0, CURVE)
+    """The Gaussian process along one parameter; the others are at their estimates."""
+    points = np.repeat(point[None], CURVE_POINTS, axis=0)
+    points[:, index] = np.linspace(-1.0, 1.0, CURVE_POINTS)
     mean, std = surrogate.mean_and_std(points)
     return {"x": space.from_unit(points)[:, index].tolist(), "mean": mean.tolist(), "std": std.tolist()}

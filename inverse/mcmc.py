@@ -1,4 +1,4 @@
-"""Markov chains: several ensembles of emcee's walkers, from different starts, until they agree."""
+"""Markov chain Monte Carlo: several emcee ensembles with different initial points, until they converge."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ LogDensity = Callable[[FloatArray], FloatArray]
 
 #: Independent ensembles, and walkers in each (more in many dimensions).
 ENSEMBLES, WALKERS = 4, 24
-#: Steps between looks at the autocorrelation, and the most of them.
-STRIDE, MOST_STEPS = 200, 6000
-#: An ensemble is long enough at this many autocorrelation times (emcee's own advice).
-LENGTHS = 50.0
+#: Steps between tests of convergence, and their maximum.
+STRIDE, MAX_STEPS = 200, 6000
+#: Minimum length of an ensemble in autocorrelation times (emcee's documentation).
+MIN_LENGTH = 50.0
 #: Ensembles agree below this R-hat (Vehtari et al. 2021, Bayesian Anal. 16:667).
-AGREE = 1.01
+MAX_R_HAT = 1.01
 
 
 @dataclass(frozen=True)
 class Chains:
-    """What was sampled.
+    """Samples of a density.
 
     Attributes:
         samples: (ensembles, steps, walkers, d), burn-in removed and thinned.
         log_density: (ensembles, steps, walkers).
-        steps: steps taken by each ensemble.
-        burn_in: steps thrown away.
-        autocorrelation: (d,) longest autocorrelation time over ensembles, steps.
-        acceptance: mean accepted share.
+        steps: of each ensemble.
+        burn_in: discarded steps.
+        autocorrelation: (d,) longest autocorrelation time over ensembles, in steps.
+        acceptance: mean acceptance fraction.
         r_hat: (d,) between ensembles.
-        converged: long enough, and in agreement.
+        converged: ensembles are long enough and agree.
     """
 
     samples: FloatArray
@@ -57,9 +57,9 @@ class Chains:
 
     @property
     def effective(self) -> float:
-        """Number of independent samples that these are worth, at least."""
-        drawn = self.samples.shape[0] * self.samples.shape[2] * (self.steps - self.burn_in)
-        return float(drawn / max(float(np.max(self.autocorrelation)), 1.0))
+        """Effective sample size of the slowest parameter."""
+        total = self.samples.shape[0] * self.samples.shape[2] * (self.steps - self.burn_in)
+        return float(total / max(float(np.max(self.autocorrelation)), 1.0))
 
 
 def sample(
@@ -69,26 +69,26 @@ def sample(
     seed: int = 0,
     ensembles: int = ENSEMBLES,
     walkers: int | None = None,
-    most_steps: int = MOST_STEPS,
+    max_steps: int = MAX_STEPS,
     progress: Callable[[int, int], None] = lambda done, most: None,
 ) -> Chains:
     """Sample a density inside [-1, 1]^d.
 
     Args:
-        log_density: (k, d) to (k,), up to a constant; −∞ where there is none, never NaN or +∞.
+        log_density: (k, d) to (k,), up to a constant; −∞ where the density is zero, never NaN or +∞.
         dimension: d.
         seed: the same seed gives the same chains.
         ensembles: independent groups of walkers.
-        walkers: in each; even, more than 2 d.
-        most_steps: after which the chains stop, converged or not.
-        progress: called with (steps done, most).
+        walkers: in each ensemble; even, more than 2 d.
+        max_steps: maximum number of steps.
+        progress: called with (steps done, maximum).
 
     Raises:
         RunError: the density is −∞ everywhere, or NaN or +∞ somewhere.
     """
 
     def checked(points: FloatArray) -> FloatArray:
-        # NaN and +∞ would end a chain without a word on the point.
+        # emcee does not report the point of a NaN or +∞.
         logs = np.asarray(log_density(points))
         wrong = np.isnan(logs) | np.isposinf(logs)
         if wrong.any():
@@ -103,16 +103,16 @@ def sample(
     moves = [(emcee.moves.DEMove(), 0.8), (emcee.moves.StretchMove(), 0.2)]
     samplers = [emcee.EnsembleSampler(count, dimension, checked, vectorize=True, moves=moves) for _ in range(ensembles)]
     states = [_start(checked, dimension, count, seed, e) for e in range(ensembles)]
-    for done in range(STRIDE, most_steps + STRIDE, STRIDE):
+    for done in range(STRIDE, max_steps + STRIDE, STRIDE):
         for e, sampler in enumerate(samplers):
             states[e] = sampler.run_mcmc(states[e], STRIDE, skip_initial_state_check=True)
-        progress(done, most_steps)
+        progress(done, max_steps)
         times = np.max([emcee.autocorr.integrated_time(s.get_chain(), tol=0) for s in samplers], axis=0)
         longest = float(times.max())
         burn, thin = int(min(5.0 * longest, 0.5 * done)), max(1, int(0.5 * longest))
         samples = np.stack([s.get_chain(discard=burn, thin=thin) for s in samplers])
         r_hat = _r_hat(samples)
-        converged = bool(done > LENGTHS * longest and np.all(r_hat < AGREE))
+        converged = bool(done > MIN_LENGTH * longest and np.all(r_hat < MAX_R_HAT))
         if converged:
             break
     return Chains(
@@ -128,25 +128,24 @@ def sample(
 
 
 def _start(log_density: LogDensity, dimension: int, count: int, seed: int, e: int) -> emcee.State:
-    """Walkers drawn from Sobol points of the cube by their density."""
+    """Walkers from Sobol points of the cube, weighted by density."""
     rng = np.random.default_rng([seed, e])
     points = 2.0 * qmc.Sobol(dimension, rng=rng).random(1024) - 1.0
     logs = log_density(points)
     if not np.any(np.isfinite(logs)):
         raise RunError("the posterior is zero everywhere: the observation is out of reach of the model")
-    # Tempered, so that the starts are wider than the posterior: agreement of ensembles then means something.
+    # Tempered: initial points must be wider than the posterior for R-hat to be a test.
     weights = np.exp(0.25 * (logs - logs.max()))
     chosen = points[rng.choice(len(points), count, p=weights / weights.sum())]
     spread = chosen + 0.04 * rng.standard_normal(chosen.shape)
-    # What sticks out is folded back: walkers that met at a bound would never part again.
+    # Reflected at the bounds: equal walkers would stay equal.
     folded = np.where(np.abs(spread) > 1.0, 2.0 * np.sign(spread) - spread, spread)
     random = np.random.RandomState(np.random.SeedSequence([seed, e]).generate_state(4))  # the kind that emcee takes
     return emcee.State(folded, random_state=random.get_state())
 
 
 def _r_hat(samples: FloatArray) -> FloatArray:
-    """(d,) rank-normalised split R-hat. The walkers of an ensemble are not independent, but ensembles are: each is one
-    chain, in the order of its steps."""
+    """(d,) rank-normalised split R-hat between ensembles; an ensemble is one chain, as its walkers interact."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # a remark on its next major version
         from arviz import rhat

@@ -1,15 +1,15 @@
-"""A run folder: everything one measurement set led to, described by the files themselves.
+"""The run folder of a measurement set.
 
-| file | what |
+| file | contents |
 |---|---|
-| `run.json` | what the folder is for: measurement (name, folder, hash), the way to it, preset, seed, version |
+| `run.json` | measurement (name, folder, hash), relative path to it, preset, seed, version |
 | `reconstruction/` | Gaussians, surface, metrics |
-| `evaluations.db` | every simulate-and-compare (SQLite) |
-| `features/` | light and albedo, what criticism simulated |
+| `evaluations.db` | every evaluation (SQLite) |
+| `features/` | light and albedo, features of simulations |
 | `fits/NAME.json` | each finished fit (`base`, `cohesion`, ...), `fit.json` is the latest |
 | `comparison/` | pictures and losses at the latest estimate |
-| `design/` | the stroke to make next |
-| `report.html` | for reading |
+| `design/` | the proposed next stroke |
+| `report.html` | the report |
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class RunFolder:
         """Open an existing run.
 
         Raises:
-            RunError: there is none, or it isn't one of ours.
+            RunError: there is none, or it isn't a run folder.
         """
         folder = Path(path)
         if not folder.is_dir():
@@ -60,21 +60,21 @@ class RunFolder:
     def prepare(
         cls, path: str | Path, *, measurement: Mapping[str, str], preset: str, seed: int, version: str
     ) -> RunFolder:
-        """Open the run for this experiment, or make it.
+        """Open the run folder of an experiment, or make it.
 
         Args:
-            path: the folder; made if absent. A folder with other things in it is refused.
+            path: the folder; made if absent. A folder with other files is refused.
             measurement: ``name``, ``folder`` and ``hash`` of the measurement set.
             preset: resolution of reconstruction and solver.
             seed: seed of reconstruction and fits.
-            version: of this package; noted, and part of each evaluation's key.
+            version: of this package.
 
         Raises:
             RunError: the folder belongs to another experiment, isn't a run, or can't be written.
         """
         folder = Path(path)
         if not (folder / "run.json").exists():
-            if folder.exists() and (not folder.is_dir() or not all(_is_left(p) for p in folder.iterdir())):
+            if folder.exists() and (not folder.is_dir() or not all(_is_leftover(p) for p in folder.iterdir())):
                 raise RunError(f"{folder}: exists and isn't a run folder; choose another --run")
             description = {
                 "format": RUN_FORMAT,
@@ -98,10 +98,10 @@ class RunFolder:
         return run.moved(measurement["folder"])
 
     def moved(self, measurement: str | Path) -> RunFolder:
-        """The run, which knows from now on that its measurement set, the same as ever, lies in this folder.
+        """The run with a new folder of its measurement set, which is stored in ``run.json``.
 
         Raises:
-            RunError: that isn't known yet, and the run can't be written to.
+            RunError: the run can't be written to.
         """
         if str(measurement) == self.description["measurement"]["folder"]:
             return self
@@ -112,10 +112,9 @@ class RunFolder:
         return replace(self, description=description)
 
     def measurement_places(self) -> tuple[Path, ...]:
-        """Folders in which the measurement set may lie: the one that was noted, the same way from here, and beside the
-        run."""
+        """Candidate folders of the measurement set: the stored one, the same relative path, and next to the run."""
         noted, here = Path(self.description["measurement"]["folder"]), self.path.resolve()
-        # runs of earlier versions know no way
+        # runs of earlier versions have no relative path
         way = str(self.description.get("way", noted))
         return tuple(dict.fromkeys(Path(os.path.normpath(p)) for p in (noted, here / way, here.parent / noted.name)))
 
@@ -135,14 +134,14 @@ class RunFolder:
         return self.path / "report.html"
 
     def lock(self) -> AbstractContextManager[None]:
-        """Be the only process that writes into the run; a context manager."""
+        """Context manager: be the only process that writes into the run."""
         return writer_lock(self.path)
 
     def check_writable(self) -> None:
-        """See that results can go into the run, before hours are spent on them.
+        """Check that the run can be written to.
 
         Raises:
-            RunError: another process is writing there, or it can't be written to.
+            RunError: it can't, or another process is writing.
         """
         for folder in (self.path, self.comparison, self.path / "features"):
             check_folder(folder)
@@ -150,11 +149,11 @@ class RunFolder:
             pass
 
     def evaluations(self, *, writable: bool = False) -> EvaluationStore:
-        """The run database; a context manager."""
+        """Context manager: the database of evaluations."""
         return EvaluationStore(self.path / "evaluations.db", writable=writable)
 
     def write_fit(self, name: str, fit: Mapping[str, Any]) -> Path:
-        """Keep a finished fit as ``fits/NAME.json`` and as the latest, ``fit.json``."""
+        """Write a finished fit as ``fits/NAME.json`` and ``fit.json``."""
         write_json(self.path / "fits" / f"{name}.json", dict(fit))
         return write_json(self.path / "fit.json", dict(fit))
 
@@ -162,19 +161,18 @@ class RunFolder:
         """The latest finished fit.
 
         Raises:
-            RunError: no fit has been finished, what is kept of it is damaged, or one of its effects is a file that the
-                user hasn't named.
+            RunError: there is none, it is damaged, or one of its effects is a file that the user hasn't named.
         """
         fit = read_fit(self.path)
         check_trusted(fit["setup"]["effects"], self.path)
         return fit
 
 
-def _is_left(path: Path) -> bool:
-    """Whether a process that was killed before it had described its run may have left it."""
+def _is_leftover(path: Path) -> bool:
+    """Whether a killed process may have left this file before it wrote ``run.json``."""
     return path.name in ("writer.lock", "writer.lock-journal") or path.match(".run.json.*.tmp")
 
 
 def _way(run: Path, measurement: str | Path) -> str:
-    """From a run folder to its set: both may be moved together."""
+    """Relative path from a run folder to its set: both may be moved together."""
     return os.path.relpath(Path(measurement).resolve(), run.resolve())

@@ -9,7 +9,7 @@ import sys
 import threading
 from types import FrameType
 
-from splatsoil.starting import SAID, end
+from splatsoil.starting import MESSAGE, end
 
 _AGAIN = 0.05  # seconds until an interrupt that came while a module was being loaded is tried again
 
@@ -48,7 +48,7 @@ def main() -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except KeyboardInterrupt:
-        print(f"\n{SAID}", file=sys.stderr)
+        print(f"\n{MESSAGE}", file=sys.stderr)
         return 130
 
 

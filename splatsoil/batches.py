@@ -1,4 +1,4 @@
-"""Work in batches, in smaller ones once memory has been full."""
+"""Batch processing that halves its batches when memory is full."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 _most: dict[str, int] = {}
-"""Largest batch by kind, of those that didn't fit as a whole."""
+"""Largest batch that fits, by kind."""
 
 
 def full_memory(error: RuntimeError) -> str:
-    """Which memory an error of torch or Warp says is full; empty for any other error."""
+    """Which memory is full by an error of torch or Warp; empty for any other error."""
     if type(error).__name__ != "OutOfMemoryError" and "Failed to allocate" not in str(error):
         return ""
     return "memory" if "device 'cpu'" in str(error) else "GPU memory"
 
 
 def in_batches(work: Callable[[Sequence[Item]], Sequence[Result]], items: Sequence[Item], kind: str) -> list[Result]:
-    """What ``work`` makes of all items at once or, where memory is full, of half as many at a time.
+    """Results of ``work`` for all items at once or, if memory is full, for half as many at a time.
 
     Args:
         work: items to as many results.
         items: any number of them.
-        kind: what they are, for the warning; batches of one kind stay small once they had to be.
+        kind: of the items, for the warning; the batch size of a kind is remembered.
 
     Raises:
         RuntimeError: memory is full with a single one.
@@ -47,13 +47,13 @@ def in_batches(work: Callable[[Sequence[Item]], Sequence[Result]], items: Sequen
             warnings.warn(text, SetWarning, stacklevel=2)
         else:
             continue
-        # Only here: while the error is known, so are the arrays of the functions that it came through.
+        # Only here: the error refers to arrays of the functions that it came through.
         _release()
     return done
 
 
 def _release() -> None:
-    """Hand back what torch holds but does not use, which Warp can't take."""
+    """Return torch's unused memory to the device, for Warp."""
     import torch
 
     torch.cuda.empty_cache()

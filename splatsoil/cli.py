@@ -1,13 +1,13 @@
-"""The command line: assembles the modules of ``splatsoil.commands`` and handles what they have in common.
+"""The command line, made of the modules of ``splatsoil.commands``.
 
-A module there is a command of the same name (``import_`` of ``import``, a word of Python's own). It has a frozen
-dataclass ``Config`` whose fields are its options (see `splatsoil.options`; its docstring is the help; a field
-``json`` makes the command print one JSON object and nothing else on stdout) and a function ``run(config) -> int`` that
-returns the exit code. ``INTERRUPTED`` says, after Ctrl-C, what is kept and how to go on, before the command line that
-does: a text, or a function of the options. Whatever is slow to import belongs inside ``run``.
+A module there is a command of the same name (``import_`` for ``import``). It has a frozen dataclass ``Config`` whose
+fields are its options (see `splatsoil.options`; its docstring is the help; a field ``json`` makes the command print one
+JSON object and nothing else on stdout) and a function ``run(config) -> int`` that returns the exit code.
+``INTERRUPTED`` is the message after Ctrl-C, before the command line that continues: a text, or a function of the
+options. Slow imports belong inside ``run``.
 
-Exit codes: what ``run`` returns; 2 for a mistake of the user's (one line on stderr, no traceback), 3 where all was done
-and the data give no answer (the first line on stdout says why), 130 after Ctrl-C.
+Exit codes: that of ``run``; 2 for a user's error (one line on stderr, no traceback), 3 if the data give no answer (the
+first line on stdout says why), 130 after Ctrl-C.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ def commands() -> dict[str, Any]:
 
 
 def after_interrupt(name: str, command: Any, config: Any) -> str:
-    """What Ctrl-C leaves, and the command line that goes on."""
-    said = getattr(command, "INTERRUPTED", "start again with")
-    return f"{said if isinstance(said, str) else said(config)}: {same_again(name, config)}"
+    """The message after Ctrl-C: what is stored, and the command line that continues."""
+    text = getattr(command, "INTERRUPTED", "start again with")
+    return f"{text if isinstance(text, str) else text(config)}: {same_again(name, config)}"
 
 
 @contextmanager
 def _printing_remarks() -> Iterator[None]:
-    """Print warnings about a set as its remarks, each once; all others are Python's."""
+    """Print each warning about a set once, as a remark; others as Python does."""
     printed: set[str] = set()
     with warnings.catch_warnings():
         warnings.simplefilter("always", SetWarning)
@@ -63,7 +63,7 @@ def _printing_remarks() -> Iterator[None]:
 
 
 def _page_or_hint(name: str, known: dict[str, Any]) -> int:
-    """The exit code, where no command is named."""
+    """Exit code without a known command: the help page or an error."""
     if name in ("", "-h", "--help"):
         page = program_page({name: command.Config for name, command in known.items()}, DESCRIPTION)
         print(page, file=sys.stdout if name else sys.stderr)
@@ -85,7 +85,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     command = known[name]
     config: Any
     if name == "benchmark" and words and not words[0].startswith("-"):
-        # What follows a benchmark's name is its own, options too.
+        # Further arguments are the benchmark's own.
         config = command.Config(words[0], tuple(words[1:]))
     else:
         config = parse(name, command.Config, words)

@@ -1,20 +1,17 @@
-"""Observed against predicted pictures: losses, residual pictures, and block residuals for inference.
+"""Comparison of observed and predicted pictures: losses, residual pictures, and block residuals for inference.
 
-Two losses. ``rgb`` is the mean square of the colour difference, the one in print. ``robust`` is made for sand, whose
-fine shape after a tool has passed is chance:
+There are two losses. ``rgb`` is the mean square colour difference of the literature. ``robust`` allows for the random
+fine shape of disturbed sand:
 
-- It compares changes since frame 0 (observed I_t − I_0 with predicted I_t − I_0), so that whatever is wrong with the
-  reconstruction before anything moves cancels.
-- It looks at differences averaged over centimetres, at several scales; single lumps average out, trench, berm and
-  shadows stay.
-- It grows with the square of small differences, but only linearly with large ones, so that a tool's edge that is off
-  by a pixel does not outweigh a berm.
-- Each scale is measured in units of what a model without any motion would leave: 0 is perfect, 1 is as good as no
-  model.
+- It compares changes since frame 0 (observed I_t − I_0 with predicted I_t − I_0). A constant error of the
+  reconstruction cancels.
+- It averages differences over centimetres, at several scales. Single lumps average out; trench, berm and shadows do
+  not.
+- It is quadratic for small and linear for large differences (Huber): one pixel at the tool's edge does not dominate.
+- Each scale is normalised by the loss of a model without motion: 0 is a perfect model, 1 a useless one.
 
-Only the bed's interior counts, and the crests from which soil may stand out, and pixels in which either picture shows
-the tool do not: where soil meets the tool, a millimetre decides what is seen. Where the tool stood at frame 0, pictures
-are compared as they are.
+Pixels of the bed's interior and of its crests are compared. Pixels in which either picture shows the tool are omitted,
+because there a millimetre decides what is visible. Where the tool was at frame 0, pictures themselves are compared.
 """
 
 from __future__ import annotations
@@ -46,24 +43,24 @@ PATCH = 0.04
 """Side of a block on the bed, m."""
 
 MARGIN = 0.02
-"""Strip along the walls that is left out, m."""
+"""Omitted strip along the walls, m."""
 
 RISE = 0.5
-"""How far heaps stand out from a crest behind which nothing of the bed is seen, as a share of the tool's width."""
+"""Height of heaps above a crest, as a share of the tool's width."""
 
 GAIN = 4.0
-"""Differences are shown this many times as strong as they are."""
+"""Factor of differences in pictures."""
 
 _MIN_PIXELS = 12
-"""Pixels a block needs."""
+"""Minimum number of pixels of a block."""
 
 _MIN_SEPARATION = 4.0
-"""Standard deviations between the tool's and the soil's colours from which pixels are told apart by colour."""
+"""Minimum distance between the colours of tool and soil, in standard deviations, for a classification by colour."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """Where a block residual was taken: a square of the bed as one camera sees it at one frame.
+    """A square of the bed as one camera sees it at one frame.
 
     Attributes:
         camera: name.
@@ -80,16 +77,14 @@ class Block:
 
 @dataclass(frozen=True)
 class Comparison:
-    """How a prediction differs from what was seen.
+    """Differences between observation and prediction.
 
     Attributes:
-        loss: the robust loss, all cameras and frames; 0 is perfect, 1 is as good as predicting no motion, NaN without
-            cameras.
-        losses: the robust loss by camera and frame; their mean is ``loss``.
-        rgb_mse: mean square colour difference (sRGB in [0, 1]) in the bed and over its crests by camera and frame.
-        blocks: (b,) mean change observed minus mean change predicted of each block, in grey levels of 255; 0 where a
-            block cannot be seen (the tool hides it).
-        labels: the blocks' places, in the same order.
+        loss: mean of ``losses``; NaN without cameras.
+        losses: the robust loss by camera and frame.
+        rgb_mse: mean square colour difference (sRGB in [0, 1]) by camera and frame.
+        blocks: (b,) observed minus predicted mean change of each block, in grey levels of 255; 0 behind the tool.
+        labels: of the blocks, in the same order.
     """
 
     loss: float
@@ -105,29 +100,29 @@ class Comparison:
 
 
 class Comparator:
-    """The measured side of comparisons, read and prepared once.
+    """The measured pictures, prepared for comparisons.
 
     Args:
         measurement: video, cameras, bed, tool.
-        surface: the undisturbed surface, to know which pixels show the bed.
-        frames: frames to compare. The first one in the video is what changes refer to and has no loss of its own.
+        surface: the undisturbed surface, which determines the pixels of the bed.
+        frames: to compare. The first one in the video is the reference of changes.
         patch: side of a block on the bed, m.
         surroundings: Gaussians of what does not move, which may hide parts of the bed; none by default.
 
     Attributes:
         observed: (h, w, 3) undistorted photographs by camera and frame.
-        before: (h, w, 3) by camera, the mean of all frames before anything moves.
-        ground: (h, w, 2) by camera, where each pixel's ray meets the undisturbed surface inside the bed, or passes
-            near over a crest, m; NaN elsewhere.
-        interior: (h, w) by camera, pixels that have such a place.
-        bed: (h, w) by camera, those of them whose ray meets the surface; the others look past a crest.
-        silhouettes: (h, w) by camera and frame, the tool's, a little wider.
-        block: (2,) sides of a block, m: about ``patch``, whole ones fill the bed.
-        patches: (h, w) by camera, the block that a pixel is in, or -1.
-        noise: the robust loss that the cameras' noise alone leaves; None where it can't be told.
+        before: (h, w, 3) by camera, the mean of all frames before the tool moves.
+        ground: (h, w, 2) by camera, where each pixel's ray meets the undisturbed surface or passes closely above a
+            crest, m; NaN elsewhere.
+        interior: (h, w) by camera, pixels with such a position.
+        bed: (h, w) by camera, those whose ray meets the surface.
+        silhouettes: (h, w) by camera and frame, the tool's, dilated.
+        block: (2,) size of a block, m: about ``patch``; whole blocks fill the bed.
+        patches: (h, w) by camera, the block of a pixel, or -1.
+        noise: expected robust loss of a perfect model, from the cameras' noise; None if unknown.
 
     Raises:
-        ParameterError: a frame that is not in the video, or nothing to compare.
+        ParameterError: a frame is not in the video, or there is none to compare.
     """
 
     def __init__(
@@ -164,7 +159,7 @@ class Comparator:
         }
         self.before = {c: np.mean([*self._still[c], self.observed[c, self.reference]], axis=0) for c in self.cameras}
         self.silhouettes = self._tool_silhouettes()
-        self._tool_colour = {c: self._tool_rule(c) for c in self.cameras}
+        self._tool_colour = {c: self._discriminant(c) for c in self.cameras}
         extent = measurement.bed.upper[:2] - measurement.bed.lower[:2]
         self.block: FloatArray = extent / np.maximum(np.round(extent / patch), 1.0)
         self.labels, self.patches = self._layout()
@@ -172,11 +167,10 @@ class Comparator:
         self.noise = self._noise()
 
     def compare(self, images: Mapping[Key, Image]) -> Comparison:
-        """Compare predicted with observed pictures.
+        """Compare predicted and observed pictures.
 
         Args:
-            images: (h, w, 3) sRGB in [0, 1] by camera and frame, as undistorted cameras see them; the reference frame
-                among them.
+            images: (h, w, 3) sRGB in [0, 1] by camera and frame of undistorted cameras, including the reference frame.
 
         Raises:
             ParameterError: a picture is missing or has another size.
@@ -193,11 +187,11 @@ class Comparator:
         return Comparison(loss, losses, squares, _in_order(means), self.labels)
 
     def blocks(self, images: Mapping[Key, Image]) -> FloatArray:
-        """(b,) `Comparison.blocks` alone, in half the time; raises what ``compare`` does."""
+        """(b,) `Comparison.blocks` alone, in half the time; raises like ``compare``."""
         return _in_order([self._block_means(*changed) for changed in self._changes(images)])
 
     def _changes(self, images: Mapping[Key, Image]) -> Iterator[tuple[str, list[Image], list[BoolImage]]]:
-        """Each camera with its (h, w, 3) changes observed minus predicted, and pixels (h, w) that count, by frame."""
+        """Each camera with its (h, w, 3) observed minus predicted changes and compared pixels (h, w), by frame."""
         for key in (*self.keys, *((c, self.reference) for c in self.cameras)):
             if key not in images:
                 raise ParameterError(f"the prediction has no picture of camera {key[0]!r} at frame {key[1]}")
@@ -213,19 +207,19 @@ class Comparator:
             yield camera, [self.observed[camera, f] - images[camera, f] - still for f in self.frames], masks
 
     def against(self, images: Mapping[Key, Image]) -> Comparator:
-        """The same comparison with these pictures, the reference frame among them, in place of the photographs: a
-        control in which the world is known. Nothing is known of their noise."""
+        """The same comparison with these pictures, including the reference frame, in place of the photographs; their
+        noise is unknown."""
         other = copy(self)
         other.observed = {key: images[key] for key in self.observed}
         other._still = {camera: [] for camera in self.cameras}
         other.before = {camera: images[camera, self.reference] for camera in self.cameras}
-        other._tool_colour = {camera: other._tool_rule(camera) for camera in self.cameras}
+        other._tool_colour = {camera: other._discriminant(camera) for camera in self.cameras}
         other._unit = other._motionless()
         other.noise = None
         return other
 
     def open_shares(self) -> FloatArray:
-        """(b,) share of each block's pixels that the tool's silhouette leaves open, in the order of ``labels``."""
+        """(b,) share of each block's pixels outside the tool's silhouette, in the order of ``labels``."""
         out = []
         for camera in self.cameras:
             patch = self.patches[camera]
@@ -237,20 +231,18 @@ class Comparator:
         return np.concatenate([np.zeros(0), *out])
 
     def still_blocks(self) -> dict[str, FloatArray]:
-        """(frames, blocks) changes between frames before anything moves, in grey levels, for each camera: noise alone.
-
-        Each is the frame minus the mean of the other still ones; a camera with fewer than two has none.
-        """
+        """(frames, blocks) noise of each camera in grey levels: a frame before the tool moves minus the mean of the
+        other ones. A camera with fewer than two such frames is omitted."""
         return {camera: 255.0 * self._block_means(camera, *changed) for camera, changed in self._still_changes()}
 
     def block_noise(self) -> float:
-        """Standard deviation of a block's change by the cameras' noise alone, in grey levels of 255; 0 if unknown."""
-        # A later frame's own noise, and that of the mean it is compared with, from n still frames.
+        """Standard deviation of a block's change by the cameras' noise, in grey levels of 255; 0 if unknown."""
+        # Noise of a later frame and of the mean of n still frames.
         variances = [float(np.mean(c**2)) * (1.0 - 1.0 / len(c) ** 2) for c in self.still_blocks().values()]
         return float(np.mean(variances)) ** 0.5 if variances else 0.0
 
     def _still_changes(self) -> Iterator[tuple[str, tuple[list[Image], list[BoolImage]]]]:
-        """Each camera with its (h, w, 3) still frames minus the mean of the others, and pixels (h, w) that count."""
+        """Each camera with its (h, w, 3) still frames minus the mean of the others, and compared pixels (h, w)."""
         for camera, still in self._still.items():
             frames = [*still, self.observed[camera, self.reference]]
             if len(frames) > 1:
@@ -259,15 +251,15 @@ class Comparator:
                 yield camera, ([f - (total - f) / (len(frames) - 1) for f in frames], [mask] * len(frames))
 
     def pictures(self, images: Mapping[Key, Image], camera: str, frame: int) -> dict[str, Image]:
-        """(h, w, 3) observed, predicted and their difference by these names; the difference is grey where equal, and
-        `GAIN` times as strong as it is."""
+        """(h, w, 3) observed, predicted and their difference by these names; the difference is grey for equal pictures
+        and scaled by `GAIN`."""
         observed, predicted = self.observed[camera, frame], images[camera, frame]
         difference = np.clip(0.5 + GAIN * (observed - predicted), 0.0, 1.0)
         return {"observed": observed, "predicted": predicted, "difference": difference.astype(np.float32)}
 
     def outlines(self, camera: str) -> FloatArray:
-        """(blocks, 4, 2) corners of each block on the undisturbed surface, in the undistorted picture of a camera, as
-        shares of its width and height; blocks in the order of ``labels``."""
+        """(blocks, 4, 2) corners of a camera's blocks on the undisturbed surface in its undistorted picture, as shares
+        of width and height."""
         centres = np.array([(b.x, b.y) for b in self.labels if (b.camera, b.frame) == (camera, self.frames[0])])
         around = 0.5 * self.block * np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
         flat = (centres[:, None] + around).reshape(-1, 2)
@@ -278,7 +270,7 @@ class Comparator:
         return (pixels / (view.width, view.height)).reshape(-1, 4, 2)
 
     def _places(self, relief: Relief, rise: float) -> dict[str, FloatArray]:
-        """Where each pixel looks, a strip along the walls left out."""
+        """Position on the ground of each pixel, without a strip along the walls."""
         low, high = self.measurement.bed.lower[:2], self.measurement.bed.upper[:2]
         margin = min(MARGIN, 0.1 * float(np.min(high - low)))
         return {
@@ -296,9 +288,9 @@ class Comparator:
                 out[camera, frame] = binary_dilation(shape, iterations=2)
         return out
 
-    def _tool_rule(self, camera: str) -> tuple[FloatArray, float] | None:
-        """A linear rule (weights (2,), threshold) on log colour ratios that tells tool from soil, whatever the light on
-        them; None where their colours are too alike."""
+    def _discriminant(self, camera: str) -> tuple[FloatArray, float] | None:
+        """Linear discriminant (weights (2,), threshold) of tool and soil on log colour ratios, which do not depend on
+        brightness; None if the colours are too similar."""
         shape = self.silhouettes[camera, self.reference]
         ratios = _log_ratios(self.before[camera])
         tool = ratios[binary_erosion(shape, iterations=4)]
@@ -313,7 +305,7 @@ class Comparator:
         return weights, float(weights @ (tool.mean(axis=0) + soil.mean(axis=0)) / 2)
 
     def _shows_tool(self, camera: str, frame: int, predicted: Image) -> BoolImage:
-        """Pixels in which either picture shows the tool, and near ones; its silhouette where colours don't tell."""
+        """Pixels in which either picture shows the tool, dilated; its silhouette without a discriminant."""
         shape = self.silhouettes[camera, frame]
         rule = self._tool_colour[camera]
         if rule is None:
@@ -324,7 +316,7 @@ class Comparator:
         return binary_dilation(shown, iterations=2)
 
     def _layout(self) -> tuple[tuple[Block, ...], dict[str, npt.NDArray[np.int64]]]:
-        """Labels of all blocks, and for each camera the block (in its order) that each pixel belongs to, or -1."""
+        """Labels of all blocks, and by camera the block of each pixel, or -1."""
         low, size = self.measurement.bed.lower[:2], self.block
         count = np.round((self.measurement.bed.upper[:2] - low) / size).astype(int)
         labels: list[Block] = []
@@ -344,7 +336,7 @@ class Comparator:
         return tuple(labels), patches
 
     def _block_means(self, camera: str, change: list[Image], masks: list[BoolImage]) -> FloatArray:
-        """(frames, blocks) mean residual over the pixels of each block that count."""
+        """(frames, blocks) mean residual over the compared pixels of each block."""
         patch = self.patches[camera]
         blocks = int(patch.max()) + 1
         out = np.zeros((len(change), blocks))
@@ -356,11 +348,11 @@ class Comparator:
         return out
 
     def _scaled_losses(self, camera: str, change: list[Image], masks: list[BoolImage]) -> FloatArray:
-        """(frames, scales) the robust loss of residual changes, before it is put into units."""
+        """(frames, scales) robust loss of residual changes before normalisation."""
         return robust_losses(change, masks, self._pixels_per_metre(camera))
 
     def _pixels_per_metre(self, camera: str) -> float:
-        """Of the bed's middle in the image."""
+        """Scale of the image at the middle of the bed."""
         view, point = self._views[camera], self.ground[camera]
         inside = point[self.interior[camera]]
         if len(inside) == 0:
@@ -369,7 +361,7 @@ class Comparator:
         return 0.5 * (view.fx + view.fy) / float(np.linalg.norm(middle - view.position))
 
     def _motionless(self) -> dict[str, FloatArray]:
-        """(scales,) what a model leaves in which nothing moves, for each camera: the loss' unit."""
+        """(scales,) loss of a model without motion, by camera: the normalisation."""
         out = {}
         for camera in self.cameras:
             first = self.observed[camera, self.reference]
@@ -380,7 +372,7 @@ class Comparator:
         return out
 
     def _noise(self) -> float | None:
-        """The robust loss that the cameras' noise alone leaves, from frames before anything moves; None without."""
+        """Robust loss of the cameras' noise, from frames before the tool moves; None without these."""
         found = [
             float((self._scaled_losses(camera, *changed) / self._unit[camera]).mean())
             for camera, changed in self._still_changes()
@@ -389,7 +381,7 @@ class Comparator:
 
 
 def _relief(surface: HeightField) -> Relief:
-    """The surface; cells that nobody knows are as high as the nearest known one."""
+    """The surface; an unknown cell has the height of the nearest known one."""
     nearest = distance_transform_edt(~np.isfinite(surface.height), return_distances=False, return_indices=True)
     height = torch.from_numpy(surface.height[tuple(nearest)])
     return Relief.of_heights(height, (float(surface.x[0]), float(surface.y[0])), surface.cell)

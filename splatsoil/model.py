@@ -1,4 +1,4 @@
-"""The forward model: a parameter vector in, what the cameras would have seen out."""
+"""The forward model: from parameters to the pictures and heights that the instruments measure."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ from splatsoil.soil.library import find_effects
 
 Image = npt.NDArray[np.float32]
 
-SCENES_KEPT = 4
-"""Scenes, one for each particle seed, that a model keeps at hand."""
+CACHED_SCENES = 4
+"""Scenes in a model's cache, one for each particle seed."""
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """What the model says the instruments see.
+    """Predicted measurements of the instruments.
 
     Attributes:
         values: the parameters, by name.
         seed: of the particles.
         images: (h, w, 3) sRGB in [0, 1] by (camera, frame), free of lens distortion.
-        trajectory: the simulation behind them.
-        surfaces: the soil's, by frame, where the set has heights.
+        trajectory: of the simulation.
+        surfaces: of the soil by frame, where the set has heights.
     """
 
     values: Mapping[str, float]
@@ -51,16 +51,16 @@ class Prediction:
 
 
 class _Poses:
-    """Posed scenes of the trajectory drawn last: what cameras alone report otherwise looks at the same ones."""
+    """Cache of posed scenes of the last trajectory: a change of the cameras alone reuses them."""
 
     def __init__(self) -> None:
         self._of: tuple[weakref.ref[Trajectory], object] | None = None
         self._made: dict[int, Posed] = {}
 
-    def of(self, trajectory: Trajectory, way: object) -> dict[int, Posed]:
-        """By frame; none yet of another trajectory, or of one posed in another way."""
-        if self._of is None or self._of[0]() is not trajectory or self._of[1] != way:
-            self._of, self._made = (weakref.ref(trajectory), way), {}
+    def of(self, trajectory: Trajectory, setting: object) -> dict[int, Posed]:
+        """By frame; empty for another trajectory or setting."""
+        if self._of is None or self._of[0]() is not trajectory or self._of[1] != setting:
+            self._of, self._made = (weakref.ref(trajectory), setting), {}
         return self._made
 
 
@@ -69,13 +69,12 @@ class Model:
 
     Args:
         measurement: bed, tool, motion, cameras.
-        reconstruction: of the scene before anything moves.
+        reconstruction: of the scene before the tool moves.
         effects: names of effects (or files that define some) that are on.
         preset: resolution of the solver.
         device: ``cpu`` or ``cuda:N``.
         frames: video frames to predict; all measured ones from frame 0 on by default.
-        intrinsic: file for the light and the albedo that photographs show, by the spacing of particles; what is there
-            isn't estimated again, and what isn't is kept there.
+        intrinsic: file that caches light and albedo from the photographs, by particle spacing.
 
     Raises:
         ParameterError: unknown preset, effect or frame.
@@ -103,7 +102,7 @@ class Model:
         if unknown or not self.frames:
             raise ParameterError(f"frames {unknown or 'none'} are not in the video; it has {measured}")
         self._intrinsic = intrinsic
-        self._scene = lru_cache(maxsize=SCENES_KEPT)(self._build_scene)
+        self._scene = lru_cache(maxsize=CACHED_SCENES)(self._build_scene)
         self._poses = _Poses()
         self.recorded = self._recorded_frames()
 
@@ -115,11 +114,7 @@ class Model:
         frames: Iterable[int] | None = None,
         scene: Scene | None = None,
     ) -> Model:
-        """The same experiment with other effects on, computed otherwise, at other frames, or drawn with another scene;
-        it shares scenes where particles agree.
-
-        An effect that is on already keeps its name here, wherever it came from.
-        """
+        """The same experiment with other effects, resolution, frames or scene; equal particles share scenes."""
         on: dict[str | Effect, Effect] = {effect.name: effect for effect in self.effects}
         chosen = self.effects if effects is None else tuple(on.get(name, name) for name in effects)
         other = Model(
@@ -135,7 +130,7 @@ class Model:
         if other.resolution.spacing == self.resolution.spacing:
             other._scene, other._poses = self._scene, self._poses
         if scene is not None:
-            other._scene, other._poses = lru_cache(maxsize=SCENES_KEPT)(lambda seed: scene), _Poses()
+            other._scene, other._poses = lru_cache(maxsize=CACHED_SCENES)(lambda seed: scene), _Poses()
         return other
 
     @property
@@ -145,11 +140,11 @@ class Model:
 
     @property
     def observation_parameters(self) -> tuple[Parameter, ...]:
-        """Those of effects that change what the cameras report: `draw` needs no new simulation for them."""
+        """Parameters of effects of observation: `draw` needs no new simulation for them."""
         return tuple(p for e in self.law.effects if e.observes for p in e.parameters)
 
     def observation(self, values: Mapping[str, float] | None = None) -> Observation:
-        """What the cameras report under ``values`` (by name; defaults for those left out).
+        """The observation model for ``values`` (by name; defaults for the rest).
 
         Raises:
             ParameterError: values out of bounds.
@@ -159,18 +154,18 @@ class Model:
     def space(self, names: Iterable[str] | None = None) -> ParameterSpace:
         """The named parameters as free ones.
 
-        By default the friction angle and, of the effects that are on, the parameters that can be off: those that only
-        shape an effect (a strain over which it decays, say) keep their defaults unless they are named.
+        By default the friction angle and the parameters with an off value of the effects that are on. Shape parameters
+        keep their defaults unless they are named.
 
         Raises:
-            ParameterError: a name that this model does not have.
+            ParameterError: the model has no such parameter.
         """
         known = {p.name: p for p in self.parameters}
-        wanted = tuple(self.law.free) if names is None else tuple(names)
-        unknown = [n for n in wanted if n not in known]
+        chosen = tuple(self.law.free) if names is None else tuple(names)
+        unknown = [n for n in chosen if n not in known]
         if unknown:
             raise ParameterError(f"unknown parameter {', '.join(unknown)}; this model has {', '.join(known)}")
-        return ParameterSpace(known[n] for n in wanted)
+        return ParameterSpace(known[n] for n in chosen)
 
     def particles(self, seed: int = 0) -> npt.NDArray[np.float64]:
         """Particles (n, 3) in m that fill the reconstructed bed."""
@@ -178,11 +173,11 @@ class Model:
 
     @property
     def photographed(self) -> bool:
-        """Whether photographs show soil, so that there is a scene; heights alone make none."""
+        """Whether photographs show soil, so that there is a scene."""
         return bool(self.reconstruction.soil.any())
 
     def scene(self, seed: int = 0) -> Scene:
-        """Scene whose Gaussians ride on the particles of ``seed``; light and albedo are estimated once."""
+        """Scene whose Gaussians move with the particles of ``seed``; light and albedo are estimated once."""
         return self._scene(seed)
 
     def _build_scene(self, seed: int) -> Scene:
@@ -205,10 +200,10 @@ class Model:
     def simulate(
         self, values: Mapping[str, float], seed: int = 0, progress: Callable[[int, int], None] | None = None
     ) -> Trajectory:
-        """Run the soil for ``values`` (by name, in physical units; defaults for those left out).
+        """Simulate the soil for ``values`` (by name, in physical units; defaults for the rest).
 
         Raises:
-            SimulationError: the simulation could not go on.
+            SimulationError: the simulation failed.
             ParameterError: unknown names or values out of bounds.
         """
         return simulate(
@@ -231,14 +226,14 @@ class Model:
         albedo: int | None = None,
         rounding: float = 1.0,
     ) -> dict[tuple[str, int], Image]:
-        """Pictures of a trajectory by (camera, frame), as cameras without distortion report it.
+        """Pictures of a trajectory by (camera, frame), without lens distortion.
 
         Args:
-            trajectory: from `simulate` of this model; one serves all values of `observation_parameters`.
+            trajectory: from `simulate` of this model, for any values of `observation_parameters`.
             seed: of the trajectory's particles.
-            values: by name; of these only observation effects' count. Everything is reported as it is by default.
-            albedo: seed of another guess of the colour of soil beneath the surface, which photographs leave open.
-            rounding: variance of the kernel that rounds off the surface, over the usual one.
+            values: by name; only those of effects of observation matter.
+            albedo: seed of a random draw of the albedo of buried soil; the standard albedo by default.
+            rounding: variance of the surface's smoothing kernel over the standard one.
 
         Raises:
             ParameterError: values out of bounds, or a trajectory without the frames that a time offset needs.
@@ -276,17 +271,14 @@ class Model:
     def surfaces(
         self, trajectory: Trajectory, values: Mapping[str, float] | None = None, *, rounding: float = 1.0
     ) -> dict[int, Relief]:
-        """The soil's surface by frame, as instruments that measure heights report it; none if the set has no heights.
-
-        Takes and raises what :meth:`draw` does.
-        """
+        """The soil's surface by frame; empty if the set has no heights. Arguments and errors are those of :meth:`draw`."""
         if not self.measurement.height_frames:
             return {}
-        late = self.observation(values).time_offset * self.measurement.frame_rate
+        delay = self.observation(values).time_offset * self.measurement.frame_rate
         bed, width = self.measurement.bed.domain, SMOOTHING * math.sqrt(rounding)
         return {
             frame: relief_of_particles(
-                torch.from_numpy(trajectory.at(frame + late)[0]).to(self.device),
+                torch.from_numpy(trajectory.at(frame + delay)[0]).to(self.device),
                 trajectory.spacing,
                 bed.lower,
                 bed.upper,
@@ -317,15 +309,15 @@ class Model:
         albedo: int | None = None,
         rounding: float = 1.0,
     ) -> Prediction:
-        """What all instruments report of a trajectory; takes and raises what :meth:`draw` does."""
+        """Predicted measurements of a trajectory; arguments and errors are those of :meth:`draw`."""
         images = self.draw(trajectory, seed, values, albedo=albedo, rounding=rounding)
         surfaces = self.surfaces(trajectory, values, rounding=rounding)
         return Prediction(dict(values), seed, images, trajectory, surfaces)
 
     def _recorded_frames(self) -> tuple[int, ...]:
-        """The model's frames, and those around them between which a time offset within its bounds interpolates."""
-        late = sum(
+        """The model's frames and their neighbours, between which a time offset interpolates."""
+        delay = sum(
             max(abs(self.observation({p.name: bound}).time_offset) for bound in (p.lower, p.upper))
             for p in self.observation_parameters
         )
-        return frames_around(self.frames, late * self.measurement.frame_rate)
+        return frames_around(self.frames, delay * self.measurement.frame_rate)

@@ -1,6 +1,6 @@
-"""What cameras report of a scene that is given: their pose, exposure, clock and focus, the light, the tool's place.
+"""Observation model: errors of camera pose, exposure, clock, focus, light and tool pose.
 
-An observation never changes the simulation, so trying another one costs pictures only. Everything is off by default.
+It does not change the simulation. Everything is off by default.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ Pose = tuple[FloatArray, FloatArray]
 
 @dataclass(frozen=True)
 class CameraShift:
-    """How a camera stands differently from its calibration, in its own axes; it turns about its centre of projection.
+    """Error of a camera's pose in its own axes; rotation is about the centre of projection.
 
     Attributes:
-        pan: turn to the right, degrees.
-        tilt: turn upwards, degrees.
-        roll: turn clockwise as seen from behind it, degrees.
+        pan: rotation to the right, degrees.
+        tilt: rotation upwards, degrees.
+        roll: rotation clockwise, seen from behind, degrees.
         right, up, forward: shift, m.
     """
 
@@ -44,20 +44,20 @@ class CameraShift:
 
 @dataclass(frozen=True)
 class Observation:
-    """Differences between what cameras are taken to report and what they do.
+    """Differences between ideal and real cameras.
 
     Attributes:
-        cameras: shift of each camera, in the measurement's order; those beyond the end stand as calibrated.
-        gain: factor on linear colour (exposure time, aperture).
-        drift: rate at which the gain's natural logarithm grows from time 0 on, 1/s.
-        offset: linear colour added to every channel (stray light, black level), of white's.
-        time_offset: pictures show a moment this much later than their frame number says, s.
-        tool_shift: (3,) shift of the drawn tool in the world, m; the soil is pushed where the motion says.
-        tool_turn: turn of the drawn tool about the vertical through its origin, from +x towards +y, degrees.
+        cameras: shift of each camera, in the measurement's order; further ones have none.
+        gain: factor of linear colour (exposure time, aperture).
+        drift: growth rate of the gain's natural logarithm from time 0 on, 1/s.
+        offset: linear colour added to every channel (stray light, black level), as a share of white.
+        time_offset: delay of pictures relative to their frame number, s.
+        tool_shift: (3,) shift of the drawn tool in the world, m; the simulation does not use it.
+        tool_turn: rotation of the drawn tool about the vertical through its origin, from +x towards +y, degrees.
         blur: standard deviation of a Gaussian blur of linear colour, pixels.
-        sun_azimuth: turn of the sun from +x towards +y, degrees.
+        sun_azimuth: rotation of the sun from +x towards +y, degrees.
         sun_elevation: rise of the sun, degrees.
-        sky_share: growth of the sky's share of the light on level, open ground.
+        sky_share: increase of the sky's share of the light on level, open ground.
     """
 
     cameras: tuple[CameraShift, ...] = ()
@@ -79,7 +79,7 @@ class Observation:
             raise ParameterError(f"a blur is 0 pixels or more, not {self.blur}")
 
     def camera(self, camera: Camera, index: int) -> Camera:
-        """The camera in place ``index`` of the measurement's list as it really stands."""
+        """The real pose of camera ``index`` of the measurement."""
         if index >= len(self.cameras) or self.cameras[index] == CameraShift():
             return camera
         shift = self.cameras[index]
@@ -91,7 +91,7 @@ class Observation:
         return replace(camera, camera_to_world=camera.camera_to_world @ change)
 
     def tool(self, pose: Pose) -> Pose:
-        """Where the tool is drawn that stands at ``pose``: rotation (3, 3), tool to world, and position (3,) in m."""
+        """Pose of the drawn tool for a ``pose``: rotation (3, 3), tool to world, and position (3,) in m."""
         if self.tool_turn == 0.0 and not any(self.tool_shift):
             return pose
         turn = Rotation.from_euler("z", self.tool_turn, degrees=True).as_matrix()
@@ -99,7 +99,7 @@ class Observation:
 
     @property
     def of_scene(self) -> Observation:
-        """What of it changes the scene that cameras look at: the moment, the light, the tool's place."""
+        """The part that changes the scene: time, light, tool pose."""
         return replace(self, cameras=(), gain=1.0, drift=0.0, offset=0.0, blur=0.0)
 
     @property
@@ -108,14 +108,14 @@ class Observation:
         return bool(self.sun_azimuth or self.sun_elevation or self.sky_share)
 
     def image(self, image: Image, time: float) -> Image:
-        """A picture (h, w, 3), sRGB in [0, 1], that the lens sees at ``time`` in s, as the camera reports it."""
+        """The camera's picture of an ideal picture (h, w, 3), sRGB in [0, 1], at ``time`` in s."""
         if self.gain == 1.0 and self.drift == 0.0 and self.offset == 0.0 and self.blur == 0.0:
             return image
         colour = self.exposed(linear(image.astype(np.float64)), time)
         return encoded(np.clip(colour, 0.0, 1.0)).astype(np.float32)
 
     def exposed(self, colour: FloatArray, time: float) -> FloatArray:
-        """Linear colour (h, w, 3) that the lens sees at ``time`` in s, as the sensor takes it."""
+        """Sensor values of linear colour (h, w, 3) at ``time`` in s."""
         gain = self.gain * math.exp(self.drift * max(time, 0.0))
         return gain * blurred(colour, self.blur) + self.offset
 

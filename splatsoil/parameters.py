@@ -1,4 +1,4 @@
-"""Parameters of law, effects and observation, and the map between dictionaries, vectors and the unit cube."""
+"""Parameters of law, effects and observation; maps between dictionaries, vectors and the unit cube."""
 
 from __future__ import annotations
 
@@ -16,21 +16,20 @@ FloatArray = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Parameter:
-    """One number a model needs.
+    """A parameter of a model.
 
     Attributes:
         name: identifier, unique among all parameters of a model (``friction_angle``).
         unit: SI unit, or ``deg`` for angles, or ``1`` for a pure number.
-        lower: smallest value that makes sense, in ``unit``.
-        upper: largest value that makes sense, in ``unit``.
-        default: value used when the parameter is not free.
-        off: value at which an effect's parameter has no influence; None for parameters of the base law, and for those
-            that only shape an effect whose size is another parameter.
-        meaningful: smallest change a user would care about, in ``unit``.
+        lower: lower bound of search and prior, in ``unit``.
+        upper: upper bound, likewise.
+        default: value of a parameter that is not free.
+        off: value at which an effect's parameter has no influence; None for base parameters and for shape parameters.
+        meaningful: smallest meaningful change, in ``unit``.
         log: search on a logarithmic scale (needs ``lower > 0``).
-        sign: +1 or -1 where physics allows one direction from ``off`` only, 0 otherwise.
-        label: short text for figures.
-        limits: values a model takes at all, where these reach beyond the bounds of search and prior.
+        sign: +1 or -1 if physics allows one direction from ``off`` only, else 0.
+        label: for figures.
+        limits: values that a model accepts, if wider than the bounds.
     """
 
     name: str

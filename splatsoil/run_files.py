@@ -1,4 +1,4 @@
-"""The JSON files of a run folder: their formats, and what each must hold for others to be understood."""
+"""The JSON files of a run folder: formats, schemas and reading."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ RECONSTRUCTION_FORMAT = "splatsoil-reconstruction/1"
 
 
 def _is_name(value: Any) -> bool:
-    """Whether it can be a file's name, and leads nowhere else."""
+    """Whether it is a plain file name, without a path."""
     return isinstance(value, str) and value not in ("", ".", "..") and not set(value) & set("/\\\0")
 
 
 def _is_effect(value: Any) -> bool:
-    """Whether it is the name of an effect, or of none, and no program's."""
+    """Whether it is the name of an effect, or empty, and not a program."""
     return value == "" or (_is_name(value) and not value.endswith(".py"))
 
 
 def _are_pictures(frames: Any) -> bool:
-    """Whether a comparison's frames, if it has any, name their pictures by names alone."""
+    """Whether the frames of a comparison name their pictures by plain file names."""
     kinds = ("observed", "predicted", "difference")
     return frames is None or (
         isinstance(frames, list)
@@ -42,11 +42,11 @@ def _are_pictures(frames: Any) -> bool:
 
 
 EACH = "*"
-"""Stands for every key there is, in a shape."""
+"""In a schema: every key."""
 NUMBER = (int, float)
 ESTIMATE = {"estimate": NUMBER, "std": NUMBER, "unit": str}
 
-SHAPES: Mapping[str, Mapping[str, Any]] = {
+SCHEMAS: Mapping[str, Mapping[str, Any]] = {
     RUN_FORMAT: {"measurement": {"name": str, "folder": str, "hash": str}, "preset": str, "seed": int},
     FIT_FORMAT: {
         "name": _is_name,
@@ -66,45 +66,45 @@ SHAPES: Mapping[str, Mapping[str, Any]] = {
     POSTERIOR_FORMAT: {"fit": str, "values": dict},
     HISTORY_FORMAT: {"models": [{"model": _is_name, "effects": [str], "parameters": {EACH: ESTIMATE}}]},
 }
-"""By format: of each key a type (or several), a shape of its own, a list of one, which each element must be of, or what
-tells whether a value is right."""
+"""Schema by format: for each key a type (or several), a schema, a list of one schema for its elements, or a
+predicate."""
 
 
-def read_kept(path: str | Path, tag: str, *, remedy: str = ANEW) -> dict[str, Any]:
-    """Read a file of a run folder that is to be of a format.
+def read_format(path: str | Path, tag: str, *, remedy: str = ANEW) -> dict[str, Any]:
+    """Read a file of a run folder and check its format.
 
     Args:
         path: the file.
         tag: its format.
-        remedy: what helps where it is something else.
+        remedy: advice to the user if the check fails.
 
     Raises:
-        RunError: it is missing, can't be read, or is something else or damaged.
+        RunError: the file is missing, unreadable, damaged, or of another format.
     """
     data = read_json(path, remedy=remedy)
     if not isinstance(data, dict) or data.get("format") != tag:
         raise RunError(f"{path}: isn't of format {tag}; {remedy}")
-    place = _astray(data, SHAPES.get(tag, {}))
+    place = _violation(data, SCHEMAS.get(tag, {}))
     if place is not None:
         raise RunError(f"{path}: is damaged, it lacks {place.removeprefix('.')}; {remedy}")
     return data
 
 
 def read_description(folder: Path) -> dict[str, Any]:
-    """What a run folder is for, from its ``run.json``.
+    """The description of a run folder, ``run.json``.
 
     Raises:
-        RunError: it isn't a run folder, is one of another version, or has links that lead out of it.
+        RunError: it isn't a run folder, is of another version, or has links that lead out of it.
     """
     path = folder / "run.json"
     if not path.is_file():
         raise RunError(f"{folder}: has no run.json, so it isn't a run folder; name one made by `splatsoil fit`")
     _check_links(folder)
-    return read_kept(path, RUN_FORMAT, remedy="choose another run folder")
+    return read_format(path, RUN_FORMAT, remedy="choose another run folder")
 
 
 def _check_links(folder: Path) -> None:
-    """What is written into a run folder stays there, and so does what is read."""
+    """RunError for a link that leads out of the run folder."""
     root = folder.resolve()
     for place, folders, files in os.walk(root):
         for entry in (Path(place) / name for name in (*folders, *files)):
@@ -115,7 +115,7 @@ def _check_links(folder: Path) -> None:
 
 
 def _resolved(path: Path) -> Path:
-    """Where a link leads; itself in no folder where it leads in a circle."""
+    """Target of a link; its name alone if it leads in a circle."""
     try:
         return path.resolve()
     except (OSError, RuntimeError):
@@ -123,31 +123,31 @@ def _resolved(path: Path) -> Path:
 
 
 def read_fit(folder: Path) -> dict[str, Any]:
-    """A run's latest finished fit, from its ``fit.json``.
+    """A run's latest finished fit, ``fit.json``.
 
     Raises:
-        RunError: no fit has been finished, or what is kept of it is damaged.
+        RunError: there is none, or it is damaged.
     """
     path = folder / "fit.json"
     if not path.is_file():
         raise RunError(f"{folder}: no fit has been finished here; `splatsoil fit` goes on where it stopped")
-    return read_kept(path, FIT_FORMAT, remedy="delete it; `splatsoil fit` makes it anew")
+    return read_format(path, FIT_FORMAT, remedy="delete it; `splatsoil fit` makes it again")
 
 
-def _astray(data: Any, shape: Any, place: str = "") -> str | None:
-    """The first place where data isn't of a shape; None where all of it is."""
-    if isinstance(shape, list):
+def _violation(data: Any, schema: Any, place: str = "") -> str | None:
+    """The first place where data violates a schema; None if it is valid."""
+    if isinstance(schema, list):
         if not isinstance(data, list):
             return place
-        parts = [(str(number), item, shape[0]) for number, item in enumerate(data)]
-    elif isinstance(shape, Mapping):
+        parts = [(str(number), item, schema[0]) for number, item in enumerate(data)]
+    elif isinstance(schema, Mapping):
         if not isinstance(data, dict):
             return place
-        wanted = dict.fromkeys(data, shape[EACH]) if EACH in shape else shape
+        wanted = dict.fromkeys(data, schema[EACH]) if EACH in schema else schema
         parts = [(key, data.get(key), inner) for key, inner in wanted.items()]
-    elif isinstance(shape, FunctionType):
-        return None if shape(data) else place
+    elif isinstance(schema, FunctionType):
+        return None if schema(data) else place
     else:
-        return None if isinstance(data, shape) else place
-    found = (_astray(item, inner, f"{place}.{key}") for key, item, inner in parts)
+        return None if isinstance(data, schema) else place
+    found = (_violation(item, inner, f"{place}.{key}") for key, item, inner in parts)
     return next((where for where in found if where is not None), None)

@@ -1,7 +1,4 @@
-"""The program's first moments: Ctrl-C while the package is being loaded, which takes a second.
-
-It imports next to nothing: until it is there, Ctrl-C ends in Python's own traceback.
-"""
+"""Ctrl-C while the package is loading, which takes a second; until this module is loaded, it ends in a traceback."""
 
 from __future__ import annotations
 
@@ -9,13 +6,13 @@ import os
 import signal
 import sys
 
-SAID = "splatsoil: interrupted; start the command again"
+MESSAGE = "splatsoil: interrupted; start the command again"
 
 
 def heed_interrupts() -> None:
-    """Where this process is the program, have Ctrl-C end it in one line; nothing is at stake yet.
+    """In the program itself, end on Ctrl-C with one line.
 
-    Who imports the package keeps the handler that is there, and a shell's background job goes on ignoring the signal.
+    Other programs that import the package keep their handler; a background job keeps ignoring the signal.
     """
     started = sys.argv[:1] == ["-m"] and "splatsoil" in sys.orig_argv
     named = os.path.basename(sys.argv[0] if sys.argv else "") in ("splatsoil", "splatsoil.exe")  # noqa: PTH119
@@ -24,6 +21,6 @@ def heed_interrupts() -> None:
 
 
 def end(number: int, frame: object) -> None:
-    """End here: an exception could be caught, and forgotten, by a module that is being loaded."""
-    os.write(2, f"\n{SAID}\n".encode())
+    """Exit; a module that is loading could catch an exception."""
+    os.write(2, f"\n{MESSAGE}\n".encode())
     os._exit(130)

@@ -20,7 +20,7 @@ from splatsoil.benchmarks._validation.sand import HUNDRED, LADDER, calibrated, c
 from splatsoil.benchmarks._validation.scene import GRAVITY
 
 from splatsoil.errors import MeasurementError
-from splatsoil.experiment.plate import PlateExperiment
+from splatsoil.experiment.plate import Loading, PlateExperiment
 from splatsoil.measurement.fields import read_table
 from splatsoil.mpm import Preset, Resolution
 from splatsoil.soil.packing import at_void_ratio
@@ -83,14 +83,13 @@ def plate(
     """A plate at depths (n,) over its diameter (m) in soil of a density (kg/m³), whose skeleton is as stiff as the
     largest pressure (Pa) that is expected asks for."""
     forces = np.full(len(depth), max(pressure * 0.25 * math.pi * diameter**2, 1.0))
-    return PlateExperiment(
-        diameter, depth * diameter, forces, 0.1, density=density, effects=effects, candidates=(), device=device
-    )
+    test = Loading(diameter, depth * diameter, forces, np.array(0.1), density)
+    return PlateExperiment(test, effects=effects, candidates=(), device=device)
 
 
 def bearing(experiment: PlateExperiment, values: Mapping[str, float]) -> FloatArray:
     """Pressures (n,) under a plate over half of density, gravity and diameter."""
-    unit = 0.125 * math.pi * experiment.density * GRAVITY * experiment.diameter**3
+    unit = 0.125 * math.pi * experiment.test.density * GRAVITY * experiment.test.diameter**3
     return np.asarray(experiment.readings(values)[:, 0] / unit)
 
 

@@ -106,14 +106,14 @@ def sentences(diagnosis: Diagnosis, candidates: Mapping[str, Candidate]) -> list
     if len(diagnosis.held_out) > 1:
         before, after = diagnosis.held_out[:2]
         out.append(
-            f"On what was set aside ({diagnosis.held_out_data}), the error is {before.error:.2g} without and "
+            f"On held-out data ({diagnosis.held_out_data}), the error is {before.error:.2g} without and "
             f"{after.error:.2g} with {after.model.replace('_', ' ')}; the noise level is {after.noise:.2g}."
         )
     worst = next((c for c in diagnosis.checks if c.p < SIGNIFICANT), None)
     if worst is not None:
         out.append(
             f"The most probable model fails most clearly here: {worst.region}, {worst.stage}, {worst.channel}, with "
-            f"{worst.ratio:.1f} times what is expected."
+            f"{worst.ratio:.1f} times the expected residual."
         )
     if candidates:
         out += _power(diagnosis, candidates)

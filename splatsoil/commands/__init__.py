@@ -1,4 +1,4 @@
-"""The command line's subcommands, one module each: a frozen dataclass of options and a function that acts on it.
+"""The subcommands of the command line, one module each: a frozen dataclass of options and a function ``run``.
 
 Shared modules: ``_options`` (parser, help), ``_output`` (JSON, tables, progress), ``_model`` (a run folder and its
 model), ``_stages`` (fit, compare, diagnose), ``_resources`` (memory, time), ``_workers`` (worker processes) and

@@ -1,4 +1,4 @@
-"""Commands on a test of a laboratory, which has no cameras: what `fit`, `diagnose`, `check` and `simulate` do then."""
+"""The commands `fit`, `diagnose`, `check` and `simulate` for laboratory tests, which have no cameras."""
 
 from __future__ import annotations
 
@@ -13,46 +13,45 @@ from splatsoil.envs.devices import resolve_device
 from splatsoil.errors import MeasurementError, RunError
 from splatsoil.files import plain, write_json
 from splatsoil.quiet import hush
-from splatsoil.run_files import read_kept
+from splatsoil.run_files import read_format
 
 ABOUT = "laboratory.json"
-"""Of a run folder: which test it is of, and with what model."""
+"""File of a run folder that names test and model."""
 ABOUT_FORMAT = "splatsoil-laboratory-run/1"
 
 
 def is_test(folder: Path) -> bool:
-    """Whether a folder holds a test of a laboratory: its ``experiment.json`` names a kind."""
+    """Whether a folder is a laboratory test: its ``experiment.json`` has a kind."""
     from splatsoil.measurement.fields import read_json
 
     try:
         data = read_json(folder / "experiment.json")
-    except MeasurementError:  # what is wrong with it is said by whoever reads it as a measurement set
+    except MeasurementError:  # reported when it is read as a measurement set
         return False
     return isinstance(data, dict) and "kind" in data
 
 
 def is_run(folder: Path) -> bool:
-    """Whether a folder is what `fit` made of a test."""
+    """Whether a folder is the run folder of a laboratory test."""
     return (folder / ABOUT).is_file()
 
 
 def fit(config: FitOptions) -> int:
-    """Estimate the parameters of a test's model; the result goes into the run folder as ``fit.json``."""
-    made_of = {"effects": list(config.effects), "preset": config.preset, "seed": config.seed}
-    about = {"set": str(config.set.resolve()), **made_of}
+    """Estimate the parameters of a test's model; write ``fit.json``."""
+    settings = {"effects": list(config.effects), "preset": config.preset, "seed": config.seed}
+    about = {"set": str(config.set.resolve()), **settings}
     return _answered(config, about, config.set, config.run)
 
 
 def diagnose(config: Any) -> int:
-    """Compare the models of a test that was fitted, or the base model of a test's folder; the result is
-    ``diagnosis.json`` in the run folder."""
+    """Compare models of a fitted test, or of a test's folder; write ``diagnosis.json``."""
     about: Mapping[str, Any] = {"set": str(config.run), "effects": [], "preset": "small", "seed": 0}
     kept = None
     if is_run(config.run):
-        about, kept = read_kept(config.run / ABOUT, ABOUT_FORMAT), config.run
+        about, kept = read_format(config.run / ABOUT, ABOUT_FORMAT), config.run
     folder = config.set or Path(about["set"])
     if not folder.is_dir():
-        raise RunError(f"{folder}: the test is no longer there; say with --set where it is now")
+        raise RunError(f"{folder}: the test is no longer there; give its place with --set")
     return _answered(config, about, folder, kept, tuple(config.effects) or None, with_effects=True)
 
 
@@ -65,7 +64,7 @@ def _answered(
     *,
     with_effects: bool = False,
 ) -> int:
-    """Compute, keep and say an answer from a test in ``folder``; the run folder is named after it if not given."""
+    """Compute, store and print a result of the test in ``folder``; the run folder is named after it if not given."""
     from splatsoil.commands.diagnose import show
     from splatsoil.laboratory.answer import diagnosed, fitted
     from splatsoil.laboratory.folder import Options, load
@@ -89,7 +88,7 @@ def _answered(
 
 
 def check(config: Any) -> int:
-    """Say what a test holds."""
+    """Print the contents of a test."""
     from splatsoil.laboratory.folder import load
 
     experiment = load(config.set)
@@ -104,12 +103,12 @@ def check(config: Any) -> int:
         "to": layout.times[-1],
         "over": layout.time_name,
     }
-    said = (
+    lines = (
         f"{experiment.kind.replace('_', ' ')}: {experiment.name}",
         f"{readings} readings of {', '.join(layout.channels)}",
         f"{layout.time_name}: {layout.times[0]:g} to {layout.times[-1]:g}",
     )
-    return print_result(config, about, last="\n".join(said))
+    return print_result(config, about, last="\n".join(lines))
 
 
 def simulate(config: Any, values: Mapping[str, float]) -> int:

@@ -1,4 +1,4 @@
-"""A run folder as commands meet it: its set, its latest fit and diagnosis, its model, and that as an experiment."""
+"""What commands load from a run folder: measurement set, latest fit and diagnosis, model, experiment."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ if TYPE_CHECKING:
 
 
 def opened(options: RunOptions) -> RunFolder:
-    """The run folder of a command, which knows where its set is now if the command says so.
+    """The run folder of a command, with a new place of its set if the options name one.
 
     Raises:
-        RunError: there is none, or the set is another one.
+        RunError: there is no run, or the set is another one.
         MeasurementError: there is no set.
     """
     from splatsoil.measurement import Measurement
@@ -52,10 +52,10 @@ def opened(options: RunOptions) -> RunFolder:
 
 
 def measurement_of(run: RunFolder) -> Measurement:
-    """The set that a run was made from: where it was, or beside the run if both have moved.
+    """The measurement set of a run, at its stored place or next to the run.
 
     Raises:
-        RunError: it is at none of these places, or has changed since.
+        RunError: it is not found, or has changed since.
     """
     from splatsoil.measurement import Measurement
     from splatsoil.measurement.measurement import EXPERIMENT
@@ -75,12 +75,12 @@ def measurement_of(run: RunFolder) -> Measurement:
             return measurement
         changed = changed or f"{run.path}: its measurement set {folder} has changed since; fit again into another --run"
     note = command_line("report", run.path, "--set", "FOLDER")
-    gone = f"{run.path}: its measurement set {first} isn't there any more, nor beside the run; `{note}` notes where it"
+    gone = f"{run.path}: its measurement set {first} isn't there any more, nor next to the run; `{note}` notes where it"
     raise RunError(changed or f"{gone} is now")
 
 
 def latest_fit(folder: RunFolder) -> dict[str, Any]:
-    """The fit that a diagnosis starts from; RunError where there is none."""
+    """The fit from which a diagnosis starts; RunError if there is none."""
     try:
         return folder.fit()
     except RunError as error:
@@ -88,13 +88,13 @@ def latest_fit(folder: RunFolder) -> dict[str, Any]:
 
 
 def require_answer(run: RunFolder, fit: Mapping[str, Any], look: str) -> None:
-    """NoAnswer where a run's fit has none; ``look`` says what to look at then."""
+    """NoAnswer if a fit has no answer; ``look`` is the advice then."""
     if reason := no_answer(fit):
         raise NoAnswer(f"{reason}: {look}", places(run))
 
 
 def note_other_sources(run: RunFolder) -> None:
-    """Say on stderr, in one line, if the latest fit was made by other sources than these."""
+    """Print one line on stderr if other source code made the latest fit."""
     fit = read_fit(run.path)
     setup = fit["setup"]
     then = (setup.get("version"), setup.get("code"))
@@ -115,15 +115,15 @@ def note_other_sources(run: RunFolder) -> None:
     )
     print(
         f"splatsoil: {run.path} was fitted by splatsoil {then[0]}, code {then[1]}, and this is {now[0]}, code "
-        f"{now[1]}; this makes it anew: {same_again('fit', options)}",
+        f"{now[1]}; to repeat it: {same_again('fit', options)}",
         file=sys.stderr,
     )
 
 
 def current_diagnosis(folder: RunFolder, path: Path, effects: tuple[str, ...] | None = None) -> dict[str, Any] | None:
-    """A diagnosis (its file is ``path``) of the latest fit by the code as it is, or None.
+    """The diagnosis in the file ``path`` if it is of the latest fit and of the present code, else None.
 
-    Code is also that of the files of ``effects``, or of the diagnosis's own candidates if not given.
+    The code includes the files of ``effects``, or of the diagnosis's own candidates if not given.
     """
     fit = folder.fit()
     data = kept_of(path, DIAGNOSIS_FORMAT, fit)
@@ -136,10 +136,10 @@ def current_diagnosis(folder: RunFolder, path: Path, effects: tuple[str, ...] | 
 
 @dataclass(frozen=True)
 class ModelSpec:
-    """What makes a run's model, beside its set and reconstruction.
+    """What defines a run's model, besides its set and reconstruction.
 
     Attributes:
-        effects: names of those that are on, or files.
+        effects: names or files of those that are on.
         preset: resolution of the solver.
         parameters: names of the free ones.
     """
@@ -150,15 +150,15 @@ class ModelSpec:
 
     @classmethod
     def of(cls, fit: Mapping[str, Any]) -> ModelSpec:
-        """What ``fit.json`` is a fit of."""
+        """Of a fit (contents of ``fit.json``)."""
         return cls(tuple(fit["setup"]["effects"]), fit["setup"]["preset"], tuple(fit["parameters"]))
 
 
 @contextmanager
 def loaded(options: Any, folder: RunFolder, spec: ModelSpec | None = None) -> Iterator[tuple[Model, Stage]]:
-    """The model of a run, that of its latest fit if not given, and what begins a stage, while these last.
+    """Context manager: the model of a run, by default that of its latest fit, and the function that begins a stage.
 
-    ``options`` are a command's. Says if other sources made the fit.
+    ``options`` are a command's. Reports if other source code made the fit.
     """
     hush()
     device = resolve_device(options.device)
@@ -170,12 +170,12 @@ def loaded(options: Any, folder: RunFolder, spec: ModelSpec | None = None) -> It
 def model_of(
     folder: RunFolder, device: str, report: Report, *, spec: ModelSpec | None = None, make: bool = True
 ) -> Model:
-    """The model that a run's latest fit is of, or a chosen one, on one device.
+    """The model of a run, by default that of its latest fit, on one device.
 
-    ``make`` is whether a reconstruction that isn't kept is made, and remarks on the set are printed.
+    ``make``: make a missing reconstruction, and print remarks on the set.
 
     Raises:
-        RunError: the reconstruction is damaged, or it isn't there and may not be made.
+        RunError: the reconstruction is damaged, or missing and not to be made.
     """
     spec = spec or ModelSpec.of(folder.fit())
     measurement = measurement_of(folder)
@@ -188,30 +188,30 @@ def model_of(
 def reconstructed(
     measurement: Measurement, run: RunFolder, device: str, report: Report, *, make: bool = True
 ) -> Reconstruction:
-    """The run's reconstruction: from the folder, or made and kept there.
+    """The run's reconstruction, loaded or made.
 
     Raises:
-        RunError: what is kept is damaged, or nothing is and it may not be made.
+        RunError: it is damaged, or missing and not to be made.
     """
     from splatsoil.reconstruction import Reconstruction, reconstruct
 
-    made_of = {"preset": run.description["preset"], "seed": run.description["seed"]}
+    settings = {"preset": run.description["preset"], "seed": run.description["seed"]}
     code = code_digest(RECONSTRUCTING)
-    wanted = {"measurement_hash": measurement.hash, "version": __version__, "code": code, **made_of}
+    identity = {"measurement_hash": measurement.hash, "version": __version__, "code": code, **settings}
     if (run.reconstruction / "reconstruction.json").is_file():
         report("reading", 0.0)
         try:
-            kept = Reconstruction.load(run.reconstruction)
+            stored = Reconstruction.load(run.reconstruction)
         except RunError as error:
             raise RunError(f"{error}: delete the folder {run.reconstruction} and run the command again") from error
-        if all(kept.metadata.get(key) == value for key, value in wanted.items()):
-            return kept
+        if all(stored.metadata.get(key) == value for key, value in identity.items()):
+            return stored
     if not make:
         raise RunError(f"{run.path}: its reconstruction isn't there")
-    made = reconstruct(measurement, device=device, progress=report, **made_of)
+    made = reconstruct(measurement, device=device, progress=report, **settings)
     with run.lock():
         made.save(run.reconstruction)
-    # Read back: float32 on disk is what every later command will start from.
+    # Every later command starts from the float32 values on disk.
     return Reconstruction.load(run.reconstruction)
 
 
@@ -223,8 +223,7 @@ def model_on(
     preset: str,
     device: str,
 ) -> Model:
-    """A model of a run's set. What photographs say of light and albedo is kept in the run's ``features/``: processes
-    that work side by side, and later commands, find it there."""
+    """A model of a run's set. Light and albedo from the photographs are cached in ``features/``."""
     from splatsoil.model import Model
 
     what = {
@@ -242,7 +241,7 @@ def model_on(
 
 
 def reconstruction_digest(reconstruction: Reconstruction) -> str:
-    """SHA-256 of what simulations and pictures start from; the same arrays, the same digest."""
+    """SHA-256 of the arrays from which simulations and pictures start."""
     g = reconstruction.gaussians
     tensors = (g.means, g.scales, g.quaternions, g.opacities, g.colours, reconstruction.soil, reconstruction.tool)
     arrays = [*(tensor.detach().cpu().numpy() for tensor in tensors), reconstruction.surface.height]
@@ -252,9 +251,10 @@ def reconstruction_digest(reconstruction: Reconstruction) -> str:
 def experiment_of(
     folder: RunFolder, model: Model, spec: ModelSpec, effects: Iterable[str] | None = None
 ) -> tuple[PlowExperiment, Simulations]:
-    """The run as an experiment, with some effects as candidates or all, and its simulations, kept in ``features/``.
+    """The run as an experiment with some candidates or all, and its simulations, cached in ``features/``.
 
-    ParameterError for an effect that is unknown or on already.
+    Raises:
+        ParameterError: an effect is unknown or already on.
     """
     from splatsoil.experiment.plow import PlowExperiment
     from splatsoil.inverse.criticism.simulations import Simulations
@@ -273,16 +273,16 @@ def experiment_of(
         "code": code_of(spec.effects),
         "layout": list(experiment.layout.shape),
     }
-    # A file counts for what it is on in alone: simulations of the model as it is are there already.
+    # A user's file affects only simulations with its effect on.
     own = {e.name: code_digest((), [file]) for file in own_files(named or ()) for e in find_effects([file])}
     return experiment, Simulations(experiment, folder.path / "features", identity, sources=own)
 
 
 def off_effects(names: Iterable[str], on: Iterable[Effect]) -> tuple[Effect, ...]:
-    """Effects by name, or from files, that are none of those that are on.
+    """Effects by name, or from files, that are off.
 
     Raises:
-        ParameterError: one is unknown, on already, or no more than discretisation error to a diagnosis.
+        ParameterError: one is unknown, already on, or part of the discretisation error in a diagnosis.
     """
     from splatsoil.soil.library import find_effects
 
@@ -292,7 +292,7 @@ def off_effects(names: Iterable[str], on: Iterable[Effect]) -> tuple[Effect, ...
             raise ParameterError(f"effect {effect.name} is on already; name one that is off")
         if effect.numerical:
             raise ParameterError(
-                f"effect {effect.name} can't be told from other numerics, which a diagnosis allows for; "
+                f"effect {effect.name} can't be distinguished from discretisation error in a diagnosis; "
                 f"fit it: splatsoil fit SET --with {effect.name}"
             )
     return wanted

@@ -1,7 +1,4 @@
-"""Options of the commands: the parser, the help page, and the command line that says the same again.
-
-All are made from the fields of a dataclass, see `splatsoil.options`.
-"""
+"""Parser, help page and command line of a command, from the fields of its dataclass (see `splatsoil.options`)."""
 
 from __future__ import annotations
 
@@ -25,7 +22,7 @@ from splatsoil.options import JSON, argument, option
 
 Preset = Literal["tiny", "small", "paper", "fine"]
 
-#: Texts of options that several commands have.
+#: Texts of common options.
 SET = "Folder of the measurement set."
 PRESET = "Resolution; small suits a laptop without a graphics card."
 DEVICE = "Where to compute: auto, cpu, cuda:0, …"
@@ -34,7 +31,7 @@ BUDGET = "Evaluations; 10 for each free parameter if not given."
 ACTING = "Effects that act, or files that define some."
 VALUES = "Parameters of the effects."
 
-#: Commands as help lists them, by what they are for.
+#: Order of commands in the help.
 ORDER = {
     "all at once": ("run",),
     "into a measurement set": ("import", "check", "simulate"),
@@ -42,20 +39,20 @@ ORDER = {
     "more of a run": ("posterior", "design", "export", "view"),
     "by themselves": ("element", "benchmark"),
 }
-#: Options that most commands have, which stand behind a command's own.
+#: Common options, listed after a command's own.
 COMMON = {"device": 1, "json": 2}
-#: Evaluations for each free parameter, unless the user says how many.
+#: Default number of evaluations for each free parameter.
 EVALUATIONS = 10
 
-WIDEST = 100
-"""Columns of a help page, at most."""
+MAX_COLUMNS = 100
+"""Maximum width of a help page."""
 KINDS = {int: "N", float: "X", Path: "PATH", str: "NAME"}
-"""What stands for a value of some type in help."""
+"""Placeholders of values in the help, by type."""
 
 
 @dataclass(frozen=True)
 class FitOptions:
-    """What decides a fit."""
+    """Options of a fit."""
 
     set: Path = argument(SET)
     parameters: tuple[str, ...] = option(
@@ -80,7 +77,7 @@ class FitOptions:
 
 @dataclass(frozen=True)
 class RunOptions:
-    """What a command on a run folder takes."""
+    """Options of a command on a run folder."""
 
     run: Path = argument("The run folder.")
     set: Path | None = option(None, "Where the measurement set is now, if it has moved; later commands know it, too.")
@@ -89,7 +86,7 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class ComputingOptions(RunOptions):
-    """What a command that simulates with the model of a run folder takes."""
+    """Options of a command that simulates the model of a run folder."""
 
     device: str = option("auto", DEVICE)
 
@@ -101,18 +98,18 @@ def check_evaluations(budget: int | None) -> None:
 
 
 def check_seed(seed: int) -> None:
-    """ParameterError for one that random numbers can't begin with."""
+    """ParameterError for an invalid seed."""
     if not 0 <= seed < 2**63:
         raise ParameterError(f"--seed: must be 0 or more and less than 2^63, not {seed}")
 
 
 def command_line(command: str, *words: object) -> str:
-    """A command as a shell takes it."""
+    """A command line, quoted for a shell."""
     return shlex.join(["splatsoil", command, *map(str, words)])
 
 
 def same_again(command: str, config: Any) -> str:
-    """The command line that means a command's options; what is as usual is left out."""
+    """The command line of a command's options, without defaults."""
     places: list[object] = []
     options: list[object] = []
     for field in _fields(config):
@@ -134,7 +131,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 class _Tuple(argparse.Action):
-    """Several values, each of its own type."""
+    """Several values of different types."""
 
     def __init__(
         self, option_strings: Sequence[str], dest: str, *, kinds: Sequence[Callable[[str], Any]], **settings: Any
@@ -150,7 +147,7 @@ class _Tuple(argparse.Action):
 
 
 def parse(command: str, config: type, words: Sequence[str]) -> Any:
-    """A dataclass of options from a command's words; ``--help`` leaves with 0, and usage errors with 2."""
+    """A dataclass of options from a command's arguments; ``--help`` exits with 0, usage errors with 2."""
     parser = parser_of(command, config)
     found, unknown = parser.parse_known_intermixed_args(list(words))
     if unknown:
@@ -160,7 +157,7 @@ def parse(command: str, config: type, words: Sequence[str]) -> Any:
 
 
 def parser_of(command: str, config: type) -> argparse.ArgumentParser:
-    """What reads a command's words, and prints its help page."""
+    """The argument parser of a command."""
     fields, hints = _fields(config), typing.get_type_hints(config)
     places = [_shown(field) for field in fields if field.metadata.get("positional")]
     parser = _Parser(
@@ -175,7 +172,7 @@ def parser_of(command: str, config: type) -> argparse.ArgumentParser:
     for field in fields:
         about, required = field.metadata, field.default is dataclasses.MISSING
         settings = _settings(hints[field.name], about.get("metavar", ""))
-        settings["help"] = (about.get("text", "") + _usual(field.default)).replace("%", "%%")
+        settings["help"] = (about.get("text", "") + _default(field.default)).replace("%", "%%")
         if about.get("positional"):
             many = ("+" if required else "*") if "nargs" in settings else None if required else "?"
             parser.add_argument(field.name, **settings | {"metavar": field.name.upper(), "nargs": many})
@@ -186,7 +183,7 @@ def parser_of(command: str, config: type) -> argparse.ArgumentParser:
 
 
 def _settings(hint: Any, metavar: str) -> dict[str, Any]:
-    """How argparse reads a value of some type."""
+    """Settings of argparse for a type."""
     inner, origin = typing.get_args(hint), typing.get_origin(hint)
     if origin in (typing.Union, types.UnionType):
         return _settings(next(part for part in inner if part is not type(None)), metavar)
@@ -200,7 +197,7 @@ def _settings(hint: Any, metavar: str) -> dict[str, Any]:
 
 
 def program_page(configs: Mapping[str, type], description: str) -> str:
-    """All commands, the first to try first."""
+    """The help page with all commands."""
     lines = ["usage: splatsoil COMMAND …", "", description, "Start with: splatsoil run examples/plow-dry --preset tiny"]
     left = dict(configs)
     for title, names in (*ORDER.items(), ("others", tuple(configs))):
@@ -213,11 +210,11 @@ def program_page(configs: Mapping[str, type], description: str) -> str:
 
 
 def _columns() -> int:
-    return min(shutil.get_terminal_size().columns, WIDEST)
+    return min(shutil.get_terminal_size().columns, MAX_COLUMNS)
 
 
 def _fields(config: Any) -> list[dataclasses.Field[Any]]:
-    """A command's own options, then those that most commands have."""
+    """A command's own options, then common ones."""
     return sorted(dataclasses.fields(config), key=lambda field: COMMON.get(field.name, 0))
 
 
@@ -226,13 +223,13 @@ def _flag(field: dataclasses.Field[Any]) -> str:
 
 
 def _shown(field: dataclasses.Field[Any]) -> str:
-    """A positional one in the usage."""
+    """A positional argument in the usage."""
     name = field.name.upper() + " …" * str(field.type).startswith("tuple")
     return name if field.default is dataclasses.MISSING else f"[{name}]"
 
 
-def _usual(value: Any) -> str:
-    """The usual value, where it is one."""
+def _default(value: Any) -> str:
+    """The default value in the help, if there is one."""
     if value is dataclasses.MISSING or value is None or value is False or value in ((), ""):
         return ""
     words = value if isinstance(value, tuple) else (value,)

@@ -1,4 +1,4 @@
-"""What commands print: the result on stdout, everything else on stderr."""
+"""Output of commands: results on stdout, everything else on stderr."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from splatsoil.measurement import Measurement
 
 Report = Callable[[str, float], None]
-"""Takes what is being done, and the share of its stage that is done, 0 to 1."""
+"""Takes a description and the completed share of the stage, 0 to 1."""
 Stage = Callable[[str], Report]
 """Begins a stage by its name."""
 
@@ -26,7 +26,7 @@ _stdout: ContextVar[TextIO | None] = ContextVar("stdout", default=None)
 
 @contextmanager
 def only_json() -> Iterator[None]:
-    """Send whatever is printed to stderr, so that stdout holds nothing but the one object of ``print_json``."""
+    """Redirect stdout to stderr, except for ``print_json``."""
     token = _stdout.set(sys.stdout)
     try:
         with redirect_stdout(sys.stderr):
@@ -39,13 +39,13 @@ def print_json(data: Mapping[str, Any]) -> None:
     """Print one JSON object on stdout, also inside ``only_json``.
 
     Raises:
-        ValueError: the data holds NaN or infinity, which JSON cannot.
+        ValueError: the data contains NaN or infinity.
     """
     print(json.dumps(data, indent=1, allow_nan=False), file=_stdout.get() or sys.stdout, flush=True)
 
 
 def places(run: RunFolder) -> dict[str, str]:
-    """The run folder and its set, as commands' JSON objects have them."""
+    """The run folder and its set, for JSON output."""
     return {"run": str(run.path), "set": str(run.description["measurement"]["folder"])}
 
 
@@ -58,7 +58,7 @@ def print_result(
     run: RunFolder | None = None,
     none: str = "",
 ) -> int:
-    """Say a command's result, and return the exit code.
+    """Print a command's result, and return the exit code.
 
     Args:
         config: the command's options.
@@ -66,7 +66,7 @@ def print_result(
         show: prints it.
         last: the line after that.
         run: whose folder and set the object names.
-        none: why there is no answer; said first.
+        none: why there is no answer; printed first.
     """
     if config.json:
         print_json({"ok": not none, **({"error": none} if none else {}), **data, **(places(run) if run else {})})
@@ -80,7 +80,7 @@ def print_result(
 
 
 def print_remarks(measurement: Measurement) -> None:
-    """Print on stderr what is odd about a set that is about to be worked on."""
+    """Print remarks on a set on stderr."""
     from splatsoil.measurement import remarks
 
     for remark in remarks(measurement):
@@ -99,10 +99,10 @@ def print_table(
 
     Args:
         title: above it.
-        columns: headings; none for rows of a name and what it is.
+        columns: headings; empty for rows of name and value.
         rows: texts.
-        left: columns that are aligned left; the first if not given.
-        faint: numbers of rows that matter less.
+        left: left-aligned columns; the first if not given.
+        faint: numbers of dimmed rows.
     """
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
@@ -130,7 +130,7 @@ def print_parameters(
     Args:
         title: above it.
         result: with ``parameters`` by name, and ``notes``.
-        value: key of what the ± is of.
+        value: key of the estimate.
         more: further columns.
         paragraphs: the sentences.
     """
@@ -148,7 +148,7 @@ def print_parameters(
 
 
 def print_text(*paragraphs: str, style: str = "", notes: Iterable[str] = ()) -> None:
-    """Print sentences, wrapped at words, and then what is to be known besides."""
+    """Print wrapped sentences, then notes."""
     from rich.console import Console
     from rich.text import Text
 
@@ -161,10 +161,10 @@ def print_text(*paragraphs: str, style: str = "", notes: Iterable[str] = ()) -> 
 
 @contextmanager
 def stages(*, quiet: bool = False) -> Iterator[Stage]:
-    """Progress on stderr: one line a stage, with what it is doing, how much is done and how long the rest will take.
+    """Context manager: progress on stderr, one line for each stage.
 
-    Yields a function that begins a stage; the one before ends then. Where stderr is no terminal (a log), a line is
-    printed when a stage begins and at every tenth of it. ``quiet`` prints nothing.
+    Yields a function that begins a stage and ends the previous one. If stderr is no terminal, a line is printed at the
+    beginning of a stage and at every 10 %. ``quiet`` prints nothing.
     """
     if quiet:
         yield lambda name: lambda what, share: None
@@ -183,7 +183,7 @@ def stages(*, quiet: bool = False) -> Iterator[Stage]:
         TextColumn("{task.percentage:>3.0f} %"),
         TimeElapsedColumn(),
         TextColumn("left"),
-        # Stages have few and unequal steps: the rate over all of the stage is the steadiest guess.
+        # Stages have few and unequal steps, so the rate is averaged over the whole stage.
         TimeRemainingColumn(),
         TextColumn("{task.fields[what]}"),
     )
@@ -204,12 +204,12 @@ def stages(*, quiet: bool = False) -> Iterator[Stage]:
 
 
 def by_frame(report: Report, share: float = 1.0) -> Callable[[int, int], None]:
-    """Takes the frame that a simulation has come to, and its last, which together are a share of a stage."""
+    """Progress function of a simulation (frame, last frame) that is a share of a stage."""
     return lambda frame, last: report(f"frame {frame}", share * frame / max(last, 1))
 
 
 def _logged(name: str) -> Report:
-    """A stage as lines of a log."""
+    """Progress of a stage as log lines."""
     print(name, file=sys.stderr, flush=True)
     tenth = 0
 

@@ -1,4 +1,4 @@
-"""Memory and time of a run, told from the set before work begins."""
+"""Estimates of a run's memory and time from its measurement set."""
 
 from __future__ import annotations
 
@@ -14,31 +14,30 @@ from splatsoil.report.text import duration
 if TYPE_CHECKING:
     from splatsoil.measurement import Measurement
 
-#: Bytes of a particle and its part of the grid (docs/performance.md), and of each frame that is drawn: its position and
-#: deformation.
+#: Bytes of a particle and its part of the grid (docs/performance.md), and of its recorded state in each frame.
 PARTICLE, FRAME = 275, 48
 #: Bytes of a pixel: red, green and blue in single precision.
 PIXEL = 12
-#: Of a video frame as many pictures are held at once: observed, predicted, and what they are compared in.
+#: Copies of a video frame in memory: observed, predicted, and temporary ones.
 PICTURES = 6
-#: GiB that a process takes before it knows of any set: Python, torch, Warp, compiled kernels.
+#: Memory of a process without data, GiB: Python, torch, Warp, compiled kernels.
 PROGRAM = 1.0
-#: Particle substeps a second: one core of the processor, and the GPU, of docs/performance.md.
+#: Particle substeps per second of one CPU core and of the GPU in docs/performance.md.
 RATE = {"cpu": 1.2e8, "cuda": 2.7e9}
-#: Simulations of a comparison beside the search's, of the model as it is.
+#: Simulations of a comparison besides those of the search.
 COMPARISON = 20
 
 
 @dataclass(frozen=True)
 class Needs:
-    """What a fit takes.
+    """Resources of a fit.
 
     Attributes:
         particles: in one simulation.
-        memory: GiB in this process.
-        simulation: GiB of it that lie where it is simulated.
-        seconds: of one simulation, about.
-        simulations: about how many there will be.
+        memory: of this process, GiB.
+        simulation: of a simulation on its device, GiB.
+        seconds: of one simulation.
+        simulations: number of them.
     """
 
     particles: int
@@ -48,7 +47,7 @@ class Needs:
     simulations: int
 
     def sentence(self, device: str) -> str:
-        """The needs in one line, where the soil isn't known yet."""
+        """The needs in one line, for an unknown amount of soil."""
         return (
             f"needs up to {self.memory:.2g} of {memory():.2g} GiB of memory and {duration(self.seconds)} a simulation "
             f"({self.particles} particles, {device}), {self.simulations} simulations"
@@ -56,14 +55,14 @@ class Needs:
 
 
 def needs(measurement: Measurement, preset: str, device: str, simulations: int, particles: int | None = None) -> Needs:
-    """What a fit takes.
+    """Estimate the resources of a fit.
 
     Args:
         measurement: the set.
         preset: of the solver and the reconstruction.
         device: ``cpu`` or ``cuda:N``.
-        simulations: about how many there will be.
-        particles: of the soil; those of a bed that is full to its top if not given.
+        simulations: number of them.
+        particles: of the soil; those of a full bed if not given.
     """
     from splatsoil.mpm import Resolution
     from splatsoil.reconstruction.presets import preset_named
@@ -86,10 +85,10 @@ def needs(measurement: Measurement, preset: str, device: str, simulations: int, 
 
 
 def check_memory(need: Needs, device: str, file: Path) -> None:
-    """See that the memory there is can hold a simulation.
+    """Check that the memory suffices.
 
     Raises:
-        ParameterError: it can't.
+        ParameterError: it does not.
     """
     places = [("this machine", need.memory, memory())]
     if device != "cpu":
@@ -103,9 +102,9 @@ def check_memory(need: Needs, device: str, file: Path) -> None:
 
 
 def memory() -> float:
-    """What this process may use of the machine's memory, GiB: all, or as much as its control group has."""
+    """Memory available to this process, GiB: of the machine, or of its control group."""
     there = [float("inf")]
-    with suppress(AttributeError, ValueError, OSError):  # not every system tells
+    with suppress(AttributeError, ValueError, OSError):  # not on every system
         there.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30)
     for limit in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
         with suppress(OSError, ValueError):  # no control group, or "max"
@@ -114,7 +113,7 @@ def memory() -> float:
 
 
 def gpu_memory(device: str) -> tuple[float, float]:
-    """What is free of a GPU's memory, and all of it, GiB."""
+    """Free and total memory of a GPU, GiB."""
     import torch
 
     free, whole = torch.cuda.mem_get_info(device)

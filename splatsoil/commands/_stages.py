@@ -1,4 +1,4 @@
-"""The stages that commands are made of: check, fit, compare, diagnose."""
+"""Stages of commands: check, fit, compare, diagnose."""
 
 from __future__ import annotations
 
@@ -38,15 +38,15 @@ if TYPE_CHECKING:
     from splatsoil.measurement import Measurement
     from splatsoil.model import Model
 
-#: Share of a fit's time that is its search.
+#: Share of the search in a fit's time.
 SEARCH = 0.5
 
 
 def prepare(options: FitOptions) -> tuple[Measurement, RunFolder]:
-    """The checked set and its run folder; says what the fit will need. Nothing is written before all is found good.
+    """The checked set and its run folder; prints the resources of the fit. Nothing is written before all checks pass.
 
     Raises:
-        MeasurementError, ParameterError, RunError: what is wrong, before any work.
+        MeasurementError, ParameterError, RunError: a check fails.
     """
     from splatsoil.measurement import Measurement
     from splatsoil.soil.law import Law
@@ -66,7 +66,7 @@ def prepare(options: FitOptions) -> tuple[Measurement, RunFolder]:
         raise MeasurementError("has no video frames from 0 on: there is nothing to compare with", file=options.set)
     simulations = (options.budget or EVALUATIONS * max(1, len(options.parameters))) + COMPARISON
     pictures = needs(measurement, options.preset, device, simulations, particles=1)
-    check_memory(pictures, device, options.set)  # how much soil there is isn't known yet
+    check_memory(pictures, device, options.set)  # the amount of soil is not known yet
     print(needs(measurement, options.preset, device, simulations).sentence(device), file=sys.stderr)
     run = RunFolder.prepare(
         options.folder(measurement.name),
@@ -80,7 +80,7 @@ def prepare(options: FitOptions) -> tuple[Measurement, RunFolder]:
 
 
 def fitted(options: FitOptions, begin: Stage) -> tuple[RunFolder, Model, dict[str, Any]]:
-    """From a set to its fit: run folder, model, and what ``fit.json`` holds. Whatever the folder has isn't made again.
+    """From a set to its fit: run folder, model, and contents of ``fit.json``. Existing results are not computed again.
 
     Raises:
         MeasurementError, ParameterError, RunError: see `prepare`.
@@ -95,7 +95,7 @@ def fitted(options: FitOptions, begin: Stage) -> tuple[RunFolder, Model, dict[st
 
 
 def facts(model: Model) -> dict[str, str]:
-    """How a model computes, for readers."""
+    """Resolution of a model, for the reader."""
     r, cameras = model.resolution, len(model.measurement.cameras)
     return {
         "cell": f"{1e3 * r.cell:.3g} mm",
@@ -106,11 +106,9 @@ def facts(model: Model) -> dict[str, str]:
 
 
 def run_fit(options: FitOptions, run: RunFolder, model: Model, report: Report) -> dict[str, Any]:
-    """Search, evaluation by evaluation, and compare the model with something else by what was simulated, and more; what
-    is in the run folder already isn't simulated again.
-    """
+    """Search, then compare the base with the discrepancy model. Stored simulations are not repeated."""
     from splatsoil.envs.measured import LOSS, MeasuredProblem
-    from splatsoil.inverse.fitting import TOGETHER, FitSetup, fit
+    from splatsoil.inverse.fitting import BATCH_SIZE, FitSetup, fit
 
     measurement, space = model.measurement, model.space(options.parameters or None)
     budget = options.budget or EVALUATIONS * len(space)
@@ -139,12 +137,12 @@ def run_fit(options: FitOptions, run: RunFolder, model: Model, report: Report) -
         finished = done
         if record.loss is not None:
             simulate.store(problem.features(record.blocks), record.parameters, record.seed)
-        said = ", ".join(f"{p.name} {record.parameters[p.name]:.4g}{symbol(p.unit)}" for p in space)
+        values = ", ".join(f"{p.name} {record.parameters[p.name]:.4g}{symbol(p.unit)}" for p in space)
         outcome = "failed" if record.loss is None else f"loss {record.loss:.4g}"
-        report(f"{done} of {budget}: {said}, {outcome}", SEARCH * done / budget)
+        report(f"{done} of {budget}: {values}, {outcome}", SEARCH * done / budget)
 
     def simulating(frame: int, last: int) -> None:
-        share = min((finished + TOGETHER * frame / (last + 1)) / budget, 1.0)
+        share = min((finished + BATCH_SIZE * frame / (last + 1)) / budget, 1.0)
         report(f"simulation {finished + 1}, frame {frame}", SEARCH * share)
 
     def comparing(what: str, share: float) -> None:
@@ -160,7 +158,7 @@ def run_fit(options: FitOptions, run: RunFolder, model: Model, report: Report) -
 
 
 def draw_comparison(run: RunFolder, model: Model, report: Report) -> dict[str, Any]:
-    """Simulate at the latest fit's estimate, and keep pictures and losses of every frame in ``comparison/``."""
+    """Simulate at the latest fit's estimate; write pictures and losses of every frame into ``comparison/``."""
     from splatsoil.comparison import GAIN, Comparator
     from splatsoil.envs.measured import LOSS
     from splatsoil.experiment.forces import force_record
@@ -222,14 +220,14 @@ def draw_comparison(run: RunFolder, model: Model, report: Report) -> dict[str, A
 
 
 def without_noise(measurement: Measurement) -> bool:
-    """Whether frames before the tool moves are the same to the last bit: no camera's are, but a renderer's."""
+    """Whether frames before the tool moves are identical: then they are rendered, not photographed."""
     still = measurement.pre_roll
     first = {name: measurement.video_frame(name, measurement.frames[0]).image() for name in measurement.cameras}
     return bool(still) and all(np.array_equal(f.image(), first[f.camera_name]) for f in still)
 
 
 def write_jpeg(path: Path, picture: np.ndarray) -> None:
-    """A picture (h, w, 3), clipped to [0, 1], as a JPEG file, whole or not at all."""
+    """Write a picture (h, w, 3), clipped to [0, 1], as a JPEG file."""
     from PIL import Image
 
     stream = io.BytesIO()
@@ -238,8 +236,8 @@ def write_jpeg(path: Path, picture: np.ndarray) -> None:
     write_bytes(path, stream.getvalue())
 
 
-def kept(options: FitOptions) -> str:
-    """What an interrupted fit leaves, for the sentence after Ctrl-C."""
+def interrupted(options: FitOptions) -> str:
+    """The message after Ctrl-C: what an interrupted fit has stored."""
     from splatsoil.measurement import Measurement
 
     try:
@@ -254,8 +252,8 @@ def kept(options: FitOptions) -> str:
 def run_diagnosis(
     folder: RunFolder, model: Model, begin: Stage, effects: Iterable[str] = (), *, workers: Workers | None = None
 ) -> dict[str, Any]:
-    """Compare the latest fit's model with those that have an effect more; the result is ``diagnosis.json`` and, by
-    model, ``diagnoses/NAME.json``. ``workers`` are processes for these effects that are there already."""
+    """Compare the latest fit's model with models of one more effect; write ``diagnosis.json`` and
+    ``diagnoses/NAME.json``. ``workers`` are running processes for these effects."""
     result = _compared_models(folder, model, begin("diagnose"), tuple(effects), workers, with_effects=True)
     write_json(folder.path / "diagnoses" / f"{result['fit']}.json", result)
     write_json(folder.path / "diagnosis.json", result)
@@ -265,8 +263,8 @@ def run_diagnosis(
 def check_adequacy(
     folder: RunFolder, model: Model, report: Report, *, workers: Workers | None = None
 ) -> dict[str, Any]:
-    """Whether the latest fit's model leaves more than noise, where and when; kept as ``comparison/misfit.json``.
-    ``workers`` are processes for no effects that are there already."""
+    """Test whether the latest fit's model is adequate; write ``comparison/misfit.json``. ``workers`` are running
+    processes without effects."""
     from splatsoil.inverse.criticism.record import misfit_of
 
     result = misfit_of(_compared_models(folder, model, report, (), workers, with_effects=False))
@@ -322,11 +320,12 @@ def compare_models(
     *,
     with_effects: bool,
 ) -> Diagnosis:
-    """A fit's model against something else and, ``with_effects``, against models with an effect more; it starts from
-    what the search has found (``fit`` is what ``fit.json`` holds, or will hold) and simulated.
+    """Compare a fit's model with the discrepancy model and, ``with_effects``, with models of one more effect.
+
+    ``fit`` holds the contents of ``fit.json``; the comparison uses its simulations.
 
     Raises:
-        SimulationError: the model as it is could not be simulated often enough.
+        SimulationError: too few simulations of the base model succeeded.
     """
     from splatsoil.inverse.criticism.design import Run
     from splatsoil.inverse.criticism.diagnosis import diagnose
@@ -352,7 +351,7 @@ def compare_models(
 
 
 def prior_of(experiment: Experiment, fit: Mapping[str, Any]) -> Prior:
-    """The prior of the parameters, given what the search for a fit leaves possible."""
+    """The prior of the parameters, given the interval of a fit's search."""
     from splatsoil.inverse.criticism.design import Prior
 
     low, high = ({name: entry[end] for name, entry in fit["minimum"].items()} for end in ("low", "high"))

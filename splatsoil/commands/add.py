@@ -1,4 +1,4 @@
-"""``splatsoil add``: put a missing effect into the model, fit again, and see the error fall."""
+"""``splatsoil add``: add a missing effect to the model, and fit again."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from splatsoil.inverse.run_folder import RunFolder
 from splatsoil.options import argument, option
 from splatsoil.report.data import kept_of, load
 from splatsoil.report.text import amount, model_name
-from splatsoil.run_files import COMPARISON_FORMAT, HISTORY_FORMAT, read_kept
+from splatsoil.run_files import COMPARISON_FORMAT, HISTORY_FORMAT, read_format
 
 if TYPE_CHECKING:
     from splatsoil.model import Model
@@ -29,7 +29,7 @@ INTERRUPTED = "finished simulations are kept; go on with"
 class Config(ComputingOptions):
     """Add effects to the model, and fit again.
 
-    Reports the error on data set aside without and with the effect. Earlier fits stay.
+    Reports the error on held-out data without and with the effect. Earlier fits stay.
     """
 
     effects: tuple[str, ...] = argument("Effects to add, by name, or files that define one each.")
@@ -37,7 +37,7 @@ class Config(ComputingOptions):
 
 
 def run(config: Config) -> int:
-    """Fit with each effect, keep the history, draw the report."""
+    """Fit with each effect, and write history and report."""
     from splatsoil.soil.law import Law
     from splatsoil.soil.library import find_effects
 
@@ -49,11 +49,11 @@ def run(config: Config) -> int:
         raise ParameterError("name an effect to add, for example: splatsoil add RUN cohesion")
     for name in config.effects:
         if len(find_effects([name])) != 1:
-            raise ParameterError(f"{name} defines several effects; put each that is to be added into a file of its own")
-    load(folder.path)  # all that the report will show: what is damaged is better known now than after hours
+            raise ParameterError(f"{name} defines several effects; give each one a file of its own")
+    load(folder.path)  # damaged files are reported before the work
     under_way = history(folder)["adding"]
     half_done = under_way.get("effects") == on
-    # A command that was interrupted, and is given again, goes on: what it has put in is on already.
+    # A repeated command continues an interrupted one, whose effects are on already.
     mine = set(under_way["done"] if under_way.get("command") == list(config.effects) else ())
     mine |= {under_way["effect"]} if half_done else set()
     left = [name for name in config.effects if not (name in on and name in mine)]
@@ -75,27 +75,26 @@ def run(config: Config) -> int:
 
 
 def history(folder: RunFolder) -> dict[str, Any]:
-    """``models`` tried so far, the first one first, and the addition of an effect that is under way (``adding``), as
-    `write_history` was given it; empty where none is."""
+    """``models`` so far, the first one first, and the unfinished addition of an effect (``adding``)."""
     path = folder.path / "history.json"
-    return {"models": [], "adding": {}, **(read_kept(path, HISTORY_FORMAT) if path.is_file() else {})}
+    return {"models": [], "adding": {}, **(read_format(path, HISTORY_FORMAT) if path.is_file() else {})}
 
 
 def write_history(
     folder: RunFolder, models: Sequence[Mapping[str, Any]], under_way: Mapping[str, Any] | None = None
 ) -> None:
-    """Keep the models tried, and what is needed to go on with an addition that is under way."""
+    """Write the models so far, and the state of an unfinished addition."""
     more = {"adding": under_way} if under_way else {}
     write_json(folder.path / "history.json", {"format": HISTORY_FORMAT, "models": list(models), **more})
 
 
 def _line(fit: Mapping[str, Any], held_out: Mapping[str, Any]) -> dict[str, Any]:
-    """A model in the history: its fit, and its error on what was set aside."""
-    kept = ("estimate", "std", "unit", "title")
+    """A model in the history: its fit, and its error on held-out data."""
+    keys = ("estimate", "std", "unit", "title")
     return {
         "model": fit["name"],
         "effects": list(fit["setup"]["effects"]),
-        "parameters": {name: {key: p[key] for key in kept} for name, p in fit["parameters"].items()},
+        "parameters": {name: {key: p[key] for key in keys} for name, p in fit["parameters"].items()},
         "loss": fit["loss"],
         "held_out": held_out["error"],
         "noise_level": held_out["noise"],
@@ -103,16 +102,16 @@ def _line(fit: Mapping[str, Any], held_out: Mapping[str, Any]) -> dict[str, Any]
 
 
 def _compared(folder: RunFolder) -> bool:
-    """Whether there are pictures at the latest fit's estimate."""
+    """Whether the latest fit has a comparison."""
     return kept_of(folder.comparison / "comparison.json", COMPARISON_FORMAT, folder.fit()) is not None
 
 
 def add_effect(
     folder: RunFolder, model: Model, name: str, begin: Stage, *, budget: int | None = None, command: Sequence[str] = ()
 ) -> Model:
-    """One effect more: a diagnosis that knows it, full fit, comparison; returns the model with it.
+    """Add one effect: diagnosis with it, fit, comparison; returns the model with it.
 
-    ``command`` is all the effects that are being added, where one command adds several.
+    ``command`` are all effects that the command adds.
     """
     from splatsoil.soil.library import find_effects
 
@@ -124,7 +123,7 @@ def add_effect(
     free = [p.name for p in own.parameters if p.off is not None or p.name in own.shapes]
     known = _model.current_diagnosis(folder, folder.path / "diagnoses" / f"{before['name']}.json", (name,))
     if known is None or effect.name not in {h["model"] for h in known["held_out"]}:
-        # A diagnosis gives the held-out error of the best effect only: alone, it is that.
+        # A diagnosis has the held-out error of the best effect only.
         known = _stages.run_diagnosis(folder, model, begin, (name,))
     scores = {h["model"]: h for h in known["held_out"]}
     if effect.name not in scores:
@@ -143,7 +142,7 @@ def add_effect(
         "held_out": scores[effect.name],
         "line": {"added": effect.name},
     }
-    # Before the fit is the latest one: from then on nothing else knows what it was made from.
+    # Before the new fit becomes the latest one.
     write_history(folder, models, under_way)
     options = FitOptions(
         set=model.measurement.folder,
@@ -161,24 +160,23 @@ def add_effect(
 
 
 def finish(folder: RunFolder, model: Model, fit: Mapping[str, Any], under_way: Mapping[str, Any], begin: Stage) -> None:
-    """What is left to do once the fit with the new effect is the latest one."""
+    """Finish an addition whose fit is the latest one."""
     if not _compared(folder):
-        if (folder.comparison / "comparison.json").is_file():  # put aside, so that before and after can be shown
+        if (folder.comparison / "comparison.json").is_file():  # the report shows before and after
             with folder.lock():
                 shutil.rmtree(folder.path / "before", ignore_errors=True)
                 folder.comparison.rename(folder.path / "before")
         _stages.draw_comparison(folder, model, begin("compare"))
     line = {**_line(fit, under_way["held_out"]), **under_way["line"]}
-    # Until all of the command is done, what it has put in is known to be its own.
     command, done = under_way["command"], [*under_way["done"], under_way["effect"]]
     write_history(folder, [*history(folder)["models"], line], {"command": command, "done": done} if command else None)
 
 
 def show(models: Sequence[Mapping[str, Any]]) -> None:
-    """The falling error, and how the parameters moved."""
+    """Print error and parameters of each model."""
     print_table(
-        "error on data that were set aside",
-        ("model", "error", "noise alone", "loss, all frames", "parameters"),
+        "error on held-out data",
+        ("model", "error", "noise level", "loss, all frames", "parameters"),
         (
             (
                 model_name(entry["model"]),

@@ -1,4 +1,4 @@
-"""``splatsoil benchmark``: measurements of the product itself."""
+"""``splatsoil benchmark``: benchmarks of splatsoil."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Config:
 
 
 def run(config: Config) -> int:
-    """Run the named module of ``splatsoil.benchmarks`` as a script; ParameterError when there is none of that name."""
+    """Run a module of ``splatsoil.benchmarks`` as a script; ParameterError for an unknown name."""
     import splatsoil.benchmarks
 
     found = sorted(info.name for info in pkgutil.iter_modules(splatsoil.benchmarks.__path__))
@@ -41,7 +41,7 @@ def run(config: Config) -> int:
 
 
 def _execute(name: str, module: str, arguments: tuple[str, ...]) -> int:
-    """A module's ``main`` with these arguments; its exit code."""
+    """Run a module's ``main``; returns its exit code."""
     before = sys.argv
     sys.argv = [f"splatsoil benchmark {name}", *arguments]
     try:

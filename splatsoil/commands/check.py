@@ -1,4 +1,4 @@
-"""``splatsoil check``: what a measurement set holds, and what is wrong with it."""
+"""``splatsoil check``: contents and errors of a measurement set."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ INTERRUPTED = "nothing was written; start again with"
 
 @dataclass(frozen=True)
 class Config:
-    """List what a measurement set contains and what is wrong with it. Writes nothing."""
+    """List the contents of a measurement set, and its errors. Writes nothing."""
 
     set: Path = argument(SET)
     json: bool = option(False, JSON)
 
 
 def run(config: Config) -> int:
-    """Print the table or the object; MeasurementError when the set breaks the format's rules."""
+    """Print the contents; MeasurementError for a violation of the format."""
     from splatsoil.measurement import Measurement, remarks
 
     if _laboratory.is_test(config.set):
@@ -82,7 +82,7 @@ def _rows(measurement: Measurement) -> list[tuple[str, str]]:
     lens = "with lens distortion" if bent else "no lens distortion"
     sizes = sorted({(f.camera.width, f.camera.height) for f in measurement.views})
     pixels = ", ".join(f"{width} x {height}" for width, height in sizes)
-    bed_size, tool_size = (" x ".join(f"{v:g}" for v in sides.round(4)) for sides in (bed.extents, tool.mesh.extents))
+    bed_size, tool_size = (" x ".join(f"{v:g}" for v in size.round(4)) for size in (bed.extents, tool.mesh.extents))
     pre_roll = {f.frame for f in measurement.pre_roll}
     frames = measurement.frames
     numbers = f"numbers {frames[0]} to {frames[-1]}" if frames else "none"

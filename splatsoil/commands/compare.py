@@ -1,4 +1,4 @@
-"""``splatsoil compare``: predicted against measured pictures, at the estimate of a run."""
+"""``splatsoil compare``: test of the fitted model's adequacy."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from splatsoil.options import option
 from splatsoil.report.text import SIGNIFICANT, averaged_sentence, no_answer, probability, residual_sentence
 
 INTERRUPTED = "the comparison was not finished; start again with"
-#: Checks shown on the screen.
-SHOWN = 12
-#: What --json prints of the misfit.
+#: Printed checks.
+MAX_CHECKS = 12
+#: Keys of the misfit in the JSON output.
 MISFIT = ("adequate", "probability", "estimates", "checks", "passes")
 
 
@@ -34,7 +34,7 @@ class Config(ComputingOptions):
 
 
 def run(config: Config) -> int:
-    """Simulate, draw, compare; pictures, losses and the misfit by block go into the run folder."""
+    """Simulate, draw and compare; results go into the run folder."""
     folder = _model.opened(config)
     none = no_answer(folder.fit())
     folder.check_writable()
@@ -57,8 +57,7 @@ def run(config: Config) -> int:
 
 
 def show(result: Mapping[str, Any], folder: str, adequate: bool | None = None) -> None:
-    """Losses of each camera, and what the whole comes to; ``adequate`` is what a comparison with something else
-    says of it."""
+    """Print the losses of each camera and in total; ``adequate`` is the result of the comparison of models."""
     name, rows = result["loss"], []
     for camera in result["cameras"]:
         frames = [entry for entry in result["frames"] if entry["camera"] == camera]
@@ -70,13 +69,13 @@ def show(result: Mapping[str, Any], folder: str, adequate: bool | None = None) -
 
 
 def show_misfit(misfit: Mapping[str, Any], run: str) -> None:
-    """The worst checks, and whether the model is adequate; the parameters where ``misfit`` has them."""
+    """Print the worst checks, whether the model is adequate, and its parameters, if there are any."""
     checks = misfit["checks"]
     failed = {number for number, check in enumerate(checks) if check["p"] < SIGNIFICANT}
     print_table(
-        "residual over what is expected, the worst first",
+        "residual over its expected value, the worst first",
         ("stage", "region", "instrument", "× expected", "p"),
-        ((c["stage"], c["region"], c["channel"], f"{c['ratio']:.2f}", f"{c['p']:.2g}") for c in checks[:SHOWN]),
+        ((c["stage"], c["region"], c["channel"], f"{c['ratio']:.2f}", f"{c['p']:.2g}") for c in checks[:MAX_CHECKS]),
         left=("stage", "region", "instrument"),
         faint=set(range(len(checks))) - failed,
     )
@@ -87,5 +86,5 @@ def show_misfit(misfit: Mapping[str, Any], run: str) -> None:
     )
     print_text(*([averaged_sentence(misfit["estimates"])] if "estimates" in misfit else []), *misfit["sentences"])
     ask = "Could these data show a missing effect?" if misfit["adequate"] else "Which effect is missing?"
-    # Wrapped, it couldn't be pasted.
+    # Not wrapped, so that it can be pasted.
     print(ask, command_line("diagnose", run))

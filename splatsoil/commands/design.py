@@ -1,4 +1,4 @@
-"""``splatsoil design``: which stroke of the tool would tell most of which model is right?"""
+"""``splatsoil design``: the stroke with the largest expected information about which model is correct."""
 
 from __future__ import annotations
 
@@ -34,20 +34,18 @@ INTERRUPTED = "finished simulations are kept; go on with"
 
 @dataclass(frozen=True)
 class Config(ComputingOptions):
-    """Propose the stroke of the tool that is expected to tell most of which model is right.
+    """Propose the most informative stroke of the tool.
 
-    Starts from a diagnosis. Simulates its probable models under other motions of the tool; the best one is written as
-    the tool_motion.csv of a measurement set. Simulations are kept: an interrupted design goes on.
+    Simulates the probable models of a diagnosis under other motions of the tool. The motion with the largest expected
+    information about which model is correct is written as a set's tool_motion.csv. An interrupted design continues.
     """
 
     draws: int = option(8, "Simulations of each model and motion.")
-    preset: Preset = option(
-        "tiny", "How finely to simulate; differences between models are looked at, for which the coarsest will do."
-    )
+    preset: Preset = option("tiny", "Resolution; the coarsest suffices for differences between models.")
 
 
 def run(config: Config) -> int:
-    """Simulate other strokes; the result goes into ``design/`` of the run folder."""
+    """Simulate other strokes; write the result into ``design/`` of the run folder."""
     from splatsoil.inverse.criticism.next_stroke import MIN_SIMULATIONS, STORED_DRAWS, probable
 
     if not MIN_SIMULATIONS <= config.draws <= STORED_DRAWS:
@@ -55,10 +53,9 @@ def run(config: Config) -> int:
     folder = _model.opened(config)
     fit = _model.latest_fit(folder)
     diagnosis = diagnosis_of(folder)
-    probable(diagnosis)  # refused before the rest is loaded
+    probable(diagnosis)  # fails before the work
     folder.check_writable()
     check_folder(folder.path / "design")
-    # Other strokes are looked at with the fitted model at a preset of their own.
     spec = replace(_model.ModelSpec.of(fit), preset=config.preset)
     with _model.loaded(config, folder, spec) as (model, begin):
         result = _designed(config, folder, diagnosis, model, spec, begin("design"))
@@ -83,7 +80,7 @@ def diagnosis_of(folder: RunFolder) -> dict[str, Any]:
 def _designed(
     config: Config, folder: RunFolder, diagnosis: Mapping[str, Any], model: Model, spec: ModelSpec, report: Report
 ) -> dict[str, Any]:
-    """The strokes, the most informative first; kept in ``design/``."""
+    """The strokes, the most informative first; written into ``design/``."""
     from splatsoil.experiment.strokes import StrokeExperiment, strokes
     from splatsoil.inverse.criticism.evidence import BASE_MODEL
     from splatsoil.inverse.criticism.next_stroke import entropy, expected_information, probable, runs_of
@@ -92,9 +89,9 @@ def _designed(
     began, seed = time.perf_counter(), int(folder.description["seed"])
     if model.measurement.cameras:
         report("light and colours", 0.0)
-        model.scene()  # kept: in other strokes the tool may begin elsewhere than photographs show it
+        model.scene()  # cached; in other strokes the tool may start elsewhere than in the photographs
     candidates = diagnosis["candidates"] or None
-    measured, kept = _model.experiment_of(folder, model, spec, candidates)
+    measured, simulations = _model.experiment_of(folder, model, spec, candidates)
     probability = probable(diagnosis)
     draws = {name: diagnosis["draws"][name][: config.draws] for name in dict.fromkeys((BASE_MODEL, *probability))}
     runs = [run for mine in runs_of(draws, seed).values() for run in mine]
@@ -102,27 +99,27 @@ def _designed(
     made = 0
 
     def expected(number: int, stroke: Stroke) -> Information:
-        """What a stroke is expected to tell."""
+        """Expected information of a stroke."""
         nonlocal made
         measurement = stroke.prepared(measured)
         other = _model.model_on(measurement, folder, model.reconstruction, spec.effects, spec.preset, model.device)
         experiment = StrokeExperiment(other, measured, candidates)
         motion = {"motion": motion_csv(stroke.measurement.tool.motion), "rate": stroke.measurement.frame_rate}
         identity = {
-            **kept.identity,
+            **simulations.identity,
             "stroke": digest({**motion, "start": stroke.start}),
             "strokes": code_digest(("experiment/strokes.py",)),
             "layout": list(experiment.layout.shape),
         }
-        simulate = Simulations(experiment, kept.folder, identity, sources=kept.sources)
+        simulate = Simulations(experiment, simulations.folder, identity, sources=simulations.sources)
         count = len(runs) + len(experiment.albedo_draws) + len(experiment.renderings)
         simulate.report = lambda purpose: report(
             f"{stroke.name}, {purpose.replace('_', ' ')}", (number + simulate.requested / count) / len(proposed)
         )
-        # A GPU makes several at a time, all of them in this process.
+        # A GPU simulates batches in this process.
         batch = Executor(lambda jobs: Future(), experiment.batch_size, experiment.prepare)
         with simulate.using(batch) if experiment.batch_size > 1 else nullcontext():
-            simulate.prefetch(lambda ask: [ask(**run.arguments()) for run in runs])
+            simulate.prefetch(lambda request: [request(**run.arguments()) for run in runs])
             found = expected_information(
                 experiment,
                 draws,
@@ -188,7 +185,7 @@ def motion_csv(motion: ToolMotion) -> str:
 
 
 def show(result: Mapping[str, Any]) -> None:
-    """The strokes, what each is expected to tell, and which to make."""
+    """Print the strokes and the proposed one."""
     models = listed([f"{model_label(name)} ({100.0 * p:.0f} %)" for name, p in result["models"].items()])
     print_text(f"models: {models}; at most {result['entropy']:.2f} bits of information")
     print_table(

@@ -20,17 +20,17 @@ INTERRUPTED = "finished simulations are kept; go on with"
 class Config(ComputingOptions):
     """Name the effect that the model lacks, with its probability.
 
-    Simulates the model as it is and with each effect that is off, at several sizes; all are compared with all data. A
-    diagnosis that was interrupted goes on.
+    Simulates the base model and the model with each effect that is off, at several sizes, and compares them with all
+    data. An interrupted diagnosis continues.
     """
 
     effects: tuple[str, ...] = option(
-        (), "Effects to consider, by name, or files that define some; all that such data tell if not given."
+        (), "Effects to consider, by name, or files that define some; all that such data can show if not given."
     )
 
 
 def run(config: Config) -> int:
-    """Diagnose; the result goes into the run folder."""
+    """Diagnose; write the result into the run folder."""
     from splatsoil.soil.library import find_effects
 
     if _laboratory.is_run(config.run) or _laboratory.is_test(config.run):
@@ -50,7 +50,7 @@ def run(config: Config) -> int:
 
 
 def show(result: Mapping[str, Any]) -> None:
-    """The table of models, the verdict, and why; the parameters where ``result`` has them."""
+    """Print models, verdict, parameters and sentences."""
     print_table(
         f"models compared with {result['fit']}",
         ("model", "probability", "size", "smallest detectable"),

@@ -1,4 +1,4 @@
-"""``splatsoil element``: a laboratory test on the soil law, at a single point."""
+"""``splatsoil element``: an element test of the soil law."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ INTERRUPTED = "the plot was not written; start again with"
 
 @dataclass(frozen=True)
 class Config:
-    """A laboratory test on the soil law, as a table and a plot."""
+    """An element test of the soil law, as a table and a plot."""
 
     test: Literal["triaxial", "extension", "simple-shear", "isotropic"] = option(
         "triaxial", "Drained triaxial compression or extension, simple shear, or isotropic compression."
@@ -42,8 +42,8 @@ class Config:
     void_ratio: float = option(0.8, "At the start.", expert=True)
     young: float = option(5.0e7, "Young's modulus in Pa.", expert=True)
     poisson: float = option(0.2, "Poisson's ratio.", expert=True)
-    strain_rate: float = option(1.0e-5, "In 1/s; only effects of rate feel it.", expert=True)
-    depth: float = option(0.0, "Below the undisturbed surface in metres; only effects of depth feel it.", expert=True)
+    strain_rate: float = option(1.0e-5, "In 1/s; used by effects of rate only.", expert=True)
+    depth: float = option(0.0, "Below the undisturbed surface in metres; used by effects of depth only.", expert=True)
     matching: Literal["compression", "extension", "plane_strain", "simple_shear"] = option(
         "compression", "Where the Drucker-Prager cone agrees with Mohr-Coulomb.", expert=True
     )
@@ -51,11 +51,10 @@ class Config:
     json: bool = option(False, JSON)
 
 
-#: A specimen strained by more is none any more; a curve of more points says no more.
 LARGEST_STRAIN, MOST_RECORDS = 10.0, 100_000
-#: Lines of the table.
+#: Rows of the table.
 ROWS = 12
-#: Least height of a plot: of stresses, in parts of the largest; of volume strain and void ratio.
+#: Minimum span of a plot's axis: of stresses, relative to the largest; of volume strain and void ratio.
 LEAST_SPAN, LEAST_STRAIN = 0.02, 1.0e-3
 
 
@@ -86,7 +85,7 @@ def run(config: Config) -> int:
 
 
 def refuse_idle(law: Law, values: dict[str, float]) -> None:
-    """ParameterError for effects that a specimen cannot feel: tools, gravity and cameras are not in the laboratory."""
+    """ParameterError for effects that do not act on a specimen, such as those of tools, gravity and cameras."""
     from splatsoil.soil.law import INTERCEPT_PER_COHESION, SLOPE, STIFFNESS, Law
     from splatsoil.soil.settings import Settings
 
@@ -101,7 +100,7 @@ def refuse_idle(law: Law, values: dict[str, float]) -> None:
 
 
 def perform(law: Law, values: dict[str, float], config: Config) -> tuple[dict[str, float], dict[str, Any]]:
-    """The parameters, and the curve as columns (records + 1,) each; the first is what the others are plotted over."""
+    """Parameters, and the curve as columns (records + 1,); the first is the abscissa."""
     from splatsoil.soil.element import Options, isotropic_compression, simple_shear, triaxial
     from splatsoil.soil.matching import Matching
 
@@ -135,7 +134,7 @@ def perform(law: Law, values: dict[str, float], config: Config) -> tuple[dict[st
 
 
 def draw(columns: dict[str, Any], config: Config) -> None:
-    """One panel for each column, over the first; written whole or not at all."""
+    """Plot each column over the first."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -146,7 +145,7 @@ def draw(columns: dict[str, Any], config: Config) -> None:
         axes.plot(x, y)
         axes.ticklabel_format(useOffset=False)
         axes.locator_params(axis="x", nbins=4)
-        # what is held is drawn as held, not its rounding
+        # a constant is drawn as a constant, without its rounding error
         least = LEAST_SPAN * float(np.abs(y).max()) if "Pa" in name else LEAST_STRAIN
         middle = 0.5 * float(y.min() + y.max())
         if float(y.max() - y.min()) < least:
@@ -163,7 +162,7 @@ def draw(columns: dict[str, Any], config: Config) -> None:
 
 
 def show(columns: dict[str, Any], config: Config) -> None:
-    """A dozen lines of the curve."""
+    """Print a dozen rows of the curve."""
     shown = np.unique(np.linspace(0, config.records, min(ROWS, config.records + 1)).astype(int))
     rows = ([f"{column[k]:.5g}" for column in columns.values()] for k in shown)
     print_table(f"{config.test} test at {config.confining:g} Pa", tuple(columns), rows, left=())

@@ -48,7 +48,7 @@ class Config(ComputingOptions):
 
 
 def run(config: Config) -> int:
-    """Simulate and write; all of it or nothing."""
+    """Simulate and write all files, or none."""
     from splatsoil.export import check_installed
 
     if not config.to:
@@ -68,7 +68,7 @@ def run(config: Config) -> int:
 
 
 def _exported(config: Config, folder: RunFolder, formats: tuple[str, ...], target: Path) -> dict[str, Any]:
-    """Write into a folder beside the target, then move it there; returns what ``export.json`` says."""
+    """Write into a temporary folder, then move it to the target; returns the contents of ``export.json``."""
     from splatsoil.export import make_writers, replay
 
     with _model.loaded(config, folder) as (fitted, begin):

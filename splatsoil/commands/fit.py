@@ -11,7 +11,7 @@ from splatsoil.commands._options import FitOptions, command_line
 from splatsoil.commands._output import print_parameters, print_result, stages
 from splatsoil.report.text import duration, model_name
 
-INTERRUPTED = _stages.kept
+INTERRUPTED = _stages.interrupted
 
 
 @dataclass(frozen=True)
@@ -24,19 +24,19 @@ class Config(FitOptions):
 
 
 def run(config: Config) -> int:
-    """Reconstruct (unless the run folder has it), fit, print; everything is kept in the run folder."""
+    """Reconstruct (unless the run folder has it), fit and print."""
     if _laboratory.is_test(config.set):
         return _laboratory.fit(config)
     with stages(quiet=config.json) as begin:
         folder, _, result = _stages.fitted(config, begin)
     compare = command_line("compare", folder.path)
     _model.require_answer(folder, result, f"`{compare}` shows where")
-    asks = f"Does the model leave more than noise, and where? {compare}"
+    asks = f"Is the model adequate, and where does it fail? {compare}"
     return print_result(config, result, lambda: show(result, str(folder.path)), last=asks, run=folder)
 
 
 def show(result: Mapping[str, Any], folder: str) -> None:
-    """A table of the parameters, and what to know about them."""
+    """Print the parameters and notes."""
     loss = f"loss {result['loss']:.4g} ± {result['loss_std']:.2g} at the estimate; {result['evaluations']} evaluations"
-    said = (f"{loss} in {duration(result['seconds'])}", f"kept in {folder}")
-    print_parameters(model_name(result["name"]), result, "estimate", {}, *said)
+    paragraphs = (f"{loss} in {duration(result['seconds'])}", f"kept in {folder}")
+    print_parameters(model_name(result["name"]), result, "estimate", {}, *paragraphs)

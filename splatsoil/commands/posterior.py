@@ -1,4 +1,4 @@
-"""``splatsoil posterior``: not only the best parameters, but all that the pictures leave possible."""
+"""``splatsoil posterior``: samples of the posterior of a fit."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ INTERRUPTED = "what was simulated is kept; go on with"
 class Config(ComputingOptions):
     """Sample the posterior: intervals, correlations, ArviZ file.
 
-    It is the posterior that the estimate and ± of the latest fit are of.
+    Estimate and ± of the latest fit are its mean and standard deviation.
     """
 
-    checks: int = option(3, "Simulations at points drawn from the posterior, which test the emulator.", expert=True)
+    checks: int = option(3, "Simulations at draws from the posterior, which test the emulator.", expert=True)
     device: str = option("auto", "Where to compute: auto (what the fit used), cpu, cuda:0, …")
     seed: int = option(0, "Of chains and checks.", expert=True)
 
 
 def run(config: Config) -> int:
-    """Compare as the fit did, sample, check; ``posterior.json`` and the folder ``posterior`` are kept."""
+    """Compare as the fit did, sample and check; write ``posterior.json`` and the folder ``posterior``."""
     from splatsoil.inverse.posterior import Density, run_posterior
 
     check_seed(config.seed)
@@ -81,7 +81,7 @@ def run(config: Config) -> int:
 
 
 def show(result: Mapping[str, Any], folder: str) -> None:
-    """A table of the parameters, and what to know about them."""
+    """Print the parameters and notes."""
     more = {"width / prior": lambda p: f"{p['contraction']:.2f}", "": lambda p: str(p["verdict"])}
     chains = result["chains"]
     print_parameters(

@@ -1,4 +1,4 @@
-"""``splatsoil reconstruct``: photographs to Gaussians, surface and solid."""
+"""``splatsoil reconstruct``: from photographs to Gaussians, surface and mesh."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ class Config:
     preset: Preset = option("small", PRESET)
     seed: int = option(0, SEED, expert=True)
     device: str = option("auto", "Where to train: auto, cpu, cuda:0, …")
-    holdout: int = option(8, "Every so many views one is set aside to judge by; 0 for none.", expert=True)
+    holdout: int = option(8, "One of so many views is held out to measure quality; 0 for none.", expert=True)
     json: bool = option(False, JSON)
 
 
 def run(config: Config) -> int:
-    """Reconstruct, save, print; an error before any work when set, options or the folder for the result are no good."""
+    """Reconstruct, save and print; set, options and folder are checked first."""
     from splatsoil.measurement import Measurement
     from splatsoil.reconstruction import reconstruct
 
@@ -63,7 +63,7 @@ def _show(result: Reconstruction, out: Path) -> None:
     if rows:
         rows.append(("mean", f"{result.psnr:.2f}", f"{result.ssim:.3f}"))
     title = f"reconstruction of {result.metadata['measurement']}"
-    print_table(title, ("photograph set aside", "PSNR in dB", "SSIM"), rows)
+    print_table(title, ("held-out photograph", "PSNR in dB", "SSIM"), rows)
     height = result.surface.height
     print_text(
         f"{len(result.gaussians)} Gaussians ({int(result.soil.sum())} soil, {int(result.tool.sum())} tool); "

@@ -1,4 +1,4 @@
-"""``splatsoil report``: the page for reading."""
+"""``splatsoil report``: the report as a page."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Config(RunOptions):
 
 
 def run(config: Config) -> int:
-    """Write the page; RunError when the folder has no finished fit."""
+    """Write the page; RunError without a finished fit."""
     folder = _model.opened(config)
     _model.note_other_sources(folder)
     path = report.write_report(folder.path)

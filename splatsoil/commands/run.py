@@ -19,25 +19,27 @@ from splatsoil.report.text import called_adequate
 if TYPE_CHECKING:
     from splatsoil.model import Model
 
-INTERRUPTED = _stages.kept
-#: What --json prints of a diagnosis.
+INTERRUPTED = _stages.interrupted
+#: Keys of a diagnosis in the JSON output.
 DIAGNOSIS = ("verdict", "class", "sentences", "models", "checks", "held_out", "estimates", "simulations")
 
 
 @dataclass(frozen=True)
 class Config(FitOptions):
-    """From a set to the report: check, reconstruct, fit, compare, and name what the model lacks.
+    """From a set to the report: check, reconstruct, fit, compare, and name missing effects.
 
-    The model is compared with all effects that it lacks. A missing one is added and fitted, until the model is
-    adequate, no effect is probable enough, or the limit is reached. A run that was interrupted goes on.
+    The model is compared with all effects that are off. A missing one is added and fitted, until the model is
+    adequate, no effect is probable enough, or the limit is reached. An interrupted run continues.
     """
 
-    stop_at_floor: bool = option(False, "Only say whether the model is adequate; do not look for missing effects.")
+    no_effects: bool = option(
+        False, "Test only whether the model is adequate; do not compare it with models of more effects."
+    )
     most_effects: int = option(2, "Largest number of effects that are added.", expert=True)
 
 
 def run(config: Config) -> int:
-    """Each stage in turn; what the run folder has already isn't done again."""
+    """Run each stage; existing results are not computed again."""
     if config.most_effects < 0:
         raise ParameterError(f"--most-effects: must be 0 or more, not {config.most_effects}")
     stopped, diagnosis, misfit = "", None, None
@@ -46,12 +48,12 @@ def run(config: Config) -> int:
         comparison = _stages.draw_comparison(folder, model, begin("compare"))
         unknown = ""
         try:
-            if config.stop_at_floor:
+            if config.no_effects:
                 misfit = _stages.check_adequacy(folder, model, begin("models"))
             else:
                 diagnosis, stopped = add_missing(folder, model, config.most_effects, begin)
                 result, comparison = folder.fit(), read_json(folder.comparison / "comparison.json")
-        except SplatsoilError as error:  # the fit stands all the same
+        except SplatsoilError as error:  # the fit is valid all the same
             unknown = f"whether the model is adequate isn't known: {error}"
         begin("report")("drawing figures", 0.0)
         page = report.write_report(folder.path)
@@ -83,7 +85,7 @@ def run(config: Config) -> int:
 
 
 def add_missing(folder: RunFolder, model: Model, most: int, begin: Stage) -> tuple[dict[str, Any], str]:
-    """Diagnose and add, ``most`` effects at most; the last diagnosis, and why it stopped."""
+    """Diagnose and add up to ``most`` effects; returns the last diagnosis and the reason of the end."""
     count = 0
     while True:
         diagnosis = _stages.run_diagnosis(folder, model, begin)

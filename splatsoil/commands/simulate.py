@@ -1,4 +1,4 @@
-"""``splatsoil simulate``: a synthetic measurement set, with any effect on."""
+"""``splatsoil simulate``: a synthetic measurement set."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ INTERRUPTED = "nothing was written; start again with"
 class Config:
     """Make a synthetic set of known soil.
 
-    Simulated sand, photographed by a path tracer; truth.json says the parameters.
+    Simulated sand, photographed by a path tracer; truth.json has the parameters.
     """
 
     out: Path = argument("Folder of the new set; must not exist, or be empty.")
@@ -41,7 +41,7 @@ class Config:
         None, "Take bed, tool, motion and cameras from this set instead of a scene.", expert=True
     )
     container: Literal["bin", "transparent", "open", "heap"] | None = option(
-        None, "What holds the soil of the scene plow; a bin of opaque walls if not given.", expert=True
+        None, "Container of the soil of the scene plow; a bin of opaque walls if not given.", expert=True
     )
     depth: float | None = option(None, "Mean depth of the soil in metres; not of the paper's scene.", expert=True)
     preset: Preset | None = option(None, "Resolution of the solver; small unless given, paper for the paper's scene.")
@@ -56,7 +56,7 @@ class Config:
 
 
 def run(config: Config) -> int:
-    """Make the set; ParameterError for options that make no sense, before anything is computed."""
+    """Make the set; ParameterError for invalid options."""
     from splatsoil.synthetic import Recipe, make_set
     from splatsoil.synthetic.world import check_place
 
@@ -85,7 +85,7 @@ def run(config: Config) -> int:
 
 
 def parse_values(words: Sequence[str]) -> dict[str, float]:
-    """``NAME=VALUE`` words to numbers by name; ParameterError for anything else."""
+    """Numbers by name from ``NAME=VALUE`` words; ParameterError for anything else."""
     out: dict[str, float] = {}
     for word in words:
         name, sign, text = word.partition("=")
@@ -104,7 +104,7 @@ def parse_values(words: Sequence[str]) -> dict[str, float]:
 
 
 def choose_setup(config: Config) -> Setup:
-    """The scene that the options describe."""
+    """The scene of the options."""
     from splatsoil.measurement import BIN, Measurement
     from splatsoil.synthetic import like, paper, plow
     from splatsoil.synthetic.setups import VIEWS

@@ -34,7 +34,7 @@ class Config:
     """
 
     folder: Path = argument("A run folder, or a measurement set.")
-    beside: str | None = option(None, "Another fit of the run to show beside the latest, as base beside cohesion.")
+    compare_with: str | None = option(None, "Another fit of the run to show next to the latest.")
     port: int = option(8080, "Of 127.0.0.1; the next free one where it is taken.")
     device: str = option("auto", DEVICE)
 
@@ -51,9 +51,9 @@ def run(config: Config) -> int:
 
     from splatsoil.view import Viewer
 
-    logging.getLogger("websockets").setLevel(logging.CRITICAL)  # a browser that leaves is no fault
+    logging.getLogger("websockets").setLevel(logging.CRITICAL)  # a closed browser is no error
     with redirect_stdout(io.StringIO()):  # viser's banner
-        # This machine alone: there is no password.
+        # Local only: there is no password.
         server = viser.ViserServer("127.0.0.1", config.port, verbose=False)
     try:
         viewer = Viewer(server, measurement, columns)
@@ -72,24 +72,26 @@ def _loaded(config: Config) -> tuple[Measurement, list[Column]]:
     from splatsoil.view import Column
 
     if not (config.folder / "run.json").is_file():
-        if config.beside is not None:
-            raise ParameterError(f"--beside: {config.folder} is no run folder; only a run has fits")
+        if config.compare_with is not None:
+            raise ParameterError(f"--compare-with: {config.folder} is no run folder; only a run has fits")
         return Measurement.load(config.folder), []
     folder = RunFolder.open(config.folder)
     data = load(folder.path)
-    if config.beside is not None and config.beside not in data.fits:
-        raise RunError(f"--beside: {folder.path} has no fit {config.beside!r}; it has {', '.join(data.fits)}")
+    if config.compare_with is not None and config.compare_with not in data.fits:
+        raise RunError(
+            f"--compare-with: {folder.path} has no fit {config.compare_with!r}; it has {', '.join(data.fits)}"
+        )
     columns = []
     with _model.loaded(config, folder) as (model, begin):
         made = model.reconstruction
         comparator = Comparator(
             model.measurement, surface=made.surface, frames=model.frames, surroundings=made.standing
         )
-        for fit in (data.fit, *([data.fits[config.beside]] if config.beside else [])):
+        for fit in (data.fit, *([data.fits[config.compare_with]] if config.compare_with else [])):
             values, report = estimates(fit), begin(fit["name"])
-            said = (f"{n} {amount(p['estimate'], p['std'], p['unit'])}" for n, p in fit["parameters"].items())
+            texts = (f"{n} {amount(p['estimate'], p['std'], p['unit'])}" for n, p in fit["parameters"].items())
             shown = model.variant(effects=_model.ModelSpec.of(fit).effects)
-            column = Column(f"{fit['name']}: {', '.join(said)}", shown, values, comparator)
+            column = Column(f"{fit['name']}: {', '.join(texts)}", shown, values, comparator)
             replay(shown, values, shown.recorded, [column], progress=by_frame(report))
             columns.append(column)
     return model.measurement, columns

@@ -1,4 +1,4 @@
-"""Experiments: observed features with labels, their noise, and what a model predicts for them."""
+"""Experiments: observed features with labels, their noise, and a model's predictions."""
 
 from splatsoil.experiment.base import Candidate, Experiment
 from splatsoil.experiment.features import Layout, Site

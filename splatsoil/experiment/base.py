@@ -1,4 +1,4 @@
-"""What criticism knows of an experiment, and nothing else."""
+"""The interface of an experiment to fits and model criticism."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ class Candidate:
 
     Attributes:
         name: the effect's.
-        kind: ``observation`` for what only changes what is reported, ``physics`` for the rest.
-        parameters: those whose off value is known: the directions in which it can act.
-        size: name of the parameter that measures it.
-        note: what it is.
-        shapes: parameters that mean nothing while the effect is off, and that data can tell once it is on.
+        kind: ``observation`` if it changes only the observation, else ``physics``.
+        parameters: those with an off value.
+        size: name of the parameter that is its size.
+        note: description.
+        shapes: parameters that act only while the effect is on, and that data can determine then.
     """
 
     name: str
@@ -38,11 +38,11 @@ class Candidate:
 
     def __post_init__(self) -> None:
         if self.size not in {p.name for p in self.parameters}:
-            raise ValueError(f"{self.name}: its size {self.size} is none of its parameters that can be off")
+            raise ValueError(f"{self.name}: its size {self.size} is not a parameter with an off value")
 
     @property
     def measure(self) -> Parameter:
-        """The parameter that measures the effect."""
+        """The parameter that is its size."""
         return next(p for p in self.parameters if p.name == self.size)
 
 
@@ -50,13 +50,13 @@ class Experiment(Protocol):
     """Observed features, their noise, and predictions.
 
     Attributes:
-        name: for people.
+        name: for the reader.
         layout: labels of the features.
-        observed: (t, s) features; anything where ``seen`` is False.
-        seen: (t, s) False where there is no observation (the tool hides it), or none that counts.
-        quiet: (t, s) True where no physics of the model can act, so that what is left there is the instruments' doing.
-        sensor: (t, s) standard deviation of what the instruments add, known or measured.
-        sensor_memory: correlation of that between neighbouring times, in [0, 1).
+        observed: (t, s) features; arbitrary where ``seen`` is False.
+        seen: (t, s) whether there is an observation (the tool can hide it).
+        quiet: (t, s) True where no physics of the model acts, so that residuals are instrument noise.
+        sensor: (t, s) standard deviation of the instruments' noise.
+        sensor_memory: its correlation between neighbouring times, in [0, 1).
         parameters: free parameters of the model.
         model: names of the effects that are on.
         candidates: effects that are off.
@@ -101,18 +101,18 @@ class Experiment(Protocol):
         """(t, s) predicted features.
 
         Args:
-            values: parameters by name, those of ``effects`` included.
+            values: parameters by name, including those of ``effects``.
             effects: candidates to switch on, by name.
             seed: of the simulation's random numbers.
             variant: one of ``discretisations``, ``renderings`` or ``albedo_draws``; empty for the standard simulation.
 
         Raises:
-            SimulationError: the simulation could not go on.
+            SimulationError: the simulation failed.
         """
 
 
 def candidate_of(effect: Effect) -> Candidate | None:
-    """The candidate that an effect of the library makes; None when none of its parameters has an off value."""
+    """The candidate of an effect; None if none of its parameters has an off value."""
     testable = tuple(p for p in effect.parameters if p.off is not None)
     if not testable:
         return None
@@ -122,7 +122,7 @@ def candidate_of(effect: Effect) -> Candidate | None:
 
 
 def candidates_of(effects: Iterable[Effect], on: Iterable[Effect]) -> tuple[Candidate, ...]:
-    """The candidates among effects, for a model that has some on: those that are off and don't exclude any of them."""
+    """Candidates for a model with some effects on: effects that are off and compatible with these."""
     present = list(on)
     names = {effect.name for effect in present}
     excluded = {other for effect in present for other in effect.conflicts}

@@ -1,13 +1,12 @@
-"""A column of soil that is let go as an experiment: the solver, no tool, no pictures."""
+"""The collapse of a soil column as an experiment: the solver without tool and pictures."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from splatsoil.errors import ParameterError
 from splatsoil.experiment.laboratory import FloatArray, LaboratoryExperiment
@@ -17,35 +16,57 @@ from splatsoil.soil.effect import Effect
 from splatsoil.soil.settings import FRICTION_ANGLE, Settings
 
 ACROSS = 1.5
-"""Cells along the column's radius, over the preset's along a tool's width."""
+"""Cells along the radius, over the preset's along a tool's width."""
 GRAVITY = 9.81
 REACH = 2.5
-"""Room for the run-out, over the column's height: Lube et al. (2004) found at most 1.24."""
+"""Length for the run-out over the column's height; Lube et al. (2004) found at most 1.24."""
 REST = 6.0
-"""Free falls of the column's height after which the heap rests."""
+"""Time to rest, in free-fall times of the column's height."""
 CHANNELS = ("radius", "height")
 SCATTER = 0.05
-"""Between trials, in radii of the column, where they are too few to tell."""
+"""Standard deviation between trials, in radii of the column, for fewer than three trials."""
 THIN = 0.02
-"""Of the radius: the deposit ends where it is thinner, a few grains in a laboratory."""
+"""Thickness at the end of the deposit, as a share of the radius: a few grains."""
+
+
+@dataclass(frozen=True, eq=False)
+class Collapse:
+    """Measured collapses of a column.
+
+    Attributes:
+        radius: of the column, m.
+        height: of it, m.
+        deposits: (trials, 2) radius and height of the deposit, m.
+        density: bulk density, kg/m³.
+        floor_friction: Coulomb coefficient of the floor.
+        name: of the test.
+
+    Raises:
+        ParameterError: lengths are not positive, or there is no deposit.
+    """
+
+    radius: float
+    height: float
+    deposits: FloatArray
+    density: float = 1600.0
+    floor_friction: float = 0.6
+    name: str = "column"
+
+    def __post_init__(self) -> None:
+        deposits = self.deposits
+        if not (self.radius > 0.0 and self.height > 0.0 and deposits.size and deposits.shape[1] == len(CHANNELS)):
+            raise ParameterError("a column test needs a radius, a height, and both of the deposit for each trial")
 
 
 class ColumnExperiment(LaboratoryExperiment):
-    """A circular column that is let go at once, of which a quarter is simulated.
+    """The sudden collapse of a circular column, of which a quarter is simulated.
 
     Args:
-        radius: of the column, m.
-        height: of it, m.
-        measured: (trials, 2) radius and height of the deposit, m.
-        density: bulk density, kg/m³.
-        floor_friction: Coulomb coefficient of the floor.
+        test: the measurement.
         effects: that are on.
         candidates: effects to consider; all of physics by default.
         preset: resolution of the solver.
         device: ``cpu`` or ``cuda:N``.
-
-    Raises:
-        ParameterError: lengths or measurements without meaning.
     """
 
     kind = "column"
@@ -54,33 +75,25 @@ class ColumnExperiment(LaboratoryExperiment):
 
     def __init__(
         self,
-        radius: float,
-        height: float,
-        measured: npt.ArrayLike,
+        test: Collapse,
         *,
-        density: float = 1600.0,
-        floor_friction: float = 0.6,
         effects: Iterable[str | Effect] = (),
         candidates: Iterable[str | Effect] | None = None,
         preset: str = "small",
         device: str = "cpu",
-        name: str = "column",
     ) -> None:
-        trials = np.atleast_2d(np.asarray(measured, dtype=np.float64))
-        if not (radius > 0.0 and height > 0.0 and trials.size and trials.shape[1] == len(CHANNELS)):
-            raise ParameterError("a column test needs a radius, a height, and both of the deposit for each trial")
-        super().__init__(name, effects, candidates)
-        self.radius, self.height, self.device = radius, height, device
-        self.settings = Settings(FRICTION_ANGLE.default, wall_friction=0.0, floor_friction=floor_friction)
-        table = self.features(trials)
+        super().__init__(test.name, effects, candidates)
+        self.test, self.device = test, device
+        self.settings = Settings(FRICTION_ANGLE.default, wall_friction=0.0, floor_friction=test.floor_friction)
+        table = self.features(test.deposits)
         spread = table.std(axis=0, ddof=1) if len(table) > 2 else np.full(len(CHANNELS), SCATTER)
-        self._read(
+        self._set_observation(
             table.mean(axis=0)[None], spread[None], (1.0,), "heap at rest", "radii of the column", CHANNELS, "heap"
         )
         chosen = PRESETS[preset]
-        cell = radius / max(round(ACROSS * chosen.cells_across_tool), 2)
-        fastest = math.sqrt(2.0 * GRAVITY * height)
-        # a tall column presses little: its skeleton may be soft
+        cell = test.radius / max(round(ACROSS * chosen.cells_across_tool), 2)
+        fastest = math.sqrt(2.0 * GRAVITY * test.height)
+        # pressures are low: a soft skeleton serves
         young = 0.1 * chosen.young
         self.resolution = Resolution(
             cell=cell,
@@ -90,21 +103,21 @@ class ColumnExperiment(LaboratoryExperiment):
             courant=chosen.courant,
             bulk=young / (3.0 * (1.0 - 2.0 * chosen.poisson)),
             shear=young / (2.0 * (1.0 + chosen.poisson)),
-            density=density,
+            density=test.density,
             relaxation=fastest / (chosen.way * cell),
         )
 
     def features(self, readings: FloatArray) -> FloatArray:
         """In radii of the column."""
-        return readings / self.radius
+        return readings / self.test.radius
 
     def readings(
         self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, variant: str = ""
     ) -> FloatArray:
         """(1, 2) radius and height of the deposit, m; arguments as for `predict`."""
         r, thickness = self._profile(values, effects=effects, seed=seed, variant=variant)
-        end = int(np.argmax(thickness < THIN * self.radius))
-        share = (thickness[end - 1] - THIN * self.radius) / (thickness[end - 1] - thickness[end])
+        end = int(np.argmax(thickness < THIN * self.test.radius))
+        share = (thickness[end - 1] - THIN * self.test.radius) / (thickness[end - 1] - thickness[end])
         return np.array([[r[end - 1] + share * (r[end] - r[end - 1]), thickness[:2].max()]])
 
     def _profile(
@@ -112,19 +125,19 @@ class ColumnExperiment(LaboratoryExperiment):
     ) -> tuple[FloatArray, FloatArray]:
         """Radii (n,) and mean thickness (n,) of the deposit in rings, m; empty beyond its end."""
         resolution = FINER_RESOLUTIONS[variant](self.resolution) if variant else self.resolution
-        # one step a frame, as short as the way of falling soil allows
+        # one step a frame, limited by the path of falling soil
         resolution = replace(resolution, frame_time=resolution.frame_time / resolution.steps, steps=1)
         spacing, cell = resolution.spacing, resolution.cell
-        wide, high = round(self.radius / spacing), max(round(self.height / spacing), 1)
+        wide, high = round(self.test.radius / spacing), max(round(self.test.height / spacing), 1)
         axes = [spacing * (np.arange(n) + 0.5) for n in (wide, wide, high)]
         centres = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-        centres = centres[np.hypot(centres[:, 0], centres[:, 1]) < self.radius]
+        centres = centres[np.hypot(centres[:, 0], centres[:, 1]) < self.test.radius]
         jitter = np.random.default_rng(seed).uniform(-0.15, 0.15, centres.shape)
-        reach = cell * math.ceil((self.radius + REACH * self.height) / cell)
+        reach = cell * math.ceil((self.test.radius + REACH * self.test.height) / cell)
         solver = Solver(
             (centres + spacing * jitter)[None],
             np.zeros(3),
-            (reach, reach, self.height + 2.0 * cell),
+            (reach, reach, self.test.height + 2.0 * cell),
             None,
             resolution,
             self.law(effects),
@@ -132,7 +145,7 @@ class ColumnExperiment(LaboratoryExperiment):
             [self.values(values)],
             self.device,
         )
-        for _ in range(math.ceil(REST * math.sqrt(self.height / GRAVITY) / resolution.frame_time)):
+        for _ in range(math.ceil(REST * math.sqrt(self.test.height / GRAVITY) / resolution.frame_time)):
             solver.advance(1)
         x = solver.positions()[0]
         edges = np.arange(0.0, reach + 2.0 * cell, 0.5 * cell)

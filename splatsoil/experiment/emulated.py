@@ -19,15 +19,14 @@ FloatArray = npt.NDArray[np.float64]
 class EmulatedExperiment:
     """Features that are known functions of parameters, with scatter and instrument noise of known covariance.
 
-    A prediction is the middle, plus each parameter's (and effect's) slope times its distance from home, plus half its
-    curve times the square of that, plus the scatter of the seed.
+    A prediction is a quadratic function of the parameters about ``home``, plus the scatter of the seed.
 
     Attributes:
         layout: labels.
-        middle: (t, s) features at home.
-        home: values of the model's parameters there.
-        slopes: (t, s) by parameter, effects' included.
-        curves: (t, s) likewise; absent ones are 0.
+        middle: (t, s) features at ``home``.
+        home: expansion point of the model's parameters.
+        slopes: (t, s) first derivatives by parameter, including those of effects.
+        curves: (t, s) second derivatives; 0 if absent.
         parameters: free parameters of the model.
         candidates: effects that are off.
         scatter_root: (t s, t s) lower Cholesky factor of one simulation's scatter.
@@ -36,7 +35,7 @@ class EmulatedExperiment:
         patterns: (t, s) what another discretisation adds, by name.
         albedo_patterns: (t, s) what another draw of the unknown albedo adds, by name.
         quiet: (t, s) where no physics acts.
-        name: for people.
+        name: for the reader.
     """
 
     layout: Layout
@@ -64,7 +63,7 @@ class EmulatedExperiment:
 
     @property
     def seen(self) -> npt.NDArray[np.bool_]:
-        """Everything is."""
+        """All features."""
         return np.ones(self.layout.shape, dtype=bool)
 
     @property

@@ -1,4 +1,4 @@
-"""Features: a low-dimensional table (times, sites) of what an experiment's instruments saw."""
+"""Features: a table (times, sites) of measurements, and its labels."""
 
 from __future__ import annotations
 
@@ -13,16 +13,15 @@ import numpy.typing as npt
 
 @dataclass(frozen=True)
 class Site:
-    """Where one column of a feature table was taken.
+    """One column of a feature table.
 
     Attributes:
         channel: the instrument (a camera's name, ``force z``, ``volume strain``).
-        x: place in m; NaN for an instrument that has none.
-        y: place in m; NaN for an instrument that has none.
-        unit: of its readings; empty for the layout's.
-        reading: increasing function from features to what the instrument reads; None where they are the same.
-        outline: corners in the channel's undistorted picture, as shares of its width and height; empty where there is
-            none.
+        x: position in m; NaN for an instrument without a place.
+        y: likewise.
+        unit: of the readings; empty for the layout's.
+        reading: increasing function from features to readings; None for the identity.
+        outline: corners in the undistorted picture, as shares of its width and height; empty for none.
     """
 
     channel: str
@@ -35,15 +34,15 @@ class Site:
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Labels of a feature table; the same only as itself.
+    """Labels of a feature table.
 
     Attributes:
-        times: (t,) what orders the rows (frame numbers, strains, depths), increasing.
+        times: (t,) increasing: frame numbers, strains, depths.
         sites: (s,) the columns.
-        time_name: what ``times`` are ("frame", "axial strain").
-        unit: of the features ("grey levels", "1"), sites that have one of their own aside.
-        stages: (t,) the part of the experiment that each row belongs to ("pushing").
-        regions: (t, s) the part of the scene that each feature shows ("trench").
+        time_name: name of ``times`` ("frame", "axial strain").
+        unit: of the features ("grey levels", "1"), except for sites with their own.
+        stages: (t,) stage of each row ("pushing").
+        regions: (t, s) region of each feature ("trench").
     """
 
     times: tuple[float, ...]
@@ -76,5 +75,5 @@ class Layout:
 
     @cached_property
     def placed(self) -> npt.NDArray[np.bool_]:
-        """(s,) sites that have a place."""
+        """(s,) sites with a place."""
         return np.array([math.isfinite(site.x) and math.isfinite(site.y) for site in self.sites])

@@ -1,7 +1,7 @@
-"""The force on the tool, where it was measured: instruments beside the cameras.
+"""Features of the measured force on the tool.
 
-Pictures leave a valley in which friction and cohesion make up for each other. The force that moves the tool differs
-along it by a factor of three to four (docs/numerics.md), so even a force that is believed to 15 % shortens it.
+In pictures friction and cohesion are correlated: one compensates for the other. The tool force differs by a factor of
+three to four between such pairs (docs/numerics.md), so a force known to 15 % separates them.
 """
 
 from __future__ import annotations
@@ -19,18 +19,17 @@ from splatsoil.measurement import Measurement
 FloatArray = npt.NDArray[np.float64]
 
 ALONG, UP = "force along", "force up"
-"""Instruments: against the way the tool is pushed, and upwards."""
+"""Components: against the direction of pushing, and upwards."""
 REGION, UNIT = "tool", "N"
 STAGE, PAUSE = "pushing", "pause"
-"""The one whose largest force is the unit, and the one in which the tool stands."""
+"""The stage whose largest force is the unit, and the stage in which the tool stands still."""
 MIN_FORCE, MIN_ROWS = 0.25, 2
-"""Rows in which the tool is pushed with this share of the largest force: with fewer there is nothing to go by."""
+"""Minimum number of rows in which the pushing force exceeds this share of the largest force."""
 SENSOR = 1.0
-"""Standard deviation of what is measured, % of the largest force."""
+"""Standard deviation of the measurement, % of the largest force."""
 SCALE = 10.0
-"""% of the largest force up to which a comparison of models takes forces as they are; beyond, relative differences
-count (inverse hyperbolic sine: Burbidge, Magee & Robb 1988, J. Am. Stat. Assoc. 83:123), because forces grow tenfold
-from weak to strong soil and simulated ones err in proportion."""
+"""Scale of the inverse hyperbolic sine (Burbidge, Magee & Robb 1988, J. Am. Stat. Assoc. 83:123), % of the largest
+force: smaller forces are compared by difference, larger ones by ratio, because simulated forces err in proportion."""
 
 
 @dataclass(frozen=True)
@@ -38,13 +37,13 @@ class ToolForces:
     """Forces as features.
 
     Attributes:
-        channels: (c,) the instruments.
+        channels: (c,) names of the components.
         observed: (t, c) measured means over each row's frames, in % of the largest.
-        stages: (t,) the part of the motion that each row belongs to.
-        measured: (t, c) rows in which there are any.
-        largest: what that is, N.
-        axes: (c, 3) the instruments' directions.
-        weights: (t, f) of frames 1, 2, …, f in each row.
+        stages: (t,) stage of each row.
+        measured: (t, c) whether there is a measurement.
+        largest: largest force, N.
+        axes: (c, 3) directions of the components.
+        weights: (t, f) of frames 1, 2, …, f in each row's mean.
     """
 
     channels: tuple[str, ...]
@@ -57,10 +56,9 @@ class ToolForces:
 
     @classmethod
     def of(cls, measurement: Measurement, rows: Sequence[Sequence[int]]) -> ToolForces | None:
-        """What a set's forces say in rows of compared frames; None where too little was measured.
+        """Forces of a set in rows of compared frames; None where too little was measured.
 
-        A row's force is the mean over the frames of its stage that are nearer to its compared frames than to others: a
-        frame's own force shakes, and pictures between the compared ones say little.
+        A row's force is the mean over the frames of its stage that are nearest to its compared frames.
         """
         force = measurement.tool.force
         compared = np.array([frame for row in rows for frame in row])
@@ -98,16 +96,16 @@ class ToolForces:
 
     @property
     def features(self) -> FloatArray:
-        """(t, c) what was measured, as a comparison of models takes it."""
+        """(t, c) measured features."""
         return compressed(self.observed)
 
     @property
     def noise(self) -> FloatArray:
-        """(t, c) standard deviation of the instrument in these, and of what it leaves open."""
+        """(t, c) standard deviation of the features."""
         return np.hypot(SENSOR / np.sqrt(1.0 + (self.observed / SCALE) ** 2), _standing(self.features, self.stages))
 
     def newtons(self, features: FloatArray) -> FloatArray:
-        """Features as forces in N: `compressed` undone."""
+        """Forces in N from features: the inverse of `compressed`."""
         return np.asarray(0.01 * self.largest * SCALE * np.sinh(features / SCALE))
 
 
@@ -144,13 +142,13 @@ def force_record(measurement: Measurement, frames: Sequence[int], force: FloatAr
 
 
 def compressed(forces: FloatArray) -> FloatArray:
-    """Forces in % of the largest, relative beyond `SCALE`."""
+    """Inverse hyperbolic sine of forces in % of the largest, see `SCALE`."""
     return np.asarray(SCALE * np.arcsinh(forces / SCALE))
 
 
 def _standing(features: FloatArray, stages: Sequence[str]) -> FloatArray:
-    """(t, c) what a set leaves open of features (t, c): how a tool stops within a frame isn't recorded, and soil stays
-    pressed against it or not. A standing tool may bear anything from nothing to what it bore last (uniform)."""
+    """(t, c) standard deviation of the force on a tool at rest. How it stops within a frame is not recorded, so the
+    force is uniform between zero and its last value."""
     out = np.zeros(features.shape)
     last = np.zeros(features.shape[1])
     for row, stage in enumerate(stages):

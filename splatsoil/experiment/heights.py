@@ -1,7 +1,7 @@
-"""Measured heights as features: the change of the surface's height in a square of the bed since the first frame.
+"""Features of measured heights: the change of height of a square of the bed since the first frame.
 
-Grids and depth maps are one instrument, as both are points on the surface. What was measured and what is predicted are
-averaged over the same cells of a square: those that were seen, and without the tool, at the first frame and later.
+Grids and depth maps are one instrument. Measured and predicted heights are averaged over the same cells of a square:
+those that are visible and without the tool at both frames.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ FloatArray = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
 
 CHANNEL, UNIT = "heights", "mm"
-"""The instrument. In mm its noise, a tenth to one, is of the size of that of pictures in grey levels: neither outweighs
-the other in the modes that instruments with a place share."""
+"""The instrument. Its noise in mm is similar to that of pictures in grey levels, so neither dominates the principal
+components."""
 MM = 1e3
 PARTS = 8
 """Cells along a square's side."""
 ENOUGH = 0.5
 """Share of a square's cells that must be known."""
 UNKNOWN_NOISE, LEAST_NOISE = 1.0, 0.05
-"""Standard deviation of a square's height, mm: where nothing tells it, and the least."""
+"""Standard deviation of a square's height, mm: default, and minimum."""
 
 
 class Heights:
@@ -38,15 +38,15 @@ class Heights:
 
     Args:
         measurement: has heights at the comparison's first frame.
-        comparator: tells squares and frames.
-        rows: places among the compared frames that make one row of features.
+        comparator: defines squares and frames.
+        rows: indices of the compared frames of each row of features.
 
     Attributes:
         sites: (s,) the squares whose heights are known at the first frame.
         observed: (t, s) measured changes, mm; 0 where unknown.
         seen: (t, s) whether any frame of a row shows enough of a square.
-        noise: (t, s) standard deviation that the instrument gives the changes, mm: from heights before anything moves,
-            or else as the set states it, as if the cells of a square erred alike.
+        noise: (t, s) standard deviation of the changes, mm: from heights before the tool moves, or as the set states it
+            (errors of a square's cells are then equal).
     """
 
     def __init__(self, measurement: Measurement, comparator: Comparator, rows: Sequence[Sequence[int]]) -> None:
@@ -84,7 +84,7 @@ class Heights:
 
     @classmethod
     def of(cls, measurement: Measurement, comparator: Comparator, rows: Sequence[Sequence[int]]) -> Heights | None:
-        """None where a set has no heights, or none of the first frame or of any that is compared."""
+        """None if the set has no heights of the first frame or of any compared one."""
         there = set(measurement.height_frames)
         enough = comparator.reference in there and not there.isdisjoint(comparator.frames)
         return cls(measurement, comparator, rows) if enough else None
@@ -94,8 +94,8 @@ class Heights:
         return self._in_rows(self._of(surfaces))
 
     def losses(self, surfaces: Mapping[int, Relief]) -> dict[int, float]:
-        """Mean square of what surfaces by frame leave of the changes at each compared frame, over that of all changes;
-        their mean is 0 for a perfect model, 1 for one without motion."""
+        """Mean square residual of each compared frame over the mean square change; 0 is a perfect model, 1 one
+        without motion."""
         moved, left = self._moved, self._moved - self._of(surfaces)
         unit = max(float(np.mean(moved[self._usable > 0.0] ** 2)), 1e-12)
         square = np.sum(self._usable * left**2, axis=1) / np.maximum(self._usable.sum(axis=1), 1.0)
@@ -103,13 +103,12 @@ class Heights:
 
     @property
     def noise_loss(self) -> float:
-        """The loss that the instrument's noise alone leaves."""
+        """Expected loss of a perfect model."""
         return self._std**2 / max(float(np.mean(self._moved[self._usable > 0.0] ** 2)), 1e-12)
 
     def pictures(self, surfaces: Mapping[int, Relief], frame: int) -> dict[str, Image]:
-        """(h, w, 3) observed and predicted changes at a frame, seen from above with y upwards, and their difference, by
-        these names: grey where nothing changes or is known, brighter where it is higher. The difference is `GAIN` times
-        as strong, as that of photographs is."""
+        """(h, w, 3) observed and predicted changes at a frame, from above with y upwards, and their difference, by
+        these names: grey for no change or no data, brighter for higher. The difference is scaled by `GAIN`."""
         seen, first = self._later[frame], self._first
         largest = max(np.nanmax(np.abs((p - first)[:, 2]), initial=1e-9) for p in self._later.values())
         changes = (seen - first)[:, 2], _heights(surfaces[frame], seen) - _heights(surfaces[self._reference], first)
@@ -141,7 +140,7 @@ class Heights:
         return Site(CHANNEL, x, y, UNIT, outline=tuple(((column + i) / nx, 1.0 - (row + j) / ny) for i, j in around))
 
     def _level(self, measurement: Measurement, still: FloatArray) -> float:
-        """Standard deviation of a square's change, mm, by heights (n, cells) before anything moves."""
+        """Standard deviation of a square's change, mm, from heights (n, cells) before the tool moves."""
         if len(still) > 1:
             others = (still.sum(axis=0) - still) / (len(still) - 1)
             left = np.stack([self._means(MM * (s - o)) for s, o in zip(still, others, strict=True)])
@@ -150,7 +149,7 @@ class Heights:
         return UNKNOWN_NOISE if stated is None else max(MM * stated, LEAST_NOISE)
 
     def _means(self, values: FloatArray) -> FloatArray:
-        """(s,) means of values (cells,) over the known cells of a square; 0 where none is known."""
+        """(s,) means of values (cells,) over the known cells of a square; 0 for none."""
         total = self._in_squares(np.nan_to_num(values))[self._kept]
         return np.asarray(total / np.maximum(self._counts(values)[self._kept], 1.0))
 

@@ -1,4 +1,4 @@
-"""What tests without cameras have in common: instruments without a place, read over a strain or a depth."""
+"""Base classes of laboratory tests: instruments without a place, read over a strain or a depth."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from splatsoil.soil.packing import at_void_ratio
 FloatArray = npt.NDArray[np.float64]
 
 MEMORY = 0.8
-"""Correlation of neighbouring readings: a specimen, or a bed, that is off stays off."""
+"""Correlation of neighbouring readings: the deviation of a specimen persists."""
 ONE_ANGLE = {"intermediate_share": 1.0}
-"""The friction angle has the same meaning in every test, see `intermediate_stress`; parameters that are not fitted."""
+"""Parameters that are not fitted: the friction angle has the same meaning in every test, see `intermediate_stress`."""
 
 
 class LaboratoryExperiment(ABC):
     """A test without cameras, and a model of it: an :class:`~splatsoil.experiment.base.Experiment`.
 
     Attributes:
-        kind: what the test is, as ``experiment.json`` says it.
+        kind: of the test, as in ``experiment.json``.
         always: effects that are on in every model of such a test.
-        of_strength: whether only effects that act on strength can change what it measures.
-        known: parameters that other tests of the soil have told, by name; they are not fitted.
+        of_strength: whether the measurement depends only on effects on strength.
+        known: parameters from other tests, by name; they are not fitted.
     """
 
     kind: ClassVar[str]
@@ -70,18 +70,18 @@ class LaboratoryExperiment(ABC):
         self.candidates = candidates_of((e for e in wanted if self.acts(e)), on)
 
     def acts(self, effect: Effect) -> bool:
-        """Whether an effect can change what such a test measures."""
+        """Whether an effect can change the measurement."""
         return effect.strength is not None if self.of_strength else not (effect.numerical or effect.observes)
 
     def law(self, effects: Iterable[str]) -> Law:
-        """The model's law with other effects on, too."""
+        """The model's law with further effects on."""
         return Law(self._known[name] for name in dict.fromkeys((*self.model, *effects)))
 
     def values(self, values: Mapping[str, float]) -> dict[str, float]:
-        """A model's parameters, those that are not fitted included."""
+        """All parameters of the model, including those that are not fitted."""
         return {**self.known, **values}
 
-    def _read(
+    def _set_observation(
         self,
         observed: FloatArray,
         sensor: FloatArray,
@@ -91,7 +91,7 @@ class LaboratoryExperiment(ABC):
         channels: Sequence[str],
         region: str,
     ) -> None:
-        """Take features (t, s) and their standard deviations (t, s); stages are the halves of the test."""
+        """Set features (t, s) and their standard deviations (t, s); the stages are the halves of the test."""
         along = np.asarray(times, dtype=np.float64).reshape(-1)
         middle = 0.5 * float(along[-1])
         self.layout = Layout(
@@ -110,7 +110,7 @@ class LaboratoryExperiment(ABC):
     def readings(
         self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, variant: str = ""
     ) -> FloatArray:
-        """(t, s) what the instruments would read, in SI units; arguments as for `predict`."""
+        """(t, s) predicted readings in SI units; arguments as for `predict`."""
 
     @abstractmethod
     def features(self, readings: FloatArray) -> FloatArray:
@@ -124,7 +124,7 @@ class LaboratoryExperiment(ABC):
 
 
 class Specimen(Protocol):
-    """What a test of one specimen measured, over its strain (n,): a stress ratio and the volume strain, (n,) each."""
+    """A test of one specimen: stress ratio and volume strain over strain, (n,) each."""
 
     @property
     def name(self) -> str: ...
@@ -145,8 +145,8 @@ class SpecimenExperiment(LaboratoryExperiment, Generic[AnySpecimen]):
     """Tests of specimens of one soil, and a model of it: the law at a single point; deterministic.
 
     Features are the stress ratio and the volume strain, each in units of its spread between specimens. The elastic
-    stiffness is a parameter of the model: a laboratory's sand is not rigid. Parameters are those of the first test's
-    void ratio, see :func:`~splatsoil.soil.packing.at_void_ratio`.
+    stiffness is a parameter of the model. Parameters refer to the first test's void ratio,
+    see :func:`~splatsoil.soil.packing.at_void_ratio`.
 
     Args:
         tests: of one soil, at the same strains.
@@ -156,7 +156,7 @@ class SpecimenExperiment(LaboratoryExperiment, Generic[AnySpecimen]):
 
     Attributes:
         spreads: of the stress ratio and of the volume strain between specimens.
-        strain_name: what is read along a test, in %.
+        strain_name: name of the strain, in %.
 
     Raises:
         ParameterError: tests whose strains differ.
@@ -181,7 +181,7 @@ class SpecimenExperiment(LaboratoryExperiment, Generic[AnySpecimen]):
         super().__init__(", ".join(t.name for t in self.tests), effects, candidates, known)
         observed = self.features(np.concatenate([np.stack([t.ratio, t.volume], axis=1) for t in self.tests], axis=1))
         names = [f", {t.name}" for t in self.tests] if len(self.tests) > 1 else [""]
-        self._read(
+        self._set_observation(
             observed,
             np.ones_like(observed),
             100.0 * self.tests[0].strain,
@@ -210,5 +210,5 @@ class SpecimenExperiment(LaboratoryExperiment, Generic[AnySpecimen]):
         return np.stack(out, axis=1)
 
     def features(self, readings: FloatArray) -> FloatArray:
-        """In units of spreads."""
+        """Readings in units of their spread."""
         return readings / np.tile(self.spreads, len(self.tests))

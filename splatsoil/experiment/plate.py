@@ -1,13 +1,12 @@
-"""A plate pressed into soil as an experiment: the force over depth, from the solver, no pictures."""
+"""A plate loading test as an experiment: force over depth from the solver, without pictures."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import trimesh
 
 from splatsoil.errors import ParameterError
@@ -20,49 +19,68 @@ from splatsoil.reconstruction import HeightField, fill
 from splatsoil.soil.effect import Effect
 
 FROUDE = 0.1
-"""Of the simulated plate's speed, by its diameter: its inertia is a hundredth of the weight of soil as deep as it is
-wide, and the soil bears ten times that weight and more."""
+"""Froude number of the simulated plate: inertia is 1 % of the weight of soil of one diameter's depth."""
 FRAMES = 100
-"""In which the plate goes as deep as it is wide."""
+"""Frames for a penetration of one diameter."""
 WIDE, DEEP = 2.0, 1.5
-"""The quarter bed's width, and its depth below the deepest place of the plate, in plate diameters: what the plate moves
-stays inside (Prandtl's mechanism)."""
+"""Width of the quarter bed and its depth below the plate, in diameters: they contain Prandtl's mechanism."""
 FINER = 4.0 / 3.0
-"""Cells across a plate, of which a quarter is simulated, over those across a tool: 4, 8 and 12."""
+"""Cells across a plate over the preset's across a tool."""
 RIGID = 100.0
-"""Young's modulus over the largest mean pressure: it gives by 1 % of the diameter. Sand is stiffer."""
+"""Minimum Young's modulus over the largest mean pressure: elastic settlement is 1 % of the diameter."""
 ROOM = 0.25
-"""Of the bed's depth, above its surface."""
+"""Free height above the surface, as a share of the bed's depth."""
 GRAVITY = 9.81
 CELLS = 8
-"""Of the level surface, along each side."""
+"""Cells of the level surface along each side."""
 SMOOTH = 2
-"""Frames on either side over which the simulated force is averaged: particles meet the plate one by one."""
+"""Frames on either side over which the simulated force is averaged."""
+
+
+@dataclass(frozen=True, eq=False)
+class Loading:
+    """A measured plate loading test.
+
+    Attributes:
+        diameter: of the plate, m.
+        depths: (t,) of its underside below the surface, m, increasing.
+        forces: (t,) upward force, N.
+        spread: (t,) or one standard deviation of the force between trials, N.
+        density: bulk density of the soil, kg/m³.
+        friction: Coulomb coefficient between plate and soil.
+        name: of the test.
+
+    Raises:
+        ParameterError: depths do not increase, or forces do not match.
+    """
+
+    diameter: float
+    depths: FloatArray
+    forces: FloatArray
+    spread: FloatArray
+    density: float = 1600.0
+    friction: float = 0.3
+    name: str = "plate"
+
+    def __post_init__(self) -> None:
+        depth = self.depths
+        if depth.shape != self.forces.shape or len(depth) < 2 or np.any(np.diff(depth) <= 0.0) or depth[0] <= 0.0:
+            raise ParameterError("a plate test needs at least two increasing depths, each with its force")
 
 
 class PlateExperiment(LaboratoryExperiment):
     """A flat circular plate pressed straight down into level soil, of which a quarter is simulated.
 
-    Features are forces at the depths that were measured, in % of the largest and relative where they are large, see
-    :func:`~splatsoil.experiment.forces.compressed`. Forces wave by the cell; so the grid's offset is drawn by the seed.
-    The skeleton is at least `RIGID` times as stiff as the largest mean
-    pressure under the plate.
+    Features are forces at the measured depths, see :func:`~splatsoil.experiment.forces.compressed`. Forces oscillate
+    with the period of a cell, so each seed has another offset of the grid.
 
     Args:
-        diameter: of the plate, m.
-        depths: (t,) of its underside below the surface, m, increasing.
-        forces: (t,) measured upward force, N.
-        spread: (t,) standard deviation of the measured force between trials, N.
-        density: bulk density, kg/m³.
+        test: the measurement.
         effects: that are on.
         candidates: effects to consider; all of physics by default.
         known: parameters that are not fitted.
-        friction: Coulomb coefficient between plate and soil.
         preset: resolution of the solver: `FINER` times as many cells across the plate as across a tool.
         device: ``cpu`` or ``cuda:N``.
-
-    Raises:
-        ParameterError: depths and forces don't match.
     """
 
     kind = "plate"
@@ -71,41 +89,31 @@ class PlateExperiment(LaboratoryExperiment):
 
     def __init__(
         self,
-        diameter: float,
-        depths: npt.ArrayLike,
-        forces: npt.ArrayLike,
-        spread: npt.ArrayLike,
+        test: Loading,
         *,
-        density: float = 1600.0,
         effects: Iterable[str | Effect] = (),
         candidates: Iterable[str | Effect] | None = None,
         known: Mapping[str, float] | None = None,
-        friction: float = 0.3,
         preset: str = "small",
         device: str = "cpu",
-        name: str = "plate",
     ) -> None:
-        depth, force = (np.asarray(v, dtype=np.float64).reshape(-1) for v in (depths, forces))
-        if depth.shape != force.shape or len(depth) < 2 or np.any(np.diff(depth) <= 0.0) or depth[0] <= 0.0:
-            raise ParameterError("a plate test needs at least two increasing depths, each with its force")
-        super().__init__(name, effects, candidates, known)
-        self.device, self.diameter, self.depths = device, diameter, depth
-        self._largest = float(np.abs(force).max())
-        share = 100.0 * force[:, None] / self._largest
-        error = np.broadcast_to(np.asarray(spread, dtype=np.float64).reshape(-1), depth.shape)[:, None]
-        self._read(
+        super().__init__(test.name, effects, candidates, known)
+        self.test, self.device = test, device
+        self._largest = float(np.abs(test.forces).max())
+        share = 100.0 * test.forces[:, None] / self._largest
+        error = np.broadcast_to(test.spread, test.depths.shape)[:, None]
+        self._set_observation(
             compressed(share),
             100.0 * error / self._largest / np.sqrt(1.0 + (share / SCALE) ** 2),
-            1e3 * depth,
+            1e3 * test.depths,
             "depth, mm",
             "% of the largest force, asinh",
             ("force",),
             "plate",
         )
-        self.density, self.friction = density, friction
         chosen = _finer(preset)
         resolution = Resolution.derive(self.set_up(), chosen)
-        pressure = self._largest / (0.25 * np.pi * diameter**2)
+        pressure = self._largest / (0.25 * np.pi * test.diameter**2)
         stiffer = max(RIGID * pressure / chosen.young, 1.0)
         self.resolution = replace(resolution, bulk=stiffer * resolution.bulk, shear=stiffer * resolution.shear)
 
@@ -118,7 +126,7 @@ class PlateExperiment(LaboratoryExperiment):
     ) -> FloatArray:
         """(t, 1) upward forces in N; arguments as for `predict`."""
         resolution = FINER_RESOLUTIONS[variant](self.resolution) if variant else self.resolution
-        # soil stops at a distance from the tool's faces: the plate is that much narrower than what the soil feels
+        # soil stays a skin's thickness away from the tool, so the plate is that much narrower
         offset = float(np.random.default_rng([seed, 1]).random()) * resolution.cell
         experiment = self.set_up(resolution.skin * resolution.spacing, offset)
         bed = experiment.bed
@@ -139,22 +147,22 @@ class PlateExperiment(LaboratoryExperiment):
         width = 2 * SMOOTH + 1
         smooth = np.convolve(np.pad(upward, SMOOTH, mode="edge"), np.full(width, 1.0 / width), mode="valid")
         # A frame's force is the mean over the frame that ends there.
-        depth = (np.arange(len(smooth)) - 0.5) * self.diameter / FRAMES
-        return np.interp(self.depths, depth, smooth)[:, None]
+        depth = (np.arange(len(smooth)) - 0.5) * self.test.diameter / FRAMES
+        return np.interp(self.test.depths, depth, smooth)[:, None]
 
     def set_up(self, skin: float = 0.0, offset: float = 0.0) -> Measurement:
-        """Bed and plate as the solver takes them; smooth walls stand for the symmetry, and there are no cameras.
+        """Bed and plate for the solver; smooth walls are symmetry planes.
 
         Args:
             skin: by how much the plate is narrower all around, m.
             offset: by how much the bed is deeper, m.
         """
-        diameter, deepest = self.diameter, float(self.depths[-1])
+        diameter, deepest = self.test.diameter, float(self.test.depths[-1])
         width, depth = WIDE * diameter, DEEP * diameter + deepest + offset
         bed = Bed(
             np.zeros(3),
             np.array([width, width, (1.0 + ROOM) * depth]),
-            density=self.density,
+            density=self.test.density,
             wall_friction=0.0,
             floor_friction=0.6,
         )
@@ -174,14 +182,14 @@ class PlateExperiment(LaboratoryExperiment):
             gravity=np.array([0.0, 0.0, -GRAVITY]),
             frame_rate=frame_rate,
             bed=bed,
-            tool=Tool(plate, motion, friction=self.friction),
+            tool=Tool(plate, motion, friction=self.test.friction),
             views=(),
             video=(),
         )
 
 
 def _finer(name: str) -> Preset:
-    """A preset with cells for a plate.
+    """A preset with the cells of a plate.
 
     Raises:
         ParameterError: it is unknown.
@@ -192,5 +200,5 @@ def _finer(name: str) -> Preset:
 
 
 def _surface_of(bed: Bed) -> float:
-    """Height of the level soil: the rest of the bed's box is room for what rises."""
+    """Height of the level soil."""
     return float(bed.lower[2] + (bed.upper[2] - bed.lower[2]) / (1.0 + ROOM))

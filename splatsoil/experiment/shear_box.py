@@ -1,4 +1,4 @@
-"""Direct shear tests, and the angle of repose, as experiments: the law in simple shear at a single point."""
+"""Direct shear tests and the angle of repose as experiments: the law in simple shear at a single point."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from splatsoil.soil.element import simple_shear
 from splatsoil.soil.law import Law
 
 RATIO_SPREAD = 0.024
-"""Of shear stress over normal stress between specimens: 1° of friction, as in triaxial tests."""
+"""Standard deviation of shear over normal stress between specimens: 1° of friction."""
 
 REPOSE_SPREAD = 1.0
-"""Of an angle of repose between heaps where they are too few to tell, degrees."""
+"""Standard deviation of an angle of repose between heaps, degrees, for fewer than three trials."""
 REPOSE_STRAIN = 1.0
-"""Shear strain that soil has gone through when it comes to rest on a heap."""
+"""Shear strain of soil that comes to rest on a heap."""
 GRAVITY = 9.81
 
 
 @dataclass(frozen=True)
 class Shearing:
-    """One test.
+    """A measured direct shear test.
 
     Attributes:
         name: of the test.
@@ -47,7 +47,7 @@ class Shearing:
 
 
 class ShearBoxExperiment(SpecimenExperiment[Shearing]):
-    """Shear box tests under constant normal stress; the box is taken to shear evenly."""
+    """Shear box tests under constant normal stress, with uniform shear."""
 
     kind = "shear_box"
     spreads = (RATIO_SPREAD, VOLUME_SPREAD)
@@ -68,11 +68,11 @@ class ShearBoxExperiment(SpecimenExperiment[Shearing]):
 
 
 class ReposeExperiment(LaboratoryExperiment):
-    """The angle of repose of a heap: a layer at the surface of a long slope is in simple shear, at its critical state.
+    """The angle of repose: the surface layer of a long slope is in simple shear at critical state.
 
     Args:
         angles: (trials,) measured, degrees.
-        height: of the heap, m; half of it is the layer that moves.
+        height: of the heap, m; half of it is the moving layer.
         density: bulk density, kg/m³.
         effects: that are on.
         candidates: effects to consider; all that act on strength by default.
@@ -100,7 +100,7 @@ class ReposeExperiment(LaboratoryExperiment):
         super().__init__(name, effects, candidates)
         self.normal = 0.5 * height * density * GRAVITY
         spread = float(measured.std(ddof=1)) if len(measured) > 2 else REPOSE_SPREAD
-        self._read(
+        self._set_observation(
             np.array([[measured.mean()]]), np.array([[spread]]), (1.0,), "heap at rest", "deg", ("angle",), "heap"
         )
 

@@ -1,4 +1,4 @@
-"""Other strokes of the same tool in the same bed, and what the same instruments would see of them."""
+"""Other strokes of the same tool in the same bed, and experiments with them."""
 
 from __future__ import annotations
 
@@ -19,24 +19,23 @@ from splatsoil.soil.effect import Effect
 FloatArray = npt.NDArray[np.float64]
 
 MEASURED = "as measured"
-"""Name of the stroke that was made, repeated in a bed that is prepared anew."""
-LEAN = 20.0
-"""Degrees by which the tool leans otherwise."""
-UNDER = 0.2
-"""Of the soil's depth, what is left beneath the tool: beyond, the floor is measured and not the soil."""
-
-MORE, WORTHWHILE = 1.5, 1.2
-"""Depth over the measured one that is wanted, and from which it is worth a stroke of its own."""
+"""Name of the measured stroke, repeated in a new bed."""
+INCLINATION = 20.0
+"""Change of the tool's inclination, degrees."""
+MIN_CLEARANCE = 0.2
+"""Soil below the tool, as a share of the soil's depth: the floor must not matter."""
+MAX_DEPTH, MIN_DEPTH = 1.5, 1.2
+"""Depth of the deeper stroke over the measured one: at most, and at least to be of use."""
 
 
 @dataclass(frozen=True, eq=False)
 class Stroke:
-    """A motion of the tool that could be made next.
+    """A proposed motion of the tool.
 
     Attributes:
-        name: for people.
-        measurement: the set as it would be with this motion; its pictures are those of the stroke that was made.
-        start: frame of this motion at which the stroke begins; what was before has been made already.
+        name: for the reader.
+        measurement: the set with this motion and the pictures of the measured stroke.
+        start: frame at which the proposed stroke begins, after the measured one.
     """
 
     name: str
@@ -44,9 +43,9 @@ class Stroke:
     start: int = 0
 
     def prepared(self, measured: PlowExperiment) -> Measurement:
-        """The set to simulate: pictures numbered as the stroke's are, a force of any size where one is measured."""
+        """The set to simulate: pictures numbered from the stroke's start; a placeholder for a measured force."""
         given, first = measured.base.measurement, self.start
-        # What is still stays before the stroke.
+        # Frames before the tool moves stay before the stroke.
         video = tuple(
             replace(f, frame=f.frame + first) if f.frame is not None and f.frame >= 0 else f for f in given.video
         )
@@ -64,7 +63,7 @@ class Stroke:
         return replace(self.measurement, video=video, heights=heights, tool=tool)
 
     def motion(self, frame_rate: float) -> ToolMotion:
-        """The stroke from its own frame 0 on, one row for each frame of a rate in 1/s."""
+        """The stroke from its start, one row for each frame at a rate in 1/s."""
         motion, rate = self.measurement.tool.motion, self.measurement.frame_rate
         begin, end = self.start / rate, float(motion.times[-1])
         frames = np.arange(int(np.ceil((end - begin) * frame_rate - 1e-6)) + 1)
@@ -75,11 +74,11 @@ class Stroke:
 
 
 def strokes(measurement: Measurement, surface: float) -> list[Stroke]:
-    """The measured stroke again, deeper, shallower, faster, slower, with the tool leaning to either side, and a second
-    one beside the first, in the soil that the first has left.
+    """The measured stroke again, deeper, shallower, faster, slower, with an inclined tool, and a second one next to the
+    first.
 
-    Left out are those that the measured stroke's bed or tool does not allow: the tool stays between the walls, a fifth
-    of the soil's depth remains beneath it, and it is not pushed deeper than its own height.
+    Omitted are strokes that bed or tool do not allow: the tool stays between the walls, a fifth of the soil's depth
+    remains below it, and it does not go deeper than its own height.
 
     Args:
         measurement: a set.
@@ -95,7 +94,7 @@ def strokes(measurement: Measurement, surface: float) -> list[Stroke]:
         return _with(measurement, replace(motion, positions=motion.positions + shift[:, None] * [0.0, 0.0, 1.0]))
 
     def faster(factor: float) -> Measurement:
-        # The pictures are as many, at the same places of the tool.
+        # As many pictures, at the same positions of the tool.
         quick = _with(measurement, replace(motion, times=motion.times / factor))
         return replace(quick, frame_rate=measurement.frame_rate * factor)
 
@@ -107,8 +106,8 @@ def strokes(measurement: Measurement, surface: float) -> list[Stroke]:
         return _with(measurement, replace(motion, positions=positions, quaternions=np.roll(bent.as_quat(), 1, axis=1)))
 
     bottom, top = _room(measurement)[4:]
-    factor = min(MORE, min(surface - _floor(measurement, surface), top - bottom) / max(surface - bottom, 1e-9))
-    deepest = [Stroke(f"deeper by {100.0 * (factor - 1.0):.0f} %", deeper(factor))] if factor >= WORTHWHILE else []
+    factor = min(MAX_DEPTH, min(surface - _floor(measurement, surface), top - bottom) / max(surface - bottom, 1e-9))
+    deepest = [Stroke(f"deeper by {100.0 * (factor - 1.0):.0f} %", deeper(factor))] if factor >= MIN_DEPTH else []
     out = [
         Stroke(MEASURED, measurement),
         *deepest,
@@ -118,20 +117,19 @@ def strokes(measurement: Measurement, surface: float) -> list[Stroke]:
     ]
     if heading_of(measurement).any():
         out += [
-            Stroke("upper edge ahead", leaning(LEAN)),
-            Stroke("lower edge ahead", leaning(-LEAN)),
+            Stroke("upper edge ahead", leaning(INCLINATION)),
+            Stroke("lower edge ahead", leaning(-INCLINATION)),
         ]
-        # What a wall doesn't allow on one side it may on the other.
-        out += [s for s in _beside(measurement) if _possible(s, measurement, surface)][:1]
+        # The first side that the walls allow.
+        out += [s for s in _second(measurement) if _possible(s, measurement, surface)][:1]
     return [stroke for stroke in out if _possible(stroke, measurement, surface)]
 
 
 class StrokeExperiment(PlowExperiment):
-    """What the cameras, and the force sensor where there is one, would see of a stroke that has not been made.
+    """An experiment with a proposed stroke: the same cameras, heights and force sensor.
 
-    Cameras, and heights, have the noise that still frames show; forces are in % of the measured stroke's largest.
-    Pictures are held against the photograph at rest, which cancels; heights are seen where they were measured.
-    Nothing is observed until :meth:`expect` says what to expect.
+    Noise is that of the measured stroke. Forces are in % of its largest. Pictures are compared with the photograph at
+    rest, which cancels. :meth:`expect` sets the expected observation.
 
     Args:
         model: of :meth:`Stroke.prepared`.
@@ -145,7 +143,7 @@ class StrokeExperiment(PlowExperiment):
         super().__init__(model, [p.name for p in measured.parameters], candidates=candidates)
         if self.forces is not None and measured.forces is not None:
             self.forces = replace(self.forces, largest=measured.forces.largest)
-        # One level for each camera, less by the frames that make a row.
+        # Noise of one frame of each camera; a row averages frames.
         level = {
             site.channel: std * np.sqrt(len(measured._bins[0]))
             for site, std in zip(measured.layout.sites, measured.sensor[0], strict=True)
@@ -157,7 +155,7 @@ class StrokeExperiment(PlowExperiment):
         self.comparator = self.comparator.against({(c, f): seen[c, self.comparator.reference] for c, f in seen})
 
     def expect(self, table: FloatArray) -> None:
-        """Take features (t, s) for what will be observed: the force's noise depends on its size."""
+        """Take features (t, s) for those that will be observed: the noise of a force depends on its size."""
         self.observed = table
         if self.forces is not None:
             forces = SCALE * np.sinh(table[:, len(self._sites) :] / SCALE)
@@ -170,30 +168,30 @@ def _with(measurement: Measurement, motion: ToolMotion) -> Measurement:
 
 
 def _lowest(measurement: Measurement, turn: Rotation) -> FloatArray:
-    """(n,) height of the tool's lowest point over its origin, m, for turns (n,)."""
+    """(n,) height of the tool's lowest point above its origin, m, for rotations (n,)."""
     corners = np.asarray(measurement.tool.mesh.vertices, dtype=np.float64)
     return np.asarray((turn.as_matrix()[:, 2] @ corners.T).min(axis=1))
 
 
-def _beside(measurement: Measurement) -> list[Stroke]:
-    """The measured stroke and after it the same a tool's width to its left, or to its right where there is no room."""
+def _second(measurement: Measurement) -> list[Stroke]:
+    """The measured stroke, followed by the same one tool width to its left, or to its right."""
     motion, rate = measurement.tool.motion, measurement.frame_rate
     heading = heading_of(measurement)
     left = np.array([-heading[1], heading[0], 0.0])
     out = []
     for name, side in (("a second one on the left", left), ("a second one on the right", -left)):
         across = _corners(measurement, 0) @ side
-        aside = motion.positions[0] + float(np.ptp(across)) * side
-        # Out of the soil, across, then as before: never faster than the stroke itself.
+        start = motion.positions[0] + float(np.ptp(across)) * side
+        # Out of the soil, across, and down again, not faster than the stroke.
         above = np.array([*motion.positions[-1, :2], max(motion.positions[:, 2].max(), motion.positions[-1, 2])])
-        over = np.array([*aside[:2], above[2]])
-        way = np.stack([motion.positions[-1], above, over, aside])
+        over = np.array([*start[:2], above[2]])
+        way = np.stack([motion.positions[-1], above, over, start])
         speed = float((np.linalg.norm(np.diff(motion.positions, axis=0), axis=1) / np.diff(motion.times)).max())
         legs = np.maximum(np.ceil(np.linalg.norm(np.diff(way, axis=0), axis=1) / speed * rate - 1e-9), 1.0).astype(int)
         last = int(motion.frames[-1])
         stops = last + np.cumsum(legs)
         frames = np.concatenate([motion.frames, stops, stops[-1] - motion.frames[0] + motion.frames[1:]])
-        positions = np.concatenate([motion.positions, way[1:], motion.positions[1:] + (aside - motion.positions[0])])
+        positions = np.concatenate([motion.positions, way[1:], motion.positions[1:] + (start - motion.positions[0])])
         quaternions = np.concatenate(
             [
                 motion.quaternions,
@@ -215,20 +213,20 @@ def _corners(measurement: Measurement, row: int) -> FloatArray:
 
 
 def _possible(stroke: Stroke, measured: Measurement, surface: float) -> bool:
-    """Whether the bed and the tool allow a stroke: what the measured one does, they do."""
+    """Whether bed and tool allow a stroke; they allow the measured one."""
     walls = (*measured.bed.lower[:2], *-measured.bed.upper[:2])
-    wanted = np.minimum(_room(measured), [*walls, _floor(measured, surface), surface])
-    return bool(np.all(_room(stroke.measurement) >= wanted - 1e-9))
+    needed = np.minimum(_room(measured), [*walls, _floor(measured, surface), surface])
+    return bool(np.all(_room(stroke.measurement) >= needed - 1e-9))
 
 
 def _floor(measurement: Measurement, surface: float) -> float:
     """Least height of the tool, m."""
-    return float(measurement.bed.lower[2] + UNDER * (surface - measurement.bed.lower[2]))
+    return float(measurement.bed.lower[2] + MIN_CLEARANCE * (surface - measurement.bed.lower[2]))
 
 
 def _room(measurement: Measurement) -> FloatArray:
-    """(6,) least x, y, -x, -y of the tool where it is lower than the bed's walls, and least heights of its lowest and
-    highest points, m."""
+    """(6,) minima of x, y, -x, -y of the tool below the top of the walls, and of the heights of its lowest and highest
+    points, m."""
     out = np.full(6, np.inf)
     for row in range(len(measurement.tool.motion.times)):
         points = _corners(measurement, row)

@@ -12,14 +12,14 @@ from splatsoil.soil.element import triaxial
 from splatsoil.soil.law import Law
 
 RATIO_SPREAD = 0.04
-"""Of q/p between specimens of one density: 1° of friction, as peaks scatter in Wichtmann & Triantafyllidis (2016)."""
+"""Standard deviation of q/p between specimens of one density: 1° of friction (Wichtmann & Triantafyllidis 2016)."""
 VOLUME_SPREAD = 0.005
-"""Of volume strain between specimens: 1° of dilation over a strain of 15 %."""
+"""Standard deviation of volume strain between specimens: 1° of dilatancy over a strain of 15 %."""
 YOUNG, REFERENCE = 2.0e7, 1.0e5
-"""Young's modulus in Pa for a stiffness factor of 1 under this confining pressure in Pa; it goes with the root of
-that (Hardin & Richart 1963, J. Soil Mech. Found. Div. 89(1)). The factor is a parameter of the model."""
+"""Young's modulus in Pa for a stiffness factor of 1 at this confining pressure in Pa; it is proportional to the root of
+the pressure (Hardin & Richart 1963, J. Soil Mech. Found. Div. 89(1))."""
 SLOW = 1.0e-5
-"""Strain rate of a laboratory's test, 1/s."""
+"""Strain rate of a laboratory test, 1/s."""
 
 
 def young_at(stress: float) -> float:
@@ -29,7 +29,7 @@ def young_at(stress: float) -> float:
 
 @dataclass(frozen=True)
 class Curve:
-    """What a laboratory measured; compression is positive.
+    """A measured triaxial test; compression is positive.
 
     Attributes:
         name: of the test.
@@ -37,7 +37,7 @@ class Curve:
         volume: nominal volume strain (n,).
         ratio: q/p (n,).
         confining: lateral stress in Pa.
-        strain_rate: of the axial strain, 1/s; slow unless it is told.
+        strain_rate: of the axial strain, 1/s.
         void_ratio: at the start.
     """
 
@@ -53,8 +53,7 @@ class Curve:
 class TriaxialExperiment(SpecimenExperiment[Curve]):
     """Drained triaxial tests; stress ratios are q/p.
 
-    One test at one pressure cannot tell cohesion from friction, nor rate from either; a series at several pressures and
-    rates can.
+    One test does not separate cohesion, friction and rate; a series at several pressures and rates does.
     """
 
     kind = "triaxial"

@@ -12,9 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from splatsoil.errors import MeasurementError, ParameterError
-from splatsoil.experiment.column import ColumnExperiment
+from splatsoil.experiment.column import Collapse, ColumnExperiment
 from splatsoil.experiment.laboratory import FloatArray, LaboratoryExperiment
-from splatsoil.experiment.plate import GRAVITY, PlateExperiment
+from splatsoil.experiment.plate import GRAVITY, Loading, PlateExperiment
 from splatsoil.experiment.shear_box import ReposeExperiment, ShearBoxExperiment, Shearing
 from splatsoil.experiment.triaxial import Curve, TriaxialExperiment
 from splatsoil.files import write_text
@@ -334,17 +334,9 @@ def _read_plate(fields: Fields, folder: Path, options: Options) -> PlateExperime
     forces = np.array([np.interp(depths, *curve) for curve in curves])
     mean = forces.mean(axis=0)
     spread = forces.std(axis=0, ddof=1) if len(forces) > 2 else TRIALS_DIFFER * mean
-    return PlateExperiment(
-        diameter,
-        depths,
-        mean,
-        spread,
-        density=density,
-        known=_limits(fields, grains / density - 1.0),
-        friction=fields.number("friction", 0.0, 2.0, default=0.3),
-        **options.simulation,
-        name=fields.text("name"),
-    )
+    friction = fields.number("friction", 0.0, 2.0, default=0.3)
+    test = Loading(diameter, depths, mean, spread, density, friction, fields.text("name"))
+    return PlateExperiment(test, known=_limits(fields, grains / density - 1.0), **options.simulation)
 
 
 def _check_plate(file: Path, depth: float, pressure: float, least: float) -> None:
@@ -363,12 +355,13 @@ def _check_plate(file: Path, depth: float, pressure: float, least: float) -> Non
 
 def _example_plate(name: str, options: Options) -> PlateExperiment:
     depths = 0.03 * (np.arange(PLATE_READINGS) + 1.0) / PLATE_READINGS
-    return PlateExperiment(0.1, depths, np.ones(len(depths)), 0.1, name=name, **options.simulation)
+    test = Loading(0.1, depths, np.ones(len(depths)), np.array(0.1), name=name)
+    return PlateExperiment(test, **options.simulation)
 
 
 def _write_plate(shape: PlateExperiment, readings: FloatArray) -> tuple[dict[str, object], dict[str, str]]:
-    table = _csv({"sinkage_mm": 1e3 * shape.depths, "force_N": readings[:, 0]})
-    about = {"diameter": shape.diameter, "density": shape.density, "friction": shape.friction}
+    table = _csv({"sinkage_mm": 1e3 * shape.test.depths, "force_N": readings[:, 0]})
+    about = {key: getattr(shape.test, key) for key in ("diameter", "density", "friction")}
     return {**about, "tests": [{"file": "plate.csv"}]}, {"plate.csv": table}
 
 
@@ -395,15 +388,15 @@ def _read_column(fields: Fields, folder: Path, options: Options) -> ColumnExperi
         if not SPREADING[0] <= spread <= SPREADING[1]:
             trial.fail("final_radius", f"a deposit of {end:g} x {left:g} m has not the volume of the column")
         trials.append([end, left])
-    return ColumnExperiment(
+    test = Collapse(
         radius,
         height,
-        trials,
+        np.array(trials).reshape(-1, 2),
         density=fields.number("density", 100.0, 20_000.0, default=1600.0, hint="it is in kg/m³"),
         floor_friction=fields.number("floor_friction", 0.0, 10.0, default=0.6),
-        **options.simulation,
         name=fields.text("name"),
     )
+    return ColumnExperiment(test, **options.simulation)
 
 
 @dataclass(frozen=True)
@@ -427,7 +420,9 @@ class Kind:
 
 def _trials(*keys: str) -> Callable[[LaboratoryExperiment, FloatArray], tuple[dict[str, object], dict[str, str]]]:
     def write(shape: LaboratoryExperiment, readings: FloatArray) -> tuple[dict[str, object], dict[str, str]]:
-        about = {"radius": shape.radius, "height": shape.height} if isinstance(shape, ColumnExperiment) else {}
+        about: dict[str, object] = {}
+        if isinstance(shape, ColumnExperiment):
+            about = {"radius": shape.test.radius, "height": shape.test.height}
         trial = {key: round(float(value), 6) for key, value in zip(keys, readings[0], strict=True)}
         return {**about, "trials": [trial]}, {}
 
@@ -465,7 +460,7 @@ KINDS: dict[str, Kind] = {
     ),
     "column": Kind(
         _read_column,
-        lambda name, o: ColumnExperiment(0.1, 0.1, [[0.2, 0.05]], name=name, **o.simulation),
+        lambda name, o: ColumnExperiment(Collapse(0.1, 0.1, np.array([[0.2, 0.05]]), name=name), **o.simulation),
         _trials("final_radius", "final_height"),
         ("radius", "height", "density", "floor_friction"),
         ("final_radius", "final_height"),

@@ -22,7 +22,7 @@ from splatsoil.run_files import (
     RECONSTRUCTION_FORMAT,
     read_description,
     read_fit,
-    read_kept,
+    read_format,
 )
 
 
@@ -90,7 +90,7 @@ def load(folder: str | Path) -> RunData:
     """
     path = Path(folder)
     run, fit = read_description(path), read_fit(path)
-    fits = {file.stem: read_kept(file, FIT_FORMAT) for file in sorted((path / "fits").glob("*.json"))}
+    fits = {file.stem: read_format(file, FIT_FORMAT) for file in sorted((path / "fits").glob("*.json"))}
     fits = fits or {str(fit["name"]): fit}
     history = _read(path / "history.json", HISTORY_FORMAT)
     return RunData(
@@ -160,7 +160,7 @@ def read_picture(path: Path, made_by: str = "compare") -> tuple[bytes, str]:
 
 def _read(path: Path, tag: str) -> dict[str, Any] | None:
     """A file of a run folder, if it is there."""
-    return read_kept(path, tag) if path.is_file() else None
+    return read_format(path, tag) if path.is_file() else None
 
 
 def kept_of(path: Path, tag: str, fit: Mapping[str, Any]) -> dict[str, Any] | None:

@@ -22,7 +22,7 @@ def test_each_container_is_reconstructed_fitted_compared_and_diagnosed(
     make_set(tmp_path / "set", setup, Recipe(33.0, preset="tiny", seed=3))
     capsys.readouterr()  # what Warp says of itself
     run = tmp_path / "run"
-    words = ["run", str(tmp_path / "set"), "--run", str(run), "--preset", "tiny", "--stop-at-floor", "--json"]
+    words = ["run", str(tmp_path / "set"), "--run", str(run), "--preset", "tiny", "--no-effects", "--json"]
     assert main(words) in (0, 3) and json.loads(capsys.readouterr().out)
     assert main(["diagnose", str(run), "--effects", "cohesion", "--json"]) in (0, 3)
     told = json.loads(capsys.readouterr().out)

@@ -27,7 +27,7 @@ from splatsoil import cli
 #: What a clock or an interruption, but nothing else, may change.
 CLOCKS = {"seconds", "created", "simulated_now"}
 QUICK = ("--preset", "tiny", "--budget", "2", "--device", "cpu")
-WHOLE = ("--preset", "tiny", "--budget", "2", "--stop-at-floor", "--device", "cpu")
+WHOLE = ("--preset", "tiny", "--budget", "2", "--no-effects", "--device", "cpu")
 
 #: Runs the program and kills it at a certain one of the moments at which it touches a file of a folder.
 KILLER = """

@@ -60,7 +60,7 @@ def missing(results: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> dict[st
     return results
 
 
-@pytest.mark.parametrize(("flags", "looks"), [([], True), (["--stop-at-floor"], False)])
+@pytest.mark.parametrize(("flags", "looks"), [([], True), (["--no-effects"], False)])
 def test_run_compares_all_effects_unless_told_to_stop(
     missing: dict[str, Any], capsys: pytest.CaptureFixture[str], flags: list[str], looks: bool
 ) -> None:
@@ -70,7 +70,7 @@ def test_run_compares_all_effects_unless_told_to_stop(
     assert ("misfit" in told) is not looks
 
 
-@pytest.mark.parametrize(("fails", "flags"), [("add_missing", []), ("check_adequacy", ["--stop-at-floor"])])
+@pytest.mark.parametrize(("fails", "flags"), [("add_missing", []), ("check_adequacy", ["--no-effects"])])
 def test_what_fails_after_the_fit_costs_no_report(
     missing: dict[str, Any], capsys: pytest.CaptureFixture[str], fails: str, flags: list[str]
 ) -> None:

@@ -36,11 +36,11 @@ GIVEN = {
     "reconstruct": "'my set' --out a/b --preset tiny --seed 3 --device cpu --holdout 0 --json",
     "report": "'a run' --set 'a set' --json",
     "run": "nowhere --parameters friction_angle --with cohesion --budget 9 --preset fine "
-    "--device cpu --seed 2 --run 'a run' --stop-at-floor --most-effects 3 --json",
+    "--device cpu --seed 2 --run 'a run' --no-effects --most-effects 3 --json",
     "simulate": "out --friction-angle 31.5 --with cohesion tilt --set cohesion=300 tilt_x=-2 --scene paper --depth "
     "0.09 --preset tiny --seed 4 --particle-seed 5 --views 12 --picture-scale 0.5 --device cuda:0 --like 'a set' "
     "--container heap --heights --depth-maps --json",
-    "view": "'a run' --beside base --port 8081 --device cpu",
+    "view": "'a run' --compare-with base --port 8081 --device cpu",
 }
 
 

@@ -48,7 +48,7 @@ def place(plow_dry: Path, cut: Callable[..., Path], tmp_path_factory: pytest.Tem
 @pytest.fixture(scope="module")
 def whole(place: Path, program: Program) -> dict[str, Any]:
     """``splatsoil run`` from nothing."""
-    told: dict[str, Any] = program("run", "set", *QUICK, "--run", "whole", "--stop-at-floor", cwd=place)
+    told: dict[str, Any] = program("run", "set", *QUICK, "--run", "whole", "--no-effects", cwd=place)
     return told
 
 

@@ -70,7 +70,7 @@ REFUSED = [
     ("view SET", "view needs viser, which isn't installed; pip install 'splatsoil[view]'"),
     ("view nowhere", "nowhere: no such folder"),
     ("view SET --port 0", "--port: must be from 1 to 65535, not 0"),
-    ("view SET --beside base", "is no run folder; only a run has fits"),
+    ("view SET --compare-with base", "is no run folder; only a run has fits"),
     ("benchmark nix", "benchmark 'nix' is unknown; there are bo-vs-mcmc"),
 ]
 

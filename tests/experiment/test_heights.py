@@ -196,7 +196,7 @@ def test_a_set_without_pictures_goes_the_whole_path(
     scanned: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = tmp_path / "run"
-    assert main(["run", str(scanned), "--run", str(run), "--preset", "tiny", "--stop-at-floor", "--json"]) == 0
+    assert main(["run", str(scanned), "--run", str(run), "--preset", "tiny", "--no-effects", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     angle = told["parameters"]["friction_angle"]
     assert abs(angle["estimate"] - 33.0) < 2.0 * angle["std"] + 1.0

@@ -7,13 +7,13 @@ import pytest
 from splatsoil.inverse.criticism.diagnosis import SUBSTANTIAL, diagnose
 
 from splatsoil.errors import ParameterError
-from splatsoil.experiment.plate import PlateExperiment
+from splatsoil.experiment.plate import Loading, PlateExperiment
 
 DEPTHS = np.array([0.004, 0.006, 0.008, 0.010, 0.013, 0.016])
 
 
 def plate(forces: np.ndarray) -> PlateExperiment:
-    return PlateExperiment(0.1, DEPTHS, forces, 0.05 * np.abs(forces) + 0.2, preset="tiny")
+    return PlateExperiment(Loading(0.1, DEPTHS, forces, 0.05 * np.abs(forces) + 0.2), preset="tiny")
 
 
 def test_a_seed_repeats_itself_and_another_one_differs() -> None:
@@ -26,7 +26,7 @@ def test_a_seed_repeats_itself_and_another_one_differs() -> None:
 def test_a_test_without_sense_is_refused() -> None:
     for depths, forces in (([0.01], [3.0]), ([0.02, 0.01], [1.0, 2.0]), ([0.01, 0.02], [1.0])):
         with pytest.raises(ParameterError, match="depths"):
-            PlateExperiment(0.1, depths, forces, 0.1)
+            Loading(0.1, np.array(depths), np.array(forces), np.array(0.1))
 
 
 def test_six_forces_do_not_claim_what_they_cannot_tell() -> None:

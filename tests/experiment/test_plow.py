@@ -27,7 +27,7 @@ def test_what_is_numerics_or_takes_a_laboratory_is_no_candidate(model: Model) ->
     others = {"stiffness", "critical_state", "hardening", "intermediate_stress"}
     assert {c.name for c in PlowExperiment(model).candidates} == set(library()) - others
     assert [c.name for c in PlowExperiment(model, candidates=["hardening"]).candidates] == ["hardening"]
-    with pytest.raises(ParameterError, match="other numerics"):
+    with pytest.raises(ParameterError, match="discretisation error"):
         off_effects(["stiffness"], ())
 
 

@@ -135,7 +135,7 @@ def run(problem: Any, count: int, file: Path, whole: int = 12) -> list[tuple]:
     """The first evaluations of a campaign, without their times."""
     jobs = [({"friction_angle": 20.0 + 30.0 * k / whole}, k) for k in range(whole)][:count]
     with EvaluationStore(file) as store:
-        records = list(evaluate(problem, jobs, store, MODEL, together=2))
+        records = list(evaluate(problem, jobs, store, MODEL, batch_size=2))
         assert [(r.parameters, r.seed) for r in records] == jobs
         assert sorted(r.key for r in store.records()) == sorted(r.key for r in records)
     return [(r.key, r.loss, r.blocks, r.message) for r in records]

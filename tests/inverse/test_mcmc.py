@@ -34,7 +34,7 @@ def test_ensembles_that_disagree_are_not_called_converged() -> None:
         x = np.abs(points[:, 0])
         return np.where(x < 1.0, -0.5 * ((x - 0.9) / 0.002) ** 2, -np.inf)
 
-    found = sample(two_peaks, 1, most_steps=400, walkers=4, ensembles=3)
+    found = sample(two_peaks, 1, max_steps=400, walkers=4, ensembles=3)
     assert not found.converged and found.steps == 400
 
 

@@ -13,8 +13,8 @@ from splatsoil.benchmarks._validation.plates import meyerhof, vesic
 
 from splatsoil.cli import main
 from splatsoil.errors import MeasurementError, ParameterError
-from splatsoil.experiment.column import ColumnExperiment
-from splatsoil.experiment.plate import PlateExperiment
+from splatsoil.experiment.column import Collapse, ColumnExperiment
+from splatsoil.experiment.plate import Loading, PlateExperiment
 from splatsoil.experiment.shear_box import ReposeExperiment, ShearBoxExperiment, Shearing
 from splatsoil.laboratory.answer import fitted
 from splatsoil.laboratory.folder import KINDS, Options, load, read_curve, simulate
@@ -72,7 +72,7 @@ def test_a_shear_box_and_a_slope_fail_by_matsuoka_and_nakai() -> None:
 def test_a_plate_bears_what_theory_says() -> None:
     """Between Vesic's and Meyerhof's bearing capacity, for angles within two degrees."""
     depths = np.arange(1, 13) * 0.02
-    plate = PlateExperiment(0.1, 0.1 * depths, np.ones(12), 0.1)
+    plate = PlateExperiment(Loading(0.1, 0.1 * depths, np.ones(12), np.array(0.1)))
     pressure = plate.readings({"friction_angle": 33.0})[:, 0] / (0.25 * math.pi * 0.01) / (1600 * 9.81 * 0.05)
     for z in (0.12, 0.2):
         mean = pressure[np.abs(depths - z) < 0.05].mean()
@@ -81,7 +81,7 @@ def test_a_plate_bears_what_theory_says() -> None:
 
 def test_a_column_runs_out_as_in_the_laboratory() -> None:
     """Lube et al. (2004): (R - R0) / R0 = 1.24 a, on sand near its angle of repose of 31 degrees."""
-    column = ColumnExperiment(0.1, 0.1, [[0.2, 0.05]], floor_friction=10.0)
+    column = ColumnExperiment(Collapse(0.1, 0.1, np.array([[0.2, 0.05]]), floor_friction=10.0))
     radius, height = column.readings({"friction_angle": 31.0})[0]
     assert radius / 0.1 - 1.0 == pytest.approx(1.24, rel=0.3)
     assert 0.03 < height < 0.1
