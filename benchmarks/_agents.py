@@ -99,7 +99,7 @@ def posterior(
     """
     seen = features[:, np.all(features != 0.0, axis=0)]  # 0 is what nobody has seen
     density = density_of(space, points, seen, np.zeros(seen.shape[1]), sensor, seed)
-    draws = sample(density, len(space), seed=seed, ensembles=2, most_steps=1000).flat
+    draws = sample(density, len(space), seed=seed, ensembles=2, max_steps=1000).flat
     return Answer(draws.mean(axis=0), draws)
 
 

@@ -34,13 +34,13 @@ from splatsoil.benchmarks._common import (
     with_section,
 )
 from splatsoil.benchmarks._truth import CELL, Truth, reconstructed
-from splatsoil.inverse.criticism.design import Prior, Run
+from splatsoil.inverse.criticism.design import Prior
 from splatsoil.inverse.criticism.diagnosis import BASE_RUNS, FINE, OBSERVATION_STEP, PAIRS
 from splatsoil.inverse.criticism.noise import Noise, Tables, noise_of, trend_of
 from splatsoil.inverse.criticism.simulations import Simulations
 
 from splatsoil.errors import SimulationError
-from splatsoil.experiment import Candidate, Layout, Site
+from splatsoil.experiment import Candidate, Layout, Run, Site
 from splatsoil.experiment.plow import MAX_ROWS, PlowExperiment
 from splatsoil.experiment.scene_parts import bins_of
 from splatsoil.files import write_text
@@ -147,7 +147,7 @@ def simulated(
         for r in runs:
             told = f"{type(experiment).__name__}: {', '.join(r.effects) or r.variant or 'base'}"
             with suppress(*allowed):
-                tables.append(ask(r.values, effects=r.effects, seed=r.seed, variant=r.variant, purpose=told))
+                tables.append(ask(r, told))
                 kept.append(r)
         if len(kept) < len(runs):
             print(f"{told}: {len(kept)} of {len(runs)} could be simulated", file=sys.stderr)

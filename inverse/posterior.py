@@ -17,13 +17,13 @@ import numpy.typing as npt
 from scipy.special import logsumexp
 
 from splatsoil.errors import SimulationError
-from splatsoil.experiment.base import Experiment
+from splatsoil.experiment.base import Experiment, Run
 from splatsoil.files import plain, write_json
 from splatsoil.parameters import Parameter
 from splatsoil.run_files import POSTERIOR_FORMAT
 from splatsoil.threads import one_thread
 
-from .criticism.design import Prior, Run
+from .criticism.design import Prior
 from .criticism.evidence import BASE_PRIOR, Comparison, Marginal
 from .criticism.noise import FACTORS, Noise
 from .criticism.simulations import Simulations
@@ -208,14 +208,14 @@ def _check_emulator(posterior: Posterior, simulate: Simulations, count: int, see
     """Parameters and χ² of simulations at draws from the posterior, those that succeeded."""
     prior = posterior.density.prior
     chosen = np.random.default_rng([seed, 7]).choice(len(posterior.unit), count, replace=False)
-    jobs = [Run(v, seed=FIRST_SEED + seed + i) for i, v in enumerate(prior.values(posterior.unit[chosen]))]
-    simulate.prefetch(lambda request: [request(job.values, seed=job.seed) for job in jobs])
+    runs = [Run(v, seed=FIRST_SEED + seed + i) for i, v in enumerate(prior.values(posterior.unit[chosen]))]
+    simulate.prefetch(runs)
     out = []
-    for job in jobs:
+    for run in runs:
         with suppress(SimulationError):
-            table = simulate(job.values, seed=job.seed, purpose="check")
-            chi2 = posterior.density.chi2(table[None], prior.unit([job]))
-            out.append({"parameters": dict(job.values), "chi2": float(chi2[0])})
+            table = simulate(run, "check")
+            chi2 = posterior.density.chi2(table[None], prior.unit([run]))
+            out.append({"parameters": dict(run.values), "chi2": float(chi2[0])})
     return out
 
 

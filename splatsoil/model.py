@@ -271,7 +271,7 @@ class Model:
     def surfaces(
         self, trajectory: Trajectory, values: Mapping[str, float] | None = None, *, rounding: float = 1.0
     ) -> dict[int, Relief]:
-        """The soil's surface by frame; empty if the set has no heights. Arguments and errors are those of :meth:`draw`."""
+        """The soil's surface by frame; empty if the set has no heights. Arguments and errors as for :meth:`draw`."""
         if not self.measurement.height_frames:
             return {}
         delay = self.observation(values).time_offset * self.measurement.frame_rate

@@ -18,6 +18,7 @@ from splatsoil.envs.together import evaluate_together
 from splatsoil import batches, cli
 from splatsoil.batches import in_batches
 from splatsoil.errors import SetWarning
+from splatsoil.experiment.base import Run
 from splatsoil.experiment.plow import PlowExperiment
 from splatsoil.mpm import Trajectory
 from splatsoil.scene import Scene
@@ -97,7 +98,7 @@ def test_simulations_for_criticism_and_for_a_fit_go_on(
     experiment.__dict__ |= {"base": base, "progress": None, "_trajectories": {}, "batch_size": 3}
     experiment._model_of = lambda effects, variant: (base, variant)
     angles = [1.0, 2.0, 3.0]
-    experiment.prepare([{"values": {"angle": a}, "effects": (), "seed": 0, "variant": ""} for a in angles])
+    experiment.prepare([Run({"angle": a}) for a in angles])
     assert [float(kept.positions[0, 0, 0]) for kept in experiment._trajectories.values()] == angles
     problem = cast(Any, object.__new__(MeasuredProblem))
     problem.__dict__ |= {"model": base, "experiment": SimpleNamespace(progress=None)}

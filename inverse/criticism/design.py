@@ -10,33 +10,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from scipy.stats import qmc
 
-from splatsoil.experiment.base import Candidate, Experiment
+from splatsoil.experiment.base import Candidate, Experiment, Run
 from splatsoil.parameters import Parameter, ParameterSpace
 
 FloatArray = npt.NDArray[np.float64]
 
 MAX_SIZE = 16.0
 """Largest size of an effect, over its smallest meaningful size."""
-
-
-@dataclass(frozen=True)
-class Run:
-    """A simulation: arguments of :meth:`~splatsoil.experiment.base.Experiment.predict`."""
-
-    values: Mapping[str, float]
-    effects: tuple[str, ...] = ()
-    seed: int = 0
-    variant: str = ""
-
-    def arguments(self) -> dict[str, Any]:
-        """By name."""
-        return {"values": dict(self.values), "effects": self.effects, "seed": self.seed, "variant": self.variant}
 
 
 @dataclass(frozen=True)

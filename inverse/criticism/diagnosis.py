@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from splatsoil.errors import SimulationError
-from splatsoil.experiment.base import Candidate, Experiment
+from splatsoil.experiment.base import Candidate, Experiment, Run
 
 from .checks import Check, Expected, checks, passes
-from .design import Prior, Run, effect_runs
+from .design import Prior, effect_runs
 from .evidence import BASE_MODEL, BASE_PRIOR, DISCREPANCY, OBSERVATION_SIZE_STD, Comparison, Evidence
 from .noise import FINE_ERROR_RATIO, Tables, compared, noise_of, nuisances, trend_of
 from .power import NAMED, detectable
@@ -147,8 +147,7 @@ class _Study:
 
     def prefetch(self) -> None:
         """Submit all simulations to the workers."""
-        runs = [*(run for runs in self.effects.values() for run in runs), *self.base, *self.fine]
-        self.simulate.prefetch(lambda request: [request(**run.arguments()) for run in runs])
+        self.simulate.prefetch([*(run for runs in self.effects.values() for run in runs), *self.base, *self.fine])
 
     def simulate_variants(self, values: Mapping[str, float]) -> None:
         """One simulation, its renderings and albedo draws, and observation effects at their smallest meaningful
@@ -161,12 +160,12 @@ class _Study:
             for p in candidate.parameters:
                 assert p.off is not None
                 end = float(np.clip(p.off + OBSERVATION_STEP * p.meaningful, p.lower, p.upper))
-                table = self.simulate({**values, p.name: end}, effects=(candidate.name,), purpose=candidate.name)
+                table = self.simulate(Run({**values, p.name: end}, (candidate.name,)))
                 tables[p.name] = (table, (end - p.off) / p.meaningful)
-        self.reference = self.simulate(values, purpose="as it is")
+        self.reference = self.simulate(Run(values))
         scaled = {name: self.reference + (table - self.reference) / step for name, (table, step) in tables.items()}
         others = (*self.experiment.albedo_draws, *self.experiment.renderings)
-        self.variants = scaled | {name: self.simulate(values, variant=name, purpose=name) for name in others}
+        self.variants = scaled | {name: self.simulate(Run(values, variant=name)) for name in others}
 
     def tables(self) -> Tables:
         """Tables of all simulations that succeeded."""
@@ -179,8 +178,7 @@ class _Study:
         succeeded, tables = [], []
         for run in runs:
             try:
-                purpose = ", ".join(run.effects) or run.variant or "base"
-                tables.append(self.simulate(**run.arguments(), purpose=purpose))
+                tables.append(self.simulate(run))
             except SimulationError as error:
                 self.failed.setdefault(", ".join(run.effects) or "the model as it is", str(error))
             else:
@@ -214,8 +212,7 @@ class _Compared:
         study, noise, model = self.study, self.evidence.noise, self.evidence.models[name]
         values = {parameter: model.moments(parameter)[0] for parameter in model.values}
         if name in self.tables.effects:
-            table = study.simulate(values, effects=(name,), seed=study.seed, purpose=name)
-            return table + noise.cell_correction
+            return study.simulate(Run(values, (name,), study.seed)) + noise.cell_correction
         point = study.prior.space.to_unit(study.prior.space.to_vector(values))[None]
         (trend,) = trend_of(point, noise.points)
         table = np.tensordot(trend, self.tables.base[1], axes=1)

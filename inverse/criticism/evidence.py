@@ -21,10 +21,10 @@ from scipy.linalg import solve_triangular
 from scipy.special import logsumexp
 from scipy.stats import multivariate_t, qmc
 
-from splatsoil.experiment.base import Candidate
+from splatsoil.experiment.base import Candidate, Run
 from splatsoil.parameters import Parameter, ParameterSpace
 
-from .design import Prior, Run, effect_points, effect_values, sizes
+from .design import Prior, effect_points, effect_values, sizes
 from .emulator import BaseEmulator, IncrementEmulator
 from .noise import FACTORS, Noise
 

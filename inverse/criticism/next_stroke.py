@@ -11,7 +11,7 @@ simulations.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any, Protocol
@@ -23,10 +23,10 @@ from scipy.special import expit, logsumexp
 from scipy.stats import t as student
 
 from splatsoil.errors import RunError, SimulationError
-from splatsoil.experiment.base import Experiment
+from splatsoil.experiment.base import Experiment, Run
 from splatsoil.parameters import ParameterSpace
 
-from .design import Prior, Run
+from .design import Prior
 from .diagnosis import FINE, LISTED, PAIRS
 from .evidence import BASE_MODEL, DISCREPANCY, Evidence
 from .noise import Tables, noise_of, shrunk
@@ -154,7 +154,7 @@ def expected_information(
     # Variants of a simulation follow it directly, while it is in memory.
     first = next((run for run in runs[BASE_MODEL] if _table(simulate, run) is not None), runs[BASE_MODEL][0])
     others = (*experiment.albedo_draws, *experiment.renderings)
-    variants = {n: simulate(first.values, seed=first.seed, variant=n, purpose=n) for n in others}
+    variants = {n: simulate(replace(first, variant=n)) for n in others}
     succeeded: dict[str, npt.NDArray[np.bool_]] = {}
     simulated: dict[str, tuple[list[Run], FloatArray]] = {FINE: ([], np.zeros((0, *experiment.layout.shape)))}
     for name, mine in runs.items():
@@ -248,10 +248,10 @@ def _weighted(bits: Mapping[str, FloatArray], probability: Mapping[str, float]) 
     return mean, float(np.sqrt(sum(own))), sum(own) ** 2 / max(spread, 1e-300)
 
 
-def _table(simulate: Callable[..., FloatArray], run: Run) -> FloatArray | None:
+def _table(simulate: Simulate, run: Run) -> FloatArray | None:
     """(t, s) of a simulation; None where it failed."""
     try:
-        return simulate(**run.arguments(), purpose=", ".join(run.effects) or run.variant or "the model as it is")
+        return simulate(run)
     except SimulationError:
         return None
 

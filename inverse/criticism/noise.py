@@ -32,9 +32,9 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import brentq
 from scipy.special import digamma, logsumexp, polygamma
 
-from splatsoil.experiment.base import Candidate, Experiment
+from splatsoil.experiment.base import Candidate, Experiment, Run
 
-from .design import Prior, Run
+from .design import Prior
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Future, wait
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +14,11 @@ import numpy as np
 import numpy.typing as npt
 
 from splatsoil.errors import SimulationError
-from splatsoil.experiment.base import Experiment
+from splatsoil.experiment.base import Experiment, Run
 from splatsoil.files import digest, read_npy, write_bytes
 
 FloatArray = npt.NDArray[np.float64]
 Simulate = Callable[..., FloatArray]
-Arguments = Mapping[str, Any]
-"""Of a simulation, by name; see :meth:`~splatsoil.experiment.base.Experiment.predict`."""
 
 
 @dataclass(frozen=True)
@@ -33,16 +31,16 @@ class Executor:
         prepare: runs a batch of simulations in this process.
     """
 
-    submit: Callable[[Sequence[Arguments]], Future[Any]]
+    submit: Callable[[Sequence[Run]], Future[Any]]
     batch_size: int = 1
-    prepare: Callable[[Sequence[Arguments]], object] = lambda jobs: None
+    prepare: Callable[[Sequence[Run]], object] = lambda runs: None
 
 
 @dataclass(frozen=True)
 class _Batch:
     """Simulations by key, submitted together."""
 
-    jobs: Mapping[str, Arguments]
+    runs: Mapping[str, Run]
     future: Future[Any]
 
 
@@ -80,26 +78,17 @@ class Simulations:
         """Number of different simulations that were requested and succeeded."""
         return sum(not isinstance(table, SimulationError) for table in self._tables.values())
 
-    def __call__(
-        self,
-        values: Mapping[str, float],
-        *,
-        effects: tuple[str, ...] = (),
-        seed: int = 0,
-        variant: str = "",
-        purpose: str = "",
-    ) -> FloatArray:
-        """(t, s) predicted features.
+    def __call__(self, run: Run, purpose: str = "") -> FloatArray:
+        """(t, s) predicted features; ``purpose`` is reported instead of the run's label.
 
         Raises:
             SimulationError: the simulation failed.
             RunError: the cached file is damaged.
         """
-        arguments = {"values": dict(values), "effects": effects, "seed": seed, "variant": variant}
-        key = self._key(arguments)
+        key = self._key(run)
         if key not in self._tables:
             try:
-                self._tables[key] = self._load_or_run(key, arguments, purpose)
+                self._tables[key] = self._load_or_run(key, run, purpose or run.label)
             except SimulationError as error:
                 self._tables[key] = error
         table = self._tables[key]
@@ -107,13 +96,13 @@ class Simulations:
             raise table
         return table
 
-    def store(self, table: FloatArray, values: Mapping[str, float], seed: int) -> None:
-        """Cache a prediction (t, s) of the base model from another source; an existing one stays.
+    def store(self, table: FloatArray, run: Run) -> None:
+        """Cache a prediction (t, s) from another source; an existing one stays.
 
         Raises:
             RunError: the folder can't be written to.
         """
-        key = self._key({"values": dict(values), "effects": (), "seed": seed, "variant": ""})
+        key = self._key(run)
         if self._cached(key) is None:
             self._write(key, table)
 
@@ -126,48 +115,32 @@ class Simulations:
         finally:
             self._executor, self._submitted = None, {}
 
-    def prefetch(self, work: Callable[[Simulate], object]) -> None:
-        """Submit the simulations that some work will request, the last ones first: this process runs the first.
-
-        Args:
-            work: requests simulations from its argument, which returns zeros here.
-        """
+    def prefetch(self, runs: Iterable[Run]) -> None:
+        """Submit simulations that will be requested in this order, the last ones first: this process runs the first."""
         if self._executor is None:
             return
-        requested: dict[str, Arguments] = {}
-
-        def record(values: Mapping[str, float], *, purpose: str = "", **others: Any) -> FloatArray:
-            arguments = {"values": dict(values), "effects": (), "seed": 0, "variant": "", **others}
-            requested.setdefault(self._key(arguments), arguments)
-            return np.zeros(self.experiment.layout.shape)
-
-        work(record)
-        drawings = {*self.experiment.albedo_draws, *self.experiment.renderings}
-        batches: list[dict[str, Arguments]] = []
-        latest: dict[object, dict[str, Arguments]] = {}
-        for key, arguments in requested.items():
+        renderings = {*self.experiment.albedo_draws, *self.experiment.renderings}
+        batches: list[dict[str, Run]] = []
+        latest: dict[object, dict[str, Run]] = {}
+        for key, run in {self._key(run): run for run in runs}.items():
             if key in self._tables or key in self._submitted or self._cached(key) is not None:
                 continue
             # Renderings of one simulation stay in one process: on a GPU a second simulation differs in the last bits.
-            drawn = arguments["variant"] in drawings
-            kind = (
-                self._key({**arguments, "variant": ""})
-                if drawn
-                else (*sorted(arguments["effects"]), arguments["variant"])
-            )
-            if kind not in latest or (len(latest[kind]) == self._executor.batch_size and not drawn):
+            rendered = run.variant in renderings
+            kind = self._key(replace(run, variant="")) if rendered else (*sorted(run.effects), run.variant)
+            if kind not in latest or (len(latest[kind]) == self._executor.batch_size and not rendered):
                 latest[kind] = {}
                 batches.append(latest[kind])
-            latest[kind][key] = arguments
+            latest[kind][key] = run
         with suppress(BrokenExecutor):  # without workers this process runs everything
-            for jobs in reversed(batches):
-                self._submitted |= dict.fromkeys(jobs, _Batch(jobs, self._executor.submit(list(jobs.values()))))
+            for batch in reversed(batches):
+                self._submitted |= dict.fromkeys(batch, _Batch(batch, self._executor.submit(list(batch.values()))))
 
-    def _key(self, arguments: Arguments) -> str:
-        effects = sorted(f"{name} {self.sources.get(name, '')}".rstrip() for name in arguments["effects"])
-        return digest({**self.identity, **arguments, "effects": effects})
+    def _key(self, run: Run) -> str:
+        effects = sorted(f"{name} {self.sources.get(name, '')}".rstrip() for name in run.effects)
+        return digest({**self.identity, **run.arguments(), "effects": effects})
 
-    def _load_or_run(self, key: str, arguments: Arguments, purpose: str) -> FloatArray:
+    def _load_or_run(self, key: str, run: Run, purpose: str) -> FloatArray:
         """From the cache, from a worker that has begun it, or run here with the rest of its batch."""
         batch, cached = self._submitted.pop(key, None), self._cached(key)
         if cached is not None and batch is None:
@@ -175,29 +148,29 @@ class Simulations:
         self.report(purpose)
         if batch is not None and batch.future.cancel():
             self._submitted = {name: other for name, other in self._submitted.items() if other is not batch}
-            return self._run_batch(key, batch.jobs)
+            return self._run_batch(key, batch.runs)
         if batch is not None:
             wait([batch.future])
             if (cached := self._cached(key)) is not None:
                 self.simulated += 1
                 return cached
         # A worker's error is raised here again, with its message.
-        return self._run(key, arguments)
+        return self._run(key, run)
 
-    def _run_batch(self, key: str, jobs: Mapping[str, Arguments]) -> FloatArray:
+    def _run_batch(self, key: str, runs: Mapping[str, Run]) -> FloatArray:
         """Run and cache a batch; return the table of ``key``."""
-        if len(jobs) > 1 and self._executor is not None:
-            self._executor.prepare(list(jobs.values()))
-        table = self._run(key, jobs[key])
-        for other in (name for name in jobs if name != key):
+        if len(runs) > 1 and self._executor is not None:
+            self._executor.prepare(list(runs.values()))
+        table = self._run(key, runs[key])
+        for other in (name for name in runs if name != key):
             # the error is raised when this simulation is requested
             with suppress(SimulationError):
                 if self._cached(other) is None:
-                    self._run(other, jobs[other])
+                    self._run(other, runs[other])
         return table
 
-    def _run(self, key: str, arguments: Arguments) -> FloatArray:
-        table = self.experiment.predict(**arguments)
+    def _run(self, key: str, run: Run) -> FloatArray:
+        table = self.experiment.predict(**run.arguments())
         self.simulated += 1
         self._write(key, table)
         return table

@@ -108,6 +108,7 @@ def facts(model: Model) -> dict[str, str]:
 def run_fit(options: FitOptions, run: RunFolder, model: Model, report: Report) -> dict[str, Any]:
     """Search, then compare the base with the discrepancy model. Stored simulations are not repeated."""
     from splatsoil.envs.measured import LOSS, MeasuredProblem
+    from splatsoil.experiment.base import Run
     from splatsoil.inverse.fitting import BATCH_SIZE, FitSetup, fit
 
     measurement, space = model.measurement, model.space(options.parameters or None)
@@ -136,7 +137,7 @@ def run_fit(options: FitOptions, run: RunFolder, model: Model, report: Report) -
         nonlocal finished
         finished = done
         if record.loss is not None:
-            simulate.store(problem.features(record.blocks), record.parameters, record.seed)
+            simulate.store(problem.features(record.blocks), Run(record.parameters, seed=record.seed))
         values = ", ".join(f"{p.name} {record.parameters[p.name]:.4g}{symbol(p.unit)}" for p in space)
         outcome = "failed" if record.loss is None else f"loss {record.loss:.4g}"
         report(f"{done} of {budget}: {values}, {outcome}", SEARCH * done / budget)
@@ -327,7 +328,7 @@ def compare_models(
     Raises:
         SimulationError: too few simulations of the base model succeeded.
     """
-    from splatsoil.inverse.criticism.design import Run
+    from splatsoil.experiment.base import Run
     from splatsoil.inverse.criticism.diagnosis import diagnose
 
     at = "", 0.0

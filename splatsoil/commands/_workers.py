@@ -22,8 +22,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from splatsoil.commands._model import ModelSpec
+    from splatsoil.experiment.base import Run
     from splatsoil.experiment.plow import PlowExperiment
-    from splatsoil.inverse.criticism.simulations import Arguments, Simulations
+    from splatsoil.inverse.criticism.simulations import Simulations
 
 MAX_WORKERS = 3
 PROCESS_MEMORY = {"cpu": 2.0, "cuda": 4.0}
@@ -97,7 +98,7 @@ class Workers:
                 yield
                 return
             pool, model = self._pool, (self._path, device, spec, self._effects, self.count)
-            submit = lambda jobs: pool.submit(_simulate, *model, jobs)  # noqa: E731
+            submit = lambda runs: pool.submit(_simulate, *model, runs)  # noqa: E731
             with simulate.using(Executor(submit, experiment.batch_size, experiment.prepare)):
                 yield
             pool.shutdown(cancel_futures=True)
@@ -141,18 +142,18 @@ def _load(device: str) -> None:
 
 
 def _simulate(
-    path: Path, device: str, spec: ModelSpec, effects: tuple[str, ...], workers: int, jobs: Sequence[Arguments]
+    path: Path, device: str, spec: ModelSpec, effects: tuple[str, ...], workers: int, runs: Sequence[Run]
 ) -> None:
     """A worker's job: run and store simulations."""
 
     def simulate_all(here: str) -> None:
         experiment, simulate = _experiment(path, here, spec, effects)
-        if len(jobs) > 1:
-            experiment.prepare(jobs)
-        for job in jobs:
+        if len(runs) > 1:
+            experiment.prepare(runs)
+        for run in runs:
             # a failure does not stop the others
             with suppress(SplatsoilError):
-                simulate(**job)
+                simulate(run)
 
     _run(simulate_all, device, workers)
 

@@ -119,7 +119,7 @@ def _designed(
         # A GPU simulates batches in this process.
         batch = Executor(lambda jobs: Future(), experiment.batch_size, experiment.prepare)
         with simulate.using(batch) if experiment.batch_size > 1 else nullcontext():
-            simulate.prefetch(lambda request: [request(**run.arguments()) for run in runs])
+            simulate.prefetch(runs)
             found = expected_information(
                 experiment,
                 draws,

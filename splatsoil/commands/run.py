@@ -32,9 +32,7 @@ class Config(FitOptions):
     adequate, no effect is probable enough, or the limit is reached. An interrupted run continues.
     """
 
-    no_effects: bool = option(
-        False, "Test only whether the model is adequate; do not compare it with models of more effects."
-    )
+    no_effects: bool = option(False, "Only test whether the model is adequate; do not add effects.")
     most_effects: int = option(2, "Largest number of effects that are added.", expert=True)
 
 

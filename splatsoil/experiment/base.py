@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +14,25 @@ from splatsoil.parameters import Parameter
 from splatsoil.soil.effect import Effect
 
 FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Run:
+    """One simulation of an experiment: the arguments of :meth:`Experiment.predict`."""
+
+    values: Mapping[str, float]
+    effects: tuple[str, ...] = ()
+    seed: int = 0
+    variant: str = ""
+
+    def arguments(self) -> dict[str, Any]:
+        """Arguments by name."""
+        return {**vars(self), "values": dict(self.values)}
+
+    @property
+    def label(self) -> str:
+        """Effects or variant, for progress messages."""
+        return ", ".join(self.effects) or self.variant or "base model"
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from splatsoil.batches import in_batches
 from splatsoil.comparison import PATCH, Block, Comparator, Comparison
 from splatsoil.errors import SimulationError, SplatsoilError
-from splatsoil.experiment.base import Candidate, candidates_of
+from splatsoil.experiment.base import Candidate, Run, candidates_of
 from splatsoil.experiment.features import Layout, Site
 from splatsoil.experiment.forces import REGION, UNIT, ToolForces, compressed
 from splatsoil.experiment.heights import UNIT as MILLIMETRES
@@ -226,15 +226,15 @@ class PlowExperiment:
         room = min(MAX_PARTICLES, MAX_CACHE // (_BYTES * len(self.base.recorded)))
         return min(max(1, room // count), MAX_BATCH)
 
-    def prepare(self, jobs: Iterable[Mapping[str, Any]]) -> None:
-        """Simulate later calls of `predict` (their keyword arguments) as batches; failures are left to `predict`."""
+    def prepare(self, runs: Iterable[Run]) -> None:
+        """Simulate later calls of `predict` as batches; failures are left to `predict`."""
         groups: dict[object, dict[object, tuple[Model, dict[str, float], int]]] = {}
-        for job in jobs:
-            model, discretisation = self._model_of(job["effects"], job["variant"])
-            moving, physics = _physics_of(model, job["values"])
-            key = (moving, discretisation, job["seed"], tuple(sorted(physics.items())))
+        for run in runs:
+            model, discretisation = self._model_of(run.effects, run.variant)
+            moving, physics = _physics_of(model, run.values)
+            key = (moving, discretisation, run.seed, tuple(sorted(physics.items())))
             if key not in self._trajectories:
-                groups.setdefault((moving, discretisation, model.recorded), {})[key] = (model, physics, job["seed"])
+                groups.setdefault((moving, discretisation, model.recorded), {})[key] = (model, physics, run.seed)
         for group in groups.values():
             try:
                 found = in_batches(self._batch, list(group.values()), "simulations")

@@ -10,8 +10,9 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from splatsoil.errors import SimulationError
+from splatsoil.experiment.base import Run
 from splatsoil.experiment.laboratory import FloatArray, LaboratoryExperiment
-from splatsoil.inverse.criticism.design import Prior, Run
+from splatsoil.inverse.criticism.design import Prior
 from splatsoil.inverse.criticism.diagnosis import diagnose
 from splatsoil.inverse.criticism.record import record
 from splatsoil.inverse.criticism.simulations import Simulations
@@ -74,7 +75,7 @@ def search(
         values = space.to_dict(space.from_unit(unit))
         report("search", min(0.9, 0.02 * len(runs)))
         try:
-            table = simulations(values, seed=seed, purpose="search")
+            table = simulations(Run(values, seed=seed), "search")
         except SimulationError:
             return np.full(experiment.observed.size, FAR)
         runs.append(Run(values, seed=seed))

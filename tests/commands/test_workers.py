@@ -17,6 +17,7 @@ from splatsoil.inverse.executors import processes
 from splatsoil.commands import _stages, _workers
 from splatsoil.commands._model import ModelSpec
 from splatsoil.errors import RunError, SimulationError
+from splatsoil.experiment.base import Run
 
 BASE = ModelSpec((), "tiny", ("friction_angle",))
 
@@ -28,17 +29,17 @@ def test_a_worker_prepares_what_goes_together_and_makes_what_can_be_made(
     prepared: list[Sequence[Any]] = []
     made: list[int] = []
 
-    def simulate(*, number: int) -> None:
-        if number == 1:
+    def simulate(run: Run) -> None:
+        if run.seed == 1:
             raise SimulationError("blew up")
-        made.append(number)
+        made.append(run.seed)
 
     experiment = SimpleNamespace(prepare=prepared.append)
     monkeypatch.setitem(_workers._experiments, (tmp_path, "cpu", BASE, ()), (experiment, simulate))  # type: ignore[misc]
-    jobs = [{"number": number} for number in range(count)]
-    _workers._simulate(tmp_path, "cpu", BASE, (), 2, jobs)
+    runs = [Run({}, seed=seed) for seed in range(count)]
+    _workers._simulate(tmp_path, "cpu", BASE, (), 2, runs)
     assert made == [number for number in range(count) if number != 1]
-    assert prepared == ([] if count == 1 else [jobs])
+    assert prepared == ([] if count == 1 else [runs])
 
 
 class Pool:
@@ -88,14 +89,14 @@ def test_workers_begin_with_the_command_and_nothing_outlives_it(helps: bool, fai
         assert workers.count == 2 and pool.jobs == [_workers._load] * 2
         if helps:
             with workers.simulating(BASE, experiment, simulate):
-                simulate.prefetch(lambda ask: [ask({"angle": 30.0}, seed=seed) for seed in (1, 2)])
+                simulate.prefetch(Run({"angle": 30.0}, seed=seed) for seed in (1, 2))
                 assert pool.jobs[2:] == [_workers._simulate] * 2
-                *known, (job,) = pool.words[-1]
+                *known, (first,) = pool.words[-1]
                 assert known == [tmp_path, "cpu", BASE, ("tilt",), 2]
-                assert (job["values"], job["seed"]) == ({"angle": 30.0}, 1), "the first ones are made here"
+                assert first == Run({"angle": 30.0}, seed=1), "the first ones are made here"
                 if fails:
                     raise SimulationError("blew up")
-            simulate.prefetch(lambda ask: ask({"angle": 31.0}))
+            simulate.prefetch([Run({"angle": 31.0})])
             assert len(pool.jobs) == 4, "nobody helps any more"
         elif fails:
             raise SimulationError("blew up")
@@ -133,7 +134,7 @@ def test_a_gpu_with_little_memory_keeps_few_workers(
     simulate = Simulations(experiment)
     with _workers.Workers(folder, "auto", ()) as workers, workers.simulating(BASE, experiment, simulate):
         assert workers.count == left
-        simulate.prefetch(lambda ask: ask({"angle": 30.0}))
+        simulate.prefetch([Run({"angle": 30.0})])
     assert [pool.jobs.count(_workers._load) for pool in made] == ([2] if left == 2 else [2, 1] if left else [2])
     assert [pool.ended for pool in made] == {2: [["let go"]], 1: [["killed"], ["let go"]], 0: [["killed"]]}[left]
     assert (_workers._simulate in made[-1].jobs) is (left > 0)

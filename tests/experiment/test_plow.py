@@ -12,6 +12,7 @@ import pytest
 from splatsoil.commands._model import off_effects
 from splatsoil.comparison import PATCH
 from splatsoil.errors import ParameterError, SimulationError
+from splatsoil.experiment.base import Run
 from splatsoil.experiment.plow import PlowExperiment
 from splatsoil.measurement import Measurement
 from splatsoil.model import Model
@@ -65,37 +66,37 @@ def test_soil_prepared_together_is_that_of_single_simulations(model: Model, monk
     def experiment() -> PlowExperiment:
         return PlowExperiment(model, candidates=("buried_obstacle", "cohesion", "exposure"))
 
-    def job(seed: int = 0, variant: str = "", effects: tuple[str, ...] = (), **values: float) -> dict[str, Any]:
-        return {"values": {"friction_angle": 35.0, **values}, "effects": effects, "seed": seed, "variant": variant}
+    def run(seed: int = 0, variant: str = "", effects: tuple[str, ...] = (), **values: float) -> Run:
+        return Run({"friction_angle": 35.0, **values}, effects, seed, variant)
 
-    jobs = [
-        job(),
-        job(1),
-        job(variant="albedo 2"),
-        job(effects=("exposure",), exposure_gain=0.9),
-        job(effects=("cohesion",), cohesion=300.0),
-        job(1, effects=("cohesion",), cohesion=300.0),
-        job(variant="fine"),
+    runs = [
+        run(),
+        run(1),
+        run(variant="albedo 2"),
+        run(effects=("exposure",), exposure_gain=0.9),
+        run(effects=("cohesion",), cohesion=300.0),
+        run(1, effects=("cohesion",), cohesion=300.0),
+        run(variant="fine"),
     ]
-    unseen = job(effects=("buried_obstacle",), obstacle_radius=0.001)
-    alone = [experiment().prediction(**each).trajectory.positions for each in jobs]
+    unseen = run(effects=("buried_obstacle",), obstacle_radius=0.001)
+    alone = [experiment().prediction(**each.arguments()).trajectory.positions for each in runs]
     assert drawn[:3] == [(0, None, 1.0), (1, None, 1.0), (0, 2, 1.0)]
     prepared = experiment()
     assert prepared.batch_size == 1, "a CPU makes one at a time, and keeps one"
     prepared.__dict__["batch_size"] = 5
-    prepared.prepare([unseen, *jobs])
+    prepared.prepare([unseen, *runs])
     assert len(prepared._trajectories) == 5
     with pytest.raises(SimulationError, match="no node"):
-        prepared.prediction(**unseen)
+        prepared.prediction(**unseen.arguments())
     monkeypatch.delattr(Model, "simulate")
-    for each, positions in zip(jobs, alone, strict=True):
-        assert np.array_equal(prepared.prediction(**each).trajectory.positions, positions)
+    for each, positions in zip(runs, alone, strict=True):
+        assert np.array_equal(prepared.prediction(**each.arguments()).trajectory.positions, positions)
     different = [alone[0], alone[1], *alone[4:]]
     assert not any(np.array_equal(a, b) for a, b in combinations(different, 2))
-    prepared.prepare([job(2)])
+    prepared.prepare([run(2)])
     assert len(prepared._trajectories) == 5, "the cache doesn't grow"
     drawn.clear()
-    prepared.prediction(**job(2, variant="rounding"))
+    prepared.prediction(**run(2, variant="rounding").arguments())
     assert drawn == [(2, None, 2.0)], "another drawing of the same simulation"
     with pytest.raises(KeyError, match="finer"):
-        prepared.prediction(**job(variant="finer"))
+        prepared.prediction(**run(variant="finer").arguments())

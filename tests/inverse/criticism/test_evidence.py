@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 from splatsoil.inverse.criticism.checks import Expected, checks, passes
-from splatsoil.inverse.criticism.design import MAX_SIZE, Prior, Run, effect_runs, sizes
+from splatsoil.inverse.criticism.design import MAX_SIZE, Prior, effect_runs, sizes
 from splatsoil.inverse.criticism.diagnosis import diagnose
 from splatsoil.inverse.criticism.emulator import BaseEmulator, IncrementEmulator
 from splatsoil.inverse.criticism.evidence import Comparison
 from splatsoil.inverse.criticism.noise import FACTORS, Noise, moderated, shrunk, trend_of
 
-from splatsoil.experiment.base import Candidate
+from splatsoil.experiment.base import Candidate, Run
 from splatsoil.experiment.emulated import EmulatedExperiment
 from splatsoil.parameters import Parameter, ParameterSpace
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from splatsoil.envs.problem import Evaluation, Image
-from splatsoil.inverse.criticism.design import Prior, Run
+from splatsoil.inverse.criticism.design import Prior
 from splatsoil.inverse.criticism.diagnosis import BASE_RUNS, PAIRS
 from splatsoil.inverse.criticism.simulations import Simulations
 from splatsoil.inverse.evaluations import EvaluationRecord
@@ -19,6 +19,7 @@ from splatsoil.inverse.run_folder import RunFolder
 
 from splatsoil.commands._stages import compare_models, prior_of
 from splatsoil.errors import SimulationError
+from splatsoil.experiment.base import Run
 from splatsoil.experiment.emulated import EmulatedExperiment
 from splatsoil.parameters import Parameter, ParameterSpace
 
@@ -62,7 +63,7 @@ def fitted(experiment: EmulatedExperiment, folder: Path, budget: int = BUDGET) -
 
     def kept(done: int, record: EvaluationRecord) -> None:
         table = experiment.observed - np.reshape(record.blocks, experiment.layout.shape)
-        simulate.store(table, record.parameters, record.seed)
+        simulate.store(table, Run(record.parameters, seed=record.seed))
 
     def compared(found: dict[str, Any]) -> Any:
         return compare_models(experiment, simulate, found, lambda what, share: None, 3, with_effects=False)

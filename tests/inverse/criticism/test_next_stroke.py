@@ -23,6 +23,7 @@ from splatsoil.inverse.criticism.next_stroke import (
 from splatsoil.inverse.criticism.simulations import Simulations
 
 from splatsoil.errors import RunError, SimulationError
+from splatsoil.experiment.base import Run
 from splatsoil.experiment.emulated import EmulatedExperiment
 
 EVEN = {"a": 0.5, "b": 0.5}
@@ -171,10 +172,10 @@ def test_a_simulation_that_cannot_go_on_costs_itself_alone(make: Callable[..., E
     }
 
     def fails(most: int) -> Callable[..., np.ndarray]:
-        def simulate(values: dict[str, float], *, effects: tuple[str, ...] = (), **others: Any) -> np.ndarray:
-            if effects and values["friction_angle"] < 34.0 + 0.25 * most:
+        def simulate(run: Run) -> np.ndarray:
+            if run.effects and run.values["friction_angle"] < 34.0 + 0.25 * most:
                 raise SimulationError("no step is short enough")
-            return Simulations(experiment)(values, effects=effects, **others)
+            return Simulations(experiment)(run)
 
         return simulate
 
