@@ -14,14 +14,14 @@ from splatsoil.benchmarks._common import FloatArray
 from splatsoil.envs.plow_sand import PlowSandEnv
 from splatsoil.envs.strokes import LOGITS, DesignEnv, NamingEnv
 from splatsoil.inverse.bayesopt import BayesianOptimiser, sobol
-from splatsoil.inverse.criticism.design import Prior, Run
+from splatsoil.inverse.criticism.design import Prior
 from splatsoil.inverse.criticism.diagnosis import BASE_RUNS
 from splatsoil.inverse.criticism.noise import Tables, noise_of
 from splatsoil.inverse.mcmc import sample
 from splatsoil.inverse.posterior import Density
 
 from splatsoil.errors import ParameterError
-from splatsoil.experiment import Layout, Site
+from splatsoil.experiment import Layout, Run, Site
 from splatsoil.experiment.emulated import EmulatedExperiment
 from splatsoil.parameters import ParameterSpace
 

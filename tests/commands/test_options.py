@@ -30,7 +30,8 @@ GIVEN = {
     "fit": "nowhere --parameters friction_angle --with cohesion --budget 9 --preset fine "
     "--device cpu --seed 2 --run 'a run' --json",
     "import": "'a folder' out --sfm --images i --scale 2 --distance a b 0.5 --tags 0.1 --known k.csv --points p.csv "
-    "--up 0 -1 0 --tool t.stl mm --motion m.csv m --motion-tags t.csv --force f.csv --robot-to-world r.txt --mesh-to-flange f.txt "
+    "--up 0 -1 0 --tool t.stl mm --motion m.csv m --motion-tags t.csv --force f.csv "
+    "--robot-to-world r.txt --mesh-to-flange f.txt "
     "--video 'a b.mp4=c.jpg' d.mp4=e.png --video-every 3 --clock-offset -0.5 --experiment e.json --json",
     "posterior": "runs/a --set 'a set' --checks 0 --device cpu --seed 1 --json",
     "reconstruct": "'my set' --out a/b --preset tiny --seed 3 --device cpu --holdout 0 --json",
