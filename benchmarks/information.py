@@ -86,14 +86,14 @@ class TrueSoil(PlowExperiment):
         """(t, s): heights are known exactly."""
         return self._after(0.0, super().sensor)
 
-    def predict(
-        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, variant: str = ""
-    ) -> FloatArray:
+    def predict(self, run: Run) -> FloatArray:
         """(t, s) true heights, and what would be seen."""
-        prediction = self.prediction(values, effects=effects, seed=seed, variant=variant)
-        run, measurement, frames = prediction.trajectory, self.base.measurement, self.comparator.frames
-        truth = Truth(measurement, {}, run.spacing**3, dict(values), ())
-        first, *later = (1e3 * truth.heights(run.at(f)[0], truth.volume) for f in (self.comparator.reference, *frames))
+        prediction = self.prediction(run)
+        motion, measurement, frames = prediction.trajectory, self.base.measurement, self.comparator.frames
+        truth = Truth(measurement, {}, motion.spacing**3, dict(run.values), ())
+        first, *later = (
+            1e3 * truth.heights(motion.at(f)[0], truth.volume) for f in (self.comparator.reference, *frames)
+        )
         rows = [np.mean([later[i] - first for i in group], axis=0) for group in bins_of(measurement, frames, MAX_ROWS)]
         return np.concatenate([np.reshape(rows, (len(rows), -1)), self.features(prediction)], axis=1)
 

@@ -109,7 +109,9 @@ class MeasuredProblem:
         Raises:
             SimulationError: the simulation could not go on.
         """
-        return self.judge(self.experiment.prediction(parameters, seed=seed))
+        from splatsoil.experiment.base import Run
+
+        return self.judge(self.experiment.prediction(Run(parameters, seed=seed)))
 
     def judge(self, prediction: Prediction) -> Evaluation:
         """A prediction compared with what was measured."""

@@ -19,10 +19,11 @@ import numpy.typing as npt
 import torch
 from scipy.stats import norm
 
+from splatsoil.arrays import FloatArray
+
 if TYPE_CHECKING:
     from botorch.models import SingleTaskGP
 
-FloatArray = npt.NDArray[np.float64]
 Acquisition = Literal["noisy", "best"]
 
 #: Space-filling evaluations before the first acquisition: minimum, and number for each parameter. With fewer, a search

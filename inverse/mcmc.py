@@ -8,12 +8,11 @@ from dataclasses import dataclass
 
 import emcee
 import numpy as np
-import numpy.typing as npt
 from scipy.stats import qmc
 
+from splatsoil.arrays import FloatArray
 from splatsoil.errors import RunError
 
-FloatArray = npt.NDArray[np.float64]
 LogDensity = Callable[[FloatArray], FloatArray]
 
 #: Independent ensembles, and walkers in each (more in many dimensions).

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import logsumexp
 
+from splatsoil.arrays import FloatArray
 from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Experiment, Run
 from splatsoil.files import plain, write_json
@@ -29,8 +30,6 @@ from .criticism.noise import FACTORS, Noise
 from .criticism.simulations import Simulations
 from .mcmc import Chains, sample
 from .run_folder import RunFolder
-
-FloatArray = npt.NDArray[np.float64]
 
 #: Posterior over prior standard deviation: a parameter is determined below the first, and not determined above the
 #: second.

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
 from splatsoil.errors import RunError
 from splatsoil.files import write_bytes
@@ -24,7 +23,6 @@ if TYPE_CHECKING:
 
     from .posterior import Posterior
 
-FloatArray = npt.NDArray[np.float64]
 
 #: Draws for the posterior predictive.
 PREDICTIVE_DRAWS = 200

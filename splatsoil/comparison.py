@@ -26,6 +26,7 @@ import numpy.typing as npt
 import torch
 from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_edt
 
+from splatsoil.arrays import BoolArray, FloatArray, Image
 from splatsoil.errors import ParameterError
 from splatsoil.measurement import Measurement
 from splatsoil.reconstruction.height_field import HeightField
@@ -33,9 +34,6 @@ from splatsoil.robust_loss import robust_losses
 from splatsoil.scene import Relief, ToolBody, ground_of_pixels, silhouette
 from splatsoil.splats import Gaussians
 
-FloatArray = npt.NDArray[np.float64]
-Image = npt.NDArray[np.float32]
-BoolImage = npt.NDArray[np.bool_]
 Key = tuple[str, int]
 """Camera and frame."""
 
@@ -190,7 +188,7 @@ class Comparator:
         """(b,) `Comparison.blocks` alone, in half the time; raises like ``compare``."""
         return _in_order([self._block_means(*changed) for changed in self._changes(images)])
 
-    def _changes(self, images: Mapping[Key, Image]) -> Iterator[tuple[str, list[Image], list[BoolImage]]]:
+    def _changes(self, images: Mapping[Key, Image]) -> Iterator[tuple[str, list[Image], list[BoolArray]]]:
         """Each camera with its (h, w, 3) observed minus predicted changes and compared pixels (h, w), by frame."""
         for key in (*self.keys, *((c, self.reference) for c in self.cameras)):
             if key not in images:
@@ -241,7 +239,7 @@ class Comparator:
         variances = [float(np.mean(c**2)) * (1.0 - 1.0 / len(c) ** 2) for c in self.still_blocks().values()]
         return float(np.mean(variances)) ** 0.5 if variances else 0.0
 
-    def _still_changes(self) -> Iterator[tuple[str, tuple[list[Image], list[BoolImage]]]]:
+    def _still_changes(self) -> Iterator[tuple[str, tuple[list[Image], list[BoolArray]]]]:
         """Each camera with its (h, w, 3) still frames minus the mean of the others, and compared pixels (h, w)."""
         for camera, still in self._still.items():
             frames = [*still, self.observed[camera, self.reference]]
@@ -278,7 +276,7 @@ class Comparator:
             for c, view in self._views.items()
         }
 
-    def _tool_silhouettes(self) -> dict[Key, BoolImage]:
+    def _tool_silhouettes(self) -> dict[Key, BoolArray]:
         body, motion = ToolBody(self.measurement.tool.mesh), self.measurement.tool.motion
         out = {}
         for frame in (self.reference, *self.frames):
@@ -304,7 +302,7 @@ class Comparator:
             return None
         return weights, float(weights @ (tool.mean(axis=0) + soil.mean(axis=0)) / 2)
 
-    def _shows_tool(self, camera: str, frame: int, predicted: Image) -> BoolImage:
+    def _shows_tool(self, camera: str, frame: int, predicted: Image) -> BoolArray:
         """Pixels in which either picture shows the tool, dilated; its silhouette without a discriminant."""
         shape = self.silhouettes[camera, frame]
         rule = self._tool_colour[camera]
@@ -335,7 +333,7 @@ class Comparator:
             labels += [Block(camera, f, float(x), float(y)) for f in self.frames for x, y in centres]
         return tuple(labels), patches
 
-    def _block_means(self, camera: str, change: list[Image], masks: list[BoolImage]) -> FloatArray:
+    def _block_means(self, camera: str, change: list[Image], masks: list[BoolArray]) -> FloatArray:
         """(frames, blocks) mean residual over the compared pixels of each block."""
         patch = self.patches[camera]
         blocks = int(patch.max()) + 1
@@ -347,7 +345,7 @@ class Comparator:
             out[k] = np.where(count >= _MIN_PIXELS / 2, total / np.maximum(count, 1), 0.0)
         return out
 
-    def _scaled_losses(self, camera: str, change: list[Image], masks: list[BoolImage]) -> FloatArray:
+    def _scaled_losses(self, camera: str, change: list[Image], masks: list[BoolArray]) -> FloatArray:
         """(frames, scales) robust loss of residual changes before normalisation."""
         return robust_losses(change, masks, self._pixels_per_metre(camera))
 

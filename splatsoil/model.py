@@ -9,10 +9,9 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 
-import numpy as np
-import numpy.typing as npt
 import torch
 
+from splatsoil.arrays import FloatArray, Image
 from splatsoil.errors import ParameterError
 from splatsoil.measurement import Measurement
 from splatsoil.mpm import Resolution, Trajectory, frames_around, simulate
@@ -24,8 +23,6 @@ from splatsoil.scene.relief import SMOOTHING
 from splatsoil.soil.effect import Effect
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
-
-Image = npt.NDArray[np.float32]
 
 CACHED_SCENES = 4
 """Scenes in a model's cache, one for each particle seed."""
@@ -167,7 +164,7 @@ class Model:
             raise ParameterError(f"unknown parameter {', '.join(unknown)}; this model has {', '.join(known)}")
         return ParameterSpace(known[n] for n in chosen)
 
-    def particles(self, seed: int = 0) -> npt.NDArray[np.float64]:
+    def particles(self, seed: int = 0) -> FloatArray:
         """Particles (n, 3) in m that fill the reconstructed bed."""
         return fill(self.reconstruction.surface, self.measurement.bed, self.resolution.spacing, seed=seed)
 

@@ -9,17 +9,15 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy.ndimage import correlate1d
 from scipy.spatial.transform import Rotation
 from scipy.special import ive
 
+from splatsoil.arrays import FloatArray, Image
 from splatsoil.colour import encoded, linear
 from splatsoil.errors import ParameterError
 from splatsoil.measurement import Camera
 
-FloatArray = npt.NDArray[np.float64]
-Image = npt.NDArray[np.float32]
 Pose = tuple[FloatArray, FloatArray]
 
 

@@ -9,9 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from splatsoil.arrays import FloatArray
 from splatsoil.errors import ParameterError
-
-FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

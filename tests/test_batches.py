@@ -96,7 +96,7 @@ def test_simulations_for_criticism_and_for_a_fit_go_on(
     base.particles, base.reported = (lambda seed: None), (lambda made, seed, values: SimpleNamespace(values=values))
     experiment: Any = object.__new__(PlowExperiment)
     experiment.__dict__ |= {"base": base, "progress": None, "_trajectories": {}, "batch_size": 3}
-    experiment._model_of = lambda effects, variant: (base, variant)
+    experiment._model_of = lambda run: (base, run.variant)
     angles = [1.0, 2.0, 3.0]
     experiment.prepare([Run({"angle": a}) for a in angles])
     assert [float(kept.positions[0, 0, 0]) for kept in experiment._trajectories.values()] == angles

@@ -20,6 +20,7 @@ from splatsoil.benchmarks._validation.sand import HUNDRED, LADDER, calibrated, c
 from splatsoil.benchmarks._validation.scene import GRAVITY
 
 from splatsoil.errors import MeasurementError
+from splatsoil.experiment.base import Run
 from splatsoil.experiment.plate import Loading, PlateExperiment
 from splatsoil.measurement.fields import read_table
 from splatsoil.mpm import Preset, Resolution
@@ -90,7 +91,7 @@ def plate(
 def bearing(experiment: PlateExperiment, values: Mapping[str, float]) -> FloatArray:
     """Pressures (n,) under a plate over half of density, gravity and diameter."""
     unit = 0.125 * math.pi * experiment.test.density * GRAVITY * experiment.test.diameter**3
-    return np.asarray(experiment.readings(values)[:, 0] / unit)
+    return np.asarray(experiment.readings(Run(values))[:, 0] / unit)
 
 
 def vesic(angle: float, depth: float) -> float:

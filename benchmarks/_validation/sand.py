@@ -16,6 +16,7 @@ from splatsoil.benchmarks._parts import Row, Section
 from splatsoil.inverse.criticism.simulations import Simulations
 
 from splatsoil.errors import MeasurementError
+from splatsoil.experiment.base import Run
 from splatsoil.experiment.triaxial import Curve, TriaxialExperiment
 from splatsoil.laboratory.answer import diagnosed, search
 from splatsoil.laboratory.folder import read_curve, together
@@ -86,7 +87,7 @@ def misfit(curve: Curve, effects: tuple[str, ...], values: Mapping[str, float], 
     """(2,) root mean squares of q/p and volume strain, in spreads between specimens, by parameters at another void
     ratio."""
     experiment = TriaxialExperiment([curve], effects, candidates=())
-    table = experiment.predict(at_void_ratio(values, before, curve.void_ratio))
+    table = experiment.predict(Run(at_void_ratio(values, before, curve.void_ratio)))
     return np.asarray(np.sqrt(np.mean((table - experiment.observed) ** 2, axis=0)))
 
 

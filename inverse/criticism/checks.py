@@ -10,11 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from splatsoil.arrays import BoolArray, FloatArray
 from splatsoil.experiment.base import Experiment
-
-FloatArray = npt.NDArray[np.float64]
 
 REPLICATES = 999
 MIN_FEATURES = 4
@@ -72,7 +70,7 @@ class Expected:
 
 
 def checks(
-    experiment: Experiment, residual: FloatArray, expected: Expected, mask: npt.NDArray[np.bool_], seed: int = 0
+    experiment: Experiment, residual: FloatArray, expected: Expected, mask: BoolArray, seed: int = 0
 ) -> list[Check]:
     """Checks of a residual (t, s) where ``mask`` (t, s) is set, the smallest p-value first."""
     layout, rng = experiment.layout, np.random.default_rng([seed, 13])

@@ -12,13 +12,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.stats import qmc
 
+from splatsoil.arrays import FloatArray
 from splatsoil.experiment.base import Candidate, Experiment, Run
 from splatsoil.parameters import Parameter, ParameterSpace
-
-FloatArray = npt.NDArray[np.float64]
 
 MAX_SIZE = 16.0
 """Largest size of an effect, over its smallest meaningful size."""

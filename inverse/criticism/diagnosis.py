@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
+from splatsoil.arrays import BoolArray, FloatArray
 from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Candidate, Experiment, Run
 
@@ -19,8 +19,6 @@ from .noise import FINE_ERROR_RATIO, Tables, compared, noise_of, nuisances, tren
 from .power import NAMED, detectable
 from .simulations import Simulations
 
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 Verdict = Literal["adequate", "missing", "one of", "something else", "undecided"]
 
 FINE = "fine"

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import cho_factor, cho_solve
 
-FloatArray = npt.NDArray[np.float64]
+from splatsoil.arrays import FloatArray
+
 Points = tuple[FloatArray, FloatArray, FloatArray]
 """Base parameters (m, n) in [-1, 1], sizes (m, k) over the smallest meaningful ones, shapes (m, j) in [-1, 1]."""
 

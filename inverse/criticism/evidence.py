@@ -16,11 +16,11 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import solve_triangular
 from scipy.special import logsumexp
 from scipy.stats import multivariate_t, qmc
 
+from splatsoil.arrays import BoolArray, FloatArray
 from splatsoil.experiment.base import Candidate, Run
 from splatsoil.parameters import Parameter, ParameterSpace
 
@@ -28,7 +28,6 @@ from .design import Prior, effect_points, effect_values, sizes
 from .emulator import BaseEmulator, IncrementEmulator
 from .noise import FACTORS, Noise
 
-FloatArray = npt.NDArray[np.float64]
 Prediction = tuple[Mapping[str, FloatArray], FloatArray, FloatArray]
 """Values by name (q,), mean and variance (q, p) of whitened scores."""
 Predict = Callable[[FloatArray], Prediction]
@@ -82,7 +81,7 @@ class Marginal:
         """Bounds of the parameter's range near which the posterior concentrates."""
         unit = ParameterSpace([parameter]).to_unit(self.values[:, None])[:, 0]
         edge = 1.0 - 2.0 * NEAR_BOUND
-        near: dict[Literal["lower", "upper"], npt.NDArray[np.bool_]] = {"lower": unit < -edge, "upper": unit > edge}
+        near: dict[Literal["lower", "upper"], BoolArray] = {"lower": unit < -edge, "upper": unit > edge}
         return [bound for bound, close in near.items() if float(self.weights @ close) > CROWDED]
 
 

@@ -17,11 +17,11 @@ from itertools import combinations
 from typing import Any, Protocol
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import solve_triangular
 from scipy.special import expit, logsumexp
 from scipy.stats import t as student
 
+from splatsoil.arrays import BoolArray, FloatArray
 from splatsoil.errors import RunError, SimulationError
 from splatsoil.experiment.base import Experiment, Run
 from splatsoil.parameters import ParameterSpace
@@ -32,8 +32,6 @@ from .evidence import BASE_MODEL, DISCREPANCY, Evidence
 from .noise import Tables, noise_of, shrunk
 from .power import NAMED
 from .simulations import Simulate
-
-FloatArray = npt.NDArray[np.float64]
 
 STORED_DRAWS = 32
 """Draws from a model's posterior that a diagnosis stores."""
@@ -155,7 +153,7 @@ def expected_information(
     first = next((run for run in runs[BASE_MODEL] if _table(simulate, run) is not None), runs[BASE_MODEL][0])
     others = (*experiment.albedo_draws, *experiment.renderings)
     variants = {n: simulate(replace(first, variant=n)) for n in others}
-    succeeded: dict[str, npt.NDArray[np.bool_]] = {}
+    succeeded: dict[str, BoolArray] = {}
     simulated: dict[str, tuple[list[Run], FloatArray]] = {FINE: ([], np.zeros((0, *experiment.layout.shape)))}
     for name, mine in runs.items():
         found = [_table(simulate, run) for run in mine]

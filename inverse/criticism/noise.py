@@ -32,12 +32,10 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import brentq
 from scipy.special import digamma, logsumexp, polygamma
 
+from splatsoil.arrays import BoolArray, FloatArray
 from splatsoil.experiment.base import Candidate, Experiment, Run
 
 from .design import Prior
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 
 MIN_VARIANCE_RATIO = 4.0
 """A component is kept if its variance exceeds the scatter's by this factor: twice its standard deviation."""

@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import logsumexp
 
+from splatsoil.arrays import FloatArray
 from splatsoil.experiment.base import Candidate
 
 from .evidence import BASE_MODEL, BASE_PRIOR, Comparison, Evidence
-
-FloatArray = npt.NDArray[np.float64]
 
 POWER = 0.8
 NAMED = 0.9

@@ -11,13 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from splatsoil.arrays import FloatArray
 from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Experiment, Run
 from splatsoil.files import digest, read_npy, write_bytes
 
-FloatArray = npt.NDArray[np.float64]
 Simulate = Callable[..., FloatArray]
 
 
@@ -138,7 +137,7 @@ class Simulations:
 
     def _key(self, run: Run) -> str:
         effects = sorted(f"{name} {self.sources.get(name, '')}".rstrip() for name in run.effects)
-        return digest({**self.identity, **run.arguments(), "effects": effects})
+        return digest({**self.identity, **vars(run), "values": dict(run.values), "effects": effects})
 
     def _load_or_run(self, key: str, run: Run, purpose: str) -> FloatArray:
         """From the cache, from a worker that has begun it, or run here with the rest of its batch."""
@@ -170,7 +169,7 @@ class Simulations:
         return table
 
     def _run(self, key: str, run: Run) -> FloatArray:
-        table = self.experiment.predict(**run.arguments())
+        table = self.experiment.predict(run)
         self.simulated += 1
         self._write(key, table)
         return table

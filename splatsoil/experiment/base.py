@@ -4,30 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Literal, Protocol
 
-import numpy as np
-import numpy.typing as npt
-
+from splatsoil.arrays import BoolArray, FloatArray
 from splatsoil.experiment.features import Layout
 from splatsoil.parameters import Parameter
 from splatsoil.soil.effect import Effect
 
-FloatArray = npt.NDArray[np.float64]
-
 
 @dataclass(frozen=True)
 class Run:
-    """One simulation of an experiment: the arguments of :meth:`Experiment.predict`."""
+    """One simulation of an experiment.
+
+    Attributes:
+        values: parameters by name, including those of ``effects``.
+        effects: candidates to switch on, by name.
+        seed: of the simulation's random numbers.
+        variant: one of the experiment's ``discretisations``, ``renderings`` or ``albedo_draws``; empty for the standard
+            simulation.
+    """
 
     values: Mapping[str, float]
     effects: tuple[str, ...] = ()
     seed: int = 0
     variant: str = ""
-
-    def arguments(self) -> dict[str, Any]:
-        """Arguments by name."""
-        return {**vars(self), "values": dict(self.values)}
 
     @property
     def label(self) -> str:
@@ -92,9 +92,9 @@ class Experiment(Protocol):
     @property
     def observed(self) -> FloatArray: ...
     @property
-    def seen(self) -> npt.NDArray[np.bool_]: ...
+    def seen(self) -> BoolArray: ...
     @property
-    def quiet(self) -> npt.NDArray[np.bool_]: ...
+    def quiet(self) -> BoolArray: ...
     @property
     def sensor(self) -> FloatArray: ...
     @property
@@ -114,16 +114,8 @@ class Experiment(Protocol):
     @property
     def stochastic(self) -> bool: ...
 
-    def predict(
-        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, variant: str = ""
-    ) -> FloatArray:
+    def predict(self, run: Run) -> FloatArray:
         """(t, s) predicted features.
-
-        Args:
-            values: parameters by name, including those of ``effects``.
-            effects: candidates to switch on, by name.
-            seed: of the simulation's random numbers.
-            variant: one of ``discretisations``, ``renderings`` or ``albedo_draws``; empty for the standard simulation.
 
         Raises:
             SimulationError: the simulation failed.

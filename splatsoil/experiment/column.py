@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from splatsoil.errors import ParameterError
+from splatsoil.experiment.base import Run
 from splatsoil.experiment.laboratory import FloatArray, LaboratoryExperiment
 from splatsoil.experiment.plow import FINER_RESOLUTIONS
 from splatsoil.mpm import PRESETS, Resolution, Solver
@@ -111,20 +112,9 @@ class ColumnExperiment(LaboratoryExperiment):
         """In radii of the column."""
         return readings / self.test.radius
 
-    def readings(
-        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, variant: str = ""
-    ) -> FloatArray:
-        """(1, 2) radius and height of the deposit, m; arguments as for `predict`."""
-        r, thickness = self._profile(values, effects=effects, seed=seed, variant=variant)
-        end = int(np.argmax(thickness < THIN * self.test.radius))
-        share = (thickness[end - 1] - THIN * self.test.radius) / (thickness[end - 1] - thickness[end])
-        return np.array([[r[end - 1] + share * (r[end] - r[end - 1]), thickness[:2].max()]])
-
-    def _profile(
-        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, variant: str = ""
-    ) -> tuple[FloatArray, FloatArray]:
-        """Radii (n,) and mean thickness (n,) of the deposit in rings, m; empty beyond its end."""
-        resolution = FINER_RESOLUTIONS[variant](self.resolution) if variant else self.resolution
+    def readings(self, run: Run) -> FloatArray:
+        """(1, 2) radius and height of the deposit, m."""
+        resolution = FINER_RESOLUTIONS[run.variant](self.resolution) if run.variant else self.resolution
         # one step a frame, limited by the path of falling soil
         resolution = replace(resolution, frame_time=resolution.frame_time / resolution.steps, steps=1)
         spacing, cell = resolution.spacing, resolution.cell
@@ -132,7 +122,7 @@ class ColumnExperiment(LaboratoryExperiment):
         axes = [spacing * (np.arange(n) + 0.5) for n in (wide, wide, high)]
         centres = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
         centres = centres[np.hypot(centres[:, 0], centres[:, 1]) < self.test.radius]
-        jitter = np.random.default_rng(seed).uniform(-0.15, 0.15, centres.shape)
+        jitter = np.random.default_rng(run.seed).uniform(-0.15, 0.15, centres.shape)
         reach = cell * math.ceil((self.test.radius + REACH * self.test.height) / cell)
         solver = Solver(
             (centres + spacing * jitter)[None],
@@ -140,9 +130,9 @@ class ColumnExperiment(LaboratoryExperiment):
             (reach, reach, self.test.height + 2.0 * cell),
             None,
             resolution,
-            self.law(effects),
+            self.law(run.effects),
             self.settings,
-            [self.values(values)],
+            [self.values(run.values)],
             self.device,
         )
         for _ in range(math.ceil(REST * math.sqrt(self.test.height / GRAVITY) / resolution.frame_time)):
@@ -150,4 +140,8 @@ class ColumnExperiment(LaboratoryExperiment):
         x = solver.positions()[0]
         edges = np.arange(0.0, reach + 2.0 * cell, 0.5 * cell)
         counts, _ = np.histogram(np.hypot(x[:, 0], x[:, 1]), edges)
-        return 0.5 * (edges[1:] + edges[:-1]), counts * spacing**3 / (0.25 * math.pi * np.diff(edges**2))
+        # mean thickness of the deposit in rings, m
+        thickness = counts * spacing**3 / (0.25 * math.pi * np.diff(edges**2))
+        r, end = 0.5 * (edges[1:] + edges[:-1]), int(np.argmax(thickness < THIN * self.test.radius))
+        share = (thickness[end - 1] - THIN * self.test.radius) / (thickness[end - 1] - thickness[end])
+        return np.array([[r[end - 1] + share * (r[end] - r[end - 1]), thickness[:2].max()]])

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
-from splatsoil.experiment.base import Candidate
+from splatsoil.arrays import BoolArray, FloatArray
+from splatsoil.experiment.base import Candidate, Run
 from splatsoil.experiment.features import Layout
 from splatsoil.parameters import Parameter
-
-FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -50,7 +48,7 @@ class EmulatedExperiment:
     curves: Mapping[str, FloatArray] = field(default_factory=dict)
     patterns: Mapping[str, FloatArray] = field(default_factory=dict)
     albedo_patterns: Mapping[str, FloatArray] = field(default_factory=dict)
-    quiet: npt.NDArray[np.bool_] = field(default_factory=lambda: np.zeros((0, 0), dtype=bool))
+    quiet: BoolArray = field(default_factory=lambda: np.zeros((0, 0), dtype=bool))
     name: str = "emulated"
     model: tuple[str, ...] = ()
     renderings: tuple[str, ...] = ()
@@ -62,7 +60,7 @@ class EmulatedExperiment:
             object.__setattr__(self, "quiet", np.zeros(self.layout.shape, dtype=bool))
 
     @property
-    def seen(self) -> npt.NDArray[np.bool_]:
+    def seen(self) -> BoolArray:
         """All features."""
         return np.ones(self.layout.shape, dtype=bool)
 
@@ -89,12 +87,9 @@ class EmulatedExperiment:
             out += {**self.patterns, **self.albedo_patterns}[variant]
         return out
 
-    def predict(
-        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, variant: str = ""
-    ) -> FloatArray:
+    def predict(self, run: Run) -> FloatArray:
         """(t, s) features; the same seed gives the same scatter."""
-        del effects
-        return self.expected(values, variant) + self.scatter(seed)
+        return self.expected(run.values, run.variant) + self.scatter(run.seed)
 
     def scatter(self, seed: int | Sequence[int]) -> FloatArray:
         """(t, s) scatter of one seed."""

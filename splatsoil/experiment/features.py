@@ -10,6 +10,8 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from splatsoil.arrays import BoolArray, FloatArray
+
 
 @dataclass(frozen=True)
 class Site:
@@ -28,7 +30,7 @@ class Site:
     x: float = math.nan
     y: float = math.nan
     unit: str = ""
-    reading: Callable[[npt.NDArray[np.float64]], npt.NDArray[np.float64]] | None = None
+    reading: Callable[[FloatArray], FloatArray] | None = None
     outline: tuple[tuple[float, float], ...] = ()
 
 
@@ -69,11 +71,11 @@ class Layout:
         return tuple(dict.fromkeys(site.channel for site in self.sites))
 
     @cached_property
-    def common(self) -> npt.NDArray[np.bool_]:
+    def common(self) -> BoolArray:
         """(s,) sites in the layout's unit."""
         return np.array([site.unit in ("", self.unit) for site in self.sites])
 
     @cached_property
-    def placed(self) -> npt.NDArray[np.bool_]:
+    def placed(self) -> BoolArray:
         """(s,) sites with a place."""
         return np.array([math.isfinite(site.x) and math.isfinite(site.y) for site in self.sites])

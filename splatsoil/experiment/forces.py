@@ -11,12 +11,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from splatsoil.arrays import BoolArray, FloatArray
 from splatsoil.experiment.scene_parts import heading_of, stages_of
 from splatsoil.measurement import Measurement
-
-FloatArray = npt.NDArray[np.float64]
 
 ALONG, UP = "force along", "force up"
 """Components: against the direction of pushing, and upwards."""
@@ -49,7 +47,7 @@ class ToolForces:
     channels: tuple[str, ...]
     observed: FloatArray
     stages: tuple[str, ...]
-    measured: npt.NDArray[np.bool_]
+    measured: BoolArray
     largest: float
     axes: FloatArray
     weights: FloatArray

@@ -9,17 +9,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
+from splatsoil.arrays import BoolArray, FloatArray, Image
 from splatsoil.comparison import GAIN, MARGIN, Comparator
 from splatsoil.experiment.features import Site
 from splatsoil.measurement import Measurement
 from splatsoil.reconstruction.heights import Cells, seen_heights
 from splatsoil.scene import Relief
-
-FloatArray = npt.NDArray[np.float64]
-Image = npt.NDArray[np.float32]
 
 CHANNEL, UNIT = "heights", "mm"
 """The instrument. Its noise in mm is similar to that of pictures in grey levels, so neither dominates the principal
@@ -75,7 +72,7 @@ class Heights:
         self._usable = np.stack([self._counts(p[:, 2] - self._first[:, 2])[self._kept] for p in self._later.values()])
         self._usable = (self._usable > enough).astype(np.float64)
         frames = np.stack([self._usable[list(row)].sum(axis=0) for row in rows])
-        self.seen: npt.NDArray[np.bool_] = frames > 0.0
+        self.seen: BoolArray = frames > 0.0
         self._moved = np.stack([self._means(MM * (p - self._first)[:, 2]) for p in self._later.values()])
         self.observed = self._in_rows(self._moved)
         self._std = self._level(measurement, still[..., 2])

@@ -9,16 +9,15 @@ from typing import ClassVar, Generic, Protocol, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from splatsoil.arrays import FloatArray
 from splatsoil.errors import ParameterError, SimulationError
-from splatsoil.experiment.base import candidates_of
+from splatsoil.experiment.base import Run, candidates_of
 from splatsoil.experiment.features import Layout, Site
 from splatsoil.parameters import Parameter
 from splatsoil.soil.effect import Effect
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects, library
 from splatsoil.soil.packing import at_void_ratio
-
-FloatArray = npt.NDArray[np.float64]
 
 MEMORY = 0.8
 """Correlation of neighbouring readings: the deviation of a specimen persists."""
@@ -107,20 +106,16 @@ class LaboratoryExperiment(ABC):
         self.quiet = np.zeros(self.layout.shape, dtype=bool)
 
     @abstractmethod
-    def readings(
-        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, variant: str = ""
-    ) -> FloatArray:
-        """(t, s) predicted readings in SI units; arguments as for `predict`."""
+    def readings(self, run: Run) -> FloatArray:
+        """(t, s) predicted readings in SI units."""
 
     @abstractmethod
     def features(self, readings: FloatArray) -> FloatArray:
         """(t, s) features of readings (t, s)."""
 
-    def predict(
-        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, variant: str = ""
-    ) -> FloatArray:
+    def predict(self, run: Run) -> FloatArray:
         """(t, s) features; see :class:`~splatsoil.experiment.base.Experiment`."""
-        return self.features(self.readings(values, effects=effects, seed=seed, variant=variant))
+        return self.features(self.readings(run))
 
 
 class Specimen(Protocol):
@@ -195,17 +190,14 @@ class SpecimenExperiment(LaboratoryExperiment, Generic[AnySpecimen]):
     def tested(self, law: Law, values: Mapping[str, float], test: AnySpecimen) -> tuple[FloatArray, FloatArray]:
         """Stress ratio (t,) and logarithmic volume strain (t,), compression positive, of one test."""
 
-    def readings(
-        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, variant: str = ""
-    ) -> FloatArray:
+    def readings(self, run: Run) -> FloatArray:
         """(t, 2 tests) stress ratio and nominal volume strain; the test is deterministic."""
-        del seed, variant
-        law, out = self.law(effects), []
+        law, out = self.law(run.effects), []
         for test in self.tests:
-            own = at_void_ratio(self.values(values), self.tests[0].void_ratio, test.void_ratio)
+            own = at_void_ratio(self.values(run.values), self.tests[0].void_ratio, test.void_ratio)
             ratio, volume = self.tested(law, own, test)
             if not np.all(np.isfinite(ratio)):
-                raise SimulationError(f"the {self.kind} test with {dict(values)} came to no finite stress")
+                raise SimulationError(f"the {self.kind} test with {dict(run.values)} came to no finite stress")
             out += [ratio, 1.0 - np.exp(-volume)]
         return np.stack(out, axis=1)
 

@@ -10,6 +10,7 @@ import numpy as np
 import trimesh
 
 from splatsoil.errors import ParameterError
+from splatsoil.experiment.base import Run
 from splatsoil.experiment.forces import SCALE, compressed
 from splatsoil.experiment.laboratory import FloatArray, LaboratoryExperiment
 from splatsoil.experiment.plow import FINER_RESOLUTIONS
@@ -121,29 +122,27 @@ class PlateExperiment(LaboratoryExperiment):
         """In % of the largest measured force, compressed."""
         return compressed(100.0 * readings / self._largest)
 
-    def readings(
-        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, variant: str = ""
-    ) -> FloatArray:
-        """(t, 1) upward forces in N; arguments as for `predict`."""
-        resolution = FINER_RESOLUTIONS[variant](self.resolution) if variant else self.resolution
+    def readings(self, run: Run) -> FloatArray:
+        """(t, 1) upward forces in N."""
+        resolution = FINER_RESOLUTIONS[run.variant](self.resolution) if run.variant else self.resolution
         # soil stays a skin's thickness away from the tool, so the plate is that much narrower
-        offset = float(np.random.default_rng([seed, 1]).random()) * resolution.cell
+        offset = float(np.random.default_rng([run.seed, 1]).random()) * resolution.cell
         experiment = self.set_up(resolution.skin * resolution.spacing, offset)
         bed = experiment.bed
         low, span = bed.lower, bed.upper - bed.lower
         x, y = (low[k] + span[k] * (np.arange(CELLS) + 0.5) / CELLS for k in (0, 1))
         surface = HeightField(x, y, np.full((CELLS, CELLS), _surface_of(bed)))
         last = int(experiment.tool.motion.frames[-1])
-        run = simulate(
+        trajectory = simulate(
             experiment,
-            fill(surface, bed, resolution.spacing, seed=seed),
-            self.values(values),
-            law=self.law(effects),
+            fill(surface, bed, resolution.spacing, seed=run.seed),
+            self.values(run.values),
+            law=self.law(run.effects),
             resolution=resolution,
             frames=(0, last),
             device=self.device,
         )[0]
-        upward = np.concatenate([[0.0], 4.0 * run.force[:, 2]])
+        upward = np.concatenate([[0.0], 4.0 * trajectory.force[:, 2]])
         width = 2 * SMOOTH + 1
         smooth = np.convolve(np.pad(upward, SMOOTH, mode="edge"), np.full(width, 1.0 / width), mode="valid")
         # A frame's force is the mean over the frame that ends there.

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from splatsoil.arrays import BoolArray, FloatArray
 from splatsoil.batches import in_batches
 from splatsoil.comparison import PATCH, Block, Comparator, Comparison
 from splatsoil.errors import SimulationError, SplatsoilError
@@ -25,8 +26,6 @@ from splatsoil.mpm import Resolution, Trajectory, simulate_together
 from splatsoil.parameters import Parameter
 from splatsoil.soil.effect import Effect
 from splatsoil.soil.library import find_effects, library
-
-FloatArray = npt.NDArray[np.float64]
 
 MAX_ROWS = 10
 MAX_FEATURES = 1800
@@ -146,12 +145,12 @@ class PlowExperiment:
         return self._table(self.comparator.blocks({(c, f): still[c] for c in still for f in frames}))
 
     @cached_property
-    def quiet(self) -> npt.NDArray[np.bool_]:
+    def quiet(self) -> BoolArray:
         """(t, s) patches that the tool's path does not disturb: only the light changes there."""
         return (self.layout.regions == UNDISTURBED) & self.seen
 
     @cached_property
-    def seen(self) -> npt.NDArray[np.bool_]:
+    def seen(self) -> BoolArray:
         """(t, s) False where the tool hides most of a patch, or a height or force was not measured."""
         heights = None if self.heights is None else self.heights.seen
         shares = self._table(self.comparator.open_shares())
@@ -180,11 +179,9 @@ class PlowExperiment:
         heights = None if self.heights is None else self.heights.noise
         return side_by_side(heights, pictured, None if self.forces is None else self.forces.noise)
 
-    def predict(
-        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, variant: str = ""
-    ) -> FloatArray:
+    def predict(self, run: Run) -> FloatArray:
         """(t, s) features; see :class:`~splatsoil.experiment.base.Experiment`."""
-        return self.features(self.prediction(values, effects=effects, seed=seed, variant=variant))
+        return self.features(self.prediction(run))
 
     def features(self, prediction: Prediction) -> FloatArray:
         """(t, s) predicted changes and forces."""
@@ -207,15 +204,13 @@ class PlowExperiment:
             return comparison.loss
         return float(np.mean(list(self.heights.losses(prediction.surfaces).values())))
 
-    def prediction(
-        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, variant: str = ""
-    ) -> Prediction:
+    def prediction(self, run: Run) -> Prediction:
         """The pictures behind the features; a variant or an effect of observation needs no new simulation."""
-        draw = 1 + self.albedo_draws.index(variant) if variant in self.albedo_draws else None
-        rounding = 2.0 if variant == ROUNDING else 1.0
-        model, discretisation = self._model_of(effects, variant)
-        trajectory = self._trajectory(model, values, seed, discretisation)
-        return model.reported(trajectory, seed, values, albedo=draw, rounding=rounding)
+        draw = 1 + self.albedo_draws.index(run.variant) if run.variant in self.albedo_draws else None
+        rounding = 2.0 if run.variant == ROUNDING else 1.0
+        model, discretisation = self._model_of(run)
+        trajectory = self._trajectory(model, run.values, run.seed, discretisation)
+        return model.reported(trajectory, run.seed, run.values, albedo=draw, rounding=rounding)
 
     @cached_property
     def batch_size(self) -> int:
@@ -230,7 +225,7 @@ class PlowExperiment:
         """Simulate later calls of `predict` as batches; failures are left to `predict`."""
         groups: dict[object, dict[object, tuple[Model, dict[str, float], int]]] = {}
         for run in runs:
-            model, discretisation = self._model_of(run.effects, run.variant)
+            model, discretisation = self._model_of(run)
             moving, physics = _physics_of(model, run.values)
             key = (moving, discretisation, run.seed, tuple(sorted(physics.items())))
             if key not in self._trajectories:
@@ -250,10 +245,10 @@ class PlowExperiment:
         particles = [models[0].particles(seed) for seed in seeds]
         return simulate_together(self.base.measurement, particles, values, models[0], self.progress)
 
-    def _model_of(self, effects: Iterable[str], variant: str) -> tuple[Model, str]:
+    def _model_of(self, run: Run) -> tuple[Model, str]:
         """The model with candidates on, and the variant if it is a discretisation, else nothing."""
-        discretisation = "" if variant in (*self.albedo_draws, *self.renderings) else variant
-        names = tuple(dict.fromkeys((*self.model, *effects)))
+        discretisation = "" if run.variant in (*self.albedo_draws, *self.renderings) else run.variant
+        names = tuple(dict.fromkeys((*self.model, *run.effects)))
         if names == self.model and not discretisation:
             return self.base, ""
         resolution = FINER_RESOLUTIONS[discretisation](self.base.resolution) if discretisation else None

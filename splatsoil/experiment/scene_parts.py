@@ -8,11 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from splatsoil.arrays import FloatArray
 from splatsoil.experiment.features import Site
 from splatsoil.measurement import Measurement
 from splatsoil.reconstruction.height_field import HeightField
-
-FloatArray = npt.NDArray[np.float64]
 
 UNDISTURBED = "undisturbed"
 """Region that the tool does not reach."""

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatsoil.errors import ParameterError
+from splatsoil.experiment.base import Run
 from splatsoil.experiment.laboratory import FloatArray, LaboratoryExperiment, SpecimenExperiment
 from splatsoil.experiment.triaxial import SLOW, VOLUME_SPREAD, young_at
 from splatsoil.soil.effect import Effect
@@ -104,14 +105,11 @@ class ReposeExperiment(LaboratoryExperiment):
             np.array([[measured.mean()]]), np.array([[spread]]), (1.0,), "heap at rest", "deg", ("angle",), "heap"
         )
 
-    def readings(
-        self, values: Mapping[str, float], *, effects: Iterable[str] = (), seed: int = 0, variant: str = ""
-    ) -> FloatArray:
+    def readings(self, run: Run) -> FloatArray:
         """(1, 1) degrees; the test is deterministic."""
-        del seed, variant
         sheared = simple_shear(
-            self.law(effects),
-            self.values(values),
+            self.law(run.effects),
+            self.values(run.values),
             confining=self.normal,
             strains=[REPOSE_STRAIN],
             young=young_at(self.normal),

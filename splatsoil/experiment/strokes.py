@@ -6,17 +6,15 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from splatsoil.arrays import FloatArray
 from splatsoil.experiment.forces import SCALE
 from splatsoil.experiment.plow import PlowExperiment, side_by_side
 from splatsoil.experiment.scene_parts import heading_of
 from splatsoil.measurement import Measurement, ToolMotion
 from splatsoil.model import Model
 from splatsoil.soil.effect import Effect
-
-FloatArray = npt.NDArray[np.float64]
 
 MEASURED = "as measured"
 """Name of the measured stroke, repeated in a new bed."""

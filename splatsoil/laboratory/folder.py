@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatsoil.errors import MeasurementError, ParameterError
+from splatsoil.experiment.base import Run
 from splatsoil.experiment.column import Collapse, ColumnExperiment
 from splatsoil.experiment.laboratory import FloatArray, LaboratoryExperiment
 from splatsoil.experiment.plate import GRAVITY, Loading, PlateExperiment
@@ -115,7 +116,7 @@ def simulate(
         raise MeasurementError("is not empty; choose another folder", file=out)
     shape = KINDS[kind].example(out.name or kind, Options(tuple(effects), preset=preset))
     shape.law(()).require_on({**shape.values(values), **_off(shape, values)})
-    description, tables = KINDS[kind].write(shape, shape.readings(values, seed=seed))
+    description, tables = KINDS[kind].write(shape, shape.readings(Run(values, seed=seed)))
     write_text(
         out / EXPERIMENT,
         json.dumps({"format": FORMAT, "kind": kind, "name": out.name or kind, **description}, indent=1) + "\n",

@@ -14,6 +14,7 @@ from splatsoil.envs import measured
 from splatsoil.envs.measured import MeasuredProblem
 
 from splatsoil.errors import MeasurementError, ParameterError, RunError
+from splatsoil.experiment.base import Run
 from splatsoil.experiment.forces import SCALE
 from splatsoil.measurement import Measurement
 from splatsoil.reconstruction import reconstruct
@@ -76,7 +77,7 @@ def test_what_is_left_of_a_measured_force_is_told(plow_dry: Path, reconstruction
     assert predicted[1] == pytest.approx(predicted[0], rel=1e-6, abs=1e-9)
     assert 0.5 * largest[0] < np.abs(predicted[0]).max() < 2.0 * largest[0]
     # What a comparison of models would be told of the same simulation.
-    direct = experiment.predict({"friction_angle": 36.0}, seed=0)
+    direct = experiment.predict(Run({"friction_angle": 36.0}))
     assert problem.features(list(evaluation.blocks))[experiment.seen] == pytest.approx(direct[experiment.seen])
 
 

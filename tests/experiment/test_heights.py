@@ -14,6 +14,7 @@ import torch
 
 from splatsoil.cli import main
 from splatsoil.comparison import Comparator
+from splatsoil.experiment.base import Run
 from splatsoil.experiment.heights import CHANNEL, LEAST_NOISE, UNKNOWN_NOISE, Heights
 from splatsoil.experiment.plow import PlowExperiment
 from splatsoil.measurement import Contents, Frame, HeightMaps, Measurement, write_measurement
@@ -184,7 +185,7 @@ def test_heights_alone_tell_the_angle(scanned: Path) -> None:
     counted = experiment.seen & ~experiment.quiet & placed
 
     def left(angle: float) -> float:
-        tables = [experiment.predict({"friction_angle": angle}, seed=seed) for seed in (0, 1)]
+        tables = [experiment.predict(Run({"friction_angle": angle}, seed=seed)) for seed in (0, 1)]
         return float(np.mean((np.mean(tables, axis=0) - experiment.observed)[counted] ** 2))
 
     assert left(33.0) < min(left(23.0), left(43.0))

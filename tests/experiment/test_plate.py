@@ -7,6 +7,7 @@ import pytest
 from splatsoil.inverse.criticism.diagnosis import SUBSTANTIAL, diagnose
 
 from splatsoil.errors import ParameterError
+from splatsoil.experiment.base import Run
 from splatsoil.experiment.plate import Loading, PlateExperiment
 
 DEPTHS = np.array([0.004, 0.006, 0.008, 0.010, 0.013, 0.016])
@@ -18,7 +19,7 @@ def plate(forces: np.ndarray) -> PlateExperiment:
 
 def test_a_seed_repeats_itself_and_another_one_differs() -> None:
     coarse = plate(np.ones(6))
-    again = [coarse.readings({"friction_angle": 42.0}, seed=seed) for seed in (0, 0, 1)]
+    again = [coarse.readings(Run({"friction_angle": 42.0}, seed=seed)) for seed in (0, 0, 1)]
     assert np.array_equal(again[0], again[1])
     assert not np.array_equal(again[0], again[2])
 
@@ -30,9 +31,7 @@ def test_a_test_without_sense_is_refused() -> None:
 
 
 def test_six_forces_do_not_claim_what_they_cannot_tell() -> None:
-    truth = plate(np.ones(6)).readings({"friction_angle": 33.0, "cohesion": 600.0}, effects=("cohesion",), seed=99)[
-        :, 0
-    ]
+    truth = plate(np.ones(6)).readings(Run({"friction_angle": 33.0, "cohesion": 600.0}, ("cohesion",), 99))[:, 0]
     found = diagnose(plate(truth), {"friction_angle": 33.0})
     # Friction and cohesion both lift the whole curve: nothing is named, and nothing would have been.
     assert found.verdict in ("adequate", "undecided"), found.evidence.probability

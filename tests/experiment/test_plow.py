@@ -79,7 +79,7 @@ def test_soil_prepared_together_is_that_of_single_simulations(model: Model, monk
         run(variant="fine"),
     ]
     unseen = run(effects=("buried_obstacle",), obstacle_radius=0.001)
-    alone = [experiment().prediction(**each.arguments()).trajectory.positions for each in runs]
+    alone = [experiment().prediction(each).trajectory.positions for each in runs]
     assert drawn[:3] == [(0, None, 1.0), (1, None, 1.0), (0, 2, 1.0)]
     prepared = experiment()
     assert prepared.batch_size == 1, "a CPU makes one at a time, and keeps one"
@@ -87,16 +87,16 @@ def test_soil_prepared_together_is_that_of_single_simulations(model: Model, monk
     prepared.prepare([unseen, *runs])
     assert len(prepared._trajectories) == 5
     with pytest.raises(SimulationError, match="no node"):
-        prepared.prediction(**unseen.arguments())
+        prepared.prediction(unseen)
     monkeypatch.delattr(Model, "simulate")
     for each, positions in zip(runs, alone, strict=True):
-        assert np.array_equal(prepared.prediction(**each.arguments()).trajectory.positions, positions)
+        assert np.array_equal(prepared.prediction(each).trajectory.positions, positions)
     different = [alone[0], alone[1], *alone[4:]]
     assert not any(np.array_equal(a, b) for a, b in combinations(different, 2))
     prepared.prepare([run(2)])
     assert len(prepared._trajectories) == 5, "the cache doesn't grow"
     drawn.clear()
-    prepared.prediction(**run(2, variant="rounding").arguments())
+    prepared.prediction(run(2, variant="rounding"))
     assert drawn == [(2, None, 2.0)], "another drawing of the same simulation"
     with pytest.raises(KeyError, match="finer"):
-        prepared.prediction(**run(variant="finer").arguments())
+        prepared.prediction(run(variant="finer"))

@@ -16,6 +16,7 @@ from splatsoil.inverse.criticism.diagnosis import Diagnosis, diagnose
 from splatsoil.inverse.criticism.evidence import BASE_MODEL, DISCREPANCY
 from splatsoil.inverse.criticism.simulations import Simulations
 
+from splatsoil.experiment.base import Run
 from splatsoil.experiment.triaxial import Curve, TriaxialExperiment
 from splatsoil.laboratory.answer import search
 from splatsoil.soil.element import triaxial
@@ -87,7 +88,7 @@ def test_tests_of_one_soil_at_other_densities_and_pressures_make_one_experiment(
     ]
     experiment = TriaxialExperiment(curves, ("critical_state",))
     values = {"friction_angle": 33.0, "stiffness_factor": 2.0, "relative_density": 0.3, "volume_range": 0.2}
-    found = experiment.readings(values)
+    found = experiment.readings(Run(values))
     law = Law(find_effects(("critical_state",)))
     soil = {"friction_angle": 33.0, "relative_density": 0.3 + np.log(1.9 / 1.75) / 0.2, "volume_range": 0.2}
     test = triaxial(law, soil, confining=4e5, strains=-np.log(1.0 - STRAINS), young=8e7, void_ratio=0.75)
@@ -96,4 +97,4 @@ def test_tests_of_one_soil_at_other_densities_and_pressures_make_one_experiment(
     assert [p.name for p in experiment.parameters] == list(values)
     known = TriaxialExperiment(curves, ("critical_state",), known={"relative_density": 0.3, "volume_range": 0.2})
     assert [p.name for p in known.parameters] == ["friction_angle", "stiffness_factor"]
-    np.testing.assert_array_equal(known.readings({"friction_angle": 33.0, "stiffness_factor": 2.0}), found)
+    np.testing.assert_array_equal(known.readings(Run({"friction_angle": 33.0, "stiffness_factor": 2.0})), found)

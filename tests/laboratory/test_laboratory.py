@@ -13,6 +13,7 @@ from splatsoil.benchmarks._validation.plates import meyerhof, vesic
 
 from splatsoil.cli import main
 from splatsoil.errors import MeasurementError, ParameterError
+from splatsoil.experiment.base import Run
 from splatsoil.experiment.column import Collapse, ColumnExperiment
 from splatsoil.experiment.plate import Loading, PlateExperiment
 from splatsoil.experiment.shear_box import ReposeExperiment, ShearBoxExperiment, Shearing
@@ -30,7 +31,7 @@ def test_a_simulated_test_is_read_as_it_was_simulated(kind: str, tmp_path: Path)
     made = simulate(kind, tmp_path / "set", values, (), "tiny", 0)
     read = load(tmp_path / "set", Options(preset="tiny"))
     assert (read.kind, read.layout.shape) == (kind, made.layout.shape)
-    np.testing.assert_allclose(read.observed, read.features(made.readings(values)), rtol=1e-3, atol=2e-2)
+    np.testing.assert_allclose(read.observed, read.features(made.readings(Run(values))), rtol=1e-3, atol=2e-2)
 
 
 def test_an_effect_without_a_size_makes_no_folder(tmp_path: Path) -> None:
@@ -61,10 +62,10 @@ def test_a_shear_box_and_a_slope_fail_by_matsuoka_and_nakai() -> None:
     plane = (critical - 1.0) / (critical + 1.0)
     strain = np.array([0.1, 0.5, 1.0])
     box = ShearBoxExperiment([Shearing("a", strain, np.zeros(3), np.zeros(3), 5e4)])
-    found = box.readings({"friction_angle": 34.0, "stiffness_factor": 5.0})
+    found = box.readings(Run({"friction_angle": 34.0, "stiffness_factor": 5.0}))
     # the intermediate stress is the law's own, not the one of an associated flow
     assert found[-1, 0] == pytest.approx(plane, rel=0.04)
-    slope = ReposeExperiment([30.0]).readings({"friction_angle": 34.0})[0, 0]
+    slope = ReposeExperiment([30.0]).readings(Run({"friction_angle": 34.0}))[0, 0]
     assert math.tan(math.radians(slope)) == pytest.approx(plane, rel=0.04)
     assert slope < 34.0
 
@@ -73,7 +74,7 @@ def test_a_plate_bears_what_theory_says() -> None:
     """Between Vesic's and Meyerhof's bearing capacity, for angles within two degrees."""
     depths = np.arange(1, 13) * 0.02
     plate = PlateExperiment(Loading(0.1, 0.1 * depths, np.ones(12), np.array(0.1)))
-    pressure = plate.readings({"friction_angle": 33.0})[:, 0] / (0.25 * math.pi * 0.01) / (1600 * 9.81 * 0.05)
+    pressure = plate.readings(Run({"friction_angle": 33.0}))[:, 0] / (0.25 * math.pi * 0.01) / (1600 * 9.81 * 0.05)
     for z in (0.12, 0.2):
         mean = pressure[np.abs(depths - z) < 0.05].mean()
         assert vesic(31.0, z) < mean < meyerhof(35.0, z)
@@ -82,7 +83,7 @@ def test_a_plate_bears_what_theory_says() -> None:
 def test_a_column_runs_out_as_in_the_laboratory() -> None:
     """Lube et al. (2004): (R - R0) / R0 = 1.24 a, on sand near its angle of repose of 31 degrees."""
     column = ColumnExperiment(Collapse(0.1, 0.1, np.array([[0.2, 0.05]]), floor_friction=10.0))
-    radius, height = column.readings({"friction_angle": 31.0})[0]
+    radius, height = column.readings(Run({"friction_angle": 31.0}))[0]
     assert radius / 0.1 - 1.0 == pytest.approx(1.24, rel=0.3)
     assert 0.03 < height < 0.1
 

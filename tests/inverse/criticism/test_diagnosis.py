@@ -11,6 +11,7 @@ import pytest
 from splatsoil.inverse.criticism.diagnosis import diagnose, held_out_mask, verdict_of
 from splatsoil.inverse.criticism.record import misfit_of, record
 
+from splatsoil.experiment.base import Run
 from splatsoil.experiment.emulated import EmulatedExperiment
 from splatsoil.files import plain
 
@@ -125,7 +126,7 @@ def test_the_noise_holds_what_seeds_scatter_by(make: Make) -> None:
         experiment = make(discretisation=0.0, seed=seed)
         found = diagnose(experiment, START, effects=False, seed=seed)
         noise = found.evidence.noise
-        drawn = noise.scores(np.array([experiment.predict(START, seed=k) for k in range(5000, 5200)]))
+        drawn = noise.scores(np.array([experiment.predict(Run(START, seed=k)) for k in range(5000, 5200)]))
         ratios.append(np.median((drawn.var(axis=0) + 0.25) / np.diag(noise.fixed)))
         sizes.append(np.sqrt(found.expected[found.mask].mean()))
     # three pairs along two directions: what they differ by scatters

@@ -44,7 +44,7 @@ class Searched:
         """Nothing is drawn."""
 
     def evaluate(self, parameters: Mapping[str, float], seed: int) -> Evaluation:
-        blocks = (self.experiment.observed - self.experiment.predict(parameters, seed=seed)).reshape(-1)
+        blocks = (self.experiment.observed - self.experiment.predict(Run(parameters, seed=seed))).reshape(-1)
         return Evaluation(float(np.mean(blocks**2)), blocks)
 
     def observed_image(self) -> Image:

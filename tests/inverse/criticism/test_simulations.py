@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -37,12 +36,12 @@ class Watched:
         self.calls: list[Mapping[str, float]] = []
         self.prepared: list[Sequence[Run]] = []
 
-    def predict(self, values: Mapping[str, float], **others: Any) -> np.ndarray:
-        self.calls.append(values)
+    def predict(self, run: Run) -> np.ndarray:
+        self.calls.append(run.values)
         time.sleep(0.005)
-        if self.fails(values):
+        if self.fails(run.values):
             raise SimulationError("blew up")
-        return table(values, **others)
+        return table(**vars(run))
 
 
 def simulations(experiment: Watched, folder: Path | None = None) -> Simulations:
