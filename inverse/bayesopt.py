@@ -146,7 +146,7 @@ class Surrogate:
 
         Args:
             count: of them.
-            acquisition: ``noisy`` (log noisy expected improvement: what is best so far is itself uncertain) or
+            acquisition: ``noisy`` (log noisy expected improvement: the best value so far is uncertain) or
                 ``best`` (log expected improvement over the best mean at an evaluated point).
         """
         with _torch(self.seed):

@@ -194,7 +194,7 @@ def evaluate(
 
     Args:
         problem: simulates and compares; begun.
-        jobs: parameters and seeds, no two alike.
+        jobs: different parameters and seeds.
         store: open for writing.
         model: what decides an evaluation besides parameters and seed.
         batch_size: number of simulations in a batch.

@@ -156,12 +156,12 @@ def run_posterior(
         experiment: of the fit's model.
         simulate: its simulations.
         density: of a comparison of that model.
-        checks: simulations at points drawn from the posterior, which test the emulator.
+        checks: number of simulations at draws from the posterior, which test the emulator.
         seed: of chains and checks.
         progress: called with (what, share done).
 
     Returns:
-        What ``posterior.json`` holds.
+        Contents of ``posterior.json``.
 
     Raises:
         RunError: the folder can't be written.

@@ -17,7 +17,8 @@ from splatsoil.inverse.criticism.simulations import Simulations
 
 from splatsoil.errors import MeasurementError
 from splatsoil.experiment.base import Run
-from splatsoil.experiment.triaxial import Curve, TriaxialExperiment
+from splatsoil.experiment.laboratory import Specimen
+from splatsoil.experiment.triaxial import TriaxialExperiment
 from splatsoil.laboratory.answer import diagnosed, search
 from splatsoil.laboratory.folder import read_curve, together
 from splatsoil.report.text import probability, verdict
@@ -39,7 +40,7 @@ HUNDRED = {"pressure_reference": 1e5}
 """The friction angle of a curved envelope is that at 100 kPa, Pa."""
 
 
-def karlsruhe(folder: Path) -> dict[str, Curve]:
+def karlsruhe(folder: Path) -> dict[str, Specimen]:
     """The loose and the dense test, by name.
 
     Raises:
@@ -57,11 +58,11 @@ def karlsruhe(folder: Path) -> dict[str, Curve]:
         table = np.array([[float(row[c]) for c in columns] for row in rows if row["test_id"] == name])[1:]
         radial, axial = 1e3 * table[:, 2], 1e3 * table[:, 3]
         ratio = (axial - radial) / ((axial + 2.0 * radial) / 3.0)
-        out[name] = Curve(name, table[:, 0] / 100.0, table[:, 1] / 100.0, ratio, 1e5, void_ratio=void_ratio)
+        out[name] = Specimen(name, table[:, 0] / 100.0, table[:, 1] / 100.0, ratio, 1e5, void_ratio=void_ratio)
     return out
 
 
-def cullinan(folder: Path) -> dict[str, Curve]:
+def cullinan(folder: Path) -> dict[str, Specimen]:
     """The drained tests, by name.
 
     Raises:
@@ -75,7 +76,7 @@ def cullinan(folder: Path) -> dict[str, Curve]:
 
 
 def calibrated(
-    curves: Sequence[Curve], effects: tuple[str, ...], known: Mapping[str, float] | None = None
+    curves: Sequence[Specimen], effects: tuple[str, ...], known: Mapping[str, float] | None = None
 ) -> dict[str, float]:
     """All parameters of a model, those of least squares and those known, at the first curve's void ratio."""
     experiment = TriaxialExperiment(curves, effects, candidates=(), known=known)
@@ -83,7 +84,7 @@ def calibrated(
     return experiment.values(values)
 
 
-def misfit(curve: Curve, effects: tuple[str, ...], values: Mapping[str, float], before: float) -> FloatArray:
+def misfit(curve: Specimen, effects: tuple[str, ...], values: Mapping[str, float], before: float) -> FloatArray:
     """(2,) root mean squares of q/p and volume strain, in spreads between specimens, by parameters at another void
     ratio."""
     experiment = TriaxialExperiment([curve], effects, candidates=())
@@ -93,7 +94,7 @@ def misfit(curve: Curve, effects: tuple[str, ...], values: Mapping[str, float], 
 
 def from_one_to_another(
     name: str,
-    curves: Mapping[str, Curve],
+    curves: Mapping[str, Specimen],
     fit: Sequence[str],
     ladder: Sequence[tuple[str, ...]],
     known: Mapping[str, float],
@@ -113,7 +114,7 @@ def from_one_to_another(
     return rows
 
 
-def told(name: str, curves: Sequence[Curve], effects: tuple[str, ...]) -> Row:
+def told(name: str, curves: Sequence[Specimen], effects: tuple[str, ...]) -> Row:
     """What a diagnosis says of a model."""
     experiment = TriaxialExperiment(curves, effects)
     found = diagnosed(experiment, None, 0, lambda what, share: None)

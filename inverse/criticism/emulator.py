@@ -55,10 +55,10 @@ class BaseEmulator:
     def predict(self, where: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Mean and variance (q, p) at points (q, n)."""
         square = np.sum(where**2, axis=1)
-        alone = TREND_VARIANCES[0] + TREND_VARIANCES[1] * square + TREND_VARIANCES[2] * square**2 + 1.0
+        prior = TREND_VARIANCES[0] + TREND_VARIANCES[1] * square + TREND_VARIANCES[2] * square**2 + 1.0
         kernels = _base_kernel(self.points, self.points), _base_kernel(where, self.points)
         noise = np.broadcast_to(self.scatter, self.scores.shape)
-        return _regressed(*kernels, alone, self.signal, noise, self.scores)
+        return _regressed(*kernels, prior, self.signal, noise, self.scores)
 
 
 @dataclass(frozen=True)
@@ -98,12 +98,12 @@ class IncrementEmulator:
     def predict(self, where: Points) -> tuple[FloatArray, FloatArray]:
         """Mean and variance (q, p) of the increment."""
         inner, cross = (_increment_kernel(x, self.points, self.lengths) for x in (self.points, where))
-        alone = np.sum(where[1] ** 2, axis=1) / UNIT_SIZE**2
-        return _regressed(inner, cross, alone, self.amplitude, self.noise, self.increments)
+        prior = np.sum(where[1] ** 2, axis=1) / UNIT_SIZE**2
+        return _regressed(inner, cross, prior, self.amplitude, self.noise, self.increments)
 
 
 def _regressed(
-    inner: FloatArray, cross: FloatArray, alone: FloatArray, signal: FloatArray, noise: FloatArray, values: FloatArray
+    inner: FloatArray, cross: FloatArray, prior: FloatArray, signal: FloatArray, noise: FloatArray, values: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Mean and variance (q, p) of Gaussian-process regression: kernels (m, m), (q, m), (q,) times signals (p,), through
     values (m, p) whose noise has a variance (m, p)."""
@@ -112,7 +112,7 @@ def _regressed(
         factor = cho_factor(signal[c] * inner + np.diag(noise[:, c]))
         mean[:, c] = signal[c] * cross @ cho_solve(factor, values[:, c])
         gain = cho_solve(factor, cross.T)
-        variance[:, c] = signal[c] * alone - signal[c] ** 2 * np.einsum("ij,ji->i", cross, gain)
+        variance[:, c] = signal[c] * prior - signal[c] ** 2 * np.einsum("ij,ji->i", cross, gain)
     return mean, np.maximum(variance, 0.0)
 
 

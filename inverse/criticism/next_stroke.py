@@ -255,7 +255,7 @@ def _table(simulate: Simulate, run: Run) -> FloatArray | None:
 
 
 def _range_of(experiment: Experiment, draws: Sequence[Mapping[str, float]]) -> Prior:
-    """The draws' range of the first parameter: scatter is what is left about a trend in it."""
+    """The draws' range of the first parameter: scatter is the residual about a trend in it."""
     first = experiment.parameters[0]
     values = [draw[first.name] for draw in draws]
     low, high = min(values), max(values)

@@ -30,7 +30,7 @@ class Config:
     test: Literal["triaxial", "extension", "simple-shear", "isotropic"] = option(
         "triaxial", "Drained triaxial compression or extension, simple shear, or isotropic compression."
     )
-    confining: float = option(100e3, "Stress at the start, and of what is held, in Pa.")
+    confining: float = option(100e3, "Confining stress in Pa.")
     friction_angle: float = option(35.0, "Of the soil, degrees.")
     effects: tuple[str, ...] = option((), ACTING, name="with", metavar="EFFECT")
     values: tuple[str, ...] = option((), VALUES, name="set", metavar="NAME=VALUE")

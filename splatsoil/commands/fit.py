@@ -18,8 +18,8 @@ INTERRUPTED = _stages.interrupted
 class Config(FitOptions):
     """Estimate the parameters, with their uncertainty.
 
-    A search over simulations, then the posterior, which contains discretisation error and model discrepancy. A fit that
-    was interrupted goes on.
+    A search over simulations, then the posterior, which contains discretisation error and model discrepancy. An
+    interrupted fit continues.
     """
 
 

@@ -26,7 +26,7 @@ class Config(ImportOptions):
 
 
 def run(config: Config) -> int:
-    """Import; MeasurementError for whatever is missing or faulty, with nothing written."""
+    """Import; MeasurementError for missing or faulty input."""
     from splatsoil.importing.build import import_set
 
     if config.needs_clock:

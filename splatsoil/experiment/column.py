@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from splatsoil.arrays import FloatArray
 from splatsoil.errors import ParameterError
 from splatsoil.experiment.base import Run
-from splatsoil.experiment.laboratory import FloatArray, LaboratoryExperiment
+from splatsoil.experiment.laboratory import LaboratoryExperiment
 from splatsoil.experiment.plow import FINER_RESOLUTIONS
 from splatsoil.mpm import PRESETS, Resolution, Solver
 from splatsoil.soil.effect import Effect

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
-from typing import ClassVar, Generic, Protocol, TypeVar
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +22,8 @@ from splatsoil.soil.packing import at_void_ratio
 
 MEMORY = 0.8
 """Correlation of neighbouring readings: the deviation of a specimen persists."""
+SLOW = 1.0e-5
+"""Strain rate of a laboratory test, 1/s."""
 ONE_ANGLE = {"intermediate_share": 1.0}
 """Parameters that are not fitted: the friction angle has the same meaning in every test, see `intermediate_stress`."""
 
@@ -118,25 +121,30 @@ class LaboratoryExperiment(ABC):
         return self.features(self.readings(run))
 
 
-class Specimen(Protocol):
-    """A test of one specimen: stress ratio and volume strain over strain, (n,) each."""
+@dataclass(frozen=True, eq=False)
+class Specimen:
+    """A measured test of one specimen; compression is positive.
 
-    @property
-    def name(self) -> str: ...
-    @property
-    def strain(self) -> FloatArray: ...
-    @property
-    def ratio(self) -> FloatArray: ...
-    @property
-    def volume(self) -> FloatArray: ...
-    @property
-    def void_ratio(self) -> float: ...
+    Attributes:
+        name: of the test.
+        strain: (n,) nominal axial strain, or displacement over height.
+        volume: (n,) nominal volume strain, or loss of height over height.
+        ratio: (n,) q/p, or shear over normal stress.
+        stress: confining, or normal stress, Pa.
+        void_ratio: at the start.
+        strain_rate: 1/s.
+    """
+
+    name: str
+    strain: FloatArray
+    volume: FloatArray
+    ratio: FloatArray
+    stress: float
+    void_ratio: float = 0.8
+    strain_rate: float = SLOW
 
 
-AnySpecimen = TypeVar("AnySpecimen", bound=Specimen)
-
-
-class SpecimenExperiment(LaboratoryExperiment, Generic[AnySpecimen]):
+class SpecimenExperiment(LaboratoryExperiment):
     """Tests of specimens of one soil, and a model of it: the law at a single point; deterministic.
 
     Features are the stress ratio and the volume strain, each in units of its spread between specimens. The elastic
@@ -164,7 +172,7 @@ class SpecimenExperiment(LaboratoryExperiment, Generic[AnySpecimen]):
 
     def __init__(
         self,
-        tests: Sequence[AnySpecimen],
+        tests: Sequence[Specimen],
         effects: Iterable[str | Effect] = (),
         *,
         candidates: Iterable[str | Effect] | None = None,
@@ -187,7 +195,7 @@ class SpecimenExperiment(LaboratoryExperiment, Generic[AnySpecimen]):
         )
 
     @abstractmethod
-    def tested(self, law: Law, values: Mapping[str, float], test: AnySpecimen) -> tuple[FloatArray, FloatArray]:
+    def tested(self, law: Law, values: Mapping[str, float], test: Specimen) -> tuple[FloatArray, FloatArray]:
         """Stress ratio (t,) and logarithmic volume strain (t,), compression positive, of one test."""
 
     def readings(self, run: Run) -> FloatArray:
@@ -197,7 +205,7 @@ class SpecimenExperiment(LaboratoryExperiment, Generic[AnySpecimen]):
             own = at_void_ratio(self.values(run.values), self.tests[0].void_ratio, test.void_ratio)
             ratio, volume = self.tested(law, own, test)
             if not np.all(np.isfinite(ratio)):
-                raise SimulationError(f"the {self.kind} test with {dict(run.values)} came to no finite stress")
+                raise SimulationError(f"the {self.kind} test with {dict(run.values)} gave no finite stress")
             out += [ratio, 1.0 - np.exp(-volume)]
         return np.stack(out, axis=1)
 

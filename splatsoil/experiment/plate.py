@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
+from splatsoil.arrays import FloatArray
 from splatsoil.errors import ParameterError
 from splatsoil.experiment.base import Run
 from splatsoil.experiment.forces import SCALE, compressed
-from splatsoil.experiment.laboratory import FloatArray, LaboratoryExperiment
+from splatsoil.experiment.laboratory import LaboratoryExperiment
 from splatsoil.experiment.plow import FINER_RESOLUTIONS
 from splatsoil.measurement import Bed, Measurement, Tool, ToolMotion
 from splatsoil.mpm import PRESETS, Preset, Resolution, simulate

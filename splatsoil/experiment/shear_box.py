@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
+from splatsoil.arrays import FloatArray
 from splatsoil.errors import ParameterError
 from splatsoil.experiment.base import Run
-from splatsoil.experiment.laboratory import FloatArray, LaboratoryExperiment, SpecimenExperiment
-from splatsoil.experiment.triaxial import SLOW, VOLUME_SPREAD, young_at
+from splatsoil.experiment.laboratory import SLOW, LaboratoryExperiment, Specimen, SpecimenExperiment
+from splatsoil.experiment.triaxial import VOLUME_SPREAD, young_at
 from splatsoil.soil.effect import Effect
 from splatsoil.soil.element import simple_shear
 from splatsoil.soil.law import Law
@@ -26,46 +26,25 @@ REPOSE_STRAIN = 1.0
 GRAVITY = 9.81
 
 
-@dataclass(frozen=True)
-class Shearing:
-    """A measured direct shear test.
-
-    Attributes:
-        name: of the test.
-        strain: displacement over the specimen's height (n,).
-        ratio: shear stress over normal stress (n,).
-        volume: loss of height over the height (n,).
-        normal: stress in Pa.
-        void_ratio: at the start.
-    """
-
-    name: str
-    strain: FloatArray
-    ratio: FloatArray
-    volume: FloatArray
-    normal: float
-    void_ratio: float = 0.8
-
-
-class ShearBoxExperiment(SpecimenExperiment[Shearing]):
+class ShearBoxExperiment(SpecimenExperiment):
     """Shear box tests under constant normal stress, with uniform shear."""
 
     kind = "shear_box"
     spreads = (RATIO_SPREAD, VOLUME_SPREAD)
     strain_name = "displacement over height, %"
 
-    def tested(self, law: Law, values: Mapping[str, float], test: Shearing) -> tuple[FloatArray, FloatArray]:
+    def tested(self, law: Law, values: Mapping[str, float], test: Specimen) -> tuple[FloatArray, FloatArray]:
         """Shear stress over normal stress, and volume strain."""
         found = simple_shear(
             law,
             values,
-            confining=test.normal,
+            confining=test.stress,
             strains=test.strain,
             void_ratio=test.void_ratio,
-            young=young_at(test.normal),
+            young=young_at(test.stress),
             strain_rate=SLOW,
         )
-        return found.shear_stress[0, 1:] / test.normal, found.volume_strain[0, 1:]
+        return found.shear_stress[0, 1:] / test.stress, found.volume_strain[0, 1:]
 
 
 class ReposeExperiment(LaboratoryExperiment):

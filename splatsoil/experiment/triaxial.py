@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
-from splatsoil.experiment.laboratory import FloatArray, SpecimenExperiment
+from splatsoil.arrays import FloatArray
+from splatsoil.experiment.laboratory import Specimen, SpecimenExperiment
 from splatsoil.soil.element import triaxial
 from splatsoil.soil.law import Law
 
@@ -18,8 +18,6 @@ VOLUME_SPREAD = 0.005
 YOUNG, REFERENCE = 2.0e7, 1.0e5
 """Young's modulus in Pa for a stiffness factor of 1 at this confining pressure in Pa; it is proportional to the root of
 the pressure (Hardin & Richart 1963, J. Soil Mech. Found. Div. 89(1))."""
-SLOW = 1.0e-5
-"""Strain rate of a laboratory test, 1/s."""
 
 
 def young_at(stress: float) -> float:
@@ -27,30 +25,7 @@ def young_at(stress: float) -> float:
     return YOUNG * float(np.sqrt(stress / REFERENCE))
 
 
-@dataclass(frozen=True)
-class Curve:
-    """A measured triaxial test; compression is positive.
-
-    Attributes:
-        name: of the test.
-        strain: nominal axial strain (n,).
-        volume: nominal volume strain (n,).
-        ratio: q/p (n,).
-        confining: lateral stress in Pa.
-        strain_rate: of the axial strain, 1/s.
-        void_ratio: at the start.
-    """
-
-    name: str
-    strain: FloatArray
-    volume: FloatArray
-    ratio: FloatArray
-    confining: float
-    strain_rate: float = SLOW
-    void_ratio: float = 0.8
-
-
-class TriaxialExperiment(SpecimenExperiment[Curve]):
+class TriaxialExperiment(SpecimenExperiment):
     """Drained triaxial tests; stress ratios are q/p.
 
     One test does not separate cohesion, friction and rate; a series at several pressures and rates does.
@@ -60,15 +35,15 @@ class TriaxialExperiment(SpecimenExperiment[Curve]):
     spreads = (RATIO_SPREAD, VOLUME_SPREAD)
     strain_name = "axial strain, %"
 
-    def tested(self, law: Law, values: Mapping[str, float], test: Curve) -> tuple[FloatArray, FloatArray]:
+    def tested(self, law: Law, values: Mapping[str, float], test: Specimen) -> tuple[FloatArray, FloatArray]:
         """q/p and volume strain."""
         found = triaxial(
             law,
             values,
-            confining=test.confining,
+            confining=test.stress,
             strains=-np.log(1.0 - test.strain),
             void_ratio=test.void_ratio,
-            young=young_at(test.confining),
+            young=young_at(test.stress),
             strain_rate=test.strain_rate,
         )
         return (found.q / found.p)[0, 1:], found.volume_strain[0, 1:]

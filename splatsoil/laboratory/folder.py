@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,17 +14,15 @@ import numpy.typing as npt
 from splatsoil.errors import MeasurementError, ParameterError
 from splatsoil.experiment.base import Run
 from splatsoil.experiment.column import Collapse, ColumnExperiment
-from splatsoil.experiment.laboratory import FloatArray, LaboratoryExperiment
+from splatsoil.experiment.laboratory import FloatArray, LaboratoryExperiment, Specimen
 from splatsoil.experiment.plate import GRAVITY, Loading, PlateExperiment
-from splatsoil.experiment.shear_box import ReposeExperiment, ShearBoxExperiment, Shearing
-from splatsoil.experiment.triaxial import Curve, TriaxialExperiment
+from splatsoil.experiment.shear_box import ReposeExperiment, ShearBoxExperiment
+from splatsoil.experiment.triaxial import TriaxialExperiment
 from splatsoil.files import write_text
 from splatsoil.measurement.fields import Fields, read_table, read_text
 from splatsoil.measurement.measurement import EXPERIMENT
 from splatsoil.soil.effect import Effect
 from splatsoil.soil.packing import of_limits
-
-AnyTest = TypeVar("AnyTest", Curve, Shearing)
 
 FORMAT = "splatsoil-laboratory/1"
 STRAINS = np.concatenate([np.arange(0.005, 0.0201, 0.005), np.arange(0.03, 0.301, 0.01)])
@@ -194,7 +192,7 @@ def _check_volume(file: Path, column: str, lost: FloatArray) -> None:
         raise MeasurementError(fault, file=file, field=column)
 
 
-def read_curve(file: Path, confining: float, void_ratio: float = 0.8, *, drained: bool = True) -> Curve:
+def read_curve(file: Path, confining: float, void_ratio: float = 0.8, *, drained: bool = True) -> Specimen:
     """A triaxial test's curve at `STRAINS`, as far as it reaches, from a CSV table.
 
     Columns are ``axial_strain_percent``, ``q_kPa`` and ``volume_strain_percent`` or ``void_ratio``; ``p_kPa``, the mean
@@ -225,7 +223,7 @@ def read_curve(file: Path, confining: float, void_ratio: float = 0.8, *, drained
     lost = (table[0, 2] - table[:, 2]) / (1.0 + table[0, 2]) if by_ratio else table[:, 2] / 100.0
     _check_volume(file, volume, lost)
     kept, lost, ratio = _at_strains(file, "a strain of", strain, lost, q / (confining + q / 3.0))
-    return Curve(file.stem, kept, lost, ratio, confining, void_ratio=void_ratio)
+    return Specimen(file.stem, kept, lost, ratio, confining, void_ratio=void_ratio)
 
 
 def _read_triaxial(fields: Fields, folder: Path, options: Options) -> TriaxialExperiment:
@@ -241,7 +239,7 @@ def _read_triaxial(fields: Fields, folder: Path, options: Options) -> TriaxialEx
     return TriaxialExperiment(together(curves), known=_limits(fields, curves[0].void_ratio), **options.model)
 
 
-def together(tests: Sequence[AnyTest]) -> list[AnyTest]:
+def together(tests: Sequence[Specimen]) -> list[Specimen]:
     """Tests at the strains that all of them reach."""
     kept = min((test.strain for test in tests), key=len)
     n = len(kept)
@@ -262,11 +260,11 @@ def _limits(fields: Fields, void_ratio: float) -> dict[str, float]:
     return found
 
 
-def _untested(kind: type[AnyTest], *stresses: float) -> list[AnyTest]:
+def _untested(*stresses: float) -> list[Specimen]:
     """Specimens to a strain of 20 % under stresses in kPa, with nothing measured yet."""
     strains = STRAINS[STRAINS <= 0.2 + 1e-9]
     nothing = np.zeros(len(strains))
-    return [kind(f"{stress:g}kPa", strains, nothing, nothing, 1e3 * stress) for stress in stresses]
+    return [Specimen(f"{stress:g}kPa", strains, nothing, nothing, 1e3 * stress) for stress in stresses]
 
 
 def _write_triaxial(shape: TriaxialExperiment, readings: FloatArray) -> tuple[dict[str, object], dict[str, str]]:
@@ -274,8 +272,8 @@ def _write_triaxial(shape: TriaxialExperiment, readings: FloatArray) -> tuple[di
     for k, curve in enumerate(shape.tests):
         file = f"{curve.name}.csv"
         ratio, volume = readings[:, 2 * k], readings[:, 2 * k + 1]
-        q = curve.confining * ratio / (1.0 - ratio / 3.0)
-        tests.append({"file": file, "confining": curve.confining, "void_ratio": curve.void_ratio, "drained": True})
+        q = curve.stress * ratio / (1.0 - ratio / 3.0)
+        tests.append({"file": file, "confining": curve.stress, "void_ratio": curve.void_ratio, "drained": True})
         tables[file] = _csv(
             {"axial_strain_percent": 100 * curve.strain, "q_kPa": q / 1e3, "volume_strain_percent": 100 * volume}
         )
@@ -293,7 +291,7 @@ def _read_shear_box(fields: Fields, folder: Path, options: Options) -> ShearBoxE
         _check_volume(file, "vertical_displacement_mm", lost)
         what = "a displacement over the height of"
         kept, ratio, lost = _at_strains(file, what, strain, 1e3 * table[:, 1] / normal, lost)
-        found.append(Shearing(file.stem, kept, ratio, lost, normal, test.number("void_ratio", 0.1, 3.0, default=0.8)))
+        found.append(Specimen(file.stem, kept, lost, ratio, normal, test.number("void_ratio", 0.1, 3.0, default=0.8)))
     return ShearBoxExperiment(together(found), known=_limits(fields, found[0].void_ratio), **options.model)
 
 
@@ -301,11 +299,11 @@ def _write_shear_box(shape: ShearBoxExperiment, readings: FloatArray) -> tuple[d
     tests, tables = [], {}
     for k, test in enumerate(shape.tests):
         file = f"{test.name}.csv"
-        tests.append({"file": file, "normal_stress": test.normal, "void_ratio": test.void_ratio})
+        tests.append({"file": file, "normal_stress": test.stress, "void_ratio": test.void_ratio})
         tables[file] = _csv(
             {
                 "displacement_mm": 1e3 * HEIGHT * test.strain,
-                "shear_stress_kPa": readings[:, 2 * k] * test.normal / 1e3,
+                "shear_stress_kPa": readings[:, 2 * k] * test.stress / 1e3,
                 "vertical_displacement_mm": -1e3 * HEIGHT * readings[:, 2 * k + 1],
             }
         )
@@ -433,14 +431,14 @@ def _trials(*keys: str) -> Callable[[LaboratoryExperiment, FloatArray], tuple[di
 KINDS: dict[str, Kind] = {
     "triaxial": Kind(
         _read_triaxial,
-        lambda name, o: TriaxialExperiment(_untested(Curve, 50.0, 100.0, 200.0), **o.model),
+        lambda name, o: TriaxialExperiment(_untested(50.0, 100.0, 200.0), **o.model),
         _write_triaxial,
         ("void_ratio_limits",),
         ("file", "confining", "void_ratio", "drained"),
     ),
     "shear_box": Kind(
         _read_shear_box,
-        lambda name, o: ShearBoxExperiment(_untested(Shearing, 25.0, 50.0, 100.0), **o.model),
+        lambda name, o: ShearBoxExperiment(_untested(25.0, 50.0, 100.0), **o.model),
         _write_shear_box,
         ("height", "void_ratio_limits"),
         ("file", "normal_stress", "void_ratio"),

@@ -17,7 +17,8 @@ from splatsoil.inverse.criticism.evidence import BASE_MODEL, DISCREPANCY
 from splatsoil.inverse.criticism.simulations import Simulations
 
 from splatsoil.experiment.base import Run
-from splatsoil.experiment.triaxial import Curve, TriaxialExperiment
+from splatsoil.experiment.laboratory import Specimen
+from splatsoil.experiment.triaxial import TriaxialExperiment
 from splatsoil.laboratory.answer import search
 from splatsoil.soil.element import triaxial
 from splatsoil.soil.law import Law
@@ -28,7 +29,7 @@ KARLSRUHE = Path(MEASURED) / "karlsruhe_triaxial" / "tmd2_loose_tmd22_dense_subs
 STRAINS = np.concatenate([np.linspace(0.005, 0.02, 4), np.linspace(0.03, 0.2, 18)])
 
 
-def criticised(curve: Curve) -> Diagnosis:
+def criticised(curve: Specimen) -> Diagnosis:
     experiment = TriaxialExperiment([curve])
     simulations = Simulations(experiment)
     values, known = search(experiment, simulations, 0, lambda what, share: None)
@@ -41,7 +42,7 @@ def effects(found: Diagnosis) -> dict[str, float]:
     return dict(sorted(known.items(), key=lambda item: -item[1]))
 
 
-def made(effects: tuple[str, ...], values: dict[str, float]) -> Curve:
+def made(effects: tuple[str, ...], values: dict[str, float]) -> Specimen:
     """A specimen of a known law with readings as a laboratory's."""
     test = triaxial(
         Law(find_effects(effects)), values, confining=1e5, strains=-np.log(1.0 - STRAINS), young=2e7, void_ratio=0.8
@@ -49,7 +50,7 @@ def made(effects: tuple[str, ...], values: dict[str, float]) -> Curve:
     generator = np.random.default_rng(0)
     ratio = (test.q / test.p)[0, 1:] + 0.005 * generator.normal(size=STRAINS.size)
     volume = 1.0 - np.exp(-test.volume_strain[0, 1:]) + 0.0005 * generator.normal(size=STRAINS.size)
-    return Curve("made", STRAINS, volume, ratio, 1e5)
+    return Specimen("made", STRAINS, volume, ratio, 1e5)
 
 
 def test_sand_of_the_base_law_is_not_said_to_miss_anything() -> None:
@@ -83,8 +84,8 @@ def test_effects_that_dilate_are_the_likeliest_on_dense_real_sand_and_not_on_loo
 def test_tests_of_one_soil_at_other_densities_and_pressures_make_one_experiment() -> None:
     """Each is the element test at its own void ratio; parameters are those of the first."""
     curves = [
-        Curve("loose", STRAINS, np.zeros(22), np.zeros(22), 1e5, void_ratio=0.9),
-        Curve("dense", STRAINS, np.zeros(22), np.zeros(22), 4e5, void_ratio=0.75),
+        Specimen("loose", STRAINS, np.zeros(22), np.zeros(22), 1e5, void_ratio=0.9),
+        Specimen("dense", STRAINS, np.zeros(22), np.zeros(22), 4e5, void_ratio=0.75),
     ]
     experiment = TriaxialExperiment(curves, ("critical_state",))
     values = {"friction_angle": 33.0, "stiffness_factor": 2.0, "relative_density": 0.3, "volume_range": 0.2}

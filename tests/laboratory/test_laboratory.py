@@ -15,8 +15,9 @@ from splatsoil.cli import main
 from splatsoil.errors import MeasurementError, ParameterError
 from splatsoil.experiment.base import Run
 from splatsoil.experiment.column import Collapse, ColumnExperiment
+from splatsoil.experiment.laboratory import Specimen
 from splatsoil.experiment.plate import Loading, PlateExperiment
-from splatsoil.experiment.shear_box import ReposeExperiment, ShearBoxExperiment, Shearing
+from splatsoil.experiment.shear_box import ReposeExperiment, ShearBoxExperiment
 from splatsoil.laboratory.answer import fitted
 from splatsoil.laboratory.folder import KINDS, Options, load, read_curve, simulate
 
@@ -61,7 +62,7 @@ def test_a_shear_box_and_a_slope_fail_by_matsuoka_and_nakai() -> None:
     critical = ratio[np.argmin(np.abs(surface - constant))]
     plane = (critical - 1.0) / (critical + 1.0)
     strain = np.array([0.1, 0.5, 1.0])
-    box = ShearBoxExperiment([Shearing("a", strain, np.zeros(3), np.zeros(3), 5e4)])
+    box = ShearBoxExperiment([Specimen("a", strain, np.zeros(3), np.zeros(3), 5e4)])
     found = box.readings(Run({"friction_angle": 34.0, "stiffness_factor": 5.0}))
     # the intermediate stress is the law's own, not the one of an associated flow
     assert found[-1, 0] == pytest.approx(plane, rel=0.04)
