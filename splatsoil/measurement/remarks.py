@@ -113,8 +113,6 @@ def _on_tool(measurement: Measurement) -> Iterator[str]:
     if touching < 0.5:
         yield f"The tool is in the soil's box in only {100.0 * touching:.0f} % of the rows of its motion."
     steps = np.linalg.norm(np.diff(motion.positions, axis=0), axis=1)
-    if steps.sum() == 0.0 and not np.abs(np.diff(motion.quaternions, axis=0)).max():
-        yield "The tool never moves."
     if (np.abs(motion.quaternions[:, 3]) > np.sqrt(0.5)).all():
         # A half turn about the vertical, or no turn in another order: neither can be ruled out.
         yield "All of the tool's quaternions are large in qz, their last number; is their order x, y, z, w?"
