@@ -153,9 +153,9 @@ def _on_force(measurement: Measurement) -> Iterator[str]:
     weight = measurement.bed.density * float(np.linalg.norm(measurement.gravity))
     weight *= float(np.sort(measurement.tool.mesh.extents)[1]) ** 3
     if not np.isin(moving, force[:, 0]).any():
-        yield "The tool's force was measured in no frame in which the tool moves; it tells nothing."
+        yield "The tool's force was measured in no frame in which the tool moves; it has no information."
     elif not largest > 0.0:
-        yield "The tool's force is 0 throughout; it tells nothing."
+        yield "The tool's force is 0 throughout; it has no information."
     elif not _FORCES[0] < largest / weight < _FORCES[1]:
         yield (
             f"The tool's force reaches {largest:.2g} N, where a cube of soil as wide as the tool weighs"
