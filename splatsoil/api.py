@@ -64,7 +64,7 @@ class Run:
 
     @property
     def data(self) -> RunData:
-        """Everything that the folder's files say; read anew each time."""
+        """The contents of the folder's files, read anew each time."""
         from splatsoil.report.data import load
 
         return load(self.path)
@@ -193,7 +193,7 @@ class Run:
 
 
 def load(folder: PathLike) -> Measurement:
-    """Read and validate a measurement set; MeasurementError says what is wrong with it, with file and field."""
+    """Read and validate a measurement set; MeasurementError names file and field of what is wrong."""
     from splatsoil.measurement import Measurement
 
     return Measurement.load(folder)
@@ -218,7 +218,7 @@ def simulate(
     views: int | None = None,
     picture_scale: float = 1.0,
 ) -> Measurement:
-    """Make a synthetic measurement set of known soil in a new folder; its ``truth.json`` says the parameters.
+    """Make a synthetic measurement set of known soil in a new folder; ``truth.json`` has the parameters.
 
     Args:
         out: the new folder.

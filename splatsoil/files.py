@@ -20,10 +20,10 @@ import numpy as np
 
 from splatsoil.errors import RunError
 
-#: Most bytes that an archive of a set or a run folder unpacks to: twenty times what the finest preset leaves.
+#: Most bytes that an archive of a set or a run folder unpacks to: twenty times those of the finest preset.
 MOST_UNPACKED = 2**30
 _HIDDEN = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
-#: What helps where a file is damaged that is made anew when it isn't there.
+#: Remedy for a damaged file that a command makes anew.
 ANEW = "delete it and run the command again"
 
 
@@ -58,7 +58,7 @@ def write_bytes(path: str | Path, data: bytes) -> Path:
 
 
 def check_folder(path: str | Path) -> None:
-    """See that results can go into a folder, which need not exist yet, before hours are spent on them; leaves nothing.
+    """See that results can go into a folder, which need not exist yet, before hours are spent on them; writes nothing.
 
     Raises:
         RunError: a file is in the way, the folder is a measurement set, or it can't be written to.
@@ -75,7 +75,7 @@ def check_folder(path: str | Path) -> None:
     there = next(place for place in (folder, *folder.parents) if place.exists())
     if not there.is_dir():
         raise RunError(f"{path}: {there} is a file and no folder; choose another folder for the result")
-    # By trying: permissions tell nothing to root, nor of folders that no one may write to.
+    # By trying: permissions do not apply to root, nor to read-only file systems.
     try:
         with tempfile.TemporaryDirectory(dir=there):
             pass

@@ -14,7 +14,7 @@ _KERNELS = 2**20  # bytes, about what one of Warp's compiled modules takes
 
 
 def hush() -> None:
-    """Keep Warp from telling which kernels it loads, and that it found no GPU.
+    """Silence Warp's messages on kernels it loads and GPUs it lacks.
 
     Where its folder for compiled kernels can't be written to, they go into one that ends with the process.
 
@@ -24,7 +24,7 @@ def hush() -> None:
     import warp
 
     warp.config.log_level = warp.LOG_ERROR
-    # That there is no GPU it tells below Python, whatever the level.
+    # The message that there is no GPU is written below Python, at any level.
     sys.stderr.flush()
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:

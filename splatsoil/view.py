@@ -134,7 +134,7 @@ class Viewer:
         self.show()
 
     def show(self) -> None:
-        """Bring the scene to what the controls say."""
+        """Update the scene by the controls."""
         with self._lock, self.server.atomic():
             frame = self.frames[self.slider.value]
             moment = frame / self.measurement.frame_rate
@@ -160,7 +160,7 @@ class Viewer:
                 node.visible = self.photographs.value
 
     def play(self) -> None:
-        """Move from frame to frame while the control says so; never returns."""
+        """Move from frame to frame while the control is on; never returns."""
         while True:
             time.sleep(PAUSE)
             if self.playing.value:
@@ -218,7 +218,7 @@ class Viewer:
         }
 
     def _add_camera(self, name: str, camera: Camera, picture: Bytes, scale: float) -> Any:
-        """A frustum with its picture, through which a click looks. That its axis pierces the middle is viser's idea."""
+        """A frustum with its image; a click moves the viewer's camera there. viser centres the principal point."""
         opencv = camera.camera_to_world[:3, :3] * [1.0, -1.0, -1.0]
         shape = 2.0 * math.atan(0.5 * camera.height / camera.fy), camera.width / camera.height
         pose: dict[str, Any] = {"wxyz": _quaternion(opencv), "position": camera.position}

@@ -558,10 +558,13 @@ SCALED = ["--scale", "1", "--up", "0", "0", "1"]
         ([], "no scale is given"),
         (["--scale", "1", "--known", "known.csv"], "--scale and --known contradict"),
         (["--scale", "0", "--up", "0", "0", "1"], "positive number of metres"),
-        (["--scale", "1"], "COLMAP doesn't know which way is up"),
+        (["--scale", "1"], "COLMAP does not define which way is up"),
         (["--scale", "1", "--up", "0", "0", "0"], "up is a direction"),
         (["--known", "known.csv"], "--known: needs --points"),
-        (["--known", "known.csv", "--points", "marks.csv", "--up", "0", "0", "1"], "--up: the known points tell it"),
+        (
+            ["--known", "known.csv", "--points", "marks.csv", "--up", "0", "0", "1"],
+            "--up: the known points determine it",
+        ),
         (
             ["--distance", "p0", "nowhere", "1", "--points", "marks.csv", "--up", "0", "0", "1"],
             "'nowhere' is not marked",
@@ -646,5 +649,5 @@ def test_the_clock_of_a_box_that_crosses_the_picture() -> None:
 
 
 def test_no_clock_is_told_from_noise() -> None:
-    with pytest.raises(MeasurementError, match="cannot be told from what is behind it"):
+    with pytest.raises(MeasurementError, match="colours of what is behind it"):
         clock_offset(*([one] if isinstance(one, Footage) else one for one in footage(shown=False)))

@@ -1,4 +1,4 @@
-"""A simulation at known parameters, moment by moment, with everything that the solver knows of its particles."""
+"""A simulation at known parameters, moment by moment, with all fields of the solver's particles."""
 
 from __future__ import annotations
 

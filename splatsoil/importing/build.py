@@ -39,7 +39,7 @@ FloatArray = npt.NDArray[np.float64]
 PRE_ROLL = 8
 """Frames before anything moves that are kept of a video, at most: they measure the noise."""
 LOOKED_AT = 60
-"""Pictures of each video that its clock is told from."""
+"""Images of each video that its clock is estimated from."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Imported:
         marks: root mean square of the marked points' distance from their pixels, px.
         points: the same of the known points, m; None without any.
         frames: of the video, by camera.
-        clock: of the video, where it was told from the pictures.
+        clock: of the video, if it was estimated from the images.
         tags: the tool's motion by its tags, where that is the one.
         missing: parts that a set needs and this lacks.
     """
@@ -125,7 +125,9 @@ def _filled(root: Path, options: ImportOptions, report: Report) -> Imported:
     clock, offset = None, options.clock_offset or 0.0
     if options.needs_clock and motion is not None:
         if mesh is None:
-            raise MeasurementError("the clock's offset is told from the tool's mesh; give --tool or --clock-offset")
+            raise MeasurementError(
+                "the clock's offset is estimated with the tool's mesh; give --tool or --clock-offset"
+            )
         report("finding the clock's offset", 0.1)
         clock = clock_offset([_footage(video, cameras[name]) for name, video in videos.items()], mesh, motion)
         offset = clock.seconds
@@ -168,16 +170,16 @@ def _similarity(source: Source, options: ImportOptions) -> tuple[FloatArray, flo
         what = f"{' and '.join(given)} contradict each other" if given else "no scale is given"
         raise MeasurementError(f"{what}; give one of --scale, --distance, --tags and --known")
     if given[0] in ("--distance", "--known") and options.points is None:
-        raise MeasurementError(f"{given[0]}: needs --points, which say where these points are in the source")
+        raise MeasurementError(f"{given[0]}: needs --points, the places of these points in the source")
     marked = None if options.points is None else read_marked(options.points, source.frames)
     if options.known is not None:
         if options.up is not None:
-            raise MeasurementError("--up: the known points tell it; leave it out")
+            raise MeasurementError("--up: the known points determine it; leave it out")
         assert marked is not None
         similarity, left = by_known_points(marked.places, read_points(options.known))
         return similarity, marked.error, left
     if options.up is None and not source.has_up:
-        raise MeasurementError(f"{source.kind} doesn't know which way is up; give --up or --known")
+        raise MeasurementError(f"{source.kind} does not define which way is up; give --up or --known")
     if options.tags is not None:
         scale, marked = tag_scale(source.frames, options.tags)
     elif options.distance is not None:
@@ -193,7 +195,7 @@ def _mesh(file: Path, unit: str) -> Any:
     mesh = read_mesh(file)
     told = mesh.units is not None
     if told and unit != "m":
-        raise MeasurementError(f"the file itself tells its unit, and was read in metres; say m, not {unit}", file=file)
+        raise MeasurementError(f"the file has its own unit and was read in metres; give m, not {unit}", file=file)
     return mesh if told else mesh.apply_scale(metres(unit, file))
 
 

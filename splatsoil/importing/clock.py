@@ -1,12 +1,10 @@
-"""How far the video's clock is off the tool's: where the tool would be seen, against what is seen there.
+"""The offset between the clocks of video and tool, by where the tool is seen.
 
-Coarsely: at the right offset a pixel's colour tells best whether the tool covers it. The mutual information between the
-two is maximised (Viola & Wells 1997, Int. J. Comput. Vis. 24:137). It needs no colour of the tool. What soil hides of
-the tool biases it by milliseconds: a tool that has sunk less, or has less soil before it, is hidden less.
+Coarsely, the mutual information of a pixel's colour and its cover by the tool is maximised (Viola & Wells 1997, Int. J.
+Comput. Vis. 24:137). The tool's colour need not be known. Occlusion by soil biases the offset by milliseconds.
 
-Finely: a place on the tool keeps its colour, wherever the tool goes. The mean absolute deviation of places' colours
-from their medians over the video is minimised. What soil hides for a time is an outlier at any offset. Pictures are
-compared with pictures: an error of the camera's place, which shifts all of them alike, does not count.
+Finely, the mean absolute deviation of the colours of places on the tool from their medians over the video is minimised.
+Occlusion is an outlier at any offset. Images are compared with images, so that an error of the camera's pose cancels.
 """
 
 from __future__ import annotations
@@ -38,8 +36,8 @@ STEP = 0.25
 RESTING = 0.01
 """Of the largest speed: a tool that is no faster rests."""
 LEAST_SHARE = 0.1
-"""Of what is unknown of a pixel's cover, its colour must tell this share at least (uncertainty coefficient: Theil 1970,
-Am. J. Sociol. 76:103); of noise it tells a few hundredths, as histograms have few entries."""
+"""Least uncertainty coefficient (Theil 1970, Am. J. Sociol. 76:103) of a pixel's cover by its colour. Noise has a few
+hundredths, because histograms have few entries."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +69,7 @@ class ClockOffset:
 
 
 class _FilmedTool:
-    """One camera's pictures, cut to where the tool ever is."""
+    """One camera's pictures, cropped to where the tool is at any time."""
 
     def __init__(self, footage: Footage, mesh: trimesh.Trimesh, motion: ToolMotion) -> None:
         from splatsoil.scene import ToolBody
@@ -164,7 +162,9 @@ def clock_offset(footage: Sequence[Footage], mesh: trimesh.Trimesh, motion: Tool
     found = np.array([np.sum([w.information(offset) for w in cameras], axis=0) for offset in offsets])
     best = int(found[:, 0].argmax())
     if not found[best, 0] > LEAST_SHARE * found[best, 1]:
-        raise MeasurementError("the tool cannot be told from what is behind it; give --clock-offset in seconds")
+        raise MeasurementError(
+            "the tool has the colours of what is behind it, so no offset is found; give --clock-offset in seconds"
+        )
 
     def refined(*chosen: _FilmedTool) -> float:
         result = minimize_scalar(

@@ -12,7 +12,7 @@ from splatsoil.options import argument, option
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """What is imported; one of `scale`, `distance`, `tags` and `known` says how the source's world becomes metres."""
+    """What is imported; one of `scale`, `distance`, `tags` and `known` determines the scale."""
 
     source: Path = argument("transforms.json, or the folder of it or of a COLMAP model; of photographs, with --sfm.")
     out: Path = argument("Folder of the new set, or of parts of one; new or empty.")
@@ -66,5 +66,5 @@ class ImportOptions:
 
     @property
     def needs_clock(self) -> bool:
-        """Whether the video's clock is to be told from its pictures."""
+        """Whether the video's clock is estimated from its images."""
         return bool(self.video) and self.motion is not None and self.clock_offset is None

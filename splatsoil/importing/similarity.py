@@ -21,7 +21,7 @@ Marks = dict[str, list[tuple[Frame, FloatArray]]]
 
 _PARALLEL = 1e-4  # squared sine of the angle between rays that meet nowhere in particular
 _UNLIKE = 0.1  # of known points' spread about their middle: what no survey is off by
-_FLAT = 1e-3  # of known points' spread along one line, across it: they tell no turn about it
+_FLAT = 1e-3  # of known points' spread along one line, across it: they determine no rotation about it
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ class Source:
     Attributes:
         frames: photographs with cameras, in the source's own world and unit.
         kind: which of the formats it is, for people.
-        has_up: whether the format says that z is up.
+        has_up: whether z is up in the format.
     """
 
     frames: tuple[Frame, ...]
@@ -76,7 +76,7 @@ def _images_of(model: Path) -> Path:
     for name in IMAGE_FOLDERS:
         if (model / name).is_dir():
             return model / name
-    raise MeasurementError("no folder images beside the model; say where its photographs are by --images", file=model)
+    raise MeasurementError("no folder images beside the model; give their folder by --images", file=model)
 
 
 def find_image(frames: Sequence[Frame], name: str) -> Frame:

@@ -20,7 +20,7 @@ class Video:
 
     Attributes:
         path: the file.
-        rate: frames a second, as the file tells.
+        rate: frames a second, by the file.
         size: width and height, px.
         count: of its frames.
     """
@@ -53,7 +53,7 @@ class Video:
             raise MeasurementError("cannot be read as a video; is it what its name says?", file=path) from error
         width, height = facts["size"]
         if not facts["fps"] > 0.0 or count < 1:
-            raise MeasurementError("the video tells no frame rate, or has no frames", file=path)
+            raise MeasurementError("the video has no frame rate or no frames", file=path)
         return cls(path, float(facts["fps"]), (int(width), int(height)), int(count))
 
     def pictures(self, wanted: set[int]) -> Iterator[tuple[int, Picture]]:

@@ -1,1 +1,1 @@
-"""Tests of a laboratory without cameras: folders that hold them, and the parameters they tell."""
+"""Laboratory tests without cameras: their folders, and estimates of parameters from them."""

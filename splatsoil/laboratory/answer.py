@@ -1,4 +1,4 @@
-"""What a test tells: the parameters of a model, and how probable each model is, by the comparison that pictures get."""
+"""Estimates from a laboratory test: parameters of a model, and the probability of each model, as with images."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Report = Callable[[str, float], None]
 
 
 def fitted(experiment: LaboratoryExperiment, folder: Path | None, seed: int, report: Report) -> dict[str, Any]:
-    """The parameters of the model as it is, with their uncertainty, and whether it leaves more than noise."""
+    """The parameters of the model as it is, with their uncertainty, and whether its residual is more than noise."""
     return _compared(experiment, folder, seed, report, effects=False)
 
 

@@ -49,8 +49,8 @@ et al. 2004, J. Fluid Mech. 508:175)."""
 DENSITIES = (-0.25, 1.25)
 """Relative densities that are poured or tamped, beyond those of index tests."""
 TRIALS_DIFFER = 0.1
-"""Standard deviation of a plate's force between trials, relative, where there are too few to tell: the nine trials of
-Pavlov & Johnson (github.com/robomechanics/3d-terramechanics) differ by 5 to 21 % from least to most."""
+"""Relative standard deviation of a plate's force between trials, where too few estimate it: the nine trials
+of Pavlov & Johnson (github.com/robomechanics/3d-terramechanics) have ranges of 5 to 21 %."""
 
 
 @dataclass(frozen=True)

@@ -53,7 +53,7 @@ class Camera:
         cx: principal point, x in pixels from the image's left edge.
         cy: principal point, y in pixels from the image's top edge.
         camera_to_world: (4, 4) float64 rigid motion, OpenGL axes, metres.
-        k1, k2, k3, k4, p1, p2: distortion, as the module says.
+        k1, k2, k3, k4, p1, p2: distortion, by the module's formulas.
         name: what the measurement set calls it; may be empty.
         model: one of CAMERA_MODELS.
     """

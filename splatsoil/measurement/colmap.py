@@ -158,7 +158,7 @@ class _Bytes:
         self.file, self.data, self.at = file, file.read_bytes(), 0
 
     def skip(self, count: int) -> int:
-        """Go on by so many bytes, and say from where."""
+        """Move on by so many bytes; returns the position before."""
         if self.at + count > len(self.data):
             raise MeasurementError("the file is truncated", file=self.file, field=f"byte {len(self.data)}")
         self.at += count

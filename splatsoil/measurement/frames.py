@@ -44,7 +44,7 @@ class Frame:
     Attributes:
         camera: calibration and pose.
         path: the image file.
-        camera_name: which camera took it; empty where the set does not say.
+        camera_name: which camera took it; empty if the set has no name for it.
         frame: its number on the tool motion's clock, negative before the motion (pre-roll), None for views.
         time: seconds on that clock, None for views.
         mask_path: image that is dark where pixels are to be ignored, or None.
@@ -222,7 +222,7 @@ def read_camera(fields: Fields, name: str, size: tuple[int, int] | None = None) 
         model=model,
     )
     if not np.isfinite(camera.rays([[camera.cx, camera.cy]])[1]).all():
-        fields.fail("k1", "the distortion leaves no image, not even at the principal point")
+        fields.fail("k1", "no ray is distorted to the principal point; check the coefficients")
     return camera
 
 

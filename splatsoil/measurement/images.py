@@ -30,7 +30,7 @@ def check_image(path: Path, size: tuple[int, int], *, sizes_from: str, field: st
     Args:
         path: the image file.
         size: (width, height) in pixels.
-        sizes_from: what told the size, for the message.
+        sizes_from: where the size is from, for the message.
         field: what named the file, for the message.
     """
     with _checked(path, size, sizes_from, field):
@@ -68,7 +68,7 @@ def _checked(path: Path, size: tuple[int, int], sizes_from: str, field: str | No
 
 
 def check_photograph(path: Path, size: tuple[int, int], *, sizes_from: str, field: str | None = None) -> None:
-    """`check_image`, and that the image shows something: a black, white or grey one tells nothing.
+    """`check_image`, and that the image shows something: a uniform one has no information.
 
     Raises:
         MeasurementError: naming file and field.
@@ -122,7 +122,7 @@ def read_mask(path: Path, field: str | None = None) -> npt.NDArray[np.bool_]:
 
 
 def read_alpha(path: Path) -> npt.NDArray[np.bool_] | None:
-    """Where an image is opaque by half or more: (height, width) bool; None where it knows no transparency.
+    """Where an image is opaque by half or more: (height, width) bool; None without transparency.
 
     Transparency is an alpha channel, a palette's, or that of one colour (PNG's tRNS).
     """
@@ -138,7 +138,7 @@ def read_alpha(path: Path) -> npt.NDArray[np.bool_] | None:
 def read_depth(path: Path, field: str | None = None, *, scale: float = 1e-3) -> FloatImage:
     """Depths of an image or a .npy file: (height, width) float32 metres, 0 where unknown.
 
-    Whole numbers are millimetres, as in nerfstudio's 16-bit images, or what ``scale`` in m says; floating-point ones
+    Whole numbers are millimetres, as in nerfstudio's 16-bit images, or multiples of ``scale`` in m; floating-point ones
     are metres. What is not positive, or not finite, is unknown.
 
     Raises:

@@ -372,6 +372,8 @@ def _check_tool(measurement: Measurement) -> None:
                 file=tool.mesh_path if large else motion,
                 field="vertices" if large else "x,y,z",
             )
+    if not (np.ptp(tool.motion.positions, axis=0).any() or np.ptp(tool.motion.quaternions, axis=0).any()):
+        raise MeasurementError("the tool never moves, so that nothing can be fitted", file=motion, field="x,y,z")
     ways = np.linalg.norm(np.diff(tool.motion.positions, axis=0), axis=1)
     fastest = float((ways / np.diff(tool.motion.times)).max())
     if fastest > _FASTEST_TOOL:

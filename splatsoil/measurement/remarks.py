@@ -113,8 +113,6 @@ def _on_tool(measurement: Measurement) -> Iterator[str]:
     if touching < 0.5:
         yield f"The tool is in the soil's box in only {100.0 * touching:.0f} % of the rows of its motion."
     steps = np.linalg.norm(np.diff(motion.positions, axis=0), axis=1)
-    if steps.sum() == 0.0 and not np.abs(np.diff(motion.quaternions, axis=0)).max():
-        yield "The tool never moves."
     if (np.abs(motion.quaternions[:, 3]) > np.sqrt(0.5)).all():
         # A half turn about the vertical, or no turn in another order: neither can be ruled out.
         yield "All of the tool's quaternions are large in qz, their last number; is their order x, y, z, w?"
@@ -155,9 +153,9 @@ def _on_force(measurement: Measurement) -> Iterator[str]:
     weight = measurement.bed.density * float(np.linalg.norm(measurement.gravity))
     weight *= float(np.sort(measurement.tool.mesh.extents)[1]) ** 3
     if not np.isin(moving, force[:, 0]).any():
-        yield "The tool's force was measured in no frame in which the tool moves; it tells nothing."
+        yield "The tool's force was measured in no frame in which the tool moves; it has no information."
     elif not largest > 0.0:
-        yield "The tool's force is 0 throughout; it tells nothing."
+        yield "The tool's force is 0 throughout; it has no information."
     elif not _FORCES[0] < largest / weight < _FORCES[1]:
         yield (
             f"The tool's force reaches {largest:.2g} N, where a cube of soil as wide as the tool weighs"

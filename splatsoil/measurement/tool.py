@@ -67,7 +67,7 @@ def read_mesh(file: Path) -> trimesh.Trimesh:
     """A closed mesh in metres with outward faces, on each of its bodies, from a file of one of the types `FORMATS`.
     Nothing that the file names is read.
 
-    Corners that differ by texture or normal alone are joined, and units that the file tells (3MF does) converted.
+    Corners that differ by texture or normal alone are joined, and units that the file has (3MF) converted.
     Bodies may touch.
 
     Raises:

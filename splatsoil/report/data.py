@@ -1,4 +1,4 @@
-"""What a run folder holds, read for showing. Only files: this knows nothing of how a fit is made."""
+"""Contents of a run folder, read from its files alone."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class RunData:
         history: models tried by adding effects, the first one first.
         reconstruction: ``reconstruction/reconstruction.json``.
         surface: the reconstructed surface.
-        truth: true values of the latest fit's parameters by name, where the set is simulated and says them.
+        truth: true values of the latest fit's parameters by name, where the set is simulated and has them.
     """
 
     folder: Path
@@ -115,7 +115,7 @@ ELSEWHERE = {"friction_angle": "phi", "tool_friction": "tool_mu"}
 
 
 def true_values(folder: str | Path, names: Iterable[str]) -> dict[str, float]:
-    """What the ``truth.json`` of a simulated set says of parameters, in their units; only those that it says."""
+    """True parameters by a simulated set's ``truth.json``, in their units; only those that it has."""
     try:
         said = read_json(Path(folder) / "truth.json")
     except RunError:  # measured sets have none

@@ -1,6 +1,6 @@
 """Figures as SVG whose colours are the page's CSS variables, so that they follow its light or dark theme.
 
-Each says in words what it shows, for who cannot see it.
+Each has a text alternative.
 """
 
 from __future__ import annotations

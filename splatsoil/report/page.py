@@ -128,7 +128,7 @@ def _corner(data: RunData) -> str:
 
 
 def _findings(data: RunData, judged: Mapping[str, Any] | None) -> list[dict[str, Any]]:
-    """What the diagnosis says, and what a comparison says of the latest fit where the diagnosis is of a smaller one."""
+    """Verdicts of the diagnosis, and of the latest fit's comparison where the diagnosis is of a smaller model."""
     out = []
     if data.diagnosis is not None:
         named = data.diagnosis["class"] if data.diagnosis["verdict"] in ("missing", "one of") else ()

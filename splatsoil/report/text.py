@@ -1,4 +1,4 @@
-"""The report's sentences. Each says no more than the numbers do."""
+"""The report's sentences."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def answers(
     there, else as fitted.
 
     Each has a ``name`` ("friction angle"), a ``number`` ("35.6 ± 0.8°"), a ``state`` (``determined``, ``bound`` or
-    ``open``), a ``remark`` where that isn't ``determined``, and the ``truth`` ("36.0°") where a simulated set says it.
+    ``open``), a ``remark`` where that isn't ``determined``, and the ``truth`` ("36.0°") where a simulated set has it.
     """
     out, better = [], averaged(fit, judged)
     for name, entry in fit["parameters"].items():
@@ -73,7 +73,7 @@ def answers(
         if not told["determined"]:
             state, remark = "open", undetermined(name)
             if fit["estimated_from"] == "loss" and name not in better:
-                remark = f"These evaluations do not determine the {plain}: they hardly say where the loss is least."
+                remark = f"These evaluations do not determine the {plain}: the loss hardly varies over the range."
         elif entry["at_bound"] is not None:
             state = "bound"
             remark = (
@@ -122,7 +122,7 @@ def averaged_sentence(estimates: Mapping[str, Mapping[str, Any]]) -> str:
 
 def undetermined(name: str) -> str:
     """Of a parameter that the data leave open."""
-    return f"The data do not determine the {name.replace('_', ' ')}: the bounds of its range say about as much."
+    return f"The data do not determine the {name.replace('_', ' ')}: its standard deviation is about that of its range."
 
 
 def fitted_sentence(fit: Mapping[str, Any], judged: Mapping[str, Any] | None) -> str:

@@ -404,6 +404,8 @@ CASES: dict[str, tuple[Spoil, str, str | None, str]] = {
     "frame-rate-of-50-000": (edit(SET, "frame_rate", to=50_000), SET, "frame_rate", "where 50000 frames a second"),
     "all-a-thousand-times-as-fast": (both(edit(SET, "frame_rate", to=50_000), times(1e-3), video_times(1e-3)), MOTION,
         "time", "faster than sound"),
+    "motion-at-rest": (numbers(lambda t: np.column_stack([t[:, :2], t[:1, 2:].repeat(len(t), 0)])), MOTION, "x,y,z",
+        "never moves"),
     "motion-too-deep": (numbers(lambda t: t - np.eye(9)[4] * 0.2), MOTION, "x,y,z", "passes the bed's floor"),
     "tool-ten-times-as-large": (tool_scaled(10.0), MESH, "vertices", "1.2 m long"),
     "tool-in-inches": (tool_scaled(39.37), MESH, "vertices", "meshes and motions are in metres"),

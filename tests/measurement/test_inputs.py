@@ -16,11 +16,11 @@ from splatsoil.measurement import measurement as limits
 from splatsoil.measurement.camera import LENSES
 from splatsoil.measurement.colmap import _MODELS
 from splatsoil.measurement.fields import Fields
-from splatsoil.measurement.frames import FRAME_FIELDS, VIDEO_FIELDS, read_camera
+from splatsoil.measurement.frames import read_camera
 from splatsoil.measurement.images import check_photograph
 from splatsoil.measurement.motion import MOTION_COLUMNS
 from splatsoil.measurement.remarks import _FORCES
-from splatsoil.measurement.tool import FORCE_COLUMNS, read_mesh
+from splatsoil.measurement.tool import read_mesh
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "inputs.md"
 HALF = np.tile(np.linspace(0.0, 1.0, 16), (16, 1))
@@ -202,24 +202,6 @@ def page() -> str:
         ):
             out += ["", f"## {title}", "", "| given | what becomes of it |", "|---|---|"]
             out += [f"| {given} | {becomes} |" for given, becomes in rows]
-    fields = {
-        "`experiment.json`": limits.FIELDS,
-        "its `bed`": limits.BED_FIELDS,
-        "its `tool`": limits.TOOL_FIELDS,
-        "a frame of `transforms.json`": FRAME_FIELDS,
-        "of the video, also": VIDEO_FIELDS,
-        "`tool_motion.csv`": MOTION_COLUMNS,
-        "`tool_force.csv`": FORCE_COLUMNS,
-    }
-    out += [
-        "",
-        "## Fields that are read",
-        "",
-        "Others are left alone, unless they look like one of these misspelt.",
-        "",
-    ]
-    out += ["| in | fields |", "|---|---|"]
-    out += [f"| {place} | {', '.join(f'`{key}`' for key in keys)} |" for place, keys in fields.items()]
     return "\n".join(out) + "\n"
 
 
