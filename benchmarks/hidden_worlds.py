@@ -17,7 +17,7 @@ import subprocess
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,12 +38,9 @@ from splatsoil.benchmarks._newton import Numerics, plough
 
 from splatsoil.errors import ParameterError
 from splatsoil.files import plain, read_json
-from splatsoil.mpm import PRESETS, Resolution, Trajectory, frames_around, simulate
+from splatsoil.mpm import PRESETS, frames_around
 from splatsoil.quiet import hush
-from splatsoil.reconstruction import fill
-from splatsoil.soil.law import Law
-from splatsoil.soil.library import find_effects
-from splatsoil.synthetic import Appearance, Recorder, Setup, photograph_run
+from splatsoil.synthetic import Appearance, Recipe, Recorder, make_set, photograph_run
 
 OWN = ("_hidden", "_newton", "_scenes", "hidden_worlds")
 """Modules beside the package by which the experiments are made."""
@@ -54,38 +51,6 @@ ELSE = "something else"
 OPEN = (ELSE, "undecided")
 LEAST = 1e-6
 """Probability from which on down the log score falls no further."""
-
-
-def ploughed_by_newton(
-    group: Sequence[Hidden], setups: Sequence[Setup], frames: Sequence[int], device: str
-) -> list[Trajectory]:
-    """Synthetic experiments side by side."""
-    numerics = Numerics()
-    soils = [hidden.soil(setup, numerics.spacing) for hidden, setup in zip(group, setups, strict=True)]
-    found = []
-    for setup, soil, run in zip(setups, soils, plough(soils, numerics, frames, device), strict=True):
-        positions = np.stack([soil.particles, *(run.particles[f] for f in frames if f > 0)]).astype(np.float32)
-        found.append(
-            Trajectory(
-                frames=tuple(frames),
-                positions=positions,
-                deformations=np.broadcast_to(np.eye(3, dtype=np.float32), (*positions.shape, 3)),
-                force=run.force[: max(setup.frames)],
-                spacing=soil.spacing,
-                resolution=Resolution.derive(setup.experiment(), "small"),
-            )
-        )
-    return found
-
-
-def ploughed_by_us(hidden: Hidden, setup: Setup, frames: Sequence[int], preset: str, device: str) -> Trajectory:
-    """A synthetic experiment of our own solver, of particles that no fit starts from."""
-    experiment = setup.experiment()
-    law = Law(effect.for_measurement(experiment) for effect in find_effects(hidden.effects))
-    resolution = Resolution.derive(experiment, preset)
-    x = fill(setup.surface, setup.bed, resolution.spacing, seed=hidden.scene.seed)
-    values = law.require_on({**hidden.values, "friction_angle": hidden.angle})
-    return simulate(experiment, x, values, law=law, resolution=resolution, frames=frames, device=device)[0]
 
 
 @dataclass(frozen=True)
@@ -100,35 +65,44 @@ class Study:
 
     def made(self, truths: Sequence[Hidden], side_by_side: int) -> Iterator[Hidden]:
         """Simulate and photograph the experiments that the folder lacks, so many at a time; each that is there."""
-        missing = [h for h in truths if not (self.out / "sets" / h.name / "truth.json").is_file()]
+        missing = [h for h in truths if not (self.folder(h) / "truth.json").is_file()]
         yield from (h for h in truths if h not in missing)
+        make = self.by_newton if self.solver == NEWTON else self.by_ours
         groups = [missing[k : k + side_by_side] for k in range(0, len(missing), side_by_side)]
         while groups:
             group = groups.pop(0)
-            setups, seen = [h.scene.setup() for h in group], [h.observation() for h in group]
-            rate = setups[0].frame_rate
-            frames = sorted({f for o in seen for f in frames_around(setups[0].frames, o.time_offset * rate)})
-            if self.solver == NEWTON:
-                try:
-                    runs = ploughed_by_newton(group, setups, frames, self.device)
-                except ValueError as error:  # a particle that flies off asks for a grid of any size
-                    self.say(f"{', '.join(h.name for h in group)}: the other solver failed ({error})")
-                    groups += [[hidden] for hidden in group if len(group) > 1]
-                    continue
+            names = ", ".join(hidden.name for hidden in group)
+            try:
+                make(group)
+            except ValueError as error:  # a particle that flies off makes Newton ask for a grid of any size
+                self.say(f"{names}: the other solver failed ({error})")
+                groups += [[hidden] for hidden in group if len(group) > 1]
             else:
-                ours = zip(group, setups, strict=True)
-                runs = [ploughed_by_us(h, setup, frames, self.solver, self.device) for h, setup in ours]
-            for each in zip(group, setups, runs, strict=True):
-                self.photograph(*each)
-                yield each[0]
+                self.say(f"{names}: simulated and photographed")
+                yield from group
 
-    def photograph(self, hidden: Hidden, setup: Setup, run: Trajectory) -> None:
-        """Make the measurement set, with its truth."""
-        solver = asdict(Numerics()) if self.solver == NEWTON else self.solver
-        truth, seed = {"hidden": hidden.kind, "values": hidden.values, "solver": solver}, hidden.scene.seed
-        recorder = Recorder(setup, run, Appearance.drawn(seed), seed, self.device, hidden.observation())
-        photograph_run(self.out / "sets" / hidden.name, recorder, plain({**truth, "scene": asdict(hidden.scene)}))
-        self.say(f"{hidden.name} simulated and photographed")
+    def by_newton(self, group: Sequence[Hidden]) -> None:
+        """Make the measurement sets of experiments that Newton ploughs side by side."""
+        setups, seen = [h.scene.setup() for h in group], [h.observation() for h in group]
+        rate = setups[0].frame_rate
+        frames = {f for o in seen for f in frames_around(setups[0].frames, o.time_offset * rate)}
+        soils = [h.soil(setup, Numerics().spacing) for h, setup in zip(group, setups, strict=True)]
+        runs = plough(soils, Numerics(), frames, self.device)
+        for hidden, setup, run, observation in zip(group, setups, runs, seen, strict=True):
+            filmed, seed = replace(run, force=run.force[: max(setup.frames)]), hidden.scene.seed
+            recorder = Recorder(setup, filmed, Appearance.drawn(seed), seed, self.device, observation)
+            photograph_run(self.folder(hidden), recorder, plain({**asdict(hidden), "solver": asdict(Numerics())}))
+
+    def by_ours(self, group: Sequence[Hidden]) -> None:
+        """The same by our own solver, of particles that no fit starts from."""
+        for hidden in group:
+            seed, values = hidden.scene.seed, hidden.values
+            recipe = Recipe(hidden.angle, hidden.effects, values, self.solver, seed, seed, self.device)
+            make_set(self.folder(hidden), hidden.scene.setup(), recipe)
+
+    def folder(self, hidden: Hidden) -> Path:
+        """The measurement set."""
+        return self.out / "sets" / hidden.name
 
     def run(self, hidden: Hidden) -> Path:
         """The run folder."""
@@ -141,7 +115,7 @@ class Study:
             return
         run.mkdir(parents=True, exist_ok=True)
         commands = (
-            ["fit", str(self.out / "sets" / hidden.name), "--run", str(run), "--preset", self.preset],
+            ["fit", str(self.folder(hidden)), "--run", str(run), "--preset", self.preset],
             ["diagnose", str(run)],
         )
         with run.with_suffix(".log").open("a") as log:

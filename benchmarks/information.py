@@ -33,7 +33,8 @@ from splatsoil.benchmarks._common import (
     tell,
     with_section,
 )
-from splatsoil.benchmarks._truth import CELL, Truth, reconstructed
+from splatsoil.benchmarks._truth import CELL, Truth
+from splatsoil.envs.measured import reconstructed
 from splatsoil.inverse.criticism.design import Prior, Run
 from splatsoil.inverse.criticism.diagnosis import BASE_RUNS, FINE, OBSERVATION_STEP, PAIRS
 from splatsoil.inverse.criticism.noise import Noise, Tables, noise_of, trend_of

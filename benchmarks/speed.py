@@ -1,14 +1,13 @@
 """How fast is a simulation? Times, each beside another in the same run; for the whole path see `whole-path`.
 
 ``splatsoil benchmark speed --page docs/performance.md`` writes the CPU's section, with ``--device cuda:0`` the GPU's.
-Times of one thread are CPU times, which other programs disturb less than the clock's; all others are the clock's.
 Newton (extra ``independent``) is measured where it is installed.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -17,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
+import warp as wp
 from splatsoil.benchmarks._common import FloatArray, at_least, sources, stamp
 from splatsoil.benchmarks._newton import Numerics, Soil, plough
 from splatsoil.benchmarks._parts import Row, Section, parts_parser, run_parts
@@ -25,10 +24,10 @@ from splatsoil.benchmarks._truth import Truth
 from splatsoil.benchmarks.effects import acting, strong
 
 from splatsoil.measurement import Measurement
-from splatsoil.mpm import PRESETS, Resolution, Solver, simulate
-from splatsoil.mpm.simulate import base_settings, step_poses
+from splatsoil.mpm import PRESETS, Resolution, simulate
 from splatsoil.quiet import hush
 from splatsoil.reconstruction import fill
+from splatsoil.soil.effect import Effect
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
 from splatsoil.synthetic import paper
@@ -37,8 +36,8 @@ BATCH = 16
 """Parameter sets of one batch on a GPU."""
 WINDOWS, FRAMES = (0, 50, 150), 3
 """Frames at which pieces of Newton's run begin (soil at rest, pushed, tool drawn back), and how many of each count."""
-ROUNDS = 15
-"""Steps of each law, taken in turns."""
+FEW = 15
+"""Frames that laws are compared by."""
 
 
 def shown(times: FloatArray) -> str:
@@ -54,25 +53,16 @@ def ratio(times: FloatArray, other: FloatArray, name: str) -> str:
     return f"{shown(times)}; {name} {shown(other)}: {f'{faster:.0f}' if faster >= 100 else f'{faster:.3g}'} × as fast"
 
 
-def timed(task: Callable[[], object], repeats: int, device: str, *, warm: int = 1, wall: bool = False) -> FloatArray:
-    """Times (repeats,) in s after ``warm`` calls that do not count: of this thread on a CPU, unless ``wall``; else the
-    clock's."""
-    clock, times = time.thread_time if device == "cpu" and not wall else time.perf_counter, []
-    for _ in range(warm):
+def timed(task: Callable[[], object], repeats: int, device: str) -> FloatArray:
+    """The clock's times (repeats,) in s, after a call that compiles and does not count."""
+    times = []
+    for _ in range(1 + repeats):
+        began = time.perf_counter()
         task()
-    for _ in range(repeats):
-        _synchronise(device)
-        began = clock()
-        task()
-        _synchronise(device)
-        times.append(clock() - began)
-    return np.array(times)
-
-
-def _synchronise(device: str) -> None:
-    """Wait until a GPU has done what it was given, by Warp and by torch."""
-    if device != "cpu":
-        torch.cuda.synchronize(device)
+        if device != "cpu":
+            wp.synchronize_device(device)
+        times.append(time.perf_counter() - began)
+    return np.array(times[1:])
 
 
 @dataclass(frozen=True)
@@ -99,17 +89,12 @@ class Scene:
         r = self.resolution
         return float(len(self.x)) * self.last * r.steps * r.substeps(r.steps)
 
-    def run(self, device: str, batch: int = 1) -> None:
-        """The whole run; the sets of a batch differ by their friction angles."""
-        angle = self.values["friction_angle"]
-        values = [{**self.values, "friction_angle": angle + 0.5 * k} for k in range(batch)]
-        simulate(self.measurement, self.x, values, resolution=self.resolution, frames=(self.last,), device=device)
-
-    def solver(self, law: Law, values: Mapping[str, float]) -> Solver:
-        """The solver at frame 0, on the CPU."""
-        bed, mesh, x = self.measurement.bed, self.measurement.tool.mesh, self.x[None].astype(np.float32)
-        settings = base_settings(self.measurement)
-        return Solver(x, bed.lower, bed.upper, mesh, self.resolution, law, settings, [{**self.values, **values}], "cpu")
+    def run(self, device: str, batch: int = 1, effects: Sequence[Effect] = (), last: int = 0) -> None:
+        """The whole run, or up to a frame, with effects on; the sets of a batch differ by their friction angles."""
+        values = {**self.values, **{key: value for effect in effects for key, value in acting(effect).items()}}
+        each = [{**values, "friction_angle": values["friction_angle"] + 0.5 * k} for k in range(batch)]
+        law, frames = Law(effects), (last or self.last,)
+        simulate(self.measurement, self.x, each, law=law, resolution=self.resolution, frames=frames, device=device)
 
 
 @dataclass(frozen=True)
@@ -158,8 +143,7 @@ def simulation(task: Task) -> Section:
             rows.append(Row(f"{name}: {BATCH} parameter sets as one batch", each))
     if device == "cpu":
         with ThreadPoolExecutor(2) as pool:
-            pair = timed(lambda: list(pool.map(scene.run, ["cpu"] * 2)), task.repeats, "cpu", wall=True)
-        alone = timed(partial(scene.run, "cpu"), task.repeats, "cpu", warm=0, wall=True)
+            pair = timed(lambda: list(pool.map(scene.run, ["cpu"] * 2)), task.repeats, "cpu")
         rows.append(Row("two runs side by side on two cores", ratio(pair, 2.0 * alone, "one after the other")))
     return Section("Simulation", rows)
 
@@ -180,27 +164,21 @@ def newton(task: Task) -> Section:
         )  # fmt: skip
         seconds.append(np.diff(ends))  # the first frame compiles, and lets stress build up
     whole = scene.last * np.mean(seconds, axis=0)
-    ours = timed(partial(scene.run, task.device), task.repeats, task.device, wall=True)
+    ours = timed(partial(scene.run, task.device), task.repeats, task.device)
     held = bool(np.median(whole) >= 20.0 * np.median(ours))
     row = Row(f"{scene.measurement.name}, {scene.last} frames", ratio(ours, whole, "Newton"), "≥ 20 ×", held)
     return Section("Against Newton's implicit MPM", [row])
 
 
 def effects(task: Task) -> Section:
-    """A step with all effects on strength that act together, over the base law's: least times, on the CPU."""
+    """Steps with all effects on strength that act together, over the base law's: least times, on the CPU."""
     names = strong()
-    acts = find_effects(names)
-    values = {key: value for effect in acts for key, value in acting(effect).items()}
-    scene, spent = task.scene, ([], [])  # type: ignore[var-annotated]
-    runs = scene.solver(Law(), {}), scene.solver(Law(acts), values)
-    r = scene.resolution
-    for frame in range(ROUNDS):
-        poses = step_poses(scene.measurement.tool.motion, frame * r.frame_time, r.frame_time, r.steps)
-        for run, own in zip(runs, spent, strict=True):
-            own.extend(timed(partial(run.advance, poses), 1, "cpu", warm=0))
-    base, whole = (min(own[1:]) for own in spent)
-    found, what = whole / base, f"a frame with {len(names)} effects on strength, over the base law's"
-    return Section("What effects cost", [Row(what, f"{found:.2f}", "≤ 2", found <= 2.0)])
+    base, whole = (
+        timed(partial(task.scene.run, "cpu", effects=on, last=FEW), task.repeats, "cpu").min()
+        for on in ((), find_effects(names))
+    )
+    found, what = whole / base, f"{FEW} frames with {len(names)} effects on strength, over the base law's"
+    return Section("What effects cost", [Row(what, f"{found:.2f}", "≤ 2", bool(found <= 2.0))])
 
 
 PARTS = (simulation, newton, effects)
