@@ -109,7 +109,7 @@ class Study:
         return self.out / "runs" / hidden.name
 
     def judge(self, hidden: Hidden) -> None:
-        """Fit and diagnose by the command line, unless that is done; what it says is kept beside its run."""
+        """Fit and diagnose by the command line, unless that is done; its output is kept beside the run."""
         run = self.run(hidden)
         if (run / "diagnosis.json").is_file():
             return
@@ -132,29 +132,29 @@ class Study:
         return [score(h, read_json(self.run(h) / "fit.json"), read_json(self.run(h) / "diagnosis.json")) for h in there]
 
 
-def score(hidden: Hidden, fit: Mapping[str, Any], told: Mapping[str, Any]) -> dict[str, Any]:
+def score(hidden: Hidden, fit: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> dict[str, Any]:
     """What fit and diagnosis report of a synthetic experiment, beside the truth.
 
     ``size`` is that of the effect's parameter, ``times`` and ``detectable`` are over its smallest meaningful change.
     """
-    models = {model["name"]: model for model in told["models"]}
+    models = {model["name"]: model for model in diagnosis["models"]}
     truth = {NOTHING: "", **dict.fromkeys(OUTSIDE, ELSE)}.get(hidden.kind, hidden.kind)
-    best, angle, verdict = told["models"][0], told["estimates"]["friction_angle"], told["verdict"]
-    named = told["class"] if verdict in ("missing", "one of") else []
+    best, angle, verdict = diagnosis["models"][0], diagnosis["estimates"]["friction_angle"], diagnosis["verdict"]
+    named = diagnosis["class"] if verdict in ("missing", "one of") else []
     row = {
         "hidden": hidden.kind,
         "truth": truth,
         "size": next(iter(hidden.values.values()), 0.0),
         "angle": hidden.angle,
         "verdict": verdict,
-        "class": told["class"],
+        "class": diagnosis["class"],
         "named": named,
         "right": truth in {"adequate": [""], ELSE: [ELSE]}.get(verdict, named),
         "best": best["name"],
         "probabilities": {name: model["probability"] for name, model in models.items()},
         "angle_found": [angle["value"], angle["std"]],
         "z": (angle["value"] - hidden.angle) / angle["std"],
-        "seconds": [fit["seconds"], told["seconds"]],
+        "seconds": [fit["seconds"], diagnosis["seconds"]],
     }
     if hidden.effects and truth in models:
         model = models[truth]
@@ -174,11 +174,11 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
     lines = []
     for r in sorted(rows, key=lambda r: (r["right"], r["hidden"])):
         size = f"{r['size']:.3g}" + (f" ({r['times']:.1f})" if "times" in r else "") if r["truth"] else "–"
-        chances = f"{_chance(r, [r['truth']]):.2f}, {_chance(r, ['']):.2f}"
+        shares = f"{_probability(r, [r['truth']]):.2f}, {_probability(r, ['']):.2f}"
         angle = f"{r['angle']:.1f}°; {r['angle_found'][0]:.1f} ± {r['angle_found'][1]:.1f}° ({r['z']:+.1f})"
         found = "{:.3g} ± {:.2g}".format(*r["size_found"]) if "size_found" in r else "–"
         seconds = "{:.0f}, {:.0f} s".format(*r["seconds"])
-        lines.append([r["hidden"], size, r["verdict"], ", ".join(r["class"]) or "–", chances, angle, found, seconds])
+        lines.append([r["hidden"], size, r["verdict"], ", ".join(r["class"]) or "–", shares, angle, found, seconds])
     return markdown(head, lines) + "\n\n" + "\n".join(f"- {line}" for line in _counts(rows))
 
 
@@ -200,15 +200,15 @@ def _counts(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
         yield from _rms(f"{what}: error of the angle, degrees", [r["angle_found"][0] - r["angle"] for r in some])
         yield from _rms(f"{what}: error of the angle over its ±", [r["z"] for r in some])
     yield from _rms("relative error of the size", [r["size_error"] for r in rows if "size_error" in r])
-    for what, told in (
+    for what, claims in (
         ("effects named", [(r, r["named"]) for r in rows if r["named"]]),
         ("the most probable model", [(r, [r["best"]]) for r in rows]),
     ):
-        mean = np.mean([_chance(*each) for each in told]) if told else math.nan
-        right = [r["truth"] in names for r, names in told]
+        mean = np.mean([_probability(*each) for each in claims]) if claims else math.nan
+        right = [r["truth"] in names for r, names in claims]
         yield from _share(f"{what}, of probability {mean:.2f} on average: right", right)
     if rows:
-        scores = [math.log(max(_chance(r, [r["truth"]]), LEAST)) for r in rows]
+        scores = [math.log(max(_probability(r, [r["truth"]]), LEAST)) for r in rows]
         yield f"log score of the true model, mean: {np.mean(scores):.2f}"
 
 
@@ -223,7 +223,7 @@ def _rms(what: str, values: Sequence[float]) -> Iterator[str]:
         yield f"{what}, root mean square of {len(values)}: {np.sqrt(np.mean(np.square(values))):.2f}"
 
 
-def _chance(row: Mapping[str, Any], names: Iterable[str]) -> float:
+def _probability(row: Mapping[str, Any], names: Iterable[str]) -> float:
     """Probability that one of these models is true; 0 for one that was not compared."""
     return float(sum(row["probabilities"].get(name, 0.0) for name in names))
 

@@ -222,17 +222,17 @@ def convergence(scan: Scanner, truth: Truth, preset: str, cells: Sequence[float]
 def table(result: Mapping[str, Any]) -> str:
     """The result as Markdown."""
     cases, preset = result["cases"], result["preset"]
-    told = [f"Preset `{preset}`, {result['seeds']} particle seeds, {result['made_by']['device']}."]
-    told += _agreement({name: case["agreement"] for name, case in cases.items()})
+    text = [f"Preset `{preset}`, {result['seeds']} particle seeds, {result['made_by']['device']}."]
+    text += _agreement({name: case["agreement"] for name, case in cases.items()})
     for name, case in cases.items():
         if case.get("convergence"):
             head = [f"{name}: cell, mm", "angle off", "heights off, mm", "push force, N", "volume"]
-            told.append(markdown(head, [_convergence(row) for row in case["convergence"]]))
+            text.append(markdown(head, [_convergence(row) for row in case["convergence"]]))
         if case.get("changes"):
             head = [f"{name}: change", "shift of the angle", "of the push force"]
             shifts = [(r["change"], f"{r['angle']:+.1f}°", f"{100 * r['force']:+.0f} %") for r in case["changes"]]
-            told.append(markdown(head, shifts))
-    return "\n\n".join(told)
+            text.append(markdown(head, shifts))
+    return "\n\n".join(text)
 
 
 def _convergence(row: Mapping[str, float]) -> list[str]:
